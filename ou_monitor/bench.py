@@ -18,6 +18,7 @@ from ou_monitor.errors import InputError
 from ou_monitor.records import as_numbers, as_seconds, Recording
 from ou_monitor.report.result import Result
 from ou_monitor.text import counted
+from ou_monitor.timeline.line import ordered, readings_of
 
 if TYPE_CHECKING:
     from ou_monitor.analysis.overview import Overview
@@ -40,7 +41,7 @@ _BLOCKS_FROM = 5000.0
 
 def _read(recording: Given) -> Recording:
     if isinstance(recording, Recording):
-        return recording
+        return ordered(recording)
     from ou_monitor.recordings.read import read_recording
 
     return read_recording(recording)
@@ -245,7 +246,6 @@ def coupling(recording: Given, signal: str | Series | Pairs, *,
     from ou_monitor.recordings.importers.log import Series, UNKNOWN
     from ou_monitor.recordings.read import read_beside
     from ou_monitor.report.coupling_document import coupling_document
-    from ou_monitor.timeline.line import readings_of
 
     name = signal if isinstance(signal, str) else 'signal'
     if isinstance(signal, str):

@@ -11,6 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 import enum
 import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +27,14 @@ LARGEST_FACTOR = 10.0
 LARGEST_LOG_SE = math.log(LARGEST_FACTOR) / Z95
 # Exponent beyond which a factor counts as infinite: exp(709.78) is the largest float.
 _INFINITE = 709.0
+# Units of a time, in s.
+TIME_UNITS = {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9}
+# The years 2000 and 2100, s since 1970: the ranges of a clock in s, ms, us and ns do not overlap.
+_CLOCKS = 946_684_800.0, 4_102_444_800.0
+# Largest magnitude accepted as a stamp, s: the year 5138, below any clock in ms.
+MOST_STAMP = 1.0e11
+# Median step above which the unit of the time is wrong, s: no logger of a supply is slower.
+LONGEST_STEP = 100.0
 
 
 def as_numbers(values: npt.ArrayLike) -> FloatArray:
@@ -43,15 +52,27 @@ def as_numbers(values: npt.ArrayLike) -> FloatArray:
         else found
 
 
+def clock_unit(stamp: float) -> str:
+    """Return the unit in which a stamp since 1970 is a date of 2000 to 2100; '' for none."""
+    return next((unit for unit, scale in TIME_UNITS.items()
+                 if _CLOCKS[0] <= stamp * scale <= _CLOCKS[1]), '')
+
+
 def as_seconds(values: npt.ArrayLike) -> FloatArray:
     """
-    Return stamps in s: numbers as they are, dates since 1970 (UTC), NaT and masked as NaN.
+    Return stamps in s; dates are counted from 1970 (UTC), NaT and masked are NaN.
 
-    Spans, and times with a zone, as pandas and xarray have them, are understood too.
+    Numbers are seconds, unless all are dates of 2000 to 2100 in ms, us or ns since 1970.  Spans,
+    and times with a zone, as pandas and xarray have them, are understood too.
     """
-    if type(values) is np.ndarray and values.dtype == np.float64:
-        return values
-    data = np.asarray(np.ma.getdata(values))
+    plain = type(values) is np.ndarray and values.dtype == np.float64
+    data = np.asarray(values if plain else np.ma.getdata(values))
+    if data.dtype.kind in 'iuf' and (unit := _fine_unit(data, np.ma.getmask(values))):
+        if data.dtype.kind == 'f':
+            return as_numbers(values) * TIME_UNITS[unit]
+        data = data.astype(f'datetime64[{unit}]')
+    elif plain:
+        return data
     # A date that is none is not itself.
     dates = [one for one in data.flat if one == one] if data.dtype.kind == 'O' else []
     if dates and all(hasattr(one, 'timestamp') for one in dates):
@@ -63,10 +84,24 @@ def as_seconds(values: npt.ArrayLike) -> FloatArray:
         return as_numbers(values)
     if np.datetime_data(data.dtype)[0] == 'generic':
         raise ValueError('stamps without a unit: timedelta64 needs one, such as [ns]')
-    count = data.astype(f'{data.dtype.kind}8[ns]').astype(np.int64)
-    # Whole seconds apart from the rest: 1.7e18 ns are beyond float64.
-    seconds = count // 10**9 + (count % 10**9) * 1e-9
+    # Whole seconds apart from the rest: 1.7e18 ns are beyond float64, and 1e19 ns beyond int64.
+    whole = data.astype(f'{data.dtype.kind}8[s]')
+    seconds = whole.astype(np.int64) + (data - whole) / np.timedelta64(1, 's')
     return np.where(np.isnat(data) | np.ma.getmaskarray(values), NAN, seconds)
+
+
+def _fine_unit(stamps: npt.NDArray[Any], masked: npt.NDArray[np.bool_] | np.bool_) -> str:
+    """Return the unit below a second of stamps that are all dates since 1970; '': they are not."""
+    most = float(stamps.max(initial=0))
+    # Also false for NaN.
+    if most <= MOST_STAMP:
+        return ''
+    known = stamps[np.isfinite(stamps) & ~masked]
+    unit = clock_unit(float(known.max(initial=0)))
+    if unit in ('', 's') or clock_unit(float(known.min())) != unit:
+        return ''
+    step = float(np.median(np.abs(np.diff(known.astype(np.float64))))) if known.size > 1 else 0.0
+    return unit if step * TIME_UNITS[unit] <= LONGEST_STEP else ''
 
 
 def exp_or_inf(log: float) -> float:
@@ -421,7 +456,7 @@ class Recording:
     Attributes
     ----------
     t : ndarray, shape (n,)
-        Stamps, s, strictly increasing.
+        Stamps, s, in any order; dates, and numbers since 1970 in ms, us or ns, become seconds.
     voltage : ndarray, shape (n,)
         Voltage, V, finite.
     throttle : ndarray, shape (n,)
@@ -460,6 +495,9 @@ class Recording:
     def __post_init__(self) -> None:
         """Take dates and masked values for what they are; refuse what cannot be one recording."""
         object.__setattr__(self, 't', as_seconds(self.t))
+        if (beyond := self.t[np.isfinite(self.t) & (np.abs(self.t) > MOST_STAMP)]).size:
+            raise ValueError(f'a stamp of {beyond[0]:.4g} s is implausible: give all stamps in s, '
+                             'or all as dates')
         for name in ('voltage', 'throttle', 'current'):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, as_numbers(getattr(self, name)))

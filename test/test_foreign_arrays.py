@@ -3,7 +3,9 @@
 from datetime import datetime, timedelta, timezone
 
 import numpy as np
-from ou_monitor import MonitorSettings, Recording, SlidingEstimator, SupplyMonitor
+from ou_monitor import (
+    analyze, compare, coupling, discover, InputError, MonitorSettings, Recording,
+    SlidingEstimator, supply_facts, SupplyMonitor)
 from ou_monitor.records import as_seconds
 import pytest
 
@@ -32,7 +34,12 @@ AXES = {
     'zone': Axis(np.array([BEGIN + timedelta(seconds=t) for t in SECONDS.tolist()], dtype=object)),
     'datetime': np.array([BEGIN.replace(tzinfo=None) + timedelta(seconds=t)
                           for t in SECONDS.tolist()], dtype=object),
-    'masked': np.ma.masked_array(SECONDS, np.zeros(N, dtype=bool))}
+    'masked': np.ma.masked_array(SECONDS, np.zeros(N, dtype=bool)),
+    'whole ns': DATES.astype(np.int64), 'float ns': DATES.astype(np.int64).astype(float),
+    'whole us': DATES.astype('datetime64[us]').astype(np.int64),
+    'float ms': 1e3 * (BEGIN.timestamp() + SECONDS), 'pandas ns': Axis(DATES.astype(np.int64)),
+    'list of ms': (1e3 * (BEGIN.timestamp() + SECONDS)).tolist(),
+    'masked ns': np.ma.masked_array(DATES.astype(np.int64), np.zeros(N, dtype=bool))}
 
 
 @pytest.mark.parametrize('axis', AXES)
@@ -40,8 +47,8 @@ def test_a_time_axis_is_seconds(axis):
     """A recording, the estimator and the monitor have the samples 10 ms apart."""
     recording = Recording(AXES[axis], VOLTS, np.full(N, 0.3))
     np.testing.assert_allclose(np.diff(recording.t), 0.01, atol=1e-6)
-    assert (recording.t[0] > 1.7e9) == (axis in (
-        'dates', 'milliseconds', 'pandas', 'zone', 'datetime'))
+    counted = axis in ('seconds', 'list', 'spans', 'masked')
+    assert recording.t[0] == pytest.approx(0.0 if counted else BEGIN.timestamp(), abs=1e-6)
     estimator, monitor = SlidingEstimator(), SupplyMonitor(MonitorSettings())
     estimator.push(AXES[axis], VOLTS)
     monitor.push(AXES[axis], VOLTS, 0.3)
@@ -54,6 +61,65 @@ def test_dates_to_the_microsecond():
     """Nanoseconds since 1970 are beyond float64, their seconds are not."""
     t = np.datetime64('2024-05-16T08:00:00.123456', 'ns') + np.arange(4) * np.timedelta64(10, 'us')
     np.testing.assert_allclose(np.diff(Recording(t, VOLTS[:4], VOLTS[:4]).t), 1e-5, atol=3e-7)
+
+
+def test_dates_far_from_today_and_whole_numbers_to_the_microsecond():
+    """Nanoseconds of a year 3000 are beyond int64; of 2024 beyond float64."""
+    far = np.array(['3000-01-01T00:00:00.5', '1000-01-01'], dtype='datetime64[ms]')
+    np.testing.assert_allclose(as_seconds(far), [32503680000.5, -30610224000.0])
+    ns = DATES.astype(np.int64)[:4] + np.arange(4) * 10_123
+    np.testing.assert_allclose(np.diff(as_seconds(ns)), 0.010010123, atol=3e-7)
+
+
+def test_one_clock_sample_by_sample():
+    """Each stamp alone is in ms, as a callback has it."""
+    estimator, monitor = SlidingEstimator(), SupplyMonitor(MonitorSettings())
+    for t, volts in zip((1e3 * (BEGIN.timestamp() + SECONDS)).tolist(), VOLTS.tolist()):
+        estimator.push(t, volts)
+        monitor.push(t, volts)
+    assert estimator.estimate().rate == pytest.approx(100.0, rel=0.01)
+    assert monitor.report(0.0).estimate.counters.resets == 0
+
+
+MANY = [1.7e12 + 1e3 * t if k % 2 else 1.7e9 + t for k, t in enumerate(SECONDS.tolist())]
+
+
+@pytest.mark.parametrize('t, words', [
+    (MANY, 'implausible'), (np.sort(MANY), 'implausible'),
+    (np.where(np.arange(N) == 50, 1.7e12, SECONDS), 'implausible'),
+    # Nanoseconds since a start-up 25 minutes ago look like milliseconds of 2017, 10^4 s apart.
+    ((1.5e12 + 1e9 * SECONDS).astype(np.int64), 'implausible'), (1e14 * SECONDS, 'implausible')])
+def test_a_mixed_or_unknown_unit_is_refused(t, words):
+    """No stamp is taken for seconds which another shows to be none; a stream drops them."""
+    with pytest.raises(ValueError, match=words):
+        Recording(t, VOLTS, VOLTS)
+    monitor = SupplyMonitor(MonitorSettings())
+    monitor.push(t, VOLTS, 0.3)
+    assert monitor.report(0.0).estimate.counters.non_finite == (np.abs(t) > 1e11).sum() > 0
+
+
+CALLS = {
+    'analyze': analyze, 'discover': discover, 'compare': lambda one: compare(one, seeds=20),
+    'coupling': lambda one: coupling(one, (one.t, one.voltage)), 'supply_facts': supply_facts}
+
+
+@pytest.mark.parametrize('call', CALLS)
+def test_stamps_in_disorder_are_sorted_as_of_a_file(call):
+    """Decreasing, repeated, unknown or negative: the same answer as in order; others no answer."""
+    t = np.arange(1200) * 0.01
+    throttle = np.where(t % 2.0 < 1.0, 0.2, 0.5)
+    volts = 15.0 - throttle + 0.01 * np.random.default_rng(2).standard_normal(t.size)
+    again = np.append(t, [t[5], np.nan])
+    facts = []
+    for stamps, part in ((t, slice(None)), (t - 5.0, slice(None)),
+                         (t[::-1], slice(None, None, -1)), (again, [*range(t.size), 7, 9])):
+        found = CALLS[call](Recording(stamps, volts[part], throttle[part]))
+        facts.append(getattr(found, 'supply', found).to_dict())
+    assert facts[0]['ou']['status'] == 'not_visible' and facts[0]['sag']['known']
+    assert facts[2] == facts[3] == facts[0]
+    assert facts[1]['lowest'] == pytest.approx(facts[0]['lowest'])
+    with pytest.raises(InputError, match='1e.04 s apart: are the stamps in ms, us or ns'):
+        CALLS[call](Recording(1e6 * t, volts, throttle))
 
 
 def test_what_is_masked_is_unknown():

@@ -73,8 +73,6 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
     window in s, brownout_voltage in V (of so many cells, to tell it by the cell),
     brownout_horizon in s, progress 0..1.
     """
-    if not (np.diff(recording.t) > 0.0).all():
-        raise ValueError('stamps must be finite and increase, as read_recording leaves them')
     report: Progress = progress or (lambda share: None)
     recording = readings_of(recording)
     voltage = _default_voltage(recording) if brownout_voltage is None else brownout_voltage

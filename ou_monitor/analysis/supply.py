@@ -30,7 +30,7 @@ from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.online.risk.forecast import LOOK
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import FloatArray, NAN, OuFacts, Recording
-from ou_monitor.timeline.line import readings_of
+from ou_monitor.timeline.line import ordered, readings_of
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 # Throttles at which sag and noise are given.
@@ -190,7 +190,7 @@ def supply_facts(recording: Recording, limit: float | None = None) -> SupplyFact
     (4.58, 0, True)
 
     """
-    return facts_and_end(recording, limit)[0]
+    return facts_and_end(ordered(recording), limit)[0]
 
 
 def facts_and_end(recording: Recording, limit: float | None = None, left: Remainder | None = None,

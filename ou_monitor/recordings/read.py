@@ -14,7 +14,6 @@ import math
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.bag import BagReader, batches
 from ou_monitor.recordings.bag_samples import (
@@ -30,7 +29,7 @@ from ou_monitor.recordings.standard_types import IMU
 from ou_monitor.records import defect_of, Recording
 from ou_monitor.stream.config import FieldSpec
 from ou_monitor.timeline.line import (
-    in_order, MOST_THROTTLE, MOST_VOLTAGE, plausible, plausible_samples, readings_of)
+    in_order, MOST_THROTTLE, MOST_VOLTAGE, part_of, plausible, plausible_samples, readings_of)
 
 # Spacing, s, from which another unit of time is more likely than a slow logger.
 _SPARSE = 5.0
@@ -145,14 +144,6 @@ def _of_log(path: Path, names: frozenset[str], columns: CsvColumns | None, fligh
     return _cut(whole, start, end), log
 
 
-def _samples(recording: Recording, which: slice | npt.NDArray[np.bool_], notes: tuple[str, ...],
-             ) -> Recording:
-    """Return the selected samples of a recording."""
-    return replace(recording, t=recording.t[which], voltage=recording.voltage[which],
-                   throttle=recording.throttle[which], notes=notes,
-                   current=None if recording.current is None else recording.current[which])
-
-
 def tidy(raw: RawColumns) -> Recording:
     """Return a `Recording` in order, each stamp once, with notes on dropped samples."""
     name = raw.name
@@ -198,7 +189,7 @@ def _cut(recording: Recording, start: float | None, end: float | None) -> Record
     part = (t >= (start or 0.0)) & (t < (math.inf if end is None else end))
     if not part.any():
         raise InputError(outside_words(recording.name, start, end, float(t[-1])))
-    return _samples(recording, part, (*recording.notes, part_words(start, end)))
+    return part_of(recording, part, part_words(start, end))
 
 
 def read_beside(

@@ -29,8 +29,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from ou_monitor.errors import InputError
 from ou_monitor.records import (
-    as_numbers, Counters, Defect, FloatArray, NAN, Note, Recording)
+    as_numbers, Counters, Defect, FloatArray, LONGEST_STEP, MOST_STAMP, NAN, Note, Recording)
 from ou_monitor.text import counted
 
 # Share of gaps that may differ from the pattern: lost samples, late logger.
@@ -295,14 +296,33 @@ def readings_of(recording: Recording) -> Recording:
         notes=(*recording.notes, note), held=recording.held + held)
 
 
+def part_of(recording: Recording, which: Picked | npt.NDArray[np.bool_], *said: str,
+            ) -> Recording:
+    """Return the selected samples of a recording, with further notes."""
+    return replace(
+        recording, t=recording.t[which], voltage=recording.voltage[which],
+        throttle=recording.throttle[which], notes=(*recording.notes, *said),
+        current=None if recording.current is None else recording.current[which])
+
+
+def ordered(recording: Recording) -> Recording:
+    """Return a recording in the order of its stamps, each once; notes count dropped samples."""
+    which, said = in_order(recording.t, recording.voltage[:, None], _FINITE)
+    recording = part_of(recording, which, *said) if said else recording
+    if recording.n > 1 and (step := float(np.median(np.diff(recording.t)))) > LONGEST_STEP:
+        raise InputError(f"the samples of '{recording.name}' are {step:.4g} s apart: are the "
+                         'stamps in ms, us or ns? Give them in s, or as dates')
+    return recording
+
+
 # Largest accepted magnitude of a voltage, V: far above any supply, with squares and cubes finite.
 MOST_VOLTAGE = 1.0e6
 # Largest accepted magnitude of a current, A: far above any supply.
 MOST_CURRENT = 1.0e6
 # Largest magnitude accepted as a throttle of 0..1, with generous ends.
 MOST_THROTTLE = 2.0
-# Largest magnitude accepted as a stamp, s: a century since 1970 is 3e9 s.
-_MOST_STAMP = 1.0e12
+# Largest finite number: unordered samples may be in any unit of voltage.
+_FINITE = float(np.finfo(np.float64).max)
 # Buffer size, samples: NumPy's overhead per call vanishes, and the buffer stays in the cache.
 BATCH = 32768
 # Search for repeats: samples used, minimum number, new samples between two searches.
@@ -332,7 +352,7 @@ def hold(values: FloatArray) -> FloatArray:
 def plausible_samples(t: FloatArray, voltage: FloatArray, throttle: FloatArray | None
                       ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
     """Return samples with NaN for implausible values (t in s, V, throttle 0..1)."""
-    return (plausible(t, _MOST_STAMP), plausible(voltage, MOST_VOLTAGE),
+    return (plausible(t, MOST_STAMP), plausible(voltage, MOST_VOLTAGE),
             None if throttle is None else plausible(throttle, MOST_THROTTLE))
 
 

@@ -222,14 +222,6 @@ def test_options_out_of_range_are_a_callers_bug(options):
         analyze(recording(15, TRUTH, seconds=0.5), **options)
 
 
-@pytest.mark.parametrize('t', [[0.0, 2.0, 1.0], [2.0, 1.0, 0.0], [0.0, 1.0, 1.0],
-                               [0.0, np.nan, 1.0], [np.nan, np.nan, np.nan]])
-def test_stamps_that_do_not_increase_are_a_callers_bug(t):
-    """Levels and pauses would be nonsense; a file is sorted by `read_recording`."""
-    with pytest.raises(ValueError, match='stamps must be finite and increase'):
-        analyze(Recording(np.array(t), np.full(3, 5.0), np.full(3, np.nan), 'made'))
-
-
 @pytest.mark.parametrize('n', [0, 1, 2, 3, 15])
 def test_tiny_recordings_end_in_a_status(n):
     """Nothing raises, nothing is invented."""

@@ -130,3 +130,13 @@ def test_swapped_columns_and_odd_times_are_reported(tmp_path):
     read_csv(csv(times[::-1], volts))
     t = read_csv(csv(1e6 * times, volts), CsvColumns(time_unit='us')).t
     np.testing.assert_allclose(t, times, rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize('begin, unit', [
+    (1.7e12, 1e-3), (1.7e15, 1e-6), (1.7e18, 1e-9), (1.5e9, 1e-6), (0.0, 1e-6)])
+def test_a_time_without_a_unit(begin, unit, tmp_path):
+    """A date since 1970; 1.5e9 us are 25 minutes since a start-up, not a date of 2017 in s."""
+    ticks = [int(begin) + round(0.01 / unit) * k for k in range(200)]
+    path = written(tmp_path, 't,U\n' + ''.join(f'{t},{12 + t % 7}\n' for t in ticks))
+    found = read_recording(path).t
+    assert (found[0] > 1e9) == (begin > 1.6e9) and found[-1] - found[0] == pytest.approx(1.99)

@@ -37,7 +37,7 @@ from ou_monitor.online.estimator.window import (
     FACTOR, FEWEST, LAGS, LOST, Resolution, Sums, T, Thinner, U, Y)
 from ou_monitor.records import (
     as_numbers, as_seconds, Counters, Estimate, Flag, FloatArray, LARGEST_LOG_SE, LOG_NAMES,
-    MOST_READINGS, NAN, OU_WINDOWS, OuFacts, Status)
+    MOST_READINGS, MOST_STAMP, NAN, OU_WINDOWS, OuFacts, Status)
 from ou_monitor.timeline.line import as_column, BATCH, Batch, TAIL, TimeLine
 
 # Samples from which a fit is tried.
@@ -169,9 +169,11 @@ class SlidingEstimator:
         stamps: Any = t
         volts: Any = voltage
         if not (type(stamps) is np.ndarray is type(volts) and stamps.dtype is _DOUBLE
-                is volts.dtype and stamps.ndim == 1 == volts.ndim):
+                is volts.dtype and stamps.ndim == 1 == volts.ndim
+                and not (stamps.size and stamps[-1] > MOST_STAMP)):
             if isinstance(stamps, float) and isinstance(volts, float) and (
-                    throttle is None or isinstance(throttle, (float, int))):
+                    throttle is None or isinstance(throttle, (float, int))) and not (
+                    stamps > MOST_STAMP):
                 if not self._line.put_one(stamps, volts, throttle):
                     self._work_off()
                     self._line.put_one(stamps, volts, throttle)

@@ -30,7 +30,7 @@ import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import CsvColumns
 from ou_monitor.recordings.mcap_file import kind_of_foreign
-from ou_monitor.records import FloatArray
+from ou_monitor.records import FloatArray, TIME_UNITS
 from ou_monitor.stream.files import open_regular
 
 TIME, VOLTAGE, THROTTLE, CURRENT = 'time_s', 'voltage_v', 'throttle', 'current_a'
@@ -47,7 +47,6 @@ MOST_OF_LINE = 65536
 _HEAD, _HEAD_LINES, _CHUNK, _BLOCK = 65536, 200, 1 << 20, 8192
 
 VOLTAGE_UNITS = {'V': 1.0, 'mV': 1e-3}
-TIME_UNITS = {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9}
 # Unit -> what the value is multiplied by after this is taken from it.
 THROTTLE_UNITS = {'1': (0.0, 1.0), '%': (0.0, 0.01), 'us': (1000.0, 1e-3)}
 DELIMITERS = {'tab': '\t', 'space': ' '}

@@ -25,18 +25,19 @@ from ou_monitor.recordings.importers import log as logs
 from ou_monitor.recordings.importers.csv_form import (
     AMPERE_WORDS, CHANNEL, CLOCK, CURRENT, CURRENT_UNITS, Form, form_of, is_clock, is_number,
     is_value, MISSING, NONE, numbers, SHARE_WORDS, shown, swapped, THROTTLE, THROTTLE_UNITS,
-    TIME, TIME_UNITS, TIME_WORDS, unit_of, VOLT_WORDS, VOLTAGE, VOLTAGE_UNITS)
+    TIME, TIME_WORDS, unit_of, VOLT_WORDS, VOLTAGE, VOLTAGE_UNITS)
 from ou_monitor.recordings.importers.log import (
     ANY, CsvColumns, Log, one_flight, RawColumns, Request, Series)
-from ou_monitor.records import Defect, FloatArray, Note
+from ou_monitor.records import (
+    clock_unit, Defect, FloatArray, LONGEST_STEP, Note, TIME_UNITS)
 from ou_monitor.text import counted, printable
 from ou_monitor.timeline.line import hold, MOST_THROTTLE
 
 
 # Columns listed at most; loggers of autopilots write some hundred.
 MOST_COLUMNS = 300
-# Share of steps back in what is no time; a supply is not read less often, s.
-_BACK, _LONGEST_STEP = 0.25, 100.0
+# Share of steps back in what is no time.
+_BACK = 0.25
 # A time without a unit is in the coarsest whose steps, and whose span, are at most these, s.
 _USUAL_STEP, _USUAL_SPAN = 2.0, 43200.0
 # A voltage without a unit beyond this is in mV: no pack of a craft has so many volts.
@@ -426,12 +427,13 @@ def _stamps(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: _Co
         # Clocks that count from 1970 tell their unit by their size.
         size = float(np.median(np.abs(known))) if known.size else 0.0
         span = float(np.ptp(known)) if known.size else 0.0
-        unit = next((name for name, scale in TIME_UNITS.items() if (
-            8e8 < size * scale < 4e9 if size > 8e8 and usual < 1e-3 * size else
-            usual * scale <= _USUAL_STEP and span * scale <= _USUAL_SPAN)), 's')
+        unit = clock_unit(size)
+        if not unit or usual * TIME_UNITS[unit] > LONGEST_STEP:
+            unit = next((name for name, scale in TIME_UNITS.items() if (
+                usual * scale <= _USUAL_STEP and span * scale <= _USUAL_SPAN)), 's')
         words = '' if unit == 's' else ', a guess: --time-unit'
     t = t * TIME_UNITS[unit]
-    if usual * TIME_UNITS[unit] > _LONGEST_STEP:
+    if usual * TIME_UNITS[unit] > LONGEST_STEP:
         raise InputError(f'{path}: the samples are {usual * TIME_UNITS[unit]:g} s apart by '
                          f"'{time.name}': is it in ms, us or ns? --time-unit says so")
     return t, unit + words
