@@ -157,6 +157,8 @@ class LoadModel:
 
 # Coefficients of x, u, u^3, x after three lags, and inrush, with x = u^1.8 (load/load_filter.py).
 SIZE = 7
+# Its last entries may be left out of a model file.
+_OPTIONAL = 5
 _COLUMNS = ('coefficients', 'covariance', 'log_variance', 'flown')
 
 
@@ -175,6 +177,11 @@ class LoadStart:
     log_variance: tuple[float, float, float]
     flown: tuple[float, float]  # Throttles between which 80 % were flown.
     delay: float = 0.0  # How late throttle was heard, s.
+    resistance: float = 0.0  # Ohm; 0: without a current that moves the voltage.
+    resistance_se: float = 0.0  # Its standard error, Ohm.
+    # Rms, V, of what the answer leaves while throttle moves, and its standard error; 0: unknown.
+    noise: float = 0.0
+    noise_se: float = 0.0
 
     def __post_init__(self) -> None:
         """Check shapes and signs."""
@@ -184,18 +191,20 @@ class LoadStart:
                              'covariances')
         if len(self.log_variance) != 3 or len(self.flown) != 2:
             raise ValueError('the load needs 3 numbers of log_variance and 2 of flown')
+        positive = (self.discharge, self.resistance, self.resistance_se, self.noise,
+                    self.noise_se)
         numbers = (*self.coefficients, *P.ravel().tolist(), *self.log_variance, *self.flown,
-                   self.cells, self.volts, self.discharge, self.delay)
+                   self.cells, self.volts, self.delay, *positive)
         if not all(map(math.isfinite, numbers)):
             raise ValueError('the numbers of the load must be finite')
         if not np.allclose(P, P.T, rtol=1e-6, atol=1e-9 * float(np.abs(P.diagonal()).max())):
             raise ValueError('the covariance of the load must be symmetric')
         if np.linalg.eigvalsh(P)[0] < -1e-9 * float(P.diagonal().max()):
             raise ValueError('the covariance of the load must not be negative')
-        if not (self.cells > 0.0 and self.volts > 0.0 and self.discharge >= 0.0
+        if not (self.cells > 0.0 and self.volts > 0.0 and min(positive) >= 0.0
                 and 0.0 <= self.flown[0] <= self.flown[1] <= 1.0 and 0.0 <= self.delay <= 1.0):
-            raise ValueError('the load needs cells and volts above 0, discharge from 0 on, flown '
-                             'within 0..1, and delay within 0..1 s')
+            raise ValueError('the load needs cells and volts above 0, discharge, resistance '
+                             'and noise from 0 on, flown within 0..1, and delay within 0..1 s')
 
     def values(self) -> dict[str, Any]:
         """Return the entries of a model file."""
@@ -210,7 +219,7 @@ class LoadStart:
         for name in values:
             if name not in names:
                 raise ValueError(f"the load has no entry '{name}': {', '.join(names)}")
-        missing = [name for name in names[:-1] if name not in values]
+        missing = [name for name in names[:-_OPTIONAL] if name not in values]
         if missing:
             raise ValueError(f"the load lacks '{missing[0]}'")
         try:

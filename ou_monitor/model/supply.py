@@ -7,7 +7,7 @@ wandering sigma); what is exact in law and what is not is said by each term.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import math
 
 import numpy as np
@@ -42,6 +42,8 @@ class SupplyModel:
         The first is the `ou`, the only one of its kind.
     load : LoadStart or None
         What the load filter knows of this craft at take-off; None: nothing.
+    date : str
+        When it was learned, as the model file says; empty: unknown.
 
     Raises
     ------
@@ -65,6 +67,7 @@ class SupplyModel:
 
     terms: tuple[Term, ...]
     load: LoadStart | None = None
+    date: str = field(default='', compare=False)
 
     def __post_init__(self) -> None:
         """Check the composition."""

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from ou_monitor.online.estimator.estimator import (
     of_estimate, RelaxationFits, SLIDING, SlidingEstimator, untimed)
 from ou_monitor.online.load.load_filter import LoadFilter
+from ou_monitor.online.load.model_watch import ModelComparison
 from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.online.risk.flag import BrownoutFlag, FlagLevel, FlagState
 from ou_monitor.online.risk.forecast import Ahead, Forecast, LOOK, look_ahead
@@ -317,10 +318,14 @@ class SupplyMonitor:
         wrong = doubt if silence and silence == why else Doubt.NONE
         level, summary = self._judge(e, risk, flag, silence, wrong)
         left_out = () if self._model is None else self._model.left_out
+        model = None if self._model is None else self._load_filter.against(
+            self._model.load, self._model.date)
+        if model is not None and model.words and fresh and level < Level.ERROR:
+            level, summary = Level.WARN, f'{summary} {model.words}'
         return MonitorReport(
             e, risk, ahead.budget, ahead.budget_reason, left_out, flag, level, summary, silent,
             limit, stamps, doubt, fresh, self._thinned, self._restarts, self._fault, self._load,
-            ahead.outcome.basis, ahead.outcome.cause, ahead.curve, ou, ou_age)
+            ahead.outcome.basis, ahead.outcome.cause, ahead.curve, ou, ou_age, model)
 
     def risk(self, voltage: float | None = None, horizon: float | None = None) -> float:
         """
@@ -516,6 +521,7 @@ class MonitorReport:
     risk_curve: tuple[float, ...] = ()
     ou: OuFacts = OuFacts('no_data')  # Relaxation, or its bounds, and the window that it is of
     ou_age: float = 0.0  # How long before the newest sample that window ended, s
+    model: ModelComparison | None = None  # This flight beside the model; None without one
 
     @property
     def brownout(self) -> bool | None:
@@ -556,6 +562,7 @@ class MonitorReport:
         values['throttle_budget'] = self.budget
         values['model_left_out'] = ','.join(self.left_out)
         values['throttle_budget_reason'] = self.budget_reason
+        values |= {} if self.model is None else self.model.fields()
         values['age'] = self.age
         values['patience'] = self.patience
         values['stamps'] = self.stamps.name

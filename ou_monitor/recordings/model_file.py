@@ -25,6 +25,7 @@ import yaml
 
 _KEYS = ('model', 'load', 'provenance')
 _TERM_KEYS = ('term', 'params', 'se')
+_DAY = re.compile(r'\d{4}-\d\d-\d\d')
 _EXPONENT = re.compile(r'[-+]?\d+(\.\d*)?[eE][-+]?\d{1,3}')
 
 
@@ -63,14 +64,21 @@ def parse_model(data: Any, where: str) -> ModelFile:
         raise InputError(f"{where}: 'model' must be a list of terms, got "
                          f'{type(entries).__name__}')
     terms = [_term(entry, f'{where}, term {k}') for k, entry in enumerate(entries, start=1)]
-    try:
-        model = SupplyModel(tuple(term for term, _ in terms), _load(data.get('load')))
-    except ValueError as error:
-        raise InputError(f'{where}: {error}') from error
     provenance = data.get('provenance') or {}
     if not isinstance(provenance, dict):
         raise InputError(f"{where}: 'provenance' must be a mapping")
+    try:
+        model = SupplyModel(tuple(term for term, _ in terms), _load(data.get('load')),
+                            _date(provenance.get('date')))
+    except ValueError as error:
+        raise InputError(f'{where}: {error}') from error
     return ModelFile(model, tuple(se for _, se in terms), provenance)
+
+
+def _date(entry: Any) -> str:
+    """Return a day, which YAML may have read as a date; empty for free text."""
+    text = str(entry)[:10]
+    return text if _DAY.fullmatch(text) else ''
 
 
 def _load(entry: Any) -> LoadStart | None:

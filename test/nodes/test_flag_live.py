@@ -166,6 +166,8 @@ def test_model_file(rig, shared_world):
     resets = rig.field('resets')
     rig.give('model_file', str(good))
     wait_until(lambda: rig.field('model_terms') == 'ou,measurement_noise', what='the terms')
+    # Of throttle it says nothing.
+    assert rig.field('model_verdict') == 'CANNOT_TELL'
     result = rig.probe.set_parameter(rig.node, 'model_file', str(bad))
     assert not result.successful and "did you mean 'measurement_noise'" in result.reason
     assert rig.get('model_file').string_value == str(good)

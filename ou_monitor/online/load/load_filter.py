@@ -21,6 +21,8 @@ from ou_monitor.model.load import (
     CELL, cells_in_series, INRUSH_TIME, LEVELS, LoadStart, ripple, SLOPES, usual_coefficients)
 from ou_monitor.online.load.blocks import (
     CLIP, DIVERGED, LoadBlock, LoadBlocks, LoadDelay, LoadNoise, log_density)
+from ou_monitor.online.load.model_watch import (
+    compare, LoadContrasts, ModelComparison, OTHER_LEVEL, other_pack)
 from ou_monitor.online.load.supply_load import (
     Basis, LAGS, LoadState, LoadStatus, POWER, static, SupplyLoad, TABLE)
 from ou_monitor.records import FloatArray, NAN
@@ -225,8 +227,8 @@ _LEAST_ERROR = 0.1
 _BACKWARDS, _PAUSE = 1.0, 60.0
 # A level that is so many times the last one, or less by that, is no battery of this craft.
 _OTHER_CRAFT = 1.6
-# So much a charged pack may differ from an empty one; the size of its sag on another day, squared.
-_OTHER_PACK, _OTHER_DAY = 1.3, 0.2 ** 2
+# Relative variance of the size of the sag on another day.
+_OTHER_DAY = 0.2 ** 2
 # Throttle or current that was unknown for so long, s, holds no more; beyond the second throttle is
 # none.
 _HOLD, _MOST_THROTTLE = 1.0, 2.0
@@ -431,13 +433,14 @@ class LoadFilter:
         self._cells = float(cells_in_series(self._volts)) if self._volts > 2.5 else \
             self._volts / CELL
         start = self._start
-        if start is not None and 1.0 / _OTHER_PACK < self._volts / start.volts < _OTHER_PACK:
+        if start is not None and (
+                1.0 / OTHER_LEVEL < self._volts / start.volts < OTHER_LEVEL):
             self._cells = start.cells
         else:
             self._start = None
         # Whether the coefficients have met a throttle.
         self._loaded = math.isfinite(u)
-        self._heard = -math.inf
+        self._heard, self._first = -math.inf, NAN
         # Of each bin of throttle: seconds, samples, and their squares about the prediction, V^2.
         self._flown = np.zeros((3, _BINS + 1))
         self._m = np.zeros(_STATES)
@@ -447,6 +450,7 @@ class LoadFilter:
 
     def _forget(self) -> None:
         """Take coefficients and noise back to the prior; the next block opens the level."""
+        self._contrasts = LoadContrasts()
         # Noise under a known throttle, and under an unknown one, which is what throttle does.
         self._noise, self._other = LoadNoise(self._volts), LoadNoise(self._volts)
         self._opening = True
@@ -470,6 +474,9 @@ class LoadFilter:
         if other or (math.isfinite(u) and not self._loaded):
             self._begin(v, u)
             return
+        if self._opening:
+            # The battery may be another one.
+            self._contrasts, self._first = LoadContrasts(), NAN
         if math.isfinite(u) is not math.isfinite(self._throttle):
             self._noise, self._other = self._other, self._noise
         self._settle(v, u)
@@ -486,6 +493,8 @@ class LoadFilter:
         m, P = self._m, self._P
         h = self._regressors()
         m[0] = self._rest = v - float(h[2:] @ m[2:])
+        if math.isnan(self._first) and math.isfinite(u):
+            self._first = float(m[0])
         # The level follows from the voltage: it shares the errors of the coefficients.
         P[0, 1:] = P[1:, 0] = -P[1:, 1:] @ h[1:]
         P[0, 0] = (0.02 * self._volts) ** 2 + h[1:] @ P[1:, 1:] @ h[1:]
@@ -565,6 +574,7 @@ class LoadFilter:
         total *= max(1.0, abs(e) / math.sqrt(total) / CLIP)
         noise.learn(e, s, u, du, block.n, block.within)
         if math.isfinite(self._throttle):
+            self._contrasts.take(block.t, block.voltage, h[2:], total)
             # What the state does not know is not noise.
             share = R / (s + R)
             square = share * block.n * min(abs(e), self._volts) ** 2
@@ -684,12 +694,27 @@ class LoadFilter:
         load = self.load()
         if not (load.known and self._m[0] > 0.0):
             return None
-        scale = max(1.0, self._noise.scale)
+        # The size is that of the whole flight: the coefficients follow its last half minute, and
+        # their error is at least a tenth.
+        found, size = self._contrasts.against(self._m[2:]), 1.0
+        if found.ratio > 0.0:
+            size += (found.ratio - 1.0) / (1.0 + (found.se / _LEAST_ERROR) ** 2)
+        scale = size ** 2 * max(1.0, self._noise.scale)
         P = 0.5 * (self._P[2:, 2:] + self._P[2:, 2:].T) * scale
         return LoadStart(
-            self._cells, float(self._m[0]), tuple(self._m[2:].tolist()),
+            self._cells, float(self._m[0]), tuple((size * self._m[2:]).tolist()),
             tuple(tuple(row) for row in P.tolist()), max(0.0, float(self._m[1])),
-            self._noise.of_blocks, load.flown, self._delay.delay)
+            self._noise.of_blocks, load.flown, self._delay.delay, *(
+                0.0 if math.isnan(one) else one for one in (
+                    load.resistance, load.resistance_se, found.noise, found.noise_se)))
+
+    def against(self, start: LoadStart | None, date: str = '') -> ModelComparison:
+        """Return this flight beside what another one has learned, of that date."""
+        if start is None or not math.isfinite(self._t) or math.isnan(self._first):
+            return ModelComparison()
+        ohm = (NAN, NAN) if self._current is None else self._current.resistance
+        return compare(self._contrasts.against(start.coefficients), start, *ohm,
+                       other_pack(start, self._first, self._level), date)
 
     def path(self, t: FloatArray, throttle: FloatArray | None,
              current: FloatArray | None = None) -> FloatArray:

@@ -1,0 +1,120 @@
+"""This flight beside the model of its supply: an old pack is found, a good one is not blamed."""
+
+from dataclasses import replace
+import math
+
+from live import ROOT
+import numpy as np
+from ou_monitor import MonitorSettings, SupplyMonitor
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.online.load.load_filter import LoadFilter
+from ou_monitor.online.load.model_watch import ModelVerdict
+from ou_monitor.recordings.model_file import read_model
+from ou_monitor.records import Level, Recording
+from ou_monitor.simulation import constant, Profile, read_throttle, simulated
+import pytest
+
+# Learned from the recorded flight whose throttle the simulated ones have.
+GECKO = read_model(ROOT / 'models' / 'gecko.yaml').model
+FLOWN: Profile = read_throttle(str(ROOT / 'bags' / 'recorded' / 'gecko.csv')).profile
+
+
+def flight(duration, seed, *, age=1.0, throttle=FLOWN):
+    """Return a simulated flight of a pack with `age` times the answer to throttle."""
+    (piece,) = simulated(GECKO, throttle, duration=duration, rate=100.0, seed=seed,
+                         charge=math.nan, resistance=age)
+    return piece
+
+
+def watched(model, made, voltage=1.0):
+    """Return the last report of a monitor that has seen a flight, voltages times a factor."""
+    monitor = SupplyMonitor(MonitorSettings(window=2.0, brownout_voltage=5.0), model)
+    monitor.push(made.t, voltage * made.voltage, made.throttle)
+    return monitor.report(0.0)
+
+
+@pytest.mark.parametrize('age, verdict', [
+    (1.0, ModelVerdict.AS_MODEL), (1.2, ModelVerdict.WEAKER), (1.4, ModelVerdict.WEAKER)])
+def test_a_pack_that_has_aged_is_found_within_a_minute(age, verdict):
+    """By how much, within the error, in record and fields; weaker is a warning with the date."""
+    report = watched(GECKO, flight(60.0, 1, age=age))
+    found = report.model
+    assert found.verdict is verdict
+    assert abs(found.sag_ratio - age) < 1.96 * found.sag_ratio_se < 0.15 * age
+    assert abs(found.noise_ratio - 1.0) < 1.96 * found.noise_ratio_se < 0.7
+    assert report.fields['model_verdict'] == verdict.name
+    assert float(report.fields['model_sag_ratio']) == found.sag_ratio
+    low, high = map(float, report.fields['model_sag_ratio_95'].split())
+    assert low < age < high
+    weaker = verdict is ModelVerdict.WEAKER
+    assert ('above the model of 2026-11-23: weak pack or cold' in report.summary) is weaker
+    assert bool(found.words) is weaker and (report.level >= Level.WARN or not weaker)
+
+
+@pytest.mark.parametrize('voltage', [0.75, 1.5])
+def test_another_number_of_cells_is_said_within_five_seconds(voltage):
+    """Three or six cells in place of four."""
+    report = watched(GECKO, flight(5.0, 3), voltage)
+    assert report.model.verdict is ModelVerdict.OTHER_PACK
+    assert report.level is Level.WARN and 'another pack' in report.summary
+
+
+def test_what_cannot_be_compared_has_no_verdict():
+    """Throttle that stands still, a model without load, no model."""
+    still = watched(GECKO, flight(20.0, 1, throttle=constant(0.3))).model
+    assert still.verdict is ModelVerdict.CANNOT_TELL and not still.words
+    made = flight(20.0, 1)
+    bare = watched(replace(GECKO, load=None), made)
+    assert bare.fields['model_verdict'] == 'CANNOT_TELL' and math.isnan(bare.model.sag_ratio)
+    none = watched(None, made)
+    assert none.model is None and 'model_verdict' not in none.fields
+
+
+def test_a_model_that_is_set_in_flight_is_compared_with_all_of_it():
+    """The same numbers as if it had been there from the start, to the filter's own beginning."""
+    made = flight(60.0, 1, age=1.2)
+    monitor = SupplyMonitor(MonitorSettings(window=2.0, brownout_voltage=5.0))
+    monitor.push(made.t, made.voltage, made.throttle)
+    monitor.set_model(GECKO)
+    found = monitor.report(0.0).model
+    assert found.verdict is ModelVerdict.WEAKER
+    assert abs(found.sag_ratio - watched(GECKO, made).model.sag_ratio) < found.sag_ratio_se
+
+
+def test_what_is_learned_is_of_the_whole_flight():
+    """Two flights of one pack teach the same answer, whatever their last half minute was like."""
+    found = []
+    for seed in (7, 99):
+        taught, made = LoadFilter(), flight(120.0, seed)
+        taught.push(made.t, made.voltage, made.throttle)
+        found.append(taught.learned())
+    high = np.power(0.35, [1.8, 1.0, 3.0, 1.8])
+    sags = [float(high @ one.coefficients[:4]) for one in found]
+    assert abs(sags[0] / sags[1] - 1.0) < 0.06
+
+
+def test_resistance_is_compared_where_a_current_is_measured():
+    """With 1.3 times the resistance; nothing is said where the model has none."""
+    rng = np.random.default_rng(1)
+    t = np.arange(0.0, 60.0, 0.02)
+    u = np.clip(0.4 + 0.2 * rng.standard_normal(121), 0.0, 1.0)[(2 * t).astype(int)]
+    current = 60.0 * u ** 1.8
+
+    def made(ohm):
+        return Recording(t, 16.0 - ohm * current + 0.02 * rng.standard_normal(t.size), u,
+                         'made', current=current)
+
+    taught, first = LoadFilter(), made(0.020)
+    taught.push(first.t, first.voltage, first.throttle, first.current)
+    model = SupplyModel(GECKO.terms, taught.learned())
+    old = made(0.026)
+    for one, ratio in ((model, 1.3), (GECKO, math.nan)):
+        monitor = SupplyMonitor(MonitorSettings(window=2.0), one)
+        monitor.push(old.t, old.voltage, old.throttle, current=old.current)
+        found = monitor.report(0.0).model
+        if math.isnan(ratio):
+            assert math.isnan(found.resistance_ratio)
+            continue
+        assert abs(found.resistance_ratio - ratio) < 1.96 * found.resistance_ratio_se < 0.5
+        assert abs(found.sag_ratio - ratio) < 1.96 * found.sag_ratio_se
+        assert found.verdict is ModelVerdict.WEAKER
