@@ -17,9 +17,9 @@ EXAMPLES = {
     'load_dependent_sigma': {'throttle': [0.0, 0.4, 1.0], 'log_factor': [0.0, 0.7, 0.4]},
     'load_dependent_alpha': {'slope': 0.8},
     'load_dependent_noise': {
-        'number': [0, 0, 0, *np.repeat(np.arange(1, 10), 2).tolist()],
-        'at': [0.0, 0.5, 1.0, *[0.0, 0.2] * 9],
-        'log_factor': [0.0, 0.8, 1.0, *[0.0, 0.3, 0.0, -0.2, 0.0, 0.4] * 3]},
+        'number': [0, 0, 0, *np.repeat(np.arange(1, 11), 2).tolist()],
+        'at': [0.0, 0.5, 1.0, *[0.0, 0.2] * 9, -0.6, 1.5],
+        'log_factor': [0.0, 0.8, 1.0, *[0.0, 0.3, 0.0, -0.2, 0.0, 0.4] * 3, -0.6, 1.2]},
     'drift': {'rate': -0.01, 'curvature': 0.002},
     'measurement_noise': {'std': 0.02},
     'quantization': {'step': 0.01},

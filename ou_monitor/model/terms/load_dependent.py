@@ -248,6 +248,39 @@ _LARGEST = 25.0
 # Rounds in which each curve is fitted beside the others; knots nearer than this share of the
 # range are one.
 _ROUNDS, _SPACING = 2, 0.02
+# The number of the curve over the sum of the others.
+SUM = len(INPUTS)
+
+
+def _curve(square: FloatArray, x: FloatArray, shares: FloatArray, log: FloatArray | None
+           ) -> tuple[FloatArray, FloatArray] | None:
+    """
+    Return knots over x and ln of the deviation of the scores there, the first 0; None: level.
+
+    square: of the scores, shape (n,); shares: of the samples, between which x is binned; log: ln
+    of their deviation where it is known by and large, shape (n,).
+    """
+    edges = np.unique(np.quantile(x, shares))
+    if edges.size < 3:
+        return None
+    if log is not None:
+        usual = float(np.mean(np.minimum(square, _LARGEST * float(np.mean(square)))))
+        square = np.minimum(square, _LARGEST * usual * np.exp(2.0 * log))
+    centre, values, count = _binned(square, x, edges)
+    if log is not None:
+        # Squares with heavy tails say less of their mean than those of normal scores.
+        alike = square * np.exp(-2.0 * log)
+        count = count / max(0.5 * float(np.mean(alike**2) / np.mean(alike)**2) - 0.5, 1.0)
+    flat = 0.0 if centre.size < 2 else float(np.sum(
+        count * (values - np.average(values, weights=count)) ** 2))
+    price = 0.5 * math.log(x.size)
+    if flat < price + _INPUT_PRICE:
+        return None
+    knots, factors, misfit = _greedy((centre, values, count), centre[[0, -1]],
+                                     price + _KNOT_PRICE, _SPACING * float(np.ptp(centre)))
+    if flat - misfit < price * (knots.size - 1) + _KNOT_PRICE * (knots.size - 2) + _INPUT_PRICE:
+        return None
+    return knots, np.clip(factors - factors[0], -_MOST, _MOST)
 
 
 @dataclass(frozen=True)
@@ -255,8 +288,8 @@ class LoadDependentNoise(Term):
     """
     Multiply the white noise by a factor whose ln is a sum of curves over throttle and its changes.
 
-    Each curve is straight between knots and level beyond the outer ones, over one of `INPUTS`.  It
-    changes what `measurement_noise` adds, and nothing without one.
+    Each curve is straight between knots and level beyond the outer ones, over one of `INPUTS`; one
+    over their sum bends it.  It changes what `measurement_noise` adds, and nothing without one.
     """
 
     NAME: ClassVar[str] = 'load_dependent_noise'
@@ -281,15 +314,15 @@ class LoadDependentNoise(Term):
         'the same flight at several times the sampling rate: white noise has no memory there '
         'either')
 
-    number: tuple[float, ...] = parameters('', 'which input each knot is of: see INPUTS')
+    number: tuple[float, ...] = parameters('', 'which input each knot is of: see INPUTS, SUM')
     at: tuple[float, ...] = parameters('', 'where it is, rising for one input')
     log_factor: tuple[float, ...] = parameters('', 'ln of the factor on the deviation there')
 
     def check(self) -> None:
         """Check that the knots rise and match."""
-        whole = all(float(k).is_integer() and 0 <= k < len(INPUTS) for k in self.number)
+        whole = all(float(k).is_integer() and 0 <= k <= SUM for k in self.number)
         if not whole or not len(self.number) == len(self.at) == len(self.log_factor):
-            raise ValueError(f'{self.NAME}: number (0 to {len(INPUTS) - 1}), at and log_factor '
+            raise ValueError(f'{self.NAME}: number (0 to {SUM}), at and log_factor '
                              f'need the same length, got {list(self.number)}, {list(self.at)} and '
                              f'{list(self.log_factor)}')
         for knots, _ in self.curves().values():
@@ -314,8 +347,11 @@ class LoadDependentNoise(Term):
     def log_of(self, inputs: Mapping[int, FloatArray]) -> FloatArray:
         """Return ln of the factor for inputs, as `Inputs` returns them."""
         size = next((x.size for x in inputs.values()), 1)
-        return np.asarray(sum((np.interp(inputs[k], *curve)
-                               for k, curve in self.curves().items()), np.zeros(size)))
+        curves = self.curves()
+        bent = curves.pop(SUM, None)
+        total = np.asarray(sum((np.interp(inputs[k], *curve) for k, curve in curves.items()),
+                               np.zeros(size)))
+        return total if bent is None else np.interp(total, *bent)
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
@@ -333,42 +369,24 @@ class LoadDependentNoise(Term):
             # What the rail adds is not multiplied.
             square = np.maximum(square - (1.0 - white), 0.0) / np.maximum(white, _LEAST_WHITE)
         square = square * np.exp(2.0 * self.log_of(inputs))
-        price = 0.5 * math.log(square.size)
         few = max(1, math.ceil(2.0 * _IN_BIN * _SHARES.size / square.size))
         shares = np.append(_SHARES[:-1:few], 1.0)
-        edges = {k: np.unique(np.quantile(x, shares)) for k, x in inputs.items()}
         found: dict[int, tuple[FloatArray, FloatArray]] = {}
         logs = {k: np.zeros(square.size) for k in inputs}
         for turn in range(_ROUNDS):
             for k, x in inputs.items():
-                if edges[k].size < 3:
-                    continue
-                rest = square * np.exp(-2.0 * (sum(logs.values()) - logs[k]))
-                if turn:
-                    usual = float(np.mean(np.minimum(rest, _LARGEST * float(np.mean(rest)))))
-                    rest = np.minimum(rest, _LARGEST * usual * np.exp(2.0 * logs[k]))
-                centre, log, count = _binned(rest, x, edges[k])
-                if turn:
-                    # Squares with heavy tails say less of their mean than those of normal scores.
-                    alike = rest * np.exp(-2.0 * logs[k])
-                    count = count / max(0.5 * float(np.mean(alike**2) / np.mean(alike)**2) - 0.5,
-                                        1.0)
-                bins = centre, log, count
-                flat = 0.0 if centre.size < 2 else float(np.sum(
-                    count * (log - np.average(log, weights=count)) ** 2))
-                if flat < price + _INPUT_PRICE:
+                curve = _curve(square * np.exp(-2.0 * (sum(logs.values()) - logs[k])), x, shares,
+                               logs[k] if turn else None)
+                if curve is None:
                     found.pop(k, None)
                     logs[k] = np.zeros(square.size)
-                    continue
-                knots, values, misfit = _greedy(
-                    bins, centre[[0, -1]], price + _KNOT_PRICE, _SPACING * float(np.ptp(centre)))
-                if flat - misfit < price * (knots.size - 1) + _KNOT_PRICE * (
-                        knots.size - 2) + _INPUT_PRICE:
-                    found.pop(k, None)
-                    logs[k] = np.zeros(square.size)
-                    continue
-                found[k] = knots, np.clip(values - values[0], -_MOST, _MOST)
-                logs[k] = np.interp(x, *found[k])
+                else:
+                    found[k] = curve
+                    logs[k] = np.interp(x, *curve)
+        total = np.asarray(sum(logs.values()))
+        bent = _curve(square * np.exp(-2.0 * total), total, shares, np.zeros(square.size))
+        if bent is not None:
+            found[SUM] = bent[0], bent[0] + bent[1]
         return LoadDependentNoise(*(tuple(float(value) for part in parts for value in part)
                                     for parts in (
             [[k] * knots.size for k, (knots, _) in found.items()],
@@ -379,7 +397,7 @@ class Inputs:
     """Some of INPUTS, from segment to segment."""
 
     def __init__(self, wanted: Iterable[int]) -> None:
-        self._wanted = list(wanted)
+        self._wanted = [k for k in wanted if k != SUM]
         self._last = math.nan
         self._before: dict[tuple[str, float], float] = {}
 
