@@ -38,7 +38,7 @@ _BUILT_IN = ('use_sim_time', 'start_type_description_service', QOS)
 LOCK = Parameter(
     'lock_parameters', False,
     'Whether all that can disarm the node is refused at run time: every parameter but '
-    'publish_rate, and ~/clear_brownout.')
+    'publish_rate, ~/clear_brownout and ~/save_model.')
 # How long an error of a callback is told in the diagnostics, s.
 TELL = 10.0
 PUBLISH_RATE = Parameter('publish_rate', 10.0, 'How often the outputs are published, Hz.',

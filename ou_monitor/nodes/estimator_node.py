@@ -11,8 +11,8 @@ newest sample), and `/diagnostics` at 1 Hz.  alpha, sigma and Var_inf are those 
 fits of up to a minute are made in a thread.  Messages wait in the middleware, which keeps the
 newest 2000, and are fetched 50 times a second and read before each report, so that no flood of
 them delays an output.  Service `~/clear_brownout` (std_srvs/Trigger): drops a flag that is
-latched or held, unless `lock_parameters` is set.  Hold, delay and latch count real time, under
-`use_sim_time` too.
+latched or held, unless `lock_parameters` is set; `~/save_model`: writes what the flight has
+learned into `model_file`.  Hold, delay and latch count real time, under `use_sim_time` too.
 
 Limits: one voltage; an estimate older than `stale_after` is not published as
 a number, though `~/state` still shows its fields.
@@ -30,12 +30,14 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 from ou_monitor.errors import InputError
+from ou_monitor.model.load import LoadStart
 from ou_monitor.nodes.base import diagnostic, LOCK, MonitorNode, PUBLISH_RATE
 from ou_monitor.nodes.clocks import IN_BURSTS, SendClock
 from ou_monitor.nodes.console import Console, PublisherWatch
 from ou_monitor.nodes.inputs import Arrivals, PolledInput, Silence, Stamper, types_on, within
 from ou_monitor.nodes.node_files import LatchFile, ModelChoice
 from ou_monitor.nodes.sources import find_source, Source, SOURCE_PARAMETERS
+from ou_monitor.online.load.model_watch import ModelComparison
 from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.online.risk.flag import FlagLevel
 from ou_monitor.online.settings import ESTIMATOR_PARAMETERS, monitor_settings, Parameter
@@ -66,6 +68,8 @@ STATE_FILE = Parameter(
     'state_file', '',
     'File that keeps a latched flag over a restart of the node (a folder: a file in it, named '
     "after the node; relative: under ROS's log directory); empty: off.")
+# Throttle above which the craft may fly.
+LANDED = 0.05
 OUTPUTS = ('alpha', 'sigma', 'var_inf', 'brownout_risk', 'throttle_budget')
 OWN_TOPICS = (*('~/' + key for key in OUTPUTS), '~/brownout', '~/state', '/diagnostics', '/clock')
 
@@ -106,6 +110,7 @@ class EstimatorNode(MonitorNode):
         self._state = self.create_publisher(DiagnosticArray, '~/state', 10)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_service(Trigger, '~/clear_brownout', self.guarded(self._clear))
+        self.create_service(Trigger, '~/save_model', self.guarded(self._save_model))
         self._stamper = Stamper(self, self._jumped)
         self._send_clock = SendClock() if self.get_parameter('smooth_stamps').value else None
         self._latch = self._open_latch()
@@ -351,6 +356,32 @@ class EstimatorNode(MonitorNode):
             'Nothing to clear: the brown-out flag is not CRITICAL.')
         return response
 
+    def _save_model(self, request: Any, response: Any) -> Any:
+        """Write what this flight has learned into `model_file`, once it has landed."""
+        loads, model = self._monitor.load_filter, self._monitor.model
+        learned = loads.learned()
+        response.success = False
+        if self.locked:
+            response.message = f'{LOCK.name} is set: the model stays as it is.'
+        elif self._stream.throttle > LANDED:
+            response.message = 'Land first: throttle is not at rest.'
+        elif model is None:
+            response.message = 'There is no model_file.'
+        elif learned is None or not learned.noise > 0.0:
+            response.message = 'Nothing to save: throttle moved too little to know the sag well.'
+        else:
+            try:
+                path = self._models.save(
+                    learned, _entry(learned, loads.against(model.load)), self._meanwhile)
+            except InputError as error:
+                response.message = f'{error}.'
+            else:
+                self._monitor.set_model(self._models.use(path))
+                response.success, response.message = True, (
+                    f'{path} holds what this flight has learned, and {self._models.terms} of '
+                    'before.')
+        return response
+
     # -- reports out
 
     def _report(self) -> tuple[MonitorReport, Level, str]:
@@ -466,6 +497,15 @@ class EstimatorNode(MonitorNode):
                   'callback_errors': str(self.faults)}
         return diagnostic(f'{self.get_fully_qualified_name()[1:]}: {part}', level, summary,
                           fields, stamp, hardware_id=self.resolve_topic_name(source.topic))
+
+
+def _entry(learned: LoadStart, found: ModelComparison) -> dict[str, object]:
+    """Return the line of a flight in the history of its model."""
+    values = {'level_v': learned.volts, 'sag_ratio': found.sag_ratio,
+              'sag_ratio_se': found.sag_ratio_se, 'resistance_ohm': learned.resistance,
+              'noise_v': learned.noise}
+    return {'date': time.strftime('%Y-%m-%d', time.gmtime())} | {
+        name: value if value > 0.0 else None for name, value in values.items()}
 
 
 def _of_monitor(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """
-The files of a node: which model is in force, and the latch that outlasts a restart.
+The files of a node: the model in force, and the latch that outlasts a restart.
 
+A model file is replaced only while it is a regular file with the bytes that were read.
 The latch is one JSON object in one small file.  It exists as long as the node runs: it says OK or
 CRITICAL and carries the name of the node, and the lock of its inode says that the node runs.  No
 file is written or replaced but a regular file with that name in it.  No ROS here.
@@ -8,28 +9,35 @@ file is written or replaced but a regular file with that name in it.  No ROS her
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, TimeoutError as NotReadyError
+from dataclasses import replace
 import fcntl
+from itertools import takewhile
 import json
 import os
 from pathlib import Path
 import stat
 import tempfile
 import time
-from typing import Any, TYPE_CHECKING
+from typing import Any, TYPE_CHECKING, TypeVar
 
 from ou_monitor.errors import InputError
 from ou_monitor.stream.files import open_regular, path_words
 
 if TYPE_CHECKING:
+    from ou_monitor.model.load import LoadStart
     from ou_monitor.model.supply import SupplyModel
+    from ou_monitor.recordings.model_file import ModelFile
 
+T = TypeVar('T')
 
 # Maximum time to read a file, s: most take 10 ms, the largest that is read at all 5 s.
 PATIENCE = 20.0
 # Time between calls of what the node must do meanwhile, s.
 PAUSE = 0.02
+# Flights kept in the history of a model file; bytes, more than a file may have that is read.
+_HISTORY, _LARGEST = 200, 2_000_000
 
 
 class ModelChoice:
@@ -42,8 +50,8 @@ class ModelChoice:
     """
 
     def __init__(self) -> None:
-        self._used: tuple[str, SupplyModel | None] = '', None
-        self._checked: tuple[str, SupplyModel | None] = '', None
+        self._used: _Chosen = '', None, b''
+        self._checked: _Chosen = '', None, b''
         self._reader = ThreadPoolExecutor(1, 'model_file')
 
     def check(self, path: str, meanwhile: Callable[[], object] = lambda: None) -> None:
@@ -53,22 +61,27 @@ class ModelChoice:
         `meanwhile` is called every `PAUSE` until it has been read.
         """
         if not path or path == self._used[0]:
-            self._checked = self._used if path else ('', None)
+            self._checked = self._used if path else ('', None, b'')
             return
-        future = self._reader.submit(_read, path)
+        try:
+            self._checked = path, *self._wait(self._reader.submit(_read, path), meanwhile)
+        except NotReadyError as error:
+            raise ValueError(f'model_file: {path_words(path)} was not read within '
+                             f'{PATIENCE:g} s') from error
+        except InputError as error:
+            raise ValueError(f'model_file: {error}') from error
+
+    def _wait(self, future: Future[T], meanwhile: Callable[[], object]) -> T:
+        """Return the result, `meanwhile` called every `PAUSE`; NotReadyError after `PATIENCE`."""
         until = time.monotonic() + PATIENCE
         while True:
             try:
-                self._checked = path, future.result(PAUSE)
-                return
-            except NotReadyError as error:
+                return future.result(PAUSE)
+            except NotReadyError:
                 if time.monotonic() > until:
                     future.cancel()
-                    raise ValueError(f'model_file: {path_words(path)} was not read within '
-                                     f'{PATIENCE:g} s') from error
+                    raise
                 meanwhile()
-            except InputError as error:
-                raise ValueError(f'model_file: {error}') from error
 
     def use(self, path: str) -> SupplyModel | None:
         """Bring a path into force that was checked last; return its model."""
@@ -76,25 +89,114 @@ class ModelChoice:
             if path != self._checked[0]:
                 raise ValueError(f'model_file {path} has not been checked')
             self._used = self._checked
-        return self._used[1]
+        return None if self._used[1] is None else self._used[1].model
 
     @property
     def terms(self) -> str:
         """Return the names of the terms in force, separated by commas; empty without a model."""
-        model = self._used[1]
-        return '' if model is None else ','.join(term.NAME for term in model.terms)
+        file = self._used[1]
+        return '' if file is None else ','.join(term.NAME for term in file.model.terms)
+
+    def save(self, load: LoadStart, entry: Mapping[str, object],
+             meanwhile: Callable[[], object] = lambda: None) -> str:
+        """
+        Write what a flight has learned into the file in force; return its path.
+
+        The entry, with its `date`, goes to the end of the file's history.  `InputError` says why
+        it is not written.
+        """
+        path, file, known = self._used
+        if file is None:
+            raise InputError('there is no model_file in force')
+        past = file.provenance.get('history')
+        history = [*(past if isinstance(past, list) else []), dict(entry)][-_HISTORY:]
+        file = replace(file, model=replace(file.model, load=load, date=str(entry['date'])),
+                       provenance={**file.provenance, 'date': entry['date'], 'history': history})
+        try:
+            written = self._wait(self._reader.submit(_save, path, file, known), meanwhile)
+        except (OSError, ValueError) as error:
+            raise InputError(f'model_file {path_words(path)} is left as it is: '
+                             f'{_words(error)}') from error
+        except NotReadyError as error:
+            raise InputError(f'model_file {path_words(path)} was not written within '
+                             f'{PATIENCE:g} s') from error
+        self._used = path, file, written
+        return path
 
 
-def _read(path: str) -> SupplyModel:
+# Path, what the file says, and its bytes.
+_Chosen = tuple[str, 'ModelFile | None', bytes]
+
+
+def _read(path: str) -> tuple[ModelFile, bytes]:
     """Read a model file; the terms and their fits are loaded only where there is one."""
     try:
         # Loading those takes a second on a busy machine; this is told at once.
-        open_regular(path).close()
+        with open_regular(path) as file:
+            known = file.read(_LARGEST)
     except (OSError, ValueError) as error:
         why = (error.strerror if isinstance(error, OSError) else None) or 'it is no path'
         raise InputError(f'cannot read the model file {path_words(path)}: {why}') from error
     from ou_monitor.recordings.model_file import read_model
-    return read_model(path).model
+    return read_model(path), known
+
+
+def _save(path: str, file: ModelFile, known: bytes) -> bytes:
+    """Replace a model file that still holds `known`; return what it holds then."""
+    from ou_monitor.recordings.model_file import as_yaml
+    # What a reader has written above the entries stays.
+    lines = known.decode('utf-8-sig').splitlines(keepends=True)
+    head = ''.join(takewhile(lambda line: line.startswith('#'), lines))
+    text = (head + as_yaml(file)).encode()
+    _check_kind(path)
+    handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    with open(handle, 'rb') as found:
+        mode = stat.S_IMODE(os.fstat(handle).st_mode)
+        if found.read(len(known) + 1) != known:
+            raise ValueError('it has changed since it was read')
+    handle, beside = _write_beside(Path(path), text, mode)
+    os.close(handle)
+    try:
+        os.rename(beside, path)
+    except BaseException:
+        os.unlink(beside)
+        raise
+    _sync_folder(Path(path))
+    return text
+
+
+def _check_kind(path: str | Path) -> None:
+    """Raise `ValueError` unless it is a regular file: opening a device may have an effect."""
+    kind = os.lstat(path).st_mode
+    if not stat.S_ISREG(kind):
+        raise ValueError('it is a symbolic link' if stat.S_ISLNK(kind)
+                         else 'it is not a regular file')
+
+
+def _write_beside(path: Path, text: bytes, mode: int) -> tuple[int, str]:
+    """Write a new file beside a path, synced and read back; return its open handle and name."""
+    # Made by O_CREAT | O_EXCL under a random name: no other file is opened or removed.
+    handle, beside = tempfile.mkstemp(prefix=f'.{path.name}.', dir=path.parent)
+    try:
+        os.fchmod(handle, mode)
+        os.write(handle, text)
+        os.fsync(handle)
+        if os.pread(handle, len(text) + 1, 0) != text:
+            raise ValueError('it does not read as it was written')
+    except BaseException:
+        os.close(handle)
+        os.unlink(beside)
+        raise
+    return handle, beside
+
+
+def _sync_folder(path: Path) -> None:
+    """Have the disk know of a rename."""
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
 
 
 # Size above which a file is not read, bytes; ours have at most 1000.
@@ -187,13 +289,10 @@ class LatchFile:
     def _claim(self) -> dict[str, Any] | None:
         """Return what the file says, locked from here on; None: there is none."""
         try:
-            # Opening a device may have an effect, and a FIFO has a reader then.
-            kind = os.lstat(self.path).st_mode
+            # A FIFO would have a reader, too.
+            _check_kind(self.path)
         except FileNotFoundError:
             return None
-        if not stat.S_ISREG(kind):
-            raise ValueError('it is a symbolic link' if stat.S_ISLNK(kind)
-                             else 'it is not a regular file')
         # What took its place meanwhile is not followed, waited for or locked.
         handle = os.open(self.path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
         try:
@@ -236,15 +335,9 @@ class LatchFile:
     def _replace(self, text: bytes) -> None:
         """Write beside, sync, read back, lock and rename."""
         there = self._claim() is not None
-        # Made by O_CREAT | O_EXCL under a random name: no other file is opened or removed.
-        handle, beside = tempfile.mkstemp(prefix=f'.{self.path.name}.', dir=self.path.parent)
+        # Readable by all, as an ordinary file is.
+        handle, beside = _write_beside(self.path, text, 0o644)
         try:
-            # Readable by all, as an ordinary file is.
-            os.fchmod(handle, 0o644)
-            os.write(handle, text)
-            os.fsync(handle)
-            if os.pread(handle, _MOST, 0) != text:
-                raise ValueError('it does not read as it was written')
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if not there:
                 # Fails where a file has come meanwhile.  File systems of SD cards have no links.
@@ -255,11 +348,7 @@ class LatchFile:
             os.unlink(beside)
             raise
         self._hold(handle)
-        folder = os.open(self.path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        _sync_folder(self.path)
         if not os.path.samestat(os.lstat(self.path), os.fstat(handle)):
             raise ValueError('another file has taken its place')
 

@@ -166,8 +166,11 @@ def test_model_file(rig, shared_world):
     resets = rig.field('resets')
     rig.give('model_file', str(good))
     wait_until(lambda: rig.field('model_terms') == 'ou,measurement_noise', what='the terms')
-    # Of throttle it says nothing.
+    # Of throttle it says nothing, nor has this flight.
     assert rig.field('model_verdict') == 'CANNOT_TELL'
+    answer = rig.probe.call(Trigger, f'{rig.node}/save_model', Trigger.Request())
+    assert not answer.success and answer.message.startswith('Nothing to save')
+    assert good.read_text() == MODEL
     result = rig.probe.set_parameter(rig.node, 'model_file', str(bad))
     assert not result.successful and "did you mean 'measurement_noise'" in result.reason
     assert rig.get('model_file').string_value == str(good)

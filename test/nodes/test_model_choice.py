@@ -1,12 +1,16 @@
 """The model file in force: it is read before the answer, and a refusal has its reason."""
 
+from dataclasses import replace
 import os
+import stat
 import sys
 from types import SimpleNamespace
 
+from live import ROOT
 from ou_monitor.errors import InputError
 from ou_monitor.nodes import node_files
 from ou_monitor.nodes.node_files import ModelChoice
+from ou_monitor.recordings.model_file import read_model
 import pytest
 
 
@@ -69,3 +73,40 @@ def test_a_file_that_is_never_read_is_refused(tmp_path, monkeypatch):
     # Its thread ends, else the interpreter would wait for it.
     for _ in range(50):
         meanwhile()
+
+
+def test_a_flight_is_saved_into_its_own_file_alone(tmp_path):
+    """In place, head, mode and terms kept, with a history; never over what was not read."""
+    path = tmp_path / 'model.yaml'
+    path.write_text((ROOT / 'models' / 'gecko.yaml').read_text())
+    path.chmod(0o640)
+    choice = ModelChoice()
+    with pytest.raises(InputError, match='no model_file in force'):
+        choice.save(None, {})
+    choice.check(str(path))
+    model = choice.use(str(path))
+    for k in range(2):
+        load = replace(model.load, volts=14.0 + k)
+        assert choice.save(load, {'date': f'2026-08-0{k + 1}', 'sag_ratio': 1.1}) == str(path)
+        assert choice.use(str(path)).load == load
+        assert choice.use(str(path)).date == f'2026-08-0{k + 1}'
+    written = read_model(path)
+    assert written.model == replace(model, load=load) and written.model.date == '2026-08-02'
+    assert [entry['date'] for entry in written.provenance['history']] == [
+        '2026-08-01', '2026-08-02']
+    assert written.provenance['recording'] == 'bags/recorded/gecko.csv'
+    assert path.read_text().startswith('# Learned by') and stat.S_IMODE(
+        path.stat().st_mode) == 0o640
+    other = tmp_path / 'other.yaml'
+    changed = path.read_text() + '# by hand'
+    path.write_text(changed)
+    for change, words in (
+            (lambda: None, 'has changed'),
+            (lambda: (path.rename(other), path.symlink_to(other)), 'symbolic link'),
+            (lambda: (path.unlink(), os.mkfifo(path)), 'not a regular file'),
+            (path.unlink, 'No such file')):
+        change()
+        with pytest.raises(InputError, match=f'left as it is: .*{words}'):
+            choice.save(load, {'date': '2026-08-03'})
+        assert choice.use(str(path)).date == '2026-08-02'
+    assert other.read_text() == changed and os.listdir(tmp_path) == ['other.yaml']

@@ -185,8 +185,9 @@ def test_locked_parameters(world):
     assert rig.probe.set_parameter(rig.node, 'publish_rate', 20.0).successful
     rig.live([4.0] * 200)
     wait_until(lambda: rig.field('brownout_level') == 'CRITICAL', what='the flag')
-    answer = rig.probe.call(Trigger, f'{rig.node}/clear_brownout', Trigger.Request())
-    assert not answer.success and 'lock_parameters' in answer.message
+    for service in ('clear_brownout', 'save_model'):
+        answer = rig.probe.call(Trigger, f'{rig.node}/{service}', Trigger.Request())
+        assert not answer.success and 'lock_parameters' in answer.message
 
 
 def test_a_dip_that_the_diagnostics_find_is_told_by_all(rig):
