@@ -8,7 +8,7 @@ that a function loads only what it uses.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import partial
 from pathlib import Path
 from typing import Any, TYPE_CHECKING, Union
 
@@ -21,13 +21,15 @@ from ou_monitor.text import counted
 from ou_monitor.timeline.line import ordered, readings_of
 
 if TYPE_CHECKING:
-    from ou_monitor.analysis.overview import Overview
+    from ou_monitor.analysis.analyze import Analysis
+    from ou_monitor.analysis.coupling import Coupling
+    from ou_monitor.analysis.supply import SupplyFacts
     from ou_monitor.model.supply import SupplyModel
     from ou_monitor.paper.network.components import PowerNetwork
     from ou_monitor.paper.network.design import Flight
     from ou_monitor.recordings.importers.log import Series
     from ou_monitor.recordings.model_file import ModelFile
-    from ou_monitor.simulation import Profile
+    from ou_monitor.simulation import Profile, Run
 
 Given = Union[Recording, str, Path]
 Progress = Callable[[float], None]
@@ -59,13 +61,6 @@ def _limit(recording: Recording, limit: float | None, cells: int) -> tuple[float
         return cells * CELL_LIMIT, cells
     stated = stated_limit(recording.source)
     return (None, 0) if stated is None else (stated[1], stated[0])
-
-
-def _seen(recording: Recording, limit: float | None, cells: int) -> Callable[[], Overview]:
-    """Return a function that finds what every command says of a recording, once."""
-    from ou_monitor.analysis.overview import overview
-
-    return cache(lambda: overview(recording, limit, cells=cells))
 
 
 def analyze(recording: Given, *, levels: tuple[float, ...] | None = None, window: float = 2.0,
@@ -111,7 +106,7 @@ def analyze(recording: Given, *, levels: tuple[float, ...] | None = None, window
 
     """
     from dataclasses import replace
-    from ou_monitor.analysis.analyze import analyze as analyzed, as_data
+    from ou_monitor.analysis.analyze import analyze as analyzed
     from ou_monitor.report.analysis_document import analysis_document
 
     recording = _read(recording)
@@ -128,11 +123,15 @@ def analyze(recording: Given, *, levels: tuple[float, ...] | None = None, window
     if found.brownout_default:
         # As other commands without a limit.
         facts = replace(facts, dips=None, budget=None)
-    return Result(
-        found, lambda command: analysis_document(found, command),
-        lambda: {**as_data(found), 'headline': analysis_document(found).headline,
-                 'supply': facts.to_dict()},
-        lambda: as_data(found)['levels'], lambda: facts)
+    return Result(found, partial(analysis_document, found), partial(_analysis_data, found),
+                  'levels', facts)
+
+
+def _analysis_data(found: Analysis) -> dict[str, Any]:
+    from ou_monitor.analysis.analyze import as_data
+    from ou_monitor.report.analysis_document import analysis_document
+
+    return {**as_data(found), 'headline': analysis_document(found).headline}
 
 
 def compare(recording: Given, model: SupplyModel | str | Path | None = None, *,
@@ -183,6 +182,7 @@ def compare(recording: Given, model: SupplyModel | str | Path | None = None, *,
     (4.66, 20)
 
     """
+    from ou_monitor.analysis.overview import overview
     from ou_monitor.comparison.compare import compare as compared
     from ou_monitor.recordings.model_file import read_model
     from ou_monitor.report.comparison_document import comparison_document
@@ -194,11 +194,9 @@ def compare(recording: Given, model: SupplyModel | str | Path | None = None, *,
     with np.errstate(over='ignore', under='ignore'):
         found = compared(recording, model, fit_until=fit_until, seeds=seeds, seed=seed,
                          levels=levels if limit is None else (*levels, limit), progress=progress)
-    seen = _seen(recording, limit, cells)
-    return Result(
-        found, lambda command: comparison_document(found, seen(), command),
-        lambda: {**found.as_data(), 'supply': seen().facts.to_dict()},
-        found.measures, lambda: seen().facts)
+    seen = overview(recording, limit, cells=cells)
+    return Result(found, partial(comparison_document, found, seen), found.as_data,
+                  found.measures, seen.facts)
 
 
 def coupling(recording: Given, signal: str | Series | Pairs, *,
@@ -243,6 +241,7 @@ def coupling(recording: Given, signal: str | Series | Pairs, *,
 
     """
     from ou_monitor.analysis.coupling import as_data, estimate_coupling
+    from ou_monitor.analysis.overview import overview
     from ou_monitor.recordings.importers.log import Series, UNKNOWN
     from ou_monitor.recordings.read import read_beside
     from ou_monitor.report.coupling_document import coupling_document
@@ -268,14 +267,16 @@ def coupling(recording: Given, signal: str | Series | Pairs, *,
         raise InputError(f"'{recording.name}', signal '{name}': {error}") from error
     # From here on as `analyze` reads it.
     read = readings_of(recording)
-    seen = _seen(read, limit, cells)
+    seen = overview(read, limit, cells=cells)
     return Result(
-        found, lambda command: coupling_document(found, read, (t, values), name, unit, seen(),
-                                                 command),
-        lambda: {**as_data(found, read.name, name, unit, read.notes),
-                 'supply': seen().facts.to_dict()},
-        lambda: {'frequency_hz': found.frequency, 'coherence': found.coherence,
-                 'gain_per_v': abs(found.response)}, lambda: seen().facts)
+        found, partial(coupling_document, found, read, (t, values), name, unit, seen),
+        partial(as_data, found, read.name, name, unit, read.notes), partial(_spectrum, found),
+        seen.facts)
+
+
+def _spectrum(found: Coupling) -> dict[str, Any]:
+    return {'frequency_hz': found.frequency, 'coherence': found.coherence,
+            'gain_per_v': abs(found.response)}
 
 
 def discover(recording: Given, *, seed: int = 0, brownout_voltage: float | None = None,
@@ -312,6 +313,7 @@ def discover(recording: Given, *, seed: int = 0, brownout_voltage: float | None 
     True
 
     """
+    from ou_monitor.analysis.overview import overview
     from ou_monitor.discovery.discover import discover as discovered
     from ou_monitor.report.discovery_document import discovery_document
 
@@ -321,11 +323,9 @@ def discover(recording: Given, *, seed: int = 0, brownout_voltage: float | None 
     # use for the source line of it.
     with np.errstate(all='ignore'):
         found = discovered(recording, seed=seed, progress=progress)
-    seen = _seen(recording, limit, cells)
-    return Result(
-        found, lambda command: discovery_document(found, seen(), command),
-        lambda: {**found.as_data(), 'supply': seen().facts.to_dict()},
-        lambda: found.as_data()['causes'], lambda: seen().facts)
+    seen = overview(recording, limit, cells=cells)
+    return Result(found, partial(discovery_document, found, seen), found.as_data, 'causes',
+                  seen.facts)
 
 
 def design(throttle: float | None = None, *, recording: Given | None = None,
@@ -406,11 +406,8 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     found = designed(circuit, throttle, voltage=level, horizon=horizon, risk=risk, rail=rail,
                      esr_follows=not esr_fixed, capacitances=capacitances or (LEAST, MOST))
     facts = None if flown is None else flown[1]
-    return Result(
-        found, lambda command: design_document(found, source, taken, command),
-        lambda: {**as_data(found, source), 'measured': taken or None,
-                 **({} if facts is None else {'supply': facts.to_dict()})},
-        lambda: as_data(found, source)['rows'], lambda: facts)
+    return Result(found, partial(design_document, found, source, taken),
+                  partial(as_data, found, source, taken), 'rows', facts)
 
 
 def _flight(recording: Recording) -> tuple[Flight, Any]:
@@ -457,8 +454,7 @@ def reproduce(*, seed: int = 1, progress: Progress | None = None) -> Result:
     from ou_monitor.report.reproduction_document import reproduction_document
 
     found = reproduced(seed, progress)
-    return Result(found, lambda command: reproduction_document(found, command),
-                  lambda: as_data(found), lambda: as_data(found)['rows'])
+    return Result(found, partial(reproduction_document, found), partial(as_data, found), 'rows')
 
 
 def simulate(model: SupplyModel | ModelFile | str | Path | None = None, *,
@@ -516,7 +512,6 @@ def simulate(model: SupplyModel | ModelFile | str | Path | None = None, *,
     (5000, True)
 
     """
-    from ou_monitor.analysis.supply import supply_facts
     from ou_monitor.recordings.write import RecordingWriter
     from ou_monitor.report.simulation_document import simulation_document
     from ou_monitor.simulation import plan
@@ -534,11 +529,18 @@ def simulate(model: SupplyModel | ModelFile | str | Path | None = None, *,
                     progress(done / run.n)
         written = {'topics': writer.topics}
 
-    def columns() -> dict[str, Any]:
-        drawn = run.recording
-        return {'time_s': drawn.t, 'voltage_v': drawn.voltage, 'throttle': drawn.throttle}
-
     return Result(
-        run, lambda command: simulation_document(run, output, command),
-        lambda: {'output': None if output is None else str(output), **run.as_data(), **written},
-        columns, lambda: supply_facts(run.recording))
+        run, partial(simulation_document, run, output),
+        partial(dict, {'output': None if output is None else str(output), **run.as_data(),
+                       **written}), partial(_columns, run), partial(_drawn_facts, run))
+
+
+def _columns(run: Run) -> dict[str, Any]:
+    drawn = run.recording
+    return {'time_s': drawn.t, 'voltage_v': drawn.voltage, 'throttle': drawn.throttle}
+
+
+def _drawn_facts(run: Run) -> SupplyFacts:
+    from ou_monitor.analysis.supply import supply_facts
+
+    return supply_facts(run.recording)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 import math
 from pathlib import Path
 from typing import Any
@@ -57,24 +57,23 @@ def through(points: Sequence[tuple[float, float]], period: float | None = None,
 
     points in s, period in s, stick_rate in Hz.
     """
-    times = np.array([t for t, _ in points], dtype=np.float64)
-    values = np.array([u for _, u in points], dtype=np.float64)
+    return partial(_through, np.array(points, dtype=np.float64).T, period, stick_rate)
 
-    def profile(t: FloatArray) -> FloatArray:
-        # Several times as fast as t % period, and as exact as needed: one rounding.
-        at = t if period is None else t - np.floor(t / period) * period
-        if stick_rate is not None:
-            # A hair more, so that a stamp at the very update is not before it.
-            at = np.floor(at * stick_rate + 1e-6) / stick_rate
-        found: FloatArray = np.interp(at, times, values)
-        return found
 
-    return profile
+def _through(points: FloatArray, period: float | None, stick_rate: float | None, t: FloatArray,
+             ) -> FloatArray:
+    # Several times as fast as t % period, and as exact as needed: one rounding.
+    at = t if period is None else t - np.floor(t / period) * period
+    if stick_rate is not None:
+        # A hair more, so that a stamp at the very update is not before it.
+        at = np.floor(at * stick_rate + 1e-6) / stick_rate
+    found: FloatArray = np.interp(at, *points)
+    return found
 
 
 def constant(throttle: float) -> Profile:
     """Return the profile that is `throttle` at all times."""
-    return lambda t: np.full(t.shape, throttle)
+    return partial(np.full_like, fill_value=throttle, dtype=np.float64)
 
 
 def _hover(t: FloatArray) -> FloatArray:
@@ -202,13 +201,13 @@ def recorded_throttle(recording: Recording, name: str) -> RecordedThrottle:
         raise InputError(f"--throttle '{name}': the recording has no throttle")
     t, u = recording.t[known] - recording.t[0], recording.throttle[known]
     # The reader has refused percent and pulses; calibrations reach a little beyond.
-    u = np.clip(u, 0.0, 1.0)
+    return RecordedThrottle(partial(_held, t, np.clip(u, 0.0, 1.0)),
+                            float(recording.t[-1] - recording.t[0]), recording)
 
-    def profile(at: FloatArray) -> FloatArray:
-        # A hair later, so that a stamp that is rounded is not before its own value.
-        return np.asarray(u[np.maximum(np.searchsorted(t, at + 1e-9, side='right') - 1, 0)])
 
-    return RecordedThrottle(profile, float(recording.t[-1] - recording.t[0]), recording)
+def _held(t: FloatArray, u: FloatArray, at: FloatArray) -> FloatArray:
+    # A hair later, so that a stamp that is rounded is not before its own value.
+    return np.asarray(u[np.maximum(np.searchsorted(t, at + 1e-9, side='right') - 1, 0)])
 
 
 # The paper's rail, V, and relaxation rate, 1/s (Table 2).

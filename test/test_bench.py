@@ -1,6 +1,8 @@
 """The commands as functions: their JSON, tables, plots and HTML, and what is missing without."""
 
+import copy
 import json
+import pickle
 import re
 import sys
 from types import SimpleNamespace
@@ -9,7 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 from ou_monitor import (
     analyze, compare, coupling, design, discover, InputError, read_recording, Recording,
-    reproduce, simulate, supply_facts)
+    reproduce, Result, simulate, supply_facts)
 from ou_monitor.cli.main import main
 from ou_monitor.report.terminal import terminal
 from project import ROOT
@@ -80,6 +82,20 @@ def test_a_simulation_is_that_of_the_command(tmp_path):
     np.testing.assert_array_equal(again.recording.voltage, drawn.recording.voltage)
     full = simulate(throttle=np.ones_like, duration=1.0)
     assert set(full.recording.throttle) == {1.0} and full.supply.ou.status != 'no_data'
+
+
+def test_a_result_is_pickled_and_copied(found):
+    """With all it says, of every function; the throttle of a simulation may be from anywhere."""
+    flown = read_recording(FLIGHT, **PART)
+    drawn = [simulate(throttle=throttle, duration=1.0, rate=100.0)
+             for throttle in ('hover', 'flight', 0.3, '0:0,1:0.5', flown, np.zeros_like)]
+    for result in (*found.values(), *drawn):
+        for again in (pickle.loads(pickle.dumps(result)), copy.copy(result),
+                      copy.deepcopy(result)):
+            assert type(again) is Result and repr(again) == repr(result)
+            assert again.to_dict() == result.to_dict() and str(again) == str(result)
+            assert list(again.plots()) == list(result.plots())
+            assert repr(again.supply) == repr(result.supply)
 
 
 def test_attributes_are_those_of_the_record(found):

@@ -50,9 +50,14 @@ class Result:
     """
 
     def __init__(self, record: Any, document: Callable[[str], Document],
-                 data: Callable[[], Mapping[str, Any]], rows: Callable[[], Rows],
-                 supply: Callable[[], SupplyFacts | None] = lambda: None) -> None:
-        """Keep the record, and how the rest is made of it when it is asked for."""
+                 data: Callable[[], Mapping[str, Any]], rows: str | Callable[[], Rows],
+                 supply: SupplyFacts | Callable[[], SupplyFacts] | None = None) -> None:
+        """
+        Keep the record, and functions that make the rest of it; the rows may be a name in the data.
+
+        A supply that a function finds is not in the JSON.  The functions have names in a module:
+        those of a closure could not be pickled.
+        """
         self.record = record
         self.document = document
         self._data, self._rows, self._supply = data, rows, supply
@@ -60,7 +65,7 @@ class Result:
     @cached_property
     def supply(self) -> SupplyFacts | None:
         """Return the facts of the supply."""
-        return self._supply()
+        return self._supply() if callable(self._supply) else self._supply
 
     def __getattr__(self, name: str) -> Any:
         """Return an attribute of the record."""
@@ -78,7 +83,10 @@ class Result:
             Of plain values; unknown numbers are None.
 
         """
-        found: dict[str, Any] = plain(self._data())
+        data = dict(self._data())
+        if self._supply is not None and not callable(self._supply):
+            data['supply'] = self._supply.to_dict()
+        found: dict[str, Any] = plain(data)
         return found
 
     def to_dataframe(self) -> DataFrame:
@@ -101,7 +109,7 @@ class Result:
             from pandas import DataFrame
         except ImportError as error:
             raise InputError(f"to_dataframe needs pandas: {how_to_install('python')}") from error
-        rows = self._rows()
+        rows = self._data()[self._rows] if isinstance(self._rows, str) else self._rows()
         return DataFrame(dict(rows) if isinstance(rows, Mapping) else [
             dict(_cells(row)) for row in rows])
 

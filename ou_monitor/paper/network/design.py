@@ -294,8 +294,8 @@ def _resistance(network: PowerNetwork, throttle: float, voltage: float) -> float
     return (network.battery_voltage - voltage) / current
 
 
-def as_data(result: Design, source: str) -> dict[str, Any]:
-    """Return the result for JSON."""
+def as_data(result: Design, source: str, taken: str) -> dict[str, Any]:
+    """Return the result for JSON; taken: what came from a flight, if anything did."""
     def row(r: DesignRow | None) -> dict[str, float] | None:
         return None if r is None else {**asdict(r), 'risk': r.risk}
 
@@ -308,7 +308,7 @@ def as_data(result: Design, source: str) -> dict[str, Any]:
         'least': row(result.least), 'resistance_at_level': result.resistance,
         'levers': [asdict(lever) for lever in result.levers],
         'risk_falls_with_capacitance': result.falls, 'lc_corner_hz': result.network.lc_corner,
-        'rows': [row(r) for r in result.rows]}
+        'rows': [row(r) for r in result.rows], 'measured': taken or None}
 
 
 def answer(result: Design) -> str:
