@@ -29,6 +29,8 @@ CORE = {'numpy', 'scipy'}
 # Extras, each with the one module that may import it.
 EXTRAS = {'dask': 'fleet.cluster', 'distributed': 'fleet.cluster',
           'pandas': 'report.result', 'pyarrow': 'fleet.table', 'tornado': 'nodes.live'}
+# The group of causes of other packages, which is no module.
+ENTRY_POINTS = 'ou_monitor.causes'
 # The one command that is a node: the table of commands names its module, and loads it last.
 NODE_COMMANDS = {('ou_monitor.cli.commands', 'ou_monitor.nodes.live')}
 # What each part may import beyond the standard library; ROS is for nodes alone.
@@ -56,7 +58,7 @@ def imports_of(source: str, module: str) -> Iterator[tuple[int, str]]:
                 yield node.lineno, f'{name}.{alias.name}'
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
             # Tables of modules loaded on first use, as in ou_monitor/__init__.py.
-            if re.fullmatch(r'ou_monitor(\.\w+)+', node.value):
+            if re.fullmatch(r'ou_monitor(\.\w+)+', node.value) and node.value != ENTRY_POINTS:
                 yield node.lineno, node.value
         elif isinstance(node, ast.Call) and node.args:
             called = getattr(node.func, 'attr', getattr(node.func, 'id', ''))

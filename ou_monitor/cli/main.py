@@ -113,6 +113,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f'{where}: not enough memory: take a part of the recording (--from, --to)',
               file=sys.stderr)
         return BAD_INPUT
+    except Exception as error:
+        from ou_monitor.model.terms.catalogue import blamed
+
+        if not (names := blamed(error)):
+            raise
+        print(f"{where}: the cause '{names[0]}' of another package failed: "
+              f"{type(error).__name__}: {' '.join(str(error).split())}", file=sys.stderr)
+        return BAD_INPUT
 
 
 if __name__ == '__main__':

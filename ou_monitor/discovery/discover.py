@@ -32,7 +32,7 @@ from ou_monitor.discovery.words import (
     coupling_found, coupling_note, explain, left_out_note, NO_OTHER, no_relaxation_note,
     throttles_note, VAGUE, verdict_sentence)
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.model.terms.catalogue import blamed, catalogue, left_out, withdraw
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import Saturation
 from ou_monitor.model.terms.term import Role
@@ -50,6 +50,17 @@ _BLIND = 1.0
 def discover(recording: Recording, *, seed: int = 0,
              progress: Progress | None = None) -> Finding:
     """Criticise the simulation of a recording, name the cause, extend; see `ou_monitor`."""
+    while True:
+        try:
+            found = _discover(recording, seed, progress)
+            return replace(found, notes=(*found.notes, *left_out()))
+        except Exception as error:
+            # A cause of another package may fail anywhere: again without it, and that is said.
+            if not withdraw(error):
+                raise
+
+
+def _discover(recording: Recording, seed: int, progress: Progress | None) -> Finding:
     done: Progress = progress or (lambda share: None)
     state = examine(recording, lambda share: done(0.05 * share))
     samples = state.samples
@@ -64,7 +75,9 @@ def discover(recording: Recording, *, seed: int = 0,
         named = named_causes(samples, start, rng, state.exact,
                              lambda share: done(0.1 + 0.5 * share))
         plain = _plain(samples, state)
-    except (ValueError, ArithmeticError, np.linalg.LinAlgError):
+    except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
+        if blamed(error):
+            raise
         return _insufficient(recording, state, 'No OU can be fitted to it and simulated: hardly '
                              'any of its samples differ, or some are far beyond all others.',
                              seed)

@@ -22,6 +22,7 @@ from ou_monitor.discovery.fitting import Fitter
 from ou_monitor.discovery.load_start import under_load
 from ou_monitor.discovery.search import (
     kinds_of, name_causes, position, Progress, Search, without_causes)
+from ou_monitor.model.terms.catalogue import blamed
 from ou_monitor.model.terms.lines import prominence
 from ou_monitor.model.terms.slow import Drift, SecondRelaxation
 from ou_monitor.model.terms.term import Role, Term
@@ -99,6 +100,8 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
     except KeyboardInterrupt:
         failure = INTERRUPTED
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
+        if blamed(error):
+            raise
         # A fit outside of what numbers can hold; the criticism still stands.
         failure = f'The search for causes broke off: {error}.'
     if failure and begun is not None:

@@ -18,7 +18,7 @@ from typing import Any
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.model.load import LoadStart
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.model.terms.catalogue import catalogue, left_out
 from ou_monitor.model.terms.term import Term
 from ou_monitor.stream.files import one_line, path_words, read_yaml
 import yaml
@@ -96,7 +96,8 @@ def _term(entry: Any, where: str) -> tuple[Term, dict[str, Any]]:
     name = str(entry['term'])
     terms = catalogue()
     if name not in terms:
-        raise InputError(f"{where}: unknown term '{name}': {nearest(name, terms)}")
+        why = next((one for one in left_out() if f"'{name}'" in one), nearest(name, terms))
+        raise InputError(f"{where}: unknown term '{name}': {why}")
     for key in entry:
         if key not in _TERM_KEYS:
             raise InputError(f"{where} ('{name}'): unknown entry '{key}': "

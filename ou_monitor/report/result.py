@@ -53,7 +53,7 @@ class Result:
                  data: Callable[[], Mapping[str, Any]], rows: str | Callable[[], Rows],
                  supply: SupplyFacts | Callable[[], SupplyFacts] | None = None) -> None:
         """
-        Keep the record, and functions that make the rest of it; the rows may be a name in the data.
+        Keep the record, and functions that make the rest; rows may be a name in the data.
 
         A supply that a function finds is not in the JSON.  The functions have names in a module:
         those of a closure could not be pickled.

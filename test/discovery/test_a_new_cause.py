@@ -1,94 +1,90 @@
 """
-A new cause is one module: a toy is added to a copy of the tree, and everything knows it.
+A cause of another package: the example is put on the path, and everything knows it.
 
-Beside its module and its tests (which hold its circuit), one line of the generator of
-hidden effects changes.
+One that cannot be used, or that fails in a search, costs a note and no answer.
 """
 
-import os
+from contextlib import contextmanager
+import json
 from pathlib import Path
 import shutil
 import subprocess
 import sys
-
-from project import ROOT
-
-MODULE = '''"""A consumer that draws a rectified sine of current: a heartbeat."""
-
-from __future__ import annotations
-
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar
-
-import numpy as np
-from ou_monitor.model.terms.laws import View
-from ou_monitor.model.terms.segment import Effect, Segment
-from ou_monitor.model.terms.term import parameter, Role, Term
-
-
-@dataclass(frozen=True)
-class Heartbeat(Term):
-    """Add a rectified sine of a second."""
-
-    NAME: ClassVar[str] = 'heartbeat'
-    FAMILY: ClassVar[str] = 'events'
-    ROLE: ClassVar[Role] = Role.MEAN
-    LINEAR: ClassVar[tuple[str, ...]] = ('height',)
-    SIGNS: ClassVar[tuple[str, ...]] = ('line', 'band', 'autocorrelation')
-    IMITATES: ClassVar[tuple[str, ...]] = ('tone',)
-    MEANING: ClassVar[str] = 'Something draws current once a second.'
-    REMEDY: ClassVar[str] = 'Look for a beacon.'
-    SEPARATED_BY: ClassVar[str] = 'the beacon switched off'
-
-    height: float = parameter('V', 'height of each beat')
-
-    def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
-        def effect(s: Segment) -> None:
-            s.level += self.height * np.abs(np.sin(np.pi * (s.at - s.origin)))
-
-        return effect
-
-    @classmethod
-    def candidates(cls, view: View) -> Sequence[Term]:
-        """Return beats of any height."""
-        return (cls(0.0),)
-'''
-
-TESTS = '''"""The heartbeat, hidden as a circuit, through all that knows causes."""
+import tomllib
 
 from hidden_effects import causes, draw
+import hidden_registry
 from hidden_registry import effect
 import numpy as np
 from ou_monitor import discover, Recording
 from ou_monitor.cli.discover import model_text
+from ou_monitor.cli.main import main
 from ou_monitor.model.supply import SupplyModel
+import ou_monitor.model.terms.catalogue as terms
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.recordings.model_file import read_model
-from ou_monitor.report.discovery_document import discovery_document
-from ou_monitor.report.page import html
-from ou_monitor.report.terminal import terminal
+from project import ROOT
 import pytest
 
+EXAMPLE = ROOT / 'examples/heartbeat'
+PROJECT = tomllib.loads((EXAMPLE / 'pyproject.toml').read_text())['project']
+(ENTRY,) = PROJECT['entry-points'][terms.GROUP].items()
 
-@effect('heartbeat')
-def heartbeat(bench, gain):
-    """Let a beacon load the rail once a second."""
-    height = -4.0 * gain * bench.stationary
-    bench.series.append(height * np.abs(np.sin(np.pi * bench.time)))
-    return {'height_v': height}
+
+@contextmanager
+def installed(folder: Path, **entries: str):
+    """Have entry points as pip would write them, beside the modules of a folder."""
+    about = folder / f"{PROJECT['name'].replace('-', '_')}-{PROJECT['version']}.dist-info"
+    about.mkdir()
+    (about / 'METADATA').write_text(
+        f"Metadata-Version: 2.1\nName: {PROJECT['name']}\nVersion: {PROJECT['version']}\n")
+    (about / 'entry_points.txt').write_text(f'[{terms.GROUP}]\n' + ''.join(
+        f'{name} = {target}\n' for name, target in entries.items()))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(folder))
+        patch.setattr(terms, '_left_out', {})
+        before = set(sys.modules)
+        catalogue.cache_clear()
+        try:
+            yield
+        finally:
+            catalogue.cache_clear()
+            for name in set(sys.modules) - before:
+                if str(folder) in str(getattr(sys.modules[name], '__file__', '')):
+                    del sys.modules[name]
 
 
 @pytest.fixture(scope='module')
-def found():
+def example(tmp_path_factory):
+    """Return the folder of the installed example, with a circuit that causes its effect."""
+    folder = tmp_path_factory.mktemp('site')
+    for module in EXAMPLE.glob('*.py'):
+        shutil.copy(module, folder)
+    with pytest.MonkeyPatch.context() as patch, installed(folder, **dict([ENTRY])):
+        patch.setitem(hidden_registry.LABELS, 'heartbeat', 'events')
+        patch.setattr(hidden_registry, 'EFFECTS', hidden_registry.EFFECTS)
+
+        @effect('heartbeat')
+        def heartbeat(bench, gain):
+            """Let a beacon load the rail once a second."""
+            height = -4.0 * gain * bench.stationary
+            bench.series.append(height * np.abs(np.sin(np.pi * bench.time)))
+            return {'height_v': height}
+
+        yield folder
+        del hidden_registry.EFFECTS['heartbeat']
+
+
+@pytest.fixture(scope='module')
+def found(example):
     """Return what is hidden, and what is found of it."""
     hidden = draw('single', np.random.default_rng(1), cause='heartbeat', duration=8.0)
     return hidden, discover(Recording(hidden.t, hidden.voltage, hidden.throttle, 'toy'))
 
 
-def test_the_generator_and_the_catalogue_have_it():
-    assert 'heartbeat' in causes() and 'heartbeat' in catalogue()
+def test_the_generator_and_the_catalogue_have_it(example):
+    assert 'heartbeat' in causes() and [*catalogue()][-1] == 'heartbeat'
+    assert terms.left_out() == ()
 
 
 def test_it_is_named_measured_and_explained(found):
@@ -104,44 +100,101 @@ def test_it_is_named_measured_and_explained(found):
 
 def test_terminal_page_and_model_file_have_it(found, tmp_path):
     _, finding = found
-    said = discovery_document(finding)
-    assert 'heartbeat' in terminal(said)
-    page = html(said)
+    assert 'heartbeat' in str(finding)
+    page = finding._repr_html_()
     assert 'heartbeat' in page and 'Look for a beacon' in page
     path = tmp_path / 'toy.yaml'
-    path.write_text(model_text(finding))
+    path.write_text(model_text(finding.record))
     model = read_model(path).model
     assert model == SupplyModel(finding.model.terms)
     assert np.isfinite(model.simulate(np.arange(100) / 1e3, np.random.default_rng(0))).all()
-'''
 
 
-def test_a_toy_cause_in_a_copy_of_the_tree(tmp_path):
-    """Only its module, its tests and one line of the generator are written."""
-    for part in ('ou_monitor', 'test/hidden', 'test/support', 'setup.cfg'):
-        source, target = ROOT / part, tmp_path / part
-        if source.is_dir():
-            shutil.copytree(source, target, ignore=shutil.ignore_patterns('__pycache__'))
-        else:
-            shutil.copy(source, target)
-    (tmp_path / 'ou_monitor/model/terms/heartbeat.py').write_text(MODULE)
-    tests = tmp_path / 'test/model/test_terms_heartbeat.py'
-    tests.parent.mkdir()
-    tests.write_text(TESTS)
-    registry = tmp_path / 'test/hidden/hidden_registry.py'
-    text = registry.read_text()
-    assert text.count('LABELS = {\n') == 1
-    registry.write_text(text.replace('LABELS = {\n', "LABELS = {\n    'heartbeat': 'events',\n"))
-    path = os.pathsep.join(str(tmp_path / part) for part in ('.', 'test/hidden', 'test/support'))
-    run = subprocess.run(
-        [sys.executable, '-m', 'pytest', '-q', '-p', 'no:cacheprovider', str(tests)],
-        cwd=tmp_path, env={**os.environ, 'PYTHONPATH': path}, capture_output=True, text=True,
-        timeout=120, check=False)
-    assert run.returncode == 0, run.stdout[-4000:] + run.stderr[-2000:]
-    assert '3 passed' in run.stdout and Path(tmp_path, 'setup.cfg').exists()
+def test_without_its_package_the_example_is_unknown():
+    """So that what is above cannot pass by what is installed; in a process of its own."""
+    code = ('from ou_monitor.model.terms.catalogue import catalogue\n'
+            "raise SystemExit('heartbeat' in catalogue())")
+    assert subprocess.run([sys.executable, '-c', code], cwd=ROOT, check=False).returncode == 0
 
 
-def test_without_its_module_the_toy_is_unknown():
-    """So that the copy above cannot pass by what is installed."""
-    from ou_monitor.model.terms.catalogue import catalogue
-    assert 'heartbeat' not in catalogue()
+RAIL = Recording(np.arange(600) / 100.0, 15.0 + 0.02 * np.random.default_rng(4).standard_normal(
+    600), np.where(np.arange(600) % 200 < 100, 0.2, 0.5), 'rail')
+# Modules of broken causes by name, and what is said of each.
+BROKEN = {
+    'absent': (None, 'ModuleNotFoundError'),
+    'wrong': ('1 +', 'SyntaxError'),
+    'ends': ('raise SystemExit(3)', 'SystemExit: 3'),
+    'number': ('Cause = 3', 'not a class derived from Term'),
+    'silent': ("class Cause(Heartbeat):\n    NAME = 'silent'\n    MEANING = ''", 'no MEANING'),
+    'tone': ("class Cause(Heartbeat):\n    NAME = 'tone'", 'not that of another cause'),
+    'other': ("class Cause(Heartbeat):\n    NAME = 'another'", 'that of the entry point'),
+    'linear': ("class Cause(Heartbeat):\n    NAME = 'linear'\n    LINEAR = ('width',)",
+               'width is in LINEAR'),
+}
+FAILING = {
+    # Where it fails in a search: with an error that fits have too, and with one that is a bug.
+    'candidates': ('    @classmethod\n    def candidates(cls, view):\n        return view.nothing',
+                   'AttributeError'),
+    'value': ("    @classmethod\n    def candidates(cls, view):\n        raise ValueError('no')",
+              'ValueError: no'),
+    'columns': ('    def start(self, rng):\n        return lambda s: 1 / 0', 'ZeroDivisionError'),
+    'bases': ('    def columns(self, s):\n        return None', 'Error'),
+}
+HEAD = 'from dataclasses import dataclass\nfrom ou_monitor_heartbeat import Heartbeat\n\n\n'
+
+
+def test_a_broken_cause_is_a_note(tmp_path):
+    """Whatever is wrong with a package: a sentence, and the answer as without it."""
+    plain = discover(RAIL).to_dict()
+    shutil.copy(EXAMPLE / 'ou_monitor_heartbeat.py', tmp_path)
+    for name, (text, _) in BROKEN.items():
+        if text is not None:
+            (tmp_path / f'broken_{name}.py').write_text(HEAD + text)
+    with installed(tmp_path, **{name: f'broken_{name}:Cause' for name in BROKEN}):
+        said = terms.left_out()
+        result = discover(RAIL).to_dict()
+    assert result.pop('notes') == [*plain.pop('notes'), *said] and result == plain
+    assert len(said) == len(BROKEN) and not any('\n' in one for one in said)
+    for name, (_, words) in BROKEN.items():
+        (one,) = (one for one in said if f"'{name}'" in one.split(' of another ')[0])
+        assert words in one
+
+
+@pytest.mark.parametrize('name', FAILING)
+def test_a_cause_that_fails_is_left_out(name, tmp_path, capsys):
+    """The search begins again without it; of the command no traceback."""
+    text, words = FAILING[name]
+    shutil.copy(EXAMPLE / 'ou_monitor_heartbeat.py', tmp_path)
+    (tmp_path / 'failing.py').write_text(
+        f"{HEAD}@dataclass(frozen=True)\nclass Cause(Heartbeat):\n    NAME = '{name}'\n"
+        f'    SIGNS = ()\n    MEASURED = True\n{text}\n')
+    recording = tmp_path / 'rail.csv'
+    np.savetxt(recording, np.column_stack([RAIL.t, RAIL.voltage, RAIL.throttle]), '%.9g', ',',
+               header='time_s,voltage_v,throttle', comments='')
+    plain = discover(recording).to_dict()
+    with installed(tmp_path, **{name: 'failing:Cause'}):
+        assert main(['discover', str(recording), '--json', str(tmp_path / 'x.json')]) == 0
+        data = json.loads((tmp_path / 'x.json').read_text())
+        (said,) = terms.left_out()
+    assert f"'{name}'" in said and words in said
+    assert data.pop('notes') == [*plain.pop('notes'), said] and data == plain
+    assert 'Traceback' not in capsys.readouterr().err
+
+
+def test_a_model_with_a_failing_cause_is_one_line(tmp_path, capsys):
+    """Of any other command; and of a model file whose cause was left out, the reason."""
+    shutil.copy(EXAMPLE / 'ou_monitor_heartbeat.py', tmp_path)
+    (tmp_path / 'failing.py').write_text(
+        f"{HEAD}class Cause(Heartbeat):\n    NAME = 'fails'\n"
+        '    def start(self, rng):\n        return lambda s: s.nothing\n')
+    (tmp_path / 'ends.py').write_text('raise SystemExit(3)')
+    with installed(tmp_path, fails='failing:Cause', ends='ends:Cause'):
+        for term, words in (('fails', "'fails' of another package failed: AttributeError"),
+                            ('ends', "'ends' of another package was left out: SystemExit: 3")):
+            path = tmp_path / f'{term}.yaml'
+            path.write_text('model:\n- {term: ou, params: {alpha: 60, sigma: 0.3, u0: 5}}\n'
+                            f'- {{term: {term}, params: {{height: 0.1}}}}\n')
+            assert main(['simulate', '--model', str(path), '--duration', '1', '--rate', '100',
+                         '--output', str(tmp_path / 'x.mcap')]) == 2
+            (line,) = capsys.readouterr().err.splitlines()
+            assert words in line

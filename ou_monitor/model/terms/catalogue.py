@@ -1,24 +1,36 @@
 """
-Every term there is, found by looking: a new class with a NAME in a module here is a term.
+Every term there is: the classes with a NAME in a module here, and causes of other packages.
 
-The names are those of model files and of findings.
+The names are those of model files and of findings.  Another package declares its causes as entry
+points of the group `ou_monitor.causes`.  One that cannot be used is left out with a reason, and
+`discover` goes on without it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib import import_module
+from importlib.metadata import entry_points
 from pkgutil import iter_modules
+import re
+import traceback
 from types import MappingProxyType
 
 import ou_monitor.model.terms as folder
 from ou_monitor.model.terms.term import Term
+from ou_monitor.text import printable
+
+GROUP = 'ou_monitor.causes'
+# Longest reason that is shown, characters.
+_LONGEST = 200
+# Causes of other packages that failed -> why, one sentence each.
+_left_out: dict[str, str] = {}
 
 
 @cache
 def catalogue() -> Mapping[str, type[Term]]:
-    """Return all terms by name, the `ou` first."""
+    """Return all terms by name, the `ou` first, those of other packages last."""
     found: dict[str, type[Term]] = {}
     for info in iter_modules(folder.__path__):
         module = import_module(f'{folder.__name__}.{info.name}')
@@ -26,4 +38,70 @@ def catalogue() -> Mapping[str, type[Term]]:
             if (isinstance(value, type) and issubclass(value, Term) and value.NAME
                     and value.__module__ == module.__name__):
                 found[value.NAME] = value
-    return MappingProxyType({'ou': found.pop('ou'), **dict(sorted(found.items()))})
+    found = {'ou': found.pop('ou'), **dict(sorted(found.items()))}
+    for entry in sorted(entry_points(group=GROUP), key=lambda one: one.name):
+        if entry.name in _left_out:
+            continue
+        try:
+            kind = entry.load()
+            _check(kind, entry.name, found)
+        # What a package does on its way, and that is anything, must not end a command.
+        except (Exception, SystemExit) as error:
+            _leave_out(entry.name, error)
+        else:
+            found[entry.name] = kind
+    return MappingProxyType(found)
+
+
+def left_out() -> tuple[str, ...]:
+    """Return a sentence for each cause of another package that cannot be used."""
+    catalogue()
+    return tuple(_left_out.values())
+
+
+def blamed(error: BaseException) -> tuple[str, ...]:
+    """Return the causes of other packages in whose code an error arose."""
+    modules = {frame.f_globals.get('__name__') for one in _chain(error)
+               for frame, _ in traceback.walk_tb(one.__traceback__)}
+    return tuple(name for name in _installed() if catalogue()[name].__module__ in modules)
+
+
+def withdraw(error: BaseException) -> bool:
+    """Leave out the causes that an error is from, or else all installed; False without any."""
+    names = blamed(error) or _installed()
+    for name in names:
+        _leave_out(name, error)
+    catalogue.cache_clear()
+    return bool(names)
+
+
+def _installed() -> list[str]:
+    return [name for name, kind in catalogue().items()
+            if not kind.__module__.startswith(f'{folder.__name__}.')]
+
+
+def _chain(error: BaseException | None) -> Iterator[BaseException]:
+    while error is not None:
+        yield error
+        error = error.__cause__
+
+
+def _leave_out(name: str, error: BaseException) -> None:
+    words = ' '.join(str(error).split())
+    _left_out[name] = printable(
+        f"The cause '{name}' of another package was left out: {type(error).__name__}"
+        + (f': {words}' if words else ''), _LONGEST) + '.'
+
+
+def _check(kind: object, name: str, known: Mapping[str, type[Term]]) -> None:
+    """Refuse what is no cause of this name."""
+    if not (isinstance(kind, type) and issubclass(kind, Term)):
+        raise TypeError('it is not a class derived from Term')
+    if name != kind.NAME or not re.fullmatch('[a-z][a-z0-9_]*', name) or name in known:
+        raise ValueError(f"its NAME is '{kind.NAME}': it must be that of the entry point, in "
+                         'small letters, and not that of another cause')
+    if missing := [word for word in ('FAMILY', 'MEANING', 'REMEDY', 'SEPARATED_BY')
+                   if not getattr(kind, word)]:
+        raise ValueError(f"it has no {', '.join(missing)}")
+    if unknown := {*kind.LINEAR, *kind.FREE}.difference(kind.parameters()):
+        raise ValueError(f"{', '.join(sorted(unknown))} is in LINEAR or FREE, but not a parameter")
