@@ -38,6 +38,9 @@ _UNKNOWN = 0.5
 # Samples count up to this far outside of the throttle that the other blocks have been through: a
 # share of its range, and what is no change of throttle at all.
 _BEYOND, _STILL = 0.05, 0.01
+# The rail answers for so long, s, to throttle that no other block has been through: most lags of
+# recorded flights are shorter.
+_AFTER = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +157,7 @@ def _solved(gram: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def covered(samples: Samples) -> npt.NDArray[np.bool_]:
-    """Return which samples are at throttle that the other blocks have been through."""
+    """Return which samples are at, or soon after, throttle that other blocks have been through."""
     found = np.ones(samples.n, dtype=np.bool_)
     u = samples.throttle
     if u is None:
@@ -164,4 +167,5 @@ def covered(samples: Samples) -> npt.NDArray[np.bool_]:
         low, high = float(rest.min()), float(rest.max())
         margin = max(_BEYOND * (high - low), _STILL)
         found[b] = (u[b] >= low - margin) & (u[b] <= high + margin)
-    return found
+    last = np.maximum.accumulate(np.where(found, -np.inf, samples.t))
+    return found & (samples.t - last > _AFTER)

@@ -177,6 +177,17 @@ def test_samples_at_throttle_never_fitted_are_not_scored():
     assert covered(Samples(samples.t, samples.voltage, None)).all()
 
 
+def test_samples_soon_after_a_punch_of_one_block_are_not_scored():
+    """The rail still answers to a throttle that the other blocks have not been through."""
+    t = np.arange(6000) / 100.0
+    u = 0.3 + 0.1 * np.sin(2.0 * t)
+    punch = (t >= 31.0) & (t < 31.5)
+    u[punch] = 1.0
+    scored = covered(Samples(t, np.zeros(t.size), u))
+    assert not scored[punch].any() and not scored[(t >= 31.5) & (t < 31.65)].any()
+    assert scored[(t < 31.0) | (t >= 33.0)].all()
+
+
 def test_what_one_block_alone_determines_has_no_gain():
     """The sag is seen in the last block only: it cannot be scored there, and why is said."""
     samples = late_start()
