@@ -67,12 +67,12 @@ CASES: tuple[tuple[str, list[tuple[str, list[str]]]], ...] = (
     ('Float64', [
         ('counts', ['-c', _LISTENER, 'Float64', 'voltage', 'counts', 'n0']),
         ('reads its field', ['-c', _LISTENER, 'Float64', 'voltage', 'reads', 'n1']),
-        ('`estimator`', ['-m', 'ou_monitor.nodes.estimator', '--ros-args', '-p',
+        ('`estimator`', ['-m', 'ou_monitor.nodes', 'estimator', '--ros-args', '-p',
                          'brownout.voltage:=13.0'])]),
     ('Imu', [
         ('counts', ['-c', _LISTENER, 'Imu', 'input', 'counts', 'n0']),
         ('changes and publishes', ['-c', _LISTENER, 'Imu', 'input', 'echoes', 'n1']),
-        ('`adaptive_filter`', ['-m', 'ou_monitor.nodes.adaptive_filter'])]))
+        ('`adaptive_filter`', ['-m', 'ou_monitor.nodes', 'adaptive_filter'])]))
 
 
 def cpu_seconds(pid: int) -> float:

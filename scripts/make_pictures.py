@@ -76,10 +76,10 @@ def live(program: str, picture: Path) -> None:
                                 stderr=subprocess.DEVNULL, text=True)
 
     running = [
-        start('nodes.estimator'),
-        start('nodes.adaptive_filter', '--ros-args', '-r', 'input:=/voltage',
+        start('nodes', 'estimator'),
+        start('nodes', 'adaptive_filter', '--ros-args', '-r', 'input:=/voltage',
               '-r', 'sigma:=/ou_estimator/sigma', '-r', 'state:=/ou_estimator/state'),
-        start('nodes.replay', 'bags/flight', '--loop'),
+        start('nodes', 'replay', 'bags/flight', '--loop'),
         start('cli.main', 'live', '--port', '0')]
     try:
         assert running[-1].stdout is not None

@@ -79,7 +79,7 @@ class Children:
         with self._log(name).open('wb') as log:
             # A session of its own: Ctrl-C reaches this program, which ends the others in order.
             self._running[name] = subprocess.Popen(
-                [sys.executable, '-u', '-m', name if '.' in name else f'ou_monitor.nodes.{name}',
+                [sys.executable, '-u', '-m', *([] if '.' in name else ['ou_monitor.nodes']), name,
                  *arguments],
                 cwd=ROOT, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
                 start_new_session=True)

@@ -163,14 +163,14 @@ def test_the_walk_sees_the_house():
     ('ou_monitor.recordings.importers.ulog', 'import orangebox'),
     ('ou_monitor.recordings.importers.log', 'from ou_monitor.analysis.analyze import analyze'),
     ('ou_monitor.fleet.fleet', 'import dask'),
-    ('ou_monitor.nodes.estimator', 'from ou_monitor.cli import main'),
-    ('ou_monitor.nodes.estimator', 'import matplotlib'),
-    ('ou_monitor.nodes.estimator', 'import tornado.web'),
-    ('ou_monitor.cli.commands', 'MODULE = "ou_monitor.nodes.estimator"'),
-    ('ou_monitor.cli.main', 'from ou_monitor.nodes import estimator'),
+    ('ou_monitor.nodes.estimator_node', 'from ou_monitor.cli import main'),
+    ('ou_monitor.nodes.estimator_node', 'import matplotlib'),
+    ('ou_monitor.nodes.estimator_node', 'import tornado.web'),
+    ('ou_monitor.cli.commands', 'MODULE = "ou_monitor.nodes.estimator_node"'),
+    ('ou_monitor.cli.main', 'from ou_monitor.nodes import estimator_node'),
     ('ou_monitor.cli.main', 'from ou_monitor import SlidingEstimator'),
-    ('ou_monitor.__init__', 'HOMES = {"Estimator": "ou_monitor.nodes.estimator"}'),
-    ('ou_monitor.__init__', 'def f():\n    from ou_monitor.nodes import estimator'),
+    ('ou_monitor.__init__', 'HOMES = {"Estimator": "ou_monitor.nodes.estimator_node"}'),
+    ('ou_monitor.__init__', 'def f():\n    from ou_monitor.nodes import estimator_node'),
     ('ou_monitor.recordings.bag', 'from ou_monitor.analysis.analyze import analyze'),
 ])
 def test_a_wrong_import_is_found(module, source):
@@ -187,7 +187,7 @@ def test_a_wrong_import_is_found(module, source):
     ('ou_monitor.recordings.importers.ulog', 'from pyulog import ULog'),
     ('ou_monitor.report.page', 'import matplotlib'),
     ('ou_monitor.fleet.table', 'from pyarrow import parquet'),
-    ('ou_monitor.nodes.estimator', 'import rclpy\nfrom ou_monitor.online.monitor import M'),
+    ('ou_monitor.nodes.estimator_node', 'import rclpy\nfrom ou_monitor.online.monitor import M'),
     ('ou_monitor.__init__', 'from ou_monitor.online.estimator.estimator import SlidingEstimator'),
 ])
 def test_a_right_import_passes(module, source):

@@ -142,9 +142,9 @@ def test_executables_exist():
     """Each executable that is named is an entry point, and replay has the options named."""
     scripts = metadata()['scripts']
     for name in re.findall(r'ros2 run ou_monitor (\w+)', README):
-        assert scripts[name] == f'ou_monitor.nodes.{name}:main'
+        assert scripts[name] == f'ou_monitor.nodes.__main__:{name}'
     line = next(line for line in README.splitlines() if 'run ou_monitor replay' in line)
-    shown = run('-m', 'ou_monitor.nodes.replay', '--help')
+    shown = run('-m', 'ou_monitor.nodes', 'replay', '--help')
     assert shown.returncode == 0, shown.stderr
     for option in re.findall(r'--\w+', line):
         assert option in shown.stdout

@@ -28,7 +28,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from ou_monitor.errors import InputError
-from ou_monitor.nodes.base import diagnostic, MonitorNode, PUBLISH_RATE
+from ou_monitor.nodes.base import MonitorNode, PUBLISH_RATE
 from ou_monitor.nodes.console import Console
 from ou_monitor.nodes.filter_channels import CHANNELS, Channels, channels_of, IMU
 from ou_monitor.nodes.filter_inputs import KnownSupply, MotorInputs, SupplyInput
@@ -101,12 +101,11 @@ class AdaptiveFilterNode(MonitorNode):
         self._stamper = Stamper(self, self._jumped)
         self._cutoff_output = self.create_publisher(Float64, '~/cutoff', 10)
         self._lag_output = self.create_publisher(Float64, '~/lag', 10)
-        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_subscription(Float64, 'sigma', self.guarded(
             lambda message: self._supply.take_sigma(message.data)), INPUT_QOS)
         self.create_subscription(DiagnosticArray, 'state', self.guarded(
             self._supply.take_state), INPUT_QOS)
-        self.refuse_other_overrides([*OWN_TOPICS, *self._motors.topics])
+        self.refuse_other_overrides([*OWN_TOPICS, *self._motors.sources.topics])
         if self._type != AUTO:
             self._open(self._type)
         self.every(0.2, self._watch)
@@ -136,8 +135,8 @@ class AdaptiveFilterNode(MonitorNode):
 
     def _of_filter(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return the parameters that belong to the filter itself."""
-        own = {p.name: values[p.name] for p in FILTER_PARAMETERS if p is not _MODE}
-        return {**own, _MODE.name: self.get_parameter(_MODE.name).value}
+        mode = {_MODE.name: self.get_parameter(_MODE.name).value}
+        return {p.name: {**values, **mode}[p.name] for p in FILTER_PARAMETERS}
 
     # -- messages in
 
@@ -145,7 +144,7 @@ class AdaptiveFilterNode(MonitorNode):
         """Subscribe as soon as a publisher shows the type."""
         self._stamper.follow()
         if self._notch.settings.count:
-            self._motors.watch()
+            self._motors.sources.watch()
         if self._channels is None:
             self._found = types_on(self, self._topic)
             known = [kind for kind in self._found if self._field or kind in CHANNELS]
@@ -236,9 +235,8 @@ class AdaptiveFilterNode(MonitorNode):
         supply, low_pass = self._known(), self.low_pass
         settings = low_pass.settings
         level, summary = self._judge(supply)
-        if self.faulty:
-            level = Level.ERROR
-            summary = f'A callback failed ({self.faults} times so far): {self.fault}. {summary}'
+        if self.fault_notes:
+            level, summary = Level.ERROR, ' '.join((*self.fault_notes, summary))
         counters: FilterCounters = low_pass.counters
         values: dict[str, object] = {
             'input_type': self._type, 'law': settings.law, 'mode': settings.mode,
@@ -252,7 +250,7 @@ class AdaptiveFilterNode(MonitorNode):
             'notch_active': self._notch.active, 'notch_source': self._notch.source,
             'notch_frequencies': ', '.join(f'{f:.4g}' for f in self._notch.frequencies),
             'notch_law_a': self._notch.law[0], 'notch_law_b': self._notch.law[1],
-            'notch_problem': ' '.join(self._motors.problems.values()),
+            'notch_problem': ' '.join(filter(None, self._motors.sources.problems.values())),
             'throttle_age': self._motors.age('throttle'), 'rpm_age': self._motors.age('rpm'),
             'passed': self._passed, 'dropped': self._dropped,
             'repeated': counters.repeated, 'back': counters.back, 'gaps': counters.gaps,
@@ -262,9 +260,7 @@ class AdaptiveFilterNode(MonitorNode):
             'input_age': self._input_silence.age, 'callback_errors': self.faults}
         fields = {key: repr(value) if isinstance(value, float) else str(value)
                   for key, value in values.items()}
-        self._diagnostics.publish(diagnostic(
-            f'{self.get_fully_qualified_name()[1:]}: adaptive low-pass', level, summary, fields,
-            self.stamp_now(), hardware_id=self._topic))
+        self.diagnose('adaptive low-pass', level, summary, fields, self._topic)
 
     def _decided_by(self, supply: KnownSupply) -> str:
         """Say in words what decides the cutoff now."""

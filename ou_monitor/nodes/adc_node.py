@@ -17,14 +17,12 @@ from array import array
 from collections.abc import Callable
 import math
 from pathlib import Path
-import threading
 import time
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
 from ou_monitor.adc.devices import Block, find_device, IioBuffer, PolledChannel
 from ou_monitor.errors import InputError
-from ou_monitor.nodes.base import diagnostic, MonitorNode, to_time
+from ou_monitor.nodes.base import MonitorNode, to_time
 from ou_monitor.nodes.inputs import Silence
 from ou_monitor.nodes.pacing import wait_until
 from ou_monitor.online.settings import Parameter
@@ -55,15 +53,16 @@ class AdcNode(MonitorNode):
 
     def __init__(self, name: str) -> None:
         super().__init__(name, (), ADC_PARAMETERS)
+        self.begin()
+
+    def start(self) -> None:
+        """Open the device, and read it in a thread."""
         values = {p.name: self.get_parameter(p.name).value for p in ADC_PARAMETERS}
         self._gain, self._shift = values['gain'], values['offset']
         folder = find_device(values['device'], Path(values['sysfs']))
         self._device = folder.name
         self._silence = Silence(self.steady_now)
-        self._end = threading.Event()
-        self._problem = ''
         self._samples, self._interval = 0, math.nan
-        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._buffer: IioBuffer | None = None
         work: Callable[[], None]
         if values['polled'] or not (folder / 'scan_elements').is_dir():
@@ -75,6 +74,7 @@ class AdcNode(MonitorNode):
             self._buffer = IioBuffer(
                 folder, Path(values['dev']) / folder.name, values['channel'], values['block'],
                 values['rate'], values['trigger'])
+            self.at_stop(self._close)
             self.rate, channel = self._buffer.rate, self._buffer.channel
             self._output = self.create_publisher(JointState, 'voltage', 100)
             work = self._read
@@ -84,28 +84,14 @@ class AdcNode(MonitorNode):
         topic = self.resolve_topic_name('voltage')
         self.get_logger().info(f'{self._device} {channel} at {self.rate:g} Hz on {topic}{hint}')
         self.every(1.0, self._diagnose)
-        self._thread = threading.Thread(target=self._run, args=(work,), name='adc', daemon=True)
-        self._thread.start()
-
-    def _run(self, work: Callable[[], None]) -> None:
-        """Do the work of the thread; what ends it is told in the diagnostics."""
-        try:
-            work()
-        except InputError as error:
-            self._problem = str(error)
-            self.get_logger().error(self._problem)
-        except Exception as error:
-            # A publisher that is gone after a shutdown is no failure.
-            if not self._end.is_set() and self.context.ok():
-                self._problem = f'{type(error).__name__}: {error}'
-                self.get_logger().error(self._problem)
+        self.run_beside(work)
 
     def _read(self) -> None:
         """Publish blocks until the end."""
         assert self._buffer is not None
         message = JointState(name=[self._channel])
         for block in self._buffer.blocks():
-            if self._end.is_set():
+            if self.ending.is_set():
                 return
             if block is not None:
                 self._publish(message, block)
@@ -128,7 +114,7 @@ class AdcNode(MonitorNode):
                 current=nan, charge=nan, capacity=nan, design_capacity=nan, percentage=nan,
                 temperature=nan, present=True, location=self._channel)
             due = time.monotonic()
-            while wait_until(due, lambda: not self._end.is_set()):
+            while wait_until(due, lambda: not self.ending.is_set()):
                 message.header.stamp = to_time(time.time())
                 message.voltage = polled.read() * self._gain + self._shift
                 self._output.publish(message)
@@ -142,8 +128,8 @@ class AdcNode(MonitorNode):
         age = self._silence.age
         holes = 0 if self._buffer is None else self._buffer.holes
         level, summary = Level.OK, f'{self._channel} of {self._device} is read.'
-        if self._problem:
-            level, summary = Level.ERROR, f'{self._device} is no longer read: {self._problem}'
+        if self.problem:
+            level, summary = Level.ERROR, f'{self._device} is no longer read: {self.problem}'
         elif age is None or age > max(SILENT, 3.0 / self.rate if self.rate > 0.0 else 0.0):
             level, summary = Level.STALE, (
                 f'No samples of {self._channel} from {self._device}'
@@ -157,18 +143,12 @@ class AdcNode(MonitorNode):
             'measured_rate': repr(1.0 / self._interval if self._interval > 0.0 else math.nan),
             'samples': str(self._samples), 'holes': str(holes),
             'stamps': 'kernel' if self._interval > 0.0 else 'read'}
-        self._diagnostics.publish(diagnostic(
-            f'{self.get_fully_qualified_name()[1:]}: adc', level, summary, fields,
-            self.stamp_now(), hardware_id=self._device))
+        self.diagnose('adc', level, summary, fields, self._device)
 
-    def destroy_node(self) -> None:
-        """End the thread, stop the buffer, end the node."""
-        self._end.set()
-        if hasattr(self, '_thread'):
-            self._thread.join(2.0)
-        if self._buffer is not None:
-            try:
-                self._buffer.close()
-            except InputError as error:
-                self.get_logger().warning(str(error))
-        super().destroy_node()
+    def _close(self) -> None:
+        """Stop the buffer."""
+        assert self._buffer is not None
+        try:
+            self._buffer.close()
+        except InputError as error:
+            self.get_logger().warning(str(error))

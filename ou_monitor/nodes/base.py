@@ -1,8 +1,8 @@
 """
-What both nodes share: parameters from a table, and callbacks that no error ends.
+What the nodes share: parameters from a table, start and end, a thread, and diagnostics.
 
-`estimator` and `adaptive_filter` declare what the tables of
-`ou_monitor.online.settings` say, so a name or a default exists once.
+The parameters are declared as tables say, so a name or a default exists once.  No error of a
+callback ends a node.
 """
 
 from __future__ import annotations
@@ -12,12 +12,14 @@ from contextlib import contextmanager, nullcontext
 import functools
 import inspect
 import math
+from threading import Event, Thread
 import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.online.settings import Parameter
+from ou_monitor.records import Level
 from rcl_interfaces.msg import (
     FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult)
 from rclpy.clock import Clock
@@ -66,6 +68,11 @@ class MonitorNode(Node):
         self._at_stop: list[Callable[[], object]] = []
         self.faults, self.fault = 0, ''
         self._faulted = -math.inf
+        # What ended the work of the thread; empty: nothing.
+        self.problem = ''
+        # Set when that work is to end.
+        self.ending = Event()
+        self._thread: Thread | None = None
         self._publishing: Timer | None = None
         self._outputs_callback: Callable[[], None] | None = None
         self._polled: list[Subscription] = []
@@ -93,6 +100,7 @@ class MonitorNode(Node):
     def begin(self) -> None:
         """Start; what has been opened by a start that fails is closed again."""
         try:
+            self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
             self.start()
         except Exception:
             self.stop()
@@ -102,6 +110,10 @@ class MonitorNode(Node):
     def stop(self) -> None:
         """Close all that was opened since `begin`; parameters stay."""
         self.running = False
+        self.ending.set()
+        if self._thread is not None:
+            # Before what it publishes on is closed.
+            self._thread.join(2.0)
         for made in reversed(self._made):
             for destroy in (self.destroy_timer, self.destroy_subscription, self.destroy_service,
                             self.destroy_publisher):
@@ -111,6 +123,21 @@ class MonitorNode(Node):
             close()
         del self._made[:], self._polled[:], self._at_stop[:]
         self._publishing = None
+
+    def run_beside(self, work: Callable[[], None]) -> None:
+        """Do some work in a thread, which must end when `ending` is set."""
+        def run() -> None:
+            try:
+                work()
+            except Exception as error:
+                # A publisher that is gone after a shutdown is no failure.
+                if not self.ending.is_set() and self.context.ok():
+                    self.problem = str(error) if isinstance(error, InputError) else (
+                        f'{type(error).__name__}: {error}')
+                    self.get_logger().error(self.problem)
+        self.ending.clear()
+        self._thread = Thread(target=run, daemon=True)
+        self._thread.start()
 
     def at_stop(self, close: Callable[[], object]) -> None:
         """Have something called when the node stops."""
@@ -176,9 +203,27 @@ class MonitorNode(Node):
         """Begin anew after a callback has raised."""
 
     @property
-    def faulty(self) -> bool:
-        """Whether a callback has raised a short time ago."""
-        return self.steady_now() - self._faulted < TELL
+    def fault_notes(self) -> list[str]:
+        """Return what is to be said of a callback that has raised a short time ago."""
+        recent = self.steady_now() - self._faulted < TELL
+        return [f'A callback failed ({self.faults} times so far): {self.fault}.'] if recent else []
+
+    def status(self, part: str, level: Level, summary: str, fields: Mapping[str, str],
+               stamp: float, hardware_id: str) -> DiagnosticArray:
+        """Return the status of a part of the node as a stamped message (stamp in s)."""
+        message = DiagnosticArray()
+        message.header.stamp = to_time(stamp)
+        message.status = [DiagnosticStatus(
+            level=bytes([level]), name=f'{self.get_fully_qualified_name()[1:]}: {part}',
+            message=summary, hardware_id=hardware_id,
+            values=[KeyValue(key=key, value=value) for key, value in fields.items()])]
+        return message
+
+    def diagnose(self, part: str, level: Level, summary: str, fields: Mapping[str, str],
+                 hardware_id: str) -> None:
+        """Publish the status of a part of the node in the diagnostics."""
+        self._diagnostics.publish(self.status(
+            part, level, summary, fields, self.stamp_now(), hardware_id))
 
     @property
     def subscriptions(self) -> Iterator[Subscription]:
@@ -340,17 +385,6 @@ def _descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
             descriptor.floating_point_range = [FloatingPointRange(
                 from_value=float(parameter.low), to_value=float(parameter.high), step=0.0)]
     return descriptor
-
-
-def diagnostic(name: str, level: int, summary: str, fields: Mapping[str, str],
-               stamp: float, hardware_id: str = '') -> DiagnosticArray:
-    """Return one status as a stamped message (stamp in s)."""
-    message = DiagnosticArray()
-    message.header.stamp = to_time(stamp)
-    message.status = [DiagnosticStatus(
-        level=bytes([level]), name=name, message=summary, hardware_id=hardware_id,
-        values=[KeyValue(key=key, value=value) for key, value in fields.items()])]
-    return message
 
 
 def to_time(stamp: float) -> object:

@@ -31,12 +31,13 @@ from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.model.load import LoadStart
-from ou_monitor.nodes.base import diagnostic, LOCK, MonitorNode, PUBLISH_RATE
+from ou_monitor.nodes.base import LOCK, MonitorNode, PUBLISH_RATE
 from ou_monitor.nodes.clocks import IN_BURSTS, SendClock
 from ou_monitor.nodes.console import Console, PublisherWatch
-from ou_monitor.nodes.inputs import Arrivals, PolledInput, Silence, Stamper, types_on, within
+from ou_monitor.nodes.inputs import (
+    Arrivals, PolledInput, Silence, SourceFinder, Stamper, within)
 from ou_monitor.nodes.node_files import LatchFile, ModelChoice
-from ou_monitor.nodes.sources import find_source, Source, SOURCE_PARAMETERS
+from ou_monitor.nodes.sources import Source, SOURCE_PARAMETERS
 from ou_monitor.online.load.model_watch import ModelComparison
 from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.online.risk.flag import FlagLevel
@@ -103,23 +104,22 @@ class EstimatorNode(MonitorNode):
         self._load, self._loaded = 0.0, self.steady_now()
         self._handed_over = -math.inf
         self._throttle_heard = Silence(self.steady_now)
-        self._problems: dict[str, str] = {}
-        self._opened: dict[str, Source] = {}
         self._outputs = {key: self.create_publisher(Float64, '~/' + key, 10) for key in OUTPUTS}
         self._brownout = self.create_publisher(Bool, '~/brownout', 10)
         self._state = self.create_publisher(DiagnosticArray, '~/state', 10)
-        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_service(Trigger, '~/clear_brownout', self.guarded(self._clear))
         self.create_service(Trigger, '~/save_model', self.guarded(self._save_model))
         self._stamper = Stamper(self, self._jumped)
         self._send_clock = SendClock() if self.get_parameter('smooth_stamps').value else None
         self._latch = self._open_latch()
-        self._sources = self._find_sources()
+        self._sources = SourceFinder(self, ('voltage', 'throttle'), {
+            p.name: self.get_parameter(p.name).value for p in SOURCE_PARAMETERS}, self._open)
+        self._sources.watch('voltage')
         self.every(0.2, self._watch)
         self.every(POLL, lambda: self._poll(HAND_OVER))
         self.every(1.0, self._diagnose)
         self.publish_every(lambda: self._publish(*self._report()))
-        self.refuse_other_overrides([*OWN_TOPICS, *(s.topic for s in self._sources.values())])
+        self.refuse_other_overrides([*OWN_TOPICS, *self._sources.topics])
 
     def _open_latch(self) -> LatchFile | None:
         """Open the file of the latch; what was latched is latched again."""
@@ -170,71 +170,14 @@ class EstimatorNode(MonitorNode):
 
     # -- where the input comes from
 
-    def _find_sources(self) -> dict[str, Source]:
-        values = {p.name: self.get_parameter(p.name).value for p in SOURCE_PARAMETERS}
-        sources = {}
-        for quantity in ('voltage', 'throttle'):
-            source = find_source(quantity, values)
-            if source is not None:
-                sources[quantity] = source
-            if source is not None and source.spec is not None:
-                self._open_known(source)
-        return sources
-
-    def _open_known(self, source: Source) -> None:
-        """Open what needs no publisher; without the throttle's package the voltage will do."""
-        try:
-            self._open(source)
-        except InputError as error:
-            if source.quantity == 'voltage':
-                raise
-            self._problems['throttle'] = f'Throttle is not used: {error}'
-            self.get_logger().warning(self._problems['throttle'])
-
     def _watch(self) -> None:
         """Look at who publishes, 5 times a second."""
         self._stamper.follow()
         self._look_at_publishers()
-        if self._arrived.age is None and 'voltage' not in self._problems:
-            self._console.waiting(self._sources['voltage'].topic)
-        for source in self._sources.values():
-            if source.quantity in self._opened:
-                self._compare(self._opened[source.quantity])
-            elif source.spec is None:
-                self._detect(source)
+        if self._arrived.age is None and not self._sources.problems['voltage']:
+            self._console.waiting(self._voltage.topic)
+        self._sources.watch()
         self._watch_throttle()
-
-    def _detect(self, source: Source) -> None:
-        """Open the source as soon as a publisher shows a type that is known."""
-        topic = self.resolve_topic_name(source.topic)
-        types = types_on(self, topic)
-        chosen = source.choose(types)
-        if chosen is not None:
-            self._problems.pop(source.quantity, None)
-            try:
-                self._open(chosen)
-            except InputError as error:
-                self._problem(source.quantity, f'{topic} is not used: {error}')
-        elif types:
-            self._problem(source.quantity, (
-                f"{topic} carries {', '.join(types)}, which no generic msg_config describes "
-                f"({', '.join(source.known_types)}): set {source.quantity}.type and "
-                f'{source.quantity}.field, or msg_config.'))
-
-    def _compare(self, source: Source) -> None:
-        """Notice publishers of another type: DDS would drop their messages without a word."""
-        topic = self.resolve_topic_name(source.topic)
-        types = types_on(self, topic)
-        self._problems.pop(source.quantity, None)
-        if types and source.spec is not None and source.spec.type not in types:
-            self._problem(source.quantity, (
-                f"{topic} carries {', '.join(types)}, but msg_config '{source.config}' expects "
-                f'{source.spec.type}.'))
-
-    def _problem(self, quantity: str, text: str) -> None:
-        if self._problems.get(quantity) != text:
-            self._problems[quantity] = text
-            self.get_logger().warning(text, throttle_duration_sec=10.0)
 
     def _open(self, source: Source) -> None:
         message, extractor = source.open()
@@ -248,7 +191,6 @@ class EstimatorNode(MonitorNode):
             self._stream.open_throttle(extractor.spec)
         self._inputs[source.quantity] = PolledInput(
             self, message, source.topic, extractor.spec, source.current)
-        self._opened[source.quantity] = source
         self.get_logger().info(
             f'{source.quantity} from {topic}: {extractor.spec.type} field '
             f"'{extractor.spec.field}' (msg_config '{source.config}')")
@@ -402,7 +344,7 @@ class EstimatorNode(MonitorNode):
             self._latch.keep(report.flag.level is FlagLevel.CRITICAL
                              and self._monitor.settings.brownout_latch, report.flag.reason)
         level, summary = report.level, report.summary
-        problem = self._problems.get('voltage')
+        problem = self._sources.problems['voltage']
         limit = max(self._monitor.settings.stale_after, report.patience)
         silent = not report.fresh
         if level is Level.ERROR:
@@ -410,14 +352,13 @@ class EstimatorNode(MonitorNode):
             summary = f'{summary} {problem}' if problem else summary
         elif problem:
             level, summary = (Level.ERROR if silent else Level.WARN), problem
-        elif 'voltage' not in self._opened:
-            topic = self.resolve_topic_name(self._sources['voltage'].topic)
-            summary = f'Waiting for a publisher on {topic}.'
+        elif 'voltage' not in self._inputs:
+            summary = f'Waiting for a publisher on {self._topic}.'
         elif silent and within(self._arrived.age, limit) and not within(
                 self._usable.age, max(report.patience, self._arrived.age or 0.0)):
             summary = self._useless()
-        elif silent and not self.count_publishers(self._topic('voltage')):
-            summary = f"No publisher on {self._topic('voltage')}: {report.summary}"
+        elif silent and not self.count_publishers(self._topic):
+            summary = f'No publisher on {self._topic}: {report.summary}'
         notes = self._notes()
         if notes:
             summary = ' '.join((summary, *notes))
@@ -433,17 +374,16 @@ class EstimatorNode(MonitorNode):
         if self._stream.thin > 1:
             notes.append(f'Overload: one of {self._stream.thin} samples is estimated from; the '
                          'floor judges all.')
-        if self.faulty:
-            notes.append(f'A callback failed ({self.faults} times so far): {self.fault}.')
-        if 'voltage' in self._opened:
-            notes += self._watched.notes(self._topic('voltage'))
+        notes += self.fault_notes
+        if 'voltage' in self._inputs:
+            notes += self._watched.notes(self._topic)
         return notes
 
     def _look_at_publishers(self) -> None:
         """Note who publishes the voltage, and what was lost."""
         voltage = self._inputs.get('voltage')
         if voltage is not None:
-            self._watched.look(self.get_publishers_info_by_topic(self._topic('voltage')),
+            self._watched.look(self.get_publishers_info_by_topic(self._topic),
                                voltage.publishers, self.steady_now())
 
     def _useless(self) -> str:
@@ -451,12 +391,18 @@ class EstimatorNode(MonitorNode):
         if self._stamper.waiting and self._stream.unplaced:
             return ('Messages without a stamp cannot be placed in time: use_sim_time is set, but '
                     'nothing comes on /clock (any more).')
-        spec = self._opened['voltage'].spec
-        return (f"Messages arrive on {self._topic('voltage')}, but their field "
+        spec = self._voltage.spec
+        return (f"Messages arrive on {self._topic}, but their field "
                 f"'{spec.field if spec else ''}' holds no finite voltage.")
 
-    def _topic(self, quantity: str) -> str:
-        return self.resolve_topic_name(self._opened[quantity].topic)
+    @property
+    def _voltage(self) -> Source:
+        """Return where the voltage is, or is waited for."""
+        return self._sources.opened.get('voltage', self._sources.sources['voltage'])
+
+    @property
+    def _topic(self) -> str:
+        return str(self.resolve_topic_name(self._voltage.topic))
 
     def _publish(self, report: MonitorReport, level: Level, summary: str) -> None:
         """Publish a report on every topic but the diagnostics."""
@@ -483,20 +429,18 @@ class EstimatorNode(MonitorNode):
                  stamp: float) -> DiagnosticArray:
         throttle_age = self._throttle_heard.age
         arrived = self._arrived.age
-        source = self._opened.get('voltage', self._sources['voltage'])
         fields = {**report.fields,
-                  'msg_config': source.config,
+                  'msg_config': self._voltage.config,
                   'messages': str(self._stream.messages),
                   'smoothed_rate': repr(self._send_clock.rate if self._send_clock else math.nan),
                   'throttle_age': repr(math.inf if throttle_age is None else throttle_age),
-                  'throttle_problem': self._problems.get('throttle', ''),
+                  'throttle_problem': self._sources.problems.get('throttle', ''),
                   'model_terms': self._models.terms,
                   'clock': self._source_clock.name,
                   'arrival_age': repr(math.inf if arrived is None else arrived),
                   **self._watched.fields(),
                   'callback_errors': str(self.faults)}
-        return diagnostic(f'{self.get_fully_qualified_name()[1:]}: {part}', level, summary,
-                          fields, stamp, hardware_id=self.resolve_topic_name(source.topic))
+        return self.status(part, level, summary, fields, stamp, self._topic)
 
 
 def _entry(learned: LoadStart, found: ModelComparison) -> dict[str, object]:

@@ -1,5 +1,5 @@
 """
-Subscriptions: types found on the graph, and the time of every message.
+Subscriptions: sources and types found on the graph, and the time of every message.
 
 Time is the message's own stamp; without one it is the middleware's source
 timestamp, under `use_sim_time` mapped to simulated time through `/clock`.
@@ -7,7 +7,7 @@ timestamp, under `use_sim_time` mapped to simulated time through `/clock`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 import math
 import time
@@ -18,13 +18,14 @@ import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import MonitorNode
 from ou_monitor.nodes.clocks import SendClock, SimClockMap
-from ou_monitor.nodes.sources import definition_of
+from ou_monitor.nodes.sources import definition_of, find_source, Source
 from ou_monitor.recordings.cdr import FieldReader, Table
 from ou_monitor.records import FloatArray
 from ou_monitor.stream.config import FieldSpec
 from ou_monitor.stream.samples import Publishers
 from rclpy.clock import JumpThreshold
 from rclpy.duration import Duration
+from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
@@ -146,7 +147,7 @@ class PolledInput:
     def __init__(self, node: MonitorNode, kind: Any, topic: str, spec: FieldSpec,
                  beside: FieldSpec | None = None) -> None:
         self._node = node
-        self._topic = node.resolve_topic_name(topic)
+        self.topic = node.resolve_topic_name(topic)
         self._input = node.create_polled(
             kind, topic, INPUT_QOS if spec.sample_rate is None else BLOCK_QOS)
         self._reader = FieldReader(spec, definition_of(kind), lambda: self._decode, self._broken,
@@ -160,7 +161,7 @@ class PolledInput:
         self._bytes = 0
 
     def _decode(self, data: bytes) -> Any:
-        return decode(data, self._kind, self._topic)
+        return decode(data, self._kind, self.topic)
 
     def _broken(self, index: int, error: InputError) -> None:
         """Leave out a message that cannot be read."""
@@ -202,7 +203,7 @@ class PolledInput:
         times: FloatArray = sent.astype(np.float64) * 1e-9
         kept = self.publishers.follow(
             [info['publication_sequence_number'] for info in infos], times, arrived,
-            self._node.count_publishers(self._topic))
+            self._node.count_publishers(self.topic))
         data = [bytes(message) for (message, _), keep in zip(taken, kept.tolist()) if keep]
         if not data:
             return None
@@ -253,7 +254,63 @@ def within(age: float | None, limit: float) -> bool:
     return age is not None and age <= limit
 
 
-def types_on(node: MonitorNode, topic: str) -> list[str]:
+class SourceFinder:
+    """
+    Sources of some quantities, each opened as soon as a publisher shows a type that is known.
+
+    By the values of the parameters; `open_source` gets a source whose type is known, and its
+    InputError is a problem.  `problems` says of a quantity why it is not used, or is silent.
+    """
+
+    def __init__(self, node: MonitorNode, quantities: tuple[str, ...], values: Mapping[str, Any],
+                 open_source: Callable[[Source], None]) -> None:
+        self._node = node
+        self._open = open_source
+        self.sources = {quantity: source for quantity in quantities
+                        if (source := find_source(quantity, values)) is not None}
+        self.opened: dict[str, Source] = {}
+        self.problems: dict[str, str] = {}
+
+    @property
+    def topics(self) -> list[str]:
+        """Return the topics that may be subscribed to."""
+        return [source.topic for source in self.sources.values()]
+
+    def watch(self, needed: str = '') -> None:
+        """Look at who publishes; an InputError in opening the `needed` quantity is raised."""
+        for quantity, source in self.sources.items():
+            topic = self._node.resolve_topic_name(source.topic)
+            types = types_on(self._node, topic)
+            opened = self.opened.get(quantity)
+            chosen = source if source.spec is not None else source.choose(types)
+            problem = ''
+            if opened is not None:
+                # DDS drops the messages of another type without a word.
+                if types and opened.spec is not None and opened.spec.type not in types:
+                    problem = (f"{topic} carries {', '.join(types)}, but msg_config "
+                               f"'{opened.config}' expects {opened.spec.type}.")
+            elif chosen is not None:
+                try:
+                    self._open(chosen)
+                    self.opened[quantity] = chosen
+                except InputError as error:
+                    if quantity == needed:
+                        raise
+                    problem = f'{topic} is not used: {error}'
+            elif types:
+                problem = (f"{topic} carries {', '.join(types)}, which no generic msg_config "
+                           f"describes ({', '.join(source.known_types)}): set {quantity}.type "
+                           f'and {quantity}.field, or msg_config.')
+            self._note(quantity, problem)
+
+    def _note(self, quantity: str, problem: str) -> None:
+        """Say a problem once, for as long as it stays the same."""
+        if problem and self.problems.get(quantity) != problem:
+            self._node.get_logger().warning(problem, throttle_duration_sec=10.0)
+        self.problems[quantity] = problem
+
+
+def types_on(node: Node, topic: str) -> list[str]:
     """Return the types that publishers offer on a topic (resolved name), each once."""
     return list(dict.fromkeys(
         end.topic_type for end in node.get_publishers_info_by_topic(topic)))

@@ -17,7 +17,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from ou_monitor.errors import InputError
 from ou_monitor.nodes.filter_channels import channels_of
-from ou_monitor.nodes.inputs import INPUT_QOS
+from ou_monitor.nodes.inputs import INPUT_QOS, types_on
 from ou_monitor.nodes.sources import message_class
 from rcl_interfaces.srv import GetParameters
 from rclpy.node import Node
@@ -106,7 +106,7 @@ class LiveNode(Node):
                      if topic.rpartition('/')[2] not in _BESIDE), '')
 
     def _listen(self, name: str, topic: str) -> None:
-        kinds = [end.topic_type for end in self.get_publishers_info_by_topic(topic)]
+        kinds = types_on(self, topic)
         if not kinds or self._open.get(name) == topic:
             return
         try:

@@ -88,7 +88,3 @@ def main() -> int:
         parser().print_help()
         return 0
     return run(NAME, _work)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

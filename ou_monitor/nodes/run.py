@@ -28,7 +28,6 @@ from ou_monitor.errors import InputError, refusal
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 BAD_INPUT = 2
-LIFECYCLE = '--lifecycle'
 # Longest wait inside the executor, s; a signal wakes it anyway.
 NAP = 1.0
 # Longest end of a node, s.  It takes 0.02 s of CPU, and 0.5 s at most was seen where 12 tasks
@@ -81,11 +80,11 @@ def loaded() -> None:
     _loading.clear()
 
 
-def run_node(name: str, about: str, work: Callable[[], int]) -> int:
+def run_node(name: str, about: str, work: Callable[[], int]) -> NoReturn:
     """Run an executable that takes ROS arguments only."""
     if {'-h', '--help'} & set(sys.argv[1:]):
         print(about.strip())
-        return 0
+        sys.exit()
 
     def checked() -> int:
         from rclpy.utilities import remove_ros_args
@@ -111,14 +110,6 @@ def end(status: int) -> NoReturn:
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(status)
-
-
-def run_managed(name: str, about: str, work: Callable[[bool], int]) -> int:
-    """Run an executable that takes --lifecycle, and ROS arguments."""
-    lifecycle = LIFECYCLE in sys.argv[1:]
-    if lifecycle:
-        sys.argv.remove(LIFECYCLE)
-    return run_node(name, about, lambda: work(lifecycle))
 
 
 def _run(name: str, work: Callable[[], int], args: list[str] | None, stopped: list[int]) -> int:

@@ -18,12 +18,11 @@ import threading
 import time
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.nodes.base import diagnostic, MonitorNode
+from ou_monitor.nodes.base import MonitorNode
 from ou_monitor.nodes.console import PublisherWatch
-from ou_monitor.nodes.inputs import PolledInput, Silence, types_on
+from ou_monitor.nodes.inputs import PolledInput, Silence, SourceFinder
 from ou_monitor.nodes.sources import find_source, Source, SOURCE_PARAMETERS
 from ou_monitor.online.settings import Parameter
 from ou_monitor.recordings.model_file import read_model
@@ -136,8 +135,6 @@ class SupplySimulatorNode(MonitorNode):
 
     def __init__(self, name: str) -> None:
         self._lock = threading.Lock()
-        self._end = threading.Event()
-        self._thread: threading.Thread | None = None
         super().__init__(name, LIVE_PARAMETERS, (*_SOURCES, *FIXED_PARAMETERS))
         self.begin()
 
@@ -153,21 +150,21 @@ class SupplySimulatorNode(MonitorNode):
         self._needs_throttle = bool(self._model.needs_throttle) or self._model.load is not None
         self._lacks = lacks(self._model)
         self._rate = values['rate']
-        self._problem, self._lost, self._sent = '', 0, 0
+        self._lost = self._sent = 0
         self._reset()
         voltage = find_source('voltage', values)
         assert voltage is not None
         self._voltage = Sender(self, voltage)
-        self._throttle_source = find_source('throttle', values)
+        self._sources = SourceFinder(self, ('throttle',), values, self._open)
+        self._throttle_source = self._sources.sources.get('throttle')
         self._played = self._play(values['throttle.play'])
         self._input: PolledInput | None = None
         self._heard = Silence(self.steady_now)
         self._throttle, self._turn = 0.0, -1
         self._watched = PublisherWatch()
-        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_service(Trigger, '~/reset', self.guarded(self._on_reset))
-        self.refuse_other_overrides(['/diagnostics', '/clock', self._voltage.source.topic, *(
-            () if self._throttle_source is None else (self._throttle_source.topic,))])
+        self.refuse_other_overrides(['/diagnostics', '/clock', self._voltage.source.topic,
+                                     *self._sources.topics])
         self.get_logger().info(
             f"{', '.join(term.NAME for term in self._model.terms)} at {self._rate:g} Hz on "
             f'{self.resolve_topic_name(self._voltage.source.topic)}'
@@ -175,15 +172,7 @@ class SupplySimulatorNode(MonitorNode):
         self._watch()
         self.every(0.2, self._watch)
         self.every(1.0, self._diagnose)
-        self._thread = threading.Thread(target=self._run, name='supply', daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        """End the thread before what it publishes on is closed."""
-        self._end.set()
-        if self._thread is not None:
-            self._thread.join()
-        super().stop()
+        self.run_beside(self._run)
 
     def apply(self, values: Mapping[str, Any]) -> None:
         """Bring the resistance into force."""
@@ -208,7 +197,7 @@ class SupplySimulatorNode(MonitorNode):
                 resistance=values['scale_resistance'])
             # Stamp of the first sample, s; NaN: where the clock is then.
             self._begin = math.nan
-            self._problem = ''
+            self.problem = ''
 
     def _on_reset(self, request: Any, response: Any) -> Any:
         try:
@@ -236,18 +225,15 @@ class SupplySimulatorNode(MonitorNode):
 
     def _watch(self) -> None:
         """Look at who publishes throttle, 5 times a second."""
-        source = self._throttle_source
-        if self._played is not None or source is None:
-            return
-        topic = self.resolve_topic_name(source.topic)
-        if self._input is None:
-            known = source if source.spec is not None else source.choose(types_on(self, topic))
-            if known is None:
-                return
-            kind, extractor = known.open()
-            self._input = PolledInput(self, kind, source.topic, extractor.spec)
-        self._watched.look(self.get_publishers_info_by_topic(topic), self._input.publishers,
-                           self.steady_now())
+        if self._played is None:
+            self._sources.watch('throttle')
+        if self._input is not None:
+            self._watched.look(self.get_publishers_info_by_topic(self._input.topic),
+                               self._input.publishers, self.steady_now())
+
+    def _open(self, source: Source) -> None:
+        kind, extractor = source.open()
+        self._input = PolledInput(self, kind, source.topic, extractor.spec)
 
     def _hear(self) -> float:
         """Return the throttle now: the newest, held for a second; then 0."""
@@ -269,19 +255,13 @@ class SupplySimulatorNode(MonitorNode):
     # -- the thread
 
     def _run(self) -> None:
-        try:
-            while not self._end.is_set():
-                self._piece()
-        except Exception as error:
-            # A publisher that is gone after a shutdown is no failure.
-            if not self._end.is_set() and self.context.ok():
-                self._problem = f'{type(error).__name__}: {error}'
-                self.get_logger().error(self._problem)
+        while not self.ending.is_set():
+            self._piece()
 
     def _piece(self) -> None:
         """Draw the next samples and publish each when it is due."""
         now = self.stamp_now()
-        if now <= 0.0 or self._problem:
+        if now <= 0.0 or self.problem:
             time.sleep(_NAP)
             return
         with self._lock:
@@ -299,8 +279,8 @@ class SupplySimulatorNode(MonitorNode):
             try:
                 voltage = run.draw(throttle)
             except ValueError as error:
-                self._problem = str(error)
-                self.get_logger().error(self._problem)
+                self.problem = str(error)
+                self.get_logger().error(self.problem)
                 return
         if run.simulation.discharge is not None and hasattr(self._voltage.message, 'percentage'):
             self._voltage.message.percentage = min(max(run.simulation.discharge.charge, 0.0), 1.0)
@@ -325,7 +305,7 @@ class SupplySimulatorNode(MonitorNode):
 
     def _wait(self, due: float) -> bool:
         """Wait until the node's clock is there, or was set; return whether to go on."""
-        while not self._end.is_set():
+        while not self.ending.is_set():
             simulated = self.get_clock().ros_time_is_active
             left = due - (self.stamp_now() if simulated else time.time())
             if left <= 0.0 or left > _JUMP + 1.0 / self._rate:
@@ -344,17 +324,16 @@ class SupplySimulatorNode(MonitorNode):
             age = self._heard.age
             notes.append(f'No throttle {f"on {topic}" if topic else "in this msg_config"}'
                          + ('' if age is None else f' for {age:.1f} s') + ': it idles.')
-        notes += self._watched.notes(topic)
+        notes += [*filter(None, self._sources.problems.values()), *self._watched.notes(topic)]
         if self.count_publishers(voltage) > 1:
             notes.append(f'{voltage} has another publisher.')
-        if self.faulty:
-            notes.append(f'A callback failed ({self.faults} times so far): {self.fault}.')
+        notes += self.fault_notes
         if self.stamp_now() <= 0.0:
             notes.append('use_sim_time is set, but nothing comes on /clock.')
         if notes:
             level = Level.WARN
-        if self._problem:
-            level, notes = Level.ERROR, [f'{self._problem} (~/reset begins anew).']
+        if self.problem:
+            level, notes = Level.ERROR, [f'{self.problem} (~/reset begins anew).']
         run = self._run_now
         discharge = run.simulation.discharge
         fields = {
@@ -364,7 +343,5 @@ class SupplySimulatorNode(MonitorNode):
             'scale_resistance': repr(run.simulation.resistance),
             'model_terms': ','.join(term.NAME for term in self._model.terms),
             'lacks': '; '.join(self._lacks), **self._watched.fields()}
-        self._diagnostics.publish(diagnostic(
-            f'{self.get_fully_qualified_name()[1:]}: supply', level,
-            ' '.join(notes) or f'A simulated supply at {self._rate:g} Hz on {voltage}.', fields,
-            self.stamp_now(), hardware_id=voltage))
+        self.diagnose('supply', level, ' '.join(notes) or (
+            f'A simulated supply at {self._rate:g} Hz on {voltage}.'), fields, voltage)

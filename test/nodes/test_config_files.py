@@ -137,7 +137,7 @@ def test_launch_nodes(described):
     for node in nodes:
         name = node.kwargs['executable']
         assert node.kwargs['package'] == 'ou_monitor'
-        assert scripts[name] == f'ou_monitor.nodes.{name}:main'
+        assert scripts[name] == f'ou_monitor.nodes.__main__:{name}'
         assert node.kwargs['namespace'].args == ('namespace',)
         assert node.kwargs['ros_arguments'][:3] == [
             '--enclave', f'/ou_monitor/{name}', '--log-level']

@@ -152,7 +152,7 @@ def test_without_ros_one_line_says_so(tmp_path, name):
     (tmp_path / 'rclpy.py').write_text("raise ImportError('No module named rclpy')\n")
     path = os.pathsep.join([str(tmp_path), str(ROOT)])
     done = subprocess.run(
-        [sys.executable, '-m', f'ou_monitor.nodes.{name}', 'x.mcap'], cwd=tmp_path, text=True,
+        [sys.executable, '-m', 'ou_monitor.nodes', name, 'x.mcap'], cwd=tmp_path, text=True,
         capture_output=True, env={**os.environ, 'PYTHONPATH': path}, check=False)
     assert done.returncode == 2
     assert done.stderr.count('\n') == 1 and 'ROS 2 is not installed' in done.stderr

@@ -116,7 +116,7 @@ class Process:
                    [str(ROOT), *filter(None, [os.environ.get('PYTHONPATH')])])}
         with self._out.open('w') as out, self._err.open('w') as err:
             self.popen = subprocess.Popen(
-                [sys.executable, '-m', name if '.' in name else f'ou_monitor.nodes.{name}',
+                [sys.executable, '-m', *([] if '.' in name else ['ou_monitor.nodes']), name,
                  *arguments],
                 stdout=out, stderr=err, env=env, cwd=folder)
 
