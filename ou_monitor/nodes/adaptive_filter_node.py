@@ -38,8 +38,7 @@ from ou_monitor.online.filter.cutoff_control import Bound
 from ou_monitor.online.filter.lowpass import AdaptiveLowPass, FilterCounters
 from ou_monitor.online.notch.notch import AdaptiveNotch
 from ou_monitor.online.settings import (
-    FILTER_PARAMETERS, filter_settings, FilterSettings, notch_options, NOTCH_PARAMETERS,
-    NotchSettings, Parameter)
+    FILTER_PARAMETERS, FilterSettings, notch_options, NOTCH_PARAMETERS, NotchSettings, Parameter)
 from ou_monitor.online.trust import InputClock, SLOW_MISSED, SourceInterval, StampOrder
 from ou_monitor.records import Level
 from std_msgs.msg import Float64
@@ -114,7 +113,7 @@ class AdaptiveFilterNode(MonitorNode):
 
     def check(self, values: Mapping[str, Any]) -> None:
         """Raise `ValueError` when the parameters contradict each other or the signal."""
-        settings = filter_settings(self._of_filter(values))
+        settings = FilterSettings(**self._of_filter(values))
         NotchSettings.from_options(notch_options(values))
         if self._channels is not None and _not_a_voltage(self._type, settings):
             raise ValueError(

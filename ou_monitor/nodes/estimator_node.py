@@ -41,7 +41,8 @@ from ou_monitor.nodes.sources import Source, SOURCE_PARAMETERS
 from ou_monitor.online.load.model_watch import ModelComparison
 from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.online.risk.flag import FlagLevel
-from ou_monitor.online.settings import ESTIMATOR_PARAMETERS, monitor_settings, Parameter
+from ou_monitor.online.settings import (
+    ESTIMATOR_PARAMETERS, monitor_settings, MonitorSettings, Parameter)
 from ou_monitor.records import FloatArray, Level
 from ou_monitor.stream.samples import SampleStream, SourceClock
 from rclpy.logging import get_logging_directory
@@ -88,7 +89,7 @@ class EstimatorNode(MonitorNode):
     def start(self) -> None:
         """Begin with nothing known but a flag that was latched."""
         sys.setswitchinterval(SWITCH)
-        settings = monitor_settings(_of_monitor(self.values()))
+        settings = _settings(self.values())
         self._monitor = SupplyMonitor(settings, self._models.use(settings.model_file),
                                       background=True)
         self._stream = SampleStream(self._monitor)
@@ -147,7 +148,7 @@ class EstimatorNode(MonitorNode):
 
     def check(self, values: Mapping[str, Any]) -> None:
         """Raise `ValueError` when the parameters contradict each other."""
-        path = monitor_settings(_of_monitor(values)).model_file
+        path = _settings(values).model_file
         self._models.check(path, self._meanwhile)
 
     def _meanwhile(self) -> None:
@@ -164,7 +165,7 @@ class EstimatorNode(MonitorNode):
     def apply(self, values: Mapping[str, Any]) -> None:
         """Bring checked parameters into force; no sample in the window is lost."""
         super().apply(values)
-        settings = monitor_settings(_of_monitor(values))
+        settings = _settings(values)
         self._monitor.configure(settings)
         self._monitor.set_model(self._models.use(settings.model_file))
 
@@ -452,6 +453,6 @@ def _entry(learned: LoadStart, found: ModelComparison) -> dict[str, object]:
         name: value if value > 0.0 else None for name, value in values.items()}
 
 
-def _of_monitor(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the parameters that belong to the monitor itself."""
-    return {name: value for name, value in values.items() if name != PUBLISH_RATE.name}
+def _settings(values: Mapping[str, Any]) -> MonitorSettings:
+    """Return the settings of the monitor; the other parameters are the node's."""
+    return monitor_settings({p.name: values[p.name] for p in ESTIMATOR_PARAMETERS})

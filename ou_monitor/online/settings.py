@@ -1,16 +1,15 @@
 """
 Every parameter of the two nodes: name, default, range and sentence, once.
 
-The nodes declare their ROS parameters from these tables, the YAML in
-`config/` is tested against them, and the offline tools take their defaults
-from them, so that a name or a default exists in one place.
+A parameter is a field of a class of settings.  The nodes declare their ROS parameters from these
+fields, and the YAML in `config/` is tested against them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from dataclasses import dataclass, field, fields, replace
+from functools import cache, cached_property
 import math
 from numbers import Real
 from typing import Any
@@ -38,110 +37,26 @@ class Parameter:
         return bool(self.choices) and self.low is not None
 
 
+def _parameter(default: bool | int | float | str, description: str, low: float | None = None,
+               high: float | None = None, choices: tuple[str, ...] = ()) -> Any:
+    """Return a field of settings that is a parameter of a node."""
+    return field(default=default, metadata={
+        'description': description, 'low': low, 'high': high, 'choices': choices})
+
+
+@cache
+def parameters_of(settings: type[Any], prefix: str = '') -> tuple[Parameter, ...]:
+    """Return the parameters that settings stand for; a group of them has a prefix or a dot."""
+    return tuple(Parameter(prefix + one.name.replace('brownout_', 'brownout.'), one.default,
+                           **one.metadata) for one in fields(settings))
+
+
 # Window as long as it takes.
 AUTO = 'auto'
 
-ESTIMATOR_PARAMETERS: tuple[Parameter, ...] = (
-    Parameter('window', AUTO,
-              'Length of the sliding window, s; auto: the shortest of 2, 8, 30 and 60 s in which '
-              'alpha is known within a factor of 1.5, else the longest.', 0.05, 3600.0, (AUTO,)),
-    Parameter('stale_after', 1.0,
-              'Age of the newest sample from which the input counts as stale, s; of a fast source '
-              'less: 300 of its intervals, but not below 0.3 s; of a slow one 2.5 intervals.',
-              0.01, 3600.0),
-    Parameter('brownout.voltage', 4.5,
-              'Supply voltage that must not be undershot, V (default: the lower limit of PX4 for '
-              'a 5 V rail).', 0.0, 1000.0),
-    Parameter('brownout.horizon', 5.0, 'Time ahead for which the risk is told, s.',
-              0.001, 3600.0),
-    Parameter('brownout.warn', 0.1, 'Risk from which the diagnostics warn, 0..1.', 0.0, 1.0),
-    Parameter('brownout.critical', 0.5,
-              'Risk within 1 s, throttle held as it is, from which the brown-out flag is set, '
-              '0..1.', 0.0, 1.0),
-    Parameter('brownout.leave', 0.5,
-              'A level is left when the risk falls below this share of what it is entered at, '
-              '0.001..1, less than 1 (default: half, our choice).', 0.001, 1.0),
-    Parameter('brownout.hold', 1.0,
-              'Time for which WARN and CRITICAL stay at least, and outlast an unknown risk, s '
-              '(default: on five recorded quads 2 s set the flag twice as long where nothing '
-              'dipped).',
-              0.0, 3600.0),
-    Parameter('brownout.delay', 0.15,
-              'Time for which a risk must last before its level is entered, s (default: three '
-              'reports, which on recorded quads halves the false rises of two; ArduPilot waits '
-              '10 s before a voltage failsafe).', 0.0, 3600.0),
-    Parameter('brownout.latch', False,
-              'Whether CRITICAL stays until ~/clear_brownout is called or this is switched off '
-              '(default: no; PX4 latches its battery warning while armed).'),
-    Parameter('brownout.floor', -1.0,
-              'Voltage at or below which the flag is CRITICAL whatever the model says, V; 0: off; '
-              'negative: brownout.voltage itself (default).', -1.0, 1000.0),
-    Parameter('brownout.floor_time', 0.01,
-              'Time over which the median of the voltage is held against the floor, s, three '
-              'samples at least (default: shorter than the dips of recorded quads, from 10 ms on, '
-              'longer than a bad sample).', 0.0, 10.0),
-    Parameter('brownout.budget_limit', 0.01,
-              'Risk that the throttle budget keeps under, 0..1; 0: brownout.warn.', 0.0, 1.0),
-    Parameter('model_file', '',
-              'Model file of the supply (discover --save-model); empty: none.'),
-)
 
 LAWS = ('constant_noise', 'kalman', 'threshold', 'throttle', 'wiener')
 
-FILTER_PARAMETERS: tuple[Parameter, ...] = (
-    Parameter('mode', 'lowpass',
-              'What comes out: the signal, or its derivative in unit/s (for a D term).',
-              choices=('lowpass', 'derivative')),
-    Parameter('order', 2, 'Order of the low-pass: 1, or 2 (Butterworth).', 1, 2),
-    Parameter('law', 'constant_noise', 'Law from sigma to cutoff.', choices=LAWS),
-    Parameter('fmin', 20.0, 'Lowest cutoff, Hz: the limit of the lag, so a safety limit.',
-              0.001, 1.0e6),
-    Parameter('fmax', 150.0, 'Highest cutoff, Hz.', 0.001, 1.0e6),
-    Parameter('max_lag', 0.0,
-              'Most lag at lag_frequency, degrees: takes the place of fmin; 0: fmin as given.',
-              0.0, 179.0),
-    Parameter('lag_frequency', 10.0, 'Where the lag is computed and limited, Hz.', 0.001, 1.0e6),
-    Parameter('sigma_ref', 0.3,
-              'Sigma up to which the cutoff stays at fmax, V/sqrt(s) (threshold, and '
-              'constant_noise without noise_wanted).', 1.0e-9, 1.0e6),
-    Parameter('coupling', 0.0, 'Supply noise in the signal, unit of the signal per V; 0: not '
-              'known, constant_noise is relative to sigma_ref.', 0.0, 1.0e9),
-    Parameter('noise_wanted', 0.0,
-              'Rms of the output noise that constant_noise holds, unit of the output, with '
-              'coupling; 0: what sigma_ref makes at fmax.', 0.0, 1.0e12),
-    Parameter('n0', 0.0,
-              'White noise of the measurement for wiener and kalman, unit^2/Hz, two-sided: '
-              'variance of a sample over sample rate.', 0.0, 1.0e12),
-    Parameter('alpha', 63.0,
-              "Relaxation rate of the supply while the estimator's is not known, 1/s.",
-              1.0e-6, 1.0e9),
-    Parameter('signal_bandwidth', 0.0,
-              'Bandwidth of the true signal for wiener, Hz; 0: the signal is the voltage itself '
-              '(for kalman: unless coupling is above 0).', 0.0, 1.0e6),
-    Parameter('signal_rms', 0.0,
-              'Rms of the true signal for wiener, unit of the signal.', 0.0, 1.0e12),
-    Parameter('signal_poles', 1,
-              'Poles of the true signal for wiener: 1 (its spectrum falls with f^2 '
-              'above its bandwidth), or 2 (Butterworth, f^4).', 1, 2),
-    Parameter('expo', 5.0, 'Curvature of the throttle law, 0..10.', 0.0, 10.0),
-    Parameter('smoothing', 0.2,
-              'Time constant of the cutoff (in its logarithm), s, at a relative error of sigma '
-              'of smoothing_error.', 0.0, 3600.0),
-    Parameter('smoothing_error', 0.1,
-              'Relative error of sigma for which smoothing is meant; a better sigma moves the '
-              'cutoff faster in proportion.', 0.001, 10.0),
-    Parameter('smoothing_range', 4.0,
-              'Most that the time constant is divided or multiplied by for the error of sigma; '
-              '1: never.', 1.0, 100.0),
-    Parameter('slew', 4.0, 'Most that the cutoff moves, octaves/s; 0: no limit.', 0.0, 1.0e6),
-    Parameter('dead_band', 0.1, 'Change of the wanted cutoff that is not followed, octaves.',
-              0.0, 10.0),
-    Parameter('fallback', 75.0, 'Cutoff when sigma is stale or unknown, Hz.', 0.001, 1.0e6),
-    Parameter('shadow', False,
-              'Whether the cutoff is only computed and published, the signal passing unfiltered.'),
-    Parameter('stale_after', 1.0, 'Age of sigma after which the fallback is used, s.',
-              0.01, 3600.0),
-)
 
 
 @dataclass(frozen=True)
@@ -187,24 +102,51 @@ class MonitorSettings:
 
     """
 
-    window: float | str = AUTO
-    stale_after: float = 1.0
-    brownout_voltage: float = 4.5
-    brownout_horizon: float = 5.0
-    brownout_warn: float = 0.1
-    brownout_critical: float = 0.5
-    brownout_leave: float = 0.5
-    brownout_hold: float = 1.0
-    brownout_delay: float = 0.15
-    brownout_latch: bool = False
-    brownout_floor: float = -1.0
-    brownout_floor_time: float = 0.01
-    brownout_budget_limit: float = 0.01
-    model_file: str = ''
+    window: float | str = _parameter(
+        AUTO, 'Length of the sliding window, s; auto: the shortest of 2, 8, 30 and 60 s in which '
+        'alpha is known within a factor of 1.5, else the longest.', 0.05, 3600.0, (AUTO,))
+    stale_after: float = _parameter(
+        1.0, 'Age of the newest sample from which the input counts as stale, s; of a fast source '
+        'less: 300 of its intervals, but not below 0.3 s; of a slow one 2.5 intervals.',
+        0.01, 3600.0)
+    brownout_voltage: float = _parameter(
+        4.5, 'Supply voltage that must not be undershot, V (default: the lower limit of PX4 for '
+        'a 5 V rail).', 0.0, 1000.0)
+    brownout_horizon: float = _parameter(
+        5.0, 'Time ahead for which the risk is told, s.', 0.001, 3600.0)
+    brownout_warn: float = _parameter(0.1, 'Risk from which the diagnostics warn, 0..1.', 0.0, 1.0)
+    brownout_critical: float = _parameter(
+        0.5, 'Risk within 1 s, throttle held as it is, from which the brown-out flag is set, '
+        '0..1.', 0.0, 1.0)
+    brownout_leave: float = _parameter(
+        0.5, 'A level is left when the risk falls below this share of what it is entered at, '
+        '0.001..1, less than 1 (default: half, our choice).', 0.001, 1.0)
+    brownout_hold: float = _parameter(
+        1.0, 'Time for which WARN and CRITICAL stay at least, and outlast an unknown risk, s '
+        '(default: on five recorded quads 2 s set the flag twice as long where nothing dipped).',
+        0.0, 3600.0)
+    brownout_delay: float = _parameter(
+        0.15, 'Time for which a risk must last before its level is entered, s (default: three '
+        'reports, which on recorded quads halves the false rises of two; ArduPilot waits 10 s '
+        'before a voltage failsafe).', 0.0, 3600.0)
+    brownout_latch: bool = _parameter(
+        False, 'Whether CRITICAL stays until ~/clear_brownout is called or this is switched off '
+        '(default: no; PX4 latches its battery warning while armed).')
+    brownout_floor: float = _parameter(
+        -1.0, 'Voltage at or below which the flag is CRITICAL whatever the model says, V; 0: '
+        'off; negative: brownout.voltage itself (default).', -1.0, 1000.0)
+    brownout_floor_time: float = _parameter(
+        0.01, 'Time over which the median of the voltage is held against the floor, s, three '
+        'samples at least (default: shorter than the dips of recorded quads, from 10 ms on, '
+        'longer than a bad sample).', 0.0, 10.0)
+    brownout_budget_limit: float = _parameter(
+        0.01, 'Risk that the throttle budget keeps under, 0..1; 0: brownout.warn.', 0.0, 1.0)
+    model_file: str = _parameter(
+        '', 'Model file of the supply (discover --save-model); empty: none.')
 
     def __post_init__(self) -> None:
         """Refuse values out of range and contradictions."""
-        check_values(ESTIMATOR_PARAMETERS, self)
+        check_values(self)
         if not self.brownout_warn < self.brownout_critical:
             raise ValueError(
                 f'brownout.warn ({self.brownout_warn}) must be less than brownout.critical '
@@ -242,38 +184,72 @@ class MonitorSettings:
         return self.brownout_budget_limit or self.brownout_warn
 
 
+ESTIMATOR_PARAMETERS = parameters_of(MonitorSettings)
+
+
 @dataclass(frozen=True)
 class FilterSettings:
-    """Settings of `AdaptiveLowPass`; see `FILTER_PARAMETERS` for units."""
+    """Settings of `AdaptiveLowPass`."""
 
-    mode: str = 'lowpass'
-    order: int = 2
-    law: str = 'constant_noise'
-    fmin: float = 20.0
-    fmax: float = 150.0
-    max_lag: float = 0.0
-    lag_frequency: float = 10.0
-    sigma_ref: float = 0.3
-    coupling: float = 0.0
-    noise_wanted: float = 0.0
-    n0: float = 0.0
-    alpha: float = 63.0
-    signal_bandwidth: float = 0.0
-    signal_rms: float = 0.0
-    signal_poles: int = 1
-    expo: float = 5.0
-    smoothing: float = 0.2
-    smoothing_error: float = 0.1
-    smoothing_range: float = 4.0
-    slew: float = 4.0
-    dead_band: float = 0.1
-    fallback: float = 75.0
-    shadow: bool = False
-    stale_after: float = 1.0
+    mode: str = _parameter(
+        'lowpass', 'What comes out: the signal, or its derivative in unit/s (for a D term).',
+        choices=('lowpass', 'derivative'))
+    order: int = _parameter(2, 'Order of the low-pass: 1, or 2 (Butterworth).', 1, 2)
+    law: str = _parameter('constant_noise', 'Law from sigma to cutoff.', choices=LAWS)
+    fmin: float = _parameter(
+        20.0, 'Lowest cutoff, Hz: the limit of the lag, so a safety limit.', 0.001, 1.0e6)
+    fmax: float = _parameter(150.0, 'Highest cutoff, Hz.', 0.001, 1.0e6)
+    max_lag: float = _parameter(
+        0.0, 'Most lag at lag_frequency, degrees: takes the place of fmin; 0: fmin as given.',
+        0.0, 179.0)
+    lag_frequency: float = _parameter(
+        10.0, 'Where the lag is computed and limited, Hz.', 0.001, 1.0e6)
+    sigma_ref: float = _parameter(
+        0.3, 'Sigma up to which the cutoff stays at fmax, V/sqrt(s) (threshold, and '
+        'constant_noise without noise_wanted).', 1.0e-9, 1.0e6)
+    coupling: float = _parameter(
+        0.0, 'Supply noise in the signal, unit of the signal per V; 0: not known, constant_noise '
+        'is relative to sigma_ref.', 0.0, 1.0e9)
+    noise_wanted: float = _parameter(
+        0.0, 'Rms of the output noise that constant_noise holds, unit of the output, with '
+        'coupling; 0: what sigma_ref makes at fmax.', 0.0, 1.0e12)
+    n0: float = _parameter(
+        0.0, 'White noise of the measurement for wiener and kalman, unit^2/Hz, two-sided: '
+        'variance of a sample over sample rate.', 0.0, 1.0e12)
+    alpha: float = _parameter(
+        63.0, "Relaxation rate of the supply while the estimator's is not known, 1/s.",
+        1.0e-6, 1.0e9)
+    signal_bandwidth: float = _parameter(
+        0.0, 'Bandwidth of the true signal for wiener, Hz; 0: the signal is the voltage itself '
+        '(for kalman: unless coupling is above 0).', 0.0, 1.0e6)
+    signal_rms: float = _parameter(
+        0.0, 'Rms of the true signal for wiener, unit of the signal.', 0.0, 1.0e12)
+    signal_poles: int = _parameter(
+        1, 'Poles of the true signal for wiener: 1 (its spectrum falls with f^2 above its '
+        'bandwidth), or 2 (Butterworth, f^4).', 1, 2)
+    expo: float = _parameter(5.0, 'Curvature of the throttle law, 0..10.', 0.0, 10.0)
+    smoothing: float = _parameter(
+        0.2, 'Time constant of the cutoff (in its logarithm), s, at a relative error of sigma of '
+        'smoothing_error.', 0.0, 3600.0)
+    smoothing_error: float = _parameter(
+        0.1, 'Relative error of sigma for which smoothing is meant; a better sigma moves the '
+        'cutoff faster in proportion.', 0.001, 10.0)
+    smoothing_range: float = _parameter(
+        4.0, 'Most that the time constant is divided or multiplied by for the error of sigma; 1: '
+        'never.', 1.0, 100.0)
+    slew: float = _parameter(
+        4.0, 'Most that the cutoff moves, octaves/s; 0: no limit.', 0.0, 1.0e6)
+    dead_band: float = _parameter(
+        0.1, 'Change of the wanted cutoff that is not followed, octaves.', 0.0, 10.0)
+    fallback: float = _parameter(75.0, 'Cutoff when sigma is stale or unknown, Hz.', 0.001, 1.0e6)
+    shadow: bool = _parameter(
+        False, 'Whether the cutoff is only computed and published, the signal passing unfiltered.')
+    stale_after: float = _parameter(
+        1.0, 'Age of sigma after which the fallback is used, s.', 0.01, 3600.0)
 
     def __post_init__(self) -> None:
         """Refuse values out of range and contradictions."""
-        check_values(FILTER_PARAMETERS, self)
+        check_values(self)
         self._check_limits()
         self._check_law()
 
@@ -347,11 +323,7 @@ class FilterSettings:
         Where `fallback` is not given it is moved into fmin..fmax, so that a
         caller who gives only the limits is not refused.
         """
-        known = {f.name for f in fields(cls)}
-        for name in options:
-            if name not in known:
-                raise ValueError(f"unknown filter option '{name}': {nearest(name, known)}")
-        values: dict[str, Any] = dict(options)
+        values = _known(options, cls, 'filter option')
         old = base or cls()
         if 'fallback' not in values:
             try:
@@ -363,25 +335,29 @@ class FilterSettings:
             if math.isfinite(lowest):
                 values['fallback'] = min(max(old.fallback, lowest),
                                          values.get('fmax', old.fmax))
-        return replace(base, **values) if base else cls(**values)
+        return replace(old, **values)
+
+
+FILTER_PARAMETERS = parameters_of(FilterSettings)
 
 
 def monitor_settings(values: Mapping[str, object]) -> MonitorSettings:
     """Return settings from dotted parameter names."""
-    return MonitorSettings(**_by_field(ESTIMATOR_PARAMETERS, values))
-
-
-def filter_settings(values: Mapping[str, object]) -> FilterSettings:
-    """Return settings from parameter names."""
-    return FilterSettings(**_by_field(FILTER_PARAMETERS, values))
-
-
-def _by_field(table: tuple[Parameter, ...], values: Mapping[str, object]) -> dict[str, Any]:
-    known = [parameter.name for parameter in table]
+    known = [parameter.name for parameter in ESTIMATOR_PARAMETERS]
     for name in values:
         if name not in known:
             raise ValueError(f"unknown parameter '{name}': {nearest(name, known)}")
-    return {name.replace('.', '_'): value for name, value in values.items()}
+    return MonitorSettings(**{  # type: ignore[arg-type]
+        name.replace('.', '_'): value for name, value in values.items()})
+
+
+def _known(options: Mapping[str, object], settings: type[Any], what: str) -> dict[str, Any]:
+    """Return options; `ValueError` where one is no field of the settings."""
+    known = [one.name for one in fields(settings)]
+    for name in options:
+        if name not in known:
+            raise ValueError(f"unknown {what} '{name}': {nearest(name, known)}")
+    return dict(options)
 
 
 def _is_number(value: object) -> bool:
@@ -393,9 +369,9 @@ def _is_number(value: object) -> bool:
         return False
 
 
-def check_values(table: tuple[Parameter, ...], settings: object, prefix: str = '') -> None:
+def check_values(settings: object, prefix: str = '') -> None:
     """Raise `ValueError` for a field that its parameter does not allow."""
-    for parameter in table:
+    for parameter in parameters_of(type(settings), prefix):
         value = getattr(settings, parameter.name.removeprefix(prefix).replace('.', '_'))
         if parameter.choices and not (parameter.mixed and not isinstance(value, str)):
             if value not in parameter.choices:
@@ -423,40 +399,30 @@ RPM_UNITS: dict[str, tuple[float, bool]] = {
     'rpm': (1.0 / 60.0, False), 'erpm': (1.0 / 60.0, True), 'hz': (1.0, False),
     'rad_s': (0.5 / math.pi, False)}
 
-NOTCH_PARAMETERS: tuple[Parameter, ...] = (
-    Parameter('notch.count', 0, 'Most notches that follow the motors; 0: none.', 0, 4),
-    Parameter('notch.fmin', 60.0,
-              'Lowest frequency of a notch, and lower end of what counts as noise, Hz: above the '
-              'band in which the vehicle is flown.', 1.0, 1.0e5),
-    Parameter('notch.cutoff', 80.0,
-              'Cutoff of the low-pass of order 2 behind the notches for whose derivative and lag '
-              'they must pay, Hz.', 1.0, 1.0e5),
-    Parameter('notch.rpm_unit', 'rpm',
-              'Unit of the motor speeds: rpm, hz or rad_s of the shaft, erpm of the field (needs '
-              'notch.poles).', choices=tuple(RPM_UNITS)),
-    Parameter('notch.poles', 0,
-              'Magnets of a motor, for erpm: 14 on most motors for 5 inch propellers; 0: not '
-              'known.', 0, 200),
-    Parameter('notch.stale_after', 0.25,
-              'Age of the motor speeds after which throttle takes their place, s.',
-              0.001, 3600.0),
-)
-
 
 @dataclass(frozen=True)
 class NotchSettings:
-    """Settings of `AdaptiveNotch`; see `NOTCH_PARAMETERS`."""
+    """Settings of `AdaptiveNotch`."""
 
-    count: int = 4  # Most notches, up to 4; 0: none, what is in force fades
-    fmin: float = 60.0  # Lowest frequency of a notch, Hz
-    cutoff: float = 80.0  # Cutoff of the low-pass behind, Hz
-    rpm_unit: str = 'rpm'  # Unit of the motor speeds
-    poles: int = 0  # Magnets of a motor, for erpm
-    stale_after: float = 0.25  # Age after which motor speeds are not used, s
+    count: int = _parameter(4, 'Most notches that follow the motors; 0: none.', 0, 4)
+    fmin: float = _parameter(
+        60.0, 'Lowest frequency of a notch, and lower end of what counts as noise, Hz: above the '
+        'band in which the vehicle is flown.', 1.0, 1.0e5)
+    cutoff: float = _parameter(
+        80.0, 'Cutoff of the low-pass of order 2 behind the notches for whose derivative and lag '
+        'they must pay, Hz.', 1.0, 1.0e5)
+    rpm_unit: str = _parameter(
+        'rpm', 'Unit of the motor speeds: rpm, hz or rad_s of the shaft, erpm of the field '
+        '(needs notch.poles).', choices=tuple(RPM_UNITS))
+    poles: int = _parameter(
+        0, 'Magnets of a motor, for erpm: 14 on most motors for 5 inch propellers; 0: not known.',
+        0, 200)
+    stale_after: float = _parameter(
+        0.25, 'Age of the motor speeds after which throttle takes their place, s.', 0.001, 3600.0)
 
     def __post_init__(self) -> None:
         """Refuse values out of range and contradictions."""
-        check_values(NOTCH_PARAMETERS, self, 'notch.')
+        check_values(self, 'notch.')
         if RPM_UNITS[self.rpm_unit][1] and (self.poles < 2 or self.poles % 2):
             raise ValueError(
                 f"notch.rpm_unit '{self.rpm_unit}' needs notch.poles, an even number of magnets "
@@ -472,12 +438,12 @@ class NotchSettings:
     def from_options(cls, options: Mapping[str, object],
                      base: NotchSettings | None = None) -> NotchSettings:
         """Return settings with the given options changed."""
-        known = {f.name for f in fields(cls)}
-        for name in options:
-            if name not in known:
-                raise ValueError(f"unknown notch option '{name}': {nearest(name, known)}")
-        values: dict[str, Any] = dict(options)
-        return replace(base, **values) if base else cls(**values)
+        return replace(base or cls(), **_known(options, cls, 'notch option'))
+
+
+# The node has none unless it is told to.
+NOTCH_PARAMETERS = tuple(replace(one, default=0) if one.name == 'notch.count' else one
+                         for one in parameters_of(NotchSettings, 'notch.'))
 
 
 def notch_options(values: Mapping[str, object]) -> dict[str, object]:

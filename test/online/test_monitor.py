@@ -6,7 +6,7 @@ import numpy as np
 from ou_monitor.model.ou import simulate
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.settings import (
-    ESTIMATOR_PARAMETERS, FILTER_PARAMETERS, filter_settings, FilterSettings, monitor_settings,
+    monitor_settings,
     MonitorSettings)
 from ou_monitor.records import Level, Status
 import pytest
@@ -89,14 +89,6 @@ def test_reset_is_counted_and_said():
     report = monitor.report(0.0)
     assert report.estimate.counters.resets == 1 and 'jumped back' in report.summary
     assert report.level is Level.STALE
-
-
-@pytest.mark.parametrize('table, settings, build', [
-    (ESTIMATOR_PARAMETERS, MonitorSettings(), monitor_settings),
-    (FILTER_PARAMETERS, FilterSettings(), filter_settings)])
-def test_the_table_and_the_settings_agree(table, settings, build):
-    """One default each: the table builds exactly the default settings."""
-    assert build({p.name: p.default for p in table}) == settings
 
 
 @pytest.mark.parametrize('values, words', [
