@@ -27,8 +27,7 @@ one step from block to block.  Coefficients that change with every sample cost n
 ones.  Rounding: r is large where the angle is small, so that below `_LEAST` samples go one by one.
 
 Samples are worked on together while they are finite and their intervals even to a factor of
-five; the others go one by one.  The output is that of the samples one by one, to rounding
-(angles within 1e-9 of each other count as one).
+five; the others go one by one.  The output is that of the samples one by one, to rounding.
 """
 
 from __future__ import annotations
@@ -82,10 +81,6 @@ _LEAST = 1e-4
 # Angle of a step, above which only fmin holds the cutoff above 0.45 of the sample rate: so much
 # of the state decays that sums over many lose it.
 _MOST = 2.0 * math.pi * OF_RATE * ODD
-# After so much angle nothing of a state is left: exp(-75 / sqrt(2)) < 1e-23.
-_FORGOTTEN = 75.0
-# Angles that differ by less, as a share, count as one; a biquad of less angle would round more.
-_SAME, _SMALL = 1e-9, 0.02
 
 
 def filter_sequence(state: LowPassState, order: int, angle: FloatArray, start: FloatArray,
@@ -102,53 +97,12 @@ def filter_sequence(state: LowPassState, order: int, angle: FloatArray, start: F
         if lowest < _LEAST or highest > _MOST:
             out[at] = [state.advance(order, *one) for one in zip(
                 angle[at].tolist(), start[at].tolist(), end[at].tolist(), strict=True)]
-        elif order == 2 and lowest > _SMALL and highest - lowest < _SAME * lowest:
-            out[at] = _even(state, 0.5 * (lowest + highest), start[at], end[at])
         else:
-            out[at] = _uneven(state, order, angle[at], start[at], end[at])
+            out[at] = _summed(state, order, angle[at], start[at], end[at])
     return out
 
 
-def _left_over(a: FloatArray, y: float, slope: float) -> FloatArray:
-    """Return what a state of order 2 makes of the output after angles, without input."""
-    p = a / _ROOT2
-    return np.asarray(np.exp(-p) * ((y * np.cos(p)) + (y + _ROOT2 * slope) * np.sin(p)))
-
-
-def _even(state: LowPassState, angle: float, start: FloatArray, end: FloatArray) -> FloatArray:
-    """Filter with one angle: a biquad from rest, and what the state leaves over."""
-    from scipy.signal import lfilter
-
-    def step(y: float, slope: float, *ends: float) -> tuple[float, float]:
-        one = LowPassState(y)
-        one.slope = slope
-        one.advance(2, angle, *ends)
-        return one.y, one.slope
-    (f11, f21), (f12, f22) = step(1.0, 0.0, 0.0, 0.0), step(0.0, 1.0, 0.0, 0.0)
-    (a1, a2), (b1, b2) = step(0.0, 0.0, 1.0, 0.0), step(0.0, 0.0, 0.0, 1.0)
-    poles = [1.0, -(f11 + f22), f11 * f22 - f12 * f21]
-    zeros = [b1, a1 - f22 * b1 + f12 * b2, f12 * a2 - f22 * a1]
-    x0 = float(start[0])
-    # From rest at x0; `start` of one sample is `end` of the one before but for a derivative.
-    if np.array_equal(start[1:], end[:-1]):
-        out = np.asarray(lfilter(zeros, poles, end - x0)) + x0
-    else:
-        out = np.asarray(lfilter([a1, f12 * a2 - f22 * a1], poles, start - x0)
-                         + lfilter([b1, f12 * b2 - f22 * b1], poles, end - x0)) + x0
-    steps = np.arange(1, min(int(_FORGOTTEN / angle), end.size) + 1)
-    left = np.asarray(angle * steps, dtype=np.float64)
-    out[:left.size] += _left_over(left, state.y - x0, state.slope)
-    if end.size > 1:
-        # The slope before the last step is what the last step made of it.
-        before = LowPassState(float(out[-2]))
-        before.advance(2, angle, float(start[-1]), float(end[-1]))
-        state.slope = (float(out[-1]) - before.y) / f12
-        state.y = float(out[-2])
-    state.advance(2, angle, float(start[-1]), float(end[-1]))
-    return out
-
-
-def _uneven(state: LowPassState, order: int, angle: FloatArray, start: FloatArray,
+def _summed(state: LowPassState, order: int, angle: FloatArray, start: FloatArray,
             end: FloatArray) -> FloatArray:
     """Filter by sums, in blocks of an angle of `_SPAN` at most, one block a row."""
     n = angle.size
