@@ -393,7 +393,7 @@ class EstimatorNode(MonitorNode):
             return ('Messages without a stamp cannot be placed in time: use_sim_time is set, but '
                     'nothing comes on /clock (any more).')
         spec = self._voltage.spec
-        return (f"Messages arrive on {self._topic}, but their field "
+        return (f'Messages arrive on {self._topic}, but their field '
                 f"'{spec.field if spec else ''}' holds no finite voltage.")
 
     @property
