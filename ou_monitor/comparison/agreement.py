@@ -9,7 +9,7 @@ from typing import Any
 from ou_monitor.records import FloatArray
 
 
-class Verdict(enum.Enum):
+class Likeness(enum.Enum):
     """Whether the recording could be one of its simulations; the value is said to people."""
 
     LOOKS_LIKE_IT = 'The simulation looks like the recording'
@@ -98,7 +98,7 @@ class Agreement:
     ks_distance: float  # Largest difference of the two distributions
     seeds: int  # Simulations
     p_value: float  # Share of the simulations that are as odd among the others
-    verdict: Verdict  # The verdict
+    verdict: Likeness  # The verdict
     words: str  # What the simulation gets wrong most, as a part of a sentence
     farthest: str  # Kind of that difference: lowest, falls, level, answer, spectrum, ks or path
     notes: tuple[str, ...]  # What was left out or assumed
@@ -107,7 +107,7 @@ class Agreement:
     @property
     def worst(self) -> str:
         """Return the sentence that says what the simulation gets wrong most."""
-        begin = 'Most wrong' if self.verdict is Verdict.DIFFERS else 'Farthest, but within chance'
+        begin = 'Most wrong' if self.verdict is Likeness.DIFFERS else 'Farthest, but within chance'
         return f'{begin}: in the simulation, {self.words}.'
 
     def measures(self) -> list[dict[str, Any]]:

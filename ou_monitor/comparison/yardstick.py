@@ -19,7 +19,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.analysis.supply import dip_begins, noise_of, rise_that_ends
-from ou_monitor.comparison.agreement import Band, Verdict
+from ou_monitor.comparison.agreement import Band, Likeness
 from ou_monitor.comparison.flight_model import Readings
 from ou_monitor.records import FloatArray, NAN, Recording
 from ou_monitor.text import number
@@ -243,7 +243,7 @@ def _fall(v: float) -> str:
 
 
 def judge(found: Sequence[Difference], explained: float, moved: bool
-          ) -> tuple[float, Verdict, str, str]:
+          ) -> tuple[float, Likeness, str, str]:
     """
     Return the share of simulations as odd as the recording, verdict, what is most wrong, its kind.
 
@@ -256,11 +256,11 @@ def judge(found: Sequence[Difference], explained: float, moved: bool
     p = float(np.mean(largest >= largest[0]))
     worst = int(np.argmax(scores[:, 0]))
     level = next(k for k, one in enumerate(found) if one.kind == 'level')
-    verdict = Verdict.DIFFERS if p < LEVEL else Verdict.LOOKS_LIKE_IT
-    if verdict is Verdict.LOOKS_LIKE_IT and moved and explained < 0.0:
-        return p, Verdict.DIFFERS, (
+    verdict = Likeness.DIFFERS if p < LEVEL else Likeness.LOOKS_LIKE_IT
+    if verdict is Likeness.LOOKS_LIKE_IT and moved and explained < 0.0:
+        return p, Likeness.DIFFERS, (
             f'the mean path explains {number(100.0 * explained, 2)} % of the variance, less than '
             'a constant would'), 'path'
-    if verdict is Verdict.LOOKS_LIKE_IT and scores[level, 0] > _WEIGHTS['level']:
-        verdict, worst = Verdict.DIFFERS, level
+    if verdict is Likeness.LOOKS_LIKE_IT and scores[level, 0] > _WEIGHTS['level']:
+        verdict, worst = Likeness.DIFFERS, level
     return p, verdict, found[worst].words(found[worst].band), found[worst].kind

@@ -100,15 +100,8 @@ COLUMNS = (
     Column('size_bytes', 'count', 'byte', 'size of its data'),
 )
 NAMES = tuple(column.name for column in COLUMNS)
-# Of these a recording without levels still has something to say.
-OF_LEVEL = ('level', 'throttle', 'time_s', 'n', 'mean', 'vpp', 'vrms', 'alpha', 'alpha_se',
-            'sigma', 'sigma_se', 'var_inf', 'var_inf_se', 'u0', 'u0_se', 'noise_std',
-            'excess_kurtosis', 'impulses', 'line_hz', 'line_rms', 'process', 'risk', 'status',
-            'flags')
-_OF_RECORDING = ('recording', 'duration_s', 'samples', 'rate_hz', 'lowest', 'lowest_at',
-                 'lowest_throttle', 'dips', 'below_s', 'sag_throttle', 'sag', 'sag_se', 'sag_full',
-                 'sag_full_se', 'supply', 'alpha_p', 'quality', 'risk_max', 'verdict', 'causes',
-                 'gain', 'gain_se', 'notes')
+# Of the recording, but not as its result has them.
+_OTHERWISE = ('vehicle', 'start', 'error')
 
 
 def rows_of(source: FoundRecording, result: Mapping[str, Any], vehicle: Vehicle,
@@ -122,12 +115,13 @@ def rows_of(source: FoundRecording, result: Mapping[str, Any], vehicle: Vehicle,
         duplicate_of=None if duplicate_of is None else printable(duplicate_of))
     if duplicate_of is not None or result['error']:
         return [base]
-    base.update({name: _known(result[name]) for name in _OF_RECORDING})
+    base.update({name: _known(value) for name, value in result.items()
+                 if name in base and name not in _OTHERWISE})
     start = result['start']
     base['start'] = (datetime.fromtimestamp(start, timezone.utc)
                      if math.isfinite(start) else None)
-    levels = result['levels'] or [{}]
-    return [{**base, **{name: _known(level.get(name)) for name in OF_LEVEL}} for level in levels]
+    return [{**base, **{name: _known(value) for name, value in level.items()}}
+            for level in result['levels'] or [{}]]
 
 
 def _known(value: Any) -> Any:

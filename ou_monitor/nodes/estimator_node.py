@@ -221,18 +221,20 @@ class EstimatorNode(MonitorNode):
     def _merge(self, voltage: Arrivals | None, throttle: Arrivals) -> Arrivals | None:
         """Place throttle messages among voltages, by arrival; return the voltages left."""
         times = self._times(throttle)
-        values = np.split(throttle.values, np.cumsum(throttle.counts)[:-1])
-        for k in range(0, throttle.size, -(-throttle.size // MOST_THROTTLES)):
+        column = throttle.column
+        values = np.split(column.values, np.cumsum(column.counts)[:-1])
+        for k in range(0, column.n, -(-column.n // MOST_THROTTLES)):
             if voltage is not None:
                 first, voltage = voltage.split(int(np.searchsorted(
                     voltage.arrived, throttle.arrived[k], 'left')))
                 self._take_voltages(first)
-            if self._stream.take_throttles(times.item(k), bool(throttle.own[k]), values[k]):
+            if self._stream.take_throttles(times.item(k), bool(column.stamped[k]), values[k]):
                 self._throttle_heard.heard(throttle.arrived.item(k))
         return voltage
 
     def _take_voltages(self, messages: Arrivals) -> None:
-        if not messages.size:
+        column = messages.column
+        if not column.n:
             return
         self._arrived.heard(messages.arrived.item(-1))
         ends = self._times(messages, self._send_clock)
@@ -242,8 +244,8 @@ class EstimatorNode(MonitorNode):
             self._stream.reset('a steady source was found behind messages in bursts')
             ends = np.full(ends.size, math.nan)
         held = self._stream.take_voltages(
-            ends, messages.own, messages.counts, messages.values, messages.arrived,
-            messages.beside)
+            ends, column.stamped, column.counts, column.values, messages.arrived,
+            column.beside)
         if held.any():
             # On simulated time they were received at some time between two polls: now.
             received = (np.full(ends.size, self.stamp_now()) if self._stamper.simulated
@@ -253,11 +255,12 @@ class EstimatorNode(MonitorNode):
 
     def _times(self, messages: Arrivals, smooth: SendClock | None = None) -> FloatArray:
         """Return the times of messages, s: of those without a stamp when they were sent."""
-        if messages.own.all():
-            return messages.ends
+        column = messages.column
+        if column.stamped.all():
+            return column.stamp
         return np.array([
             end if own else self._stamper.source_time(end, smooth)
-            for end, own in zip(messages.ends.tolist(), messages.own.tolist())])
+            for end, own in zip(column.stamp.tolist(), column.stamped.tolist())])
 
     def _balance(self, pushed: float) -> None:
         """Thin the samples where estimating from them takes too long (s of CPU)."""

@@ -14,12 +14,11 @@ import time
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import MonitorNode
 from ou_monitor.nodes.clocks import SendClock, SimClockMap
 from ou_monitor.nodes.sources import definition_of, find_source, Source
-from ou_monitor.recordings.cdr import FieldReader, Table
+from ou_monitor.recordings.cdr import FieldColumn, FieldReader, MessageTable
 from ou_monitor.records import FloatArray
 from ou_monitor.stream.config import FieldSpec
 from ou_monitor.stream.samples import Publishers
@@ -111,29 +110,15 @@ class Stamper:
 class Arrivals:
     """Messages of one publisher, in order of arrival."""
 
-    # Stamps (of the last sample of a block), s; the time of sending where a message has none;
-    # shape (m,).
-    ends: FloatArray
-    own: npt.NDArray[np.bool_]  # Whether the stamp is the message's own; shape (m,)
-    counts: npt.NDArray[np.int64]  # Values in each; shape (m,)
-    values: FloatArray  # Values in SI units; NaN where one is not finite; shape (counts.sum()
+    column: FieldColumn  # What they hold; in place of a stamp that is missing, when it was sent
     received: FloatArray  # When the middleware received each, by the wall clock, s; shape (m,)
     arrived: FloatArray  # The same by the monotonic clock, s; shape (m,)
-    # A second field of each message, SI units; NaN where there is none; shape (m,).
-    beside: FloatArray
-
-    @property
-    def size(self) -> int:
-        """Return the number of messages."""
-        return int(self.ends.size)
 
     def split(self, at: int) -> tuple[Arrivals, Arrivals]:
         """Return the first `at` messages, and the rest."""
-        cut = int(self.counts[:at].sum())
-        return tuple(Arrivals(  # type: ignore[return-value]
-            self.ends[part], self.own[part], self.counts[part], self.values[values],
-            self.received[part], self.arrived[part], self.beside[part]) for part, values in (
-                (slice(None, at), slice(None, cut)), (slice(at, None), slice(cut, None))))
+        first, rest = self.column.split(at)
+        return (Arrivals(first, self.received[:at], self.arrived[:at]),
+                Arrivals(rest, self.received[at:], self.arrived[at:]))
 
 
 class PolledInput:
@@ -209,14 +194,13 @@ class PolledInput:
             return None
         ends = np.cumsum([len(message) for message in data])
         begins = np.concatenate(([0], ends[:-1]))
-        table = Table(b''.join(data), np.zeros(ends.size, np.uint16),
+        table = MessageTable(b''.join(data), np.zeros(ends.size, np.uint16),
                       np.arange(ends.size, dtype=np.uint64), begins, ends)
         column = self._reader.read(table)
         # In the place of log times: the number of each that could be read.
         read = np.flatnonzero(kept)[column.log_time.astype(np.int64)]
-        return Arrivals(np.where(column.stamped, column.stamp, times[read]), column.stamped,
-                        column.counts, column.values, received[read], arrived[read],
-                        column.beside)
+        column = column._replace(stamp=np.where(column.stamped, column.stamp, times[read]))
+        return Arrivals(column, received[read], arrived[read])
 
 
 def decode(data: bytes, kind: Any, topic: str) -> Any:

@@ -239,9 +239,9 @@ class SupplySimulatorNode(MonitorNode):
         """Return the throttle now: the newest, held for a second; then 0."""
         found = None if self._input is None else self._input.take()
         if found is not None:
-            good = np.flatnonzero(np.abs(found.values) <= _MOST_THROTTLE)
+            good = np.flatnonzero(np.abs(found.column.values) <= _MOST_THROTTLE)
             if good.size:
-                self._throttle = min(max(float(found.values[good[-1]]), 0.0), 1.0)
+                self._throttle = min(max(float(found.column.values[good[-1]]), 0.0), 1.0)
                 self._heard.heard()
         if self._idles:
             self._throttle = 0.0

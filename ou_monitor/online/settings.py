@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from functools import cache, cached_property
+from functools import cached_property
 import math
 from numbers import Real
 from typing import Any
@@ -41,14 +41,14 @@ def _parameter(default: bool | int | float | str, description: str, low: float |
                high: float | None = None, choices: tuple[str, ...] = ()) -> Any:
     """Return a field of settings that is a parameter of a node."""
     return field(default=default, metadata={
-        'description': description, 'low': low, 'high': high, 'choices': choices})
+        'default': default, 'description': description, 'low': low, 'high': high,
+        'choices': choices})
 
 
-@cache
 def parameters_of(settings: type[Any], prefix: str = '') -> tuple[Parameter, ...]:
     """Return the parameters that settings stand for; a group of them has a prefix or a dot."""
-    return tuple(Parameter(prefix + one.name.replace('brownout_', 'brownout.'), one.default,
-                           **one.metadata) for one in fields(settings))
+    return tuple(Parameter(prefix + one.name.replace('brownout_', 'brownout.'), **one.metadata)
+                 for one in fields(settings))
 
 
 # Window as long as it takes.

@@ -28,7 +28,7 @@ from mcap_ros2.decoder import DecoderFactory
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.cdr import (
     Broken, check_extent, DEFAULTS, Definitions, endless, Field, FieldColumn, FieldReader, join,
-    short_name, Table)
+    short_name, MessageTable)
 from ou_monitor.recordings.mcap_file import (
     ABOUT, custom_data, McapFile, moment, MOST_BYTES, MOST_NODES, ORIGIN, SAMPLE_RATE, Span)
 from ou_monitor.recordings.standard_types import SCHEMAS, TYPE_HASHES
@@ -150,7 +150,7 @@ class Part(NamedTuple):
     """The messages of one chunk or run."""
 
     #: Topic -> its messages, in the order of the file.
-    tables: dict[str, Table]
+    tables: dict[str, MessageTable]
     #: Log time that no message of a later part is before, ns; None after the last part.
     later_ns: int | None
     #: Share of the bytes to be read that are read, 0..1.

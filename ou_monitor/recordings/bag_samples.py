@@ -429,4 +429,4 @@ def _clock(spec: FieldSpec) -> BlockClock | None:
 
 def _stamps(clock: BlockClock | None, column: FieldColumn) -> FloatArray:
     """Return the stamp of each value, s."""
-    return column.stamp if clock is None else clock.stamps_of_many(column.stamp, column.counts)
+    return column.stamp if clock is None else clock.stamps(column.stamp, column.counts)

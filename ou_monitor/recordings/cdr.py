@@ -290,7 +290,7 @@ Broken = Callable[[int, InputError], None]
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class MessageTable:
     """Messages in a block of bytes, in the order of the file."""
 
     #: The block.
@@ -308,11 +308,11 @@ class Table:
         """Return the number of messages."""
         return int(self.begin.size)
 
-    def where(self, mask: npt.NDArray[np.bool_]) -> Table:
+    def where(self, mask: npt.NDArray[np.bool_]) -> MessageTable:
         """Return the messages for which `mask`, shape (n,), is true."""
         if mask.all():
             return self
-        return Table(self.data, self.channel[mask], self.log_time[mask], self.begin[mask],
+        return MessageTable(self.data, self.channel[mask], self.log_time[mask], self.begin[mask],
                      self.end[mask])
 
     def rows(self, picked: IntArray, length: int) -> Rows:
@@ -441,7 +441,7 @@ class FieldReader:
         # Length of the message -> layouts met.
         self._layouts: dict[int, list[Layout]] = {}
 
-    def read(self, table: Table) -> FieldColumn:
+    def read(self, table: MessageTable) -> FieldColumn:
         """Return the field of the messages of a table, in its order."""
         # A damaged message may hold a signalling NaN, of which NumPy would warn.
         with np.errstate(invalid='ignore'):
@@ -450,7 +450,7 @@ class FieldReader:
         return column._replace(values=zero.apply(column.values),
                                beside=other[0].apply(column.beside) if other else column.beside)
 
-    def _read(self, table: Table) -> FieldColumn:
+    def _read(self, table: MessageTable) -> FieldColumn:
         """Return the field with zeros as they are."""
         found = _Found(table.n)
         rest: list[IntArray] = []
@@ -482,7 +482,8 @@ class FieldReader:
         column = FieldColumn(table.log_time, stamp, stamped, count, values, found.beside)
         return column if kept.all() else column.take(np.flatnonzero(kept))
 
-    def _in_bulk(self, table: Table, left: IntArray, length: int, found: _Found) -> IntArray:
+    def _in_bulk(self, table: MessageTable, left: IntArray, length: int, found: _Found,
+                 ) -> IntArray:
         """Read messages of one length by layouts; return those that have none."""
         known = self._layouts.setdefault(length, [])
         rows = table.rows(left, length)
@@ -550,7 +551,7 @@ class FieldReader:
                 return None
         return layout
 
-    def _one(self, table: Table, k: int, found: _Found) -> bool:
+    def _one(self, table: MessageTable, k: int, found: _Found) -> bool:
         """Read one message the general way; False: it is to be left out."""
         if self._decode is None:
             self._decode = self._decoder()

@@ -35,7 +35,7 @@ from mcap.records import Channel, Chunk, Metadata, Schema
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
-from ou_monitor.recordings.cdr import gather, IntArray, Table
+from ou_monitor.recordings.cdr import gather, IntArray, MessageTable
 from ou_monitor.records import Defect, Note
 from ou_monitor.stream.files import open_regular, parse_yaml, path_words
 from ou_monitor.text import counted, printable
@@ -505,7 +505,7 @@ class McapFile:
                 last.offset + last.length + last.index_length == at):
             self.spans[-1] = last._replace(index_length=last.index_length + _HEAD.size + length)
 
-    def _add_span(self, table: Table, span: Span) -> None:
+    def _add_span(self, table: MessageTable, span: Span) -> None:
         """Add the messages of a span to the index."""
         keys, counts = np.unique(table.channel, return_counts=True)
         for key, n in zip(keys.tolist(), counts.tolist()):
@@ -552,7 +552,7 @@ class McapFile:
         """Return channel -> topic of some topics."""
         return {key: topic.name for key, topic in self.topics.items() if topic.name in wanted}
 
-    def tables(self, spans: Sequence[Span], wanted: set[str]) -> dict[str, Table]:
+    def tables(self, spans: Sequence[Span], wanted: set[str]) -> dict[str, MessageTable]:
         """Return the messages of some spans by topic, in the order of the file."""
         try:
             table = self._table_of(spans)
@@ -576,7 +576,7 @@ class McapFile:
         parts = {name: table.where(mine) for name, mine in topics.items()}
         return {name: part for name, part in parts.items() if part.n}
 
-    def _table_of(self, spans: Sequence[Span]) -> Table:
+    def _table_of(self, spans: Sequence[Span]) -> MessageTable:
         """Return the messages of some spans; register their schemas and channels."""
         blocks: list[bytes] = []
         indexes: list[bytes] = []
@@ -809,11 +809,12 @@ def _by_index(data: bytes, indexes: Sequence[bytes], begins: IntArray,
     return places, others
 
 
-def _table(data: bytes, at: IntArray) -> Table:
+def _table(data: bytes, at: IntArray) -> MessageTable:
     """Return the messages whose records start at given offsets."""
     length = gather(data, at + 1, '<u8').astype(np.int64)
-    return Table(data, gather(data, at + _HEAD.size, '<u2'), gather(data, at + _HEAD.size + 6,
-                 '<u8'), at + _DATA, at + _HEAD.size + length)
+    return MessageTable(data, gather(data, at + _HEAD.size, '<u2'),
+                        gather(data, at + _HEAD.size + 6, '<u8'), at + _DATA,
+                        at + _HEAD.size + length)
 
 
 # First bytes -> what it is, and what to do.

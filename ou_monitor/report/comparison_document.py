@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from ou_monitor.analysis.overview import known_lines, Overview
-from ou_monitor.comparison.agreement import Agreement, Band, Verdict
+from ou_monitor.comparison.agreement import Agreement, Band, Likeness
 from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text)
 from ou_monitor.report.svg import Plot
@@ -45,7 +45,7 @@ def _answer(found: Agreement) -> list[str]:
     low = found.lowest
     lowest = (f'lowest voltage is {number(low.median, 4)} V ({number(low.low, 4)} to '
               f'{number(low.high, 4)}), measured {number(low.measured, 4)} V')
-    if found.verdict is Verdict.LOOKS_LIKE_IT:
+    if found.verdict is Likeness.LOOKS_LIKE_IT:
         # Without throttle the path is a level, which may explain nothing.
         path = [] if not found.explained > 0.0 else [
             f'Its mean path explains {100.0 * found.explained:.0f} % of the variance.']
@@ -77,7 +77,7 @@ def _rows(found: Agreement) -> list[tuple[str, str, str, str]]:
 
 def _path(found: Agreement) -> list[tuple[str, str]]:
     thirds = ', '.join(number(1e3 * b, 2) for b in found.bias_by_third)
-    worst = [('Farthest off', found.words)] if found.verdict is Verdict.LOOKS_LIKE_IT else []
+    worst = [('Farthest off', found.words)] if found.verdict is Likeness.LOOKS_LIKE_IT else []
     return [('Mean path', f'explains {number(100.0 * found.explained, 3)} % of the variance; rms '
              f'error {number(1e3 * found.rmse, 3)} mV, bias {number(1e3 * found.bias, 2)} mV (by '
              f'thirds {thirds})'),

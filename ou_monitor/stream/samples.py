@@ -247,20 +247,8 @@ class BlockClock:
         """Forget the time line, as after a clock that jumped back; this is not a gap."""
         self._anchor = None
 
-    def stamps(self, end_stamp: float, n: int) -> FloatArray:
-        """Return the stamps of the samples of the next block (end_stamp in s)."""
-        start, first, step = self._next(end_stamp, n)
-        if n == 0:
-            return np.empty(0)
-        assert self._anchor is not None
-        return self._anchor + (start + np.arange(first, first + n, dtype=np.float64) * step)
-
-    def stamps_of_many(self, end_stamps: FloatArray, n: npt.NDArray[np.int64]) -> FloatArray:
-        """
-        Return the stamps of the samples of many blocks, as `stamps` would one by one.
-
-        end_stamps in s.
-        """
+    def stamps(self, end_stamps: FloatArray, n: npt.NDArray[np.int64]) -> FloatArray:
+        """Return the stamps of the n samples of each of the next blocks (end_stamps in s)."""
         lines = []
         for end, count in zip(end_stamps.tolist(), n.tolist()):
             line = self._next(end, count)
@@ -464,7 +452,7 @@ class SampleStream:
             arrived, current = arrived[placed], current[placed]
         if not ends.size:
             return held
-        stamps = ends if self._block is None else self._block.stamps_of_many(ends, counts)
+        stamps = ends if self._block is None else self._block.stamps(ends, counts)
         last = np.cumsum(counts) - 1
         firsts, ends = stamps[last + 1 - counts], stamps[last]
         columns = stamps, values, np.repeat(arrived, counts), np.repeat(current, counts)
@@ -498,7 +486,8 @@ class SampleStream:
         values = found.tolist()
         stamps = [end]
         if self._throttle_block is not None and math.isfinite(end):
-            stamps = self._throttle_block.stamps(end, len(values)).tolist()
+            stamps = self._throttle_block.stamps(
+                np.array([end]), np.array([len(values)])).tolist()
         if not values or not stamps:
             return False
         if stamps[0] < self._newest_throttle - BACK:

@@ -1,7 +1,7 @@
 """A recording beside its simulations: what is like it, what differs, and which is worst."""
 
 import numpy as np
-from ou_monitor.comparison.agreement import Verdict
+from ou_monitor.comparison.agreement import Likeness
 from ou_monitor.comparison.compare import compare
 from ou_monitor.comparison.flight_model import damping, Readings
 from ou_monitor.errors import InputError
@@ -37,7 +37,7 @@ def model(sigma: float = SIGMA, sag: float = SAG) -> SupplyModel:
 def test_a_recording_of_the_model_looks_like_it():
     """One in twenty may differ by chance: of ten at most two, but for 1 % of such tests."""
     found = [compare(drawn(seed), model(), seeds=20, seed=seed) for seed in range(10)]
-    assert sum(one.verdict is Verdict.DIFFERS for one in found) <= 2
+    assert sum(one.verdict is Likeness.DIFFERS for one in found) <= 2
     assert np.mean([one.p_value for one in found]) > 0.2
 
 
@@ -59,7 +59,7 @@ def test_a_doubled_sigma_differs():
     v = SupplyModel((OU(ALPHA, SIGMA, LEVEL),)).simulate(t, np.random.default_rng(2))
     found = compare(Recording(t, v, np.full(t.size, np.nan), 'bench'),
                     SupplyModel((OU(ALPHA, 2.0 * SIGMA, LEVEL),)), seeds=40)
-    assert found.verdict is Verdict.DIFFERS
+    assert found.verdict is Likeness.DIFFERS
     assert found.worst.startswith('Most wrong')
     top = found.spectrum[-1].power
     # 2000 ordinates: 2 % each for the recording and for the median.
@@ -70,7 +70,7 @@ def test_a_doubled_sigma_differs():
 def test_a_wrong_sag_is_the_worst(sag):
     """A sag that is wrong by a factor is told by levels and answers, not by noise."""
     found = compare(drawn(3), model(sag=sag), seeds=40)
-    assert found.verdict is Verdict.DIFFERS
+    assert found.verdict is Likeness.DIFFERS
     assert any(word in found.worst for word in ('rises of throttle', 'lowest', 'falls through'))
 
 
@@ -96,7 +96,7 @@ def test_the_second_half_follows_from_the_first():
     """The model that is fitted explains what is not noise, and its bands hold the recording."""
     found = compare(flight(1), seeds=40)
     assert found.fitted == (0.0, pytest.approx(14.99, abs=0.03))
-    assert found.verdict is Verdict.LOOKS_LIKE_IT
+    assert found.verdict is Likeness.LOOKS_LIKE_IT
     assert 'load_sag' in found.model and 'load_dependent_noise' in found.model
     assert found.explained > 0.9
     assert found.lowest.inside and all(falls.inside for falls in found.falls)
@@ -131,7 +131,7 @@ def test_without_throttle_there_is_level_and_noise():
         found = compare(Recording(t, v, np.full(t.size, held), 'bench'), seeds=40)
         assert found.model == ('ou', 'measurement_noise')
         assert any('only level and noise' in note for note in found.notes)
-        differ += found.verdict is Verdict.DIFFERS
+        differ += found.verdict is Likeness.DIFFERS
     assert differ <= 1
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 from ou_monitor.analysis.supply import supply_facts
-from ou_monitor.comparison.agreement import Verdict
+from ou_monitor.comparison.agreement import Likeness
 from ou_monitor.comparison.flight_model import Readings
 from ou_monitor.comparison.yardstick import band, between_codes, Difference, judge, Yardstick
 from ou_monitor.records import Recording
@@ -110,7 +110,7 @@ def test_the_verdict_follows_from_path_and_level():
     # Twelve others at once: at 1.1 half-bands from the median the level alone is no oddity.
     others = [Difference('lowest', 0.0, np.random.default_rng(k).standard_normal(400), 1e-9,
                          lambda b: 'lowest') for k in range(12)]
-    looks, differs = Verdict.LOOKS_LIKE_IT, Verdict.DIFFERS
+    looks, differs = Likeness.LOOKS_LIKE_IT, Likeness.DIFFERS
     at = [(0.0, 0.1, True, looks), (0.0, -0.1, False, looks), (0.0, -0.1, True, differs),
           (2.2, 0.1, True, differs)]
     for level, explained, moved, verdict in at:

@@ -11,7 +11,7 @@ import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings import standard_types as cdr
 from ou_monitor.recordings.bag import parse_definition
-from ou_monitor.recordings.cdr import FieldReader, join, seconds, Table
+from ou_monitor.recordings.cdr import FieldReader, join, seconds, MessageTable
 from ou_monitor.recordings.standard_types import SCHEMAS
 from ou_monitor.stream.config import Extractor, FieldSpec
 import pytest
@@ -32,7 +32,7 @@ def table_of(messages, times=None):
     steps = np.array([len(g) for g in gaps], dtype=np.int64)
     end = np.cumsum(steps + lengths)
     times = np.arange(len(messages)) * 10**7 + 5 if times is None else times
-    return Table(data, np.zeros(len(messages), np.uint16), np.array(times, np.uint64),
+    return MessageTable(data, np.zeros(len(messages), np.uint16), np.array(times, np.uint64),
                  end - lengths, end)
 
 

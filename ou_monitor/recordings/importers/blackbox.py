@@ -27,7 +27,7 @@ from orangebox.reader import Reader
 from orangebox.types import FrameType
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import (
-    CURRENT, DEGREE, Flight, GRAVITY, Inertial, Log, log_of, MotorSpeeds, quiet, Request, RPM,
+    CURRENT, DEGREE, GRAVITY, Inertial, Log, log_of, MotorSpeeds, quiet, Request, RPM,
     Series, SIGNAL, three_axes, THROTTLE, UNKNOWN, VOLTAGE)
 from ou_monitor.records import FloatArray
 
@@ -52,19 +52,18 @@ Headers = dict[str, Any]
 _FIRMWARE = re.compile(r'(Betaflight|Cleanflight|INAV|EmuFlight)\s+(\d+)\.(\d+)\.?(\d*)', re.I)
 
 
-def flights(path: Path) -> tuple[Flight, ...]:
-    """Return the flights in a file, without decoding them."""
+def _sizes(path: Path) -> list[int]:
+    """Return the bytes of each flight in a file, without decoding them."""
     with quiet(path, 'orangebox'):
         pointers = Reader(str(path), None, True).log_pointers
     ends = [*pointers[1:], path.stat().st_size]
-    return tuple(Flight(k + 1, end - begin)
-                 for k, (begin, end) in enumerate(zip(pointers, ends)))
+    return [end - begin for begin, end in zip(pointers, ends)]
 
 
 def read(path: Path, request: Request) -> Log:
     """Read one flight of a blackbox file; the largest when none is named."""
-    held = flights(path)
-    wanted = request.flight or max(held, key=lambda one: one.size, default=Flight(1, 0)).number
+    held = _sizes(path)
+    wanted = request.flight or (held.index(max(held)) + 1 if held else 1)
     notes = []
     if not 1 <= wanted <= len(held):
         raise InputError(f'{path} has no flight {wanted}: it holds {len(held)}')
@@ -107,8 +106,9 @@ def read(path: Path, request: Request) -> Log:
     t = columns['time'] * 1e-6
     if request.flight is None and len(held) > 1:
         # Only this one is decoded; the others are as long as their bytes say.
-        pace = float(t[-1] - t[0]) / max(held[wanted - 1].size, 1) if t.size else 0.0
-        lengths = '; '.join(f'{one.number}: about {pace * one.size:.0f} s' for one in held)
+        pace = float(t[-1] - t[0]) / max(held[wanted - 1], 1) if t.size else 0.0
+        lengths = '; '.join(f'{k + 1}: about {pace * size:.0f} s'
+                            for k, size in enumerate(held))
         notes.insert(0, f'The file holds {len(held)} flights ({lengths}); this is flight '
                      f'{wanted}, the largest: --flight N chooses another.')
     series = [*_battery(t, columns, headers, notes), *_throttles(t, columns, headers)]

@@ -137,14 +137,6 @@ class Series:
         return not bool((np.isfinite(self.values) & (self.values != 0.0)).any())
 
 
-@dataclass(frozen=True)
-class Flight:
-    """One of several flights in a file: number from 1, and its size in bytes."""
-
-    number: int
-    size: int
-
-
 @dataclass(frozen=True, eq=False)
 class Log:
     """What a log file holds."""
