@@ -195,7 +195,7 @@ class PolledInput:
         ends = np.cumsum([len(message) for message in data])
         begins = np.concatenate(([0], ends[:-1]))
         table = MessageTable(b''.join(data), np.zeros(ends.size, np.uint16),
-                      np.arange(ends.size, dtype=np.uint64), begins, ends)
+                             np.arange(ends.size, dtype=np.uint64), begins, ends)
         column = self._reader.read(table)
         # In the place of log times: the number of each that could be read.
         read = np.flatnonzero(kept)[column.log_time.astype(np.int64)]

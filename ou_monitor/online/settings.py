@@ -58,7 +58,6 @@ AUTO = 'auto'
 LAWS = ('constant_noise', 'kalman', 'threshold', 'throttle', 'wiener')
 
 
-
 @dataclass(frozen=True)
 class MonitorSettings:
     """

@@ -28,7 +28,7 @@ from mcap_ros2.decoder import DecoderFactory
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.cdr import (
     Broken, check_extent, DEFAULTS, Definitions, endless, Field, FieldColumn, FieldReader, join,
-    short_name, MessageTable)
+    MessageTable, short_name)
 from ou_monitor.recordings.mcap_file import (
     ABOUT, custom_data, McapFile, moment, MOST_BYTES, MOST_NODES, ORIGIN, SAMPLE_RATE, Span)
 from ou_monitor.recordings.standard_types import SCHEMAS, TYPE_HASHES

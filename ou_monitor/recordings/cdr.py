@@ -313,7 +313,7 @@ class MessageTable:
         if mask.all():
             return self
         return MessageTable(self.data, self.channel[mask], self.log_time[mask], self.begin[mask],
-                     self.end[mask])
+                            self.end[mask])
 
     def rows(self, picked: IntArray, length: int) -> Rows:
         """Return messages of one length in bytes as rows."""

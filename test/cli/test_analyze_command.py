@@ -1,9 +1,9 @@
 """`ou-monitor analyze`: CSV in; table, JSON and page out; every bad input one line."""
 
-import json
 import math
 import re
 
+from command_line import failure, strict, write_csv
 import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.model.ou import simulate
@@ -22,32 +22,8 @@ def flight(tmp_path_factory):
     sigma = np.where(t < SECONDS, SIGMA[0.1], SIGMA[0.4])
     voltage = simulate(t, ALPHA, sigma, np.random.default_rng(1), u0=5.0 - 0.5 * throttle)
     path = tmp_path_factory.mktemp('csv') / 'flight <b>.csv'
-    write(path, t, voltage, throttle)
+    write_csv(path, t, voltage, throttle)
     return path
-
-
-def write(path, t, voltage, throttle=None):
-    """Write a CSV as the contract has it."""
-    columns = [t, voltage] if throttle is None else [t, voltage, throttle]
-    np.savetxt(path, np.column_stack(columns), '%.9g', ',', comments='',
-               header=','.join(['time_s', 'voltage_v', 'throttle'][:len(columns)]))
-
-
-def strict(text):
-    """Parse JSON; NaN and Infinity are errors."""
-    def refuse(word):
-        raise ValueError(f'{word} is not JSON')
-
-    return json.loads(text, parse_constant=refuse)
-
-
-def failure(capsys, *argv):
-    """Run a command that must fail; return its one line."""
-    assert main([str(word) for word in argv]) == 2
-    out, err = capsys.readouterr()
-    assert out == ''
-    assert re.fullmatch(r'ou-monitor( analyze)?: [^\n]+\n', err)
-    return err
 
 
 def test_json_on_standard_output_is_alone_and_true(flight, capsys):
@@ -92,7 +68,8 @@ def test_table_fits_a_terminal(flight, capsys):
 def test_it_says_where_voltage_and_throttle_came_from(flight, tmp_path, capsys):
     """Columns of a CSV, with and without throttle; topics and fields of a bag."""
     alone = tmp_path / 'alone.csv'
-    write(alone, np.arange(600) / 100.0, 5.0 + 0.01 * np.random.default_rng(1).normal(size=600))
+    rng = np.random.default_rng(1)
+    write_csv(alone, np.arange(600) / 100.0, 5.0 + 0.01 * rng.normal(size=600))
     for path, words in (
             (flight, r'voltage: column voltage_v; throttle: column throttle'),
             (alone, r'voltage: column voltage_v; throttle: none'),
@@ -123,7 +100,7 @@ def test_report_and_json_files(flight, tmp_path, capsys):
 def test_unknown_is_null(tmp_path, capsys):
     """A stuck sensor without throttle: status and nulls, exit status 0."""
     path = tmp_path / 'stuck.csv'
-    write(path, np.arange(100) / 100.0, np.full(100, 5.0))
+    write_csv(path, np.arange(100) / 100.0, np.full(100, 5.0))
     assert main(['analyze', str(path), '--json', '-']) == 0
     (level,) = strict(capsys.readouterr().out)['levels']
     assert level['throttle'] is None and level['sigma'] is None
@@ -165,7 +142,7 @@ def test_bad_recordings_are_named(tmp_path, content, word, capsys):
 def test_levels_need_a_throttle(tmp_path, capsys):
     """--levels on a recording without throttle cannot be meant."""
     path = tmp_path / 'plain.csv'
-    write(path, np.arange(100) / 100.0, 5.0 + 0.01 * np.sin(np.arange(100)))
+    write_csv(path, np.arange(100) / 100.0, 5.0 + 0.01 * np.sin(np.arange(100)))
     assert 'no throttle' in failure(capsys, 'analyze', path, '--levels', '0.1')
 
 

@@ -4,6 +4,7 @@ import json
 import re
 from xml.etree import ElementTree
 
+from command_line import failure
 import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.model.supply import SupplyModel
@@ -99,15 +100,6 @@ def test_the_page_shows_the_traces_first(folder, tmp_path, capsys):
     assert names.index('figure') == names.index('headline') + 1
     assert 'measured' in text and 'one simulation' in text
     assert '--seeds 20' in text and '--model' in text
-
-
-def failure(capsys, *argv):
-    """Run a command that must fail; return its one line."""
-    assert main([str(word) for word in argv]) == 2
-    out, err = capsys.readouterr()
-    assert out == ''
-    assert re.fullmatch(r'ou-monitor compare: [^\n]+\n', err)
-    return err
 
 
 @pytest.mark.parametrize('options, words', [

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 import re
 
+from command_line import failure
 import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.model.ou import simulate
@@ -80,15 +81,6 @@ def found(capsys, *argv):
     return json.loads(out)
 
 
-def failure(capsys, *argv):
-    """Run a command that must fail; return its one line."""
-    assert main(['coupling', *map(str, argv)]) == 2
-    out, err = capsys.readouterr()
-    assert out == ''
-    assert re.fullmatch(r'ou-monitor( coupling)?: [^\n]+\n', err)
-    return err
-
-
 def test_column_and_field_path_say_the_same(table, bag, capsys):
     """The gain is within its interval from either file."""
     one = found(capsys, table, '--signal', 'gyro_x')
@@ -110,8 +102,8 @@ def test_a_csv_with_other_names_and_units(series, tmp_path, capsys):
     data = found(capsys, path, '--signal', 'gyro', '--time-column', 'ms', '--time-unit', 'ms',
                  '--voltage-column', 'mv', '--unit', 'mV', '--throttle-column', 'duty')
     assert data['seen'] and data['gain_ci95'][0] <= GAIN <= data['gain_ci95'][1]
-    assert 'not a signal' in failure(capsys, path, '--signal', 'ms', '--time-column', 'ms',
-                                     '--voltage-column', 'mv')
+    assert 'not a signal' in failure(capsys, 'coupling', path, '--signal', 'ms',
+                                     '--time-column', 'ms', '--voltage-column', 'mv')
 
 
 def test_a_part(table, bag, capsys):
@@ -122,7 +114,7 @@ def test_a_part(table, bag, capsys):
         assert data['duration_s'] == pytest.approx(12.0, abs=0.1) and low <= GAIN <= high
         assert data['dropped'] == {'voltage': 0, 'signal': 0}
         assert any('from 4 s to 16 s' in note for note in data['notes'])
-    assert "--to: '-1'" in failure(capsys, table, '--signal', 'gyro_x', '--to', '-1')
+    assert "--to: '-1'" in failure(capsys, 'coupling', table, '--signal', 'gyro_x', '--to', '-1')
 
 
 def test_none_is_said_with_the_limit(table, capsys):
@@ -161,7 +153,7 @@ def test_the_page(table, tmp_path, capsys):
         html.index('What the voltage and the signal share'))
     # Not again without being asked to.
     assert 'exists already: --force' in failure(
-        capsys, table, '--signal', 'gyro_x', '--report', target)
+        capsys, 'coupling', table, '--signal', 'gyro_x', '--report', target)
 
 
 @pytest.mark.parametrize('options, words', [
@@ -178,7 +170,7 @@ def test_bad_input_is_one_line(table, options, words, capsys):
         assert main(['coupling', str(table)]) == 2
         assert words in capsys.readouterr().err
         return
-    assert words in failure(capsys, table, *options)
+    assert words in failure(capsys, 'coupling', table, *options)
 
 
 @pytest.mark.parametrize('signal, words', [
@@ -188,7 +180,7 @@ def test_bad_input_is_one_line(table, options, words, capsys):
 ])
 def test_a_signal_that_a_bag_lacks_is_one_line(bag, signal, words, capsys):
     """Topic, field and path."""
-    assert words in failure(capsys, bag, '--signal', signal)
+    assert words in failure(capsys, 'coupling', bag, '--signal', signal)
 
 
 @pytest.fixture
@@ -228,4 +220,4 @@ def test_a_log_is_taken_as_it_is(logs, tmp_path, capsys):
             (['--signal', 'motor[0]', '--msg-config', 'x'], 'is for bags'),
             (['--signal', 'motor[0]', '--flight', '2'], 'no flight 2'),
             (['--signal', 'motor[0]', '--from', '90'], 'holds no sample')):
-        assert words in failure(capsys, path, *arguments)
+        assert words in failure(capsys, 'coupling', path, *arguments)

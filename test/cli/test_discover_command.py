@@ -1,11 +1,11 @@
 """`ou-monitor discover`: CSV in; summary, JSON, model and page out; bad input one line."""
 
 from dataclasses import replace
-import json
 import math
 import re
 from xml.etree import ElementTree
 
+from command_line import failure, strict, write_csv
 import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.criticism.samples import Samples
@@ -37,33 +37,8 @@ def flight(tmp_path_factory):
     u = np.repeat(rng.random(31), 200)[:t.size]
     v = SupplyModel((OU(63.0, 0.3156, 5.0), LoadSag(0.6, 0.0))).simulate(t, rng, u)
     path = tmp_path_factory.mktemp('csv') / 'my flight.csv'
-    write(path, t, v, u)
+    write_csv(path, t, v, u)
     return path
-
-
-def write(path, t, voltage, throttle=None):
-    """Write a CSV as the contract has it."""
-    columns = [t, voltage] if throttle is None else [t, voltage, throttle]
-    np.savetxt(path, np.column_stack(columns), '%.9g', ',', comments='',
-               header=','.join(['time_s', 'voltage_v', 'throttle'][:len(columns)]))
-
-
-def strict(text):
-    """Parse JSON; NaN and Infinity are errors."""
-    def refuse(word):
-        raise ValueError(f'{word} is not JSON')
-
-    return json.loads(text, parse_constant=refuse)
-
-
-def failure(capsys, *argv):
-    """Run a command that must fail; return its one line."""
-    assert main([str(word) for word in argv]) == 2
-    out, err = capsys.readouterr()
-    # The finding is told even where its model is refused.
-    assert out == '' or '--save-model' in argv
-    assert re.fullmatch(r'ou-monitor discover: [^\n]+\n', err)
-    return err
 
 
 def test_json_on_standard_output_is_alone(flight, capsys):
@@ -126,7 +101,7 @@ def test_summary_model_and_page(flight, tmp_path, capsys):
 def test_too_short_is_a_result(tmp_path, capsys):
     """Exit 0 with the reason; but there is no model to save."""
     path = tmp_path / 'short.csv'
-    write(path, np.array([0.0, 0.1]), np.array([5.0, 5.1]))
+    write_csv(path, np.array([0.0, 0.1]), np.array([5.0, 5.1]))
     assert main(['discover', str(path)]) == 0
     assert 'at least' in capsys.readouterr().out
     err = failure(capsys, 'discover', path, '--save-model', tmp_path / 'm.yaml')
@@ -136,7 +111,7 @@ def test_too_short_is_a_result(tmp_path, capsys):
 def test_too_short_still_writes_all_but_the_model(tmp_path, capsys):
     """Report and JSON tell the verdict; the one line, that there is no model."""
     path, data, page = (tmp_path / name for name in ('short.csv', 'd.json', 'r.html'))
-    write(path, np.array([0.0, 0.1]), np.array([5.0, 5.1]))
+    write_csv(path, np.array([0.0, 0.1]), np.array([5.0, 5.1]))
     words = ['discover', path, '--save-model', tmp_path / 'm.yaml', '--report', page, '--json']
     assert 'no model' in failure(capsys, *words, data)
     assert strict(data.read_text())['verdict'] == 'insufficient_data'

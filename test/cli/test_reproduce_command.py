@@ -1,29 +1,11 @@
 """`ou-monitor reproduce` as a user meets it."""
 
-import json
-import re
 from xml.etree import ElementTree
 
+from command_line import failure, strict
 from ou_monitor.cli.main import main
 from ou_monitor.paper.reproduce import reproduce as module
 import pytest
-
-
-def strict(text):
-    """Parse JSON; NaN and Infinity are errors."""
-    def refuse(word):
-        raise ValueError(f'{word} is not JSON')
-
-    return json.loads(text, parse_constant=refuse)
-
-
-def failure(capsys, *argv):
-    """Run a command that must fail; return its one line."""
-    assert main([str(word) for word in argv]) == 2
-    out, err = capsys.readouterr()
-    assert out == ''
-    assert re.fullmatch(r'ou-monitor( reproduce)?: [^\n]+\n', err)
-    return err
 
 
 def test_table_json_and_report(tmp_path, capsys, monkeypatch):

@@ -4,12 +4,12 @@ import json
 import math
 import os
 from pathlib import Path
-import re
 import signal
 import subprocess
 import sys
 import time
 
+from command_line import failure
 import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.errors import InputError
@@ -31,14 +31,6 @@ MODEL = """model:
 def simulate(*argv):
     """Run the command; it must succeed."""
     assert main(['simulate', *(str(word) for word in argv)]) == 0
-
-
-def failure(capsys, *argv):
-    """Run a command that must fail; return its one line."""
-    assert main(['simulate', *(str(word) for word in argv)]) == 2
-    out, err = capsys.readouterr()
-    assert out == '' and re.fullmatch(r'ou-monitor( simulate)?: [^\n]+\n', err), out + err
-    return err
 
 
 @pytest.mark.parametrize('name', ['a.mcap', 'folder'])
@@ -209,15 +201,15 @@ def test_throttle_of_blocks(tmp_path):
 ])
 def test_bad_options_leave_nothing(tmp_path, options, words, capsys):
     """One line with the option or the value, status 2, and no file."""
-    assert words in failure(capsys, '--output', tmp_path / 'a.mcap', *options)
+    assert words in failure(capsys, 'simulate', '--output', tmp_path / 'a.mcap', *options)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_output_is_needed(tmp_path, monkeypatch, capsys):
     """Without it there is nowhere to go, nor anything to tell."""
     monkeypatch.chdir(tmp_path)
-    assert '--output' in failure(capsys, '--preset', 'idle')
-    assert '--json' in failure(capsys, '--save-model', 'm.yaml', '--json', '-')
+    assert '--output' in failure(capsys, 'simulate', '--preset', 'idle')
+    assert '--json' in failure(capsys, 'simulate', '--save-model', 'm.yaml', '--json', '-')
 
 
 @pytest.mark.parametrize('name', ['a.mcap', 'a'])
@@ -227,10 +219,10 @@ def test_nothing_is_overwritten(tmp_path, name, capsys):
     simulate('--preset', 'idle', '--duration', 1, '--output', path)
     before = {p: p.read_bytes() for p in tmp_path.rglob('*') if p.is_file()}
     capsys.readouterr()
-    assert 'exists already' in failure(capsys, '--preset', 'idle', '--duration', '2', '--output',
-                                       path)
+    assert 'exists already' in failure(capsys, 'simulate', '--preset', 'idle',
+                                       '--duration', '2', '--output', path)
     assert {p: p.read_bytes() for p in tmp_path.rglob('*') if p.is_file()} == before
-    assert 'no folder' in failure(capsys, '--output', tmp_path / 'none' / 'b.mcap')
+    assert 'no folder' in failure(capsys, 'simulate', '--output', tmp_path / 'none' / 'b.mcap')
 
 
 @pytest.mark.parametrize('name', ['a.mcap', 'a'])
@@ -246,7 +238,7 @@ def test_nothing_is_overwritten(tmp_path, name, capsys):
 def test_an_error_half_way_leaves_nothing(tmp_path, name, model, words, capsys):
     """A model that cannot be read, or whose simulation fails when the bag is open."""
     (tmp_path / 'm.yaml').write_text(model)
-    assert words in failure(capsys, '--model', tmp_path / 'm.yaml', '--duration', 100,
+    assert words in failure(capsys, 'simulate', '--model', tmp_path / 'm.yaml', '--duration', 100,
                             '--output', tmp_path / name)
     assert [p.name for p in tmp_path.iterdir()] == ['m.yaml']
 

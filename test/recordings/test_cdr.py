@@ -11,7 +11,7 @@ import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings import standard_types as cdr
 from ou_monitor.recordings.bag import parse_definition
-from ou_monitor.recordings.cdr import FieldReader, join, seconds, MessageTable
+from ou_monitor.recordings.cdr import FieldReader, join, MessageTable, seconds
 from ou_monitor.recordings.standard_types import SCHEMAS
 from ou_monitor.stream.config import Extractor, FieldSpec
 import pytest
@@ -33,7 +33,7 @@ def table_of(messages, times=None):
     end = np.cumsum(steps + lengths)
     times = np.arange(len(messages)) * 10**7 + 5 if times is None else times
     return MessageTable(data, np.zeros(len(messages), np.uint16), np.array(times, np.uint64),
-                 end - lengths, end)
+                        end - lengths, end)
 
 
 def general_decoder(kind, text):

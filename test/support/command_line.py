@@ -1,0 +1,32 @@
+"""What tests of several commands do: write a CSV, read strict JSON, see a command fail."""
+
+import json
+import re
+
+import numpy as np
+from ou_monitor.cli.main import main
+
+
+def write_csv(path, t, voltage, throttle=None):
+    """Write a CSV as the contract has it."""
+    columns = [t, voltage] if throttle is None else [t, voltage, throttle]
+    np.savetxt(path, np.column_stack(columns), '%.9g', ',', comments='',
+               header=','.join(['time_s', 'voltage_v', 'throttle'][:len(columns)]))
+
+
+def strict(text):
+    """Parse JSON; NaN and Infinity are errors."""
+    def refuse(word):
+        raise ValueError(f'{word} is not JSON')
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def failure(capsys, command, *argv):
+    """Run a command that must fail; return its one line."""
+    assert main([command, *map(str, argv)]) == 2
+    out, err = capsys.readouterr()
+    # The finding is told even where its model is refused.
+    assert out == '' or '--save-model' in argv
+    assert re.fullmatch(rf'ou-monitor( {command})?: [^\n]+\n', err), out + err
+    return err
