@@ -12,8 +12,8 @@ from pathlib import Path
 import sys
 import time
 
-from ou_monitor.comparison.agreement import Agreement, Band
 from ou_monitor.comparison.compare import compare
+from ou_monitor.comparison.yardstick import Agreement, Band
 from ou_monitor.recordings.read import read_recording
 from real_flights import FLIGHTS
 from tables import put, table

@@ -11,10 +11,10 @@ from collections.abc import Callable
 import math
 
 import numpy as np
-from ou_monitor.comparison.agreement import Agreement, SpectrumBand, Traces
 from ou_monitor.comparison.flight_model import (
     Drawn, FiledModel, fit_flight, FlightModel, MOVES, Readings)
-from ou_monitor.comparison.yardstick import band, differences, distance, judge, Measures, Yardstick
+from ou_monitor.comparison.yardstick import (
+    Agreement, band, differences, distance, judge, Measures, SpectrumBand, Traces, Yardstick)
 from ou_monitor.criticism.curves import stray
 from ou_monitor.criticism.readings import current_at, usable, why_nothing
 from ou_monitor.criticism.repeats import without_repeats

@@ -1,9 +1,9 @@
 """A recording beside its simulations: what is like it, what differs, and which is worst."""
 
 import numpy as np
-from ou_monitor.comparison.agreement import Likeness
 from ou_monitor.comparison.compare import compare
 from ou_monitor.comparison.flight_model import damping, Readings
+from ou_monitor.comparison.yardstick import Likeness
 from ou_monitor.errors import InputError
 from ou_monitor.model.load import LoadModel, lowpass
 from ou_monitor.model.supply import SupplyModel

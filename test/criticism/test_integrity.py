@@ -5,9 +5,8 @@ import tracemalloc
 
 import numpy as np
 from ou_monitor.criticism.adc import find_rails, find_step
-from ou_monitor.criticism.integrity import _judge_step, examine, LEAST
+from ou_monitor.criticism.integrity import _judge_step, examine, judge_stamps, LEAST
 from ou_monitor.criticism.samples import choose_samples, events_between, MOST
-from ou_monitor.criticism.stamps import judge_stamps
 from ou_monitor.model.ou import simulate
 from ou_monitor.records import Recording
 import pytest
