@@ -2,9 +2,15 @@
 
 import signal
 
+from hypothesis import HealthCheck, settings
 import pytest
 
 _ROS = ('nodes/', 'test_package.py', 'test_scripts.py', 'test_readme.py')
+
+
+# A machine that is busy with something else generates examples slowly.
+settings.register_profile('suite', deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile('suite')
 
 
 def pytest_configure():
