@@ -12,7 +12,7 @@ import math
 from typing import Any, NamedTuple
 
 from ou_monitor.nodes.base import MonitorNode
-from ou_monitor.nodes.inputs import INPUT_QOS, Silence, SourceFinder
+from ou_monitor.nodes.inputs import INPUT_QOS, Silence, SourceFinder, within
 from ou_monitor.nodes.sources import Source
 from ou_monitor.records import Status
 
@@ -87,7 +87,7 @@ class SupplyInput:
         at the present throttle, and of the `rate`, 1/s: white noise of the ADC is
         in it, so that it is no less than the supply's own.
         """
-        fresh = _fresh(self._state_heard.age, stale_after)
+        fresh = within(self._state_heard.age, stale_after)
         error, (alpha, throttle, level, level_se, noise) = (
             (self._error, self._known) if fresh else (NAN, [NAN] * len(_FIELDS)))
         why = self._why(fresh, stale_after)
@@ -103,7 +103,7 @@ class SupplyInput:
         age = self._state_heard.age
         if age is None:
             return f'no message on {self._state_topic}'
-        if not _fresh(age, stale_after):
+        if not within(age, stale_after):
             return f'{self._state_topic} has been silent for {age:.1f} s'
         return f'the state on {self._state_topic} has no throttle'
 
@@ -111,7 +111,7 @@ class SupplyInput:
         age = self._heard.age
         if age is None:
             return f'no message on {self._topic}'
-        if not _fresh(age, stale_after):
+        if not within(age, stale_after):
             return f'sigma on {self._topic} is stale, {age:.1f} s old'
         if math.isnan(self._sigma):
             return f'sigma on {self._topic} is not a number, or negative'
@@ -123,10 +123,6 @@ class SupplyInput:
             # It does not follow the throttle.
             return f'sigma is of the last {window:g} s, too long for the filter'
         return ''
-
-
-def _fresh(age: float | None, limit: float) -> bool:
-    return age is not None and age <= limit
 
 
 def _number(values: dict[str, str], key: str) -> float:
@@ -160,8 +156,7 @@ class MotorInputs:
 
     def throttle(self, stale_after: float) -> float:
         """Return the throttle, 0..1; NaN when none younger than `stale_after`, s, came."""
-        age = self._silence['throttle'].age
-        return self._throttle if age is not None and age <= stale_after else NAN
+        return self._throttle if within(self._silence['throttle'].age, stale_after) else NAN
 
     def take_speeds(self) -> list[float]:
         """Return the motor speeds that came since this was asked last; empty: none."""

@@ -22,7 +22,7 @@ import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import MonitorNode
 from ou_monitor.nodes.console import PublisherWatch
-from ou_monitor.nodes.inputs import PolledInput, Silence, SourceFinder
+from ou_monitor.nodes.inputs import PolledInput, Silence, SourceFinder, within
 from ou_monitor.nodes.sources import find_source, Source, SOURCE_PARAMETERS
 from ou_monitor.online.settings import Parameter
 from ou_monitor.recordings.model_file import read_model
@@ -249,8 +249,7 @@ class SupplySimulatorNode(MonitorNode):
 
     @property
     def _idles(self) -> bool:
-        age = self._heard.age
-        return age is None or age > _HOLD
+        return not within(self._heard.age, _HOLD)
 
     # -- the thread
 

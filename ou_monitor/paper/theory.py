@@ -156,14 +156,6 @@ def check_state(u0: npt.ArrayLike, d: int) -> FloatArray:
     return state
 
 
-def check_starts(u0: npt.ArrayLike, paths: int, d: int) -> FloatArray:
-    """Return the first states of paths, shape (paths, d), of one for all or one for each."""
-    first = np.atleast_1d(np.asarray(u0, dtype=np.float64))
-    if first.shape not in ((d,), (paths, d)):
-        raise ValueError(f'u0 must have shape ({d},) or ({paths}, {d}), got {first.shape}')
-    return np.array(np.broadcast_to(first, (paths, d)))
-
-
 @dataclass(frozen=True)
 class MatrixModel:
     """
@@ -315,17 +307,11 @@ class Generator:
             raise ValueError(f't must be zero or positive and finite, got {t} s')
         return np.asarray(expm(self.q * t))
 
-    def starts(
-        self, paths: int, rng: np.random.Generator, start: int | None = None,
-    ) -> IntArray:
-        """Return first states, from the stationary law unless one is given."""
+    def starts(self, paths: int, rng: np.random.Generator) -> IntArray:
+        """Return first states, from the stationary law."""
         if paths < 1:
             raise ValueError(f'paths must be 1 or more, got {paths}')
-        if start is None:
-            return np.asarray(rng.choice(self.size, paths, p=self.stationary), dtype=np.intp)
-        if not isinstance(start, (int, np.integer)) or not 0 <= start < self.size:
-            raise ValueError(f'start must be a state 0..{self.size - 1}, got {start}')
-        return np.full(paths, start, dtype=np.intp)
+        return np.asarray(rng.choice(self.size, paths, p=self.stationary), dtype=np.intp)
 
     def segments(
         self, edges: FloatArray, state: IntArray, rng: np.random.Generator,
@@ -448,11 +434,6 @@ class SwitchedSystem:
         return cls(generator, np.array([one.matrix for one in systems]),
                    np.array([one.offset for one in systems]))
 
-    @property
-    def dimension(self) -> int:
-        """Return the number of components d of u."""
-        return int(self.matrices.shape[1])
-
     def averaged(self) -> AffineSystem:
         """Return the averaged system du/dt = C_hat(u) = sum_x pi(x) C(u; x)."""
         pi = self.generator.stationary
@@ -488,13 +469,12 @@ class SwitchedSystem:
     def simulate(
         self, t: npt.ArrayLike, u0: npt.ArrayLike, rng: np.random.Generator, *,
         eps: float = 1.0, paths: int = 1, scaling: Scaling = 'averaging',
-        start: int | None = None,
     ) -> FloatArray:
         """Draw paths, exact between the jumps and exact in the jumps (t in s)."""
-        at_eps, times, d = self.scaled(eps, scaling), check_times(t), self.dimension
-        state = at_eps.generator.starts(paths, rng, start)
-        u = check_starts(u0, paths, d)
-        found = np.empty((paths, times.size, d))
+        at_eps, times = self.scaled(eps, scaling), check_times(t)
+        state = at_eps.generator.starts(paths, rng)
+        u = np.tile(check_state(u0, self.matrices.shape[1]), (paths, 1))
+        found = np.empty((paths, times.size, u.shape[1]))
         found[:, 0] = u
         with np.errstate(over='ignore', invalid='ignore'):
             for k, which, at, dt in at_eps.generator.segments(times, state, rng):

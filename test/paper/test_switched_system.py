@@ -92,14 +92,6 @@ def test_simulation_has_the_exact_moments(eps, scaling):
         assert (np.abs(products.mean(axis=0) - covariance) < error).all()
 
 
-def test_the_start_of_the_chain_is_respected():
-    """Before the first jump u follows the state asked for: most paths, over a short time."""
-    system = SwitchedSystem(CYCLE, np.zeros((3, 1, 1)), np.array([[1.0], [10.0], [100.0]]))
-    for start, speed in enumerate((1.0, 10.0, 100.0)):
-        u = system.simulate([0.0, 1e-3], [0.0], np.random.default_rng(1), paths=50, start=start)
-        assert np.median(u[:, 1, 0]) == pytest.approx(speed * 1e-3, rel=1e-12)
-
-
 def test_balanced_changes_nothing_at_eps_one():
     """Same moments; and the switched part averages to zero."""
     balanced = PAPER.balanced()

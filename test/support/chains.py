@@ -23,10 +23,10 @@ def vector_system() -> SwitchedSystem:
         np.array([0.5, 0.0]))
 
 
-def drawn(chain, edges, paths, rng, start=None):
+def drawn(chain, edges, paths, rng):
     """Return states on a grid, (paths, k), and times spent between, (paths, k - 1, states)."""
     grid = np.asarray(edges, dtype=np.float64)
-    state = chain.starts(paths, rng, start)
+    state = chain.starts(paths, rng)
     states = np.empty((paths, grid.size), dtype=np.intp)
     states[:, 0] = state
     spent = np.zeros((paths, grid.size - 1, chain.size))
