@@ -78,7 +78,10 @@ def test_the_page_lists_every_field(rig):
     table = page.split('## Fields of')[1].split('\n## ')[0]
     firsts = re.findall(r'^\| (`.*?) \|', table, re.MULTILINE)
     listed = [name for first in firsts for name in re.findall(r'`(\w+)`', first)]
-    assert sorted(listed) == sorted(values_of(rig.status))
+    # The comparison with a model is there with a model only.
+    always = [name for name in listed if not re.fullmatch(
+        r'model_(verdict|words|\w+_ratio)', name)]
+    assert sorted(always) == sorted(values_of(rig.status))
 
 
 def test_stamps_that_stop_are_named_and_hide_no_dip(rig):
