@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 
 from ou_monitor.bench import analyze
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
-    check_outputs, limit_given, part_of_recording, positive_number, read_given, repeated,
+    check_outputs, command_line, given, limit_given, part_of_recording, read_given,
     throttle_levels)
+from ou_monitor.cli.options import POSITIVE
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
 
@@ -18,8 +18,8 @@ def run(args: argparse.Namespace) -> int:
     """Run the command."""
     check_outputs(args, 'report', RECORDING=args.recording, **{'--msg-config': args.msg_config})
     levels = throttle_levels(args.levels)
-    window = positive_number('--window', args.window)
-    horizon = positive_number('--brownout-horizon', args.brownout_horizon)
+    window = given('--window', args.window, POSITIVE)
+    horizon = given('--brownout-horizon', args.brownout_horizon, POSITIVE)
     limit = limit_given(args)
     _in_range(limit['brownout_voltage'], horizon)
     start, end = part_of_recording(args.start, args.end)
@@ -27,14 +27,9 @@ def run(args: argparse.Namespace) -> int:
     with Progress('analyzing', args.json == output.STDOUT) as progress:
         found = analyze(recording, levels=levels, window=window, brownout_horizon=horizon,
                         progress=progress, **limit)
-    output.deliver(args, found, command_line(args))
+    output.deliver(args, found, command_line(
+        args, 'analyze', 'levels', 'window', 'brownout_voltage', 'cells', 'brownout_horizon'))
     return 0
-
-
-def command_line(args: argparse.Namespace) -> str:
-    """Return the command that repeats this analysis."""
-    return shlex.join(['ou-monitor', 'analyze', args.recording, *repeated(
-        args, 'levels', 'window', 'brownout_voltage', 'cells', 'brownout_horizon')])
 
 
 def _in_range(voltage: float | None, horizon: float) -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import math
-from typing import Any, TYPE_CHECKING
+from collections.abc import Callable
+import shlex
+from typing import Any, TYPE_CHECKING, TypeVar
 
 from ou_monitor.analysis.crafts import CELL_LIMIT
 from ou_monitor.cli import output
+from ou_monitor.cli.options import number, POSITIVE, TIME
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
 
@@ -15,7 +17,7 @@ if TYPE_CHECKING:
     from ou_monitor.recordings.importers.log import CsvColumns, Series
     from ou_monitor.records import Recording
 
-_NAN = float('nan')
+Number = TypeVar('Number', int, float)
 # No lithium cell is ever charged to it, V.
 _CELL_MOST = 5.0
 # Fields of `CsvColumns`, and the options that give them.
@@ -85,22 +87,24 @@ def repeated(args: argparse.Namespace, *names: str) -> list[str]:
     return words + (['--partial'] if args.partial else [])
 
 
-def positive_number(option: str, text: str) -> float:
-    """Return the number of an option."""
+def command_line(args: argparse.Namespace, command: str, *names: str) -> str:
+    """Return the command that repeats this one, with some of its options."""
+    return shlex.join(['ou-monitor', command, args.recording, *repeated(args, *names)])
+
+
+def given(option: str, text: str, read: Callable[[str], Number]) -> Number:
+    """Return the number of an option, as one of `options` reads it."""
     try:
-        value = float(text)
-    except ValueError:
-        value = _NAN
-    if not (math.isfinite(value) and value > 0.0):
-        raise InputError(f"{option}: '{text}' is not a positive number")
-    return value
+        return read(text)
+    except argparse.ArgumentTypeError as error:
+        raise InputError(f'{option}: {error}') from None
 
 
 def brownout_limit(args: argparse.Namespace) -> float | None:
     """Return the limit of ``--brownout-voltage`` and ``--cells``, V; None when there is none."""
     if args.brownout_voltage is None:
         return None if args.cells is None else args.cells * CELL_LIMIT
-    voltage = positive_number('--brownout-voltage', args.brownout_voltage)
+    voltage = given('--brownout-voltage', args.brownout_voltage, POSITIVE)
     if args.cells is None:
         return voltage
     if voltage > _CELL_MOST:
@@ -119,17 +123,9 @@ def throttle_levels(text: str | None) -> tuple[float, ...] | None:
     """Return the levels of ``--levels 0,0.05,...``, in order; None when not given."""
     if text is None:
         return None
-    levels = []
-    for word in text.split(','):
-        try:
-            value = float(word)
-        except ValueError:
-            value = _NAN
-        if not 0.0 <= value <= 1.0:
-            raise InputError(f"--levels: '{word.strip()}' is not a throttle between 0 and 1; "
-                             'write 5 % as 0.05 and separate levels by commas')
-        levels.append(value)
-    ordered = sorted(levels)
+    throttle = number('a throttle between 0 and 1; write 5 % as 0.05 and separate levels by '
+                      'commas', lambda value: 0.0 <= value <= 1.0)
+    ordered = sorted(given('--levels', word.strip(), throttle) for word in text.split(','))
     if any(high - low < 1e-6 for low, high in zip(ordered, ordered[1:])):
         raise InputError(f"--levels: a level is given twice in '{text}'")
     return tuple(ordered)
@@ -137,16 +133,8 @@ def throttle_levels(text: str | None) -> tuple[float, ...] | None:
 
 def part_of_recording(start: str | None, end: str | None) -> tuple[float | None, float | None]:
     """Return the ends of ``--from`` and ``--to``, s; None where there is none."""
-    found: list[float | None] = []
-    for option, text in (('--from', start), ('--to', end)):
-        try:
-            value = None if text is None else float(text)
-        except ValueError:
-            value = _NAN
-        if value is not None and not (math.isfinite(value) and value >= 0.0):
-            raise InputError(f"{option}: '{text}' is not a time in seconds, 0 or more")
-        found.append(value)
-    first, last = found
+    first, last = (None if text is None else given(option, text, TIME)
+                   for option, text in (('--from', start), ('--to', end)))
     if first is not None and last is not None and not first < last:
         raise InputError(f'--from {start} is not before --to {end}')
     return first, last

@@ -10,8 +10,8 @@ import math
 from typing import Any
 
 from ou_monitor.cli.options import (
-    CSV, estimate, FILES, flight_number, FORCE, JSON, levels, limit, Option, PART, pole_count,
-    RECORDING, REPORT, seed, TOPICS, TYPES, WithoutOut)
+    CSV, estimate, FILES, FLIGHT, FORCE, JSON, levels, limit, Option, PART, RECORDING, REPORT,
+    seed, TOPICS, TYPES, whole, WithoutOut)
 from ou_monitor.cli.output import path_argument
 
 
@@ -114,9 +114,9 @@ _CONVERT = Command(
      Option('--imu', metavar='NAME', action='append', default=[],
             help="which gyro becomes /imu, or 'none'; may be given several times (default: the "
             'first of the list)'),
-     Option('--poles', metavar='N', type=pole_count,
+     Option('--poles', metavar='N', type=whole('an even number from 2 on', 2, step=2),
             help='magnets of a rotor, for eRPM (default: as the log says)'),
-     Option('--flight', metavar='N', type=flight_number,
+     Option('--flight', metavar='N', type=FLIGHT,
             help='which flight of a file with several, from 1 (default: the largest)'),
      Option('--type', choices=TYPES, default='battery_state',
             help='message of the voltage (default %(default)s; adc_block needs a steady 10 kHz)'),

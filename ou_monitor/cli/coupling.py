@@ -5,19 +5,21 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 import math
-import shlex
 
 from ou_monitor.bench import coupling
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
-    check_outputs, limit_given, part_of_recording, read_given_beside, repeated)
+    check_outputs, command_line, given, limit_given, part_of_recording, read_given_beside)
+from ou_monitor.cli.options import number
 from ou_monitor.errors import InputError
+
+_LEVEL = number('a probability between 0 and 1', lambda value: 0.0 < value < 1.0)
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
     check_outputs(args, 'report', RECORDING=args.recording, **{'--msg-config': args.msg_config})
-    band, level, limit = _band(args.band), _level(args.level), limit_given(args)
+    band, level, limit = _band(args.band), given('--level', args.level, _LEVEL), limit_given(args)
     start, end = part_of_recording(args.start, args.end)
     recording, series = read_given_beside(args, start, end)
     t, values = series.t, series.values
@@ -27,14 +29,9 @@ def run(args: argparse.Namespace) -> int:
         t, values = t[part], values[part]
     found = coupling(recording, replace(series, name=args.signal, t=t, values=values), band=band,
                      level=level, **limit)
-    output.deliver(args, found, command_line(args))
+    output.deliver(args, found, command_line(
+        args, 'coupling', 'signal', 'band', 'level', 'brownout_voltage', 'cells'))
     return 0
-
-
-def command_line(args: argparse.Namespace) -> str:
-    """Return the command that repeats this."""
-    return shlex.join(['ou-monitor', 'coupling', args.recording, *repeated(
-        args, 'signal', 'band', 'level', 'brownout_voltage', 'cells')])
 
 
 def _band(text: str | None) -> tuple[float, float] | None:
@@ -47,13 +44,3 @@ def _band(text: str | None) -> tuple[float, float] | None:
     if not (0.0 < low < high and math.isfinite(high)):
         raise InputError(f"--band: '{text}' must be two frequencies, 0 < LOW < HIGH")
     return low, high
-
-
-def _level(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.0 < value < 1.0:
-        raise InputError(f"--level: '{text}' is not a probability between 0 and 1")
-    return value

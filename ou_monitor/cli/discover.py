@@ -6,14 +6,13 @@ import argparse
 from dataclasses import replace
 from datetime import datetime, timezone
 import math
-import shlex
 from typing import TYPE_CHECKING
 
 from ou_monitor import __version__
 from ou_monitor.bench import discover
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
-    check_outputs, limit_given, part_of_recording, read_given, repeated)
+    check_outputs, command_line, limit_given, part_of_recording, read_given)
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
 
@@ -32,7 +31,8 @@ def run(args: argparse.Namespace) -> int:
     recording = read_given(args, start, end)
     with Progress('discovering', args.json == output.STDOUT) as progress:
         finding = discover(recording, seed=args.seed, progress=progress, **limit)
-    output.deliver(args, finding, command_line(args),
+    output.deliver(args, finding, command_line(
+        args, 'discover', 'seed', 'brownout_voltage', 'cells'),
                    model=args.save_model if args.force or not finding.refused else None)
     if args.save_model is not None:
         # Last: that there is none must not keep the others from being written.
@@ -41,12 +41,6 @@ def run(args: argparse.Namespace) -> int:
                              '--force saves it all the same')
         output.write_text(model_text(finding.record, recording), args.save_model)
     return 0
-
-
-def command_line(args: argparse.Namespace) -> str:
-    """Return the command that repeats this discovery."""
-    return shlex.join(['ou-monitor', 'discover', args.recording, *repeated(
-        args, 'seed', 'brownout_voltage', 'cells')])
 
 
 def model_text(finding: Finding, recording: Recording | None = None) -> str:

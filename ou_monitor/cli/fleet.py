@@ -13,7 +13,8 @@ from typing import Any, TYPE_CHECKING
 from ou_monitor import __version__
 from ou_monitor.cli import output
 from ou_monitor.cli.arguments import (
-    brownout_limit, positive_number, repeated, throttle_levels)
+    brownout_limit, given, repeated, throttle_levels)
+from ou_monitor.cli.options import POSITIVE, whole
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import how_to_install, InputError
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from ou_monitor.fleet.fleet import Fleet
 
 TABLE, REPORT = 'fleet.parquet', 'fleet.html'
+_WORKERS = whole('a number of processes from 1 to 1024', 1, 1024)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -31,7 +33,8 @@ def run(args: argparse.Namespace) -> int:
         raise InputError('--output: the path is empty')
     if args.scheduler is not None and args.workers is not None:
         raise InputError('--workers is for local processes, --scheduler for a cluster: give one')
-    workers = usable_cores() if args.workers is None else _count('--workers', args.workers)
+    workers = usable_cores() if args.workers is None else given(
+        '--workers', args.workers, _WORKERS)
     _check_installed(args)
     folder = Path(args.output)
     if folder.exists() and not folder.is_dir():
@@ -128,18 +131,8 @@ def _options(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
         from ou_monitor.stream.config import load_msg_config
         load_msg_config(config)
     return Options(
-        levels=throttle_levels(args.levels), window=positive_number('--window', args.window),
+        levels=throttle_levels(args.levels), window=given('--window', args.window, POSITIVE),
         brownout_voltage=math.nan if (limit := brownout_limit(args)) is None else limit,
-        brownout_horizon=positive_number('--brownout-horizon', args.brownout_horizon),
+        brownout_horizon=given('--brownout-horizon', args.brownout_horizon, POSITIVE),
         msg_config=config, voltage_topic=args.voltage_topic, throttle_topic=args.throttle_topic,
         partial=args.partial, discover=args.discover, seed=args.seed), more
-
-
-def _count(option: str, text: str) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        value = 0
-    if not 1 <= value <= 1024:
-        raise InputError(f"{option}: '{text}' is not a number of processes from 1 to 1024")
-    return value

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
+import math
 from typing import Any
 
 
@@ -26,19 +28,32 @@ class WithoutOut(argparse.Action):
                 action.required = False
 
 
-def flight_number(text: str) -> int:
-    """Return the number of a flight, from 1."""
-    if not text.isascii() or not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a number from 1 on")
-    return int(text)
+def whole(what: str, low: int, high: float = math.inf, step: int = 1) -> Callable[[str], int]:
+    """Return what reads a whole number within a range, a multiple of a step; what: in words."""
+    def read(text: str) -> int:
+        if not (text.isascii() and text.isdigit() and low <= int(text) <= high
+                and int(text) % step == 0):
+            raise argparse.ArgumentTypeError(f"'{text}' is not {what}")
+        return int(text)
+    return read
 
 
-def pole_count(text: str) -> int:
-    """Return the magnets of a rotor."""
-    if not text.isascii() or not text.isdigit() or int(text) < 2 or int(text) % 2:
-        raise argparse.ArgumentTypeError(f"'{text}' is not an even number from 2 on")
-    return int(text)
+def number(what: str, fits: Callable[[float], bool]) -> Callable[[str], float]:
+    """Return what reads a number that fits; what: in words."""
+    def read(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not fits(value):
+            raise argparse.ArgumentTypeError(f"'{text}' is not {what}")
+        return value
+    return read
 
+
+FLIGHT = whole('a number from 1 on', 1)
+POSITIVE = number('a positive number', lambda value: 0.0 < value < math.inf)
+TIME = number('a time in seconds, 0 or more', lambda value: 0.0 <= value < math.inf)
 
 RECORDING = Option(
     'recording', metavar='RECORDING',
@@ -59,22 +74,6 @@ TOPICS = (
     Option('--partial', action='store_true', help='use what a truncated file still holds'))
 
 
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value < float('inf'):
-        raise argparse.ArgumentTypeError(f"'{text}' is not a positive number")
-    return value
-
-
-def _row_count(text: str) -> int:
-    if not text.isascii() or not text.isdigit():
-        raise argparse.ArgumentTypeError(f"'{text}' is not a number of lines, 0 or more")
-    return int(text)
-
-
 # How a CSV is written, where it is not read as it should be.
 CSV = (
     Option('--time-column', metavar='NAME', help='column of a CSV (default: found by its name)'),
@@ -84,17 +83,17 @@ CSV = (
     Option('--throttle-unit', choices=('1', '%', 'us'),
            help='of the throttle in a CSV: 0..1, percent, or a pulse of 1000 to 2000 us (default: '
            'found)'),
-    Option('--sample-interval', metavar='S', type=_positive,
+    Option('--sample-interval', metavar='S', type=POSITIVE,
            help='time from row to row of a CSV, s, in place of a column'),
     Option('--delimiter', metavar='C',
            help="what separates the cells of a CSV: a character, 'tab' or 'space' (default: "
            'found)'),
     Option('--decimal', choices=('.', ','), help='decimal mark of a CSV (default: found)'),
-    Option('--skip-rows', metavar='N', type=_row_count,
+    Option('--skip-rows', metavar='N', type=whole('a number of lines, 0 or more', 0),
            help='lines above the header of a CSV (default: found)'))
 # How a log or a CSV is read.
 FILES = (
-    Option('--flight', metavar='N', type=flight_number,
+    Option('--flight', metavar='N', type=FLIGHT,
            help='which flight of a log with several, from 1 (default: the largest)'),
     Option('--voltage-column', metavar='NAME',
            help='column of a CSV (default: found by its name), or series of a log (default: the '
@@ -110,26 +109,14 @@ JSON = Option(
 FORCE = Option('--force', action='store_true', help='overwrite files that exist already')
 REPORT = Option('--report', metavar='FILE.html', help='write a self-contained HTML page')
 # Cells of the largest packs that fly, with room.
-_MOST_CELLS = 28
+_CELLS = whole('a number of cells, 1 to 28', 1, 28)
 TYPES = ('battery_state', 'float32', 'float64', 'adc_block')
-
-
-def _cell_count(text: str) -> int:
-    if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= _MOST_CELLS:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a number of cells, 1 to {_MOST_CELLS}")
-    return int(text)
-
-
-def _seed_number(text: str) -> int:
-    if not text.isascii() or not text.isdigit():
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number, 0 or more")
-    return int(text)
 
 
 def seed(default: int, text: str = 'same seed, same result') -> Option:
     """Return the option of a seed."""
-    return Option('--seed', metavar='N', type=_seed_number, default=default,
-                  help=f'{text} (default: %(default)s)')
+    return Option('--seed', metavar='N', type=whole('a whole number, 0 or more', 0),
+                  default=default, help=f'{text} (default: %(default)s)')
 
 
 def levels(found: str) -> Option:
@@ -141,7 +128,7 @@ def levels(found: str) -> Option:
 def limit(meaning: str) -> tuple[Option, ...]:
     """Return the options of the limit; meaning: what --brownout-voltage does, and its default."""
     return (Option('--brownout-voltage', metavar='V', help=meaning),
-            Option('--cells', metavar='N', type=_cell_count,
+            Option('--cells', metavar='N', type=_CELLS,
                    help='cells in series: --brownout-voltage is then volts a cell (default with '
                    '--cells: 3.3)'))
 
