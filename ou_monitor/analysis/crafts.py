@@ -33,6 +33,8 @@ CELL_LIMIT = 3.3
 # The highest median of this time is the pack before the flight, glitches and noise left out, s.
 _FULL = 0.5
 
+# Cells beyond which a craft is of no known class: the largest known quads have 6.
+_MOST_CELLS = 8
 MICRO, QUAD = '1S micro', 'quad, 2S and more'
 # Class -> craft -> cells, sag and noise at half throttle, V, and resistance at once, Ohm, of the
 # pack; by `supply_facts` in November 2026.
@@ -150,33 +152,36 @@ def stated_limit(source: Mapping[str, str]) -> tuple[int, float] | None:
 def craft_of(recording: Recording, facts: SupplyFacts, given: int = 0) -> Craft:
     """Return how a supply stands among known crafts of its class."""
     cells, source = cells_of(recording, given)
-    kind = '' if not cells else MICRO if cells == 1 else QUAD
+    kind = '' if not 0 < cells <= _MOST_CELLS else MICRO if cells == 1 else QUAD
     if not kind or not recording.has_throttle:
         return Craft(cells, source, full_voltage(recording), '', ())
     low, high = facts.sag.flown
     seen = low - _NEAR <= _AT <= high + _NEAR
+    # Each with its standard error; that of the noise is small beside the factor that is usual.
     values = {
-        'sag': float(np.interp(_AT, facts.sag.throttle, facts.sag.sag_v))
-        if seen and facts.sag.known else NAN,
-        'noise': float(np.interp(_AT, facts.noise.throttle, facts.noise.rms_v)) if seen else NAN,
-        'resistance': facts.resistance.ohm}
+        'sag': [float(np.interp(_AT, facts.sag.throttle, one)) if seen and facts.sag.known else NAN
+                for one in (facts.sag.sag_v, facts.sag.se_v)],
+        'noise': [float(np.interp(_AT, facts.noise.throttle, facts.noise.rms_v)) if seen else NAN,
+                  0.0],
+        'resistance': [facts.resistance.ohm, facts.resistance.se_ohm]}
     found = []
-    for k, (name, value) in enumerate(values.items()):
+    for k, (name, (value, se)) in enumerate(values.items()):
         known = [row[1 + k] / row[0] for row in KNOWN[kind].values()
                  if math.isfinite(row[1 + k])]
         if known:
-            found.append(_measure(name, value / cells, float(np.median(known))))
+            found.append(_measure(name, value / cells, 2.0 * se / cells, float(np.median(known))))
     return Craft(cells, source, full_voltage(recording), kind, tuple(found))
 
 
-def _measure(name: str, value: float, middle: float) -> Measure:
+def _measure(name: str, value: float, reach: float, middle: float) -> Measure:
+    """Judge a value by its interval, value +- reach."""
     usual = middle / _USUAL, middle * _USUAL
-    if not math.isfinite(value):
-        return Measure(name, value, usual, 'unknown', '', '')
-    if usual[0] <= value <= usual[1]:
-        return Measure(name, value, usual, 'usual', '', '')
-    high = value > usual[1]
-    return Measure(name, value, usual, 'high' if high else 'low', *_REASONS[name, high])
+    high = value - reach > usual[1]
+    if high or value + reach < usual[0]:
+        return Measure(name, value, usual, 'high' if high else 'low', *_REASONS[name, high])
+    # Also false for NaN.
+    known = reach <= value and usual[0] <= value <= usual[1]
+    return Measure(name, value, usual, 'usual' if known else 'unknown', '', '')
 
 
 def craft_line(craft: Craft) -> str:

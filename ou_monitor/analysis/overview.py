@@ -113,8 +113,11 @@ def answers(found: Overview) -> list[str]:
         parts.append(f'The voltage fell to {number(least.voltage_v, 4)} V at '
                      f'{number(least.time_s)} s.')
     if found.facts.sag.known:
-        at, sag, _ = found.sag
-        parts.append(f'The rail sags by {volts(sag)} at {100.0 * at:.0f} % throttle.')
+        at, sag, se = found.sag
+        parts.append(f'The rail sags by {volts(sag)} at {100.0 * at:.0f} % throttle.'
+                     if sag > 2.0 * se else
+                     'No sag over throttle can be told from none: at '
+                     f'{100.0 * at:.0f} % throttle it is below {volts(sag + 2.0 * se)}.')
     if found.line is not None and found.line.all_share > _LOUD:
         line = found.line
         what = (f'A line at {number(line.frequency, 4)} Hz makes' if line.lines == 1 else

@@ -16,6 +16,8 @@ from ou_monitor.fleet.judgement import (
 from ou_monitor.records import FloatArray, NAN
 from ou_monitor.text import chance, counted, number, p_words
 
+# Mean voltages of one pack differ by less, even from full to empty under load (4.35 V to 2.8 V).
+_ONE_PACK = 1.6
 # Heads of the table of vehicles.
 VEHICLE_HEADS = ('vehicle', 'flights', 'lowest, V', 'dips', 'sag, V', '/flight',
                  'sigma, V/sqrt(s)', '/flight', 'alpha, 1/s', '/flight')
@@ -148,6 +150,13 @@ def comparison_words(fleet: Fleet) -> list[str]:
     """Return sentences: how recordings were compared, and what so few cannot tell."""
     judged = fleet.judgement
     notes = []
+    for vehicle in fleet.vehicles:
+        means = [row['mean'] for row in fleet.rows if row['vehicle'] == vehicle
+                 and row['mean'] is not None and row['mean'] > 0.0]
+        if means and max(means) > _ONE_PACK * min(means):
+            notes.append(f'{vehicle}: voltages of {number(min(means))} to {number(max(means))} V '
+                         'are those of several supplies, and compared as one: --vehicle-from '
+                         'REGEX, or a folder each, parts them.')
     references = [judged.values[name].curve.reference for name in LOGARITHMIC]
     if all(map(math.isfinite, references)):
         notes.append('sigma and alpha are shown as measured. To be compared they are brought to '

@@ -1,10 +1,13 @@
 """Cells of a pack, and how a supply stands among known crafts."""
 
+from dataclasses import replace
 import json
 
 import numpy as np
 from ou_monitor.analysis.crafts import (
-    cell_count, cells_of, craft_advice, craft_line, craft_of, KNOWN, MICRO, QUAD, stated_limit)
+    _measure, cell_count, cells_of, craft_advice, craft_line, craft_of, KNOWN, MICRO, QUAD,
+    stated_limit)
+from ou_monitor.analysis.overview import answers, overview
 from ou_monitor.analysis.supply import supply_facts
 from ou_monitor.cli.main import main
 from ou_monitor.records import NAN, Recording
@@ -58,10 +61,34 @@ def test_usual_high_and_low():
             assert f'is {verdict}' in craft_line(known) and not craft_advice(craft)
             assert [found[name].remedy in said for said in craft_advice(known)] == (
                 [True] if verdict == 'high' else [])
+    wheel = flown(cells=16)
+    assert craft_of(wheel, supply_facts(wheel)).measures == ()
     micro = flown(cells=1, sag=0.1, noise=0.02)
     found = craft_of(micro, supply_facts(micro))
     assert found.kind == MICRO
     assert {one.name: one.verdict for one in found.measures} == {'sag': 'usual', 'noise': 'high'}
+
+
+def test_a_sag_that_its_error_hides_is_neither_judged_nor_said():
+    """As of a robot whose log has a flag for a throttle: 8 mV a cell, +- volts, is not low."""
+    one = flown(noise=0.3)
+    facts = supply_facts(one)
+    assert 'The rail sags by' in ' '.join(answers(overview(one)))
+    hidden = replace(facts, sag=replace(facts.sag, sag_v=(0.03,) * 11, se_v=(1.0,) * 11))
+    craft = craft_of(one, hidden)
+    assert {one.name: one.verdict for one in craft.measures} == {
+        'sag': 'unknown', 'noise': 'usual', 'resistance': 'unknown'}
+    assert 'sag' not in craft_line(craft)
+    said = ' '.join(answers(replace(overview(one), facts=hidden)))
+    assert 'it is below 2.03 V' in said and 'sags' not in said
+
+
+@pytest.mark.parametrize('value, reach, verdict', [
+    (3.0, 0.5, 'high'), (3.0, 1.5, 'unknown'), (0.2, 0.1, 'low'), (0.2, 0.5, 'unknown'),
+    (1.0, 0.9, 'usual'), (1.0, 1.1, 'unknown'), (NAN, NAN, 'unknown'), (1.0, NAN, 'unknown')])
+def test_a_verdict_is_by_the_interval(value, reach, verdict):
+    """Usual is 0.5 to 2: beyond it with the whole interval, or in it with half of one."""
+    assert _measure('sag', value, reach, 1.0).verdict == verdict
 
 
 def test_the_limit_of_the_log_and_impossible_cells(tmp_path, capsys):

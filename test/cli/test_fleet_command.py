@@ -320,6 +320,22 @@ def test_a_strange_clock_and_a_strange_name(tmp_path, one_process):
         'ms.csv': True, '\\udcff.csv': False}
 
 
+def test_two_packs_in_one_folder_are_said(tmp_path, one_process, capsys):
+    """A 1S and a 3S are one vehicle by their folder: said, for they are compared as one."""
+    made = flight(1, n=1500)
+    for name, factors in (('mixed', (1.0, 3.0)), ('same', (1.0, 1.3))):
+        logs = tmp_path / name
+        logs.mkdir()
+        for k, factor in enumerate(factors):
+            write_csv(Recording(made.t, factor * made.voltage, made.throttle, ''),
+                      logs / f'{k}.csv')
+    assert main(['fleet', str(tmp_path), '--output', str(tmp_path / 'out'), '--json',
+                 str(tmp_path / 'x.json')]) == 0
+    said = [note for note in json.loads((tmp_path / 'x.json').read_text())['notes']
+            if 'several supplies' in note]
+    assert [note.split(':')[0] for note in said] == ['mixed'] and '--vehicle-from' in said[0]
+
+
 def test_missing_extra_is_named(logs, tmp_path, capsys, monkeypatch):
     """Without Dask or Arrow the line says what to install."""
     import importlib.util

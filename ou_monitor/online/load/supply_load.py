@@ -43,7 +43,7 @@ class LoadStatus(enum.Enum):
     NO_DATA = 'No voltage has arrived.'
     NO_THROTTLE = 'Throttle is not known: the level is that under load, the sag is not known.'
     STILL = 'Throttle has not moved: the sag is unknown.'
-    UNCERTAIN = 'Not enough throttle variation yet to estimate the sag.'
+    UNCERTAIN = 'The sag is too uncertain: it needs more changes of throttle.'
     NO_RELATION = ('The voltage does not fall with throttle: check the topic, the unit and the '
                    'sign of throttle.')
 
