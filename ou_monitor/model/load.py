@@ -158,7 +158,7 @@ class LoadModel:
 # Coefficients of x, u, u^3, x after three lags, and inrush, with x = u^1.8 (load/load_filter.py).
 SIZE = 7
 # Its last entries may be left out of a model file.
-_OPTIONAL = 5
+_OPTIONAL = 6
 _COLUMNS = ('coefficients', 'covariance', 'log_variance', 'flown')
 
 
@@ -182,6 +182,7 @@ class LoadStart:
     # Rms, V, of what the answer leaves while throttle moves, and its standard error; 0: unknown.
     noise: float = 0.0
     noise_se: float = 0.0
+    size_se: float = 0.0  # Relative standard error of the size of the answer; 0: unknown.
 
     def __post_init__(self) -> None:
         """Check shapes and signs."""
@@ -192,7 +193,7 @@ class LoadStart:
         if len(self.log_variance) != 3 or len(self.flown) != 2:
             raise ValueError('the load needs 3 numbers of log_variance and 2 of flown')
         positive = (self.discharge, self.resistance, self.resistance_se, self.noise,
-                    self.noise_se)
+                    self.noise_se, self.size_se)
         numbers = (*self.coefficients, *P.ravel().tolist(), *self.log_variance, *self.flown,
                    self.cells, self.volts, self.delay, *positive)
         if not all(map(math.isfinite, numbers)):

@@ -22,7 +22,7 @@ from ou_monitor.model.load import (
 from ou_monitor.online.load.blocks import (
     CLIP, DIVERGED, LoadBlock, LoadBlocks, LoadDelay, LoadNoise, log_density)
 from ou_monitor.online.load.model_watch import (
-    compare, LoadContrasts, ModelComparison, OTHER_LEVEL, other_pack)
+    compare, LoadContrasts, ModelComparison, OTHER_LEVEL, other_pack, SIZE_ERROR)
 from ou_monitor.online.load.supply_load import (
     Basis, LAGS, LoadState, LoadStatus, POWER, static, SupplyLoad, TABLE)
 from ou_monitor.records import FloatArray, NAN
@@ -696,17 +696,20 @@ class LoadFilter:
             return None
         # The size is that of the whole flight: the coefficients follow its last half minute, and
         # their error is at least a tenth.
-        found, size = self._contrasts.against(self._m[2:]), 1.0
+        found, size, size_se = self._contrasts.against(self._m[2:]), 1.0, SIZE_ERROR
         if found.ratio > 0.0:
-            size += (found.ratio - 1.0) / (1.0 + (found.se / _LEAST_ERROR) ** 2)
+            size += (found.ratio - 1.0) / (1.0 + (found.se / SIZE_ERROR) ** 2)
+            share = found.se / found.ratio
+            size_se = share * SIZE_ERROR / math.hypot(share, SIZE_ERROR)
+        ohm, ohm_se, noise, noise_se = np.nan_to_num((
+            load.resistance, load.resistance_se, found.noise, found.noise_se)).tolist()
         scale = size ** 2 * max(1.0, self._noise.scale)
         P = 0.5 * (self._P[2:, 2:] + self._P[2:, 2:].T) * scale
         return LoadStart(
             self._cells, float(self._m[0]), tuple((size * self._m[2:]).tolist()),
             tuple(tuple(row) for row in P.tolist()), max(0.0, float(self._m[1])),
-            self._noise.of_blocks, load.flown, self._delay.delay, *(
-                0.0 if math.isnan(one) else one for one in (
-                    load.resistance, load.resistance_se, found.noise, found.noise_se)))
+            self._noise.of_blocks, load.flown, self._delay.delay, ohm, ohm_se,
+            noise, noise_se, size_se)
 
     def against(self, start: LoadStart | None, date: str = '') -> ModelComparison:
         """Return this flight beside what another one has learned, of that date."""

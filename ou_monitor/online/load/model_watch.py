@@ -16,7 +16,6 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.load import LoadStart, SIZE
-from ou_monitor.online.load.supply_load import static
 from ou_monitor.records import FloatArray, NAN
 
 # Voltages and the model's answer are compared within stretches of this length, s, so that the
@@ -26,6 +25,8 @@ _STRETCH, _MOST = 2.0, 150
 _FEWEST = 4.0
 # Least relative error of the model: what its form leaves where throttle is flown otherwise.
 _FORM = 0.05
+# Relative error of a size of the sag that the filter alone has learned: at least a tenth.
+SIZE_ERROR = 0.1
 # Least relative error of the noise: how it differs between simulated flights of one model.
 _NOISE_FORM = 0.15
 # Noise that counts at least, V.
@@ -148,14 +149,6 @@ def other_pack(start: LoadStart, first: float, level: float) -> str:
     return ''
 
 
-def relative_error(start: LoadStart) -> float:
-    """Return the relative error of the model's sag at the highest throttle flown."""
-    high = static(max(start.flown[1], 0.1))
-    sag = float(high @ np.array(start.coefficients[:4]))
-    square = float(high @ np.array(start.covariance)[:4, :4] @ high)
-    return math.sqrt(max(square, 0.0)) / sag if sag > 0.0 else math.inf
-
-
 def judge(ratio: float, se: float, date: str) -> tuple[ModelVerdict, str]:
     """Return the verdict on a sag now over then, its error included, and the sentence."""
     if not se <= _VAGUE * max(ratio, 1.0):
@@ -178,7 +171,7 @@ def compare(found: Contrast, start: LoadStart, ohm: float, ohm_se: float, other:
     Resistance now in Ohm, NaN where unknown; other: why it is another pack.
     """
     ratio = found.ratio
-    se = math.hypot(found.se, ratio * relative_error(start), ratio * _FORM)
+    se = math.hypot(found.se, ratio * (start.size_se or SIZE_ERROR), ratio * _FORM)
     verdict, words = (ModelVerdict.OTHER_PACK, other) if other else judge(ratio, se, date)
     return ModelComparison(
         verdict, ratio, se, *_over(ohm, ohm_se, start.resistance, start.resistance_se),

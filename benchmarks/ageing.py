@@ -1,0 +1,156 @@
+"""
+This flight beside the model of its supply: packs aged in simulation, and recorded pairs.
+
+`aged`: a model learned from one simulated flight, and 60 s of other ones under the recorded
+throttle, begun at three places of it, with 1, 1.1, 1.2 and 1.4 times the answer, and 5 s with
+three quarters of the voltage.  The verdict counts at any second, not only at the last.
+`pairs`: recorded flights or halves of one craft, each with the model of the other; at the last
+sample, and whether WEAKER at any second.  Needs `OU_MONITOR_REALDATA`.
+
+    python benchmarks/ageing.py aged models/gecko.yaml:bags/recorded/gecko.csv --page PAGE
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from itertools import permutations
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+from ou_monitor.model.load import LoadStart
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.online.load.load_filter import LoadFilter
+from ou_monitor.online.load.model_watch import ModelComparison, ModelVerdict
+from ou_monitor.recordings.model_file import read_model
+from ou_monitor.recordings.read import read_recording
+from ou_monitor.records import Recording
+from ou_monitor.simulation import read_throttle, RecordedThrottle, simulated
+from tables import put, table
+
+# Hz; length of the flight that teaches and of those compared, s.
+RATE, TAUGHT, LENGTH = 100.0, 120.0, 60.0
+AGES, PLACES = (1.0, 1.1, 1.2, 1.4), (0.0, 1.0 / 3.0, 2.0 / 3.0)
+# Name, file below OU_MONITOR_REALDATA, flight of a log, and the craft: pairs are of one craft.
+FLIGHTS: tuple[tuple[str, str, int | None, str], ...] = (
+    ('gecko', 'bf_gecko_a.csv', None, ''), ('nazgul', 'raw/bf_nazgul_4s.bbl', None, ''),
+    ('hiro', 'raw/bf_hiro_4s.BFL', None, ''), ('erle', 'raw/ac_erle_althold2.BIN', None, ''),
+    ('roma 1', 'raw/bf_roma_6s.bbl', 1, 'roma'), ('roma 2', 'raw/bf_roma_6s.bbl', 2, 'roma'),
+    ('roma 3', 'raw/bf_roma_6s.bbl', 3, 'roma'),
+    ('Crazyflie alone', 'cf_solo_large.csv', None, 'cf'),
+    ('Crazyflie in a pair', 'cf_pair_large.csv', None, 'cf'))
+
+
+def seconds(made: Recording, start: LoadStart, factor: float = 1.0) -> Iterator[ModelComparison]:
+    """Yield what each second of a flight says beside a model, its voltages times a factor."""
+    loads = LoadFilter()
+    loads.begin_with(start)
+    edges = np.searchsorted(made.t, np.arange(made.t[0], made.t[-1] + 1.0))
+    for first, last in zip(edges, edges[1:]):
+        part = slice(first, last)
+        loads.push(made.t[part], factor * made.voltage[part], made.throttle[part])
+        yield loads.against(start)
+
+
+def learned(made: Recording) -> LoadStart | None:
+    """Return what a flight teaches."""
+    loads = LoadFilter()
+    loads.push(made.t, made.voltage, made.throttle)
+    return loads.learned()
+
+
+def aged(model: SupplyModel, flown: RecordedThrottle, name: str, seeds: int) -> list[list[str]]:
+    """Return a row for each age."""
+    def flight(seed: int, age: float = 1.0, place: float = 0.0,
+               length: float = LENGTH) -> Recording:
+        (made,) = simulated(
+            model, lambda t: flown.profile((t + place * flown.duration) % flown.duration),
+            duration=length, rate=RATE, seed=seed, charge=math.nan, resistance=age)
+        return made
+
+    found: dict[float, list[tuple[float, float, float]]] = {age: [] for age in AGES}
+    other = runs = 0
+    for taught in range(seeds):
+        start = learned(flight(1000 + taught, length=TAUGHT))
+        if start is None:
+            continue
+        for place in PLACES:
+            runs += 1
+            *_, last = seconds(flight(taught, 1.0, place, 6.0), start, 0.75)
+            other += last.verdict is ModelVerdict.OTHER_PACK
+            for age in AGES:
+                said = list(seconds(flight(taught, age, place), start))
+                weaker = [k for k, one in enumerate(said, 1) if one.verdict is ModelVerdict.WEAKER]
+                found[age].append((said[-1].sag_ratio, said[-1].noise_ratio,
+                                   weaker[0] if weaker else math.inf))
+    rows = []
+    for age, one in found.items():
+        ratio, noise, at = np.array(one).T
+        rows.append([
+            name, f'{age:g}', f'{np.isfinite(at).sum()} of {len(one)}',
+            f'{np.median(at):.0f}' if np.isfinite(np.median(at)) else '-',
+            f'{np.nanmean(ratio):.2f} ± {np.nanstd(ratio):.2f}',
+            f'{np.nanmean(noise):.2f} ± {np.nanstd(noise):.2f}',
+            f'{other} of {runs}' if age == 1.0 else ''])
+    return rows
+
+
+def half(made: Recording, second: bool) -> Recording:
+    """Return a half of a recording."""
+    part = (made.t >= 0.5 * (made.t[0] + made.t[-1])) == second
+    return Recording(made.t[part], made.voltage[part], made.throttle[part], made.name)
+
+
+def pairs() -> list[list[str]]:
+    """Return a row for each recorded pair, either way."""
+    folder, flights, rows = Path(os.environ['OU_MONITOR_REALDATA']), {}, []
+    for name, file, number, craft in FLIGHTS:
+        made = read_recording(folder / file, flight=number)
+        flights.setdefault(craft or name, []).append((name, made))
+        if not craft:
+            flights[name] = [(f'{name}, first half', half(made, False)),
+                             (f'{name}, second half', half(made, True))]
+    for craft in flights.values():
+        for (then, first), (now, second) in permutations(craft, 2):
+            start = learned(first)
+            if start is None:
+                rows.append([now, then, '-', '-', 'the model has no load', ''])
+                continue
+            said = list(seconds(second, start))
+            last, ever = said[-1], any(one.verdict is ModelVerdict.WEAKER for one in said)
+            rows.append([now, then, f'{last.sag_ratio:.2f} ± {last.sag_ratio_se:.2f}',
+                         f'{last.noise_ratio:.2f} ± {last.noise_ratio_se:.2f}',
+                         last.verdict.name, 'yes' if ever else ''])
+    return rows
+
+
+def main() -> int:
+    """Measure, and print the tables, or put them into the page."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
+    parser.add_argument('what', choices=('aged', 'pairs'))
+    parser.add_argument('runs', nargs='*', metavar='MODEL.yaml:RECORDING')
+    parser.add_argument('--seeds', type=int, default=10)
+    parser.add_argument('--page', type=Path)
+    options = parser.parse_args()
+    if options.what == 'aged':
+        rows = []
+        for run in options.runs:
+            path, _, recording = run.partition(':')
+            rows += aged(read_model(path).model, read_throttle(recording), Path(path).stem,
+                         options.seeds)
+        text = table(('model', 'answer', 'ever weaker', 'median s', 'sag now / then',
+                      'noise now / then', 'another pack'), rows)
+    else:
+        text = table(('flight', 'model of', 'sag now / then', 'noise now / then', 'verdict',
+                      'ever weaker'), pairs())
+    if options.page:
+        put(options.page, text, options.what)
+    else:
+        print(text)
+    return 0
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())
