@@ -141,18 +141,16 @@ def abandon_stdout() -> None:
 
 def write_text(text: str, target: str | Path) -> None:
     """Write a text file in UTF-8."""
-    path = Path(target)
-    # What is there stays until the new one is whole; a device or a pipe is written as it is.
-    draft = path if path.exists() and not path.is_file() else path.with_name(
-        f'.{path.name}.{os.getpid()}.draft')
+    from ou_monitor.stream.files import write_whole
+
+    # A file name may hold bytes that are no text.
+    path, content = Path(target), text.encode('utf-8', 'backslashreplace')
+    if not _is_device(path):
+        write_whole(path, content)
+        return
     try:
-        # A file name may hold bytes that are no text.
-        draft.write_text(text, encoding='utf-8', errors='backslashreplace')
-        if draft is not path:
-            os.replace(draft, path)
+        path.write_bytes(content)
     except OSError as error:
-        if draft is not path:
-            draft.unlink(missing_ok=True)
         raise InputError(f"cannot write '{target}': {error.strerror or error}") from error
 
 

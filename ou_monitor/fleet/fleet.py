@@ -20,11 +20,11 @@ from ou_monitor.errors import InputError
 from ou_monitor.fleet.analysis import Options, work
 from ou_monitor.fleet.find import duplicates, Found, FoundRecording
 from ou_monitor.fleet.judgement import judge, Judgement
-from ou_monitor.fleet.table import reason, Row, rows_of, write_whole
+from ou_monitor.fleet.table import Row, rows_of
 from ou_monitor.fleet.vehicles import assign, number_flights
 from ou_monitor.fleet.workers import LocalWorkers, Workers
 from ou_monitor.records import NAN
-from ou_monitor.stream.files import open_regular
+from ou_monitor.stream.files import open_regular, write_whole
 from ou_monitor.text import printable
 
 FOLDER = 'parts'
@@ -45,7 +45,7 @@ class Parts:
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InputError(f"cannot write into '{folder}': {reason(error)}") from error
+            raise InputError(f"cannot write into '{folder}': {error.strerror or error}") from error
         # An output folder that cannot be written must fail before the work, not after it.
         probe = self._folder / '.probe'
         write_whole(probe, b' ' * 4096)

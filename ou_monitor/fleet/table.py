@@ -8,13 +8,12 @@ from datetime import datetime, timezone
 import io
 import json
 import math
-import os
 from pathlib import Path
 from typing import Any
 
-from ou_monitor.errors import InputError
 from ou_monitor.fleet.find import FoundRecording
 from ou_monitor.fleet.vehicles import Vehicle
+from ou_monitor.stream.files import write_whole
 from ou_monitor.text import printable
 
 Row = dict[str, Any]
@@ -155,25 +154,3 @@ def write_table(rows: Sequence[Row], path: Path) -> None:
     parquet.write_table(pyarrow.Table.from_pylist(plain, schema=schema), content,
                         compression='zstd')
     write_whole(path, content.getvalue())
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file so that it is there whole or not at all."""
-    draft = path.with_name(path.name + '.draft')
-    try:
-        # What is there may be a FIFO, which would wait for its reader, or a link to elsewhere.
-        draft.unlink(missing_ok=True)
-        draft.write_bytes(content)
-        os.replace(draft, path)
-    except OSError as error:
-        try:
-            draft.unlink(missing_ok=True)
-        except OSError:
-            # The folder itself refuses, which is what the error below reports.
-            pass
-        raise InputError(f"cannot write '{path}': {reason(error)}") from error
-
-
-def reason(error: OSError) -> str:
-    """Return what the system says of an error."""
-    return error.strerror or str(error)

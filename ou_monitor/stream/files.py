@@ -8,7 +8,7 @@ A FIFO or a device is refused before a byte is read.  Errors about YAML are one 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 import os
 from pathlib import Path
 import re
@@ -49,6 +49,21 @@ def open_regular(path: str | Path) -> BinaryIO:
         file.close()
         raise OSError(0, 'it is not a regular file', str(path))
     return file
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file so that it is there whole or not at all."""
+    draft = path.with_name(f'.{path.name}.{os.getpid()}.draft')
+    try:
+        # What is there may be a FIFO, which would wait for its reader, or a link to elsewhere.
+        draft.unlink(missing_ok=True)
+        draft.write_bytes(content)
+        os.replace(draft, path)
+    except OSError as error:
+        # The folder itself may refuse.
+        with suppress(OSError):
+            draft.unlink(missing_ok=True)
+        raise InputError(f"cannot write '{path}': {error.strerror or error}") from error
 
 
 def read_yaml(path: str | Path, what: str, *, most_bytes: int = MOST_BYTES,

@@ -104,11 +104,11 @@ def test_what_was_there_stays_when_the_disk_is_full(tmp_path, monkeypatch):
     target = tmp_path / 'report.html'
     output.write_text('old', target)
 
-    def full(path, text, **_):
-        with path.open('w') as file:
-            file.write(text[:2])
+    def full(path, content):
+        with path.open('wb') as file:
+            file.write(content[:2])
         raise OSError(errno.ENOSPC, 'No space left on device')
-    monkeypatch.setattr(Path, 'write_text', full)
+    monkeypatch.setattr(Path, 'write_bytes', full)
     with pytest.raises(InputError, match='No space left'):
         output.write_text('new page', target)
     assert target.read_text() == 'old' and list(tmp_path.iterdir()) == [target]

@@ -15,10 +15,10 @@ from ou_monitor.fleet.cluster import check_address
 from ou_monitor.fleet.find import duplicates, find_recordings
 from ou_monitor.fleet.fleet import Parts
 from ou_monitor.fleet.summary import failure_words
-from ou_monitor.fleet.table import write_whole
 from ou_monitor.fleet.vehicles import assign, natural, number_flights, read_pattern
 from ou_monitor.fleet.workers import LocalWorkers, LOST, usable_memory
 from ou_monitor.recordings.read import read_recording
+from ou_monitor.stream.files import write_whole
 from project import ROOT
 import pytest
 
@@ -242,7 +242,7 @@ def test_a_disk_that_fills_up_leaves_the_old_file(tmp_path, monkeypatch):
 def test_a_fifo_in_the_place_of_a_draft_hangs_nothing(tmp_path):
     """It and a link are removed, not opened; what the link leads to stays."""
     target, elsewhere = tmp_path / 'report.html', tmp_path / 'elsewhere'
-    draft = tmp_path / 'report.html.draft'
+    draft = tmp_path / f'.report.html.{os.getpid()}.draft'
     os.mkfifo(draft)
     write_whole(target, b'new')
     elsewhere.write_bytes(b'kept')
