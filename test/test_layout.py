@@ -27,7 +27,7 @@ MCAP_MODULES = {'ou_monitor.recordings.bag', 'ou_monitor.recordings.mcap_file'}
 PARSERS = {'pyulog': 'ulog', 'pymavlink': 'dataflash', 'orangebox': 'blackbox'}
 CORE = {'numpy', 'scipy'}
 # Extras, each with the one module that may import it.
-EXTRAS = {'dask': 'fleet.cluster', 'distributed': 'fleet.cluster',
+EXTRAS = {'argcomplete': 'cli.main', 'dask': 'fleet.cluster', 'distributed': 'fleet.cluster',
           'pandas': 'report.result', 'pyarrow': 'fleet.table', 'tornado': 'nodes.live'}
 # The group of causes of other packages, which is no module.
 ENTRY_POINTS = 'ou_monitor.causes'

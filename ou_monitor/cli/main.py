@@ -51,6 +51,11 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     if first and not first.startswith('-') and first not in COMMANDS:
         raise InputError(f"unknown command '{first}': {nearest(first, COMMANDS)}")
     parser = build_parser([first] if first in COMMANDS else None)
+    # Set by the shell that asks for completions, so that no run of a command pays for it.
+    if '_ARGCOMPLETE' in os.environ:
+        import argcomplete
+
+        argcomplete.autocomplete(parser)
     args, extra = parser.parse_known_args(argv)
     if extra:
         options = _options(parser, args.command)

@@ -157,6 +157,19 @@ def test_interrupt_is_quiet(monkeypatch, capsys):
     assert capsys.readouterr() == ('', '')
 
 
+def test_a_shell_completes_commands_and_their_options(monkeypatch):
+    """With what a shell sets, and only then, the parsers go to argcomplete, an extra."""
+    asked = []
+    stand = SimpleNamespace(autocomplete=asked.append)
+    monkeypatch.setitem(sys.modules, 'argcomplete', stand)
+    assert cli.main(['analyze', '--help']) == 0 and not asked
+    monkeypatch.setenv('_ARGCOMPLETE', '1')
+    assert cli.main([]) == 2
+    (parser,) = asked
+    assert set(cli.COMMANDS) == {
+        name for action in parser._actions for name in action.choices or ()}
+
+
 def test_a_bug_is_not_dressed_up_as_bad_input(monkeypatch):
     """What is not InputError keeps its traceback: it must be reported, not hidden."""
     def run(args):
