@@ -35,9 +35,9 @@ Given = Union[Recording, str, Path]
 Progress = Callable[[float], None]
 Pairs = tuple[npt.ArrayLike, npt.ArrayLike]
 
-# Fewest samples that have a scatter beside their mean and their trend.
+# Minimum number of samples: one more than mean and trend take.
 _FEWEST = 3
-# From this rate on samples travel in blocks by default, Hz.
+# Rate from which samples are written in blocks by default, Hz.
 _BLOCKS_FROM = 5000.0
 
 
@@ -78,8 +78,7 @@ def analyze(recording: Given, *, levels: tuple[float, ...] | None = None, window
     window : float
         Window of the sliding estimate, s.
     brownout_voltage : float, optional
-        Voltage that must not be undershot, V; as the header of a log says, or the node's default,
-        when left out.
+        Brown-out limit, V; by default that of the log's header, else the node's.
     brownout_horizon : float
         Horizon of the risk, s.
     cells : int
@@ -90,12 +89,12 @@ def analyze(recording: Given, *, levels: tuple[float, ...] | None = None, window
     Returns
     -------
     Result
-        Its record has `levels`, `by_throttle`, `quality`, `craft`; its table a row a level.
+        Its record has `levels`, `by_throttle`, `quality`, `craft`; its table one row per level.
 
     Raises
     ------
     InputError
-        When it cannot be read, is too short, or cannot have so many cells.
+        When the recording cannot be read, is too short, or contradicts `cells`.
 
     Examples
     --------
@@ -121,7 +120,7 @@ def analyze(recording: Given, *, levels: tuple[float, ...] | None = None, window
                      brownout_horizon=brownout_horizon, cells=cells, progress=progress)
     facts = found.overview.facts
     if found.brownout_default:
-        # As other commands without a limit.
+        # Without a given limit, report no dips and no budget, as the other commands.
         facts = replace(facts, dips=None, budget=None)
     return Result(found, partial(analysis_document, found), partial(_analysis_data, found),
                   'levels', facts)
@@ -148,8 +147,8 @@ def compare(recording: Given, model: SupplyModel | str | Path | None = None, *,
     model : SupplyModel or path, optional
         What is simulated; without it, a model is fitted to the part before fit_until.
     fit_until : float, optional
-        Begin of the part that is simulated, s after the first sample; half of the recording, or
-        with a model its begin, where left out.
+        Start of the simulated part, s after the first sample; by default half-way, or with a model
+        the first sample.
     seeds : int
         Simulations, 20 to 10000.
     seed : int
@@ -157,14 +156,14 @@ def compare(recording: Given, model: SupplyModel | str | Path | None = None, *,
     levels : tuple of float
         Further voltages, V, whose crossings are counted.
     brownout_voltage, cells
-        As for `analyze`; one more such voltage.
+        As for `analyze`; its crossings are counted too.
     progress : callable, optional
         Takes the share that is done, 0..1.
 
     Returns
     -------
     Result
-        What the simulations get right and wrong: its table has a row a measure.
+        What the simulations get right and wrong; its table has one row per measure.
 
     Raises
     ------
@@ -210,10 +209,10 @@ def coupling(recording: Given, signal: str | Series | Pairs, *,
     recording : Recording or path
         The supply.
     signal : str or pair of arrays
-        What is looked at: of a path, the name of a topic and field, a column or a series; beside a
+        The signal: with a path, the name of a topic and field, a column or a series; with a
         `Recording`, stamps (s, or dates) and values.
     band : tuple of float, optional
-        Frequencies looked at, Hz; from 5 Hz to a quarter of the slower rate when left out.
+        Frequency band, Hz; by default from 5 Hz to a quarter of the slower rate.
     level : float
         Probability of a false alarm.
     brownout_voltage, cells
@@ -222,12 +221,12 @@ def coupling(recording: Given, signal: str | Series | Pairs, *,
     Returns
     -------
     Result
-        Gain, lag, coherence; its table has a row a frequency.
+        Gain, lag, coherence; its table has one row per frequency.
 
     Raises
     ------
     InputError
-        When there is no such signal, or too little of it beside the voltage.
+        When there is no such signal, or it hardly overlaps with the voltage.
 
     Examples
     --------
@@ -298,7 +297,7 @@ def discover(recording: Given, *, seed: int = 0, brownout_voltage: float | None 
     Returns
     -------
     Result
-        Verdict, causes, extended model, gain; its table has a row a cause.
+        Verdict, causes, extended model, gain; its table has one row per cause.
 
     Raises
     ------
@@ -319,8 +318,7 @@ def discover(recording: Given, *, seed: int = 0, brownout_voltage: float | None 
 
     recording = _read(recording)
     limit, cells = _limit(recording, brownout_voltage, cells)
-    # What overflows on the way ends as not finite, which the search refuses: a user has no
-    # use for the source line of it.
+    # The search refuses values that overflow; NumPy's warning of them would not help a user.
     with np.errstate(all='ignore'):
         found = discovered(recording, seed=seed, progress=progress)
     seen = overview(recording, limit, cells=cells)
@@ -338,12 +336,12 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     Parameters
     ----------
     throttle : float, optional
-        Throttle, 0..1; the highest that was flown when left out with a recording.
+        Throttle, 0..1; with a recording, by default the highest flown.
     recording : Recording or path, optional
-        A flight that level, sag, resistance and noise are taken from.
+        Flight that gives level, sag, resistance and noise.
     network : mapping or PowerNetwork, optional
-        Components in SI units, such as ``{'cells': 4, 'bulk_capacitance': 470e-6}``; they go
-        before what was measured.
+        Components in SI units, such as ``{'cells': 4, 'bulk_capacitance': 470e-6}``; they override
+        measured values.
     rail : {'bus', 'regulated'}
         The battery bus at the ESCs, or the regulated rail.
     voltage : float, optional
@@ -351,16 +349,16 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     horizon : float
         Horizon of the risk, s.
     risk : float
-        Risk that is allowed, 0..1.
+        Maximum risk, 0..1.
     capacitances : tuple of float, optional
-        Least and most capacitance looked at, F.
+        Smallest and largest capacitance tried, F.
     esr_fixed : bool
         Whether the ESR stays; else it falls as 1/C.
 
     Returns
     -------
     Result
-        Verdict, the least capacitance and the levers; its table has a row a capacitance.
+        Verdict, smallest capacitance, other remedies; its table has one row per capacitance.
 
     Raises
     ------
@@ -440,7 +438,7 @@ def reproduce(*, seed: int = 1, progress: Progress | None = None) -> Result:
     Returns
     -------
     Result
-        Its table has a row a printed number, with the verdict.
+        Its table has one row per printed number, with the verdict.
 
     Examples
     --------
@@ -464,7 +462,7 @@ def simulate(model: SupplyModel | ModelFile | str | Path | None = None, *,
              scale_resistance: float = 1.0, output: str | Path | None = None,
              message: str | None = None, progress: Progress | None = None) -> Result:
     """
-    Draw a recording from a model of a supply, exact in law at any rate.
+    Draw a recording from a model of a supply, exact in distribution at any rate.
 
     Parameters
     ----------
@@ -476,7 +474,7 @@ def simulate(model: SupplyModel | ModelFile | str | Path | None = None, *,
         Name of a profile, throttle 0..1, points 'T:U,T:U,...', a recording, or a function of
         stamps, s; that of the preset when left out.
     start, end : float, optional
-        Part of a path that throttle names, s.
+        Part of the recording that `throttle` names, s.
     duration : float, optional
         Length, s; of the preset or of the recorded throttle when left out.
     rate : float, optional
@@ -484,11 +482,11 @@ def simulate(model: SupplyModel | ModelFile | str | Path | None = None, *,
     seed : int
         The same one gives the same recording.
     capacity_left : float, optional
-        Charge at the begin, 0..1; -1: where the recording of the model began.
+        Initial charge, 0..1; -1: as at the start of the model's recording.
     scale_resistance : float
         Factor on the answer to throttle.
     output : path, optional
-        Bag to write, piece by piece; the samples are drawn when they are asked for otherwise.
+        Bag to write, piece by piece; without it, samples are drawn on demand.
     message : str, optional
         Message of the voltage in the bag.
     progress : callable, optional
@@ -497,7 +495,7 @@ def simulate(model: SupplyModel | ModelFile | str | Path | None = None, *,
     Returns
     -------
     Result
-        Its record has the `recording`; its table a row a sample.
+        Its record has the `recording`; its table one row per sample.
 
     Raises
     ------

@@ -14,7 +14,7 @@ from ou_monitor.model.terms.term import parameter, Role, Term
 
 @dataclass(frozen=True)
 class Heartbeat(Term):
-    """Add a rectified sine of a second."""
+    """Add a rectified sine with a period of 1 s."""
 
     NAME: ClassVar[str] = 'heartbeat'
     FAMILY: ClassVar[str] = 'events'

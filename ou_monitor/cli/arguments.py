@@ -18,19 +18,19 @@ if TYPE_CHECKING:
     from ou_monitor.records import Recording
 
 Number = TypeVar('Number', int, float)
-# No lithium cell is ever charged to it, V.
+# Above the voltage of any charged lithium cell, V.
 _CELL_MOST = 5.0
 # Fields of `CsvColumns`, and the options that give them.
 _COLUMNS = {'time': 'time_column', 'voltage': 'voltage_column', 'throttle': 'throttle_column',
             'current': 'current_column', **{name: name for name in (
                 'unit', 'time_unit', 'throttle_unit', 'sample_interval', 'delimiter', 'decimal',
                 'skip_rows')}}
-# Options of the topics, by the names that the parser gives them.
+# Options that choose topics and columns, by their names in the parser.
 _TOPICS = ('msg_config', 'voltage_topic', 'throttle_topic', 'flight', *_COLUMNS.values())
 
 
 def check_outputs(args: argparse.Namespace, *names: str, **inputs: Any) -> None:
-    """Refuse outputs that overwrite an input, cannot be written, or, but for JSON, are no file."""
+    """Refuse outputs that overwrite an input, cannot be written, or (but for JSON) are '-'."""
     targets = {f"--{name.replace('_', '-')}": getattr(args, name) for name in names}
     for option, target in targets.items():
         if target == output.STDOUT:

@@ -24,7 +24,7 @@ def run(args: argparse.Namespace) -> int:
     recording, series = read_given_beside(args, start, end)
     t, values = series.t, series.values
     if start is not None or end is not None:
-        # What lies outside the part has no voltage beside it, and is not counted as dropped.
+        # Samples outside the part have no voltage; do not count them as dropped.
         part = (t >= recording.t[0]) & (t <= recording.t[-1])
         t, values = t[part], values[part]
     found = coupling(recording, replace(series, name=args.signal, t=t, values=values), band=band,

@@ -23,18 +23,18 @@ from ou_monitor.errors import InputError
 if TYPE_CHECKING:
     from ou_monitor.report.result import Result
 
-# Seconds between two lines where there is no terminal, and until the time left is guessed.
+# Seconds between two lines without a terminal, and before the time left is estimated.
 _EVERY, _FIRST = 60.0, 2.0
-# Share that must be done before the time left is guessed.
+# Share that must be done before the time left is estimated.
 _LEAST = 0.02
 
 
 class Progress:
     """
-    How far a command is, on standard error; `quiet`: no lines where there is no terminal.
+    Progress of a command on standard error; `quiet`: no lines without a terminal.
 
-    A terminal shows a bar and the time left; elsewhere a line comes every minute, so that
-    what ends sooner says nothing.
+    A terminal shows a bar and the time left; elsewhere a line comes every minute, so shorter work
+    prints nothing.
     """
 
     def __init__(self, label: str, quiet: bool = False) -> None:
@@ -42,7 +42,7 @@ class Progress:
         self._live = sys.stderr.isatty()
         self._drawn = 0.0
         self._told = time.monotonic()
-        # When the first share was told, and which: what an earlier run did took no time.
+        # Time and value of the first share: the work of an earlier run took no time.
         self._first: tuple[float, float] | None = None
 
     def __call__(self, share: float) -> None:
@@ -64,7 +64,7 @@ class Progress:
         self._write(f'\r{self._label} {bar}{share:4.0%}{left}\x1b[K')
 
     def _left(self, share: float, now: float) -> str:
-        """Return the time left, as far as it can be told from what is done."""
+        """Return the time left, estimated from the share done; '' when it is too early."""
         began, first = self._first or (now, share)
         passed, done = now - began, share - first
         if done < _LEAST or share >= 1.0 or passed < _FIRST:
@@ -73,7 +73,7 @@ class Progress:
 
     @staticmethod
     def _write(text: str) -> None:
-        # That nobody listens must not stop the work.
+        # A closed stream must not stop the work.
         with suppress(OSError, ValueError):
             sys.stderr.write(text)
             sys.stderr.flush()
@@ -94,7 +94,7 @@ class Progress:
 
 
 def duration(seconds: float) -> str:
-    """Return a time that is a guess, in words."""
+    """Return an estimated time in words."""
     if seconds < 90.0:
         return f'{max(1, round(seconds))} s'
     return f'{round(seconds / 60.0)} min' if seconds < 5400.0 else f'{seconds / 3600.0:.1f} h'
@@ -107,11 +107,11 @@ _STORAGE = ('.mcap', '.db3', '.zst', '.zstd', '.lz4')
 
 
 def write_json(data: Mapping[str, Any], target: str) -> None:
-    """Write strict JSON (target in A)."""
-    # Not above: `--help` does without NumPy.
+    """Write strict JSON."""
+    # Imported here, so that `--help` needs no NumPy.
     from ou_monitor.report.result import plain
 
-    # ASCII: whatever the encoding of standard output, and bytes of a file name that are no text.
+    # ASCII suits every encoding of standard output, and file names that are not text.
     text = json.dumps(plain(data), indent=2, allow_nan=False)
     if target == STDOUT:
         say(text)
@@ -166,7 +166,7 @@ def check_paths(inputs: Mapping[str, str | Path | None],
     """
     Refuse paths that are empty, and outputs that would overwrite an input or each other.
 
-    Nor is anything else overwritten that is there already, but by `force`.
+    Other existing files are overwritten only with `force`.
     """
     for name, given in (*inputs.items(), *outputs.items()):
         if given is not None and not str(given):
@@ -183,7 +183,7 @@ def check_paths(inputs: Mapping[str, str | Path | None],
                 raise InputError(f"{other} and {name} are both '{target}': give each its own "
                                  'name')
     for name, target in written:
-        # A folder where a file belongs is told by `check_writable`.
+        # `check_writable` reports a folder where a file belongs.
         if target.is_file() and not force:
             raise InputError(f"{name} '{target}' exists already: --force overwrites it, or give "
                              'another name')
@@ -191,7 +191,7 @@ def check_paths(inputs: Mapping[str, str | Path | None],
 
 @contextmanager
 def replacing(bag: Path | None, force: bool) -> Iterator[None]:
-    """Make room for a bag, if one is written; what was there comes back when writing fails."""
+    """Move an existing bag aside while a new one is written; restore it if that fails."""
     if bag is None or not (bag.exists() or bag.is_symlink()):
         yield
         return
@@ -214,7 +214,7 @@ def replacing(bag: Path | None, force: bool) -> Iterator[None]:
 
 
 def _is_device(path: Path) -> bool:
-    """Return whether it is such as /dev/null, where nothing is overwritten."""
+    """Return whether a path is a device, such as /dev/null, where nothing is overwritten."""
     return path.exists() and not path.is_file() and not path.is_dir()
 
 
@@ -248,7 +248,7 @@ def check_writable(target: str | None) -> None:
 
 def deliver(args: argparse.Namespace, found: Result, command: str = '',
             report: str | Path | None = None, **files: object) -> None:
-    """Write what a command found where its arguments say: a page, JSON, a terminal."""
+    """Write a command's result to the page, JSON file and terminal that its arguments name."""
     report = report or getattr(args, 'report', None)
     document = found.document(command)
     if report is not None:
@@ -263,13 +263,13 @@ def deliver(args: argparse.Namespace, found: Result, command: str = '',
 
 
 def summary(answer: Sequence[str], **files: object) -> None:
-    """Write what a terminal still shows when all has run through: two sentences, the files."""
+    """Write the last lines of a terminal: two sentences and the files."""
     from ou_monitor.report.terminal import paragraph
 
     made = {name: path for name, path in files.items()
             if path is not None and str(path) != STDOUT}
     if len(made) > 1:
-        # Who asked for JSON will find it; people look for the page.
+        # A reader looks for the page; a script knows its JSON file.
         made.pop('json', None)
     last = '; '.join(f'{name.capitalize()}: {path}' for name, path in made.items())
     say('\n' + '\n'.join([*map(paragraph, answer[:2]), last or paragraph(_NO_FILE)]))

@@ -1,10 +1,10 @@
 """
-What throttle says of the intensity of the noise, in whatever form.
+A free law of the noise's intensity over throttle.
 
-The laws of the catalogue give that one form each.  A cause that is inferred only may owe its
-evidence to what their form leaves; so it is tested beside a law that is free: the logarithm of the
-variance is a sum of curves over throttle, its rises, its falls and where it comes from, over
-several spans of time, as stiff as blocks of the recording that were kept back want it.
+Each law of the catalogue has one form, and a latent cause may owe its evidence to the misfit of
+that form. So it is tested beside a free law: the logarithm of the variance is a sum of curves over
+throttle, its rises, falls and changes, over several spans of time. Held-out blocks of the
+recording choose the stiffness.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from ou_monitor.discovery.validation import blocks_of
 from ou_monitor.records import FloatArray
 from scipy.signal import lfilter
 
-# Spans over which throttle is remembered, s: those of the clustering that `battery` looks at, up
-# to some relaxations of a load.
+# Memory spans of throttle, s: as the clustering statistics of `battery`, up to a few relaxations
+# of a load.
 _SPANS = (0.02, 0.1, 0.5, 2.5)
 # Knots of the curve over throttle, and of the others.
 _KNOTS, _FEW_KNOTS = 8, 5
 # Segments that a recording is cut into: throttle is the same in all samples of one.
 _SEGMENTS = 8000
-# A square counts up to this, as in `battery`: wrong samples are no law of throttle.
+# Largest square that counts, as in `battery`, so that bad samples shape no law.
 _LARGEST = 25.0
-# Precisions of a coefficient, a logarithm of a variance, before the recording: from one that may
-# be anything to one that 1000 squares hardly move.
+# Prior precisions of a coefficient (ln variance): from almost free to hardly moved by 1000
+# squares.
 _STIFFNESS = tuple(4.0 ** k for k in range(6))
-# Times by which throttle is moved for comparison: by chance the true one does best once in 20.
+# Number of time shifts to compare with: by chance the unshifted throttle is best once in 20.
 _SHIFTS = 19
-# Steps of a fit, and the gain of one that is too little for another, nats.
+# Maximum steps of a fit; gain below which it stops, nats.
 _STEPS, _SETTLED = 30, 0.05
 
 
@@ -51,8 +51,8 @@ def free_law(samples: Samples, z: FloatArray) -> FloatArray | None:
     Returns
     -------
     ndarray, shape (n,), or None
-        None where throttle does not predict that of blocks that were kept back, or that of
-        another time says more than half as much.
+        None where throttle does not predict the variance of held-out blocks, or where shifted
+        throttle gains over half as much.
 
     """
     u = samples.throttle
@@ -68,7 +68,7 @@ def free_law(samples: Samples, z: FloatArray) -> FloatArray | None:
                                *(_hats(one, _FEW_KNOTS) for one in means[1:])])
     columns[:, 1:] -= count @ columns[:, 1:] / count.sum()
     blocks = blocks_of(begin.size)
-    # What m normal scores say of the logarithm of their variance: m/2.
+    # Fisher information of m normal scores on the logarithm of their variance: m/2.
     known = np.array([0.5 * (columns[b].T * count[b]) @ columns[b] for b in blocks])
     worth = [sum(_kept_back(columns, square, count, b, known.sum(axis=0) - own, stiff)
                  for b, own in zip(blocks, known, strict=True)) for stiff in _STIFFNESS]
@@ -80,7 +80,7 @@ def free_law(samples: Samples, z: FloatArray) -> FloatArray | None:
         return columns @ _fitted(columns, square, count, known.sum(axis=0), _STIFFNESS[best])
 
     log = fitted(columns)
-    # An intensity that wanders goes with any throttle for a while.
+    # A wandering intensity follows any throttle for a while.
     others = [_gain(fitted(np.roll(columns, k * begin.size // (_SHIFTS + 1), axis=0)), square,
                     count) for k in range(1, _SHIFTS + 1)]
     if max(others) > decision.OWN * _gain(log, square, count):
@@ -133,7 +133,7 @@ def _fitted(columns: FloatArray, square: FloatArray, count: FloatArray, known: F
 
 def _kept_back(columns: FloatArray, square: FloatArray, count: FloatArray, block: slice,
                known: FloatArray, stiff: float) -> float:
-    """Return what the law that the others show gains over none on a block, nats."""
+    """Return the gain on a block, nats, of the law fitted to the other blocks, over no law."""
     rest = np.ones(count.size, dtype=np.bool_)
     rest[block] = False
     beta = _fitted(columns[rest], square[rest], count[rest], known, stiff)
@@ -142,7 +142,7 @@ def _kept_back(columns: FloatArray, square: FloatArray, count: FloatArray, block
 
 
 def _gain(log: FloatArray, square: FloatArray, count: FloatArray, level: float = 0.0) -> float:
-    """Return what a law gains over one variance throughout, their mean where none is given."""
+    """Return the gain of a law over a constant variance (by default the mean), nats."""
     level = math.log(max(level or float(square.sum() / count.sum()), 1e-300))
     return _density(log, square, count) - _density(np.full(log.size, level), square, count)
 

@@ -7,8 +7,8 @@ tridiagonal; its banded Cholesky factor, in the order of time, is the
 information form of the Kalman filter (Rue & Held, Gaussian Markov Random
 Fields, 2005), so no Python loop runs over the samples.
 
-Where nothing changes any more the gain settles: it is found on the first
-samples and the rest is a constant filter.
+Where the model stays constant the gain settles: it is solved on the first samples, and a constant
+filter does the rest.
 
 Limits: Q_k must be regular and R_k above 0 (a millionth of Q_k stands for "no
 measurement noise"); the states are few, for the cost grows with their square.
@@ -79,7 +79,7 @@ class Filter:
                 look[:, 0] = f[..., 0] = 0.0
             else:
                 variance[begin] += look[:, 0] @ known @ look[:, 0]
-                # What is known of the last sample before, carried one step on.
+                # Information on the last sample before, propagated by one step.
                 q[..., 0] += f[..., 0] @ known @ f[..., 0].T
             p = _filtered(f, q, h, r)
             for i in range(d):
@@ -126,10 +126,9 @@ class Filter:
         return e, state
 
 
-# Modes nearer to each other than this (condition of the eigenvectors) are not
-# taken apart.
+# Condition number of the eigenvectors above which modes are not separated.
 _APART = 1e10
-# Samples filtered at once where they are not.
+# Samples filtered at once where modes are not separated.
 _CHUNK = 4096
 
 
@@ -156,7 +155,7 @@ class _Steady:
                 continue
             if root.imag == 0.0:
                 root, drive, before = root.real, drive.real, before.real
-            # The conjugate of a mode that turns adds the same again.
+            # The conjugate of a complex mode adds the same again.
             seen = 2.0 * seen if root.imag > 0.0 else seen.real
             kept, _ = lfilter([drive], [1.0, -root], columns, axis=0, zi=root * before[None, :])
             e[0] -= (seen * before).real
@@ -277,7 +276,7 @@ def _filtered(f: FloatArray, q: FloatArray, h: FloatArray, r: FloatArray) -> Flo
     weight = _inverse(q)
     known = _pattern(weight)
     forward = _times(weight, f, known, turns)
-    # What the step into the next sample says of this one.
+    # Information on this sample from the step into the next one.
     back = np.zeros_like(f)
     _symmetric(f[..., 1:], forward[..., 1:], turns, known @ turns, back[..., :-1])
     diagonal = weight + back

@@ -79,7 +79,7 @@ rest. {_DESCRIBED}.
 
 
 def replay() -> int:
-    """Publish a bag; the reader of bags, which an apt-only Jazzy has not, is loaded here."""
+    """Publish a bag; the bag reader is imported here, because an apt-only Jazzy lacks it."""
     from ou_monitor.nodes.replay import main
     return main()
 

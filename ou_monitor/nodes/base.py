@@ -1,8 +1,8 @@
 """
 What the nodes share: parameters from a table, start and end, a thread, and diagnostics.
 
-The parameters are declared as tables say, so a name or a default exists once.  No error of a
-callback ends a node.
+Parameters are declared from tables, so each name and default exists once. An exception in a
+callback does not end a node.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from rclpy.time import Time
 from rclpy.timer import Timer
 
 QOS = 'qos_overrides.'
-# rclpy's own, never declared by us.
+# Declared by rclpy itself.
 _BUILT_IN = ('use_sim_time', 'start_type_description_service', QOS)
 
 LOCK = Parameter(
     'lock_parameters', False,
     'Whether all that can disarm the node is refused at run time: every parameter but '
     'publish_rate, ~/clear_brownout and ~/save_model.')
-# How long an error of a callback is told in the diagnostics, s.
+# How long the diagnostics report an exception of a callback, s.
 TELL = 10.0
 PUBLISH_RATE = Parameter('publish_rate', 10.0, 'How often the outputs are published, Hz.',
                          0.01, 1000.0)
@@ -51,13 +51,13 @@ class MonitorNode(Node):
     """
     Node whose parameters come from a table.
 
-    A change of those in `table` is checked as a whole (`check` raises `ValueError` with the reason
-    and the old values stay) and then handed to `apply`, which must not lose state.  Those in
-    `fixed` are read once, at the start; a managed node begins when it is activated (lifecycle),
-    and then reads them anew, else `begin` is called at the end of its making.
+    Changes to parameters in `table` are checked together (`check` raises `ValueError` with the
+    reason, and the old values stay), then passed to `apply`, which must keep all state. Parameters
+    in `fixed` are read at the start. A managed node (lifecycle) begins, and reads them, whenever
+    it is activated; any other calls `begin` at the end of its constructor.
     """
 
-    # Whether it works: between begin and stop.
+    # True between `begin` and `stop`.
     running = False
 
     def __init__(self, name: str, table: Sequence[Parameter],
@@ -68,9 +68,9 @@ class MonitorNode(Node):
         self._at_stop: list[Callable[[], object]] = []
         self.faults, self.fault = 0, ''
         self._faulted = -math.inf
-        # What ended the work of the thread; empty: nothing.
+        # Error that ended the work of the thread; '' if none.
         self.problem = ''
-        # Set when that work is to end.
+        # Set to end that work.
         self.ending = Event()
         self._thread: Thread | None = None
         self._publishing: Timer | None = None
@@ -95,10 +95,10 @@ class MonitorNode(Node):
         self.add_post_set_parameters_callback(self.guarded(self._after_set))
 
     def start(self) -> None:
-        """Open all that the node works with."""
+        """Create publishers, subscriptions, services and timers."""
 
     def begin(self) -> None:
-        """Start; what has been opened by a start that fails is closed again."""
+        """Start; if that fails, close again all that was opened."""
         try:
             self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
             self.start()
@@ -112,7 +112,7 @@ class MonitorNode(Node):
         self.running = False
         self.ending.set()
         if self._thread is not None:
-            # Before what it publishes on is closed.
+            # Before its publishers are closed.
             self._thread.join(2.0)
         for made in reversed(self._made):
             for destroy in (self.destroy_timer, self.destroy_subscription, self.destroy_service,
@@ -125,7 +125,7 @@ class MonitorNode(Node):
         self._publishing = None
 
     def run_beside(self, work: Callable[[], None]) -> None:
-        """Do some work in a thread, which must end when `ending` is set."""
+        """Run work in a thread; it must end when `ending` is set."""
         def run() -> None:
             try:
                 work()
@@ -140,7 +140,7 @@ class MonitorNode(Node):
         self._thread.start()
 
     def at_stop(self, close: Callable[[], object]) -> None:
-        """Have something called when the node stops."""
+        """Register a function that is called when the node stops."""
         self._at_stop.append(close)
 
     def destroy_node(self) -> None:
@@ -164,7 +164,7 @@ class MonitorNode(Node):
             self.publish_every(self._outputs_callback)
 
     def every(self, period: float, callback: Callable[[], None]) -> Timer:
-        """Call back every `period` s of real time: silence is told on simulated time too."""
+        """Call back every `period` s of real time: silence shows under simulated time too."""
         timer = self.create_timer(period, self.guarded(callback), clock=self.steady)
         self._made.append(timer)
         return timer
@@ -176,9 +176,9 @@ class MonitorNode(Node):
 
     def guarded(self, callback: Callable[..., Any]) -> Callable[..., Any]:
         """
-        Return the callback such that what it raises is told, and ends nothing.
+        Return a callback whose exceptions are reported instead of raised.
 
-        Left to itself an exception becomes a SystemError in the EventsExecutor.
+        An uncaught exception becomes a SystemError in the EventsExecutor.
         """
         @functools.wraps(callback)
         def call(*args: Any) -> Any:
@@ -191,7 +191,7 @@ class MonitorNode(Node):
         return call
 
     def _take_fault(self, error: Exception) -> None:
-        """Count and log what a callback raised, and begin anew."""
+        """Count and log an exception of a callback, and recover."""
         words = ' '.join(str(error).split())[:200]
         self.fault = f'{type(error).__name__}: {words}' if words else type(error).__name__
         self.faults += 1
@@ -200,11 +200,11 @@ class MonitorNode(Node):
         self.recover(error)
 
     def recover(self, error: Exception) -> None:
-        """Begin anew after a callback has raised."""
+        """Restart what an exception of a callback may have left unfinished."""
 
     @property
     def fault_notes(self) -> list[str]:
-        """Return what is to be said of a callback that has raised a short time ago."""
+        """Return a note on a recent exception of a callback, if any."""
         recent = self.steady_now() - self._faulted < TELL
         return [f'A callback failed ({self.faults} times so far): {self.fault}.'] if recent else []
 
@@ -255,19 +255,19 @@ class MonitorNode(Node):
         return made
 
     def _keep(self, made: Any) -> None:
-        """Note what is to be closed at the end; rclpy opens its own before there is a list."""
+        """Remember what `stop` closes; rclpy opens its own before the list exists."""
         if hasattr(self, '_made'):
             self._made.append(made)
 
     def _overriding(self, topic: str) -> dict[str, Any]:
-        """Return the option by which a topic takes `qos_overrides`, where there are any for it."""
+        """Return the option that applies `qos_overrides` to a topic; empty if it has none."""
         prefix = f'qos_overrides.{self.resolve_topic_name(topic)}.'
         wanted = any(name.startswith(prefix) for name in getattr(self, '_parameter_overrides', ()))
         return {'qos_overriding_options': QoSOverridingOptions.with_default_policies()
                 } if wanted else {}
 
     def refuse_other_overrides(self, topics: Iterable[str]) -> None:
-        """Refuse `qos_overrides` of topics that are none of ours."""
+        """Refuse `qos_overrides` for topics that this node does not use."""
         known = [self.resolve_topic_name(topic) for topic in topics]
         for name in self._parameter_overrides:
             if name.startswith(QOS) and not any(
@@ -308,7 +308,7 @@ class MonitorNode(Node):
         return float(self.get_clock().now().nanoseconds) * 1e-9
 
     def _widen_overrides(self, declared: Sequence[Parameter]) -> None:
-        """Take `-p window:=2` for 2.0: YAML writes whole numbers without a point."""
+        """Read `-p window:=2` as 2.0: YAML writes whole numbers without a point."""
         self._floats = {p.name for p in declared if isinstance(p.default, float) or p.mixed}
         overrides = self._parameter_overrides
         for name in self._floats & overrides.keys():
@@ -318,7 +318,7 @@ class MonitorNode(Node):
         return [_as_double(p) if p.name in self._floats else p for p in parameters]
 
     def _warn_misspelt(self) -> None:
-        """Name overrides that rclpy would ignore without a word."""
+        """Warn of overrides that rclpy would silently ignore."""
         for name in self._parameter_overrides:
             if not self.has_parameter(name) and not name.startswith(_BUILT_IN):
                 known = [key for key in self._parameters if not key.startswith(_BUILT_IN)]
@@ -350,7 +350,7 @@ class MonitorNode(Node):
 
 @contextmanager
 def _readable_overrides(topic: str) -> Iterator[None]:
-    """Make bad input of `qos_overrides` that cannot be used."""
+    """Turn errors in `qos_overrides` into an `InputError`."""
     try:
         yield
     except (InvalidQosOverridesError, RuntimeError, ValueError) as error:
@@ -358,7 +358,7 @@ def _readable_overrides(topic: str) -> Iterator[None]:
 
 
 def _never(message: Any) -> None:
-    """Stand for the callback of a subscription that is polled."""
+    """Do nothing: rclpy wants a callback for a polled subscription too."""
 
 
 def _as_double(parameter: RosParameter) -> RosParameter:

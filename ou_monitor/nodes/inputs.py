@@ -34,19 +34,19 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 # deep enough for 0.2 s at 10 kHz while the estimator fits.
 INPUT_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000,
                        reliability=ReliabilityPolicy.BEST_EFFORT)
-# Of blocks so many, or 2000 of 10 000 samples would wait in 80 MB.
+# Fewer blocks: 2000 of 10 000 samples would take 80 MB.
 BLOCK_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=200,
                        reliability=ReliabilityPolicy.BEST_EFFORT)
-# Messages taken at a time: all that can wait, but no more than so many bytes of them, which take
-# some 50 ms and 50 MB until they are estimated from.
+# Maximum messages and bytes taken at a time: all that can wait, unless they exceed the bytes,
+# which need about 50 ms and 50 MB to process.
 MOST_TAKEN, MOST_BYTES = 2000, 2_000_000
-# No message waits longer in the middleware, s: it keeps 2000.
+# Maximum wait of a message in the middleware, s: it keeps 2000.
 MOST_WAIT = 60.0
 CLOCK_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class Stamper:
-    """Time of messages; `on_jump` is called with the reason when that clock stepped."""
+    """Times of messages; `on_jump` is called with the reason when their clock steps."""
 
     def __init__(self, node: MonitorNode, on_jump: Callable[[str], None]) -> None:
         self._node = node
@@ -110,7 +110,7 @@ class Stamper:
 class Arrivals:
     """Messages of one publisher, in order of arrival."""
 
-    column: FieldColumn  # What they hold; in place of a stamp that is missing, when it was sent
+    column: FieldColumn  # Their content; the send time replaces a missing stamp
     received: FloatArray  # When the middleware received each, by the wall clock, s; shape (m,)
     arrived: FloatArray  # The same by the monotonic clock, s; shape (m,)
 
@@ -123,10 +123,10 @@ class Arrivals:
 
 class PolledInput:
     """
-    One field of the messages of a topic, fetched when it is asked for, many at a time.
+    One field of the messages of a topic, fetched in batches on request.
 
-    `spec` says which field and stamp, `beside` a second field, of one number in each.
-    `publishers` are who sends, `unreadable` counts messages that could not be decoded.
+    `spec` names the field and the stamp, `beside` a second field with one number a message.
+    `publishers` follows the senders; `unreadable` counts messages that could not be decoded.
     """
 
     def __init__(self, node: MonitorNode, kind: Any, topic: str, spec: FieldSpec,
@@ -140,7 +140,8 @@ class PolledInput:
         self._kind = kind
         self.publishers = Publishers()
         self.unreadable = 0
-        # Fetched, not yet read: messages, by which clocks (wall, monotonic, s), and their size.
+        # Fetched, not yet read: messages, when (wall and monotonic clock, s), and their total
+        # size.
         self._fetched: list[tuple[bytes, dict[str, Any]]] = []
         self._when: list[tuple[float, float]] = []
         self._bytes = 0
@@ -154,11 +155,11 @@ class PolledInput:
 
     @property
     def full(self) -> bool:
-        """Whether as much has been fetched as is to be read at a time."""
+        """Whether a full batch has been fetched."""
         return len(self._fetched) >= MOST_TAKEN or self._bytes >= MOST_BYTES
 
     def fetch(self) -> None:
-        """Fetch what waits in the middleware, which would drop it; `take` reads it."""
+        """Fetch waiting messages before the middleware drops them; `take` reads them."""
         handle = self._input.handle
         wall, now = time.time(), self._node.steady_now()
         with handle:
@@ -171,7 +172,7 @@ class PolledInput:
                 self._bytes += len(found[0])
 
     def take(self) -> Arrivals | None:
-        """Return what waits, of the publisher followed; None when nothing does."""
+        """Return the waiting messages of the followed publisher; None if there are none."""
         self.fetch()
         taken = self._fetched
         if not taken:
@@ -197,18 +198,18 @@ class PolledInput:
         table = MessageTable(b''.join(data), np.zeros(ends.size, np.uint16),
                              np.arange(ends.size, dtype=np.uint64), begins, ends)
         column = self._reader.read(table)
-        # In the place of log times: the number of each that could be read.
+        # Here `log_time` holds the index of each message that could be read.
         read = np.flatnonzero(kept)[column.log_time.astype(np.int64)]
         column = column._replace(stamp=np.where(column.stamped, column.stamp, times[read]))
         return Arrivals(column, received[read], arrived[read])
 
 
 def decode(data: bytes, kind: Any, topic: str) -> Any:
-    """Return a message of a class of messages."""
+    """Deserialize a message of a class."""
     try:
         return deserialize_message(data, kind)
     except Exception as error:
-        # Of the middleware: it has no type of its own.
+        # The middleware has no exception type of its own.
         raise InputError(f'a message on {topic} cannot be read: {error}') from error
 
 
@@ -221,7 +222,7 @@ class Silence:
         self.interval = 0.0
 
     def heard(self, at: float | None = None) -> None:
-        """Take an arrival (at in s; now when left out); `interval`: since the one before, s."""
+        """Record an arrival (at in s; default: now) and the `interval` since the last one, s."""
         now = self._now() if at is None else at
         if self._last > -math.inf:
             self.interval = now - self._last
@@ -240,10 +241,10 @@ def within(age: float | None, limit: float) -> bool:
 
 class SourceFinder:
     """
-    Sources of some quantities, each opened as soon as a publisher shows a type that is known.
+    Sources of some quantities, each opened once a publisher offers a known type.
 
-    By the values of the parameters; `open_source` gets a source whose type is known, and its
-    InputError is a problem.  `problems` says of a quantity why it is not used, or is silent.
+    The parameters' values name them. `open_source` opens a source of a known type; its InputError
+    becomes a problem. `problems` says why a quantity is not used; '' if it is.
     """
 
     def __init__(self, node: MonitorNode, quantities: tuple[str, ...], values: Mapping[str, Any],
@@ -261,7 +262,7 @@ class SourceFinder:
         return [source.topic for source in self.sources.values()]
 
     def watch(self, needed: str = '') -> None:
-        """Look at who publishes; an InputError in opening the `needed` quantity is raised."""
+        """Check the publishers; an InputError in opening the `needed` quantity is raised."""
         for quantity, source in self.sources.items():
             topic = self._node.resolve_topic_name(source.topic)
             types = types_on(self._node, topic)
@@ -269,7 +270,7 @@ class SourceFinder:
             chosen = source if source.spec is not None else source.choose(types)
             problem = ''
             if opened is not None:
-                # DDS drops the messages of another type without a word.
+                # DDS silently drops messages of another type.
                 if types and opened.spec is not None and opened.spec.type not in types:
                     problem = (f"{topic} carries {', '.join(types)}, but msg_config "
                                f"'{opened.config}' expects {opened.spec.type}.")
@@ -288,7 +289,7 @@ class SourceFinder:
             self._note(quantity, problem)
 
     def _note(self, quantity: str, problem: str) -> None:
-        """Say a problem once, for as long as it stays the same."""
+        """Log a problem once until it changes."""
         if problem and self.problems.get(quantity) != problem:
             self._node.get_logger().warning(problem, throttle_duration_sec=10.0)
         self.problems[quantity] = problem

@@ -151,7 +151,7 @@ class Part(NamedTuple):
 
     #: Topic -> its messages, in the order of the file.
     tables: dict[str, MessageTable]
-    #: Log time that no message of a later part is before, ns; None after the last part.
+    #: No later part has a message before this log time, ns; None after the last part.
     later_ns: int | None
     #: Share of the bytes to be read that are read, 0..1.
     done: float

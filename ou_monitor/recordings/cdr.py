@@ -1,12 +1,11 @@
 """
 CDR messages as arrays: the layout of one message, verified in all others.
 
-CDR has no fixed places: a text or a sequence moves all that comes after it.  But in a
-recording the same texts and lengths come again and again.  So the layout is worked out
-once on one message, with every length word that it rests on, and holds for all messages
-of the same size with the same words there: their fields are columns.  What remains goes
-to the general decoder one by one, and so does everything that it would refuse; the
-outcome is the same, bit for bit.
+CDR has no fixed offsets: a text or a sequence shifts all that follows. But in a recording the same
+texts and lengths recur. So the layout is derived once from one message, with every length word
+that it depends on, and holds for all messages of the same size with the same length words: their
+fields are columns. The general decoder reads all others one by one, and refuses what it would
+refuse anyway; the result is the same, bit for bit.
 
 Plain CDR version 1, little endian (OMG DDS-XTypes 7.4.3): alignment is counted
 from after the 4-byte header.  The fields come from the definition in a bag or from the message
@@ -44,7 +43,7 @@ Rows = npt.NDArray[np.uint8]
 _LITTLE_ENDIAN = b'\x00\x01'
 _HEADER = 4
 
-# Beyond these the general decoder is as quick, and no message can make the walk long.
+# Limits of the walk through a message; beyond them the general decoder is as quick.
 _MOST_STEPS = 2000
 _MOST_WORDS = 64
 _MOST_DEPTH = 50
@@ -65,7 +64,7 @@ class Field:
 # package/Type -> its fields.
 Definitions = dict[str, tuple[Field, ...]]
 
-# What the general decoder takes where a bag does not carry these.
+# Definitions that the general decoder uses where a bag carries none.
 _TIME = (Field('sec', 'uint32'), Field('nanosec', 'uint32'))
 DEFAULTS: Definitions = {
     'builtin_interfaces/Time': _TIME, 'builtin_interfaces/Duration': _TIME}
@@ -78,7 +77,7 @@ def short_name(kind: str) -> str:
 
 
 class _NoLayoutError(ValueError):
-    """The message goes on beyond its end, or beyond what a walk through it may take."""
+    """The message exceeds its own length, or the limits of the walk."""
 
 
 @dataclass(frozen=True)
@@ -282,8 +281,7 @@ def check_extent(message: bytes, kind: str, definitions: Definitions) -> None:
           most_words=len(message)).message(kind, (), 0)
 
 
-# Layouts that are tried for messages of one length; a topic with more of them
-# is not one whose messages are alike.
+# Maximum layouts for messages of one length; a topic with more has no recurring layout.
 MOST_LAYOUTS = 16
 
 Broken = Callable[[int, InputError], None]
@@ -402,7 +400,7 @@ class _Found:
 
     def __init__(self, n: int) -> None:
         self.stamp, self.beside = np.full(n, np.nan), np.full(n, np.nan)
-        # Places of messages alike, shape (k,), and their values, shape (k, values in each).
+        # Indices of messages alike, shape (k,), and their values, shape (k, values in each).
         self.blocks: list[tuple[IntArray, FloatArray]] = []
 
 
@@ -540,7 +538,7 @@ class FieldReader:
             return None
         found = layout.places
         for spec, path, _, _ in self._fields:
-            # An array is a block of samples, or a mistake that the general way names.
+            # An array is a block of samples, or an error that the general decoder reports.
             if path not in found or (found[path].size is not None and spec.sample_rate is None):
                 return None
         if self._stamp is not None:

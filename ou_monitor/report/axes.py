@@ -10,9 +10,9 @@ from ou_monitor.report.svg import Plot
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Pixels of a page for an inch.
+# Pixels of a page per inch.
 _INCH = 100.0
-# Looks of a page, as matplotlib names them.
+# Line styles of a page, as matplotlib names them.
 _LOOKS: dict[str, dict[str, Any]] = {
     'dash': {'linestyle': '--'}, 'thick': {'linewidth': 2.0}, 'faint': {'alpha': 0.55}}
 

@@ -18,9 +18,9 @@ from ou_monitor.records import FloatArray
 @dataclass(frozen=True)
 class LoadDependentSigma(Term):
     """
-    Multiply sigma by a factor that is a straight line in ln between knots.
+    Multiply sigma by a factor whose logarithm is linear between knots.
 
-    Level beyond the outer knots.
+    It is constant beyond the outer knots.
     """
 
     NAME: ClassVar[str] = 'load_dependent_sigma'
@@ -30,7 +30,7 @@ class LoadDependentSigma(Term):
     ROLE: ClassVar[Role] = Role.DRIVE
     SIGNS: ClassVar[tuple[str, ...]] = ('variance throttle',)
     MEASURED: ClassVar[bool] = True
-    # Where it steps was searched for.
+    # Price of the search for a step's position.
     SEARCH: ClassVar[float] = by_parameters(
         0.0, lambda term: _STEP_PRICE if term.steps() else 0.0)
     LIVE: ClassVar[bool] = True
@@ -63,7 +63,7 @@ class LoadDependentSigma(Term):
         return effect
 
     def free(self) -> tuple[str, ...]:
-        """Return the knots but the first, which sigma of the ou stands for."""
+        """Return all knots but the first, where the OU's sigma is the level."""
         return tuple(f'log_factor {k}' for k in range(1, len(self.log_factor)))
 
     def moved(self, name: str, by: float) -> LoadDependentSigma:
@@ -79,7 +79,7 @@ class LoadDependentSigma(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return the likelier two of: a straight line, steps, and as many knots as it takes."""
+        """Return the two likeliest of a straight line, single steps, and as many knots as pay."""
         if view.throttle is None:
             return ()
         u = view.throttle[view.train]
@@ -104,23 +104,22 @@ class LoadDependentSigma(Term):
                 for _, knots, factors in forms[:2]]
 
 
-# What the search for the edge of a step costs, nats: ln of the edges tried.
+# Price of the search for the edge of a step, nats: ln of the edges tried.
 _STEP_PRICE = 4.5
-# The same for a knot; bins of throttle, scores in one at least, and knots at most.
+# The same for a knot; bins of throttle, minimum scores in a bin, maximum knots.
 _KNOT_PRICE = 3.5
 _BINS, _IN_BIN, _MOST_KNOTS = 40, 20, 9
-# Logarithms of factors that a fit stays within: where white noise hides the rail, nothing
-# else holds them.
+# Largest logarithm of a factor: where white noise hides the rail, nothing else limits it.
 _MOST = 4.0
-# Knots nearer than this are one, and half the width of a step, in throttle.
+# Minimum distance of knots, and half the width of a step, in throttle.
 _APART, _EDGE = 0.02, 0.002
 
 
 def _ends(throttle: FloatArray) -> FloatArray:
     """
-    Return the knots of a straight line: where it ends, so that it is level nowhere.
+    Return the knots of a straight line: its ends, so that no part of it is constant.
 
-    Of throttle throughout, which is known, also of the part kept.
+    All throttle counts, also that of the held-out part.
     """
     return np.array([throttle.min(), throttle.max()])
 
@@ -129,7 +128,7 @@ Bins = tuple[FloatArray, FloatArray, FloatArray]
 
 
 def _binned(square: FloatArray, x: FloatArray, edges: FloatArray) -> Bins:
-    """Return inputs, ln of the deviation of the scores, and samples, of bins that have some."""
+    """Return mean input, ln of the scores' deviation, and count, of each bin with enough."""
     last = edges.size - 2
     where = np.clip(np.searchsorted(edges, x, side='right') - 1, 0, last)
     count = np.bincount(where, minlength=last + 1).astype(np.float64)
@@ -154,7 +153,7 @@ def _hats(x: FloatArray, knots: FloatArray) -> FloatArray:
 
 
 def _to_bins(bins: Bins, knots: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return factors that fit the bins, for sets of knots, and what is left of each, nats."""
+    """Return factors that fit the bins, and the misfit, nats, for each set of knots."""
     centre, log, count = bins
     # The logarithm of a deviation found from n scores has a variance of 1/(2 n).
     weight = 2.0 * count
@@ -169,9 +168,9 @@ def _to_bins(bins: Bins, knots: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _greedy(bins: Bins, knots: FloatArray, price: float, apart: float
             ) -> tuple[FloatArray, FloatArray, float]:
     """
-    Return knots, factors there, and what is left, nats.
+    Return knots, factors there, and the misfit, nats.
 
-    The ends, and one after the other where it helps most, while it pays; nearer ones are one.
+    From the ends on, add the best knot, not nearer than `apart`, while it gains `price`.
     """
     factors, misfit = _to_bins(bins, knots[None])
     found = knots, factors[0], float(misfit[0])
@@ -229,7 +228,7 @@ class LoadDependentAlpha(Term):
         return () if view.throttle is None else (cls(0.0),)
 
 
-# Spans of the means of throttle that its changes are counted from, s.
+# Spans of the means of throttle from which its changes are counted, s.
 _FAST, _SLOW = 0.03, 0.2
 # What the noise may follow, by number, and the span, s: throttle; its distance from its mean of
 # the last 30 ms; its change from sample to sample; the distance between its means of the last 30
@@ -238,15 +237,13 @@ INPUTS = (('throttle', 0.0), ('fast', _FAST), ('step', 0.0), ('slow', _SLOW), *(
     (what, span) for span in (0.1, 0.5, 2.5) for what in ('rises', 'falls')))
 # What the choice of an input costs, nats: ln of their number.
 _INPUT_PRICE = math.log(len(INPUTS))
-# Share of white noise in the errors of one step below which they are not taken apart.
+# Share of white noise in the one-step errors below which it is not separated.
 _LEAST_WHITE = 0.05
-# Shares of the samples between which inputs are binned: changes are mostly none.
+# Quantiles that bound the bins of an input: most changes are zero.
 _SHARES = np.array([*np.linspace(0.0, 0.95, 39), 0.97, 0.98, 0.985, 0.99, 0.995, 0.998, 1.0])
-# A square counts up to this where the curves are known by and large: wrong samples are no law of
-# throttle.
+# Largest square that counts once the curves are roughly known, so that bad samples shape no law.
 _LARGEST = 25.0
-# Rounds in which each curve is fitted beside the others; knots nearer than this share of the
-# range are one.
+# Rounds of fitting each curve given the others; minimum distance of knots over the range.
 _ROUNDS, _SPACING = 2, 0.02
 # The number of the curve over the sum of the others.
 SUM = len(INPUTS)
@@ -255,10 +252,10 @@ SUM = len(INPUTS)
 def _curve(square: FloatArray, x: FloatArray, shares: FloatArray, log: FloatArray | None
            ) -> tuple[FloatArray, FloatArray] | None:
     """
-    Return knots over x and ln of the deviation of the scores there, the first 0; None: level.
+    Return knots over x and ln of the scores' deviation there, the first 0; None: constant.
 
-    square: of the scores, shape (n,); shares: of the samples, between which x is binned; log: ln
-    of their deviation where it is known by and large, shape (n,).
+    square: of the scores, shape (n,); shares: quantiles that bound the bins of x; log: ln of the
+    scores' deviation once roughly known, shape (n,).
     """
     edges = np.unique(np.quantile(x, shares))
     if edges.size < 3:
@@ -268,7 +265,7 @@ def _curve(square: FloatArray, x: FloatArray, shares: FloatArray, log: FloatArra
         square = np.minimum(square, _LARGEST * usual * np.exp(2.0 * log))
     centre, values, count = _binned(square, x, edges)
     if log is not None:
-        # Squares with heavy tails say less of their mean than those of normal scores.
+        # The mean of heavy-tailed squares is less certain than that of normal scores.
         alike = square * np.exp(-2.0 * log)
         count = count / max(0.5 * float(np.mean(alike**2) / np.mean(alike)**2) - 0.5, 1.0)
     flat = 0.0 if centre.size < 2 else float(np.sum(
@@ -289,7 +286,7 @@ class LoadDependentNoise(Term):
     Multiply the white noise by a factor whose ln is a sum of curves over throttle and its changes.
 
     Each curve is straight between knots and level beyond the outer ones, over one of `INPUTS`; one
-    over their sum bends it.  It changes what `measurement_noise` adds, and nothing without one.
+    over their sum bends it.  It scales `measurement_noise`; without one it does nothing.
     """
 
     NAME: ClassVar[str] = 'load_dependent_noise'
@@ -299,7 +296,7 @@ class LoadDependentNoise(Term):
     ROLE: ClassVar[Role] = Role.DRIVE
     SIGNS: ClassVar[tuple[str, ...]] = ('variance throttle', 'variance change')
     MEASURED: ClassVar[bool] = True
-    # Where its knots are was searched for, and which of the inputs have any.
+    # Price of the search for inputs and knots.
     SEARCH: ClassVar[float] = by_parameters(0.0, lambda term: sum(
         _KNOT_PRICE * (values.size - 2) + _INPUT_PRICE for _, values in term.curves().values()))
     APART: ClassVar[int] = by_parameters(0, lambda term: len(term.at) - len(set(term.number)))
@@ -355,18 +352,18 @@ class LoadDependentNoise(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return the curves that the squares of the scores have."""
+        """Return the curves fitted to the squares of the scores."""
         return [] if view.throttle is None else [cls((), (), ()).apart(view)]
 
     def apart(self, view: View) -> LoadDependentNoise:
-        """Return the curves that the scores of a model with this term have."""
+        """Return the curves fitted to the scores of a model with this term."""
         assert view.throttle is not None
         inputs = {k: x[view.train] for k, x in Inputs(range(len(INPUTS)))(
             view.step, view.throttle).items()}
         square = view.z[view.train] ** 2
         white = 1.0 - np.broadcast_to(view.trust, view.z.shape)[view.train]
         if float(white.mean()) > _LEAST_WHITE:
-            # What the rail adds is not multiplied.
+            # The term does not scale the rail's part.
             square = np.maximum(square - (1.0 - white), 0.0) / np.maximum(white, _LEAST_WHITE)
         square = square * np.exp(2.0 * self.log_of(inputs))
         few = max(1, math.ceil(2.0 * _IN_BIN * _SHARES.size / square.size))

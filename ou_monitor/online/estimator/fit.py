@@ -1,21 +1,20 @@
 """
 From the sums of a window to OU parameters.
 
-Restricted quasi-likelihood (model/arma.py) of the ARMA(1,1) that samples or block
-means of an OU in white noise are.  While throttle moves, or when the voltage
-drifts, the mean is regressed along with it: sag, its curvature, its lag.
-Generalised least squares from the lag sums alone: with the inverse
-autocovariances of the noise every product x' K^-1 z is a weighted sum of the
-sums over lags, so no sample is read again.
+Samples, or block means, of an OU in white noise are an ARMA(1,1), which is fitted by restricted
+quasi-likelihood (model/arma.py). While throttle moves, or when the voltage drifts, sag, its
+curvature and its lag are regressed out of the mean. Generalised least squares needs the lag sums
+only: with the inverse autocovariances of the noise every product x' K^-1 z is a weighted sum of
+the sums over lags, so no sample is read again.
 
-Windows whose stamps are not evenly spaced: the exact Gaussian likelihood.  Dearer than the sums
-over lags, so only for windows that need it: irregular sources, and windows with many holes.  The
-inverse covariance Q of a sampled OU is tridiagonal, so the likelihood costs O(n): K = Q^-1 + nu I
-with A = I + nu Q tridiagonal, K^-1 = Q A^-1 and log|K| = log|A| - log|Q|. It is the likelihood of
-the Kalman filter, restricted to the contrasts of the regressors (REML: Harville, J. Am. Stat.
-Assoc. 72 (1977) 320).  Its gradient needs no more than the elimination and the three diagonals of
-A^-1, so a search that begins where the samples would be if they were even takes a handful of
-evaluations.  Without SciPy, which would cost the nodes 45 MB.
+Windows whose stamps are not evenly spaced: the exact Gaussian likelihood.  It costs more than the
+sums over lags and serves only irregular sources and windows with many holes.  The inverse
+covariance Q of a sampled OU is tridiagonal, so the likelihood costs O(n): K = Q^-1 + nu I with A =
+I + nu Q tridiagonal, K^-1 = Q A^-1 and log|K| = log|A| - log|Q|. It is the likelihood of the
+Kalman filter, restricted to the contrasts of the regressors (REML: Harville, J. Am. Stat. Assoc.
+72 (1977) 320).  Its gradient needs no more than the elimination and the three diagonals of A^-1,
+so a search that starts from the fit of evenly spaced samples takes a handful of evaluations. It
+avoids SciPy, which would cost the nodes 45 MB.
 """
 
 from __future__ import annotations
@@ -175,11 +174,10 @@ def independent(cov: FloatArray) -> FloatArray:
 # A trend is taken into the model from this many standard errors on: by chance
 # once in 16 000 long windows.
 TREND_SCORE = 4.0
-# A few relaxations look like a trend more often: the score asked for grows by
-# 1 + 6/x, x = alpha T.  That leaves 1 % of windows of 4 to 13 relaxations, and
-# 5 % of random walks, in which 16 relaxations about a trend are seen; with twice
-# as much a drift of 8 standard deviations over 25 relaxations would be missed
-# in every fifth window rather than in every twelfth.
+# A few relaxations look like a trend more often, so the score asked for grows by 1 + 6/x, x =
+# alpha T. A false trend then remains in 1 % of windows of 4 to 13 relaxations, and in 5 % of
+# random walks (16 apparent relaxations). A drift of 8 standard deviations over 25 relaxations is
+# missed in one window of 12; twice the constant would miss it in one of 5.
 _FEW = 6.0
 # From this score on a trend is looked into (by chance once in 22 windows).
 SUSPECT = 2.0
@@ -187,7 +185,7 @@ SUSPECT = 2.0
 
 @dataclass(slots=True)
 class WindowFit:
-    """What the sums of a window say."""
+    """Fit of the sums of a window."""
 
     # alpha times the step, and the moving-average coefficient.
     a: float
@@ -215,8 +213,8 @@ def fit_window(sums: Sums, m: int, start: tuple[float, float] | None = None) -> 
         fit = _fit_still(sums, m, start)
     if fit.correlated and (abs(fit.trend_score) > SUSPECT
                            or fit.a * sums.n < arma.DOUBTFUL):
-        # To a rail without restoring force any drift is chance: so the drift is
-        # judged by the fit that knows it.
+        # Without restoring force any drift may be chance, so the fit that includes the drift
+        # decides.
         drifting = _fit_moving(sums, m, None, trend=True)
         if drifting.correlated and abs(drifting.trend_score) > TREND_SCORE * (
                 1.0 + _FEW / (drifting.a * sums.n)):
@@ -338,10 +336,10 @@ _SETTLED = 1e-5
 # Evaluations that a fit may take after the first; 4 to 8 are usual, more where nothing tells
 # alpha from noise.
 _MOST_POINTS = 24
-# Step of the differences of slopes, in ln a and z: of a curvature of one they are then
-# right to 1e-4 and rounded to 1e-7.
+# Step of the finite differences of slopes, in ln a and z: for unit curvature the error is 1e-4,
+# the rounding 1e-7.
 _STEP = 1e-4
-# Curvature below which a direction counts as this much curved, nats; longest step.
+# Lower limit of the curvature of a direction, nats; longest step.
 _FLAT, _LONGEST = 1e-3, 1.5
 # Share of noise up to which the search is linear in it; noise of more than ten thousand times the
 # diffusion of one step hides any OU.
@@ -539,7 +537,7 @@ def fit_exact(likelihood: Likelihood, used: int, before: ExactFit | None = None)
     """
     Fit alpha, sigma, the white noise and the mean, of the first `used` regressors.
 
-    before: the fit of a window that is nearly this one.
+    before: the fit of a nearly identical window.
     """
     low, high = np.array([likelihood.low, 0.0]), np.array([likelihood.high, _LOUDEST])
     place, at, curved = _least(
@@ -573,7 +571,7 @@ def _least(f: Callable[[FloatArray], _Point], here: FloatArray, curved: FloatArr
             curved = np.stack([(f(here + step).slopes - at.slopes) / _STEP
                                for step in _STEP * np.eye(2)])
             curved = 0.5 * (curved + curved.T)
-        # On an end beyond which f falls, only the other is left.
+        # At a bound beyond which f falls, only the other coordinate moves.
         free = ~(((here <= low) & (at.slopes > 0.0)) | ((here >= high) & (at.slopes < 0.0)))
         slopes = np.where(free, at.slopes, 0.0)
         values, vectors = np.linalg.eigh(np.where(np.outer(free, free), curved, np.eye(2)))
@@ -589,7 +587,7 @@ def _least(f: Callable[[FloatArray], _Point], here: FloatArray, curved: FloatArr
             new = f(there)
             if new.value <= at.value:
                 break
-            # To the least point of the parabola through both values and the slope here.
+            # To the minimum of the parabola through both values and the slope here.
             whole = False
             step *= min(max(0.5 * gain / (new.value - at.value + gain), 0.1), 0.5)
             gain = -float(slopes @ step)
@@ -608,7 +606,7 @@ def _least(f: Callable[[FloatArray], _Point], here: FloatArray, curved: FloatArr
 
 # Samples up to which the exact likelihood is used.
 MOST = 4096
-# Share of its variance that time must keep beside the load to be told from it.
+# Share of its variance that time must keep, given the load, to be separable from it.
 _APART = 1e-5
 
 
@@ -617,7 +615,7 @@ def fit_irregular(columns: FloatArray, moves: bool, before: ExactFit | None = No
     """
     Fit the OU, the noise and the mean at the stamps as they are.
 
-    before: the second thing returned for a window that is nearly this one.
+    before: the second value returned for a nearly identical window.
     """
     t, y = columns[T] - columns[T, 0], columns[Y]
     load = np.empty((0, t.size))

@@ -1,13 +1,13 @@
 """
 From the cutoff that a law wants to the cutoff in force.
 
-limits -> dead band -> smoothing in ln(fc), fast for a certain sigma -> slew
-limit -> 0.45 of the sample rate, but not below fmin.  What is not known asks for the fallback.
-Nothing in force lies outside fmin..fmax, whatever the rate is.
+limits -> dead band -> smoothing in ln(fc), fast for a certain sigma -> slew limit -> 0.45 of the
+sample rate, but not below fmin.  An unknown cutoff gives the fallback.  The cutoff in force never
+leaves fmin..fmax, whatever the rate is.
 
-Over many samples: the distance to the aim, in ln(cutoff), falls on a line while it slews and as
-exp(-t / constant) behind: where the one gives way to the other is found by search, and the samples
-of a stretch come from its two numbers, all stretches at once.
+Over many samples, the distance to the aim, in ln(cutoff), falls linearly while slewing and then as
+exp(-t / constant). A search finds the transition; two numbers give all samples of a stretch, and
+all stretches are computed at once.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ import numpy as np
 from ou_monitor.online.settings import FilterSettings
 from ou_monitor.records import FloatArray
 
-# A rest of the way, in ln(cutoff), that is not worth a step.
+# Convergence tolerance, in ln(cutoff).
 ARRIVED = 1e-6
 
 
 class CutoffWay:
     """
-    Stretches of one way; `slewing`: whether the slew limit cut the last move, None: no move.
+    Stretches of the way to the aims; `slewing`: whether the slew limit cut the last move, or None.
 
     elapsed, shape (n + 1,): s before each of n samples and at the end; dt: of each, s; most: 1/s.
     """
@@ -43,7 +43,7 @@ class CutoffWay:
         self._parts: list[tuple[float, float, float, float]] = []
 
     def go(self, first: int, last: int, aim: float, gap: float, constant: float) -> float:
-        """Go from a distance to an aim, Hz, over samples first..last - 1; return what is left."""
+        """Approach an aim, Hz, over samples first..last - 1; return the remaining distance."""
         time, most, end = self._time, self._most, math.log(aim)
         bounds = self._bounds.get(constant)
         if bounds is None:
@@ -60,7 +60,7 @@ class CutoffWay:
                 after = bisect_left(time, now + (far - high) / most, k + 1, last)
                 left = gap - line * (time[after] - now)
             elif far > low * (1.0 - 1e-12):
-                # Steps of one length are cut, of another not.
+                # The length of the step decides whether it is cut.
                 after, dt = k + 1, float(self._dt[k])
                 self.slewing = far > self._limit(dt, constant)
                 if self.slewing:
@@ -119,15 +119,15 @@ class CutoffWay:
 LN2 = math.log(2.0)
 # Highest cutoff as a share of the sample rate (Betaflight allows 0.475).
 OF_RATE = 0.45
-# Samples over which the sample rate is averaged; how far an interval may be from the mean before
-# it is odd; and how many odd ones in a row are a new rate.
+# Samples over which the sample rate is averaged; factor off the mean that makes an interval odd;
+# odd intervals in a row that mean a new rate.
 INTERVALS = 100
 ODD = 5.0
 _NEW = 5
 
 
 class Bound(enum.Enum):
-    """What decides the cutoff at this sample; the value is how it is told."""
+    """What decides the cutoff at this sample; the value is its text."""
 
     NONE = 'the law'
     LOWEST = 'fmin'
@@ -144,8 +144,8 @@ class SampleInterval:
     """
     Mean time between samples, s, over some 100 of them; 0 before the second sample.
 
-    An interval of more than five means is a gap and left out, unless gaps are a third of all;
-    five in a row that are five times off are a new rate, which starts the mean anew.
+    Intervals over five times the mean are gaps and left out, unless a third of all are gaps. Five
+    intervals in a row that are off by a factor of five are a new rate and restart the mean.
     """
 
     __slots__ = ('_long', '_n', '_short', 'mean')
@@ -175,11 +175,11 @@ class SampleInterval:
 
     @property
     def settled(self) -> bool:
-        """Whether the mean is over all the samples that it ever will be."""
+        """Whether the mean covers its full number of samples."""
         return self._n == INTERVALS
 
     def went_on(self, mean: float, samples: int) -> None:
-        """Take so many normal intervals, of which the mean is known, s (mean in s)."""
+        """Take a number of normal intervals by their mean (mean in s)."""
         self.mean = mean
         self._short, self._long = 0, max(self._long - samples, 0)
 
@@ -208,7 +208,7 @@ def time_constant(settings: FilterSettings, error: float) -> float:
 
 
 class CutoffControl:
-    """The cutoff in force, and what holds it."""
+    """The cutoff in force, and what limits it."""
 
     def __init__(self, settings: FilterSettings) -> None:
         self._settings = settings
@@ -258,7 +258,7 @@ class CutoffControl:
 
     def update(self, wanted: float, error: float, dt: float, interval: float) -> float:
         """
-        Take what the law wants; return the cutoff in force.
+        Take the law's cutoff; return the cutoff in force.
 
         wanted in Hz, dt in s, interval in s, result in Hz.
         """
@@ -273,7 +273,7 @@ class CutoffControl:
     def run(self, begin: list[int], wanted: list[float], error: list[float],
             dt: FloatArray, interval: FloatArray) -> FloatArray:
         """
-        Take what the law wants from some samples on; return what `update` would have returned.
+        Take the law's cutoffs from some samples on; return what `update` would have returned.
 
         begin: where each wanted cutoff begins, the first 0.
 
@@ -323,7 +323,7 @@ class CutoffControl:
         self._slewing = abs(step) > most
         if self._slewing:
             step = math.copysign(most, step)
-        # What is left below any meaning is not crept after for ever.
+        # Stop at the tolerance instead of creeping on.
         arrived = abs(gap - step) < ARRIVED
         self._moving = self._aim if arrived else self._moving * math.exp(step)
 

@@ -1,9 +1,9 @@
 """
-This flight beside the saved model of its supply: sag, resistance and noise now over then.
+Compare this flight with the saved model of its supply: ratios of sag, resistance and noise.
 
-Limits first: cold and age look alike; a pack warms, and its sag falls by up to a quarter within a
-flight; 5 cells for 6 pass for an empty pack unless they are full; throttle that hardly moves
-compares nothing.
+Limits first: a cold pack looks like an old one; a pack warms, and its sag falls by up to a quarter
+within a flight; a full 5S pack for a 6S one is not detected at once; steady throttle allows no
+comparison.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ import numpy.typing as npt
 from ou_monitor.model.load import LoadStart, SIZE
 from ou_monitor.records import FloatArray, NAN
 
-# Voltages and the model's answer are compared within stretches of this length, s, so that the
-# level cancels out (1 s and 4 s give the same); of the last five minutes.
+# Length, s, of the stretches within which voltages and the model's answer are compared, so that
+# the level cancels out (1 s and 4 s give the same); maximum number kept, five minutes.
 _STRETCH, _MOST = 2.0, 150
-# Least effective number of stretches, as the error comes from how they differ.
+# Minimum effective number of stretches: their scatter gives the error.
 _FEWEST = 4.0
-# Least relative error of the model: what its form leaves where throttle is flown otherwise.
+# Minimum relative error of the model: its form errs when throttle is flown differently.
 _FORM = 0.05
-# Relative error of a size of the sag that the filter alone has learned: at least a tenth.
+# Relative error of the sag where only the filter has learned it.
 SIZE_ERROR = 0.1
-# Least relative error of the noise: how it differs between simulated flights of one model.
+# Minimum relative error of the noise: its scatter between simulated flights of one model.
 _NOISE_FORM = 0.15
-# Noise that counts at least, V.
+# Lower limit of the noise, V.
 _LEAST_NOISE = 1e-6
-# Weaker: by more than this share, and by so many standard errors (1 % of a normal law lies above).
+# Weaker: above both limits, relative and in standard errors (1 % of a normal law lies above).
 _LEAST, _ERRORS = 0.10, 2.33
 # Relative error above which the ratio is not determined.
 _VAGUE = 0.15
@@ -44,7 +44,7 @@ _TAKE_OFF, _EMPTY, _FULL = 3.4, 3.2, 4.4
 
 
 class ModelVerdict(enum.Enum):
-    """What the comparison of this flight with the model says."""
+    """Result of comparing this flight with the model."""
 
     AS_MODEL = 'as the model'
     WEAKER = 'weaker than the model'
@@ -61,7 +61,7 @@ class ModelComparison:
     sag_ratio_se: float = NAN  # Its standard error, the model's included
     resistance_ratio: float = NAN  # NaN without a current, now or then
     resistance_ratio_se: float = NAN
-    # Of what the answer leaves while throttle moves; NaN where the model does not say.
+    # Of the residual while throttle moves; NaN where the model has none.
     noise_ratio: float = NAN
     noise_ratio_se: float = NAN
     words: str = ''  # One sentence; empty: nothing to do
@@ -81,16 +81,16 @@ class ModelComparison:
 
 @dataclass(frozen=True)
 class Contrast:
-    """How a voltage answers beside what coefficients say; NaN: too few stretches."""
+    """Measured answer to throttle against the predicted one; NaN: too few stretches."""
 
     ratio: float = NAN  # Slope of the voltage over the answer
     se: float = NAN
-    noise: float = NAN  # Rms of what is left while throttle moves, outliers weighed down, V
+    noise: float = NAN  # Residual rms while throttle moves, outliers downweighted, V
     noise_se: float = NAN
 
 
 class LoadContrasts:
-    """Weighted products of voltage and regressors within stretches of 2 s, means taken out."""
+    """Weighted products of voltage and regressors within stretches of 2 s, means removed."""
 
     def __init__(self) -> None:
         # Of each: sum of the weights, 1/V^2, and products of voltage and regressors.
@@ -110,7 +110,7 @@ class LoadContrasts:
         self._sums += np.outer(row / variance, row)
 
     def against(self, coefficients: npt.ArrayLike) -> Contrast:
-        """Return the voltage over the answer of coefficients, V."""
+        """Compare the voltage with the answer, V, that these coefficients predict."""
         if len(self._stretches) < _FEWEST:
             return Contrast()
         a = np.asarray(coefficients, dtype=np.float64)
@@ -123,7 +123,7 @@ class LoadContrasts:
         ratio, share = float(along.sum()) / total, squares / total
         if 1.0 / float(share @ share) < _FEWEST:
             return Contrast()
-        # What each stretch leaves, were the slope of the others alone (jackknife).
+        # Residual of each stretch from the slope of the others (jackknife).
         left = (along - ratio * squares) / (1.0 - share)
         # The logarithm, so that glitches in one stretch do not decide.
         squared = (products[:, 0, 0] - 2.0 * ratio * along + ratio * ratio * squares) / weights
@@ -135,9 +135,9 @@ class LoadContrasts:
 
 
 def other_pack(start: LoadStart, first: float, level: float) -> str:
-    """Return why the level at the first sample or now, V, is another pack's; empty: it is not."""
+    """Return why the level, V, at the first sample or now shows another pack; '': it does not."""
     cells = start.cells
-    # The number of cells of a rail says nothing.
+    # The number of cells means nothing for a rail.
     lithium = _EMPTY <= start.volts / cells <= _FULL
     each = level / cells
     if lithium and not _EMPTY <= each <= _FULL or not (
@@ -150,7 +150,7 @@ def other_pack(start: LoadStart, first: float, level: float) -> str:
 
 
 def judge(ratio: float, se: float, date: str) -> tuple[ModelVerdict, str]:
-    """Return the verdict on a sag now over then, its error included, and the sentence."""
+    """Return the verdict on a ratio of sags with its standard error, and the sentence."""
     if not se <= _VAGUE * max(ratio, 1.0):
         return ModelVerdict.CANNOT_TELL, ''
     more, model = ratio - 1.0, 'the model' + (f' of {date}' if date else '')
@@ -166,9 +166,9 @@ def judge(ratio: float, se: float, date: str) -> tuple[ModelVerdict, str]:
 def compare(found: Contrast, start: LoadStart, ohm: float, ohm_se: float, other: str, date: str
             ) -> ModelComparison:
     """
-    Return a flight beside what another one has learned, of that date.
+    Compare this flight with the model that an earlier one, of that date, has learned.
 
-    Resistance now in Ohm, NaN where unknown; other: why it is another pack.
+    ohm: resistance now, NaN where unknown; other: why it is another pack, else ''.
     """
     ratio = found.ratio
     se = math.hypot(found.se, ratio * (start.size_se or SIZE_ERROR), ratio * _FORM)

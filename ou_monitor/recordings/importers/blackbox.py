@@ -34,9 +34,9 @@ from ou_monitor.records import FloatArray
 # The clock counts us in 32 bits.
 WRAP = 2**32
 
-# Longest step between frames taken as such, s: a pause of the log is longer.
+# Longest step between frames, s; a longer one is a pause of the log.
 _PAUSE = 10.0
-# Fewest frames after a step in time that are a part of the flight and not broken bytes.
+# Minimum frames after a step in time; fewer are corrupt bytes, not flight.
 _PART = 16
 
 GYRO, UNFILTERED, DEBUG, ACCELEROMETER = 'gyroADC', 'gyroUnfilt', 'debug', 'accSmooth'
@@ -93,7 +93,7 @@ def read(path: Path, request: Request) -> Log:
         notes.append(f'Flight {wanted} has no end mark: it was cut off or goes on at its end; '
                      f'{end} of {size} bytes of frames were read.')
     elif rest.strip(b'\xff\0'):
-        # Not what flash is erased to, nor what a card is filled up with.
+        # Bytes of erased flash and padding of cards do not count.
         notes.append(f'{len(rest)} of {size} bytes after the end mark of flight {wanted} were '
                      'not read.')
     table, odd = _in_time(table)
@@ -105,7 +105,7 @@ def read(path: Path, request: Request) -> Log:
         facts['flight'] = f'{wanted} of {len(held)}'
     t = columns['time'] * 1e-6
     if request.flight is None and len(held) > 1:
-        # Only this one is decoded; the others are as long as their bytes say.
+        # Only this flight is decoded; the bytes of the others give their lengths.
         pace = float(t[-1] - t[0]) / max(held[wanted - 1], 1) if t.size else 0.0
         lengths = '; '.join(f'{k + 1}: about {pace * size:.0f} s'
                             for k, size in enumerate(held))
@@ -291,13 +291,13 @@ def _throttles(t: FloatArray, columns: Fields,
 
 
 def _signed(value: FloatArray) -> FloatArray:
-    """Return counts that a logger wrote without their sign: a stick below its lowest pulse."""
+    """Restore the sign of counts logged without one: a stick below its lowest pulse."""
     value = np.where(value >= 2.0 ** 31, value - 2.0 ** 32, value)
     return np.where((value >= 2.0 ** 15) & (value < 2.0 ** 16), value - 2.0 ** 16, value)
 
 
 def _pair(value: Any) -> tuple[float, float] | None:
-    """Return two numbers that rise; None when they are not that."""
+    """Return two rising numbers; None otherwise."""
     if isinstance(value, list) and len(value) == 2 and all(
             isinstance(x, (int, float)) for x in value) and value[1] > value[0]:
         return float(value[0]), float(value[1])
@@ -305,7 +305,7 @@ def _pair(value: Any) -> tuple[float, float] | None:
 
 
 def _high_resolution(headers: Headers) -> float:
-    """Return by what gyro, sticks and setpoints are larger than usual: 1 or 10."""
+    """Return the extra scale of gyro, sticks and setpoints: 1 or 10."""
     return 10.0 if _number(headers, 'blackbox_high_resolution') else 1.0
 
 
@@ -362,7 +362,7 @@ def _gyro_scale(headers: Headers) -> float | None:
 
 def _signals(t: FloatArray, columns: Fields, headers: Headers, known: set[str], *,
              debug_gyro: bool) -> Iterator[Series]:
-    """Yield the fields that are nothing else, in SI where their unit is known (t in s)."""
+    """Yield the remaining fields, in SI where their unit is known (t in s)."""
     gyro, one_g = _gyro_scale(headers), _number(headers, 'acc_1G')
     rates = DEGREE / _high_resolution(headers)
     for name, values in columns.items():
@@ -394,7 +394,7 @@ def _speeds(t: FloatArray, columns: Fields, headers: Headers, notes: list[str],
         notes.append('eRPM was left out: the header does not state motor_poles; give --poles N, '
                      'the magnets of a rotor (14 is common).')
         return None
-    # Logged are hundreds of electrical turns a minute, of which a pair of poles makes one.
+    # eRPM is logged in hundreds; each pair of poles makes one electrical turn per turn.
     scale = 100.0 * RPM * 2.0 / count
     values = np.column_stack([columns[name] for name in fields]) * scale
     origin = '--poles' if poles else 'the header'

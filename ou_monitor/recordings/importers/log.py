@@ -1,9 +1,9 @@
 """
 What an importer returns: a `Log`, candidate `Series`, motion, with where each is from.
 
-Limits first: a log is read whole into memory, its wanted fields only.  Stamps
-are seconds from the first moment of the log, or of the flight in it; absolute
-time is not kept.  Importers know nothing of how a log is written as a bag.
+Limits first: a log is read whole into memory, its wanted fields only.  Stamps are seconds from the
+first moment of the log, or of the flight in it; absolute time is not kept.  Importers do not
+depend on the bag format.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ class Inertial:
     name: str
     # Stamps, s from the start of the log; shape (n,).
     t: FloatArray
-    # rad/s and m/s^2 along the axes of `base_link`, the acceleration with what holds against
-    # gravity; None where the log has none; shape (n, 3).
+    # rad/s and m/s^2 along the axes of `base_link`, the acceleration as specific force (gravity
+    # included); None where the log has none; shape (n, 3).
     angular_velocity: FloatArray | None
     acceleration: FloatArray | None
     # Conversion of the values; kind of series.
@@ -76,9 +76,9 @@ SIGNAL = 'signal'
 UNITS = {VOLTAGE: 'V', THROTTLE: '0..1', CURRENT: 'A'}
 UNKNOWN = '?'
 
-# Values that only broken bytes make; a message could not hold them.
+# Larger values come from corrupt bytes only; a message could not hold them.
 LARGEST = 1e9
-# Stamps that only broken bytes make: further ahead than this, by so few samples.
+# Stamps of corrupt bytes: groups of fewer than _FEW samples, over _FAR from the others.
 _FAR = 3600.0  # s
 _FEW = 16
 Progress = Callable[[float], None]
@@ -153,13 +153,13 @@ class Log:
     inertial: tuple[Inertial, ...] = ()
     # Of the motors.
     speeds: MotorSpeeds | None = None
-    # Of all series of the file, those that were not read included.
+    # Names of all series of the file, unread ones included.
     names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class RawColumns:
-    """Samples of a supply as a file holds them: neither in order nor each stamp once."""
+    """Samples of a supply as a file holds them: unsorted, with repeated stamps."""
 
     # Stamps, s; NaN where not known.
     t: FloatArray
@@ -181,7 +181,7 @@ class RawColumns:
 
 @dataclass(frozen=True)
 class CsvColumns:
-    """How a CSV is to be read; None: as it seems to be written."""
+    """How to read a CSV; None: detected."""
 
     # Names of columns; 'none' leaves the throttle or the current out.
     time: str | None = None
@@ -227,7 +227,7 @@ def one_flight(path: Path, request: Request) -> None:
 
 
 def sound(t: FloatArray, rows: FloatArray) -> tuple[Picked, list[str]]:
-    """Return samples as `in_order`, without those whose stamps only broken bytes make."""
+    """Return samples as `in_order`, without those whose stamps come from corrupt bytes."""
     notes: list[str] = []
     places = np.flatnonzero(np.isfinite(t) & np.isfinite(rows).all(axis=1))
     if places.size < t.size:
@@ -244,7 +244,7 @@ def sound(t: FloatArray, rows: FloatArray) -> tuple[Picked, list[str]]:
 
 
 def clean(series: Series) -> tuple[Series, tuple[str, ...]]:
-    """Return a series with finite values and stamps that increase, and notes of what that took."""
+    """Return a series with finite values and rising stamps, and notes on what was changed."""
     which, notes = sound(series.t, series.values[:, None])
     values = series.values[which]
     if series.quantity == THROTTLE:
@@ -256,13 +256,13 @@ def clean(series: Series) -> tuple[Series, tuple[str, ...]]:
 
 
 def near(t: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return which stamps are not a few on the far side of a pause over an hour."""
+    """Return which stamps are not in a small group beyond a pause over an hour."""
     order = np.argsort(t, kind='stable')
     good = np.ones(t.size, dtype=bool)
     pauses = np.flatnonzero(np.diff(t[order]) > _FAR) + 1
     parts = np.split(order, pauses)
     if max(part.size for part in parts) < _FEW:
-        # A log of a sample every few hours has no crowd to be far from.
+        # A log with a sample every few hours has no large group to compare with.
         return good
     for part in parts:
         good[part] = part.size >= _FEW
@@ -270,7 +270,7 @@ def near(t: FloatArray) -> npt.NDArray[np.bool_]:
 
 
 def rising(t: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return a longest part of the stamps that does not go back."""
+    """Return a longest subsequence of the stamps that does not go back."""
     good = np.ones(t.size, dtype=bool)
     if (t[1:] >= t[:-1]).all():
         return good
@@ -300,7 +300,7 @@ def log_of(form: str, series: Sequence[Series], facts: dict[str, str], notes: It
            names: Iterable[str], inertial: Iterable[Inertial] = (),
            speeds: MotorSpeeds | None = None, start: float = math.inf) -> Log:
     """Return a log, its stamps counted from the first of its series, or `start` (s) if earlier."""
-    # Broken bytes make stamps near zero: a first sample counts when another is near it.
+    # Corrupt bytes give stamps near zero: a first sample counts only with others near it.
     start = min([start, *(float(one.t[near(one.t)].min()) for one in series if one.t.size)])
 
     def shifted(parts: Iterable[_Timed]) -> tuple[_Timed, ...]:
@@ -345,7 +345,7 @@ def quiet(path: Path, parser: str) -> Iterator[io.StringIO]:
 
 @contextmanager
 def quiet_process() -> Iterator[None]:
-    """Send standard error nowhere, also for parsers in C, which do not know Python's."""
+    """Discard the process's standard error, which parsers in C write past Python's."""
     sys.stderr.flush()
     kept = os.dup(2)
     nowhere = os.open(os.devnull, os.O_WRONLY)
