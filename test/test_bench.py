@@ -212,6 +212,18 @@ def test_the_limit_of_a_log_holds_in_python_too(monkeypatch):
         discover(log, cells=9)
 
 
+@pytest.mark.parametrize('command', [analyze, compare, discover])
+def test_arrays_beyond_any_supply_are_dropped_as_from_a_file(command):
+    """With all of them gone, one line says so, or the verdict does; NumPy does not overflow."""
+    t = np.arange(6000) / 100.0
+    v = 1e200 * (5.0 + np.random.default_rng(0).normal(0.0, 0.1, t.size))
+    try:
+        said = str(command(Recording(t, v, np.full(t.size, np.nan), 'huge')).to_dict())
+    except InputError as error:
+        said = str(error)
+    assert 'usable samples' in said or 'dropped' in said
+
+
 def test_the_namespace_is_light():
     """A name of a folder would hide a function, whichever is loaded first."""
     import ou_monitor.analysis.coupling  # noqa: F401

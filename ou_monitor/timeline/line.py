@@ -307,7 +307,7 @@ def part_of(recording: Recording, which: Picked | npt.NDArray[np.bool_], *said: 
 
 def ordered(recording: Recording) -> Recording:
     """Return a recording in the order of its stamps, each once; notes count dropped samples."""
-    which, said = in_order(recording.t, recording.voltage[:, None], _FINITE)
+    which, said = in_order(recording.t, recording.voltage[:, None], MOST_VOLTAGE, ' V')
     recording = part_of(recording, which, *said) if said else recording
     if recording.n > 1 and (step := float(np.median(np.diff(recording.t)))) > LONGEST_STEP:
         raise InputError(f"the samples of '{recording.name}' are {step:.4g} s apart: are the "
@@ -321,8 +321,6 @@ MOST_VOLTAGE = 1.0e6
 MOST_CURRENT = 1.0e6
 # Largest magnitude accepted as a throttle of 0..1, with generous ends.
 MOST_THROTTLE = 2.0
-# Largest finite number: unordered samples may be in any unit of voltage.
-_FINITE = float(np.finfo(np.float64).max)
 # Buffer size, samples: NumPy's overhead per call vanishes, and the buffer stays in the cache.
 BATCH = 32768
 # Search for repeats: samples used, minimum number, new samples between two searches.

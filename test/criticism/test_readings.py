@@ -4,8 +4,8 @@ import math
 import warnings
 
 import numpy as np
-from ou_monitor import discover
 from ou_monitor.criticism.readings import find_bad, usable, why_nothing
+from ou_monitor.discovery.discover import discover
 from ou_monitor.discovery.finding import Verdict
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.supply import SupplyModel
