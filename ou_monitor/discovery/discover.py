@@ -110,7 +110,7 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
     crossing = crossing_rates(samples, (baseline,), () if unknown else whole.terms, rng, scored)
     against = doubts(whole.terms, crossing, recording.duration,
                      float(np.median(samples.step[1:])), larger) if causes else ()
-    verdict = judge(after, len(causes), len(named.dropped), against)
+    verdict = judge(remaining, len(causes), against)
     done(1.0)
     return Finding(
         recording=recording.name, n=recording.n, duration=recording.duration, verdict=verdict,

@@ -2,33 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
-from ou_monitor.criticism.null_bank import family_chance
-from ou_monitor.discovery.finding import CrossingRate, Verdict
+from ou_monitor.discovery.finding import Criticism, CrossingRate, Verdict
 from ou_monitor.model.terms.load_answer import LoadTransient
 from ou_monitor.model.terms.term import Term
 from ou_monitor.text import listed, number
 
-# Chance of the largest statistic above which a model passes.
+# Chance that any statistic of a right model lies outside its band.
 NOTHING = 0.01
 # Step, in a coordinate, that a parameter at the end of its range cannot take.
 _STEP = 1e-4
 
 
-def largest_chance(values: Mapping[str, float]) -> float:
-    """Return the chance that the largest statistic of a right model is as large as this one."""
-    largest = max((abs(value) for value in values.values()), default=0.0)
-    return family_chance(largest, max(len(values), 1))
-
-
-def judge(after: Mapping[str, float], causes: int, dropped: int, doubts: Sequence[str] = ()
-          ) -> Verdict:
-    """Return the verdict on statistics after some causes; others dropped, doubts beside them."""
-    passes = largest_chance(after) > NOTHING and not dropped
+def judge(remaining: Sequence[Criticism], causes: int, doubts: Sequence[str] = ()) -> Verdict:
+    """Return the verdict on a number of causes: by what remains, and doubts beside it."""
     if causes == 0:
-        return Verdict.NO_EFFECT if passes else Verdict.UNEXPLAINED
-    return Verdict.EXPLAINED if passes and not doubts else Verdict.PARTLY_EXPLAINED
+        return Verdict.UNEXPLAINED if remaining else Verdict.NO_EFFECT
+    return Verdict.PARTLY_EXPLAINED if remaining or doubts else Verdict.EXPLAINED
 
 
 def doubts(terms: Sequence[Term], crossing: CrossingRate, duration: float, step: float,

@@ -200,9 +200,6 @@ def _verdict(verdict: Verdict, causes: Sequence[Cause], left: Sequence[Criticism
         return ('The plain OU simulates this recording: no statistic that a recording of this '
                 'length supports deviates.')
     if verdict is Verdict.UNEXPLAINED:
-        if not left:
-            return ('The simulation deviates from the recording, and no known cause explains '
-                    f'it.{tried}')
         return ('The simulation deviates from the recording, and no known cause explains it: '
                 f'{remaining_words(left)}.{tried}')
     if verdict is Verdict.EXPLAINED:
