@@ -121,6 +121,8 @@ class SecondRelaxation(Term):
 
 # Octaves from pole to pole: 1/f within 0.2 %, and within 6 %.
 _FINE, _COARSE = 0.5, 3.0
+# Relaxation times in a step after which 1e-9 of a state is left.
+_FORGOTTEN = 20.0
 # The upper end, the last poles and the corner of the low-pass: at the end the
 # low-pass has taken 1.5 %, and where the poles end most of the rest.
 _LADDER, _CORNER = 4.5, 8.0
@@ -234,7 +236,16 @@ class FlickerNoise(Term):
         variances = self.amplitude ** 2 * variances
         # Most recordings have but a few different steps.
         step, which = np.unique(s.step, return_inverse=True)
-        rate, last, finite = self.corner, poles.size, np.isfinite(step)
+        rate, finite = self.corner, np.isfinite(step)
+        fast = poles * float(step[finite].min(initial=math.inf)) > _FORGOTTEN
+        if fast[1:].any():
+            # Without memory from sample to sample, behind the low-pass too: one state for all.
+            seen = variances * rate / (rate + poles)
+            first = int(np.argmax(fast))
+            variances[first] *= float(seen[fast].sum() / seen[first])
+            poles, variances = (x[~fast | (np.arange(x.size) == first)]
+                                for x in (poles, variances))
+        last = poles.size
         f = np.zeros((step.size, last + 1, last + 1))
         q = np.zeros_like(f)
         f[:, last, last] = np.exp(-rate * step)
