@@ -123,7 +123,9 @@ install() {
     mapfile -t lists < <(lists_of "$level")
     for list in "${lists[@]}"; do options+=(-r "$list"); done
     # What builds packages comes from a lock too, so that pip fetches nothing without a hash.
-    [ "$SOURCE" = sourced ] || options+=(--require-hashes --no-build-isolation)
+    # A lock is complete: pip 23 looks for the newest `coverage[toml]` beside a pinned `coverage`,
+    # and then refuses it for want of a hash.
+    [ "$SOURCE" = sourced ] || options+=(--require-hashes --no-deps --no-build-isolation)
     echo "$ME: installing ${lists[*]} into ${VENV##*/}, once; this takes some minutes" >&2
     : >"$LOG"
     if ! { [ "$SOURCE" = sourced ] || pip_install --require-hashes -r scripts/build.lock; } ||
