@@ -15,9 +15,9 @@ from ou_monitor.comparison.flight_model import (
     Drawn, FiledModel, fit_flight, FlightModel, MOVES, Readings)
 from ou_monitor.comparison.yardstick import (
     Agreement, band, differences, distance, judge, Measures, SpectrumBand, Traces, Yardstick)
+from ou_monitor.criticism.adc import without_repeats
 from ou_monitor.criticism.curves import stray
 from ou_monitor.criticism.readings import current_at, usable, why_nothing
-from ou_monitor.criticism.repeats import without_repeats
 from ou_monitor.errors import InputError
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.records import FloatArray, Recording

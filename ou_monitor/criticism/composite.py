@@ -13,12 +13,10 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
-from ou_monitor.criticism.battery import Covariates, large_ones, throttle_paths
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.criticism.structure import (
-    driven, Events, fit_gaussian, GaussianFit, white_noise)
-from ou_monitor.model.terms.laws import LawFit, View
-from ou_monitor.model.terms.term import Role, Term
+from ou_monitor.criticism.structure import driven, Events, fit_gaussian, GaussianFit, white_noise
+from ou_monitor.model.terms.laws import View
+from ou_monitor.model.terms.term import LawFit, Role, Term
 from ou_monitor.records import FloatArray
 
 # Rounds between events and the Gaussian part.
@@ -138,16 +136,3 @@ def view_of(samples: Samples, gaussian: GaussianFit, z: FloatArray, part: slice)
                 at=samples.t - samples.t[0], step=samples.step, throttle=samples.throttle,
                 train=part, trust=np.clip(1.0 - white / gaussian.variance, 0.0, 1.0),
                 driven=np.clip(added / gaussian.variance, 0.0, 1.0))
-
-
-def covariates_of(samples: Samples, composite: Composite) -> Covariates:
-    """Return the series that the scores of a model are correlated with."""
-    gaussian, events = composite.gaussian, composite.events
-    residual = samples.voltage - gaussian.mean
-    found = None if events is None else (events.push > 0.0) | (events.error > 0.0)
-    keep = float(np.median(gaussian.phi[1:]))
-    paths = () if samples.throttle is None else tuple(throttle_paths(samples.throttle, keep))
-    return Covariates(
-        state=np.concatenate(([0.0], residual[:-1])), at=samples.t - samples.t[0],
-        throttle=samples.throttle, rate=1.0 / float(np.median(samples.step[1:])), keep=keep,
-        large=large_ones(gaussian.z, found), paths=paths)

@@ -14,9 +14,9 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.criticism.adc import find_knee, find_rails, find_step, redraw, usual_change
+from ou_monitor.criticism.adc import (
+    find_knee, find_rails, find_step, redraw, usual_change, without_repeats)
 from ou_monitor.criticism.readings import load_of, usable, why_nothing
-from ou_monitor.criticism.repeats import without_repeats
 from ou_monitor.criticism.samples import (
     choose_samples, events_between, lines_between, Samples, without_tones)
 from ou_monitor.model.terms.catalogue import catalogue

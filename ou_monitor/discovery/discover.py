@@ -9,35 +9,33 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from ou_monitor.criticism.battery import criticise, family_chance, family_edge
 from ou_monitor.criticism.composite import Composite, fit_composite
 from ou_monitor.criticism.integrity import examine, Integrity
-from ou_monitor.criticism.null_bank import criticise, family_chance, family_edge
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate, fit_gaussian
 from ou_monitor.discovery.clipped import redrawn
 from ou_monitor.discovery.decision import relaxes
 from ou_monitor.discovery.earning import Earned, earned, refusal
-from ou_monitor.discovery.errors import standard_errors, with_reach
-from ou_monitor.discovery.finding import Cause, Criticism, Finding, Verdict
-from ou_monitor.discovery.fitting import Fitter
+from ou_monitor.discovery.finding import Cause, Criticism, CrossingRate, Finding, Verdict
+from ou_monitor.discovery.fitting import Fitter, standard_errors, with_reach
 from ou_monitor.discovery.gain import (
-    crossing_rates, gain_of, grown, guess, mean_score, shrink_of, why_unknown, without)
-from ou_monitor.discovery.load_start import whole_load
+    covered, crossing_rates, gain_of, grown, guess, held_out, HeldOut, mean_score, shrink_of,
+    why_unknown, without)
 from ou_monitor.discovery.named import INTERRUPTED, Named, named_causes
 from ou_monitor.discovery.regression import load_terms
-from ou_monitor.discovery.search import position, Progress
-from ou_monitor.discovery.validation import covered, held_out, HeldOut
-from ou_monitor.discovery.verdict import doubts, judge, NOTHING
+from ou_monitor.discovery.search import position, Progress, whole_load
 from ou_monitor.discovery.words import (
     coupling_found, coupling_note, explain, left_out_note, NO_OTHER, no_relaxation_note,
     throttles_note, VAGUE, verdict_sentence)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import blamed, catalogue, left_out, withdraw
+from ou_monitor.model.terms.load_answer import LoadTransient
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import Saturation
-from ou_monitor.model.terms.term import Role
+from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.records import Recording
-from ou_monitor.text import Z95
+from ou_monitor.text import listed, number, Z95
 
 # Why the gain of a line is not known that was found in all samples, of which some are used.
 FAST = 'the samples that are used are too few to show a line so fast.'
@@ -253,3 +251,50 @@ def _notes(state: Integrity, named: Named, model: Composite, dropped: Sequence[s
     elif relaxes(ou.alpha, duration):
         notes.append(coupling_note(ou.alpha, duration))
     return tuple(notes)
+
+
+# Chance that any statistic of a right model lies outside its band.
+NOTHING = 0.01
+# Step, in a coordinate, that a parameter at the end of its range cannot take.
+_STEP = 1e-4
+
+
+def judge(remaining: Sequence[Criticism], causes: int, doubts: Sequence[str] = ()) -> Verdict:
+    """Return the verdict on a number of causes: by what remains, and doubts beside it."""
+    if causes == 0:
+        return Verdict.UNEXPLAINED if remaining else Verdict.NO_EFFECT
+    return Verdict.PARTLY_EXPLAINED if remaining or doubts else Verdict.EXPLAINED
+
+
+def doubts(terms: Sequence[Term], crossing: CrossingRate, duration: float, step: float,
+           larger: bool = False) -> tuple[str, ...]:
+    """
+    Return what speaks against a model beside its statistics, for people (times in s).
+
+    larger: whether its one-step errors are larger than those of the plain OU.
+    """
+    found = ['its one-step errors are larger than those of the plain OU'] if larger else []
+    if crossing.worse:
+        found.append(f'it falls through {number(crossing.level, 4)} V '
+                     f'{number(crossing.extended)} times a minute, where '
+                     f'{number(crossing.observed)} were measured and the plain OU says '
+                     f'{number(crossing.baseline)}')
+    ends = [f'{name} of {term.NAME}' for term in terms for name in _at_ends(term, duration, step)]
+    if ends:
+        found.append(f'{listed(ends)} {"stand" if ends[1:] else "stands"} at the end of the range')
+    return tuple(found)
+
+
+def _at_ends(term: Term, duration: float, step: float) -> list[str]:
+    """Return the parameters of a term that stand at the end of their range."""
+    if isinstance(term, LoadTransient) and not term.delay:
+        return [] if 2.0 * step < term.tau < 0.25 * duration else ['tau']
+    return [name for name in term.free()
+            if not (_moves(term, name, _STEP) and _moves(term, name, -_STEP))]
+
+
+def _moves(term: Term, name: str, by: float) -> bool:
+    try:
+        return term.moved(name, by) != term
+    except ValueError:
+        return False

@@ -18,9 +18,8 @@ from ou_monitor.criticism.curves import stray
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import decision
 from ou_monitor.discovery.fitting import is_trend
-from ou_monitor.discovery.gain import cause_gain, without
+from ou_monitor.discovery.gain import cause_gain, held_out, HeldOut, without
 from ou_monitor.discovery.search import position
-from ou_monitor.discovery.validation import held_out, HeldOut
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.term import Term

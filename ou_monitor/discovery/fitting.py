@@ -11,19 +11,21 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 import math
+from typing import Any
 
 import numpy as np
 from ou_monitor.criticism.composite import Composite, fit_composite, LAW_COST, view_of
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.criticism.spectral_start import from_spectrum
-from ou_monitor.criticism.structure import evaluate
+from ou_monitor.criticism.structure import coefficients, driven, evaluate, state_space, white_noise
 from ou_monitor.discovery import decision
 from ou_monitor.discovery.free_law import free_law
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.reading import Saturation
 from ou_monitor.model.terms.term import Role, Term
-from ou_monitor.records import FloatArray
+from ou_monitor.model.whittle import Ordinates
+from ou_monitor.records import FloatArray, NAN
 
 # Starting points that are fitted, samples that decide which, and kinds that are fitted in full.
 _FULL, _GLANCE, _FEW = 2, 8000, 4
@@ -320,3 +322,153 @@ def _by_scores(samples: Samples, starts: list[Term], view: View) -> list[Term]:
         return float(z @ z - rest @ rest)
 
     return sorted(starts, key=lambda term: -explained(term))
+
+
+def from_spectrum(samples: Samples, composite: Composite, starts: Sequence[Term]
+                  ) -> tuple[tuple[Term, ...], float]:
+    """
+    Return the terms of a model and more of them, fitted to the spectrum of its scores.
+
+    starts are the terms of `composite` without its laws, the `ou` as it should begin, and more
+    of them at the end.  The second result is the gain of the fit, nats.
+    """
+    ordinates = Ordinates.of(composite.z[samples.train])
+    spectrum = _Spectrum(samples, composite.gaussian.terms, ordinates.omega)
+    free = [(k, name) for k, term in enumerate(starts) if k == 0 or term.ROLE in (
+        Role.BLOCK, Role.NOISE) for name in term.free()]
+    before = spectrum.of(composite.gaussian.terms)
+
+    def terms_at(x: FloatArray) -> tuple[Term, ...]:
+        found = list(starts)
+        for (k, name), by in zip(free, x.tolist(), strict=True):
+            try:
+                found[k] = found[k].moved(name, by)
+            except ValueError:
+                # As far as its range goes.
+                continue
+        return tuple(found)
+
+    x, gain = ordinates.climb(lambda x: np.log(spectrum.of(terms_at(x)) / before),
+                              np.zeros(len(free)))
+    return terms_at(x), gain
+
+
+class _Spectrum:
+    """What models say of a spectrum, what throttle does to alpha, sigma and noise as in one."""
+
+    def __init__(self, samples: Samples, terms: Sequence[Term], omega: FloatArray) -> None:
+        self._turn = np.exp(1j * omega)
+        step = float(np.median(samples.step[1:]))
+        self._few = Samples(step * np.arange(3.0), np.zeros(3), None)
+        ou = terms[0]
+        assert isinstance(ou, OU)
+        s = driven(samples, terms)
+        self._faster = math.exp(float(np.mean(np.log(s.alpha / ou.alpha))))
+        self._louder = 1.0 / math.sqrt(float(np.mean((ou.sigma / s.sigma) ** 2)))
+        self._blur = samples.blur
+        noise = samples.blur + sum(term.variance() for term in terms)
+        each = white_noise(samples, terms, s)
+        self._noisier = 1.0 / float(np.mean(noise / each)) if noise > 0.0 else 1.0
+
+    def of(self, terms: Sequence[Term]) -> FloatArray:
+        """Return the spectrum of a model, up to a factor."""
+        ou = terms[0]
+        assert isinstance(ou, OU)
+        ou = replace(ou, alpha=ou.alpha * self._faster, sigma=ou.sigma * self._louder)
+        kept = [term for term in terms[1:] if term.ROLE is Role.BLOCK]
+        space = state_space(self._few, [ou, *kept], None)[1]
+        f, q, h = space.f[1], space.q[1], space.h
+        left = self._turn[:, None, None] * np.eye(h.size) - f
+        seen = np.linalg.solve(left.transpose(0, 2, 1), np.broadcast_to(
+            h[:, None], (self._turn.size, h.size, 1)))[..., 0]
+        noise = self._blur + sum(
+            term.variance() for term in terms[1:] if term.ROLE is Role.NOISE)
+        found: FloatArray = np.einsum('ki,ij,kj->k', seen.conj(), q, seen).real
+        return found + noise * self._noisier
+
+
+def standard_errors(samples: Samples, model: Composite, part: slice) -> tuple[dict[str, Any], ...]:
+    """Return standard errors by parameter, a dict a term."""
+    found = [_gathered(term, se) for term, se in zip(model.terms, model.se)]
+    for k, more in _of_mean(samples, model, part).items():
+        found[k] = {**more, **found[k]}
+    return tuple(found)
+
+
+def with_reach(term: Term, se: dict[str, Any], samples: Samples) -> dict[str, Any]:
+    """Return errors with an infinite one for each parameter that no such recording can show."""
+    duration = float(samples.t[-1] - samples.t[0])
+    values = term.values()
+    far = [name for name, value in values.items() if isinstance(value, float) and (
+        (term.unit(name) == 's' and value > duration)
+        or (term.unit(name) == '1/s' and 0.0 < value * duration < 1.0))]
+    if isinstance(term, Saturation):
+        far += [name for name, met in (('low', term.low >= float(samples.logged.min())),
+                                       ('high', term.high <= float(samples.logged.max())))
+                if not met]
+    return {**se, **dict.fromkeys(far, math.inf)}
+
+
+def _gathered(term: Term, se: dict[str, float]) -> dict[str, Any]:
+    """Return errors of single knots, named `parameter 2`, as a list."""
+    gathered: dict[str, Any] = {}
+    for name, value in se.items():
+        base, _, at = name.partition(' ')
+        if at:
+            values = gathered.setdefault(base, [NAN] * len(getattr(term, base)))
+            values[int(at)] = float(value)
+        else:
+            gathered[name] = float(value)
+    return gathered
+
+
+def _of_mean(samples: Samples, model: Composite, part: slice) -> dict[int, dict[str, Any]]:
+    """Return errors of the level and of what multiplies known columns."""
+    terms = model.gaussian.terms
+    where = [(k, j) for k, term in enumerate(terms) for j in range(len(coefficients(term)))]
+    base = evaluate(samples, terms)
+    weight = 1.0 / np.sqrt(base.variance[part])
+    through = np.empty((weight.size, len(where)))
+    for column, (k, j) in enumerate(where):
+        beta = coefficients(terms[k])
+        # Innovations are linear in these, so any step will do.
+        beta[j] += 1.0
+        moved = evaluate(samples, (*terms[:k], _with(terms[k], beta), *terms[k + 1:]))
+        through[:, column] = weight * (base.innovation - moved.innovation)[part]
+    norm = np.sqrt((through * through).sum(axis=0))
+    # What the instrument does not show (the level behind a high-pass) has no error.
+    norm = np.where(norm > 1e-9 * norm.max(), norm, np.inf)
+    through /= norm
+    covariance = np.linalg.pinv(through.T @ through) / np.outer(norm, norm)
+    found: dict[int, dict[str, Any]] = {}
+    for k, term in enumerate(terms):
+        at = [column for column, (owner, _) in enumerate(where) if owner == k]
+        if at:
+            found[k] = _by_parameter(term, covariance[np.ix_(at, at)])
+    return found
+
+
+def _with(term: Term, beta: list[float]) -> Term:
+    return replace(term, u0=beta[0]) if isinstance(term, OU) else term.with_linear(beta)
+
+
+def _by_parameter(term: Term, covariance: FloatArray) -> dict[str, Any]:
+    """Return errors of parameters from the covariance of the coefficients."""
+    beta = coefficients(term)
+    names = ('u0',) if isinstance(term, OU) else term.LINEAR
+    spread = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
+    slopes = np.zeros((len(names), len(beta)))
+    for j, error in enumerate(spread.tolist()):
+        step = 1e-3 * error
+        if step <= 0.0:
+            continue
+        up, down = list(beta), list(beta)
+        up[j], down[j] = beta[j] + step, beta[j] - step
+        high, low = _with(term, up), _with(term, down)
+        for i, name in enumerate(names):
+            a, b = getattr(high, name), getattr(low, name)
+            if not isinstance(a, tuple):
+                slopes[i, j] = (a - b) / (2.0 * step)
+    variance = np.einsum('ij,jk,ik->i', slopes, covariance, slopes)
+    return {name: math.sqrt(max(float(value), 0.0)) for name, value in zip(names, variance)
+            if value > 0.0}

@@ -15,7 +15,7 @@ import math
 import numpy as np
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import decision
-from ou_monitor.discovery.validation import blocks_of
+from ou_monitor.discovery.gain import blocks_of
 from ou_monitor.records import FloatArray
 from scipy.signal import lfilter
 

@@ -12,16 +12,15 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from ou_monitor.criticism.composite import Composite, covariates_of
-from ou_monitor.criticism.null_bank import criticise, NullBank, simulate_bank, simulate_bank_of
+from ou_monitor.criticism.battery import (
+    covariates_of, criticise, NullBank, simulate_bank, simulate_bank_of)
+from ou_monitor.criticism.composite import Composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate
 from ou_monitor.discovery import decision
-from ou_monitor.discovery.errors import standard_errors
-from ou_monitor.discovery.fitting import Fitter
-from ou_monitor.discovery.load_start import under_load
+from ou_monitor.discovery.fitting import Fitter, standard_errors
 from ou_monitor.discovery.search import (
-    kinds_of, name_causes, position, Progress, Search, without_causes)
+    kinds_of, name_causes, position, Progress, Search, under_load, without_causes)
 from ou_monitor.model.terms.catalogue import blamed
 from ou_monitor.model.terms.lines import prominence
 from ou_monitor.model.terms.slow import Drift, SecondRelaxation

@@ -11,10 +11,9 @@ import numpy as np
 from ou_monitor.analysis.overview import known_lines, other_scale, Overview
 from ou_monitor.criticism.curves import compare_curves, Comparison
 from ou_monitor.discovery.finding import Criticism, Finding, Verdict
-from ou_monitor.discovery.plain_names import both_names, plain, PLAIN_NAMES
 from ou_monitor.discovery.words import (
-    cause_rows, gain_words, MNAT, NOT_KNOWN, overlap_words, plain_model_words, plain_words,
-    with_error)
+    both_names, cause_rows, gain_words, MNAT, NOT_KNOWN, overlap_words, plain, plain_model_words,
+    PLAIN_NAMES, plain_words, with_error)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text)

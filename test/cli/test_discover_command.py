@@ -10,8 +10,7 @@ import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.finding import Cause, Finding, Verdict
-from ou_monitor.discovery.plain_names import both_names, plain, PLAIN_NAMES
-from ou_monitor.discovery.words import explain, parameters
+from ou_monitor.discovery.words import both_names, explain, parameters, plain, PLAIN_NAMES
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_answer import LoadSag

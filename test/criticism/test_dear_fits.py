@@ -4,7 +4,7 @@ import numpy as np
 from ou_monitor.criticism import structure
 from ou_monitor.criticism.composite import fit_composite
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.discovery.errors import standard_errors
+from ou_monitor.discovery.fitting import standard_errors
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise

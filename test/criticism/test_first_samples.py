@@ -5,9 +5,8 @@ import math
 import numpy as np
 from numpy.testing import assert_allclose
 from ou_monitor.criticism.curves import compare_curves
-from ou_monitor.criticism.mean_columns import columns_of
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.criticism.structure import evaluate, state_space
+from ou_monitor.criticism.structure import columns_of, evaluate, state_space
 from ou_monitor.discovery.decision import rivals_of, TIE
 from ou_monitor.model.terms.ac_coupling import ACCoupling
 from ou_monitor.model.terms.load_answer import LoadSag

@@ -1,8 +1,7 @@
 """Values that were held, told from codes alike by chance, by lines, and at rest."""
 
 import numpy as np
-from ou_monitor.criticism.adc import find_knee
-from ou_monitor.criticism.repeats import without_repeats
+from ou_monitor.criticism.adc import find_knee, without_repeats
 import pytest
 from scipy.signal import lfilter
 

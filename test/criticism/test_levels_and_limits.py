@@ -9,10 +9,9 @@ from ou_monitor.analysis.level_tests import _correlated, _mean_drift
 from ou_monitor.criticism.adc import find_rails, redraw
 from ou_monitor.criticism.composite import _same
 from ou_monitor.criticism.curves import _bins, compare_curves
-from ou_monitor.criticism.mean_columns import solved
 from ou_monitor.criticism.readings import why_nothing
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.criticism.structure import evaluate, Events
+from ou_monitor.criticism.structure import evaluate, Events, solved
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.records import Estimate, Status
 import pytest

@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-from ou_monitor.criticism.composite import covariates_of, fit_composite
-from ou_monitor.criticism.null_bank import (
-    _PRIOR, criticise, family_chance, family_edge, simulate_bank, SIZE)
+from ou_monitor.criticism.battery import (
+    _PRIOR, covariates_of, criticise, family_chance, family_edge, simulate_bank, SIZE)
+from ou_monitor.criticism.composite import fit_composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ou import OU

@@ -14,9 +14,8 @@ import numpy as np
 from ou_monitor.analysis.level_comparison import alpha_constancy, sigma_change
 from ou_monitor.analysis.level_result import fit_level, fit_parts
 from ou_monitor.analysis.levels import LoadLevel, Stay
-from ou_monitor.criticism.battery import statistics
-from ou_monitor.criticism.composite import (
-    covariates_of, fit_composite, view_of)
+from ou_monitor.criticism.battery import covariates_of, statistics
+from ou_monitor.criticism.composite import fit_composite, view_of
 from ou_monitor.criticism.innovations import FAMILY_WISE, innovations, other_pole
 from ou_monitor.criticism.integrity import examine
 from ou_monitor.criticism.samples import Samples

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from ou_monitor.criticism.composite import fit_composite
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.criticism.spectral_start import from_spectrum
+from ou_monitor.discovery.fitting import from_spectrum
 from ou_monitor.discovery.gain import guess
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.terms.slow import SecondRelaxation

@@ -3,7 +3,7 @@
 import math
 from typing import ClassVar
 
-from ou_monitor.criticism.null_bank import family_chance
+from ou_monitor.criticism.battery import family_chance
 from ou_monitor.discovery import decision
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.term import Role, Term

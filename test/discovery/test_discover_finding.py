@@ -5,12 +5,12 @@ import json
 import math
 
 import numpy as np
-from ou_monitor.criticism.null_bank import family_chance
+from ou_monitor.criticism.battery import family_chance
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.decision import failing, withdrawn
-from ou_monitor.discovery.errors import with_reach
+from ou_monitor.discovery.discover import doubts, judge
 from ou_monitor.discovery.finding import Cause, Criticism, CrossingRate, Finding, Verdict
-from ou_monitor.discovery.verdict import doubts, judge
+from ou_monitor.discovery.fitting import with_reach
 from ou_monitor.discovery.words import (
     coupling_note, explain, overlap_words, parameters, plain_words, verdict_sentence, why_named,
     with_error)

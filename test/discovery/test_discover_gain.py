@@ -6,12 +6,11 @@ import numpy as np
 from ou_monitor.criticism.composite import fit_composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate
-from ou_monitor.discovery import validation
-from ou_monitor.discovery.errors import standard_errors
+from ou_monitor.discovery import gain as gains
+from ou_monitor.discovery.fitting import standard_errors
 from ou_monitor.discovery.gain import (
-    BLOCKS, cause_gain, crossing_level, crossing_rates, crossings, if_known, mean_difference,
-    mean_score, without)
-from ou_monitor.discovery.validation import blocks_of, covered, held_out
+    BLOCKS, blocks_of, cause_gain, covered, crossing_level, crossing_rates, crossings, held_out,
+    if_known, mean_difference, mean_score, without)
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_answer import LoadSag
@@ -115,7 +114,7 @@ def test_a_block_whose_rest_gives_no_model_is_not_known(monkeypatch):
             raise ValueError('singular')
         return evaluate(*given, **more)
 
-    monkeypatch.setattr(validation, 'evaluate', fails_once)
+    monkeypatch.setattr(gains, 'evaluate', fails_once)
     part = held_out(samples, model)
     third = blocks_of(samples.n)[2]
     assert not part.known[third].any()

@@ -7,8 +7,8 @@ from ou_monitor import discover
 from ou_monitor.criticism.composite import fit_composite, view_of
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate
-from ou_monitor.discovery.gain import crossing_rates, crossings, gain_of
-from ou_monitor.discovery.validation import blocks_of, covered, held_out
+from ou_monitor.discovery.gain import (
+    blocks_of, covered, crossing_rates, crossings, gain_of, held_out)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_answer import LoadSag
 from ou_monitor.model.terms.load_dependent import LoadDependentSigma

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.earning import refusal
-from ou_monitor.discovery.felt import felt
+from ou_monitor.discovery.finding import felt
 from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.shocks import Glitches

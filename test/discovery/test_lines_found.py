@@ -11,8 +11,7 @@ from ou_monitor.analysis.levels import LoadLevel, Stay
 from ou_monitor.criticism.composite import Composite, fit_composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate
-from ou_monitor.discovery.errors import standard_errors
-from ou_monitor.discovery.fitting import Fitter
+from ou_monitor.discovery.fitting import Fitter, standard_errors
 from ou_monitor.discovery.named import _in_doubt, _other, _SURE
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient

@@ -3,7 +3,7 @@
 import numpy as np
 from ou_monitor import discover, Recording
 from ou_monitor.discovery import decision
-from ou_monitor.discovery.validation import errors_grow
+from ou_monitor.discovery.gain import errors_grow
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient

@@ -8,14 +8,12 @@ import numpy as np
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.finding import Cause, Criticism, Verdict
 from ou_monitor.discovery.gain import (
-    BLOCKS, cause_gain, crossing_level, crossing_rates, crossings, gain_of, guess, mean_difference,
-    why_unknown)
-from ou_monitor.discovery.validation import blocks_of, FOLDS, HeldOut
+    BLOCKS, blocks_of, cause_gain, crossing_level, crossing_rates, crossings, FOLDS, gain_of,
+    guess, HeldOut, mean_difference, why_unknown)
 from ou_monitor.discovery.words import (
-    cause_rows, explain, gain_remark, gain_text, gain_words, left_out_note,
-    no_relaxation_note, overlap_words, remaining_words, throttles_note, unmeasured_words,
-    verdict_sentence,
-    why_named, with_error)
+    cause_rows, explain, gain_remark, gain_text, gain_words, left_out_note, no_relaxation_note,
+    overlap_words, remaining_words, throttles_note, unmeasured_words, verdict_sentence, why_named,
+    with_error)
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.terms.load_answer import LoadSag
 from ou_monitor.model.terms.ou import OU

@@ -7,20 +7,18 @@ from golden_runs import flight, table
 import numpy as np
 from ou_monitor import discover
 from ou_monitor.analysis.level_tests import examine_level, holm
-from ou_monitor.criticism.battery import statistics
-from ou_monitor.criticism.composite import covariates_of, fit_composite, view_of
+from ou_monitor.criticism.battery import (
+    covariates_of, criticise, simulate_bank, simulate_bank_of, statistics)
+from ou_monitor.criticism.composite import fit_composite, view_of
 from ou_monitor.criticism.curves import compare_curves
 from ou_monitor.criticism.integrity import examine
-from ou_monitor.criticism.null_bank import criticise, simulate_bank, simulate_bank_of
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate, Events, fit_gaussian
 from ou_monitor.discovery.decision import kinds_to_try
-from ou_monitor.discovery.errors import standard_errors
-from ou_monitor.discovery.fitting import Fitter
+from ou_monitor.discovery.fitting import Fitter, standard_errors
 from ou_monitor.discovery.gain import (
-    cause_gain, crossing_rates, gain_of, guess, without)
+    cause_gain, covered, crossing_rates, gain_of, guess, held_out, without)
 from ou_monitor.discovery.regression import load_terms, mean_answer
-from ou_monitor.discovery.validation import covered, held_out
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.term import Role

@@ -7,8 +7,8 @@ import numpy as np
 from ou_monitor import AdaptiveLowPass
 from ou_monitor.criticism.composite import Composite
 from ou_monitor.criticism.samples import choose_samples, events_between, lines_between
-from ou_monitor.criticism.spectral_start import from_spectrum
 from ou_monitor.criticism.structure import evaluate
+from ou_monitor.discovery.fitting import from_spectrum
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.online.risk.flag import BrownoutFlag
 from ou_monitor.online.settings import MonitorSettings

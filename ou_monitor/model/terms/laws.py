@@ -5,15 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 from ou_monitor.records import FloatArray
 from scipy.optimize import minimize
 from scipy.special import ndtr, ndtri
-
-if TYPE_CHECKING:
-    from ou_monitor.model.terms.term import Term
 
 LOG_2PI = math.log(2.0 * math.pi)
 # Probabilities nearer to 0 and 1 than this are cut: scores of 8 and more are one thing.
@@ -44,26 +40,6 @@ class View:
     def rate(self) -> float:
         """Return the usual rate, Hz."""
         return 1.0 / float(np.median(self.step[1:]))
-
-
-@dataclass(frozen=True, eq=False)
-class LawFit:
-    """A law of the innovations, fitted."""
-
-    term: Term  # With its parameters
-    se: dict[str, float]  # Their standard errors, where known
-    z: FloatArray  # Normal scores under the law: independent N(0, 1) when it is right; shape (n,)
-    # Log predictive density of each sample over that of N(0, 1) for `View.z`, nats; shape (n,).
-    gain: FloatArray
-    free: int  # Parameters fitted
-    push: FloatArray | None = None  # Variance that events add to the state, V^2; shape (n,)
-    error: FloatArray | None = None  # Variance that events add to the measurement, V^2; shape (n,)
-    # Factor on the variance of what the noise adds in the step before each sample, as the law
-    # believes it was: the inverse of the mean precision; shape (n,).
-    power: FloatArray | None = None
-    # What the law believes to be added to the level, V: the Gaussian part is fitted to what is
-    # left without it; shape (n,).
-    offset: FloatArray | None = None
 
 
 def normal_scores(cdf: FloatArray) -> FloatArray:

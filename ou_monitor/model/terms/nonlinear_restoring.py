@@ -8,9 +8,9 @@ import math
 from typing import ClassVar
 
 import numpy as np
-from ou_monitor.model.terms.laws import LawFit, log_normal, View
+from ou_monitor.model.terms.laws import log_normal, View
 from ou_monitor.model.terms.segment import Effect, Segment, Stage
-from ou_monitor.model.terms.term import parameter, Role, Term
+from ou_monitor.model.terms.term import LawFit, parameter, Role, Term
 from ou_monitor.records import FloatArray
 
 

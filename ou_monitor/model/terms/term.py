@@ -19,7 +19,7 @@ import math
 from typing import Any, cast, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
-from ou_monitor.model.terms.laws import LawFit, View
+from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.segment import Effect, Segment, Stage
 from ou_monitor.records import FloatArray
 
@@ -389,6 +389,26 @@ class Term:
         """Return the parameters by name; a tuple becomes a list."""
         found = {spec.name: getattr(self, spec.name) for spec in fields(self)}
         return {k: list(v) if isinstance(v, tuple) else v for k, v in found.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class LawFit:
+    """A law of the innovations, fitted."""
+
+    term: Term  # With its parameters
+    se: dict[str, float]  # Their standard errors, where known
+    z: FloatArray  # Normal scores under the law: independent N(0, 1) when it is right; shape (n,)
+    # Log predictive density of each sample over that of N(0, 1) for `View.z`, nats; shape (n,).
+    gain: FloatArray
+    free: int  # Parameters fitted
+    push: FloatArray | None = None  # Variance that events add to the state, V^2; shape (n,)
+    error: FloatArray | None = None  # Variance that events add to the measurement, V^2; shape (n,)
+    # Factor on the variance of what the noise adds in the step before each sample, as the law
+    # believes it was: the inverse of the mean precision; shape (n,).
+    power: FloatArray | None = None
+    # What the law believes to be added to the level, V: the Gaussian part is fitted to what is
+    # left without it; shape (n,).
+    offset: FloatArray | None = None
 
 
 def _listed(names: Any) -> str:
