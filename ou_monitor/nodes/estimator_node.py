@@ -181,20 +181,20 @@ class EstimatorNode(MonitorNode):
         self._watch_throttle()
 
     def _open(self, source: Source) -> None:
-        message, extractor = source.open()
+        message, spec = source.open()
         topic = self.resolve_topic_name(source.topic)
         if source.quantity == 'voltage':
-            self._stream.open_voltage(extractor.spec)
-            if extractor.spec.sample_rate is not None:
+            self._stream.open_voltage(spec)
+            if spec.sample_rate is not None:
                 # Blocks have a time line of their own.
                 self._send_clock = None
         else:
-            self._stream.open_throttle(extractor.spec)
+            self._stream.open_throttle(spec)
         self._inputs[source.quantity] = PolledInput(
-            self, message, source.topic, extractor.spec, source.current)
+            self, message, source.topic, spec, source.current)
         self.get_logger().info(
-            f'{source.quantity} from {topic}: {extractor.spec.type} field '
-            f"'{extractor.spec.field}' (msg_config '{source.config}')")
+            f"{source.quantity} from {topic}: {spec.type} field '{spec.field}' "
+            f"(msg_config '{source.config}')")
 
     # -- messages in
 

@@ -13,8 +13,9 @@ import math
 from typing import Any
 
 from ou_monitor.errors import InputError, nearest
-from ou_monitor.nodes.sources import message_class
-from ou_monitor.stream.config import Extractor, FieldPath, FieldSpec, parse_field_path
+from ou_monitor.nodes.sources import definition_of, message_class
+from ou_monitor.recordings.cdr import value_path
+from ou_monitor.stream.config import FieldPath, FieldSpec
 
 IMU = 'sensor_msgs/msg/Imu'
 # Of a derivative: angular acceleration (rad/s^2); any other of a message with a stamp, as x,
@@ -156,10 +157,9 @@ def _derivative(kind: str, channels: Channels) -> Channels:
 
 def _field_channel(kind: str, field: str) -> Channels:
     """Return one field of any installed type, tried on an empty message."""
-    steps = parse_field_path(field)
     message = message_class(kind)()
-    # It says what is wrong with a path in words; None stands for an element not there yet.
-    Extractor(FieldSpec('input', kind, field)).extract(message)
+    steps = value_path(FieldSpec('input', kind, field), definition_of(message_class(kind)))
+    # None stands for an element not there yet.
     value = _walk(message, steps)
     if value is not None and not isinstance(value, float):
         raise InputError(

@@ -135,9 +135,7 @@ class PolledInput:
         self.topic = node.resolve_topic_name(topic)
         self._input = node.create_polled(
             kind, topic, INPUT_QOS if spec.sample_rate is None else BLOCK_QOS)
-        self._reader = FieldReader(spec, definition_of(kind), lambda: self._decode, self._broken,
-                                   beside)
-        self._kind = kind
+        self._reader = FieldReader(spec, definition_of(kind), self._broken, beside)
         self.publishers = Publishers()
         self.unreadable = 0
         # Fetched, not yet read: messages, when (wall and monotonic clock, s), and their total
@@ -146,10 +144,7 @@ class PolledInput:
         self._when: list[tuple[float, float]] = []
         self._bytes = 0
 
-    def _decode(self, data: bytes) -> Any:
-        return decode(data, self._kind, self.topic)
-
-    def _broken(self, index: int, error: InputError) -> None:
+    def _broken(self, index: int, why: str) -> None:
         """Leave out a message that cannot be read."""
         self.unreadable += 1
 

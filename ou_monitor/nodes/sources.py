@@ -19,9 +19,9 @@ from typing import Any
 
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.online.settings import Parameter
-from ou_monitor.recordings.cdr import Definitions, Field
+from ou_monitor.recordings.cdr import Definitions, Field, stamp_paths, value_path
 from ou_monitor.stream.config import (
-    Extractor, FieldSpec, list_msg_configs, load_msg_config, ManyExtractor, MsgConfig)
+    FieldSpec, list_msg_configs, load_msg_config, ManyExtractor, MsgConfig)
 
 AUTO = 'auto'
 
@@ -82,19 +82,23 @@ class Source:
 
     def open_many(self) -> tuple[Any, ManyExtractor]:
         """Return the message class and what takes several numbers out of it."""
-        return self._open(ManyExtractor)
-
-    def open(self) -> tuple[Any, Extractor]:  # noqa: A003
-        """Return the message class and the extractor, tried on an empty message."""
-        return self._open(Extractor)
-
-    def _open(self, kind: Any) -> tuple[Any, Any]:
-        if self.spec is None:
-            raise InputError(f'the type of the {self.quantity} is not known yet')
-        message = message_class(self.spec.type, self.install)
-        extractor = kind(self.spec)
+        message, spec = self._open()
+        extractor = ManyExtractor(spec)
         extractor.extract(message())
         return message, extractor
+
+    def open(self) -> tuple[Any, FieldSpec]:  # noqa: A003
+        """Return the message class and where the quantity is in its messages."""
+        message, spec = self._open()
+        definitions = definition_of(message)
+        value_path(spec, definitions)
+        stamp_paths(spec, definitions)
+        return message, spec
+
+    def _open(self) -> tuple[Any, FieldSpec]:
+        if self.spec is None:
+            raise InputError(f'the type of the {self.quantity} is not known yet')
+        return message_class(self.spec.type, self.install), self.spec
 
 
 def find_source(quantity: str, values: Mapping[str, Any]) -> Source | None:

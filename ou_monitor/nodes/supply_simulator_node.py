@@ -29,7 +29,7 @@ from ou_monitor.recordings.model_file import read_model
 from ou_monitor.records import FloatArray, Level
 from ou_monitor.simulation import (
     is_recording, lacks, Profile, read_profile, read_throttle, RunningSupply, STICK_RATE)
-from ou_monitor.stream.config import Extractor, parse_field_path
+from ou_monitor.stream.config import parse_field_path, walk
 from std_srvs.srv import Trigger
 
 # Read again at each reset, but for the last one, which is in force at once.
@@ -76,8 +76,7 @@ class Sender:
             assert usual is not None
             source = usual
         self.source = source
-        kind, extractor = source.open()
-        spec = extractor.spec
+        kind, spec = source.open()
         if spec.sample_rate is not None:
             raise InputError(f"msg_config '{source.config}' has blocks of samples, which are not "
                              'simulated live: ou-monitor simulate --type adc_block, and replay')
@@ -88,11 +87,11 @@ class Sender:
                          'temperature'):
                 setattr(self.message, name, math.nan)
             self.message.present = True
-        self._set = _setter(self.message, spec.field, extractor)
+        self._set = _setter(self.message, spec.field, spec.type)
         self._scale, self._offset = spec.sign * spec.unit_factor, spec.offset
         # Writes the stamp, where there is one.
         self.stamp = None if spec.stamp_field is None else _setter(
-            self.message, spec.stamp_field, extractor, stamp_factor=spec.stamp_factor)
+            self.message, spec.stamp_field, spec.type, stamp_factor=spec.stamp_factor)
         self._output = node.create_publisher(kind, source.topic, 100)
 
     def send(self, stamp: float, value: float) -> None:
@@ -103,12 +102,12 @@ class Sender:
         self._output.publish(self.message)
 
 
-def _setter(message: Any, path: str, extractor: Extractor, stamp_factor: float = math.nan
+def _setter(message: Any, path: str, kind: str, stamp_factor: float = math.nan,
             ) -> Callable[[float], None]:
-    """Return what writes a number, or a stamp in s, at a field path."""
+    """Return what writes a number, or a stamp in s, at a field path of a message of a type."""
     *steps, last = parse_field_path(path)
-    owner = extractor.walk(message, tuple(steps), path)
-    now = None if owner is None else extractor.walk(owner, (last,), path)
+    owner = walk(message, tuple(steps), path, kind)
+    now = None if owner is None else walk(owner, (last,), path, kind)
     if now is None:
         raise InputError(f"field '{path}' has no element to write to")
     if hasattr(now, 'nanosec'):
@@ -232,8 +231,8 @@ class SupplySimulatorNode(MonitorNode):
                                self._input.publishers, self.steady_now())
 
     def _open(self, source: Source) -> None:
-        kind, extractor = source.open()
-        self._input = PolledInput(self, kind, source.topic, extractor.spec)
+        kind, spec = source.open()
+        self._input = PolledInput(self, kind, source.topic, spec)
 
     def _hear(self) -> float:
         """Return the throttle now: the newest, held for a second; then 0."""

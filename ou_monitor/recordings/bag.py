@@ -15,20 +15,17 @@ from __future__ import annotations
 import bisect
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import redirect_stderr, suppress
-import functools
 import io
 from pathlib import Path, PurePosixPath
 import shutil
 from types import TracebackType
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 from mcap.writer import CompressionType, Writer
 from mcap_ros2._dynamic import _for_each_msgdef
-from mcap_ros2.decoder import DecoderFactory
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.cdr import (
-    Broken, check_extent, DEFAULTS, Definitions, endless, Field, FieldColumn, FieldReader, join,
-    MessageTable, short_name)
+    DEFAULTS, Definitions, Field, FieldColumn, FieldReader, join, MessageTable)
 from ou_monitor.recordings.mcap_file import (
     ABOUT, custom_data, McapFile, moment, MOST_BYTES, MOST_NODES, ORIGIN, SAMPLE_RATE, Span)
 from ou_monitor.recordings.standard_types import SCHEMAS, TYPE_HASHES
@@ -135,15 +132,6 @@ class RawMessage(NamedTuple):
     type: str  # noqa: A003
     log_time_ns: int
     data: bytes
-
-
-class DecodedMessage(NamedTuple):
-    """One message with its fields as attributes."""
-
-    topic: str
-    type: str  # noqa: A003
-    log_time_ns: int
-    message: Any
 
 
 class Part(NamedTuple):
@@ -270,52 +258,15 @@ class BagReader:
             yield from pending[:ready]
             del pending[:ready]
 
-    def definition(self, kind: str) -> str:
-        """Return the ros2msg text of a type in the bag."""
-        return _text(self._schemas[kind])
-
-    def has_header(self, topic: str) -> bool:
-        """Return whether messages of a topic have a header, and so a stamp."""
-        kind = self.topics[topic]
-        with suppress(Exception):
-            fields = parse_definition(kind, self.definition(kind))[short_name(kind)]
-            return Field('header', 'std_msgs/Header') in fields
-        return False
-
-    def decoded(self, topics: Iterable[str] | None = None) -> Iterator[DecodedMessage]:
-        """Yield the messages with their fields as attributes, in log-time order."""
-        decoder = functools.cache(self.decoder)
-        for topic, kind, log_time, data in self.raw_messages(topics):
-            yield DecodedMessage(topic, kind, log_time, decoder(kind)(data))
-
-    def decoder(self, kind: str) -> Callable[[bytes], Any]:
-        """Return the function from CDR bytes to a message of one type in the bag."""
-        def complain(error: Exception) -> InputError:
-            return InputError(f'{self.path}: a message of type {kind} cannot be decoded '
-                              f'({type(error).__name__}: {printable(error, 200)})')
+    def definitions(self, kind: str) -> Definitions:
+        """Return the fields of a type in the bag, and of those in it."""
         try:
-            # The library also prints unreadable definitions to standard error.
-            with redirect_stderr(io.StringIO()):
-                decode = DecoderFactory().decoder_for('cdr', self._schemas[kind])
-            definitions = parse_definition(kind, self.definition(kind))
+            return parse_definition(kind, self._schemas[kind].data.decode('utf-8', 'replace'))
+        # The library has errors of many kinds.
         except Exception as error:
-            raise complain(error) from error
-        if decode is None:
-            raise InputError(f'{self.path}: type {kind} has no ros2msg definition')
-        name = short_name(kind)
-        unsafe = endless(name, definitions)
-
-        def checked(data: bytes) -> Any:
-            try:
-                if data[:1] != b'\0' or data[1:2] > b'\1':
-                    # The library would misread other encodings.
-                    raise ValueError('it is not plain CDR')
-                if unsafe:
-                    check_extent(data, name, definitions)
-                return decode(data)
-            except Exception as error:
-                raise complain(error) from error
-        return checked
+            raise InputError(f'{self.path}: a message of type {kind} cannot be decoded: its '
+                             f'definition cannot be read ({type(error).__name__}: '
+                             f'{printable(error, 200)})') from error
 
     def _wanted(self, topics: Iterable[str]) -> set[str]:
         wanted = set(topics)
@@ -326,15 +277,12 @@ class BagReader:
         return wanted
 
 
-def _text(schema: Any) -> str:
-    return str(schema.data.decode('utf-8', 'replace'))
-
-
 def _alike(schema: Any, other: Any) -> bool:
     """Return whether two definitions of a type have the same fields."""
     with suppress(Exception):
-        return (parse_definition(schema.name, _text(schema))
-                == parse_definition(other.name, _text(other)))
+        one, two = (parse_definition(each.name, each.data.decode('utf-8', 'replace'))
+                    for each in (schema, other))
+        return one == two
     return False
 
 
@@ -355,33 +303,27 @@ def parse_definition(kind: str, text: str) -> Definitions:
     return found
 
 
-def _reader(bag: BagReader, spec: FieldSpec, broken: Broken | None,
-            beside: FieldSpec | None) -> FieldReader:
-    """Return the reader of a field of a topic of a bag; `broken` as of `batches`."""
-    def refuse(log_time: int, error: InputError) -> None:
-        raise InputError(f'{error} ({moment(log_time, bag.start_ns)}); use --partial to leave it '
-                         'out') from error
-
-    definitions = None
-    # The decoder names what is wrong with a definition.
-    with suppress(Exception):
-        definitions = parse_definition(spec.type, bag.definition(spec.type))
-    return FieldReader(spec, definitions, functools.partial(bag.decoder, spec.type),
-                       broken or refuse, beside)
-
-
 def batches(
     bag: BagReader, specs: Mapping[str, FieldSpec], *, end_ns: int | None = None,
-    progress: Callable[[float], None] | None = None, broken: Broken | None = None,
-    beside: Mapping[str, FieldSpec] | None = None,
+    progress: Callable[[float], None] | None = None,
+    broken: Callable[[str], None] | None = None, beside: Mapping[str, FieldSpec] | None = None,
 ) -> Iterator[dict[str, FieldColumn]]:
     """
     Yield fields of a bag by log time, batch by batch, at least to `end_ns`, ns.
 
-    `beside`: a second field of the messages of a name.
+    `beside`: a second field of the messages of a name.  `broken` is called with the reason for
+    each message that cannot be decoded; None: the first is an InputError.
     """
-    readers = {name: _reader(bag, spec, broken, (beside or {}).get(name))
-               for name, spec in specs.items()}
+    def reader_of(spec: FieldSpec, second: FieldSpec | None) -> FieldReader:
+        def refuse(log_time: int, why: str) -> None:
+            words = (f'{bag.path}: a message of type {spec.type} cannot be decoded ({why}) '
+                     f'({moment(log_time, bag.start_ns)})')
+            if broken is None:
+                raise InputError(f'{words}; use --partial to leave it out')
+            broken(words)
+        return FieldReader(spec, bag.definitions(spec.type), refuse, second)
+
+    readers = {name: reader_of(spec, (beside or {}).get(name)) for name, spec in specs.items()}
     pending: dict[str, list[FieldColumn]] = {name: [] for name in specs}
     counts = dict.fromkeys(specs, 0)
     topics = [spec.topic for spec in specs.values()]
@@ -419,76 +361,47 @@ _TOGETHER = 2 * 1024 * 1024
 CHUNK_SIZE = 128 * 1024  # bytes
 
 
-class BagTarget:
-    """
-    A new .mcap file, or a new rosbag2 directory with one in it: `file`, open for writing.
-
-    InputError when the target exists, its folder does not, or it cannot be written.
-    """
-
-    def __init__(self, path: Path) -> None:
-        """Open the target; never overwrite anything."""
-        self.path = path
-        self._folder = None if path.suffix == '.mcap' else path
-        if path.exists() or path.is_symlink():
-            raise InputError(f'{path} exists already: remove it or choose another name')
-        if not path.parent.is_dir():
-            raise InputError(f'cannot write {path}: there is no folder {path.parent}')
-        self._mcap = path
-        try:
-            if self._folder is not None:
-                self._folder.mkdir()
-                self._mcap = self._folder / f'{path.name}_0.mcap'
-            self.file: BinaryIO = self._mcap.open('xb')
-        except OSError as error:
-            raise InputError(f'cannot write {path}: {error.strerror}') from error
-
-    def finish(self, topics: Mapping[str, str], counts: Mapping[str, int], start_ns: int,
-               end_ns: int, custom: Mapping[str, str]) -> None:
-        """Close the file and, in a directory, write its metadata.yaml."""
-        self.file.close()
-        if self._folder is not None:
-            write_metadata(self._folder, self._mcap.name, topics, counts, start_ns, end_ns,
-                           custom)
-
-    def remove(self) -> None:
-        """Remove the files that this object has written."""
-        # On a full disk closing fails too, because the buffer cannot be flushed.
-        with suppress(OSError):
-            self.file.close()
-        if self._folder is not None:
-            shutil.rmtree(self._folder)
-        else:
-            self._mcap.unlink()
-
-
 class BagWriter:
     """
     Writes a bag: an .mcap file when the path ends in .mcap, else a rosbag2 directory.
 
     A context manager; after an exception in its block the files are removed.
     `about`, where the data came from, is kept in a metadata record of the file, and in the custom
-    data of metadata.yaml.  InputError: the target exists or cannot be written.
+    data of metadata.yaml.  InputError: the target exists, its folder does not, or it cannot be
+    written.
     """
 
     def __init__(self, path: Path | str, *, about: Mapping[str, str] | None = None) -> None:
-        """Open the target."""
+        """Open the target; never overwrite anything."""
         # A file name may hold bytes that are not text; MCAP and YAML cannot store those.
         self._about = {key: _as_text(value) for key, value in (about or {}).items()}
         self.path = Path(path)
-        self._target = BagTarget(self.path)
+        self._folder = None if self.path.suffix == '.mcap' else self.path
+        self._mcap = self.path if self._folder is None else (
+            self._folder / f'{self.path.name}_0.mcap')
+        if self.path.exists() or self.path.is_symlink():
+            raise InputError(f'{path} exists already: remove it or choose another name')
+        if not self.path.parent.is_dir():
+            raise InputError(f'cannot write {path}: there is no folder {self.path.parent}')
+        try:
+            if self._folder is not None:
+                self._folder.mkdir()
+            self._file = self._mcap.open('xb')
+        except OSError as error:
+            raise self._cannot(error) from error
         self._topics: dict[str, str] = {}
         self._channels: dict[str, int] = {}
         self._counts: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
-        self._definitions: dict[str, str] = {}
-        self._encoders: dict[str, Callable[[Any], bytes]] = {}
         self._start_ns: int | None = None
         self._end_ns = 0
-        self._writer = Writer(self._target.file, CHUNK_SIZE, CompressionType.ZSTD)
+        self._writer = Writer(self._file, CHUNK_SIZE, CompressionType.ZSTD)
         self._writer.start(profile='ros2', library='ou_monitor')
         if self._about:
             self._writer.add_metadata(ABOUT, self._about)
+
+    def _cannot(self, error: OSError) -> InputError:
+        return InputError(f'cannot write {self.path}: {error.strerror}')
 
     def add_topic(
         self, name: str, type: str, *,  # noqa: A002
@@ -504,7 +417,6 @@ class BagWriter:
             raise ValueError(f'no definition of type {type}: give its ros2msg text as schema')
         if type not in self._schemas:
             self._schemas[type] = self._writer.register_schema(type, 'ros2msg', text.encode())
-            self._definitions[type] = text
         self._topics[topic] = type
         metadata = {'offered_qos_profiles': yaml.safe_dump(_qos(), sort_keys=False),
                     'topic_type_hash': TYPE_HASHES.get(type, '')}
@@ -516,44 +428,46 @@ class BagWriter:
         self._counts[topic] = 0
         return topic
 
-    def write(self, topic: str, t_ns: int, message: Any) -> None:
-        """Write one message (t_ns in ns)."""
+    def write(self, topic: str, t_ns: int, data: bytes) -> None:
+        """Write one message, in CDR (t_ns in ns)."""
         name = topic if topic in self._counts else '/' + topic
         if name not in self._counts:
             raise ValueError(f"topic '{topic}' was not added")
         if t_ns < 0:
             raise ValueError(f'a bag cannot hold a negative log time, got {t_ns} ns')
-        data = message if isinstance(message, bytes) else self._encode(
-            self._topics[name], message)
         try:
             self._writer.add_message(
                 self._channels[name], t_ns, data, t_ns, self._counts[name])
         except OSError as error:
-            raise InputError(f'cannot write {self.path}: {error.strerror}') from error
+            raise self._cannot(error) from error
         self._counts[name] += 1
         self._start_ns = t_ns if self._start_ns is None else min(t_ns, self._start_ns)
         self._end_ns = max(t_ns, self._end_ns)
 
-    def _encode(self, kind: str, message: Any) -> bytes:
-        """Serialize a message object."""
-        if kind not in self._encoders:
-            # The library's writer cannot set the QoS of a channel: use only its encoder.
-            from mcap_ros2._dynamic import serialize_dynamic
-            self._encoders[kind] = serialize_dynamic(kind, self._definitions[kind])[kind]
-        return self._encoders[kind](message)
-
     def close(self) -> None:
         """Finish the bag."""
-        if self._target.file.closed:
+        if self._file.closed:
             return
         finish: Callable[[], None] = self._writer.finish
         try:
             finish()
-            self._target.finish(self._topics, self._counts, self._start_ns or 0, self._end_ns,
-                                self._about)
+            self._file.close()
+            if self._folder is not None:
+                write_metadata(self._folder, self._mcap.name, self._topics, self._counts,
+                               self._start_ns or 0, self._end_ns, self._about)
         except OSError as error:
-            self._target.remove()
-            raise InputError(f'cannot write {self.path}: {error.strerror}') from error
+            self._remove()
+            raise self._cannot(error) from error
+
+    def _remove(self) -> None:
+        """Remove the files that this object has written."""
+        # On a full disk closing fails too, because the buffer cannot be flushed.
+        with suppress(OSError):
+            self._file.close()
+        if self._folder is not None:
+            shutil.rmtree(self._folder)
+        else:
+            self._mcap.unlink()
 
     def __enter__(self) -> BagWriter:
         """Return itself."""
@@ -567,7 +481,7 @@ class BagWriter:
         if kind is None:
             self.close()
         else:
-            self._target.remove()
+            self._remove()
 
 
 def _as_text(value: str) -> str:

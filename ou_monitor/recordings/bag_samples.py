@@ -10,17 +10,16 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-import re
 
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.bag import BagReader, batches
-from ou_monitor.recordings.cdr import FieldColumn, join, TimeArray
+from ou_monitor.recordings.cdr import FieldColumn, join, TimeArray, value_path
 from ou_monitor.recordings.importers.log import RawColumns
-from ou_monitor.recordings.mcap_file import moment
 from ou_monitor.records import Defect, defect_of, FloatArray, Note
 from ou_monitor.stream.config import FieldSpec, list_msg_configs, load_msg_config, MsgConfig
 from ou_monitor.stream.samples import BlockClock, ThrottleHold
@@ -232,12 +231,6 @@ def part_words(start: float | None, end: float | None) -> str:
     return f'Only the part {span_words(start, end)} of the recording was read.'
 
 
-def _has_field(bag: BagReader, spec: FieldSpec) -> bool:
-    """Return whether a type, as the bag defines it, has a field."""
-    own = re.split(r'^=+$', bag.definition(spec.type), maxsplit=1, flags=re.M)[0]
-    return re.search(rf'^\s*\S+\s+{re.escape(spec.field)}\b', own, re.M) is not None
-
-
 def read_bag(
     bag: BagReader, *, msg_config: str | Path | None, voltage_topic: str | None,
     throttle_topic: str | None, start: float | None, end: float | None,
@@ -260,8 +253,9 @@ def read_bag(
         notes.append(part_words(start, end))
     broken: list[str] = []
 
-    def leave_out(log_time: int, error: InputError) -> None:
-        broken.append('' if broken else f'{error} ({moment(log_time, bag.start_ns)})')
+    def leave_out(words: str) -> None:
+        # The first one is reported.
+        broken.append('' if broken else words)
 
     first = 0 if start is None else _limit(bag, start)
     last = None if end is None else _limit(bag, end)
@@ -301,8 +295,11 @@ def _specs(bag: BagReader, choice: TopicChoice) -> dict[str, FieldSpec]:
     specs = {VOLTAGE: spec}
     if choice.throttle is not None:
         specs[THROTTLE] = choice.throttle
-    if choice.current is not None and _has_field(bag, choice.current):
-        specs[CURRENT] = choice.current
+    if choice.current is not None:
+        # Older types of a battery have no current.
+        with suppress(InputError):
+            value_path(choice.current, bag.definitions(choice.current.type))
+            specs[CURRENT] = choice.current
     return specs
 
 

@@ -2,51 +2,49 @@
 CDR messages as arrays: the layout of one message, verified in all others.
 
 CDR has no fixed offsets: a text or a sequence shifts all that follows. But in a recording the same
-texts and lengths recur. So the layout is derived once from one message, with every length word
-that it depends on, and holds for all messages of the same size with the same length words: their
-fields are columns. The general decoder reads all others one by one, and refuses what it would
-refuse anyway; the result is the same, bit for bit.
+texts and lengths recur. So a message is walked once, by the definition of its type, and its layout
+holds for all messages of the same size with the same length words: their fields are columns.
+Messages unlike all before are walked one by one; one that does not fit its type is refused.
 
-Plain CDR version 1, little endian (OMG DDS-XTypes 7.4.3): alignment is counted
-from after the 4-byte header.  The fields come from the definition in a bag or from the message
-class; a type that is not in `PRIMITIVES` gives no layout.
+Plain CDR version 1 (OMG DDS-XTypes 7.4.3): alignment is counted from after the 4-byte header.
+The fields come from the definition in a bag or from the message class.  Limits: a type with a
+wstring is refused.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 import struct
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.errors import InputError
+from ou_monitor.errors import InputError, nearest
 from ou_monitor.records import FloatArray
-from ou_monitor.stream.config import (
-    Extractor, FieldPath, FieldSpec, parse_field_path, ZeroRule)
+from ou_monitor.stream.config import FieldPath, FieldSpec, parse_field_path, ZeroRule
 
 IntArray = npt.NDArray[np.int64]
 TimeArray = npt.NDArray[np.uint64]
 
-# ROS name -> NumPy type, little endian, as the general decoder reads it.
+# ROS name -> NumPy type, without its byte order.
 PRIMITIVES = {
-    'bool': '?', 'byte': 'u1', 'char': 'i1', 'int8': 'i1', 'uint8': 'u1', 'int16': '<i2',
-    'uint16': '<u2', 'int32': '<i4', 'uint32': '<u4', 'int64': '<i8', 'uint64': '<u8',
-    'float32': '<f4', 'float64': '<f8',
+    'bool': '?', 'byte': 'u1', 'char': 'i1', 'int8': 'i1', 'uint8': 'u1', 'int16': 'i2',
+    'uint16': 'u2', 'int32': 'i4', 'uint32': 'u4', 'int64': 'i8', 'uint64': 'u8',
+    'float32': 'f4', 'float64': 'f8',
 }
 TEXT = 'string'
 
 Rows = npt.NDArray[np.uint8]
 
-# Representation identifier CDR_LE; the two bytes after it are options.
-_LITTLE_ENDIAN = b'\x00\x01'
+# Representation identifier and options.
 _HEADER = 4
 
-# Limits of the walk through a message; beyond them the general decoder is as quick.
-_MOST_STEPS = 2000
-_MOST_WORDS = 64
-_MOST_DEPTH = 50
+# Steps of a walk beyond four for each byte: a few bytes may state 2^32 elements of no bytes.
+_FREE_STEPS, _MOST_DEPTH = 1000, 50
+# Maximum layouts for messages of one length, and length words in one that is compared with others;
+# a topic with more has no recurring layout.
+MOST_LAYOUTS, _MOST_WORDS = 16, 64
 
 
 @dataclass(frozen=True)
@@ -64,7 +62,7 @@ class Field:
 # package/Type -> its fields.
 Definitions = dict[str, tuple[Field, ...]]
 
-# Definitions that the general decoder uses where a bag carries none.
+# Definitions of types that a bag need not carry.
 _TIME = (Field('sec', 'uint32'), Field('nanosec', 'uint32'))
 DEFAULTS: Definitions = {
     'builtin_interfaces/Time': _TIME, 'builtin_interfaces/Duration': _TIME}
@@ -76,8 +74,51 @@ def short_name(kind: str) -> str:
     return f'{words[0]}/{words[-1]}'
 
 
-class _NoLayoutError(ValueError):
-    """The message exceeds its own length, or the limits of the walk."""
+def _find(spec: FieldSpec, text: str, definitions: Definitions) -> tuple[FieldPath, Field]:
+    """Return a path, and the field at its end; an element of an array is no array."""
+    path, at = parse_field_path(text), Field('', short_name(spec.type))
+    for step in path:
+        if isinstance(step, int):
+            if not at.array:
+                raise InputError(f"field path '{text}' of {spec.type}: [{step}] asks for an "
+                                 'element of something that is not an array')
+            at = replace(at, array=False)
+            continue
+        inside = {} if at.array else {one.name: one for one in definitions.get(at.type, ())}
+        if step not in inside:
+            raise InputError(f"field path '{text}' is not in {spec.type}: no '{step}' there; "
+                             + nearest(step, inside))
+        at = inside[step]
+    return path, at
+
+
+def value_path(spec: FieldSpec, definitions: Definitions) -> FieldPath:
+    """Return the path of a number, or of an array of them where the spec has a sample rate."""
+    path, found = _find(spec, spec.field, definitions)
+    if found.type not in PRIMITIVES:
+        raise InputError(f"field '{spec.field}' of {spec.type} holds a {found.type}, not a "
+                         'number: name a numeric field in the msg config')
+    if found.array and spec.sample_rate is None:
+        raise InputError(
+            f"field '{spec.field}' of {spec.type} is an array: name one element, "
+            f"'{spec.field}[0]', or give sample_rate if it is a block of samples")
+    return path
+
+
+def stamp_paths(spec: FieldSpec, definitions: Definitions) -> tuple[FieldPath, ...]:
+    """Return the paths of a stamp: of seconds and nanoseconds, of a number, or none."""
+    if spec.stamp_field is None:
+        return ()
+    path, found = _find(spec, spec.stamp_field, definitions)
+    if not found.array:
+        parts = {one.name: one for one in definitions.get(found.type, ())}
+        if found.type in PRIMITIVES:
+            return (path,)
+        if all(name in parts and parts[name].type in PRIMITIVES and not parts[name].array
+               for name in ('sec', 'nanosec')):
+            return (*path, 'sec'), (*path, 'nanosec')
+    raise InputError(f"stamp_field '{spec.stamp_field}' of {spec.type} is a {found.type}"
+                     + '[]' * found.array + ', not a builtin_interfaces/Time or a number')
 
 
 @dataclass(frozen=True)
@@ -93,34 +134,48 @@ class Place:
 
     def column(self, rows: Rows) -> FloatArray:
         """Return the numbers of many messages."""
-        kind = np.dtype('u1' if self.kind == '?' else self.kind)
+        truth = self.kind.endswith('?')
+        kind = np.dtype('u1' if truth else self.kind)
         shape = rows.shape[:1] if self.size is None else (rows.shape[0], self.size)
-        if not rows.shape[0] or self.size == 0:
+        if self.size == 0:
             return np.empty(shape)
         strides = (rows.shape[1], kind.itemsize)[:len(shape)]
         raw: npt.NDArray[np.generic] = np.ndarray(shape, kind, rows, self.offset, strides)
-        return (raw != 0 if self.kind == '?' else raw).astype(np.float64)
+        return (raw != 0 if truth else raw).astype(np.float64)
 
 
-@dataclass(frozen=True)
 class Layout:
-    """The layout of one message."""
+    """
+    The layout of one message, walked from front to back.
 
-    # Bytes of the message.
-    length: int
-    # (offset, value) of every uint32 that states a length.
-    words: tuple[tuple[int, int], ...]
-    # (offset, bytes) of every text, its closing zero left out.
-    texts: tuple[tuple[int, int], ...]
-    # Where the fields asked for are.
-    places: dict[FieldPath, Place]
+    ValueError: it does not fit its type.
+    """
+
+    def __init__(self, data: bytes, kind: str, definitions: Definitions,
+                 wanted: frozenset[FieldPath]) -> None:
+        if len(data) < _HEADER or data[0] != 0 or data[1] > 1:
+            # Other encodings align otherwise.
+            raise ValueError('it is not plain CDR')
+        # (offset, value) of every uint32 that states a length.
+        self.words: list[tuple[int, int]] = []
+        # (offset, bytes) of every text, its closing zero left out.
+        self.texts: list[tuple[int, int]] = []
+        # Where the wanted fields are; an element beyond its array is not there.
+        self.places: dict[FieldPath, Place] = {}
+        self._order = '<' if data[1] else '>'
+        self._word_of = struct.Struct(f'{self._order}I')
+        self._data, self._definitions, self._wanted = data, definitions, wanted
+        self._at, self._left = _HEADER, 4 * len(data) + _FREE_STEPS
+        self._message(kind, (), 0)
+        # A layout may be kept for long.
+        self._data = b''
 
     def holds_for(self, rows: Rows) -> npt.NDArray[np.bool_]:
-        """Return which messages have this layout."""
-        same: npt.NDArray[np.bool_] = (rows[:, 0] == 0) & (rows[:, 1] == 1)
+        """Return which messages of the same size have this layout."""
+        same: npt.NDArray[np.bool_] = (rows[:, 0] == 0) & (rows[:, 1] == (self._order == '<'))
         for offset, value in self.words:
             word: npt.NDArray[np.uint32] = np.ndarray(
-                rows.shape[:1], '<u4', rows, offset, rows.strides[:1])
+                rows.shape[:1], f'{self._order}u4', rows, offset, rows.strides[:1])
             same &= word == value
         high = np.zeros(rows.shape[0], np.uint8)
         for offset, size in self.texts:
@@ -130,161 +185,79 @@ class Layout:
         same &= high < 0x80
         return same
 
-
-def layout_of(
-    message: bytes, kind: str, definitions: Definitions, wanted: Iterable[FieldPath],
-) -> Layout | None:
-    """Return the layout of one message."""
-    if message[:2] != _LITTLE_ENDIAN or len(message) < _HEADER:
-        return None
-    walk = _Walk(message, definitions, frozenset(wanted))
-    try:
-        walk.message(kind, (), 0)
-    except _NoLayoutError:
-        return None
-    return Layout(len(message), tuple(walk.words), tuple(walk.texts), walk.places)
-
-
-class _Walk:
-    """Reads one message from front to back, noting where things are."""
-
-    def __init__(
-        self, data: bytes, definitions: Definitions, wanted: frozenset[FieldPath], *,
-        most_steps: int = _MOST_STEPS, most_words: int = _MOST_WORDS,
-    ) -> None:
-        self.words: list[tuple[int, int]] = []
-        self.texts: list[tuple[int, int]] = []
-        self.places: dict[FieldPath, Place] = {}
-        self._data = data
-        self._definitions = definitions
-        self._wanted = wanted
-        self._at = _HEADER
-        self._left, self._most_words = most_steps, most_words
-        self._length = struct.Struct('<I' if data[1:2] in (b'\x01', b'\x03') else '>I')
-
-    def message(self, kind: str, path: FieldPath, depth: int) -> None:
+    def _message(self, kind: str, path: FieldPath, depth: int) -> None:
         fields = self._definitions.get(kind)
         if fields is None:
-            raise _NoLayoutError('a type in it is not defined')
+            raise ValueError(f"type '{kind}' in it is not defined")
         if depth > _MOST_DEPTH:
-            raise _NoLayoutError('its types are nested too deep')
+            raise ValueError('its types are nested too deep')
         if not fields:
             # A message without fields is sent as one byte.
             self._take(1, 1)
         for field in fields:
-            self._field(field, (*path, field.name), depth)
-
-    def _field(self, field: Field, path: FieldPath, depth: int) -> None:
-        self._step(1)
-        if not field.array:
-            self._one(field.type, path, depth)
-            return
-        size = self._word() if field.size is None else field.size
-        if field.type in PRIMITIVES:
-            self._numbers(field.type, size, path)
-            return
-        self._step(size)
-        for k in range(size):
-            self._one(field.type, (*path, k), depth)
+            self._step(1)
+            here = (*path, field.name)
+            if not field.array:
+                self._one(field.type, here, depth)
+                continue
+            size = self._word() if field.size is None else field.size
+            if field.type in PRIMITIVES:
+                self._numbers(field.type, size, here)
+                continue
+            self._step(size)
+            for k in range(size):
+                self._one(field.type, (*here, k), depth)
 
     def _step(self, number: int) -> None:
         self._left -= number
         if self._left < 0:
-            raise _NoLayoutError('it states more elements than it has bytes')
+            raise ValueError('it states more elements than it has bytes')
 
     def _one(self, kind: str, path: FieldPath, depth: int) -> None:
         if kind == TEXT:
-            self._text()
+            length = self._word()
+            begin = self._take(length, 1)
+            if length > 1:
+                self._data[begin:begin + length - 1].decode()
+                self.texts.append((begin, length - 1))
         elif kind in PRIMITIVES:
-            item = PRIMITIVES[kind]
-            width = np.dtype(item).itemsize
+            width = np.dtype(PRIMITIVES[kind]).itemsize
             begin = self._take(width, width)
             if path in self._wanted:
-                self.places[path] = Place(begin, item)
+                self.places[path] = Place(begin, self._order + PRIMITIVES[kind])
         else:
-            self.message(kind, path, depth + 1)
+            self._message(kind, path, depth + 1)
 
     def _numbers(self, kind: str, size: int, path: FieldPath) -> None:
-        item = PRIMITIVES[kind]
+        item = self._order + PRIMITIVES[kind]
         width = np.dtype(item).itemsize
         # An empty array is not aligned.
         begin = self._take(size * width, width if size else 1)
         for wanted in self._wanted:
-            # Arrays of bytes are bytes to the general decoder, not numbers.
-            if wanted == path and item != 'u1':
+            if wanted == path:
                 self.places[wanted] = Place(begin, item, size)
             elif len(wanted) == len(path) + 1 and wanted[:-1] == path:
                 k = wanted[-1]
                 if isinstance(k, int) and k < size:
                     self.places[wanted] = Place(begin + k * width, item)
 
-    def _text(self) -> None:
-        length = self._word()
-        begin = self._take(length, 1)
-        if length > 1:
-            self.texts.append((begin, length - 1))
-
     def _word(self) -> int:
         begin = self._take(4, 4)
-        if len(self.words) == self._most_words:
-            raise _NoLayoutError('it states too many lengths')
-        (value,) = self._length.unpack_from(self._data, begin)
+        value = int(self._word_of.unpack_from(self._data, begin)[0])
         self.words.append((begin, value))
-        return int(value)
+        return value
 
     def _take(self, size: int, align: int) -> int:
         """Skip some bytes; return their start."""
         begin = self._at + (_HEADER - self._at) % align
         self._at = begin + size
         if self._at > len(self._data):
-            raise _NoLayoutError('it is shorter than its own lengths state')
+            raise ValueError('it is shorter than its own lengths state')
         return begin
 
 
-# Arrays that the general decoder slices without checking that enough bytes exist.
-_SLICED = frozenset(('uint8', 'byte'))
-_FREE_STEPS = 1000
-
-
-def endless(kind: str, definitions: Definitions) -> bool:
-    """
-    Whether a few bytes of a type can keep the general decoder busy for ever.
-
-    It reads elements of a type that takes no bytes, or none that it checks, as often as a
-    length word says; identifiers such as ``uint8[16] uuid`` are of that kind.
-    """
-    least: dict[str, int] = {}
-
-    def bytes_checked(name: str) -> int:
-        if name not in least:
-            # A type within itself ends by its own depth.
-            least[name] = 1
-            fields = definitions.get(name, ())
-            least[name] = sum(map(of_field, fields)) if fields else 1
-        return least[name]
-
-    def of_field(field: Field) -> int:
-        one = 1 if field.type in PRIMITIVES or field.type == TEXT else bytes_checked(field.type)
-        if not field.array:
-            return one
-        if field.size is None:
-            return 4
-        return 0 if field.type in _SLICED else one * field.size
-
-    bytes_checked(kind)
-    return any(count == 0 for name, count in least.items() if name != kind)
-
-
-def check_extent(message: bytes, kind: str, definitions: Definitions) -> None:
-    """Raise ValueError where a message of a type as of `endless` goes on beyond its end."""
-    _Walk(message, definitions, frozenset(), most_steps=4 * len(message) + _FREE_STEPS,
-          most_words=len(message)).message(kind, (), 0)
-
-
-# Maximum layouts for messages of one length; a topic with more has no recurring layout.
-MOST_LAYOUTS = 16
-
-Broken = Callable[[int, InputError], None]
+# Called with the log time, ns, of a message that does not fit its type, and the reason.
+Broken = Callable[[int, str], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,6 +288,8 @@ class MessageTable:
 
     def rows(self, picked: IntArray, length: int) -> Rows:
         """Return messages of one length in bytes as rows."""
+        if not length:
+            return np.empty((picked.size, 0), np.uint8)
         return gather(self.data, self.begin[picked], f'V{length}').view(np.uint8).reshape(
             -1, length)
 
@@ -395,188 +370,125 @@ def _spread(begin: IntArray, count: IntArray) -> IntArray:
     return places + np.arange(places.size)
 
 
-class _Found:
-    """What messages hold, while they are read."""
-
-    def __init__(self, n: int) -> None:
-        self.stamp, self.beside = np.full(n, np.nan), np.full(n, np.nan)
-        # Indices of messages alike, shape (k,), and their values, shape (k, values in each).
-        self.blocks: list[tuple[IntArray, FloatArray]] = []
-
-
 class FieldReader:
     """
-    Reads one field, and its stamp, of messages of one type (definitions: None where unreadable).
+    Reads one field, and its stamp, of messages of one type.
 
     `beside` is a second field, of one number in each message.  The `nan` rules are not applied: a
-    value that is missing or not finite is NaN.  `decoder` returns the general decoder, and is
-    asked only when needed; `broken` is called with the log time, ns, of a message that cannot be
-    decoded and the error.  `general` counts messages that went that way.
+    value that is missing or not finite is NaN.  Messages that do not fit their type are left out
+    after a call of `broken`.  InputError: the type has no such field, or it is no number.
     """
 
-    def __init__(
-        self, spec: FieldSpec, definitions: Definitions | None,
-        decoder: Callable[[], Callable[[bytes], Any]],
-        broken: Callable[[int, InputError], None] | None = None, beside: FieldSpec | None = None,
-    ) -> None:
-        """Prepare the paths; layouts are learned from messages."""
+    def __init__(self, spec: FieldSpec, definitions: Definitions, broken: Broken,
+                 beside: FieldSpec | None = None) -> None:
+        """Check the paths; layouts are learned from messages."""
         self.spec = spec
-        self.general = 0
-        # Field, its path, its general way and its zeros; the second one where it is asked for.
-        self._fields = [(one, parse_field_path(one.field),
-                         Extractor(replace(one, nan='unknown', zero='value')), ZeroRule(one.zero))
-                        for one in (spec, beside) if one is not None]
-        self._decoder = decoder
-        self._broken = broken
-        self._decode: Callable[[bytes], Any] | None = None
+        self._definitions, self._broken = definitions, broken
         self._kind = short_name(spec.type)
-        self._definitions = definitions
-        self._stamp: FieldPath | None = None
-        self._paths = [path for _, path, _, _ in self._fields]
-        if spec.stamp_field is not None:
-            self._stamp = parse_field_path(spec.stamp_field)
-            self._paths += [self._stamp, (*self._stamp, 'sec'), (*self._stamp, 'nanosec')]
+        self._fields = [(one, value_path(one, definitions), ZeroRule(one.zero))
+                        for one in (spec, beside) if one is not None]
+        self._stamp = stamp_paths(spec, definitions)
+        self._wanted = frozenset((*self._stamp, *(path for _, path, _ in self._fields)))
         # Length of the message -> layouts met.
         self._layouts: dict[int, list[Layout]] = {}
 
     def read(self, table: MessageTable) -> FieldColumn:
         """Return the field of the messages of a table, in its order."""
+        n = table.n
+        stamp, beside, count = np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, np.int64)
+        # Indices of messages alike, shape (k,), and their values, shape (k, values in each).
+        blocks: list[tuple[IntArray, FloatArray]] = []
+        kept, refused = np.ones(n, np.bool_), dict[int, str]()
         # A damaged message may hold a signalling NaN, of which NumPy would warn.
         with np.errstate(invalid='ignore'):
-            column = self._read(table)
-        zero, *other = (rule for _, _, _, rule in self._fields)
+            for picked, rows, layout in self._alike(table, refused):
+                # A slice is written far faster than places are.
+                at = slice(None) if picked.size == n else picked
+                stamp[at] = self._stamps(layout, rows)
+                block, *other = (self._values(layout, rows, spec, path)
+                                 for spec, path, _ in self._fields)
+                blocks.append((picked, block))
+                count[at] = block.shape[1]
+                if other and other[0].shape[1] == 1:
+                    beside[at] = other[0][:, 0]
+        for k, why in sorted(refused.items()):
+            self._broken(int(table.log_time[k]), why)
+            kept[k] = False
+        stamped = ~np.isnan(stamp)
+        if not stamped.all():
+            stamp[~stamped] = seconds(table.log_time[~stamped])
+        if len(blocks) == 1 and not refused:
+            # All alike, and in order.
+            values = blocks[0][1].reshape(-1)
+        else:
+            begin = np.cumsum(count) - count
+            values = np.empty(int(count.sum()))
+            for picked, block in blocks:
+                values[begin[picked][:, None] + np.arange(block.shape[1])] = block
+        column = FieldColumn(table.log_time, stamp, stamped, count, values, beside)
+        if refused:
+            column = column.take(np.flatnonzero(kept))
+        zero, *others = (rule for _, _, rule in self._fields)
         return column._replace(values=zero.apply(column.values),
-                               beside=other[0].apply(column.beside) if other else column.beside)
+                               beside=others[0].apply(column.beside) if others else column.beside)
 
-    def _read(self, table: MessageTable) -> FieldColumn:
-        """Return the field with zeros as they are."""
-        found = _Found(table.n)
-        rest: list[IntArray] = []
+    def _alike(self, table: MessageTable, refused: dict[int, str],
+               ) -> Iterator[tuple[IntArray, Rows, Layout]]:
+        """Yield indices, rows and layout of messages alike; note why others are refused."""
         lengths = table.end - table.begin
         # A comparison costs a tenth of a sort, and most messages of a topic are of one length.
         alike = lengths.size > 0 and bool((lengths == lengths[0]).all())
         for length in (lengths[:1] if alike else np.unique(lengths)).tolist():
             left = np.nonzero(lengths == length)[0]
-            if self._definitions is not None and length:
-                left = self._in_bulk(table, left, length, found)
-            rest.append(left)
-        kept = np.ones(table.n, dtype=bool)
-        for k in np.sort(np.concatenate([np.empty(0, np.int64), *rest])).tolist():
-            kept[k] = self._one(table, k, found)
-        stamp, count = found.stamp, np.zeros(table.n, np.int64)
-        for picked, block in found.blocks:
-            count[picked] = block.shape[1]
-        stamped = ~np.isnan(stamp)
-        if not stamped.all():
-            stamp[~stamped] = seconds(table.log_time[~stamped])
-        if len(found.blocks) == 1 and kept.all():
-            # All alike, and in order.
-            values = found.blocks[0][1].reshape(-1)
-        else:
-            begin = np.cumsum(count) - count
-            values = np.empty(int(count.sum()))
-            for picked, block in found.blocks:
-                values[begin[picked][:, None] + np.arange(block.shape[1])] = block
-        column = FieldColumn(table.log_time, stamp, stamped, count, values, found.beside)
-        return column if kept.all() else column.take(np.flatnonzero(kept))
+            rows = table.rows(left, length)
+            known = self._layouts.setdefault(length, [])
+            tried = 0
+            while left.size:
+                if tried < len(known):
+                    layout, tried = known[tried], tried + 1
+                    fits = layout.holds_for(rows)
+                else:
+                    try:
+                        layout = Layout(rows[0].tobytes(), self._kind, self._definitions,
+                                        self._wanted)
+                    except ValueError as error:
+                        refused[int(left[0])] = str(error)
+                        left, rows = left[1:], rows[1:]
+                        continue
+                    if (len(known) == MOST_LAYOUTS or len(layout.words) > _MOST_WORDS
+                            or not layout.holds_for(rows[:1])[0]):
+                        yield left[:1], rows[:1], layout
+                        left, rows = left[1:], rows[1:]
+                        continue
+                    known.append(layout)
+                    continue
+                if fits.all():
+                    yield left, rows, layout
+                    break
+                if fits.any():
+                    yield left[fits], rows[fits], layout
+                    left, rows = left[~fits], rows[~fits]
 
-    def _in_bulk(self, table: MessageTable, left: IntArray, length: int, found: _Found,
-                 ) -> IntArray:
-        """Read messages of one length by layouts; return those that have none."""
-        known = self._layouts.setdefault(length, [])
-        rows = table.rows(left, length)
-        for layout in known:
-            left, rows = self._by_layout(layout, left, rows, found)
-            if not left.size:
-                return left
-        strange: list[IntArray] = []
-        while left.size and len(known) < MOST_LAYOUTS and len(strange) < MOST_LAYOUTS:
-            learned = self._learn(rows[0].tobytes())
-            if learned is None or not learned.holds_for(rows[:1])[0]:
-                strange.append(left[:1])
-                left, rows = left[1:], rows[1:]
-                continue
-            known.append(learned)
-            left, rows = self._by_layout(learned, left, rows, found)
-        return np.concatenate([*strange, left])
+    def _stamps(self, layout: Layout, rows: Rows) -> FloatArray | float:
+        """Return the stamps in messages, s; NaN where one is missing or zero."""
+        if not self._stamp or any(path not in layout.places for path in self._stamp):
+            return np.nan
+        whole, *nano = (layout.places[path].column(rows) for path in self._stamp)
+        own = whole + 1e-9 * nano[0] if nano else whole * self.spec.stamp_factor
+        own[~np.isfinite(own) | (own == 0.0)] = np.nan
+        return own
 
-    def _by_layout(self, layout: Layout, left: IntArray, rows: Rows, found: _Found,
-                   ) -> tuple[IntArray, Rows]:
-        """Read the messages with a layout; return the others."""
-        fits = layout.holds_for(rows)
-        if not fits.any():
-            return left, rows
-        everything = bool(fits.all())
-        picked, mine = (left, rows) if everything else (left[fits], rows[fits])
-        # A slice is written far faster than places are.
-        at = slice(None) if picked.size == found.stamp.size else picked
-        own = self._stamps(layout, mine)
-        if own is not None:
-            own[~np.isfinite(own) | (own == 0.0)] = np.nan
-            found.stamp[at] = own
-        block, *other = (_scaled(layout.places[path].column(mine).reshape(picked.size, -1), spec)
-                         for spec, path, _, _ in self._fields)
-        found.blocks.append((picked, block))
-        if other and other[0].shape[1] == 1:
-            found.beside[at] = other[0][:, 0]
-        return (left[:0], rows[:0]) if everything else (left[~fits], rows[~fits])
-
-    def _stamps(self, layout: Layout, rows: Rows) -> FloatArray | None:
-        """Return the stamps in messages, s, by the formulas of `Extractor`."""
-        if self._stamp is None:
-            return None
-        whole = layout.places.get((*self._stamp, 'sec'))
-        if whole is None:
-            return layout.places[self._stamp].column(rows) * self.spec.stamp_factor
-        return whole.column(rows) + 1e-9 * layout.places[(*self._stamp, 'nanosec')].column(rows)
-
-    def _learn(self, message: bytes) -> Layout | None:
-        """Return the layout of a message when it gives all that is asked for."""
-        assert self._definitions is not None
-        layout = layout_of(message, self._kind, self._definitions, self._paths)
-        if layout is None:
-            return None
-        found = layout.places
-        for spec, path, _, _ in self._fields:
-            # An array is a block of samples, or an error that the general decoder reports.
-            if path not in found or (found[path].size is not None and spec.sample_rate is None):
-                return None
-        if self._stamp is not None:
-            number = found.get(self._stamp)
-            time = [found.get((*self._stamp, part)) for part in ('sec', 'nanosec')]
-            if any(place is None or place.size is not None
-                   for place in ([number] if number is not None else time)):
-                return None
-        return layout
-
-    def _one(self, table: MessageTable, k: int, found: _Found) -> bool:
-        """Read one message the general way; False: it is to be left out."""
-        if self._decode is None:
-            self._decode = self._decoder()
-        try:
-            decoded = self._decode(bytes(table.data[table.begin[k]:table.end[k]]))
-        except InputError as error:
-            if self._broken is None:
-                raise
-            self._broken(int(table.log_time[k]), error)
-            return False
-        self.general += 1
-        field, *other = (extractor.extract(decoded) for _, _, extractor, _ in self._fields)
-        if field.stamp is not None:
-            found.stamp[k] = field.stamp
-        missing = self.spec.sample_rate is None and not field.values.size
-        found.blocks.append((np.array([k]), np.array([[np.nan]]) if missing
-                             else field.values[None, :]))
-        if other and other[0].values.size == 1:
-            found.beside[k] = other[0].values[0]
-        return True
-
-
-def _scaled(block: FloatArray, spec: FieldSpec) -> FloatArray:
-    """Return raw numbers, changed in place, in SI units; NaN where one is not finite."""
-    block *= spec.sign * spec.unit_factor
-    block += spec.offset
-    finite = np.isfinite(block)
-    if not finite.all():
-        block[~finite] = np.nan
-    return block
+    @staticmethod
+    def _values(layout: Layout, rows: Rows, spec: FieldSpec, path: FieldPath) -> FloatArray:
+        """Return a field in SI units, shape (messages, values in each); NaN: not finite."""
+        place = layout.places.get(path)
+        if place is None:
+            # An element beyond its array: nothing in a block, else an unknown value.
+            return np.full((rows.shape[0], int(spec.sample_rate is None)), np.nan)
+        block = place.column(rows).reshape(rows.shape[0], -1)
+        block *= spec.sign * spec.unit_factor
+        block += spec.offset
+        finite = np.isfinite(block)
+        if not finite.all():
+            block[~finite] = np.nan
+        return block

@@ -18,7 +18,7 @@ from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.bag import BagReader, batches
 from ou_monitor.recordings.bag_samples import (
     check_throttle, known_current, outside_words, part_words, read_bag)
-from ou_monitor.recordings.cdr import join
+from ou_monitor.recordings.cdr import Field, join, short_name
 from ou_monitor.recordings.importers.choose import (
     choose as choose_series, columns_of, NONE, signal_of)
 from ou_monitor.recordings.importers.csv_table import read_column, read_csv
@@ -230,8 +230,10 @@ def read_signal(path: str | Path, signal: str, *, partial: bool = False,
         return Series(signal, SIGNAL, *read_column(path, signal, columns), '1')
     bag = BagReader(path, partial=partial)
     topic, field = _split(path, signal, bag.topics)
-    spec = FieldSpec(topic, bag.topics[topic], field, nan='unknown',
-                     stamp_field='header.stamp' if bag.has_header(topic) else None)
+    kind = bag.topics[topic]
+    stamped = Field('header', 'std_msgs/Header') in bag.definitions(kind)[short_name(kind)]
+    spec = FieldSpec(topic, kind, field, nan='unknown',
+                     stamp_field='header.stamp' if stamped else None)
     parts = [batch['signal'] for batch in batches(bag, {'signal': spec})]
     if not parts:
         raise InputError(f"{path}: topic '{topic}' holds no message")

@@ -1,18 +1,15 @@
 """
-Read `msg_config/*.yaml` (topic, type and field of a voltage), and extract values by it.
+Read `msg_config/*.yaml`: topic, type and field of a voltage.
 
 One file describes one source (an autopilot bridge, an ADC driver); a new message type needs a new
 file and no code.  An error in a file is one line with the file, the key and the nearest valid key.
-
-Extractors work on any object with attributes: rclpy messages and decoded MCAP messages.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 import math
-import operator
 from pathlib import Path
 import re
 from typing import Any
@@ -287,118 +284,25 @@ class ZeroRule:
         return np.where(nothing, np.nan, values) if nothing.any() else values
 
 
-@dataclass(frozen=True, eq=False)
-class Extracted:
-    """Stamp and values of one message."""
-
-    # Stamp, s (of the LAST sample of a block); None where it is missing or zero: use the
-    # middleware's source timestamp.
-    stamp: float | None
-    # Values in SI units, in order, shape (n,).  Numbers that are not finite are left out with the
-    # rule ``drop`` (n may be 0); with ``unknown``, and in blocks, whose samples keep their places
-    # in time, they are NaN.
-    values: FloatArray
-    # Number of values that were not finite, or missing.
-    missing: int
-
-
-class Extractor:
-    """Extracts one field and its stamp from messages of one type; InputError: malformed path."""
-
-    def __init__(self, spec: FieldSpec) -> None:
-        """Prepare the paths once; messages arrive at kHz."""
-        self.spec = spec
-        self._zero = ZeroRule(spec.zero)
-        self._scale = spec.sign * spec.unit_factor
-        self._value = self._getter(spec.field)
-        self._stamp = None if spec.stamp_field is None else self._getter(spec.stamp_field)
-
-    def extract(self, msg: object) -> Extracted:
-        """Return the stamp and the values of one message."""
-        stamp = None if self._stamp is None else self._read_stamp(self._stamp(msg))
-        raw = self._value(msg)
-        if raw is None:
-            return Extracted(stamp, np.empty(0), 1)
-        # A damaged message may hold a signalling NaN, which makes NumPy warn.
-        with np.errstate(invalid='ignore'):
-            values = self._zero.apply(self._numbers(raw) * self._scale + self.spec.offset)
-        finite = np.isfinite(values)
-        missing = values.size - int(np.count_nonzero(finite))
-        if missing:
-            if self.spec.nan == 'drop' and self.spec.sample_rate is None:
-                values = values[finite]
-            else:
-                values[~finite] = np.nan
-        return Extracted(stamp, values, missing)
-
-    def _numbers(self, raw: Any) -> FloatArray:
-        """Return the raw content of the field as a new array of shape (n,)."""
-        is_text = isinstance(raw, (str, bytes))
-        try:
-            if is_text:
-                raise TypeError('text')
-            values = np.array(raw, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise InputError(
-                f"field '{self.spec.field}' of {self.spec.type} holds a {type(raw).__name__}, "
-                'not a number: name a numeric field in the msg config') from error
-        if values.ndim > 1 or (values.ndim == 1 and self.spec.sample_rate is None):
-            raise InputError(
-                f"field '{self.spec.field}' of {self.spec.type} is an array: name one element, "
-                f"'{self.spec.field}[0]', or give sample_rate if it is a block of samples")
-        if values.ndim == 0:
-            values = values.reshape(1)
-        return values
-
-    def _read_stamp(self, raw: Any) -> float | None:
-        """Return a stamp in seconds; None for zero, which means "no stamp"."""
-        if raw is None:
-            return None
-        if hasattr(raw, 'sec') and hasattr(raw, 'nanosec'):
-            seconds = float(raw.sec) + 1e-9 * float(raw.nanosec)
-        elif isinstance(raw, (int, float)):
-            seconds = float(raw) * self.spec.stamp_factor
+def walk(msg: object, steps: FieldPath, path: str, kind: str) -> Any:
+    """Follow a path, of a message of a type, step by step; None where an array is too short."""
+    at: Any = msg
+    for step in steps:
+        if isinstance(step, str):
+            if not hasattr(at, step):
+                describe = getattr(at, 'get_fields_and_field_types', dict)
+                raise InputError(f"field path '{path}' is not in {kind}: no '{step}' there; "
+                                 + nearest(step, describe()))
+            at = getattr(at, step)
         else:
-            raise InputError(
-                f"stamp_field '{self.spec.stamp_field}' of {self.spec.type} is a "
-                f'{type(raw).__name__}, not a builtin_interfaces/Time or a number')
-        return seconds if math.isfinite(seconds) and seconds != 0.0 else None
-
-    def _getter(self, path: str) -> Callable[[object], Any]:
-        """Return a function that reads `path` from a message."""
-        steps = parse_field_path(path)
-        names = [step for step in steps if isinstance(step, str)]
-        if len(names) == len(steps):
-            get = operator.attrgetter('.'.join(names))
-
-            def plain(msg: object) -> Any:
-                try:
-                    return get(msg)
-                except AttributeError:
-                    return self.walk(msg, steps, path)
-            return plain
-        return lambda msg: self.walk(msg, steps, path)
-
-    def walk(self, msg: object, steps: FieldPath, path: str) -> Any:
-        """Follow a path step by step; None where an array is too short."""
-        at: Any = msg
-        for step in steps:
-            if isinstance(step, str):
-                if not hasattr(at, step):
-                    raise InputError(
-                        f"field path '{path}' is not in {self.spec.type}: no '{step}' there; "
-                        + nearest(step, _fields_of(at)))
-                at = getattr(at, step)
-            else:
-                try:
-                    if step >= len(at):
-                        return None
-                except TypeError as error:
-                    raise InputError(
-                        f"field path '{path}' of {self.spec.type}: [{step}] asks for an element "
-                        'of something that is not an array') from error
-                at = at[step]
-        return at
+            try:
+                if step >= len(at):
+                    return None
+            except TypeError as error:
+                raise InputError(f"field path '{path}' of {kind}: [{step}] asks for an element "
+                                 'of something that is not an array') from error
+            at = at[step]
+    return at
 
 
 class ManyExtractor:
@@ -411,17 +315,16 @@ class ManyExtractor:
     def __init__(self, spec: FieldSpec) -> None:
         self.spec = spec
         self._array, self._each = parse_each_path(spec.field)
-        self._walker = Extractor(replace(spec, field=spec.field.partition('[]')[0]))
 
     def extract(self, msg: object) -> FloatArray:
         """Return the values of one message in SI units, shape (n,); NaN: unknown."""
         path = self.spec.field
-        raw = self._walker.walk(msg, self._array, path)
+        raw = walk(msg, self._array, path, self.spec.type)
         if raw is None:
             return np.empty(0)
         try:
             if self._each is not None:
-                raw = [self._walker.walk(one, self._each, path) for one in raw]
+                raw = [walk(one, self._each, path, self.spec.type) for one in raw]
             if isinstance(raw, (str, bytes)):
                 raise TypeError('text')
             values = np.array(raw, dtype=np.float64).ravel()
@@ -430,12 +333,3 @@ class ManyExtractor:
                 f"field '{self.spec.field}' of {self.spec.type} holds no numbers: name a numeric "
                 "field, an array of them, or one of each element, 'name[].field'") from error
         return np.asarray(values * (self.spec.sign * self.spec.unit_factor) + self.spec.offset)
-
-
-def _fields_of(msg: object) -> Iterable[str]:
-    """Return the names of the fields of a message, for hints."""
-    describe = getattr(msg, 'get_fields_and_field_types', None)
-    if callable(describe):
-        return list(describe())
-    slots = [name for name in getattr(msg, '__slots__', ()) if not name.startswith('_')]
-    return slots or [name for name in getattr(msg, '__dict__', {}) if not name.startswith('_')]

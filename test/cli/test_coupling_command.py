@@ -5,10 +5,12 @@ from pathlib import Path
 import re
 
 from command_line import failure
+from made_bags import encode
 import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.model.ou import simulate
 from ou_monitor.recordings.bag import BagWriter
+from ou_monitor.recordings.standard_types import FLOAT32
 from pages import self_contained
 import pytest
 
@@ -64,12 +66,12 @@ def bag(series, tmp_path_factory):
         for k, stamp in enumerate(t):
             at = round(1e9 * stamp) + 10**9
             time = {'sec': at // 10**9, 'nanosec': at % 10**9}
-            writer.write('/voltage', at, {'data': voltage[k]})
-            writer.write('/throttle', at, {'data': throttle[k]})
+            writer.write('/voltage', at, encode(FLOAT32, {'data': voltage[k]}))
+            writer.write('/throttle', at, encode(FLOAT32, {'data': throttle[k]}))
             # Logged 3 ms late: the stamp in the message counts.
-            writer.write('/imu', at + 3_000_000, {
+            writer.write('/imu', at + 3_000_000, encode('some_msgs/msg/Gyro', {
                 'header': {'stamp': time, 'frame_id': ''},
-                'angular_velocity': {'x': x[k], 'y': y[k], 'z': 0.0}})
+                'angular_velocity': {'x': x[k], 'y': y[k], 'z': 0.0}}, IMU))
     return path
 
 

@@ -9,6 +9,7 @@ from live import BAGS, seconds, values_of, wait_until
 import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.recordings.bag import BagReader
+from ou_monitor.recordings.read import read_recording
 import pytest
 from rclpy.qos import ReliabilityPolicy
 from std_msgs.msg import Bool, Float64
@@ -119,9 +120,8 @@ def test_one_instant(states, run):
 
 def test_the_same_numbers_as_offline(states):
     """Node and library are one estimator: the same samples give the same estimate."""
-    samples = [(m.message.header.stamp.sec + m.message.header.stamp.nanosec * 1e-9,
-                m.message.voltage) for m in BagReader(BAG).decoded(['/voltage'])]
-    t, v = np.array(samples).T
+    recording = read_recording(BAG)
+    t, v = recording.t, recording.voltage
     offline = SlidingEstimator(window=WINDOW)
     compared = done = 0
     for _, fields in states:

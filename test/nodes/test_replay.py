@@ -5,10 +5,12 @@ import threading
 import time
 
 from live import BAGS, seconds, wait_until
+from made_bags import encode
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.nodes.replay import options
 from ou_monitor.recordings.bag import BagReader, BagWriter
+from ou_monitor.recordings.standard_types import FLOAT32
 import pytest
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
@@ -23,7 +25,7 @@ def write_bag(path, n, period_ns=1_000_000, topic='/voltage'):
     with BagWriter(path) as bag:
         name = bag.add_topic(topic, 'std_msgs/msg/Float32')
         for k in range(n):
-            bag.write(name, T0 + k * period_ns, {'data': float(k)})
+            bag.write(name, T0 + k * period_ns, encode(FLOAT32, {'data': float(k)}))
     return path
 
 
@@ -140,7 +142,8 @@ def test_topics_and_no_clock(world, tmp_path):
         for name in ('/a', '/b'):
             bag.add_topic(name, 'std_msgs/msg/Float32')
         for k in range(20):
-            bag.write('/a' if k % 2 else '/b', T0 + k * 1_000_000, {'data': float(k)})
+            bag.write('/a' if k % 2 else '/b', T0 + k * 1_000_000,
+                      encode(FLOAT32, {'data': float(k)}))
     probe = world.probe()
     process = world.start('replay', path, '--topics', '/b', '--clock', '0', '--json', '-',
                           '--wait', '0.5')
@@ -188,7 +191,7 @@ def late(folder):
     with BagWriter(path) as bag:
         name = bag.add_topic('/voltage', 'std_msgs/msg/Float32')
         for k in range(10):
-            bag.write(name, 2**63 + k * 1_000_000, {'data': 5.0})
+            bag.write(name, 2**63 + k * 1_000_000, encode(FLOAT32, {'data': 5.0}))
     return path
 
 
@@ -237,9 +240,9 @@ def test_types_that_are_not_installed_are_left_out(world, tmp_path):
             if installed:
                 bag.add_topic('/voltage', 'std_msgs/msg/Float32')
             for k in range(10):
-                bag.write('/alien', T0 + k * 1_000_000, {'x': 1.0})
+                bag.write('/alien', T0 + k * 1_000_000, bytes(8))
                 if installed:
-                    bag.write('/voltage', T0 + k * 1_000_000, {'data': 5.0})
+                    bag.write('/voltage', T0 + k * 1_000_000, encode(FLOAT32, {'data': 5.0}))
     mixed = world.start('replay', tmp_path / 'mixed.mcap', '--wait', '0', '--json', '-')
     alien = world.start('replay', tmp_path / 'alien.mcap', '--wait', '0')
     summary = summary_of(mixed)

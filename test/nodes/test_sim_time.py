@@ -6,7 +6,9 @@ import time
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from live import ou_path, values_of, wait_until
+from made_bags import encode
 from ou_monitor.recordings.bag import BagWriter
+from ou_monitor.recordings.standard_types import FLOAT32
 import pytest
 from rosgraph_msgs.msg import Clock
 
@@ -21,7 +23,7 @@ def test_loop_on_simulated_time(world):
     with BagWriter(path) as bag:
         topic = bag.add_topic('/voltage', 'std_msgs/msg/Float32')
         for k, voltage in enumerate(ou_path(1000 * SECONDS, 0.001, seed=11, sigma=SIGMA)):
-            bag.write(topic, T0 + k * 1_000_000, {'data': voltage})
+            bag.write(topic, T0 + k * 1_000_000, encode(FLOAT32, {'data': voltage}))
     probe = world.probe()
     states = probe.listen('/ou_estimator/state', DiagnosticArray)
     estimator = world.start('estimator', '--ros-args', '-p', 'use_sim_time:=true')

@@ -1,19 +1,17 @@
-"""Fields in bulk: bit for bit what the general decoder gives, or refuses."""
+"""Fields in bulk: bit for bit what the MCAP library decodes, or refused."""
 
-from functools import partial
 import itertools
+import re
 
 from hypothesis import given, settings, strategies as st
-from mcap.records import Schema
-from mcap_ros2._dynamic import serialize_dynamic
-from mcap_ros2.decoder import DecoderFactory
+from made_bags import decode, encode
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings import standard_types as cdr
 from ou_monitor.recordings.bag import parse_definition
 from ou_monitor.recordings.cdr import FieldReader, join, MessageTable, seconds
 from ou_monitor.recordings.standard_types import SCHEMAS
-from ou_monitor.stream.config import Extractor, FieldSpec
+from ou_monitor.stream.config import FieldSpec, parse_field_path, walk
 import pytest
 from rosbags.typesys import get_typestore, Stores
 
@@ -36,61 +34,88 @@ def table_of(messages, times=None):
                         end - lengths, end)
 
 
-def general_decoder(kind, text):
-    """Return the decoder of the MCAP library."""
-    schema = Schema(id=1, name=kind, encoding='ros2msg', data=text.encode())
-    return DecoderFactory().decoder_for('cdr', schema)
+def numbers(raw):
+    """Return a field of an object as numbers; None: it holds none."""
+    raw = list(raw) if isinstance(raw, bytes) else raw
+    try:
+        return None if isinstance(raw, str) else np.array(raw, dtype=float)
+    except (TypeError, ValueError):
+        return None
 
 
 def one_by_one(spec, text, messages, table):
-    """Return stamps, counts and values by the general decoder, or None where it refuses."""
-    decode = general_decoder(spec.type, text)
-    extractor = Extractor(FieldSpec(**{**spec.__dict__, 'nan': 'unknown'}))
+    """Return stamps, counts and values as the library decodes them, or None where it refuses."""
     stamps, counts, values = [], [], [np.empty(0)]
     for message, logged in zip(messages, seconds(table.log_time)):
         try:
-            found = extractor.extract(decode(message))
+            decoded = decode(spec.type, message, text)
         except Exception:
             return None
-        held = found.values
-        if not held.size and spec.sample_rate is None:
+        raw = walk(decoded, parse_field_path(spec.field), spec.field, spec.type)
+        held = np.empty(0) if raw is None else numbers(raw)
+        if held is None or (raw is not None and held.ndim and spec.sample_rate is None):
+            return None
+        held = np.atleast_1d(held) * (spec.sign * spec.unit_factor) + spec.offset
+        held[~np.isfinite(held)] = np.nan
+        if raw is None and spec.sample_rate is None:
             held = np.array([np.nan])
-        stamps.append(logged if found.stamp is None else found.stamp)
+        stamp = spec.stamp_field and walk(decoded, parse_field_path(spec.stamp_field), '', '')
+        if stamp is None:
+            stamp = 0.0
+        elif hasattr(stamp, 'nanosec'):
+            stamp = float(stamp.sec) + 1e-9 * float(stamp.nanosec)
+        elif isinstance(stamp, (int, float)):
+            stamp = float(stamp) * spec.stamp_factor
+        else:
+            return None
+        stamps.append(stamp if np.isfinite(stamp) and stamp != 0.0 else logged)
         counts.append(held.size)
         values.append(held)
     return np.array(stamps), np.array(counts), np.concatenate(values)
 
 
-def reader_of(spec, text):
+def refuse(log_time, why):
+    """Raise for a message that does not fit its type."""
+    raise InputError(why)
+
+
+def reader_of(spec, text, broken=refuse):
     """Return a reader of a field."""
-    return FieldReader(spec, parse_definition(spec.type, text),
-                       partial(general_decoder, spec.type, text))
+    return FieldReader(spec, parse_definition(spec.type, text), broken)
 
 
 def in_bulk(spec, text, table):
-    """Return the same in bulk, and how many messages went the general way."""
-    reader = reader_of(spec, text)
+    """Return the same in bulk."""
     try:
-        column = reader.read(table)
-    except Exception:
-        return None, reader.general
-    return (column.stamp, column.counts, column.values), reader.general
+        column = reader_of(spec, text).read(table)
+    except InputError:
+        return None
+    return column.stamp, column.counts, column.values
 
 
 def assert_same(found, expected):
     """All bits are the same."""
-    assert (found is None) == (expected is None)
-    if found is not None:
-        for one, other in zip(found, expected, strict=True):
-            np.testing.assert_array_equal(one.astype(np.float64).view(np.uint64),
-                                          other.astype(np.float64).view(np.uint64))
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one.astype(np.float64).view(np.uint64),
+                                      other.astype(np.float64).view(np.uint64))
 
 
-def assert_both_ways(spec, text, messages):
-    """Compare the two ways."""
+def assert_both_ways(spec, text, messages, broken=False):
+    """
+    Compare the two ways.
+
+    Of a broken message the library takes texts that go on beyond it, and of a type without a
+    number there an empty array: both are refused here.
+    """
     table = table_of(messages)
-    found, _ = in_bulk(spec, text, table)
-    assert_same(found, one_by_one(spec, text, messages, table))
+    found = in_bulk(spec, text, table)
+    expected = one_by_one(spec, text, messages, table)
+    if found is not None:
+        assert_same(found, expected)
+    elif expected is not None and not broken:
+        assert re.search(r'holds a|is an array|is a', str(pytest.raises(
+            InputError, reader_of, spec, text).value))
+        assert not expected[1].any() or spec.stamp_field is not None
 
 
 class Maker:
@@ -178,12 +203,11 @@ def test_any_schema_any_message(rnd, data):
     """Random definitions, paths, shapes, texts, broken bytes: one outcome, both ways."""
     maker = Maker(rnd)
     text = maker.text()
-    encode = serialize_dynamic(KIND, text)[KIND]
     base = maker.message()
     messages = []
     for _ in range(rnd.randint(1, 8)):
         content = maker.alike(base) if rnd.random() < 0.8 else maker.message()
-        messages.append(encode(content))
+        messages.append(encode(KIND, content, text))
     paths = maker.paths()
     spec = FieldSpec(
         'x', KIND, rnd.choice(paths), unit_factor=0.1, sign=rnd.choice((1, -1)), offset=0.3,
@@ -196,20 +220,20 @@ def test_any_schema_any_message(rnd, data):
         small = [k for k, byte in enumerate(broken) if 0 < byte < 12] or [0]
         broken[rnd.choice((rnd.choice(small), rnd.randrange(len(broken))))] = rnd.choice(
             (0, 1, 2, 3, 4, 7, 0x80, 0xc3, 0xff))
-        assert_both_ways(spec, text, [*messages, bytes(broken)])
-    assert_both_ways(spec, text, [*messages, messages[0][:rnd.randint(1, len(messages[0]))]])
+        assert_both_ways(spec, text, [*messages, bytes(broken)], broken=True)
+    assert_both_ways(spec, text, [*messages, messages[0][:rnd.randint(1, len(messages[0]))]],
+                     broken=True)
 
 
 @pytest.mark.parametrize('field', ['s', 'd', 'e', 'u', 'u[1]', 'n.x', 'n', 'a', 'a[0].x', 'a[1].x',
                                    'f', 'f[1]', 'f[2]'])
 @pytest.mark.parametrize('rate', [None, 10.0])
 def test_cases_that_are_easily_missed(field, rate):
-    """Empty arrays are not aligned; bytes are no block; equal sizes can hide unequal shapes."""
+    """Empty arrays are not aligned; equal sizes can hide unequal shapes."""
     text = ('string s\nstring t\nfloat64[] d\nuint8 e\nuint8[] u\nN n\nN[] a\nfloat32[] f\n'
             + 80 * '=' + '\nMSG: p/N\nfloat64 x\n')
-    encode = serialize_dynamic(KIND, text)[KIND]
-    messages = [encode({'s': s, 't': t, 'd': d, 'e': 4, 'u': u, 'n': {'x': 2.5},
-                        'a': [{'x': float(k)} for k in range(m)], 'f': [0.5, 1.5][:m]})
+    messages = [encode(KIND, {'s': s, 't': t, 'd': d, 'e': 4, 'u': u, 'n': {'x': 2.5},
+                              'a': [{'x': float(k)} for k in range(m)], 'f': [0.5, 1.5][:m]}, text)
                 for s, t in (('a', 'abcdefghi'), ('abcdefghi', 'a'), ('', ''), ('', 'abcdefghij'))
                 for d in ([], [1.0]) for u in ([], [7, 8]) for m in (0, 1, 2)]
     spec = FieldSpec('x', KIND, field, sample_rate=rate)
@@ -230,50 +254,53 @@ def battery(frame, volts, cells=(), stamp=(5, 7)):
 BATTERY = FieldSpec('/v', cdr.BATTERY_STATE, 'voltage', stamp_field='header.stamp')
 
 
-def test_messages_alike_never_meet_the_general_decoder():
-    """Frames and cells of several lengths: each shape is learned once."""
-    messages = [battery(frame, k + 0.5, cells, (k, k)) for k, (frame, cells) in enumerate(
-        20 * [('', ()), ('base_link', ()), ('bat', (3.7, 3.8)), ('base_linl', ())])]
-    table = table_of(messages)
-    found, general = in_bulk(BATTERY, SCHEMAS[cdr.BATTERY_STATE], table)
-    assert general == 0
-    assert_same(found, one_by_one(BATTERY, SCHEMAS[cdr.BATTERY_STATE], messages, table))
-    assert found[2].tolist() == [k + 0.5 for k in range(80)]
+def read_all(spec, messages, times=None, text=None):
+    """Return the column, and the log times and reasons of what was left out."""
+    broken = []
+    reader = reader_of(spec, text or SCHEMAS[spec.type], lambda *why: broken.append(why))
+    return reader.read(table_of(messages, times)), broken
+
+
+def shapes(count):
+    """Return frames of which no two have texts of one length, and some of one length of bytes."""
+    return [''.join(chr(97 + (k >> b & 1)) for b in range(6)) * (1 + k) for k in range(count)]
+
+
+@pytest.mark.parametrize('frames', [
+    20 * ['', 'base_link', 'bat', 'base_linl'], shapes(40), ['été', 'ete', '\u4e2d'] * 20],
+    ids=['alike', 'unlike', 'not ASCII'])
+def test_frames_of_any_length(frames):
+    """Shapes that recur are learned; others are walked one by one."""
+    messages = [battery(frame, k + 0.5, (3.7,) * (k % 3), (k, k))
+                for k, frame in enumerate(frames)]
+    column, broken = read_all(BATTERY, messages)
+    assert column.values.tolist() == [k + 0.5 for k in range(len(frames))] and not broken
+    assert_both_ways(BATTERY, SCHEMAS[cdr.BATTERY_STATE], messages)
 
 
 @pytest.mark.parametrize('stamp, counts', [((5, 7), True), ((0, 0), False), ((0, 1), True),
                                            ((-1, 10**9), False)])
 def test_stamps_and_their_absence(stamp, counts):
     """A zero stamp is none: the log time counts."""
-    table = table_of([battery('', 5.0, stamp=stamp)], [3 * 10**9])
-    (stamps, _, _), general = in_bulk(BATTERY, SCHEMAS[cdr.BATTERY_STATE], table)
-    assert general == 0
-    assert stamps[0] == (stamp[0] + 1e-9 * stamp[1] if counts else 3.0)
+    column, _ = read_all(BATTERY, [battery('', 5.0, stamp=stamp)], [3 * 10**9])
+    assert column.stamp[0] == (stamp[0] + 1e-9 * stamp[1] if counts else 3.0)
+    assert column.stamped.tolist() == [counts]
 
 
-def test_unusual_messages_use_the_general_decoder():
-    """Big endian, XCDR2, no text, cut off: only these, one by one."""
+def test_unusual_messages():
+    """Big endian is read; XCDR2, no text, cut off are left out with the reason, in order."""
     good = cdr.encode_scalars(cdr.FLOAT32, [1.0, 2.0, 4.0])
     big = b'\0\0\0\0' + np.array([8.0], '>f4').tobytes()
     xcdr2 = b'\0\x07' + good[0][2:]
     spec = FieldSpec('/v', cdr.FLOAT32, 'data')
-    table = table_of([good[0], big, good[1], xcdr2, good[2]])
-    (_, _, values), general = in_bulk(spec, SCHEMAS[cdr.FLOAT32], table)
-    assert (values.tolist(), general) == ([1.0, 8.0, 2.0, 1.0, 4.0], 2)
-    assert in_bulk(spec, SCHEMAS[cdr.FLOAT32], table_of([good[0], good[1][:6]]))[0] is None
-    odd = bytearray(battery('base', 5.0))
-    odd[odd.index(b'base')] = 0xff
-    assert in_bulk(BATTERY, SCHEMAS[cdr.BATTERY_STATE], table_of([bytes(odd)]))[0] is None
-
-
-def test_many_shapes_end():
-    """A topic without two messages alike is read the general way, after a few tries."""
-    frames = [''.join(chr(97 + (k >> b & 1)) for b in range(6)) * (1 + k) for k in range(40)]
-    messages = [battery(frame, 5.0 + k) for k, frame in enumerate(frames)]
-    messages += [battery('x', k, [1.0] * 20) for k in range(3)]
-    table = table_of(messages)
-    found, _ = in_bulk(BATTERY, SCHEMAS[cdr.BATTERY_STATE], table)
-    assert_same(found, one_by_one(BATTERY, SCHEMAS[cdr.BATTERY_STATE], messages, table))
+    column, broken = read_all(spec, [good[0], big, xcdr2, good[1], good[1][:6], b'', good[2]],
+                              range(7))
+    assert column.values.tolist() == [1.0, 8.0, 2.0, 4.0]
+    assert column.log_time.tolist() == [0, 1, 3, 6]
+    assert broken == [(2, 'it is not plain CDR'),
+                      (4, 'it is shorter than its own lengths state'), (5, 'it is not plain CDR')]
+    odd = battery('base', 5.0).replace(b'base', b'\xffase')
+    assert "codec can't decode" in read_all(BATTERY, [odd])[1][0][1]
 
 
 @pytest.mark.parametrize('labels', [[], ['a'], ['rows', 'columns'], ['x' * 7, 'y' * 8]])
@@ -286,20 +313,16 @@ def test_blocks_of_any_layout_and_length(labels):
         dim = message.layout.dim[0]
         message.layout.dim = [type(dim)(label, 2, 2) for label in labels]
         messages.append(bytes(STORE.serialize_cdr(message, cdr.FLOAT32_ARRAY)))
-    spec = FieldSpec('/v', cdr.FLOAT32_ARRAY, 'data', sample_rate=10.0)
-    (_, counts, values), general = in_bulk(spec, SCHEMAS[cdr.FLOAT32_ARRAY], table_of(messages))
-    assert general == 0
-    assert counts.tolist() == [3, 0, 3, 5, 5, 1]
-    assert values.tolist() == [0, 1, 2, 2, 3, 4, 3, 4, 5, 6, 7, 4, 5, 6, 7, 8, 5]
+    column, _ = read_all(FieldSpec('/v', cdr.FLOAT32_ARRAY, 'data', sample_rate=10.0), messages)
+    assert column.counts.tolist() == [3, 0, 3, 5, 5, 1]
+    assert column.values.tolist() == [0, 1, 2, 2, 3, 4, 3, 4, 5, 6, 7, 4, 5, 6, 7, 8, 5]
 
 
 def test_in_time_order_keeps_what_belongs_together():
     """Blocks move as a whole; those of one time stay as they are."""
     messages = [cdr.encode_block([float(k)] * n) for k, n in enumerate((2, 1, 3, 0, 2))]
-    table = table_of(messages, [30, 10, 10, 5, 20])
     spec = FieldSpec('/v', cdr.FLOAT32_ARRAY, 'data', sample_rate=10.0)
-    reader = FieldReader(spec, parse_definition(spec.type, SCHEMAS[spec.type]), lambda: None)
-    column = reader.read(table).in_time_order()
+    column = read_all(spec, messages, [30, 10, 10, 5, 20])[0].in_time_order()
     assert column.counts.tolist() == [0, 1, 3, 2, 2]
     assert column.values.tolist() == [1, 2, 2, 2, 4, 4, 0, 0]
     first, rest = column.split(3)
@@ -313,20 +336,48 @@ def test_log_times_of_any_size():
         0.0, 1e-9, 18446744073 + 0.709551615]
 
 
-def test_wrong_path_gives_the_general_decoders_error():
-    """The nearest field is named, as it is for messages one by one."""
-    spec = FieldSpec('/v', cdr.BATTERY_STATE, 'voltagee')
-    text = SCHEMAS[cdr.BATTERY_STATE]
-    reader = reader_of(spec, text)
-    with pytest.raises(InputError, match="did you mean 'voltage'"):
-        reader.read(table_of([battery('', 5.0)]))
+@pytest.mark.parametrize('rule, expected', [
+    ('value', [0.0, 5.0, 0.0]), ('unknown', [np.nan, 5.0, np.nan]),
+    ('unknown_at_first', [np.nan, 5.0, 0.0])])
+def test_what_a_zero_means(rule, expected):
+    """A value, never one, or none as long as there was nothing else."""
+    spec = FieldSpec('/v', cdr.FLOAT32, 'data', zero=rule)
+    found = read_all(spec, cdr.encode_scalars(cdr.FLOAT32, [0.0, 5.0, 0.0]))[0].values
+    np.testing.assert_array_equal(found, expected)
+
+
+TREE = ('string s\nN[] n\nfloat64[] d\nfloat64 x\nT t\n' + 80 * '=' + '\nMSG: p/N\nint32 mv\n'
+        + 80 * '=' + '\nMSG: p/T\nint32 sec\nuint32 nanosec\n')
+
+
+@pytest.mark.parametrize('options, words', [
+    ({'field': 'xx'}, "no 'xx' there; did you mean 'x'"),
+    ({'field': 'n[0].m'}, "did you mean 'mv'"), ({'field': 'n.mv'}, "no 'mv' there"),
+    ({'field': 's'}, 'holds a string, not a number'), ({'field': 'n[0]'}, 'holds a p/N'),
+    ({'field': 'd'}, r"is an array: name one element, 'd\[0\]', or give sample_rate"),
+    ({'field': 'x[0]'}, 'something that is not an array'),
+    ({'stamp_field': 's'}, "stamp_field 's' of p/msg/Top is a string"),
+    ({'stamp_field': 'd'}, r'is a float64\[\]'), ({'stamp_field': 'n[0]'}, 'is a p/N')])
+def test_paths_that_the_type_does_not_have(options, words):
+    """Refused before a message is read, with the way out."""
+    with pytest.raises(InputError, match=words):
+        reader_of(FieldSpec('/v', KIND, **{'field': 'x', **options}), TREE)
+
+
+def test_units_and_stamps():
+    """The value is sign * unit_factor * raw + offset; an element too many is a missing value."""
+    spec = FieldSpec('/v', KIND, 'n[1].mv', sign=-1, unit_factor=1e-3, offset=0.5, stamp_field='t')
+    rest = {'d': [], 'x': 0.0, 's': ''}
+    messages = [encode(KIND, {'n': [{'mv': 1}, {'mv': 4200}][:k],
+                              't': {'sec': 12, 'nanosec': 250_000_000}, **rest}, TREE)
+                for k in (2, 1, 2)]
+    column, _ = read_all(spec, messages, text=TREE)
+    np.testing.assert_array_equal(column.values, [-4.2 + 0.5, np.nan, -4.2 + 0.5])
+    assert column.stamp.tolist() == [12.25] * 3
 
 
 def test_a_signalling_nan_is_a_nan():
     """Of which NumPy warns where it is scaled or widened, and a warning is an error here."""
-    text = 'float32 x\n'
-    signalling = bytes.fromhex('000100000100807f')
     spec = FieldSpec('x', KIND, 'x', unit_factor=0.1)
-    found, _ = in_bulk(spec, text, table_of([signalling]))
-    assert np.isnan(found[2]).all()
-    assert_both_ways(spec, text, [signalling])
+    column, _ = read_all(spec, [bytes.fromhex('000100000100807f')], text='float32 x\n')
+    assert np.isnan(column.values).all()

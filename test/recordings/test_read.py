@@ -2,6 +2,7 @@
 
 import tracemalloc
 
+from made_bags import encode
 from mcap.writer import Writer
 import numpy as np
 from ou_monitor.errors import InputError
@@ -30,7 +31,8 @@ def make(path, *topics):
         for name, kind, messages in topics:
             bag.add_topic(name, kind, schema=TEXT.get(kind))
             for t, message in messages:
-                bag.write(name, t, message)
+                bag.write(name, t, encode(kind, message, TEXT.get(kind)) if isinstance(
+                    message, dict) else message)
     return path
 
 

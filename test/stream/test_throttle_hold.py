@@ -4,6 +4,7 @@ import math
 from types import SimpleNamespace
 
 from hypothesis import example, given, HealthCheck, settings, strategies as st
+from made_bags import encode
 import numpy as np
 from one_by_one import OneByOne
 from ou_monitor.recordings.bag import BagWriter
@@ -114,11 +115,13 @@ def bench(folder, config, messages, blocks):
     path = folder / 'bag.mcap'
     path.unlink(missing_ok=True)
     with BagWriter(path) as bag:
-        for name, block in zip(('voltage', 'throttle'), blocks, strict=True):
-            kind = 'x_msgs/msg/Block' if block else 'x_msgs/msg/Sample'
+        kinds = {name: 'x_msgs/msg/Block' if block else 'x_msgs/msg/Sample'
+                 for name, block in zip(('voltage', 'throttle'), blocks, strict=True)}
+        for name, kind in kinds.items():
             bag.add_topic('/' + name, kind, schema=TYPES[kind])
         for name, logged, stamp, data in messages:
-            bag.write('/' + name, logged, {'stamp': stamp, 'data': data})
+            bag.write('/' + name, logged, encode(
+                kinds[name], {'stamp': stamp, 'data': data}, TYPES[kinds[name]]))
     recording = read_recording(path, msg_config=config)
     return dict(zip(zip(recording.t.tolist(), recording.voltage.tolist(), strict=True),
                     recording.throttle.tolist(), strict=True))

@@ -1,10 +1,12 @@
 """Bags for the tests of reading: by the library in every way, and by hand, record by record."""
 
+from functools import cache
 import struct
 import zlib
 
 from mcap.opcode import Opcode as Op
 from mcap.writer import CompressionType, IndexType, Writer
+from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 import numpy as np
 from ou_monitor.recordings.mcap_file import MAGIC
 from ou_monitor.recordings.standard_types import encode_scalars, FLOAT32, FLOAT64, SCHEMAS
@@ -36,6 +38,21 @@ def write(path, rows, **options):
             writer.add_message(channels[topic], t, data, t)
         writer.finish()
     return path
+
+
+@cache
+def _way(generate, kind, text):
+    return generate(kind, text or SCHEMAS[kind])[kind]
+
+
+def encode(kind, content, text=None):
+    """Return a message of a type, given as a dict, as the library writes it."""
+    return _way(serialize_dynamic, kind, text)(content)
+
+
+def decode(kind, data, text=None):
+    """Return a message as an object, as the library reads it."""
+    return _way(generate_dynamic, kind, text)(data)
 
 
 def supply(count=COUNT):

@@ -1,8 +1,19 @@
 """Messages one by one into a `SampleStream`, with the source's time where one has no stamp."""
 
 import numpy as np
-from ou_monitor.stream.config import Extractor
 from ou_monitor.stream.samples import SampleStream
+
+
+def extracted(spec, message):
+    """Return the values and the stamp, s, of a message; None: it carries none."""
+    values = np.atleast_1d(np.array(getattr(message, spec.field), dtype=float))
+    values[~np.isfinite(values)] = np.nan
+    if spec.nan == 'drop' and spec.sample_rate is None:
+        values = values[np.isfinite(values)]
+    stamp = None if spec.stamp_field is None else getattr(message, spec.stamp_field)
+    if hasattr(stamp, 'sec'):
+        stamp = stamp.sec + 1e-9 * stamp.nanosec
+    return values, stamp or None
 
 
 class OneByOne(SampleStream):
@@ -11,23 +22,23 @@ class OneByOne(SampleStream):
     def open_voltage(self, spec):
         """Set the field of the voltage."""
         super().open_voltage(spec)
-        self.extract_voltage = Extractor(spec).extract
+        self.voltage = spec
 
     def open_throttle(self, spec):
         """Set the field of the throttle."""
         super().open_throttle(spec)
-        self.extract_throttle = Extractor(spec).extract
+        self.loads = spec
 
     def take_voltage(self, message, source_time):
         """Take one message of the voltage."""
-        found = self.extract_voltage(message)
-        values = found.values if found.values.size or self._block else np.array([np.nan])
-        end = source_time() if found.stamp is None else found.stamp
-        return bool(self.take_voltages(np.array([end]), np.array([found.stamp is not None]),
+        values, stamp = extracted(self.voltage, message)
+        values = values if values.size or self._block else np.array([np.nan])
+        end = source_time() if stamp is None else stamp
+        return bool(self.take_voltages(np.array([end]), np.array([stamp is not None]),
                                        np.array([values.size]), values)[0])
 
     def take_throttle(self, message, source_time):
         """Take one message of the throttle."""
-        found = self.extract_throttle(message)
-        end = source_time() if found.stamp is None else found.stamp
-        return self.take_throttles(end, found.stamp is not None, found.values)
+        values, stamp = extracted(self.loads, message)
+        end = source_time() if stamp is None else stamp
+        return self.take_throttles(end, stamp is not None, values)
