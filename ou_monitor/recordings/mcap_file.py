@@ -21,7 +21,6 @@ import math
 import os
 from pathlib import Path
 import resource
-import shlex
 import struct
 from typing import Any, BinaryIO, NamedTuple
 import zlib
@@ -36,12 +35,12 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.cdr import gather, IntArray, MessageTable
+from ou_monitor.recordings.importers.formats import kind_of_foreign, MAGIC
 from ou_monitor.records import Defect, Note
-from ou_monitor.stream.files import open_regular, parse_yaml, path_words
+from ou_monitor.stream.files import open_regular, parse_yaml, path_words, plain_texts
 from ou_monitor.text import counted, printable
 import zstandard
 
-MAGIC = b'\x89MCAP0\r\n'
 # Opcode and length of a record; channel, sequence, log time and publish time of a message.
 _HEAD, _MESSAGE = struct.Struct('<BQ'), struct.Struct('<HIQQ')
 _FOOTER = _HEAD.size + 20 + len(MAGIC)
@@ -325,7 +324,7 @@ class McapFile:
         starts = [] if summary is None else sorted(
             index.chunk_start_offset for index in summary.chunk_indexes)
         counted_there = None if summary is None else summary.statistics
-        private: list[Break] = []
+        private = False
         at, op, in_data = len(MAGIC), 0, True
         while op != Opcode.FOOTER and len(self.breaks) < _MOST_BREAKS:
             try:
@@ -361,9 +360,10 @@ class McapFile:
                     _check_attachment(file, length)
                 elif op == Opcode.MESSAGE_INDEX:
                     self._walk_index(file, at, length)
-                elif op >= _PRIVATE and len(private) < _MOST_NOTES:
-                    private.append(Break(at, f'a record of a private kind (0x{op:02x}, {length} '
-                                         'bytes)'))
+                elif op >= _PRIVATE and counted_there is None and not private:
+                    private = True
+                    raise Damage(f'a record of a private kind (0x{op:02x}) may have been a '
+                                 'message, and no count tells that none is missing')
             except Damage as error:
                 # The frame is whole: later records may be intact.
                 self._break(at, error)
@@ -375,14 +375,6 @@ class McapFile:
             elif at + len(MAGIC) < self._size:
                 self._break(at + len(MAGIC), f'{self._size - at - len(MAGIC)} bytes follow the '
                             'end of the recording, which may be another one')
-        for one in private:
-            if self.breaks or counted_there is None:
-                # These bytes may have been messages.
-                self._break(one.offset, f'{one.why}, and no count of the messages to tell that '
-                            'none is missing')
-            else:
-                self.notes.append(f'{one.why.capitalize()} at byte {one.offset} of '
-                                  f'{printable(self.path.name)} was passed over.')
         if counted_there is not None and not self.breaks:
             for key, stated in counted_there.channel_message_counts.items():
                 found = self.counts.get(key, 0)
@@ -630,12 +622,6 @@ def _rate(text: str) -> float | None:
     return None
 
 
-def plain_texts(found: Any) -> dict[str, str]:
-    """Return the metadata of a recording as names and texts of one line each."""
-    return {printable(key, 100): printable(value, 1000)
-            for key, value in list(found.items())[:1000]}
-
-
 def custom_data(content: Any) -> dict[str, str]:
     """Return the custom data in the content of a metadata.yaml."""
     info = content.get('rosbag2_bagfile_information', content) if isinstance(
@@ -815,42 +801,3 @@ def _table(data: bytes, at: IntArray) -> MessageTable:
     return MessageTable(data, gather(data, at + _HEAD.size, '<u2'),
                         gather(data, at + _HEAD.size + 6, '<u8'), at + _DATA,
                         at + _HEAD.size + length)
-
-
-# First bytes -> what it is, and what to do.
-_FOREIGN = {
-    b'PK\x03\x04': 'a ZIP archive, or a workbook of Excel (.xlsx): unpack it, or save it as CSV',
-    b'\xd0\xcf\x11\xe0': 'a workbook of Excel (.xls): save it as CSV',
-    b'\x1f\x8b': "compressed: unpack it with 'gunzip' first",
-    b'<SALEAE>': 'a binary export of Saleae Logic: export it as CSV',
-    b'AG10': 'a binary export of a Keysight oscilloscope: save it as CSV',
-    b'RG01': 'a binary export of a Rigol oscilloscope: save it as CSV',
-    b'PAR1': 'Parquet: save it as CSV', b'\x89HDF': 'HDF5: save it as CSV',
-    b'MATLAB 5.0': 'a MAT file of MATLAB: save it as CSV', b'{"': 'JSON: export a CSV',
-    b'<?xml': 'XML: export a CSV', b'%PDF': 'a PDF', b'\x89PNG': 'a picture',
-    b'\xff\xd8\xff': 'a picture', b'<!DOCTYPE': 'a web page, not the file behind it',
-    b'<!doctype': 'a web page, not the file behind it',
-    b'<html': 'a web page, not the file behind it'}
-
-
-def kind_of_foreign(head: bytes, path: Path = Path('LOG')) -> str:
-    """Return the likely kind of a file that is not MCAP, and what to do with it."""
-    if head.startswith(b'SQLite format 3'):
-        return ("it is an SQLite rosbag2 (.db3): convert it with 'ros2 bag convert' to the "
-                'storage mcap')
-    if head.startswith(b'#ROSBAG'):
-        return "it is a ROS 1 bag: convert it with 'rosbags-convert'"
-    if head.startswith(b'\x28\xb5\x2f\xfd'):
-        return "it is compressed as a whole: unpack it with 'zstd -d' first"
-    for begin, words in _FOREIGN.items():
-        if head.lstrip(b'\xef\xbb\xbf \t\r\n').startswith(begin):
-            return f'it is {words}'
-    # Here, for the table of formats has the bag in it, and so needs this module.
-    from ou_monitor.recordings.importers.formats import BAG, CSV, format_of
-    log = format_of(head)
-    if log is not None and log.name not in (BAG, CSV):
-        command = shlex.join(['ou-monitor', 'convert', str(path), path.stem])
-        return f'it is a log, {log.words}, not a recording: convert it first, with {command}'
-    if head[:1] and all(byte in b'\t\n\r' or 32 <= byte < 127 for byte in head):
-        return 'it is text'
-    return 'its first bytes are ' + (head[:8].hex(' ') or 'missing')

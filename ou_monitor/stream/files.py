@@ -38,6 +38,12 @@ def path_words(path: str | Path) -> str:
     return printable(path, _MOST_OF_PATH)
 
 
+def plain_texts(found: Any) -> dict[str, str]:
+    """Return the metadata of a recording as names and texts of one line each."""
+    return {printable(key, 100): printable(value, 1000)
+            for key, value in list(found.items())[:1000]}
+
+
 def open_regular(path: str | Path) -> BinaryIO:
     """
     Open a regular file for reading, without waiting for a FIFO's writer.

@@ -28,8 +28,8 @@ from typing import NamedTuple, TextIO
 
 import numpy as np
 from ou_monitor.errors import InputError
+from ou_monitor.recordings.importers.formats import kind_of_foreign
 from ou_monitor.recordings.importers.log import CsvColumns
-from ou_monitor.recordings.mcap_file import kind_of_foreign
 from ou_monitor.records import FloatArray, TIME_UNITS
 from ou_monitor.stream.files import open_regular
 

@@ -12,19 +12,20 @@ from contextlib import redirect_stderr
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+import shlex
 import sys
 from typing import NamedTuple
 
 import numpy as np
 from ou_monitor.errors import how_to_install, InputError
 from ou_monitor.recordings.importers.log import Log, Progress, quiet, Request
-from ou_monitor.recordings.mcap_file import MAGIC as MCAP_MAGIC, plain_texts
-from ou_monitor.stream.files import open_regular
+from ou_monitor.stream.files import open_regular, plain_texts
 from ou_monitor.text import printable
 
 # Enough to tell every format; the formats of a text log come first in it.
 HEAD = 8192  # bytes
 
+MAGIC = b'\x89MCAP0\r\n'
 ULOG = b'ULog\x01\x12\x35'
 DATAFLASH = b'\xa3\x95\x80'
 BLACKBOX = b'H Product:Blackbox flight data recorder'
@@ -64,7 +65,7 @@ def _is_crazyflie(head: bytes) -> bool:
 BAG, CSV = 'mcap', 'csv'
 # The first that fits is taken.
 FORMATS = (
-    Format(BAG, 'MCAP bag (.mcap)', lambda head: head.startswith(MCAP_MAGIC), ''),
+    Format(BAG, 'MCAP bag (.mcap)', lambda head: head.startswith(MAGIC), ''),
     Format('ulog', 'PX4 ULog (.ulg)', lambda head: head.startswith(ULOG), 'ulog', 'pyulog',
            'ulog'),
     Format('dataflash', 'ArduPilot dataflash (.bin)', lambda head: head.startswith(DATAFLASH),
@@ -82,6 +83,40 @@ FORMATS = (
 def format_of(head: bytes) -> Format | None:
     """Return the format of a file by its first bytes."""
     return next((one for one in FORMATS if head and one.fits(head)), None)
+
+
+# First bytes -> what it is, and what to do.
+_FOREIGN = {
+    b'SQLite format 3': "an SQLite rosbag2 (.db3): convert it with 'ros2 bag convert' to the "
+                        'storage mcap',
+    b'#ROSBAG': "a ROS 1 bag: convert it with 'rosbags-convert'",
+    b'\x28\xb5\x2f\xfd': "compressed as a whole: unpack it with 'zstd -d' first",
+    b'PK\x03\x04': 'a ZIP archive, or a workbook of Excel (.xlsx): unpack it, or save it as CSV',
+    b'\xd0\xcf\x11\xe0': 'a workbook of Excel (.xls): save it as CSV',
+    b'\x1f\x8b': "compressed: unpack it with 'gunzip' first",
+    b'<SALEAE>': 'a binary export of Saleae Logic: export it as CSV',
+    b'AG10': 'a binary export of a Keysight oscilloscope: save it as CSV',
+    b'RG01': 'a binary export of a Rigol oscilloscope: save it as CSV',
+    b'PAR1': 'Parquet: save it as CSV', b'\x89HDF': 'HDF5: save it as CSV',
+    b'MATLAB 5.0': 'a MAT file of MATLAB: save it as CSV', b'{"': 'JSON: export a CSV',
+    b'<?xml': 'XML: export a CSV', b'%PDF': 'a PDF', b'\x89PNG': 'a picture',
+    b'\xff\xd8\xff': 'a picture', b'<!DOCTYPE': 'a web page, not the file behind it',
+    b'<!doctype': 'a web page, not the file behind it',
+    b'<html': 'a web page, not the file behind it'}
+
+
+def kind_of_foreign(head: bytes, path: Path = Path('LOG')) -> str:
+    """Return the likely kind of a file that is not MCAP, and what to do with it."""
+    for begin, words in _FOREIGN.items():
+        if head.lstrip(b'\xef\xbb\xbf \t\r\n').startswith(begin):
+            return f'it is {words}'
+    log = format_of(head)
+    if log is not None and log.name not in (BAG, CSV):
+        command = shlex.join(['ou-monitor', 'convert', str(path), path.stem])
+        return f'it is a log, {log.words}, not a recording: convert it first, with {command}'
+    if head[:1] and all(byte in b'\t\n\r' or 32 <= byte < 127 for byte in head):
+        return 'it is text'
+    return 'its first bytes are ' + (head[:8].hex(' ') or 'missing')
 
 
 def detect(path: Path) -> Format:
