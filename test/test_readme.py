@@ -7,7 +7,8 @@ import re
 import subprocess
 import sys
 
-from ou_monitor.cli.arguments import brownout_limit, CELL_LIMIT
+from ou_monitor.analysis.crafts import CELL_LIMIT
+from ou_monitor.cli.arguments import brownout_limit
 from ou_monitor.cli.commands import COMMANDS
 from project import metadata, ROOT
 import pytest
@@ -304,7 +305,7 @@ def test_the_limit_is_documented_as_it_is():
     """The volts a cell of --cells alone, and what no cell has."""
     text = ' '.join((ROOT / 'doc/commands.md').read_text().split())
     assert f'`--cells N` alone takes {CELL_LIMIT:g} V a cell' in text
-    args = argparse.Namespace(brownout_voltage='3.5', cells=4)
+    args = argparse.Namespace(brownout_voltage=3.5, cells=4)
     assert brownout_limit(args) == 14.0 and '`--cells 4 --brownout-voltage 3.5` is 14 V' in text
     for name in ('analyze', 'compare', 'coupling', 'discover', 'fleet'):
         options = [n for one in COMMANDS[name].options if not isinstance(one, tuple)

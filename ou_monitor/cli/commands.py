@@ -7,12 +7,188 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 import math
+import re
 from typing import Any
 
-from ou_monitor.cli.options import (
-    CSV, estimate, FILES, FLIGHT, FORCE, JSON, levels, limit, Option, PART, RECORDING, REPORT,
-    seed, TOPICS, TYPES, whole, WithoutOut)
 from ou_monitor.cli.output import path_argument
+
+
+class Option:
+    """Names of an option or of an argument, and what argparse knows of it."""
+
+    def __init__(self, *names: str, **keywords: Any) -> None:
+        self.names = names
+        self.keywords = keywords
+
+
+class WithoutOut(argparse.Action):
+    """A flag that needs no OUT; an optional positional could not follow an option."""
+
+    def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
+                 values: Any, option_string: str | None = None) -> None:
+        """Set the flag."""
+        setattr(namespace, self.dest, True)
+        for action in parser._actions:
+            if action.dest == 'out':
+                action.required = False
+
+
+def whole(what: str, low: int, high: float = math.inf, step: int = 1) -> Callable[[str], int]:
+    """Return what reads a whole number within a range, a multiple of a step; what: in words."""
+    def read(text: str) -> int:
+        if not (text.isascii() and text.isdigit() and low <= int(text) <= high
+                and int(text) % step == 0):
+            raise argparse.ArgumentTypeError(f"'{text}' is not {what}")
+        return int(text)
+    return read
+
+
+def number(what: str, fits: Callable[[float], bool]) -> Callable[[str], float]:
+    """Return what reads a number that fits; what: in words."""
+    def read(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not fits(value):
+            raise argparse.ArgumentTypeError(f"'{text}' is not {what}")
+        return value
+    return read
+
+
+# Divisors, which are exact: 10u is 1e-5 to the last digit.
+_PREFIX = {'': 1.0, 'p': 1e12, 'n': 1e9, 'u': 1e6, 'µ': 1e6, 'm': 1e3, 'k': 1e-3, 'M': 1e-6}
+_QUANTITY = re.compile(r'([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([pnuµmkM]?)'
+                       r'(F|H|[Oo]hm|Ω|V|A|Hz|W|s|1/s)?')
+
+
+def quantity(unit: str) -> Callable[[object], float]:
+    """Return what reads a number that may have an SI prefix and a unit."""
+    def read(text: object) -> float:
+        match = None if isinstance(text, bool) else _QUANTITY.fullmatch(str(text).strip())
+        if not match or math.isinf(float(match[1])):
+            raise argparse.ArgumentTypeError(f"'{text}' is not a number; write it as " + (
+                f'0.00047, 470u or 470u{unit}' if unit else '0.4 or 1e-3'))
+        given = {'ohm': 'Ohm', 'Ω': 'Ohm'}.get(match[3], match[3])
+        if given is not None and given != unit:
+            raise argparse.ArgumentTypeError(f"'{text}' must be in {unit}" if unit else
+                                             f"'{text}' must have no unit")
+        return float(match[1]) / _PREFIX[match[2]]
+    return read
+
+
+def throttles(text: str) -> tuple[float, ...]:
+    """Read throttles 0..1 separated by commas; return them in order."""
+    read = number('a throttle between 0 and 1; write 5 % as 0.05 and separate levels by commas',
+                  lambda value: 0.0 <= value <= 1.0)
+    ordered = tuple(sorted(read(word.strip()) for word in text.split(',')))
+    if any(high - low < 1e-6 for low, high in zip(ordered, ordered[1:])):
+        raise argparse.ArgumentTypeError(f"a level is given twice in '{text}'")
+    return ordered
+
+
+def band(text: str) -> tuple[float, float]:
+    """Read two frequencies, Hz."""
+    try:
+        low, high = (float(word) for word in text.split(','))
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"'{text}' is not LOW,HIGH in Hz, such as 10,100") from None
+    if not (0.0 < low < high and math.isfinite(high)):
+        raise argparse.ArgumentTypeError(f"'{text}' must be two frequencies, 0 < LOW < HIGH")
+    return low, high
+
+
+FLIGHT = whole('a number from 1 on', 1)
+POSITIVE = number('a positive number', lambda value: 0.0 < value < math.inf)
+TIME = number('a time in seconds, 0 or more', lambda value: 0.0 <= value < math.inf)
+
+RECORDING = Option(
+    'recording', metavar='RECORDING',
+    help='.mcap file, rosbag2 folder, CSV of any logger, or a log that convert reads (.bbl, .bin, '
+    '.ulg)')
+# Which part of a recording is read.
+PART = (
+    Option('--from', metavar='S', dest='start', type=TIME,
+           help='leave out what comes before, s after the first message'),
+    Option('--to', metavar='S', dest='end', type=TIME,
+           help='leave out what comes from here on, s after the first message'))
+# How a bag is read.
+TOPICS = (
+    Option('--msg-config', metavar='NAME',
+           help='msg_config that says which topic and field is the voltage'),
+    Option('--voltage-topic', metavar='TOPIC', help='topic of the voltage'),
+    Option('--throttle-topic', metavar='TOPIC', help='topic of the throttle'),
+    Option('--partial', action='store_true', help='use what a truncated file still holds'))
+
+
+# How a CSV is written, where it is not read as it should be.
+CSV = (
+    Option('--time-column', metavar='NAME', help='column of a CSV (default: found by its name)'),
+    Option('--unit', choices=('V', 'mV'), help='of the voltage in a CSV (default: found)'),
+    Option('--time-unit', choices=('s', 'ms', 'us', 'ns'),
+           help='of the time in a CSV (default: found)'),
+    Option('--throttle-unit', choices=('1', '%', 'us'),
+           help='of the throttle in a CSV: 0..1, percent, or a pulse of 1000 to 2000 us (default: '
+           'found)'),
+    Option('--sample-interval', metavar='S', type=POSITIVE,
+           help='time from row to row of a CSV, s, in place of a column'),
+    Option('--delimiter', metavar='C',
+           help="what separates the cells of a CSV: a character, 'tab' or 'space' (default: "
+           'found)'),
+    Option('--decimal', choices=('.', ','), help='decimal mark of a CSV (default: found)'),
+    Option('--skip-rows', metavar='N', type=whole('a number of lines, 0 or more', 0),
+           help='lines above the header of a CSV (default: found)'))
+# How a log or a CSV is read.
+FILES = (
+    Option('--flight', metavar='N', type=FLIGHT,
+           help='which flight of a log with several, from 1 (default: the largest)'),
+    Option('--voltage-column', metavar='NAME',
+           help='column of a CSV (default: found by its name), or series of a log (default: the '
+           'battery)'),
+    Option('--throttle-column', metavar='NAME',
+           help="column of a CSV or series of a log, or 'none' (default: found)"),
+    Option('--current-column', metavar='NAME',
+           help="column of a CSV or series of a log, or 'none' (default: found)"),
+    *CSV)
+JSON = Option(
+    '--json', metavar='FILE',
+    help="write the result as JSON ('-': to standard output, alone)")
+FORCE = Option('--force', action='store_true', help='overwrite files that exist already')
+REPORT = Option('--report', metavar='FILE.html', help='write a self-contained HTML page')
+# Cells of the largest packs that fly, with room.
+_CELLS = whole('a number of cells, 1 to 28', 1, 28)
+TYPES = ('battery_state', 'float32', 'float64', 'adc_block')
+
+
+def seed(default: int, text: str = 'same seed, same result') -> Option:
+    """Return the option of a seed."""
+    return Option('--seed', metavar='N', type=whole('a whole number, 0 or more', 0),
+                  default=default, help=f'{text} (default: %(default)s)')
+
+
+def levels(found: str) -> Option:
+    """Return the option of the load levels; found: what they are without it."""
+    return Option('--levels', metavar='0,0.05,...', type=throttles,
+                  help=f'throttles 0..1 of the load levels (default: {found})')
+
+
+def limit(meaning: str) -> tuple[Option, ...]:
+    """Return the options of the limit; meaning: what --brownout-voltage does, and its default."""
+    return (Option('--brownout-voltage', metavar='V', type=POSITIVE, help=meaning),
+            Option('--cells', metavar='N', type=_CELLS,
+                   help='cells in series: --brownout-voltage is then volts a cell (default with '
+                   '--cells: 3.3)'))
+
+
+def estimate(voltage: str) -> tuple[Option, ...]:
+    """Return the options of the sliding estimate and of the risk."""
+    return (
+        Option('--window', metavar='S', type=POSITIVE, default=2.0,
+               help='window of the sliding estimate, s (default: %(default)s)'),
+        *limit(voltage),
+        Option('--brownout-horizon', metavar='S', type=POSITIVE, default=5.0,
+               help='horizon of that risk, s (default: %(default)s)'))
 
 
 class _Help(argparse.HelpFormatter):
@@ -30,7 +206,9 @@ class Command:
 
     name: str  # As on the command line
     job: str  # One line
-    module: str  # Where its function ``run(args) -> exit status`` is
+    # Where its function of the arguments is, which returns the exit status: ``run``, or the name
+    # behind a colon.
+    module: str
     description: str  # Begin of its help
     # Options; a tuple of two or more is a choice of at most one of them.
     options: tuple[Option | tuple[Option, ...], ...]
@@ -54,13 +232,15 @@ class Command:
 
     def run(self, args: argparse.Namespace) -> int:
         """Run the command; return the exit status."""
-        function: Callable[[argparse.Namespace], int] = import_module(self.module).run
+        module, _, name = self.module.partition(':')
+        function: Callable[[argparse.Namespace], int] = getattr(
+            import_module(module), name or 'run')
         return function(args)
 
 
 _ANALYZE = Command(
     'analyze', 'Vpp, Vrms, alpha, tau, sigma, Var_inf with 95 % intervals per load level',
-    'ou_monitor.cli.analyze',
+    'ou_monitor.cli.recorded:analyze',
     'Analyze the noise of a supply: per load level Vpp, Vrms, alpha, tau, sigma and Var_inf with '
     '95 % intervals, and the type of process.',
     (RECORDING, levels('found'), *PART,
@@ -72,7 +252,7 @@ _ANALYZE = Command(
 
 _COMPARE = Command(
     'compare', 'a recording beside simulations of it: what the simulation gets wrong most',
-    'ou_monitor.cli.compare',
+    'ou_monitor.cli.recorded:compare',
     'Simulate a recording over its own throttle many times, and show both side by side: mean '
     'path, lowest voltage, falls through low levels, spectrum, answer to throttle, distribution. '
     'Without --model, a model is fitted to the part before S, and the rest is simulated.',
@@ -80,10 +260,11 @@ _COMPARE = Command(
      Option('--model', metavar='FILE.yaml', type=path_argument,
             help='simulate this model, as discover --save-model writes it; its level is moved to '
             'that of the first seconds'),
-     Option('--fit-until', metavar='S',
+     Option('--fit-until', metavar='S', type=TIME,
             help='begin of what is simulated, s after the first sample (default: half of the '
             'recording; with --model its begin)'),
-     Option('--seeds', metavar='N', default='50', help='simulations (default: %(default)s)'),
+     Option('--seeds', metavar='N', type=whole('a whole number, 20 to 10000', 20, 10_000),
+            default=50, help='simulations (default: %(default)s)'),
      seed(0, 'same seed, same simulations'),
      *limit('also count falls through this voltage, V (default: two low levels that the '
             'recording shows)'),
@@ -129,16 +310,17 @@ _CONVERT = Command(
 
 _COUPLING = Command(
     'coupling', 'gain from the supply voltage to a signal, such as a gyro axis',
-    'ou_monitor.cli.coupling',
+    'ou_monitor.cli.recorded:coupling',
     'Estimate how much noise of the supply is in a signal: gain with 95 % interval and lag, or '
     'the gain that would have been detected.',
     (RECORDING, *PART,
      Option('--signal', metavar='NAME', required=True,
             help='TOPIC/FIELD.PATH (/imu/angular_velocity.x), a column, or a series of a log '
             '(gyroUnfilt[0], IMU.GyrX)'),
-     Option('--band', metavar='LOW,HIGH',
+     Option('--band', metavar='LOW,HIGH', type=band,
             help='frequencies looked at, Hz (default: 5 to a quarter of the slower rate)'),
-     Option('--level', metavar='P', default='0.05',
+     Option('--level', metavar='P', default=0.05, type=number(
+         'a probability between 0 and 1', lambda value: 0.0 < value < 1.0),
             help='probability of a false alarm (default: %(default)s)'),
      *limit('also count dips below this voltage, V'), *TOPICS, *FILES, JSON, REPORT, FORCE),
     ('flight.bbl --signal gyroUnfilt[0] --report gyro.html',
@@ -152,20 +334,22 @@ _DESIGN = Command(
     (Option('--from', metavar='RECORDING', dest='recording',
             help='take level, sag, resistance and noise from a flight (any recording that analyze '
             'reads); --set goes first'),
-     Option('--risk', metavar='X', default='1e-3',
+     Option('--risk', metavar='X', type=quantity(''), default='1e-3',
             help='probability of a brown-out allowed within the horizon, 0..1 (default: '
             '%(default)s)'),
-     Option('--throttle', metavar='Y',
+     Option('--throttle', metavar='Y', type=number(
+         'between 0 and 1; write 40 % as 0.4', lambda value: 0.0 <= value <= 1.0),
             help='throttle, 0..1 (default with --from: the highest that was flown)'),
      Option('--rail', choices=('bus', 'regulated'), default='bus',
             help='the battery bus at the ESCs, or the regulated rail (default: %(default)s)'),
-     Option('--voltage', metavar='V',
+     Option('--voltage', metavar='V', type=quantity('V'),
             help='brown-out level, V (default: 3.3 V a cell on the bus; 4.5 V on a regulated rail '
             'of 5 V, 2.88 V on one of 3.3 V)'),
-     Option('--horizon', metavar='S', default='5', help='horizon, s (default: %(default)s)'),
-     Option('--capacitance-min', metavar='F', default='10uF',
+     Option('--horizon', metavar='S', type=quantity('s'), default='5',
+            help='horizon, s (default: %(default)s)'),
+     Option('--capacitance-min', metavar='F', type=quantity('F'), default='10uF',
             help='least capacitance to look at (default: %(default)s)'),
-     Option('--capacitance-max', metavar='F', default='22mF',
+     Option('--capacitance-max', metavar='F', type=quantity('F'), default='22mF',
             help='most capacitance to look at (default: %(default)s)'),
      Option('--esr-fixed', action='store_true',
             help='keep the ESR (default: ESR falls as 1/C, as of more capacitors of one series in '
@@ -182,7 +366,7 @@ _DESIGN = Command(
 
 _DISCOVER = Command(
     'discover', 'criticise the simulation, name the cause, extend, measure the gain',
-    'ou_monitor.cli.discover',
+    'ou_monitor.cli.recorded:discover',
     'Fit and simulate the plain OU, find what it gets wrong, name the cause, extend the model, '
     'and measure the gain on samples not used for the fit.',
     (RECORDING, *PART, seed(0), *limit('also count dips below this voltage, V'), *TOPICS, *FILES,
@@ -205,7 +389,8 @@ _FLEET = Command(
             help='.mcap files, rosbag2 folders, .csv files, and folders to be searched for them'),
      Option('--output', metavar='DIR', required=True,
             help='folder for fleet.parquet, fleet.html and the parts of a run'),
-     Option('--workers', metavar='N', help='local processes (default: one a core)'),
+     Option('--workers', metavar='N', help='local processes (default: one a core)',
+            type=whole('a number of processes from 1 to 1024', 1, 1024)),
      Option('--scheduler', metavar='ADDRESS',
             help='Dask scheduler whose workers are used instead, tls://HOST:8786; they need the '
             'recordings under the same paths'),
@@ -239,7 +424,7 @@ _LIVE = Command(
 
 _REPRODUCE = Command(
     'reproduce', 'recompute every number of the paper, verdict per row',
-    'ou_monitor.cli.reproduce',
+    'ou_monitor.cli.recorded:reproduce',
     'Recompute every number of the paper: printed value, recomputed value, and whether it agrees, '
     'differs by rounding, or does not hold.',
     (seed(1, 'same seed, same simulations'), JSON, REPORT, FORCE),

@@ -12,9 +12,7 @@ from typing import Any, TYPE_CHECKING
 
 from ou_monitor import __version__
 from ou_monitor.cli import output
-from ou_monitor.cli.arguments import (
-    brownout_limit, given, repeated, throttle_levels)
-from ou_monitor.cli.options import POSITIVE, whole
+from ou_monitor.cli.arguments import brownout_limit, repeated
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import how_to_install, InputError
 
@@ -22,7 +20,6 @@ if TYPE_CHECKING:
     from ou_monitor.fleet.fleet import Fleet
 
 TABLE, REPORT = 'fleet.parquet', 'fleet.html'
-_WORKERS = whole('a number of processes from 1 to 1024', 1, 1024)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -33,8 +30,6 @@ def run(args: argparse.Namespace) -> int:
         raise InputError('--output: the path is empty')
     if args.scheduler is not None and args.workers is not None:
         raise InputError('--workers is for local processes, --scheduler for a cluster: give one')
-    workers = usable_cores() if args.workers is None else given(
-        '--workers', args.workers, _WORKERS)
     _check_installed(args)
     folder = Path(args.output)
     if folder.exists() and not folder.is_dir():
@@ -58,9 +53,9 @@ def run(args: argparse.Namespace) -> int:
         with Progress('comparing', quiet) as comparing, \
                 Progress('analyzing', quiet) as progress:
             fleet = run_fleet(
-                found, folder, options, version, workers=workers, scheduler=args.scheduler,
-                insecure=args.insecure, pattern=pattern, stated_options=more,
-                comparing=comparing, progress=progress)
+                found, folder, options, version, workers=args.workers or usable_cores(),
+                scheduler=args.scheduler, insecure=args.insecure, pattern=pattern,
+                stated_options=more, comparing=comparing, progress=progress)
     except KeyboardInterrupt:
         print(f"stopped; what is done is kept in '{folder}', and the same command goes on from "
               'there', file=sys.stderr)
@@ -82,7 +77,7 @@ def _check_installed(args: argparse.Namespace) -> None:
         raise InputError(f"{' and '.join(missing)} {'is' if len(missing) == 1 else 'are'} not "
                          f"installed: {how_to_install('fleet')}")
     if args.scheduler is not None:
-        from ou_monitor.fleet.cluster import check_address
+        from ou_monitor.fleet.workers import check_address
         check_address(args.scheduler, args.insecure)
     elif args.insecure:
         raise InputError('--insecure is for --scheduler: local processes open no connection')
@@ -94,9 +89,8 @@ def version() -> str:
 
 
 def _write(fleet: Fleet, folder: Path, args: argparse.Namespace) -> None:
-    from ou_monitor.fleet.summary import as_data
     from ou_monitor.fleet.table import write_table
-    from ou_monitor.report.fleet_document import fleet_document
+    from ou_monitor.report.fleet_document import as_data, fleet_document
     from ou_monitor.report.result import Result
 
     write_table(fleet.rows, folder / TABLE)
@@ -131,8 +125,8 @@ def _options(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
         from ou_monitor.stream.config import load_msg_config
         load_msg_config(config)
     return Options(
-        levels=throttle_levels(args.levels), window=given('--window', args.window, POSITIVE),
+        levels=args.levels, window=args.window,
         brownout_voltage=math.nan if (limit := brownout_limit(args)) is None else limit,
-        brownout_horizon=given('--brownout-horizon', args.brownout_horizon, POSITIVE),
+        brownout_horizon=args.brownout_horizon,
         msg_config=config, voltage_topic=args.voltage_topic, throttle_topic=args.throttle_topic,
         partial=args.partial, discover=args.discover, seed=args.seed), more

@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
             [[name, text] for name, (_, text) in PROFILES.items()], left=[0, 1]))
         return 0
     # A profile by name or number is no file, and no output is taken for one.
-    start, end = part_of_recording(args.start, args.end)
+    start, end = part_of_recording(args)
     recorded = args.throttle is not None and is_recording(args.throttle)
     table = args.throttle if recorded or str(args.throttle).lower().endswith('.csv') else None
     output.check_paths(

@@ -12,8 +12,8 @@ import pytest
 
 
 @pytest.mark.parametrize('voltage, cells, limit', [
-    (None, None, None), ('14', None, 14.0), (None, 4, 13.2), ('3.5', 4, 14.0), ('3.5', 1, 3.5),
-    ('4.5', None, 4.5)])
+    (None, None, None), (14.0, None, 14.0), (None, 4, 13.2), (3.5, 4, 14.0), (3.5, 1, 3.5),
+    (4.5, None, 4.5)])
 def test_with_cells_it_is_volts_a_cell(voltage, cells, limit):
     """Without, of the whole; cells alone have a limit of their own."""
     found = brownout_limit(Namespace(brownout_voltage=voltage, cells=cells))
@@ -23,7 +23,7 @@ def test_with_cells_it_is_volts_a_cell(voltage, cells, limit):
 def test_volts_of_the_pack_beside_cells_are_refused():
     """With the number that is meant."""
     with pytest.raises(InputError, match='no cell has 14 V: write 3.5, or leave --cells out'):
-        brownout_limit(Namespace(brownout_voltage='14', cells=4))
+        brownout_limit(Namespace(brownout_voltage=14.0, cells=4))
 
 
 @pytest.mark.parametrize('cells', ['0', '-1', '2.5', 'four', '99'])

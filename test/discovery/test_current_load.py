@@ -2,7 +2,7 @@
 
 import numpy as np
 from ou_monitor import discover, Recording
-from ou_monitor.cli.discover import model_text
+from ou_monitor.cli.recorded import model_text
 from ou_monitor.criticism.readings import load_of
 from ou_monitor.errors import InputError
 from ou_monitor.model.supply import SupplyModel

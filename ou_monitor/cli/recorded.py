@@ -1,0 +1,140 @@
+"""The commands on one recording, and `reproduce`: what they are given goes to `bench`."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable
+from dataclasses import replace
+from datetime import datetime, timezone
+import math
+import shlex
+from typing import Any, TYPE_CHECKING
+
+from ou_monitor import __version__, bench
+from ou_monitor.cli import output
+from ou_monitor.cli.arguments import brownout_limit, check_outputs, read_given, repeated
+from ou_monitor.cli.output import Progress
+from ou_monitor.errors import InputError
+
+if TYPE_CHECKING:
+    from ou_monitor.discovery.finding import Finding
+    from ou_monitor.records import Recording
+
+
+def analyze(args: argparse.Namespace) -> int:
+    """Run `analyze`: the paper's Tables 1 and 2 for a recording."""
+    given = _given(args, 'levels', 'window', 'brownout_horizon')
+    recording, _ = read_given(args)
+    with Progress('analyzing', args.json == output.STDOUT) as progress:
+        found = bench.analyze(recording, progress=progress, **given)
+    output.deliver(args, found, _command(args, given))
+    return 0
+
+
+def compare(args: argparse.Namespace) -> int:
+    """Run `compare`: a recording beside simulations of it."""
+    from ou_monitor.recordings.model_file import read_model
+
+    given = _given(args, 'fit_until', 'seeds', 'seed')
+    model = None if args.model is None else read_model(args.model).model
+    recording, _ = read_given(args)
+    with Progress('comparing', args.json == output.STDOUT) as progress:
+        found = bench.compare(recording, model, progress=progress, **given)
+    output.deliver(args, found, _command(args, [*given, 'model']))
+    return 0
+
+
+def coupling(args: argparse.Namespace) -> int:
+    """Run `coupling`: supply noise in a signal."""
+    given = _given(args, 'band', 'level')
+    recording, series = read_given(args, args.signal)
+    assert series is not None
+    t, values = series.t, series.values
+    if args.start is not None or args.end is not None:
+        # Samples outside the part have no voltage; do not count them as dropped.
+        part = (t >= recording.t[0]) & (t <= recording.t[-1])
+        t, values = t[part], values[part]
+    found = bench.coupling(recording, replace(series, name=args.signal, t=t, values=values),
+                           **given)
+    output.deliver(args, found, _command(args, ['signal', *given]))
+    return 0
+
+
+def discover(args: argparse.Namespace) -> int:
+    """Run `discover`: what the simulation gets wrong, why, and the gain."""
+    given = _given(args, 'seed')
+    recording, _ = read_given(args)
+    with Progress('discovering', args.json == output.STDOUT) as progress:
+        finding = bench.discover(recording, progress=progress, **given)
+    output.deliver(args, finding, _command(args, given),
+                   model=args.save_model if args.force or not finding.refused else None)
+    if args.save_model is not None:
+        # Last: that there is none must not keep the others from being written.
+        if finding.refused and not args.force:
+            raise InputError(f'no model saved: {finding.refused[0].lower()}{finding.refused[1:]}; '
+                             '--force saves it all the same')
+        output.write_text(model_text(finding.record, recording), args.save_model)
+    return 0
+
+
+def reproduce(args: argparse.Namespace) -> int:
+    """Run `reproduce`: every number of the paper, recomputed, with a verdict."""
+    check_outputs(args, 'report')
+    with Progress('recomputing', args.json == output.STDOUT) as progress:
+        found = bench.reproduce(seed=args.seed, progress=progress)
+    output.deliver(args, found, f'ou-monitor reproduce --seed {args.seed}')
+    return 0
+
+
+def _given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Return some arguments and the limit for a function of `bench`; check paths and ranges."""
+    from ou_monitor.online.settings import ESTIMATOR_PARAMETERS
+
+    check_outputs(args, *(name for name in ('save_model', 'report') if name in args),
+                  RECORDING=args.recording, **{
+                      '--msg-config': args.msg_config, '--model': getattr(args, 'model', None)})
+    given = {name: getattr(args, name) for name in names}
+    given.update(brownout_voltage=brownout_limit(args), cells=args.cells or 0)
+    for parameter in ESTIMATOR_PARAMETERS:
+        # What the node would refuse.
+        value = given.get(parameter.name.replace('.', '_'))
+        if (parameter.name.startswith('brownout.') and value is not None
+                and parameter.low is not None and parameter.high is not None
+                and not parameter.low <= value <= parameter.high):
+            raise InputError(f"--{parameter.name.replace('.', '-')}: {value:g} is not within "
+                             f'{parameter.low:g} to {parameter.high:g}')
+    return given
+
+
+def _command(args: argparse.Namespace, names: Iterable[str]) -> str:
+    """Return the command that repeats this one, with some of its options."""
+    return shlex.join(['ou-monitor', args.command, args.recording, *repeated(args, *names)])
+
+
+def model_text(finding: Finding, recording: Recording | None = None) -> str:
+    """Return the extended model, and what is known at take-off, as the text of a model file."""
+    from ou_monitor.online.load.load_filter import LoadFilter
+    from ou_monitor.recordings.model_file import as_yaml, ModelFile
+
+    if finding.model is None:
+        raise InputError(f"no model to save: '{finding.recording}' was not fitted. "
+                         f'{finding.sentence}')
+    if finding.load == 'current':
+        raise InputError('no model saved: its load is the measured current, and a model file is '
+                         'for throttle')
+
+    def known(value: float) -> float | None:
+        return value if math.isfinite(value) else None
+
+    provenance = {
+        'recording': finding.recording, 'date': datetime.now(timezone.utc).date().isoformat(),
+        'ou_monitor': __version__, 'verdict': finding.verdict.value,
+        'heldout_score': known(finding.score), 'gain': known(finding.gain),
+        'gain_se': known(finding.gain_se), 'seed': finding.seed}
+    loads = LoadFilter()
+    if recording is not None:
+        loads.push(recording.t, recording.voltage, recording.throttle, recording.current)
+    model = replace(finding.model, load=loads.learned())
+    return as_yaml(ModelFile(model, tuple(
+        {name: error for name, error in se.items() if error != math.inf}
+        for se in finding.se), provenance))
