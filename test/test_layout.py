@@ -1,7 +1,8 @@
 """The arrows of doc/architecture.md, walked import by import."""
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 import re
 import subprocess
@@ -27,7 +28,7 @@ MCAP_MODULES = {'ou_monitor.recordings.bag', 'ou_monitor.recordings.mcap_file'}
 PARSERS = {'pyulog': 'ulog', 'pymavlink': 'dataflash', 'orangebox': 'blackbox'}
 CORE = {'numpy', 'scipy'}
 # Extras, each with the one module that may import it.
-EXTRAS = {'argcomplete': 'cli.main', 'dask': 'fleet.cluster', 'distributed': 'fleet.cluster',
+EXTRAS = {'argcomplete': 'cli.main', 'dask': 'fleet.workers', 'distributed': 'fleet.workers',
           'pandas': 'report.result', 'pyarrow': 'fleet.table', 'tornado': 'nodes.live'}
 # The group of causes of other packages, which is no module.
 ENTRY_POINTS = 'ou_monitor.causes'
@@ -58,8 +59,9 @@ def imports_of(source: str, module: str) -> Iterator[tuple[int, str]]:
                 yield node.lineno, f'{name}.{alias.name}'
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
             # Tables of modules loaded on first use, as in ou_monitor/__init__.py.
-            if re.fullmatch(r'ou_monitor(\.\w+)+', node.value) and node.value != ENTRY_POINTS:
-                yield node.lineno, node.value
+            named = re.fullmatch(r'(ou_monitor(?:\.\w+)+)(?::\w+)?', node.value)
+            if named and named[1] != ENTRY_POINTS:
+                yield node.lineno, named[1]
         elif isinstance(node, ast.Call) and node.args:
             called = getattr(node.func, 'attr', getattr(node.func, 'id', ''))
             first = node.args[0]
@@ -142,6 +144,45 @@ def test_the_walk_sees_the_house():
     """Every part is on disk, so that the test above cannot pass on nothing."""
     parts = {part_of(module) for module in modules()}
     assert parts == set(LEVEL) | {'__init__'}
+
+
+def circle(sources: Mapping[str, str]) -> list[str]:
+    """Return modules that import one another in a circle, wherever the imports stand."""
+    graph = {module: {name for node in ast.walk(ast.parse(source))
+                      if isinstance(node, (ast.Import, ast.ImportFrom))
+                      for name in _imported(node) if name in sources and name != module}
+             for module, source in sources.items()}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+def _imported(node: ast.Import | ast.ImportFrom) -> Iterator[str]:
+    for alias in node.names:
+        if isinstance(node, ast.Import):
+            yield alias.name
+        else:
+            # A module, or a name in one.
+            yield from (f'{node.module}.{alias.name}', str(node.module))
+
+
+def test_a_circle_is_found():
+    """However long, and where an import waits for a call."""
+    sources = {'p.a': 'from p import b', 'p.b': 'def f():\n    from p.c import x', 'p.c': ''}
+    assert circle(sources) == []
+    assert set(circle({**sources, 'p.c': 'import p.a'})) == set(sources)
+
+
+@pytest.mark.parametrize('kind, homes', [
+    ('TimeLine', ('timeline', 'online')), ('SupplyFacts', ('analysis',)),
+    ('Document', ('report',))])
+def test_each_stage_is_made_in_its_place(kind, homes):
+    """Source -> TimeLine -> Supply -> Facts -> Document: nobody makes one beside it."""
+    made = {part_of(module) for module, path in modules().items()
+            if re.search(rf'(?<![\w.])(?<!class ){kind}\(', path.read_text(encoding='utf-8'))}
+    assert made and made <= set(homes)
 
 
 @pytest.mark.parametrize('module, source', [

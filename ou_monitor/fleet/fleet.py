@@ -139,7 +139,7 @@ def _workers(count: int, scheduler: str | None, version: Callable[[], str], inse
              ) -> Workers:
     if scheduler is None:
         return LocalWorkers(count)
-    from ou_monitor.fleet.cluster import ClusterWorkers
+    from ou_monitor.fleet.workers import ClusterWorkers
 
     return ClusterWorkers(scheduler, version, insecure)
 

@@ -17,9 +17,9 @@ from ou_monitor.criticism.curves import outline
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import FloatArray, NAN, OuFacts, Recording, Severity
 from ou_monitor.report.document import (
-    Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text, worst_first)
-from ou_monitor.report.scale import span
-from ou_monitor.report.svg import Plot
+    Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text, UNKNOWN,
+    worst_first)
+from ou_monitor.report.svg import Plot, span
 from ou_monitor.text import chance, counted, listed, number
 
 # Changes drawn in one plot, and relaxation times of them.
@@ -37,7 +37,6 @@ _TESTS = {'mean_drift': 'mean moves', 'variance_drift': 'intensity moves',
 _BEWARE = {
     'VOLTAGE_UNIT': 'Beware: the voltages seem to be millivolts or counts, not volts.',
     'TIME_UNIT': 'Beware: the time seems to be in ms or us, not in s.'}
-_UNKNOWN = '-'
 
 
 def analysis_document(analysis: Analysis, command: str = '') -> Document:
@@ -192,12 +191,11 @@ def _by_throttle(analysis: Analysis) -> Part:
         flown = low - 0.05 <= u <= high + 0.05
         rows.append([
             f'{100.0 * u:.0f} %' + ('' if flown else '\nnot flown'),
-            f'{millivolts(fall)} +- {millivolts(2.0 * se)}' if math.isfinite(fall) else _UNKNOWN,
-            millivolts(rms) if flown else _UNKNOWN, millivolts(still) if flown else _UNKNOWN,
+            f'{millivolts(fall)} +- {millivolts(2.0 * se)}' if math.isfinite(fall) else UNKNOWN,
+            millivolts(rms) if flown else UNKNOWN, millivolts(still) if flown else UNKNOWN,
             chance(curves.at(u, 'risk'))])
     heads = ['throttle', 'sag, mV', 'noise, mV rms', 'steady, mV rms', 'brown-out risk']
-    kept = [k for k in range(len(heads)) if k == 0 or any(row[k] != _UNKNOWN for row in rows)]
-    return Table([heads[k] for k in kept], [[row[k] for k in kept] for row in rows], left=[0])
+    return Table.of_known(heads, rows, left=[0])
 
 
 def _curves(analysis: Analysis) -> list[Part]:
@@ -280,7 +278,7 @@ def _levels(levels: Sequence[LevelResult]) -> list[Part]:
 def _interval(level: LevelResult, name: str) -> str:
     value = getattr(level.estimate, name)
     if not math.isfinite(value):
-        return _UNKNOWN
+        return UNKNOWN
     low, high = level.estimate.interval(name)
     return f'{number(value)}\n[{number(low)}, {number(high)}]'
 
@@ -382,7 +380,7 @@ def _changes(analysis: Analysis, fit: Relaxation) -> Table:
     side = 'overshoot, mV' if fit.kind == 'release' else 'undershoot, mV'
 
     def with_error(value: float, se: float, digits: int, scale: float) -> str:
-        return _UNKNOWN if not math.isfinite(value) else (
+        return UNKNOWN if not math.isfinite(value) else (
             f'{number(scale * value, digits)} +- {number(scale * se, 2)}')
 
     rows = [[number(change.t - start, 4),

@@ -17,8 +17,7 @@ from ou_monitor.discovery.words import (
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text)
-from ou_monitor.report.scale import span
-from ou_monitor.report.svg import Plot
+from ou_monitor.report.svg import Plot, span
 from ou_monitor.text import listed, number, Z95
 
 # Causes in the first sentence; rows of what is left on a terminal.

@@ -53,6 +53,10 @@ class Notes:
         return cls([(severity, text) for text in texts], most)
 
 
+# A cell of which nothing is known.
+UNKNOWN = '-'
+
+
 @dataclass(frozen=True)
 class Table:
     """Rows of cells under heads."""
@@ -61,6 +65,14 @@ class Table:
     rows: Sequence[Sequence[str]]
     left: Sequence[int] = ()  # Columns flush left
     most: int | None = None  # Rows on a terminal; the page has all
+
+    @classmethod
+    def of_known(cls, heads: Sequence[str], rows: Sequence[Sequence[str]],
+                 left: Sequence[int] = (), most: int | None = None) -> Table:
+        """Return a table without the columns in which nothing is known of any row."""
+        kept = [k for k in range(len(heads)) if any(row[k] != UNKNOWN for row in rows)]
+        return cls([heads[k] for k in kept], [[row[k] for k in kept] for row in rows],
+                   [n for n, k in enumerate(kept) if k in left], most)
 
 
 @dataclass(frozen=True)

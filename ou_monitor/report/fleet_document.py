@@ -1,25 +1,26 @@
-"""What `fleet` says: what stands out first, then the fleet, then every recording."""
+"""What `fleet` says: what stands out first, then the fleet, then every recording; and its JSON."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 import math
+import re
 from typing import Any
 
 import numpy as np
 from ou_monitor.criticism.curves import outline
-from ou_monitor.fleet import lowest
-from ou_monitor.fleet.comparison import LOGARITHMIC, QUANTITIES, USABLE, Values
 from ou_monitor.fleet.fleet import Fleet
-from ou_monitor.fleet.judgement import DRIFT_RATE, Trend
-from ou_monitor.fleet.summary import (
-    answer, change, comparison_words, failure_words, finding_words, quality_counts, vehicle_table)
+from ou_monitor.fleet.judgement import (
+    DRIFT_RATE, fewest, Judgement, LEAST, LEAST_VEHICLES, LOGARITHMIC, OUTLIER_RATE, QUANTITIES,
+    Trend, USABLE, Values)
 from ou_monitor.fleet.table import Row
-from ou_monitor.records import FloatArray, Severity
+from ou_monitor.records import FloatArray, NAN, Severity
 from ou_monitor.report.document import (
-    Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text)
+    Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text, UNKNOWN)
 from ou_monitor.report.svg import Plot
-from ou_monitor.text import chance, counted, number
+from ou_monitor.text import chance, counted, number, p_words, volts
 
 _TITLES = {'sigma': 'Noise intensity \u03c3', 'alpha': 'Relaxation rate \u03b1',
            'sag': 'Sag at full throttle'}
@@ -32,37 +33,45 @@ _LEAST, _MOST = 6, 30
 _WORST, _SHOWN = 12, 10
 # Sentences and recordings listed at most; the table has all of them.
 _SENTENCES, _RECORDINGS = 40, 500
+# Mean voltages of one pack differ by less, even from full to empty under load (4.35 V to 2.8 V).
+_ONE_PACK = 1.6
+# Heads of the table of vehicles.
+VEHICLE_HEADS = ('vehicle', 'flights', 'lowest, V', 'dips', 'sag, V', '/flight',
+                 'sigma, V/sqrt(s)', '/flight', 'alpha, 1/s', '/flight')
+# Characters of the name of a vehicle in a table.
+_NAME = 30
+# Heads of the table of recordings.
+LOWEST_HEADS = ('vehicle', 'recording', 'lowest, V', 'at, s', 'dips', 'below, s', 'sag, V',
+                'at throttle')
 
 
 def fleet_document(fleet: Fleet, command: str = '') -> Document:
     """Return what is said of a fleet."""
-    rows = lowest.worst(fleet)
+    rows = worst(fleet)
     odd = finding_words(fleet)
-    vehicles, lows = vehicle_table(fleet), lowest.table(fleet, _WORST)
+    vehicles = vehicle_table(fleet)
     copies = [f"{row['path']} is {row['duplicate_of']}" for row in fleet.duplicates]
     subject = (f'{counted(fleet.recordings, "recording")}, '
                f'{counted(len(fleet.vehicles), "vehicle")}, '
                f'{counted(len(fleet.rows), "row")} in the table')
     parts: list[Part] = [
         lambda: [Figure(_lowest(fleet, rows), 'Each dot is a recording.')] if rows else [],
-        Facts(lowest.facts(fleet)),
+        Facts(facts(fleet)),
         Section('What stands out', [
             Notes.of(odd[:_SENTENCES], Severity.WARNING, _SHOWN),
             *([Text(f'and {len(odd) - _SENTENCES} more: see the table.')]
               if len(odd) > _SENTENCES else [])] if odd else [
                   Text('Nothing, at the false-alarm rates stated below.')]),
-        Section('Lowest voltages', [Table(
-            *lows, left=[lows[0].index(name) for name in ('vehicle', 'recording')
-                         if name in lows[0]], most=_SHOWN)]),
+        Section('Lowest voltages', [lowest_table(fleet)]),
         Section('Not analysed: the next run tries them again', [
             Notes.of(failure_words(fleet), Severity.ERROR, _SHOWN)] if fleet.failed else []),
         Section('There twice, analysed once', [Notes.of(copies, most=_SHOWN)] if copies else []),
         Section('Vehicles', [
-            Table(*vehicles, left=[0], most=2 * _SHOWN),
+            vehicles,
             Text('The lowest of all flights, their dips together; the rest are medians of what '
                  'was measured, and the change a flight of what is compared. A star marks what '
                  'stands out.', legend=True), lambda: _strips(fleet)]
-                if vehicles[1] else [Text('No vehicle was identified.', legend=True)]),
+                if vehicles.rows else [Text('No vehicle was identified.', legend=True)]),
         lambda: [Section('Drift over the flights', _drift(fleet)),
                  Section('Distributions', _distributions(fleet), folded=True),
                  Section('Quality', _quality(fleet), folded=True)],
@@ -70,6 +79,375 @@ def fleet_document(fleet: Fleet, command: str = '') -> Document:
             Notes.of([*fleet.notes, *comparison_words(fleet)])]),
         lambda: [Section('Recordings', _recordings(fleet), folded=True)]]
     return Document('Supply noise of a fleet', subject, answer(fleet), parts, command)
+
+
+def answer(fleet: Fleet) -> list[str]:
+    """Return what the fleet says: the lowest voltage, what stands out, what was analysed."""
+    return [part for part in (*sentences(fleet), _standing_out(fleet), _analysed(fleet))
+            if part]
+
+
+def headline(fleet: Fleet) -> str:
+    """Return the answer as a paragraph."""
+    return ' '.join(answer(fleet))
+
+
+def _analysed(fleet: Fleet) -> str:
+    parts = [f'{fleet.analysed} of {counted(fleet.recordings, "recording")} of '
+             f'{counted(len(fleet.vehicles), "vehicle")} analysed']
+    if fleet.failed:
+        parts.append(f'{len(fleet.failed)} could not be')
+    if fleet.duplicates:
+        parts.append('1 is a copy of another' if len(fleet.duplicates) == 1 else
+                     f'{len(fleet.duplicates)} are copies of others')
+    without = {row['path'] for row in fleet.rows if row['status'] is not None} - {
+        row['path'] for row in fleet.rows if row['status'] in USABLE}
+    if without:
+        parts.append(f'{len(without)} with no estimate of sigma at any level')
+    return ', '.join(parts) + '.'
+
+
+def _standing_out(fleet: Fleet) -> str:
+    judged, text = fleet.judgement, ''
+    drifting = sorted({t.vehicle for t in judged.drifting})
+    odd = {judged.values[name].paths[k] for name, k in judged.odd_recordings()}
+    vehicles = sorted({judged.vehicles[name].names[k] for name, k in judged.odd_vehicles()})
+    if drifting:
+        text += f' Drift over the flights: {_listed(drifting)}.'
+    if vehicles:
+        text += f' Unlike the rest of the fleet: {_listed(vehicles)}.'
+    if odd:
+        text += f' Unlike the other flights of their vehicle: {counted(len(odd), "recording")}.'
+    if not (drifting or vehicles or odd):
+        tested = judged.trends or any(np.isfinite(o.bound) for o in (
+            *judged.recordings.values(), *[v.outliers for v in judged.vehicles.values()]))
+        text += (' Nothing stands out.' if tested else
+                 ' There are too few recordings a vehicle to tell what stands out.')
+    return text.strip()
+
+
+def _listed(names: list[str], most: int = 5) -> str:
+    more = len(names) - most
+    return ', '.join(names[:most]) + (f' and {more} more' if more > 0 else '')
+
+
+def change(name: str, value: float) -> str:
+    """Return a change of a quantity with its sign: in % on the log scale, else in mV."""
+    if not math.isfinite(value):
+        return '-'
+    if name not in LOGARITHMIC:
+        return f'{1e3 * value:+.3g} mV' if abs(value) < 1.0 else f'{value:+.3g} V'
+    percent = 100.0 * math.expm1(value)
+    if percent >= 100.0:
+        return f'x {number(math.exp(value))}'
+    return f'{percent:+.0f} %' if abs(percent) >= 10.0 else f'{percent:+.2g} %'
+
+
+def trend_words(trend: Trend) -> str:
+    """Return a drift in a sentence."""
+    flights = trend.last - trend.first
+    return (f'{trend.vehicle}: {trend.quantity} drifts by '
+            f'{change(trend.quantity, trend.slope)} a flight (95 % '
+            f'{change(trend.quantity, trend.low)} to {change(trend.quantity, trend.high)}), '
+            f'{change(trend.quantity, flights * trend.slope)} over {trend.flights} flights; '
+            f'{p_words(trend.p_value)}, over the fleet {chance(trend.p_family)}.')
+
+
+def finding_words(fleet: Fleet) -> list[str]:
+    """Return what stands out, a sentence each: drift, vehicles, recordings."""
+    judged = fleet.judgement
+    found = [trend_words(trend) for trend in judged.drifting]
+    for name, k in judged.odd_vehicles():
+        one = judged.vehicles[name]
+        centre = float(one.outliers.centre[k])
+        values = judged.values[name]
+        found.append(f'{one.names[k]}: {name} is {shown(values, one.value[k])}{_at(values)}, '
+                     f'{change(name, float(one.value[k]) - centre)} beside the median of the '
+                     f'vehicles; p over the fleet {chance(float(one.outliers.chance[k]))}.')
+    for name, k in judged.odd_recordings():
+        values, out = judged.values[name], judged.recordings[name]
+        off = change(name, float(values.value[k] - out.centre[k]))
+        found.append(f'{values.vehicles[k]}, {values.paths[k]}: {name} is '
+                     f'{shown(values, values.value[k])}{_at(values)} ({_measured(values, k)}), '
+                     f'{off} beside the other flights; p over the fleet '
+                     f'{chance(float(out.chance[k]))}.')
+    return found
+
+
+def failure_words(fleet: Fleet) -> list[str]:
+    """Return each recording without numbers and why, the path named once."""
+    found = []
+    for row in fleet.failed:
+        error = str(row['error']).removeprefix(row['path'])
+        # What is left may name a line of it, or a file within it.
+        found.append(row['path'] + (error if re.match(r':\d+:|/', error) else
+                                    f": {error.lstrip(': ')}"))
+    return found
+
+
+def shown(values: Values, value: float | FloatArray) -> str:
+    """Return one value in its unit, as it is at the reference throttle."""
+    return f'{number(float(values.shown(value)))} {QUANTITIES[values.name]}'
+
+
+def _at(values: Values) -> str:
+    """Return the throttle that recordings are compared at."""
+    if values.name == 'sag':
+        return ' at full throttle'
+    at = values.curve.reference
+    return f' at {100.0 * at:.0f} % throttle' if math.isfinite(at) else ''
+
+
+def _measured(values: Values, k: int) -> str:
+    at = values.throttle[k]
+    return (f'{number(float(values.measured[k]))} as measured'
+            + (f' at {100.0 * at:.0f} %' if math.isfinite(at) else ''))
+
+
+def comparison_words(fleet: Fleet) -> list[str]:
+    """Return sentences: how recordings were compared, and what so few cannot tell."""
+    judged = fleet.judgement
+    notes = []
+    for vehicle in fleet.vehicles:
+        means = [row['mean'] for row in fleet.rows if row['vehicle'] == vehicle
+                 and row['mean'] is not None and row['mean'] > 0.0]
+        if means and max(means) > _ONE_PACK * min(means):
+            notes.append(f'{vehicle}: voltages of {number(min(means))} to {number(max(means))} V '
+                         'are those of several supplies, and compared as one: --vehicle-from '
+                         'REGEX, or a folder each, parts them.')
+    references = [judged.values[name].curve.reference for name in LOGARITHMIC]
+    if all(map(math.isfinite, references)):
+        notes.append('sigma and alpha are shown as measured. To be compared they are brought to '
+                     + ' and '.join(dict.fromkeys(f'{100.0 * u:.0f} %' for u in references))
+                     + ' throttle along a curve common to all, and the error of that curve is '
+                     'counted; sag is compared at full throttle.')
+    tests = len(judged.trends)
+    if tests:
+        need = fewest(tests, DRIFT_RATE)
+        few = sorted({t.vehicle for t in judged.trends if t.flights < need})
+        notes.append(f'Drift: {tests} tests, held to {100 * DRIFT_RATE:g} % for any false one '
+                     f'(Holm); with so many, {need} flights of a vehicle are the fewest that can '
+                     'show one' + (f', which {counted(len(few), "vehicle")} of those tested '
+                                   'do not have.' if few else '.'))
+    else:
+        notes.append('No vehicle has the 5 flights that a test for drift needs.')
+    if any(np.isfinite(o.bound) for o in judged.recordings.values()):
+        notes.append(
+            f'Outliers: a fleet with nothing wrong shows any with chance '
+            f'{100 * OUTLIER_RATE:g} % (all quantities, recordings and vehicles together, where '
+            'the scatter between good recordings is normal).')
+    else:
+        notes.append(f'No vehicle has the {LEAST} flights that outliers among them need.')
+    if len(fleet.vehicles) < LEAST_VEHICLES:
+        notes.append(f'Vehicles are not compared with each other: that needs {LEAST_VEHICLES}.')
+    return notes
+
+
+def vehicle_table(fleet: Fleet) -> Table:
+    """Return what is known of each vehicle."""
+    judged = fleet.judgement
+    found, seen = [], once(fleet)
+    shown_as = short_names(fleet.vehicles)
+    for vehicle in fleet.vehicles:
+        flights = {row['path'] for row in fleet.rows if row['vehicle'] == vehicle
+                   and row['flight'] is not None}
+        mine = [row for row in seen if row['vehicle'] == vehicle]
+        dips = dips_of(mine)
+        cells = [shown_as[vehicle], str(len(flights)),
+                 number(min((row['lowest'] for row in mine), default=NAN), 4),
+                 UNKNOWN if dips is None else str(dips.count)]
+        for name in ('sag', 'sigma', 'alpha'):
+            cells += [_median(judged, name, vehicle), _slope(judged, name, vehicle)]
+        found.append(cells)
+    return Table.of_known(VEHICLE_HEADS, found, left=[0], most=2 * _SHOWN)
+
+
+def _median(judged: Judgement, name: str, vehicle: str) -> str:
+    one = judged.vehicles[name]
+    if vehicle not in one.names:
+        return UNKNOWN
+    k = one.names.index(vehicle)
+    star = '*' if one.outliers.found[k] else ''
+    values = judged.values[name]
+    mine = [k for k, of in enumerate(values.vehicles) if of == vehicle]
+    return number(float(np.median(values.measured[mine]))) + star
+
+
+def _slope(judged: Judgement, name: str, vehicle: str) -> str:
+    for trend in judged.trends:
+        if (trend.quantity, trend.vehicle) == (name, vehicle):
+            return change(name, trend.slope) + ('*' if trend.p_family <= DRIFT_RATE else '')
+    return UNKNOWN
+
+
+def quality_counts(fleet: Fleet) -> list[tuple[str, int]]:
+    """Return statuses that are not good, flags, verdicts and causes with how often they occur."""
+    counts: Counter[str] = Counter()
+    counted_paths: set[str] = set()
+    for row in fleet.rows:
+        if row['status'] is not None:
+            if row['status'] not in USABLE:
+                counts[f"level without estimate: {row['status']}"] += 1
+            counts.update(f'level with flag {flag}' for flag in row['flags'] or ())
+        if row['path'] not in counted_paths and row['verdict'] is not None:
+            counts[f"recording with verdict {row['verdict']}"] += 1
+            counts.update(f'recording with cause {cause}' for cause in set(row['causes'] or ()))
+        counted_paths.add(row['path'])
+    return counts.most_common()
+
+
+def as_data(fleet: Fleet) -> dict[str, Any]:
+    """Return a fleet as plain data; NaN stands for unknown."""
+    judged = fleet.judgement
+    odd = [{'what': 'vehicle', 'quantity': name, 'vehicle': judged.vehicles[name].names[k],
+            'path': None, 'score': float(judged.vehicles[name].outliers.score[k]),
+            'p_family': float(judged.vehicles[name].outliers.chance[k])}
+           for name, k in judged.odd_vehicles()]
+    odd += [{'what': 'recording', 'quantity': name, 'vehicle': judged.values[name].vehicles[k],
+             'path': judged.values[name].paths[k],
+             'score': float(judged.recordings[name].score[k]),
+             'p_family': float(judged.recordings[name].chance[k])}
+            for name, k in judged.odd_recordings()]
+    return {
+        'headline': headline(fleet), 'recordings': fleet.recordings, 'analysed': fleet.analysed,
+        'failed': len(fleet.failed), 'duplicates': len(fleet.duplicates),
+        'brownout_voltage': fleet.limit,
+        'vehicles': [{
+            'vehicle': vehicle,
+            **{name: _vehicle_value(judged, name, vehicle) for name in QUANTITIES}}
+            for vehicle in fleet.vehicles],
+        'drift': [{
+            'vehicle': t.vehicle, 'quantity': t.quantity, 'flights': t.flights,
+            'slope': t.slope, 'ci95': [t.low, t.high], 'p_value': t.p_value,
+            'p_family': t.p_family, 'stands': t.p_family <= DRIFT_RATE} for t in judged.trends],
+        'outliers': odd,
+        'rows': [{name: value.isoformat() if name == 'start' and value is not None else value
+                  for name, value in row.items()} for row in fleet.rows],
+        'notes': [*fleet.notes, *comparison_words(fleet)]}
+
+
+def _vehicle_value(judged: Judgement, name: str, vehicle: str) -> float:
+    one = judged.vehicles[name]
+    return (float(judged.values[name].shown(one.value[one.names.index(vehicle)]))
+            if vehicle in one.names else NAN)
+
+
+@dataclass(frozen=True)
+class DipCount:
+    """Dips of a vehicle or of the whole fleet."""
+
+    count: int = 0  # Dips below the limit
+    below: float = 0.0  # Time below it, s
+    recordings: int = 0  # Recordings with dips
+
+
+def once(fleet: Fleet) -> list[Row]:
+    """Return one row of each recording that was analysed, lowest voltage known."""
+    rows = {row['path']: row for row in fleet.rows if row['lowest'] is not None}
+    return list(rows.values())
+
+
+def dips_of(rows: Sequence[Row]) -> DipCount | None:
+    """Return the dips of recordings; None where no limit was given."""
+    known = [row for row in rows if row['dips'] is not None]
+    if not known:
+        return None
+    return DipCount(sum(int(row['dips']) for row in known), sum(row['below_s'] for row in known),
+                    sum(row['dips'] > 0 for row in known))
+
+
+def worst(fleet: Fleet) -> list[Row]:
+    """Return the recordings: those with most dips first, then by their lowest voltage."""
+    return sorted(once(fleet), key=lambda row: (-(row['dips'] or 0), row['lowest'], row['path']))
+
+
+def sentences(fleet: Fleet) -> list[str]:
+    """Return what a pilot wants to know; nothing where no recording has a voltage."""
+    rows = once(fleet)
+    if not rows:
+        return []
+    low = min(rows, key=lambda row: row['lowest'])
+    lowest = (f'{number(low["lowest"], 4)} V at {number(low["lowest_at"])} s of '
+              f'{_name(low)}')
+    found = dips_of(rows)
+    if found is None:
+        text = f'The lowest voltage was {lowest}'
+    elif not found.count:
+        text = f'No recording fell below {fleet.limit:g} V: the lowest was {lowest}'
+    else:
+        most = worst(fleet)[0]
+        where = f'in {found.recordings} of {counted(len(rows), "recording")}'
+        if found.recordings > 1 and most['dips'] > 1:
+            where += f', most in {_name(most)}, {most["dips"]}'
+        text = (f'{counted(found.count, "dip")} below {fleet.limit:g} V {where}: the lowest was '
+                f'{lowest}')
+    sags = [row for row in rows if row['sag'] is not None]
+    if not sags:
+        return [f'{text}.']
+    row = max(sags, key=lambda row: row['sag'])
+    return [f'{text}.', f'The rail sags by up to {volts(row["sag"])}, at '
+            f'{100.0 * row["sag_throttle"]:.0f} % throttle.']
+
+
+def facts(fleet: Fleet) -> list[tuple[str, str]]:
+    """Return what is always known of a fleet: pairs of name and words."""
+    rows = once(fleet)
+    if not rows:
+        return []
+    low = min(rows, key=lambda row: row['lowest'])
+    lines = [('Lowest voltage', f'{number(low["lowest"], 4)} V at {number(low["lowest_at"])} s of '
+              f'{_name(low)}' + _throttle(low['lowest_throttle']))]
+    found = dips_of(rows)
+    if found is not None:
+        lines.append((f'Below {fleet.limit:g} V', (
+            f'{counted(found.count, "dip")}, {number(found.below, 2)} s in all, in '
+            f'{found.recordings} of {counted(len(rows), "recording")}') if found.count
+            else 'never'))
+    sags = [row for row in rows if row['sag'] is not None]
+    if sags:
+        least, most = (choose(sags, key=lambda row: row['sag']) for choose in (min, max))
+        lines.append(('Sag', (f'{volts(least["sag"])} to ' if len(sags) > 1 else '')
+                      + f'{volts(most["sag"])} (+- {volts(2.0 * most["sag_se"])}) at the highest '
+                      f'throttle flown; known in {len(sags)} of '
+                      f'{counted(len(rows), "recording")}'))
+    else:
+        lines.append(('Sag', 'unknown in all: throttle is not known, or did not move enough'))
+    return lines
+
+
+def _name(row: Row) -> str:
+    """Return what a recording is called, with its vehicle."""
+    vehicle = '' if row['vehicle'] is None else f' ({row["vehicle"]})'
+    return f'{row["recording"]}{vehicle}'
+
+
+def _throttle(value: float | None) -> str:
+    return '' if value is None else f', at {100.0 * value:.0f} % throttle'
+
+
+def short_names(names: Sequence[str]) -> dict[str, str]:
+    """Return names as tables show them: long ones without their middle."""
+    short = {name: name if len(name) <= _NAME else f'{name[:13]}\u2026{name[13 - _NAME + 1:]}'
+             for name in names}
+    uses = Counter(short.values())
+    return {name: text if uses[text] == 1 else name for name, text in short.items()}
+
+
+def lowest_table(fleet: Fleet, most: int = _WORST) -> Table:
+    """Return the recordings with the lowest voltages."""
+    names = short_names(fleet.vehicles)
+    return Table.of_known(LOWEST_HEADS, [_cells(row, names) for row in worst(fleet)[:most]],
+                          left=[0, 1], most=_SHOWN)
+
+
+def _cells(row: Row, names: dict[str, str]) -> list[str]:
+    def shown(value: float | None, digits: int = 3) -> str:
+        return UNKNOWN if value is None or math.isnan(value) else number(value, digits)
+
+    return [names.get(row['vehicle'], UNKNOWN), row['recording'], shown(row['lowest'], 4),
+            shown(row['lowest_at']), UNKNOWN if row['dips'] is None else f'{row["dips"]:g}',
+            shown(row['below_s'], 2), shown(row['sag']),
+            UNKNOWN if row['sag_throttle'] is None else f'{100.0 * row["sag_throttle"]:.0f} %']
 
 
 def _lowest(fleet: Fleet, rows: list[Row]) -> Plot:
@@ -81,7 +459,7 @@ def _lowest(fleet: Fleet, rows: list[Row]) -> Plot:
     under = np.array([bool(row['dips']) for row in rows])
     x = at + _side_by_side(at, np.array([float(row['flight'] or 0) for row in rows]))
     plot = Plot('Lowest voltage of every recording', 'vehicle', 'V', height=240).places(
-        list(lowest.short_names(names).values()))
+        list(short_names(names).values()))
     plot.markers(x[~under], low[~under], 'recordings' if under.any() else '', 0)
     if under.any():
         plot.markers(x[under], low[under], 'with dips', 1)
@@ -118,7 +496,7 @@ def _by_vehicle(fleet: Fleet, values: Values) -> Plot:
     y, odd = values.measured, out.found
     plot = Plot(f'{_TITLES[values.name]} of every recording', 'vehicle', _UNITS[values.name],
                 height=260, log_y=values.name in LOGARITHMIC)
-    plot.places(list(lowest.short_names(names).values()))
+    plot.places(list(short_names(names).values()))
     for k in range(0, len(names), 2):
         plot.shade(k + 0.5, k + 1.5, 7)
     plot.markers((x + spread)[~odd], y[~odd], 'recordings', 0)
@@ -227,15 +605,15 @@ def _recordings(fleet: Fleet) -> list[Part]:
     places: dict[str, dict[str, int]] = {
         name: {path: k for k, path in enumerate(values.paths)}
         for name, values in judged.values.items()}
-    once: dict[str, Mapping[str, Any]] = {}
+    firsts: dict[str, Mapping[str, Any]] = {}
     flags: dict[str, set[str]] = {}
     for row in fleet.rows:
         if row['error'] is not None or row['duplicate_of'] is not None:
             continue
-        once.setdefault(row['path'], row)
+        firsts.setdefault(row['path'], row)
         flags.setdefault(row['path'], set()).update(row['flags'] or ())
-    rows, names = [], lowest.short_names(fleet.vehicles)
-    for path, first in list(once.items())[:_RECORDINGS]:
+    rows, names = [], short_names(fleet.vehicles)
+    for path, first in list(firsts.items())[:_RECORDINGS]:
         cells = [names.get(first['vehicle'], '-'), str(first['flight'] or '-'),
                  f"{first['recording']}\n{_date(first)}",
                  number(first['duration_s'] or math.nan)]
@@ -246,7 +624,7 @@ def _recordings(fleet: Fleet) -> list[Part]:
         rows.append([*cells, ', '.join(sorted(flags[path])) or '-'])
     heads = ['vehicle', 'flight', 'recording', 's', 'lowest, V', 'dips', *[
         f'{name}, {_UNITS[name]}' for name in QUANTITIES], 'flags']
-    more = len(once) - _RECORDINGS
+    more = len(firsts) - _RECORDINGS
     return [Table(heads, rows, left=[0, 2, 9]), Text(
         'As measured. Small: at which throttle, and, where the vehicle has enough flights, how '
         'far from the others of it, in standard deviations.' + (

@@ -30,9 +30,8 @@ import zlib
 import numpy as np
 from ou_monitor.records import FloatArray, Severity
 from ou_monitor.report.document import (
-    Code, Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text)
-from ou_monitor.report.scale import extremes
-from ou_monitor.report.svg import Curve, Plot
+    Code, Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text, UNKNOWN)
+from ou_monitor.report.svg import Curve, extremes, Plot
 
 # Points of a plot that are embedded as they are: an hour at 1 kHz is then a page of 1.5 MB.
 MOST = 150_000
@@ -160,7 +159,7 @@ def _append(kind: str, values: Any, block: bytearray, low: float = 0.0,
 
 
 # What is not known, as a page sets it.
-UNKNOWN = '\u2013'
+_DASH = '\u2013'
 # Hues of Okabe & Ito (2008), distinct with every common colour blindness;
 # lifted for the dark form.
 _LIGHT = ('#0072b2', '#d55e00', '#009e73', '#cc79a7', '#b07d00', '#3a9bd9', '#6b4fa0', '#5f6b6d')
@@ -339,7 +338,7 @@ def _table(part: Table) -> str:
     def line(tag: str, cells: Sequence[str]) -> str:
         out = []
         for k, text in enumerate(cells):
-            main, _, small = (UNKNOWN if text == '-' else text).partition('\n')
+            main, _, small = (_DASH if text == UNKNOWN else text).partition('\n')
             inner = _set(main) + (f'<br/><small>{_set(small)}</small>' if small else '')
             out.append(f'<{tag}{_LEFT if k in part.left else ""}>{inner}</{tag}>')
         return '<tr>' + ''.join(out) + '</tr>'

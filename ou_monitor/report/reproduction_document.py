@@ -16,8 +16,7 @@ from ou_monitor.paper.reproduce.reproduce import (
 from ou_monitor.paper.reproduce.table2 import sigma_of
 from ou_monitor.report.document import (
     Document, Figure, Notes, Pair, Part, Section, Table, Text)
-from ou_monitor.report.scale import span
-from ou_monitor.report.svg import Plot
+from ou_monitor.report.svg import Plot, span
 
 _BINS = 40
 

@@ -22,6 +22,11 @@ if TYPE_CHECKING:
     from ou_monitor.analysis.supply import SupplyFacts
     from pandas import DataFrame
 
+# Pixels of a page per inch.
+_INCH = 100.0
+# Line styles of a page, as matplotlib names them.
+_LOOKS: dict[str, dict[str, Any]] = {
+    'dash': {'linestyle': '--'}, 'thick': {'linewidth': 2.0}, 'faint': {'alpha': 0.55}}
 # Rows by name, or columns by name.
 Rows = Sequence[Mapping[str, Any]] | Mapping[str, Any]
 
@@ -147,8 +152,6 @@ class Result:
             When there is no such plot, or no matplotlib for a new figure.
 
         """
-        from ou_monitor.report.axes import draw
-
         found = self.plots()
         if not found:
             raise InputError('there is nothing to plot')
@@ -208,3 +211,44 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+def draw(plot: Plot, ax: Axes | None = None) -> Axes:
+    """Draw on axes, or on those of a new figure, and return them."""
+    if ax is None:
+        try:
+            from matplotlib import pyplot
+        except ImportError as error:
+            raise InputError(f"a new figure needs matplotlib: {how_to_install('python')}"
+                             ) from error
+        figure = pyplot.figure(figsize=(plot.width / _INCH, plot.height / _INCH),
+                               layout='constrained')
+        ax = figure.add_subplot()
+    for curve in plot.curves:
+        colour, *names = curve.style.split()
+        look: dict[str, Any] = {'color': f'C{colour[1:]}', 'label': curve.label or None}
+        for name in names:
+            look |= _LOOKS[name]
+        if curve.kind == 'band' and curve.high is not None:
+            ax.fill_between(curve.x, curve.y, curve.high, **{
+                'alpha': 0.22, 'linewidth': 0.0, **look})
+        elif curve.kind == 'bars' and curve.high is not None:
+            middle, half = 0.5 * (curve.y + curve.high), 0.5 * (curve.high - curve.y)
+            ax.errorbar(curve.x, middle, half, linestyle='none', capsize=4.0, **look)
+        elif curve.kind == 'markers':
+            ax.plot(curve.x, curve.y, 'o', **look)
+        else:
+            ax.plot(curve.x, curve.y, **look, drawstyle=(
+                'steps-post' if curve.kind == 'steps' else 'default'))
+    for start, stop, colour, _ in plot.shades:
+        ax.axvspan(start, stop, color=f'C{colour[1:]}', alpha=0.1, linewidth=0.0)
+    for x, label in plot.marks:
+        ax.axvline(x, color='black', linestyle=':', label=label)
+    ax.set(title=plot.title, xlabel=plot.x_label, ylabel=plot.y_label,
+           xscale='log' if plot.log_x else 'linear', yscale='log' if plot.log_y else 'linear',
+           xlim=plot.x_range, ylim=plot.y_range)
+    if plot.names:
+        ax.set_xticks(range(1, len(plot.names) + 1), plot.names)
+    if plot.marks or any(curve.label for curve in plot.curves):
+        ax.legend()
+    return ax

@@ -9,7 +9,7 @@ from dask import config
 from distributed import LocalCluster
 from distributed.security import Security
 from ou_monitor.errors import InputError
-from ou_monitor.fleet.cluster import ClusterWorkers
+from ou_monitor.fleet.workers import ClusterWorkers
 import pytest
 
 pytestmark = pytest.mark.skipif(shutil.which('openssl') is None,

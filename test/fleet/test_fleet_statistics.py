@@ -3,9 +3,8 @@
 import math
 
 import numpy as np
-from ou_monitor.fleet.comparison import values_of
 from ou_monitor.fleet.judgement import (
-    DRIFT_RATE, fewest, judge, LEAST_FLIGHTS, OUTLIER_RATE, outliers, trends)
+    DRIFT_RATE, fewest, judge, LEAST_FLIGHTS, OUTLIER_RATE, outliers, trends, values_of)
 import pytest
 from simulated_fleets import BEND, LEVELS, SLOPE, table
 

@@ -11,13 +11,12 @@ from types import SimpleNamespace
 
 from ou_monitor.errors import InputError
 from ou_monitor.fleet.analysis import Options, work
-from ou_monitor.fleet.cluster import check_address
 from ou_monitor.fleet.find import duplicates, find_recordings
 from ou_monitor.fleet.fleet import Parts
-from ou_monitor.fleet.summary import failure_words
 from ou_monitor.fleet.vehicles import assign, natural, number_flights, read_pattern
-from ou_monitor.fleet.workers import LocalWorkers, LOST, usable_memory
+from ou_monitor.fleet.workers import check_address, LocalWorkers, LOST, usable_memory
 from ou_monitor.recordings.read import read_recording
+from ou_monitor.report.fleet_document import failure_words
 from ou_monitor.stream.files import write_whole
 from project import ROOT
 import pytest

@@ -4,13 +4,12 @@ from dataclasses import replace
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
-from ou_monitor.fleet import lowest
 from ou_monitor.fleet.fleet import Fleet
 from ou_monitor.fleet.judgement import judge
-from ou_monitor.fleet.summary import (
-    as_data, finding_words, headline, vehicle_table)
 from ou_monitor.fleet.table import NAMES
-from ou_monitor.report.fleet_document import fleet_document
+from ou_monitor.report.fleet_document import (
+    as_data, facts, finding_words, fleet_document, headline, lowest_table, short_names,
+    vehicle_table, worst)
 from ou_monitor.report.page import html
 from ou_monitor.text import number
 import pytest
@@ -57,7 +56,8 @@ def test_the_page_tells_what_stands_out(odd):
 
 def test_stars_mark_what_stands(odd):
     """The drifting vehicle at its slope, the odd one at its median; no star elsewhere."""
-    heads, rows = vehicle_table(odd)
+    made = vehicle_table(odd)
+    heads, rows = made.heads, made.rows
     assert 'dips' not in heads
     at = heads.index('sigma, V/sqrt(s)')
     cells = {row[0]: row for row in rows}
@@ -104,19 +104,19 @@ def test_the_lowest_voltage_comes_first():
     assert headline(known).startswith(
         '4 dips below 13.5 V in 2 of 3 recordings, most in b (quad), 3: the lowest was 13.10 V '
         'at 12.0 s of b (quad). The rail sags by up to 1.90 V, at 95 % throttle.')
-    assert lowest.facts(known) == [
+    assert facts(known) == [
         ('Lowest voltage', '13.10 V at 12.0 s of b (quad), at 80 % throttle'),
         ('Below 13.5 V', '4 dips, 0.40 s in all, in 2 of 3 recordings'),
         ('Sag', '1.20 V to 1.90 V (+- 400 mV) at the highest throttle flown; known in 2 of 3 '
          'recordings')]
-    assert [row['path'] for row in lowest.worst(known)] == ['b', 'c', 'a']
+    assert [row['path'] for row in worst(known)] == ['b', 'c', 'a']
     text = page_text(known)
     assert text.index('4 dips below') < text.index('Lowest voltages') < text.index('Vehicles')
-    heads, (first, *_) = vehicle_table(known)
-    assert heads == ['vehicle', 'flights', 'lowest, V', 'dips']
-    assert first == ['hexa', '0', '13.40', '1']
-    heads, rows = lowest.table(known, 2)
-    assert [dict(zip(heads, row))['vehicle'] for row in rows] == ['quad', 'hexa']
+    made = vehicle_table(known)
+    assert made.heads == ['vehicle', 'flights', 'lowest, V', 'dips']
+    assert made.rows[0] == ['hexa', '0', '13.40', '1']
+    made = lowest_table(known, 2)
+    assert [row[made.heads.index('vehicle')] for row in made.rows] == ['quad', 'hexa']
     assert as_data(known)['brownout_voltage'] == 13.5
 
 
@@ -124,8 +124,8 @@ def test_without_a_limit_no_dip_is_counted():
     """Not known is no column, not 0; and where a limit was kept, that is said."""
     assert headline(fleet([seen('a', 'quad', 14.2, None)])).startswith(
         'The lowest voltage was 14.20 V at 12.0 s of a (quad).')
-    heads, _ = lowest.table(fleet([seen('a', 'quad', 14.2, None)]), 9)
-    assert heads == ['vehicle', 'recording', 'lowest, V', 'at, s']
+    made = lowest_table(fleet([seen('a', 'quad', 14.2, None)]))
+    assert made.heads == ['vehicle', 'recording', 'lowest, V', 'at, s']
     kept = replace(fleet([seen('a', 'quad', 14.2, 0)]), limit=14.0)
     assert headline(kept).startswith('No recording fell below 14 V: the lowest was 14.20 V')
 
@@ -153,6 +153,6 @@ def test_long_names_are_cut_where_they_stay_apart():
     board = 'CUBEPILOT_CUBEORANGE 0006000000003836'
     names = ['uav1', board + '38393239510d', board + '38393239510e', board + 'x' + 'y' * 16,
              board + 'z' + 'y' * 16]
-    found = lowest.short_names(names)
+    found = short_names(names)
     assert found['uav1'] == 'uav1' and found[names[1]] == 'CUBEPILOT_CUB\u2026383638393239510d'
     assert len(set(found.values())) == 5 and found[names[3]] == names[3]

@@ -11,8 +11,8 @@ from ou_monitor.analysis.analyze import analyze
 from ou_monitor.records import Recording
 from ou_monitor.report.analysis_document import analysis_document
 from ou_monitor.report.page import html as page_of
-from ou_monitor.report.scale import linear_ticks, log_ticks, Scale, span, thin, tick_text
-from ou_monitor.report.svg import Plot
+from ou_monitor.report.svg import (
+    linear_ticks, log_ticks, Plot, Scale, span, thin, tick_text)
 from pages import parsed, self_contained
 import pytest
 from simulated_recordings import recording, without_throttle
