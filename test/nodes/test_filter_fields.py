@@ -8,8 +8,8 @@ from geometry_msgs.msg import Point, PoseWithCovariance, Vector3Stamped
 from live import values_of, wait_until
 import numpy as np
 from ou_monitor.errors import InputError
+from ou_monitor.nodes.adaptive_filter_node import SupplyInput
 from ou_monitor.nodes.filter_channels import CHANNELS, channels_of
-from ou_monitor.nodes.filter_inputs import SupplyInput
 from ou_monitor.nodes.inputs import decode
 import pytest
 from rclpy.serialization import serialize_message
