@@ -1,5 +1,6 @@
 """Which tests may run beside each other: files may, but all that starts ROS goes one by one."""
 
+import os
 import signal
 
 from hypothesis import HealthCheck, settings
@@ -14,7 +15,9 @@ settings.load_profile('suite')
 
 
 def pytest_configure():
-    """Let Ctrl-C work in what the tests start: a shell has it ignored below a background job."""
+    """Let what the tests start hear Ctrl-C, as not below a background job, and share byte code."""
+    # Where a shell forbids it, each process compiles all that it imports anew.
+    os.environ.pop('PYTHONDONTWRITEBYTECODE', None)
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 

@@ -13,6 +13,7 @@ from ou_monitor import (
     analyze, compare, coupling, design, discover, InputError, read_recording, Recording,
     reproduce, Result, simulate, supply_facts)
 from ou_monitor.cli.main import main
+from ou_monitor.paper.reproduce import reproduce as reproduction
 from ou_monitor.report.terminal import terminal
 from project import ROOT
 import pytest
@@ -37,8 +38,11 @@ CALLS = {
 
 @pytest.fixture(scope='module')
 def found():
-    """Return every result once."""
-    return {name: call() for name, (_, call) in CALLS.items()}
+    """Return every result once; `reproduce` and its command with fewer simulations."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(reproduction, 'CREST_PATHS', 200)
+        patch.setattr(reproduction, 'JUMP_SECONDS', 10.0)
+        yield {name: call() for name, (_, call) in CALLS.items()}
 
 
 @pytest.mark.parametrize('name', CALLS)

@@ -9,6 +9,7 @@ import sys
 import ou_monitor
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.term import Term
+from ou_monitor.paper.reproduce import reproduce as reproduction
 import pytest
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
@@ -25,8 +26,10 @@ def test_every_public_name_is_there(name):
     *(getattr(ou_monitor, name) for name in ou_monitor.__all__ if name != '__version__'),
     SupplyModel, Term], ids=lambda value: value.__name__)
 def test_the_example_of_every_public_name_runs(value, monkeypatch):
-    """Its docstring has one, and it prints what it says."""
+    """Its docstring has one, and it prints what it says; `reproduce` with fewer simulations."""
     monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(reproduction, 'CREST_PATHS', 200)
+    monkeypatch.setattr(reproduction, 'JUMP_SECONDS', 10.0)
     (example,) = doctest.DocTestFinder(recurse=False).find(value, value.__name__)
     assert example.examples, f'{value.__name__} has no example'
     failed = []

@@ -8,10 +8,13 @@ import subprocess
 import sys
 import time
 
-from live import DEADLINE, ROOT, wait_until
+from live import DEADLINE, refusal, ROOT, wait_until
+from ou_monitor.nodes.adaptive_filter_node import AdaptiveFilterNode
+from ou_monitor.nodes.estimator_node import EstimatorNode
 import pytest
 
 NODES = {'estimator': 'ou_estimator', 'adaptive_filter': 'ou_adaptive_filter'}
+KINDS = {'estimator': EstimatorNode, 'adaptive_filter': AdaptiveFilterNode}
 
 
 def names(probe):
@@ -94,7 +97,6 @@ def test_a_signal_while_it_ends_is_only_noted(tmp_path):
 
 
 @pytest.mark.parametrize('name, arguments, words', [
-    ('estimator', ['-p', 'window:=-1.0'], 'window must lie within 0.05..3600'),
     ('estimator', ['-p', 'window:=long'], "window: unknown 'long'"),
     ('estimator', ['-p', 'window:=.nan'], 'window must be a finite number or auto'),
     ('estimator', ['-p', 'brownout.warn:=0.5'], 'must be less than brownout.critical'),
@@ -102,7 +104,6 @@ def test_a_signal_while_it_ends_is_only_noted(tmp_path):
     ('estimator', ['-p', 'msg_config:=px4'], 'clone https://github.com/PX4/px4_msgs'),
     ('estimator', ['-p', 'msg_config:=std_float32', '-p', 'voltage.field:=daat'],
      "did you mean 'data'?"),
-    ('estimator', ['--params-file', 'no_such.yaml'], 'cannot read the ROS arguments'),
     ('adaptive_filter', ['-p', 'law:=constant_nose'], "did you mean 'constant_noise'?"),
     ('adaptive_filter', ['-p', 'fmin:=200.0'], 'fmin'),
     ('adaptive_filter', ['-p', 'input.type:=std_msgs/msg/String'], 'cannot filter'),
@@ -112,9 +113,18 @@ def test_a_signal_while_it_ends_is_only_noted(tmp_path):
      'name a float field'),
     ('adaptive_filter', ['-p', 'law:=wiener'], 'law wiener needs n0'),
     ('adaptive_filter', ['-p', 'max_lag:=5.0'], 'allow more lag or raise fmax'),
+], ids=lambda value: '' if isinstance(value, list) else value[:24])
+def test_what_is_refused(name, arguments, words):
+    """With the reason."""
+    assert words in refusal(lambda: KINDS[name](NODES[name]), *arguments)
+
+
+@pytest.mark.parametrize('name, arguments, words', [
+    ('estimator', ['-p', 'window:=-1.0'], 'window must lie within 0.05..3600'),
+    ('estimator', ['--params-file', 'no_such.yaml'], 'cannot read the ROS arguments'),
     ('adaptive_filter', ['-r', '__node:=9 lives'], 'cannot read the ROS arguments'),
 ], ids=lambda value: '' if isinstance(value, list) else value[:24])
-def test_what_is_refused(world, name, arguments, words):
+def test_a_refusal_is_one_line(world, name, arguments, words):
     """Exit status 2 and one FATAL line that says why."""
     process = world.start(name, '--ros-args', *arguments)
     assert process.wait() == 2
@@ -171,11 +181,8 @@ def test_qos_overrides_are_taken_or_refused(world):
     assert process.stop() == 0
     for name, words in (('/rail.subscription.depth:=5', 'is of no topic of this node'),
                         ('/voltage.subscription.reliability:=somehow', 'qos_overrides of')):
-        refused = world.start('estimator', '--ros-args', '-p', 'msg_config:=std_float64',
-                              '-p', f'qos_overrides.{name}')
-        assert refused.wait() == 2
-        (line,) = [line for line in refused.err.splitlines() if 'FATAL' in line]
-        assert words in line
+        assert words in refusal(lambda: EstimatorNode('ou_estimator'), '-p',
+                                'msg_config:=std_float64', '-p', f'qos_overrides.{name}')
 
 
 def test_the_nodes_have_one_thread_of_blas():

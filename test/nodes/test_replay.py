@@ -4,10 +4,11 @@ import json
 import threading
 import time
 
-from live import BAGS, seconds, wait_until
+from live import BAGS, refusal, seconds, wait_until
 from made_bags import encode
 import numpy as np
 from ou_monitor.errors import InputError
+from ou_monitor.nodes.player import Player
 from ou_monitor.nodes.replay import options
 from ou_monitor.recordings.bag import BagReader, BagWriter
 from ou_monitor.recordings.standard_types import FLOAT32
@@ -206,15 +207,19 @@ def test_times_that_the_clock_cannot_tell(world, numbered):
     ([late], 'play it with --clock 0'),
     ([foreign], 'not an MCAP file'),
     ([empty], 'no messages'),
-    (['missing.mcap'], 'no bag missing.mcap'),
     ([BAG, '--topics', '/volage'], "did you mean '/voltage'?"),
-    ([BAG, '--rate', '0'], '--rate must be a positive number'),
-    ([BAG, '--ros-args', '-p', 'x'], 'cannot read the ROS arguments'),
 ], ids=lambda value: '' if isinstance(value, list) else value[:20])
-def test_what_is_refused(world, arguments, words):
+def test_what_is_refused(tmp_path, arguments, words):
+    """With the reason."""
+    chosen = options([str(a(tmp_path) if callable(a) else a) for a in arguments])
+    assert words in refusal(lambda: Player('ou_replay', BagReader(chosen.bag), chosen))
+
+
+@pytest.mark.parametrize('arguments, words', [
+    ([], 'no bag missing.mcap'), (['--ros-args', '-p', 'x'], 'cannot read the ROS arguments')])
+def test_a_refusal_is_one_line(world, arguments, words):
     """Exit status 2 and one line that says why, no traceback."""
-    made = [a(world.folder) if callable(a) else a for a in arguments]
-    process = world.start('replay', *made)
+    process = world.start('replay', 'missing.mcap', *arguments)
     assert process.wait() == 2
     lines = [line for line in process.err.strip().splitlines() if '[rcl]' not in line]
     assert len(lines) == 1 and words in lines[0], process.err
@@ -223,6 +228,7 @@ def test_what_is_refused(world, arguments, words):
 @pytest.mark.parametrize('arguments, words', [
     ([], 'required: bag'),
     (['bag', '--rate', 'nan'], '--rate must be a positive number'),
+    (['bag', '--rate', '0'], '--rate must be a positive number'),
     (['bag', '--rate', 'fast'], "invalid float value: 'fast'"),
     (['bag', '--clock', '-1'], '--clock must lie within'),
     (['bag', '--wait', 'inf'], '--wait must be 0 or more'),

@@ -165,7 +165,7 @@ def estimates(stamps, sent, voltage):
 
 
 @pytest.mark.parametrize('lost', [0.0, 0.01])
-@pytest.mark.parametrize('pauses', [1, 4, 10, 20])
+@pytest.mark.parametrize('pauses', [1, 20])
 def test_unstamped_scalars_at_10_khz(pauses, lost):
     """
     Alpha and sigma within 5 % of those from true stamps, with pauses of up to half the time.
@@ -173,15 +173,13 @@ def test_unstamped_scalars_at_10_khz(pauses, lost):
     A pause p moves the line by p / FOLLOW of the time it is made up in: spacing is wrong by 5 %
     at most, in a window by less: measured 2.6 and 0.6 % at worst in 960 windows.
     """
-    for seed in range(3):
-        due, sent, voltage = paused_at_10_khz(
-            np.random.default_rng(40 + seed), 5.1, pauses, lost)
-        clock = SendClock()
-        stamps = np.array([clock(s) for s in sent.tolist()])
-        assert (np.diff(stamps) > 0.0).all()
-        assert clock.rate == pytest.approx(1e4, rel=0.001 + 1.5 * lost)
-        true = estimates(due, sent, voltage)
-        np.testing.assert_allclose(estimates(stamps, sent, voltage), true, rtol=0.05)
+    due, sent, voltage = paused_at_10_khz(np.random.default_rng(40), 5.1, pauses, lost)
+    clock = SendClock()
+    stamps = np.array([clock(s) for s in sent.tolist()])
+    assert (np.diff(stamps) > 0.0).all()
+    assert clock.rate == pytest.approx(1e4, rel=0.001 + 1.5 * lost)
+    true = estimates(due, sent, voltage)
+    np.testing.assert_allclose(estimates(stamps, sent, voltage), true, rtol=0.05)
 
 
 def test_a_burst_is_not_a_rate():

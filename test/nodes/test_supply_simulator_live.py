@@ -4,11 +4,12 @@ import math
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
-from live import diagnosis, values_of, wait_until
+from live import diagnosis, refusal, values_of, wait_until
 import numpy as np
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_answer import LoadSag
 from ou_monitor.model.terms.ou import OU
+from ou_monitor.nodes.supply_simulator_node import SupplySimulatorNode
 from ou_monitor.recordings.model_file import as_yaml, ModelFile
 from ou_monitor.simulation import PRESETS, read_profile, simulated
 import pytest
@@ -123,11 +124,9 @@ def test_throttle_that_fails(world):
     (('throttle.play:=hoover',), 'hover'),
     (('rate:=5000.0',), 'rate'),
 ])
-def test_bad_input(world, options, words):
-    """Status 2 and one line that names it."""
+def test_bad_input(tmp_path, options, words):
+    """It is named."""
     if options and not options[0].startswith('model_file'):
-        options = (*options, f'model_file:={saved(world.folder, EXACT)}')
-    node = world.start('supply_simulator', '--ros-args',
-                       *(word for option in options for word in ('-p', option)))
-    assert node.wait() == 2
-    assert words in node.err
+        options = (*options, f'model_file:={saved(tmp_path, EXACT)}')
+    assert words in refusal(lambda: SupplySimulatorNode('supply_simulator'),
+                            *(word for option in options for word in ('-p', option)))

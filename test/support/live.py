@@ -350,6 +350,22 @@ class World:
             assert 'Traceback' not in process.err, process.err
 
 
+def refusal(make: Callable[[], Any], *arguments: object) -> str:
+    """Return why what `make` makes in this process, under ROS arguments, is refused."""
+    from ou_monitor.errors import InputError
+    import rclpy
+    from rclpy.exceptions import ParameterException
+    from rclpy.signals import SignalHandlerOptions
+    rclpy.init(args=['--ros-args', *map(str, arguments)], domain_id=new_domain(),
+               signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        with pytest.raises((InputError, ParameterException)) as found:
+            make()
+        return str(found.value)
+    finally:
+        rclpy.shutdown()
+
+
 def values_of(status: Any) -> dict[str, str]:
     """Return the key/value pairs of a DiagnosticStatus."""
     return {pair.key: pair.value for pair in status.values}
