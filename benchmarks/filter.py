@@ -15,7 +15,6 @@ import argparse
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import date
-from html import escape
 from pathlib import Path
 import sys
 import time
@@ -27,17 +26,9 @@ import filter_error  # noqa: E402
 from filter_error import CASES, fly, RATE  # noqa: E402
 import numpy as np  # noqa: E402
 from ou_monitor.report.svg import Plot  # noqa: E402
+from tables import drawing, put  # noqa: E402
 
 SEED = 20261121
-_COLOURS = ('#0072b2', '#d55e00', '#009e73', '#cc79a7', '#b07d00', '#3a9bd9', '#6b4fa0', '#5f6b6d')
-_STYLE = """<style>
-text { fill: #5d686c; font: 12px system-ui, -apple-system, "Segoe UI", sans-serif; }
-text.title { fill: #1c2326; font-weight: 600; font-size: 13px; } text.legend { fill: #1c2326; }
-.grid { stroke: #dde3e5; stroke-width: 1; } .line { fill: none; stroke-width: 1.2; }
-.thick { stroke-width: 2; } .dash { stroke-dasharray: 6 4; } .faint { opacity: .5; }
-.panel { fill: #ffffff; opacity: .8; } .band { stroke: none; opacity: .18; }
-""" + ''.join(f'.line.s{k} {{ stroke: {c}; }} .dot.s{k}, .band.s{k} {{ fill: {c}; }}\n'
-              for k, c in enumerate(_COLOURS)) + '</style>'
 
 
 def _tell() -> Callable[[str], None]:
@@ -54,10 +45,7 @@ def _drawing(plots: list[tuple[Plot, int, int]], title: str) -> str:
         parts.append(plot.svg().replace(
             '<svg ', f'<svg x="0" y="{top}" width="{wide}" height="{high}" ', 1))
         top += high
-    return '\n'.join([
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
-        f'width="{width}" height="{height}" role="img" aria-label="{escape(title, quote=True)}">',
-        _STYLE, f'<rect width="{width}" height="{height}" fill="#ffffff"/>', *parts, '</svg>', ''])
+    return drawing(parts, width, height, title)
 
 
 def error(given: argparse.Namespace) -> tuple[str, str]:
@@ -127,20 +115,14 @@ def flight(given: argparse.Namespace) -> tuple[str, str]:
                         'Voltage, sigma, cutoff and signal over a flight')
 
 
-def _write(given: argparse.Namespace, text: str, drawing: str) -> None:
+def _write(given: argparse.Namespace, text: str, figure: str) -> None:
     if given.table and text:
-        begin, end = f'<!-- {given.part} begins -->', f'<!-- {given.part} ends -->'
-        old = given.table.read_text(encoding='utf-8')
-        if begin not in old or end not in old:
-            raise SystemExit(f'{given.table} has no lines "{begin}" and "{end}"')
-        head, rest = old.split(begin, 1)
         stamp = f'{date.today().isoformat()}, seed {given.seed}, {given.seconds:g} s each.'
-        given.table.write_text(f'{head}{begin}\n{stamp}\n\n{text}\n{end}{rest.split(end, 1)[1]}',
-                               encoding='utf-8')
+        put(given.table, f'{stamp}\n\n{text}', given.part)
     elif text:
         print(text)
-    if given.figure and drawing:
-        given.figure.write_text(drawing, encoding='utf-8')
+    if given.figure and figure:
+        given.figure.write_text(figure, encoding='utf-8')
 
 
 def main() -> int:

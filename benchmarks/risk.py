@@ -1,18 +1,19 @@
 """
-How the brown-out risk compares with what happens, and with the alarms that fly.
+How the brown-out risk of simulated rails compares with what happens.
 
-    python benchmarks/risk.py calibration --table doc/results/risk.md
-        --figure doc/results/risk_reliability.svg
-    python benchmarks/risk.py alarms --table doc/results/risk.md
-        --figure doc/results/risk_alarms.svg
-    python benchmarks/risk.py cost --table doc/results/risk.md
+    python benchmarks/risk.py --table doc/results/risk.md --figure doc/results/risk_reliability.svg
+
+The flights use nothing of the package.  The rail is C dv/dt = (source - v)/R - i(throttle) -
+noise, stepped twenty times a sample by the exponential Euler scheme; between two fine steps the
+lowest point is drawn by the Brownian bridge, so that what is counted is the continuous path.
+sigma depends on throttle and wanders; throttle changes in steps; the ADC adds white noise.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from datetime import date
 import json
 import math
@@ -25,11 +26,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import numpy as np  # noqa: E402
 from ou_monitor import brownout_probability  # noqa: E402
 from ou_monitor.online.monitor import SupplyMonitor  # noqa: E402
-from ou_monitor.online.risk.flag import FlagLevel  # noqa: E402
-from ou_monitor.records import Estimate, Status  # noqa: E402
+from ou_monitor.online.settings import MonitorSettings  # noqa: E402
+from ou_monitor.records import Estimate  # noqa: E402
 from ou_monitor.report.svg import Plot  # noqa: E402
-from risk_flights import (  # noqa: E402
-    brier, Flights, fly, Horizon, monitor_settings, predict, RATE, reliability, stationary, WARM)
+from scipy.special import ndtr  # noqa: E402
+from scipy.stats import beta  # noqa: E402
 from tables import drawing, number, put, table  # noqa: E402
 
 SEED = 20261121
@@ -38,144 +39,261 @@ _BATCH = 100
 # Predictions within this factor of what is observed are called calibrated.
 _FACTOR = 1.5
 # Names that fit into a legend.
-_SHORT = {'published risk': 'published', 'published risk, lowest of 0.5 s': 'lowest of 0.5 s',
-          'window alone, errors averaged': 'window alone',
+_SHORT = {'published risk': 'published', 'window alone, errors averaged': 'window alone',
           'window alone, errors ignored': 'and without errors',
-          'stationary, as the paper': 'paper', 'threshold on the voltage': 'threshold',
-          'threshold with a timer of 10 s': 'with timer'}
+          'stationary, as the paper': 'paper'}
+
+RATE, FINE = 1000.0, 20
+# Throttle as a flight has it: what it is set to, and for how long, s.
+_THROTTLE, _DWELL = (0.15, 0.9), (2.0, 9.0)
 
 
-# Seconds between looks; an alarm is in time that is on at a look from `AFTER` to `LEAD`
-# before the brown-out, s, and one is for nothing that no brown-out follows within `AFTER`.
-LOOK, LEAD, AFTER = 0.1, 0.5, 5.0
-# Looks that are taken together: what lasts is told from a dip.
-_STEADY = 5
-# Continuous time below a threshold before ArduPilot acts (BATT_LOW_TIMER), s.
-TIMER = 10.0
+# Seconds before the first prediction, and between looks.
+WARM, WINDOW = 3.0, 2.0
+# Samples from one report of the monitor to the next: a slow companion computer.
+STEP = 250
+PUBLISHED = 'published risk'
+# Edges of the bins of predicted probability.
+EDGES = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
+
+
+@dataclass(frozen=True)
+class Horizon:
+    """
+    One prediction, and what happened.
+
+    Attributes
+    ----------
+    flight : int
+        Number of the flight.
+    t : float
+        When it was made, s.
+    predicted : dict of str to float
+        Probability by method.
+    happened : bool
+        Whether the path went below the level within the horizon.
+    steady : bool
+        Whether throttle did not change within the horizon.
+
+    """
+
+    flight: int
+    t: float
+    predicted: dict[str, float]
+    happened: bool
+    steady: bool
+
+
+def monitor_settings(level: float, horizon: float) -> MonitorSettings:
+    """Return the defaults but for the level, the horizon and a floor that would answer for it."""
+    return MonitorSettings(window=WINDOW, brownout_voltage=level, brownout_horizon=horizon,
+                           brownout_floor=0.0)
+
+
+def stationary(e: Estimate, level: float) -> float:
+    """Return the paper's P(|U - U0| > delta): the share of time, both sides."""
+    return 2.0 * float(ndtr(-(e.u0 - level) / math.sqrt(e.var_inf)))
+
+
+def certain(e: Estimate, level: float, horizon: float) -> float:
+    """Return the first-passage risk as if the estimate had no errors."""
+    known = replace(e, alpha_se=0.0, sigma_se=0.0, var_inf_se=0.0, u0_se=0.0)
+    return brownout_probability(known, level, horizon, e.voltage)
+
+
+def predict(flights: Flights, levels: np.ndarray, horizon: float, every: float,
+            progress: Callable[[], None]) -> Iterator[Horizon]:
+    """
+    Predict, every so often, over horizons that do not overlap.
+
+    Parameters
+    ----------
+    flights : Flights
+        What is flown.
+    levels : ndarray, shape (flights,)
+        Brown-out voltage of each, V.
+    horizon : float
+        Time ahead, s.
+    every : float
+        From one prediction to the next, s; at least the horizon.
+    progress : callable
+        Called after each flight.
+
+    Yields
+    ------
+    Horizon
+        Where the estimate is usable and the rail not already below.
+
+    """
+    count, ahead = flights.t.size, round(horizon * RATE)
+    for f, level in enumerate(levels.tolist()):
+        monitor = SupplyMonitor(monitor_settings(level, horizon))
+        v, u = flights.voltage[f].astype(np.float64), flights.throttle[f]
+        for at in range(STEP, count - ahead, STEP):
+            part = slice(at - STEP, at)
+            monitor.push(flights.t[part], v[part], u[part])
+            report = monitor.report(0.0)
+            e = report.estimate
+            if at < WARM * RATE or at % round(every * RATE) or not e.usable or (
+                    v[at - 1] <= level or flights.path[f, at - 1] <= level):
+                continue
+            yield Horizon(f, float(flights.t[at - 1]), {
+                PUBLISHED: report.risk,
+                'window alone, errors averaged': brownout_probability(
+                    e, level, horizon, e.voltage),
+                'window alone, errors ignored': certain(e, level, horizon),
+                'stationary, as the paper': stationary(e, level),
+            }, bool(flights.low[f, at:at + ahead].min() < level),
+                bool((u[at:at + ahead] == u[at - 1]).all()))
+        progress()
+
+
+@dataclass(frozen=True)
+class Bin:
+    """Predictions that are alike: how many, their mean, and how often it happened."""
+
+    low: float
+    high: float
+    count: int
+    predicted: float
+    hits: int
+
+    @property
+    def observed(self) -> float:
+        """Return the share that happened."""
+        return self.hits / self.count
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Return the 95 % interval of the share (Clopper & Pearson 1934)."""
+        k, n = self.hits, self.count
+        return (float(beta.ppf(0.025, k, n - k + 1)) if k else 0.0,
+                float(beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0)
+
+
+def reliability(predicted: np.ndarray, happened: np.ndarray) -> list[Bin]:
+    """Return the reliability diagram."""
+    bins = []
+    for low, high in zip(EDGES[:-1], EDGES[1:]):
+        inside = (predicted >= low) & (predicted < (high if high < 1.0 else 2.0))
+        if inside.any():
+            bins.append(Bin(low, high, int(inside.sum()), float(predicted[inside].mean()),
+                            int(happened[inside].sum())))
+    return bins
+
+
+def brier(predicted: np.ndarray, happened: np.ndarray) -> float:
+    """Return the Brier score: mean square of probability less outcome."""
+    return float(np.mean((predicted - happened) ** 2))
 
 
 @dataclass(frozen=True, eq=False)
-class Timeline:
+class Flights:
     """
-    What the methods say during a flight, up to its end or its brown-out.
+    Some flights of one length.
 
     Attributes
     ----------
     t : ndarray, shape (n,)
-        s.
-    says : dict of str to ndarray of shape (n,)
-        The larger, the more alarming; NaN where nothing is said.
-    brownout : float
-        When the path went below the level, s; inf when it did not.
+        Stamps, s.
+    voltage : ndarray, shape (flights, n)
+        What the ADC tells, V.
+    throttle : ndarray, shape (flights, n)
+        0..1.
+    low : ndarray, shape (flights, n)
+        Lowest point of the path from the sample before to this one, V.
+    path : ndarray, shape (flights, n)
+        The rail itself at the samples, V.
+    alpha, level, spread : ndarray, shape (flights,)
+        1/s; level at half throttle, V; stationary deviation there, V.
 
     """
 
     t: np.ndarray
-    says: dict[str, np.ndarray]
-    brownout: float
+    voltage: np.ndarray
+    throttle: np.ndarray
+    low: np.ndarray
+    path: np.ndarray
+    alpha: np.ndarray
+    level: np.ndarray
+    spread: np.ndarray
 
 
-def timelines(flights: Flights, levels: np.ndarray, horizon: float,
-              progress: Callable[[], None]) -> list[Timeline]:
-    """Return one of each flight."""
-    made = []
-    step = round(LOOK * RATE)
-    for f, level in enumerate(levels.tolist()):
-        below = np.flatnonzero(flights.low[f] < level)
-        end = int(below[0]) if below.size else flights.t.size
-        monitor, risks = SupplyMonitor(monitor_settings(level, horizon)), [math.nan] * _STEADY
-        v, u = flights.voltage[f].astype(np.float64), flights.throttle[f]
-        t, rows = [], []
-        for at in range(step, end, step):
-            part = slice(at - step, at)
-            monitor.push(flights.t[part], v[part], u[part])
-            report = monitor.report(0.0)
-            e = report.estimate
-            risks = [*risks[1:], report.risk]
-            if at < WARM * RATE:
-                continue
-            paper = stationary(e, level) if e.usable else math.nan
-            t.append(flights.t[at - 1])
-            # How low the last look went, and how high the last ten seconds.
-            rows.append((report.risk, min(risks),
-                         float(report.flag.level is FlagLevel.CRITICAL), paper,
-                         level - v[part].min(),
-                         level - v[max(0, at - round(TIMER * RATE)):at].max()
-                         if at >= TIMER * RATE else -math.inf))
-        table = np.array(rows).reshape(-1, len(METHODS)).T
-        made.append(Timeline(np.array(t), dict(zip(METHODS, table)),
-                             float(flights.t[end]) if below.size else math.inf))
-        progress()
-    return made
+def throttle_steps(rng: np.random.Generator, flights: int, n: int) -> np.ndarray:
+    """Return steps of throttle, shape (flights, n)."""
+    out = np.empty((flights, n))
+    for row in out:
+        at = 0
+        while at < n:
+            end = at + int(rng.uniform(*_DWELL) * RATE)
+            row[at:end] = rng.uniform(*_THROTTLE)
+            at = end
+    return out
 
 
-METHODS = ('published risk', 'published risk, lowest of 0.5 s', 'flag, as set by default',
-           'stationary, as the paper', 'threshold on the voltage',
-           'threshold with a timer of 10 s')
-
-
-@dataclass(frozen=True)
-class Score:
+def fly(rng: np.random.Generator, flights: int, seconds: float, *, wander: float = 0.08,
+        noise: float = 0.2, throttle: np.ndarray | None = None) -> Flights:
     """
-    One method at one setting.
+    Simulate.
 
-    Attributes
+    Parameters
     ----------
-    setting : float
-        From which on it alarms.
-    missed : float
-        Share of brown-outs without an alarm in time.
-    false_per_hour : float
-        Alarms that no brown-out followed.
-    lead : float
-        Median time from the alarm to the brown-out, of those in time, s.
+    rng : numpy.random.Generator
+        Source of randomness.
+    flights : int
+        How many.
+    seconds : float
+        Length, s.
+    wander : float
+        Deviation of ln sigma after one second, 1/sqrt(s); it comes back within
+        a minute.
+    noise : float
+        Largest white noise of the ADC, in stationary deviations; drawn.
+    throttle : ndarray, shape (flights, n), optional
+        Steps are drawn when left out.
+
+    Returns
+    -------
+    Flights
 
     """
-
-    setting: float
-    missed: float
-    false_per_hour: float
-    lead: float
-
-
-def score(lines: Sequence[Timeline], method: str, setting: float) -> Score:
-    """Return how a method does over all flights."""
-    outs = missed = wrong = 0
-    hours, leads = 0.0, []
-    for line in lines:
-        on = line.t[line.says[method] >= setting]
-        hours += (line.t[-1] - line.t[0]) / 3600.0 if line.t.size else 0.0
-        wrong += _apart(on[on < line.brownout - AFTER])
-        # A flight in which it happens before anything can be said tells nothing.
-        if math.isfinite(line.brownout) and line.t.size and line.brownout > line.t[0] + AFTER:
-            outs += 1
-            before = on[(on >= line.brownout - AFTER) & (on <= line.brownout - LEAD)]
-            if before.size:
-                leads.append(line.brownout - before[0])
-            else:
-                missed += 1
-    return Score(setting, missed / outs if outs else math.nan, wrong / hours,
-                 float(np.median(leads)) if leads else math.nan)
-
-
-def _apart(times: np.ndarray) -> int:
-    """Return how many alarms these are: one that goes on counts again every `AFTER`."""
-    count, last = 0, -math.inf
-    for t in times.tolist():
-        if t >= last + AFTER:
-            count, last = count + 1, t
-    return count
-
-
-def settings(lines: Sequence[Timeline], method: str, count: int = 60) -> np.ndarray:
-    """Return settings from never to always."""
-    values = np.concatenate([line.says[method] for line in lines])
-    values = values[np.isfinite(values)]
-    if not values.size:
-        return np.array([math.inf])
-    share = np.concatenate((np.geomspace(1e-5, 0.1, count // 2),
-                            np.linspace(0.12, 1.0, count // 2)))
-    return np.unique(np.quantile(values, 1.0 - share))
+    n = int(seconds * RATE)
+    h = 1.0 / RATE / FINE
+    throttle = throttle_steps(rng, flights, n) if throttle is None else throttle
+    # Components: 20..120 1/s, 20..150 mV.
+    resistance = rng.uniform(0.05, 0.4, flights)
+    alpha = np.exp(rng.uniform(math.log(20.0), math.log(120.0), flights))
+    capacitance = 1.0 / (alpha * resistance)
+    spread = np.exp(rng.uniform(math.log(0.02), math.log(0.15), flights))
+    intensity = spread * np.sqrt(2.0 * alpha)
+    growth = rng.uniform(0.3, 2.0, flights)
+    sag = rng.uniform(0.5, 4.0, flights) * spread
+    source = 5.0 + sag * 0.5
+    adc = rng.uniform(0.0, noise, flights) * spread
+    log = np.zeros(flights)
+    keep = np.exp(-h / (resistance * capacitance))
+    v = source - sag * throttle[:, 0] + spread * rng.standard_normal(flights)
+    voltage, low, path = (np.empty((flights, n), np.float32) for _ in range(3))
+    for k in range(n):
+        u = throttle[:, k]
+        log += wander / math.sqrt(RATE) * rng.standard_normal(flights) - log / (60.0 * RATE)
+        current = sag * u / resistance
+        rest = source - resistance * current
+        # White current through the capacitor, its intensity as throttle and time have it.
+        sigma = intensity * (1.0 + growth * (u - 0.5)) * np.exp(log)
+        lowest = v
+        kicks = rng.standard_normal((FINE, flights))
+        drops = rng.exponential(size=(FINE, flights))
+        step = sigma * math.sqrt(h)
+        for kick, drop in zip(kicks, drops):
+            after = rest + (v - rest) * keep + step * kick
+            # Lowest point of a Brownian bridge: P(min < m) = exp(-2 (a-m)(b-m) / (sigma^2 h)).
+            bottom = 0.5 * (v + after - np.sqrt((v - after)**2 + 2.0 * step**2 * drop))
+            lowest = np.minimum(lowest, bottom)
+            v = after
+        voltage[:, k], low[:, k], path[:, k] = v + adc * rng.standard_normal(flights), lowest, v
+    return Flights(np.arange(1, n + 1) / RATE, voltage, throttle, low, path, alpha,
+                   source - 0.5 * sag, spread)
 
 
 def _told(what: str, of: int) -> Callable[[], None]:
@@ -264,100 +382,29 @@ def _reliability_figure(found: Sequence[Horizon]) -> str:
             for b in bins:
                 low, high = b.interval
                 plot.line(np.array([b.predicted] * 2), np.array([max(low, 1e-5), high]), '', 0)
-    return _document(plot, 'reliability')
-
-
-def alarms(given: argparse.Namespace) -> tuple[str, str]:
-    """Return a table of alarms at equal misses, and curves of both."""
-    lines = []
-    tell = _told('flights', given.flights)
-    for begin in range(0, given.flights, _BATCH):
-        rng = np.random.default_rng([given.seed, 1, begin])
-        count = min(_BATCH, given.flights - begin)
-        flights = fly(rng, count, given.seconds)
-        levels = flights.level - flights.spread * rng.uniform(3.5, 9.0, count)
-        lines += timelines(flights, levels, given.horizon, tell)
-    outs = sum(math.isfinite(line.brownout) for line in lines)
-    plot = Plot('Alarms for nothing against brown-outs missed', 'brown-outs missed (share)',
-                'false alarms per hour', width=900, height=480, log_y=True, legend_row=True)
-    rows = []
-    for colour, method in enumerate(METHODS):
-        scores = [score(lines, method, s) for s in settings(lines, method)]
-        if method == METHODS[2]:
-            flag = score(lines, method, 0.5)
-            rows.append([method, f'{flag.missed:.2f}', number(flag.false_per_hour, '.3g'),
-                         number(flag.lead, '.2g')])
-            plot.line(np.array([flag.missed - 0.01, flag.missed + 0.01]),
-                      np.array([flag.false_per_hour] * 2), 'flag', colour, 'thick')
-            continue
-        plot.line(np.array([s.missed for s in scores]),
-                  np.array([max(s.false_per_hour, 0.05) for s in scores]),
-                  _SHORT.get(method, method), colour, 'thick')
-        for missed in (0.1, 0.2, 0.3):
-            best = _at(scores, missed)
-            rows.append([f'{method}, {missed:.0%} missed at most', f'{best.missed:.2f}',
-                         number(best.false_per_hour, '.3g'), number(best.lead, '.2g')]
-                        if best else [f'{method}, {missed:.0%} missed at most', '-', '-', '-'])
-    hours = sum(line.t[-1] - line.t[0] for line in lines if line.t.size) / 3600.0
-    text = (f'**{len(lines)} flights, {hours:.1f} hours, {outs} brown-outs; an alarm counts that '
-            'is on half a second before**\n\n' + table(
-                ['alarm', 'missed', 'false alarms per hour', 'median lead, s'], rows))
-    return text, _document(plot, 'alarms')
-
-
-def _document(plot: Plot, title: str) -> str:
-    return drawing([plot.svg()], 900, 480, title)
-
-
-def _at(scores: Sequence[Score], missed: float) -> Score | None:
-    """Return the setting with the fewest false alarms that misses no more than a share."""
-    good = [s for s in scores if s.missed <= missed]
-    return min(good, key=lambda s: s.false_per_hour) if good else None
-
-
-def cost(given: argparse.Namespace) -> tuple[str, str]:
-    """Return the time of an evaluation, beside a bare comparison and an estimate."""
-    e = Estimate(t=0.0, alpha=63.0, sigma=0.632, var_inf=0.632**2 / 126.0, u0=5.0, alpha_se=0.15,
-                 sigma_se=0.02, var_inf_se=0.15, u0_se=0.005, noise_std=0.005, rate=1000.0,
-                 n=2000, duration=2.0, status=Status.OK)
-    brownout_probability(e, 4.8, 5.0, 4.95)
-    took = []
-    for k in range(given.flights):
-        begin = time.perf_counter()
-        brownout_probability(e, 4.7 + 0.0001 * k, 5.0, 4.95)
-        took.append(time.perf_counter() - begin)
-    p50, p99 = np.quantile(took, [0.5, 0.99]) * 1e3
-    return table(['p50, ms', 'p99, ms'], [[f'{p50:.3f}', f'{p99:.3f}']]), ''
-
-
-def _write(given: argparse.Namespace, text: str, drawing: str) -> None:
-    if given.table:
-        put(given.table, f'{date.today().isoformat()}, seed {given.seed}.\n\n{text}', given.part)
-    else:
-        print(text)
-    if given.figure and drawing:
-        given.figure.write_text(drawing, encoding='utf-8')
+    return drawing([plot.svg()], 900, 480, 'reliability')
 
 
 def main() -> int:
     """Parse arguments, measure, write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
-    parts = parser.add_subparsers(dest='part', required=True)
-    for name, action, flights, seconds in (('calibration', calibration, 2500, 24.0),
-                                           ('alarms', alarms, 300, 60.0),
-                                           ('cost', cost, 2000, 0.0)):
-        part = parts.add_parser(name, help=action.__doc__)
-        part.set_defaults(action=action)
-        part.add_argument('--flights', type=int, default=flights)
-        part.add_argument('--seconds', type=float, default=seconds, help='of each flight')
-        part.add_argument('--horizon', type=float, default=2.0, help='s')
-        part.add_argument('--seed', type=int, default=SEED)
-        part.add_argument('--table', type=Path)
-        part.add_argument('--figure', type=Path)
-    parts.choices['calibration'].add_argument(
-        '--lines', type=Path, help='results as JSON lines: written, or read where it exists')
+    parser.add_argument('--flights', type=int, default=2500)
+    parser.add_argument('--seconds', type=float, default=24.0, help='of each flight')
+    parser.add_argument('--horizon', type=float, default=2.0, help='s')
+    parser.add_argument('--seed', type=int, default=SEED)
+    parser.add_argument('--table', type=Path)
+    parser.add_argument('--figure', type=Path)
+    parser.add_argument('--lines', type=Path,
+                        help='results as JSON lines: written, or read where it exists')
     given = parser.parse_args()
-    _write(given, *given.action(given))
+    text, figure = calibration(given)
+    if given.table:
+        put(given.table, f'{date.today().isoformat()}, seed {given.seed}.\n\n{text}',
+            'calibration')
+    else:
+        print(text)
+    if given.figure:
+        given.figure.write_text(figure, encoding='utf-8')
     return 0
 
 

@@ -22,8 +22,10 @@ text.light { fill: #ffffff; } .grid { stroke: #dde3e5; stroke-width: 1; }
 .s0 { stroke: #0072b2; } .s1 { stroke: #d55e00; } .s2 { stroke: #009e73; }
 .s3 { stroke: #cc79a7; } .s4 { stroke: #8a6d00; } .s5 { stroke: #56b4e9; }
 .s6 { stroke: #444444; } .s7 { stroke: #9aa5a9; }
-.band { stroke: none; opacity: .18; } .band.s0 { fill: #0072b2; } .band.s1 { fill: #d55e00; }
-.band.s7 { fill: #9aa5a9; }
+.band { stroke: none; opacity: .18; } .faint { opacity: .5; }
+.band.s0, .dot.s0 { fill: #0072b2; } .band.s1, .dot.s1 { fill: #d55e00; }
+.dot.s2 { fill: #009e73; } .dot.s3 { fill: #cc79a7; } .dot.s4 { fill: #8a6d00; }
+.band.s7, .dot.s7 { fill: #9aa5a9; }
 .shade { fill: #d55e00; opacity: .35; }
 .panel { fill: #ffffff; opacity: .8; } .right { fill: none; stroke: #1c2326; stroke-width: 1.2; }
 </style>"""
