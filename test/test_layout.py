@@ -168,6 +168,11 @@ def _imported(node: ast.Import | ast.ImportFrom) -> Iterator[str]:
             yield from (f'{node.module}.{alias.name}', str(node.module))
 
 
+def test_no_modules_import_one_another():
+    """Neither within a folder nor across, nor late within a function."""
+    assert circle({m: path.read_text(encoding='utf-8') for m, path in modules().items()}) == []
+
+
 def test_a_circle_is_found():
     """However long, and where an import waits for a call."""
     sources = {'p.a': 'from p import b', 'p.b': 'def f():\n    from p.c import x', 'p.c': ''}
