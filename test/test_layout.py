@@ -23,7 +23,8 @@ LEVEL = {
 FACADE_LEVEL = 8.5
 PLOTTING = {'matplotlib', 'plotly', 'seaborn', 'bokeh', 'PIL'}
 MCAP = {'mcap', 'mcap_ros2', 'rosbags', 'rosbag2_py', 'zstandard', 'lz4'}
-MCAP_MODULES = {'ou_monitor.recordings.bag', 'ou_monitor.recordings.mcap_file'}
+MCAP_MODULES = {f'ou_monitor.recordings.{name}' for name in (
+    'bag', 'mcap_file', 'standard_types')}
 # Parsers of logs: optional, each in one importer.
 PARSERS = {'pyulog': 'ulog', 'pymavlink': 'dataflash', 'orangebox': 'blackbox'}
 CORE = {'numpy', 'scipy'}

@@ -95,7 +95,7 @@ def _taken(chosen: Any, extras: Any) -> dict[str, dict[str, Any]]:
                              'unit': 'rad/s, m/s^2', 'n': int(one.t.size)}
     if extras.speeds is not None:
         rows['/motor_speed'] = {
-            'field': ', '.join(extras.speeds.names), 'scale': extras.speeds.scale,
+            'field': ', '.join(extras.speeds.motors), 'scale': extras.speeds.scale,
             'what': extras.speeds.words, 'unit': 'rad/s', 'n': int(extras.speeds.t.size)}
     return rows
 
@@ -123,7 +123,7 @@ def _list(args: argparse.Namespace, log: Any) -> int:
     if args.json is not None:
         output.write_json({'log': str(args.log), 'format': log.format, 'facts': log.facts,
                            'series': rows, 'imu': gyros, 'motor_speed': [] if log.speeds is None
-                           else list(log.speeds.names), 'notes': log.notes}, args.json)
+                           else list(log.speeds.motors), 'notes': log.notes}, args.json)
     if args.json == output.STDOUT:
         return 0
     output.say(f'{args.log}: {log.format}' + ''.join(
@@ -139,7 +139,7 @@ def _list(args: argparse.Namespace, log: Any) -> int:
                    + ('' if row['acceleration'] else ', no accelerometer'))
     if log.speeds is not None:
         output.say(f'* /motor_speed: {log.speeds.words}, {log.speeds.t.size} samples, '
-                   f"{', '.join(log.speeds.names)}")
+                   f"{', '.join(log.speeds.motors)}")
     for quantity in (VOLTAGE, THROTTLE):
         if len(taken[quantity]) > 1:
             output.say(f'Several would be taken as {quantity}: choose with --{quantity} NAME.')
@@ -151,6 +151,6 @@ def _list(args: argparse.Namespace, log: Any) -> int:
 def _gyros(log: Any, taken: set[str]) -> list[dict[str, Any]]:
     """Return what could become sensor_msgs/Imu."""
     return [{'name': one.name, 'what': one.words, 'n': int(one.t.size), 'scale': one.scale,
-             'angular_velocity': one.angular_velocity is not None,
-             'acceleration': one.acceleration is not None, 'default': one.name in taken}
+             'angular_velocity': 'angular_velocity' in one.vectors,
+             'acceleration': 'linear_acceleration' in one.vectors, 'default': one.name in taken}
             for one in log.inertial]

@@ -7,28 +7,26 @@ refused with the byte and the recording time where the trouble begins or, when a
 far as it is intact.  `BagWriter` writes bags, metadata.yaml as of version 9 (ROS 2 Jazzy); every
 version is read, for only the list of files and the custom data are used.
 
-This module and `mcap_file.py` are the only ones that import mcap.
+This module, `mcap_file.py` and `standard_types.py` are the only ones that import mcap.
 """
 
 from __future__ import annotations
 
 import bisect
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import redirect_stderr, suppress
-import io
+from contextlib import suppress
 from pathlib import Path, PurePosixPath
 import shutil
 from types import TracebackType
 from typing import Any, NamedTuple
 
 from mcap.writer import CompressionType, Writer
-from mcap_ros2._dynamic import _for_each_msgdef
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.cdr import (
-    DEFAULTS, Definitions, Field, FieldColumn, FieldReader, join, MessageTable)
+    Definitions, FieldColumn, FieldReader, join, MessageTable)
 from ou_monitor.recordings.mcap_file import (
     ABOUT, custom_data, McapFile, moment, MOST_BYTES, MOST_NODES, ORIGIN, SAMPLE_RATE, Span)
-from ou_monitor.recordings.standard_types import SCHEMAS, TYPE_HASHES
+from ou_monitor.recordings.standard_types import parse_definition, SCHEMAS, TYPE_HASHES
 from ou_monitor.stream.config import FieldSpec
 from ou_monitor.stream.files import one_line, path_words, read_yaml
 from ou_monitor.text import printable, some
@@ -284,23 +282,6 @@ def _alike(schema: Any, other: Any) -> bool:
                     for each in (schema, other))
         return one == two
     return False
-
-
-def parse_definition(kind: str, text: str) -> Definitions:
-    """Return the fields of a type and of those in it, as the library understands them."""
-    found = dict(DEFAULTS)
-
-    def add(_: str, name: str, parsed: Any) -> None:
-        found[name] = tuple(
-            Field(field.name, field.type.type if field.type.is_primitive_type()
-                  else f'{field.type.pkg_name}/{field.type.type}', bool(field.type.is_array),
-                  field.type.array_size if field.type.is_fixed_size_array() else None)
-            for field in parsed.fields)
-
-    # The library also prints unreadable definitions to standard error.
-    with redirect_stderr(io.StringIO()):
-        _for_each_msgdef(kind, text, add)
-    return found
 
 
 def batches(

@@ -134,14 +134,20 @@ class Place:
 
     def column(self, rows: Rows) -> FloatArray:
         """Return the numbers of many messages."""
-        truth = self.kind.endswith('?')
-        kind = np.dtype('u1' if truth else self.kind)
+        raw = self._seen(rows)
+        return (raw != 0 if self.kind.endswith('?') else raw).astype(np.float64)
+
+    def fill(self, rows: Rows, values: npt.ArrayLike) -> None:
+        """Write the numbers of many messages."""
+        self._seen(rows)[...] = values
+
+    def _seen(self, rows: Rows) -> npt.NDArray[Any]:
+        kind = np.dtype('u1' if self.kind.endswith('?') else self.kind)
         shape = rows.shape[:1] if self.size is None else (rows.shape[0], self.size)
-        if self.size == 0:
+        if 0 in shape:
             return np.empty(shape)
-        strides = (rows.shape[1], kind.itemsize)[:len(shape)]
-        raw: npt.NDArray[np.generic] = np.ndarray(shape, kind, rows, self.offset, strides)
-        return (raw != 0 if truth else raw).astype(np.float64)
+        return np.ndarray(shape, kind, rows, self.offset,
+                          (rows.shape[1], kind.itemsize)[:len(shape)])
 
 
 class Layout:

@@ -1,21 +1,29 @@
 """
-The standard message types that bags are written with: definitions, and encoding in bulk.
+Message types: parsing of definitions, and the standard types that bags are written with.
 
 A bag carries the definition (ros2msg) of every type in it, so that it can be read
 where ROS is not installed.  Texts and hashes are those of ROS 2 Jazzy's
 common_interfaces, comments left out; a test compares them with an independent
 library.  The hash (REP-2016, RIHS01) is what rosbag2 writes beside the type.
-Encoding is plain CDR version 1, little endian (OMG DDS-XTypes 7.4.3), alignment counted
-from after the 4-byte header.  `cdr.py` is the way back, for any type.
+Many messages are encoded at once: the library encodes one, and its layout says where the others
+differ.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-import struct
+from collections.abc import Mapping, Sequence
+from contextlib import redirect_stderr
+from functools import lru_cache
+import io
+import json
+import math
+from typing import Any
 
+from mcap_ros2._dynamic import _for_each_msgdef, serialize_dynamic
 import numpy as np
 import numpy.typing as npt
+from ou_monitor.recordings.cdr import DEFAULTS, Definitions, Field, Layout, short_name
+from ou_monitor.stream.config import FieldPath, parse_field_path
 
 _SEPARATOR = 80 * '='
 
@@ -135,9 +143,6 @@ TYPE_HASHES: dict[str, str] = {
 }
 
 
-# Representation identifier CDR_LE, no options.
-HEADER = b'\x00\x01\x00\x00'
-
 IMU = 'sensor_msgs/msg/Imu'
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 FLOAT32 = 'std_msgs/msg/Float32'
@@ -145,31 +150,49 @@ FLOAT64 = 'std_msgs/msg/Float64'
 FLOAT32_ARRAY = 'std_msgs/msg/Float32MultiArray'
 BATTERY_STATE = 'sensor_msgs/msg/BatteryState'
 
-_FLOAT32 = np.dtype([('head', 'V4'), ('data', '<f4')])
-_FLOAT64 = np.dtype([('head', 'V4'), ('data', '<f8')])
-# With an empty frame_id ("\0" and three bytes of padding), no cells, an empty
-# location and an empty serial number.
-_BATTERY = np.dtype([
-    ('head', 'V4'), ('sec', '<i4'), ('nanosec', '<u4'), ('frame_length', '<u4'),
-    ('frame', 'V4'), ('voltage', '<f4'), ('unmeasured', '<f4', (6,)), ('status', 'u1', (3,)),
-    ('present', 'u1'), ('cells', '<u4', (2,)), ('location_length', '<u4'), ('location', 'V4'),
-    ('serial_length', '<u4'), ('serial', 'V1')])
 
-_IMU = np.dtype([
-    ('head', 'V4'), ('sec', '<i4'), ('nanosec', '<u4'), ('frame_length', '<u4'), ('frame', 'V12'),
-    *((name, '<f8', (size,)) for name, size in (
-        ('orientation', 4), ('orientation_covariance', 9), ('angular_velocity', 3),
-        ('angular_velocity_covariance', 9), ('linear_acceleration', 3),
-        ('linear_acceleration_covariance', 9)))])
+def parse_definition(kind: str, text: str) -> Definitions:
+    """Return the fields of a type and of those in it, as the library understands them."""
+    found = dict(DEFAULTS)
+
+    def add(_: str, name: str, parsed: Any) -> None:
+        found[name] = tuple(
+            Field(field.name, field.type.type if field.type.is_primitive_type()
+                  else f'{field.type.pkg_name}/{field.type.type}', bool(field.type.is_array),
+                  field.type.array_size if field.type.is_fixed_size_array() else None)
+            for field in parsed.fields)
+
+    # The library also prints unreadable definitions to standard error.
+    with redirect_stderr(io.StringIO()):
+        _for_each_msgdef(kind, text, add)
+    return found
+
+
+@lru_cache(maxsize=64)
+def _template(kind: str, content: str, wanted: frozenset[FieldPath]) -> tuple[bytes, Layout]:
+    """Return a message of a type, given as JSON, and where the wanted fields are."""
+    data = serialize_dynamic(kind, SCHEMAS[kind])[kind](json.loads(content))
+    return data, Layout(data, short_name(kind), parse_definition(kind, SCHEMAS[kind]), wanted)
+
+
+def _encode(kind: str, columns: Mapping[str, npt.NDArray[Any]],
+            stamps_ns: npt.NDArray[np.int64] | None = None, **content: Any) -> list[bytes]:
+    """Return messages that differ in some fields, by their paths; the rest is as in `content`."""
+    if stamps_ns is not None:
+        columns = {'header.stamp.sec': stamps_ns // 1_000_000_000,
+                   'header.stamp.nanosec': stamps_ns % 1_000_000_000, **columns}
+    paths = {parse_field_path(path): values for path, values in columns.items()}
+    data, layout = _template(kind, json.dumps(content), frozenset(paths))
+    rows = np.tile(np.frombuffer(data, np.uint8), (len(next(iter(paths.values()))), 1))
+    for path, values in paths.items():
+        layout.places[path].fill(rows, values)
+    whole, size = rows.tobytes(), len(data)
+    return [whole[at:at + size] for at in range(0, len(whole), size)]
 
 
 def encode_scalars(kind: str, values: npt.ArrayLike) -> list[bytes]:
     """Return one std_msgs/Float32 or Float64 message for each value."""
-    layout = {FLOAT32: _FLOAT32, FLOAT64: _FLOAT64}[kind]
-    rows = np.zeros(np.size(values), layout)
-    rows['head'] = np.void(HEADER)
-    rows['data'] = values
-    return _split(rows)
+    return _encode(kind, {'data': np.asarray(values)})
 
 
 def encode_battery(stamps_ns: npt.NDArray[np.int64], voltage: npt.ArrayLike) -> list[bytes]:
@@ -178,40 +201,26 @@ def encode_battery(stamps_ns: npt.NDArray[np.int64], voltage: npt.ArrayLike) -> 
 
     stamps_ns in ns, voltage in V.
     """
-    rows = np.zeros(stamps_ns.size, _BATTERY)
-    rows['head'] = np.void(HEADER)
-    rows['sec'] = stamps_ns // 1_000_000_000
-    rows['nanosec'] = stamps_ns % 1_000_000_000
-    # Strings count their terminating zero.
-    for name in ('frame_length', 'location_length', 'serial_length'):
-        rows[name] = 1
-    rows['voltage'] = voltage
-    rows['unmeasured'] = np.nan
-    rows['present'] = 1
-    return _split(rows)
+    return _encode(BATTERY_STATE, {'voltage': np.asarray(voltage)}, stamps_ns, present=True,
+                   **dict.fromkeys(('temperature', 'current', 'charge', 'capacity',
+                                    'design_capacity', 'percentage'), math.nan))
 
 
-def encode_imu(stamps_ns: npt.NDArray[np.int64], angular_velocity: npt.NDArray[np.float64] | None,
-               acceleration: npt.NDArray[np.float64] | None) -> list[bytes]:
+def encode_imu(stamps_ns: npt.NDArray[np.int64], vectors: Mapping[str, npt.NDArray[np.float64]],
+               ) -> list[bytes]:
     """
-    Return one sensor_msgs/Imu in `base_link` for each stamp; None: not measured.
+    Return one sensor_msgs/Imu in `base_link` for each stamp.
 
-    stamps_ns in ns, angular_velocity of shape (n, 3) in rad/s, acceleration in m/s^2.
+    stamps_ns in ns; vectors: angular_velocity, rad/s, and linear_acceleration, m/s^2, as far as
+    measured, each of shape (n, 3).
     """
-    rows = np.zeros(stamps_ns.size, _IMU)
-    rows['head'] = np.void(HEADER)
-    rows['sec'], rows['nanosec'] = stamps_ns // 1_000_000_000, stamps_ns % 1_000_000_000
-    rows['frame_length'], rows['frame'] = 10, np.void(b'base_link\0\0\0')
-    rows['orientation'][:, 3] = 1.0
     # By the message definition -1 means not measured, and 0 an unknown covariance.
-    rows['orientation_covariance'][:, 0] = -1.0
-    for name, values in (('angular_velocity', angular_velocity),
-                         ('linear_acceleration', acceleration)):
-        if values is None:
-            rows[f'{name}_covariance'][:, 0] = -1.0
-        else:
-            rows[name] = values
-    return _split(rows)
+    unmeasured = {f'{name}_covariance': [-1.0, *[0.0] * 8] for name in (
+        'orientation', 'angular_velocity', 'linear_acceleration') if name not in vectors}
+    columns = {f'{name}.{axis}': values[:, k] for name, values in vectors.items()
+               for k, axis in enumerate('xyz')}
+    return _encode(IMU, columns, stamps_ns, header={'frame_id': 'base_link'},
+                   orientation={'w': 1.0}, **unmeasured)
 
 
 def encode_joints(stamps_ns: npt.NDArray[np.int64], names: Sequence[str],
@@ -221,33 +230,17 @@ def encode_joints(stamps_ns: npt.NDArray[np.int64], names: Sequence[str],
 
     stamps_ns in ns, velocity of shape (n, m) in rad/s.
     """
-    # From the frame, which is empty, to the number of velocities: the same in all.
-    texts = struct.pack('<I4sI', 1, b'', len(names))
-    for name in names:
-        data = name.encode() + b'\0'
-        texts += b'\0' * (-len(texts) % 4) + struct.pack('<I', len(data)) + data
-    texts += b'\0' * (-len(texts) % 4) + struct.pack('<II', 0, len(names))
-    # Counted from the stamp, of 8 bytes.
-    texts += b'\0' * (-len(texts) % 8)
-    layout = np.dtype([('head', 'V4'), ('sec', '<i4'), ('nanosec', '<u4'),
-                       ('texts', f'V{len(texts)}'), ('velocity', '<f8', (len(names),)),
-                       ('effort', '<u4')])
-    rows = np.zeros(stamps_ns.size, layout)
-    rows['head'] = np.void(HEADER)
-    rows['sec'], rows['nanosec'] = stamps_ns // 1_000_000_000, stamps_ns % 1_000_000_000
-    rows['texts'], rows['velocity'] = np.void(texts), velocity
-    return _split(rows)
+    return _encode(JOINT_STATE, {'velocity': velocity}, stamps_ns, name=list(names),
+                   velocity=[0.0] * len(names))
+
+
+def encode_blocks(samples: npt.NDArray[np.float64]) -> list[bytes]:
+    """Return std_msgs/Float32MultiArrays with one dimension named 'samples', shape (m, n)."""
+    n = samples.shape[1]
+    return _encode(FLOAT32_ARRAY, {'data': samples}, data=[0.0] * n, layout={
+        'dim': [{'label': 'samples', 'size': n, 'stride': n}]})
 
 
 def encode_block(samples: npt.ArrayLike) -> bytes:
-    """Return one std_msgs/Float32MultiArray with one dimension named 'samples'."""
-    data = np.asarray(samples, dtype='<f4')
-    layout = struct.pack('<II8sIII', 1, 8, b'samples', data.size, data.size, 0)
-    return HEADER + layout + struct.pack('<I', data.size) + data.tobytes()
-
-
-def _split(rows: npt.NDArray[np.void]) -> list[bytes]:
-    """Return the bytes of each row."""
-    size = rows.dtype.itemsize
-    whole = rows.tobytes()
-    return [whole[at:at + size] for at in range(0, len(whole), size)]
+    """Return one block of samples."""
+    return encode_blocks(np.asarray(samples)[None])[0]

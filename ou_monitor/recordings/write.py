@@ -11,7 +11,7 @@ series std_msgs/Float64; the unit of each is in the metadata of its topic.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 import heapq
 import math
@@ -23,9 +23,9 @@ import numpy.typing as npt
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.bag import BagWriter
 from ou_monitor.recordings.importers.choose import Chosen, Extras, SPEEDS
-from ou_monitor.recordings.importers.log import Inertial, MotorSpeeds, Series
+from ou_monitor.recordings.importers.log import Motion, Series, VELOCITY
 from ou_monitor.recordings.standard_types import (
-    BATTERY_STATE, encode_battery, encode_block, encode_imu, encode_joints, encode_scalars,
+    BATTERY_STATE, encode_battery, encode_blocks, encode_imu, encode_joints, encode_scalars,
     FLOAT32, FLOAT32_ARRAY, FLOAT64, IMU, JOINT_STATE)
 from ou_monitor.records import FloatArray, Recording
 
@@ -35,8 +35,8 @@ TYPES = {
     'adc_block': FLOAT32_ARRAY,
 }
 
-# Samples encoded at once; bounds memory.
-SLICE = 1024
+# Samples encoded at once; bounds memory.  Whole blocks.
+SLICE = 1000
 
 # An adc_block of a log: rate of its samples, Hz, and how many there are in one.
 BLOCK_RATE = 10000.0
@@ -52,6 +52,7 @@ _LAST_NS = 2.0**62
 # The header's stamp counts seconds in an int32.
 LAST_HEADER_NS = (2**31) * 1_000_000_000 - 1
 
+Stamps = npt.NDArray[np.int64]
 # Log time (ns), which topic, message.  At one instant the throttle goes first:
 # it holds for that sample.
 Timed = tuple[int, int, bytes]
@@ -153,9 +154,8 @@ class RecordingWriter:
     def close(self) -> None:
         """Finish the bag."""
         stamps, samples = self._rest
-        if samples.size:
-            self._bag.write(self._names[VOLTAGE], int(stamps[-1]), encode_block(samples))
-            self._rest = stamps[:0], samples[:0]
+        self._rest = stamps[:0], samples[:0]
+        self._send(self._messages(VOLTAGE, TYPES[self._type], stamps, samples))
         self._bag.close()
 
     def __enter__(self) -> RecordingWriter:
@@ -175,22 +175,19 @@ class RecordingWriter:
                 raise
         self._bag.__exit__(kind, error, trace)
 
-    def _voltage(self, stamps: npt.NDArray[np.int64], voltage: FloatArray) -> Iterator[Timed]:
+    def _messages(self, topic: int, kind: str, stamps: Stamps, values: FloatArray,
+                  ) -> Iterator[Timed]:
+        for t, message in encode(kind, stamps, values, self._block):
+            yield t, topic, message
+
+    def _voltage(self, stamps: Stamps, voltage: FloatArray) -> Iterator[Timed]:
+        whole = stamps.size
         if self._type == 'adc_block':
             stamps = np.concatenate((self._rest[0], stamps))
             voltage = np.concatenate((self._rest[1], voltage))
             whole = stamps.size - stamps.size % self._block
             self._rest = stamps[whole:], voltage[whole:]
-            for first in range(0, whole, self._block):
-                last = first + self._block
-                yield int(stamps[last - 1]), VOLTAGE, encode_block(voltage[first:last])
-            return
-        if self._type == 'battery_state':
-            messages = encode_battery(stamps, voltage)
-        else:
-            messages = encode_scalars(TYPES[self._type], voltage)
-        for t, message in zip(stamps.tolist(), messages, strict=True):
-            yield t, VOLTAGE, message
+        return self._messages(VOLTAGE, TYPES[self._type], stamps[:whole], voltage[:whole])
 
     def _throttles(self, stamps: npt.NDArray[np.int64], throttle: FloatArray) -> Iterator[Timed]:
         known = np.isfinite(throttle)
@@ -202,9 +199,7 @@ class RecordingWriter:
         periods = times // THROTTLE_PERIOD_NS
         changed |= np.diff(periods, prepend=self._period) > 0
         self._throttle, self._period = float(values[-1]), int(periods[-1])
-        for t, message in zip(times[changed].tolist(),
-                              encode_scalars(FLOAT32, values[changed]), strict=True):
-            yield t, THROTTLE, message
+        yield from self._messages(THROTTLE, FLOAT32, times[changed], values[changed])
 
 
 def check_steady(name: str, since_first: npt.NDArray[np.int64], before: int,
@@ -217,9 +212,6 @@ def check_steady(name: str, since_first: npt.NDArray[np.int64], before: int,
             'need it: use another type')
 
 
-Stamps = npt.NDArray[np.int64]
-
-
 @dataclass(frozen=True, eq=False)
 class _Stream:
     """One topic: stamps (s), messages of a part of them, and where they come from."""
@@ -227,7 +219,7 @@ class _Stream:
     topic: str
     kind: str
     t: FloatArray
-    encode: Callable[[Stamps, slice], list[bytes]]
+    encode: Callable[[Stamps, slice], Iterable[tuple[int, bytes]]]
     origin: dict[str, str]
 
 
@@ -240,9 +232,9 @@ def write_log(
     streams = [_of_series(name, FLOAT32, series) for name, series in (
         ('throttle', chosen.throttle), ('current', chosen.current)) if series is not None]
     if extras is not None:
-        streams += [_of_inertial(name, one) for name, one in extras.inertial.items()]
+        streams += [_of_motion(name, one) for name, one in extras.inertial.items()]
         if extras.speeds is not None:
-            streams.append(_of_speeds(extras.speeds))
+            streams.append(_of_motion(SPEEDS, extras.speeds))
         streams += [_of_series(name, FLOAT64, one) for name, one in extras.signals.items()]
     streams.append(_of_series('voltage', TYPES[kind], chosen.voltage))
     first = min(float(stream.t[0]) for stream in streams)
@@ -278,6 +270,20 @@ def write_log(
     return topics, notes
 
 
+def encode(kind: str, stamps: Stamps, values: FloatArray, block: int = BLOCK,
+           ) -> Iterator[tuple[int, bytes]]:
+    """Yield messages of numbers with their log times, ns, by blocks that of the last sample."""
+    if kind == FLOAT32_ARRAY:
+        whole = stamps.size - stamps.size % block
+        yield from zip(stamps[block - 1:whole:block].tolist(),
+                       encode_blocks(values[:whole].reshape(-1, block)), strict=True)
+        if whole < stamps.size:
+            yield int(stamps[-1]), encode_blocks(values[None, whole:])[0]
+        return
+    yield from zip(stamps.tolist(), encode_battery(stamps, values) if kind == BATTERY_STATE
+                   else encode_scalars(kind, values), strict=True)
+
+
 def _origin(topic: str, name: str, unit: str, scale: str, words: str) -> dict[str, str]:
     """Return where a topic came from, by keys that are its own."""
     return {f'{topic}_field': name, f'{topic}_unit': unit, f'{topic}_scale': scale,
@@ -285,39 +291,24 @@ def _origin(topic: str, name: str, unit: str, scale: str, words: str) -> dict[st
 
 
 def _of_series(topic: str, kind: str, series: Series) -> _Stream:
-    def encode(stamps: Stamps, part: slice) -> list[bytes]:
-        values = series.values[part]
-        return (encode_battery(stamps, values) if kind == BATTERY_STATE
-                else [encode_block(values)] if kind == FLOAT32_ARRAY
-                else encode_scalars(kind, values))
-    return _Stream(topic, kind, series.t, encode, _origin(
-        topic, series.name, series.unit, series.scale, series.words))
+    return _Stream(topic, kind, series.t,
+                   lambda stamps, part: encode(kind, stamps, series.values[part]),
+                   _origin(topic, series.name, series.unit, series.scale, series.words))
 
 
-def _of_inertial(topic: str, one: Inertial) -> _Stream:
-    def encode(stamps: Stamps, part: slice) -> list[bytes]:
-        gyro, force = (None if values is None else values[part]
-                       for values in (one.angular_velocity, one.acceleration))
-        return encode_imu(stamps, gyro, force)
-    return _Stream(topic, IMU, one.t, encode, _origin(
-        topic, one.name, 'rad/s, m/s^2', one.scale, one.words))
-
-
-def _of_speeds(speeds: MotorSpeeds) -> _Stream:
-    def encode(stamps: Stamps, part: slice) -> list[bytes]:
-        return encode_joints(stamps, speeds.names, speeds.values[part])
-    return _Stream(SPEEDS, JOINT_STATE, speeds.t, encode, _origin(
-        SPEEDS, ', '.join(speeds.names), 'rad/s', speeds.scale, speeds.words))
+def _of_motion(topic: str, one: Motion) -> _Stream:
+    def messages(stamps: Stamps, part: slice) -> Iterable[tuple[int, bytes]]:
+        held = {field: values[part] for field, values in one.vectors.items()}
+        return zip(stamps.tolist(), encode_joints(stamps, one.motors, held[VELOCITY])
+                   if one.motors else encode_imu(stamps, held), strict=True)
+    return _Stream(
+        topic, JOINT_STATE if one.motors else IMU, one.t, messages,
+        _origin(topic, ', '.join(one.motors) or one.name,
+                'rad/s' if one.motors else 'rad/s, m/s^2', one.scale, one.words))
 
 
 def _messages(place: int, stamps: Stamps, stream: _Stream) -> Iterator[Timed]:
-    if stream.kind == FLOAT32_ARRAY:
-        for first in range(0, stamps.size, BLOCK):
-            part = slice(first, first + BLOCK)
-            yield int(stamps[part][-1]), place, stream.encode(stamps[part], part)[0]
-        return
     for first in range(0, stamps.size, SLICE):
         part = slice(first, first + SLICE)
-        for t, message in zip(stamps[part].tolist(), stream.encode(stamps[part], part),
-                              strict=True):
+        for t, message in stream.encode(stamps[part], part):
             yield t, place, message

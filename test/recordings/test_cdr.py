@@ -8,9 +8,8 @@ from made_bags import decode, encode
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings import standard_types as cdr
-from ou_monitor.recordings.bag import parse_definition
 from ou_monitor.recordings.cdr import FieldReader, join, MessageTable, seconds
-from ou_monitor.recordings.standard_types import SCHEMAS
+from ou_monitor.recordings.standard_types import parse_definition, SCHEMAS
 from ou_monitor.stream.config import FieldSpec, parse_field_path, walk
 import pytest
 from rosbags.typesys import get_typestore, Stores

@@ -70,8 +70,8 @@ def test_imu(absent):
     """In base_link, -1 for what is not measured, 0 for a covariance not known."""
     values = {'angular_velocity': np.arange(9.0).reshape(3, 3),
               'linear_acceleration': -np.arange(9.0).reshape(3, 3)}
-    messages = cdr.encode_imu(STAMPS, *(None if name == absent else rows
-                                        for name, rows in values.items()))
+    messages = cdr.encode_imu(STAMPS, {name: rows for name, rows in values.items()
+                                       if name != absent})
     for k, (data, ns) in enumerate(zip(messages, STAMPS.tolist(), strict=True)):
         theirs = STORE.deserialize_cdr(data, cdr.IMU)
         assert bytes(STORE.serialize_cdr(theirs, cdr.IMU)) == data

@@ -27,8 +27,8 @@ from orangebox.reader import Reader
 from orangebox.types import FrameType
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import (
-    CURRENT, DEGREE, GRAVITY, Inertial, Log, log_of, MotorSpeeds, quiet, Request, RPM,
-    Series, SIGNAL, three_axes, THROTTLE, UNKNOWN, VOLTAGE)
+    CURRENT, DEGREE, GRAVITY, gyro_of, Log, log_of, Motion, quiet, Request, RPM, Series,
+    SIGNAL, three_axes, THROTTLE, UNKNOWN, VELOCITY, VOLTAGE)
 from ou_monitor.records import FloatArray
 
 # The clock counts us in 32 bits.
@@ -311,7 +311,7 @@ def _high_resolution(headers: Headers) -> float:
 
 def _motion(t: FloatArray, columns: Fields, headers: Headers, notes: list[str], *,
             debug_gyro: bool, poles: int | None,
-            ) -> tuple[tuple[Inertial, ...], MotorSpeeds | None]:
+            ) -> tuple[tuple[Motion, ...], Motion | None]:
     """Return gyros with the accelerometer, and motor speeds (t in s)."""
     acc = three_axes(columns, [f'{ACCELEROMETER}[{axis}]' for axis in range(3)])
     one_g = _number(headers, 'acc_1G')
@@ -333,8 +333,8 @@ def _motion(t: FloatArray, columns: Fields, headers: Headers, notes: list[str], 
         if scale is None:
             notes.append(f'{name} was left out of /imu: the header does not state gyro_scale.')
             continue
-        inertial.append(Inertial(name, t, values * scale, scaled, f'{name} {scale:.6g}, {words}',
-                                 what, rank))
+        inertial.append(gyro_of(name, t, values * scale, scaled, f'{name} {scale:.6g}, {words}',
+                                what, rank))
     return tuple(inertial), _speeds(t, columns, headers, notes, poles)
 
 
@@ -384,7 +384,7 @@ def _signals(t: FloatArray, columns: Fields, headers: Headers, known: set[str], 
 
 
 def _speeds(t: FloatArray, columns: Fields, headers: Headers, notes: list[str],
-            poles: int | None) -> MotorSpeeds | None:
+            poles: int | None) -> Motion | None:
     fields = sorted((name for name in columns if name.startswith(f'{ERPM}[')), key=_place)
     if not fields:
         return None
@@ -398,8 +398,9 @@ def _speeds(t: FloatArray, columns: Fields, headers: Headers, notes: list[str],
     scale = 100.0 * RPM * 2.0 / count
     values = np.column_stack([columns[name] for name in fields]) * scale
     origin = '--poles' if poles else 'the header'
-    return MotorSpeeds(tuple(f'motor_{_place(name)}' for name in fields), t, values,
-                       f'eRPM {scale:.6g}', f'rotor speed, {count} poles by {origin}')
+    return Motion('', t, {VELOCITY: values}, f'eRPM {scale:.6g}',
+                  f'rotor speed, {count} poles by {origin}',
+                  motors=tuple(f'motor_{_place(name)}' for name in fields))
 
 
 def _place(name: str) -> int:

@@ -19,8 +19,8 @@ import numpy as np
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.bag_samples import check_throttle
 from ou_monitor.recordings.importers.log import (
-    ANY, clean, CURRENT, Inertial, Log, MotorSpeeds, RawColumns, Series, SIGNAL, sound, THROTTLE,
-    UNKNOWN, VOLTAGE)
+    ANY, clean, CURRENT, FORCE, Log, Motion, RATE, RawColumns, Series, SIGNAL, sound, THROTTLE,
+    UNKNOWN, VELOCITY, VOLTAGE)
 from ou_monitor.records import Defect, FloatArray, led, Note
 from ou_monitor.text import counted, printable
 
@@ -213,9 +213,9 @@ class Extras:
     """Series chosen from a log beside voltage, throttle and current."""
 
     # By topic, without the slash.
-    inertial: dict[str, Inertial]
+    inertial: dict[str, Motion]
     # Of the motors.
-    speeds: MotorSpeeds | None
+    speeds: Motion | None
     # By topic, without the slash.
     signals: dict[str, Series]
     # What was dropped, and what the log does not hold.
@@ -226,10 +226,10 @@ def choose_extras(path: Path, log: Log, *, imus: Sequence[str] = (),
                   signals: Sequence[str] = ()) -> Extras:
     """Choose: the gyro that is there when nothing is said, and the series named."""
     notes: list[str] = []
-    inertial: dict[str, Inertial] = {}
+    inertial: dict[str, Motion] = {}
     for one in _inertial(path, log, imus):
-        kept, said = clean_inertial(one)
-        notes += led(one.name, said)
+        kept, said = clean_motion(one)
+        notes += led(one.name, (*said, *pace_notes(kept.t)))
         if not kept.t.size:
             notes.append(f'{one.name} has no usable sample.')
             continue
@@ -243,7 +243,7 @@ def choose_extras(path: Path, log: Log, *, imus: Sequence[str] = (),
         notes.append(f"Also in the log: {', '.join(others)} (--imu NAME).")
     speeds = log.speeds
     if speeds is not None:
-        speeds, said = clean_speeds(speeds)
+        speeds, said = clean_motion(speeds)
         notes += led(SPEEDS, said)
         speeds = speeds if speeds.t.size else None
     named: dict[str, Series] = {}
@@ -259,7 +259,7 @@ def choose_extras(path: Path, log: Log, *, imus: Sequence[str] = (),
     return Extras(inertial, speeds, named, tuple(notes))
 
 
-def default_inertial(log: Log) -> list[Inertial]:
+def default_inertial(log: Log) -> list[Motion]:
     """Return what becomes /imu when nothing is said: one, or none."""
     ranked = [one for one in log.inertial if one.rank is not None and one.t.size]
     return sorted(ranked, key=lambda one: one.rank or 0)[:1]
@@ -288,38 +288,29 @@ def signal_of(path: Path, log: Log, signal: str) -> tuple[Series, tuple[str, ...
     return series, tuple(led(signal, (*said, *pace_notes(series.t))))
 
 
-_RATE, _FORCE = 'angular_velocity', 'linear_acceleration'
-
-
 def _of_topic(path: Path, log: Log, signal: str) -> Series | None:
     """Return a series of a topic of `convert`: NAME/angular_velocity.x, motor_speed/..."""
-    found = re.fullmatch(rf'/?(.+)/({_RATE}|{_FORCE})\.([xyz])', signal)
-    if found is not None:
-        name, field, axis = found.groups()
-        held = (default_inertial(log) if name == IMU else
-                [one for one in log.inertial if one.name == name])
+    found = re.fullmatch(rf'/?(.+)/(({RATE}|{FORCE})\.[xyz]|{VELOCITY}\[\d+\])', signal)
+    if found is None:
+        return None
+    name, column, field = found.groups()
+    held = [log.speeds] if log.speeds else []
+    if field is not None:
+        held = default_inertial(log) if name == IMU else [
+            one for one in log.inertial if one.name == name]
         if not held:
             known = ', '.join(one.name for one in log.inertial) or 'none'
             raise InputError(f"{path} has no gyro '{name}': it holds {known}")
-        one, _ = clean_inertial(held[0])
-        values = one.angular_velocity if field == _RATE else one.acceleration
-        if values is None:
-            raise InputError(f"{path}: {held[0].name} has no {field.replace('_', ' ')}")
-        return Series(signal, SIGNAL, one.t, values[:, 'xyz'.index(axis)], one.scale,
-                      own_unit='rad/s' if field == _RATE else 'm/s^2')
-    found = re.fullmatch(rf'/?{SPEEDS}/velocity\[(\d+)\]', signal)
-    if found is None:
+    elif name != SPEEDS:
         return None
-    if log.speeds is None:
+    if not held:
         raise InputError(f'{path} holds no motor speeds'
                          + ''.join(f' ({note})' for note in log.notes if 'eRPM' in note))
-    speeds, _ = clean_speeds(log.speeds)
-    place = int(found[1])
-    if place >= len(speeds.names):
-        raise InputError(f'{path} holds {len(speeds.names)} motor speeds: velocity[{place}] is '
-                         'not there')
-    return Series(signal, SIGNAL, speeds.t, speeds.values[:, place], speeds.scale,
-                  own_unit='rad/s')
+    one, _ = clean_motion(held[0])
+    if column not in one.columns:
+        raise InputError(f"{path}: '{name}' has no {column}: it holds {', '.join(one.columns)}")
+    return Series(signal, SIGNAL, one.t, one.columns[column], one.scale,
+                  own_unit='m/s^2' if field == FORCE else 'rad/s')
 
 
 def topic_of(name: str) -> str:
@@ -341,7 +332,7 @@ def _free(topic: str, taken: set[str]) -> str:
     return free
 
 
-def _inertial(path: Path, log: Log, names: Sequence[str]) -> list[Inertial]:
+def _inertial(path: Path, log: Log, names: Sequence[str]) -> list[Motion]:
     if not names:
         return default_inertial(log)
     found = []
@@ -359,20 +350,11 @@ def _inertial(path: Path, log: Log, names: Sequence[str]) -> list[Inertial]:
     return found
 
 
-def clean_inertial(one: Inertial) -> tuple[Inertial, tuple[str, ...]]:
+def clean_motion(one: Motion) -> tuple[Motion, tuple[str, ...]]:
     """Return finite rows with rising stamps, and what that took."""
-    columns = [part for part in (one.angular_velocity, one.acceleration) if part is not None]
-    which, notes = sound(one.t, np.hstack(columns))
-    gyro, acc = (None if part is None else part[which]
-                 for part in (one.angular_velocity, one.acceleration))
-    kept = replace(one, t=one.t[which], angular_velocity=gyro, acceleration=acc)
-    return kept, (*notes, *pace_notes(kept.t))
-
-
-def clean_speeds(one: MotorSpeeds) -> tuple[MotorSpeeds, tuple[str, ...]]:
-    """Return finite rows with rising stamps, and what that took."""
-    which, notes = sound(one.t, one.values)
-    return replace(one, t=one.t[which], values=one.values[which]), tuple(notes)
+    which, notes = sound(one.t, np.hstack([*one.vectors.values()]))
+    vectors = {field: values[which] for field, values in one.vectors.items()}
+    return replace(one, t=one.t[which], vectors=vectors), tuple(notes)
 
 
 def pace_notes(t: FloatArray) -> tuple[str, ...]:

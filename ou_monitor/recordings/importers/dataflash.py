@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import (
-    CURRENT, FRD_TO_FLU, Inertial, Log, log_of, MotorSpeeds, one_flight, quiet, quiet_process,
-    Request, RPM, Series, SIGNAL, three_axes, THROTTLE, UNKNOWN, VOLTAGE)
+    CURRENT, FRD_TO_FLU, gyro_of, Log, log_of, Motion, one_flight, quiet, quiet_process, Request,
+    RPM, Series, SIGNAL, three_axes, THROTTLE, UNKNOWN, VELOCITY, VOLTAGE)
 from ou_monitor.records import FloatArray
 from pymavlink import DFReader
 
@@ -290,7 +290,7 @@ def _others(name: str, columns: dict[str, list[float]], units: dict[str, str],
                          group=name, own_unit=unit)
 
 
-def _gyros(table: Table) -> Iterator[Inertial]:
+def _gyros(table: Table) -> Iterator[Motion]:
     """Yield each gyro, with the accelerometer of its message, along front, left and up."""
     first: set[str] = set()
     for (kind, instance), columns in sorted(table.items()):
@@ -299,13 +299,13 @@ def _gyros(table: Table) -> Iterator[Inertial]:
             continue
         rank = None if kind in first else GYROS[kind]
         first.add(kind)
-        yield Inertial(f'{kind}[{instance}]' if instance else kind, np.array(columns['t']),
-                       rates * FRD_TO_FLU, None if forces is None else forces * FRD_TO_FLU,
-                       'front, right, down turned to front, left, up',
-                       'gyro and accelerometer' if forces is not None else 'gyro', rank)
+        yield gyro_of(f'{kind}[{instance}]' if instance else kind, np.array(columns['t']),
+                      rates * FRD_TO_FLU, None if forces is None else forces * FRD_TO_FLU,
+                      'front, right, down turned to front, left, up',
+                      'gyro and accelerometer' if forces is not None else 'gyro', rank)
 
 
-def _speeds(table: Table) -> MotorSpeeds | None:
+def _speeds(table: Table) -> Motion | None:
     """Return the speeds that ESCs reported, at the stamps of the first one."""
     kind, field = SPEED
     found = {instance: columns for (name, instance), columns in sorted(table.items())
@@ -319,9 +319,9 @@ def _speeds(table: Table) -> MotorSpeeds | None:
         # Each ESC reports in its turn: the last report holds.
         last = np.maximum(np.searchsorted(own, t, 'right') - 1, 0)
         values.append(np.array(columns[field])[last] * RPM)
-    return MotorSpeeds(tuple(f'motor_{instance or 0}' for instance in found), t,
-                       np.column_stack(values), f'rpm {RPM:.6g}',
-                       'speed as the ESC reports it, the last report held')
+    return Motion('', t, {VELOCITY: np.column_stack(values)}, f'rpm {RPM:.6g}',
+                  'speed as the ESC reports it, the last report held',
+                  motors=tuple(f'motor_{instance or 0}' for instance in found))
 
 
 def _throttle_scale(values: FloatArray) -> float:

@@ -34,38 +34,41 @@ GRAVITY = 9.80665  # m/s^2, by which accelerometers are scaled
 RPM = 2.0 * math.pi / 60.0
 
 
+# Fields of the messages that hold motion: rad/s and m/s^2 along the axes of `base_link`, the
+# acceleration as specific force (gravity included); rotors, rad/s.
+RATE, FORCE, VELOCITY = 'angular_velocity', 'linear_acceleration', 'velocity'
+
+
 @dataclass(frozen=True, eq=False)
-class Inertial:
-    """A gyro, an accelerometer, or both."""
+class Motion:
+    """A gyro with its accelerometer, if it has one, or the speeds of all motors."""
 
     # How the user names it.
     name: str
     # Stamps, s from the start of the log; shape (n,).
     t: FloatArray
-    # rad/s and m/s^2 along the axes of `base_link`, the acceleration as specific force (gravity
-    # included); None where the log has none; shape (n, 3).
-    angular_velocity: FloatArray | None
-    acceleration: FloatArray | None
-    # Conversion of the values; kind of series.
+    # Field -> values, shape (n, 3) or (n, motors).
+    vectors: dict[str, FloatArray]
+    # Conversion of the values, poles included; kind of series.
     scale: str
     words: str
     # Taken when nothing of a smaller rank is there; None: only by name.
     rank: int | None = None
+    # Names of the motors, as in the message: ``motor_0``; of a gyro none.
+    motors: tuple[str, ...] = ()
+
+    @property
+    def columns(self) -> dict[str, FloatArray]:
+        """Return path in the message -> values, shape (n,)."""
+        return {f'{field}[{k}]' if self.motors else f"{field}.{'xyz'[k]}": column
+                for field, values in self.vectors.items() for k, column in enumerate(values.T)}
 
 
-@dataclass(frozen=True, eq=False)
-class MotorSpeeds:
-    """Speeds of all motors at the same stamps."""
-
-    # Of the m motors, as in the message: ``motor_0``.
-    names: tuple[str, ...]
-    # Stamps, s from the start of the log; shape (n,).
-    t: FloatArray
-    # Of the rotor, rad/s; shape (n, m).
-    values: FloatArray
-    # Conversion of the values, poles included; kind of series.
-    scale: str
-    words: str
+def gyro_of(name: str, t: FloatArray, rates: FloatArray, forces: FloatArray | None, scale: str,
+            words: str, rank: int | None = None) -> Motion:
+    """Return a gyro, with its accelerometer unless that is None; see `Motion`."""
+    return Motion(name, t, {RATE: rates, **({} if forces is None else {FORCE: forces})}, scale,
+                  words, rank)
 
 
 VOLTAGE, THROTTLE, CURRENT = 'voltage', 'throttle', 'current'
@@ -150,9 +153,9 @@ class Log:
     # What was dropped or could not be read, one sentence each.
     notes: tuple[str, ...] = ()
     # Gyros and accelerometers.
-    inertial: tuple[Inertial, ...] = ()
+    inertial: tuple[Motion, ...] = ()
     # Of the motors.
-    speeds: MotorSpeeds | None = None
+    speeds: Motion | None = None
     # Names of all series of the file, unread ones included.
     names: tuple[str, ...] = ()
 
@@ -297,8 +300,8 @@ _Timed = TypeVar('_Timed', bound=Any)
 
 
 def log_of(form: str, series: Sequence[Series], facts: dict[str, str], notes: Iterable[str],
-           names: Iterable[str], inertial: Iterable[Inertial] = (),
-           speeds: MotorSpeeds | None = None, start: float = math.inf) -> Log:
+           names: Iterable[str], inertial: Iterable[Motion] = (),
+           speeds: Motion | None = None, start: float = math.inf) -> Log:
     """Return a log, its stamps counted from the first of its series, or `start` (s) if earlier."""
     # Corrupt bytes give stamps near zero: a first sample counts only with others near it.
     start = min([start, *(float(one.t[near(one.t)].min()) for one in series if one.t.size)])

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 from ou_monitor.recordings.importers.log import (
-    CURRENT, FRD_TO_FLU, Inertial, Log, log_of, MotorSpeeds, one_flight, Progress, quiet, Request,
-    RPM, Series, SIGNAL, three_axes, THROTTLE, UNKNOWN, VOLTAGE)
+    CURRENT, FRD_TO_FLU, gyro_of, Log, log_of, Motion, one_flight, Progress, quiet, Request, RPM,
+    Series, SIGNAL, three_axes, THROTTLE, UNKNOWN, VELOCITY, VOLTAGE)
 from ou_monitor.records import Defect, FloatArray, Note
 from pyulog import ULog
 
@@ -133,8 +133,8 @@ def read(path: Path, request: Request) -> Log:
         notes.append(f'The logger lost data {len(ulog.dropouts)} '
                      f'time{"s" * (len(ulog.dropouts) != 1)}, {lost:.3f} s in all.')
     series: list[Series] = []
-    inertial: list[Inertial] = []
-    speeds: MotorSpeeds | None = None
+    inertial: list[Motion] = []
+    speeds: Motion | None = None
     for data in ulog.data_list:
         columns: dict[str, Any] = data.data
         if 'timestamp' in columns:
@@ -178,7 +178,7 @@ def _others(name: str, topic: str, columns: dict[str, Any], known: set[str]) -> 
                      'as logged', group=name, own_unit=unit)
 
 
-def _gyros(name: str, topic: str, columns: dict[str, Any]) -> Iterator[Inertial]:
+def _gyros(name: str, topic: str, columns: dict[str, Any]) -> Iterator[Motion]:
     """Yield gyro and accelerometer of a topic along front, left and up."""
     for source, gyro, acc, rank, words in GYROS:
         if source != topic:
@@ -187,9 +187,9 @@ def _gyros(name: str, topic: str, columns: dict[str, Any]) -> Iterator[Inertial]
         forces = three_axes(columns, _axes(acc)) if acc else None
         if rates is not None:
             t = np.asarray(columns['timestamp'], dtype=np.float64) * 1e-6
-            yield Inertial(name, t, rates * FRD_TO_FLU,
-                           None if forces is None else forces * FRD_TO_FLU,
-                           'front, right, down turned to front, left, up', words, rank)
+            yield gyro_of(name, t, rates * FRD_TO_FLU,
+                          None if forces is None else forces * FRD_TO_FLU,
+                          'front, right, down turned to front, left, up', words, rank)
 
 
 def _axes(stem: str) -> list[str]:
@@ -197,17 +197,17 @@ def _axes(stem: str) -> list[str]:
     return [f'{stem}[{axis}]' for axis in range(3)] if stem else ['x', 'y', 'z']
 
 
-def _speeds(topic: str, columns: dict[str, Any]) -> MotorSpeeds | None:
+def _speeds(topic: str, columns: dict[str, Any]) -> Motion | None:
     """Return the speeds reported by ESCs, or None."""
     fields = [f'esc[{k}].esc_rpm' for k in range(16) if f'esc[{k}].esc_rpm' in columns]
     fields = [name for name in fields if np.any(columns[name])]
     if topic != 'esc_status' or not fields:
         return None
     values = np.column_stack([np.asarray(columns[name], dtype=np.float64) for name in fields])
-    return MotorSpeeds(
-        tuple(f'motor_{name[4:name.index("]")]}' for name in fields),
-        np.asarray(columns['timestamp'], dtype=np.float64) * 1e-6, np.abs(values) * RPM,
-        f'rpm {RPM:.6g}', 'speed as the ESC reports it')
+    return Motion(
+        '', np.asarray(columns['timestamp'], dtype=np.float64) * 1e-6,
+        {VELOCITY: np.abs(values) * RPM}, f'rpm {RPM:.6g}', 'speed as the ESC reports it',
+        motors=tuple(f'motor_{name[4:name.index("]")]}' for name in fields))
 
 
 def _facts(ulog: Any) -> dict[str, str]:
