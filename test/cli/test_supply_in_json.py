@@ -53,10 +53,14 @@ def said(command, path, limit, folder, *more):
 def test_all_commands_give_the_same_object(path, limit, part, tmp_path):
     """Equal to the last digit."""
     ends = '--from', str(part[0]), '--to', str(part[1])
-    found = {command: said(command, path, limit, tmp_path, *ends, *more) for command, more in (
-        ('analyze', ()), ('compare', ('--seeds', '20')), ('discover', ()),
-        ('coupling', ('--signal', SIGNALS[path.stem])))}
-    assert found['analyze'] and found['discover']
+    commands = {'analyze': (), 'compare': ('--seeds', '20'),
+                'coupling': ('--signal', SIGNALS[path.stem])}
+    if path.stem == 'flight':
+        # A search takes ten seconds on the others.
+        commands['discover'] = ()
+    found = {command: said(command, path, limit, tmp_path, *ends, *more)
+             for command, more in commands.items()}
+    assert found['analyze'] and ('discover' not in commands or found['discover'])
     assert all(one['supply'] == found['analyze']['supply'] for one in found.values() if one)
     assert found['analyze']['supply']['dips']['limit_v'] == limit
 
