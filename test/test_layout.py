@@ -181,9 +181,17 @@ def test_a_circle_is_found():
     assert set(circle({**sources, 'p.c': 'import p.a'})) == set(sources)
 
 
+def test_a_command_says_a_document():
+    """What it prints and its JSON go through one function; an export is for another program."""
+    said = {path.stem: path.read_text(encoding='utf-8').count('output.say(')
+            + path.read_text(encoding='utf-8').count('write_json(')
+            for path in (ROOT / PACKAGE / 'cli').glob('*.py') if path.stem != 'output'}
+    assert {name: n for name, n in said.items() if n} == {'simulate': 1}
+
+
 @pytest.mark.parametrize('kind, homes', [
     ('TimeLine', ('timeline', 'online')), ('SupplyFacts', ('analysis',)),
-    ('Document', ('report',))])
+    ('Document', ('report', 'cli'))])
 def test_each_stage_is_made_in_its_place(kind, homes):
     """Source -> TimeLine -> Supply -> Facts -> Document: nobody makes one beside it."""
     made = {part_of(module) for module, path in modules().items()

@@ -9,7 +9,7 @@ from typing import Any
 from ou_monitor.cli import output
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
-from ou_monitor.report import terminal
+from ou_monitor.report.document import Document, Facts, Notes, Part, Table, Text
 
 # Endings that OUT cannot have: a folder of that name would mislead.
 LOG_ENDINGS = ('.csv', '.ulg', '.bin', '.bbl', '.bfl', '.log', '.db3', '.bag', '.txt')
@@ -67,20 +67,16 @@ def _convert(args: argparse.Namespace, log: Any) -> int:
     volts = chosen.voltage
     duration = float(volts.t[-1] - volts.t[0])
     taken = _taken(chosen, extras)
-    if args.json is not None:
-        output.write_json({
-            'log': str(args.log), 'out': str(args.out), 'n': volts.n, 'duration_s': duration,
-            'topics': topics, 'source': {**about, **taken}, 'notes': notes}, args.json)
-    if args.json == output.STDOUT:
-        return 0
-    output.say(f'{args.out}: {volts.n} samples, {duration:.3f} s'
+    parts: list[Part] = [
+        Table(['topic', 'from', 'what it is', 'samples', 'unit', 'message'], [
+            [topic, one['field'], one['what'], str(one['n']), one['unit'], topics[topic]]
+            for topic, one in taken.items()], left=[0, 1, 2, 4, 5]),
+        Facts([(name, str(value)) for name, value in log.facts.items()]), Notes.of(notes)]
+    subject = (f'{args.out}: {volts.n} samples, {duration:.3f} s'
                + (f', {volts.rate:.6g} Hz' if volts.n > 1 else ''))
-    output.say('\n'.join(f"  {topic}: {one['field']} ({one['what']}), {one['n']} samples, "
-                         f"{one['unit']}, {topics[topic]}" for topic, one in taken.items()))
-    for name, value in log.facts.items():
-        output.say(f'  {name}: {value}')
-    for note in notes:
-        output.say(f'note: {note}')
+    output.tell(args, Document('A bag', subject, (), parts), lambda: {
+        'log': str(args.log), 'out': str(args.out), 'n': volts.n, 'duration_s': duration,
+        'topics': topics, 'source': {**about, **taken}, 'notes': notes})
     return 0
 
 
@@ -120,31 +116,25 @@ def _list(args: argparse.Namespace, log: Any) -> int:
             'rate_hz': one.rate, 'min': low, 'max': high, 'unit': one.unit,
             'repeats': one.repeats, 'scale': one.scale})
     gyros = _gyros(log, {one.name for one in default_inertial(log)})
-    if args.json is not None:
-        output.write_json({'log': str(args.log), 'format': log.format, 'facts': log.facts,
-                           'series': rows, 'imu': gyros, 'motor_speed': [] if log.speeds is None
-                           else list(log.speeds.motors), 'notes': log.notes}, args.json)
-    if args.json == output.STDOUT:
-        return 0
-    output.say(f'{args.log}: {log.format}' + ''.join(
-        f', {name} {value}' for name, value in log.facts.items()))
-    output.say(terminal.table(
-        ('', 'quantity', 'name', 'samples', 'rate Hz', 'min', 'max', 'unit', 'repeats', 'what'),
-        [('*' if row['default'] else '', row['quantity'], row['name'], str(row['n']),
-          *(f'{row[key]:.4g}' for key in ('rate_hz', 'min', 'max')), row['unit'],
-          f'{row["repeats"]:.0%}', row['what']) for row in rows], left=(0, 1, 2, 7, 9)))
-    for row in gyros:
-        output.say(f"{'*' if row['default'] else ' '} --imu {row['name']}: {row['what']}, "
-                   f"{row['n']} samples"
-                   + ('' if row['acceleration'] else ', no accelerometer'))
-    if log.speeds is not None:
-        output.say(f'* /motor_speed: {log.speeds.words}, {log.speeds.t.size} samples, '
-                   f"{', '.join(log.speeds.motors)}")
-    for quantity in (VOLTAGE, THROTTLE):
-        if len(taken[quantity]) > 1:
-            output.say(f'Several would be taken as {quantity}: choose with --{quantity} NAME.')
-    for note in log.notes:
-        output.say(f'note: {note}')
+    several = [f'Several would be taken as {quantity}: choose with --{quantity} NAME.'
+               for quantity in (VOLTAGE, THROTTLE) if len(taken[quantity]) > 1]
+    speeds = [] if log.speeds is None else list(log.speeds.motors)
+    parts: list[Part] = [
+        Table(('', 'quantity', 'name', 'samples', 'rate Hz', 'min', 'max', 'unit', 'repeats',
+               'what'), [
+            ['*' if row['default'] else '', row['quantity'], row['name'], str(row['n']),
+             *(f'{row[key]:.4g}' for key in ('rate_hz', 'min', 'max')), row['unit'],
+             f'{row["repeats"]:.0%}', row['what']] for row in rows], left=(0, 1, 2, 7, 9)),
+        Table(('', '--imu', 'samples', 'what'), [
+            ['*' if row['default'] else '', row['name'], str(row['n']), row['what']
+             + ('' if row['acceleration'] else ', no accelerometer')] for row in gyros],
+              left=(0, 1, 3)),
+        *([Text(f'* /motor_speed: {log.speeds.words}, {log.speeds.t.size} samples, '
+                f"{', '.join(speeds)}")] if speeds else []), Notes.of([*several, *log.notes])]
+    output.tell(args, Document('A log', f'{args.log}: {log.format}' + ''.join(
+        f', {name} {value}' for name, value in log.facts.items()), (), parts), lambda: {
+            'log': str(args.log), 'format': log.format, 'facts': log.facts, 'series': rows,
+            'imu': gyros, 'motor_speed': speeds, 'notes': log.notes})
     return 0
 
 

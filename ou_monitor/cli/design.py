@@ -13,22 +13,19 @@ from ou_monitor.cli.arguments import check_outputs, read_given
 from ou_monitor.cli.commands import quantity
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.paper.network.components import PowerNetwork, UNITS
-from ou_monitor.report.terminal import table
+from ou_monitor.report.document import Document, Table
 from ou_monitor.stream.files import read_yaml
 
 
-def _list(target: str | None) -> None:
-    """Show the components with defaults and units; as JSON where that is asked for."""
+def _list(args: argparse.Namespace) -> None:
+    """Show the components with defaults and units."""
     network = PowerNetwork()
     values = asdict(network)
-    if target is not None:
-        output.write_json({name: {'default': network.line_feedthrough if value is None else value,
-                                  'unit': UNITS.get(name, '')}
-                           for name, value in values.items()}, target)
-    if target != output.STDOUT:
-        output.say(table(['component', 'default', 'unit'], [
-            [name, _shown(value, network), UNITS.get(name, '')]
-            for name, value in values.items()], left=[0, 2]))
+    output.tell(args, Document('Components', '', (), [Table(['component', 'default', 'unit'], [
+        [name, _shown(value, network), UNITS.get(name, '')]
+        for name, value in values.items()], left=[0, 2])]), lambda: {
+            name: {'default': network.line_feedthrough if value is None else value,
+                   'unit': UNITS.get(name, '')} for name, value in values.items()})
 
 
 def _shown(value: object, network: PowerNetwork) -> str:
@@ -41,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the command."""
     check_outputs(args, 'report', **{'--network': args.network, '--from': args.recording})
     if args.list:
-        _list(args.json)
+        _list(args)
         return 0
     if args.throttle is None and args.recording is None:
         raise InputError('--throttle is missing: ou-monitor design --throttle 0.4 asks for 40 %, '

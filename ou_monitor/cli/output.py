@@ -7,7 +7,7 @@ Progress is a bar on a terminal, a line now and then elsewhere.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 import json
 import math
@@ -21,6 +21,7 @@ from typing import Any, TYPE_CHECKING
 from ou_monitor.errors import InputError
 
 if TYPE_CHECKING:
+    from ou_monitor.report.document import Document
     from ou_monitor.report.result import Result
 
 # Seconds between two lines without a terminal, and before the time left is estimated.
@@ -254,12 +255,20 @@ def deliver(args: argparse.Namespace, found: Result, command: str = '',
     if report is not None:
         from ou_monitor.report.page import html
         write_text(html(document), report)
-    if args.json is not None:
-        write_json(found.to_dict(), args.json)
+    tell(args, document, found.to_dict)
     if args.json != STDOUT:
-        from ou_monitor.report.terminal import terminal
-        say(terminal(document))
         summary(document.answer, **files, report=report, json=args.json)
+
+
+def tell(args: argparse.Namespace, document: Document,
+         data: Callable[[], Mapping[str, Any]]) -> None:
+    """Write what a command says to the terminal, and its data to the file of --json."""
+    from ou_monitor.report.terminal import terminal
+
+    if args.json is not None:
+        write_json(data(), args.json)
+    if args.json != STDOUT:
+        say(terminal(document))
 
 
 def summary(answer: Sequence[str], **files: object) -> None:

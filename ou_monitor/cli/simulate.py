@@ -11,7 +11,7 @@ from ou_monitor.cli.arguments import part_of_recording
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.model_file import as_yaml
-from ou_monitor.report import terminal
+from ou_monitor.report.document import Document, Table
 from ou_monitor.simulation import is_recording, PRESETS, PROFILES, Run
 
 # Endings of files that are no bag: a folder of such a name would surprise.
@@ -24,20 +24,17 @@ def run(args: argparse.Namespace) -> int:
     """Simulate."""
     if args.list:
         output.check_paths({}, {'--json': args.json}, args.force)
-        if args.json is not None:
-            output.write_json({
-                'presets': {name: {'throttle': p.throttle, 'rate_hz': p.rate,
-                                   'duration_s': p.duration, 'text': p.text}
-                            for name, p in PRESETS.items()},
-                'profiles': {name: text for name, (_, text) in PROFILES.items()}}, args.json)
-            if args.json == output.STDOUT:
-                return 0
-        output.say(terminal.table(['Preset', 'Throttle', 'Rate, Hz', 'Length, s', 'What it is'], [
-            [name, p.throttle, f'{p.rate:g}', f'{p.duration:g}', p.text]
-            for name, p in PRESETS.items()], left=[0, 1, 4]))
-        output.say(terminal.table(
-            ['Throttle profile', 'What it is'],
-            [[name, text] for name, (_, text) in PROFILES.items()], left=[0, 1]))
+        output.tell(args, Document('Presets', '', (), [
+            Table(['Preset', 'Throttle', 'Rate, Hz', 'Length, s', 'What it is'], [
+                [name, p.throttle, f'{p.rate:g}', f'{p.duration:g}', p.text]
+                for name, p in PRESETS.items()], left=[0, 1, 4]),
+            Table(['Throttle profile', 'What it is'],
+                  [[name, text] for name, (_, text) in PROFILES.items()], left=[0, 1])]),
+                    lambda: {
+            'presets': {name: {'throttle': p.throttle, 'rate_hz': p.rate,
+                               'duration_s': p.duration, 'text': p.text}
+                        for name, p in PRESETS.items()},
+            'profiles': {name: text for name, (_, text) in PROFILES.items()}})
         return 0
     # A profile by name or number is no file, and no output is taken for one.
     start, end = part_of_recording(args)
@@ -72,10 +69,8 @@ def run(args: argparse.Namespace) -> int:
         output.write_text(as_yaml(found.file), args.save_model)
     if args.output is None:
         return 0
-    if args.json is not None:
-        output.write_json(found.to_dict(), args.json)
-    if args.json != output.STDOUT:
-        output.say(found.document('').subject)
+    said = found.document('')
+    output.tell(args, Document(said.title, said.subject, (), ()), found.to_dict)
     return 0
 
 

@@ -29,8 +29,8 @@ def test_convert(log, tmp_path, capsys, name, kind):
     """The bag reads back, and what was mended is said."""
     out = tmp_path / name
     assert main(['convert', str(log), str(out), '--type', kind]) == 0
-    text = capsys.readouterr().out
-    assert '3 samples' in text and 'note: voltage_v, throttle: 1 sample dropped' in text
+    text = ' '.join(capsys.readouterr().out.split())
+    assert '3 samples' in text and '- voltage_v, throttle: 1 sample dropped' in text
     back = read_recording(out)
     np.testing.assert_allclose(back.t, [0.5, 0.6, 0.7], rtol=0, atol=1e-9)
     np.testing.assert_allclose(back.voltage, [5.0, 5.1, 5.3], rtol=1e-7)
@@ -126,7 +126,7 @@ def test_columns_of_a_csv(tmp_path, capsys):
     path = tmp_path / 'a.csv'
     path.write_text('time_s,bus,duty,amps,word\n0,5.0,0.1,2,x\n1,5.1,0.2,3,y\n2,5.2,0.3,4,z\n')
     assert main(['convert', str(path), '--list']) == 0
-    text = capsys.readouterr().out
+    text = ' '.join(capsys.readouterr().out.split())
     assert all(word in text for word in ('bus', 'duty', 'amps', "'word' does not hold numbers"))
     assert main(['convert', str(path), '--voltage', 'bus', str(tmp_path / 'b'), '--throttle',
                  'duty', '--current', 'amps']) == 0
