@@ -1,6 +1,8 @@
 """Which tests may run beside each other: files may, but all that starts ROS goes one by one."""
 
 import os
+from pathlib import Path
+import shutil
 import signal
 
 from hypothesis import HealthCheck, settings
@@ -15,9 +17,12 @@ settings.load_profile('suite')
 
 
 def pytest_configure():
-    """Let what the tests start hear Ctrl-C, as not below a background job, and share byte code."""
-    # Where a shell forbids it, each process compiles all that it imports anew.
-    os.environ.pop('PYTHONDONTWRITEBYTECODE', None)
+    """Let what the tests start hear Ctrl-C, which a background job does not; have no byte code."""
+    # A process whose files are limited, as by a full disk, leaves byte code that is cut short.
+    os.environ['PYTHONDONTWRITEBYTECODE'] = '1'
+    for folder in (Path(__file__).parents[1] / 'ou_monitor').rglob('__pycache__'):
+        # What an earlier run has left.
+        shutil.rmtree(folder, ignore_errors=True)
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
