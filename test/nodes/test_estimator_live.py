@@ -3,62 +3,28 @@
 import math
 import time
 
-from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray
-from live import ou_path, values_of, wait_until
+from live import Estimator, ou_path, wait_until
 import numpy as np
 import pytest
 from sensor_msgs.msg import BatteryState
-from std_msgs.msg import Bool, Float32, Float32MultiArray, Float64, String
+from std_msgs.msg import Float32, Float32MultiArray, Float64, String
 
 OK, WARN, STALE = b'\x00', b'\x01', b'\x03'
 DT = 0.001
 
 
-class Rig:
-    """An estimator in a namespace, fed with stamped messages; time is what their stamps say."""
+class Rig(Estimator):
+    """An estimator whose alpha is heard too; time is what the stamps of its samples say."""
 
-    def __init__(self, world, probe, namespace, *arguments):
-        self.namespace, self.probe = namespace, probe
-        self.node = f'/{namespace}/ou_estimator'
-        self.states = probe.listen(f'{self.node}/state', DiagnosticArray)
-        self.alpha = probe.listen(f'{self.node}/alpha', Float64)
-        self.flags = probe.listen(f'{self.node}/brownout', Bool)
-        self.process = world.start(
-            'estimator', '--ros-args', '-r', f'__ns:=/{namespace}', *arguments)
-        self.output = None
-        self.t = 1000.0
-
-    def connect(self, kind, topic='voltage'):
-        """Publish a type; wait until the estimator has subscribed."""
-        self.output = self.probe.publisher(f'/{self.namespace}/{topic}', kind, 1000)
-        wait_until(self.output.get_subscription_count, what='subscription')
+    def __init__(self, world, namespace, *arguments, probe=None):
+        super().__init__(world, namespace, *arguments, probe=probe)
+        self.alpha = self.probe.listen(f'{self.node}/alpha', Float64)
+        wait_until(lambda: self.states, what='first state')
 
     def feed(self, voltages, dt=DT, currents=None):
-        """Send stamped samples, dt apart; do not flood best effort."""
-        currents = [math.nan] * len(voltages) if currents is None else currents
-        for k, (voltage, current) in enumerate(zip(voltages, currents, strict=True)):
-            self.t += dt
-            seconds, nanoseconds = divmod(round(self.t * 1e9), 10**9)
-            self.last = voltage
-            message = BatteryState(voltage=voltage, current=current)
-            message.header.stamp = Time(sec=seconds, nanosec=nanoseconds)
-            self.output.publish(message)
-            if k % 20 == 19:
-                time.sleep(0.002)
-
-    @property
-    def status(self):
-        """Return the newest status."""
-        return self.states[-1].status[0]
-
-    def field(self, name):
-        """Return a field of the newest state."""
-        return values_of(self.status)[name]
-
-    def count(self, name):
-        """Return a counter of the newest state."""
-        return int(self.field(name))
+        """Remember the last one."""
+        self.last = voltages[-1]
+        super().feed(voltages, dt, currents)
 
     def catch_up(self):
         """Wait until what was sent is in the state, the last few lost ones allowed for."""
@@ -85,9 +51,7 @@ class Rig:
 def rigs(shared_world):
     """Give two estimators in namespaces, the first one fed."""
     probe = shared_world.probe()
-    made = [Rig(shared_world, probe, name) for name in ('a', 'b')]
-    for rig in made:
-        wait_until(lambda rig=rig: rig.states, what='first state')
+    made = [Rig(shared_world, name, probe=probe) for name in ('a', 'b')]
     made[0].connect(BatteryState)
     return made
 
@@ -234,8 +198,7 @@ def test_descriptors_tell_range_and_meaning(rig):
 
 def test_current_of_the_battery_gives_a_resistance(world):
     """16 V behind 20 mOhm, discharge negative: the level without load, though throttle is not."""
-    rig = Rig(world, world.probe(), 'current')
-    wait_until(lambda: rig.states)
+    rig = Rig(world, 'current')
     rig.connect(BatteryState)
     rng = np.random.default_rng(5)
     drawn = np.repeat(rng.uniform(5.0, 60.0, 40), 25)
@@ -253,8 +216,7 @@ def test_current_of_the_battery_gives_a_resistance(world):
 
 def test_slow_input_is_said_to_be_too_slow(world):
     """PX4's 1 Hz cannot carry alpha = 63 1/s: a warning, not a number."""
-    rig = Rig(world, world.probe(), 'slow', '-p', 'window:=60.0')
-    wait_until(lambda: rig.states)
+    rig = Rig(world, 'slow', '-p', 'window:=60.0')
     rig.connect(BatteryState)
     rig.feed(ou_path(60, 1.0, seed=8), dt=1.0)
     wait_until(lambda: rig.count('n') >= 55)
@@ -264,8 +226,7 @@ def test_slow_input_is_said_to_be_too_slow(world):
 
 def test_a_type_nobody_knows_is_named(world):
     """And so is what to do; the right type is taken when it comes."""
-    rig = Rig(world, world.probe(), 'odd')
-    wait_until(lambda: rig.states)
+    rig = Rig(world, 'odd')
     odd = rig.probe.publisher('/odd/voltage', String)
     wait_until(lambda: 'std_msgs/msg/String' in rig.status.message, what='complaint')
     assert 'voltage.type' in rig.status.message
@@ -280,8 +241,7 @@ def test_a_type_nobody_knows_is_named(world):
 def test_another_type_than_configured_is_named(world):
     """DDS would drop it without a word."""
     probe = world.probe()
-    rig = Rig(world, probe, 'c', '-p', 'msg_config:=std_float32')
-    wait_until(lambda: rig.states)
+    rig = Rig(world, 'c', '-p', 'msg_config:=std_float32', probe=probe)
     keep = probe.publisher('/c/voltage', Float64)
     wait_until(lambda: 'expects std_msgs/msg/Float32' in rig.status.message, what='complaint')
     assert keep and rig.status.level == b'\x02'
@@ -289,8 +249,7 @@ def test_another_type_than_configured_is_named(world):
 
 def test_blocks_of_adc_samples(world):
     """Blocks of 100 at 10 kHz without a stamp: every sample counts, sigma is the truth."""
-    rig = Rig(world, world.probe(), 'adc')
-    wait_until(lambda: rig.states)
+    rig = Rig(world, 'adc')
     throttle = rig.probe.publisher('/adc/throttle', Float32)
     wait_until(throttle.get_subscription_count)
     # The throttle is there before the voltage: the node waits on.

@@ -1,20 +1,17 @@
 """The flag of a real estimator: floor, latch and its service, parameters, model file."""
 
 import math
-import time
 
-from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray
-from live import ou_path, refusal, values_of, wait_until
+from live import Estimator, ou_path, refusal, wait_until
 from ou_monitor.nodes.estimator_node import EstimatorNode
 import pytest
 from rcl_interfaces.srv import GetParameters
 from sensor_msgs.msg import BatteryState
-from std_msgs.msg import Bool, Float64
+from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
 ERROR, STALE = b'\x02', b'\x03'
-DT, DT_NS = 0.002, 2_000_000
+DT = 0.002
 MODEL = """\
 model:
 - term: ou
@@ -24,39 +21,17 @@ model:
 """
 
 
-class Rig:
-    """An estimator in a namespace, fed with stamped messages."""
+class Rig(Estimator):
+    """An estimator whose throttle budget is heard too."""
 
-    def __init__(self, world, namespace, *arguments):
-        self.probe = world.probe()
-        self.node = f'/{namespace}/ou_estimator'
-        self.states = self.probe.listen(f'{self.node}/state', DiagnosticArray)
-        self.flags = self.probe.listen(f'{self.node}/brownout', Bool)
+    def __init__(self, world, namespace):
+        super().__init__(world, namespace)
         self.budgets = self.probe.listen(f'{self.node}/throttle_budget', Float64)
-        self.process = world.start(
-            'estimator', '--ros-args', '-r', f'__ns:=/{namespace}', *arguments)
-        self.output = self.probe.publisher(f'/{namespace}/voltage', BatteryState, 1000)
-        wait_until(lambda: self.output.get_subscription_count() and self.states, what='its input')
-        self.ns = 1000 * 10**9
+        self.connect(BatteryState)
 
     def feed(self, voltages):
-        """Send stamped samples; do not flood best effort."""
-        for k, voltage in enumerate(voltages):
-            self.ns += DT_NS
-            message = BatteryState(voltage=voltage)
-            message.header.stamp = Time(sec=self.ns // 10**9, nanosec=self.ns % 10**9)
-            self.output.publish(message)
-            if k % 20 == 19:
-                time.sleep(0.002)
-
-    @property
-    def status(self):
-        """Return the newest status."""
-        return self.states[-1].status[0]
-
-    def field(self, name):
-        """Return a field of the newest state."""
-        return values_of(self.status)[name]
+        """Send samples 2 ms apart."""
+        super().feed(voltages, DT)
 
     def wait_level(self, level):
         """Wait until the flag has a level."""

@@ -10,44 +10,32 @@ import sys
 import threading
 import time
 
-from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
-from live import memory_of, ou_path, ROOT, Starved, unused_domain, values_of, wait_until
+from live import Estimator, memory_of, ou_path, ROOT, Starved, unused_domain, values_of, wait_until
 import pytest
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import BatteryState
-from std_msgs.msg import Bool, Float64
 from std_srvs.srv import Trigger
 
 ERROR, STALE = b'\x02', b'\x03'
 FLOOD = ROOT / 'test/support/flood.py'
 
 
-class Rig:
-    """An estimator in a namespace; stamps are what the test says."""
+class Rig(Estimator):
+    """An estimator, and when its states came; stamps are what the test says."""
 
-    def __init__(self, world, namespace, *arguments, kind=BatteryState):
-        self.probe, self.node = world.probe(), f'/{namespace}/ou_estimator'
+    def __init__(self, world, namespace, *arguments):
+        super().__init__(world, namespace, *arguments)
         self.times = []
-        self.states = self.probe.listen(f'{self.node}/state', DiagnosticArray)
         self.probe.node.create_subscription(
             DiagnosticArray, f'{self.node}/state',
             lambda message: self.times.append(time.monotonic()), 100)
-        self.flags = self.probe.listen(f'{self.node}/brownout', Bool)
-        self.process = world.start(
-            'estimator', '--ros-args', '-r', f'__ns:=/{namespace}', *arguments)
-        self.output = self.probe.publisher(f'/{namespace}/voltage', kind, 1000)
-        wait_until(lambda: self.output.get_subscription_count() or namespace == 'load',
-                   what='its input')
-        wait_until(lambda: self.states, what='a state')
-
-    def send(self, voltage, stamp, output=None):
-        """Send one sample with a stamp, s."""
-        whole = int(stamp)
-        message = BatteryState(voltage=voltage)
-        message.header.stamp = Time(sec=whole, nanosec=int((stamp - whole) * 1e9))
-        (output or self.output).publish(message)
+        if namespace == 'load':
+            # Its samples come from another process.
+            wait_until(lambda: self.states, what='a state')
+        else:
+            self.connect(BatteryState)
 
     def live(self, voltages, dt=0.002, stamp=time.time):
         """Send samples as they are taken, in real time."""
@@ -55,15 +43,6 @@ class Rig:
         for k, voltage in enumerate(voltages):
             time.sleep(max(start + dt * k - time.monotonic(), 0.0))
             self.send(voltage, stamp())
-
-    @property
-    def status(self):
-        """Return the newest status."""
-        return self.states[-1].status[0]
-
-    def field(self, name):
-        """Return a field of the newest state."""
-        return values_of(self.status)[name]
 
 
 @pytest.fixture(scope='module')
@@ -331,7 +310,7 @@ def test_overload_mutes_nothing(world, rate):
     States keep coming, two dips of 50 ms are flagged, losses are counted, memory is bounded, and
     SIGINT ends it.  The longest silence allowed: 2 s, and what this machine itself pauses.
     """
-    rig = Rig(world, 'load', '-p', 'brownout.hold:=1.0', kind=Float64)
+    rig = Rig(world, 'load', '-p', 'brownout.hold:=1.0')
     pid = rig.process.popen.pid
     starved = Starved(pid)
     env = {**os.environ, 'ROS_DOMAIN_ID': str(world.domain)}

@@ -350,6 +350,61 @@ class World:
             assert 'Traceback' not in process.err, process.err
 
 
+class Estimator:
+    """An estimator in a namespace: what it says, and stamped messages into it."""
+
+    def __init__(self, world: World, namespace: str, *arguments: str,
+                 probe: Probe | None = None) -> None:
+        from diagnostic_msgs.msg import DiagnosticArray
+        from std_msgs.msg import Bool
+        self.namespace, self.probe = namespace, probe or world.probe()
+        self.node = f'/{namespace}/ou_estimator'
+        self.states = self.probe.listen(f'{self.node}/state', DiagnosticArray)
+        self.flags = self.probe.listen(f'{self.node}/brownout', Bool)
+        self.process = world.start(
+            'estimator', '--ros-args', '-r', f'__ns:=/{namespace}', *arguments)
+        self.output: Any = None
+        # Stamp of the newest sample that `feed` has sent, s.
+        self.t = 1000.0
+
+    def connect(self, kind: Any) -> None:
+        """Publish a type; wait until the estimator has subscribed and says something."""
+        self.output = self.probe.publisher(f'/{self.namespace}/voltage', kind, 1000)
+        wait_until(lambda: self.output.get_subscription_count() and self.states, what='its input')
+
+    def send(self, voltage: float, stamp: float, output: Any = None,
+             current: float = math.nan) -> None:
+        """Send one BatteryState with a stamp, s."""
+        from builtin_interfaces.msg import Time
+        from sensor_msgs.msg import BatteryState
+        whole, rest = divmod(round(stamp * 1e9), 10**9)
+        message = BatteryState(voltage=voltage, current=current)
+        message.header.stamp = Time(sec=whole, nanosec=rest)
+        (output or self.output).publish(message)
+
+    def feed(self, voltages: list[float], dt: float = 0.001,
+             currents: list[float] | None = None) -> None:
+        """Send stamped samples, dt apart; do not flood best effort."""
+        for k, voltage in enumerate(voltages):
+            self.t += dt
+            self.send(voltage, self.t, current=math.nan if currents is None else currents[k])
+            if k % 20 == 19:
+                time.sleep(0.002)
+
+    @property
+    def status(self) -> Any:
+        """Return the newest status."""
+        return self.states[-1].status[0]
+
+    def field(self, name: str) -> str:
+        """Return a field of the newest state."""
+        return values_of(self.status)[name]
+
+    def count(self, name: str) -> int:
+        """Return a counter of the newest state."""
+        return int(self.field(name))
+
+
 def refusal(make: Callable[[], Any], *arguments: object) -> str:
     """Return why what `make` makes in this process, under ROS arguments, is refused."""
     from ou_monitor.errors import InputError
