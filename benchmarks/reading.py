@@ -33,7 +33,7 @@ from ou_monitor.recordings.bag_samples import choose  # noqa: E402
 from ou_monitor.recordings.cdr import join  # noqa: E402
 from ou_monitor.recordings.read import read_recording  # noqa: E402
 from ou_monitor.recordings.standard_types import (  # noqa: E402
-    BATTERY_STATE, encode_battery, encode_block, encode_scalars, FLOAT32, FLOAT32_ARRAY, SCHEMAS)
+    BATTERY_STATE, encode_battery, encode_blocks, encode_scalars, FLOAT32, FLOAT32_ARRAY, SCHEMAS)
 from ou_monitor.records import Recording  # noqa: E402
 from rosbags.highlevel import AnyReader  # noqa: E402
 from rosbags.typesys import get_typestore, Stores  # noqa: E402
@@ -117,7 +117,7 @@ def messages(case: Case, count: int) -> list[tuple[str, int, bytes]]:
     times = START + np.arange(1, count + 1) * (10_000_000 if case.block else 1_000_000)
     values = rng.normal(5.0, 0.1, count)
     if case.block:
-        voltage = [encode_block(row) for row in rng.normal(5.0, 0.1, (count, BLOCK))]
+        voltage = encode_blocks(rng.normal(5.0, 0.1, (count, BLOCK)))
     elif case.type == IMU:
         voltage = list(_imu(times, values))
     elif case.type == BATTERY_STATE:
@@ -293,7 +293,7 @@ def memory(given: argparse.Namespace, folder: Path) -> str:
     """Peak memory of a process that reads a long bag."""
     path = folder / 'long.mcap'
     rng = np.random.default_rng(1)
-    blocks = [encode_block(row) for row in rng.normal(5.0, 0.1, (997, BLOCK))]
+    blocks = encode_blocks(rng.normal(5.0, 0.1, (997, BLOCK)))
     with BagWriter(path) as bag:
         bag.add_topic('voltage', FLOAT32_ARRAY, sample_rate=10_000.0)
         bag.add_topic('throttle', FLOAT32)

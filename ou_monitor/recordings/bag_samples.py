@@ -24,7 +24,7 @@ from ou_monitor.records import Defect, defect_of, FloatArray, Note
 from ou_monitor.stream.config import FieldSpec, list_msg_configs, load_msg_config, MsgConfig
 from ou_monitor.stream.samples import BlockClock, ThrottleHold
 from ou_monitor.text import counted, printable, some
-from ou_monitor.timeline.line import MOST_CURRENT, MOST_THROTTLE, plausible
+from ou_monitor.timeline.line import check_throttle
 
 
 @dataclass(frozen=True)
@@ -187,33 +187,6 @@ def _throttle(
 
 
 VOLTAGE, THROTTLE, CURRENT = 'voltage', 'throttle', 'current'
-# Share of implausible throttles up to which they count as errors of single samples.
-_WILD = 0.05
-
-
-def check_throttle(name: str, throttle: FloatArray, voltage: FloatArray | None = None) -> None:
-    """Refuse a throttle in percent, microseconds or counts, or swapped with the voltage."""
-    if plausible(throttle, MOST_THROTTLE) is throttle:
-        return
-    known = throttle[np.isfinite(throttle)]
-    # A few wild values are errors, not another unit: they become NaN, here as in the node.
-    if float(np.count_nonzero(np.abs(known) > MOST_THROTTLE)) <= _WILD * known.size:
-        return
-    if voltage is not None and float(np.nanmax(np.abs(voltage), initial=0.0)) <= 1.0 \
-            and float(np.median(known)) < 100.0:
-        raise InputError(
-            f'{name}: the voltage stays within 0 to 1 and throttle runs from '
-            f'{known.min():g} to {known.max():g}: are the two columns swapped?')
-    raise InputError(
-        f'{name}: throttle runs from {known.min():g} to {known.max():g}, and 0 to 1 is '
-        'expected: divide a percentage by 100 (of a bag: unit_factor of a msg config), turn '
-        'a pulse of w microseconds into (w - 1000) / 1000')
-
-
-def known_current(current: FloatArray | None) -> FloatArray | None:
-    """Return a current with NaN for implausible values; None if all are."""
-    known = None if current is None else plausible(current, MOST_CURRENT)
-    return None if known is None or np.isnan(known).all() else known
 
 
 def span_words(start: float | None, end: float | None) -> str:

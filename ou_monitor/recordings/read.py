@@ -12,12 +12,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 import math
 from pathlib import Path
+from typing import TypedDict, Unpack
 
 import numpy as np
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.bag import BagReader, batches
-from ou_monitor.recordings.bag_samples import (
-    check_throttle, known_current, outside_words, part_words, read_bag)
+from ou_monitor.recordings.bag_samples import outside_words, part_words, read_bag
 from ou_monitor.recordings.cdr import Field, join, short_name
 from ou_monitor.recordings.importers.choose import (
     choose as choose_series, columns_of, NONE, signal_of)
@@ -29,7 +29,8 @@ from ou_monitor.recordings.standard_types import IMU
 from ou_monitor.records import defect_of, Recording
 from ou_monitor.stream.config import FieldSpec
 from ou_monitor.timeline.line import (
-    in_order, MOST_THROTTLE, MOST_VOLTAGE, part_of, plausible, plausible_samples, readings_of)
+    check_throttle, in_order, MOST_CURRENT, MOST_THROTTLE, MOST_VOLTAGE, part_of, plausible,
+    plausible_samples, readings_of)
 
 # Spacing, s, from which another unit of time is more likely than a slow logger.
 _SPARSE = 5.0
@@ -87,61 +88,70 @@ def read_recording(
 
     """
     return readings_of(_read(
-        Path(path), msg_config=msg_config, voltage_topic=voltage_topic,
-        throttle_topic=throttle_topic, partial=partial, start=start, end=end, flight=flight,
-        columns=columns, progress=progress))
+        Path(path), Options(
+            msg_config=msg_config, voltage_topic=voltage_topic, throttle_topic=throttle_topic,
+            partial=partial, start=start, end=end, flight=flight, columns=columns,
+            progress=progress))[0])
 
 
-def _read(
-    path: Path, *, msg_config: str | Path | None, voltage_topic: str | None,
-    throttle_topic: str | None, partial: bool, start: float | None, end: float | None,
-    flight: int | None, columns: CsvColumns | None, progress: Callable[[float], None] | None,
-) -> Recording:
-    """Read a recording with the repeats of its logger."""
+class Options(TypedDict, total=False):
+    """Options of `read_recording`."""
+
+    msg_config: str | Path | None
+    voltage_topic: str | None
+    throttle_topic: str | None
+    partial: bool
+    start: float | None
+    end: float | None
+    flight: int | None
+    columns: CsvColumns | None
+    progress: Callable[[float], None] | None
+
+
+def _read(path: Path, options: Options, signal: str | None = None) -> tuple[Recording, Log | None]:
+    """Read a recording with the repeats of its logger, and a log with a signal by name."""
+    start, end, columns = (options.get('start'), options.get('end'), options.get('columns'))
+    flight = options.get('flight')
     _check_part(start, end)
-    topics = {'--msg-config': msg_config, '--voltage-topic': voltage_topic,
-              '--throttle-topic': throttle_topic}
-    if is_csv(path):
-        _refuse_topics(path, 'a CSV', topics)
+    csv, log = is_csv(path), is_log(path)
+    for option in ('msg_config', 'voltage_topic', 'throttle_topic'):
+        if (csv or log) and options.get(option) is not None:
+            raise InputError(f"{path} is a {'CSV' if csv else 'log'}: "
+                             f"--{option.replace('_', '-')} is for bags")
+    if csv:
         if flight is not None:
             raise InputError(f'{path} is a CSV: --flight is for logs')
-        return _cut(tidy(read_csv(path, columns)), start, end)
-    if is_log(path):
-        _refuse_topics(path, 'a log', topics)
-        return _of_log(path, frozenset(), columns, flight, start, end, progress)[0]
+        return _cut(tidy(read_csv(path, columns)), start, end), None
+    if log:
+        recording, whole = _of_log(path, signal, columns, flight, options.get('progress'))
+        return _cut(recording, start, end), whole
     if flight is not None or columns is not None:
         raise InputError(f'{path} is a bag: --flight is for logs, names and units of columns are '
                          'for logs and CSVs')
     return tidy(read_bag(
-        BagReader(path, partial=partial), msg_config=msg_config, voltage_topic=voltage_topic,
-        throttle_topic=throttle_topic, start=start, end=end, progress=progress))
+        BagReader(path, partial=options.get('partial', False)),
+        msg_config=options.get('msg_config'), voltage_topic=options.get('voltage_topic'),
+        throttle_topic=options.get('throttle_topic'), start=start, end=end,
+        progress=options.get('progress'))), None
 
 
-def _refuse_topics(path: Path, kind: str, topics: Mapping[str, object]) -> None:
-    """Refuse options that choose among the topics of a bag."""
-    for option, value in topics.items():
-        if value is not None:
-            raise InputError(f'{path} is {kind}: {option} is for bags')
-
-
-def _of_log(path: Path, names: frozenset[str], columns: CsvColumns | None, flight: int | None,
-            start: float | None, end: float | None,
+def _of_log(path: Path, signal: str | None, columns: CsvColumns | None, flight: int | None,
             progress: Callable[[float], None] | None) -> tuple[Recording, Log]:
-    """Read the supply of a log; return also the log with the named series."""
+    """Read the supply of a log; return also the log, with a signal by name."""
     named = columns or CsvColumns()
     if named != CsvColumns(voltage=named.voltage, throttle=named.throttle,
                            current=named.current):
         raise InputError(f'{path} is a log: its time and units are known')
-    wanted = (name for name in (named.voltage, named.throttle, named.current)
+    wanted = (name for name in (named.voltage, named.throttle, named.current, signal)
               if name is not None)
-    log = import_log(path, Request(flight, names.union(wanted), progress=progress))
+    log = import_log(path, Request(flight, frozenset(wanted), progress=progress))
     chosen = choose_series(path, log, voltage=named.voltage, throttle=named.throttle,
                            current=named.current, option='--{}-column')
     whole = tidy(columns_of(path, log, chosen))
     if chosen.throttle is None and named.throttle != NONE:
         whole = replace(whole, notes=(*whole.notes, 'The throttle is unknown: the log holds '
                                                     'none (--throttle-column NAME).'))
-    return _cut(whole, start, end), log
+    return whole, log
 
 
 def tidy(raw: RawColumns) -> Recording:
@@ -162,8 +172,9 @@ def tidy(raw: RawColumns) -> Recording:
             spacing := float(np.median(np.diff(t)))) >= _SPARSE:
         notes.append(f'The samples are {spacing:.4g} s apart: is the time in ms, us or ns? '
                      'Give --time-unit for a CSV.')
+    current = None if raw.current is None else plausible(raw.current[which], MOST_CURRENT)
     return Recording(t, raw.voltage[which], throttle[which], name, raw.source, tuple(notes),
-                     known_current(None if raw.current is None else raw.current[which]))
+                     None if current is None or np.isnan(current).all() else current)
 
 
 def _unusable(name: str, notes: Sequence[str]) -> str:
@@ -192,12 +203,8 @@ def _cut(recording: Recording, start: float | None, end: float | None) -> Record
     return part_of(recording, part, part_words(start, end))
 
 
-def read_beside(
-    path: str | Path, signal: str, *, msg_config: str | Path | None = None,
-    voltage_topic: str | None = None, throttle_topic: str | None = None, partial: bool = False,
-    start: float | None = None, end: float | None = None, flight: int | None = None,
-    columns: CsvColumns | None = None, progress: Callable[[float], None] | None = None,
-) -> tuple[Recording, Series]:
+def read_beside(path: str | Path, signal: str, **options: Unpack[Options],
+                ) -> tuple[Recording, Series]:
     """
     Read a recording, and one whole scalar beside it; options as for `read_recording`.
 
@@ -205,19 +212,12 @@ def read_beside(
     `readings_of`).  A log is read once.
     """
     path = Path(path)
-    if is_log(path):
-        _check_part(start, end)
-        _refuse_topics(path, 'a log', {
-            '--msg-config': msg_config, '--voltage-topic': voltage_topic,
-            '--throttle-topic': throttle_topic})
-        recording, log = _of_log(path, frozenset((signal,)), columns, flight, start, end,
-                                 progress)
-        series, said = signal_of(path, log, signal)
-        return replace(recording, notes=(*recording.notes, *said)), series
-    recording = _read(
-        path, msg_config=msg_config, voltage_topic=voltage_topic, throttle_topic=throttle_topic,
-        partial=partial, start=start, end=end, flight=flight, columns=columns, progress=progress)
-    return recording, read_signal(path, signal, partial=partial, columns=columns)
+    recording, log = _read(path, options, signal)
+    if log is None:
+        return recording, read_signal(path, signal, partial=options.get('partial', False),
+                                      columns=options.get('columns'))
+    series, said = signal_of(path, log, signal)
+    return replace(recording, notes=(*recording.notes, *said)), series
 
 
 def read_signal(path: str | Path, signal: str, *, partial: bool = False,

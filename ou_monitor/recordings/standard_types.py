@@ -239,8 +239,3 @@ def encode_blocks(samples: npt.NDArray[np.float64]) -> list[bytes]:
     n = samples.shape[1]
     return _encode(FLOAT32_ARRAY, {'data': samples}, data=[0.0] * n, layout={
         'dim': [{'label': 'samples', 'size': n, 'stride': n}]})
-
-
-def encode_block(samples: npt.ArrayLike) -> bytes:
-    """Return one block of samples."""
-    return encode_blocks(np.asarray(samples)[None])[0]

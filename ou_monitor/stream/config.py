@@ -7,8 +7,8 @@ file and no code.  An error in a file is one line with the file, the key and the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields, MISSING
 import math
 from pathlib import Path
 import re
@@ -80,7 +80,7 @@ class MsgConfig:
     # Where the voltage is, V.
     voltage: FieldSpec
     # Where the throttle is, 0..1.
-    throttle: FieldSpec | None
+    throttle: FieldSpec | None = None
     # Where the current drawn is, A, in the messages of the voltage.
     current: FieldSpec | None = None
     # Where the speeds of the motors are, 1/min of the shaft unless `notch.rpm_unit` says
@@ -88,24 +88,13 @@ class MsgConfig:
     rpm: FieldSpec | None = None
 
 
-# Accepted YAML types of each key of FieldSpec and MsgConfig, and a word for them.
-_NUMBER = ((int, float), 'a number')
-_TEXT = ((str,), 'text')
-_FIELD_KINDS: dict[str, tuple[tuple[type, ...], str]] = {
-    'topic': _TEXT, 'type': _TEXT, 'field': _TEXT, 'unit_factor': _NUMBER,
-    'sign': ((int,), '1 or -1'), 'offset': _NUMBER, 'nan': _TEXT, 'zero': _TEXT,
-    'sample_rate': ((int, float, type(None)), 'a number or null'),
-    'stamp_field': ((str, type(None)), 'text or null'), 'stamp_factor': _NUMBER,
-}
-_CONFIG_KINDS: dict[str, tuple[tuple[type, ...], str]] = {
-    'description': _TEXT, 'package': _TEXT, 'install': _TEXT,
-    'generic': ((bool,), 'true or false'), 'voltage': ((dict,), 'a group of keys'),
-    'throttle': ((dict, type(None)), 'a group of keys or null'),
-    'current': ((dict, type(None)), 'a group of keys or null'),
-    'rpm': ((dict, type(None)), 'a group of keys or null'),
-}
-_FIELD_NEEDED = ('topic', 'type', 'field')
-_CONFIG_NEEDED = ('description', 'package', 'install', 'generic', 'voltage')
+# Annotation of a record's field -> accepted YAML types, and a word for them.
+_KINDS: dict[str, tuple[tuple[type, ...], str]] = {
+    'str': ((str,), 'text'), 'str | None': ((str, type(None)), 'text or null'),
+    'float': ((int, float), 'a number'),
+    'float | None': ((int, float, type(None)), 'a number or null'), 'int': ((int,), '1 or -1'),
+    'bool': ((bool,), 'true or false'), 'FieldSpec': ((dict,), 'a group of keys'),
+    'FieldSpec | None': ((dict, type(None)), 'a group of keys or null')}
 
 
 def parse_field_path(path: str) -> FieldPath:
@@ -179,7 +168,7 @@ def _load(path: Path) -> MsgConfig:
     content = read_yaml(path, 'msg config')
     where = path_words(path)
     with one_line():
-        top = _checked(content, _CONFIG_KINDS, _CONFIG_NEEDED, where)
+        top = _checked(content, MsgConfig, where)
         throttle, current, rpm = (top.get(key) for key in ('throttle', 'current', 'rpm'))
         if current is not None:
             # The current comes from the messages of the voltage, with their stamps.
@@ -195,20 +184,19 @@ def _load(path: Path) -> MsgConfig:
             rpm=None if rpm is None else _field_spec(rpm, f'{where}: rpm', parse_each_path))
 
 
-def _checked(
-    content: Any, kinds: Mapping[str, tuple[tuple[type, ...], str]],
-    needed: tuple[str, ...], where: str,
-) -> dict[str, Any]:
-    """Return the group of keys; InputError names the first wrong one."""
+def _checked(content: Any, record: type, where: str) -> dict[str, Any]:
+    """Return the keys of a record; InputError names the first wrong one."""
+    # The name is the file's.
+    known = {one.name: one for one in fields(record) if one.name != 'name'}
     if not isinstance(content, dict):
-        raise InputError(f"{where}: expected keys ({', '.join(kinds)}), found none")
+        raise InputError(f"{where}: expected keys ({', '.join(known)}), found none")
     for key, value in content.items():
-        if key not in kinds:
+        if key not in known:
             shown = printable(key, 60)
             # Do not quote keys of a file that is probably no msg config.
-            name = '' if closest(shown, kinds) is None else f" '{shown}'"
-            raise InputError(f'{where}: unknown key{name}: {nearest(shown, kinds)}')
-        accepted, word = kinds[key]
+            name = '' if closest(shown, known) is None else f" '{shown}'"
+            raise InputError(f'{where}: unknown key{name}: {nearest(shown, known)}')
+        accepted, word = _KINDS[str(known[key].type)]
         # In Python true is an int; in YAML it is not a number.
         wrong_bool = isinstance(value, bool) and bool not in accepted
         if wrong_bool or not isinstance(value, accepted):
@@ -218,15 +206,15 @@ def _checked(
                 hint = ' (a number with an exponent needs a point: 1.0e-3)'
             raise InputError(f"{where}: '{key}' must be {word}, found "
                              f'{printable(repr(value), 60)}{hint}')
-    for key in needed:
-        if key not in content:
+    for key, one in known.items():
+        if one.default is MISSING and key not in content:
             raise InputError(f"{where}: key '{key}' is missing")
     return content
 
 
 def _field_spec(content: Any, where: str,
                 parse: Callable[[str], object] = parse_field_path) -> FieldSpec:
-    group = _checked(content, _FIELD_KINDS, _FIELD_NEEDED, where)
+    group = _checked(content, FieldSpec, where)
     for key in ('unit_factor', 'offset', 'sample_rate', 'stamp_factor'):
         if group.get(key) is not None:
             group[key] = float(group[key])

@@ -321,6 +321,8 @@ MOST_VOLTAGE = 1.0e6
 MOST_CURRENT = 1.0e6
 # Largest magnitude accepted as a throttle of 0..1, with generous ends.
 MOST_THROTTLE = 2.0
+# Share of implausible throttles up to which they count as errors of single samples.
+WILD = 0.05
 # Buffer size, samples: NumPy's overhead per call vanishes, and the buffer stays in the cache.
 BATCH = 32768
 # Search for repeats: samples used, minimum number, new samples between two searches.
@@ -338,6 +340,25 @@ def plausible(values: FloatArray, most: float) -> FloatArray:
     # NaN is not beyond, and stays.
     beyond = (values > most) | (values < -most)
     return np.where(beyond, NAN, values) if beyond.any() else values
+
+
+def check_throttle(name: str, throttle: FloatArray, voltage: FloatArray | None = None) -> None:
+    """Refuse a throttle in percent, microseconds or counts, or swapped with the voltage."""
+    if plausible(throttle, MOST_THROTTLE) is throttle:
+        return
+    known = throttle[np.isfinite(throttle)]
+    # A few wild values are errors, not another unit: they become NaN, here as in the node.
+    if float(np.count_nonzero(np.abs(known) > MOST_THROTTLE)) <= WILD * known.size:
+        return
+    if voltage is not None and float(np.nanmax(np.abs(voltage), initial=0.0)) <= 1.0 \
+            and float(np.median(known)) < 100.0:
+        raise InputError(
+            f'{name}: the voltage stays within 0 to 1 and throttle runs from '
+            f'{known.min():g} to {known.max():g}: are the two columns swapped?')
+    raise InputError(
+        f'{name}: throttle runs from {known.min():g} to {known.max():g}, and 0 to 1 is '
+        'expected: divide a percentage by 100 (of a bag: unit_factor of a msg config), turn '
+        'a pulse of w microseconds into (w - 1000) / 1000')
 
 
 def hold(values: FloatArray) -> FloatArray:

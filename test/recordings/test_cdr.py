@@ -4,7 +4,7 @@ import itertools
 import re
 
 from hypothesis import given, settings, strategies as st
-from made_bags import decode, encode
+from made_bags import decode, encode, encode_block
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings import standard_types as cdr
@@ -307,7 +307,7 @@ def test_blocks_of_any_layout_and_length(labels):
     """Dimensions are passed over; blocks of unequal length stay in order."""
     messages = []
     for n in (3, 0, 3, 5, 5, 1):
-        message = STORE.deserialize_cdr(cdr.encode_block(np.arange(n) + len(messages)),
+        message = STORE.deserialize_cdr(encode_block(np.arange(n) + len(messages)),
                                         cdr.FLOAT32_ARRAY)
         dim = message.layout.dim[0]
         message.layout.dim = [type(dim)(label, 2, 2) for label in labels]
@@ -319,7 +319,7 @@ def test_blocks_of_any_layout_and_length(labels):
 
 def test_in_time_order_keeps_what_belongs_together():
     """Blocks move as a whole; those of one time stay as they are."""
-    messages = [cdr.encode_block([float(k)] * n) for k, n in enumerate((2, 1, 3, 0, 2))]
+    messages = [encode_block([float(k)] * n) for k, n in enumerate((2, 1, 3, 0, 2))]
     spec = FieldSpec('/v', cdr.FLOAT32_ARRAY, 'data', sample_rate=10.0)
     column = read_all(spec, messages, [30, 10, 10, 5, 20])[0].in_time_order()
     assert column.counts.tolist() == [0, 1, 3, 2, 2]

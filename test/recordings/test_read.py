@@ -2,14 +2,14 @@
 
 import tracemalloc
 
-from made_bags import encode
+from made_bags import encode, encode_block
 from mcap.writer import Writer
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.bag import BagWriter
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.recordings.standard_types import (
-    BATTERY_STATE, encode_battery, encode_block, encode_scalars, FLOAT32, FLOAT32_ARRAY, FLOAT64,
+    BATTERY_STATE, encode_battery, encode_scalars, FLOAT32, FLOAT32_ARRAY, FLOAT64,
     SCHEMAS)
 import pytest
 from rosbags.typesys import get_typestore, Stores

@@ -9,7 +9,8 @@ from mcap.writer import CompressionType, IndexType, Writer
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 import numpy as np
 from ou_monitor.recordings.mcap_file import MAGIC
-from ou_monitor.recordings.standard_types import encode_scalars, FLOAT32, FLOAT64, SCHEMAS
+from ou_monitor.recordings.standard_types import (
+    encode_blocks, encode_scalars, FLOAT32, FLOAT64, SCHEMAS)
 
 START = 1_704_067_200_000_000_000
 MS = 1_000_000
@@ -53,6 +54,11 @@ def encode(kind, content, text=None):
 def decode(kind, data, text=None):
     """Return a message as an object, as the library reads it."""
     return _way(generate_dynamic, kind, text)(data)
+
+
+def encode_block(samples):
+    """Return one block of samples."""
+    return encode_blocks(np.asarray(samples, dtype=float)[None])[0]
 
 
 def supply(count=COUNT):

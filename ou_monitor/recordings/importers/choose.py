@@ -17,12 +17,12 @@ import re
 
 import numpy as np
 from ou_monitor.errors import InputError, nearest
-from ou_monitor.recordings.bag_samples import check_throttle
 from ou_monitor.recordings.importers.log import (
     ANY, clean, CURRENT, FORCE, Log, Motion, RATE, RawColumns, Series, SIGNAL, sound, THROTTLE,
     UNKNOWN, VELOCITY, VOLTAGE)
 from ou_monitor.records import Defect, FloatArray, led, Note
 from ou_monitor.text import counted, printable
+from ou_monitor.timeline.line import check_throttle
 
 # What leaves a quantity out.
 NONE = 'none'
@@ -99,17 +99,14 @@ def columns_of(path: Path, log: Log, chosen: Chosen) -> RawColumns:
             # A value holds until the next one.
             place = np.searchsorted(_in_a_bag(one.t), t, 'right')
             held[one.quantity] = np.append(np.nan, _single(one.values))[place]
-    taken = {quantity: one for quantity, one in (
-        (VOLTAGE, volts), (THROTTLE, chosen.throttle), (CURRENT, chosen.current))
-        if one is not None}
+    taken = {VOLTAGE: volts.name} | (
+        {} if chosen.throttle is None else {THROTTLE: chosen.throttle.name})
     unknown = np.full(volts.n, np.nan)
     return RawColumns(
         t, _single(volts.values), held.get(THROTTLE, unknown), held.get(CURRENT, unknown),
         printable(path.name),
-        {'file': printable(path.name), 'format': log.format,
-         **{quantity: one.name for quantity, one in taken.items() if quantity != CURRENT},
-         **log.facts},
-        (*log.notes, *chosen.notes), {quantity: one.scale for quantity, one in taken.items()})
+        {'file': printable(path.name), 'format': log.format, **taken, **log.facts},
+        (*log.notes, *chosen.notes))
 
 
 def _in_a_bag(t: FloatArray) -> FloatArray:

@@ -31,7 +31,7 @@ from ou_monitor.recordings.importers.log import (
 from ou_monitor.records import (
     clock_unit, Defect, FloatArray, LONGEST_STEP, Note, TIME_UNITS)
 from ou_monitor.text import counted, printable
-from ou_monitor.timeline.line import hold, MOST_THROTTLE
+from ou_monitor.timeline.line import hold, MOST_THROTTLE, WILD
 
 
 # Columns listed at most; loggers of autopilots write some hundred.
@@ -42,8 +42,6 @@ _BACK = 0.25
 _USUAL_STEP, _USUAL_SPAN = 2.0, 43200.0
 # A voltage without a unit beyond this is in mV: no pack of a craft has so many volts.
 _MOST_VOLTS = 1000.0
-# Share of wild values that are no unit, as `bag_samples.check_throttle` has it.
-_WILD = 0.05
 
 
 # Quantity -> patterns of the end of a column's name without its unit, the best first; small
@@ -468,9 +466,9 @@ def _throttle_unit(known: FloatArray, volts: FloatArray) -> str:
     """Return the unit that the sizes of a throttle speak for; '1' where none does."""
     beyond = known[known > MOST_THROTTLE]
     # Beside a voltage within 0 to 1 it may be the voltage: `check_throttle` says so.
-    if beyond.size <= _WILD * known.size or float(np.nanmax(np.abs(volts), initial=0.0)) <= 1.0:
+    if beyond.size <= WILD * known.size or float(np.nanmax(np.abs(volts), initial=0.0)) <= 1.0:
         return '1'
-    low, high = (float(np.quantile(known, q)) for q in (_WILD, 1.0 - 0.1 * _WILD))
+    low, high = (float(np.quantile(known, q)) for q in (WILD, 1.0 - 0.1 * WILD))
     if high <= 110.0:
         return '%'
     return 'us' if low >= 800.0 and high <= 2200.0 else '1'

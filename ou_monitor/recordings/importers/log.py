@@ -178,8 +178,6 @@ class RawColumns:
     source: dict[str, str]
     # What was dropped or could not be read, one sentence each.
     notes: tuple[str, ...] = ()
-    # Quantity -> conversion of the logged values to SI, where the file states it.
-    scales: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
