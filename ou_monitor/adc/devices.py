@@ -112,6 +112,23 @@ def _known(sysfs: Path) -> str:
     return ', '.join(f'{path.name} ({_name(path)})' for path in _all(sysfs)) or 'none'
 
 
+def choose_channel(folder: Path, known: Sequence[str], channel: str) -> str:
+    """Return the given channel, or the only one."""
+    if channel in known:
+        return channel
+    if not channel and len(known) == 1:
+        return known[0]
+    asked = f"no channel '{channel}'" if channel else f'{len(known)} voltage channels'
+    raise InputError(f"{folder.name} has {asked}: give channel:= one of "
+                     f"{', '.join(known) or 'none'}")
+
+
+def find_attribute(folder: Path, channel: str, what: str) -> Path | None:
+    """Return the attribute of a channel, of its kind, or of the device; None: none of them."""
+    return next((folder / name for name in (f'{channel}_{what}', f'in_voltage_{what}', what)
+                 if (folder / name).exists()), None)
+
+
 # Polling rate where the driver does not state its own, Hz.
 USUAL_RATE = 10.0
 
@@ -127,26 +144,18 @@ class PolledChannel:
         ends = {'_input': 'in[0-9]*_input', '_raw': 'in_voltage*_raw'}
         known = {path.name.removesuffix(end): path for end, pattern in ends.items()
                  for path in sorted(folder.glob(pattern))}
-        if channel and channel not in known or not channel and len(known) != 1:
-            asked = f"no channel '{channel}'" if channel else f'{len(known)} voltage channels'
-            names = ', '.join(known) or 'none'
-            raise InputError(f'{folder.name} has {asked}: give channel:= one of {names}')
-        self.channel = channel or next(iter(known))
+        self.channel = choose_channel(folder, list(known), channel)
         self._path = known[self.channel]
         self._scale, self._offset = 1.0, 0.0
         if self._path.name.endswith('_raw'):
-            self._scale = self._attribute(folder, 'scale', 1.0)
-            self._offset = self._attribute(folder, 'offset', 0.0)
+            scale, offset = (find_attribute(folder, self.channel, what)
+                             for what in ('scale', 'offset'))
+            self._scale = 1.0 if scale is None else number_of(scale)
+            self._offset = 0.0 if offset is None else number_of(offset)
         interval = folder / 'update_interval'
         spacing = number_of(interval) if interval.exists() else 0.0
         self.rate = 1e3 / spacing if spacing > 0.0 else USUAL_RATE
         self.read()
-
-    def _attribute(self, folder: Path, what: str, default: float) -> float:
-        for name in (f'{self.channel}_{what}', f'in_voltage_{what}'):
-            if (folder / name).exists():
-                return number_of(folder / name)
-        return default
 
     def read(self) -> float:
         """Return the present voltage, V (both kinds count in mV)."""
@@ -271,7 +280,9 @@ class IioBuffer:
         if not (folder / 'scan_elements').is_dir() or not (folder / 'buffer').is_dir():
             raise InputError(f'{folder.name} has no buffer (no scan_elements): it can only be '
                              'polled, give polled:=true')
-        self.channel = _choose(folder, channel)
+        self.channel = choose_channel(folder, sorted(
+            path.name.removesuffix('_en')
+            for path in (folder / 'scan_elements').glob('in_voltage*_en')), channel)
         self.holes = 0
         # Newest stamp of the kernel, and newest intervals, ns.
         self._newest: int | None = None
@@ -279,14 +290,18 @@ class IioBuffer:
         write_attribute(folder / 'buffer/enable', 0)
         if trigger:
             write_attribute(folder / 'trigger/current_trigger', trigger)
+        own = find_attribute(folder, self.channel, 'sampling_frequency')
         if rate > 0.0:
-            write_attribute(self._attribute('sampling_frequency'), f'{rate:g}')
-        own = self._attribute('sampling_frequency')
-        self.rate = number_of(own) if own.exists() else float('nan')
+            write_attribute(own or folder / 'in_voltage_sampling_frequency', f'{rate:g}')
+        self.rate = float('nan') if own is None else number_of(own)
         self.block = block or (max(round(0.01 * self.rate), 1) if self.rate > 0.0 else 1)
-        self._scale = number_of(self._needed('scale'))
-        shift = self._attribute('offset')
-        self._offset = number_of(shift) if shift.exists() else 0.0
+        scale, offset = (find_attribute(folder, self.channel, what)
+                         for what in ('scale', 'offset'))
+        if scale is None:
+            raise InputError(f'{folder.name} does not say what a count of {self.channel} is '
+                             f'(no {self.channel}_scale)')
+        self._scale = number_of(scale)
+        self._offset = 0.0 if offset is None else number_of(offset)
         self._elements = self._enable()
         self._scan = Scan(self._elements)
         self._clock = self._stamp_clock()
@@ -294,20 +309,6 @@ class IioBuffer:
         if (folder / 'buffer/watermark').exists():
             write_attribute(folder / 'buffer/watermark', self.block)
         self._handle = self._open()
-
-    def _attribute(self, what: str) -> Path:
-        """Return the attribute of the channel, of its kind, or of the device."""
-        for name in (f'{self.channel}_{what}', f'in_voltage_{what}', what):
-            if (self._folder / name).exists():
-                return self._folder / name
-        return self._folder / f'in_voltage_{what}'
-
-    def _needed(self, what: str) -> Path:
-        path = self._attribute(what)
-        if not path.exists():
-            raise InputError(f'{self._folder.name} does not say what a count of {self.channel} is '
-                             f'(no {self.channel}_{what})')
-        return path
 
     def _enable(self) -> list[Element]:
         """Enable the channel and the timestamp alone; return the elements."""
@@ -402,21 +403,3 @@ class IioBuffer:
         """Stop the buffer."""
         os.close(self._handle)
         write_attribute(self._folder / 'buffer/enable', 0)
-
-
-def _names(known: list[str]) -> str:
-    return ', '.join(known) or 'none'
-
-
-def _choose(folder: Path, channel: str) -> str:
-    """Return the given channel, or the only one."""
-    known = sorted(path.name.removesuffix('_en') for path in (folder / 'scan_elements').glob(
-        'in_voltage*_en'))
-    if channel in known:
-        return channel
-    if channel:
-        raise InputError(f"{folder.name} has no channel '{channel}'; available: {_names(known)}")
-    if len(known) != 1:
-        raise InputError(f'{folder.name} has {len(known)} voltage channels: give channel:= one of '
-                         f'{_names(known)}')
-    return known[0]

@@ -2,8 +2,7 @@
 
 import shutil
 
-from made_bags import decode
-from mcap.writer import CompressionType, IndexType, Writer
+from mcap.writer import Writer
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings import bag as bag_module
@@ -86,30 +85,6 @@ def test_metadata_is_version_9(tmp_path):
         assert topic['serialization_format'] == 'cdr'
         assert isinstance(topic['offered_qos_profiles'], list)
         assert topic['type_description_hash'].startswith('RIHS01_')
-
-
-@pytest.mark.parametrize('options', [
-    {'use_chunking': False}, {'compression': CompressionType.NONE},
-    {'compression': CompressionType.LZ4}, {'index_types': IndexType.NONE},
-    {'use_statistics': False}, {'chunk_size': 100}, {'enable_crcs': False},
-    {'use_chunking': False, 'use_statistics': False, 'index_types': IndexType.NONE,
-     'use_summary_offsets': False, 'repeat_channels': False, 'repeat_schemas': False}])
-def test_every_kind_of_mcap(tmp_path, options):
-    """Chunked or not, indexed or not, in any compression, in any order of time."""
-    path = tmp_path / 'other.mcap'
-    times = [int(t) for t in np.random.default_rng(1).permutation(500)]
-    with path.open('wb') as file:
-        writer = Writer(file, **{'chunk_size': 2000, **options})
-        writer.start(profile='ros2', library='test')
-        schema = writer.register_schema(FLOAT32, 'ros2msg', SCHEMAS[FLOAT32].encode())
-        channel = writer.register_channel('/u', 'cdr', schema)
-        for t in times:
-            writer.add_message(channel, t, encode_scalars(FLOAT32, [t])[0], t)
-        writer.finish()
-    reader = BagReader(path)
-    found = [(m.log_time_ns, decode(m.type, m.data).data) for m in reader.raw_messages()]
-    assert found == [(t, float(t)) for t in range(500)]
-    assert (reader.start_ns, reader.end_ns, reader.counts['/u']) == (0, 499, 500)
 
 
 def test_memory_holds_overlapping_chunks_only(tmp_path, monkeypatch):

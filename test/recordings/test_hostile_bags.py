@@ -88,21 +88,6 @@ def test_the_limit_of_a_chunk(tmp_path, monkeypatch):
     assert 'must be a number of MB' in complaint(BagReader, path)
 
 
-def test_many_bombs_are_one(tmp_path):
-    """Each chunk is within its limit; together they are not in proportion to the file."""
-    content = message(0, bytes(2**20 - 100), 1)
-    one = chunk(content, n=1, compression='zstd', packed=zstandard.compress(content))
-    path = by_hand(tmp_path / 'a.mcap', schema(), channel(), messages(N), one * 40)
-    assert 'and those before it hold' in complaint(BagReader, path, max_chunk=2**20, within=5.0)
-
-
-def test_records_other_than_messages_are_limited(tmp_path):
-    """A chunk full of empty records is no reason for millions of objects."""
-    content = bytes(9 * 1_000_000)
-    path = by_hand(tmp_path / 'a.mcap', schema(), channel(), messages(N), chunk(content, n=1))
-    assert 'in it are not messages' in complaint(BagReader, path)
-
-
 def index_of(chunk_at, chunk_length, unpacked, *, index_length=0, offset=None):
     """Return a chunk index."""
     behind = (chunk_at + chunk_length) % 2**64
@@ -206,27 +191,60 @@ def test_a_length_within_a_chunk(tmp_path, length):
         assert 'cut off' in (line := complaint(read_recording, path)) or 'shorter' in line
 
 
-@pytest.mark.parametrize('where', ['chunk', 'file', 'summary'])
-def test_a_second_definition(tmp_path, where):
-    """A schema or channel that becomes another one is never taken for the first."""
-    other = schema(definition='float32 more\nfloat32 data\n')
-    first = len(MAGIC) + len(record(Op.HEADER, text('ros2'), text('')))
-    one = chunk(schema() + channel() + messages(N))
-    two = chunk(other + messages(N))
-    if where == 'summary':
-        summary = other + channel() + index_of(first, len(one), FIRST + STEP * N) + statistics()
-        path = by_hand(tmp_path / 'a.mcap', one, summary=summary)
-    else:
-        path = by_hand(tmp_path / 'a.mcap', one, *([two] if where == 'chunk' else [other]))
+SOUND = schema() + channel() + messages(N)
+OTHER = schema(definition='float32 more\nfloat32 data\n')
+BOMB = message(0, bytes(2**20 - 100), 1)
+
+
+@pytest.mark.parametrize('parts, words', [
+    # Each chunk is within its limit; together they are out of proportion to the file.
+    ([SOUND, chunk(BOMB, n=1, compression='zstd', packed=zstandard.compress(BOMB)) * 40],
+     'and those before it hold'),
+    ([SOUND, chunk(bytes(9 * 1_000_000), n=1)], 'in it are not messages'),
+    ([chunk(SOUND), chunk(OTHER + messages(N))], 'defined a second time'),
+    ([chunk(SOUND), OTHER], 'defined a second time'),
+    # XCDR2 aligns otherwise: its numbers are never read as plain CDR.
+    *(([schema(definition='uint32 n\nfloat64 data\n'), channel(),
+        message(0, encoding + struct.pack('<HId', 0, 0, 5.0))], 'not plain CDR')
+      for encoding in (b'\x00\x07', b'\x00\x09', b'\x00\x02', b'\x01\x01')),
+], ids=lambda value: value.replace(' ', '-') if isinstance(value, str) else '')
+def test_what_is_refused(tmp_path, monkeypatch, parts, words):
+    """In one line, before long, whatever follows."""
+    monkeypatch.setenv('OU_MONITOR_MAX_CHUNK_MB', '10')
+    if words.startswith('and those'):
+        monkeypatch.setenv('OU_MONITOR_MAX_CHUNK_MB', str(2**20 / 1e6))
+    assert words in complaint(read_recording, by_hand(tmp_path / 'a.mcap', *parts), within=5.0)
+
+
+def test_a_second_definition_in_the_summary(tmp_path):
+    """A schema that becomes another one is never taken for the first."""
+    one, first = chunk(SOUND), len(MAGIC) + len(record(Op.HEADER, text('ros2'), text('')))
+    summary = OTHER + channel() + index_of(first, len(one), FIRST + STEP * N) + statistics()
+    path = by_hand(tmp_path / 'a.mcap', one, summary=summary)
     assert 'defined a second time' in complaint(read_recording, path)
 
 
-@pytest.mark.parametrize('encoding', [b'\x00\x07', b'\x00\x09', b'\x00\x02', b'\x01\x01'])
-def test_an_encoding_that_is_not_plain_cdr(tmp_path, encoding):
-    """XCDR2 aligns otherwise: its numbers are never read as plain CDR."""
-    path = by_hand(tmp_path / 'a.mcap', schema(definition='uint32 n\nfloat64 data\n'), channel(),
-                   message(0, encoding + struct.pack('<HId', 0, 0, 5.0)))
-    assert 'not plain CDR' in complaint(read_recording, path)
+def rosbag2(content):
+    """Return the metadata record of rosbag2."""
+    return record(Op.METADATA, text('rosbag2'), text(text('serialized_metadata') + text(content)))
+
+
+@pytest.mark.parametrize('parts, about, notes', [
+    *(([schema(), channel(offered_qos_profiles=qos), messages(N)], {}, 0)
+      for qos in ('- {reliability: [1]}', '[' * 9000, '&a [*a]', 'x' * 10**6, '\x00')),
+    # Of metadata, texts and numbers are taken.
+    ([SOUND, rosbag2('[' * 9000)], {}, 0), ([SOUND, rosbag2('x: &a [*a]')], {}, 0),
+    ([SOUND, rosbag2('custom_data: {a: [1], b: 2}')], {'b': '2'}, 0),
+    # ROS has no names of more than 256 characters, and no definition of megabytes.
+    ([chunk(SOUND + b''.join(channel('/' + 'x' * 300 + str(k), k + 2) for k in range(1000)))],
+     {}, 20),
+    ([chunk(schema('a/msg/B', 'float64 data\n' * 100_000, 2) + channel('/b', 2, 2) + SOUND)],
+     {}, 1)])
+def test_what_is_left_out(tmp_path, parts, about, notes):
+    """The messages are read; notes are few and short."""
+    bag = BagReader(by_hand(tmp_path / 'a.mcap', *parts))
+    assert (bag.counts, bag.about, len(bag.notes)) == ({'/voltage': N}, about, notes)
+    assert all(len(note) < 400 for note in bag.notes)
 
 
 def test_messages_outside_of_chunks(tmp_path):
@@ -263,15 +281,6 @@ def test_names_do_not_reach_the_terminal(tmp_path):
     complaint(BagReader, folder / 'gone\x1b[2J.mcap')
 
 
-def test_names_of_any_length(tmp_path):
-    """ROS has none beyond 256 characters; notes are not one for each of thousands."""
-    many = b''.join(channel('/' + 'x' * 300 + str(k), k + 2) for k in range(1000))
-    path = by_hand(tmp_path / 'a.mcap', chunk(schema() + channel() + many + messages(N)))
-    bag = BagReader(path)
-    assert list(bag.topics) == ['/voltage'] and len(bag.notes) <= 21
-    assert all(len(note) < 400 for note in bag.notes)
-
-
 def test_topics_of_any_number(tmp_path):
     """A refusal names some of them."""
     many = b''.join(channel(f'/x{k}', k + 2) for k in range(3000))
@@ -280,14 +289,6 @@ def test_topics_of_any_number(tmp_path):
     line = complaint(read_recording, path, within=10.0)
     assert len(line) < 5000 and 'more' in line
     assert len(complaint(read_recording, path, voltage_topic='/none', within=10.0)) < 5000
-
-
-def test_definitions_of_any_length(tmp_path):
-    """One of megabytes is left out."""
-    path = by_hand(tmp_path / 'a.mcap', chunk(
-        schema() + channel() + schema('a/msg/B', 'float64 data\n' * 100_000, 2)
-        + channel('/b', 2, 2) + messages(N)))
-    assert list(BagReader(path).topics) == ['/voltage']
 
 
 LONG = '=' * 80 + '\nMSG: a/T\n'
@@ -340,22 +341,6 @@ def test_a_channel_many_times(tmp_path):
     began = time.process_time()
     assert read_recording(path).n == N
     assert time.process_time() - began < 15.0
-
-
-@pytest.mark.parametrize('qos', [
-    '- {reliability: [1]}', '[' * 9000, '&a [*a]', 'x' * 10**6, '\x00'])
-def test_qos_of_a_channel(tmp_path, qos):
-    """Whatever it is, the messages are read."""
-    path = by_hand(tmp_path / 'a.mcap', schema(), channel(offered_qos_profiles=qos), messages(N))
-    assert BagReader(path).counts == {'/voltage': N}
-
-
-@pytest.mark.parametrize('content', ['[' * 9000, 'custom_data: {a: [1], b: 2}', 'x: &a [*a]'])
-def test_metadata_of_rosbag2_in_a_record(tmp_path, content):
-    """Texts and numbers are taken; what cannot be read is no reason to refuse."""
-    path = by_hand(tmp_path / 'a.mcap', schema(), channel(), messages(N), record(
-        Op.METADATA, text('rosbag2'), text(text('serialized_metadata') + text(content))))
-    assert BagReader(path).about == ({'b': '2'} if 'custom' in content else {})
 
 
 @pytest.mark.parametrize('name', ['a.mcap', 'a.csv', 'a'])

@@ -93,6 +93,7 @@ def test_whole(bag, rows):
 @pytest.mark.parametrize('options', [
     {}, {'use_chunking': False}, {'index_types': IndexType.CHUNK}, {'index_types': IndexType.NONE},
     {'use_statistics': False}, {'enable_crcs': False}, {'enable_data_crcs': True},
+    {'chunk_size': 100},
     {'use_chunking': False, 'use_statistics': False, 'index_types': IndexType.NONE,
      'use_summary_offsets': False, 'repeat_channels': False, 'repeat_schemas': False}])
 def test_every_way_of_writing(bag, rows, tmp_path, compression, options):

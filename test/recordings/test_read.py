@@ -12,9 +12,7 @@ from ou_monitor.recordings.standard_types import (
     BATTERY_STATE, encode_battery, encode_scalars, FLOAT32, FLOAT32_ARRAY, FLOAT64,
     SCHEMAS)
 import pytest
-from rosbags.typesys import get_typestore, Stores
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
 MS = 1_000_000
 STRING = 'std_msgs/msg/String'
 PX4_BATTERY, PX4_STICK = 'px4_msgs/msg/BatteryStatus', 'px4_msgs/msg/ManualControlSetpoint'
@@ -45,12 +43,6 @@ def battery(stamps, values, late=5 * MS):
     """Return BatteryStates logged later than their stamps."""
     stamps = np.array(stamps, dtype=np.int64)
     return [(int(t) + late, data) for t, data in zip(stamps, encode_battery(stamps, values))]
-
-
-def big_endian(values):
-    """Return Float32 messages as a big-endian middleware writes them."""
-    return [(MS * (k + 1), b'\x00\x00\x00\x00' + np.array([v], '>f4').tobytes())
-            for k, v in enumerate(values)]
 
 
 def complaint(path, **options):
@@ -131,26 +123,6 @@ def test_header_stamps(tmp_path):
     np.testing.assert_allclose(recording.t, [0.1, 0.101, 0.2], rtol=0, atol=1e-12)
     np.testing.assert_allclose(recording.voltage, [5.0, 5.1, 5.2], rtol=1e-7)
     assert 'throttle is unknown' in recording.notes[0]
-
-
-@pytest.mark.parametrize('frame', ['x', 'base_link'])
-def test_header_stamps_by_the_general_decoder(tmp_path, frame):
-    """Messages of unequal length are decoded one by one, with the same outcome."""
-    messages = []
-    for t, data in battery([100 * MS, 101 * MS], [5.0, 5.25]):
-        message = STORE.deserialize_cdr(data, BATTERY_STATE)
-        message.header.frame_id = frame * (1 + t % 2)
-        message.cell_voltage = np.array([4.0] * len(messages), dtype=np.float32)
-        messages.append((t, bytes(STORE.serialize_cdr(message, BATTERY_STATE))))
-    recording = read_recording(make(tmp_path / 'b.mcap', ('voltage', BATTERY_STATE, messages)))
-    np.testing.assert_allclose(recording.t, [0.1, 0.101], rtol=0, atol=1e-12)
-    assert recording.voltage.tolist() == [5.0, 5.25]
-
-
-def test_big_endian(tmp_path):
-    """What the shortcut does not know, the general decoder does."""
-    path = make(tmp_path / 'bag.mcap', ('voltage', FLOAT32, big_endian([5.0, 5.5])))
-    assert read_recording(path).voltage.tolist() == [5.0, 5.5]
 
 
 def test_blocks(tmp_path):
