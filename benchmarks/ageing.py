@@ -16,7 +16,6 @@ import argparse
 from collections.abc import Iterator
 from itertools import permutations
 import math
-import os
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +27,7 @@ from ou_monitor.recordings.model_file import read_model
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import Recording
 from ou_monitor.simulation import read_throttle, RecordedThrottle, simulated
-from tables import put, table
+from tables import deliver, recorded, table
 
 # Hz; length of the flight that teaches and of those compared, s.
 RATE, TAUGHT, LENGTH = 100.0, 120.0, 60.0
@@ -105,7 +104,7 @@ def half(made: Recording, second: bool) -> Recording:
 
 def pairs() -> list[list[str]]:
     """Return a row for each recorded pair, either way."""
-    folder, flights, rows = Path(os.environ['OU_MONITOR_REALDATA']), {}, []
+    folder, flights, rows = recorded(), {}, []
     for name, file, number, craft in FLIGHTS:
         made = read_recording(folder / file, flight=number)
         flights.setdefault(craft or name, []).append((name, made))
@@ -145,10 +144,7 @@ def main() -> int:
     else:
         text = table(('flight', 'model of', 'sag now / then', 'noise now / then', 'verdict',
                       'ever weaker'), pairs())
-    if options.page:
-        put(options.page, text, options.what)
-    else:
-        print(text)
+    deliver(text, options.page, options.what)
     return 0
 
 

@@ -32,9 +32,8 @@ The closed loop is simulated: dips that no throttle announces, and an hour witho
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-import os
 from pathlib import Path
 import sys
 
@@ -45,7 +44,7 @@ from ou_monitor import MonitorSettings, read_recording, SupplyMonitor  # noqa: E
 from ou_monitor.online.risk.flag import FlagLevel  # noqa: E402
 from ou_monitor.records import Recording  # noqa: E402
 from ou_monitor.report.svg import Plot  # noqa: E402
-from tables import drawing, put, table  # noqa: E402
+from tables import deliver, drawing, recorded, table  # noqa: E402
 
 # Name, file, flight of the log, cells.
 FLIGHTS = (('gecko', 'bf_gecko_a.csv', None, 4), ('nazgul', 'raw/bf_nazgul_4s.bbl', 1, 4),
@@ -297,12 +296,10 @@ def strip(watch: Watch) -> str:
 
 def flights(options: argparse.Namespace) -> str:
     """Return the tables of recorded flights; draw their strips."""
-    folder = os.environ.get('OU_MONITOR_REALDATA')
-    if folder is None:
-        raise SystemExit('OU_MONITOR_REALDATA is not set: it names the folder of the flights')
+    folder = recorded()
     watches = []
     for name, file, flight, cells in FLIGHTS:
-        path = Path(folder) / file
+        path = folder / file
         if options.flight and name not in options.flight:
             continue
         if not path.exists():
@@ -386,7 +383,7 @@ def loop(options: argparse.Namespace) -> str:
         [f'healthy, {options.minutes:g} min', '0', '-', '-', '-', str(healthy)]])
 
 
-def main(show: Callable[[str], object] = print) -> int:
+def main() -> int:
     """Print the tables, or put them into the page."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parts = parser.add_subparsers(dest='part', required=True)
@@ -403,10 +400,7 @@ def main(show: Callable[[str], object] = print) -> int:
         part.add_argument('--page', type=Path, help='page whose table is replaced')
     options = parser.parse_args()
     text = options.action(options)
-    if options.page:
-        put(options.page, text, options.part)
-    else:
-        show(text)
+    deliver(text, options.page, options.part)
     return 0
 
 

@@ -13,7 +13,6 @@ import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass
 import math
-import os
 from pathlib import Path
 import sys
 
@@ -25,7 +24,7 @@ from ou_monitor.recordings.importers.formats import import_log
 from ou_monitor.recordings.importers.log import Request
 from scipy import stats
 from scipy.signal import lfilter
-from tables import put, table
+from tables import deliver, recorded, table
 
 # Name, file below OU_MONITOR_REALDATA, number of the flight.
 LOGS = (('nazgul', 'raw/bf_nazgul_4s.bbl', 1), ('roma', 'raw/bf_roma_6s.bbl', 3),
@@ -131,11 +130,8 @@ def main() -> int:
     parser.add_argument('--each', type=int, default=2, help='draws of each axis and kind')
     parser.add_argument('--page', type=Path, help='page whose table is replaced')
     options = parser.parse_args()
-    folder = os.environ.get('OU_MONITOR_REALDATA')
-    if folder is None:
-        parser.error('OU_MONITOR_REALDATA is not set: it names the folder of the flights')
     rng = np.random.default_rng(20)
-    known = list(flights(Path(folder)))
+    known = list(flights(recorded()))
     flown = [one for one in known if np.isfinite(one.throttle).any() and np.ptp(one.t) > 20.0]
     counts: dict[str, dict[str, dict[str, list[bool]]]] = {}
     for flight in known:
@@ -164,10 +160,7 @@ def main() -> int:
                                    for seen in mine[kind]['power']], True)])
     text = table(['recording', 'axes', *(f'{kind}: seen' for kind in KINDS),
                   'gain 5 deg/s per V: seen'], rows)
-    if options.page:
-        put(options.page, text, 'coupling')
-    else:
-        print(text)
+    deliver(text, options.page, 'coupling')
     return 0
 
 

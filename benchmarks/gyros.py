@@ -8,14 +8,13 @@ debug_mode is GYRO_SCALED (6); else `gyroADC`, behind them.
 from __future__ import annotations
 
 from dataclasses import dataclass
-import os
-from pathlib import Path
 import sys
 
 import numpy as np
 from ou_monitor.recordings.importers.choose import choose
 from ou_monitor.recordings.importers.formats import import_log
 from ou_monitor.recordings.importers.log import Request
+from tables import recorded
 
 # Name, file below OU_MONITOR_REALDATA, number of the flight, which gyro.
 FLIGHTS = (
@@ -45,17 +44,11 @@ class Gyro:
     rpm: np.ndarray | None  # Of the shafts.
 
 
-def folder() -> Path | None:
-    """Return where the recordings are; None where OU_MONITOR_REALDATA is not set."""
-    named = os.environ.get('OU_MONITOR_REALDATA')
-    return Path(named) if named else None
-
-
 def read(name: str, seconds: float = np.inf) -> Gyro | None:
     """Read a flight up to so many s; None where it is not there, with a word on stderr."""
     file, number, kind = next(one[1:] for one in (*FLIGHTS, *SLOW) if one[0] == name)
-    where = folder()
-    if where is None or not (where / file).exists():
+    where = recorded()
+    if not (where / file).exists():
         print(f'{name}: {file} is not there, left out', file=sys.stderr)
         return None
     log = import_log(where / file, Request(number, poles=14 if name == 'bf3s' else None))

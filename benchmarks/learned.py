@@ -27,7 +27,7 @@ import gyros  # noqa: E402
 import numpy as np  # noqa: E402
 from ou_monitor import AdaptiveLowPass  # noqa: E402
 from scipy import signal  # noqa: E402
-from tables import put, table  # noqa: E402
+from tables import deliver, table  # noqa: E402
 
 SEED, ALPHA, SPREAD, WHITE = 20261122, 63.0, 0.05, 0.01
 SIGMA = SPREAD * math.sqrt(2.0 * ALPHA)
@@ -95,8 +95,6 @@ def main() -> int:
                         help='by how much the deviation of the noise is told wrong')
     parser.add_argument('--page', type=Path, help='page whose table is replaced')
     options = parser.parse_args()
-    if gyros.folder() is None:
-        parser.error('OU_MONITOR_REALDATA is not set: it names the folder of the flights')
     rows = []
     for name, *_ in (*gyros.FLIGHTS, *gyros.SLOW):
         gyro = gyros.read(name) if name in (options.flight or [name]) else None
@@ -105,10 +103,7 @@ def main() -> int:
             print(*rows[-2:], sep='\n', file=sys.stderr)
     text = table(['gyro', '', 'stretches', *(word for told in options.told for word in (
         'mean' if told == 1.0 else f'noise told {told:g} times: mean', 'worst'))], rows)
-    if options.page:
-        put(options.page, text, 'learned')
-    else:
-        print(text)
+    deliver(text, options.page, 'learned')
     return 0
 
 

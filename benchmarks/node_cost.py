@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from ou_monitor.model.ou import simulate  # noqa: E402
-from tables import put, table  # noqa: E402
+from tables import deliver, table  # noqa: E402
 
 DOMAIN = '63'
 # What listens on a topic and publishes how many it has had, 10 times a second as the nodes do.
@@ -192,10 +192,7 @@ def main() -> int:
                   'start-up, s of CPU', 'RSS, MB'], rows)
     text += (f'\nPython {sys.version.split()[0]}, NumPy {np.__version__}, '
              f'{args.seconds:g} s each, all nodes of a block at the same time.\n')
-    if args.page is None:
-        print(text)
-    else:
-        put(args.page, text, 'nodes')
+    deliver(text, args.page, 'nodes')
     return 0
 
 

@@ -39,7 +39,7 @@ import numpy as np  # noqa: E402
 from ou_monitor import AdaptiveNotch  # noqa: E402
 from ou_monitor.online.notch.notch import Notch, phase_lag  # noqa: E402
 from scipy import optimize, signal  # noqa: E402
-from tables import put, table  # noqa: E402
+from tables import deliver, table  # noqa: E402
 
 LAG_AT, NOISE_FROM = 10.0, 60.0
 CUTOFFS = (40.0, 60.0, 80.0, 120.0)
@@ -263,8 +263,6 @@ def main() -> int:
     parser.add_argument('--cutoffs', type=float, nargs='+', default=list(CUTOFFS))
     parser.add_argument('--page', type=Path, help='page whose table is replaced')
     options = parser.parse_args()
-    if gyros.folder() is None:
-        parser.error('OU_MONITOR_REALDATA is not set: it names the folder of the flights')
     rows = []
     for name, *_ in gyros.FLIGHTS:
         if options.flight and name not in options.flight:
@@ -275,10 +273,7 @@ def main() -> int:
                 rows.append(row)
                 print(row, file=sys.stderr)
     text = table(HEAD, rows)
-    if options.page:
-        put(options.page, text, 'notch')
-    else:
-        print(text)
+    deliver(text, options.page, 'notch')
     return 0
 
 

@@ -16,7 +16,6 @@ import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
 import json
-import os
 from pathlib import Path
 import sys
 import time
@@ -29,7 +28,7 @@ from ou_monitor.online.risk.courses import AT_PEAK, excursion_risk, excursions, 
 from ou_monitor.records import Recording  # noqa: E402
 from real_flights import flights  # noqa: E402
 from scipy.special import expit  # noqa: E402
-from tables import put, table  # noqa: E402
+from tables import deliver, recorded, table  # noqa: E402
 
 QUADS = ('gecko', 'nazgul', 'roma', 'bf3s', 'erle')
 OTHERS = ('cf_solo', 'cf_pair')
@@ -278,19 +277,16 @@ def tables(cases: dict[str, list[Case]], facts: dict[str, dict[str, float]]) -> 
     return '\n\n'.join(parts)
 
 
-def main(show: Callable[[str], None] = print) -> int:
+def main() -> int:
     """Measure the flights and print the tables, or put them into the page."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parser.add_argument('flight', nargs='*', help='names (default all)')
     parser.add_argument('--page', type=Path, help='page whose tables are replaced')
     parser.add_argument('--json', type=Path, help='file for what is known of each flight')
     options = parser.parse_args()
-    folder = os.environ.get('OU_MONITOR_REALDATA')
-    if folder is None:
-        parser.error('OU_MONITOR_REALDATA is not set: it names the folder of the flights')
     cases: dict[str, list[Case]] = {'middle': [], 'single': []}
     facts = {}
-    for name, recording in flights(Path(folder), options.flight or [*QUADS, *OTHERS]):
+    for name, recording in flights(recorded(), options.flight or [*QUADS, *OTHERS]):
         if not np.isfinite(recording.throttle).any():
             print(f'{name}: no throttle was found in the log, left out', file=sys.stderr)
             continue
@@ -303,10 +299,7 @@ def main(show: Callable[[str], None] = print) -> int:
     if options.json:
         options.json.write_text(json.dumps(facts, indent=1), encoding='utf-8')
     text = tables(cases, facts)
-    if options.page:
-        put(options.page, text, 'real flights')
-    else:
-        show(text)
+    deliver(text, options.page, 'real flights')
     return 0
 
 

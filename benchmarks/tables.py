@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from html import escape
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,22 @@ def put(path: Path, text: str, name: str) -> None:
         if mark and last:
             text = f'{head}{mark}\n{text}\n{last}{tail}'
     path.write_text(text)
+
+
+def deliver(text: str, page: Path | None, name: str) -> None:
+    """Put a text between the marks of a page, or print it where there is none."""
+    if page is None:
+        print(text)
+    else:
+        put(page, text, name)
+
+
+def recorded() -> Path:
+    """Return the folder of the recorded flights; it ends a program where there is none."""
+    folder = os.environ.get('OU_MONITOR_REALDATA')
+    if folder is None:
+        raise SystemExit('OU_MONITOR_REALDATA is not set: it names the folder of the flights')
+    return Path(folder)
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
