@@ -119,8 +119,8 @@ def choose_channel(folder: Path, known: Sequence[str], channel: str) -> str:
     if not channel and len(known) == 1:
         return known[0]
     asked = f"no channel '{channel}'" if channel else f'{len(known)} voltage channels'
-    raise InputError(f"{folder.name} has {asked}: give channel:= one of "
-                     f"{', '.join(known) or 'none'}")
+    names = ', '.join(known) or 'none'
+    raise InputError(f'{folder.name} has {asked}: give channel:= one of {names}')
 
 
 def find_attribute(folder: Path, channel: str, what: str) -> Path | None:
