@@ -239,7 +239,7 @@ def fetched(python: Path, *packages: str) -> None:
 
 
 def test_pip_of_debian_12_puts_the_command_on_the_path(tree, tmp_path):
-    """Python 3.11, pip 23.0, no wheel: `pip install .` as the README has it."""
+    """Python 3.11, pip 23.0, no wheel; `pip install .` builds in an environment of its own."""
     assert run(python311(), '-m', 'venv', tmp_path / 'venv').returncode == 0
     python = tmp_path / 'venv/bin/python'
     fetched(python, 'pip==23.0.*')
@@ -254,18 +254,6 @@ def test_pip_of_debian_12_puts_the_command_on_the_path(tree, tmp_path):
     assert (tmp_path / 'venv/share/ou_monitor/msg_config').is_dir()
     shown = run(python, '-c', 'import ou_monitor; print(ou_monitor.__file__)', cwd=tmp_path)
     assert Path(shown.stdout.strip()).is_relative_to(tmp_path / 'venv/lib'), shown.stderr
-
-
-def test_python_m_build(tree, tmp_path):
-    """As a packager runs it, in an environment of its own."""
-    venv.create(tmp_path / 'venv', with_pip=True, symlinks=True)
-    python = tmp_path / 'venv/bin/python'
-    fetched(python, 'build')
-    source = tmp_path / 'source'
-    shutil.copytree(tree, source)
-    done = run(python, '-m', 'build', '--outdir', tmp_path / 'dist', source)
-    assert done.returncode == 0, done.stdout + done.stderr
-    check_archives(tmp_path / 'dist', tree)
 
 
 def test_pip_gives_the_offline_half(offline, tmp_path):
