@@ -84,10 +84,9 @@ def say(text: str) -> None:
 
 
 def ours(y: Array, dt: float, throttle: Array | None = None) -> Fit:
-    """Return our estimate of one window, from nothing; the window starts with a slot."""
+    """Return our estimate of one window, from nothing."""
     n = y.size
     window = n * dt
-    # Steps of exactly dt; a start at a multiple of the window keeps all samples.
     estimator = SlidingEstimator(window)
     estimator.push(1000.0 * window + np.arange(n) * dt, y, throttle)
     e = estimator.estimate()

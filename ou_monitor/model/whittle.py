@@ -2,12 +2,15 @@
 Fits to a periodogram: of all time scales of a recording at once, in milliseconds.
 
 The ordinates of a long series are nearly independent exponentials with the spectrum for their
-means (Whittle, Ark. Mat. 2 (1953) 423); in bins they are gamma.
+means (Whittle, Ark. Mat. 2 (1953) 423); in bins they are gamma.  `Ordinates` are those of scores;
+`CrossSpectrum` has regressors beside a voltage, and expects of each ordinate what it is in a
+window of this length (the debiased Whittle likelihood: Sykulski et al., Biometrika 106 (2019)
+251).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 import math
 
@@ -83,3 +86,110 @@ class Ordinates:
             if gain < _SETTLED:
                 break
         return x, value - self.likelihood(np.zeros(self.power.size))
+
+
+# Ordinates of a cross spectrum taken one by one; relative width of the bins above.
+_ONE_BY_ONE, _WIDTH = 24, 0.06
+
+
+def cosines(x: FloatArray) -> FloatArray:
+    """Return the orthonormal cosine transform (DCT-II) of rows, shape (q, n)."""
+    n = x.shape[1]
+    # By one Fourier transform of the even places and, backwards, the odd ones: Makhoul, IEEE
+    # Trans. Acoust. Speech Signal Process. 28 (1980) 27.
+    F = np.fft.rfft(np.concatenate([x[:, ::2], x[:, 1::2][:, ::-1]], axis=1), axis=1)
+    F *= np.exp(-0.5j * np.pi / n * np.arange(F.shape[1])) * math.sqrt(2.0 / n)
+    F[:, 0] *= math.sqrt(0.5)
+    return np.concatenate([F.real, -F.imag[:, (n - 1) // 2:0:-1]], axis=1)
+
+
+class CrossSpectrum:
+    """
+    Cross spectra of regressors and a voltage, the last row, and the likelihood of a noise.
+
+    rows: shape (q, n), in stretches of `lengths` evenly spaced readings; without regressors (q =
+    1) each stretch has a mean of its own.
+
+    The ordinates are those of the cosine transform, whose window goes on as in a mirror: a voltage
+    that ends elsewhere than it began leaks into no other ordinate, as it does in Fourier's.
+    """
+
+    def __init__(self, rows: FloatArray, lengths: Sequence[int]) -> None:
+        q, n = rows.shape
+        self.free = n - (q - 1 or len(lengths))
+        # Stretches of nearly one length share their bins: lost messages make hundreds of them.
+        groups: dict[int, list[FloatArray]] = {}
+        for part in np.split(rows, np.cumsum(lengths)[:-1], axis=1):
+            groups.setdefault(round(math.log(part.shape[1]) / _WIDTH), []).append(part)
+        crosses, places, sizes = [], [], []
+        for group in groups.values():
+            longest = max(part.shape[1] for part in group)
+            edges = [*range(min(_ONE_BY_ONE, longest) + 1)]
+            while edges[-1] < longest:
+                edges.append(min(longest, edges[-1] + max(1, int(_WIDTH * edges[-1]))))
+            cross = np.zeros((len(edges) - 1, q, q))
+            # Number, sum of the places in the band, and of their signs by turns.
+            sums = np.zeros((3, len(edges) - 1))
+            for part in group:
+                size = part.shape[1]
+                C = cosines(part)
+                if q == 1:
+                    C[:, 0] = 0.0
+                starts = [a for a in edges[:-1] if a < size]
+                ends = np.append(starts, min(edges[-1], size))
+                bins = len(starts)
+                count = np.diff(ends)
+                sums[:, :bins] += np.stack([
+                    count, count * 0.5 * (ends[:-1] + ends[1:] - 1) / size,
+                    count % 2 * (1 - 2 * (ends[:-1] % 2))])
+                sums[0, 0] -= q == 1
+                for k, row in enumerate(C):
+                    cross[:bins, k, k:] += np.add.reduceat(C[k:] * row, starts, axis=1).T
+            crosses.append(cross)
+            places.append(sums)
+            sizes.append(np.full(sums.shape[1], sum(part.shape[1] for part in group) / len(group)))
+        cross = np.concatenate(crosses)
+        self._cross = (cross + np.triu(cross, 1).transpose(0, 2, 1)).reshape(-1, q * q)
+        self._q, self._n = q, np.concatenate(sizes)
+        self._count, place, sign = np.concatenate(places, axis=1)
+        omega = np.pi * place / np.maximum(self._count, 1e-9)
+        self._sign = sign / np.maximum(self._count, 1.0)
+        self._chord = 4.0 * np.sin(0.5 * omega) ** 2
+        # Square of an ordinate's weight on the first reading and the last together.
+        self._ends = np.where(omega > 0.0, 4.0 - self._chord, 2.0) / self._n
+        #: Inverse of the ordinates of a random walk; the mean is a regressor.
+        self.walk = 4.0 * np.sin(0.5 * np.maximum(omega, 0.5 * np.pi / self._n)) ** 2
+
+    @property
+    def size(self) -> int:
+        """Return the numbers that one spectrum takes."""
+        return max(self._cross.shape)
+
+    def ou(self, a: FloatArray) -> FloatArray:
+        """Return the ordinates expected of an OU of variance 1; a: alpha D, shape (k, 1)."""
+        # The inverse covariance is (1 - phi)^2 + phi L, of which the cosines are eigenvectors,
+        # but for phi (1 - phi) at both ends: Woodbury.
+        phi, gap = np.exp(-a), -np.expm1(-a)
+        square = gap * gap + phi * self._chord
+        end = self._ends * phi * gap * (1.0 - self._sign * np.exp(-a * self._n)) / (1.0 + phi)
+        return np.asarray(gap * (1.0 + phi) / square * (1.0 - end / square))
+
+    def cost(self, S: FloatArray, used: int | None = None
+             ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """
+        Return minus the log-likelihood of spectra, shape (k, bins), restricted and profiled.
+
+        used: only so many of the regressors.  The second is the factor on the spectrum, the third
+        the products x' K^-1 z of all rows, shape (k, q, q).
+        """
+        gram = ((1.0 / S) @ self._cross).reshape(-1, self._q, self._q)
+        # Rounding must not make it indefinite.
+        gram[:, range(self._q), range(self._q)] *= 1.0 + 1e-10
+        free, own = self.free, gram
+        if used is not None and used < self._q - 1:
+            kept = [*range(used), self._q - 1]
+            free, own = free + self._q - 1 - used, gram[:, kept][:, :, kept]
+        d = np.log(np.diagonal(np.linalg.cholesky(own), axis1=1, axis2=2))
+        left = 2.0 * d[:, -1]
+        value = 0.5 * free * left + 0.5 * np.log(S) @ self._count + d[:, :-1].sum(axis=1)
+        return value, np.exp(left) / free, gram

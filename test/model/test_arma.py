@@ -31,7 +31,7 @@ def test_block_autocovariances_are_the_double_sums(a, m):
 
 
 def spectral(a, m, share):
-    """Return theta and innovation variance from the spectrum (Kolmogorov's formula)."""
+    """Return theta from the spectrum (Kolmogorov's formula)."""
     gamma = block_autocovariances(a, m, 2)
     gamma[0] += share
     phi = math.exp(-a)
@@ -39,35 +39,15 @@ def spectral(a, m, share):
     g1 = gamma[1] * (1.0 + phi * phi) - phi * (gamma[0] + phi * gamma[1])
     w = (np.arange(4096) + 0.5) * math.pi / 4096
     q = math.exp(np.log(g0 + 2.0 * g1 * np.cos(w)).mean())
-    return -g1 / q, q
+    return -g1 / q
 
 
 @pytest.mark.parametrize('m', BLOCKS)
 @pytest.mark.parametrize('a, share', [
     (0.01, 0.0), (0.01, 0.3), (0.063, 0.1), (0.3, 0.0), (0.3, 2.0), (2.0, 0.5), (0.02, 20.0)])
-def test_theta_and_innovation_variance_are_those_of_the_spectrum(a, share, m):
+def test_theta_is_that_of_the_spectrum(a, share, m):
     """The geometric mean of the spectrum is the innovation variance; 4096 points give 1e-9."""
-    theta, q = spectral(a, m, share)
-    assert arma.theta_at(a, m, share) == pytest.approx(theta, abs=1e-8)
-    assert arma.innovation_variance(a, arma.theta_at(a, m, share), m) == pytest.approx(
-        q, rel=1e-7)
-
-
-@settings(deadline=None, max_examples=200)
-@given(st.floats(-7.0, 1.0), st.integers(1, 1000), st.floats(-4.0, 4.0))
-def test_noise_share_undoes_theta(log_a, m, log_share):
-    """
-    Rounding of theta, 2e-16, over d theta / d share is what comes back as share.
-
-    The slope is the smaller, the nearer theta is to its ends; beyond a loss of
-    1e-6 the example says nothing.
-    """
-    a, share = math.exp(log_a), math.exp(log_share)
-    theta = arma.theta_at(a, m, share)
-    slope = (arma.theta_at(a, m, 1.01 * share) - theta) / (0.01 * share)
-    lost = 1e-15 / max(slope * share, 1e-300) / min(a, 1.0) ** 2
-    assert lost > 1e-6 or arma.noise_share(a, theta, m) == pytest.approx(
-        share, rel=1e-7 + lost)
+    assert arma.theta_at(a, m, share) == pytest.approx(spectral(a, m, share), abs=1e-8)
 
 
 @settings(deadline=None)
@@ -75,14 +55,14 @@ def test_noise_share_undoes_theta(log_a, m, log_share):
 def test_noise_raises_theta_between_its_ends(log_a, m, log_share):
     """-0.268 = sqrt(3) - 2 is Working's (1960) averaged random walk; phi is pure noise."""
     a = math.exp(log_a)
-    low, theta = arma.noise_free_theta(a, m), arma.theta_at(a, m, math.exp(log_share))
+    low, theta = arma.theta_at(a, m, 0.0), arma.theta_at(a, m, math.exp(log_share))
     assert math.sqrt(3.0) - 2.0 - 1e-9 < low < theta < math.exp(-a)
 
 
 def test_long_blocks_of_a_random_walk():
     """Working, Econometrica 28 (1960) 916: theta = sqrt(3) - 2 as m grows."""
-    assert arma.noise_free_theta(1e-5, 4000) == pytest.approx(math.sqrt(3.0) - 2.0, abs=1e-5)
-    assert arma.noise_free_theta(0.3, 1) == 0.0
+    assert arma.theta_at(1e-5, 4000, 0.0) == pytest.approx(math.sqrt(3.0) - 2.0, abs=1e-5)
+    assert arma.theta_at(0.3, 1, 0.0) == pytest.approx(0.0, abs=1e-15)
 
 
 @pytest.mark.parametrize('m', [1, 4])

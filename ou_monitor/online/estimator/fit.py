@@ -1,20 +1,17 @@
 """
-From the sums of a window to OU parameters.
+From the samples of a window to OU parameters.
 
-Samples, or block means, of an OU in white noise are an ARMA(1,1), which is fitted by restricted
-quasi-likelihood (model/arma.py). While throttle moves, or when the voltage drifts, sag, its
-curvature and its lag are regressed out of the mean. Generalised least squares needs the lag sums
-only: with the inverse autocovariances of the noise every product x' K^-1 z is a weighted sum of
-the sums over lags, so no sample is read again.
+While throttle moves, or when the voltage drifts, sag, its curvature and its lag are regressed out
+of the mean, within the restricted likelihood (REML: Harville, J. Am. Stat. Assoc. 72 (1977) 320).
 
-Windows whose stamps are not evenly spaced: the exact Gaussian likelihood.  It costs more than the
-sums over lags and serves only irregular sources and windows with many holes.  The inverse
+Evenly spaced samples, or block means: `SpectralLikelihood`, Whittle's of the window's ordinates
+(model/whittle.py), which `window: auto` and `supply_facts` maximise too.
+
+Windows whose stamps are not evenly spaced: `StampLikelihood`, the exact Gaussian one.  The inverse
 covariance Q of a sampled OU is tridiagonal, so the likelihood costs O(n): K = Q^-1 + nu I with A =
 I + nu Q tridiagonal, K^-1 = Q A^-1 and log|K| = log|A| - log|Q|. It is the likelihood of the
-Kalman filter, restricted to the contrasts of the regressors (REML: Harville, J. Am. Stat. Assoc.
-72 (1977) 320).  Its gradient needs no more than the elimination and the three diagonals of A^-1,
-so a search that starts from the fit of evenly spaced samples takes a handful of evaluations. It
-avoids SciPy, which would cost the nodes 45 MB.
+Kalman filter.  Its gradient needs no more than the elimination and the three diagonals of A^-1,
+so a search that starts from the fit of evenly spaced samples takes a handful of evaluations.
 """
 
 from __future__ import annotations
@@ -23,132 +20,24 @@ from collections.abc import Callable
 from dataclasses import dataclass
 import enum
 import math
+from typing import Protocol
 
 import numpy as np
 from ou_monitor.model import arma
-from ou_monitor.online.estimator.window import (
-    FACTOR, FAST, FEWEST, LAGS, LOST, SLOW, Sums, T, U, Y)
+from ou_monitor.model.ou_fit import stretches
+from ou_monitor.model.whittle import CrossSpectrum
 from ou_monitor.records import FloatArray
-
 
 # Directions of the load that vary less than this share of the largest are
 # left out: the window does not show them.
 _UNSEEN = 1e-5
 # A load variable of less variance than this (full scale squared) is constant.
 _STILL = 1e-12
-# Exponents of theta, as many as lags could be; parts of vectors.
-_COUNT = np.arange(256.0)
-_ONE, _NO_TIME = np.ones(1), np.zeros(1)
-
-
-@dataclass(slots=True)
-class MeanFit:
-    """The mean, fitted at one choice of noise."""
-
-    beta: FloatArray  # Coefficients of load and time, V per unit; shape (c,)
-    cov: FloatArray  # Their covariance per unit innovation variance, times n; shape (c, c)
-    # Gradient of half the log-determinant of their information in ln a and theta (see
-    # `arma.objective`).
-    tilt: tuple[float, float]
-    gram: FloatArray  # Products x' K^-1 z over n of voltage, load and time; shape (c + 1, c + 1)
-
-
-class Moments:
-    """
-    Sample autocovariances of the voltage and of what may explain its mean.
-
-    Lags without pairs count as uncorrelated.  `mean`, shape (c,): of voltage (less its reference),
-    load, and time (0); `basis`, shape (c, r): coefficients of load and, last, time in each of r
-    independent regressors.
-    """
-
-    def __init__(self, sums: Sums, trend: bool) -> None:
-        n, c, lags = sums.n, sums.first.size, sums.pairs.size
-        self.n = n
-        mean = sums.first / n
-        self.mean = np.concatenate([mean, _NO_TIME])
-        halves = 0.5 / np.maximum(sums.pairs, 1.0)
-        # Lag 0, then lags 1..K; time, counted from the middle in windows, comes last.
-        raw = np.empty((lags + 1, c + 1, c + 1))
-        zero = sums.second / n
-        zero -= mean[:, None] * mean
-        raw[0, :c, :c] = zero
-        np.multiply(sums.spread, -halves[:, None, None], out=raw[1:, :c, :c])
-        raw[1:, :c, :c] += zero
-        k = np.arange(lags + 1.0) / n
-        raw[:, :c, c] = (sums.place - 0.5 * (n - 1) * sums.first) / n / n
-        raw[1:, :c, c] -= sums.change * (k[1:] * halves)[:, None]
-        raw[:, c, :c] = raw[:, :c, c]
-        raw[:, c, c] = (1.0 - 1.0 / (n * n)) / 12.0 - 0.5 * k * k
-        self._raw = raw
-        self._flat = raw.reshape(lags + 1, -1)
-        # Powers of theta, their derivatives, and lag 0 apart.
-        self._powers = np.zeros((3, lags + 1))
-        self._powers[0, 0] = 1.0
-        load = independent(zero[1:, 1:])
-        self._load = np.zeros((c, load.shape[1]))
-        self._load[:-1] = load
-        self.basis = independent(raw[0, 1:, 1:]) if trend else self._load
-
-    @property
-    def rank(self) -> int:
-        """Return the number of regressors."""
-        return int(self.basis.shape[1])
-
-    def residual(self, beta: FloatArray) -> tuple[float, FloatArray]:
-        """Return autocovariances, V^2, of the voltage less its mean: lag 0, lags 1..K."""
-        w = np.concatenate([_ONE, -beta])
-        c = (self._raw @ w) @ w
-        return float(c[0]), c[1:]
-
-    def regress(self, log_a: float, theta: float) -> MeanFit:
-        """Fit the mean by generalised least squares with the noise of (ln a, theta)."""
-        gram, by_log_a, by_theta = (self._weights(log_a, theta) @ self._flat).reshape(
-            3, *self._raw.shape[1:])
-        basis = self.basis
-        inner = gram[1:, 1:]
-        cov = basis @ np.linalg.inv(basis.T @ inner @ basis) @ basis.T
-        # The gradient of half a log-determinant is half the trace of inverse times change.
-        return MeanFit(cov @ gram[1:, 0], cov,
-                       (0.5 * float(np.vdot(cov, by_log_a[1:, 1:])),
-                        0.5 * float(np.vdot(cov, by_theta[1:, 1:]))), gram)
-
-    def trend_score(self, mean: MeanFit) -> float:
-        """Return a trend beyond the load, over its standard error, with the noise of `mean`."""
-        gram = mean.gram
-        cov = mean.cov
-        if self.basis is not self._load:
-            load = self._load
-            cov = load @ np.linalg.inv(load.T @ gram[1:, 1:] @ load) @ load.T
-        # What the load does not explain of the trend and of the voltage.
-        x, y = gram[1:, -1], gram[1:, 0]
-        explained = cov @ x
-        xx = float(gram[-1, -1] - explained @ x)
-        xy = float(gram[-1, 0] - explained @ y)
-        yy = float(gram[0, 0] - y @ cov @ y)
-        if not xx > 0.0:
-            return 0.0
-        spread = max(yy - xy * xy / xx, 0.0) * xx / self.n
-        return xy / math.sqrt(spread) if spread > 0.0 else 0.0
-
-    def _weights(self, log_a: float, theta: float) -> FloatArray:
-        """Return what each lag counts in x' K^-1 z, and the derivatives by ln a and theta."""
-        phi = math.exp(-math.exp(log_a))
-        by = -math.exp(log_a) * phi
-        one, cross, apart = 1.0 - theta * theta, 1.0 - phi * theta, theta - phi
-        lead, tail = 1.0 + phi * phi - 2.0 * phi * theta, 2.0 * cross * apart
-        more = 2.0 * theta / one
-        powers = self._powers
-        k = _COUNT[:powers.shape[1] - 1]
-        powers[1, 1:] = theta ** k
-        np.multiply(k[1:], powers[1, 1:-1], out=powers[2, 2:])
-        turn = np.array([
-            [lead, tail, 0.0],
-            [-2.0 * by * apart, -2.0 * by * (theta * apart + cross), 0.0],
-            [more * lead - 2.0 * phi, more * tail + 2.0 * (cross - phi * apart), tail]])
-        turn /= one
-        weights: FloatArray = turn @ powers
-        return weights
+# Neighbouring samples correlated by less than this many standard errors are not correlated.
+_CORRELATED = 4.0
+# alpha D beyond which neighbouring samples say nothing of relaxation; relaxations in the window
+# below which a drift may be chance.
+_FASTEST, _DOUBTFUL = 4.6, 25.0
 
 
 def independent(cov: FloatArray) -> FloatArray:
@@ -167,7 +56,8 @@ def independent(cov: FloatArray) -> FloatArray:
         return np.empty((0, 0))
     scale = np.sqrt(variances)
     values, vectors = np.linalg.eigh(cov / (scale[:, None] * scale))
-    found: FloatArray = vectors[:, values > _UNSEEN * values[-1]] / scale[:, None]
+    seen = values > _UNSEEN * values[-1]
+    found: FloatArray = vectors[:, seen] / np.sqrt(values[seen]) / scale[:, None]
     return found
 
 
@@ -181,106 +71,6 @@ TREND_SCORE = 4.0
 _FEW = 6.0
 # From this score on a trend is looked into (by chance once in 22 windows).
 SUSPECT = 2.0
-
-
-@dataclass(slots=True)
-class WindowFit:
-    """Fit of the sums of a window."""
-
-    # alpha times the step, and the moving-average coefficient.
-    a: float
-    theta: float
-    scale: float  # sigma^2 times the step, V^2
-    noise_share: float  # Noise variance of one sample in units of `scale`
-    noise_score: float  # Distance of theta from "no noise" in standard errors
-    log_var: tuple[float, float, float]  # Variances of ln(alpha), ln(sigma), ln(Var_inf)
-    level: FloatArray  # Means of voltage (less its reference) and load variables; shape (c,)
-    # Coefficients of the load, V per unit, and of time (0 without `trend`); shape (c,).
-    beta: FloatArray
-    beta_cov: FloatArray  # Their covariance, V^2
-    trend: bool  # Whether a trend was needed
-    trend_score: float  # Trend over its standard error
-    # Whether neighbouring samples are correlated at all; if not, a to log_var are NaN.
-    correlated: bool
-    variance: float  # Variance about the mean, V^2
-
-
-def fit_window(sums: Sums, m: int, start: tuple[float, float] | None = None) -> WindowFit:
-    """Fit the OU, the noise and the mean."""
-    if sums.first.size > 1:
-        fit = _fit_moving(sums, m, start, trend=False)
-    else:
-        fit = _fit_still(sums, m, start)
-    if fit.correlated and (abs(fit.trend_score) > SUSPECT
-                           or fit.a * sums.n < arma.DOUBTFUL):
-        # Without restoring force any drift may be chance, so the fit that includes the drift
-        # decides.
-        drifting = _fit_moving(sums, m, None, trend=True)
-        if drifting.correlated and abs(drifting.trend_score) > TREND_SCORE * (
-                1.0 + _FEW / (drifting.a * sums.n)):
-            return drifting
-    return fit
-
-
-def _fit_still(sums: Sums, m: int, start: tuple[float, float] | None) -> WindowFit:
-    """Fit a window whose mean is a constant."""
-    log_a, theta = start or (math.nan, math.nan)
-    end = arma.fit_sums(sums.row.tolist(), sums.pairs.size, log_a, theta, m)
-    level, c0 = np.array(end[:1]), end[1]
-    if end[2] != end[2]:
-        return _uncorrelated(level, _EMPTY, False, c0)
-    return WindowFit(end[2], end[3], end[5], end[6], end[7], (end[8], end[9], end[10]), level,
-                     _EMPTY, _NO_COV, False, end[11], _found(end[2:]), c0)
-
-
-_EMPTY = np.empty(0)
-_NO_COV = np.empty((0, 0))
-
-
-def _correlated(c0: float, c: FloatArray, n: int) -> bool:
-    return c0 > 0.0 and float(c[0]) > arma.CORRELATED * c0 / math.sqrt(n)
-
-
-def _found(end: tuple[float, ...]) -> bool:
-    """Whether a relaxation was found: within reach of the rate, and of positive variance."""
-    return end[0] < arma.FASTEST and end[3] > 0.0
-
-
-def _uncorrelated(level: FloatArray, beta: FloatArray, trend: bool, c0: float) -> WindowFit:
-    nan = math.nan
-    return WindowFit(nan, nan, nan, nan, nan, (nan, nan, nan), level, beta,
-                     np.full((beta.size, beta.size), nan), trend, nan, False, c0)
-
-
-def _fit_moving(sums: Sums, m: int, start: tuple[float, float] | None, trend: bool
-                ) -> WindowFit:
-    """Fit noise and mean in turn; the mean hardly moves, so two rounds are usual."""
-    moments = Moments(sums, trend)
-    at = start
-    # Without a start: ordinary least squares, as the fastest OU is as good as white.
-    mean = moments.regress(*(at or (arma.HIGH, 0.0)))
-    on_bound = False
-    for _ in range(8):
-        c0, c = moments.residual(mean.beta)
-        if not _correlated(c0, c, sums.n):
-            return _uncorrelated(moments.mean, mean.beta, trend, c0)
-        log_a, theta = at or arma.guess(c0, c.tolist())
-        tilt = mean.tilt if at else (0.0, 0.0)
-        before = log_a, theta
-        log_a, theta, on_bound = arma.search(
-            c0, c.tolist(), sums.n - 1.0 - moments.rank, log_a, theta, m, *tilt)
-        settled = at is not None and max(
-            abs(log_a - before[0]), abs(theta - before[1])) < arma.STEADY
-        at = log_a, theta
-        mean = moments.regress(log_a, theta)
-        if settled:
-            break
-    c0, c = moments.residual(mean.beta)
-    end = arma.finish(c0, c.tolist(), sums.n, sums.n - 1.0 - moments.rank, log_a, theta, on_bound,
-                      m)
-    return WindowFit(end[0], end[1], end[3], end[4], end[5], (end[6], end[7], end[8]),
-                     moments.mean, mean.beta, mean.cov * (end[2] / sums.n), trend,
-                     moments.trend_score(mean), _found(end), c0)
 
 
 class FitEnd(enum.Enum):
@@ -302,7 +92,6 @@ class Fitted:
     noise_var: float  # Variance of the white noise of one raw sample, V^2
     noise_score: float  # How many standard errors the noise is from none
     log_var: tuple[float, float, float]  # Variances of ln(alpha), ln(sigma), ln(Var_inf)
-    variance: float  # Variance about the mean, V^2
     level: FloatArray  # Means of voltage and load variables; shape (c,)
     # Load coefficients, V per unit, and covariance, V^2.
     beta: FloatArray
@@ -310,35 +99,24 @@ class Fitted:
     trend: bool  # Whether the mean drifts
     n: int  # Samples, or block means, fitted
     alpha_step: float  # alpha times the step between them
-
-
-def from_window(fit: WindowFit, step: float, m: int, n: int, reference: float) -> Fitted:
-    """Return a window's fit in physical units (step in s, reference in V)."""
-    level = fit.level.copy()
-    level[0] += reference
-    if not fit.correlated:
-        return Fitted(FitEnd.UNCORRELATED, math.nan, math.nan, fit.variance * m, math.nan,
-                      (math.nan,) * 3, fit.variance, level, fit.beta, fit.beta_cov, fit.trend, n,
-                      math.nan)
-    return Fitted(
-        FitEnd.FOUND, fit.a / step, math.sqrt(fit.scale / step),
-        fit.noise_share * fit.scale * m, fit.noise_score, fit.log_var, fit.variance, level,
-        fit.beta, fit.beta_cov, fit.trend, n, fit.a)
+    high: float  # Bias of alpha, over the length of the window
 
 
 # Relaxations between two samples beyond which they are independent: exp(2 * 300) is a double.
 _FAR = 300.0
 # Unknowns of a tridiagonal system that are eliminated at once: fewer steps of NumPy calls.
 _DENSE = 24
-# A step that gains less than this, nats, is not taken: the optimum is then within a hundredth of
-# a standard error.
-_SETTLED = 1e-5
+# A step that gains less than this, nats, is not taken: the optimum is then within 1e-4 standard
+# errors, wherever the search began.
+_SETTLED = 1e-9
 # Evaluations that a fit may take after the first; 4 to 8 are usual, more where nothing tells
 # alpha from noise.
 _MOST_POINTS = 24
 # Step of the finite differences of slopes, in ln a and z: for unit curvature the error is 1e-4,
-# the rounding 1e-7.
-_STEP = 1e-4
+# the rounding 1e-7; and of those of values.
+_STEP, _HAIR = 1e-4, 1e-3
+# Points of the first grid of a search, in ln a and z.
+_GRID = (16, 8)
 # Lower limit of the curvature of a direction, nats; longest step.
 _FLAT, _LONGEST = 1e-3, 1.5
 # Share of noise up to which the search is linear in it; noise of more than ten thousand times the
@@ -362,18 +140,72 @@ class _Point:
     gram: FloatArray
 
 
-class Likelihood:
-    """Restricted likelihood of one data set, profiled over scale and mean (t in s, y in V)."""
+class _Likelihood(Protocol):
+    """A restricted likelihood, profiled over scale and mean."""
 
-    def __init__(self, t: FloatArray, y: FloatArray, regressors: FloatArray) -> None:
+    n: int  # Samples
+    m: int  # Raw samples in each
+    step: float  # Mean step, s
+    low: FloatArray  # Ends of ln a and z
+    high: FloatArray
+
+    def at(self, log_a: float, z: float, used: int) -> _Point:
+        """Return the likelihood with the first `used` regressors."""
+
+    def start(self, used: int) -> FloatArray:
+        """Return ln a and z where a search may begin."""
+
+
+def _ends(n: int) -> tuple[FloatArray, FloatArray]:
+    """Return the ends of ln a and z: one relaxation in ten windows, neighbours uncorrelated."""
+    return np.array([math.log(0.1 / (n - 1)), 0.0]), np.array([math.log(2.0 * _FASTEST), _LOUDEST])
+
+
+class SpectralLikelihood:
+    """Of samples, or means of m, in evenly spaced stretches of `lengths`; the voltage is last."""
+
+    def __init__(self, rows: FloatArray, lengths: list[int], step: float, m: int = 1) -> None:
+        self.n, self.m, self.step = rows.shape[1], m, step
+        self._cross = CrossSpectrum(rows, lengths)
+        self.low, self.high = _ends(self.n)
+
+    def _spectra(self, log_a: FloatArray, z: FloatArray) -> FloatArray:
+        """Return the spectra of OU and noise in units of sigma^2, shape (k, bins)."""
+        gamma = np.array([arma.block_autocovariance(math.exp(x), self.m) for x in log_a.tolist()])
+        a = np.exp(log_a)
+        # Block means of an OU are correlated as an OU of this variance, and vary by less.
+        size = gamma[:, 1] * np.exp(a)
+        white = gamma[:, 0] - size + _SMALL * np.expm1(z)
+        return np.asarray(self.step * (
+            size[:, None] * self._cross.ou(a[:, None]) + white[:, None]))
+
+    def at(self, log_a: float, z: float, used: int) -> _Point:
+        """Return the likelihood with the first `used` regressors, see `StampLikelihood.at`."""
+        value, scale, gram = self._cross.cost(self._spectra(
+            log_a + _HAIR * np.array([0.0, 1.0, -1.0, 0.0, 0.0]),
+            z + _HAIR * np.array([0.0, 0.0, 0.0, 1.0, -1.0])), used)
+        inverse = np.linalg.inv(gram[0, :used, :used])
+        return _Point(float(value[0]), (value[1::2] - value[2::2]) / (2.0 * _HAIR),
+                      float(scale[0]), inverse @ gram[0, :used, -1], inverse * float(scale[0]),
+                      gram[0])
+
+    def start(self, used: int) -> FloatArray:
+        """Return the best ln a and z of a grid."""
+        log_a, z = (x.ravel() for x in np.meshgrid(*(
+            np.linspace(*ends) for ends in zip(self.low, self.high, _GRID)), indexing='ij'))
+        k = int(np.argmin(self._cross.cost(self._spectra(log_a, z), used)[0]))
+        return np.array([log_a[k], z[k]])
+
+
+class StampLikelihood:
+    """Exact, of samples at any stamps, s; rows: regressors, the voltage, V, last."""
+
+    def __init__(self, t: FloatArray, rows: FloatArray) -> None:
         self.steps = np.diff(t)
-        self.n = t.size
+        self.n, self.m = t.size, 1
         self.step = float(t[-1] - t[0]) / (self.n - 1)
-        self.shift = float(y.mean())
-        self._table = np.concatenate([regressors.T, [y - self.shift]])
-        # Slowest rate worth a name: one relaxation in ten windows; fastest: the correlation of
-        # neighbours is below 1e-4.
-        self.low, self.high = math.log(0.1 / (self.n - 1)), arma.HIGH
+        self._table = rows
+        self.low, self.high = _ends(self.n)
 
     def at(self, log_a: float, z: float, used: int) -> _Point:
         """
@@ -427,38 +259,14 @@ class Likelihood:
         return _Point(value, slopes, rest / free, beta, inverse * (rest / free), gram)
 
     def start(self, used: int) -> FloatArray:
-        """Return ln a and z by the quasi-likelihood of the samples taken as even."""
-        x, y = self._table[:used], self._table[-1]
-        r, m = y - np.linalg.lstsq(x.T, y, rcond=None)[0] @ x, 1
-        log_a, z = self.high, 0.0
-        while True:
-            c0, c = _variogram(r)
-            if not c0 > 0.0:
-                break
-            log_a, theta, _ = arma.search(c0, c, r.size - used, *arma.guess(c0, c), m, 0.0, 0.0)
-            a = math.exp(log_a)
-            z = noise_scale(max(arma.noise_share(a, theta, m), 0.0) * m * m)
-            log_a -= math.log(m)
-            # Coarser where noise hides what the lags can hold, as in even windows.
-            if theta ** LAGS <= LOST or r.size < FACTOR * FEWEST:
-                break
-            r = r[:r.size // FACTOR * FACTOR].reshape(-1, FACTOR).mean(axis=1)
-            m *= FACTOR
-        return np.clip([log_a, z], [self.low, 0.0], [self.high, _LOUDEST])
+        """Return ln a and z of the samples taken as evenly spaced."""
+        even = SpectralLikelihood(self._table, [self.n], self.step)
+        return maximise(even, used).place
 
 
 def noise_scale(share: float) -> float:
     """Return z of the white noise over sigma^2 times the mean step: linear, then logarithmic."""
     return math.log1p(share / _SMALL)
-
-
-def _variogram(r: FloatArray) -> tuple[float, list[float]]:
-    """Return the variance of residuals, and their autocovariances by the variogram, V^2."""
-    c0, c = float(r @ r) / r.size, []
-    for k in range(1, min(LAGS, r.size - 1) + 1):
-        d = r[k:] - r[:-k]
-        c.append(c0 - 0.5 * float(d @ d) / d.size)
-    return c0, c
 
 
 def solve_tridiagonal(diag: FloatArray, off: FloatArray, right: FloatArray
@@ -508,10 +316,11 @@ def _woven(even: FloatArray, odd: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class ExactFit:
-    """Result of `fit_exact`; no bias correction."""
+class Maximum:
+    """Result of `maximise`; no bias correction."""
 
-    # Relaxation rate, 1/s; noise intensity, V/sqrt(s); variance of the white noise, V^2.
+    # Relaxation rate, 1/s; noise intensity, V/sqrt(s); variance of the white noise, V^2, of a
+    # sample or block mean.
     alpha: float
     sigma: float
     noise_var: float
@@ -526,33 +335,30 @@ class ExactFit:
     # alpha times the mean step, and noise_var over sigma^2 times the mean step.
     a: float
     share: float
-    # Products of all columns at the maximum, see `_Point`.
+    # Products of all rows at the maximum, see `_Point`.
     gram: FloatArray
     # ln a and z at the maximum, and the curvature there, nats: where the next window begins.
     place: FloatArray
     curved: FloatArray | None
 
 
-def fit_exact(likelihood: Likelihood, used: int, before: ExactFit | None = None) -> ExactFit:
+def maximise(likelihood: _Likelihood, used: int, before: Maximum | None = None) -> Maximum:
     """
     Fit alpha, sigma, the white noise and the mean, of the first `used` regressors.
 
     before: the fit of a nearly identical window.
     """
-    low, high = np.array([likelihood.low, 0.0]), np.array([likelihood.high, _LOUDEST])
+    low, high = likelihood.low, likelihood.high
     place, at, curved = _least(
         lambda p: likelihood.at(p.item(0), p.item(1), used),
         likelihood.start(used) if before is None else np.clip(before.place, low, high),
         None if before is None else before.curved, low, high)
     log_a, z = place.tolist()
-    beta = at.beta.copy()
-    beta[0] += likelihood.shift
     a, share = math.exp(log_a), _SMALL * math.expm1(z)
     # The likelihood is flat at the slow end: within 5 % of the end is at the end.
-    edge = -1 if log_a < low[0] + 0.05 else 1 if a > arma.FASTEST else 0
-    return ExactFit(a / likelihood.step, math.sqrt(at.scale),
-                    share * at.scale * likelihood.step, beta, at.cov, -at.value, edge, a, share,
-                    at.gram, place, curved)
+    edge = -1 if log_a < low[0] + 0.05 else 1 if a > _FASTEST else 0
+    return Maximum(a / likelihood.step, math.sqrt(at.scale), share * at.scale * likelihood.step,
+                   at.beta, at.cov, -at.value, edge, a, share, at.gram, place, curved)
 
 
 def _least(f: Callable[[FloatArray], _Point], here: FloatArray, curved: FloatArray | None,
@@ -608,55 +414,123 @@ def _least(f: Callable[[FloatArray], _Point], here: FloatArray, curved: FloatArr
 MOST = 4096
 # Share of its variance that time must keep, given the load, to be separable from it.
 _APART = 1e-5
+# Samples that make one of a coarser grid, and samples below which there is none.
+_FACTOR, _FEWEST = 4, 100
+# An ADC step is white noise only where the OU crosses several codes within a
+# step: D >= (0.7 step / sigma)^2 (doc/estimation.md).
+_DITHER = 0.7
+# What alpha is high by, in 1/T: spectral likelihood, and that of the stamps.  The restricted
+# likelihood of the stamps leaves 2/T of the bias of alpha (Tang & Chen, J. Econometrics 149 (2009)
+# 65: 4/T with unknown mean, half of it from the mean), the spectral one 0.1 to 1.2/T, and 1.6 to
+# 2.5/T beside 5 mV of noise (600 simulated windows each of 12 to 126 relaxations).  Var_inf =
+# sigma^2 / (2 alpha) is convex in alpha, and users divide one by the other, so that one correction
+# serves both: it leaves Var_inf high by 0.5/(alpha T) and 1.3/(alpha T).
+_HIGH_BY = (0.5, 1.5)
+# What regression leaves, or a diffusion of one step, below this share of the mean square is
+# rounding.
+_EXACT = 1e-14
 
 
-def fit_irregular(columns: FloatArray, moves: bool, before: ExactFit | None = None
-                  ) -> tuple[Fitted, ExactFit | None]:
+def fit_window(t: FloatArray, y: FloatArray, load: FloatArray, m: int, adc: float,
+               stamps: Callable[[float], bool], before: Maximum | None,
+               ) -> tuple[Fitted, Maximum | None]:
     """
-    Fit the OU, the noise and the mean at the stamps as they are.
+    Fit the OU, the noise and the mean.
 
-    before: the second value returned for a nearly identical window.
+    t in s, y in V; load: variables of shape (c, n), none while throttle stands still; m: raw
+    samples in each; adc: ADC step, V; stamps: whether stamps count as they are at an alpha times
+    the mean step (inf: whatever it is); before: the second value returned for a nearly identical
+    window.
     """
-    t, y = columns[T] - columns[T, 0], columns[Y]
-    load = np.empty((0, t.size))
-    if moves:
-        u, fast, slow = columns[[U, FAST, SLOW]]
-        load = np.stack([u, u * u, fast, slow])
-    level = load.mean(axis=1)
-    centred = load - level[:, None]
+    level = np.append(y.mean(), load.mean(axis=1))
+    centred = load - level[1:, None]
     basis = independent(centred @ centred.T / t.size)
     known = basis.T @ centred
-    time = t / t[-1] - 0.5
+    time = (t - t[0]) / (t[-1] - t[0]) - 0.5
     # Time beside the load: what of it the load does not explain.
     within = known @ time / t.size
-    time -= time.mean() + within @ known
-    likelihood = Likelihood(t, y, np.column_stack([np.ones(t.size), known.T, time]))
-    used = 1 + len(known)
-    fit, trend = fit_exact(likelihood, used, before), False
-    doubtful = fit.a * t.size < arma.DOUBTFUL
-    # Where there may be another optimum the next search begins anew.
-    again = None if doubtful or fit.edge else fit
-    if float(time @ time) > _APART * t.size / 12.0 and (
-            doubtful or abs(_score(fit.gram, used, t.size)) > SUSPECT):
-        drifting = fit_exact(likelihood, used + 1, again)
-        if drifting.beta[-1] ** 2 > TREND_SCORE ** 2 * drifting.beta_cov[-1, -1]:
-            fit, trend = drifting, True
-            basis = np.block([[basis, -(basis @ within)[:, None]],
-                              [np.zeros((1, len(known))), np.ones((1, 1))]])
-            level = np.append(level, 0.0)
-    beta = basis @ fit.beta[1:]
-    cov = basis @ fit.beta_cov[1:, 1:] @ basis.T
-    variance = fit.sigma ** 2 / (2.0 * fit.alpha) + fit.noise_var
-    outcome = {-1: FitEnd.UNBOUND, 0: FitEnd.FOUND, 1: FitEnd.UNCORRELATED}[fit.edge]
+    time = time - time.mean() - within @ known
+    used, apart = 1 + len(known), float(time @ time) > _APART * t.size / 12.0
+    rows = np.stack([np.ones(t.size), *known, *([time] if apart else []), y - level[0]])
+    # What least squares leaves, against rounding; the fit adds what it changes.
+    plain = np.linalg.lstsq(rows[:used].T, rows[-1], rcond=None)[0]
+    rows[-1] -= plain @ rows[:used]
+    left = rows[-1]
+    variance = float(left @ left) / t.size
+    rounding = _EXACT * float(np.mean((y - y[0]) ** 2))
+    exact, held, trend = stamps(math.inf), m, False
+    likelihood: _Likelihood = _spectral(t, rows, m)
+    found: Maximum | None = None
+    again: Maximum | None = None
+    if variance > rounding and (exact or _correlated(left)):
+        if not exact:
+            found = maximise(likelihood, used, before)
+            exact = stamps(found.a)
+        if found is None or exact:
+            likelihood = StampLikelihood(t, rows)
+            found = maximise(likelihood, used, before)
+        while not exact and found.edge == 0 and likelihood.n >= _FACTOR * _FEWEST and (
+                likelihood.step < (_DITHER * adc / found.sigma) ** 2):
+            # Coarser where an ADC step hides what neighbours differ by.
+            held *= _FACTOR
+            likelihood = _spectral(t, rows, m, held // m)
+            found = maximise(likelihood, used)
+        doubtful = found.a * likelihood.n < _DOUBTFUL
+        # Where there may be another optimum the next search begins anew.
+        again = None if doubtful or found.edge or held > m else found
+        if apart and found.edge <= 0 and (
+                doubtful or abs(_score(found.gram, used, likelihood.n)) > SUSPECT):
+            # Without restoring force any drift may be chance, so the fit that includes the drift
+            # decides.
+            drifting = maximise(likelihood, used + 1, again)
+            if drifting.edge <= 0 and drifting.beta[-1] ** 2 > drifting.beta_cov[-1, -1] * (
+                    TREND_SCORE * (1.0 + _FEW / (drifting.a * likelihood.n))) ** 2:
+                found, trend = drifting, True
+    if found is None or found.edge > 0 or found.sigma ** 2 * likelihood.step < rounding:
+        level[0] += plain[0]
+        return Fitted(FitEnd.UNCORRELATED, math.nan, math.nan, variance * m, math.nan,
+                      (math.nan,) * 3, level, np.append(basis @ plain[1:], 0.0),
+                      np.full((len(load) + 1,) * 2, math.nan), trend, t.size, math.nan,
+                      math.nan), None
+    whole = np.zeros((len(load) + 1, used - 1 + trend))
+    whole[:-1, :used - 1] = basis
+    beta = found.beta.copy()
+    beta[:used] += plain
+    level[0] += beta[0]
+    if trend:
+        whole[:-1, -1], whole[-1, -1] = -(basis @ within), 1.0
+    theta, bare = (arma.theta_at(found.a, likelihood.m, share) for share in (found.share, 0.0))
+    spread = (1.0 - math.exp(-found.a) * theta) / (math.exp(-found.a) - theta) * math.sqrt(
+        (1.0 - theta * theta) / likelihood.n)
     return Fitted(
-        outcome, fit.alpha, fit.sigma, fit.noise_var, math.inf if fit.share else 0.0,
-        arma.log_covariance(fit.a, arma.theta_at(fit.a, 1, fit.share), 1, t.size), variance,
-        np.concatenate(([fit.beta[0]], level)), beta, cov, trend, t.size, fit.a), again
+        FitEnd.UNBOUND if found.edge else FitEnd.FOUND, found.alpha, found.sigma,
+        found.noise_var * likelihood.m, max(theta - bare, 0.0) / spread,
+        arma.log_covariance(found.a, theta, likelihood.m, likelihood.n), level,
+        whole @ beta[1:], whole @ found.beta_cov[1:, 1:] @ whole.T, trend, likelihood.n,
+        found.a, _HIGH_BY[int(exact)]), again
+
+
+def _spectral(t: FloatArray, rows: FloatArray, m: int, factor: int = 1) -> SpectralLikelihood:
+    """Return the likelihood of the stretches without a gap, or of means of so many samples."""
+    parts = stretches(t) or [slice(0, t.size)]
+    sizes = [(part.stop - part.start) // factor for part in parts]
+    step = sum(t[part.stop - 1] - t[part.start] for part in parts) / sum(
+        part.stop - part.start - 1 for part in parts)
+    means = [rows[:, part.start:part.start + size * factor].reshape(
+        len(rows), size, factor).mean(axis=2) for part, size in zip(parts, sizes)]
+    return SpectralLikelihood(np.concatenate(means, axis=1), sizes, factor * step, factor * m)
+
+
+def _correlated(left: FloatArray) -> bool:
+    """Whether neighbours are correlated at all."""
+    square = float(left @ left)
+    return square > 0.0 and float(left[1:] @ left[:-1]) > (
+        _CORRELATED * square / math.sqrt(left.size))
 
 
 def _score(gram: FloatArray, used: int, n: int) -> float:
     """Return the coefficient of the regressor after the first `used`, in standard errors."""
-    others = np.linalg.pinv(gram[:used, :used], hermitian=True) @ gram[:used, used:]
+    others = np.linalg.solve(gram[:used, :used], gram[:used, used:])
     rest = gram[used:, used:] - gram[used:, :used] @ others
     xx, xy, yy = rest.item(0, 0), rest.item(0, -1), rest.item(-1, -1)
     left = (xx * yy - xy * xy) / (n - used - 1)

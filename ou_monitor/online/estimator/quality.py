@@ -3,12 +3,6 @@ What the input and the fit are good for: ADC steps, bias, honest errors, status,
 
 In a diffusion equal neighbours have probability zero, so repeats, lattices and mass at the
 extremes are exact findings, told from the samples before any model.
-
-Small-sample correction.  The restricted likelihood leaves 2/T of the bias of alpha (Tang & Chen,
-J. Econometrics 149 (2009) 65: 4/T with unknown mean, half of it from the mean).  Var_inf =
-sigma^2 / (2 alpha) is convex in alpha and unbiased already at alpha - 1/T.  Both are published,
-and users divide one by the other, so one correction serves both: 1.5/T, which leaves each high by
-0.5/(alpha T), a thirtieth of its standard error at alpha T = 126.
 """
 
 from __future__ import annotations
@@ -91,8 +85,6 @@ def _piles_up(y: FloatArray) -> bool:
     return False
 
 
-# What alpha is high by, in 1/T (see above).
-_HIGH_BY = 1.5
 # Relaxation times in the window from which alpha is known to a quarter (doc/estimation.md).
 GOOD_RELAXATIONS = 25.0
 # Standard error of ln(alpha), before it is widened, beyond which alpha is not known to a factor.
@@ -101,9 +93,9 @@ _BURIED = 0.5
 # error is this many times that without noise.
 _BURIED_BY = 2.0
 # In short windows ln(alpha) has wider tails than its information says: its
-# standard error grows by 1 + 1.5/x + 70/x^2, x = alpha T, which brings the
+# standard error grows by 1 + 1.5/x + 70/x^2, x = alpha T + 1.5, which brings the
 # coverage of 95 % intervals to 94 % at x = 12; doc/estimation.md.
-_WIDER, _MUCH_WIDER = 1.5, 70.0
+_WIDER, _MUCH_WIDER, _AS_FITTED = 1.5, 70.0, 1.5
 # Width of the zone beside "no noise" in which errors of sigma shrink (measured).
 _NEAR = 0.75
 # Throttle that moves less than this (standard deviation) cannot tell sag.
@@ -126,7 +118,7 @@ def log_errors(fit: Fitted, duration: float) -> tuple[float, float, float]:
     duration in s.
     """
     # Fewer than a thousandth are as good as none.
-    relaxations = max(fit.alpha * duration, 1e-3)
+    relaxations = max(fit.alpha * duration - fit.high + _AS_FITTED, 1e-3)
     wider = 1.0 + (_WIDER + _MUCH_WIDER / relaxations) / relaxations
     near = math.exp(-0.5 * math.pow(min(fit.noise_score / _NEAR, 1e3), 2))
     return (_root(fit.log_var[0]) * wider, _root(fit.log_var[1]) * math.sqrt(1.0 - 0.32 * near),
@@ -158,14 +150,14 @@ def judge(fit: Fitted, measured: Mapping[str, Any], quality: Quality, throttle_s
             _SMOOTH, _SMOOTH_SCORE / math.sqrt(fit.n)):
         flags.append(Flag.LOWPASS_UPSTREAM)
     known.update(sigma=fit.sigma, sigma_se=se[1])
-    relaxations = fit.alpha * duration - _HIGH_BY
+    relaxations = fit.alpha * duration - fit.high
     if fit.outcome is FitEnd.UNBOUND or relaxations < 0.5:
         return Estimate(status=Status.UNBOUND, flags=tuple(flags), **known)
     if fit.log_var[0] > max(_BURIED ** 2, _BURIED_BY ** 2 * 2.0 / relaxations):
         return Estimate(status=Status.BURIED, flags=tuple(flags), **known)
     # A short window often looks longer than it is: one standard error is granted.
     surely = relaxations * math.exp(-se[0])
-    alpha = fit.alpha - _HIGH_BY / duration
+    alpha = fit.alpha - fit.high / duration
     var_inf = fit.sigma ** 2 / (2.0 * alpha)
     # The mean of an OU over a long window has variance 2 Var_inf / (alpha T).
     level_var = 2.0 * var_inf / (alpha * duration)

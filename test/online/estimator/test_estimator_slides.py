@@ -23,10 +23,9 @@ def numbers(e):
 @pytest.mark.parametrize('moving', [False, True])
 def test_estimates_on_the_way_change_nothing(moving):
     """
-    With 60 estimates on the way sums are taken in pieces, and searches start warm.
+    With 60 estimates on the way searches start warm.
 
-    Each search stops where a step is below 1e-6 (1e-3 while the mean is fitted
-    along, which leaves its square).
+    Each stops where a step gains less than 1e-9 nats, 1e-4 standard errors.
     """
     once, often = SlidingEstimator(2.0), SlidingEstimator(2.0)
     y = Y - 0.6 * U if moving else Y
@@ -36,7 +35,7 @@ def test_estimates_on_the_way_change_nothing(moving):
         often.push(T[part], y[part], U[part] if moving else None)
         often.estimate()
     a, b = once.estimate(), often.estimate()
-    assert numbers(a) == pytest.approx(numbers(b), rel=1e-4 if moving else 1e-5, nan_ok=True)
+    assert numbers(a) == pytest.approx(numbers(b), rel=1e-4, nan_ok=True)
     assert (a.n, a.duration, a.status, a.flags) == (b.n, b.duration, b.status, b.flags)
 
 
@@ -47,22 +46,20 @@ def test_sliding_is_the_fit_of_what_is_left():
         slid.push(T[begin:begin + 250], Y[begin:begin + 250])
         slid.estimate()
     e = slid.estimate()
-    # The window is resolved to a fortieth of itself.
-    assert 2000 - 50 <= e.n <= 2000 + 1 and e.duration == pytest.approx(DT * (e.n - 1))
+    assert e.n == 2001 and e.duration == pytest.approx(DT * (e.n - 1))
     alone = estimate(T[6000 - e.n:], Y[6000 - e.n:], window=2.1)
-    # Pairs that reach back behind the window are what a window that has slid knows more.
-    assert numbers(e)[:3] == pytest.approx(numbers(alone)[:3], rel=0.02)
+    assert numbers(e)[:3] == pytest.approx(numbers(alone)[:3], rel=1e-4)
 
 
 @pytest.mark.parametrize('seconds', [1.0, 2.0, 5.0])
-def test_resolution_of_the_window(seconds):
-    """Over many lengths of the past the window is within a fortieth of what was asked."""
+def test_the_window_is_as_long_as_asked(seconds):
+    """Over many lengths of the past, to one step."""
     estimator = SlidingEstimator(seconds)
     for begin in range(0, 6000, 13):
         estimator.push(T[begin:begin + 13], Y[begin:begin + 13])
         e = estimator.estimate()
         if T[begin] > seconds + 0.1:
-            assert seconds * (1.0 - 1.0 / 40.0) - 2 * DT <= e.duration <= seconds + DT
+            assert seconds - DT <= e.duration <= seconds * (1.0 + 1e-6)
 
 
 @settings(deadline=None, max_examples=25)
@@ -72,7 +69,7 @@ def test_units_and_shifts(scale, shift, slower, moving):
     Other volts, another level, another origin and unit of time.
 
     Doubles at a level of 100 V leave 1e-12 of sums of squares, the search its
-    1e-6 (see above); stamps in other units move the edges of slots by nothing.
+    1e-4 standard errors (see above).
     """
     n = 1500
     t, y = T[:n], Y[:n]
@@ -84,7 +81,7 @@ def test_units_and_shifts(scale, shift, slower, moving):
     one = estimate(t, y, u, window=2.0)
     two = estimate(slower * t, shift + scale * y, u, window=2.0 * slower)
     assert (two.status, two.n) == (one.status, one.n)
-    tight = 2e-4 if moving else 1e-5
+    tight = 2e-4
     assert two.alpha * slower == pytest.approx(one.alpha, rel=tight)
     assert two.sigma * slower ** 0.5 == pytest.approx(scale * one.sigma, rel=tight)
     assert two.var_inf == pytest.approx(scale ** 2 * one.var_inf, rel=tight)
@@ -98,10 +95,10 @@ def test_window_change_keeps_samples():
     """Shorter: the newest stay. Longer: nothing is lost, and the past is not invented."""
     estimator = SlidingEstimator(4.0)
     estimator.push(T, Y)
-    assert estimator.estimate().n == pytest.approx(4000, abs=101)
+    assert estimator.estimate().n == pytest.approx(4000, abs=1)
     estimator.window = 1.0
     e = estimator.estimate()
-    assert e.n == pytest.approx(1000, abs=26) and e.t == T[-1]
+    assert e.n == pytest.approx(1000, abs=1) and e.t == T[-1]
     assert e.alpha == pytest.approx(
         estimate(T[-e.n:], Y[-e.n:], window=1.1).alpha, rel=0.05)
     estimator.window = 3.0
@@ -117,9 +114,7 @@ def test_no_drift_and_bounded_memory():
     """
     Ten million samples at a level of 12 V, then against an estimator that is new.
 
-    Nothing is ever subtracted, so the sums are those of the window alone, to the
-    rounding of some thousand terms; only the voltage that moments are taken
-    against (the first ever seen) differs.  Memory is what the window needs.
+    Memory is what the window and one batch need.
     """
     rng = np.random.default_rng(52)
     y = 12.0 + 0.05 * paths(rng, 1, 10_000)[0]
@@ -137,13 +132,13 @@ def test_no_drift_and_bounded_memory():
             begin = tracemalloc.get_traced_memory()[0]
     end, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    # A window of 2000 samples takes 0.1 MB, a batch of 32768 at most 1 MB a column.
-    assert end - begin < 2e6 and peak < 3e7
+    # A batch of 32768 in three columns takes 0.8 MB, with room for as many 1.6 MB.
+    assert end - begin < 4e6 and peak < 3e7
     e = old.estimate()
     assert e.counters == Counters(pushed=10_000 * blocks, used=10_000 * blocks)
     new = SlidingEstimator(2.0)
     new.push((blocks - 1) * 10.0 + t, y)
-    # The same slots; new searches start elsewhere: 1e-6, once more from the same start.
+    # New searches start elsewhere, which is 1e-6.
     fresh = new.estimate()
     assert (e.n, e.status) == (fresh.n, fresh.status)
     assert numbers(e)[:5] == pytest.approx(numbers(fresh)[:5], rel=1e-5)

@@ -10,8 +10,8 @@ from ou_monitor.records import Counters, Flag, Status
 import pytest
 
 NAN = math.nan
-FIT = Fitted(FitEnd.FOUND, 63.0, 0.632, 25e-6, 5.0, (0.016, 0.001, 0.016), 3e-3,
-             np.array([5.0]), np.empty(0), np.empty((0, 0)), False, 2000, 0.063)
+FIT = Fitted(FitEnd.FOUND, 63.0, 0.632, 25e-6, 5.0, (0.016, 0.001, 0.016),
+             np.array([5.0]), np.empty(0), np.empty((0, 0)), False, 2000, 0.063, 1.5)
 BASE = {'t': 2.0, 'voltage': 5.0, 'throttle': NAN, 'n': 2000, 'duration': 2.0, 'rate': 1000.0,
         'counters': Counters()}
 CLEAN = Quality(0.0, 1, False, 0.02)
@@ -23,7 +23,7 @@ def judged(fit=FIT, base=BASE, quality=CLEAN, throttle_std=NAN, smoothness=NAN, 
 
 
 def test_corrections():
-    """Tang & Chen: 1.5/T off alpha; Var_inf goes with it; sigma and the noise stay."""
+    """The bias off alpha; Var_inf goes with it; sigma and the noise stay."""
     e = judged()
     assert e.alpha == pytest.approx(63.0 - 1.5 / 2.0)
     assert (e.sigma, e.noise_std) == (0.632, pytest.approx(5e-3))
