@@ -137,6 +137,17 @@ def _basis(rows: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.inv(np.linalg.qr(R[:, kept], mode='r')).T @ rows[kept])
 
 
+def _beside(basis: FloatArray, rows: FloatArray) -> FloatArray:
+    """Return an orthonormal basis of what rows add to an orthonormal one."""
+    size = np.sqrt(np.mean(rows * rows, axis=1))
+    rows = rows[size > 0.0] / size[size > 0.0, None]
+    # Twice, against rounding.
+    for _ in range(2):
+        rows = rows - (rows @ basis.T) @ basis
+    rows = rows[np.sqrt(np.mean(rows * rows, axis=1)) >= _SPANNED]
+    return _basis(rows) if rows.size else rows
+
+
 def _moved(x: FloatArray, late: int) -> FloatArray:
     """Return what `x` is `late` samples later; its ends hold."""
     if not late:
@@ -197,11 +208,12 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
 
     def best(x: FloatArray, regressors: Any, most: int = _DELAYS) -> list[FloatArray]:
         """Return the regressors of a load at the delay that leaves least."""
-        left, held, rest = {}, _basis(np.stack(columns)[:, last]), v[last]
+        left, held = {}, _basis(np.stack(columns)[:, last])
+        rest = v[last] - (held @ v[last]) @ held
         for late in sorted(range(-most, most + 1), key=abs):
             # Those before the last ones are for the lags to settle.
             loads = regressors(_moved(x[-2 * _DELAY_READINGS:], late))[:5]
-            Q = _basis(np.stack([*held, *(c[last] for c in loads)]))
+            Q = _beside(held, np.stack([c[last] for c in loads]))
             left[late] = float(rest @ rest - np.sum((Q @ rest) ** 2))
         least = min(left, key=left.__getitem__)
         # A delay must pay, or noise would choose it.
