@@ -495,7 +495,9 @@ class Recording:
     def __post_init__(self) -> None:
         """Take dates and masked values for what they are; refuse what cannot be one recording."""
         object.__setattr__(self, 't', as_seconds(self.t))
-        if (beyond := self.t[np.isfinite(self.t) & (np.abs(self.t) > MOST_STAMP)]).size:
+        # Without the copy that `abs` would make of an hour of stamps.
+        far = (self.t > MOST_STAMP) | (self.t < -MOST_STAMP)
+        if (beyond := self.t[np.isfinite(self.t) & far]).size:
             raise ValueError(f'a stamp of {beyond[0]:.4g} s is implausible: give all stamps in s, '
                              'or all as dates')
         for name in ('voltage', 'throttle', 'current'):
