@@ -11,7 +11,7 @@ from typing import NoReturn
 from ou_monitor.nodes.run import run_node, spin
 
 LIFECYCLE = '--lifecycle'
-_DESCRIBED = "'ros2 param describe' shows what each parameter means and its range"
+_DESCRIBED = "'ros2 param describe' explains each parameter and gives its range"
 
 
 @dataclass(frozen=True)

@@ -3,21 +3,21 @@ The node of `adaptive_filter`.
 
 Inputs (relative names): `input` (a type of `filter_channels.CHANNELS`, or any
 installed type with `input.field`), `sigma` (std_msgs/Float64), and `state`
-(the estimator's `~/state`, DiagnosticArray), which is used while it is
-published: error of sigma, alpha, throttle, level, and whether the estimate is usable.
+(the estimator's `~/state`, DiagnosticArray): while it is published it gives the
+error of sigma, alpha, throttle, level, and whether the estimate is usable.
 With `notch.count` above 0 also `throttle` and `rpm` (by msg_config or `rpm.type` and
-`rpm.field`) for the notches, which stand before the low-pass; without `throttle` that of the
-state is taken.
+`rpm.field`) for the notches, which come before the low-pass; without `throttle` the
+throttle in `state` is used.
 Outputs: `~/output` (type, stamp and frame of the input; a derivative as
 geometry_msgs/AccelStamped or Vector3Stamped), `~/cutoff` (Hz) and `~/lag`
 (ms, phase delay at `lag_frequency`, notches included) as std_msgs/Float64 at `publish_rate`,
 `/diagnostics` at 1 Hz.
 
-Limits: of an IMU the angular velocity is filtered, with `input.acceleration` the
-linear acceleration too, and the covariances as those of white noise; of a BatteryState the
-voltage, unless `input.field` names another; the rest passes through; a message
-with a non-finite signal is counted and not passed on.  Messages whose stamps stand still or go
-back are placed by their arrival, and the diagnostics say so.
+Limits: an IMU's angular velocity is filtered, with `input.acceleration` its linear
+acceleration too, and its covariances shrink as for white noise; a BatteryState's
+voltage, unless `input.field` names another field.  Everything else passes through.
+Messages with a non-finite signal are counted and dropped.  Messages whose stamps repeat
+or go back are placed by their arrival, and the diagnostics report it.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ from ou_monitor.records import Level, NAN, Status
 from std_msgs.msg import Float64
 
 AUTO = 'auto'
-# The mode gives the output its unit, so it is not for changing in flight.
+# Fixed at run time: the mode decides the unit of the output.
 _MODE = next(p for p in FILTER_PARAMETERS if p.name == 'mode')
 RUN_TIME = (*(p for p in FILTER_PARAMETERS if p is not _MODE), *NOTCH_PARAMETERS)
 FIXED = (
-    Parameter('input.type', AUTO, 'Message type of `input`; auto: that of its publisher.'),
+    Parameter('input.type', AUTO, "Message type of `input`; auto: the publisher's type."),
     Parameter('input.field', '',
               'Field path of the signal; empty: data, voltage of a battery, angular velocity of '
               'an IMU.'),
@@ -56,31 +56,31 @@ FIXED = (
               'Filter the linear acceleration of an IMU beside its angular velocity.'),
     _MODE, *MOTOR_PARAMETERS)
 OWN_TOPICS = ('input', 'sigma', 'state', '~/output', '~/cutoff', '~/lag', '/diagnostics', '/clock')
-# Fields of the state that the filter uses as they are.
+# Fields of the state that the filter uses unchanged.
 _FIELDS = ('alpha', 'throttle', 'u0', 'u0_se', 'load_noise')
-# A sigma of a window longer than the sliding one by this is that of a fit.
+# A sigma whose window exceeds the sliding one by this ratio comes from a fit.
 _LONGER = 1.1
 _USABLE = (Status.OK.name, Status.SHORT_WINDOW.name)
 
 
 class KnownSupply(NamedTuple):
-    """The supply as it is known."""
+    """Latest valid estimate of the supply."""
 
-    # Noise intensity, V/sqrt(s), and the standard error of its logarithm; NaN: not known.
+    # Noise intensity, V/sqrt(s), and the standard error of its logarithm; NaN: unknown.
     sigma: float = NAN
     sigma_se: float = NAN
-    alpha: float = NAN  # Relaxation rate, 1/s; NaN: not known
-    throttle: float = NAN  # Throttle, 0..1; NaN: not known
-    # Level at the present throttle and its standard error, V; NaN: not known.
+    alpha: float = NAN  # Relaxation rate, 1/s; NaN: unknown
+    throttle: float = NAN  # Throttle, 0..1; NaN: unknown
+    # Level at the present throttle and its standard error, V; NaN: unknown.
     level: float = NAN
     level_se: float = NAN
-    why: str = ''  # Why sigma is not known; empty when it is
-    # 'relaxation': the estimator's sigma; 'load': the noise beside the load; 'none'.
+    why: str = ''  # Why sigma is unknown; empty when it is valid
+    # 'relaxation': the estimator's sigma; 'load': the noise not explained by the load; 'none'.
     source: str = 'none'
 
 
 class SupplyInput:
-    """Newest of `sigma` and `state`, each forgotten when it is stale (`now`: monotonic, s)."""
+    """Newest `sigma` and `state`, each dropped when stale (`now`: monotonic, s)."""
 
     def __init__(self, now: Callable[[], float], topics: tuple[str, str]) -> None:
         self._topic, self._state_topic = topics
@@ -92,21 +92,21 @@ class SupplyInput:
 
     @property
     def age(self) -> float | None:
-        """Seconds since the last sigma; None when there was none."""
+        """Seconds since the last sigma; None before the first."""
         return self._heard.age
 
     @property
     def state_age(self) -> float | None:
-        """Seconds since the last state; None when there was none."""
+        """Seconds since the last state; None before the first."""
         return self._state_heard.age
 
     def take_sigma(self, value: float) -> None:
-        """Take a sigma, V/sqrt(s); negative counts as not known."""
+        """Take a sigma, V/sqrt(s); a negative one counts as unknown."""
         self._heard.heard()
         self._sigma = value if value >= 0.0 and math.isfinite(value) else NAN
 
     def take_state(self, message: Any) -> None:
-        """Take a DiagnosticArray of the estimator; others on the topic are passed over."""
+        """Take a DiagnosticArray of the estimator; ignore others on the topic."""
         for status in message.status:
             values = {pair.key: pair.value for pair in status.values}
             if 'sigma_se' in values:
@@ -120,11 +120,11 @@ class SupplyInput:
 
     def now(self, stale_after: float, rate: float = NAN) -> KnownSupply:
         """
-        Return what is known, nothing of it older than `stale_after`, s.
+        Return the latest values that are not older than `stale_after`, s.
 
-        Without a sigma it is that of an OU of the deviation which the load leaves
-        at the present throttle, and of the `rate`, 1/s: white noise of the ADC is
-        in it, so that it is no less than the supply's own.
+        Without a sigma, use that of an OU process with the deviation left after the load
+        at the present throttle and relaxation `rate`, 1/s: it includes the ADC's white noise,
+        so it is never below the supply's own sigma.
         """
         fresh = within(self._state_heard.age, stale_after)
         error, (alpha, throttle, level, level_se, noise) = (
@@ -138,7 +138,7 @@ class SupplyInput:
             self._sigma, error, alpha, throttle, level, level_se, source='relaxation')
 
     def why_no_throttle(self, stale_after: float) -> str:
-        """Say why the throttle is not known."""
+        """Say why the throttle is unknown."""
         age = self._state_heard.age
         if age is None:
             return f'no message on {self._state_topic}'
@@ -176,7 +176,7 @@ QUANTITIES = ('throttle', 'rpm')
 
 class MotorInputs:
     """
-    Newest throttle, and motor speeds that have not been asked for yet.
+    Newest throttle, and the motor speeds received since the last call.
 
     By the values of `sources.MOTOR_PARAMETERS` and a monotonic clock, s.
     """
@@ -190,15 +190,15 @@ class MotorInputs:
         self.sources = SourceFinder(node, QUANTITIES, values, self._open)
 
     def age(self, quantity: str) -> float | None:
-        """Return the seconds since a message came; None when there was none."""
+        """Return the seconds since the last message; None before the first."""
         return self._silence[quantity].age
 
     def throttle(self, stale_after: float) -> float:
-        """Return the throttle, 0..1; NaN when none younger than `stale_after`, s, came."""
+        """Return the throttle, 0..1; NaN when the last is older than `stale_after`, s."""
         return self._throttle if within(self._silence['throttle'].age, stale_after) else NAN
 
     def take_speeds(self) -> list[float]:
-        """Return the motor speeds that came since this was asked last; empty: none."""
+        """Return the motor speeds received since the last call; empty: none."""
         speeds, self._speeds = self._speeds, []
         return speeds
 
@@ -224,7 +224,7 @@ class MotorInputs:
 class AdaptiveFilterNode(MonitorNode):
     """Low-pass with a cutoff driven by sigma, as a node."""
 
-    # Asked by `check` from the beginning on.
+    # `check` reads it from the beginning on.
     _channels: Channels | None = None
     _type = AUTO
     _topic = ''
@@ -238,7 +238,7 @@ class AdaptiveFilterNode(MonitorNode):
         """Begin with no message filtered."""
         self._channels = None
         self._filters: list[AdaptiveLowPass] = []
-        # Stands for them until there are any, and for what they would say.
+        # Replaces the filters until they exist.
         self._idle = AdaptiveLowPass(**self._of_filter(self.values()))
         self._notch = AdaptiveNotch(**notch_options(self.values()))
         self._motors = MotorInputs(
@@ -256,7 +256,7 @@ class AdaptiveFilterNode(MonitorNode):
         self._type, self._field, self._acceleration = (
             self.get_parameter(f'input.{key}').value for key in ('type', 'field', 'acceleration'))
         if self._acceleration:
-            # What it contradicts is said at the start, whatever comes.
+            # Contradictions are reported at the start, before any message.
             self._channels_of(IMU)
         self._topic = self.resolve_topic_name('input')
         self._stamper = Stamper(self, self._jumped)
@@ -362,7 +362,7 @@ class AdaptiveFilterNode(MonitorNode):
 
     def _notched(self, stamp: float, values: Sequence[float], supply: KnownSupply
                  ) -> Sequence[float]:
-        """Return the signals behind the notches; of a shadow they are as they were."""
+        """Return the signals after the notches; in shadow mode unchanged."""
         if not self._notch.settings.count and not self._notch.active:
             return values
         throttle = self._motors.throttle(self.low_pass.settings.stale_after)
@@ -383,10 +383,10 @@ class AdaptiveFilterNode(MonitorNode):
                                 self.low_pass.settings.alpha)
 
     def _jumped(self, reason: str) -> None:
-        """Do nothing: to the filter a step back is a step of no length, its output stays."""
+        """Do nothing: a step back in time has length 0, so the output stays."""
         self.get_logger().info(f'{reason}: the filter goes on from its output')
 
-    # -- what is said
+    # -- reporting
 
     def _publish(self) -> None:
         self._cutoff_output.publish(Float64(data=self.low_pass.cutoff))
@@ -424,7 +424,7 @@ class AdaptiveFilterNode(MonitorNode):
         self.diagnose('adaptive low-pass', level, summary, fields, self._topic)
 
     def _decided_by(self, supply: KnownSupply) -> str:
-        """Say in words what decides the cutoff now."""
+        """Say in words what determines the cutoff now."""
         low_pass = self.low_pass
         s, bound = low_pass.settings, low_pass.bound
         if not self._passed:
@@ -441,7 +441,7 @@ class AdaptiveFilterNode(MonitorNode):
         return bound.value
 
     def _unknown(self, supply: KnownSupply) -> str:
-        """Say why what the law needs is not known."""
+        """Say why the inputs of the law are unknown."""
         s = self.low_pass.settings
         if s.law == 'throttle':
             return self._supply.why_no_throttle(s.stale_after)
@@ -496,11 +496,11 @@ class AdaptiveFilterNode(MonitorNode):
 
 
 def _not_a_voltage(kind: str, settings: FilterSettings) -> bool:
-    """Tell whether a law that would filter the voltage itself meets a signal that is none."""
+    """Return whether the law needs the voltage itself but the signal is another."""
     own = {'kalman': settings.of_voltage, 'wiener': not settings.signal_bandwidth}
     return kind == 'sensor_msgs/msg/Imu' and own.get(settings.law, False)
 
 
 def _of_signal(settings: FilterSettings) -> str:
-    """Return the parameter by which a law knows that its signal is not the voltage."""
+    """Return the parameter that tells a law that its signal is not the voltage."""
     return 'coupling' if settings.law == 'kalman' else 'signal_bandwidth'

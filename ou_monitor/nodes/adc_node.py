@@ -2,13 +2,13 @@
 The node of `adc`.
 
 An IIO device with a buffer is read in blocks by a thread and published on `voltage` as
-sensor_msgs/JointState (a header and an array; `position` holds the samples, V, the stamp is that
-of the last one, by the kernel): msg_config `adc` reads it.  hwmon, and IIO without a buffer, are
-asked at their rate and published as sensor_msgs/BatteryState, a sample each, stamped when asked.
+sensor_msgs/JointState (a header and an array; `position` holds the samples, V, the stamp is the
+kernel's for the last one): msg_config `adc` reads it.  hwmon, and IIO without a buffer, are
+polled and published as sensor_msgs/BatteryState, one sample each, stamped when polled.
 `/diagnostics` at 1 Hz.
 
-Limits: one channel.  The blocks' stamps are the kernel's only with a timestamp channel; holes that
-it shows split a block, so that the estimator sees the gap.
+Limits: one channel.  Blocks carry kernel stamps only with a timestamp channel; a gap in them
+splits a block, so that the estimator detects the gap.
 """
 
 from __future__ import annotations
@@ -30,26 +30,26 @@ from ou_monitor.records import Level
 from sensor_msgs.msg import BatteryState, JointState
 
 ADC_PARAMETERS: tuple[Parameter, ...] = (
-    Parameter('device', '', 'IIO or hwmon device: its name, that of its folder, or a path.'),
+    Parameter('device', '', 'IIO or hwmon device: its name, its folder name, or a path.'),
     Parameter('channel', '', 'Channel, as in_voltage0 or in1; empty: the only one.'),
-    Parameter('gain', 1.0, 'Volts of the supply for a volt at the ADC (the divider).',
+    Parameter('gain', 1.0, 'Supply volts per volt at the ADC (the divider).',
               1.0e-6, 1.0e6),
-    Parameter('offset', 0.0, 'Added after that, V.', -1000.0, 1000.0),
+    Parameter('offset', 0.0, 'Added after the gain, V.', -1000.0, 1000.0),
     Parameter('rate', 0.0,
-              'Sampling frequency that is set (IIO), or how often a polled device is asked, Hz; '
-              '0: as the device says.', 0.0, 1.0e7),
-    Parameter('block', 0, 'Samples in a message; 0: those of 10 ms.', 0, 1_000_000),
-    Parameter('trigger', '', 'Name of the IIO trigger that is set; empty: as it is.'),
-    Parameter('polled', False, 'Whether an IIO device is polled, though it has a buffer.'),
-    Parameter('sysfs', '/sys', 'Where sysfs is.'),
-    Parameter('dev', '/dev', 'Where the character devices are.'),
+              'Sampling frequency to set (IIO), or polling rate of a polled device, Hz; '
+              '0: as the device is set.', 0.0, 1.0e7),
+    Parameter('block', 0, 'Samples in a message; 0: 10 ms of samples.', 0, 1_000_000),
+    Parameter('trigger', '', 'Name of the IIO trigger to set; empty: unchanged.'),
+    Parameter('polled', False, 'Whether to poll an IIO device even if it has a buffer.'),
+    Parameter('sysfs', '/sys', 'Path of sysfs.'),
+    Parameter('dev', '/dev', 'Path of the character devices.'),
 )
-# Silence after which the device is told to be silent, s.
+# Silence after which the device is reported silent, s.
 SILENT = 1.0
 
 
 class AdcNode(MonitorNode):
-    """One voltage of the kernel's, as a node."""
+    """One voltage read from the kernel, as a node."""
 
     def __init__(self, name: str) -> None:
         super().__init__(name, (), ADC_PARAMETERS)
@@ -99,7 +99,7 @@ class AdcNode(MonitorNode):
     def _publish(self, message: Any, block: Block) -> None:
         message.header.stamp = to_time(block.stamp)
         volts = block.volts * self._gain + self._shift
-        # It is taken over as it is; a list would be looked at number by number.
+        # It is taken over as an array; a list would be checked number by number.
         message.position = array('d', volts.tobytes())
         self._output.publish(message)
         self._samples += volts.size
@@ -107,7 +107,7 @@ class AdcNode(MonitorNode):
         self._silence.heard()
 
     def _poller(self, polled: PolledChannel) -> Callable[[], None]:
-        """Return the work that asks a channel at its rate."""
+        """Return the loop that polls a channel at its rate."""
         def work() -> None:
             nan = math.nan
             message = BatteryState(
@@ -120,7 +120,7 @@ class AdcNode(MonitorNode):
                 self._output.publish(message)
                 self._samples += 1
                 self._silence.heard()
-                # Where it cannot keep up it does not catch up.
+                # Missed polls are skipped.
                 due = max(due + 1.0 / self.rate, time.monotonic())
         return work
 
@@ -137,7 +137,7 @@ class AdcNode(MonitorNode):
                 + ': does its trigger run?')
         elif holes:
             level, summary = Level.WARN, (
-                f'{summary} {holes} times samples were missing: a larger block, or a lower rate.')
+                f'{summary} Samples were lost {holes} times: enlarge the block or lower the rate.')
         fields = {
             'device': self._device, 'channel': self._channel, 'rate': repr(self.rate),
             'measured_rate': repr(1.0 / self._interval if self._interval > 0.0 else math.nan),

@@ -39,7 +39,7 @@ _BUILT_IN = ('use_sim_time', 'start_type_description_service', QOS)
 
 LOCK = Parameter(
     'lock_parameters', False,
-    'Whether all that can disarm the node is refused at run time: every parameter but '
+    'Whether to refuse at run time all that can disarm the node: every parameter but '
     'publish_rate, ~/clear_brownout and ~/save_model.')
 # How long the diagnostics report an exception of a callback, s.
 TELL = 10.0
@@ -53,8 +53,8 @@ class MonitorNode(Node):
 
     Changes to parameters in `table` are checked together (`check` raises `ValueError` with the
     reason, and the old values stay), then passed to `apply`, which must keep all state. Parameters
-    in `fixed` are read at the start. A managed node (lifecycle) begins, and reads them, whenever
-    it is activated; any other calls `begin` at the end of its constructor.
+    in `fixed` are read at the start. A managed node (lifecycle) reads them and begins on each
+    activation; any other node calls `begin` at the end of its constructor.
     """
 
     # True between `begin` and `stop`.
@@ -68,9 +68,9 @@ class MonitorNode(Node):
         self._at_stop: list[Callable[[], object]] = []
         self.faults, self.fault = 0, ''
         self._faulted = -math.inf
-        # Error that ended the work of the thread; '' if none.
+        # Error that ended the thread's work; '' if none.
         self.problem = ''
-        # Set to end that work.
+        # Set to end the thread's work.
         self.ending = Event()
         self._thread: Thread | None = None
         self._publishing: Timer | None = None
@@ -98,7 +98,7 @@ class MonitorNode(Node):
         """Create publishers, subscriptions, services and timers."""
 
     def begin(self) -> None:
-        """Start; if that fails, close again all that was opened."""
+        """Start; if that fails, close everything opened so far."""
         try:
             self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
             self.start()
@@ -108,11 +108,11 @@ class MonitorNode(Node):
         self.running = True
 
     def stop(self) -> None:
-        """Close all that was opened since `begin`; parameters stay."""
+        """Close everything opened since `begin`; parameters stay."""
         self.running = False
         self.ending.set()
         if self._thread is not None:
-            # Before its publishers are closed.
+            # Before the publishers are closed.
             self._thread.join(2.0)
         for made in reversed(self._made):
             for destroy in (self.destroy_timer, self.destroy_subscription, self.destroy_service,
@@ -130,7 +130,7 @@ class MonitorNode(Node):
             try:
                 work()
             except Exception as error:
-                # A publisher that is gone after a shutdown is no failure.
+                # Publishing after a shutdown is not a failure.
                 if not self.ending.is_set() and self.context.ok():
                     self.problem = str(error) if isinstance(error, InputError) else (
                         f'{type(error).__name__}: {error}')
@@ -159,12 +159,12 @@ class MonitorNode(Node):
         """Bring checked parameters into force without losing state."""
         if self._publishing is not None and self._outputs_callback is not None and (
                 self._publishing.timer_period_ns != round(1e9 / values[PUBLISH_RATE.name])):
-            # A new period of an old timer begins only when the old one has ended.
+            # A timer applies a new period only after the old one has ended.
             self.destroy_timer(self._publishing)
             self.publish_every(self._outputs_callback)
 
     def every(self, period: float, callback: Callable[[], None]) -> Timer:
-        """Call back every `period` s of real time: silence shows under simulated time too."""
+        """Call back every `period` s of real time, so silence shows under simulated time too."""
         timer = self.create_timer(period, self.guarded(callback), clock=self.steady)
         self._made.append(timer)
         return timer
@@ -185,7 +185,7 @@ class MonitorNode(Node):
             try:
                 return callback(*args)
             except Exception as error:
-                # After a shutdown by signal the publishers are gone: that is no failure.
+                # After a shutdown by signal the publishers are closed: not a failure.
                 if self.context.ok():
                     self._take_fault(error)
         return call
@@ -200,7 +200,7 @@ class MonitorNode(Node):
         self.recover(error)
 
     def recover(self, error: Exception) -> None:
-        """Restart what an exception of a callback may have left unfinished."""
+        """Restart work that an exception of a callback may have left unfinished."""
 
     @property
     def fault_notes(self) -> list[str]:
@@ -227,7 +227,7 @@ class MonitorNode(Node):
 
     @property
     def subscriptions(self) -> Iterator[Subscription]:
-        """Return the subscriptions that an executor serves: all but those that are polled."""
+        """Return the subscriptions that an executor serves: all except polled ones."""
         return (s for s in super().subscriptions if s not in self._polled)
 
     def create_publisher(self, kind: Any, topic: str, qos: Any, **options: Any) -> Publisher:
@@ -255,7 +255,7 @@ class MonitorNode(Node):
         return made
 
     def _keep(self, made: Any) -> None:
-        """Remember what `stop` closes; rclpy opens its own before the list exists."""
+        """Record what `stop` closes; rclpy opens its own before the list exists."""
         if hasattr(self, '_made'):
             self._made.append(made)
 
@@ -289,8 +289,8 @@ class MonitorNode(Node):
         """
         Return a subscription callback of (message, info), guarded, for every executor.
 
-        rclpy 7.1's EventsExecutor hands over one tuple where the other
-        executors hand over two arguments.
+        rclpy 7.1's EventsExecutor passes one tuple where the other
+        executors pass two arguments.
         """
         inner = self.guarded(callback)
 
@@ -300,7 +300,7 @@ class MonitorNode(Node):
         return call
 
     def steady_now(self) -> float:
-        """Return the monotonic time, s: silence is measured by it, never by the wall clock."""
+        """Return the monotonic time, s, which measures silence (the wall clock may jump)."""
         return time.monotonic()
 
     def stamp_now(self) -> float:
@@ -358,7 +358,7 @@ def _readable_overrides(topic: str) -> Iterator[None]:
 
 
 def _never(message: Any) -> None:
-    """Do nothing: rclpy wants a callback for a polled subscription too."""
+    """Do nothing: rclpy requires a callback for a polled subscription too."""
 
 
 def _as_double(parameter: RosParameter) -> RosParameter:

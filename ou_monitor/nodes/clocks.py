@@ -1,24 +1,23 @@
 """
 Times of messages that carry no stamp: when sent, when sampled, and in simulated time.
 
-`SendClock`: when samples were taken, told from when they were sent.
+`SendClock`: estimates sampling times from sending times.
 
-A message without a stamp is known only by its source timestamp.  A driver
-samples by a timer, but what sends is scheduled: after a pause of 10 ms ten
-messages leave within 0.2 ms, and an increment that took 1 ms seems to have
-taken 20 us.  Half a per cent of such intervals doubles sigma.  So, as long as
-the source is steady, its samples are put on an even time line that leans
-slowly towards the source timestamps.
+A message without a stamp has only its source timestamp.  A driver samples by a timer,
+but its sending is scheduled: after a pause of 10 ms ten messages leave within 0.2 ms,
+and an increment that took 1 ms seems to have taken 20 us.  Half a per cent of such
+intervals doubles sigma.  So, while the source is steady, its samples are put on an even
+time line that drifts slowly towards the source timestamps.
 
 A steady source can be late, never early: the lower convex hull of source
 timestamp against message number is a straight line, its slope the period, and
-many messages lie near it (the way clock skew is told from delays: Zhang, Liu &
+many messages lie near it (clock skew is separated from delays in this way: Zhang, Liu &
 Xia 2002, "Clock synchronization algorithms for network measurements").  The
 hull must span many pauses, whatever the rate: a burst of 400 messages sent
 10 us apart is a straight line, too.
 
-Limits: a constant delay stays; a source that is not steady is left as it is, and `in_bursts` says
-so where its intervals cannot be those of samples, as of a driver that empties a buffer.
+Limits: a constant delay stays; an unsteady source is left unchanged, and `in_bursts` reports it
+when its intervals cannot be sampling intervals, as when a driver empties a buffer.
 
 `SimClockMap`: the middleware stamps every message with the wall clock of its sender.  When a
 bag is replayed at four times its speed, those stamps lie four times too close
@@ -36,37 +35,37 @@ import math
 import numpy as np
 from ou_monitor.records import FloatArray
 
-# Looked at: so many messages, and so many seconds of them, whichever is more.
+# Messages examined: the larger of this number and the messages of these seconds.
 KEEP, SPAN = 400, 1.0
-# Never more messages than that: a second at 30 kHz.
+# Maximum number of messages examined: one second at 30 kHz.
 MOST = 30_000
-# The first judgement is made with so many, over so long, s: pauses of 50 ms, each caught up
-# in a burst, tilt a line over 0.2 s by a quarter at most.
+# Messages, and seconds, needed for the first judgement: pauses of 50 ms, each caught up in a
+# burst, tilt a line over 0.2 s by a quarter at most.
 LEAST, FIRST_SPAN = 200, 0.2
 # Messages and seconds between judgements (a judgement takes 0.2 ms for 400 messages, 0.6 ms for
 # 10 000).
 JUDGE, JUDGE_SPAN = 100, 0.1
-# A message is near the line within NEAR sqrt(n) periods, n the messages looked at: the distance
-# of a source without a timer from its line grows as sqrt(n), so the share of it that is near is
-# one for all n.  Measured: near are 14 % of a Poisson source at most (99th percentile, n = 200;
-# 12 % from 400 on), 23 % or more of a 10 kHz timer whose process pauses 30 times a second for
-# 5..50 ms, 21 % when one message in a hundred is lost besides.
+# A message is near the line within NEAR sqrt(n) periods, n the messages examined: an untimed
+# source drifts from its line as sqrt(n), so its share of near messages does not depend on n.
+# Measured: at most 14 % of a Poisson source is near (99th percentile, n = 200; 12 % from 400 on),
+# 23 % or more of a 10 kHz timer whose process pauses 30 times a second for 5..50 ms, 21 % when one
+# message in a hundred is also lost.
 NEAR, ON_LINE = 0.1, 0.2
-# A source sends in bursts when half of its intervals are below this share of their mean (of a
+# A source sends in bursts when half of its intervals are below this fraction of their mean (for a
 # Poisson source: below 0.69).
 SHORT = 0.25
-# Messages of a burst behind which there is a gap.
+# Messages in a burst that is followed by a gap.
 LUMP = 8
 IN_BURSTS = (
-    'The messages come in bursts and carry no stamps, and no steady source is seen behind '
-    'them: no estimate can be made of them; stamp them in the driver, or send blocks of samples '
+    'The messages come in bursts without stamps, and no steady source was detected behind '
+    'them, so nothing can be estimated: stamp them in the driver, or send blocks of samples '
     'with adc.sample_rate.')
 # The line follows the source with this time constant, s: 50 ms of delay, made up within 50 ms,
 # move it by 1.2 ms.
 FOLLOW = 1.0
-# Later than this, s, is no delay but a gap; earlier than this, a clock that went back.
+# Later than this, s, counts as a gap, not a delay; earlier than this, the clock went back.
 GAP, BACK = 0.25, 0.5
-# Points from which the hull is made; of more messages, the lowest of each group.
+# Maximum points of the hull; with more messages, the lowest of each group is used.
 _POINTS = 400
 
 
@@ -97,7 +96,7 @@ def _hull_edge(numbers: list[int], times: list[float]) -> tuple[int, float]:
     """
     Return where the middle edge of the lower convex hull starts, and its slope.
 
-    The middle in time: a burst holds many messages, but lasts no time.
+    The middle in time: a burst holds many messages but takes hardly any time.
     """
     hull: list[tuple[int, float]] = []
     for k, time in zip(numbers, times):
@@ -117,7 +116,7 @@ class SendClock:
     """
     Turn source timestamps of single samples into stamps.
 
-    `in_bursts`: the messages show no steady source, and their times are worth nothing; `settled`:
+    `in_bursts`: no steady source is detectable, and the times are unusable; `settled`:
     how often a line was found after such times had been given.
     """
 
@@ -133,7 +132,7 @@ class SendClock:
 
     @property
     def rate(self) -> float:
-        """Rate of the even time line, Hz; NaN while the source is not known to be steady."""
+        """Rate of the even time line, Hz; NaN until the source is found to be steady."""
         return 1.0 / self._period
 
     def __call__(self, source: float) -> float:
@@ -152,7 +151,7 @@ class SendClock:
         return self._last
 
     def _take_gap(self, gap: float) -> None:
-        """Notice bursts so far apart, s, that nothing can be told of what they are made of."""
+        """Detect bursts too far apart, s, to identify their source."""
         times = self._times
         lump = len(times) >= LUMP and times[-1] - times[0] < SHORT * gap
         self._lumps = self._lumps + 1 if lump else 0
@@ -161,11 +160,11 @@ class SendClock:
 
     @property
     def _gap(self) -> float:
-        # Of a slow source an interval is no gap.
+        # An interval of a slow source is not a gap.
         return GAP if math.isnan(self._period) else max(GAP, 5.0 * self._period)
 
     def _judge(self) -> None:
-        """Learn the period; give it up when all messages looked at have not shown it."""
+        """Learn the period; drop it when none of the messages examined shows it."""
         times = self._times
         looked = np.array(times)
         end = float(looked[-1])
@@ -188,7 +187,7 @@ class SendClock:
             self._last = end - self._period
 
     def _tell(self, in_bursts: bool) -> bool:
-        """Note whether times are worth nothing; return false when they begin to be worth more."""
+        """Record whether times are unusable; return false when they become usable."""
         settled = self.in_bursts and not in_bursts
         self.settled += settled
         self.in_bursts = in_bursts
@@ -204,14 +203,14 @@ class SendClock:
         return expected - math.expm1(-self._period / FOLLOW) * error
 
 
-# Half a second at the usual 100 Hz: averages the jitter of single publications away, and still
-# follows a change of the replay rate within that half second.
+# Half a second at the usual 100 Hz: averages the jitter of single publications, and still follows
+# a change of the replay rate within half a second.
 PAIRS = 50
-# A clock off the line by more than this, s of the sender's time, was stepped (next pass, seek):
-# no publication is that late.
+# A clock off the line by more than this, s of the sender's time, was stepped (next pass, seek): no
+# publication is that late.
 STEP = 0.25
-# A clock of which nothing has come for so many s of the sender's time, and so many of its own
-# intervals, has stopped: what is sent after that has no simulated time.
+# A clock silent for this time, s of the sender's clock, and this number of its own intervals, has
+# stopped: later messages have no simulated time.
 STOPPED, MISSED = 1.0, 5.0
 
 
@@ -219,8 +218,8 @@ class SimClockMap:
     """
     Straight line through the last pairs (source time, clock), by least squares.
 
-    Limits: nothing is known before two pairs have come, and nothing `STOPPED` after the last
-    one; between pairs and shortly after the last the line is continued.
+    Limits: undefined before two pairs have come, and `STOPPED` after the last one;
+    between pairs and shortly after the last the line is continued.
     """
 
     def __init__(self) -> None:
@@ -236,7 +235,7 @@ class SimClockMap:
 
     @property
     def patience(self) -> float:
-        """Return the silence of the clock, s, after which it has stopped."""
+        """Return the silence, s, after which the clock counts as stopped."""
         span = self._pairs[-1][0] - self._pairs[0][0] if self.ready else 0.0
         return max(STOPPED, MISSED * span / max(len(self._pairs) - 1, 1))
 
@@ -277,7 +276,7 @@ class SimClockMap:
         self._zero = first_clock + mean_y
 
     def __call__(self, source: float) -> float:
-        """Return the simulated time, s, at which a message was sent; NaN when not known yet."""
+        """Return the simulated time, s, at which a message was sent; NaN while undefined."""
         if not self.ready or source - self._pairs[-1][0] > self.patience:
             return math.nan
         return self._line(source)

@@ -1,4 +1,4 @@
-"""What a node says: of what changes, on the console, and who publishes its voltage."""
+"""Console messages of a node: changes of its state, and the publishers of its voltage."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from ou_monitor.nodes.base import MonitorNode
 from ou_monitor.online.risk.flag import FlagLevel, FlagState
 from ou_monitor.stream.samples import Publishers
 
-# How often it is said that a topic has no publisher, and how long one may be silent, s.
+# Period of the reminder that a topic has no publisher, and the silence reported, s.
 AGAIN = 60.0
 MUTE = 10.0
 
 
 class Console:
-    """Says what changes, with the node's logger."""
+    """Logs changes with the node's logger."""
 
     def __init__(self, node: MonitorNode) -> None:
         self._node = node
@@ -24,9 +24,9 @@ class Console:
 
     def waiting(self, topic: str) -> None:
         """
-        Say why no message has come yet on a topic.
+        Say why a topic has brought no message yet.
 
-        It has no publisher: at once, then once a minute; or one that is not heard, after a while.
+        Without a publisher: at once, then once a minute; with a silent publisher: after a while.
         """
         now, topic = self._node.steady_now(), self._node.resolve_topic_name(topic)
         if self._node.count_publishers(topic):
@@ -49,10 +49,10 @@ class Console:
         self._muted = now + AGAIN
         self._node.get_logger().info(
             f'{topic} has a publisher, but no message has come: it sends none, or runs as another '
-            'user, whose messages Fast DDS does not bring (doc/deploy.md).')
+            'user, whose messages Fast DDS does not deliver (doc/deploy.md).')
 
     def flag(self, state: FlagState) -> None:
-        """Say when the flag becomes CRITICAL, and when it is no longer."""
+        """Log when the flag becomes CRITICAL, and when it ends."""
         critical = state.level is FlagLevel.CRITICAL
         if critical == self._critical:
             return
@@ -74,7 +74,7 @@ class PublisherWatch:
         self._looked = -math.inf
 
     def look(self, ends: list[Any], publishers: Publishers, now: float) -> None:
-        """Take who publishes (endpoints), and what was counted of them (now in s)."""
+        """Take the publishers (endpoints) and their message counts (now in s)."""
         self._names = tuple(
             f'{end.node_namespace.rstrip("/")}/{end.node_name} '
             f'[{bytes(end.endpoint_gid).hex()[-8:]}]' for end in ends)
@@ -84,7 +84,7 @@ class PublisherWatch:
             self._looked = now
 
     def notes(self, topic: str) -> list[str]:
-        """Return what is to be said of the publishers of a topic."""
+        """Return notes on the publishers of a topic."""
         notes = []
         if self._lost_of_late:
             notes.append(f'{self._lost_of_late} messages were lost within the last second.')

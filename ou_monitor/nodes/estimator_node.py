@@ -4,14 +4,14 @@ The node of `estimator`.
 Inputs: voltage and throttle, as a msg_config says (`voltage`, `throttle` by
 default), best effort.  Outputs at `publish_rate` of real time, reliable:
 `~/alpha`, `~/sigma`, `~/var_inf`, `~/brownout_risk`, `~/throttle_budget`
-(std_msgs/Float64, NaN when not known), `~/brownout` (std_msgs/Bool, published
+(std_msgs/Float64, NaN when unknown), `~/brownout` (std_msgs/Bool, published
 only while it is known, so that it is never silently false), `~/state`
 (DiagnosticArray, every field of one estimate, stamped with the estimate's
-newest sample), and `/diagnostics` at 1 Hz.  alpha, sigma and Var_inf are those of `window`, whose
-fits of up to a minute are made in a thread.  Messages wait in the middleware, which keeps the
-newest 2000, and are fetched 50 times a second and read before each report, so that no flood of
-them delays an output.  Service `~/clear_brownout` (std_srvs/Trigger): drops a flag that is
-latched or held, unless `lock_parameters` is set; `~/save_model`: writes what the flight has
+newest sample), and `/diagnostics` at 1 Hz.  alpha, sigma and Var_inf are estimated from `window`;
+fits of up to a minute run in a thread.  Messages wait in the middleware, which keeps the
+newest 2000, and are fetched 50 times a second and read before each report, so that a flood of
+messages does not delay an output.  Services: `~/clear_brownout` (std_srvs/Trigger) drops a flag
+that is latched or held, unless `lock_parameters` is set; `~/save_model` writes what the flight has
 learned into `model_file`.  Hold, delay and latch count real time, under `use_sim_time` too.
 
 Limits: one voltage; an estimate older than `stale_after` is not published as
@@ -49,22 +49,22 @@ from rclpy.logging import get_logging_directory
 from std_msgs.msg import Bool, Float64
 from std_srvs.srv import Trigger
 
-# How often the messages that wait are fetched, s, whatever `publish_rate` is.
+# Period of fetching the waiting messages, s, whatever `publish_rate` is.
 POLL = 0.02
-# How often what was fetched is read and handed to the monitor at least, s; before each report in
-# any case.  Each time costs 2 to 3 ms of CPU however few samples there are.
+# Maximum period of handing fetched messages to the monitor, s; also done before each report. Each
+# time costs 2 to 3 ms of CPU, however few samples there are.
 HAND_OVER = 0.25
-# Share of the time that estimating may take: where the estimates of a second take more, they
-# come more rarely; where the samples do, they are thinned.
+# Maximum load of estimating, a share of the time: above it estimates become rarer, and where
+# pushing samples alone exceeds it, they are thinned.
 SHARE = 0.25
-# An estimate that takes longer than this, s of CPU, is not made at each report.
+# An estimate that takes longer than this, s of CPU, is not made for every report.
 HEAVY = 0.02
-# Longest time for which the thread of the fits keeps the interpreter from the executor, s: at
-# Python's 5 ms each of the executor's calls would wait so long.
+# Maximum time the thread of the fits keeps the interpreter from the executor, s: at Python's 5 ms
+# each of the executor's calls would wait that long.
 SWITCH = 2e-4
-# Samples are thinned to one of so many at most.
+# Maximum thinning: one sample in this many is kept.
 MOST_THIN = 1024
-# Throttle messages placed among the voltages at each hand-over; of more, evenly many of them.
+# Maximum throttle messages placed among the voltages at each hand-over, evenly chosen.
 MOST_THROTTLES = 100
 STATE_FILE = Parameter(
     'state_file', '',
@@ -87,7 +87,7 @@ class EstimatorNode(MonitorNode):
             self.begin()
 
     def start(self) -> None:
-        """Begin with nothing known but a flag that was latched."""
+        """Begin without data, except for a latched flag."""
         sys.setswitchinterval(SWITCH)
         settings = _settings(self.values())
         self._monitor = SupplyMonitor(settings, self._models.use(settings.model_file),
@@ -123,13 +123,13 @@ class EstimatorNode(MonitorNode):
         self.refuse_other_overrides([*OWN_TOPICS, *self._sources.topics])
 
     def _open_latch(self) -> LatchFile | None:
-        """Open the file of the latch; what was latched is latched again."""
+        """Open the file of the latch; restore a latched flag."""
         name = self.get_parameter(STATE_FILE.name).value
         if not name:
             return None
         latch = LatchFile(Path(get_logging_directory()) / Path(name).expanduser(),
                           self.get_fully_qualified_name())
-        # What is being written then is written.
+        # Wait for the write in progress.
         self.at_stop(latch.close)
         reason = latch.read()
         if latch.problem:
@@ -142,7 +142,7 @@ class EstimatorNode(MonitorNode):
         return latch
 
     def recover(self, error: Exception) -> None:
-        """Begin anew after a callback has raised: nothing is known of the supply."""
+        """Begin anew after a callback has raised, without data of the supply."""
         if self.running:
             self._monitor.restart(error)
 
@@ -172,7 +172,7 @@ class EstimatorNode(MonitorNode):
     # -- where the input comes from
 
     def _watch(self) -> None:
-        """Look at who publishes, 5 times a second."""
+        """Check the publishers, 5 times a second."""
         self._stamper.follow()
         self._look_at_publishers()
         if self._arrived.age is None and not self._sources.problems['voltage']:
@@ -186,7 +186,7 @@ class EstimatorNode(MonitorNode):
         if source.quantity == 'voltage':
             self._stream.open_voltage(spec)
             if spec.sample_rate is not None:
-                # Blocks have a time line of their own.
+                # Blocks have their own time line.
                 self._send_clock = None
         else:
             self._stream.open_throttle(spec)
@@ -203,7 +203,7 @@ class EstimatorNode(MonitorNode):
         for each in self._inputs.values():
             each.fetch()
         now = self.steady_now()
-        # On simulated time messages count as received when they are read.
+        # On simulated time a message counts as received when it is read.
         if now - self._handed_over < most and not self._stamper.simulated and not any(
                 each.full for each in self._inputs.values()):
             return
@@ -239,7 +239,7 @@ class EstimatorNode(MonitorNode):
         self._arrived.heard(messages.arrived.item(-1))
         ends = self._times(messages, self._send_clock)
         if self._send_clock is not None and self._send_clock.settled > self._settled:
-            # What came before lies on another time line; of this poll it is not known which.
+            # Earlier messages lie on another time line, and this poll may hold some of them.
             self._settled = self._send_clock.settled
             self._stream.reset('a steady source was found behind messages in bursts')
             ends = np.full(ends.size, math.nan)
@@ -247,14 +247,14 @@ class EstimatorNode(MonitorNode):
             ends, column.stamped, column.counts, column.values, messages.arrived,
             column.beside)
         if held.any():
-            # On simulated time they were received at some time between two polls: now.
+            # On simulated time they arrived at some time between two polls: use now.
             received = (np.full(ends.size, self.stamp_now()) if self._stamper.simulated
                         else messages.received)
             self._usable.heard(messages.arrived[held].item(-1))
             self._source_clock.take(ends[held], received[held], messages.arrived[held].item(-1))
 
     def _times(self, messages: Arrivals, smooth: SendClock | None = None) -> FloatArray:
-        """Return the times of messages, s: of those without a stamp when they were sent."""
+        """Return the times of messages, s; the sending times for those without a stamp."""
         column = messages.column
         if column.stamped.all():
             return column.stamp
@@ -277,14 +277,14 @@ class EstimatorNode(MonitorNode):
             stream.thin //= 2
 
     def _watch_throttle(self) -> None:
-        """Stop believing a throttle that has fallen silent."""
+        """Invalidate a throttle that has fallen silent."""
         age = self._throttle_heard.age
         limit = self._throttle_limit()
         if age is not None and age > limit and not math.isnan(self._stream.throttle):
             self._stream.lose_throttle()
 
     def _throttle_limit(self) -> float:
-        """Return the patience with the throttle, s: three messages missed of a slow source."""
+        """Return the timeout of the throttle, s: three messages of a slow source."""
         return 3.0 * max(self._monitor.settings.stale_after, self._throttle_heard.interval)
 
     def _jumped(self, reason: str) -> None:
@@ -331,7 +331,7 @@ class EstimatorNode(MonitorNode):
     # -- reports out
 
     def _report(self) -> tuple[MonitorReport, Level, str]:
-        """Return the monitor's report, with what only the node can know put first."""
+        """Return the monitor's report, the node's own findings first."""
         self._poll()
         now = self.steady_now()
         bursts = self._send_clock is not None and self._send_clock.in_bursts
@@ -340,7 +340,7 @@ class EstimatorNode(MonitorNode):
         report = self._monitor.report(
             self._source_clock.age(now), now, self._usable.age, again=again)
         if again:
-            # An estimate of 1 ms at 10 Hz is no load; of 100 ms the next one waits.
+            # An estimate of 1 ms at 10 Hz is a small load; one of 100 ms delays the next.
             took = time.thread_time() - begin
             self._due = now + (took / SHARE if took > HEAVY else 0.0)
         self._console.flag(report.flag)
@@ -352,7 +352,7 @@ class EstimatorNode(MonitorNode):
         limit = max(self._monitor.settings.stale_after, report.patience)
         silent = not report.fresh
         if level is Level.ERROR:
-            # A flag that is set comes before what is wrong with the input.
+            # An active flag comes before problems of the input.
             summary = f'{summary} {problem}' if problem else summary
         elif problem:
             level, summary = (Level.ERROR if silent else Level.WARN), problem
@@ -373,25 +373,25 @@ class EstimatorNode(MonitorNode):
         return report, level, summary
 
     def _notes(self) -> list[str]:
-        """Return what is to be said of the input whatever else is."""
+        """Return the notes on the input that apply in every state."""
         notes = []
         if self._stream.thin > 1:
             notes.append(f'Overload: one of {self._stream.thin} samples is estimated from; the '
-                         'floor judges all.')
+                         'floor checks all.')
         notes += self.fault_notes
         if 'voltage' in self._inputs:
             notes += self._watched.notes(self._topic)
         return notes
 
     def _look_at_publishers(self) -> None:
-        """Note who publishes the voltage, and what was lost."""
+        """Record who publishes the voltage, and the messages lost."""
         voltage = self._inputs.get('voltage')
         if voltage is not None:
             self._watched.look(self.get_publishers_info_by_topic(self._topic),
                                voltage.publishers, self.steady_now())
 
     def _useless(self) -> str:
-        """Say why messages that arrive do not count as a voltage."""
+        """Say why arriving messages hold no usable voltage."""
         if self._stamper.waiting and self._stream.unplaced:
             return ('Messages without a stamp cannot be placed in time: use_sim_time is set, but '
                     'nothing comes on /clock (any more).')
@@ -401,7 +401,7 @@ class EstimatorNode(MonitorNode):
 
     @property
     def _voltage(self) -> Source:
-        """Return where the voltage is, or is waited for."""
+        """Return the topic of the voltage, present or awaited."""
         return self._sources.opened.get('voltage', self._sources.sources['voltage'])
 
     @property
@@ -415,7 +415,7 @@ class EstimatorNode(MonitorNode):
                   'var_inf': report.estimate.var_inf, 'brownout_risk': report.risk,
                   'throttle_budget': report.budget}
         for key, output in self._outputs.items():
-            # What is stale is no longer known.
+            # Stale values are published as unknown.
             output.publish(Float64(data=values[key] if report.fresh else math.nan))
         if report.brownout is not None:
             self._brownout.publish(Bool(data=report.brownout))
@@ -425,7 +425,7 @@ class EstimatorNode(MonitorNode):
         self._diagnosed = self.steady_now()
         found = self._report()
         if found[0].flag.low:
-            # A dip is told in one report; without a hold the next one knows nothing of it.
+            # A dip appears in one report; without a hold the next one does not contain it.
             self._publish(*found)
         self._diagnostics.publish(self._message('supply', *found, self.stamp_now()))
 

@@ -1,8 +1,8 @@
 """
-What `adaptive_filter` takes out of a message, and puts back.
+The signals that `adaptive_filter` takes out of a message and puts back.
 
-A derivative is in the unit of its signal per second, which the field of the signal
-is not: it goes out in a message that says what it is.
+A derivative has the unit of its signal per second, so it does not fit the signal's field:
+it is published in a message of its own type.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from ou_monitor.recordings.cdr import value_path
 from ou_monitor.stream.config import FieldPath, FieldSpec
 
 IMU = 'sensor_msgs/msg/Imu'
-# Of a derivative: angular acceleration (rad/s^2); any other of a message with a stamp, as x,
-# and without one.
+# Types of derivatives: angular acceleration (rad/s^2); any other, as x, with a stamp, and without
+# one.
 ACCEL, VECTOR, PLAIN = ('geometry_msgs/msg/AccelStamped', 'geometry_msgs/msg/Vector3Stamped',
                         'std_msgs/msg/Float64')
 _NONE = (math.nan, math.nan, math.nan)
@@ -27,14 +27,14 @@ _NONE = (math.nan, math.nan, math.nan)
 
 @dataclass(frozen=True)
 class Group:
-    """Numbers of a message that it holds together or not at all."""
+    """Numbers that a message holds all together or not at all."""
 
     fields: tuple[FieldPath, ...]  # One for each signal
-    # A matrix that shrinks with their noise; -1 as its first element says that the message does
-    # not hold them, all 0 that it is not known.
+    # A matrix that shrinks with their noise; -1 as its first element: the message does not hold
+    # them; all 0: unknown.
     covariance: FieldPath | None = None
-    # Whether a message that does not hold them is left out; else they are 0 to the filter, and
-    # stay in the message as they are.
+    # Whether a message without them is left out; otherwise the filter takes them as 0, and they
+    # stay unchanged in the message.
     needed: bool = True
 
 
@@ -43,13 +43,13 @@ class Channels:
     """The signals of one message type."""
 
     names: tuple[str, ...]  # Signals, one low-pass each
-    groups: tuple[Group, ...]  # Where they are
-    output: str = ''  # Type of what goes out; empty: that of the input
-    # Message and filtered values to a message of that type; None: they take the signals' places.
+    groups: tuple[Group, ...]  # Where they are in the message
+    output: str = ''  # Type of the output; empty: the type of the input
+    # From a message and filtered values to an output; None: they replace the signals.
     make: Callable[[Any, Sequence[float]], Any] | None = None
 
     def take(self, message: Any) -> Sequence[float]:
-        """Return the values in a message; empty where it does not hold them."""
+        """Return the values in a message; empty if it does not hold them."""
         values: list[float] = []
         for group in self.groups:
             found = None if _is_absent(message, group) else [
@@ -62,7 +62,7 @@ class Channels:
         return tuple(values)
 
     def put(self, message: Any, values: Sequence[float], left: float) -> Any:
-        """Return the message that goes out; `left` of the variance of white noise is left."""
+        """Return the output message; `left` of white noise's variance remains."""
         if self.make is not None:
             return self.make(message, values)
         at = 0
@@ -103,7 +103,7 @@ _RATES = _vector('angular_velocity')
 _DATA = Channels(('data',), (Group((('data',),)),))
 _GYRO = Channels(('x', 'y', 'z'), (_RATES,))
 
-# The types that are filtered without a field being named.
+# Types that are filtered without naming a field.
 CHANNELS: dict[str, Channels] = {
     'std_msgs/msg/Float32': _DATA,
     'std_msgs/msg/Float64': _DATA,
@@ -129,7 +129,7 @@ def channels_of(kind: str, field: str, *, mode: str = 'lowpass',
         raise InputError(
             f"input.type: cannot filter '{kind}' without input.field (the path of its signal); "
             f'{nearest(kind, CHANNELS)}')
-    # A number without a unit stays one.
+    # A number without a unit stays without one.
     return found if mode != 'derivative' or found is _DATA else _derivative(kind, found)
 
 
@@ -159,7 +159,7 @@ def _field_channel(kind: str, field: str) -> Channels:
     """Return one field of any installed type, tried on an empty message."""
     message = message_class(kind)()
     steps = value_path(FieldSpec('input', kind, field), definition_of(message_class(kind)))
-    # None stands for an element not there yet.
+    # None stands for an element that does not exist yet.
     value = _walk(message, steps)
     if value is not None and not isinstance(value, float):
         raise InputError(
@@ -169,7 +169,7 @@ def _field_channel(kind: str, field: str) -> Channels:
 
 
 def _walk(message: Any, steps: FieldPath) -> Any:
-    """Return what is at a path; None where an array is too short."""
+    """Return the value at a path; None where an array is too short."""
     at = message
     for step in steps:
         if isinstance(step, str):

@@ -1,7 +1,7 @@
 """
 Subscriptions: sources and types found on the graph, and the time of every message.
 
-Time is the message's own stamp; without one it is the middleware's source
+Time is the message's own stamp, or else the middleware's source
 timestamp, under `use_sim_time` mapped to simulated time through `/clock`.
 """
 
@@ -30,15 +30,15 @@ from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-# Best effort, because a reliable subscription receives nothing from best-effort publishers;
-# deep enough for 0.2 s at 10 kHz while the estimator fits.
+# Best effort, because a reliable subscription receives nothing from best-effort publishers; depth
+# for 0.2 s at 10 kHz while the estimator fits.
 INPUT_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000,
                        reliability=ReliabilityPolicy.BEST_EFFORT)
 # Fewer blocks: 2000 of 10 000 samples would take 80 MB.
 BLOCK_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=200,
                        reliability=ReliabilityPolicy.BEST_EFFORT)
-# Maximum messages and bytes taken at a time: all that can wait, unless they exceed the bytes,
-# which need about 50 ms and 50 MB to process.
+# Maximum messages and bytes taken at a time: all that can wait, up to the bytes, which need about
+# 50 ms and 50 MB to process.
 MOST_TAKEN, MOST_BYTES = 2000, 2_000_000
 # Maximum wait of a message in the middleware, s: it keeps 2000.
 MOST_WAIT = 60.0
@@ -84,13 +84,13 @@ class Stamper:
             self._clock_input = None
 
     def source_time(self, source: float, smooth: SendClock | None = None) -> float:
-        """Return the time, s, of a message without a stamp, sent at `source`; NaN: not known."""
+        """Return the time, s, of a message without a stamp, sent at `source`; NaN: undefined."""
         if smooth is not None:
             source = smooth(source)
         return self._map(source) if self.simulated else source
 
     def time_of(self, stamp: float, info: Any) -> float:
-        """Return a header's stamp, s; where it is 0, as without one, the source time."""
+        """Return a header's stamp, s; the source time where it is 0 or missing."""
         return stamp or self.source_time(float(info['source_timestamp']) * 1e-9)
 
     def _clock(self, message: Any, info: Any) -> None:
@@ -209,7 +209,7 @@ def decode(data: bytes, kind: Any, topic: str) -> Any:
 
 
 class Silence:
-    """Time since something last arrived, by the monotonic clock."""
+    """Time since the last arrival, by the monotonic clock."""
 
     def __init__(self, now: Callable[[], float]) -> None:
         self._now = now
@@ -225,12 +225,12 @@ class Silence:
 
     @property
     def age(self) -> float | None:
-        """Seconds since the last arrival; None when there was none."""
+        """Seconds since the last arrival; None before the first."""
         return None if self._last == -math.inf else self._now() - self._last
 
 
 def within(age: float | None, limit: float) -> bool:
-    """Return whether something came within the limit, s."""
+    """Return whether something arrived within the limit, s."""
     return age is not None and age <= limit
 
 

@@ -3,12 +3,12 @@ Nodes that a manager configures, activates and deactivates (managed nodes, desig
 
 | state | what is there |
 |---|---|
-| unconfigured, inactive | parameters and the services of the life cycle; nothing else is open |
-| active | all that the plain node has |
+| unconfigured, inactive | parameters and the life-cycle services only |
+| active | the whole plain node |
 
 Configuring checks what the parameters name (message types, model file), so that activating, which
-begins with nothing known, does not fail for them.  What fails says so on the console, and the
-node stays in the state before.  A latched flag outlasts all of it in its file, `state_file`.
+starts without data, does not fail for them.  A failure is logged, and the node stays in its
+former state.  A latched flag survives all transitions in its file, `state_file`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SUCCESS, FAILURE, ERROR = (TransitionCallbackReturn.SUCCESS, TransitionCallbackR
 
 
 def managed(kind: type[MonitorNode]) -> Callable[[str], MonitorNode]:
-    """Return what makes a managed node of a kind, unconfigured."""
+    """Return the unconfigured managed version of a kind of node."""
     class Managed(LifecycleNodeMixin, kind):  # type: ignore[misc, valid-type]
         """A node whose work is begun and ended by transitions."""
 
@@ -37,7 +37,7 @@ def managed(kind: type[MonitorNode]) -> Callable[[str], MonitorNode]:
             asked = change.callback
 
             def answer(request: Any, response: Any) -> Any:
-                # rclpy 7.1 raises where a state has no such transition, and the node would end.
+                # rclpy 7.1 raises if a state has no such transition, which would end the node.
                 try:
                     return asked(request, response)
                 except Exception as error:
@@ -47,7 +47,7 @@ def managed(kind: type[MonitorNode]) -> Callable[[str], MonitorNode]:
             change.callback = answer
 
         def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-            """Check that it could begin, and end again."""
+            """Check that the node can begin; then stop it."""
             def tried() -> None:
                 self.begin()
                 self.stop()
@@ -58,7 +58,7 @@ def managed(kind: type[MonitorNode]) -> Callable[[str], MonitorNode]:
             return self._done('activated', self.begin)
 
         def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-            """End; the window is gone."""
+            """Stop; the window is discarded."""
             return self._done('deactivated', self.stop)
 
         def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -66,15 +66,15 @@ def managed(kind: type[MonitorNode]) -> Callable[[str], MonitorNode]:
             return SUCCESS
 
         def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-            """End, from any state."""
+            """Stop, from any state."""
             return self._done('shut down', self.stop)
 
         def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-            """Be unconfigured again."""
+            """Return to the unconfigured state."""
             return self._done('reset', self.stop)
 
         def _done(self, what: str, work: Callable[[], Any]) -> TransitionCallbackReturn:
-            # Left to rclpy an exception would be an error without a word.
+            # rclpy would report an exception without its message.
             try:
                 work()
             except InputError as error:

@@ -1,9 +1,9 @@
 """
 `ou-monitor live`: a page to watch while flying, served from the topics of the nodes.
 
-Limits first: read-only, and on 127.0.0.1 unless another address is given, which then wants the
-token that is printed; it speaks HTTP without encryption.  Of more than `CONNECTIONS` at once the
-further ones are closed, and one without a whole request after `PATIENCE`.
+Limits first: read-only, and on 127.0.0.1 unless another address is given, which then requires the
+token that is printed; HTTP without encryption.  Connections above `CONNECTIONS` at once
+are closed, and a connection without a whole request after `PATIENCE`.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from ou_monitor.errors import how_to_install, InputError
 from ou_monitor.nodes.run import make_executor, NAP, run as run_ros
 
 NAME = 'ou_live'
-# Time between looks for new rows and at the context, s.
+# Period of checking for new rows and for the end of the context, s.
 _STEP = 0.1
-# Connections at once: a browser takes up to six, and each page that is open holds one.
+# Maximum connections: a browser takes up to six, and each open page holds one.
 CONNECTIONS = 64
-# Longest wait for a request on an open connection, s.
+# Timeout of a request on an open connection, s.
 PATIENCE = 10.0
-# Largest header and body of a request, bytes; browsers send some 1000, and no body.
+# Maximum header and body of a request, bytes; browsers send some 1000, without a body.
 _HEADER, _BODY = 16384, 0
-# Most digits of a number that is read at all; Python refuses some thousand with an error.
+# Maximum digits of a number that is parsed; Python raises an error for some thousand.
 _DIGITS = 18
-# A line that keeps the connection open, s, when there is nothing to say.
+# Period of a line that keeps an idle connection open, s.
 _ALIVE = 5.0
 
 
@@ -69,7 +69,7 @@ def _serve(host: str, port: int, estimator: str, low_pass: str) -> int:
             while node.context.ok():
                 executor.spin_once(timeout_sec=NAP)
         except ExternalShutdownException:
-            # The page ends with the context.
+            # The server ends with the context.
             return
 
     thread = Thread(target=spin)
@@ -85,7 +85,7 @@ def _serve(host: str, port: int, estimator: str, low_pass: str) -> int:
 
 
 def _local(host: str) -> bool:
-    """Return whether an address is of this machine alone."""
+    """Return whether an address is local to this machine."""
     try:
         return host == 'localhost' or ipaddress.ip_address(host.strip('[]')).is_loopback
     except ValueError:
@@ -113,7 +113,7 @@ async def _page(node: Any, host: str, port: int) -> None:
 
 
 def make_server(app: Any, patience: float = PATIENCE) -> Any:
-    """Return the server of an application; `patience` in s."""
+    """Return the server of an application; timeout `patience` in s."""
     from tornado.httpserver import HTTPServer
 
     class Bounded(HTTPServer):
@@ -126,20 +126,20 @@ def make_server(app: Any, patience: float = PATIENCE) -> Any:
             else:
                 super().handle_stream(stream, address)
 
-    # Both times run from the last request: a page that streams rows is within one.
+    # Both times count from the last request, which includes a page that streams rows.
     return Bounded(app, idle_connection_timeout=patience, body_timeout=patience,
                    max_header_size=_HEADER, max_body_size=_BODY)
 
 
 def application(node: Any, token: str) -> Any:
-    """Return the page and its stream of rows; with a token only for who knows it."""
+    """Return the page and its stream of rows; a token, if given, is required."""
     from tornado.iostream import StreamClosedError
     from tornado.web import Application, HTTPError, RequestHandler
 
     html, policy = _html()
 
     class Guarded(RequestHandler):
-        """Refuses who does not know the token, and pages of other names that resolve to here."""
+        """Refuses requests without the token, and pages of other names that resolve to here."""
 
         def prepare(self) -> None:
             """Check the request."""
@@ -168,15 +168,15 @@ def application(node: Any, token: str) -> Any:
         """The stream of rows."""
 
         async def get(self) -> None:
-            """Send rows as they come, from the last one that the browser has."""
+            """Send rows as they come, after the last one the browser received."""
             self.set_header('Content-Type', 'text/event-stream')
-            # A browser that comes back says which row it had last.
+            # A browser that reconnects sends the number of its last row.
             last = self.request.headers.get('Last-Event-ID', '')
             known = last.isascii() and last.isdigit() and len(last) <= _DIGITS
             sent = int(last) if known else 0
             newest = node.rows(0)
             if newest and sent > newest[-1]['k']:
-                # Of another process: from the beginning.
+                # The number is from another process: start from the beginning.
                 sent = 0
             quiet = 0.0
             try:

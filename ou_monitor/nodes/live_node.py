@@ -1,8 +1,8 @@
 """
 The node behind the live page: listens to estimator and filter, and keeps the last minute.
 
-Limits first: a row five times a second, so a dip between two of them shows in the flag and not
-in the line; of the filter's signals the lowest and highest value of each row are kept.
+Limits first: a row five times a second, so a dip between two rows shows in the flag but not
+in the line; for the filter's signals each row keeps the lowest and highest value.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from rcl_interfaces.srv import GetParameters
 from rclpy.node import Node
 from std_msgs.msg import Float64
 
-# Time between rows, s, and how many are kept.
+# Period of the rows, s, and number of rows kept.
 PERIOD, KEPT = 0.2, 300
-# Between looks at the graph and at the parameters, s.
+# Period of checking the graph and the parameters, s.
 _LOOK = 1.0
-# A state that is older, s, is no longer shown as the present one.
+# Age above which a state is no longer shown as the present one, s.
 _STALE = 2.0
-# Parameters of the estimator that the page shows.
+# Parameters of the estimator shown on the page.
 _SHOWN = ('brownout.voltage', 'brownout.horizon')
-# Fields of the state that the page shows as numbers, and as words.
+# Fields of the state shown as numbers, and as words.
 _NUMBERS = ('voltage', 'throttle', 'sigma', 'noise_std', 'brownout_risk', 'throttle_budget', 'age')
 _WORDS = ('brownout', 'brownout_level', 'risk_basis', 'status')
-# What a filter subscribes to beside its signal.
+# Topics a filter subscribes to beside its signal.
 _BESIDE = ('sigma', 'state', 'rpm', 'throttle', 'clock')
 
 
@@ -63,7 +63,7 @@ class LiveNode(Node):
         self.create_timer(_LOOK, self._look)
 
     def rows(self, after: int) -> list[dict[str, Any]]:
-        """Return the rows whose number is larger."""
+        """Return the rows with larger numbers."""
         with self._lock:
             return [row for row in self._rows if row['k'] > after]
 
@@ -82,7 +82,7 @@ class LiveNode(Node):
         self._lag = message.data
 
     def _look(self) -> None:
-        """Find the filter's signals as soon as they are there; ask for the limit."""
+        """Subscribe to the filter's signals once they exist; request the limit."""
         if self._answer is not None and self._answer.done():
             values = self._answer.result().values
             self._limits = {name: value.double_value for name, value in zip(_SHOWN, values)}
@@ -95,12 +95,12 @@ class LiveNode(Node):
             self._listen('raw', source)
 
     def _input(self) -> str:
-        """Return the topic that the filter filters; empty when it is not there."""
+        """Return the topic that the filter filters; empty if there is none."""
         space, _, name = self._filter.rpartition('/')
         try:
             topics = self.get_subscriber_names_and_types_by_node(name, space or '/')
         except Exception:
-            # There is no such node yet; rclpy has an error of its own for that in each version.
+            # The node does not exist yet; each rclpy version raises its own error for that.
             return ''
         return next((topic for topic, _ in topics
                      if topic.rpartition('/')[2] not in _BESIDE), '')
@@ -146,7 +146,7 @@ class LiveNode(Node):
 
 
 def known(value: str | float | None) -> float | None:
-    """Return a number, as JSON can hold it; None for what is not known."""
+    """Return a number as JSON can hold it; None if it is undefined."""
     try:
         number = math.nan if value is None else float(value)
     except ValueError:

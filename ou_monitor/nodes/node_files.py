@@ -1,10 +1,10 @@
 """
 The files of a node: the model in force, and the latch that outlasts a restart.
 
-A model file is replaced only while it is a regular file with the bytes that were read.
-The latch is one JSON object in one small file.  It exists as long as the node runs: it says OK or
-CRITICAL and carries the name of the node, and the lock of its inode says that the node runs.  No
-file is written or replaced but a regular file with that name in it.  No ROS here.
+A model file is replaced only if it is a regular file and still has the bytes that were read.
+The latch is one JSON object in one small file.  It exists while the node runs: it holds OK or
+CRITICAL and the name of the node; the lock of its inode shows that the node runs.  Only
+regular files with that name in them are written or replaced.  No ROS here.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ if TYPE_CHECKING:
 
 T = TypeVar('T')
 
-# Maximum time to read a file, s: most take 10 ms, the largest that is read at all 5 s.
+# Timeout of reading a file, s: most take 10 ms, the largest allowed 5 s.
 PATIENCE = 20.0
-# Time between calls of what the node must do meanwhile, s.
+# Period of calls that keep the node working while it waits, s.
 PAUSE = 0.02
-# Flights kept in the history of a model file; bytes, more than a file may have that is read.
+# Maximum flights in the history of a model file; maximum size of a model file, bytes.
 _HISTORY, _LARGEST = 200, 2_000_000
 
 
@@ -44,9 +44,9 @@ class ModelChoice:
     """
     Model of the parameter `model_file`.
 
-    A file is read when the path changes, not again when another parameter does: give an empty path
-    and then the old one to have it read anew.  It is read in a thread, and whoever has it checked
-    waits for it, so that the answer is true.
+    A file is read when the path changes, not when another parameter does: to reload it, give an
+    empty path and then the old one.  It is read in a thread, and the check waits for it, so that
+    its answer is final.
     """
 
     def __init__(self) -> None:
@@ -56,9 +56,9 @@ class ModelChoice:
 
     def check(self, path: str, meanwhile: Callable[[], object] = lambda: None) -> None:
         """
-        Read the file, unless it is the one in force; `ValueError` says why it cannot be used.
+        Read the file unless it is in force; `ValueError` says why it cannot be used.
 
-        `meanwhile` is called every `PAUSE` until it has been read.
+        Calls `meanwhile` every `PAUSE` while reading.
         """
         if not path or path == self._used[0]:
             self._checked = self._used if path else ('', None, b'')
@@ -72,7 +72,7 @@ class ModelChoice:
             raise ValueError(f'model_file: {error}') from error
 
     def _wait(self, future: Future[T], meanwhile: Callable[[], object]) -> T:
-        """Return the result, `meanwhile` called every `PAUSE`; NotReadyError after `PATIENCE`."""
+        """Return the result, calling `meanwhile` every `PAUSE`; NotReadyError after `PATIENCE`."""
         until = time.monotonic() + PATIENCE
         while True:
             try:
@@ -84,7 +84,7 @@ class ModelChoice:
                 meanwhile()
 
     def use(self, path: str) -> SupplyModel | None:
-        """Bring a path into force that was checked last; return its model."""
+        """Bring the path checked last into force; return its model."""
         if path != self._used[0]:
             if path != self._checked[0]:
                 raise ValueError(f'model_file {path} has not been checked')
@@ -124,14 +124,14 @@ class ModelChoice:
         return path
 
 
-# Path, what the file says, and its bytes.
+# Path, parsed content, and bytes of the file.
 _Chosen = tuple[str, 'ModelFile | None', bytes]
 
 
 def _read(path: str) -> tuple[ModelFile, bytes]:
-    """Read a model file; the terms and their fits are loaded only where there is one."""
+    """Read a model file; terms and fits are imported only where there is one."""
     try:
-        # Loading those takes a second on a busy machine; this is told at once.
+        # Importing them takes a second on a busy machine; this error comes at once.
         with open_regular(path) as file:
             known = file.read(_LARGEST)
     except (OSError, ValueError) as error:
@@ -142,9 +142,9 @@ def _read(path: str) -> tuple[ModelFile, bytes]:
 
 
 def _save(path: str, file: ModelFile, known: bytes) -> bytes:
-    """Replace a model file that still holds `known`; return what it holds then."""
+    """Replace a model file that still holds `known`; return its new bytes."""
     from ou_monitor.recordings.model_file import as_yaml
-    # What a reader has written above the entries stays.
+    # Keep what a reader has written above the entries.
     lines = known.decode('utf-8-sig').splitlines(keepends=True)
     head = ''.join(takewhile(lambda line: line.startswith('#'), lines))
     text = (head + as_yaml(file)).encode()
@@ -175,7 +175,7 @@ def _check_kind(path: str | Path) -> None:
 
 def _write_beside(path: Path, text: bytes, mode: int) -> tuple[int, str]:
     """Write a new file beside a path, synced and read back; return its open handle and name."""
-    # Made by O_CREAT | O_EXCL under a random name: no other file is opened or removed.
+    # Made by O_CREAT | O_EXCL under a random name, so no other file is opened or removed.
     handle, beside = tempfile.mkstemp(prefix=f'.{path.name}.', dir=path.parent)
     try:
         os.fchmod(handle, mode)
@@ -191,7 +191,7 @@ def _write_beside(path: Path, text: bytes, mode: int) -> tuple[int, str]:
 
 
 def _sync_folder(path: Path) -> None:
-    """Have the disk know of a rename."""
+    """Flush a rename to the disk."""
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(folder)
@@ -199,7 +199,7 @@ def _sync_folder(path: Path) -> None:
         os.close(folder)
 
 
-# Size above which a file is not read, bytes; ours have at most 1000.
+# Maximum size of a latch file, bytes; ours have at most 1000.
 _MOST = 4096
 _KEYS = {'node', 'level', 'reason', 'time'}
 # Time between attempts to write, s.
@@ -210,9 +210,8 @@ class LatchFile:
     """
     Keeps the flag of one node in a file, or in a file named after the node in a folder.
 
-    `problem` says in one line why the file cannot be used now; empty: the disk has what was asked
-    for last.  `refused`: the file found at the start may not be touched, and stays as it is; what
-    it said, if anything, is unknown.
+    `problem` says in one line why the file cannot be used now; empty: the last request is on
+    disk.  `refused`: the file found at the start must not be changed, and its content is unknown.
     """
 
     def __init__(self, path: str | Path, node: str) -> None:
@@ -222,7 +221,7 @@ class LatchFile:
         self.problem = ''
         self.refused = False
         self._node = node
-        # An open handle of the file that holds its lock.
+        # Open handle of the file, which holds its lock.
         self._lock: int | None = None
         self._wanted: dict[str, Any] = self._record(False, '')
         self._written: dict[str, Any] | None = None
@@ -236,7 +235,7 @@ class LatchFile:
                 'reason': reason[:300], 'time': time.time()}
 
     def read(self) -> str:
-        """Claim the file, or make it; return why and when the flag was latched, if it was."""
+        """Claim or create the file; return why and when the flag was latched, if it was."""
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             found = self._claim()
@@ -256,7 +255,7 @@ class LatchFile:
         return f'latched before the node was started anew, at {when}: {reason}'
 
     def keep(self, latched: bool, reason: str) -> None:
-        """Have the file say whether the flag is latched; called often, it retries a write."""
+        """Write whether the flag is latched; called often, it retries a write."""
         if self.refused:
             return
         changed = latched != (self._wanted['level'] == 'CRITICAL')
@@ -268,14 +267,14 @@ class LatchFile:
             self._job = self._writer.submit(self._write, self._wanted)
 
     def close(self) -> None:
-        """Write what is not written yet, and give the file up."""
+        """Write pending changes, and release the file."""
         if not self.refused and self._written is not self._wanted:
             self._writer.submit(self._write, self._wanted)
         self._writer.shutdown()
         self._hold(None)
 
     def _write(self, record: dict[str, Any]) -> None:
-        """Replace the file; what was written by the job before is not written again."""
+        """Replace the file, unless the job before has written the same."""
         if self._written is record:
             return
         try:
@@ -287,13 +286,13 @@ class LatchFile:
         self._written, self.problem = record, ''
 
     def _claim(self) -> dict[str, Any] | None:
-        """Return what the file says, locked from here on; None: there is none."""
+        """Return the content of the file, locked from here on; None: no file."""
         try:
-            # A FIFO would have a reader, too.
+            # Opening a FIFO would give it a reader.
             _check_kind(self.path)
         except FileNotFoundError:
             return None
-        # What took its place meanwhile is not followed, waited for or locked.
+        # A link or other file in its place is not followed, waited for or locked.
         handle = os.open(self.path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
         try:
             found = self._parse(handle)
@@ -303,7 +302,7 @@ class LatchFile:
                     fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except BlockingIOError:
                     raise ValueError('another node of this name is using it') from None
-                # Its owner replaces the file before it lets go of the lock.
+                # Its owner replaces the file before releasing the lock.
                 if not os.path.samestat(os.lstat(self.path), mine):
                     raise ValueError('another node of this name is using it')
                 self._hold(handle)
@@ -314,7 +313,7 @@ class LatchFile:
         return found
 
     def _parse(self, handle: int) -> dict[str, Any]:
-        """Return the record in an open file; `ValueError` where it is not one of this node."""
+        """Return the record in an open file; `ValueError` if it is not this node's."""
         if not stat.S_ISREG(os.fstat(handle).st_mode):
             raise ValueError('it is not a regular file')
         text = os.read(handle, _MOST + 1)
@@ -335,12 +334,12 @@ class LatchFile:
     def _replace(self, text: bytes) -> None:
         """Write beside, sync, read back, lock and rename."""
         there = self._claim() is not None
-        # Readable by all, as an ordinary file is.
+        # Readable by all, like an ordinary file.
         handle, beside = _write_beside(self.path, text, 0o644)
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if not there:
-                # Fails where a file has come meanwhile.  File systems of SD cards have no links.
+                # Fails if a file has appeared meanwhile.  File systems of SD cards have no links.
                 os.close(os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
             os.rename(beside, self.path)
         except BaseException:
@@ -353,7 +352,7 @@ class LatchFile:
             raise ValueError('another file has taken its place')
 
     def _hold(self, handle: int | None) -> None:
-        """Keep the handle that has the lock, in place of the one before."""
+        """Keep the handle that has the lock; close the one before."""
         old, self._lock = self._lock, handle
         if old is not None:
             os.close(old)

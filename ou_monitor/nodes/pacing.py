@@ -1,5 +1,5 @@
 """
-Sending on schedule: reading ahead, waiting until an instant, and account of how well that went.
+Sending on schedule: reading ahead, waiting for an instant, and statistics of the error.
 
 `time.sleep` wakes late by about 0.06 ms on Linux; the last stretch is spun.
 The schedule is absolute, so a late message does not delay those after it.
@@ -17,10 +17,10 @@ import threading
 import time
 from typing import Generic, TypeVar
 
-# The last stretch before an instant that is spun, s: about the usual lateness of sleep, so that a
-# 1 kHz bag costs a tenth of a core.
+# Length of the spin before an instant, s: about the usual lateness of sleep, so that a 1 kHz bag
+# costs a tenth of a core.
 SPIN = 0.0001
-# The longest single sleep, s: bounds how late a signal is noticed.
+# Maximum single sleep, s: limits the delay in noticing a signal.
 NAP = 0.05
 
 
@@ -54,7 +54,7 @@ class SpacingError:
         self._last = None
 
     def add(self, due: float, done: float) -> None:
-        """Take one event: when it was due and when it was done, s."""
+        """Take one event: its due time and its actual time, s."""
         if self._last is not None:
             error = (done - self._last[1]) - (due - self._last[0])
             self._counts[round(abs(error) * 1e6)] += 1
@@ -83,15 +83,15 @@ class SpacingError:
 
 Item = TypeVar('Item')
 
-# Messages held at most: about 20 s at 10 kHz, some 50 MB.
+# Maximum messages held: about 20 s at 10 kHz, some 50 MB.
 AHEAD = 200_000
-# Longest time, s, for which the reading thread may keep the interpreter from the sending one;
-# Python's 5 ms would be seen in the spacing.
+# Maximum time the reading thread may keep the interpreter from the sending one, s; Python's 5 ms
+# would show in the spacing.
 SWITCH = 0.0002
 
 
 class Prefetch(Generic[Item]):
-    """Iterate over a source that a thread reads ahead, by so many items; it raises in turn."""
+    """Iterate over a source that a thread reads ahead, up to `ahead` items; errors pass on."""
 
     def __init__(self, source: Iterable[Item], ahead: int = AHEAD) -> None:
         self._source = source

@@ -24,9 +24,9 @@ from rclpy.publisher import Publisher
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-# Deep enough that a burst is not overwritten before the middleware has sent it.
+# Queue depth: the middleware must send a burst before it is overwritten.
 DEPTH = 1000
-# How long the end waits for reliable subscribers.
+# Timeout for reliable subscribers at the end.
 FLUSH = Duration(seconds=1)
 
 RCLError = rclpy_implementation.RCLError
@@ -84,7 +84,7 @@ class Player(Node):
     def play(self) -> dict[str, Any]:
         """Play until the end, or a signal; return what was done."""
         self._wait_for_subscriber()
-        # The garbage collector's pauses would be seen in the spacing.
+        # The garbage collector's pauses would show in the spacing.
         gc.collect()
         gc.freeze()
         began = time.monotonic()
@@ -98,7 +98,7 @@ class Player(Node):
         return summary
 
     def _wait_for_subscriber(self) -> None:
-        """Wait, so that the first samples find somebody."""
+        """Wait for a subscriber, so that it receives the first samples."""
         until = time.monotonic() + self._options.wait
         while self.going() and time.monotonic() < until:
             if any(output.get_subscription_count() for output in self._outputs.values()):
@@ -147,11 +147,11 @@ class Player(Node):
         self._passes += 1
 
     def _tick(self, origin: int, start: float) -> None:
-        """Publish what the schedule's clock shows at this very moment."""
+        """Publish the schedule's clock as it is now."""
         if self._clock_output is None:
             return
         now = origin + round((time.monotonic() - start) * self._options.rate * 1e9)
-        # At a high rate the last tick would be beyond what a stamp can hold.
+        # At a high rate the last tick would exceed the range of a stamp.
         now = min(max(now, 0), LAST_HEADER_NS)
         self._send(self._clock_output, ClockMessage(clock=Time(nanoseconds=now).to_msg()))
 
@@ -159,7 +159,7 @@ class Player(Node):
         try:
             output.publish(message)
         except RCLError:
-            # A signal has just ended the context: the loop is about to notice.
+            # A signal has just ended the context; the loop will notice.
             if self.going():
                 raise
 
@@ -189,14 +189,14 @@ class Player(Node):
 
 
 class _Ticks:
-    """Instants of /clock; those already past are left out: the clock is late, not a backlog."""
+    """Instants of /clock; past ones are skipped: the clock may be late but never piles up."""
 
     def __init__(self, start: float, frequency: float) -> None:
         self._start, self._frequency, self._n = start, frequency, 0
         self.due = start if frequency > 0.0 else math.inf
 
     def advance(self) -> None:
-        """Go to the next instant that is still to come."""
+        """Go to the next future instant."""
         passed = math.floor((time.monotonic() - self._start) * self._frequency)
         self._n = max(self._n, passed) + 1
         self.due = self._start + self._n / self._frequency

@@ -21,15 +21,15 @@ NAME = 'ou_replay'
 
 
 class _Parser(argparse.ArgumentParser):
-    """Parser whose complaint is one line."""
+    """Parser that reports an error in one line."""
 
     def error(self, message: str) -> Any:
-        """Raise what the caller reports."""
+        """Raise the error for the caller to report."""
         raise InputError(f'{message} (see --help)')
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the parser of the command line, ROS arguments taken out."""
+    """Return the parser of the command line without ROS arguments."""
     p = _Parser(prog='replay', allow_abbrev=False, description=(
         'Publish the messages of a bag with their original spacing, and /clock. Remap with '
         '--ros-args -r FROM:=TO.'))
@@ -38,15 +38,15 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument('--loop', action='store_true',
                    help='begin again at the end; the clock jumps back')
     p.add_argument('--clock', type=float, default=100.0, metavar='HZ',
-                   help='how often /clock is published (default 100, 0: never)')
+                   help='rate at which /clock is published (default 100, 0: never)')
     p.add_argument('--partial', action='store_true',
-                   help='play what a damaged bag still holds')
+                   help='play the readable part of a damaged bag')
     p.add_argument('--topics', nargs='+', default=None, metavar='TOPIC',
                    help='play these topics only')
     p.add_argument('--wait', type=float, default=2.0, metavar='SECONDS',
-                   help='wait that long for a subscriber before the start (default 2)')
+                   help='maximum wait for a subscriber before the start (default 2)')
     p.add_argument('--json', default=None, metavar='FILE',
-                   help='write what was played and how well (- is stdout)')
+                   help='write a summary with the spacing error (- is stdout)')
     return p
 
 

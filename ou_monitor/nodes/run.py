@@ -1,11 +1,11 @@
 """
 Start, spin and end a node: the same for every executable.
 
-Exit status: 0 after SIGINT, SIGTERM or the end of the work; 2 when something
-the user gave cannot be used, with one FATAL line that says what and what to
-do; SIGALRM where the middleware does not let go (`END`); anything else is a bug and shows its
-traceback.  This module can be
-imported where ROS 2 is not installed, so that the executables can say so.
+Exit status: 0 after SIGINT, SIGTERM or the end of the work; 2 for unusable
+user input, with one FATAL line that says what is wrong and what to
+do; SIGALRM if the middleware hangs (`END`); anything else is a bug and shows its
+traceback.  This module can be imported where ROS 2 is not installed, so that the executables
+can report that.
 """
 
 from __future__ import annotations
@@ -23,36 +23,36 @@ from typing import Any, NoReturn
 
 from ou_monitor.errors import InputError, refusal
 
-# Before NumPy is loaded.  Matrices here are small, and threads of BLAS that share a core wait for
-# one another: of a node with a real-time priority beside another task, each for 0.1 s.
+# Set before NumPy is loaded.  Matrices here are small, and BLAS threads that share a core wait for
+# one another: 0.1 s each time in a node with real-time priority beside another task.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 BAD_INPUT = 2
-# Longest wait inside the executor, s; a signal wakes it anyway.
+# Maximum wait inside the executor, s; a signal wakes it anyway.
 NAP = 1.0
-# Longest end of a node, s.  It takes 0.02 s of CPU, and 0.5 s at most was seen where 12 tasks
-# shared two cores.  But Fast DDS waits 10 s, and then aborts, for a lock in shared memory that
-# another process held when it was stopped, and while it waits nothing of Python runs.
+# Timeout of ending a node, s.  It takes 0.02 s of CPU, and at most 0.5 s measured with 12 tasks on
+# two cores.  But Fast DDS waits 10 s, and then aborts, for a lock in shared memory that another
+# process held when it was stopped, and Python does not run while it waits.
 END = 1.0
-# How Fast DDS is told where its profiles are (the older name first), or its transports.
+# Variables that give Fast DDS its profiles (the older name first), or its transports.
 PROFILES = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
 TRANSPORTS = 'FASTDDS_BUILTIN_TRANSPORTS'
-# Set while a signal may end the process at once, and while it may break off the making of a node.
+# Set while a signal may end the process at once, and while it may interrupt making a node.
 _loading, _making = threading.Event(), threading.Event()
 
 
 def one_line(text: object) -> str:
-    """Return a text with its line breaks and runs of blanks made single blanks."""
+    """Return a text with each line break or run of blanks as one blank."""
     return ' '.join(str(text).split())
 
 
 def run(name: str, work: Callable[[], int], args: list[str] | None = None) -> int:
     """Initialise ROS 2, do the work, shut down; return the exit status."""
-    # rclpy ends the context on SIGINT and SIGTERM and then calls the handler that was there
-    # before.  Python's own would raise KeyboardInterrupt inside whatever callback runs, and the
-    # EventsExecutor turns that into SystemError: so ours only notes the signal.  While modules
-    # are still being loaded there is nothing to be ended in order: the process ends at once.
-    # While a node is being made no callback runs, and it is left as for any error.
+    # rclpy ends the context on SIGINT and SIGTERM and then calls the previous handler.  Python's
+    # own would raise KeyboardInterrupt inside a callback, which the EventsExecutor turns into
+    # SystemError: so ours only records the signal.  While modules are still being loaded nothing
+    # needs an orderly end: the process ends at once. While a node is being made no callback runs,
+    # and the signal raises like any error.
     stopped: list[int] = []
     _loading.set()
 
@@ -60,13 +60,13 @@ def run(name: str, work: Callable[[], int], args: list[str] | None = None) -> in
         if _loading.is_set():
             os._exit(0)
         stopped.append(number)
-        # Only the first: another would break off what it has begun.
+        # Only the first: another would interrupt the cleanup.
         if _making.is_set() and len(stopped) == 1:
             from rclpy.executors import ExternalShutdownException
             raise ExternalShutdownException
 
-    # They stay until the process ends.  With Ctrl-C both the terminal and ros2 launch send SIGINT,
-    # and Python's handler would raise in a destructor of the middleware, which aborts.
+    # The handlers stay until the process ends.  With Ctrl-C both the terminal and ros2 launch send
+    # SIGINT, and Python's handler would raise in a destructor of the middleware, which aborts.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, note)
     try:
@@ -76,7 +76,7 @@ def run(name: str, work: Callable[[], int], args: list[str] | None = None) -> in
 
 
 def loaded() -> None:
-    """Have signals only noted from here on: there is a node, or something else to be ended."""
+    """From here on only record signals: there is a node, or something else to clean up."""
     _loading.clear()
 
 
@@ -90,7 +90,7 @@ def run_node(name: str, about: str, work: Callable[[], int]) -> NoReturn:
         from rclpy.utilities import remove_ros_args
         left = remove_ros_args(sys.argv)[1:]
         if left:
-            # rclpy would start without it: with another fmin, say, than was asked for.
+            # rclpy would start without it, for example with another fmin than requested.
             raise InputError(f"'{left[0]}' is not taken: parameters and remappings go behind "
                              '--ros-args, as in --ros-args -p NAME:=VALUE -r FROM:=TO')
         return work()
@@ -100,10 +100,10 @@ def run_node(name: str, about: str, work: Callable[[], int]) -> NoReturn:
 
 def end(status: int) -> NoReturn:
     """
-    End the process; all that wants order, the participant of DDS too, is closed before.
+    End the process, after everything that needs an orderly end (DDS too) has been closed.
 
-    Left to itself the interpreter takes its modules down for 0.1 to 0.3 s, and waits for threads
-    that make tables of the risk.
+    Otherwise the interpreter takes 0.1 to 0.3 s to unload modules, and waits for threads
+    that tabulate the risk.
     """
     gc.collect()
     atexit._run_exitfuncs()
@@ -136,24 +136,24 @@ def _run(name: str, work: Callable[[], int], args: list[str] | None, stopped: li
     except ExternalShutdownException:
         return 0
     except (binding.RCLError, InvalidHandle, NotInitializedException):
-        # A signal has ended the context while a node was being built: that is no failure.
+        # A signal has ended the context while a node was being built: not a failure.
         if stopped and not rclpy.ok():
             return 0
         raise
     finally:
         rclpy.try_shutdown()
         if stopped:
-            # The signal has ended the context, but not the log file: its last lines wait.
+            # The signal has ended the context, but its last log lines are not written yet.
             binding.rclpy_logging_fini()
 
 
 def _choose_queues() -> None:
     """
-    Have Fast DDS keep what arrives without CPU, unless the user has chosen otherwise.
+    Make Fast DDS use a queue that needs no CPU, unless the user has configured it.
 
-    Its own queue holds 512 messages of all topics together, and is given up after 1 s.  Other
-    middlewares do not read these variables.  Where discovery is limited to this machine,
-    rmw_fastrtps adds transports of its own, and which of two takes a message is left to chance.
+    Its own queue holds 512 messages of all topics together, and is dropped after 1 s.  Other
+    middlewares ignore these variables.  If discovery is limited to this machine,
+    rmw_fastrtps adds its own transports, and either one may take a message.
     """
     beside = (Path('DEFAULT_FASTRTPS_PROFILES.xml'), Path('DEFAULT_FASTDDS_PROFILES.xml'))
     local = (os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() in ('LOCALHOST', 'OFF')
@@ -182,7 +182,7 @@ def spin(make: Callable[[], Any]) -> int:
     Make one node and spin it until its context ends, then destroy it.
 
     The EventsExecutor takes 10 000 messages/s where the SingleThreadedExecutor
-    loses most of them; it is used where this rclpy has it.
+    loses most of them; it is used if this rclpy has it.
     """
     from rclpy.executors import ExternalShutdownException
     executor = make_executor()
@@ -195,21 +195,21 @@ def spin(make: Callable[[], Any]) -> int:
     executor.add_node(node)
     manager = ServiceManager()
     if manager.interval:
-        # By a timer of the node: an executor that serves no timers is one that hangs.
+        # By a timer of the node: an executor that serves no timers hangs.
         node.every(manager.interval, lambda: manager.tell('WATCHDOG=1'))
-    # What is loaded stays: a collector that looks through it holds all up for 40 ms, and the end
-    # of the process for 0.2 s.
+    # Freeze loaded objects: a garbage collection over them blocks for 40 ms, and delays the end of
+    # the process by 0.2 s.
     gc.freeze()
     manager.tell('READY=1')
     try:
-        # Not spin(): in rclpy 7.1.6 the EventsExecutor's goes on for ever after a signal.
+        # Not spin(): in rclpy 7.1.6 the EventsExecutor's continues for ever after a signal.
         while node.context.ok():
             executor.spin_once(timeout_sec=NAP)
     except ExternalShutdownException:
         node.context.try_shutdown()
     finally:
         manager.tell('STOPPING=1')
-        # A latch is on disk since it was told; by default this signal ends the process.
+        # A latch is already on disk; by default this signal ends the process.
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.setitimer(signal.ITIMER_REAL, END)
         executor.remove_node(node)
@@ -218,7 +218,7 @@ def spin(make: Callable[[], Any]) -> int:
 
 
 def make_executor() -> Any:
-    """Return the EventsExecutor of this rclpy, or the plain one where there is none."""
+    """Return the EventsExecutor of this rclpy, or the plain one if it has none."""
     try:
         from rclpy.experimental.events_executor import EventsExecutor
     except ImportError:
@@ -229,21 +229,21 @@ def make_executor() -> Any:
 
 class ServiceManager:
     """
-    The service manager that has started this process, if one has.
+    The service manager that has started this process, if any.
 
-    `interval`, s, is how often it is told that the process works: half of the time after which it
-    would end the process; 0: not at all.
+    `interval`, s, is the period of the watchdog message, half of the manager's
+    timeout; 0: none.
     """
 
     def __init__(self) -> None:
         self._address = os.environ.get('NOTIFY_SOCKET', '')
-        # Where a watchdog is set for another process, it is not ours to feed.
+        # A watchdog set for another process is ignored.
         ours = os.environ.get('WATCHDOG_PID', str(os.getpid())) == str(os.getpid())
         span = os.environ.get('WATCHDOG_USEC', '') if self._address and ours else ''
         self.interval = 0.5e-6 * int(span) if span.isdigit() else 0.0
 
     def tell(self, state: str) -> None:
-        """Send one state, 'READY=1'; what cannot be sent is left out, for nothing can be done."""
+        """Send one state, 'READY=1'; a failure to send is ignored."""
         if not self._address:
             return
         # An abstract name begins with a zero byte, which the variable writes as @.

@@ -1,7 +1,7 @@
 """
 Which topic, type and field the voltage and the throttle are read from.
 
-Either a msg_config says so, or (`auto`) the type that a publisher offers on
+A msg_config gives them, or (`auto`) the type that a publisher offers on
 the topic chooses among the generic msg_configs.  Parameters override single
 entries.
 """
@@ -30,7 +30,7 @@ _CONFIG = Parameter('msg_config', AUTO,
 
 
 def _where(quantity: str, words: str) -> tuple[Parameter, ...]:
-    """Return the parameters that say where a quantity is."""
+    """Return the parameters that locate a quantity."""
     return (
         Parameter(f'{quantity}.topic', '',
                   f'Topic of the {words}; empty: as the msg_config says.'),
@@ -47,29 +47,29 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
     Parameter('smooth_stamps', True,
               'Whether unstamped samples of a steady source are put on an even time line.'),
 )
-# Of the node that follows the motors.
+# For the node that follows the motors.
 MOTOR_PARAMETERS: tuple[Parameter, ...] = (
     _CONFIG, *_where('throttle', 'throttle'), *_where('rpm', 'motor speeds'))
 
-# In auto mode a bare scalar needs no msg_config of its own to be a throttle.
+# In auto mode a bare scalar serves as throttle without its own msg_config.
 _SCALARS = ('std_msgs/msg/Float32', 'std_msgs/msg/Float64')
 _ARRAYS = ('std_msgs/msg/Float32MultiArray', 'std_msgs/msg/Float64MultiArray')
 
 
 @dataclass(frozen=True)
 class Source:
-    """One quantity: either known, or to be found out from its publisher."""
+    """One quantity: specified, or to be determined from its publisher."""
 
     quantity: str  # 'voltage', 'throttle' or 'rpm'
     topic: str  # Topic, relative or absolute
-    spec: FieldSpec | None  # Where the quantity is; None until a publisher shows its type
-    config: str  # Which msg_config said so
+    spec: FieldSpec | None  # Where the quantity is; None until the publisher's type is known
+    config: str  # Its msg_config
     install: str = ''  # What to install when the package of the type is missing
-    candidates: tuple[Source, ...] = ()  # What may be chosen, in auto mode
-    current: FieldSpec | None = None  # Of a voltage: where in its messages the current is
+    candidates: tuple[Source, ...] = ()  # Choices in auto mode
+    current: FieldSpec | None = None  # For a voltage: the field of the current
 
     def choose(self, types: Sequence[str]) -> Source | None:
-        """Return the candidate for one of the types on offer; None when there is none."""
+        """Return the candidate for one of the types on offer; None if there is none."""
         for candidate in self.candidates:
             if candidate.spec is not None and candidate.spec.type in types:
                 return candidate
@@ -81,7 +81,7 @@ class Source:
         return list(dict.fromkeys(c.spec.type for c in self.candidates if c.spec is not None))
 
     def open_many(self) -> tuple[Any, ManyExtractor]:
-        """Return the message class and what takes several numbers out of it."""
+        """Return the message class and a function that reads several of its numbers."""
         message, spec = self._open()
         extractor = ManyExtractor(spec)
         extractor.extract(message())
@@ -102,7 +102,7 @@ class Source:
 
 
 def find_source(quantity: str, values: Mapping[str, Any]) -> Source | None:
-    """Return where a quantity comes from, by the parameters."""
+    """Return the source of a quantity according to the parameters."""
     topic, kind, field = (str(values[f'{quantity}.{key}']) for key in ('topic', 'type', 'field'))
     rate = float(values['adc.sample_rate']) if quantity == 'voltage' else 0.0
     if values['msg_config'] == AUTO:
@@ -127,10 +127,10 @@ def find_source(quantity: str, values: Mapping[str, Any]) -> Source | None:
 
 
 def _generic(quantity: str) -> list[Source]:
-    """Return what the generic msg_configs say of a quantity, one of a type."""
+    """Return the generic msg_configs' entries for a quantity, one per type."""
     found: dict[str, Source] = {}
     if quantity != 'voltage':
-        # They look alike in all msg_configs, so none of them is named.
+        # They are the same in all msg_configs, so no msg_config is named.
         for kind in (*_SCALARS, *(_ARRAYS if quantity == 'rpm' else ())):
             found[kind] = Source(quantity, quantity, FieldSpec(quantity, kind, 'data'), AUTO)
     for config in list_msg_configs().values():
@@ -143,7 +143,7 @@ def _generic(quantity: str) -> list[Source]:
 
 
 def _install(config: MsgConfig, spec: FieldSpec) -> str:
-    """Return how to install the package of a type, where the msg_config says it of that one."""
+    """Return how to install the package of a type, if the msg_config says it."""
     return config.install if spec.type.partition('/')[0] == config.package else ''
 
 
@@ -152,7 +152,7 @@ def _topic_of(offered: Sequence[Source], quantity: str) -> str:
 
 
 def _by_hand(quantity: str, topic: str, kind: str, field: str) -> Source:
-    """Return a source of any installed type; a header's stamp is used when it has one."""
+    """Return a source of any installed type; a header's stamp is used if it has one."""
     if not field:
         raise InputError(
             f"{quantity}.type is '{kind}', which no generic msg_config describes: give "
@@ -167,8 +167,8 @@ def _overridden(source: Source, topic: str, field: str, rate: float) -> Source:
     spec = source.spec
     if spec is None:
         return source
-    # A rate makes a block of a field only where the message config says it is one, or where the
-    # user named the field.
+    # A rate makes a block of a field only if the message config says so, or if the user named the
+    # field.
     block = rate > 0.0 and (spec.sample_rate is not None or source.config == 'parameters')
     spec = replace(spec, topic=topic or spec.topic, field=field or spec.field,
                    sample_rate=rate if block else spec.sample_rate)
@@ -178,14 +178,14 @@ def _overridden(source: Source, topic: str, field: str, rate: float) -> Source:
 # Where the ament index of a prefix lists its packages, a file each.
 _INDEX = 'share/ament_index/resource_index/packages'
 
-# What rosidl calls the primitives in Python, and in a definition.
+# rosidl's names of the primitives in Python, and in a definition.
 _WORDS = {'float': 'float32', 'double': 'float64', 'boolean': 'bool', 'octet': 'byte'}
 _SEQUENCE = re.compile(r'sequence<(.*?)(?:, \d+)?>')
 _ARRAY = re.compile(r'(.*)\[(\d+)\]')
 
 
 def _is_indexed(package: str) -> bool:
-    """Whether an ament index names a package: of a sourced prefix, or of this environment."""
+    """Whether an ament index lists a package, in a sourced prefix or this environment."""
     prefixes = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
     return any(prefix and (Path(prefix) / _INDEX / package).is_file()
                for prefix in (*prefixes, sys.prefix))
@@ -214,7 +214,7 @@ def message_class(name: str, install: str = '') -> Any:
 
 
 def definition_of(kind: Any) -> Definitions:
-    """Return the fields of a message class, and of those in it."""
+    """Return the fields of a message class, nested ones included."""
     found: Definitions = {}
 
     def add(name: str, message: Any) -> None:

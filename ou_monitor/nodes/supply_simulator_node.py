@@ -3,11 +3,11 @@ The node of `supply_simulator`.
 
 A thread draws samples under the newest throttle and publishes them by the node's clock (simulated
 time too) as `msg_config` says: sensor_msgs/BatteryState on `voltage` by default.  Throttle comes
-from its topic, or is played and published (`throttle.play`).  `~/reset` (std_srvs/Trigger) begins
-anew; `/diagnostics` at 1 Hz.
+from its topic, or is played and published (`throttle.play`).  `~/reset` (std_srvs/Trigger)
+restarts; `/diagnostics` at 1 Hz.
 
-Limits: one voltage, no current.  Above 200 Hz samples are drawn for 20 ms at a time: throttle acts
-so much later, and messages that carry a stamp leave together.
+Limits: one voltage, no current.  Above 200 Hz samples are drawn 20 ms at a time: throttle acts
+that much later, and messages that carry a stamp leave together.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from ou_monitor.simulation import (
 from ou_monitor.stream.config import parse_field_path, walk
 from std_srvs.srv import Trigger
 
-# Read again at each reset, but for the last one, which is in force at once.
+# Read again at each reset, except the last one, which takes effect at once.
 LIVE_PARAMETERS: tuple[Parameter, ...] = (
-    Parameter('seed', 0, 'Seed of all that is random, from the next ~/reset on.', 0, 2**31 - 1),
+    Parameter('seed', 0, 'Seed of the random numbers, from the next ~/reset on.', 0, 2**31 - 1),
     Parameter('capacity_left', -1.0,
               'Charge of the pack at the start, 0..1, from the next ~/reset on; -1: as where the '
               "model's recording began.", -1.0, 1.0),
@@ -51,19 +51,19 @@ FIXED_PARAMETERS: tuple[Parameter, ...] = (
 )
 _SOURCES = tuple(p for p in SOURCE_PARAMETERS if p.name not in (
     'adc.sample_rate', 'smooth_stamps'))
-# What is published or played where the parameters leave the type open.
+# Type published or played if the parameters leave it open.
 _USUAL = {'voltage': 'sensor_msgs/msg/BatteryState', 'throttle': 'std_msgs/msg/Float32'}
-# Up to this rate, Hz, each sample is drawn on its own; above, those of this time, s, in one go: a
-# call of the model costs 0.2 ms of CPU, and a wake of the thread as much as a message.
+# Up to this rate, Hz, each sample is drawn on its own; above, as many as this time, s, holds: a
+# call of the model costs 0.2 ms of CPU, and waking the thread as much as a message.
 _EACH, _AHEAD = 200.0, 0.02
-# Throttle that falls silent is held for this time, s; then the craft idles.
+# A throttle that falls silent is held for this time, s; then the craft idles.
 _HOLD = 1.0
-# Throttle beyond this is none (as the estimator's rule); below, it is taken within 0..1.
+# Throttle beyond this is invalid (the estimator's rule); below, it is clipped to 0..1.
 _MOST_THROTTLE = 2.0
-# A clock that is so far from the next sample, s, was set: samples go on from where it is.  A
+# A clock that is this far from the next sample, s, was set: samples continue from its time.  A
 # machine under load pauses for a second.
 _JUMP = 5.0
-# Longest sleep, s; and how often simulated time is looked at, s.
+# Maximum sleep, s, and period of checking simulated time, s.
 _NAP, _LOOK = 0.05, 0.002
 
 
@@ -82,14 +82,14 @@ class Sender:
                              'simulated live: ou-monitor simulate --type adc_block, and replay')
         self.message = kind()
         if spec.type == _USUAL['voltage']:
-            # What is not simulated is not known.
+            # Quantities that are not simulated are unknown.
             for name in ('current', 'charge', 'capacity', 'design_capacity', 'percentage',
                          'temperature'):
                 setattr(self.message, name, math.nan)
             self.message.present = True
         self._set = _setter(self.message, spec.field, spec.type)
         self._scale, self._offset = spec.sign * spec.unit_factor, spec.offset
-        # Writes the stamp, where there is one.
+        # Writes the stamp, if there is one.
         self.stamp = None if spec.stamp_field is None else _setter(
             self.message, spec.stamp_field, spec.type, stamp_factor=spec.stamp_factor)
         self._output = node.create_publisher(kind, source.topic, 100)
@@ -104,7 +104,7 @@ class Sender:
 
 def _setter(message: Any, path: str, kind: str, stamp_factor: float = math.nan,
             ) -> Callable[[float], None]:
-    """Return what writes a number, or a stamp in s, at a field path of a message of a type."""
+    """Return a function that writes a number, or a stamp in s, at a field path of a type."""
     *steps, last = parse_field_path(path)
     owner = walk(message, tuple(steps), path, kind)
     now = None if owner is None else walk(owner, (last,), path, kind)
@@ -194,7 +194,7 @@ class SupplySimulatorNode(MonitorNode):
                 self._model, rate=self._rate, seed=values['seed'],
                 charge=None if self._model.load is None else charge,
                 resistance=values['scale_resistance'])
-            # Stamp of the first sample, s; NaN: where the clock is then.
+            # Stamp of the first sample, s; NaN: the clock's time then.
             self._begin = math.nan
             self.problem = ''
 
@@ -209,7 +209,7 @@ class SupplySimulatorNode(MonitorNode):
         return response
 
     def _play(self, text: str) -> tuple[Profile, float, Sender] | None:
-        """Return the throttle that is played, its length, s, and what publishes it."""
+        """Return the throttle that is played, its length, s, and its publisher."""
         if not text:
             return None
         if self._throttle_source is None:
@@ -223,7 +223,7 @@ class SupplySimulatorNode(MonitorNode):
     # -- throttle
 
     def _watch(self) -> None:
-        """Look at who publishes throttle, 5 times a second."""
+        """Check who publishes throttle, 5 times a second."""
         if self._played is None:
             self._sources.watch('throttle')
         if self._input is not None:
@@ -302,7 +302,7 @@ class SupplySimulatorNode(MonitorNode):
         return throttle
 
     def _wait(self, due: float) -> bool:
-        """Wait until the node's clock is there, or was set; return whether to go on."""
+        """Wait until the node's clock runs, or was set; return whether to continue."""
         while not self.ending.is_set():
             simulated = self.get_clock().ros_time_is_active
             left = due - (self.stamp_now() if simulated else time.time())
