@@ -49,8 +49,9 @@ _DELAYS, _DELAY_READINGS = 4, 8000
 _FAR = 20
 # A throttle that spans less does not move.
 _MOVED = 0.01
-# A gap is a step of this many usual ones; stretches of fewer readings are left out.
-_GAP, _STRETCH = 1.6, 16
+# A gap is a step of this many usual ones: to begin anew at each lost message costs more than the
+# time line is wrong by.  Stretches of fewer readings are left out.
+_GAP, _STRETCH = 5.0, 16
 # Share of the readings that pieces of one length must hold.
 _HELD = 0.8
 # The shortest of OU_WINDOWS in which alpha is known within this factor counts, else the longest.
@@ -96,11 +97,9 @@ _POWER = 1.8
 
 
 def stretches(t: FloatArray) -> list[slice]:
-    """Return the stretches without a gap; all in one where the stamps are uneven throughout."""
+    """Return the stretches without a gap; a few lost messages are none."""
     steps = np.diff(t)
     gaps = np.flatnonzero(steps > _GAP * np.median(steps))
-    if gaps.size > 0.05 * steps.size:
-        gaps = np.flatnonzero(steps > 5.0 * np.median(steps))
     edges = [0, *(gaps + 1).tolist(), t.size]
     return [slice(a, b) for a, b in zip(edges, edges[1:]) if b - a >= _STRETCH]
 

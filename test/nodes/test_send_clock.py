@@ -148,12 +148,7 @@ def paused_at_10_khz(rng, seconds, pauses, lost):
 
 
 def estimates(stamps, sent, voltage):
-    """
-    Return alpha and sigma of the 2 s windows that end 3, 4, 5 s after the first message.
-
-    They end in the middle of a slot (1/40 of a window), so that a line which is some
-    milliseconds late holds the same samples.
-    """
+    """Return alpha and sigma of the 2 s windows that end 3, 4, 5 s after the first message."""
     estimator, found = SlidingEstimator(2.0), []
     edges = np.searchsorted(sent, sent[0] + np.arange(-0.025, 5.03, 0.05))
     for k, (begin, end) in enumerate(zip(edges[:-1], edges[1:]), 1):
