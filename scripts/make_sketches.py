@@ -34,10 +34,12 @@ CAUSES: dict[str, tuple[dict[str, object], float]] = {
     'held_samples': ({'rate': 60.0}, 0.5),
     'jumps': ({'rate': 3.0, 'mean': -0.3, 'std': 0.05}, 1.0),
     'load_dependent_alpha': ({'slope': -5.0}, 2.0),
-    'load_dependent_noise': ({'ripple': 3.0, 'step': 0.0}, 2.0),
+    'load_dependent_noise': (
+        {'number': (0, 0), 'at': (0.0, 1.0), 'log_factor': (0.0, 1.5)}, 2.0),
     'load_dependent_sigma': ({'throttle': [0.0, 1.0], 'log_factor': [0.0, 2.5]}, 2.0),
     'load_sag': ({'linear': 0.5, 'square': 0.0}, 2.0),
     'load_transient': ({'gain': -0.4, 'tau': 0.1, 'delay': 0.0}, 2.0),
+    'lopsided_noise': ({'skew': -0.8, 'tail': 0.8}, 1.0),
     'measurement_noise': ({'std': 0.06}, 1.0),
     'nonlinear_restoring': ({'square': 600.0, 'cube': 9000.0}, 1.0),
     'quantization': ({'step': 0.06}, 0.5),
@@ -53,7 +55,7 @@ CAUSES: dict[str, tuple[dict[str, object], float]] = {
 }
 # Causes that are seen through another one; every other sketch has the OU alone beside it.
 _SEEN_BY = {'ac_coupling': 'load_sag', 'clock_jitter': 'tone',
-            'load_dependent_noise': 'measurement_noise'}
+            'load_dependent_noise': 'measurement_noise', 'lopsided_noise': 'measurement_noise'}
 _POINTS, _WIDTH, _HEIGHT = 300, 240, 64
 # Of the OU behind a cause: calm, so that the cause stands out, but for those that change it.
 _CALM, _LOUD = 0.15, 0.632

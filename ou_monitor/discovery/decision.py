@@ -31,9 +31,6 @@ TIE = 3.0
 # further terms brought 0.8 % at most where the form was right.
 FORM = 0.005
 CURVE = 0.1
-# Share of its evidence that a latent law must keep beside a free law of throttle: what throttle
-# explains the larger part of, in whatever form, is throttle's.
-OWN = 0.5
 # Relaxation times in a recording from which the rate is one, and no trend: it is then known to
 # sqrt(2/20) = 30 %.
 RELAXES = 20.0
@@ -69,6 +66,7 @@ def kinds_to_try(kinds: Iterable[Kind], model: Sequence[Kind], given: Collection
             if kind.NAME not in ('ou', *given) and kind.ROLE is not Role.EXACT
             and comes_first(kind) is first and (not is_answer(kind) or kind.FAMILY == 'slow')
             and (throttle or not kind.NEEDS_THROTTLE)
+            and (kind.ROLE is not Role.LAW or kind.CHANGES is None or kind.CHANGES in model)
             and (kind.RECURS or all(other.NAME != kind.NAME for other in model))
             and not any(imitate(kind, other) for other in model)]
 
@@ -119,11 +117,6 @@ def is_answer(kind: Kind) -> bool:
 def is_latent(kind: Kind) -> bool:
     """Return whether a cause is inferred only: neither from a measured input nor from time."""
     return not (kind.NEEDS_THROTTLE or kind.MEASURED)
-
-
-def is_throttles(alone: float, beside: float) -> bool:
-    """Return whether throttle explains what a latent law does (alone, beside it: in nats)."""
-    return beside < max(ACCEPT, OWN * alone)
 
 
 def is_shared(gains: npt.ArrayLike, errors: float = 1.0) -> bool:

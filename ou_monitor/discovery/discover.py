@@ -27,10 +27,10 @@ from ou_monitor.discovery.regression import load_terms
 from ou_monitor.discovery.search import position, Progress, whole_load
 from ou_monitor.discovery.words import (
     coupling_found, coupling_note, explain, left_out_note, NO_OTHER, no_relaxation_note,
-    throttles_note, VAGUE, verdict_sentence)
+    VAGUE, verdict_sentence)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import blamed, catalogue, left_out, withdraw
-from ou_monitor.model.terms.load_answer import LoadTransient
+from ou_monitor.model.terms.load_answer import LoadTransient, SHORTEST
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import Saturation
 from ou_monitor.model.terms.term import Role, Term
@@ -236,8 +236,6 @@ def _notes(state: Integrity, named: Named, model: Composite, dropped: Sequence[s
                      if name in named.dropped else
                      f"'{name}' fitted, but does not help to predict what was kept back: left "
                      'out.')
-    if named.throttles:
-        notes.append(throttles_note(named.throttles))
     if uncovered:
         notes.append(left_out_note(uncovered, samples.n - uncovered))
     duration = float(samples.t[-1] - samples.t[0])
@@ -288,7 +286,7 @@ def doubts(terms: Sequence[Term], crossing: CrossingRate, duration: float, step:
 def _at_ends(term: Term, duration: float, step: float) -> list[str]:
     """Return the parameters of a term that stand at the end of their range."""
     if isinstance(term, LoadTransient) and not term.delay:
-        return [] if 2.0 * step < term.tau < 0.25 * duration else ['tau']
+        return [] if SHORTEST * step < term.tau < 0.25 * duration else ['tau']
     return [name for name in term.free()
             if not (_moves(term, name, _STEP) and _moves(term, name, -_STEP))]
 

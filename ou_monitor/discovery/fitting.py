@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 import math
 from typing import Any
 
@@ -18,7 +17,6 @@ from ou_monitor.criticism.composite import Composite, fit_composite, LAW_COST, v
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import coefficients, driven, evaluate, state_space, white_noise
 from ou_monitor.discovery import decision
-from ou_monitor.discovery.free_law import free_law
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.ou import OU
@@ -59,8 +57,6 @@ class Fitter:
     cost: float = 0.0  # Processor time of the fits, s, estimated from their filters
     # Kinds that were tried in vain, and what score tests said of them, nats.
     failed: dict[str, float] = field(default_factory=dict)
-    # Latent laws with evidence, most of which a free law of throttle explains.
-    throttles: set[str] = field(default_factory=set)
 
     def evidence(self, composite: Composite) -> float:
         """Return the evidence for a model, nats."""
@@ -133,12 +129,11 @@ class Fitter:
         fit takes seconds come last, and only where score tests show them beside the best of the
         others, unless they imitate it.  statistics are those of a model.
         """
-        view, values = self.view(composite), statistics(composite)
-        free = _FreeLaw(self.samples, view.z)
+        values = statistics(composite)
         shown = {kind: decision.scored(kind, values) for kind in kinds}
         tried = [kind for kind in kinds if not kind.DEAR
                  and shown[kind] > self.failed.get(kind.NAME, -1.0)]
-        glances = self._glances(composite, tried, free, 0.0)
+        glances = self._glances(composite, tried, 0.0)
         found = self._in_full(composite, glances, [])
         dear = [kind for kind in kinds if kind.DEAR and decision.affordable(kind, self.cost)
                 and shown[kind] > self.failed.get(
@@ -150,7 +145,7 @@ class Fitter:
             dear = [kind for kind in dear if decision.imitate(kind, catalogue()[best.name])
                     or decision.scored(kind, left) > decision.TIE]
         if dear:
-            glances += self._glances(composite, dear, free, _WITHIN * top)
+            glances += self._glances(composite, dear, _WITHIN * top)
             found = self._in_full(composite, glances, found)
             # Of what the spectrum shows to gain less than another kind more is not known.
             tried += [kind for kind in dear if not top or not kind.BROAD]
@@ -158,18 +153,19 @@ class Fitter:
         self.failed |= {kind.NAME: shown[kind] for kind in tried if kind not in gained}
         return found
 
-    def _glances(self, composite: Composite, kinds: Sequence[type[Term]], free: _FreeLaw,
-                 least: float) -> list[_Glance]:
+    def _glances(self, composite: Composite, kinds: Sequence[type[Term]], least: float
+                 ) -> list[_Glance]:
         """Return what kinds gain at first sight, if it is enough, nats."""
         view, before = self.view(composite), self.evidence(composite)
         found = []
         for kind in kinds:
             if kind.ROLE is Role.LAW:
-                gain, start = self._latent_gain(kind, view, free), None
+                gain, start = self._law_gain(kind, view), None
             else:
                 start = self.best_start(composite, kind, view, least)
                 gain = -math.inf if start is None else self.evidence(start) - before
-            if gain > least:
+            # Less than another kind now is not in vain: beside that one it may be the best.
+            if gain > (least if kind.BROAD else 0.0):
                 found.append((gain, kind, start))
         return found
 
@@ -179,7 +175,9 @@ class Fitter:
         found, names = list(known), {trial.name for trial in known}
         best = sorted(glances, key=lambda glance: -glance[0])[:_FEW]
         for gain, kind, start in best:
-            if gain < _WITHIN * best[0][0] or kind.NAME in names:
+            # Of what was fitted, not of what a glance saw: a law may lose all in a fit.
+            top = max((trial.evidence for trial in found), default=0.0)
+            if gain < _WITHIN * top or kind.NAME in names:
                 continue
             full = self.fit([*composite.terms, kind] if start is None else start.terms,
                             start or composite)
@@ -204,20 +202,6 @@ class Fitter:
         return -math.inf if fit is None else (
             float(fit.gain.sum()) - fit.term.SEARCH
             - 0.5 * fit.free * math.log(self.samples.train.stop))
-
-    def _latent_gain(self, kind: type[Term], view: View, free: _FreeLaw) -> float:
-        """Return the same, if a free law of throttle, a log-variance, does not explain it."""
-        log = free.log if decision.is_latent(kind) else None
-        if log is None:
-            return self._law_gain(kind, view)
-        beside = self._law_gain(kind, replace(
-            view, z=view.z * np.exp(-0.5 * log), variance=view.variance * np.exp(log)))
-        alone = self._law_gain(kind, view) if beside > decision.ACCEPT else 0.0
-        if not decision.is_throttles(alone, beside):
-            return alone
-        if alone > decision.ACCEPT:
-            self.throttles.add(kind.NAME)
-        return -math.inf
 
     def best_start(self, composite: Composite, kind: type[Term], view: View, least: float = 0.0
                    ) -> Composite | None:
@@ -285,19 +269,6 @@ def is_trend(samples: Samples, model: Composite) -> bool:
     ou = model.terms[0]
     assert isinstance(ou, OU)
     return not decision.relaxes(ou.alpha, float(samples.t[-1] - samples.t[0]))
-
-
-@dataclass(eq=False)
-class _FreeLaw:
-    """What throttle says of the noise of scores, found when first asked for."""
-
-    samples: Samples
-    z: FloatArray
-
-    @cached_property
-    def log(self) -> FloatArray | None:
-        """Return the logarithm of the variance; None where throttle says nothing."""
-        return free_law(self.samples, self.z)
 
 
 def _joined(composite: Composite) -> Term:

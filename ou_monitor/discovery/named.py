@@ -46,7 +46,7 @@ class Named:
     """
     What the search left: a model fitted on everything, its causes, statistics before and after.
 
-    `bank` is what the statistics are measured by; `throttles` are laws that throttle explains.
+    `bank` is what the statistics are measured by.
 
     """
 
@@ -58,7 +58,6 @@ class Named:
     before: Mapping[str, float]
     after: Mapping[str, float]
     failure: str
-    throttles: tuple[str, ...]
 
 
 def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
@@ -110,8 +109,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
     return Named(found.whole, bank, tuple(names),
                  _with_trends(samples, found.whole, found.search.rivals),
                  tuple(name for name in dict.fromkeys(dropped) if name not in names), before,
-                 found.after, failure or (STOPPED if search.stopped else ''),
-                 tuple(sorted(fitter.throttles.difference(names))))
+                 found.after, failure or (STOPPED if search.stopped else ''))
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from ou_monitor.model.load import INRUSH_TIME
 from ou_monitor.model.load_fit import fit_load
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.laws import View
-from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
+from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient, SHORTEST
 from ou_monitor.model.terms.slow import Drift
 from ou_monitor.model.terms.term import NEXT_TO_ZERO, Role, Term
 from ou_monitor.records import FloatArray
@@ -59,7 +59,7 @@ def load_terms(samples: Samples) -> tuple[Term, ...]:
     duration = float(samples.t[-1] - samples.t[0])
     shortest = float(np.median(samples.step[1:]))
     times = [tau for tau in (INRUSH_TIME, model.fast_time, model.slow_time)
-             if 0.5 * shortest <= tau and decision.relaxes(1.0 / tau, duration)]
+             if SHORTEST * shortest <= tau and decision.relaxes(1.0 / tau, duration)]
     terms = (LoadSag(0.0, NEXT_TO_ZERO), *(LoadTransient(0.0, tau, 0.0) for tau in times),
              Drift(0.0, NEXT_TO_ZERO))
     return tuple(term for term in terms if term.NAME in catalogue())

@@ -122,14 +122,6 @@ def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
     return ' '.join(part for part in parts if part)
 
 
-def throttles_note(names: Sequence[str]) -> str:
-    """Return the note on latent laws that were not named, as throttle explains most of them."""
-    quoted = listed([f"'{name}'" for name in names])
-    return ('The noise follows throttle and its changes in a form that the catalogue does not '
-            f'have: it explains most of what {quoted} would, so '
-            f'{"none of them is" if names[1:] else "that is not"} named.')
-
-
 def left_out_note(count: int, scored: int) -> str:
     """Return that samples at throttle which other blocks do not cover are not scored."""
     return (f'{count} samples are at throttle that the rest of the recording does not cover: a '
@@ -359,6 +351,7 @@ PLAIN_NAMES = {
     'load_dependent_sigma': 'noise that changes with throttle',
     'load_sag': 'sag',
     'load_transient': 'slow recovery after throttle',
+    'lopsided_noise': 'noise with falls deeper than its rises',
     'measurement_noise': 'noise of the sensor',
     'nonlinear_restoring': 'a load of constant power',
     'quantization': 'a coarse ADC',

@@ -166,15 +166,6 @@ def test_dear_kinds_are_tried_while_time_is_left_for_them(kind, cost, may):
     assert decision.affordable(kind, cost) is may
 
 
-@pytest.mark.parametrize('alone, beside, throttles', [
-    # The larger part of it is throttle's, or none is.
-    (100.0, 49.0, True), (100.0, 51.0, False), (100.0, 130.0, False), (692.0, 171.0, True),
-    # Beside the free law it needs what any cause needs.
-    (8.0, 5.9, True), (8.0, 6.1, False), (0.0, -20.0, True)])
-def test_what_throttle_explains_in_another_form(alone, beside, throttles):
-    assert decision.is_throttles(alone, beside) is throttles
-
-
 def test_rivals_are_those_within_a_tie_of_the_best():
     evidence = [('a', 13.1), ('best', 10.0), ('b', 7.1), ('c', 6.9)]
     assert decision.rivals_of('best', evidence) == ['a', 'b']

@@ -211,7 +211,7 @@ def test_explained_needs_statistics_errors_falls_and_parameters():
     assert all(words in said for words in ('2.9', '46', '15.5'))
     good = CrossingRate(14.0, 46.0, 15.5, 44.0, 2.0, 1.0, 0.5)
     assert len(doubts((OU(60.0, 0.3, 5.0),), good, 60.0, 0.001, larger=True)) == 1
-    lag = LoadTransient(0.2, 0.002, 0.0)
+    lag = LoadTransient(0.2, 0.0005, 0.0)
     assert doubts((lag,), good, 60.0, 0.001) == ('tau of load_transient stands at the end of the '
                                                  'range',)
     assert not doubts((replace(lag, tau=0.1), replace(lag, tau=6000.0, delay=0.02)), good, 60.0,

@@ -12,7 +12,7 @@ from ou_monitor.discovery.gain import (
     guess, HeldOut, mean_difference, why_unknown)
 from ou_monitor.discovery.words import (
     cause_rows, explain, gain_remark, gain_text, gain_words, left_out_note, no_relaxation_note,
-    overlap_words, remaining_words, throttles_note, unmeasured_words, verdict_sentence, why_named,
+    overlap_words, remaining_words, unmeasured_words, verdict_sentence, why_named,
     with_error)
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.terms.load_answer import LoadSag
@@ -117,9 +117,6 @@ def test_sentences_of_the_verdict():
 def test_notes_with_numbers():
     assert no_relaxation_note(50.0, 0.02).startswith('Samples 20.0 ms apart')
     assert 'alpha = 50.0 1/s is only' in no_relaxation_note(50.0, 0.02)
-    assert throttles_note(['glitches', 'volatility']).endswith(
-        "most of what 'glitches' and 'volatility' would, so none of them is named.")
-    assert throttles_note(['jumps']).endswith("'jumps' would, so that is not named.")
     assert left_out_note(3, 7).startswith('3 samples') and 'other 7 are' in left_out_note(3, 7)
     assert unmeasured_words(24, 5, False) == (
         '5 samples are left to score it on, fewer than 24. A longer recording would measure it.')

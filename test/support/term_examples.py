@@ -22,6 +22,7 @@ EXAMPLES = {
         'log_factor': [0.0, 0.8, 1.0, *[0.0, 0.3, 0.0, -0.2, 0.0, 0.4] * 3, -0.6, 1.2]},
     'drift': {'rate': -0.01, 'curvature': 0.002},
     'measurement_noise': {'std': 0.02},
+    'lopsided_noise': {'skew': -0.4, 'tail': 0.9},
     'quantization': {'step': 0.01},
     'held_samples': {'rate': 270.0},
     'saturation': {'low': 4.9, 'high': 5.1},

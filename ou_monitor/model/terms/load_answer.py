@@ -127,13 +127,14 @@ class LoadTransient(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return time constants from two steps to a quarter of the recording, and delays."""
+        """Return time constants from half a step to a quarter of the recording, and delays."""
         step = 1.0 / view.rate
         longest = 0.25 * float(view.at[-1])
         if longest <= 2.0 * step:
             return ()
-        count = max(2, math.ceil(2.0 * math.log2(longest / (2.0 * step))))
-        lags = [cls(0.0, float(tau), 0.0) for tau in np.geomspace(2.0 * step, longest, count)]
+        count = max(2, math.ceil(2.0 * math.log2(longest / (SHORTEST * step))))
+        lags = [cls(0.0, float(tau), 0.0) for tau in np.geomspace(
+            SHORTEST * step, longest, count)]
         # Late by whole steps, and for good: a delay.
         latest = max(_LATEST, 4.0 * step)
         late = np.unique(np.rint(np.geomspace(step, latest, _DELAYS) / step)) * step
@@ -142,6 +143,9 @@ class LoadTransient(Term):
             cls(0.0, _FOR_GOOD * 4.0 * longest, float(delay)) for delay in late)]
 
 
+# Steps of the recording in the shortest time constant that it shows: a seventh of the answer is
+# left at the next reading.
+SHORTEST = 0.5
 # Longest time in which motors run up, s.
 _INRUSH = 0.2
 # Delays tried, and the longest of them, s.

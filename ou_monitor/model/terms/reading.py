@@ -38,7 +38,10 @@ class MeasurementNoise(Term):
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
         def effect(s: Segment) -> None:
-            s.voltage += self.std * s.noise * rng.standard_normal(s.t.size)
+            draws = rng.standard_normal(s.t.size)
+            for shape in s.shape:
+                draws = shape(draws)
+            s.voltage += self.std * s.noise * draws
 
         return effect
 
@@ -64,6 +67,115 @@ class MeasurementNoise(Term):
 # Share of the one-step variance below which white noise is none: it moves the likelihood of n
 # samples by n/4 of its square, so that 10^7 samples would not show it.
 _LEAST = 1e-3
+
+
+@dataclass(frozen=True)
+class LopsidedNoise(Term):
+    """
+    Make the draws of the white noise lopsided, of unchanged mean and variance.
+
+    A draw is sinh((asinh(normal) + skew) / tail), less its mean and over its deviation (Jones &
+    Pewsey, Biometrika 96 (2009) 761): skew < 0 has falls that are rarer and deeper than the
+    rises, tail < 1 more of both.  It shapes `measurement_noise`; without one it does nothing.
+    """
+
+    NAME: ClassVar[str] = 'lopsided_noise'
+    FAMILY: ClassVar[str] = 'events'
+    STAGE: ClassVar[Stage] = Stage.INSTRUMENT
+    ROLE: ClassVar[Role] = Role.LAW
+    SIGNS: ClassVar[tuple[str, ...]] = ('skewness', 'kurtosis', 'tails')
+    IMITATES: ClassVar[tuple[str, ...]] = ('clock_jitter', 'glitches', 'heavy_tails', 'jumps')
+    CHANGES: ClassVar[type[Term] | None] = MeasurementNoise
+    MEANING: ClassVar[str] = (
+        'The white noise is lopsided: bursts of load, shorter than the time between readings and '
+        'not seen in throttle, make falls rarer and deeper than rises, or the other way round.')
+    REMEDY: ClassVar[str] = (
+        'Take the margin from the lower side of the noise, not from its deviation; capacitance at '
+        'the ESCs makes short falls shallower.')
+    SEPARATED_BY: ClassVar[str] = 'the same flight at several times the sampling rate'
+
+    skew: float = parameter('', 'asymmetry: below 0 falls are deeper than rises')
+    tail: float = parameter('', 'weight of the tails: 1 as a normal law, below 1 more', 0.0,
+                            above=True)
+
+    def start(self, rng: np.random.Generator) -> Effect:
+        """Begin a simulation."""
+        mean, std = _moments(self.skew, self.tail)
+
+        def effect(s: Segment) -> None:
+            s.shape.append(lambda draws: (_lopsided(draws, self.skew, self.tail) - mean) / std)
+
+        return effect
+
+    @classmethod
+    def fit_law(cls, view: View) -> LawFit | None:
+        """Fit it to scores that are white noise for the most part, their scale free."""
+        white = 1.0 - np.broadcast_to(view.trust, view.z.shape)[view.train]
+        found, paid = cls._climbed(view)
+        # Tails alone are told apart by where they come from: other causes are.
+        return found if float(white.mean()) > _MOSTLY and paid else None
+
+    def refit_law(self, view: View) -> LawFit:
+        """Fit again, whatever other laws have taken over: the evidence says what is left."""
+        return self._climbed(view)[0]
+
+    @classmethod
+    def _climbed(cls, view: View) -> tuple[LawFit, bool]:
+        """Return the fit, and whether its asymmetry gains more than a parameter costs."""
+        z = view.z
+        edges = np.unique(np.quantile(z[view.train], np.linspace(0.0, 1.0, _CELLS + 1)))
+        cells = np.clip(np.searchsorted(edges, z[view.train]) - 1, 0, edges.size - 2)
+        count = np.bincount(cells, minlength=edges.size - 1)
+        some = count > 0
+        count = count[some].astype(np.float64)
+        centre = np.bincount(cells, z[view.train], edges.size - 1)[some] / count
+
+        def value(x: FloatArray) -> float:
+            return float(count @ _lopsided_scores(centre, *x)[1])
+
+        skewed = float(np.sign(np.mean(z[view.train] ** 3)))
+        x, most = climb(value, [0.1 * skewed, -0.1, 0.0], 0.2)
+        even = climb(lambda x: value(np.array([0.0, *x])), x[1:], 0.2)[1]
+        scores, gain = _lopsided_scores(z, *x)
+        se = curvature_se(value, x)
+        tail = math.exp(x[1])
+        fit = LawFit(cls(float(x[0]), tail), {'skew': float(se[0]), 'tail': tail * float(se[1])},
+                     np.clip(scores, -_FARTHEST, _FARTHEST), gain, 3)
+        return fit, most - even > 0.5 * math.log(z[view.train].size)
+
+
+# Share of white noise in the errors from which its law is theirs; cells of scores that a fit
+# tells apart; the largest score that a law gives.
+_MOSTLY, _CELLS, _FARTHEST = 0.5, 400, 8.0
+# Points and weights of the normal law.
+_NORMAL = np.polynomial.hermite_e.hermegauss(80)
+
+
+def _lopsided(draws: FloatArray, skew: float, tail: float) -> FloatArray:
+    """Return normal draws as the law has them, mean and deviation not set."""
+    return np.asarray(np.sinh((np.arcsinh(draws) + skew) / tail))
+
+
+def _moments(skew: float, tail: float) -> tuple[float, float]:
+    """Return the mean and the deviation of the law."""
+    points, weights = _NORMAL[0], _NORMAL[1] / _NORMAL[1].sum()
+    values = _lopsided(points, skew, tail)
+    mean = float(weights @ values)
+    return mean, math.sqrt(float(weights @ (values - mean) ** 2))
+
+
+def _lopsided_scores(z: FloatArray, skew: float, log_tail: float, log_scale: float
+                     ) -> tuple[FloatArray, FloatArray]:
+    """Return normal scores under the law, and gains in log density, nats."""
+    tail = math.exp(min(max(log_tail, -1.5), 1.5))
+    skew = min(max(skew, -3.0), 3.0)
+    mean, std = _moments(skew, tail)
+    unit = std * math.exp(-log_scale)
+    y = mean + unit * z
+    wide = tail * np.arcsinh(y) - skew
+    scores = np.sinh(wide)
+    slope = np.log(np.cosh(wide)) + math.log(tail * unit) - 0.5 * np.log1p(y * y)
+    return scores, slope - 0.5 * scores * scores + 0.5 * z * z
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ Segments pass through the terms of a model in the order of their `Stage`.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import enum
 
 import numpy as np
@@ -52,6 +52,8 @@ class Segment:
     level: FloatArray  # All else that the rail does, V; shape (n,)
     noise: FloatArray  # Factor on the deviation of the white noise of the measurement; shape (n,)
     voltage: FloatArray  # What is logged, V; shape (n,)
+    # What becomes of the normal draws of the white noise; none: they stay normal.
+    shape: list[Callable[[FloatArray], FloatArray]] = field(default_factory=list)
 
 
 Effect = Callable[[Segment], None]

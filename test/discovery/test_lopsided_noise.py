@@ -1,0 +1,69 @@
+"""Noise with falls deeper than its rises: what it simulates, and where discover names it."""
+
+import numpy as np
+from ou_monitor import discover
+from ou_monitor.criticism.composite import fit_composite
+from ou_monitor.criticism.samples import Samples
+from ou_monitor.discovery.decision import kinds_to_try
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.reading import LopsidedNoise, MeasurementNoise, Quantization
+from ou_monitor.records import Recording
+import pytest
+from scipy.stats import kstest, skew
+
+RAIL, STD = OU(1.0, 0.01, 12.0), 0.05
+N, RATE = 6000, 50.0
+T = np.arange(N) / RATE
+
+
+@pytest.mark.parametrize('shape, sign', [((-0.4, 0.9), -1), ((0.3, 0.7), 1), ((0.0, 0.8), 0)])
+def test_its_mean_and_deviation_are_those_of_white_noise(shape, sign):
+    terms = OU(1.0, 0.0, 0.0), MeasurementNoise(STD), LopsidedNoise(*shape)
+    v = SupplyModel(terms).simulate(np.arange(10**5) / RATE, np.random.default_rng(1))
+    assert v.mean() == pytest.approx(0.0, abs=4.0 * STD / 300.0)
+    assert v.std() == pytest.approx(STD, rel=0.03)
+    assert np.sign(np.round(skew(v), 0 if not sign else 2)) == sign
+
+
+def test_a_fit_finds_its_parameters_and_leaves_normal_scores():
+    terms = RAIL, MeasurementNoise(STD), LopsidedNoise(-0.4, 0.9)
+    samples = Samples(T, SupplyModel(terms).simulate(T, np.random.default_rng(2)), None)
+    found = fit_composite(samples, [RAIL, MeasurementNoise(STD), LopsidedNoise], slice(0, N))
+    law, errors = found.terms[-1], found.se[-1]
+    assert law.skew == pytest.approx(-0.4, abs=4.0 * errors['skew'])
+    assert law.tail == pytest.approx(0.9, abs=4.0 * errors['tail'])
+    assert max(errors.values()) < 0.1
+    assert kstest(found.z, 'norm').pvalue > 0.01
+    assert abs(float(np.corrcoef(found.z[1:], found.z[:-1])[0, 1])) < 4.0 / np.sqrt(N)
+
+
+def recording(noise, seed):
+    """Return a rail with a sag under throttle in steps, and noise of unit deviation."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.random(N // 50), 50)
+    rail = SupplyModel((RAIL,)).simulate(T, rng)
+    return Recording(T, rail - 0.8 * u + STD * noise(rng), u, 'bursts')
+
+
+def test_bursts_of_load_are_named_and_explain_the_recording():
+    """The charge of two bursts of random size between two readings: a gamma law."""
+    found = discover(recording(lambda rng: -(rng.gamma(2.0, size=N) - 2.0) / np.sqrt(2.0), 3))
+    assert {'load_sag', 'measurement_noise', 'lopsided_noise'} == {c.name for c in found.causes}
+    law = next(c.term for c in found.causes if c.name == 'lopsided_noise')
+    assert law.skew < -0.2 and abs(next(
+        one.after for one in found.criticism if one.statistic == 'skewness')) < 4.0
+
+
+def test_even_tails_are_not_called_lopsided():
+    found = discover(recording(lambda rng: rng.laplace(size=N) / np.sqrt(2.0), 4))
+    assert 'lopsided_noise' not in {c.name for c in found.causes}
+
+
+def test_steps_of_the_adc_alone_are_not_shaped():
+    """It is tried beside white noise only: it has none to shape in a rail read in coarse steps."""
+    kinds = kinds_to_try(catalogue().values(), [OU, Quantization], (), True, False)
+    assert LopsidedNoise not in kinds
+    assert LopsidedNoise in kinds_to_try(
+        catalogue().values(), [OU, MeasurementNoise], (), True, False)
