@@ -124,7 +124,7 @@ def choose_channel(folder: Path, known: Sequence[str], channel: str) -> str:
 
 
 def find_attribute(folder: Path, channel: str, what: str) -> Path | None:
-    """Return the attribute of a channel, of its kind, or of the device; None: none of them."""
+    """Return the attribute of a channel, else of its kind, else of the device; None if missing."""
     return next((folder / name for name in (f'{channel}_{what}', f'in_voltage_{what}', what)
                  if (folder / name).exists()), None)
 
@@ -261,7 +261,7 @@ class Block:
     stamp: float
     # Voltages, V; shape (n,).
     volts: FloatArray
-    # Spacing by the kernel's stamps, s; NaN where there are none.
+    # Spacing by the kernel's stamps, s; NaN without stamps.
     interval: float
 
 
@@ -324,7 +324,7 @@ class IioBuffer:
         return wanted
 
     def _stamp_clock(self) -> int | None:
-        """Return the clock of the timestamps; None where there are none."""
+        """Return the clock of the timestamps; None without timestamps."""
         if all(element.name != STAMP for element in self._elements):
             return None
         path = self._folder / 'current_timestamp_clock'

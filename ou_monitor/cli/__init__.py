@@ -1,1 +1,1 @@
-"""The `ou-monitor` command, one module a verb."""
+"""The `ou-monitor` command, one module per verb."""

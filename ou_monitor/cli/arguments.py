@@ -1,4 +1,4 @@
-"""Arguments that several commands share: how they are checked, read, and repeated."""
+"""Arguments shared by several commands: checked, read, and repeated."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _TOPICS = ('msg_config', 'voltage_topic', 'throttle_topic', 'flight', *_COLUMNS.
 
 
 def check_outputs(args: argparse.Namespace, *names: str, **inputs: Any) -> None:
-    """Refuse outputs that overwrite an input, cannot be written, or (but for JSON) are '-'."""
+    """Refuse outputs that overwrite an input, cannot be written, or (except for JSON) are '-'."""
     targets = {f"--{name.replace('_', '-')}": getattr(args, name) for name in names}
     for option, target in targets.items():
         if target == output.STDOUT:
@@ -53,7 +53,7 @@ def read_given(args: argparse.Namespace, signal: str | None = None
 
 
 def columns_given(args: argparse.Namespace) -> CsvColumns | None:
-    """Return the columns of a CSV that were named; None when nothing was."""
+    """Return the named columns of a CSV; None when none was named."""
     from ou_monitor.recordings.importers.log import CsvColumns
 
     given = {name: getattr(args, option) for name, option in _COLUMNS.items()
@@ -79,8 +79,8 @@ def _word(value: object) -> str:
 
 
 def brownout_limit(args: argparse.Namespace) -> float | None:
-    """Return the limit of ``--brownout-voltage`` and ``--cells``, V; None when there is none."""
-    # With it comes SciPy, which not every command needs.
+    """Return the limit of ``--brownout-voltage`` and ``--cells``, V; None if not given."""
+    # It imports SciPy, which not every command needs.
     from ou_monitor.analysis.crafts import CELL_LIMIT
 
     if args.brownout_voltage is None:
@@ -96,7 +96,7 @@ def brownout_limit(args: argparse.Namespace) -> float | None:
 
 
 def part_of_recording(args: argparse.Namespace) -> tuple[float | None, float | None]:
-    """Return the ends of ``--from`` and ``--to``, s; None where there is none."""
+    """Return the ends of ``--from`` and ``--to``, s; None where not given."""
     start, end = getattr(args, 'start', None), getattr(args, 'end', None)
     if start is not None and end is not None and not start < end:
         raise InputError(f'--from {start:g} is not before --to {end:g}')

@@ -1,4 +1,4 @@
-"""The table of commands: what each is for, where it is, and its options; imports none of them."""
+"""The table of commands: purpose, module and options of each; imports none of them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ou_monitor.cli.output import path_argument
 
 
 class Option:
-    """Names of an option or of an argument, and what argparse knows of it."""
+    """Names of an option or of an argument, and its settings for argparse."""
 
     def __init__(self, *names: str, **keywords: Any) -> None:
         self.names = names
@@ -34,7 +34,7 @@ class WithoutOut(argparse.Action):
 
 
 def whole(what: str, low: int, high: float = math.inf, step: int = 1) -> Callable[[str], int]:
-    """Return what reads a whole number within a range, a multiple of a step; what: in words."""
+    """Return a parser of whole numbers within a range and a multiple of a step; what: in words."""
     def read(text: str) -> int:
         if not (text.isascii() and text.isdigit() and low <= int(text) <= high
                 and int(text) % step == 0):
@@ -44,7 +44,7 @@ def whole(what: str, low: int, high: float = math.inf, step: int = 1) -> Callabl
 
 
 def number(what: str, fits: Callable[[float], bool]) -> Callable[[str], float]:
-    """Return what reads a number that fits; what: in words."""
+    """Return a parser of numbers that fit; what: in words."""
     def read(text: str) -> float:
         try:
             value = float(text)
@@ -56,14 +56,14 @@ def number(what: str, fits: Callable[[float], bool]) -> Callable[[str], float]:
     return read
 
 
-# Divisors, which are exact: 10u is 1e-5 to the last digit.
+# Divisors, because they are exact: 10u is 1e-5 to the last digit.
 _PREFIX = {'': 1.0, 'p': 1e12, 'n': 1e9, 'u': 1e6, 'µ': 1e6, 'm': 1e3, 'k': 1e-3, 'M': 1e-6}
 _QUANTITY = re.compile(r'([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([pnuµmkM]?)'
                        r'(F|H|[Oo]hm|Ω|V|A|Hz|W|s|1/s)?')
 
 
 def quantity(unit: str) -> Callable[[object], float]:
-    """Return what reads a number that may have an SI prefix and a unit."""
+    """Return a parser of numbers with an optional SI prefix and unit."""
     def read(text: object) -> float:
         match = None if isinstance(text, bool) else _QUANTITY.fullmatch(str(text).strip())
         if not match or math.isinf(float(match[1])):
@@ -122,7 +122,7 @@ TOPICS = (
     Option('--partial', action='store_true', help='use what a truncated file still holds'))
 
 
-# How a CSV is written, where it is not read as it should be.
+# Format of a CSV, if it is not detected correctly.
 CSV = (
     Option('--time-column', metavar='NAME', help='column of a CSV (default: found by its name)'),
     Option('--unit', choices=('V', 'mV'), help='of the voltage in a CSV (default: found)'),
@@ -156,7 +156,7 @@ JSON = Option(
     help="write the result as JSON ('-': to standard output, alone)")
 FORCE = Option('--force', action='store_true', help='overwrite files that exist already')
 REPORT = Option('--report', metavar='FILE.html', help='write a self-contained HTML page')
-# Cells of the largest packs that fly, with room.
+# Cells of the largest packs that fly, with a margin.
 _CELLS = whole('a number of cells, 1 to 28', 1, 28)
 TYPES = ('battery_state', 'float32', 'float64', 'adc_block')
 
@@ -168,7 +168,7 @@ def seed(default: int, text: str = 'same seed, same result') -> Option:
 
 
 def levels(found: str) -> Option:
-    """Return the option of the load levels; found: what they are without it."""
+    """Return the option of the load levels; found: their default."""
     return Option('--levels', metavar='0,0.05,...', type=throttles,
                   help=f'throttles 0..1 of the load levels (default: {found})')
 
@@ -192,7 +192,7 @@ def estimate(voltage: str) -> tuple[Option, ...]:
 
 
 class _Help(argparse.HelpFormatter):
-    """Help whose lines that begin with blanks, such as examples, stay as they are."""
+    """Help whose lines that begin with blanks, such as examples, stay unchanged."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         fill = super()._fill_text
@@ -206,14 +206,14 @@ class Command:
 
     name: str  # As on the command line
     job: str  # One line
-    # Where its function of the arguments is, which returns the exit status: ``run``, or the name
-    # behind a colon.
+    # Module of its function of the arguments, which returns the exit status: ``run``, or the name
+    # after a colon.
     module: str
-    description: str  # Begin of its help
-    # Options; a tuple of two or more is a choice of at most one of them.
+    description: str  # Start of its help
+    # Options; of a tuple of two or more at most one may be given.
     options: tuple[Option | tuple[Option, ...], ...]
     examples: tuple[str, ...]  # Command lines, without ``ou-monitor`` and its name
-    epilog: str = ''  # What stands before the examples at the end of its help
+    epilog: str = ''  # Text before the examples at the end of its help
 
     def add_to(self, subparsers: Any) -> None:
         """Add the parser of this command."""
@@ -318,7 +318,7 @@ _COUPLING = Command(
             help='TOPIC/FIELD.PATH (/imu/angular_velocity.x), a column, or a series of a log '
             '(gyroUnfilt[0], IMU.GyrX)'),
      Option('--band', metavar='LOW,HIGH', type=band,
-            help='frequencies looked at, Hz (default: 5 to a quarter of the slower rate)'),
+            help='frequency band, Hz (default: 5 to a quarter of the slower rate)'),
      Option('--level', metavar='P', default=0.05, type=number(
          'a probability between 0 and 1', lambda value: 0.0 < value < 1.0),
             help='probability of a false alarm (default: %(default)s)'),
@@ -330,7 +330,7 @@ _DESIGN = Command(
     'design', 'which capacitance brings the brown-out risk under X at throttle Y',
     'ou_monitor.cli.design',
     'Compute alpha, sigma, Var_inf and the brown-out risk of a rail from the components of its '
-    'power network, over bulk capacitances, and the least one that meets a risk.',
+    'power network, over bulk capacitances, and the smallest one that meets a risk.',
     (Option('--from', metavar='RECORDING', dest='recording',
             help='take level, sag, resistance and noise from a flight (any recording that analyze '
             'reads); --set goes first'),
@@ -348,9 +348,9 @@ _DESIGN = Command(
      Option('--horizon', metavar='S', type=quantity('s'), default='5',
             help='horizon, s (default: %(default)s)'),
      Option('--capacitance-min', metavar='F', type=quantity('F'), default='10uF',
-            help='least capacitance to look at (default: %(default)s)'),
+            help='smallest capacitance to try (default: %(default)s)'),
      Option('--capacitance-max', metavar='F', type=quantity('F'), default='22mF',
-            help='most capacitance to look at (default: %(default)s)'),
+            help='largest capacitance to try (default: %(default)s)'),
      Option('--esr-fixed', action='store_true',
             help='keep the ESR (default: ESR falls as 1/C, as of more capacitors of one series in '
             'parallel)'),

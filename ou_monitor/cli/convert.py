@@ -11,7 +11,7 @@ from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
 from ou_monitor.report.document import Document, Facts, Notes, Part, Table, Text
 
-# Endings that OUT cannot have: a folder of that name would mislead.
+# Endings that OUT must not have: a folder with such a name would mislead.
 LOG_ENDINGS = ('.csv', '.ulg', '.bin', '.bbl', '.bfl', '.log', '.db3', '.bag', '.txt')
 
 
@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check_place(out: Path, force: bool) -> None:
-    """Refuse an OUT that cannot be written, before a long log is read; writing checks again."""
+    """Refuse an OUT that cannot be written before reading a long log; writing checks again."""
     if not force and (out.exists() or out.is_symlink()):
         raise InputError(f"OUT '{out}' exists already: --force overwrites it, or give another "
                          'name')
@@ -139,7 +139,7 @@ def _list(args: argparse.Namespace, log: Any) -> int:
 
 
 def _gyros(log: Any, taken: set[str]) -> list[dict[str, Any]]:
-    """Return what could become sensor_msgs/Imu."""
+    """Return the series that could become sensor_msgs/Imu."""
     return [{'name': one.name, 'what': one.words, 'n': int(one.t.size), 'scale': one.scale,
              'angular_velocity': 'angular_velocity' in one.vectors,
              'acceleration': 'linear_acceleration' in one.vectors, 'default': one.name in taken}

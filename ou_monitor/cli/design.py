@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def read_network(path: str) -> dict[str, Any]:
-    """Return the components that a YAML file gives (path in A)."""
+    """Return the components that a YAML file gives."""
     if not Path(path).is_file():
         raise InputError(f"--network: there is no file '{path}'")
     try:
@@ -79,7 +79,7 @@ def read_network(path: str) -> dict[str, Any]:
 
 
 def component(name: str, where: str) -> str:
-    """Return the name of a component when there is such a one."""
+    """Return the name of a component if it exists."""
     valid = [field.name for field in fields(PowerNetwork)]
     if name not in valid:
         raise InputError(f"{where}: unknown component '{name}': {nearest(name, valid)}")

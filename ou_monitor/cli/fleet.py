@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--output '{folder}' is a file: name a folder")
     output.check_paths({}, {'--json': args.json}, args.force)
     if not (folder / 'parts').is_dir():
-        # Of an earlier run both are made again; any others are not ours.
+        # These two files of an earlier run are written again; other files are not ours.
         output.check_paths({}, {f'--output ({name})': folder / name for name in (REPORT, TABLE)},
                            args.force)
     output.check_writable(args.json)
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check_installed(args: argparse.Namespace) -> None:
-    """Refuse to start without the packages that are needed, or with an unsafe scheduler."""
+    """Refuse to start if a package is missing or the scheduler is unsafe."""
     from importlib.util import find_spec
 
     needed = ['pyarrow'] + ([] if args.scheduler is None else ['dask', 'distributed'])
@@ -84,7 +84,7 @@ def _check_installed(args: argparse.Namespace) -> None:
 
 
 def version() -> str:
-    """Return the version of the package, as a worker has it."""
+    """Return the package version of a worker."""
     return __version__
 
 
@@ -108,7 +108,7 @@ def command_line(args: argparse.Namespace) -> str:
 
 
 def _options(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
-    """Return the options of the work, and the content of a file that they name."""
+    """Return the options of the work, with the content of the file they name."""
     from ou_monitor.fleet.analysis import Options
 
     config, more = args.msg_config, {}

@@ -1,4 +1,4 @@
-"""`ou-monitor COMMAND`: finds the command, runs it, turns trouble into one line."""
+"""`ou-monitor COMMAND`: finds and runs the command, and reports an error in one line."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from ou_monitor import __version__
 from ou_monitor.cli.commands import COMMANDS
 from ou_monitor.errors import InputError, nearest, refusal
 
-# Before NumPy is loaded.  Matrices here are small: threads of BLAS only wait for one another, and
+# Set before NumPy is loaded.  Matrices here are small, so BLAS threads only wait for one another:
 # on two busy cores a product of two series of 20 000 took 21 ms instead of 4 us.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 PROGRAM = 'ou-monitor'
 BAD_INPUT = 2
-# What a shell reports for a program that Ctrl-C ended.
+# Exit status that a shell reports for a program ended by Ctrl-C.
 INTERRUPTED = 130
 
 
@@ -46,12 +46,12 @@ def build_parser(commands: Sequence[str] | None = None) -> argparse.ArgumentPars
 
 
 def _parse(argv: Sequence[str]) -> argparse.Namespace:
-    """Return the parsed arguments; exit with one line when they are wrong."""
+    """Return the parsed arguments; exit with one line if they are wrong."""
     first = argv[0] if argv else ''
     if first and not first.startswith('-') and first not in COMMANDS:
         raise InputError(f"unknown command '{first}': {nearest(first, COMMANDS)}")
     parser = build_parser([first] if first in COMMANDS else None)
-    # Set by the shell that asks for completions, so that no run of a command pays for it.
+    # Set by the shell that asks for completions, so other runs skip this.
     if '_ARGCOMPLETE' in os.environ:
         import argcomplete
 
@@ -79,11 +79,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if argv is None else argv)
     where = PROGRAM
     for name in ('stdout', 'stderr'):
-        # Closed by whoever started this, as daemons do: nobody listens, and nothing fails for it.
+        # Closed by the parent, as daemons do: nobody reads the output, and its loss is not an
+        # error.
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, 'w', encoding='utf-8'))
     if isinstance(sys.stdout, TextIOWrapper):
-        # As standard error has it: a file name that the terminal cannot show is no failure.
+        # Like standard error: an unprintable character in a file name is not an error.
         sys.stdout.reconfigure(errors='backslashreplace')
     try:
         try:
@@ -91,14 +92,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             where = f'{PROGRAM} {args.command}'
             return int(args.run(args))
         except SystemExit as stop:
-            # From argparse: --help, --version and bad arguments.  What it printed
-            # is still in the buffer, and an error of writing it can still be reported.
+            # From argparse: --help, --version and bad arguments.  Its output is still in the
+            # buffer, so an error of writing it can still be reported.
             from ou_monitor.cli.output import say
 
             say('', end='')
             return stop.code if isinstance(stop.code, int) else 0
     except InputError as error:
-        # One line, whatever a file name or a library's message may hold.
+        # One line, whatever a file name or a library's message contains.
         print(f"{where}: {' '.join(str(error).split())}", file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:
@@ -106,12 +107,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         from ou_monitor.cli.output import abandon_stdout
 
-        # The reader (head, less) has gone.  Nothing more may be written, also
-        # not by the flush at exit.
+        # The reader (head, less) has closed the pipe: write nothing more, also not in the flush at
+        # exit.
         abandon_stdout()
         return 0
     except OSError as error:
-        # What the system refuses, such as to look into a folder, may come from any call.
+        # Refusals by the system, such as searching a folder, may come from any call.
         print(f'{where}: {refusal(error)}', file=sys.stderr)
         return BAD_INPUT
     except MemoryError:

@@ -1,7 +1,7 @@
 """
 What commands write: tables and progress for people, JSON and files for programs.
 
-Progress is a bar on a terminal, a line now and then elsewhere.
+Progress is a bar on a terminal, and an occasional line elsewhere.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from ou_monitor.report.document import Document
     from ou_monitor.report.result import Result
 
-# Seconds between two lines without a terminal, and before the time left is estimated.
+# Seconds between two lines without a terminal, and before the remaining time is estimated.
 _EVERY, _FIRST = 60.0, 2.0
-# Share that must be done before the time left is estimated.
+# Share of the work after which the remaining time is estimated.
 _LEAST = 0.02
 
 
@@ -43,7 +43,7 @@ class Progress:
         self._live = sys.stderr.isatty()
         self._drawn = 0.0
         self._told = time.monotonic()
-        # Time and value of the first share: the work of an earlier run took no time.
+        # Time and value of the first share: results of an earlier run took no time.
         self._first: tuple[float, float] | None = None
 
     def __call__(self, share: float) -> None:
@@ -65,7 +65,7 @@ class Progress:
         self._write(f'\r{self._label} {bar}{share:4.0%}{left}\x1b[K')
 
     def _left(self, share: float, now: float) -> str:
-        """Return the time left, estimated from the share done; '' when it is too early."""
+        """Return the remaining time, estimated from the share done; '' if it is too early."""
         began, first = self._first or (now, share)
         passed, done = now - began, share - first
         if done < _LEAST or share >= 1.0 or passed < _FIRST:
@@ -80,7 +80,7 @@ class Progress:
             sys.stderr.flush()
 
     def close(self) -> None:
-        """Wipe the bar."""
+        """Erase the bar."""
         if self._live and self._drawn:
             self._write('\r\x1b[K')
         self._live, self._drawn, self._told = False, 0.0, math.inf
@@ -90,7 +90,7 @@ class Progress:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Wipe the bar, whatever happened."""
+        """Erase the bar, also after an error."""
         self.close()
 
 
@@ -112,7 +112,7 @@ def write_json(data: Mapping[str, Any], target: str) -> None:
     # Imported here, so that `--help` needs no NumPy.
     from ou_monitor.report.result import plain
 
-    # ASCII suits every encoding of standard output, and file names that are not text.
+    # ASCII suits every encoding of standard output, and file names that are not valid text.
     text = json.dumps(plain(data), indent=2, allow_nan=False)
     if target == STDOUT:
         say(text)
@@ -134,8 +134,8 @@ def say(text: str, end: str = '\n') -> None:
 
 
 def abandon_stdout() -> None:
-    """Send what is left in the buffer nowhere, so that the flush at exit cannot fail."""
-    # A standard output that is no file, as in a test, has nothing to abandon.
+    """Discard what is left in the buffer, so that the flush at exit cannot fail."""
+    # A standard output without a file, as in a test, has nothing to discard.
     with suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
@@ -144,7 +144,7 @@ def write_text(text: str, target: str | Path) -> None:
     """Write a text file in UTF-8."""
     from ou_monitor.stream.files import write_whole
 
-    # A file name may hold bytes that are no text.
+    # A file name may hold bytes that are not valid text.
     path, content = Path(target), text.encode('utf-8', 'backslashreplace')
     if not _is_device(path):
         write_whole(path, content)
@@ -184,7 +184,7 @@ def check_paths(inputs: Mapping[str, str | Path | None],
                 raise InputError(f"{other} and {name} are both '{target}': give each its own "
                                  'name')
     for name, target in written:
-        # `check_writable` reports a folder where a file belongs.
+        # `check_writable` reports a folder in place of a file.
         if target.is_file() and not force:
             raise InputError(f"{name} '{target}' exists already: --force overwrites it, or give "
                              'another name')
@@ -220,14 +220,14 @@ def _is_device(path: Path) -> bool:
 
 
 def _same(first: Path, second: Path) -> bool:
-    """Return whether two paths are one file, by whatever links."""
+    """Return whether two paths are one file, also through links."""
     if first.resolve() == second.resolve():
         return True
     return first.exists() and second.exists() and first.samefile(second)
 
 
 def _overwrites(target: Path, source: Path) -> bool:
-    """Return whether writing the target harms the source: a file, or a bag's folder."""
+    """Return whether writing the target would harm the source: a file, or a bag's folder."""
     if _same(target, source):
         return True
     if not source.is_dir() or source.resolve() not in target.resolve().parents:
@@ -237,7 +237,7 @@ def _overwrites(target: Path, source: Path) -> bool:
 
 
 def check_writable(target: str | None) -> None:
-    """Refuse, before the work, an output that will fail."""
+    """Refuse an output that cannot be written, before the work starts."""
     if target is None or target == STDOUT:
         return
     path = Path(target)
@@ -262,7 +262,7 @@ def deliver(args: argparse.Namespace, found: Result, command: str = '',
 
 def tell(args: argparse.Namespace, document: Document,
          data: Callable[[], Mapping[str, Any]]) -> None:
-    """Write what a command says to the terminal, and its data to the file of --json."""
+    """Write a command's result to the terminal, and its data to the file of --json."""
     from ou_monitor.report.terminal import terminal
 
     if args.json is not None:
@@ -278,7 +278,7 @@ def summary(answer: Sequence[str], **files: object) -> None:
     made = {name: path for name, path in files.items()
             if path is not None and str(path) != STDOUT}
     if len(made) > 1:
-        # A reader looks for the page; a script knows its JSON file.
+        # Name the page for readers; a script knows its JSON file.
         made.pop('json', None)
     last = '; '.join(f'{name.capitalize()}: {path}' for name, path in made.items())
     say('\n' + '\n'.join([*map(paragraph, answer[:2]), last or paragraph(_NO_FILE)]))

@@ -1,4 +1,4 @@
-"""The commands on one recording, and `reproduce`: what they are given goes to `bench`."""
+"""The commands on one recording, and `reproduce`: they pass their arguments to `bench`."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def discover(args: argparse.Namespace) -> int:
     output.deliver(args, finding, _command(args, given),
                    model=args.save_model if args.force or not finding.refused else None)
     if args.save_model is not None:
-        # Last: that there is none must not keep the others from being written.
+        # Last, so that a refused model does not stop the other files from being written.
         if finding.refused and not args.force:
             raise InputError(f'no model saved: {finding.refused[0].lower()}{finding.refused[1:]}; '
                              '--force saves it all the same')
@@ -96,7 +96,7 @@ def _given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
     given = {name: getattr(args, name) for name in names}
     given.update(brownout_voltage=brownout_limit(args), cells=args.cells or 0)
     for parameter in ESTIMATOR_PARAMETERS:
-        # What the node would refuse.
+        # The node would refuse it too.
         value = given.get(parameter.name.replace('.', '_'))
         if (parameter.name.startswith('brownout.') and value is not None
                 and parameter.low is not None and parameter.high is not None
@@ -112,7 +112,7 @@ def _command(args: argparse.Namespace, names: Iterable[str]) -> str:
 
 
 def model_text(finding: Finding, recording: Recording | None = None) -> str:
-    """Return the extended model, and what is known at take-off, as the text of a model file."""
+    """Return the extended model, with the state at take-off, as the text of a model file."""
     from ou_monitor.online.load.load_filter import LoadFilter
     from ou_monitor.recordings.model_file import as_yaml, ModelFile
 

@@ -14,9 +14,9 @@ from ou_monitor.recordings.model_file import as_yaml
 from ou_monitor.report.document import Document, Table
 from ou_monitor.simulation import is_recording, PRESETS, PROFILES, Run
 
-# Endings of files that are no bag: a folder of such a name would surprise.
+# Endings that a bag must not have: a folder with such a name would mislead.
 _NO_BAG = ('.bag', '.bin', '.csv', '.db3', '.json', '.txt', '.ulg', '.yaml', '.yml')
-# Samples at most over which the cost of an export is measured.
+# Maximum number of samples used to measure the loss of an export.
 _EXPORT_MOST = 200_000
 
 
@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
                         for name, p in PRESETS.items()},
             'profiles': {name: text for name, (_, text) in PROFILES.items()}})
         return 0
-    # A profile by name or number is no file, and no output is taken for one.
+    # A profile's name or number is not an input file, so no output can overwrite it.
     start, end = part_of_recording(args)
     recorded = args.throttle is not None and is_recording(args.throttle)
     table = args.throttle if recorded or str(args.throttle).lower().endswith('.csv') else None
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _export(args: argparse.Namespace, run: Run) -> None:
-    """Print the model for another simulator; what is lost goes to stderr."""
+    """Print the model for another simulator; report on stderr what it cannot express."""
     import numpy as np
     from ou_monitor.comparison.export import export
 
