@@ -1,4 +1,4 @@
-"""One recording -> what the fleet table holds of it; this is what the workers run."""
+"""One recording -> its entry in the fleet table; this is what the workers run."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import NAN, Recording
 from ou_monitor.text import printable
 
-# A clock that says less than the year 2000 counts from a start-up, not from 1970; one that says
-# more than 2100 does not count seconds.
+# A clock before the year 2000 counts from a start-up, not from 1970; one after 2100 does not count
+# seconds.
 _EPOCH, _LATEST = 946684800.0, 4102444800.0
 
 
@@ -32,13 +32,13 @@ class Options:
     # Of the risk, V and s; a voltage of NaN leaves the risk unknown.
     brownout_voltage: float = NAN
     brownout_horizon: float = 5.0
-    # As of `read_recording`.
+    # Arguments of `read_recording`.
     msg_config: str | None = None
     voltage_topic: str | None = None
     throttle_topic: str | None = None
-    partial: bool = False  # Whether damaged bags are read as far as they hold
-    discover: bool = False  # Whether causes are looked for, which takes some seconds a recording
-    seed: int = 0  # Of `discover`
+    partial: bool = False  # Whether to read the intact part of damaged bags
+    discover: bool = False  # Whether to search for causes, which takes some seconds a recording
+    seed: int = 0  # Seed of `discover`
 
     def as_data(self) -> dict[str, Any]:
         """Return the options as JSON holds them."""
@@ -46,7 +46,7 @@ class Options:
 
 
 def work(path: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Analyse one recording; whatever is wrong with it is in the result."""
+    """Analyse one recording; the result reports any failure."""
     try:
         return _analysed(path, Options(**options))
     except InputError as error:
@@ -54,8 +54,8 @@ def work(path: str, options: Mapping[str, Any]) -> dict[str, Any]:
     except MemoryError:
         why = 'The recording does not fit into the memory of the worker: use fewer workers.'
     except Exception as error:
-        # One recording that our code cannot bear must not cost the others; the kind of error
-        # is what a report about it needs.
+        # A recording that our code cannot process must not stop the others; the kind of error is
+        # needed to report it.
         why = (f'The analysis failed ({type(error).__name__}: {printable(error, 200)}): please '
                'report it.')
     return {'error': ' '.join(why.split()), 'levels': []}
@@ -68,7 +68,7 @@ def _analysed(path: str, options: Options) -> dict[str, Any]:
     if recording.n < 2:
         raise InputError(f'{recording.name} holds {recording.n} usable sample: nothing can be '
                          'estimated from it')
-    # What overflows ends as not finite, which the analysis tells by its status.
+    # Overflows become non-finite, which the analysis reports in its status.
     with np.errstate(all='ignore'):
         analysis = analyze(
             recording, levels=options.levels if recording.has_throttle else None,

@@ -1,10 +1,10 @@
 """
-Which recordings there are: files, bags, and folders searched for both.
+Find recordings: files, bags, and folders searched for both.
 
 Limits: links to folders are not followed, and hidden folders are not entered.  A FIFO, a
-device or a link that leads nowhere, by the name of a recording, is one that cannot be read.
-Two recordings count as the same when every byte of their data is; a copy that
-was recompressed is another recording.
+device or a broken link with the name of a recording counts as an unreadable recording.
+Two recordings are the same when every byte of their data is; a recompressed copy
+is another recording.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from ou_monitor.recordings.importers.formats import is_log
 from ou_monitor.stream.files import open_regular
 from ou_monitor.text import printable
 
-# Endings of logs of autopilots; what of these is one is told by its first bytes.
+# Endings of autopilot logs; the first bytes decide whether a file is one.
 _LOGS = ('', '.ulg', '.bin', '.log', '.bbl', '.bfl', '.txt', '.db3')
-# Other files end so too: they are passed over without a word.
+# Other files share these endings: they are skipped silently.
 _COMMON = ('', '.log', '.txt')
 _BLOCK = 1 << 20
-# Folders within folders that are searched.
+# Maximum depth of the folders searched.
 _MOST_DEPTH = 50
 
 
@@ -37,21 +37,21 @@ class FoundRecording:
     """One recording on disk."""
 
     path: Path  # File, or folder of a bag; absolute, links resolved
-    files: tuple[Path, ...]  # Its files of data, in order of name
+    files: tuple[Path, ...]  # Its data files, in order of name
     size: int  # Bytes in them
-    stamp: tuple[int, ...]  # Times of their last change, ns
+    stamp: tuple[int, ...]  # Times of their last changes, ns
 
 
 @dataclass(frozen=True)
 class Found:
-    """What a search gave."""
+    """The result of a search."""
 
     sources: tuple[FoundRecording, ...]  # In order of path, each once
-    notes: tuple[str, ...]  # What was passed over, one sentence each
+    notes: tuple[str, ...]  # What was skipped, one sentence each
 
 
 def find_recordings(given: Sequence[str], leave_out: Path | None = None) -> Found:
-    """Return the recordings that some paths stand for."""
+    """Return the recordings at some paths."""
     search = _Search(None if leave_out is None else leave_out.resolve())
     for text in given:
         if not text:
@@ -74,7 +74,7 @@ def find_recordings(given: Sequence[str], leave_out: Path | None = None) -> Foun
 
 
 class _Search:
-    """Collects paths, and what was passed over."""
+    """Collects recordings and skipped paths."""
 
     def __init__(self, leave_out: Path | None) -> None:
         self.paths: set[Path] = set()
@@ -86,7 +86,7 @@ class _Search:
     def add(self, path: Path) -> None:
         path = path.parent if path.name == FILE else path
         real = Path(os.path.realpath(path))
-        # A link that leads nowhere, or in a circle, keeps its own name.
+        # A broken or circular link keeps its own name.
         self.paths.add(real if os.path.exists(real) else
                        Path(os.path.realpath(path.parent)) / path.name)
 
@@ -124,7 +124,7 @@ class _Search:
                 self._logs.append(path)
 
     def notes(self) -> list[str]:
-        """Return what was passed over, one sentence a kind."""
+        """Return what was skipped, one sentence per kind."""
         found = []
         if self._csv:
             found.append(_passed(self._csv, '.csv file', 'without columns of time and voltage'))
@@ -137,7 +137,7 @@ class _Search:
 
 def _walk(root: Path, onerror: Callable[[OSError], None] | None = None,
           ) -> Iterator[tuple[str, list[str], list[str]]]:
-    """Yield as os.walk does, which calls itself for each level, to a depth that ends."""
+    """Yield as os.walk does, which recurses for each level, to a limited depth."""
     for folder, inner, names in os.walk(root, onerror=onerror):
         if folder.count(os.sep) - str(root).count(os.sep) >= _MOST_DEPTH and inner:
             inner.clear()
@@ -152,7 +152,7 @@ def _passed(paths: Sequence[Path], what: str, why: str) -> str:
 
 
 def _is_bag(folder: Path) -> bool:
-    """Return whether a folder is one bag: it has metadata, or is a bag that was cut off."""
+    """Return whether a folder is one bag: it has metadata, or is a truncated bag."""
     try:
         if (folder / FILE).is_file():
             return True
@@ -168,7 +168,7 @@ def _has_columns(path: Path) -> bool:
     try:
         open_regular(path).close()
     except OSError:
-        # It is a recording as far as its name says; the reader tells what is wrong with it.
+        # Its name says that it is a recording; the reader reports the error.
         return True
     return holds_supply(path)
 
@@ -182,7 +182,7 @@ def _source(path: Path) -> FoundRecording:
         try:
             found = file.stat()
         except OSError:
-            # Gone since it was found, a link to nowhere, or not to be looked at: the reader tells.
+            # Deleted since it was found, a broken link, or unreadable: the reader reports it.
             files.remove(file)
             continue
         if not stat.S_ISREG(found.st_mode):
@@ -196,7 +196,7 @@ def _source(path: Path) -> FoundRecording:
 
 def duplicates(sources: Sequence[FoundRecording],
                progress: Callable[[float], None] | None = None) -> dict[Path, Path]:
-    """Return the recordings whose data another one has too (progress 0..1)."""
+    """Return the recordings whose data equal another's (progress 0..1)."""
     sizes: dict[int, list[FoundRecording]] = {}
     for source in sources:
         if source.size:
@@ -221,7 +221,7 @@ def duplicates(sources: Sequence[FoundRecording],
 
 
 def _digest(source: FoundRecording) -> bytes | None:
-    """Return a hash of the data; None where it cannot be read, which the reader tells."""
+    """Return a hash of the data; None if unreadable, which the reader reports."""
     digest = hashlib.blake2b()
     try:
         for path in source.files:

@@ -1,9 +1,9 @@
 """
-Many recordings -> rows, with what was done before left as it is.
+Many recordings -> rows, reusing finished results.
 
-Results are kept as they come, a file for each recording, so that a run can be taken up again.  A
-result counts for a recording with the same path, size, time of change, options and version of the
-package.  One with an error is not kept: that recording is tried again.
+Results are saved as they come, a file for each recording, so that a run can be resumed.  A
+result is valid for a recording with the same path, size, time of change, options and version of
+the package.  Results with an error are not saved: those recordings are tried again.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from ou_monitor.stream.files import open_regular, write_whole
 from ou_monitor.text import printable
 
 FOLDER = 'parts'
-# A result has some 10 kB.
+# Maximum size of a result that is read, bytes; one has some 10 kB.
 _MOST = 50_000_000
 
 
 class Parts:
     """
-    The results in the folder of a fleet, which is created; InputError where that cannot be.
+    The results in the folder of a fleet, which is created; InputError if that fails.
 
-    options: what the results depend on, the version of the package among it, as JSON holds it.
+    options: what the results depend on, including the package version, as JSON holds it.
     """
 
     def __init__(self, folder: Path, options: Mapping[str, Any]) -> None:
@@ -46,7 +46,7 @@ class Parts:
             self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(f"cannot write into '{folder}': {error.strerror or error}") from error
-        # An output folder that cannot be written must fail before the work, not after it.
+        # An unwritable output folder must fail before the work, not after it.
         probe = self._folder / '.probe'
         write_whole(probe, b' ' * 4096)
         probe.unlink()
@@ -57,17 +57,17 @@ class Parts:
                                + '.json')
 
     def load(self, source: FoundRecording) -> dict[str, Any] | None:
-        """Return the result of a recording; None when there is none."""
+        """Return the result of a recording; None if there is none."""
         try:
             with open_regular(self._path(source)) as file:
                 found = json.loads(file.read(_MOST + 1)[:_MOST])
         except (OSError, ValueError, RecursionError):
-            # Not there, cut off by a loss of power, or none of ours: it is computed again.
+            # Missing, truncated by a loss of power, or foreign: it is computed again.
             return None
         return found if isinstance(found, dict) and found.get('error') == '' else None
 
     def save(self, source: FoundRecording, result: Mapping[str, Any]) -> None:
-        """Keep the result of a recording."""
+        """Save the result of a recording."""
         write_whole(self._path(source), json.dumps(result).encode())
 
 
@@ -80,11 +80,11 @@ class Fleet:
 
     rows: list[Row]  # The table, in order of vehicle, flight, path and level
     judgement: Judgement  # What stands out
-    # Where the names of the vehicles are from, what was passed over, and the like.
+    # Sources of the vehicles' names, skipped files, and the like.
     notes: tuple[str, ...]
     recordings: int  # Recordings found
-    kept: int  # Of these, done by an earlier run
-    limit: float = NAN  # Voltage that dips are counted below, V; NaN when none was given
+    kept: int  # Of these, finished by an earlier run
+    limit: float = NAN  # Voltage below which dips are counted, V; NaN when none was given
 
     @property
     def vehicles(self) -> list[str]:
@@ -98,12 +98,12 @@ class Fleet:
 
     @property
     def duplicates(self) -> list[Row]:
-        """Return the rows of recordings that are there twice."""
+        """Return the rows of duplicate recordings."""
         return [row for row in self.rows if row['duplicate_of'] is not None]
 
     @property
     def analysed(self) -> int:
-        """Return how many recordings have numbers of their own."""
+        """Return the number of recordings that have results of their own."""
         return len({row['path'] for row in self.rows
                     if row['error'] is None and row['duplicate_of'] is None})
 
@@ -112,7 +112,7 @@ def run_fleet(found: Found, folder: Path, options: Options, version: Callable[[]
               workers: int, scheduler: str | None = None, insecure: bool = False,
               pattern: re.Pattern[str] | None = None, stated_options: dict[str, Any] | None = None,
               comparing: Progress | None = None, progress: Progress | None = None) -> Fleet:
-    """Analyse all recordings that are not done yet, and judge the fleet."""
+    """Analyse all unfinished recordings, and judge the fleet."""
     parts = Parts(folder, {**options.as_data(), **(stated_options or {}), 'version': version()})
     twice = duplicates(found.sources, comparing)
     results: dict[Path, dict[str, Any]] = {}
@@ -146,9 +146,9 @@ def _workers(count: int, scheduler: str | None, version: Callable[[], str], inse
 
 def _work(missing: Sequence[FoundRecording], results: dict[Path, dict[str, Any]], parts: Parts,
           options: Options, pool: Workers, progress: Progress | None) -> None:
-    """Analyse what is missing, and keep each result as it comes."""
+    """Analyse unfinished recordings, and save each result as it comes."""
     kept = len(results)
-    # The largest first: the last one to end is then a short one.
+    # The largest first, so that the last one to end is short.
     order = sorted(missing, key=lambda source: (-source.size, source.path))
     tell = progress or (lambda share: None)
     tell(kept / (kept + len(order)))
@@ -166,7 +166,7 @@ def _table(sources: Sequence[FoundRecording], results: dict[Path, dict[str, Any]
            twice: dict[Path, Path], pattern: re.Pattern[str] | None
            ) -> tuple[list[Row], list[str]]:
     """Return all rows, and notes on how vehicles and flights were named."""
-    # A copy is of the vehicle that its content names, or of that of its own path.
+    # A copy belongs to the vehicle that its content names, or else to its own path's.
     whole = {s.path: results[twice.get(s.path, s.path)] for s in sources}
     vehicles, notes = assign({path: r.get('vehicle', '') for path, r in whole.items()}, pattern)
     starts = {path: r.get('start', NAN) for path, r in results.items() if not r['error']}

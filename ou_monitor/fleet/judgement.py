@@ -1,40 +1,39 @@
 """
-The fleet table -> what stands out: drifting vehicles, recordings and vehicles that are off.
+The fleet table -> drifting vehicles, and outliers among recordings and vehicles.
 
-Drift: the test is that of Mann and Kendall: exact for few flights, and it asks for
-nothing but that flights without drift come in any order.  The slope is that
-of Theil and Sen with its interval.  All tests of the fleet are held to one
-family rate by Holm's procedure.
+Drift: the Mann-Kendall test, exact for few flights, which only assumes that flights
+without drift come in any order.  The slope and its interval are Theil and Sen's.  Holm's
+procedure keeps all tests of the fleet at one family rate.
 
-Outliers: a value deviates by its distance from the median of its group (or from the
-line that its group drifts along), over sqrt(s^2 + se^2): se is its standard
-error, and s the scatter between recordings that makes the median of these
-ratios that of a normal law (as a median absolute deviation).  The bound is
+Outliers: a value's score is its distance from the median of its group (or from the group's
+drift line) over sqrt(s^2 + se^2): se is its standard error, and s the scatter between
+recordings that gives these ratios the median of a normal law (as a median absolute
+deviation).  The bound is
 where the largest ratio of the whole fleet lies when nothing is wrong, by
 simulation of fleets of the same groups and errors, estimated in the same way
 (with s at its upper 90 % bound, so that the rate is rather below than above).
 
-Limits of drift: flights in a row that share a cause (a season, a battery) look like a
+Limits of drift: consecutive flights that share a cause (a season, a battery) look like a
 drift.  Below a certain number of flights no order of them is rare enough in a
 fleet of many tests; `fewest` returns that number.
 
-Limits of outliers: the scatter between good recordings is taken to be normal and of one
-size on every vehicle.  Where its tails are heavier there are more alarms than
+Limits of outliers: the scatter between good recordings is assumed normal and equal
+on every vehicle.  Heavier tails give more alarms than
 stated; where a large part of a group is off, its median follows.  A median of
-few deviations is vague, so the bound of few is wide: doc/fleet.md has it.
+few deviations is vague, so its bound is wide: see doc/fleet.md.
 
-Recordings are brought to one throttle, so that they can be compared.
+Recordings are compared at one common throttle.
 
 The logarithms of sigma and alpha follow a common curve over throttle (straight
-between knots), fitted to all levels by Huber's estimate with a level of its own
-for each vehicle; what a recording lies above it, averaged over its levels by
-time, is its deviation.  What is shown is what was measured; what is compared
-carries the error of the curve between its own throttle and the usual one.
+between knots), fitted to all levels by Huber's estimate with a separate level
+for each vehicle; a recording's distance above it, averaged over its levels by
+time, is its deviation.  Measured values are shown; compared values include the
+error of the curve between their own throttle and the usual one.
 
-Limits of that: the shape of the curve is taken to be that of all vehicles, and
+Limits of the curve: its shape is assumed equal on all vehicles, and
 throttle to mean the same load on each.  Recordings without throttle are
-compared as they are.  Sag is compared at full throttle, where it is known no
-better than the form of the load (doc/load.md).
+compared unchanged.  Sag is compared at full throttle, as accurately
+as the form of the load allows (doc/load.md).
 """
 
 from __future__ import annotations
@@ -53,13 +52,13 @@ from ou_monitor.text import Z95
 Row = Mapping[str, Any]
 IntArray = npt.NDArray[np.intp]
 USABLE = ('OK', 'SHORT_WINDOW')
-# Quantities that are compared -> unit; the first two on the log scale.
+# Quantities compared -> unit; the first two on the log scale.
 QUANTITIES = {'sigma': 'V/sqrt(s)', 'alpha': '1/s', 'sag': 'V'}
 LOGARITHMIC = ('sigma', 'alpha')
 _HUBER = 1.345
 _ROUNDS = 30
 _MOST_BINS = 60.0
-# Pieces of the curve at most, rows that each takes, and how far apart its knots are at least.
+# Maximum pieces of the curve, rows needed for each, and minimum distance of its knots.
 _PIECES, _ROWS, _APART = 8, 12, 0.03
 
 
@@ -67,12 +66,12 @@ _PIECES, _ROWS, _APART = 8, 12, 0.03
 class CommonCurve:
     """The common curve over throttle of the logarithm of a quantity: straight between knots."""
 
-    reference: float  # Throttle that all recordings are brought to; NaN when none has any
-    # Throttles, and the logarithm there above that at the reference; empty for a flat curve.
+    reference: float  # Throttle at which recordings are compared; NaN when none has any
+    # Throttles, and the logarithm there less its value at the reference; empty for a flat curve.
     knots: tuple[float, ...] = ()
     heights: tuple[float, ...] = ()
-    # Of the slopes between k knots; recordings, not levels, count as independent; shape (k - 1, k
-    # - 1).
+    # Covariance of the slopes between k knots; recordings, not levels, count as independent; shape
+    # (k - 1, k - 1).
     covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __call__(self, throttle: FloatArray) -> FloatArray:
@@ -84,7 +83,7 @@ class CommonCurve:
         return rise
 
     def pieces(self, throttle: FloatArray) -> FloatArray:
-        """Return how much of each slope lies below some throttles, shape (n, k - 1)."""
+        """Return the weight of each slope below some throttles, shape (n, k - 1)."""
         u = np.asarray(throttle, dtype=np.float64)
         known = np.where(np.isfinite(u), u, self.reference)
         return _pieces(known, self.knots)
@@ -96,15 +95,16 @@ class Values:
 
     name: str  # Quantity
     paths: tuple[str, ...]  # Recordings
-    vehicles: tuple[str, ...]  # Of each; empty where unknown
-    flights: IntArray  # Number of the flight; 0 where there is none; shape (n,)
-    # Logarithm at the reference throttle (sag: V at full throttle) and its standard error, with
-    # that of the move from its own throttle rather than from the usual one; shape (n,).
+    vehicles: tuple[str, ...]  # Vehicle of each; empty where unknown
+    flights: IntArray  # Number of the flight; 0 where unknown; shape (n,)
+    # Logarithm at the reference throttle (sag: V at full throttle) and its standard error,
+    # including the error of moving it from its own throttle rather than from the usual one; shape
+    # (n,).
     value: FloatArray
     error: FloatArray
-    curve: CommonCurve  # What was taken out
-    # In the unit of the quantity, as measured, and at which throttle; the mean over the levels (by
-    # time; of the logarithm); NaN where throttle is unknown; shape (n,).
+    curve: CommonCurve  # Curve that was subtracted
+    # Values as measured, in the unit of the quantity, and their throttle; means over the levels
+    # (by time; of the logarithm); NaN where throttle is unknown; shape (n,).
     measured: FloatArray
     throttle: FloatArray
 
@@ -165,10 +165,10 @@ def values_of(rows: Sequence[Row], name: str) -> Values:
 
 
 def _move_error(place: FloatArray, curve: CommonCurve) -> FloatArray:
-    """Return the error of the move of each recording from its throttle to the usual one."""
+    """Return the error of moving each recording from its throttle to the usual one."""
     if not curve.knots or not place.size:
         return np.zeros(len(place))
-    # What all are moved by alike cancels when they are compared.
+    # A common move cancels in the comparison.
     move = place - np.median(place, axis=0)
     variance = np.einsum('ki,ij,kj->k', move, curve.covariance, move)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
@@ -188,7 +188,7 @@ def _values(name: str, rows: Sequence[Row], curve: CommonCurve, value: FloatArra
 
 
 def _pieces(u: FloatArray, knots: Sequence[float]) -> FloatArray:
-    """Return how much of each span between knots lies below throttles, shape (n, k - 1)."""
+    """Return the part of each span between knots below throttles, shape (n, k - 1)."""
     columns = [np.clip(u - low, 0.0, high - low) for low, high in zip(knots, knots[1:])]
     return np.column_stack(columns) if columns else np.zeros((u.size, 0))
 
@@ -212,8 +212,8 @@ def _curve(y: FloatArray, u: FloatArray, vehicles: Sequence[str], recordings: In
     slopes = np.zeros(parts)
     inner, rest = np.zeros((y.size, parts + 1)), y
     for _ in range(_ROUNDS):
-        # Each vehicle has a level of its own, taken out by centring.  One without throttle has
-        # no weight here, and no row.
+        # Each vehicle has its own level, removed by centring.  A vehicle without throttle has
+        # weight 0, and no row.
         count = np.maximum(np.bincount(of, weight, len(names)), 1e-300)
         inner = np.column_stack([
             column - (np.bincount(of, weight * column, len(names)) / count)[of]
@@ -238,11 +238,11 @@ def _curve(y: FloatArray, u: FloatArray, vehicles: Sequence[str], recordings: In
 def _jackknife(inner: FloatArray, rest: FloatArray, weight: FloatArray, of: IntArray,
                vehicle: IntArray) -> FloatArray:
     """
-    Return the covariance of slopes when recordings are left out one by one.
+    Return the covariance of slopes by leaving out one recording at a time.
 
-    As residuals are alike within a recording (of), and each vehicle takes a level.
+    Residuals within a recording (of) are correlated, and each vehicle takes a level.
     """
-    # Slope of Huber's function: what lies beyond its bend does not pull.
+    # Derivative of Huber's function: residuals beyond its bend have no weight.
     pulls = (weight >= 1.0).astype(np.float64)
     bread = np.linalg.pinv((inner * pulls[:, None]).T @ inner, rcond=1e-9)
     count = np.maximum(np.bincount(vehicle, pulls), 1.0)
@@ -260,20 +260,20 @@ def _jackknife(inner: FloatArray, rest: FloatArray, weight: FloatArray, of: IntA
 
 
 def _knots(u: FloatArray) -> list[float]:
-    """Return knots at even shares of the rows, not too near each other; increasing."""
+    """Return knots at even shares of the rows, not too close to each other; increasing."""
     pieces = min(max(u.size // _ROWS, 1), _PIECES)
     wanted = np.quantile(u, np.linspace(0.0, 1.0, pieces + 1)).tolist()
     knots = wanted[:1]
     for knot in wanted[1:]:
         if knot - knots[-1] >= _APART:
             knots.append(knot)
-    # The last one holds the end, so that nothing is flat that should not be.
+    # The last knot is the end, so that the curve is not flat before it.
     if len(knots) > 1:
         knots[-1] = wanted[-1]
     return [float(knot) for knot in knots]
 
 
-# With fewer flights not even one vehicle alone can reach 5 %: 2/4! is 0.08.
+# With fewer flights even a single vehicle cannot reach 5 %: 2/4! is 0.08.
 LEAST_FLIGHTS = 5
 
 
@@ -281,11 +281,11 @@ LEAST_FLIGHTS = 5
 class Trend:
     """Trend of one quantity of one vehicle."""
 
-    # Of what.
+    # Vehicle and quantity.
     quantity: str
     vehicle: str
-    flights: int  # How many were used
-    # Change a flight (of the logarithm, or V for sag) and its 95 % interval.
+    flights: int  # Number of flights used
+    # Change per flight (of the logarithm, or V for sag) and its 95 % interval.
     slope: float
     low: float
     high: float
@@ -293,7 +293,7 @@ class Trend:
     # Numbers of the first and the last flight used.
     first: int
     last: int
-    p_value: float  # Of the test alone
+    p_value: float  # Of this test alone
     p_family: float = NAN  # After Holm, over all tests of the fleet
 
     def line(self, flight: FloatArray) -> FloatArray:
@@ -311,7 +311,7 @@ def trends(all_values: Sequence[Values]) -> tuple[Trend, ...]:
 
 
 def _of_values(values: Values) -> list[Trend]:
-    # A second to import, and the workers do not need it.
+    # Takes a second to import, and the workers do not need it.
     from scipy import stats
 
     found = []
@@ -333,7 +333,7 @@ def _of_values(values: Values) -> list[Trend]:
 
 
 def fewest(tests: int, rate: float) -> int:
-    """Return the flights below which no drift can be significant among some tests."""
+    """Return the minimum number of flights for a significant drift among some tests."""
     n = LEAST_FLIGHTS
     while 2.0 / math.factorial(n) > rate / max(tests, 1):
         n += 1
@@ -342,12 +342,12 @@ def fewest(tests: int, rate: float) -> int:
 
 # The median of |z| of a normal law.
 _MEDIAN = 0.6744897501960817
-# A group of fewer says nothing about which of its members is off.
+# Minimum size of a group: in a smaller one it is unclear which member is off.
 LEAST = 4
 SIMULATIONS = 4000
-# Cells of the arrays that are simulated at once; bounds memory.
+# Maximum number of cells simulated at once; limits memory.
 _CELLS = 2_000_000
-# One-sided bound of 90 % in standard deviations of a normal law.
+# One-sided 90 % bound in standard deviations of a normal law.
 _UPPER = 1.2815515655446004
 
 
@@ -357,14 +357,14 @@ class Outliers:
 
     # Distance from the group in standard deviations; NaN where the group is too small; shape (n,).
     score: FloatArray
-    # Chance that any value of a fleet with nothing wrong is as far off; NaN where there is no
-    # score; shape (n,).
+    # Probability that any value of a fleet with nothing wrong is as far off; NaN without a score;
+    # shape (n,).
     chance: FloatArray
-    centre: FloatArray  # What each was compared with; shape (n,)
-    # Standard deviation between recordings of one group, beside their errors; NaN when unknown.
+    centre: FloatArray  # Value that each was compared with; shape (n,)
+    # Standard deviation between recordings of one group, without their errors; NaN when unknown.
     scatter: float
-    bound: float  # Score that is reached with chance `rate` in a fleet with nothing wrong
-    rate: float  # That chance
+    bound: float  # Score reached with probability `rate` in a fleet with nothing wrong
+    rate: float  # Probability of any false alarm
 
     @property
     def found(self) -> npt.NDArray[np.bool_]:
@@ -393,8 +393,8 @@ def outliers(value: FloatArray, error: FloatArray, groups: Sequence[str], rate: 
     centre[good] = middle[0] + (0.0 if trend is None else trend[good])
     rng = np.random.default_rng(seed)
     size = max(1, min(simulations, _CELLS // se.size))
-    # Where errors are as large as s, s may come out as zero, and the scores of the best recordings
-    # too large: fleets are simulated with the largest s that the data allow.
+    # Where errors are as large as s, the estimate of s may be zero, and the scores of the best
+    # recordings too large: fleets are simulated with the largest s that the data allow.
     share = min(0.5 + 0.5 * _UPPER / math.sqrt(se.size), 0.95)
     most = float(_scatter(rest, se, share)[0, 0])
     largest: list[FloatArray] = []
@@ -416,7 +416,7 @@ def _centred(value: FloatArray, members: Sequence[npt.NDArray[np.intp]]
     wide = np.empty(value.shape[1])
     for index in members:
         middle[:, index] = np.median(value[:, index], axis=1, keepdims=True)
-        # A value pulls its own median towards it; of a mean it would be exactly this much.
+        # A value pulls its own median towards it; for a mean by exactly this much.
         wide[index] = np.sqrt(1.0 - 1.0 / index.size)
     return (value - middle) / wide, middle
 
@@ -430,8 +430,8 @@ def _scatter(rest: FloatArray, error: FloatArray, share: float = 0.5) -> FloatAr
     """
     Return s of each row; shape (k, 1).
 
-    The median of |rest| / sqrt(s^2 + se^2) is that of a normal law, `_MEDIAN`,
-    where s^2 is the median of rest^2 / `_MEDIAN`^2 - se^2.  A `share` above one
+    The median of |rest| / sqrt(s^2 + se^2) equals a normal law's, `_MEDIAN`,
+    if s^2 is the median of rest^2 / `_MEDIAN`^2 - se^2.  A `share` above one
     half gives an upper bound: the median of n values lies below their quantile
     of share 0.5 + z / (2 sqrt(n)) as often as a normal value below z.
     """
@@ -439,12 +439,12 @@ def _scatter(rest: FloatArray, error: FloatArray, share: float = 0.5) -> FloatAr
     return np.sqrt(np.maximum(np.quantile(excess, share, axis=1)[:, None], 0.0))
 
 
-# Chance of any false drift in a fleet with nothing wrong, and of any false outlier.
+# Probability of any false drift in a fleet with nothing wrong, and of any false outlier.
 DRIFT_RATE = 0.05
 OUTLIER_RATE = 0.05
-# Fewer vehicles do not tell which of them is off.
+# Minimum number of vehicles to find which of them is off.
 LEAST_VEHICLES = 6
-# Standard error of a median over that of a mean, of many normal values.
+# Standard error of a median over the mean's, for many normal values.
 _MEDIAN_ERROR = 1.2533141373155
 
 
@@ -456,7 +456,7 @@ class VehicleValues:
     # Medians on the scale of `Values.value`, and their standard errors; shape (v,).
     value: FloatArray
     error: FloatArray
-    outliers: Outliers  # How far each is off the fleet
+    outliers: Outliers  # How far each is from the fleet
 
 
 @dataclass(frozen=True, eq=False)
@@ -464,16 +464,16 @@ class Judgement:
     """What stands out in a fleet."""
 
     values: dict[str, Values]  # Quantity -> recordings
-    trends: tuple[Trend, ...]  # All that were tested, least likely first
-    recordings: dict[str, Outliers]  # Quantity -> each recording beside those of its vehicle
-    vehicles: dict[str, VehicleValues]  # Quantity -> each vehicle beside the others
-    # Chance of any false alarm in one of these comparisons, such that it is `OUTLIER_RATE` in all
-    # together.
+    trends: tuple[Trend, ...]  # All that were tested, lowest p-value first
+    recordings: dict[str, Outliers]  # Quantity -> each recording among those of its vehicle
+    vehicles: dict[str, VehicleValues]  # Quantity -> each vehicle among the others
+    # Probability of any false alarm in one of these comparisons, set so that it is `OUTLIER_RATE`
+    # for all together.
     rate: float
 
     @property
     def drifting(self) -> tuple[Trend, ...]:
-        """Return the trends that stand at the family rate."""
+        """Return the trends that are significant at the family rate."""
         return tuple(t for t in self.trends if t.p_family <= DRIFT_RATE)
 
     def odd_recordings(self) -> list[tuple[str, int]]:
@@ -491,7 +491,7 @@ class Judgement:
 
 
 def judge(rows: Sequence[Row], seed: int = 0) -> Judgement:
-    """Say what stands out."""
+    """Return what stands out."""
     values = {name: values_of(rows, name) for name in QUANTITIES}
     tested = trends(tuple(values.values()))
     # Each quantity is compared twice: recordings within vehicles, and vehicles.
@@ -516,7 +516,7 @@ def _of(values: Values, vehicle: str) -> npt.NDArray[np.bool_]:
 
 
 def _vehicles(values: Values, within: Outliers, rate: float, seed: int) -> VehicleValues:
-    """Return the vehicles beside each other."""
+    """Return the comparison of the vehicles."""
     names = tuple(sorted(set(values.vehicles) - {''}))
     scatter = float(np.nan_to_num(within.scatter))
     value, error = np.zeros(len(names)), np.zeros(len(names))

@@ -27,18 +27,18 @@ class Column:
     # ``text``, ``texts`` (a list), ``json``, ``number`` (unknown: null), ``count`` or
     # ``time`` (UTC).
     kind: str
-    unit: str  # SI unit; empty where there is none
+    unit: str  # SI unit; empty if none
     meaning: str  # One line
 
 
 _LOG = 'standard error of its logarithm'
 
 COLUMNS = (
-    Column('vehicle', 'text', '', 'vehicle; null where it is unknown'),
+    Column('vehicle', 'text', '', 'vehicle; null if unknown'),
     Column('vehicle_from', 'text', '', 'where the name of the vehicle is from: metadata, pattern, '
            'folder'),
     Column('flight', 'count', '', 'number of the flight of this vehicle, from 1'),
-    Column('start', 'time', '', 'first sample; null where its clock does not know the date'),
+    Column('start', 'time', '', 'first sample; null if its clock has no date'),
     Column('recording', 'text', '', 'name of the recording'),
     Column('path', 'text', '', 'file or folder'),
     Column('level', 'text', '', "load level, such as '40 %', or 'all' for the whole recording"),
@@ -58,14 +58,14 @@ COLUMNS = (
     Column('u0_se', 'number', 'V', 'standard error of u0'),
     Column('noise_std', 'number', 'V', 'white noise of the sensor'),
     Column('excess_kurtosis', 'number', '1', 'of the innovations; 0 for a Gaussian'),
-    Column('impulses', 'count', '', 'innovations larger than the largest normal one would be'),
+    Column('impulses', 'count', '', 'innovations above the largest expected of a normal law'),
     Column('line_hz', 'number', 'Hz', 'frequency of the strongest spectral line; null: none '
            'found'),
     Column('line_rms', 'number', 'V', 'its rms'),
     Column('process', 'text', '', 'type of process'),
     Column('risk', 'number', '1', 'probability of a brown-out within the horizon, from the level; '
            'needs --brownout-voltage'),
-    Column('status', 'text', '', 'what became of the fit: OK, SHORT_WINDOW, or why there is none'),
+    Column('status', 'text', '', 'result of the fit: OK, SHORT_WINDOW, or why there is none'),
     Column('flags', 'texts', '', 'cautions about the input'),
     Column('duration_s', 'number', 's', 'length of the recording'),
     Column('samples', 'count', '', 'samples of the recording'),
@@ -78,34 +78,34 @@ COLUMNS = (
     Column('below_s', 'number', 's', 'time below the limit; needs the same'),
     Column('sag_throttle', 'number', '1', 'highest throttle flown, to a tenth; null where the sag '
            'is unknown'),
-    Column('sag', 'number', 'V', 'sag there, positive, as analyze tells it'),
+    Column('sag', 'number', 'V', 'sag there, positive, as in analyze'),
     Column('sag_se', 'number', 'V', 'standard error of sag'),
     Column('sag_full', 'number', 'V', 'sag at full throttle, if its form holds up to there; '
            'recordings are compared by it'),
     Column('sag_full_se', 'number', 'V', 'standard error of sag_full'),
     Column('supply', 'json', '', 'the facts that all commands share, as JSON'),
     Column('alpha_p', 'number', '1', 'p-value of alpha being the same at all levels'),
-    Column('quality', 'texts', '', 'what to know about the recording, worst first'),
+    Column('quality', 'texts', '', 'defects of the recording, worst first'),
     Column('risk_max', 'number', '1', 'highest risk that the node would have published on the '
            'way; needs --brownout-voltage'),
     Column('verdict', 'text', '', 'verdict of discover; null without --discover'),
     Column('causes', 'texts', '', 'causes that discover names; null without --discover'),
-    Column('gain', 'number', 'nat', 'gain of the extended model, per sample kept back'),
+    Column('gain', 'number', 'nat', 'gain of the extended model, per held-out sample'),
     Column('gain_se', 'number', 'nat', 'standard error of gain'),
-    Column('notes', 'texts', '', 'what was dropped, mended or left out of the recording'),
+    Column('notes', 'texts', '', 'what was dropped, repaired or left out of the recording'),
     Column('duplicate_of', 'text', '', 'path of the recording with the same content; this one '
            'was not analysed again'),
     Column('error', 'text', '', 'why there are no numbers; null when there are'),
     Column('size_bytes', 'count', 'byte', 'size of its data'),
 )
 NAMES = tuple(column.name for column in COLUMNS)
-# Of the recording, but not as its result has them.
+# Columns of the recording that its result lacks.
 _OTHERWISE = ('vehicle', 'start', 'error')
 
 
 def rows_of(source: FoundRecording, result: Mapping[str, Any], vehicle: Vehicle,
             flight: int | None, duplicate_of: Path | None = None) -> list[Row]:
-    """Return the rows of one recording: one a level, or one that says why there is none."""
+    """Return the rows of one recording: one per level, or one with the error."""
     base: Row = dict.fromkeys(NAMES)
     base.update(
         vehicle=vehicle.name or None, vehicle_from=vehicle.named_by if vehicle.name else None,
@@ -124,12 +124,12 @@ def rows_of(source: FoundRecording, result: Mapping[str, Any], vehicle: Vehicle,
 
 
 def _known(value: Any) -> Any:
-    """Return a value, None for a number that is not known."""
+    """Return a value; None for an unknown number."""
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def _as_text(value: Any) -> Any:
-    """Return texts without what is no text, such as bytes in a file name; objects as JSON."""
+    """Return valid text, without bytes of a file name that are not; objects as JSON."""
     if isinstance(value, str):
         return value.encode('utf-8', 'backslashreplace').decode()
     if isinstance(value, dict):

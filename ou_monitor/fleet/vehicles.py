@@ -1,10 +1,9 @@
 """
-Which vehicle a recording is of, and which of its flights.
+Vehicle and flight number of a recording.
 
-The rule: what the recording names itself (its metadata), else what a pattern
-finds in its path, else the folder it lies in.  Recordings are compared within
-a vehicle only; where the vehicle is unknown there is none, and the
-recording is compared with nothing.
+The vehicle is the one that the recording names itself (its metadata), else the match of a
+pattern in its path, else its folder.  Recordings are compared within
+a vehicle only; a recording of an unknown vehicle is compared with nothing.
 """
 
 from __future__ import annotations
@@ -58,7 +57,7 @@ def assign(stated: Mapping[Path, str], pattern: re.Pattern[str] | None = None
             if not by_pattern:
                 unmatched.append(path)
         elif path.parent in named:
-            # Its neighbours name their vehicle: the folder is no vehicle of its own.
+            # Its neighbours name their vehicle, so the folder is not a vehicle.
             found[path] = Vehicle('', FOLDER)
             mixed.append(path)
         else:
@@ -66,7 +65,7 @@ def assign(stated: Mapping[Path, str], pattern: re.Pattern[str] | None = None
     notes = [_rule(found)]
     if differing:
         notes.append(f'{_these(differing)}: the metadata name another vehicle than '
-                     '--vehicle-from finds; the metadata hold.')
+                     '--vehicle-from finds; the metadata are used.')
     if unmatched:
         notes.append(f'{_these(unmatched)}: --vehicle-from finds no vehicle in the path; they '
                      'are compared with nothing.')
@@ -78,12 +77,12 @@ def assign(stated: Mapping[Path, str], pattern: re.Pattern[str] | None = None
         v.name for v in found.values() if v.named_by != METADATA and v.name}
     if both:
         notes.append(f'{", ".join(sorted(both))}: some recordings name this vehicle themselves, '
-                     'others were counted to it by their path; check that it is one vehicle.')
+                     'others were assigned to it by their path; check that it is one vehicle.')
     return found, notes
 
 
 def _match(pattern: re.Pattern[str] | None, path: Path) -> str:
-    """Return the vehicle that a pattern finds in a path; empty: none."""
+    """Return the vehicle that a pattern finds in a path; empty if none."""
     found = None if pattern is None else pattern.search(str(path))
     if found is None:
         return ''
@@ -104,7 +103,7 @@ def _folder_names(folders: set[Path]) -> dict[Path, str]:
 
 
 def _rule(found: Mapping[Path, Vehicle]) -> str:
-    """Say where the names of the vehicles are from."""
+    """Say where the vehicles' names come from."""
     words = {METADATA: 'by their metadata', PATTERN: 'by --vehicle-from',
              FOLDER: 'by the folder they lie in'}
     parts = []
@@ -125,7 +124,7 @@ def _these(paths: Sequence[Path]) -> str:
 
 def number_flights(vehicles: Mapping[Path, Vehicle], starts: Mapping[Path, float]
                    ) -> tuple[dict[Path, int], list[str]]:
-    """Return which flight of its vehicle each recording is, from 1 (starts in s)."""
+    """Return the flight number of each recording within its vehicle, from 1 (starts in s)."""
     flights: dict[Path, int] = {}
     by_name = []
     groups: dict[str, list[Path]] = {}
@@ -146,7 +145,7 @@ def number_flights(vehicles: Mapping[Path, Vehicle], starts: Mapping[Path, float
         more = len(by_name) - _SHOWN
         some += f' and {more} more' if more > 0 else ''
         notes.append(f'{some}: the flights are in the order of their names, because their '
-                     'dates are not known or not distinct.')
+                     'dates are unknown or not distinct.')
     return flights, notes
 
 

@@ -1,12 +1,12 @@
 """
 Work on many processes: of this machine, or of a Dask scheduler.
 
-Those of this machine are reached over pipes: no port, no socket, nothing to connect to.  This is
+Local processes are reached over pipes: no port or socket to connect to.  This is
 the only module that imports Dask.
 
-Limits: a worker that dies takes with it what it was given.  It may have been
-killed for the memory that others used, so a recording is tried a second time
-alone, when nothing else runs, before it counts as deadly.
+Limits: a worker that dies loses its tasks.  It may have been
+killed for memory that others used, so a recording is tried a second time
+alone, when nothing else runs, before it is given up.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ from ou_monitor.recordings.mcap_file import usable_memory
 # Several processes with several threads of linear algebra each are slower than with one.
 _ONE_THREAD = dict.fromkeys(
     ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'NUMBA_NUM_THREADS'), '1')
-# Share of the memory that all workers together may fill, and the least that one needs, byte.
+# Share of the memory that all workers together may fill, and the minimum for one, bytes.
 _MEMORY_SHARE, _MEMORY_LEAST = 0.9, 1 << 29
-# How long is waited for a scheduler or for a worker, s.
+# Timeouts for a scheduler and for a worker, s.
 _PATIENCE = 30.0
-# How often a wait looks whether there are workers left, s.
+# Period of checking whether workers are left, s.
 _LOOK = 1.0
 LOST = ('The worker died while it did this recording, also in a second try alone: it was killed, '
         'or the recording does not fit into memory.')
-# Place of a task in the list of arguments, its result, and why there is none.
+# Index of a task in the list of arguments, its result, and its error.
 Outcome = tuple[int, Any, str]
 
 
@@ -58,7 +58,7 @@ class Workers(ABC):
 
     @abstractmethod
     def _room(self) -> int:
-        """Return how many tasks may be under way."""
+        """Return the maximum number of tasks under way."""
 
     @abstractmethod
     def _submit(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
@@ -66,15 +66,15 @@ class Workers(ABC):
 
     @abstractmethod
     def _wait(self, futures: Sequence[Any]) -> list[Any]:
-        """Wait until a future is done; return all that are."""
+        """Wait until a future is done; return all finished ones."""
 
     @abstractmethod
     def _outcome(self, future: Any) -> tuple[Any, str]:
-        """Return the result of a future that is done, or why there is none."""
+        """Return the result of a finished future, or its error."""
 
     @abstractmethod
     def close(self) -> None:
-        """End what is under way, and let go of the workers."""
+        """Cancel what is under way, and release the workers."""
 
     def each(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]
              ) -> Iterator[Outcome]:
@@ -106,7 +106,7 @@ class Workers(ABC):
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End what is under way."""
+        """Cancel what is under way."""
         self.close()
 
 
@@ -114,10 +114,10 @@ class LocalWorkers(Workers):
     """Processes of this machine, each with a share of the memory."""
 
     def __init__(self, count: int) -> None:
-        # The workers hold the reading end: they end when the other one closes, also by our death.
+        # The workers hold the reading end: they end when the other end closes, also if we die.
         self._watched, self._alive = multiprocessing.get_context('spawn').Pipe(duplex=False)
         self._memory = max(int(_MEMORY_SHARE * usable_memory()) // count, _MEMORY_LEAST)
-        # A pool of one for each: when a pool breaks, it is clear by whom, and the others go on.
+        # One pool for each, so that a broken pool identifies its task and the others go on.
         self._pools: list[ProcessPoolExecutor | None] = [None] * count
         self._at: dict[Future[Any], int] = {}
 
@@ -151,7 +151,8 @@ class LocalWorkers(Workers):
                 pool.shutdown()
             return None, LOST
         except Exception as error:
-            # The function itself raises nothing, so it is the way to or from the worker.
+            # The function itself raises nothing, so the error came on the way to or from the
+            # worker.
             return None, failure(error)
 
     def close(self) -> None:
@@ -171,10 +172,10 @@ def failure(error: Exception) -> str:
 @contextmanager
 def _environment_of_workers() -> Iterator[None]:
     """
-    Let a process that starts now have one thread, and hear no Ctrl-C from its first instruction.
+    Start processes with one thread each, and with Ctrl-C blocked from their first instruction.
 
     A terminal sends Ctrl-C to the whole group; the main process ends its
-    workers itself, and their words about it would only hide its own.
+    workers itself, and their messages would only hide its own.
     """
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(_ONE_THREAD)
@@ -192,7 +193,7 @@ def _environment_of_workers() -> Iterator[None]:
 
 
 def _prepare(watched: Connection, memory: int) -> None:
-    """Bound the memory of this worker (byte), and end it with the main process."""
+    """Limit the memory of this worker (bytes), and end it with the main process."""
     hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
     if hard == resource.RLIM_INFINITY or memory < hard:
         resource.setrlimit(resource.RLIMIT_DATA, (memory, hard))
@@ -211,7 +212,7 @@ def check_address(address: str, insecure: bool = False) -> None:
     if insecure or parts.scheme == 'tls' or _is_loopback(parts.hostname or ''):
         return
     raise InputError(
-        f"--scheduler: '{address}' is not encrypted: whoever is on that network can run programs "
+        f"--scheduler: '{address}' is not encrypted: anyone on that network can run programs "
         'on its workers and on this machine. Use tls://HOST:PORT, or --insecure where nobody else '
         'can reach it')
 
@@ -227,9 +228,9 @@ class ClusterWorkers(Workers):
     """
     The workers of a Dask scheduler, which have this package and the recordings at the same paths.
 
-    Certificates of ``tls://`` are those of Dask's configuration (``distributed.comm.tls``); what
-    `check` returns must be the same here and on every worker; `insecure` lets an address of
-    another machine be without TLS.  InputError: the address is not safe, no scheduler or no
+    Dask's configuration (``distributed.comm.tls``) has the certificates of ``tls://``; the result
+    of `check` must be the same here and on every worker; `insecure` allows an address of
+    another machine without TLS.  InputError: the address is not safe, no scheduler or no
     worker answers, or the workers have another version.
     """
 
@@ -248,7 +249,7 @@ class ClusterWorkers(Workers):
         _quiet()
         try:
             client = self._stack.enter_context(Client(address, timeout=_PATIENCE))
-        # Dask raises a TypeError where there is no certificate.
+        # Dask raises a TypeError if there is no certificate.
         except (OSError, TypeError, ValueError) as error:
             raise InputError(f"--scheduler: no scheduler answers at '{address}' "
                              f"({str(error).splitlines()[0] if str(error) else 'time-out'}); "
@@ -271,8 +272,8 @@ class ClusterWorkers(Workers):
         return client
 
     def _room(self) -> int:
-        # One beside that in work, so that no worker waits for the next; what is lost with a worker
-        # before it was begun is tried again too.
+        # Two tasks a thread, so that no worker waits for the next one; a task that was lost with a
+        # worker before it began is tried again too.
         return 2 * max(1, sum(int(count) for count in self._client.nthreads().values()))
 
     def _submit(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
@@ -301,7 +302,7 @@ class ClusterWorkers(Workers):
             found = [future for future in futures if future.status in ('finished', 'error')]
             if found:
                 return found
-            # What was done on a worker that died is being done again.
+            # Work done on a worker that died is being done again.
             time.sleep(0.05)
 
     def _outcome(self, future: Any) -> tuple[Any, str]:
@@ -312,16 +313,17 @@ class ClusterWorkers(Workers):
         except (KilledWorker, TimeoutError):
             return None, LOST
         except Exception as error:
-            # The function itself raises nothing, so it is the way to or from the worker.
+            # The function itself raises nothing, so the error came on the way to or from the
+            # worker.
             return None, failure(error)
 
     def close(self) -> None:
-        """Let go of the workers."""
+        """Release the workers."""
         self._stack.close()
 
 
 def _quiet() -> None:
-    """Keep Dask's own words about workers off the terminal: what matters is in the table."""
+    """Keep Dask's messages about workers off the terminal: the table has what matters."""
     for name in ('distributed', 'distributed.core', 'distributed.client', 'distributed.batched',
                  'tornado', 'asyncio'):
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)

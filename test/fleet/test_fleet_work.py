@@ -269,7 +269,7 @@ def test_vehicle_rules():
                            Path('/f/uav2_b.mcap'): 'SN42'}, read_pattern(r'(uav\d)_'))
     assert [v.name for v in found.values()] == ['uav1', '', 'SN42']
     assert any("'/f/other.csv': --vehicle-from finds no vehicle" in note for note in notes)
-    assert any('the metadata hold' in note for note in notes)
+    assert any('the metadata are used' in note for note in notes)
     by_name, _ = assign(paths('/f/x_uav7.csv'), read_pattern(r'(x)_(?P<vehicle>uav\d)'))
     assert [v.name for v in by_name.values()] == ['uav7']
 
