@@ -1,1 +1,1 @@
-"""Self-contained HTML pages: scale -> svg -> page -> one module a kind of report."""
+"""Self-contained HTML pages: scale -> svg -> page -> one module per kind of report."""

@@ -1,4 +1,4 @@
-"""What `analyze` says: facts, what to know of them, the paper's tables, what they rest on."""
+"""The report of `analyze`: facts, cautions, the paper's tables, and their evidence."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from ou_monitor.report.document import (
 from ou_monitor.report.svg import Plot, span
 from ou_monitor.text import chance, counted, listed, number
 
-# Changes drawn in one plot, and relaxation times of them.
+# Maximum changes drawn in one plot, and its length in relaxation times.
 _MOST_DRAWN, _DRAWN_TAUS = 6, 8.0
-# Rows of a table on a terminal.
+# Maximum rows of a table on a terminal.
 _MOST_LINES, _MOST_CHANGES = 12, 8
-# Smaller risks are drawn as this.
+# Lower limit of the drawn risk.
 _LEAST_RISK = 1e-4
-# More levels than colours would repeat colours; lines marked in the spectrum of one level.
+# Maximum levels drawn (more would repeat colours), and lines marked in the spectrum of a level.
 _MAX_DRAWN, _MAX_MARKED = 6, 3
 _TESTS = {'mean_drift': 'mean moves', 'variance_drift': 'intensity moves',
           'gaussian': 'not Gaussian', 'impulses': 'impulses', 'correlated': 'correlated',
           'one_relaxation': 'not one relaxation', 'second_relaxation': 'second relaxation'}
-# What changes the meaning of every number.
+# Warnings that change the meaning of every number.
 _BEWARE = {
     'VOLTAGE_UNIT': 'Beware: the voltages seem to be millivolts or counts, not volts.',
     'TIME_UNIT': 'Beware: the time seems to be in ms or us, not in s.'}
 
 
 def analysis_document(analysis: Analysis, command: str = '') -> Document:
-    """Return what is said of an analysis."""
+    """Return the report of an analysis."""
     recording = analysis.recording
     rate = (recording.n - 1) / recording.duration if recording.duration > 0.0 else NAN
     subject = (f'{recording.name or "recording"}: {recording.n} samples in '
@@ -63,7 +63,7 @@ def analysis_document(analysis: Analysis, command: str = '') -> Document:
 
 
 def answer(analysis: Analysis) -> list[str]:
-    """Return the answer: what was seen, what is safe, sigma and tau where they are known."""
+    """Return the answer: lowest voltage, safe throttle, sigma and tau as far as known."""
     curves, names = analysis.by_throttle, {item.name for item in analysis.quality}
     first, *others = answers(analysis.overview) or ['The recording holds no samples.']
     safe = [] if math.isnan(curves.budget) else [
@@ -75,7 +75,7 @@ def answer(analysis: Analysis) -> list[str]:
 
 
 def facts(analysis: Analysis) -> list[tuple[str, str]]:
-    """Return what is always known, as names and words."""
+    """Return the facts as names and words."""
     found = known_lines(analysis.overview)
     if not found:
         return []
@@ -85,7 +85,7 @@ def facts(analysis: Analysis) -> list[tuple[str, str]]:
 
 
 def _budget(analysis: Analysis) -> str:
-    """Return the throttle budget, and what a throttle beyond it would risk."""
+    """Return the throttle budget, and the risk of a throttle beyond it."""
     curves = analysis.by_throttle
     if math.isnan(curves.voltage):
         middle = float(np.median(analysis.recording.voltage))
@@ -112,7 +112,7 @@ def _budget(analysis: Analysis) -> str:
 
 
 def _why_none(analysis: Analysis) -> str:
-    """Say whether it is the supply at rest or what was flown that leaves no budget."""
+    """Say why there is no budget: the supply at rest, or the flight before."""
     rest = analysis.overview.load.level
     if rest > analysis.by_throttle.voltage:
         return (f'right after what was flown, though the supply at rest is at {number(rest, 4)} V')
@@ -162,20 +162,20 @@ def _change(analysis: Analysis) -> list[str]:
 
 
 def notes(analysis: Analysis) -> Notes:
-    """Return what to know before using the numbers, worst first."""
+    """Return cautions about the numbers, worst first."""
     return worst_first([*((item.severity, _caution(item)) for item in analysis.quality),
                         *((Severity.INFO, note) for note in analysis.notes
                           if note not in {item.text for item in analysis.quality})])
 
 
 def _caution(item: QualityItem) -> str:
-    """Return one sentence, led by the throttles at which it is true."""
+    """Return one sentence, preceded by the throttles to which it applies."""
     at = [f'{100.0 * x:.3g}' for x in item.throttles if math.isfinite(x)]
     return f'At {listed(at)} % throttle: {item.text}' if at else item.text
 
 
 def _by_throttle(analysis: Analysis) -> Part:
-    """Return the table of sag, noise and risk: those of `supply`, at its throttles."""
+    """Return the table of sag, noise and risk at the throttles of `supply`."""
     curves, sag, noise = (analysis.by_throttle, analysis.overview.facts.sag,
                           analysis.overview.facts.noise)
     low, high = noise.flown
@@ -311,7 +311,7 @@ def _process(analysis: Analysis) -> list[Part]:
 
 
 def _lines(analysis: Analysis) -> list[Part]:
-    """Return the spectral lines, and the least that would have been detected."""
+    """Return the spectral lines, and the smallest that would have been detected."""
     searched = [level for level in analysis.levels if not level.lines.why_not]
     if not searched:
         return []
@@ -321,7 +321,7 @@ def _lines(analysis: Analysis) -> list[Part]:
              chance(line.p_value)]
             for level in searched for line in level.lines.lines]
     least = max(level.lines.detectable for level in searched)
-    detectable = ('how large one would have to be is not known with so few samples'
+    detectable = ('the smallest detectable one is unknown with so few samples'
                   if not math.isfinite(least) else
                   f'one of {number(1e3 * least)} mV rms would have been detected at each of '
                   'those searched (90 %)')
@@ -345,7 +345,7 @@ def _drawn_relaxation(analysis: Analysis, fit: Relaxation) -> Callable[[], list[
 
 
 def _relaxation_sentence(analysis: Analysis, k: int) -> str:
-    """Return what follows falls (k = 0) or rises (k = 1) of throttle."""
+    """Return the relaxation after falls (k = 0) or rises (k = 1) of throttle."""
     fit, cause = analysis.relaxations[k], analysis.causes[k]
     if not fit.detected:
         return cause.sentence
@@ -458,7 +458,7 @@ def _sliding(analysis: Analysis) -> list[Part]:
         low, high = sliding.interval(name)
         plot = Plot(f'{title} in a sliding window of {sliding.window:g} s', 'time, s', unit,
                     height=200, log_y=True).limits(x=limits)
-        # One window without information must not flatten all the others.
+        # One window without information must not flatten the others.
         plot.limits(y=span([value, low, high], log=True, trim=0.01))
         plot.band(sliding.t - start, low, high, '95 % interval')
         plot.line(sliding.t - start, value, 'estimate', style='thick')
@@ -476,7 +476,7 @@ def _sliding(analysis: Analysis) -> list[Part]:
 
 
 def _drawn(analysis: Analysis) -> list[LevelResult]:
-    """Return the levels that get a colour: those with most time, in order of throttle."""
+    """Return the levels that are drawn: the longest ones, in order of throttle."""
     longest = sorted(analysis.levels, key=lambda level: -level.time)[:_MAX_DRAWN]
     return [level for level in analysis.levels if level in longest]
 
@@ -501,7 +501,7 @@ def _shape(analysis: Analysis) -> list[Part]:
         edges, density = level.density()
         if density.size:
             counted += 1
-            # An empty bin has no place on a logarithmic axis.
+            # An empty bin cannot be drawn on a logarithmic axis.
             histogram.line(*outline(edges, np.where(density > 0.0, density, np.nan)),
                            level.label, k)
     z = np.linspace(-5.0, 5.0, 201)

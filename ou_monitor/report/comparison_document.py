@@ -1,4 +1,4 @@
-"""What `compare` says: a recording and its simulations over each other."""
+"""The report of `compare`: a recording and its simulations over each other."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from ou_monitor.text import number
 
 # Colours: measured, simulated.
 _MEASURED, _SIMULATED = 7, 1
-_VOLTAGE = ('Line: measured. Band: 95 % of the simulations at each moment. Pale line: one of '
-            'them. Broken lines: the levels whose falls are counted.')
-# What was fitted where a model was given.
+_VOLTAGE = ('Line: measured. Band: 95 % of the simulations at each moment. Pale line: one '
+            'simulation. Broken lines: the levels whose falls are counted.')
+# Range of the fit if a model was given.
 _NOTHING = (0.0, 0.0)
 
 
 def comparison_document(found: Agreement, seen: Overview, command: str = '') -> Document:
-    """Return what is said of a comparison; seen: what is known of the recording anyway."""
+    """Return the report of a comparison; seen: the facts of the recording."""
     first, last = found.simulated
     subject = (f'{found.recording or "recording"}: '
                + ('' if found.fitted == _NOTHING else
@@ -34,9 +34,9 @@ def comparison_document(found: Agreement, seen: Overview, command: str = '') -> 
         lambda: [Section('Throttle, answer to its rises, distribution, spectrum', _others(found),
                          folded=True)],
         Notes.of(found.notes),
-        Text(f'{found.seeds} simulations with the stamps, the throttle and the steps of the ADC '
-             f'of the recording. {100.0 * found.p_value:.0f} % of them, the recording counted '
-             'with them, are as far off as the recording is; below 5 % it is said to differ.',
+        Text(f'{found.seeds} simulations with the stamps, throttle and ADC steps of the '
+             f'recording. {100.0 * found.p_value:.0f} % of them, counting the recording as one, '
+             'are as far off as the recording; below 5 % it is said to differ.',
              legend=True)]
     return Document('Beside its simulation', subject, _answer(found), parts, command)
 
@@ -46,7 +46,7 @@ def _answer(found: Agreement) -> list[str]:
     lowest = (f'lowest voltage is {number(low.median, 4)} V ({number(low.low, 4)} to '
               f'{number(low.high, 4)}), measured {number(low.measured, 4)} V')
     if found.verdict is Likeness.LOOKS_LIKE_IT:
-        # Without throttle the path is a level, which may explain nothing.
+        # Without throttle the mean path is a level, which explains no variance.
         path = [] if not found.explained > 0.0 else [
             f'Its mean path explains {100.0 * found.explained:.0f} % of the variance.']
         return [f'{found.verdict.value}: its {lowest}.', *path]

@@ -1,4 +1,4 @@
-"""What `coupling` says: how much of a signal is noise of the supply, and how they go together."""
+"""The report of `coupling`: the share of supply noise in a signal, and their coherence."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from ou_monitor.text import chance, counted, number, p_words
 
 def coupling_document(found: Coupling, recording: Recording, signal: tuple[FloatArray, FloatArray],
                       name: str, unit: str, seen: Overview, command: str = '') -> Document:
-    """Return what is said of a coupling; signal: stamps, s, and values."""
+    """Return the report of a coupling; signal: stamps, s, and values."""
     grid, per = found.grid, f'{unit} per V'.lstrip()
     subject = (f'{recording.name or "recording"}, {name}: {grid.duration:.4g} s in common, '
                f'{found.segments:.0f} segments'
-               + (', throttle taken out' if found.partial else ''))
+               + (', throttle removed' if found.partial else ''))
     lost = [f'{counted(n)} of the {what} dropped.' for n, what in
             zip(grid.lost, ('voltage', 'signal')) if n]
     gaps = [f'{counted(grid.gaps, "gap")} left out.'] if grid.gaps else []
@@ -26,7 +26,7 @@ def coupling_document(found: Coupling, recording: Recording, signal: tuple[Float
         lambda: [Figure(voltage_plot(recording, seen.limit))],
         Facts([*_facts(found, per), *known_lines(seen)]),
         lambda: [Figure(_coherence(found), 'Squared coherence of the two: 1 where the signal is '
-                        'the voltage, 0 where they have nothing to do with each other.'),
+                        'the voltage, 0 where they are unrelated.'),
                  Section('Signal and gain', [
                      Figure(_signal(recording, signal, name, unit)),
                      Figure(_gain(found, per),
@@ -43,7 +43,7 @@ def _answer(found: Coupling, name: str, per: str) -> str:
     if found.seen:
         return (f'{number(100.0 * found.noise_share, 2)} % of {name} from {band} is noise of the '
                 f'supply: {number(found.gain)} {per}.')
-    return (f'No noise of the supply is seen in {name} from {band}; a gain of '
+    return (f'No noise of the supply is detected in {name} from {band}; a gain of '
             f'{number(found.limit)} {per} would have been.')
 
 
@@ -57,10 +57,10 @@ def _facts(found: Coupling, per: str) -> list[tuple[str, str]]:
                   f'(+- {number(2e3 * found.lag_se, 2)} ms)'),
                  ('For the filter', f'coupling: {number(abs(found.gain))}')]
     else:
-        lines = [('Would be seen', f'a gain of {number(found.limit, 4)} {per}, in '
+        lines = [('Detectable', f'a gain of {number(found.limit, 4)} {per}, in '
                   f'{100.0 * POWER:.0f} % of such recordings'),
                  ('For the filter', 'no law that follows sigma helps this signal')]
-    return [*lines, ('Chance', f'{p_words(found.p_value)}; seen is what is below '
+    return [*lines, ('Chance', f'{p_words(found.p_value)}; detected if below '
                      f'{chance(found.level)}'),
             ('Largest coherence', f'{number(found.coherence[peak])} (squared) at '
              f'{number(found.frequency[peak])} Hz; by chance up to {number(found.threshold)}')]

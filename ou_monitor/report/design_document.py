@@ -1,4 +1,4 @@
-"""What `design` says: the least capacitance, a table over others, and what else would help."""
+"""The report of `design`: the least capacitance, a table over others, and alternatives."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from ou_monitor.report.document import Document, Figure, Table, Text
 from ou_monitor.report.svg import Plot
 from ou_monitor.text import number
 
-# One row of the printed table for this many rows of the calculation.
+# Rows of the calculation for each row of the printed table.
 _EVERY = 10
-# Smaller risks are drawn as this.
+# Lower limit of the drawn risk.
 _LEAST_RISK = 1e-9
 
 
 def design_document(result: Design, source: str, taken: str = '', command: str = '',
                     ) -> Document:
-    """Return what is said of a design; taken: what came from a flight, if anything did."""
+    """Return the report of a design; taken: the values from a flight, if any."""
     present = result.present
     chosen = [(present, 'present')]
     if result.least is not None:
@@ -50,7 +50,7 @@ def design_document(result: Design, source: str, taken: str = '', command: str =
 
 
 def _risk(result: Design) -> Plot:
-    """Return the risk over capacitance, with the one allowed."""
+    """Return the risk over capacitance, with the target."""
     farads = np.array([row.capacitance for row in result.rows])
     plot = Plot('Risk by capacitance', 'bulk capacitance, uF', 'probability', log_x=True,
                 log_y=True, legend_row=True).limits(y=(_LEAST_RISK, 2.0))
@@ -66,7 +66,7 @@ def _time(value: float) -> str:
 
 def taken_words(flight: Flight, network: PowerNetwork, throttle: float, values: dict[str, Any],
                 ) -> str:
-    """Return what was taken from a flight, and what was not."""
+    """Return the values taken from a flight, and the missing ones."""
     known = flight.resistance > 0.0 and values.get('battery_resistance') is None
     return (f'From the flight: {flight.level:.4g} V open at its end, {network.cells} cells '
             f'({flight.full:.4g} V at most; --set cells=N), sag '
@@ -76,4 +76,4 @@ def taken_words(flight: Flight, network: PowerNetwork, throttle: float, values: 
             + (f'{1e3 * flight.resistance:.3g} mOhm.' if known else
                f'{1e3 * network.battery_resistance:.3g} mOhm as given or assumed: the current is '
                'scaled to the sag.')
-            + ' The bulk capacitor and its ESR cannot be seen: --set bulk_capacitance=470uF.')
+            + ' A flight does not show bulk capacitor and ESR: --set bulk_capacitance=470uF.')

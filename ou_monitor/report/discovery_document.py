@@ -1,4 +1,4 @@
-"""What `discover` says: what the simulation gets wrong, why, and the gain."""
+"""The report of `discover`: errors of the simulation, their causes, and the gain."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from ou_monitor.report.document import (
 from ou_monitor.report.svg import Plot, span
 from ou_monitor.text import listed, number, Z95
 
-# Causes in the first sentence; rows of what is left on a terminal.
+# Causes in the first sentence; remaining discrepancies shown on a terminal.
 _FIRST, _SHOWN = 3, 8
-# Rows of statistics drawn at most.
+# Maximum rows of statistics drawn.
 _ROWS = 18
 # Rows of dots: sizes, in pixels.
 _WIDTH, _LEFT, _RIGHT, _ROW, _TOP, _BOTTOM = 860, 250, 20, 22, 34, 40
 # Simulations behind the voltage.
 _DRAWS = 20
-# Scores up to about this are drawn on a straight scale, larger ones on a logarithmic.
+# Maximum score on the straight part of the scale; larger scores are logarithmic.
 _STRAIGHT = 4.0
 _TICKS = (0.0, 4.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 10000.0)
 
 
 def discovery_document(finding: Finding, seen: Overview | None = None, command: str = '',
                        ) -> Document:
-    """Return what is said of a discovery; seen: what is known of the recording anyway."""
+    """Return the report of a discovery; seen: the facts of the recording."""
     samples, baseline = finding.samples, finding.baseline
     used = '' if samples is None or samples.n == finding.n else f', {samples.n} used'
     subject = (f'{finding.recording or "recording"}: {finding.n} samples in '
@@ -43,8 +43,8 @@ def discovery_document(finding: Finding, seen: Overview | None = None, command: 
     known = [] if seen is None else known_lines(seen)
     if seen is not None and baseline is not None and other_scale(
             seen.facts.ou, baseline.alpha, 0.0, baseline.sigma, 0.0):
-        known.append(('Plain OU', 'describes another time scale than this relaxation: level and '
-                      'load are in it'))
+        known.append(('Plain OU', 'describes another time scale than this relaxation: it includes '
+                      'level and load'))
     parts: list[Part] = [
         lambda: [] if samples is None else [Figure(_voltage(finding), (
             f'Band: range of {_DRAWS} simulations of the {_model_name(finding)} at each moment, '
@@ -64,7 +64,7 @@ def discovery_document(finding: Finding, seen: Overview | None = None, command: 
 
 
 def answer(finding: Finding) -> list[str]:
-    """Return the strongest causes, and what all are worth in errors of prediction."""
+    """Return the strongest causes, and the gain of all in prediction errors."""
     if not finding.causes:
         return [plain(finding.sentence)]
     order = sorted(finding.causes, key=lambda c: -c.gain if math.isfinite(c.gain) else math.inf)
@@ -83,7 +83,7 @@ def answer(finding: Finding) -> list[str]:
 
 
 def _worth(finding: Finding) -> str:
-    """Return a gain in two parts: smaller errors of prediction, and their size better known."""
+    """Return a gain in two parts: smaller prediction errors, and their size better estimated."""
     gain, shrink, size = finding.gain, finding.shrink, finding.size_gain
     if not gain > Z95 * finding.gain_se or not math.isfinite(size):
         return gain_words(gain, finding.gain_se)
@@ -95,7 +95,7 @@ def _worth(finding: Finding) -> str:
 
 
 def _model_name(finding: Finding) -> str:
-    """Return what the model that is simulated is called."""
+    """Return the name of the simulated model."""
     return 'extended model' if finding.causes else 'plain OU'
 
 
@@ -112,7 +112,7 @@ def _voltage(finding: Finding) -> Plot:
             try:
                 drawn = finding.simulated.simulate(samples.t, rng, samples.throttle)
             except ValueError:
-                # A force that runs away has no simulation.
+                # A diverging force has no simulation.
                 break
             low, high = np.fmin(low, drawn), np.fmax(high, drawn)
         if np.isfinite(low).all():
@@ -142,23 +142,23 @@ def _causes(finding: Finding) -> list[Part]:
                   *(f'{row.label}: {row.explanation}' for row in found)]),
         Text(f'{MNAT} Gain: the loss of held-out score when the cause is left out and the rest is '
              'fitted again; its standard error comes from means of blocks and from the errors of '
-             'the parameters. p: twice the smaller of two chances, that of the likelihood ratio '
-             'on the part fitted (its search counted) and that of the gain. The samples '
-             'themselves show exact findings; those undone in the samples share one gain. Terms '
-             'of one kind that share a gain are one row.', legend=True)]
+             'the parameters. p: twice the smaller of two p-values, of the likelihood ratio on '
+             'the part fitted (corrected for the search) and of the gain. Exact findings show in '
+             'the samples themselves; those undone there share one gain. Terms of one kind that '
+             'share a gain are one row.', legend=True)]
 
 
 def _gain(finding: Finding) -> list[Part]:
     c, baseline = finding.crossing, finding.baseline
     assert baseline is not None
-    rows = [['score kept back, nats/sample', '-', number(finding.baseline_score, 4),
+    rows = [['held-out score, nats/sample', '-', number(finding.baseline_score, 4),
              number(finding.score, 4), _with_error(finding.gain, finding.gain_se)]]
     if math.isfinite(c.level):
         rows.append([f'falls through {number(c.level, 4)} V, 1/min',
                      *(_with_error(*pair) for pair in (
                          (c.observed, c.observed_se), (c.baseline, c.baseline_se),
                          (c.extended, c.extended_se))), '-'])
-    # Where nothing was added to the plain OU there is nothing to compare it with.
+    # If nothing was added to the plain OU, there is nothing to compare.
     kept = 5 if finding.causes else 3
     felt = finding.felt.words
     return [Table(['', 'observed', 'plain OU', 'extended', 'gain'][:kept],
@@ -180,7 +180,7 @@ def _statistics(finding: Finding) -> list[Part]:
     dots = 'Hollow: plain OU. Full: extended model' if finding.causes else 'Dot: plain OU'
     return [Figure(
         _dot_rows(f'{dots}. Band: what simulations produce', 'standard scores', rows),
-        text + 'The band comes from simulations that pass through the same fit: under a right '
+        text + 'The band comes from simulations that pass through the same fit: under a correct '
         'model one recording in a hundred has a statistic outside it.')]
 
 
@@ -195,7 +195,7 @@ def _comparisons(finding: Finding) -> list[Part]:
              for curve in compared for k, name in enumerate(named)]
     return [*[Pair(drawn[k:k + 2]) for k in range(0, len(drawn), 2)], Text(
         'Line or dots: the data. Band or bars: the range of 40 simulations with the stamps and '
-        'the throttle of the data; about one point in twenty of a right model lies outside.',
+        'the throttle of the data; about one point in twenty of a correct model lies outside.',
         legend=True)]
 
 
@@ -205,18 +205,18 @@ def _plot(curve: Comparison, k: int, name: str) -> Plot:
                 height=250, log_x=curve.log_x, log_y=curve.log_y, legend_row=True)
     data = curve.data
     if curve.log_y:
-        # A bin without samples has no place on a logarithmic axis.
+        # A bin without samples cannot be drawn on a logarithmic axis.
         floor = 0.3 * float(np.nanmin(np.where(data > 0.0, data, np.nan)))
         low, high = np.where(high > 0.0, np.maximum(low, floor), np.nan), np.maximum(high, floor)
         data = np.where(data > 0.0, data, np.nan)
     ends = [data, *[edge for pair in curve.bands for edge in pair]]
-    # Both plots of a pair have one axis.
+    # Both plots of a pair share one axis.
     ends = [np.where(e > 0.0, np.maximum(e, floor), np.nan) for e in ends] if curve.log_y \
         else ends
     bottom, top = span(ends, curve.log_y)
     plot.limits(y=(bottom, top))
     if curve.points:
-        # Room for the markers at both ends.
+        # Margin for the markers at both ends.
         plot.limits(span([curve.x], pad=0.12), (bottom, top))
         plot.bars(curve.x, low, high, 'simulated', k)
         return plot.markers(curve.x, data, 'data', 7)
@@ -249,7 +249,7 @@ def _parameters(finding: Finding) -> list[Part]:
                          with_error(value, se.get(spec.name), positive=term.positive(spec.name)),
                          spec.metadata['unit'] or '-', spec.metadata['text']])
     about = ('Extended model: all terms fitted together on the whole recording. Its alpha and '
-             'sigma describe what remains of relaxation and noise beside all causes; those of the '
+             'sigma describe the relaxation and noise that the causes leave; those of the '
              'plain OU above include the causes.'
              if finding.causes else
              'The plain OU is kept, as no cause was named: the model above.')
@@ -283,7 +283,7 @@ def _dot_rows(title: str, x_label: str,
                     f'{f"{value:g}".replace("-", chr(0x2212))}</text>')
     for k, (name, low, high, before, after) in enumerate(rows):
         y = _TOP + _ROW * (k + 0.5)
-        # Browsers show the title of a group where one points at it.
+        # Browsers show the title of a group under the pointer.
         parts.append(f'<g><title>{escape(_dot_title(name, low, high, before, after))}</title>'
                      f'<text class="legend" text-anchor="end" x="{_LEFT - 10}" '
                      f'y="{y + 4:.1f}">{escape(name)}</text>'
@@ -304,7 +304,7 @@ def _dot_rows(title: str, x_label: str,
 
 
 def _dot_title(name: str, low: float, high: float, before: float, after: float) -> str:
-    """Return the numbers of a row; what is not known is left out."""
+    """Return the known numbers of a row."""
     def text(value: float) -> str:
         return f'{value:.3g}'.replace('-', '\u2212')
 

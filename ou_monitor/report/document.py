@@ -1,8 +1,8 @@
 """
-What a command says, as records; `page` and `terminal` are the two that write them.
+The report of a command, as records; `page` and `terminal` write them.
 
 Texts are ASCII: '+-', 'sigma' and 'V/sqrt(s)' in the head of a table become signs on a page.  In a
-cell or a head, what follows a line end is small on a page and goes on in the line on a terminal.
+cell or a head, text after a line break is small on a page and continues the line on a terminal.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Text:
-    """A paragraph; a legend is for a page only."""
+    """A paragraph; a legend appears on a page only."""
 
     text: str
     legend: bool = False
@@ -34,17 +34,17 @@ class Code:
 
 @dataclass(frozen=True)
 class Facts:
-    """Names, and what is known of each."""
+    """Facts: names and values."""
 
     pairs: Sequence[tuple[str, str]]
 
 
 @dataclass(frozen=True)
 class Notes:
-    """Sentences of a list, each with what it weighs."""
+    """Sentences of a list, each with its severity."""
 
     notes: Sequence[tuple[Severity, str]]
-    most: int | None = None  # Sentences on a terminal; the page has all
+    most: int | None = None  # Maximum sentences on a terminal; the page has all
 
     @classmethod
     def of(cls, texts: Iterable[str], severity: Severity = Severity.INFO,
@@ -53,7 +53,7 @@ class Notes:
         return cls([(severity, text) for text in texts], most)
 
 
-# A cell of which nothing is known.
+# An unknown cell.
 UNKNOWN = '-'
 
 
@@ -64,12 +64,12 @@ class Table:
     heads: Sequence[str]
     rows: Sequence[Sequence[str]]
     left: Sequence[int] = ()  # Columns flush left
-    most: int | None = None  # Rows on a terminal; the page has all
+    most: int | None = None  # Maximum rows on a terminal; the page has all
 
     @classmethod
     def of_known(cls, heads: Sequence[str], rows: Sequence[Sequence[str]],
                  left: Sequence[int] = (), most: int | None = None) -> Table:
-        """Return a table without the columns in which nothing is known of any row."""
+        """Return a table without the columns that are unknown in every row."""
         kept = [k for k in range(len(heads)) if any(row[k] != UNKNOWN for row in rows)]
         return cls([heads[k] for k in kept], [[row[k] for k in kept] for row in rows],
                    [n for n, k in enumerate(kept) if k in left], most)
@@ -85,7 +85,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Pair:
-    """Figures side by side where there is room; a lone one keeps its half."""
+    """Figures side by side if there is room; a single one keeps its half."""
 
     figures: Sequence[Figure]
 
@@ -104,20 +104,20 @@ class Section:
     folded: bool = False
 
 
-# What is drawn for a page only is a function, so that a terminal does not pay for it.
+# Functions make the parts that only a page has, so that a terminal does not pay for them.
 Part = Union[Text, Code, Facts, Notes, Table, Figure, Pair, Section,
              Callable[[], 'Sequence[Part]']]
 
 
 @dataclass(frozen=True)
 class Document:
-    """All that a command says."""
+    """A whole report."""
 
-    title: str  # What it is of, for a page
-    subject: str  # What was read and how much of it, one line
-    answer: Sequence[str]  # Sentences, the one that matters most first
+    title: str  # Heading of a page
+    subject: str  # Recording and its size, one line
+    answer: Sequence[str]  # Sentences, most important first
     parts: Sequence[Part]
-    command: str = ''  # That repeats it
+    command: str = ''  # Command that repeats it
 
     @property
     def headline(self) -> str:
@@ -126,7 +126,7 @@ class Document:
 
 
 def worst_first(notes: Iterable[tuple[Severity, str]]) -> Notes:
-    """Return notes in the order in which they matter, each sentence once."""
+    """Return notes by severity, each sentence once."""
     said: dict[str, Severity] = {}
     for severity, text in notes:
         said[text] = max(severity, said.get(text, severity))

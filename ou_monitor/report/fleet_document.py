@@ -1,4 +1,4 @@
-"""What `fleet` says: what stands out first, then the fleet, then every recording; and its JSON."""
+"""The report of `fleet`: what stands out, the fleet, every recording; and its JSON."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ from ou_monitor.text import chance, counted, number, p_words, volts
 _TITLES = {'sigma': 'Noise intensity \u03c3', 'alpha': 'Relaxation rate \u03b1',
            'sag': 'Sag at full throttle'}
 _UNITS = {'sigma': 'V/\u221as', 'alpha': '1/s', 'sag': 'V'}
-# Drifts drawn at most; without any, the most likely ones are drawn, so many.
+# Maximum drifts drawn; number of most likely ones drawn if none is significant.
 _DRAWN, _LIKELY = 8, 2
 # Trends in the table: at least, with those of p below 5 %, and at most.
 _LEAST, _MOST = 6, 30
 # Recordings in the table of the lowest voltages; rows and sentences on a terminal.
 _WORST, _SHOWN = 12, 10
-# Sentences and recordings listed at most; the table has all of them.
+# Maximum sentences and recordings listed; the table has all of them.
 _SENTENCES, _RECORDINGS = 40, 500
-# Mean voltages of one pack differ by less, even from full to empty under load (4.35 V to 2.8 V).
+# Maximum ratio of mean voltages of one pack: full to empty under load, 4.35 V to 2.8 V.
 _ONE_PACK = 1.6
 # Heads of the table of vehicles.
 VEHICLE_HEADS = ('vehicle', 'flights', 'lowest, V', 'dips', 'sag, V', '/flight',
                  'sigma, V/sqrt(s)', '/flight', 'alpha, 1/s', '/flight')
-# Characters of the name of a vehicle in a table.
+# Maximum characters of a vehicle's name in a table.
 _NAME = 30
 # Heads of the table of recordings.
 LOWEST_HEADS = ('vehicle', 'recording', 'lowest, V', 'at, s', 'dips', 'below, s', 'sag, V',
@@ -46,7 +46,7 @@ LOWEST_HEADS = ('vehicle', 'recording', 'lowest, V', 'at, s', 'dips', 'below, s'
 
 
 def fleet_document(fleet: Fleet, command: str = '') -> Document:
-    """Return what is said of a fleet."""
+    """Return the report of a fleet."""
     rows = worst(fleet)
     odd = finding_words(fleet)
     vehicles = vehicle_table(fleet)
@@ -68,8 +68,8 @@ def fleet_document(fleet: Fleet, command: str = '') -> Document:
         Section('There twice, analysed once', [Notes.of(copies, most=_SHOWN)] if copies else []),
         Section('Vehicles', [
             vehicles,
-            Text('The lowest of all flights, their dips together; the rest are medians of what '
-                 'was measured, and the change a flight of what is compared. A star marks what '
+            Text('The lowest of all flights, their dips together; the rest are medians of '
+                 'measured values, and changes a flight of compared values. A star marks what '
                  'stands out.', legend=True), lambda: _strips(fleet)]
                 if vehicles.rows else [Text('No vehicle was identified.', legend=True)]),
         lambda: [Section('Drift over the flights', _drift(fleet)),
@@ -82,7 +82,7 @@ def fleet_document(fleet: Fleet, command: str = '') -> Document:
 
 
 def answer(fleet: Fleet) -> list[str]:
-    """Return what the fleet says: the lowest voltage, what stands out, what was analysed."""
+    """Return the answer: the lowest voltage, what stands out, and what was analysed."""
     return [part for part in (*sentences(fleet), _standing_out(fleet), _analysed(fleet))
             if part]
 
@@ -154,7 +154,7 @@ def trend_words(trend: Trend) -> str:
 
 
 def finding_words(fleet: Fleet) -> list[str]:
-    """Return what stands out, a sentence each: drift, vehicles, recordings."""
+    """Return what stands out, one sentence each: drift, vehicles, recordings."""
     judged = fleet.judgement
     found = [trend_words(trend) for trend in judged.drifting]
     for name, k in judged.odd_vehicles():
@@ -175,23 +175,23 @@ def finding_words(fleet: Fleet) -> list[str]:
 
 
 def failure_words(fleet: Fleet) -> list[str]:
-    """Return each recording without numbers and why, the path named once."""
+    """Return each recording without numbers and the reason, its path named once."""
     found = []
     for row in fleet.failed:
         error = str(row['error']).removeprefix(row['path'])
-        # What is left may name a line of it, or a file within it.
+        # The rest may name a line of the file, or a file within it.
         found.append(row['path'] + (error if re.match(r':\d+:|/', error) else
                                     f": {error.lstrip(': ')}"))
     return found
 
 
 def shown(values: Values, value: float | FloatArray) -> str:
-    """Return one value in its unit, as it is at the reference throttle."""
+    """Return one value in its unit, at the reference throttle."""
     return f'{number(float(values.shown(value)))} {QUANTITIES[values.name]}'
 
 
 def _at(values: Values) -> str:
-    """Return the throttle that recordings are compared at."""
+    """Return the throttle at which recordings are compared."""
     if values.name == 'sag':
         return ' at full throttle'
     at = values.curve.reference
@@ -205,7 +205,7 @@ def _measured(values: Values, k: int) -> str:
 
 
 def comparison_words(fleet: Fleet) -> list[str]:
-    """Return sentences: how recordings were compared, and what so few cannot tell."""
+    """Return sentences on how recordings were compared, and on limits of small fleets."""
     judged = fleet.judgement
     notes = []
     for vehicle in fleet.vehicles:
@@ -213,22 +213,22 @@ def comparison_words(fleet: Fleet) -> list[str]:
                  and row['mean'] is not None and row['mean'] > 0.0]
         if means and max(means) > _ONE_PACK * min(means):
             notes.append(f'{vehicle}: voltages of {number(min(means))} to {number(max(means))} V '
-                         'are those of several supplies, and compared as one: --vehicle-from '
-                         'REGEX, or a folder each, parts them.')
+                         'come from several supplies but are compared as one: --vehicle-from '
+                         'REGEX, or a folder each, separates them.')
     references = [judged.values[name].curve.reference for name in LOGARITHMIC]
     if all(map(math.isfinite, references)):
-        notes.append('sigma and alpha are shown as measured. To be compared they are brought to '
+        notes.append('sigma and alpha are shown as measured. For comparison they are moved to '
                      + ' and '.join(dict.fromkeys(f'{100.0 * u:.0f} %' for u in references))
-                     + ' throttle along a curve common to all, and the error of that curve is '
-                     'counted; sag is compared at full throttle.')
+                     + ' throttle along a curve common to all, whose error is included; '
+                     'sag is compared at full throttle.')
     tests = len(judged.trends)
     if tests:
         need = fewest(tests, DRIFT_RATE)
         few = sorted({t.vehicle for t in judged.trends if t.flights < need})
         notes.append(f'Drift: {tests} tests, held to {100 * DRIFT_RATE:g} % for any false one '
-                     f'(Holm); with so many, {need} flights of a vehicle are the fewest that can '
-                     'show one' + (f', which {counted(len(few), "vehicle")} of those tested '
-                                   'do not have.' if few else '.'))
+                     f'(Holm); with this number of tests a vehicle needs at least {need} flights '
+                     'to show one' + (f', which {counted(len(few), "vehicle")} of those tested '
+                                      'do not have.' if few else '.'))
     else:
         notes.append('No vehicle has the 5 flights that a test for drift needs.')
     if any(np.isfinite(o.bound) for o in judged.recordings.values()):
@@ -244,7 +244,7 @@ def comparison_words(fleet: Fleet) -> list[str]:
 
 
 def vehicle_table(fleet: Fleet) -> Table:
-    """Return what is known of each vehicle."""
+    """Return the rows of the table of vehicles."""
     judged = fleet.judgement
     found, seen = [], once(fleet)
     shown_as = short_names(fleet.vehicles)
@@ -281,7 +281,7 @@ def _slope(judged: Judgement, name: str, vehicle: str) -> str:
 
 
 def quality_counts(fleet: Fleet) -> list[tuple[str, int]]:
-    """Return statuses that are not good, flags, verdicts and causes with how often they occur."""
+    """Return the counts of bad statuses, flags, verdicts and causes."""
     counts: Counter[str] = Counter()
     counted_paths: set[str] = set()
     for row in fleet.rows:
@@ -336,19 +336,19 @@ def _vehicle_value(judged: Judgement, name: str, vehicle: str) -> float:
 class DipCount:
     """Dips of a vehicle or of the whole fleet."""
 
-    count: int = 0  # Dips below the limit
+    count: int = 0  # Number of dips below the limit
     below: float = 0.0  # Time below it, s
     recordings: int = 0  # Recordings with dips
 
 
 def once(fleet: Fleet) -> list[Row]:
-    """Return one row of each recording that was analysed, lowest voltage known."""
+    """Return one row for each analysed recording with a known lowest voltage."""
     rows = {row['path']: row for row in fleet.rows if row['lowest'] is not None}
     return list(rows.values())
 
 
 def dips_of(rows: Sequence[Row]) -> DipCount | None:
-    """Return the dips of recordings; None where no limit was given."""
+    """Return the dips of recordings; None without a limit."""
     known = [row for row in rows if row['dips'] is not None]
     if not known:
         return None
@@ -362,7 +362,7 @@ def worst(fleet: Fleet) -> list[Row]:
 
 
 def sentences(fleet: Fleet) -> list[str]:
-    """Return what a pilot wants to know; nothing where no recording has a voltage."""
+    """Return the main facts for a pilot; empty if no recording has a voltage."""
     rows = once(fleet)
     if not rows:
         return []
@@ -390,7 +390,7 @@ def sentences(fleet: Fleet) -> list[str]:
 
 
 def facts(fleet: Fleet) -> list[tuple[str, str]]:
-    """Return what is always known of a fleet: pairs of name and words."""
+    """Return the facts of a fleet: pairs of name and words."""
     rows = once(fleet)
     if not rows:
         return []
@@ -411,12 +411,12 @@ def facts(fleet: Fleet) -> list[tuple[str, str]]:
                       f'throttle flown; known in {len(sags)} of '
                       f'{counted(len(rows), "recording")}'))
     else:
-        lines.append(('Sag', 'unknown in all: throttle is not known, or did not move enough'))
+        lines.append(('Sag', 'unknown in all: throttle is unknown, or did not move enough'))
     return lines
 
 
 def _name(row: Row) -> str:
-    """Return what a recording is called, with its vehicle."""
+    """Return the name of a recording, with its vehicle."""
     vehicle = '' if row['vehicle'] is None else f' ({row["vehicle"]})'
     return f'{row["recording"]}{vehicle}'
 
@@ -426,7 +426,7 @@ def _throttle(value: float | None) -> str:
 
 
 def short_names(names: Sequence[str]) -> dict[str, str]:
-    """Return names as tables show them: long ones without their middle."""
+    """Return names for tables: long ones without their middle."""
     short = {name: name if len(name) <= _NAME else f'{name[:13]}\u2026{name[13 - _NAME + 1:]}'
              for name in names}
     uses = Counter(short.values())
@@ -470,7 +470,7 @@ def _lowest(fleet: Fleet, rows: list[Row]) -> Plot:
 
 
 def _side_by_side(at: FloatArray, flights: FloatArray) -> FloatArray:
-    """Return how far dots of one place are moved, in the order of their flights."""
+    """Return the offsets of dots at one place, in the order of their flights."""
     moved = np.zeros(at.size)
     for place in np.unique(at[np.isfinite(at)]):
         mine = np.flatnonzero(at == place)
@@ -491,7 +491,7 @@ def _by_vehicle(fleet: Fleet, values: Values) -> Plot:
     names = fleet.vehicles
     out = fleet.judgement.recordings[values.name]
     x = np.array([names.index(v) + 1.0 if v else np.nan for v in values.vehicles])
-    # Flights lie side by side in their order, so that a drift shows as a slope.
+    # Flights lie side by side in order, so that a drift shows as a slope.
     spread = _side_by_side(x, values.flights.astype(np.float64))
     y, odd = values.measured, out.found
     plot = Plot(f'{_TITLES[values.name]} of every recording', 'vehicle', _UNITS[values.name],
@@ -511,7 +511,7 @@ def _drift(fleet: Fleet) -> list[Part]:
     if not drawn:
         return [Text('No vehicle has enough flights for a test.')]
     parts: list[Part] = [] if judged.drifting else [
-        Text('No drift stands at the rate of the fleet; the most likely ones are drawn.')]
+        Text('No drift is significant at the rate of the fleet; the most likely ones are drawn.')]
     parts += Pair.two_by_two([
         Figure(_trend_plot(judged.values[t.quantity], t), _caption(t, fleet)) for t in drawn])
     listed = [t for k, t in enumerate(judged.trends) if k < _LEAST or t.p_value < DRIFT_RATE]
@@ -522,12 +522,12 @@ def _drift(fleet: Fleet) -> list[Part]:
     more = len(judged.trends) - len(rows)
     return [*parts, Table(['vehicle', 'quantity', 'flights', 'change a flight\n[95 %]', 'p',
                            'p over the fleet', 'stands'], rows, left=[0, 1]), Text(
-        'Intervals by Theil and Sen. p is that of Mann and Kendall, the next one after Holm.'
+        'Theil-Sen slopes and intervals. p: Mann-Kendall; the next one after Holm.'
         + (f' {more} less likely trends are not shown.' if more > 0 else ''), legend=True)]
 
 
 def _compared(name: str, fleet: Fleet) -> str:
-    """Return at which throttle a quantity is compared."""
+    """Return the throttle at which a quantity is compared."""
     at = fleet.judgement.values[name].curve.reference
     return 'full throttle' if name == 'sag' else (
         f'{100.0 * at:.0f} % throttle' if math.isfinite(at) else 'the throttle of each')
@@ -574,7 +574,7 @@ def _distributions(fleet: Fleet) -> list[Part]:
     if over:
         parts.append(Text(
             'Histograms are at the reference throttle. Over throttle: every level of every '
-            'recording, and the common curve that is taken out, through the median of all.',
+            'recording, and the common curve that is removed, through the median of all.',
             legend=True))
     return parts
 
@@ -626,8 +626,8 @@ def _recordings(fleet: Fleet) -> list[Part]:
         f'{name}, {_UNITS[name]}' for name in QUANTITIES], 'flags']
     more = len(firsts) - _RECORDINGS
     return [Table(heads, rows, left=[0, 2, 9]), Text(
-        'As measured. Small: at which throttle, and, where the vehicle has enough flights, how '
-        'far from the others of it, in standard deviations.' + (
+        'As measured. Small: at which throttle, and, if the vehicle has enough flights, the '
+        'distance from its other flights, in standard deviations.' + (
             f' {more} more recordings are in the Parquet table.' if more > 0 else ''),
         legend=True)]
 

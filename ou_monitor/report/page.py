@@ -7,9 +7,9 @@ request to a network.
 
 The data of a plot: one JSON object with one block of bytes, compressed by zlib, in base64.
 Rounding: columns of up to 4096 values are exact (float64).  Longer ones: x to 1/2000 of the median
-distance of the points embedded, y to 1 part in 16 million (float32) of the value or, where that is
-less, of the range.  Beyond 150 000 points in a plot a curve is an envelope: the lowest and the
-highest of each so many samples, so that every peak stays; the page says so.
+distance of the points embedded, y to 1 part in 16 million (float32) of the value or, if less,
+of the range.  Beyond 150 000 points in a plot a curve is an envelope: the lowest and the
+highest of each group of samples, so that every peak stays; the page says so.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ from ou_monitor.report.document import (
     Code, Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text, UNKNOWN)
 from ou_monitor.report.svg import Curve, extremes, Plot
 
-# Points of a plot that are embedded as they are: an hour at 1 kHz is then a page of 1.5 MB.
+# Maximum points of a plot embedded in full: an hour at 1 kHz then makes a page of 1.5 MB.
 MOST = 150_000
 _EXACT = 4096
-# Steps of a time stamp in the median distance of two samples.
+# Resolution of a time stamp: steps in the median distance of two samples.
 _GRID = 1000
 _UNIT = re.compile(r'(10[\u207b\u00b2\u00b3\u00b9\u2070-\u2079]+ )?'
                    r'(%|1|[mk\u00b5]?(V|A|W|s|Hz|\u03a9))([\u00b2/].*)?')
@@ -73,14 +73,14 @@ def embed(plot: Plot, most: int = MOST) -> str:
         'marks': [[_known(x), label] for x, label in plot.marks], 'names': plot.names,
         'block': base64.b64encode(zlib.compress(bytes(block), 6)).decode('ascii')}
     text = json.dumps(found, allow_nan=False, separators=(',', ':'))
-    # Neither a tag nor an entity: the same text to a parser of HTML and to one of XML.
+    # Without tags and entities, HTML and XML parsers read the same text.
     for sign in '<>&':
         text = text.replace(sign, f'\\u{ord(sign):04x}')
     return f'<script type="application/json" class="plot-data">{text}</script>'
 
 
 def envelope(curve: Curve, every: int) -> Curve:
-    """Reduce a curve to the lowest and the highest of each so many samples."""
+    """Reduce a curve to the lowest and the highest of each group of `every` samples."""
     if curve.high is None:
         index = extremes(curve.y, every)
         return replace(curve, x=curve.x[index], y=curve.y[index])
@@ -94,7 +94,7 @@ def envelope(curve: Curve, every: int) -> Curve:
 
 
 def _changes(curve: Curve) -> Curve:
-    """Return steps without the points at which nothing steps; nothing is lost."""
+    """Return steps without the points at which the value stays; lossless."""
     x, y = curve.x, curve.y
     if x.size < 3:
         return curve
@@ -105,7 +105,7 @@ def _changes(curve: Curve) -> Curve:
 
 
 def _in_order(curve: Curve) -> Curve:
-    """Return separate points in the order of x, in which they are found; lines as they are."""
+    """Return separate points in the order of x, for searching; lines unchanged."""
     if curve.kind not in ('markers', 'bars'):
         return curve
     order = np.argsort(curve.x, kind='stable')
@@ -115,7 +115,7 @@ def _in_order(curve: Curve) -> Curve:
 
 
 def _axis(label: str, ends: tuple[float, float], log: bool) -> dict[str, Any]:
-    """Return an axis; its label taken apart into a name and a unit."""
+    """Return an axis; its label split into name and unit."""
     name, comma, unit = label.rpartition(', ')
     if not comma:
         name, unit = ('', label) if _UNIT.fullmatch(label) else (label, '')
@@ -128,7 +128,7 @@ def _known(value: float) -> float | None:
 
 
 def _abscissa(x: FloatArray, log: bool, block: bytearray) -> list[float | str]:
-    """Append x; a long increasing one as the second differences of its place on a fine grid."""
+    """Append x; a long increasing one as second differences on a fine grid."""
     if x.size > _EXACT and not log and np.isfinite(x).all():
         step = np.diff(x)
         by = float(np.median(step)) / _GRID
@@ -140,7 +140,7 @@ def _abscissa(x: FloatArray, log: bool, block: bytearray) -> list[float | str]:
 
 
 def _ordinate(y: FloatArray, log: bool, block: bytearray) -> list[float | str]:
-    """Append y; a long one as float32 from its middle, or from zero where that is nearer."""
+    """Append y; a long one as float32 from its middle, or from zero if nearer."""
     finite = y[np.isfinite(y)]
     if y.size > _EXACT and finite.size:
         middle, size = float(np.median(finite)), np.abs(finite[finite != 0.0])
@@ -152,16 +152,16 @@ def _ordinate(y: FloatArray, log: bool, block: bytearray) -> list[float | str]:
 
 def _append(kind: str, values: Any, block: bytearray, low: float = 0.0,
             by: float = 1.0) -> list[float | str]:
-    """Append a column; return type, place, length, what to add and what to multiply by."""
+    """Append a column; return type, offset, length, and the summand and factor to decode it."""
     place = len(block)
     block += values.tobytes()
     return [kind, place, int(values.size), low, by]
 
 
-# What is not known, as a page sets it.
+# An unknown cell on a page.
 _DASH = '\u2013'
-# Hues of Okabe & Ito (2008), distinct with every common colour blindness;
-# lifted for the dark form.
+# Hues of Okabe & Ito (2008), distinct with every common colour blindness; lighter for the dark
+# form.
 _LIGHT = ('#0072b2', '#d55e00', '#009e73', '#cc79a7', '#b07d00', '#3a9bd9', '#6b4fa0', '#5f6b6d')
 _DARK = ('#5cb3f0', '#ff8a45', '#35cfa0', '#ea9cc9', '#e6b84a', '#9bd2f7', '#b59cf0', '#a9b4b6')
 
@@ -246,24 +246,24 @@ def _file(name: str) -> str:
 def _script() -> tuple[str, str]:
     """Return the text of the script, and the source that names it in the policy."""
     code = ''.join(_file(f'plots_{part}.js') for part in ('draw', 'input', 'live'))
-    # A section of character data to a parser of XML, comments to a script.
+    # A section of character data to an XML parser, comments to a script.
     text = f"//<![CDATA[\n'use strict';\n{{\n{code}}}\n//]]>"
     digest = base64.b64encode(hashlib.sha256(text.encode('utf-8')).digest()).decode('ascii')
     return text, f"'sha256-{digest}'"
 
 
-# A minus, but for a hyphen within a word or a range of dates; signs that a terminal may not have.
+# A minus, except for a hyphen within a word or a range of dates; signs that a terminal may lack.
 _MINUS = re.compile(r'(?<![\w.)^-])-(?=[\d.])')
 _SIGNS = {'+-': '\u00b1', ' -> ': ' \u2192 '}
 _SOFT, _LEFT = ' class="soft"', ' class="left"'
-# Of the heads of tables: symbols and units.
+# In the heads of tables: symbols and units.
 _SYMBOLS = {'alpha': '\u03b1', 'sigma': '\u03c3', 'tau': '\u03c4', 'Var_inf': 'Var\u221e',
             'V/sqrt(s)': 'V/\u221as', 'V^2': 'V\u00b2', 'uF': '\u00b5F', 'Ohm': '\u03a9'}
 _SYMBOL = re.compile(r'(?<!\w)(' + '|'.join(map(re.escape, _SYMBOLS)) + r')(?!\w)')
 
 
 def _set(text: str) -> str:
-    """Return a text with the signs that a page has and a terminal may not, escaped."""
+    """Return an escaped text with the signs that a terminal may lack."""
     for plain, sign in _SIGNS.items():
         text = text.replace(plain, sign)
     return escape(_MINUS.sub('\u2212', text))
@@ -286,8 +286,8 @@ def html(document: Document) -> str:
 
 
 def section(document: Document) -> str:
-    """Return a document as part of a page of somebody else: no script, and no data of plots."""
-    # Nested, the rules are for this section alone.
+    """Return a document for inclusion in another page: no script, and no data of plots."""
+    # Nested, the rules apply to this section alone.
     style = _stylesheet().replace(':root', 'article').replace('body {', 'article {')
     return (f'<div class="ou-monitor"><style>.ou-monitor {{{style}}}</style><article>\n'
             f'<h1>{escape(document.title)}</h1>\n<p{_SOFT}>{escape(document.subject)}</p>\n'
@@ -321,7 +321,7 @@ def _part(part: Part, live: bool = True) -> str:
         below = f'<figcaption>{_set(part.caption)}</figcaption>' if part.caption else ''
         return f'<figure>{drawn}{below}</figure>'
     if isinstance(part, Pair):
-        # A lone one keeps its half.
+        # A single figure keeps its half.
         more = '<div></div>' if len(part.figures) == 1 else ''
         both = ''.join(_part(figure, live) for figure in part.figures)
         return f'<div class="pair">{both}{more}</div>'
@@ -350,7 +350,7 @@ def _table(part: Table) -> str:
 
 
 def _page(title: str, subtitle: str, body: str) -> str:
-    """Return a whole page that needs nothing but itself."""
+    """Return a whole page that loads nothing else."""
     text, source = _script() if 'class="plot-data"' in body else ('', "'none'")
     policy = (f"default-src 'none'; script-src {source}; style-src 'unsafe-inline'; "
               "base-uri 'none'; form-action 'none'")

@@ -1,4 +1,4 @@
-"""What `reproduce` says: every printed number beside its recomputation."""
+"""The report of `reproduce`: every printed number beside its recomputation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _BINS = 40
 
 
 def reproduction_document(result: Reproduction, command: str = '') -> Document:
-    """Return what is said of a reproduction."""
+    """Return the report of a reproduction."""
     parts: list[Part] = [
         lambda: [Section('Figures, simulated from the numbers printed', [
             *_screens(result), *_transient(), *_spectrum(result), *_crest_and_factor(result)])],
@@ -51,7 +51,7 @@ def _table(rows: Sequence[Row]) -> Table:
 
 
 def _how(rows: Sequence[Row]) -> Callable[[], list[Part]]:
-    """Return what each row means and how it was recomputed, for a page."""
+    """Return the meaning of each row and how it was recomputed, for a page."""
     return lambda: [Notes.of(f'{row.quantity}: {row.sentence} How: {row.how}.' for row in rows)]
 
 

@@ -1,7 +1,7 @@
 """
-What a command found, in the forms that Python users hold: record, JSON, table, plot, HTML.
+The result of a command for Python users: record, JSON, table, plot, HTML.
 
-Limits: the table and the plots are the main ones of the command; `to_dict` has everything.
+Limits: the table and the plots are the command's main ones; `to_dict` has everything.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ Rows = Sequence[Mapping[str, Any]] | Mapping[str, Any]
 
 class Result:
     """
-    What one of the functions `analyze`, `compare`, `coupling`, `design`, `discover`, .. found.
+    The result of one of the functions `analyze`, `compare`, `coupling`, `design`, `discover`, ..
 
-    Attributes of the record can be had from the result itself: ``found.causes``.  Printed, it is
-    what the command prints; in a notebook, what its page shows.
+    It has the attributes of its record: ``found.causes``.  Printing it shows the output of
+    the command; a notebook shows its page.
 
     Attributes
     ----------
     record : object
-        The record behind it, with all that was found.
+        The record, with all results.
     supply : SupplyFacts or None
-        The facts of the supply; None where there is no recording.
+        The facts of the supply; None without a recording.
 
     Examples
     --------
@@ -60,8 +60,8 @@ class Result:
         """
         Keep the record, and functions that make the rest; rows may be a name in the data.
 
-        A supply that a function finds is not in the JSON.  The functions have names in a module:
-        those of a closure could not be pickled.
+        A supply that a function returns is not in the JSON.  Functions are module-level:
+        closures cannot be pickled.
         """
         self.record = record
         self.document = document
@@ -137,14 +137,14 @@ class Result:
         Parameters
         ----------
         ax : matplotlib.axes.Axes, optional
-            Where to; axes of a new figure when left out.
+            Axes to draw on; those of a new figure when left out.
         title : str, optional
-            Which of `plots`; the main one when left out.
+            Title in `plots`; the main one when left out.
 
         Returns
         -------
         matplotlib.axes.Axes
-            What was drawn on.
+            The axes with the drawing.
 
         Raises
         ------

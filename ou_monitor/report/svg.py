@@ -20,17 +20,17 @@ from ou_monitor.records import FloatArray
 SERIES = 8
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 30, 42
-# Width of a letter of the 12-pixel sans serif, generously.
+# Width of a letter of the 12-pixel sans serif, rounded up.
 _LETTER = 7.0
 # Half the width of the cap of a bar, pixels.
 _CAP = 7.0
-# Letters that a cut name keeps at least.
+# Minimum letters of a cut name.
 _SHORTEST = 6
 # Height of a legend in a row of its own, pixels.
 _LEGEND = 18
 
 
-# What is larger is no value.
+# Maximum magnitude of a value; larger ones are not drawn.
 _HUGE = 1e100
 
 
@@ -47,7 +47,7 @@ class Scale:
     log: bool = False  # Whether the axis is logarithmic
 
     def __call__(self, values: FloatArray | float) -> FloatArray:
-        """Return pixels; NaN for what a log axis cannot show."""
+        """Return pixels; NaN for values that a log axis cannot show."""
         data = np.asarray(values, dtype=np.float64)
         low, high = self.low, self.high
         if self.log:
@@ -103,8 +103,8 @@ def span(values: list[FloatArray], log: bool = False, pad: float = 0.05,
          trim: float = 0.0) -> tuple[float, float]:
     """Return the ends of an axis that holds all finite values, with a margin."""
     joined = np.concatenate([np.ravel(v) for v in values]) if values else np.zeros(0)
-    # What is larger or, on a log axis, smaller than this would overflow in the
-    # arithmetic of the axis; it is no voltage either.
+    # Larger values, or smaller ones on a log axis, would overflow in the arithmetic of the axis,
+    # and are not voltages.
     joined = joined[np.abs(joined) < _HUGE]
     if log:
         joined = np.log10(joined[joined > 1.0 / _HUGE])
@@ -287,7 +287,7 @@ class Plot:
 
     @property
     def _legend_place(self) -> str:
-        """Return where the legend fits without covering a curve, ``corner`` where nowhere."""
+        """Return a place where the legend covers no curve; ``corner`` if there is none."""
         size = sum(_LETTER * len(c.label) + 34.0 for c in self._named)
         right = self.width - _RIGHT
         beside = _LEFT + 1.15 * _LETTER * len(self.title) + size < right
@@ -297,7 +297,7 @@ class Plot:
 
     @property
     def _top(self) -> int:
-        """Return where the axes begin, pixels."""
+        """Return the upper end of the axes, pixels."""
         return _TOP + (_LEGEND if self._named and self._legend_place == 'row' else 0)
 
     def _axes(self, x: Scale, y: Scale, right: int, bottom: int) -> list[str]:
@@ -386,7 +386,7 @@ def _legend_entry(curve: Curve, x: float, y: int) -> str:
 
 
 def short(names: Sequence[str], room: float) -> list[str]:
-    """Return names cut to the pixels that each has; none where that is too little."""
+    """Return names cut to the pixels that each has; empty if those are too few."""
     most = int(room / _LETTER) - 1
     if most < min(_SHORTEST, max(map(len, names), default=0)):
         return []
@@ -406,7 +406,7 @@ def _runs(good: np.ndarray) -> list[slice]:
 
 
 def _points(x: FloatArray, y: FloatArray) -> str:
-    # One wild value must not make a coordinate that a renderer chokes on.
+    # One wild value must not give a coordinate that a renderer cannot handle.
     y = np.clip(y, -1e4, 1e4)
     x = np.clip(x, -1e4, 1e4)
     return 'L'.join(f'{a:.1f},{b:.1f}' for a, b in zip(x, y))

@@ -1,4 +1,4 @@
-"""A document as plain text: paragraphs, aligned tables, lists; legends and plots are for pages."""
+"""A document as plain text: paragraphs, aligned tables, lists; without legends and plots."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from ou_monitor.records import Severity
 from ou_monitor.report.document import (
     Document, Facts, Notes, Part, Section, Table, Text)
 
-# Lines are broken to be read at this width, or at that of a narrower terminal, but for these.
+# Maximum and minimum width of text, letters; in between the terminal's own is used.
 COLUMNS, _NARROWEST = 100, 40
 
 
 def columns() -> int:
-    """Return the width to write for: of the terminal where there is one, at most `COLUMNS`."""
+    """Return the width to write for: the terminal's if there is one, at most `COLUMNS`."""
     if not sys.stdout.isatty():
         return COLUMNS
     return max(_NARROWEST, min(COLUMNS, shutil.get_terminal_size().columns))
@@ -29,7 +29,7 @@ def terminal(document: Document) -> str:
 
 
 def _part(part: Part) -> str:
-    """Return one part; empty when it is for a page only."""
+    """Return one part; empty if it is for a page only."""
     if isinstance(part, Text):
         return '' if part.legend else paragraph(part.text)
     if isinstance(part, Facts):
@@ -48,7 +48,7 @@ def _part(part: Part) -> str:
 
 
 def _more(count: int, most: int | None) -> list[str]:
-    """Return a line that says how much is left out."""
+    """Return a line with the number of entries left out."""
     return [] if most is None or count <= most else [
         f'and {count - most} more: --report and --json have all']
 
@@ -65,7 +65,7 @@ def item(text: str) -> str:
 
 
 def facts(pairs: Sequence[tuple[str, str]]) -> str:
-    """Lay out names and what is known of each, the words broken beside the names."""
+    """Lay out facts, the words broken beside their names."""
     width = max((len(name) for name, _ in pairs), default=0) + 2
     return '\n'.join(fill(words, columns(), initial_indent=name.ljust(width),
                           subsequent_indent=' ' * width, break_long_words=False,
