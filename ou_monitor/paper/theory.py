@@ -8,7 +8,7 @@ exponential and the next state comes from an alias table, so a jump costs the sa
 of states.
 
 A system switched by it is du/dt = D u + d + speed (A_x u + a_x), x = x(clock t).  Two scalings of
-the paper, both with a small eps; eps = 1 is the system as given, D and d are not sped up:
+the paper, both with a small eps; at eps = 1 the system is unchanged, and D and d are not sped up:
 
 - averaging (eq. 1): clock 1/eps, speed 1; u^eps -> the averaged system.
 - diffusion (eq. 3): clock 1/eps^2, speed 1/eps, for A, a of zero average: the paths tend in law to
@@ -18,10 +18,10 @@ the paper, both with a small eps; eps = 1 is the system as given, D and d are no
       B(u) = 2 sum_xy pi(x) R0(x, y) sym[C(u; x) C(u; y)'].
 
   Equation (6) of the paper lacks the 2, which (4) as printed needs: the variance of the integral
-  of C(x(t)) grows at the rate of twice the integral of its autocovariance over positive lags
+  of C(x(t)) grows at twice the integral of its autocovariance over positive lags
   (Korolyuk & Limnios, Stochastic Systems in Merging Phase Space, 2005, give it with the 2).
 
-Between two jumps a switched system is affine, its average is affine, and so are drift and noise of
+Between two jumps a switched system is affine; so are its average, and drift and noise of
 its diffusion limit.
 """
 
@@ -39,7 +39,7 @@ from ou_monitor.records import FloatArray
 from scipy.linalg import expm
 from scipy.sparse.csgraph import connected_components
 
-# Beyond this many substeps of the series the matrix exponential is cheaper.
+# Maximum substeps of the series; beyond them the matrix exponential is cheaper.
 _MOST_SUBSTEPS = 32.0
 
 
@@ -58,8 +58,8 @@ def flow(matrix: FloatArray, offset: FloatArray, tau: FloatArray, u: FloatArray)
     Move m states along their affine systems, each for its own time.
 
     Taylor series of the exponential acting on the state, in substeps of norm
-    at most 1, to the last digit; no eigenvectors, so a matrix that cannot be
-    diagonalised is as good as any. Very long steps use the matrix exponential.
+    at most 1, to the last digit; without eigenvectors, so that a defective matrix
+    is handled too. Very long steps use the matrix exponential.
 
     matrix in 1/s, tau in s.
     """
@@ -118,7 +118,7 @@ class AffineSystem:
 
     @property
     def growth_rate(self) -> float:
-        """Return the largest real part of an eigenvalue of A, 1/s; >= 0 when nothing restores."""
+        """Return the largest real part of an eigenvalue of A, 1/s; >= 0: no restoring force."""
         return float(np.linalg.eigvals(self.matrix).real.max())
 
     def solve(self, t: npt.ArrayLike, u0: npt.ArrayLike) -> FloatArray:
@@ -161,10 +161,10 @@ class MatrixModel:
     """
     The deterministic matrix model of amplitude, phase and power (paper, 3.1).
 
-    u = (A, phi, P), du/dt = C u.  Two entries of the printed matrix do not do what the text around
-    them says: with +gamma on the diagonal the power grows as exp(gamma t), it relaxes only with
+    u = (A, phi, P), du/dt = C u.  Two entries of the printed matrix contradict the text around
+    them: with +gamma on the diagonal the power grows as exp(gamma t), and relaxes only with
     -alpha_p there; and dphi/dt = omega phi is a phase that grows as exp(omega t), where a carrier
-    has dphi/dt = omega.  This takes both as the text means them; `as_printed` as printed.
+    has dphi/dt = omega.  This class follows the text; `as_printed` follows the print.
     """
 
     alpha: float  # Damping of the amplitude, 1/s, >= 0
@@ -207,7 +207,7 @@ class MatrixModel:
 
 IntArray = npt.NDArray[np.intp]
 
-# A row may miss zero by this share of the largest rate: rounding of the input.
+# Tolerance of a row sum, as a share of the largest rate: rounding of the input.
 ROW_TOLERANCE = 1e-9
 
 
@@ -252,8 +252,8 @@ class Generator:
         Return the stationary law pi, shape (n,).
 
         Elimination without subtractions (Grassmann, Taksar & Heyman, Oper.
-        Res. 33 (1985) 1107): every entry to full relative precision, however
-        far apart the rates are.
+        Res. 33 (1985) 1107): every entry has full relative precision, even for
+        rates of very different size.
         """
         p = self.q / np.abs(self.q).max()
         np.fill_diagonal(p, 0.0)
@@ -272,8 +272,8 @@ class Generator:
         """
         Return R0 = integral_0^inf (exp(Q t) - Pi) dt, s, shape (n, n).
 
-        (s Pi - Q)^-1 - Pi / s is the same for every s > 0; the mean rate of
-        leaving keeps the matrix to invert well scaled.
+        (s Pi - Q)^-1 - Pi / s is the same for every s > 0; s is the mean rate of
+        leaving, so that the matrix to invert is well scaled.
         """
         rate = float(self.leaving.mean())
         # Pi: every row is the stationary law.
@@ -341,7 +341,7 @@ class Generator:
 
 
 def check_rates(q: FloatArray) -> None:
-    """Refuse what is no generator at all (q in 1/s)."""
+    """Refuse a matrix that is not a generator (q in 1/s)."""
     if q.ndim != 2 or q.shape[0] != q.shape[1]:
         raise ValueError(f'Q must be square, got shape {q.shape}')
     if len(q) < 2:
@@ -487,7 +487,7 @@ class SwitchedSystem:
         return found
 
 
-# The average may miss zero by this share of the largest switched entry.
+# Tolerance of the average, as a share of the largest switched entry.
 BALANCE_TOLERANCE = 1e-9
 PRINTED_FACTOR = 1.0
 CORRECT_FACTOR = 2.0

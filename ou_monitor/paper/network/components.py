@@ -19,7 +19,7 @@ import math
 from typing import Any
 
 RAILS = ('bus', 'regulated')
-# Fields that may be zero; those not named here must be positive.
+# Fields that may be zero; all others must be positive.
 MAY_BE_ZERO = frozenset({
     'bulk_esr', 'filter_inductance', 'filter_resistance', 'filter_esr', 'line_gain', 'output_esr',
     'mcu_current', 'mcu_noise', 'switching_scale', 'flutter'})
@@ -31,14 +31,14 @@ UNITS = {
     'regulator_voltage': 'V', 'regulator_resistance': 'Ohm', 'regulator_bandwidth': 'Hz',
     'regulator_efficiency': '', 'line_gain': '', 'output_capacitance': 'F', 'output_esr': 'Ohm',
     'mcu_current': 'A', 'mcu_noise': 'A', 'mcu_noise_rate': '1/s', 'cells': '', 'escs': ''}
-# The noise of a telegraph vanishes at duty 0 and 1 and its rate is infinite there.
+# Lower limit of the duty: at 0 and 1 a telegraph has no noise and an infinite rate.
 LEAST_DUTY = 0.01
 # A lithium cell at rest, V.
 NOMINAL_CELL = 3.7
 
 
 def completed(values: dict[str, Any]) -> dict[str, Any]:
-    """Return components with what follows from them: voltage from cells, a rail below a cell."""
+    """Return components with derived values: voltage from cells, a rail below a cell."""
     found = dict(values)
     if 'cells' in found:
         found.setdefault('battery_voltage', NOMINAL_CELL * found['cells'])
@@ -68,14 +68,14 @@ class PowerNetwork:
     current_exponent: float = 1.5
     escs: int = 4  # ESCs that switch independently.
     esc_frequency: float = 48e3  # PWM frequency, Hz (24..48 kHz, the paper's section 4.5).
-    # Measured rms of the random ESC current over that of the telegraph; 1 is the telegraph.
+    # Measured rms of the random ESC current over the telegraph's; 1 is the telegraph.
     switching_scale: float = 1.0
     # Slow fluctuation of the motor current (control loop, gusts): rms as a share of the
     # mean, and its rate, 1/s (motor and propeller, 30 ms). Left out by default.
     flutter: float = 0.0
     flutter_rate: float = 33.3
-    # Optional LC filter between bus and regulator, H, Ohm, F, Ohm; an inductance of 0 leaves
-    # it out; the two resistances damp it.
+    # Optional LC filter between bus and regulator, H, Ohm, F, Ohm; without it the inductance is 0;
+    # the two resistances damp it.
     filter_inductance: float = 0.0
     filter_resistance: float = 0.05
     filter_capacitance: float = 100e-6
@@ -83,27 +83,27 @@ class PowerNetwork:
     # Set voltage, V, and output resistance within the bandwidth, Ohm.
     regulator_voltage: float = 5.0
     regulator_resistance: float = 0.03
-    # The regulator rejects changes of its input slower than this, Hz, and passes faster ones
-    # times `line_gain`; when that is None, the duty of a buck converter, regulator_voltage
-    # over battery_voltage, which is its open-loop gain (Erickson & Maksimovic, Fundamentals
-    # of Power Electronics, section 8.2).
+    # The regulator rejects changes of its input slower than this, Hz, and passes faster ones times
+    # `line_gain`; None: the duty of a buck converter, regulator_voltage over battery_voltage,
+    # which is its open-loop gain (Erickson & Maksimovic, Fundamentals of Power Electronics,
+    # section 8.2).
     regulator_bandwidth: float = 20e3
     regulator_efficiency: float = 0.9  # Output power over input power, 0..1.
     line_gain: float | None = None
-    # Let the regulator draw constant power: its input then has the incremental resistance
+    # Whether the regulator draws constant power: its input then has the incremental resistance
     # -V^2/P.
     constant_power: bool = True
     # Capacitor of the regulated rail, F and Ohm (2 x 22 uF ceramic).
     output_capacitance: float = 44e-6
     output_esr: float = 0.003
-    # Mean current of the regulated rail, rms of its fluctuation, A, and the rate at which
-    # that relaxes, 1/s.
+    # Mean current of the regulated rail, rms of its fluctuation, A, and the fluctuation's
+    # relaxation rate, 1/s.
     mcu_current: float = 0.5
     mcu_noise: float = 0.05
     mcu_noise_rate: float = 1e6
 
     def __post_init__(self) -> None:
-        """Refuse values that no component has."""
+        """Refuse values that no component can have."""
         for field in fields(self):
             self._check(field.name, getattr(self, field.name))
         if self.regulator_efficiency > 1.0:
@@ -184,8 +184,8 @@ class Load:
     bus: float
     regulated: float
     sag: float  # Battery voltage less the mean of the bus, V.
-    # Incremental conductance P/V^2 of the constant-power load, 1/Ohm, counted positive; 0
-    # without.
+    # Incremental conductance P/V^2 of the constant-power load, 1/Ohm, counted positive; otherwise
+    # 0.
     input_conductance: float
 
     def mean(self, rail: str) -> float:

@@ -12,12 +12,12 @@ Without LC filter, and once the network is slower than the noise, both fall as
 C rises; with less C the second rose by up to 1.44 times in 39 of 6000 drawn
 networks.  With an LC filter the risk may rise, up to an oscillation.
 
-`network_of` sets the components so that they give what a flight measured; its limits: sag and
-noise are of the sensor, its filter and its white noise included, so that noise
-slower than its filter alone is seen.  What noise is added while throttle moves, and an OU that was
-found, are slow fluctuations of the current, which no capacitor of a board changes; the rest is
-taken for the switching of the ESCs.  Without a current the resistance is the one given, and the
-current is scaled to the sag: what packs in parallel buy then holds, an ESR beside it is a guess.
+`network_of` sets the components so that they reproduce a flight.  Limits: sag and noise are the
+sensor's, with its white noise and without what its filter removes.  Noise added while throttle
+moves, and an OU that was found, count as slow fluctuations of the current, which no capacitor of a
+board changes; the rest is attributed to the switching of the ESCs.  Without a measured current the
+resistance is the one given, and the current is scaled to the sag: the effect of packs in parallel
+then holds, an ESR beside it is a guess.
 """
 
 from __future__ import annotations
@@ -36,22 +36,22 @@ from ou_monitor.text import number
 from scipy.optimize import brentq
 
 CELL_BROWNOUT = 3.3
-# Regulated voltage, V -> (brown-out level, V, who says so).
+# Regulated voltage, V -> (brown-out level, V, source).
 REGULATED_BROWNOUT = {
     5.0: (4.5, 'lower limit of the 5 V rail in PX4'),
     3.3: (2.88, 'STM32F405 brown-out reset level 3, falling, highest (ST DS8626)')}
 LEAST, MOST = 10e-6, 22e-3
-# Capacitances looked at before the root is narrowed; the risk may not be monotone.
+# Capacitances tried before the root is narrowed; the risk may not be monotone.
 _GRID = 81
-# Rates below this are never, 1/s.
+# Rates below this count as never, 1/s.
 _NEVER = 1e-300
-# What is within reach beside capacitors: packs in parallel, share of the resistance that new leads
-# and a fresh pack leave, share of the throttle that a limit leaves.
+# Range of the alternatives to capacitors: packs in parallel, share of the resistance that new
+# leads and a fresh pack leave, share of the throttle that a limit leaves.
 _PACKS, _RESISTANCE, _THROTTLE = 3, 0.5, 0.5
 
 
 class DesignVerdict(enum.Enum):
-    """What the calculation comes to."""
+    """The verdict of the calculation."""
 
     ENOUGH = 'the present capacitor is enough'
     FOUND = 'a capacitance in the range brings the risk under the target'
@@ -102,15 +102,15 @@ class DesignRow:
 
 @dataclass(frozen=True)
 class Lever:
-    """What one change of the craft buys."""
+    """The benefit of one change of the craft."""
 
     name: str  # What is changed.
-    unit: str  # Its unit, of the values as shown.
-    # Value now, and one that is easily had.
+    unit: str  # Unit of the values as shown.
+    # Present value, and one that is easy to get.
     present: float
     tried: float
-    risk: float  # Risk with the one tried.
-    least: float  # Smallest change that meets the target; NaN: none within reach.
+    risk: float  # Risk with the second value.
+    least: float  # Smallest change that meets the target; NaN: out of reach.
 
 
 @dataclass(frozen=True)
@@ -125,17 +125,17 @@ class Design:
     horizon: float
     target: float
     esr_follows: bool  # Whether ESR is 1/C of the present one (capacitors in parallel).
-    verdict: DesignVerdict  # What it comes to.
+    verdict: DesignVerdict  # Verdict.
     present: DesignRow  # With the present capacitor.
-    # With the least capacitance that, with all larger ones looked at, meets the target; None
-    # when there is none.
+    # With the smallest capacitance that meets the target, as all larger ones tried do; None if
+    # there is none.
     least: DesignRow | None
     rows: tuple[DesignRow, ...]  # A table over capacitances, rising.
-    falls: bool  # Whether the risk falls, or stays, at each step of the capacitance.
-    # Battery resistance at which the mean of the bus is at the level, Ohm; NaN when no
-    # resistance does that or the rail is regulated.
+    falls: bool  # Whether the risk never rises with capacitance in the table.
+    # Battery resistance at which the mean of the bus is at the level, Ohm; NaN if there is none or
+    # the rail is regulated.
     resistance: float
-    # What other capacitors, packs in parallel, leads and throttle limits buy.
+    # Alternatives to capacitors: packs in parallel, leads and throttle limits.
     levers: tuple[Lever, ...]
 
 
@@ -252,7 +252,7 @@ def _levers(network: PowerNetwork, throttle: float, voltage: float, horizon: flo
 
 
 def _share(risk: Callable[[float], float], least: float, target: float) -> float:
-    """Return the largest share of 1 down to the least that meets the target; NaN: none."""
+    """Return the largest share of 1, down to `least`, that meets the target; NaN if none does."""
     if risk(1.0) <= target:
         return 1.0
     if risk(least) > target:
@@ -295,7 +295,7 @@ def _resistance(network: PowerNetwork, throttle: float, voltage: float) -> float
 
 
 def as_data(result: Design, source: str, taken: str) -> dict[str, Any]:
-    """Return the result for JSON; taken: what came from a flight, if anything did."""
+    """Return the result for JSON; taken: the values from a flight, if any."""
     def row(r: DesignRow | None) -> dict[str, float] | None:
         return None if r is None else {**asdict(r), 'risk': r.risk}
 
@@ -420,7 +420,7 @@ def probability(value: float) -> str:
     return '<1e-12' if 0.0 < value < 1e-12 else number(value, 2)
 
 
-# Throttle from which a sag is more than what stands in the way of its exponent.
+# Throttle from which the exponent of a sag can be estimated.
 _FROM = 0.1
 # Bounds of the exponent of the current over throttle.
 _EXPONENTS = 1.0, 4.0
@@ -428,10 +428,10 @@ _EXPONENTS = 1.0, 4.0
 
 @dataclass(frozen=True)
 class Flight:
-    """What a recording says of a supply, as numbers; NaN: unknown."""
+    """Facts of a supply from a recording, as numbers; NaN: unknown."""
 
     level: float  # Open-circuit voltage at its end, V
-    full: float  # Its highest voltage but for a few readings, V
+    full: float  # Its highest voltage except for a few readings, V
     cells: int  # In series; 0: unknown
     throttle: Sequence[float]  # 0..1, of the next three
     sag: Sequence[float]  # V
@@ -439,14 +439,14 @@ class Flight:
     steady: Sequence[float]  # Rms while throttle stands still, V
     flown: tuple[float, float]  # Throttles, 1 % and 99 % quantile
     highest: float  # Throttle, 0..1
-    resistance: float  # At once, from a current, Ohm
+    resistance: float  # Instantaneous, from a current, Ohm
     alpha: float  # Of an OU that was found, 1/s
     var_inf: float  # Its variance, V^2
 
 
 def network_of(flight: Flight, throttle: float, given: dict[str, Any]) -> PowerNetwork:
     """
-    Return the network of a flight; `given` goes before what was measured.
+    Return the network of a flight; values `given` override measured ones.
 
     Raises ValueError where level, sag or noise at the throttle are unknown.
     """

@@ -2,26 +2,26 @@
 A rail of a power network at one throttle: poles, variance, density, OU.
 
 The network is linear about its operating point, dx = A x dt + B dW, and the rail's deviation is
-c x.  Noise is coloured, with one state a source, so that the variance stays finite where a
+c x.  Noise is coloured, with one state per source, so that the variance stays finite where a
 capacitor's ESR turns current directly into voltage.
 
 Effect of more bulk capacitance.  Without LC filter the bus carries the ESC
 current through |Z(f)|^2 = R^2 (1 + (w r C)^2) / (1 + (w (R + r) C)^2), which
 falls with C at every frequency: Var_inf falls for noise of any colour, on both
-rails, and so does the pole 1/((R + r) C): the paper's section 4.5 has alpha
-rise.  These poles are fast: with 40 mOhm the paper's 63 1/s would take 0.4 F.
+rails, and so does the pole 1/((R + r) C), although the paper's section 4.5 says that alpha
+rises.  These poles are fast: with 40 mOhm the paper's 63 1/s would take 0.4 F.
 Exceptions:
 
 - Slow noise.  When the noise relaxes more slowly than the pole (a small C, or
   flutter), alpha is the rate of the noise and does not move with C.
 - ESR.  With r fixed, fast noise leaves (R r / (R + r))^2 times its variance
-  however large C is.  The pole carries less and less of it; once that is under
-  1 %, alpha is the next pole, the rate of the noise: it jumps up.  With r C
-  fixed, which is capacitors of one series in parallel, neither happens on the
+  however large C is, and the pole carries less and less of it; below
+  1 %, alpha jumps up to the next pole, the rate of the noise.  With r C
+  fixed (capacitors of one series in parallel), neither happens on the
   bus.
 - LC filter.  C shorts the battery resistance that damps L; the resonance rises,
-  and where it is excited Var_inf of either rail may rise with C.  A regulator
-  of constant power can then turn it into an oscillation.
+  and where it is excited Var_inf of either rail may rise with C.  A constant-power
+  regulator can then turn it into an oscillation.
 
 """
 
@@ -39,7 +39,7 @@ from scipy.linalg import solve_continuous_lyapunov
 
 # A pole counts as excited when its share of Var_inf is at least this.
 EXCITED = 0.01
-# States that are noise currents come last, in this order.
+# Noise currents are the last states, in this order.
 SOURCES = ('switching', 'flutter', 'mcu')
 ComplexArray = npt.NDArray[np.complex128]
 
@@ -105,12 +105,12 @@ class Rail:
 
     @property
     def poles(self) -> ComplexArray:
-        """Poles, 1/s, shape (n,), slowest first, those of the noise sources included."""
+        """Poles, 1/s, shape (n,), slowest first, including the noise sources' poles."""
         return self._modes[0]
 
     @property
     def shares(self) -> FloatArray:
-        """Part of Var_inf that each pole carries, shape (n,); zeros without noise."""
+        """Share of Var_inf that each pole carries, shape (n,); zeros without noise."""
         if self.var_inf == 0.0:
             return np.zeros(self.poles.size)
         return np.asarray(self._modes[1].real / self.var_inf)
@@ -120,7 +120,7 @@ class Rail:
         """
         Relaxation rate, 1/s: the slowest pole that carries 1 % of Var_inf or more.
 
-        Of a complex pair the rate of its envelope; NaN without noise.
+        For a complex pair, the rate of its envelope; NaN without noise.
 
         """
         excited = np.flatnonzero(np.abs(self.shares) >= EXCITED)
@@ -209,7 +209,7 @@ def _circuit(net: PowerNetwork, g: float) -> tuple[FloatArray, dict[str, FloatAr
     if filtered:
         current = unit['inductor']
         bus = (r * unit['bulk'] - r * esr * (drawn + current)) / (r + esr)
-        # The capacitor gets the inductor's current less -g v of the regulator.
+        # The capacitor's current is the inductor's less -g v of the regulator.
         source = (unit['filter'] + net.filter_esr * current) / (1.0 - net.filter_esr * g)
         rate['inductor'] = (bus - net.filter_resistance * current - source) / net.filter_inductance
         rate['filter'] = (current + g * source) / net.filter_capacitance
@@ -217,7 +217,7 @@ def _circuit(net: PowerNetwork, g: float) -> tuple[FloatArray, dict[str, FloatAr
         bus = source = (r * unit['bulk'] - r * esr * drawn) / (r + esr - r * esr * g)
         current = -g * source
     rate['bulk'] = (-bus / r - drawn - current) / net.bulk_capacitance
-    # `line` is what the regulator has followed of its input; the rest passes.
+    # `line` is the part of its input that the regulator rejects; the rest passes.
     rate['line'] = 2.0 * math.pi * net.regulator_bandwidth * (source - unit['line'])
     passed = net.line_feedthrough * (source - unit['line'])
     ro, eso = net.regulator_resistance, net.output_esr

@@ -1,5 +1,5 @@
 """
-Vpp over Vrms of one Ornstein-Uhlenbeck process on a screen, and the jumps that would explain it.
+Vpp over Vrms of one Ornstein-Uhlenbeck process on a screen, and jumps that could explain it.
 
 Paths are drawn with the exact transition over a hundred of the paper's samples; the extremes in
 between follow the law of the Brownian bridge, which differs from the process by a share
@@ -24,13 +24,12 @@ from ou_monitor.paper.reproduce.table1 import over, vpp_range, vrms_range
 from ou_monitor.records import FloatArray
 from scipy.signal import lfilter
 
-# The paper does not say how long its screens are, ms.
+# Screen lengths tried, ms: the paper does not give its own.
 SCREENS_MS = (10, 100, 500)
 TYPICAL_MS = 100
 # Share of screens left out at either end.
 TAIL = 0.05
-# Samples of the oscilloscope to a step of the simulation; segments held in
-# memory; screens of white noise.
+# Oscilloscope samples per step of the simulation; segments in memory; screens of white noise.
 _SAMPLES, _AT_ONCE, _WHITE = 100, 100, 200
 
 
@@ -43,11 +42,11 @@ class Crests:
     white: FloatArray  # Of white Gaussian noise, on a screen of 100 ms; shape (k,)
 
     def mean(self, screen: int) -> tuple[float, float]:
-        """Return mean and standard error on screens of that many ms."""
+        """Return mean and standard error on screens of this length, ms."""
         return mean_and_error(self.by_screen[screen].mean(axis=1))
 
     def quantile(self, screen: int, share: float) -> float:
-        """Return a quantile over screens of that many ms."""
+        """Return a quantile over screens of this length, ms."""
         return float(np.quantile(self.by_screen[screen], share))
 
     @property
@@ -113,9 +112,9 @@ def crest(state: published.PrintedLoad) -> tuple[float, Range]:
 
 def screen_for(crest_factor: float) -> float:
     """
-    Return how long a screen must be for an OU to show a crest factor, s.
+    Return the screen length at which an OU shows a crest factor, s.
 
-    Half of the screens of that length go beyond crest/2 standard deviations on
+    Half of the screens of this length go beyond crest/2 standard deviations on
     one side: passages above a high level d come nearly as a Poisson process of
     rate alpha d exp(-d^2/2) / sqrt(2 pi).
 
@@ -148,11 +147,11 @@ def rows(crests: Crests) -> list[Row]:
 
 
 WHERE = 'Section 5'
-# Jumps per second, and their share of the variance, that are tried.
+# Jumps per second, and their shares of the variance, that are tried.
 RATES = (2.0, 5.0, 10.0, 20.0, 50.0)
 SHARES = (0.25, 0.5, 0.75, 0.95)
 JUMP_SCREENS_MS = (100, 500)
-# Sampled more coarsely than 1 MHz: takes less than 0.1 off a crest factor.
+# Sampling coarser than 1 MHz: takes less than 0.1 off a crest factor.
 _SAMPLING = 20e3
 
 
@@ -203,7 +202,7 @@ def simulate_jumps(rng: np.random.Generator, seconds: float,
             for ms in JUMP_SCREENS_MS:
                 values = crest_of(path.reshape(-1, round(1e-3 * ms * _SAMPLING)))
                 low, high = np.quantile(values, [TAIL, 1.0 - TAIL])
-                # Neighbouring screens share little, a screen being many tau.
+                # Neighbouring screens are almost independent: a screen is many tau long.
                 found.append(JumpCrest(
                     ms, rate, share, float(values.mean()),
                     float(values.std(ddof=1) / math.sqrt(values.size)),
@@ -213,12 +212,12 @@ def simulate_jumps(rng: np.random.Generator, seconds: float,
 
 
 def largest(found: list[JumpCrest], screen: int) -> JumpCrest:
-    """Return the jumps with the largest mean crest factor on screens of that many ms."""
+    """Return the jumps with the largest mean crest factor on screens of this length, ms."""
     return max((c for c in found if c.screen == screen), key=lambda c: c.mean)
 
 
 def impulse_height(state: published.PrintedLoad, crests: Crests) -> float:
-    """Return by how much short impulses must widen an OU to its printed Vpp, mV."""
+    """Return the height of short impulses that widens an OU to its printed Vpp, mV."""
     return state.vpp.value - crests.mean(TYPICAL_MS)[0] * state.vrms.value
 
 

@@ -13,7 +13,7 @@ from ou_monitor.paper.reproduce.published import Printed, Row
 from ou_monitor.paper.reproduce.table1 import exponent, over, vrms_range
 from scipy.linalg import solve_continuous_lyapunov
 
-# Any rail of one resistance: Ohm, F, A^2/Hz (two-sided); elasticities do not depend on them.
+# An RC rail of any values: Ohm, F, A^2/Hz (two-sided); elasticities do not depend on them.
 _R, _C, _S = 0.07, 470e-6, 1e-6
 
 
@@ -26,7 +26,7 @@ def rc_rail(resistance: float, capacitance: float, density: float) -> tuple[floa
 
 
 def doubled(network: PowerNetwork) -> tuple[Rail, Rail]:
-    """Return the bus at 40 % throttle, as it is and with a second capacitor in parallel."""
+    """Return the bus at 40 % throttle, now and with a second capacitor in parallel."""
     more = replace(network, bulk_capacitance=2.0 * network.bulk_capacitance,
                    bulk_esr=0.5 * network.bulk_esr)
     return rail_at(network, published.HIGH.load), rail_at(more, published.HIGH.load)

@@ -1,4 +1,4 @@
-"""Section 4.4: how often the rail is beyond a threshold, and how often it gets there."""
+"""Section 4.4: the share of time beyond a threshold, and the rate of reaching it."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from scipy.integrate import quad
 from scipy.special import erfc
 
 WHERE = 'Section 4.4'
-# Threshold for the numbers, V: the paper names none.
+# Threshold of the numbers, V: the paper gives none.
 DELTA = 0.1
-# Samples so far apart are independent: exp(-SPACING) is left of their correlation.
+# Distance of independent samples, in tau: their correlation is exp(-SPACING).
 _SPACING = 8.0
 
 
@@ -27,9 +27,9 @@ def beyond(delta: float, var_inf: float) -> float:
 
 
 def beyond_by_quadrature(delta: float, var_inf: float) -> float:
-    """Return the integral of section 4.4 as it is printed, by quadrature."""
+    """Return the integral of section 4.4 as printed, by quadrature."""
     scale = 1.0 / math.sqrt(2.0 * math.pi * var_inf)
-    # Beyond 40 standard deviations there is nothing that a double can hold.
+    # Beyond 40 standard deviations the density is below the smallest double.
     end = delta + 40.0 * math.sqrt(var_inf)
     total, _ = quad(lambda x: scale * math.exp(-0.5 * x * x / var_inf), delta, end,
                     epsabs=0.0, epsrel=1e-12, limit=200)

@@ -1,5 +1,5 @@
 """
-Numbers as printed in the paper, and each beside its recomputation with the verdict that follows.
+Printed numbers of the paper, and the verdict of each beside its recomputation.
 
 Units are the paper's own: mV, ms, 1/s, V/sqrt(s), V^2.
 """
@@ -13,9 +13,9 @@ import math
 
 Range = tuple[float, float]
 
-# Standard errors allowed to a recomputed number: one row in 370 is called wrong by chance.
+# Standard errors allowed to a recomputed number: by chance one row in 370 is called wrong.
 STANDARD_ERRORS = 3.0
-# A number printed at half a unit from the true one is rounded rightly either way.
+# A number half a unit from the true one is correctly rounded either way.
 _TIE = 1e-9
 
 
@@ -31,11 +31,11 @@ class RowVerdict(enum.Enum):
 class Printed:
     """A number or a bound, as the paper has it."""
 
-    # As printed, with all of its digits (``63.0``, ``315.6e-3``), or a claim as a bound (``> 0``,
-    # ``< 0``).
+    # As printed, with all digits (``63.0``, ``315.6e-3``), or a claim as a bound (``> 0``, ``<
+    # 0``).
     text: str
-    # Half a unit of the last printed digit, which is how far rounding may have moved it; follows
-    # from the text unless given (``~0`` has no digits).
+    # Half a unit of the last printed digit, the most that rounding can have moved it; derived from
+    # the text unless given (``~0`` has no digits).
     half_unit: float = math.nan
 
     def __post_init__(self) -> None:
@@ -55,17 +55,17 @@ class Printed:
 
     @property
     def is_bound(self) -> bool:
-        """Tell whether this is a claim that something is above or below a number."""
+        """Return whether this is a claim that something is above or below a number."""
         return self.text[0] in '<>'
 
     @property
     def value(self) -> float:
-        """Return the number itself; of a claim, the bound."""
+        """Return the number itself, or the bound of a claim."""
         return float(self.text.lstrip('<>~ '))
 
     @property
     def ends(self) -> Range:
-        """All values that may have been printed like this."""
+        """All values that would be printed like this."""
         if self.text[0] == '>':
             return math.nextafter(self.value, math.inf), math.inf
         if self.text[0] == '<':
@@ -79,25 +79,25 @@ class Row:
     """One printed number, recomputed."""
 
     where: str  # Table, figure or section of the paper.
-    # What it is; the unit is the paper's.
+    # Quantity, and its unit in the paper.
     quantity: str
     unit: str
     printed: Printed  # As printed.
-    recomputed: float  # The same from what it was computed from, finite.
+    recomputed: float  # The same recomputed from its inputs, finite.
     how: str  # How it was recomputed.
-    sentence: str  # What this says.
+    sentence: str  # Conclusion.
     error: float | None = None  # Standard error of `recomputed`; None for arithmetic.
-    # Where the recomputed number lies if it is one draw of something random, or if its error
-    # is not normal; replaces 3 standard errors.
+    # Range of the recomputed number if it is one draw of something random, or if its error is not
+    # normal; replaces 3 standard errors.
     band: Range | None = None
-    # Range of the printed number when what *it* was computed from is changed within its
+    # Range of the printed number when the inputs of *that* number are changed within their
     # rounding.
     printed_inputs: Range | None = None
-    inputs: Range | None = None  # Likewise of the recomputed one.
-    point: int = 0  # Which of the eight points it belongs to; 0 for none.
+    inputs: Range | None = None  # Likewise for the recomputed one.
+    point: int = 0  # Which of the eight points it belongs to, or 0.
 
     def __post_init__(self) -> None:
-        """Refuse what would make the verdict meaningless."""
+        """Refuse values that would make the verdict meaningless."""
         if not math.isfinite(self.recomputed):
             raise ValueError(f'{self.quantity}: recomputed is {self.recomputed}')
         if self.error is not None and not 0.0 <= self.error < math.inf:
@@ -109,7 +109,7 @@ class Row:
 
     @property
     def interval(self) -> Range:
-        """Where the recomputed number lies: the band, or 3 standard errors each way."""
+        """Range of the recomputed number: the band, or 3 standard errors each way."""
         if self.band is not None:
             return self.band
         reach = STANDARD_ERRORS * (self.error or 0.0)
@@ -118,11 +118,11 @@ class Row:
     @property
     def verdict(self) -> RowVerdict:
         """
-        Return what follows from the ranges.
+        Return the verdict from the ranges.
 
         `AGREES`: the recomputed number rounds to the printed one, or its
-        interval reaches it. `ROUNDING`: it does once what either was computed
-        from may move within its own rounding. `DOES_NOT_HOLD`: not even then.
+        interval reaches it. `ROUNDING`: it does once the inputs of either move
+        within their own rounding. `DOES_NOT_HOLD`: not even then.
         """
         if _meet(self.printed.ends, self.interval):
             return RowVerdict.AGREES
@@ -163,10 +163,10 @@ TABLE_1 = (
     PrintedLoad(0.40, '40 %', Printed('287.5'), Printed('66.7'), Printed('56.3'),
                 'diffusion process'))
 IDLE, LOW, MEDIUM, HIGH = TABLE_1
-# Those with a Vrms.
+# Load states with a Vrms.
 LOADED = (LOW, MEDIUM, HIGH)
 
-# Fig. 5: ms and |U| in mV; the last point is not used by the paper.
+# Fig. 5: ms and |U| in mV; the paper does not use the last point.
 FIG_5_MS = (0.0, 10.0, 25.0, 35.0, 50.0)
 FIG_5_MV = (Printed('368'), Printed('200'), Printed('80'), Printed('40'), Printed('6'))
 FIG_5_USED = 4
@@ -179,7 +179,7 @@ ROOT_2_ALPHA = Printed('11.22')
 SIGMA = {MEDIUM.label: Printed('315.6e-3'), HIGH.label: Printed('632.0e-3')}
 VAR_INF = {MEDIUM.label: Printed('7.91e-4'), HIGH.label: Printed('3.17e-3')}
 
-# Where numbers of Table 2 are printed again: section, quantity, number, unit.
+# Repetitions of numbers of Table 2: section, quantity, number, unit.
 RESTATED = (
     ('Section 4.4', 'alpha', Printed('63.0'), '1/s'),
     ('Section 4.4', 'sigma at 40 %', Printed('632.0e-3'), 'V/sqrt(s)'),

@@ -33,8 +33,8 @@ from ou_monitor.text import number
 from scipy.signal import welch
 
 Progress = Callable[[float], None]
-# Independent segments of half a second, so that the 95 % quantile is known to 0.03; and
-# seconds with jumps.
+# Independent segments of half a second, which give the 95 % quantile to 0.03; and seconds with
+# jumps.
 CREST_PATHS, JUMP_SECONDS = 4000, 100.0
 # In the order of the paper.
 _ORDER = ('Section 3.1', 'Section 3.3', 'Section 4.1', 'Section 4.2', 'Section 4.4',
@@ -46,23 +46,23 @@ class Point:
     """One point."""
 
     number: int  # 1 to 8
-    title: str  # What it is about
-    text: str  # What was found, with numbers
-    rows: tuple[Row, ...]  # The rows it rests on
+    title: str  # Subject
+    text: str  # Finding, with numbers
+    rows: tuple[Row, ...]  # Rows it is based on
 
     @property
     def outcome(self) -> str:
-        """How many of its rows have which verdict, in words."""
+        """Number of its rows by verdict, in words."""
         return tally(self.rows)
 
 
 def count(rows: Sequence[Row]) -> dict[RowVerdict, int]:
-    """Return how many rows have each verdict."""
+    """Return the number of rows by verdict."""
     return {verdict: sum(row.verdict is verdict for row in rows) for verdict in RowVerdict}
 
 
 def tally(rows: Sequence[Row]) -> str:
-    """Return the counts in words, without those that are zero."""
+    """Return the counts in words, without zeros."""
     words = {RowVerdict.AGREES: ('agrees', 'agree'),
              RowVerdict.ROUNDING: ('within rounding', 'within rounding'),
              RowVerdict.DOES_NOT_HOLD: ('does not hold', 'do not hold')}
@@ -246,7 +246,7 @@ class Reproduction:
     figures: Figures  # Further series to draw
 
     def parts(self) -> list[tuple[str, list[Row]]]:
-        """Return the rows by table, figure and whole section of the paper, none of them empty."""
+        """Return the rows by table, figure and whole section of the paper; no empty ones."""
         found: dict[str, list[Row]] = {}
         for row in self.rows:
             # 'Section 4.5' belongs to 'Section 4'; 'Fig. 5' stays.
@@ -262,7 +262,7 @@ def reproduce(seed: int = 1, progress: Progress | None = None) -> Reproduction:
     def within(start: float, stop: float) -> Progress:
         return lambda share: report(start + share * (stop - start))
 
-    # Each part has its own generator, so that none depends on what others draw.
+    # Each part has its own generator, so that none depends on the others' draws.
     rngs = np.random.default_rng(seed).spawn(8)
     crests = simulate_crests(rngs[0], CREST_PATHS, within(0.0, 0.35))
     found = simulate_jumps(rngs[1], JUMP_SECONDS, within(0.35, 0.6))
@@ -285,7 +285,7 @@ def reproduce(seed: int = 1, progress: Progress | None = None) -> Reproduction:
 
 
 def headline(result: Reproduction) -> str:
-    """Return what came out, in one sentence."""
+    """Return the result in one sentence."""
     counts = count(result.rows)
     return (f'Of {len(result.rows)} numbers and claims of the paper, '
             f'{counts[RowVerdict.AGREES]} agree with their recomputation, '
@@ -298,7 +298,7 @@ def recomputed(row: Row) -> str:
     digits = max(4, 1 + sum(c.isdigit() for c in row.printed.text.split('e')[0].lstrip('0.')))
     if not row.error:
         return number(row.recomputed, digits)
-    # As many decimals as the error has to two digits.
+    # Decimals: as many as give the error two digits.
     decimals = max(0, 1 - math.floor(math.log10(row.error)))
     return f'{row.recomputed:.{decimals}f} +- {row.error:.{decimals}f}'
 
@@ -329,7 +329,7 @@ def _row_data(row: Row) -> dict[str, Any]:
 
 # Length of a drawn screen, s.
 SCREEN = 0.1
-# For the spectrum: length, s, and points a decade.
+# For the spectrum: length, s, and points per decade.
 _SPECTRUM, _PER_DECADE = 2.0, 12
 
 
@@ -337,7 +337,7 @@ _SPECTRUM, _PER_DECADE = 2.0, 12
 class Screen:
     """One simulated oscilloscope screen."""
 
-    state: published.PrintedLoad  # The row of Table 1 it stands for
+    state: published.PrintedLoad  # Its row of Table 1
     # s and V, in steps of the oscilloscope; shape (n,).
     t: FloatArray
     u: FloatArray
@@ -347,7 +347,7 @@ class Screen:
 class DrawnSpectrum:
     """One-sided density of a load state."""
 
-    state: published.PrintedLoad  # The row of Table 1 it stands for
+    state: published.PrintedLoad  # Its row of Table 1
     # Hz and V^2/Hz, of a simulated recording at 1 MHz; shape (k,).
     frequency: FloatArray
     density: FloatArray
@@ -358,7 +358,7 @@ class DrawnSpectrum:
 class Figures:
     """All series."""
 
-    screens: tuple[Screen, ...]  # One a load state
+    screens: tuple[Screen, ...]  # One per load state
     spectra: tuple[DrawnSpectrum, ...]  # Of 10 and 40 %
 
 
@@ -375,7 +375,7 @@ def lorentzian(frequency: FloatArray, alpha: float, sigma: float) -> FloatArray:
 
 
 def draw(rng: np.random.Generator) -> Figures:
-    """Simulate what the figures show."""
+    """Simulate the figures."""
     t = np.arange(round(SCREEN * published.SAMPLING_HZ)) / published.SAMPLING_HZ
     step = 1e-3 * vpp_step().size
     screens = tuple(

@@ -1,8 +1,8 @@
 """
 Sections 3 and 8: the matrix as printed, averaging, and formulas (4) to (6) of switching.
 
-The chain is drawn jump by jump and the system moved exactly between jumps; no
-limit theorem is used on the side that is recomputed.
+The chain is drawn jump by jump and the system moved exactly between jumps; the
+recomputed side uses no limit theorem.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def variance_rate(system: SwitchedSystem, rng: np.random.Generator,
     """
     Return the long-run growth rate of the variance of a balanced additive system.
 
-    (Var U(T) - Var U(S)) / (T - S), which has no bias once S is longer than the
+    (Var U(T) - Var U(S)) / (T - S), unbiased once S is longer than the
     memory of the chain.
     """
     memory = 1.0 / float(system.generator.leaving.min())
@@ -125,14 +125,15 @@ def _drift(rng: np.random.Generator, paths: int) -> list[Row]:
     drift = float(switching_drift(system).matrix[0, 0])
     span = 2.0 * RATE / GROWTH ** 2
     u = system.simulate(np.array([0.0, 0.5 * span, span]), [1.0], rng, paths=paths)[:, 1:, 0]
-    # Mean growth, over a time in which it is large beside its scatter.
+    # Time over which the mean growth is large beside its scatter.
     mean, error = mean_and_error(u[:, 0])
     rate, rate_se = 2.0 * math.log(mean) / span, 2.0 * error / mean / span
-    # Side by side: of a column, NumPy 1.26's logarithm differs in the last digit by where it lies.
+    # In contiguous memory: NumPy 1.26's logarithm of a column differs in the last digit by its
+    # place.
     log, log_se = mean_and_error(np.log(np.ascontiguousarray(u[:, 1])) / span)
     intensity = float(diffusion_limit(system, PRINTED_FACTOR).intensity([1.0])[0, 0])
     ito = drift - 0.5 * intensity
-    # The limit leaves out a share GROWTH^2 / (4 RATE^2) of the drift.
+    # The limit omits a share GROWTH^2 / (4 RATE^2) of the drift.
     left = drift * (GROWTH / RATE) ** 2 / 4.0
     how = f'dU = +-{GROWTH:g} U dt, {RATE:g} 1/s each way, {paths} paths: growth'
     return [
@@ -153,7 +154,7 @@ def printed_matrix() -> MatrixModel:
 
 
 def switched() -> SwitchedSystem:
-    """Return the matrix model as the text means it, its coefficients switched by an ESC."""
+    """Return the matrix model as the text intends it, its coefficients switched by an ESC."""
     rate = 2.0 * published.ESC_HZ[0]
     return SwitchedSystem.of_matrix_model(
         Generator.telegraph(rate, rate), alpha=DAMPING * _SWING, omega=CARRIER * _SWING,

@@ -19,11 +19,11 @@ _FINEST = 64
 class ReadingStep:
     """The largest step of which all readings are multiples, within their rounding."""
 
-    # Where it lies, in the unit of the readings.
+    # Range of the step, in the unit of the readings.
     low: float
     high: float
-    multiples: tuple[int, ...]  # How many steps each reading is
-    chance: float  # Probability, about, that readings without any steps would have one this large
+    multiples: tuple[int, ...]  # Steps in each reading
+    chance: float  # Approximate probability that readings without steps show one this large
 
     @property
     def size(self) -> float:
@@ -79,7 +79,7 @@ def over(top: Range, below: Range) -> Range:
 
 
 def rows(white_crest: float, white_crest_se: float) -> list[Row]:
-    """Return the rows of Table 1, without those of the crest factors."""
+    """Return the rows of Table 1 without the crest factors."""
     return [*_vpp(), _idle(white_crest, white_crest_se), *_vrms(), *_amp(), *_grades()]
 
 
@@ -148,7 +148,7 @@ def _grades() -> list[Row]:
 
 
 def exponent(low: published.PrintedLoad, high: published.PrintedLoad) -> tuple[float, Range]:
-    """Return how sigma grows with load: d ln sigma / d ln load between two states."""
+    """Return the growth of sigma with load: d ln sigma / d ln load between two states."""
     span = math.log(high.load / low.load)
     ends = over(vrms_range(high), vrms_range(low))
     return (math.log(high.vrms.value / low.vrms.value) / span,

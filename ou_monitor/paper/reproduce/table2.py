@@ -1,4 +1,4 @@
-"""Table 2, and where its numbers are printed again."""
+"""Table 2, and the repetitions of its numbers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def sigma_of(state: published.PrintedLoad) -> float:
 
 def sigma_half_width(state: published.PrintedLoad, line: LogLine) -> float:
     """
-    Return how well sigma is known, V/sqrt(s).
+    Return the uncertainty of sigma, V/sqrt(s).
 
     Half a step of Vrms and half of the 95 % interval of alpha, in quadrature.
     """

@@ -26,8 +26,8 @@ from scipy.optimize import brentq, least_squares
 WHERE = 'Fig. 5'
 # Corner of the AC coupling of many hand-held oscilloscopes, Hz.
 CORNER_HZ = 10.0
-# Rates of rails to see through it, 1/s.  A bulk capacitor of 470 uF behind
-# 40 mOhm of battery and 30 mOhm of its own relaxes at 3e4 1/s.
+# Rates of rails fitted through it, 1/s.  A bulk capacitor of 470 uF behind 40 mOhm of battery and
+# 30 mOhm of its own relaxes at 3e4 1/s.
 RAILS = (500.0, 1000.0, 2000.0, 5000.0)
 TYPICAL_RAIL = 1000.0
 _RATE, _HOLD, _WATCH = 10e3, 0.3, 0.06
@@ -141,7 +141,7 @@ def fitted_through_coupling(time: FloatArray) -> tuple[FloatArray, float]:
 
 
 def fitted_rate(rail: float, corner: float = CORNER_HZ) -> float:
-    """Return the rate the paper's fit gives for a step behind a high-pass, 1/s."""
+    """Return the rate that the paper's fit gives for a step behind a high-pass, 1/s."""
     w = 2.0 * math.pi * corner
     peak = math.log(rail / w) / (rail - w)
     used = TIME[:published.FIG_5_USED]
@@ -149,7 +149,7 @@ def fitted_rate(rail: float, corner: float = CORNER_HZ) -> float:
 
 
 def slowest_rail() -> float:
-    """Return the least rate of a rail that Fig. 5 allows behind a 10 Hz coupling, 1/s."""
+    """Return the lowest rate of a rail that Fig. 5 allows behind a 10 Hz coupling, 1/s."""
     line = paper_fit()
     least = line.alpha - line.half_width
     return float(brentq(lambda rail: fitted_rate(rail) - least, 70.0, 1e5))
@@ -159,7 +159,7 @@ def simulate_fitted(rng: np.random.Generator, draws: int) -> FloatArray:
     """
     Release a load behind an AC-coupled oscilloscope and fit it as the paper does.
 
-    The rail is an OU whose noise is half a step of the oscilloscope, the most
+    The rail is an OU with noise of half a step of the oscilloscope, the largest
     that reads as "~0"; the points are taken 0, 10, 25 and 35 ms after the peak
     of the noiseless trace.
 
@@ -246,7 +246,7 @@ def _instrument(fitted: FloatArray) -> list[Row]:
     corner = 2.0 * math.pi * CORNER_HZ
     typical = fitted[RAILS.index(TYPICAL_RAIL)]
     mean, spread = float(typical.mean()), float(typical.std(ddof=1))
-    # Elasticity: slope of ln(fitted) over ln(rail), one value a draw.
+    # Elasticity: slope of ln(fitted) over ln(rail), one value per draw.
     log = np.log(RAILS) - np.mean(np.log(RAILS))
     slopes = log @ np.log(fitted) / float(log @ log)
     slope, slope_se = float(slopes.mean()), float(slopes.std(ddof=1) / math.sqrt(slopes.size))
