@@ -2,10 +2,10 @@
 Bags: an .mcap file, or a rosbag2 directory of several with its `metadata.yaml`.
 
 `BagReader` reads messages one by one, and `batches` fields of topics as arrays, in the order of
-log times; memory holds the chunks that overlap in time.  A bag that is cut off or damaged is
-refused with the byte and the recording time where the trouble begins or, when asked, read as
-far as it is intact.  `BagWriter` writes bags, metadata.yaml as of version 9 (ROS 2 Jazzy); every
-version is read, for only the list of files and the custom data are used.
+log times; memory holds the chunks that overlap in time.  A truncated or damaged bag is
+refused with the byte and the recording time of the damage or, on request, read as
+far as it is intact.  `BagWriter` writes bags with metadata.yaml version 9 (ROS 2 Jazzy); every
+version is read, because only the list of files and the custom data are used.
 
 This module, `mcap_file.py` and `standard_types.py` are the only ones that import mcap.
 """
@@ -51,7 +51,7 @@ class BagFiles(NamedTuple):
 
 
 def _qos() -> list[dict[str, Any]]:
-    """Return the QoS that bags are written with, as rosbag2 writes it; no alias in the YAML."""
+    """Return the QoS that rosbag2 writes for bags; no alias in the YAML."""
     return [{
         'history': 'keep_last', 'depth': 10, 'reliability': 'reliable', 'durability': 'volatile',
         'deadline': dict(_FOR_EVER), 'lifespan': dict(_FOR_EVER), 'liveliness': 'automatic',
@@ -139,7 +139,7 @@ class Part(NamedTuple):
     tables: dict[str, MessageTable]
     #: No later part has a message before this log time, ns; None after the last part.
     later_ns: int | None
-    #: Share of the bytes to be read that are read, 0..1.
+    #: Share of the bytes to be read that is done, 0..1.
     done: float
 
 
@@ -150,9 +150,9 @@ class BagReader:
     max_chunk: bytes that a chunk may unpack to; else OU_MONITOR_MAX_CHUNK_MB, or 256 times the
     file, at least 64 MiB and at most an eighth of the memory.  By topic: message types in
     `topics`, numbers in `counts`, rate of the samples within blocks, Hz, in `sample_rates`,
-    and where values came from in `origins`, as far as the bag states it.  `about` is the custom
+    and origins of values in `origins`, if the bag states them.  `about` is the custom
     data of metadata.yaml or of the files; `start_ns`, `end_ns` the log times of the first and last
-    message; `damage` where and how the bag is damaged, else None; `notes` topics left out, and the
+    message; `damage` the place and kind of damage, or None; `notes` topics left out, and the
     like.  InputError: missing, empty, foreign, without messages, or damaged and not `partial`.
     """
 
@@ -257,10 +257,10 @@ class BagReader:
             del pending[:ready]
 
     def definitions(self, kind: str) -> Definitions:
-        """Return the fields of a type in the bag, and of those in it."""
+        """Return the fields of a type in the bag, and of its nested types."""
         try:
             return parse_definition(kind, self._schemas[kind].data.decode('utf-8', 'replace'))
-        # The library has errors of many kinds.
+        # The library raises errors of many kinds.
         except Exception as error:
             raise InputError(f'{self.path}: a message of type {kind} cannot be decoded: its '
                              f'definition cannot be read ({type(error).__name__}: '

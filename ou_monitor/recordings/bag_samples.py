@@ -309,13 +309,13 @@ class _Load:
         self.unknown = 0
 
     def before(self, column: FieldColumn) -> None:
-        """Take messages before the part to read: what was said last holds in it."""
+        """Take messages before the part to read; the last value holds in it."""
         if np.isfinite(column.values).any():
             self.waiting.clear()
         self.waiting.append(column)
 
     def take(self, log_time: TimeArray, ends: FloatArray, own: npt.NDArray[np.bool_]) -> None:
-        """Place what waits among the next voltage messages (ends in s)."""
+        """Place waiting messages among the next voltage messages (ends in s)."""
         at = values = np.empty(0)
         stamped, before = np.empty(0, np.bool_), np.empty(0, np.int64)
         if self.waiting:
@@ -336,7 +336,7 @@ class _Load:
 
 
 class _Supply:
-    """Samples of the voltage, with what is known beside them, as they come from a bag."""
+    """Samples of the voltage, with throttle and current, as they come from a bag."""
 
     def __init__(self, specs: Mapping[str, FieldSpec], own_current: bool) -> None:
         volts = specs[VOLTAGE]
@@ -371,7 +371,7 @@ class _Supply:
             whole.frombytes(np.ascontiguousarray(part).view(np.uint8))
 
     def columns(self, name: str, source: dict[str, str], notes: list[str]) -> RawColumns:
-        """Return all that was taken."""
+        """Return all samples taken."""
         t = np.frombuffer(self.t)
         found: dict[str, FloatArray] = {}
         for which, load in self.loads.items():

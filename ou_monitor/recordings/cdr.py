@@ -75,7 +75,7 @@ def short_name(kind: str) -> str:
 
 
 def _find(spec: FieldSpec, text: str, definitions: Definitions) -> tuple[FieldPath, Field]:
-    """Return a path, and the field at its end; an element of an array is no array."""
+    """Return a path, and the field at its end; an element of an array is not an array."""
     path, at = parse_field_path(text), Field('', short_name(spec.type))
     for step in path:
         if isinstance(step, int):
@@ -123,13 +123,13 @@ def stamp_paths(spec: FieldSpec, definitions: Definitions) -> tuple[FieldPath, .
 
 @dataclass(frozen=True)
 class Place:
-    """Where numbers are in a message."""
+    """The place of numbers in a message."""
 
     # Byte of the first one.
     offset: int
     # NumPy type of each.
     kind: str
-    # How many; None for a single number that is not an array.
+    # Number of elements; None for a single number that is not an array.
     size: int | None = None
 
     def column(self, rows: Rows) -> FloatArray:
@@ -166,7 +166,7 @@ class Layout:
         self.words: list[tuple[int, int]] = []
         # (offset, bytes) of every text, its closing zero left out.
         self.texts: list[tuple[int, int]] = []
-        # Where the wanted fields are; an element beyond its array is not there.
+        # Places of the wanted fields; an element beyond its array is missing.
         self.places: dict[FieldPath, Place] = {}
         self._order = '<' if data[1] else '>'
         self._word_of = struct.Struct(f'{self._order}I')
@@ -364,7 +364,7 @@ def join(parts: Sequence[FieldColumn]) -> FieldColumn:
 
 
 def seconds(log_time: TimeArray) -> FloatArray:
-    """Return ns as s; whole seconds apart, for an epoch in ns does not fit a float64."""
+    """Return ns as s; whole seconds apart, because an epoch in ns does not fit a float64."""
     whole, rest = np.divmod(log_time, np.uint64(1_000_000_000))
     return whole + rest * 1e-9
 
@@ -381,8 +381,8 @@ class FieldReader:
     Reads one field, and its stamp, of messages of one type.
 
     `beside` is a second field, of one number in each message.  The `nan` rules are not applied: a
-    value that is missing or not finite is NaN.  Messages that do not fit their type are left out
-    after a call of `broken`.  InputError: the type has no such field, or it is no number.
+    missing or non-finite value is NaN.  Messages that do not fit their type are left out
+    after a call of `broken`.  InputError: the type has no such field, or it is not a number.
     """
 
     def __init__(self, spec: FieldSpec, definitions: Definitions, broken: Broken,
@@ -424,7 +424,7 @@ class FieldReader:
         if not stamped.all():
             stamp[~stamped] = seconds(table.log_time[~stamped])
         if len(blocks) == 1 and not refused:
-            # All alike, and in order.
+            # All alike and in order.
             values = blocks[0][1].reshape(-1)
         else:
             begin = np.cumsum(count) - count

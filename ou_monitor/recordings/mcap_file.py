@@ -60,20 +60,21 @@ _LENGTHS = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
 # Keys in a channel's metadata: rate of the samples within a block, Hz; prefix of the keys about
 # the origin of the values.
 SAMPLE_RATE, ORIGIN = 'sample_rate_hz', 'origin.'
-# Metadata records that say where the recording came from: written here, and by rosbag2, whose
-# record holds the text of a metadata.yaml of at most so many bytes and values (2000 topics).
+# Metadata records on the origin of the recording: our own, and rosbag2's, which holds the text of
+# a metadata.yaml; maximum bytes and values of that (2000 topics).
 ABOUT, ROSBAG2 = 'ou_monitor', 'rosbag2'
 MOST_BYTES, MOST_NODES = 8_000_000, 200_000
-# A metadata record, and all together; bytes.  rosbag2 writes two tables of contents.
+# Maximum bytes of a metadata record (of all: twice that), and number of rosbag2's tables of
+# contents that are read; it writes two.
 _MOST_METADATA, _MOST_TABLES = 10_000_000, 3
-# A definition has some kB; DDS has no names beyond 256 characters.
+# Maximum size of a definition (usual: some kB) and of a name (DDS: 256 characters).
 _MOST_DEFINITION, _MOST_OF_NAME = 256 * 1024, 256
-# Damages after which the walk ends, topics left out that are named, and records of a chunk
-# beside its messages: one schema and one channel for each number.
+# Damages after which the walk ends, topics left out that are named, and records of a chunk beside
+# its messages: one schema and one channel for each number.
 _MOST_BREAKS, _MOST_NOTES, _MOST_OTHERS = 10_000, 20, 2 * 65536
 # Block size for messages outside of chunks, bytes.
 _BLOCK = 64 * 1024
-# Of more channels only those in a chunk are looked for.
+# With more channels, only those in a chunk are searched.
 _FEW_CHANNELS = 8
 
 # Maximum ratio of unpacked chunks to the file: 20 to 30 for logs of a constant voltage, 30 000 for
@@ -121,7 +122,7 @@ class Topic(NamedTuple):
     schema: Any
     #: Rate of the samples within a block, Hz.
     sample_rate: float | None
-    #: Where its values came from.
+    #: Origin of its values.
     origin: dict[str, str]
 
 
@@ -129,7 +130,7 @@ def usable_memory() -> int:
     """Return the smallest memory limit of machine, control group and process, bytes."""
     limits = [os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES')]
     for file in ('/sys/fs/cgroup/memory.max', '/sys/fs/cgroup/memory/memory.limit_in_bytes'):
-        # Not there, or the word "max".
+        # Missing, or the word "max".
         with suppress(OSError, ValueError):
             limits.append(int(Path(file).read_text(encoding='ascii')))
     allowed = resource.getrlimit(resource.RLIMIT_AS)[0]
@@ -166,9 +167,9 @@ class McapFile:
     """
     One .mcap file, its `topics` by channel, `counts` of messages, `spans` that hold them.
 
-    `partial`: walk the whole file; `max_chunk`: bytes that a chunk may unpack to.  `about` is what
-    the file says of itself, `start_ns` and `end_ns` the log times of the first and last message,
-    `origin_ns` that of the first message of the bag.  InputError: missing, empty or foreign.
+    `partial`: walk the whole file; `max_chunk`: bytes that a chunk may unpack to.  `about` is
+    the file's own metadata, `start_ns` and `end_ns` the log times of the first and last message,
+    `origin_ns` the log time of the bag's first message.  InputError: missing, empty or foreign.
     """
 
     def __init__(self, path: Path, partial: bool, max_chunk: int | None = None) -> None:
@@ -185,7 +186,7 @@ class McapFile:
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._unpacked = self._tables = self._metadata = 0
-        # To make one costs as much as to unpack a small chunk.
+        # Creating one costs as much as unpacking a small chunk.
         self._zstd = zstandard.ZstdDecompressor()
         with self._open() as file:
             self._size = file.seek(0, os.SEEK_END)
@@ -531,7 +532,7 @@ class McapFile:
             raise Damage(_over_limit('it unpacks to', stated, self._limit))
         try:
             data = _decompressed(chunk.compression, chunk.data, stated, self._zstd)
-        # zstd and lz4 have errors of their own.
+        # zstd and lz4 raise their own errors.
         except Exception as error:
             raise Damage(printable(error, 200) or type(error).__name__) from error
         if len(data) != stated or span.unpacked not in (0, stated):
@@ -592,7 +593,7 @@ class McapFile:
 
 
 class _Strict(ReadDataStream):
-    """The library's stream, made to refuse a text longer than its record."""
+    """The library's stream, extended to refuse a text longer than its record."""
 
     def read(self, length: int) -> bytes:
         """Return exactly `length` bytes."""
@@ -673,7 +674,7 @@ def _check_attachment(file: BinaryIO, length: int) -> None:
 
 
 def _crc(file: BinaryIO, length: int) -> int:
-    """Return the checksum of the next bytes of a file, as many as there are."""
+    """Return the checksum of the next bytes of a file, up to its end."""
     found = 0
     while length > 0 and (block := file.read(min(1 << 20, length))):
         found = zlib.crc32(block, found)
@@ -753,9 +754,9 @@ def _by_index(data: bytes, indexes: Sequence[bytes], begins: IntArray,
     """
     Return the records of chunks as `_records`, by the message indexes behind each.
 
-    begins: start of each chunk in `data`, and the end of the last.  None where the messages that
-    these name and records of other kinds do not fill each chunk from end to end: then the indexes
-    do not tell what the chunks hold.
+    begins: start of each chunk in `data`, and the end of the last.  None if the messages
+    in these indexes and records of other kinds do not fill each chunk from end to end: then the
+    indexes do not describe the chunks.
     """
     parts = [np.empty(0, np.int64)]
     for first, index in zip(begins.tolist(), indexes):
@@ -781,7 +782,7 @@ def _by_index(data: bytes, indexes: Sequence[bytes], begins: IntArray,
     if not ((gather(data, places, 'u1') == Opcode.MESSAGE) & (ends >= places + _DATA)
             & (ends <= len(data))).all():
         return None
-    # No record goes on from one chunk to the next.
+    # A record must not cross from one chunk to the next.
     inner = begins[1:-1]
     at_inner = np.searchsorted(places, inner)
     behind = np.append(0, np.insert(ends, at_inner, inner))

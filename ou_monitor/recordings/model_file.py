@@ -118,7 +118,7 @@ def _term(entry: Any, where: str) -> tuple[Term, dict[str, Any]]:
 
 
 def _numbers(value: Any) -> Any:
-    """Return a value with texts such as 1e-3 as numbers (YAML 1.1 wants a point: 1.0e-3)."""
+    """Return a value with texts such as 1e-3 as numbers (YAML 1.1 requires a point: 1.0e-3)."""
     if isinstance(value, list):
         return [_numbers(v) for v in value]
     return float(value) if isinstance(value, str) and _EXPONENT.fullmatch(value) else value

@@ -60,7 +60,7 @@ def read_recording(
         Whether to read the intact part of a damaged bag, with a note.
     start, end : float, optional
         Part to read, s after the first message of the bag (by log time) or the first sample of
-        the CSV or log: start <= t < end.  The throttle of before is held.
+        the CSV or log: start <= t < end.  The throttle before it is held.
     flight : int, optional
         Flight of a log with several, from 1; default: the largest.
     columns : CsvColumns, optional
@@ -167,7 +167,7 @@ def tidy(raw: RawColumns) -> Recording:
     notes, t = [*raw.notes, *said], t[which]
     if not t.size:
         raise InputError(_unusable(name, notes))
-    # A median of so much needs half of it on average.
+    # A median this large needs half of it on average.
     if t.size > 2 and t[-1] - t[0] >= 0.5 * _SPARSE * (t.size - 1) - 1.0 and (
             spacing := float(np.median(np.diff(t)))) >= _SPARSE:
         notes.append(f'The samples are {spacing:.4g} s apart: is the time in ms, us or ns? '

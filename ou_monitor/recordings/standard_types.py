@@ -2,10 +2,10 @@
 Message types: parsing of definitions, and the standard types that bags are written with.
 
 A bag carries the definition (ros2msg) of every type in it, so that it can be read
-where ROS is not installed.  Texts and hashes are those of ROS 2 Jazzy's
-common_interfaces, comments left out; a test compares them with an independent
-library.  The hash (REP-2016, RIHS01) is what rosbag2 writes beside the type.
-Many messages are encoded at once: the library encodes one, and its layout says where the others
+without ROS.  Texts and hashes are from ROS 2 Jazzy's
+common_interfaces, without comments; a test compares them with an independent
+library.  rosbag2 writes the hash (REP-2016, RIHS01) beside the type.
+Many messages are encoded at once: the library encodes one, and its layout shows where the others
 differ.
 """
 
@@ -27,7 +27,7 @@ from ou_monitor.stream.config import FieldPath, parse_field_path
 
 _SEPARATOR = 80 * '='
 
-# rosbag2 prints this line between a definition and those that it uses.
+# rosbag2 prints this line between a definition and the definitions it uses.
 _STD_HEADER = f"""\
 {_SEPARATOR}
 MSG: std_msgs/Header
@@ -152,7 +152,7 @@ BATTERY_STATE = 'sensor_msgs/msg/BatteryState'
 
 
 def parse_definition(kind: str, text: str) -> Definitions:
-    """Return the fields of a type and of those in it, as the library understands them."""
+    """Return the fields of a type and of its nested types, as the library parses them."""
     found = dict(DEFAULTS)
 
     def add(_: str, name: str, parsed: Any) -> None:
@@ -170,7 +170,7 @@ def parse_definition(kind: str, text: str) -> Definitions:
 
 @lru_cache(maxsize=64)
 def _template(kind: str, content: str, wanted: frozenset[FieldPath]) -> tuple[bytes, Layout]:
-    """Return a message of a type, given as JSON, and where the wanted fields are."""
+    """Return a message of a type, given as JSON, and the places of the wanted fields."""
     data = serialize_dynamic(kind, SCHEMAS[kind])[kind](json.loads(content))
     return data, Layout(data, short_name(kind), parse_definition(kind, SCHEMAS[kind]), wanted)
 

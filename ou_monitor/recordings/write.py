@@ -1,12 +1,12 @@
 """
-Write a `Recording`, or what was taken from a log, as a bag.
+Write a `Recording`, or the series of a log, as a bag.
 
-`replay`, `ros2 bag play` and `analyze` take it.  Limits: messages hold float32 (but
+`replay`, `ros2 bag play` and `analyze` read it.  Limits: messages hold float32 (except
 std_msgs/Float64), 0.5 uV at 5 V.
 
-Of a log every series keeps its own stamps, counted from the start of the log, to 10 ns of a
+Every series of a log keeps its own stamps, counted from the start of the log, to 10 ns in a
 day.  Gyros are sensor_msgs/Imu, motor speeds sensor_msgs/JointState (velocity, rad/s), named
-series std_msgs/Float64; the unit of each is in the metadata of its topic.
+series std_msgs/Float64; the metadata of each topic have its unit.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from ou_monitor.recordings.standard_types import (
     FLOAT32, FLOAT32_ARRAY, FLOAT64, IMU, JOINT_STATE)
 from ou_monitor.records import FloatArray, Recording
 
-# What `type` may be -> message type of the voltage.
+# Names of `type` -> message type of the voltage.
 TYPES = {
     'battery_state': BATTERY_STATE, 'float32': FLOAT32, 'float64': FLOAT64,
     'adc_block': FLOAT32_ARRAY,
 }
 
-# Samples encoded at once; bounds memory.  Whole blocks.
+# Maximum samples encoded at once; limits memory.  Whole blocks.
 SLICE = 1000
 
-# An adc_block of a log: rate of its samples, Hz, and how many there are in one.
+# An adc_block of a log: rate of its samples, Hz, and samples per block.
 BLOCK_RATE = 10000.0
 BLOCK = 100
 
@@ -46,15 +46,15 @@ BLOCK = 100
 # from the middle.
 THROTTLE_PERIOD_NS = 1_000_000_000
 
-# Stamps of 64 bits with room to be moved.
+# Range of 64-bit stamps, with a margin for shifts.
 _LAST_NS = 2.0**62
 
 # The header's stamp counts seconds in an int32.
 LAST_HEADER_NS = (2**31) * 1_000_000_000 - 1
 
 Stamps = npt.NDArray[np.int64]
-# Log time (ns), which topic, message.  At one instant the throttle goes first:
-# it holds for that sample.
+# Log time (ns), topic index, message.  At equal times the throttle comes first: it holds for that
+# sample.
 Timed = tuple[int, int, bytes]
 THROTTLE, VOLTAGE = 0, 1
 
@@ -66,7 +66,7 @@ def write_recording(
     progress: Callable[[float], None] | None = None,
 ) -> tuple[str, ...]:
     """
-    Write topics `/voltage` and, where throttle is known, `/throttle`.
+    Write topics `/voltage` and, if throttle is known, `/throttle`.
 
     start_ns in ns, sample_rate in Hz, progress 0..1.
     """
@@ -96,8 +96,8 @@ class RecordingWriter:
     """
     Writes a recording that comes in pieces, as `write_recording`; memory does not grow with them.
 
-    A context manager; what was written is removed when its block fails.  `topics`: their message
-    types; `notes`: what was changed on the way, one sentence each.
+    A context manager; if its block fails, the bag is removed.  `topics`: their message
+    types; `notes`: changes made, one sentence each.
     """
 
     def __init__(self, path: str | Path, *, type: str = 'battery_state',  # noqa: A002
@@ -195,7 +195,7 @@ class RecordingWriter:
         if not values.size:
             return
         changed = np.diff(values, prepend=np.float32(self._throttle)) != 0.0
-        # One sample a period is sent whatever it says.
+        # One sample a period is written even if unchanged.
         periods = times // THROTTLE_PERIOD_NS
         changed |= np.diff(periods, prepend=self._period) > 0
         self._throttle, self._period = float(values[-1]), int(periods[-1])
@@ -204,7 +204,7 @@ class RecordingWriter:
 
 def check_steady(name: str, since_first: npt.NDArray[np.int64], before: int,
                  sample_rate: float) -> None:
-    """Refuse what blocks without stamps cannot hold: any spacing but the stated one."""
+    """Refuse a spacing that blocks without stamps cannot hold: any but the stated one."""
     grid = (before + np.arange(since_first.size)) * (1e9 / sample_rate)
     if np.abs(since_first - grid).max() > 0.5e9 / sample_rate:
         raise InputError(
@@ -214,7 +214,7 @@ def check_steady(name: str, since_first: npt.NDArray[np.int64], before: int,
 
 @dataclass(frozen=True, eq=False)
 class _Stream:
-    """One topic: stamps (s), messages of a part of them, and where they come from."""
+    """One topic: stamps (s), messages of a part of them, and their origin."""
 
     topic: str
     kind: str
@@ -228,7 +228,7 @@ def write_log(
     extras: Extras | None = None, progress: Callable[[float], None] | None = None,
 ) -> tuple[dict[str, str], tuple[str, ...]]:
     """Write a bag (progress 0..1)."""
-    # At one instant what holds for the sample goes before it, the voltage last.
+    # At equal times the voltage comes last, after the values that hold for it.
     streams = [_of_series(name, FLOAT32, series) for name, series in (
         ('throttle', chosen.throttle), ('current', chosen.current)) if series is not None]
     if extras is not None:
@@ -243,7 +243,7 @@ def write_log(
              ) if shift else ()
     total = sum(stream.t.size for stream in streams)
     topics: dict[str, str] = {}
-    # Refused before anything is on disk.
+    # Refused before anything is written to disk.
     stamps = [as_nanoseconds(stream.t, stream.origin[f'{stream.topic}_field']) + shift
               for stream in streams]
     if kind == 'adc_block':
@@ -257,7 +257,7 @@ def write_log(
     for stream in streams:
         whole |= stream.origin
     with BagWriter(path, about=whole) as bag:
-        # The order of the table of contents: the voltage first.
+        # Topics in the order of the table of contents: the voltage first.
         for stream in reversed(streams):
             rate = BLOCK_RATE if stream.kind == FLOAT32_ARRAY else None
             topics[bag.add_topic(stream.topic, stream.kind, sample_rate=rate,
@@ -285,7 +285,7 @@ def encode(kind: str, stamps: Stamps, values: FloatArray, block: int = BLOCK,
 
 
 def _origin(topic: str, name: str, unit: str, scale: str, words: str) -> dict[str, str]:
-    """Return where a topic came from, by keys that are its own."""
+    """Return the origin of a topic, by keys of its own."""
     return {f'{topic}_field': name, f'{topic}_unit': unit, f'{topic}_scale': scale,
             f'{topic}_what': words}
 

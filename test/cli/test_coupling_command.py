@@ -217,7 +217,7 @@ def test_a_log_is_taken_as_it_is(logs, tmp_path, capsys):
         assert data['duration_s'] < 18.1
     for arguments, words in (
             (['--signal', 'gyroADC[9]'], "did you mean 'gyroADC["),
-            (['--signal', '/imu/linear_acceleration.x'], 'no linear acceleration'),
+            (['--signal', '/imu/linear_acceleration.x'], 'no linear_acceleration.x'),
             (['--signal', '/motor_speed/velocity[0]'], 'no motor speeds'),
             (['--signal', 'debug/angular_velocity.x'], "no gyro 'debug'"),
             (['--signal', 'motor[0]', '--msg-config', 'x'], 'is for bags'),

@@ -1,1 +1,1 @@
-"""Logs of autopilots, one module a format -> series of voltage, throttle and current."""
+"""Logs of autopilots, one module per format -> series of voltage, throttle and current."""

@@ -1,13 +1,13 @@
 """
 Betaflight and INAV blackbox, read by orangebox.
 
-Limits first: the ADC is read more slowly than is logged, so most voltages are
-repeats.  Frames that were predicted from damaged ones are
-left out up to the next key frame.  orangebox is under GPL-3; nothing of it is
-loaded for other formats.  The axes are Betaflight's own (x forwards, y left, z up),
-which are those of `base_link`.
+Limits first: the ADC is read more slowly than the log is written, so most voltages are
+repeats.  Frames predicted from damaged ones are
+left out up to the next key frame.  orangebox is under GPL-3; other formats
+load nothing of it.  Betaflight's axes (x forwards, y left, z up)
+are those of `base_link`.
 
-Scales are those of Betaflight's viewer (flightlog_parser, flightlog_fields_presenter) and of
+Scales come from Betaflight's viewer (flightlog_parser, flightlog_fields_presenter) and from
 the header: `gyro_scale`, `acc_1G`, `motor_poles`, `blackbox_high_resolution`.
 """
 
@@ -34,7 +34,7 @@ from ou_monitor.records import FloatArray
 # The clock counts us in 32 bits.
 WRAP = 2**32
 
-# Longest step between frames, s; a longer one is a pause of the log.
+# Maximum step between frames, s; a longer one is a pause of the log.
 _PAUSE = 10.0
 # Minimum frames after a step in time; fewer are corrupt bytes, not flight.
 _PART = 16
@@ -105,7 +105,7 @@ def read(path: Path, request: Request) -> Log:
         facts['flight'] = f'{wanted} of {len(held)}'
     t = columns['time'] * 1e-6
     if request.flight is None and len(held) > 1:
-        # Only this flight is decoded; the bytes of the others give their lengths.
+        # Only this flight is decoded; the others' lengths are estimated from their bytes.
         pace = float(t[-1] - t[0]) / max(held[wanted - 1], 1) if t.size else 0.0
         lengths = '; '.join(f'{k + 1}: about {pace * size:.0f} s'
                             for k, size in enumerate(held))
@@ -132,7 +132,7 @@ def _wanted(names: list[str], request: Request) -> list[str]:
 
 
 def _frames(parser: Any, places: list[int], request: Request) -> tuple[FloatArray, int]:
-    """Return the wanted fields of the sound frames, shape (n, fields), and how many were not."""
+    """Return the wanted fields of the sound frames, shape (n, fields), and the rest's number."""
     pick = itemgetter(*places) if len(places) > 1 else (lambda data: (data[places[0]],))
     reader, context = parser.reader, parser._ctx
     rows: list[tuple[int, ...]] = []
@@ -164,7 +164,7 @@ def _frames(parser: Any, places: list[int], request: Request) -> tuple[FloatArra
 
 
 def _in_time(table: FloatArray) -> tuple[FloatArray, int]:
-    """Return the frames in the order of an unwrapped time, and how many did not fit."""
+    """Return the frames in the order of an unwrapped time, and the number that did not fit."""
     if len(table) < 2:
         return table, 0
     time = np.unwrap(np.mod(table[:, 0], WRAP), period=WRAP)
@@ -175,7 +175,7 @@ def _in_time(table: FloatArray) -> tuple[FloatArray, int]:
     table = table.copy()
     table[:, 0] = time
     kept = table[good]
-    # Parts that go back are from other bytes than this flight's.
+    # Parts that go back in time are not bytes of this flight.
     ahead = np.ones(len(kept), dtype=bool)
     ahead[1:] = kept[1:, 0] > np.maximum.accumulate(kept[:-1, 0])
     kept = kept[ahead]
@@ -220,10 +220,10 @@ def _version(headers: Headers) -> tuple[str, tuple[int, int, int]]:
 
 def _battery_scales(headers: Headers) -> tuple[float | None, float | None]:
     """
-    Return V and A per unit; None where it is not known.
+    Return V and A per unit; None if unknown.
 
-    As Betaflight's blackbox-log-viewer has it (flightlog_fields_presenter.js);
-    for other firmware the limits of a cell, in the header, tell the unit.
+    As in Betaflight's blackbox-log-viewer (flightlog_fields_presenter.js);
+    for other firmware the cell limits in the header decide the unit.
 
     """
     name, version = _version(headers)
@@ -345,7 +345,7 @@ def _shows_gyro(headers: Headers, firmware: str, version: tuple[int, int, int]) 
 
 
 def _gyro_scale(headers: Headers) -> float | None:
-    """Return rad/s per unit of the gyro; None where the header does not state it."""
+    """Return rad/s per unit of the gyro; None if the header does not state it."""
     raw: Any = headers.get('gyro_scale', headers.get('gyro.scale'))
     try:
         # The bits of a float, written as a whole number.
@@ -409,7 +409,7 @@ def _place(name: str) -> int:
 
 
 def _number(headers: Headers, key: str) -> float:
-    """Return a positive number of the header; 0 when it states none."""
+    """Return a positive number of the header; 0 if missing."""
     value = headers.get(key)
     good = isinstance(value, (int, float)) and math.isfinite(value) and value > 0
     return float(value) if good and value is not None else 0.0

@@ -1,11 +1,11 @@
 """
-What is taken from a log: voltage, throttle, current, gyros, speeds, named series.
+Selection from a log: voltage, throttle, current, gyros, speeds, named series.
 
-The battery is meant when nothing is said, never a rail behind a regulator; of
-several batteries the user chooses.  For the throttle the smallest rank is
-taken: what goes to the motors before what the stick asks for.
+The default is the battery, never a rail behind a regulator; of
+several batteries the user chooses.  The default throttle has the smallest
+rank: motor outputs before stick commands.
 
-Of gyro and accelerometer, rows with a number that is not finite are dropped whole.
+Rows of gyro and accelerometer with a non-finite number are dropped whole.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from ou_monitor.records import Defect, FloatArray, led, Note
 from ou_monitor.text import counted, printable
 from ou_monitor.timeline.line import check_throttle
 
-# What leaves a quantity out.
+# Word that leaves a quantity out.
 NONE = 'none'
 
-# Series named in one line; the others are in the list.
+# Maximum series named in one line; --list shows the others.
 MOST = 4
 
 
@@ -37,22 +37,22 @@ class Chosen:
 
     # At least one sample.
     voltage: Series
-    # None where the log has none, or none is wanted.
+    # None if missing in the log, or not wanted.
     throttle: Series | None
     current: Series | None
-    # What was dropped, and what else could have been taken.
+    # Dropped samples, and alternatives in the log.
     notes: tuple[str, ...]
 
 
 def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | None = None,
            current: str | None = None, option: str = '--{}') -> Chosen:
-    """Choose, and drop what cannot be a sample (option: what chooses a quantity by name)."""
+    """Choose series, and drop unusable samples (option: the option that chooses a quantity)."""
     volts = _pick(path, log, VOLTAGE, voltage, option)
     if volts is None:
         raise InputError(_no_voltage(path, log))
     first = _pick(path, log, THROTTLE, throttle, option)
     if first is not None and log.format == 'csv':
-        # Readers of autopilot logs know the scale of theirs; a column says nothing of it.
+        # Importers of autopilot logs know the scale; a column does not state it.
         check_throttle(f'{path}: {first.name}', first.values)
     if current is not None:
         second = _pick(path, log, CURRENT, current, option)
@@ -75,7 +75,7 @@ def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | 
         if not mended.n:
             notes.append(f'{one.name} has no usable sample.')
         chosen.append(mended if mended.n else None)
-    # What befell several alike, such as columns of one table, is said once.
+    # A note common to several series, such as columns of one table, appears once.
     notes = [note for sentence, names in dropped.items()
              for note in led(', '.join(names), [sentence])] + notes
     if chosen[0] is None:
@@ -120,7 +120,7 @@ def _single(values: FloatArray) -> FloatArray:
 
 
 def default(log: Log, quantity: str) -> list[Series]:
-    """Return the series that are taken when nothing is said; several: it is not clear."""
+    """Return the default series; several if the choice is not clear."""
     ranked = [one for one in _of(log, quantity) if one.rank is not None and one.n]
     least = min((one.rank for one in ranked if one.rank is not None), default=None)
     return [one for one in ranked if one.rank == least]
@@ -159,7 +159,7 @@ def _pick(path: Path, log: Log, quantity: str, name: str | None, option: str
 
 
 def _current(log: Log, voltage: Series) -> Series | None:
-    """Return the current of the sensor of the voltage, or the only one of a lone battery."""
+    """Return the current of the voltage's sensor, or the only one of a single battery."""
     ranked = [one for one in _of(log, CURRENT) if one.rank is not None and one.n]
     beside = [one for one in _of(log, CURRENT)
               if one.group and one.group == voltage.group and not one.silent]
@@ -182,12 +182,12 @@ def _no_voltage(path: Path, log: Log) -> str:
 
 
 def _also(log: Log, chosen: tuple[Series, Series | None], option: str) -> list[str]:
-    """Say what else could have been taken."""
+    """Return a note on the alternatives."""
     notes: list[str] = []
     for quantity, one in zip((VOLTAGE, THROTTLE), chosen):
         others = [other for other in _of(log, quantity)
                   if not other.silent and (one is None or other.name != one.name)]
-        # Of the throttles, what could have been taken unasked; of the voltages, the rails as well.
+        # Throttles that could be defaults; voltages, including rails.
         ranked = [other for other in others if other.rank is not None]
         others = ranked or others if quantity == THROTTLE else others
         if others:
@@ -199,9 +199,9 @@ def _also(log: Log, chosen: tuple[Series, Series | None], option: str) -> list[s
 IMU, SPEEDS = 'imu', 'motor_speed'
 # Topics that a named series must not take.
 _TAKEN = ('voltage', 'throttle', 'current', IMU, SPEEDS)
-# Parts of a series whose spacings are compared; ratio from which a note reports a change.
+# Parts of a series whose spacings are compared; minimum ratio for a note on a change.
 _PARTS, _UNEQUAL = 10, 1.5
-# Pause, in typical steps, from which it is a gap.
+# Minimum length of a gap, in typical steps.
 _GAP = 3.0
 
 
@@ -211,17 +211,17 @@ class Extras:
 
     # By topic, without the slash.
     inertial: dict[str, Motion]
-    # Of the motors.
+    # Speeds of the motors.
     speeds: Motion | None
     # By topic, without the slash.
     signals: dict[str, Series]
-    # What was dropped, and what the log does not hold.
+    # Dropped samples, and quantities missing in the log.
     notes: tuple[str, ...]
 
 
 def choose_extras(path: Path, log: Log, *, imus: Sequence[str] = (),
                   signals: Sequence[str] = ()) -> Extras:
-    """Choose: the gyro that is there when nothing is said, and the series named."""
+    """Choose the default gyro or the one asked for, and the series named."""
     notes: list[str] = []
     inertial: dict[str, Motion] = {}
     for one in _inertial(path, log, imus):
@@ -257,7 +257,7 @@ def choose_extras(path: Path, log: Log, *, imus: Sequence[str] = (),
 
 
 def default_inertial(log: Log) -> list[Motion]:
-    """Return what becomes /imu when nothing is said: one, or none."""
+    """Return the default series for /imu: one, or none."""
     ranked = [one for one in log.inertial if one.rank is not None and one.t.size]
     return sorted(ranked, key=lambda one: one.rank or 0)[:1]
 
@@ -348,14 +348,14 @@ def _inertial(path: Path, log: Log, names: Sequence[str]) -> list[Motion]:
 
 
 def clean_motion(one: Motion) -> tuple[Motion, tuple[str, ...]]:
-    """Return finite rows with rising stamps, and what that took."""
+    """Return finite rows with rising stamps, and notes on dropped ones."""
     which, notes = sound(one.t, np.hstack([*one.vectors.values()]))
     vectors = {field: values[which] for field, values in one.vectors.items()}
     return replace(one, t=one.t[which], vectors=vectors), tuple(notes)
 
 
 def pace_notes(t: FloatArray) -> tuple[str, ...]:
-    """Say where stamps pause, and whether their rate changes (t in s)."""
+    """Return notes on pauses of the stamps, and on changes of their rate (t in s)."""
     if t.size < 4 * _PARTS:
         return ()
     steps = np.diff(t)

@@ -1,16 +1,16 @@
 """
-Crazyflie logs of the micro-SD deck, read without a parser of others.
+Crazyflie logs of the micro-SD deck, read without a library.
 
 Limits first: the battery is read at 100 Hz or less, so a faster log repeats it.  The format has
-one checksum over the whole file: where it does not match, the wrong bytes are not located, and a
-note says so.  Events of the firmware's own are taken by name only.
+one checksum over the whole file: a mismatch does not locate the wrong bytes, and a
+note reports it.  The firmware's own events are read only by name.
 
-As bitcraze/crazyflie-firmware writes it (src/deck/drivers/src/usddeck.c; decoded by
+As written by bitcraze/crazyflie-firmware (src/deck/drivers/src/usddeck.c; decoded by
 tools/usdlog/cfusdlog.py), little-endian: byte 0xBC, version and number of events (2 x uint16);
-of each event its number (uint16), name (ending in 0), number of variables (uint16), and each
+for each event its number (uint16), name (ending in 0), number of variables (uint16), and each
 variable as ``group.name(type)`` (ending in 0), the type a letter of Python's `struct`; then
 records of the number of an event, a stamp (version 1: uint32, ms; 2: uint64, us) and its
-variables; at the end the CRC-32 of all before.
+variables; at the end the CRC-32 of everything before.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from ou_monitor.records import Defect, FloatArray, Note
 from ou_monitor.stream.files import open_regular
 from ou_monitor.text import counted
 
-# Version -> type of the stamp, and s in its unit.
+# Version -> type of the stamp, and its unit in s.
 _STAMPS = {1: ('<u4', 1e-3), 2: ('<u8', 1e-6)}
 _TYPES = frozenset('bBhHiIqQefd')
-# Event of the variables that are logged at a steady rate; their names stand without it.
+# Event of the variables that are logged at a steady rate; their names have no prefix.
 _STEADY = 'fixedFrequency'
 
 # Variable -> quantity, factor, rank, words, group.  Log groups `pm`, `motor` and `stabilizer`.
@@ -53,7 +53,7 @@ _UNITS = {**{f'{_GYRO}.{axis}': ('rad/s', DEGREE) for axis in 'xyz'},
 
 
 class _Event(NamedTuple):
-    """What a record of one event holds."""
+    """Content of a record of one event."""
 
     name: str
     row: np.dtype[np.void]
@@ -75,7 +75,7 @@ def read(path: Path, request: Request) -> Log:
     if not sound:
         notes.append(Note('The checksum does not match: the log was cut off or is damaged, and '
                           'wrong values cannot be told from right ones.', Defect.DAMAGED_FILE))
-    # Bytes that are too few for a record are the checksum, or its beginning.
+    # Too few bytes for a record are the checksum, or its beginning.
     if end - read_to > (0 if sound else 4):
         notes.append(f'{counted(end - read_to, "byte")} from byte {read_to} on were not read: no '
                      'record of this log.')
@@ -146,7 +146,7 @@ def _places(data: bytes, begin: int, end: int, events: dict[int, _Event],
 
 def _series(prefix: str, t: FloatArray, columns: dict[str, FloatArray]) -> Iterator[Series]:
     """Yield each variable in SI, and the mean of the motors."""
-    # Values of an event are not offered as a battery: they have no steady rate.
+    # Values of an event are not candidates for the battery: they have no steady rate.
     ranked = not prefix
     motors = [f'motor.m{k}' for k in range(1, 5)]
     if all(name in columns for name in motors):

@@ -1,17 +1,17 @@
 """
 Read a table of text, such as a CSV: time, voltage and, where present, throttle and current.
 
-Limits first: one file is one flight, lines of one width, each a row; how it is written is found in
+Limits first: one file is one flight, lines of one width, each a row.  The format is detected in
 the first 64 kB: the encoding, delimiter, decimal mark, header lines and stated units with which
 most cells of the first lines are numbers, dates or times.  Columns and units are found by names
-and sizes, said in one note, and each is overruled by a field of `CsvColumns`.  A unit in a name or
-in a line of units is taken as stated; a unit that nothing states is guessed from the values.
+and sizes and reported in one note; fields of `CsvColumns` override them.  A unit in a name or
+in a line of units is taken as stated; an unstated unit is guessed from the values.
 `time_s`, `voltage_v`, `throttle` and `current_a` are taken first and need no note.
 
-The rows are read by the csv module of the standard library, in blocks whose columns are turned
-into numbers at once.  Measured for 10^6 rows of 3 columns: 1.1 s of CPU, 3.2 s row by row;
-`numpy.loadtxt` and the CSV reader of pyarrow take 0.3 s, but the first knows no blank cell and no
-text, the second no line number and no row of another width, and is a dependency of 100 MB.
+The csv module of the standard library reads the rows, in blocks whose columns are converted
+to numbers at once.  Measured for 10^6 rows of 3 columns: 1.1 s of CPU, 3.2 s row by row;
+`numpy.loadtxt` and the CSV reader of pyarrow take 0.3 s, but the first accepts no blank cell or
+text, the second reports no line number and no row of another width, and is a dependency of 100 MB.
 """
 
 from __future__ import annotations
@@ -45,19 +45,19 @@ from ou_monitor.timeline.line import hold, MOST_THROTTLE, WILD
 
 TIME, VOLTAGE, THROTTLE, CURRENT = 'time_s', 'voltage_v', 'throttle', 'current_a'
 
-# What loggers write for a number that they do not have.
+# Words of loggers for a missing number.
 MISSING = frozenset(('', 'nan', 'null', 'none', 'na', 'n/a', '#n/a', '-', '--', 'x'))
-# Added where a cell looks like it.
+# Added to an error if a cell looks like it.
 _MARK = ': the decimal mark is a point'
-# Characters of a cell that are shown.
+# Maximum characters of a cell that are shown.
 _LONGEST = 40
-# A log of 1000 columns has lines of some 10 000 characters.
+# Maximum characters of a line: a log of 1000 columns has lines of some 10 000.
 MOST_OF_LINE = 65536
-# Bytes, then lines, in which the form is looked for; characters and rows read at once.
+# Bytes, then lines, in which the format is detected; characters and rows read at once.
 _HEAD, _HEAD_LINES, _CHUNK, _BLOCK = 65536, 200, 1 << 20, 8192
 
 VOLTAGE_UNITS = {'V': 1.0, 'mV': 1e-3}
-# Unit -> what the value is multiplied by after this is taken from it.
+# Unit -> the summand that is subtracted from a value, and the factor.
 THROTTLE_UNITS = {'1': (0.0, 1.0), '%': (0.0, 0.01), 'us': (1000.0, 1e-3)}
 DELIMITERS = {'tab': '\t', 'space': ' '}
 NONE = 'none'
@@ -90,24 +90,24 @@ CHANNEL = re.compile(r'(?:ch|channel|chan|kanal|analog)[_ ]?[0-9a-d]|a[0-3]', re
 
 
 class Form(NamedTuple):
-    """How a file is written."""
+    """The format of a file."""
 
     encoding: str
     delimiter: str
     comma: bool  # Whether the decimal mark is a comma
     skip: int  # Lines above the first row of numbers
-    line: int  # Number of the line with the names; 0: no line has them
-    names: tuple[str, ...]  # Of the columns as they stand, else 'column 1' and so on
-    units: tuple[str, ...]  # As stated, '' where nothing is
+    line: int  # Number of the line with the names; 0: there is none
+    names: tuple[str, ...]  # Names of the columns as written, else 'column 1' and so on
+    units: tuple[str, ...]  # As stated, '' if not stated
     width: int  # Cells of a row
-    rows: tuple[tuple[str, ...], ...]  # The first ones
-    start: float  # Of rows that are numbered, s
+    rows: tuple[tuple[str, ...], ...]  # The first rows
+    start: float  # Start of numbered rows, s
     step: float  # From row to row, s; NaN: not stated
-    stated: str  # The words that state the step
+    stated: str  # Words that state the step
 
 
 def form_of(path: Path, wanted: CsvColumns) -> Form:
-    """Find out how a file is written from its first lines."""
+    """Detect the format of a file from its first lines."""
     try:
         with open_regular(path) as file:
             head = file.read(_HEAD)
@@ -157,7 +157,7 @@ def _encoding(path: Path, head: bytes) -> str:
 
 def _laid_out(lines: list[str], encoding: str, delimiter: str, comma: bool, skip: int,
               ) -> tuple[float, Form] | None:
-    """Return how well a delimiter and a decimal mark fit, and the form; None: not at all."""
+    """Return how well a delimiter and a decimal mark fit, and the form; None if they do not."""
     rows: list[list[str]] = []
     for line in lines:
         plain = '' if line.lstrip().startswith('#') else line
@@ -167,7 +167,7 @@ def _laid_out(lines: list[str], encoding: str, delimiter: str, comma: bool, skip
                 skipinitialspace=True)), [])])
         except csv.Error:
             rows.append([])
-    # A field in quotes may hold line ends; its rest is no row of the form.
+    # A quoted field may hold line breaks; the rest of it is not a row of the format.
     filled = [row for row in rows[skip:] if any(row)]
     widths = Counter(len(row) for row in filled[len(filled) // 3:])
     if not widths:
@@ -181,7 +181,7 @@ def _laid_out(lines: list[str], encoding: str, delimiter: str, comma: bool, skip
                   and all(not row[j:j + 1] or is_value(row[j]) or row[j].lower() in MISSING
                           for j in places)), None)
     if first is None:
-        # A header alone is a form without a row.
+        # A header alone is a format without rows.
         first, places = len(rows), []
         if len(filled) != 1 or any(map(is_value, filled[0])):
             return None
@@ -198,7 +198,7 @@ def _laid_out(lines: list[str], encoding: str, delimiter: str, comma: bool, skip
 def _prepared(lines: list[str], delimiter: str, comma: bool) -> list[str]:
     """Return lines for the reader: decimal points; one blank where blanks separate."""
     if comma:
-        # A point becomes a comma, so that no thousands' mark passes for a decimal mark.
+        # A point becomes a comma, so that a thousands separator is not taken for a decimal mark.
         lines = ['\0'.join(line.split('.')).replace(',', '.').replace('\0', ',')
                  for line in lines]
     return [' '.join(line.split()) + '\n' for line in lines] if delimiter == ' ' else lines
@@ -229,7 +229,7 @@ def swapped(cell: str) -> str:
 
 
 def unit_of(name: str) -> tuple[str, str]:
-    """Split a name into what it names and the unit it states, in small letters; '': none."""
+    """Split a name into its quantity and the unit it states, in small letters; '': none."""
     text = name.strip().strip('\'"')
     if found := re.match(r'(millis|micros|ms|us|ns)(?![A-Za-z])', text):
         return text, found[1]
@@ -254,7 +254,7 @@ def _header(rows: list[list[str]], lines: list[str], first: int, width: int, del
     if above:
         names, line = rows[above[-1]], above[-1] + 1
     else:
-        # A header that is marked as a comment.
+        # A header marked as a comment.
         for k in range(first - 1, skip - 1, -1):
             cells = next(iter(csv.reader([lines[k].lstrip('# \t')], delimiter=delimiter)), [])
             if len(cells) == width and width > 1:
@@ -298,7 +298,7 @@ def _stated_step(lines: list[str], above: list[list[str]]) -> tuple[float, float
 
 def numbers(path: Path, form: Form, places: Sequence[int],
             texts: dict[int, list[str]] | None = None) -> list[FloatArray]:
-    """Return columns of numbers, NaN where blank; `texts` is filled with cells as they stand."""
+    """Return columns of numbers, NaN where blank; `texts` gets cells as written."""
     parts: list[list[FloatArray]] = [[] for _ in places]
     last = max([*places, *(texts or {})])
     width = len(form.names)
@@ -385,7 +385,7 @@ def _fitting(path: Path, rows: list[list[str]], width: int, last: int, form: For
                 f'{path}:{_line(begin, rows, k)}: {len(row)} cells, and the header names '
                 f'{width} columns: mend the line; the decimal mark is a point')
         if not any(cell.strip() for cell in row):
-            # It stays in the block, so that the number of a line can be told.
+            # It stays in the block, so that line numbers can be counted.
             row.clear()
         elif len(row) <= last:
             raise InputError(f'{path}:{_line(begin, rows, k)}: the line ends before column '
@@ -397,7 +397,7 @@ def _floats(cells: Sequence[str], where: Callable[[int], str], comma: bool) -> F
     """Return cells as numbers (where: words for the place of one)."""
     try:
         values = np.fromiter(map(float, cells), np.float64, len(cells))
-        # To Python 5_01 is 501, and an Arabic five 5.
+        # Python reads 5_01 as 501, and an Arabic five as 5.
         if '_' not in (text := ''.join(cells)) and text.isascii():
             return values
     except ValueError:
@@ -418,25 +418,25 @@ def _floats(cells: Sequence[str], where: Callable[[int], str], comma: bool) -> F
 
 
 def _place(path: Path, form: Form, place: int, begin: int, rows: list[list[str]], k: int) -> str:
-    """Return where a cell is."""
+    """Return the place of a cell in words."""
     filled = [j for j, row in enumerate(rows) if row]
     at = _line(begin, rows, filled[k] if k < len(filled) else k)
     return f"{path}:{at}: column '{form.names[place]}'"
 
 
 def shown(text: str) -> str:
-    """Return what fits in one line: an open quote makes the rest of a file one cell."""
+    """Return the part that fits in one line: an open quote makes the rest of a file one cell."""
     shown = text.strip()
     return shown if len(shown) <= _LONGEST else shown[:_LONGEST] + '...'
 
 
-# Columns listed at most; loggers of autopilots write some hundred.
+# Maximum columns listed; loggers of autopilots write some hundred.
 MOST_COLUMNS = 300
-# Share of steps back in what is no time.
+# Share of backward steps above which a column is not a time.
 _BACK = 0.25
-# A time without a unit is in the coarsest whose steps, and whose span, are at most these, s.
+# A time without a unit has the coarsest unit with steps, and span, of at most these, s.
 _USUAL_STEP, _USUAL_SPAN = 2.0, 43200.0
-# A voltage without a unit beyond this is in mV: no pack of a craft has so many volts.
+# A voltage without a unit above this is in mV: no pack of a craft has so many volts.
 _MOST_VOLTS = 1000.0
 
 
@@ -476,22 +476,22 @@ _DAY = 86400.0  # s
 
 
 class _Column(NamedTuple):
-    """A column that is taken."""
+    """A selected column."""
 
-    place: tuple[int, ...]  # Of its cells: two for a date and a time; none: rows are counted
+    place: tuple[int, ...]  # Its cells: two for a date and a time; none: rows are counted
     name: str
-    unit: str  # As stated or given, '' where nothing is
-    scale: float  # What values are multiplied by, where a maker's is known; 0: by the unit
+    unit: str  # As stated or given, '' if neither
+    scale: float  # Factor if the maker's is known; 0: by the unit
 
 
 class _Table(NamedTuple):
-    """What is taken from a file, in SI units."""
+    """The data read from a file, in SI units."""
 
     form: Form
     t: FloatArray
     found: dict[str, tuple[_Column, FloatArray]]  # By quantity
-    named: dict[str, FloatArray]  # Other columns that were asked for, as they stand
-    note: str  # How the file was read; '' where nothing had to be found
+    named: dict[str, FloatArray]  # Other requested columns, as written
+    note: str  # How the file was read; '' if nothing was detected
 
 
 def read_csv(path: Path, columns: CsvColumns | None = None) -> RawColumns:
@@ -504,14 +504,14 @@ def read_csv(path: Path, columns: CsvColumns | None = None) -> RawColumns:
     if column.name != VOLTAGE:
         source |= {quantity: printable(one.name) for quantity, (one, _) in table.found.items()
                    if quantity != logs.CURRENT}
-    # A blank cell is no message: what was commanded last holds.
+    # A blank cell is not a message: the last command holds.
     return RawColumns(table.t, volts, hold(held.get(logs.THROTTLE, nothing)),
                       held.get(logs.CURRENT, nothing), name, source,
                       (table.note,) if table.note else ())
 
 
 def read(path: Path, request: Request) -> Log:
-    """Read the columns of a supply, and those asked for."""
+    """Read the columns of a supply, and the requested ones."""
     one_flight(path, request)
     table = _table(path, request.columns or CsvColumns(), more=request.names)
     header, t = [name for name in table.form.names if name], table.t
@@ -535,7 +535,7 @@ def read(path: Path, request: Request) -> Log:
         others = [name for name in dict.fromkeys(header) if name not in known]
         if len(others) > MOST_COLUMNS:
             notes.append(f'{len(others) - MOST_COLUMNS} more columns are not listed.')
-        # One pass each: a column of text ends the reading of its pass only.
+        # One pass each: a column of text stops only its own pass.
         for name in others[:MOST_COLUMNS]:
             try:
                 values, = numbers(path, table.form, [table.form.names.index(name)])
@@ -548,7 +548,7 @@ def read(path: Path, request: Request) -> Log:
 
 def read_column(path: Path, name: str, columns: CsvColumns | None = None,
                 ) -> tuple[FloatArray, FloatArray]:
-    """Return the stamps, s, and one column of a CSV as it stands, NaN kept."""
+    """Return the stamps, s, and one column of a CSV as written, NaN kept."""
     table = _table(path, columns or CsvColumns(), more=(name,))
     if name not in table.named:
         raise InputError(f"{path}: '{name}' is the time, not a signal"
@@ -592,7 +592,7 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
 
 
 def _absent(path: Path, form: Form, name: str, option: str = '') -> str:
-    """Return that a column is not there."""
+    """Return the error for a missing column."""
     hint = nearest(name, form.names) if form.line else (
         f'the first line holds numbers; add a header line {TIME},{VOLTAGE}[,{THROTTLE}]')
     return f"{path}:{form.line or form.skip + 1}: no column '{name}': {hint}" + option
@@ -605,7 +605,7 @@ def _named(path: Path, form: Form, name: str, option: str) -> int:
 
 
 def _choose(form: Form, quantity: str, taken: Sequence[int] = ()) -> list[int]:
-    """Return the columns that seem to be a quantity, the first of the best pattern first."""
+    """Return the candidate columns of a quantity, the first of the best pattern first."""
     plain = [re.sub(r'\W+', '_', unit_of(name)[0].strip().lower()).strip('_') if name else None
              for name in form.names[:form.width]]
     plain = [name if name is None else name or 'time' if form.names[k].strip('_% ') else name
@@ -689,7 +689,7 @@ def _unit_column(form: Form, place: int, unit: str | None) -> _Column:
 
 def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: _Column, needed: bool,
                ) -> dict[str, _Column]:
-    """Return the columns of voltage, throttle and current, as far as they are there."""
+    """Return the columns of voltage, throttle and current that exist."""
     names = {logs.VOLTAGE: (wanted.voltage, '--voltage-column', wanted.unit),
              logs.THROTTLE: (wanted.throttle, '--throttle-column', wanted.throttle_unit),
              logs.CURRENT: (wanted.current, '--current-column', None)}
@@ -720,7 +720,7 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: _Column, needed
 
 def _read(path: Path, form: Form, time: _Column, places: list[int],
           ) -> tuple[FloatArray, list[FloatArray]]:
-    """Return the time as it stands, days and clocks in s, and columns of numbers."""
+    """Return the time as written, days and clocks in s, and columns of numbers."""
     sample = [row[time.place[-1]] for row in form.rows
               if time.place and time.place[-1] < len(row) and row[time.place[-1]]]
     if not time.place:
@@ -754,7 +754,7 @@ def _clock(path: Path, cells: list[str], name: str) -> FloatArray:
         raise InputError(f"{path}: column '{name}': {error}") from error
     spans = [float(np.nanmax(t) - np.nanmin(t)) if np.isfinite(t).any() else math.inf
              for t in either]
-    # Of 04/05 either may be the day: the one in which the recording is the shorter.
+    # In 04/05 either may be the day: choose the shorter recording.
     t = either[0] if spans[0] <= spans[1] else either[1]
     if any(one is not None and not (one[1] or one[4]) for one in found):
         t = t + _DAY * np.concatenate(([0.0], np.cumsum(np.diff(t) < -0.5 * _DAY)))
@@ -814,7 +814,7 @@ def _stamps(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: _Co
     if time.unit:
         unit, words = time.unit if wanted.time_unit else TIME_WORDS[time.unit], ''
     else:
-        # Clocks that count from 1970 tell their unit by their size.
+        # Clocks that count from 1970 show their unit by their size.
         size = float(np.median(np.abs(known))) if known.size else 0.0
         span = float(np.ptp(known)) if known.size else 0.0
         unit = clock_unit(size)
@@ -855,9 +855,9 @@ def _in_si(quantity: str, column: _Column, values: FloatArray, given: str | None
 
 
 def _throttle_unit(known: FloatArray, volts: FloatArray) -> str:
-    """Return the unit that the sizes of a throttle speak for; '1' where none does."""
+    """Return the unit suggested by the sizes of a throttle; '1' by default."""
     beyond = known[known > MOST_THROTTLE]
-    # Beside a voltage within 0 to 1 it may be the voltage: `check_throttle` says so.
+    # With a voltage within 0 to 1 it may be the voltage: `check_throttle` reports it.
     if beyond.size <= WILD * known.size or float(np.nanmax(np.abs(volts), initial=0.0)) <= 1.0:
         return '1'
     low, high = (float(np.quantile(known, q)) for q in (WILD, 1.0 - 0.1 * WILD))
@@ -867,7 +867,7 @@ def _throttle_unit(known: FloatArray, volts: FloatArray) -> str:
 
 
 def _how(form: Form, time: _Column, found: dict[str, _Column], units: dict[str, str]) -> str:
-    """Return in one line how a file was read; '' where nothing had to be found."""
+    """Return in one line how a file was read; '' if nothing was detected."""
     if time.name == TIME and not form.comma and form.encoding in ('utf-8', 'utf-8-sig') and all(
             column.name == {logs.VOLTAGE: VOLTAGE, logs.THROTTLE: THROTTLE,
                             logs.CURRENT: CURRENT}[quantity] for quantity, column in found.items()

@@ -1,9 +1,9 @@
 """
 ArduPilot dataflash, binary and text, read by pymavlink.
 
-Limits first: ArduPilot averages the battery's ADC before it is logged, and logs
-at 10 Hz as delivered.  Which outputs are motors is known from the parameters
-`SERVOn_FUNCTION` of the log; without them outputs are taken by name only.
+Limits first: ArduPilot averages the battery's ADC before logging it, by default
+at 10 Hz.  The parameters `SERVOn_FUNCTION` of the log identify the motor
+outputs; without them outputs are taken by name only.
 """
 
 from __future__ import annotations
@@ -48,10 +48,10 @@ PLAIN = (
     ('MOTB', 'ThrOut', THROTTLE, 3, 'throttle output of the mixer'),
     ('RATE', 'AOut', THROTTLE, 4, 'throttle output'),
 )
-# Message -> rank; of several instances the first.  Axes are front, right, down.
+# Message -> rank; the first of several instances.  Axes are front, right, down.
 GYROS = {'IMU': 0, 'GYR': 1, 'IMU2': None, 'IMU3': None}
 RATES, FORCES = ('GyrX', 'GyrY', 'GyrZ'), ('AccX', 'AccY', 'AccZ')
-# What the fields are where the log does not say (before 2018).
+# Units of the fields if the log does not state them (before 2018).
 KNOWN_UNITS = {**dict.fromkeys(RATES, 'rad/s'), **dict.fromkeys(FORCES, 'm/s^2')}
 SPEED = ('ESC', 'RPM')
 OUTPUTS = ('RCOU', 'RCO2', 'RCO3')
@@ -72,7 +72,7 @@ def read(path: Path, request: Request) -> Log:
         text = not file.read(2).startswith(b'\xa3\x95')
     with quiet(path, 'pymavlink'), _plain_text(path, text) as (name, mended):
         reader = DFReader.DFReader_text if text else DFReader.DFReader_binary
-        # Made before it is set up: when that fails, pymavlink leaves its files open.
+        # Created before it is set up: if that fails, pymavlink leaves its files open.
         log: Any = reader.__new__(reader)
         try:
             with quiet_process():
@@ -108,7 +108,7 @@ def read(path: Path, request: Request) -> Log:
 
 @contextmanager
 def _plain_text(path: Path, text: bool) -> Iterator[tuple[str, list[str]]]:
-    """Yield the name of a log that pymavlink can decode, and what that took."""
+    """Yield the name of a log that pymavlink can decode, and notes on changes."""
     content = path.read_bytes() if text else b''
     if content.isascii():
         yield str(path), []
@@ -122,14 +122,14 @@ def _plain_text(path: Path, text: bool) -> Iterator[tuple[str, list[str]]]:
 
 def _close(log: Any) -> None:
     for name in ('data_map', 'filehandle'):
-        # A map that the failed set-up still looks into cannot be closed; it goes with it.
+        # A map in use by the failed set-up cannot be closed; it goes with it.
         with suppress(BufferError):
             if hasattr(log, name):
                 getattr(log, name).close()
 
 
 def _collect(log: Any, request: Request) -> tuple[Table, list[str], int]:
-    """Return the wanted fields of all messages, what the log says in words, and bad messages."""
+    """Return the wanted fields of all messages, the log's texts, and the count of bad ones."""
     fields: dict[str, list[str]] = {kind: [*RATES, *FORCES] for kind in GYROS}
     for kind, field, *_ in (*PLAIN, SPEED):
         fields.setdefault(kind, []).append(field)
@@ -187,14 +187,14 @@ def _numbers(form: Any) -> list[str]:
 
 
 def _units(log: Any, kind: str) -> dict[str, str]:
-    """Return what the log states of units (since 2018)."""
+    """Return the units that the log states (since 2018)."""
     form = next(one for one in log.formats.values() if one.name == kind)
     stated = zip(form.columns, form.units or ())
     return {name: unit.replace('/s/s', '/s^2') for name, unit in stated if unit}
 
 
 def _lost_binary(log: Any) -> list[str]:
-    """Say how many bytes of a binary log belong to no message."""
+    """Return a note on the bytes of a binary log that belong to no message."""
     size = int(log.data_len)
     read_bytes, end = 0, 0
     for kind, offsets in enumerate(log.offsets):
@@ -218,7 +218,7 @@ def _lost_binary(log: Any) -> list[str]:
 
 
 def _lost_text(log: Any) -> list[str]:
-    """Say which lines pymavlink passes over, and whether the last one ends."""
+    """Return notes on lines that pymavlink skips, and on an incomplete last one."""
     size = int(log.data_len)
     text = bytes(log.data_map[:size]).decode('ascii', 'replace')
     lost = 0
@@ -235,7 +235,7 @@ def _lost_text(log: Any) -> list[str]:
 
 
 def _cells(parameters: dict[str, float]) -> dict[str, str]:
-    """Return cells, of which thrust is scaled by the full pack, and the lowest voltage of one."""
+    """Return the number of cells, from the full pack that scales thrust, and a cell's minimum."""
     full = parameters.get('MOT_BAT_VOLT_MAX', 0.0)
     if not full > 3.0:
         return {}
@@ -281,7 +281,7 @@ def _plain(name: str, kind: str, columns: dict[str, list[float]],
 
 def _others(name: str, columns: dict[str, list[float]], units: dict[str, str],
             known: set[str]) -> Iterator[Series]:
-    """Yield the fields that are nothing else, as logged."""
+    """Yield the fields of no other quantity, as logged."""
     t = np.array(columns['t'])
     for field, values in columns.items():
         if field != 't' and f'{name}.{field}' not in known:
@@ -316,7 +316,7 @@ def _speeds(table: Table) -> Motion | None:
     values = []
     for columns in found.values():
         own = np.array(columns['t'])
-        # Each ESC reports in its turn: the last report holds.
+        # ESCs report in turn: the last report holds.
         last = np.maximum(np.searchsorted(own, t, 'right') - 1, 0)
         values.append(np.array(columns[field])[last] * RPM)
     return Motion('', t, {VELOCITY: np.column_stack(values)}, f'rpm {RPM:.6g}',
@@ -325,7 +325,7 @@ def _speeds(table: Table) -> Motion | None:
 
 
 def _throttle_scale(values: FloatArray) -> float:
-    """Return the factor to 0..1: of a share, percent (Plane), or thousandths (before 2016)."""
+    """Return the factor to 0..1: from a share, percent (Plane), or thousandths (before 2016)."""
     finite = np.abs(values[np.isfinite(values)])
     highest = float(finite.max()) if finite.size else 0.0
     return 1.0 if highest <= 1.5 else 0.01 if highest <= 110.0 else 0.001

@@ -1,5 +1,5 @@
 """
-The table of formats, told by their first bytes, and the way into those of logs.
+The table of formats, identified by their first bytes, and the entry to the log importers.
 
 To add a format: a module here with ``read(path, request) -> Log``, and a line in the table.
 """
@@ -22,7 +22,7 @@ from ou_monitor.recordings.importers.log import Log, Progress, quiet, Request
 from ou_monitor.stream.files import open_regular, plain_texts
 from ou_monitor.text import printable
 
-# Enough to tell every format; the formats of a text log come first in it.
+# Enough to identify every format; the format messages of a text log come first in it.
 HEAD = 8192  # bytes
 
 MAGIC = b'\x89MCAP0\r\n'
@@ -42,14 +42,14 @@ class Format(NamedTuple):
     fits: Callable[[bytes], bool]
     # Name of the module that reads it, beside this one; empty: not a log.
     module: str
-    # Package that it needs beyond the core, and the extra of pyproject.toml that brings it.
+    # Package needed beyond the core, and the extra of pyproject.toml that installs it.
     package: str = ''
     extra: str = ''
 
 
 def _is_text(head: bytes) -> bool:
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        # Spreadsheets write "Unicode text" so; their cells are of the first 256 characters.
+        # Spreadsheets write "Unicode text" in it; their cells use its first 256.
         head = head[2:].replace(b'\0', b'')
     # Text of other encodings than UTF-8 passes, so that its reader can name the byte.
     return bool(head) and (head[0] < 0x80 or head.startswith(codecs.BOM_UTF8)) and all(
@@ -57,7 +57,7 @@ def _is_text(head: bytes) -> bool:
 
 
 def _is_crazyflie(head: bytes) -> bool:
-    # 0xBC, version 1 or 2, and the number of events, of which the firmware has 20 at most.
+    # 0xBC, version 1 or 2, and the number of events, at most 20 in the firmware.
     return len(head) > 5 and head[0] == 0xBC and head[1:3] in (b'\1\0', b'\2\0') and (
         0 < int.from_bytes(head[3:5], 'little') <= 255)
 
@@ -139,24 +139,24 @@ def detect(path: Path) -> Format:
                      'today: ' + '; '.join(one.words for one in FORMATS if one.module))
 
 
-# Endings of tables of text; of the others the first bytes decide that none is one.
+# Endings of text tables; their first bytes must not fit another format.
 _TABLES = ('.csv', '.tsv', '.tab', '.txt', '.dat', '.asc', '.log')
 
 
 def _begins_as(path: Path) -> Format | None:
-    """Return the format of a file by its first bytes; None: none, or it cannot be read."""
+    """Return the format of a file by its first bytes; None if unknown or unreadable."""
     if not path.is_file():
         return None
     try:
         with open_regular(path) as file:
             return format_of(file.read(HEAD))
     except OSError:
-        # Whoever reads it says why it cannot be read.
+        # The reader reports why it cannot be read.
         return None
 
 
 def is_csv(path: Path) -> bool:
-    """Return whether a file is a CSV by its ending, and nothing else by its first bytes."""
+    """Return whether a file is a CSV by its ending, and not another format by its first bytes."""
     ending = path.suffix.lower()
     if ending not in _TABLES or path.is_dir():
         return False
@@ -178,7 +178,7 @@ def import_log(path: Path, request: Request) -> Log:
     try:
         module = import_module(f'{__package__}.{form.module}')
     except ImportError as error:
-        # Only what the importer itself loads is an extra; a fault of ours is not hidden.
+        # Only packages that the importer loads are extras; our own errors are not hidden.
         if not form.package or (error.name or '').split('.')[0] != form.package:
             raise
         raise InputError(
@@ -186,7 +186,7 @@ def import_log(path: Path, request: Request) -> Log:
             f'{how_to_install(form.extra)}') from error
     if request.progress is not None:
         request = replace(request, progress=_shown(request.progress))
-    # Broken bytes make numbers that no cast takes, and fields of any shape.
+    # Broken bytes give numbers that no cast accepts, and fields of any shape.
     with np.errstate(all='ignore'), quiet(path, form.package or 'ou_monitor'):
         log: Log = module.read(path, request)
     # Names in a log reach messages, tables and bags.

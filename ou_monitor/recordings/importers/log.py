@@ -1,8 +1,8 @@
 """
 What an importer returns: a `Log`, candidate `Series`, motion, with where each is from.
 
-Limits first: a log is read whole into memory, its wanted fields only.  Stamps are seconds from the
-first moment of the log, or of the flight in it; absolute time is not kept.  Importers do not
+Limits first: the wanted fields of a log are read into memory at once.  Stamps are seconds from the
+start of the log, or of the flight in it; absolute time is not kept.  Importers do not
 depend on the bag format.
 """
 
@@ -30,7 +30,7 @@ from ou_monitor.timeline.line import in_order, Picked
 # Front, right, down -> front, left, up.
 FRD_TO_FLU = np.array([1.0, -1.0, -1.0])
 DEGREE = math.pi / 180.0
-GRAVITY = 9.80665  # m/s^2, by which accelerometers are scaled
+GRAVITY = 9.80665  # m/s^2, the scale of accelerometers
 RPM = 2.0 * math.pi / 60.0
 
 
@@ -52,9 +52,9 @@ class Motion:
     # Conversion of the values, poles included; kind of series.
     scale: str
     words: str
-    # Taken when nothing of a smaller rank is there; None: only by name.
+    # Default if no smaller rank exists; None: only by name.
     rank: int | None = None
-    # Names of the motors, as in the message: ``motor_0``; of a gyro none.
+    # Names of the motors, as in the message: ``motor_0``; empty for a gyro.
     motors: tuple[str, ...] = ()
 
     @property
@@ -79,7 +79,7 @@ SIGNAL = 'signal'
 UNITS = {VOLTAGE: 'V', THROTTLE: '0..1', CURRENT: 'A'}
 UNKNOWN = '?'
 
-# Larger values come from corrupt bytes only; a message could not hold them.
+# Maximum magnitude: larger values come from corrupt bytes, and a message could not hold them.
 LARGEST = 1e9
 # Stamps of corrupt bytes: groups of fewer than _FEW samples, over _FAR from the others.
 _FAR = 3600.0  # s
@@ -102,9 +102,9 @@ class Series:
     values: FloatArray
     # Conversion from the logged value.
     scale: str
-    # What it is, for people.
+    # Description.
     words: str = ''
-    # Taken when nothing of a smaller rank is there; None: only by name.
+    # Default if no smaller rank exists; None: only by name.
     rank: int | None = None
     # The sensor; a voltage and a current of one sensor share it.
     group: str = ''
@@ -136,13 +136,13 @@ class Series:
 
     @property
     def silent(self) -> bool:
-        """Whether it never holds anything but zero or "unknown"."""
+        """Whether all values are zero or "unknown"."""
         return not bool((np.isfinite(self.values) & (self.values != 0.0)).any())
 
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """What a log file holds."""
+    """The content of a log file."""
 
     # Name of the format.
     format: str  # noqa: A003
@@ -150,11 +150,11 @@ class Log:
     series: tuple[Series, ...]
     # Vehicle, firmware, number of the flight, as far as known.
     facts: dict[str, str] = field(default_factory=dict)
-    # What was dropped or could not be read, one sentence each.
+    # Dropped or unreadable parts, one sentence each.
     notes: tuple[str, ...] = ()
     # Gyros and accelerometers.
     inertial: tuple[Motion, ...] = ()
-    # Of the motors.
+    # Speeds of the motors.
     speeds: Motion | None = None
     # Names of all series of the file, unread ones included.
     names: tuple[str, ...] = ()
@@ -164,19 +164,19 @@ class Log:
 class RawColumns:
     """Samples of a supply as a file holds them: unsorted, with repeated stamps."""
 
-    # Stamps, s; NaN where not known.
+    # Stamps, s; NaN if unknown.
     t: FloatArray
-    # V, with every repeat that the logger wrote; NaN where not known.
+    # V, with all repeats of the logger; NaN if unknown.
     voltage: FloatArray
-    # 0..1, held from its last value on; NaN where not known.
+    # 0..1, held from its last value on; NaN if unknown.
     throttle: FloatArray
-    # A, positive while the battery is drained; NaN where not known; None: unknown throughout.
+    # A, positive while the battery is drained; NaN if unknown; None: unknown throughout.
     current: FloatArray | None
-    # Of the file, printable.
+    # Name of the file, printable.
     name: str
     # Origin: file, format, chosen series, firmware.
     source: dict[str, str]
-    # What was dropped or could not be read, one sentence each.
+    # Dropped or unreadable parts, one sentence each.
     notes: tuple[str, ...] = ()
 
 
@@ -205,13 +205,13 @@ class CsvColumns:
 
 @dataclass(frozen=True)
 class Request:
-    """What an importer is asked for."""
+    """The request to an importer."""
 
-    # Which flight of a file with several.
+    # Flight of a file with several.
     flight: int | None = None
     # Series named by the user, for formats that read only wanted ones.
     names: frozenset[str] = frozenset()
-    # Magnets of a motor's rotor, where the log does not say; eRPM needs it.
+    # Magnets of a motor's rotor, if the log does not state them; needed for eRPM.
     poles: int | None = None
     # Whether all candidates are wanted (``--list``).
     everything: bool = False
@@ -245,7 +245,7 @@ def sound(t: FloatArray, rows: FloatArray) -> tuple[Picked, list[str]]:
 
 
 def clean(series: Series) -> tuple[Series, tuple[str, ...]]:
-    """Return a series with finite values and rising stamps, and notes on what was changed."""
+    """Return a series with finite values and rising stamps, and notes on changes."""
     which, notes = sound(series.t, series.values[:, None])
     values = series.values[which]
     if series.quantity == THROTTLE:

@@ -1,9 +1,9 @@
 """
 PX4 ULog, read by pyulog.
 
-Limits first: ULog has no mark at its end and no checksums, so a log that was cut
-off between two messages looks whole.  PX4 may have low-passed the voltage
-(`BATn_V_FILT`).  Which of `actuator_outputs` are motors is not in the log: they
+Limits first: ULog has no end mark and no checksums, so a log truncated
+between two messages looks complete.  PX4 may have low-passed the voltage
+(`BATn_V_FILT`).  The log does not say which `actuator_outputs` are motors: they
 are taken by name only.
 """
 
@@ -33,7 +33,7 @@ GYROS = (
     ('vehicle_angular_velocity', 'xyz', '', 1, "gyro after the autopilot's filters"),
     ('sensor_gyro', '', '', 2, 'one gyro, along the axes of its board'),
 )
-# Ends of the names of fields that state a unit.
+# Endings of names of fields that state a unit.
 ENDINGS = (('_m_s2', 'm/s^2'), ('_rad', 'rad/s'), ('_m_s', 'm/s'), ('_v', 'V'), ('_a', 'A'),
            ('_rpm', 'rpm'), ('_pa', 'Pa'), ('_celsius', 'deg C'), ('_celcius', 'deg C'),
            ('_us', 'us'), ('_ms', 'ms'), ('_hz', 'Hz'), ('_meter', 'm'))
@@ -57,8 +57,8 @@ PLAIN = (
 # Bytes before the content of a message: its length and its kind.
 HEAD = 3
 KINDS = frozenset(b'BFIMPQARDLCSO')
-# Messages of unknown kind that are larger are broken bytes to pyulog, which restarts one byte
-# behind their first.
+# Larger messages of unknown kind are broken bytes to pyulog, which restarts one byte after their
+# first.
 LARGEST = 10_000
 
 
@@ -66,8 +66,8 @@ class _Watched(io.BufferedReader):
     """
     A file that records the bytes its reader skips silently.
 
-    pyulog steps back by the length that a message claims, also where the file ended before: for
-    ever.  And it reads all of it, at each byte of a damaged part.
+    pyulog steps back by the length that a message claims even if the file ended before: an endless
+    loop.  And it reads the rest of the file at each byte of a damaged part.
     """
 
     progress: Progress | None = None
@@ -81,7 +81,7 @@ class _Watched(io.BufferedReader):
     broken = False
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Read, and note the first message of unknown kind and a message that is cut off."""
+        """Read, and record the first message of unknown kind and a truncated message."""
         if self.broken and size is not None and size > LARGEST:
             self.had, self.missing, self.broken = 0, size, False
             return bytes(size)
@@ -92,7 +92,7 @@ class _Watched(io.BufferedReader):
         self.reads += 1
         if self.progress is not None and self.reads % 16384 == 0:
             self.progress(at / self.size)
-        # The head of a message has 3 bytes: none of them is a regular end.
+        # The head of a message has 3 bytes: reading none is the regular end.
         if size is not None and len(data) < size and (data or size != HEAD):
             self.cut_at = at - len(data)
         elif data:
@@ -103,7 +103,7 @@ class _Watched(io.BufferedReader):
         return data
 
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        """Move; a step back over more than was read counts from where the reader thinks it is."""
+        """Move; a step back over more than was read counts from the reader's assumed position."""
         if whence == io.SEEK_CUR and -offset > self.had:
             offset += self.missing
         return super().seek(offset, whence)
@@ -162,7 +162,7 @@ def _declared(ulog: Any) -> Iterator[str]:
 
 
 def _others(name: str, topic: str, columns: dict[str, Any], known: set[str]) -> Iterator[Series]:
-    """Yield the fields that are nothing else, as logged."""
+    """Yield the fields of no other quantity, as logged."""
     t = np.asarray(columns['timestamp'], dtype=np.float64) * 1e-6
     rates = ('vehicle_angular_velocity', 'sensor_gyro')
     for field, values in columns.items():
@@ -221,7 +221,7 @@ def _facts(ulog: Any) -> dict[str, str]:
     if uuid.strip('0'):
         facts['vehicle'] = f'{board} {uuid}'.lstrip()
     elif board:
-        # Many vehicles have the same; simulators say that their number is 0.
+        # Many vehicles share one; simulators state 0.
         facts['board'] = board
     given = ulog.initial_parameters
     cells = given.get('BAT1_N_CELLS', given.get('BAT_N_CELLS', 0))
@@ -243,7 +243,7 @@ def _series(name: str, topic: str, columns: dict[str, Any]) -> Iterator[Series]:
             continue
         values = np.asarray(columns[field], dtype=np.float64)
         if quantity == CURRENT:
-            # The message says -1 for "not known".
+            # The message uses -1 for "unknown".
             values = np.where(values == -1.0, np.nan, values)
         one = Series(f'{name}.{field}', quantity, t, values, '1', words, rank, name)
         if quantity != THROTTLE and (one.silent or not there):
