@@ -259,7 +259,7 @@ _COMPARE = Command(
     (RECORDING, *PART,
      Option('--model', metavar='FILE.yaml', type=path_argument,
             help='simulate this model, as discover --save-model writes it; its level is moved to '
-            'that of the first seconds'),
+            'the level of the first seconds'),
      Option('--fit-until', metavar='S', type=TIME,
             help='begin of what is simulated, s after the first sample (default: half of the '
             'recording; with --model its begin)'),
@@ -289,7 +289,7 @@ _CONVERT = Command(
             help="which throttle, or 'none' (default: motors, else what is asked of them, else "
             'the stick)'),
      Option('--current', metavar='NAME',
-            help="which current, or 'none' (default: that of the sensor of the voltage)"),
+            help="which current, or 'none' (default: from the sensor of the voltage)"),
      Option('--signal', metavar='NAME', action='append', default=[],
             help='any other series, as a topic of its own; may be given several times'),
      Option('--imu', metavar='NAME', action='append', default=[],
@@ -375,7 +375,7 @@ _DISCOVER = Command(
             help='write the extended model, for simulate --model and the estimator'),
      Option('--force', action='store_true',
             help='overwrite files that exist already, and save the model even where it predicts '
-                 'worse than the plain OU or its simulations leave the range that was seen'),
+                 'worse than the plain OU or its simulations leave the recorded range'),
      REPORT),
     ('flight.mcap --report causes.html', 'flight.bbl --save-model flight.yaml --force'))
 

@@ -465,7 +465,7 @@ class Judgement:
 
     values: dict[str, Values]  # Quantity -> recordings
     trends: tuple[Trend, ...]  # All that were tested, lowest p-value first
-    recordings: dict[str, Outliers]  # Quantity -> each recording among those of its vehicle
+    recordings: dict[str, Outliers]  # Quantity -> each recording in its vehicle
     vehicles: dict[str, VehicleValues]  # Quantity -> each vehicle among the others
     # Probability of any false alarm in one of these comparisons, set so that it is `OUTLIER_RATE`
     # for all together.

@@ -65,7 +65,7 @@ COLUMNS = (
     Column('process', 'text', '', 'type of process'),
     Column('risk', 'number', '1', 'probability of a brown-out within the horizon, from the level; '
            'needs --brownout-voltage'),
-    Column('status', 'text', '', 'result of the fit: OK, SHORT_WINDOW, or why there is none'),
+    Column('status', 'text', '', 'result of the fit: OK, SHORT_WINDOW, or why it failed'),
     Column('flags', 'texts', '', 'cautions about the input'),
     Column('duration_s', 'number', 's', 'length of the recording'),
     Column('samples', 'count', '', 'samples of the recording'),

@@ -86,23 +86,23 @@ class SupplyInput:
         self._topic, self._state_topic = topics
         self._sigma = NAN
         self._state: dict[str, str] = {}
-        self._heard, self._state_heard = Silence(now), Silence(now)
+        self._sigma_silence, self._state_silence = Silence(now), Silence(now)
         self._error = NAN
         self._known = [NAN] * len(_FIELDS)
 
     @property
     def age(self) -> float | None:
         """Seconds since the last sigma; None before the first."""
-        return self._heard.age
+        return self._sigma_silence.age
 
     @property
     def state_age(self) -> float | None:
         """Seconds since the last state; None before the first."""
-        return self._state_heard.age
+        return self._state_silence.age
 
     def take_sigma(self, value: float) -> None:
         """Take a sigma, V/sqrt(s); a negative one counts as unknown."""
-        self._heard.heard()
+        self._sigma_silence.record()
         self._sigma = value if value >= 0.0 and math.isfinite(value) else NAN
 
     def take_state(self, message: Any) -> None:
@@ -110,7 +110,7 @@ class SupplyInput:
         for status in message.status:
             values = {pair.key: pair.value for pair in status.values}
             if 'sigma_se' in values:
-                self._state_heard.heard()
+                self._state_silence.record()
                 self._state = values
                 # Of ln sigma, as `AdaptiveLowPass` takes it.
                 error = _number(values, 'sigma_se')
@@ -126,7 +126,7 @@ class SupplyInput:
         at the present throttle and relaxation `rate`, 1/s: it includes the ADC's white noise,
         so it is never below the supply's own sigma.
         """
-        fresh = within(self._state_heard.age, stale_after)
+        fresh = within(self._state_silence.age, stale_after)
         error, (alpha, throttle, level, level_se, noise) = (
             (self._error, self._known) if fresh else (NAN, [NAN] * len(_FIELDS)))
         why = self._why(fresh, stale_after)
@@ -139,7 +139,7 @@ class SupplyInput:
 
     def why_no_throttle(self, stale_after: float) -> str:
         """Say why the throttle is unknown."""
-        age = self._state_heard.age
+        age = self._state_silence.age
         if age is None:
             return f'no message on {self._state_topic}'
         if not within(age, stale_after):
@@ -147,7 +147,7 @@ class SupplyInput:
         return f'the state on {self._state_topic} has no throttle'
 
     def _why(self, fresh: bool, stale_after: float) -> str:
-        age = self._heard.age
+        age = self._sigma_silence.age
         if age is None:
             return f'no message on {self._topic}'
         if not within(age, stale_after):
@@ -213,7 +213,7 @@ class MotorInputs:
                 self._throttle = values[0]
             else:
                 return
-            self._silence[source.quantity].heard()
+            self._silence[source.quantity].record()
         self._node.create_subscription(
             message, source.topic, self._node.guarded(take), INPUT_QOS)
         self._node.get_logger().info(
@@ -336,7 +336,7 @@ class AdaptiveFilterNode(MonitorNode):
     def _take_input(self, data: bytes, info: Any) -> None:
         assert self._channels is not None
         arrived = self.steady_now()
-        self._input_silence.heard(arrived)
+        self._input_silence.record(arrived)
         self._input_interval.push_one(arrived)
         try:
             message = decode(data, self._message, self._topic)

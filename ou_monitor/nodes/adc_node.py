@@ -104,7 +104,7 @@ class AdcNode(MonitorNode):
         self._output.publish(message)
         self._samples += volts.size
         self._interval = block.interval
-        self._silence.heard()
+        self._silence.record()
 
     def _poller(self, polled: PolledChannel) -> Callable[[], None]:
         """Return the loop that polls a channel at its rate."""
@@ -119,7 +119,7 @@ class AdcNode(MonitorNode):
                 message.voltage = polled.read() * self._gain + self._shift
                 self._output.publish(message)
                 self._samples += 1
-                self._silence.heard()
+                self._silence.record()
                 # Missed polls are skipped.
                 due = max(due + 1.0 / self.rate, time.monotonic())
         return work

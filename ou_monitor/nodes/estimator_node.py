@@ -104,7 +104,7 @@ class EstimatorNode(MonitorNode):
         self._due = self._published = self._diagnosed = -math.inf
         self._load, self._loaded = 0.0, self.steady_now()
         self._handed_over = -math.inf
-        self._throttle_heard = Silence(self.steady_now)
+        self._throttle_silence = Silence(self.steady_now)
         self._outputs = {key: self.create_publisher(Float64, '~/' + key, 10) for key in OUTPUTS}
         self._brownout = self.create_publisher(Bool, '~/brownout', 10)
         self._state = self.create_publisher(DiagnosticArray, '~/state', 10)
@@ -229,14 +229,14 @@ class EstimatorNode(MonitorNode):
                     voltage.arrived, throttle.arrived[k], 'left')))
                 self._take_voltages(first)
             if self._stream.take_throttles(times.item(k), bool(column.stamped[k]), values[k]):
-                self._throttle_heard.heard(throttle.arrived.item(k))
+                self._throttle_silence.record(throttle.arrived.item(k))
         return voltage
 
     def _take_voltages(self, messages: Arrivals) -> None:
         column = messages.column
         if not column.n:
             return
-        self._arrived.heard(messages.arrived.item(-1))
+        self._arrived.record(messages.arrived.item(-1))
         ends = self._times(messages, self._send_clock)
         if self._send_clock is not None and self._send_clock.settled > self._settled:
             # Earlier messages lie on another time line, and this poll may hold some of them.
@@ -250,7 +250,7 @@ class EstimatorNode(MonitorNode):
             # On simulated time they arrived at some time between two polls: use now.
             received = (np.full(ends.size, self.stamp_now()) if self._stamper.simulated
                         else messages.received)
-            self._usable.heard(messages.arrived[held].item(-1))
+            self._usable.record(messages.arrived[held].item(-1))
             self._source_clock.take(ends[held], received[held], messages.arrived[held].item(-1))
 
     def _times(self, messages: Arrivals, smooth: SendClock | None = None) -> FloatArray:
@@ -278,14 +278,14 @@ class EstimatorNode(MonitorNode):
 
     def _watch_throttle(self) -> None:
         """Invalidate a throttle that has fallen silent."""
-        age = self._throttle_heard.age
+        age = self._throttle_silence.age
         limit = self._throttle_limit()
         if age is not None and age > limit and not math.isnan(self._stream.throttle):
             self._stream.lose_throttle()
 
     def _throttle_limit(self) -> float:
         """Return the timeout of the throttle, s: three messages of a slow source."""
-        return 3.0 * max(self._monitor.settings.stale_after, self._throttle_heard.interval)
+        return 3.0 * max(self._monitor.settings.stale_after, self._throttle_silence.interval)
 
     def _jumped(self, reason: str) -> None:
         self._source_clock = SourceClock()
@@ -431,7 +431,7 @@ class EstimatorNode(MonitorNode):
 
     def _message(self, part: str, report: MonitorReport, level: Level, summary: str,
                  stamp: float) -> DiagnosticArray:
-        throttle_age = self._throttle_heard.age
+        throttle_age = self._throttle_silence.age
         arrived = self._arrived.age
         fields = {**report.fields,
                   'msg_config': self._voltage.config,

@@ -53,7 +53,7 @@ class Stamper:
         self._on_jump = on_jump
         self._map = SimClockMap()
         self._clock_input: Subscription | None = None
-        self._clock_heard = Silence(node.steady_now)
+        self._clock_silence = Silence(node.steady_now)
         self._jumps = node.get_clock().create_jump_callback(
             JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1),
                           on_clock_change=True),
@@ -69,14 +69,14 @@ class Stamper:
     @property
     def waiting(self) -> bool:
         """Whether messages without a stamp cannot be placed in time yet."""
-        age = self._clock_heard.age
+        age = self._clock_silence.age
         return self.simulated and (age is None or not self._map.ready or age > self._map.patience)
 
     def follow(self) -> None:
         """Follow `use_sim_time`, which may change at run time."""
         wanted = self._node.get_clock().ros_time_is_active
         if wanted and self._clock_input is None:
-            self._map, self._clock_heard = SimClockMap(), Silence(self._node.steady_now)
+            self._map, self._clock_silence = SimClockMap(), Silence(self._node.steady_now)
             self._clock_input = self._node.create_subscription(
                 ClockMessage, '/clock', self._node.with_info(self._clock), CLOCK_QOS)
         elif not wanted and self._clock_input is not None:
@@ -94,7 +94,7 @@ class Stamper:
         return stamp or self.source_time(float(info['source_timestamp']) * 1e-9)
 
     def _clock(self, message: Any, info: Any) -> None:
-        self._clock_heard.heard()
+        self._clock_silence.record()
         clock = message.clock.sec + message.clock.nanosec * 1e-9
         if self._map.add(float(info['source_timestamp']) * 1e-9, clock):
             self._on_jump('/clock stepped')
@@ -216,7 +216,7 @@ class Silence:
         self._last = -math.inf
         self.interval = 0.0
 
-    def heard(self, at: float | None = None) -> None:
+    def record(self, at: float | None = None) -> None:
         """Record an arrival (at in s; default: now) and the `interval` since the last one, s."""
         now = self._now() if at is None else at
         if self._last > -math.inf:

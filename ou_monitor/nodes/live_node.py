@@ -48,7 +48,7 @@ class LiveNode(Node):
         self._count = 0
         self._begin = time.monotonic()
         self._state: dict[str, str] = {}
-        self._level, self._summary, self._heard = 0, '', -math.inf
+        self._level, self._summary, self._state_arrival = 0, '', -math.inf
         self._cutoff, self._lag = math.nan, math.nan
         self._limits: dict[str, float] = {}
         self._signals: dict[str, list[float]] = {'raw': [], 'filtered': []}
@@ -73,7 +73,7 @@ class LiveNode(Node):
         status = message.status[0]
         self._state = {item.key: item.value for item in status.values}
         self._level, self._summary = status.level[0], status.message
-        self._heard = time.monotonic()
+        self._state_arrival = time.monotonic()
 
     def _take_cutoff(self, message: Any) -> None:
         self._cutoff = message.data
@@ -128,7 +128,7 @@ class LiveNode(Node):
 
     def _add_row(self) -> None:
         now = time.monotonic()
-        silent = now - self._heard
+        silent = now - self._state_arrival
         row: dict[str, Any] = {
             't': now - self._begin, 'silent': None if math.isinf(silent) else silent,
             'limit': self._limits.get(_SHOWN[0]), 'horizon': self._limits.get(_SHOWN[1])}

@@ -158,7 +158,7 @@ class SupplySimulatorNode(MonitorNode):
         self._throttle_source = self._sources.sources.get('throttle')
         self._played = self._play(values['throttle.play'])
         self._input: PolledInput | None = None
-        self._heard = Silence(self.steady_now)
+        self._throttle_silence = Silence(self.steady_now)
         self._throttle, self._turn = 0.0, -1
         self._watched = PublisherWatch()
         self.create_service(Trigger, '~/reset', self.guarded(self._on_reset))
@@ -241,14 +241,14 @@ class SupplySimulatorNode(MonitorNode):
             good = np.flatnonzero(np.abs(found.column.values) <= _MOST_THROTTLE)
             if good.size:
                 self._throttle = min(max(float(found.column.values[good[-1]]), 0.0), 1.0)
-                self._heard.heard()
+                self._throttle_silence.record()
         if self._idles:
             self._throttle = 0.0
         return self._throttle
 
     @property
     def _idles(self) -> bool:
-        return not within(self._heard.age, _HOLD)
+        return not within(self._throttle_silence.age, _HOLD)
 
     # -- the thread
 
@@ -319,7 +319,7 @@ class SupplySimulatorNode(MonitorNode):
             self._throttle_source.topic)
         voltage = self.resolve_topic_name(self._voltage.source.topic)
         if self._played is None and self._needs_throttle and self._idles:
-            age = self._heard.age
+            age = self._throttle_silence.age
             notes.append(f'No throttle {f"on {topic}" if topic else "in this msg_config"}'
                          + ('' if age is None else f' for {age:.1f} s') + ': it idles.')
         notes += [*filter(None, self._sources.problems.values()), *self._watched.notes(topic)]

@@ -312,7 +312,7 @@ class McapFile:
             try:
                 op, length = _frame(file, index.offset, self._size, True)
                 if op != Opcode.METADATA:
-                    raise Damage(f'at byte {index.offset} is none')
+                    raise Damage(f'it is missing at byte {index.offset}')
                 self._learn_about(file, length)
             except Damage as error:
                 self.notes.append(f'Metadata of {printable(self.path.name)} cannot be read '

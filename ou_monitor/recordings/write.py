@@ -272,7 +272,7 @@ def write_log(
 
 def encode(kind: str, stamps: Stamps, values: FloatArray, block: int = BLOCK,
            ) -> Iterator[tuple[int, bytes]]:
-    """Yield messages of numbers with their log times, ns, by blocks that of the last sample."""
+    """Yield messages of numbers with their log times, ns (a block's: its last sample's)."""
     if kind == FLOAT32_ARRAY:
         whole = stamps.size - stamps.size % block
         yield from zip(stamps[block - 1:whole:block].tolist(),

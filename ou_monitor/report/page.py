@@ -54,7 +54,7 @@ def embed(plot: Plot, most: int = MOST) -> str:
     for curve in drawn:
         every = 1
         if curve in long:
-            # Two points stand for `every` samples of a line, one for those of a band.
+            # `every` samples become two points of a line, one point of a band.
             room = most // len(long) // (1 if curve.kind == 'band' else 2)
             every = max(math.ceil(curve.x.size / max(room, 1)), 1)
             curve = envelope(curve, every)

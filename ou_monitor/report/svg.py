@@ -121,7 +121,7 @@ def span(values: list[FloatArray], log: bool = False, pad: float = 0.05,
 
 
 def extremes(y: FloatArray, every: int) -> npt.NDArray[np.intp]:
-    """Return where each so many samples are lowest and highest, and where they break off (NaN)."""
+    """Return each group's lowest and highest sample, and where they break off (NaN)."""
     start = np.arange(0, y.size, every)
     group = np.arange(y.size) // every
     kept = []

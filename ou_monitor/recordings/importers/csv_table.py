@@ -132,7 +132,7 @@ def form_of(path: Path, wanted: CsvColumns) -> Form:
             if found and (best is None or found[0] > best[0]):
                 best = found
     if best is None:
-        raise InputError(f'{path}: the header cannot be told from the numbers: --delimiter, '
+        raise InputError(f'{path}: the header cannot be separated from the numbers: --delimiter, '
                          '--decimal and --skip-rows say how it is written')
     return best[1]
 
@@ -350,7 +350,7 @@ def _blocks(path: Path, file: TextIO, form: Form, width: int,
 
 
 def _lines(path: Path, file: TextIO, form: Form) -> Iterator[list[str]]:
-    """Yield lines, those of comments blank, a chunk at a time."""
+    """Yield lines, a chunk at a time; comments are blank."""
     rest, number = '', 0
     while text := file.read(_CHUNK):
         lines = io.StringIO(rest + text).readlines()
