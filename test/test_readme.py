@@ -304,7 +304,7 @@ def test_continuous_integration_runs_the_suite():
 def test_the_limit_is_documented_as_it_is():
     """The volts a cell of --cells alone, and what no cell has."""
     text = ' '.join((ROOT / 'doc/commands.md').read_text().split())
-    assert f'`--cells N` alone takes {CELL_LIMIT:g} V a cell' in text
+    assert f'`--cells N` alone means {CELL_LIMIT:g} V per cell' in text
     args = argparse.Namespace(brownout_voltage=3.5, cells=4)
     assert brownout_limit(args) == 14.0 and '`--cells 4 --brownout-voltage 3.5` is 14 V' in text
     for name in ('analyze', 'compare', 'coupling', 'discover', 'fleet'):
