@@ -81,15 +81,15 @@ def find_device(device: str, sysfs: Path) -> Path:
     driver ('ads1015').
     """
     if not device:
-        raise InputError(f'no device given; available: {_known(sysfs)}')
+        raise InputError(f'no device given; available: {_names(sysfs)}')
     if '/' in device:
         path = Path(device)
         if not path.is_dir():
-            raise InputError(f'no such device: {path} is not a folder; available: {_known(sysfs)}')
+            raise InputError(f'no such device: {path} is not a folder; available: {_names(sysfs)}')
         return path
     found = [path for path in _all(sysfs) if device in (path.name, _name(path))]
     if not found:
-        raise InputError(f"no such device: '{device}'; available: {_known(sysfs)}")
+        raise InputError(f"no such device: '{device}'; available: {_names(sysfs)}")
     if len(found) > 1:
         raise InputError(f"several devices are called '{device}': give one of "
                          f"{', '.join(path.name for path in found)}")
@@ -108,7 +108,7 @@ def _name(path: Path) -> str:
         return ''
 
 
-def _known(sysfs: Path) -> str:
+def _names(sysfs: Path) -> str:
     return ', '.join(f'{path.name} ({_name(path)})' for path in _all(sysfs)) or 'none'
 
 

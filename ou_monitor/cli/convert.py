@@ -66,7 +66,7 @@ def _convert(args: argparse.Namespace, log: Any) -> int:
     notes = (*log.notes, *chosen.notes, *extras.notes, *moved)
     volts = chosen.voltage
     duration = float(volts.t[-1] - volts.t[0])
-    taken = _taken(chosen, extras)
+    taken = _topic_contents(chosen, extras)
     parts: list[Part] = [
         Table(['topic', 'from', 'what it is', 'samples', 'unit', 'message'], [
             [topic, one['field'], one['what'], str(one['n']), one['unit'], topics[topic]]
@@ -80,7 +80,7 @@ def _convert(args: argparse.Namespace, log: Any) -> int:
     return 0
 
 
-def _taken(chosen: Any, extras: Any) -> dict[str, dict[str, Any]]:
+def _topic_contents(chosen: Any, extras: Any) -> dict[str, dict[str, Any]]:
     """Return what each topic holds."""
     found = {'/voltage': chosen.voltage, '/throttle': chosen.throttle,
              '/current': chosen.current, **{f'/{k}': one for k, one in extras.signals.items()}}

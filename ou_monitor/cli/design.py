@@ -22,13 +22,13 @@ def _list(args: argparse.Namespace) -> None:
     network = PowerNetwork()
     values = asdict(network)
     output.tell(args, Document('Components', '', (), [Table(['component', 'default', 'unit'], [
-        [name, _shown(value, network), UNITS.get(name, '')]
+        [name, _default_words(value, network), UNITS.get(name, '')]
         for name, value in values.items()], left=[0, 2])]), lambda: {
             name: {'default': network.line_feedthrough if value is None else value,
                    'unit': UNITS.get(name, '')} for name, value in values.items()})
 
 
-def _shown(value: object, network: PowerNetwork) -> str:
+def _default_words(value: object, network: PowerNetwork) -> str:
     if value is None:
         return f'{network.line_feedthrough:.4g}'
     return str(value).lower() if isinstance(value, bool) else f'{value:g}'

@@ -53,18 +53,18 @@ class Progress:
         if not self._live:
             if now - self._told >= _EVERY and share < 1.0 and not self._quiet:
                 self._told = now
-                self._write(f'{self._label}: {share:.0%} done{self._left(share, now)}\n')
+                self._write(f'{self._label}: {share:.0%} done{self._remaining_time(share, now)}\n')
             return
         if now - self._drawn < 0.1 and share < 1.0:
             return
         self._drawn = now
-        left = self._left(share, now)
+        left = self._remaining_time(share, now)
         width = min(40, shutil.get_terminal_size().columns - len(self._label) - 12 - len(left))
         full = int(width * min(max(share, 0.0), 1.0))
         bar = f"[{'#' * full}{'.' * (width - full)}] " if width >= 5 else ''
         self._write(f'\r{self._label} {bar}{share:4.0%}{left}\x1b[K')
 
-    def _left(self, share: float, now: float) -> str:
+    def _remaining_time(self, share: float, now: float) -> str:
         """Return the remaining time, estimated from the share done; '' if it is too early."""
         began, first = self._first or (now, share)
         passed, done = now - began, share - first

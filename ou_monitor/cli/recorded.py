@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 def analyze(args: argparse.Namespace) -> int:
     """Run `analyze`: the paper's Tables 1 and 2 for a recording."""
-    given = _given(args, 'levels', 'window', 'brownout_horizon')
+    given = _bench_arguments(args, 'levels', 'window', 'brownout_horizon')
     recording, _ = read_given(args)
     with Progress('analyzing', args.json == output.STDOUT) as progress:
         found = bench.analyze(recording, progress=progress, **given)
@@ -35,7 +35,7 @@ def compare(args: argparse.Namespace) -> int:
     """Run `compare`: a recording beside simulations of it."""
     from ou_monitor.recordings.model_file import read_model
 
-    given = _given(args, 'fit_until', 'seeds', 'seed')
+    given = _bench_arguments(args, 'fit_until', 'seeds', 'seed')
     model = None if args.model is None else read_model(args.model).model
     recording, _ = read_given(args)
     with Progress('comparing', args.json == output.STDOUT) as progress:
@@ -46,7 +46,7 @@ def compare(args: argparse.Namespace) -> int:
 
 def coupling(args: argparse.Namespace) -> int:
     """Run `coupling`: supply noise in a signal."""
-    given = _given(args, 'band', 'level')
+    given = _bench_arguments(args, 'band', 'level')
     recording, series = read_given(args, args.signal)
     assert series is not None
     t, values = series.t, series.values
@@ -62,7 +62,7 @@ def coupling(args: argparse.Namespace) -> int:
 
 def discover(args: argparse.Namespace) -> int:
     """Run `discover`: what the simulation gets wrong, why, and the gain."""
-    given = _given(args, 'seed')
+    given = _bench_arguments(args, 'seed')
     recording, _ = read_given(args)
     with Progress('discovering', args.json == output.STDOUT) as progress:
         finding = bench.discover(recording, progress=progress, **given)
@@ -86,7 +86,7 @@ def reproduce(args: argparse.Namespace) -> int:
     return 0
 
 
-def _given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
+def _bench_arguments(args: argparse.Namespace, *names: str) -> dict[str, Any]:
     """Return some arguments and the limit for a function of `bench`; check paths and ranges."""
     from ou_monitor.online.settings import ESTIMATOR_PARAMETERS
 

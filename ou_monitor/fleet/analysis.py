@@ -82,12 +82,12 @@ def _analysed(path: str, options: Options) -> dict[str, Any]:
             'vehicle': recording.source.get('vehicle', ''),
             'start': start if _EPOCH <= start < _LATEST else NAN, 'duration_s': recording.duration,
             'samples': recording.n, 'rate_hz': (recording.n - 1) / recording.duration,
-            **_seen(analysis.overview), 'supply': facts.to_dict(),
+            **_facts(analysis.overview), 'supply': facts.to_dict(),
             'risk_max': float(known.max()) if known.size else NAN,
             'alpha_p': analysis.alpha_test.p_value,
             'quality': [f'{item.severity.value}: {item.text}' for item in analysis.quality],
             'levels': [_level(level, options) for level in analysis.levels],
-            'notes': list(analysis.notes), **_discovered(recording, options)}
+            'notes': list(analysis.notes), **_discovery(recording, options)}
 
 
 def _level(level: LevelResult, options: Options) -> dict[str, Any]:
@@ -107,7 +107,7 @@ def _level(level: LevelResult, options: Options) -> dict[str, Any]:
         'flags': [flag.name for flag in e.flags]}
 
 
-def _seen(found: Overview) -> dict[str, float]:
+def _facts(found: Overview) -> dict[str, float]:
     """Return the facts that the table compares: lowest voltage, dips and sag."""
     lowest, dips, sag = found.facts.lowest, found.facts.dips, found.facts.sag
     there = found.sag if sag.known else (NAN, NAN, NAN)
@@ -119,7 +119,7 @@ def _seen(found: Overview) -> dict[str, float]:
         'sag_full_se': sag.se_v[-1] if sag.known else NAN}
 
 
-def _discovered(recording: Recording, options: Options) -> dict[str, Any]:
+def _discovery(recording: Recording, options: Options) -> dict[str, Any]:
     if not options.discover:
         return {'verdict': None, 'causes': None, 'gain': NAN, 'gain_se': NAN}
     from ou_monitor.discovery.discover import discover

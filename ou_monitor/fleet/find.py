@@ -127,10 +127,10 @@ class _Search:
         """Return what was skipped, one sentence per kind."""
         found = []
         if self._csv:
-            found.append(_passed(self._csv, '.csv file', 'without columns of time and voltage'))
+            found.append(_skipped(self._csv, '.csv file', 'without columns of time and voltage'))
         if self._logs:
-            found.append(_passed(self._logs, 'file', 'with the ending of a log, but not one that '
-                                 'can be read'))
+            found.append(_skipped(self._logs, 'file', 'with the ending of a log, but not one that '
+                                  'can be read'))
         found += [f'The folder {text} cannot be searched.' for text in self._closed]
         return found
 
@@ -146,7 +146,7 @@ def _walk(root: Path, onerror: Callable[[OSError], None] | None = None,
         yield folder, inner, names
 
 
-def _passed(paths: Sequence[Path], what: str, why: str) -> str:
+def _skipped(paths: Sequence[Path], what: str, why: str) -> str:
     many = '' if len(paths) == 1 else 's'
     return f"{len(paths)} {what}{many} passed over, such as '{paths[0]}': {why}."
 

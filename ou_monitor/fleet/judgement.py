@@ -502,7 +502,7 @@ def judge(rows: Sequence[Row], seed: int = 0) -> Judgement:
         trend = np.zeros(one.value.size)
         for t in drifting:
             if t.quantity == name:
-                mine = _of(one, t.vehicle) & (one.flights > 0)
+                mine = _is_of_vehicle(one, t.vehicle) & (one.flights > 0)
                 trend[mine] = t.line(one.flights[mine].astype(np.float64)) - t.line(np.array(
                     0.5 * (t.first + t.last)))
         recordings[name] = outliers(one.value, one.error, one.vehicles, rate, trend, seed=seed)
@@ -510,7 +510,7 @@ def judge(rows: Sequence[Row], seed: int = 0) -> Judgement:
     return Judgement(values, tested, recordings, vehicles, rate)
 
 
-def _of(values: Values, vehicle: str) -> npt.NDArray[np.bool_]:
+def _is_of_vehicle(values: Values, vehicle: str) -> npt.NDArray[np.bool_]:
     mine: npt.NDArray[np.bool_] = np.array(values.vehicles, dtype=str) == vehicle
     return mine
 
@@ -521,7 +521,7 @@ def _vehicles(values: Values, within: Outliers, rate: float, seed: int) -> Vehic
     scatter = float(np.nan_to_num(within.scatter))
     value, error = np.zeros(len(names)), np.zeros(len(names))
     for k, name in enumerate(names):
-        mine = _of(values, name)
+        mine = _is_of_vehicle(values, name)
         value[k] = np.median(values.value[mine])
         one = np.sqrt(np.mean(scatter ** 2 + values.error[mine] ** 2) / mine.sum())
         # The median of two is their mean.

@@ -114,16 +114,16 @@ def rows_of(source: FoundRecording, result: Mapping[str, Any], vehicle: Vehicle,
         duplicate_of=None if duplicate_of is None else printable(duplicate_of))
     if duplicate_of is not None or result['error']:
         return [base]
-    base.update({name: _known(value) for name, value in result.items()
+    base.update({name: _null_if_unknown(value) for name, value in result.items()
                  if name in base and name not in _OTHERWISE})
     start = result['start']
     base['start'] = (datetime.fromtimestamp(start, timezone.utc)
                      if math.isfinite(start) else None)
-    return [{**base, **{name: _known(value) for name, value in level.items()}}
+    return [{**base, **{name: _null_if_unknown(value) for name, value in level.items()}}
             for level in result['levels'] or [{}]]
 
 
-def _known(value: Any) -> Any:
+def _null_if_unknown(value: Any) -> Any:
     """Return a value; None for an unknown number."""
     return None if isinstance(value, float) and math.isnan(value) else value
 

@@ -88,7 +88,7 @@ class SupplyInput:
         self._state: dict[str, str] = {}
         self._sigma_silence, self._state_silence = Silence(now), Silence(now)
         self._error = NAN
-        self._known = [NAN] * len(_FIELDS)
+        self._values = [NAN] * len(_FIELDS)
 
     @property
     def age(self) -> float | None:
@@ -115,7 +115,7 @@ class SupplyInput:
                 # Of ln sigma, as `AdaptiveLowPass` takes it.
                 error = _number(values, 'sigma_se')
                 self._error = error if error >= 0.0 else NAN
-                self._known = [_number(values, key) for key in _FIELDS]
+                self._values = [_number(values, key) for key in _FIELDS]
                 return
 
     def now(self, stale_after: float, rate: float = NAN) -> KnownSupply:
@@ -128,7 +128,7 @@ class SupplyInput:
         """
         fresh = within(self._state_silence.age, stale_after)
         error, (alpha, throttle, level, level_se, noise) = (
-            (self._error, self._known) if fresh else (NAN, [NAN] * len(_FIELDS)))
+            (self._error, self._values) if fresh else (NAN, [NAN] * len(_FIELDS)))
         why = self._why(fresh, stale_after)
         if why and noise > 0.0 and rate > 0.0:
             return KnownSupply(noise * math.sqrt(2.0 * rate), throttle=throttle, source='load')
@@ -351,8 +351,8 @@ class AdaptiveFilterNode(MonitorNode):
             self._dropped += 1
             return
         stamp = self._input_clock.time_of(stamp, arrived)
-        supply = self._known()
-        values = self._notched(stamp, values, supply)
+        supply = self._supply_now()
+        values = self._apply_notches(stamp, values, supply)
         self._output.publish(self._channels.put(message, [
             channel.step(stamp, value, supply.sigma, supply.sigma_se, supply.alpha,
                          supply.throttle, supply.level, supply.level_se)
@@ -360,8 +360,8 @@ class AdaptiveFilterNode(MonitorNode):
             self.low_pass.noise_left))
         self._passed += 1
 
-    def _notched(self, stamp: float, values: Sequence[float], supply: KnownSupply
-                 ) -> Sequence[float]:
+    def _apply_notches(self, stamp: float, values: Sequence[float], supply: KnownSupply
+                       ) -> Sequence[float]:
         """Return the signals after the notches; in shadow mode unchanged."""
         if not self._notch.settings.count and not self._notch.active:
             return values
@@ -378,7 +378,7 @@ class AdaptiveFilterNode(MonitorNode):
         notched = 0.0 if s.shadow else max(self._notch.delays(s.lag_frequency), default=0.0)
         return self.low_pass.delay + notched
 
-    def _known(self) -> KnownSupply:
+    def _supply_now(self) -> KnownSupply:
         return self._supply.now(self.low_pass.settings.stale_after,
                                 self.low_pass.settings.alpha)
 
@@ -393,7 +393,7 @@ class AdaptiveFilterNode(MonitorNode):
         self._lag_output.publish(Float64(data=1e3 * self._delay))
 
     def _diagnose(self) -> None:
-        supply, low_pass = self._known(), self.low_pass
+        supply, low_pass = self._supply_now(), self.low_pass
         settings = low_pass.settings
         level, summary = self._judge(supply)
         if self.fault_notes:

@@ -156,7 +156,7 @@ class SendClock:
         lump = len(times) >= LUMP and times[-1] - times[0] < SHORT * gap
         self._lumps = self._lumps + 1 if lump else 0
         if self._lumps > 1:
-            self._tell(True)
+            self._record_bursts(True)
 
     @property
     def _gap(self) -> float:
@@ -183,10 +183,10 @@ class SendClock:
             self._period, self._doubts = period, 0
         elif self._doubts > len(times):
             self._period = math.nan
-        if not self._tell(bursts and math.isnan(self._period)):
+        if not self._record_bursts(bursts and math.isnan(self._period)):
             self._last = end - self._period
 
-    def _tell(self, in_bursts: bool) -> bool:
+    def _record_bursts(self, in_bursts: bool) -> bool:
         """Record whether times are unusable; return false when they become usable."""
         settled = self.in_bursts and not in_bursts
         self.settled += settled

@@ -174,7 +174,7 @@ class EstimatorNode(MonitorNode):
     def _watch(self) -> None:
         """Check the publishers, 5 times a second."""
         self._stamper.follow()
-        self._look_at_publishers()
+        self._check_publishers()
         if self._arrived.age is None and not self._sources.problems['voltage']:
             self._console.waiting(self._voltage.topic)
         self._sources.watch()
@@ -360,7 +360,7 @@ class EstimatorNode(MonitorNode):
             summary = f'Waiting for a publisher on {self._topic}.'
         elif silent and within(self._arrived.age, limit) and not within(
                 self._usable.age, max(report.patience, self._arrived.age or 0.0)):
-            summary = self._useless()
+            summary = self._why_unusable()
         elif silent and not self.count_publishers(self._topic):
             summary = f'No publisher on {self._topic}: {report.summary}'
         notes = self._notes()
@@ -383,14 +383,14 @@ class EstimatorNode(MonitorNode):
             notes += self._watched.notes(self._topic)
         return notes
 
-    def _look_at_publishers(self) -> None:
+    def _check_publishers(self) -> None:
         """Record who publishes the voltage, and the messages lost."""
         voltage = self._inputs.get('voltage')
         if voltage is not None:
             self._watched.look(self.get_publishers_info_by_topic(self._topic),
                                voltage.publishers, self.steady_now())
 
-    def _useless(self) -> str:
+    def _why_unusable(self) -> str:
         """Say why arriving messages hold no usable voltage."""
         if self._stamper.waiting and self._stream.unplaced:
             return ('Messages without a stamp cannot be placed in time: use_sim_time is set, but '

@@ -60,7 +60,7 @@ class LiveNode(Node):
         self._ask = self.create_client(GetParameters, f'{estimator}/get_parameters')
         self._answer: Any = None
         self.create_timer(PERIOD, self._add_row)
-        self.create_timer(_LOOK, self._look)
+        self.create_timer(_LOOK, self._find_signals)
 
     def rows(self, after: int) -> list[dict[str, Any]]:
         """Return the rows with larger numbers."""
@@ -81,7 +81,7 @@ class LiveNode(Node):
     def _take_lag(self, message: Any) -> None:
         self._lag = message.data
 
-    def _look(self) -> None:
+    def _find_signals(self) -> None:
         """Subscribe to the filter's signals once they exist; request the limit."""
         if self._answer is not None and self._answer.done():
             values = self._answer.result().values

@@ -234,7 +234,7 @@ class SupplySimulatorNode(MonitorNode):
         kind, spec = source.open()
         self._input = PolledInput(self, kind, source.topic, spec)
 
-    def _hear(self) -> float:
+    def _newest_throttle(self) -> float:
         """Return the throttle now: the newest, held for a second; then 0."""
         found = None if self._input is None else self._input.take()
         if found is not None:
@@ -242,12 +242,12 @@ class SupplySimulatorNode(MonitorNode):
             if good.size:
                 self._throttle = min(max(float(found.column.values[good[-1]]), 0.0), 1.0)
                 self._throttle_silence.record()
-        if self._idles:
+        if self._is_idle:
             self._throttle = 0.0
         return self._throttle
 
     @property
-    def _idles(self) -> bool:
+    def _is_idle(self) -> bool:
         return not within(self._throttle_silence.age, _HOLD)
 
     # -- the thread
@@ -295,7 +295,7 @@ class SupplySimulatorNode(MonitorNode):
 
     def _throttle_at(self, times: FloatArray) -> FloatArray:
         if self._played is None:
-            return np.full(times.size, self._hear())
+            return np.full(times.size, self._newest_throttle())
         profile, length, _ = self._played
         throttle = profile(times % length if math.isfinite(length) else times)
         self._throttle = float(throttle[-1])
@@ -318,7 +318,7 @@ class SupplySimulatorNode(MonitorNode):
         topic = '' if self._throttle_source is None else self.resolve_topic_name(
             self._throttle_source.topic)
         voltage = self.resolve_topic_name(self._voltage.source.topic)
-        if self._played is None and self._needs_throttle and self._idles:
+        if self._played is None and self._needs_throttle and self._is_idle:
             age = self._throttle_silence.age
             notes.append(f'No throttle {f"on {topic}" if topic else "in this msg_config"}'
                          + ('' if age is None else f' for {age:.1f} s') + ': it idles.')

@@ -377,7 +377,7 @@ def check_classes(rates: FloatArray) -> None:
 Scaling = Literal['averaging', 'diffusion']
 
 
-def _left_out() -> FloatArray:
+def _no_values() -> FloatArray:
     return np.empty(0)
 
 
@@ -388,10 +388,10 @@ class SwitchedSystem:
     generator: Generator  # The chain, n states
     matrices: FloatArray  # A_x, 1/s; shape (n, d, d)
     # a_x, unit of u per second; zeros when left out; shape (n, d).
-    offsets: FloatArray = field(default_factory=_left_out)
+    offsets: FloatArray = field(default_factory=_no_values)
     # D, 1/s: not switched, not sped up; zeros when left out; shape (d, d).
-    drift_matrix: FloatArray = field(default_factory=_left_out)
-    drift_offset: FloatArray = field(default_factory=_left_out)  # d, likewise; shape (d,)
+    drift_matrix: FloatArray = field(default_factory=_no_values)
+    drift_offset: FloatArray = field(default_factory=_no_values)  # d, likewise; shape (d,)
 
     def __post_init__(self) -> None:
         """Check the shapes and fill in the zeros."""

@@ -204,7 +204,7 @@ class BagReader:
                     raise InputError(f"{self.path}: topic '{topic.name}' has two types, "
                                      f'{known} and {topic.type}')
                 schema = self._schemas.setdefault(topic.type, topic.schema)
-                if schema.data != topic.schema.data and not _alike(schema, topic.schema):
+                if schema.data != topic.schema.data and not _same_fields(schema, topic.schema):
                     raise InputError(f'{self.path}: type {topic.type} has two definitions, which '
                                      'differ: read the files of the bag one by one')
                 self.counts[topic.name] = (
@@ -275,7 +275,7 @@ class BagReader:
         return wanted
 
 
-def _alike(schema: Any, other: Any) -> bool:
+def _same_fields(schema: Any, other: Any) -> bool:
     """Return whether two definitions of a type have the same fields."""
     with suppress(Exception):
         one, two = (parse_definition(each.name, each.data.decode('utf-8', 'replace'))
@@ -369,7 +369,7 @@ class BagWriter:
                 self._folder.mkdir()
             self._file = self._mcap.open('xb')
         except OSError as error:
-            raise self._cannot(error) from error
+            raise self._write_error(error) from error
         self._topics: dict[str, str] = {}
         self._channels: dict[str, int] = {}
         self._counts: dict[str, int] = {}
@@ -381,7 +381,7 @@ class BagWriter:
         if self._about:
             self._writer.add_metadata(ABOUT, self._about)
 
-    def _cannot(self, error: OSError) -> InputError:
+    def _write_error(self, error: OSError) -> InputError:
         return InputError(f'cannot write {self.path}: {error.strerror}')
 
     def add_topic(
@@ -420,7 +420,7 @@ class BagWriter:
             self._writer.add_message(
                 self._channels[name], t_ns, data, t_ns, self._counts[name])
         except OSError as error:
-            raise self._cannot(error) from error
+            raise self._write_error(error) from error
         self._counts[name] += 1
         self._start_ns = t_ns if self._start_ns is None else min(t_ns, self._start_ns)
         self._end_ns = max(t_ns, self._end_ns)
@@ -438,7 +438,7 @@ class BagWriter:
                                self._start_ns or 0, self._end_ns, self._about)
         except OSError as error:
             self._remove()
-            raise self._cannot(error) from error
+            raise self._write_error(error) from error
 
     def _remove(self) -> None:
         """Remove the files that this object has written."""

@@ -60,15 +60,15 @@ def choose(
                 f"{path}: topic '{topic}' is {topics[topic]}, but msg config '{config.name}' "
                 f'expects {config.voltage.type}: choose another with --msg-config')
     else:
-        found = _named(config.voltage, topics) or _only_of_type(config, topics)
+        found = _by_name(config.voltage, topics) or _only_of_type(config, topics)
         if not found:
-            raise InputError(_not_there(path, config, topics))
+            raise InputError(_topic_error(path, config, topics))
         if len(found) > 1:
             raise InputError(f'{path}: several topics fit: {some(found)}; choose with '
                              '--voltage-topic')
         topic = found[0]
     throttle, notes = _throttle(path, config, topics, topic, throttle_topic)
-    others = [name for name in _alike(config.voltage, topics) if name != topic]
+    others = [name for name in _by_suffix(config.voltage, topics) if name != topic]
     if voltage_topic is None and others:
         notes = (*notes, f'{topic} was taken for the voltage; {some(others)} would fit too: '
                          'choose with --voltage-topic.')
@@ -85,15 +85,15 @@ def _absolute(topic: str) -> str:
     return '/' + topic.lstrip('/')
 
 
-def _named(spec: FieldSpec, topics: Mapping[str, str]) -> list[str]:
+def _by_name(spec: FieldSpec, topics: Mapping[str, str]) -> list[str]:
     """Return the topics that match a spec by name and type."""
     exact = _absolute(spec.topic)
     if topics.get(exact) == spec.type:
         return [exact]
-    return _alike(spec, topics)
+    return _by_suffix(spec, topics)
 
 
-def _alike(spec: FieldSpec, topics: Mapping[str, str]) -> list[str]:
+def _by_suffix(spec: FieldSpec, topics: Mapping[str, str]) -> list[str]:
     """Return the topics of a spec's type that end with its name."""
     return sorted(name for name, kind in topics.items()
                   if kind == spec.type and name.endswith(_absolute(spec.topic)))
@@ -101,7 +101,7 @@ def _alike(spec: FieldSpec, topics: Mapping[str, str]) -> list[str]:
 
 def _only_of_type(config: MsgConfig, topics: Mapping[str, str]) -> list[str]:
     """Return the topics of the voltage's type that are not the throttle by name."""
-    taken = set() if config.throttle is None else set(_named(config.throttle, topics))
+    taken = set() if config.throttle is None else set(_by_name(config.throttle, topics))
     return sorted(name for name, kind in topics.items()
                   if kind == config.voltage.type and name not in taken)
 
@@ -110,7 +110,7 @@ def _detect(path: Path, topics: Mapping[str, str], voltage_topic: str | None) ->
     configs = list(list_msg_configs().values())
     considered = topics if voltage_topic is None else {
         _absolute(voltage_topic): topics[_absolute(voltage_topic)]}
-    fitting = [config for config in configs if _named(config.voltage, considered)]
+    fitting = [config for config in configs if _by_name(config.voltage, considered)]
     if not fitting:
         # A topic named by the user decides by its type; otherwise the throttle's topic must be
         # known, to exclude it.
@@ -128,7 +128,7 @@ def _detect(path: Path, topics: Mapping[str, str], voltage_topic: str | None) ->
         f"--msg-config one of {', '.join(c.name for c in configs)}, or a YAML file of your own")
 
 
-def _not_there(path: Path, config: MsgConfig, topics: Mapping[str, str]) -> str:
+def _topic_error(path: Path, config: MsgConfig, topics: Mapping[str, str]) -> str:
     wanted = _absolute(config.voltage.topic)
     kind = topics.get(wanted)
     if kind is not None:
@@ -168,7 +168,7 @@ def _throttle(
                          'config reads: name one in a YAML file of your own')
     if spec is None:
         return None, (f"Msg config '{config.name}' has no throttle: it is unknown.",)
-    found = _named(spec, topics)
+    found = _by_name(spec, topics)
     if not found and not config.generic:
         found = [name for name, kind in topics.items() if kind == spec.type and name != voltage]
     # In a bag of several vehicles take the one beside the voltage.

@@ -134,14 +134,14 @@ class Place:
 
     def column(self, rows: Rows) -> FloatArray:
         """Return the numbers of many messages."""
-        raw = self._seen(rows)
+        raw = self._view(rows)
         return (raw != 0 if self.kind.endswith('?') else raw).astype(np.float64)
 
     def fill(self, rows: Rows, values: npt.ArrayLike) -> None:
         """Write the numbers of many messages."""
-        self._seen(rows)[...] = values
+        self._view(rows)[...] = values
 
-    def _seen(self, rows: Rows) -> npt.NDArray[Any]:
+    def _view(self, rows: Rows) -> npt.NDArray[Any]:
         kind = np.dtype('u1' if self.kind.endswith('?') else self.kind)
         shape = rows.shape[:1] if self.size is None else (rows.shape[0], self.size)
         if 0 in shape:
@@ -407,7 +407,7 @@ class FieldReader:
         kept, refused = np.ones(n, np.bool_), dict[int, str]()
         # A damaged message may hold a signalling NaN, of which NumPy would warn.
         with np.errstate(invalid='ignore'):
-            for picked, rows, layout in self._alike(table, refused):
+            for picked, rows, layout in self._groups(table, refused):
                 # A slice is written far faster than places are.
                 at = slice(None) if picked.size == n else picked
                 stamp[at] = self._stamps(layout, rows)
@@ -438,8 +438,8 @@ class FieldReader:
         return column._replace(values=zero.apply(column.values),
                                beside=others[0].apply(column.beside) if others else column.beside)
 
-    def _alike(self, table: MessageTable, refused: dict[int, str],
-               ) -> Iterator[tuple[IntArray, Rows, Layout]]:
+    def _groups(self, table: MessageTable, refused: dict[int, str],
+                ) -> Iterator[tuple[IntArray, Rows, Layout]]:
         """Yield indices, rows and layout of messages alike; note why others are refused."""
         lengths = table.end - table.begin
         # A comparison costs a tenth of a sort, and most messages of a topic are of one length.

@@ -341,7 +341,7 @@ def _transients(analysis: Analysis) -> list[Part]:
 
 
 def _drawn_relaxation(analysis: Analysis, fit: Relaxation) -> Callable[[], list[Part]]:
-    return lambda: [Figure(_relaxing(analysis, fit))]
+    return lambda: [Figure(_relaxation_plot(analysis, fit))]
 
 
 def _relaxation_sentence(analysis: Analysis, k: int) -> str:
@@ -356,7 +356,7 @@ def _relaxation_sentence(analysis: Analysis, k: int) -> str:
             f'{number(1e3 * fit.tau_high)}) ms. {caveat}{cause.sentence}')
 
 
-def _relaxing(analysis: Analysis, fit: Relaxation) -> Plot:
+def _relaxation_plot(analysis: Analysis, fit: Relaxation) -> Plot:
     recording = analysis.recording
     what = 'falls' if fit.kind == 'release' else 'rises'
     plot = Plot(f'After throttle {what} (dashed: fit)', 'time since throttle arrived, ms', 'mV',

@@ -57,7 +57,7 @@ def discovery_document(finding: Finding, seen: Overview | None = None, command: 
                   lambda: [Section(f'Statistics{after}', _statistics(finding), folded=True),
                            Section('Data beside simulations', _comparisons(finding),
                                    folded=True)],
-                  Section('What is left', [_left(finding)], folded=True),
+                  Section('What is left', [_discrepancies(finding)], folded=True),
                   lambda: [Section('Parameters', _parameters(finding), folded=True)]]
     parts.append(Section('What to know before using these numbers', [Notes.of(finding.notes)]))
     return Document('What the simulation gets wrong', subject, answer(finding), parts, command)
@@ -79,10 +79,10 @@ def answer(finding: Finding) -> list[str]:
     refused = [f'{finding.refused}: trust the named causes, not the fitted values.'
                ] if finding.refused else []
     return [f'A plain simulation lacks {listed([*names[:_FIRST], *others])}.',
-            _worth(finding), closer, *refused]
+            _gain_words(finding), closer, *refused]
 
 
-def _worth(finding: Finding) -> str:
+def _gain_words(finding: Finding) -> str:
     """Return a gain in two parts: smaller prediction errors, and their size better estimated."""
     gain, shrink, size = finding.gain, finding.shrink, finding.size_gain
     if not gain > Z95 * finding.gain_se or not math.isfinite(size):
@@ -166,14 +166,14 @@ def _gain(finding: Finding) -> list[Part]:
             Text(f'Plain OU, with nothing else in the model: {plain_model_words(baseline)}.')]
 
 
-def _shown(finding: Finding) -> list[Criticism]:
+def _drawn_statistics(finding: Finding) -> list[Criticism]:
     """Return the statistics of the rows: the largest, before or after."""
     worst = sorted(finding.criticism, key=lambda c: -max(abs(c.before), abs(c.after)))
     return worst[:_ROWS]
 
 
 def _statistics(finding: Finding) -> list[Part]:
-    rows = [(c.statistic, c.low, c.high, c.before, c.after) for c in _shown(finding)]
+    rows = [(c.statistic, c.low, c.high, c.before, c.after) for c in _drawn_statistics(finding)]
     text = (f'{len(finding.discrepancies)} of {len(finding.criticism)} statistics of the '
             'one-step errors lie outside the band for the plain OU'
             + (f', {len(finding.remaining)} for the extended model. ' if finding.causes else '. '))
@@ -224,17 +224,17 @@ def _plot(curve: Comparison, k: int, name: str) -> Plot:
     return plot.line(curve.x, data, 'data', 7, 'thick')
 
 
-def _left(finding: Finding) -> Part:
+def _discrepancies(finding: Finding) -> Part:
     if not finding.remaining:
         return Text(f'Nothing: no statistic of the {_model_name(finding)} lies outside the band.')
-    rows = [[c.statistic, *([_known(c.before)] if finding.causes else []), _known(c.after),
+    rows = [[c.statistic, *([_number(c.before)] if finding.causes else []), _number(c.after),
              f'[{number(c.low)}, {number(c.high)}]', plain_words(c.statistic)]
             for c in finding.remaining]
     return Table(['statistic', *(['plain OU'] if finding.causes else []), 'score',
                   'band', 'in words'], rows, left=[0, len(rows[0]) - 1], most=_SHOWN)
 
 
-def _known(value: float) -> str:
+def _number(value: float) -> str:
     return number(value) if math.isfinite(value) else NOT_KNOWN
 
 

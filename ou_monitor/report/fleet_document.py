@@ -83,7 +83,7 @@ def fleet_document(fleet: Fleet, command: str = '') -> Document:
 
 def answer(fleet: Fleet) -> list[str]:
     """Return the answer: the lowest voltage, what stands out, and what was analysed."""
-    return [part for part in (*sentences(fleet), _standing_out(fleet), _analysed(fleet))
+    return [part for part in (*sentences(fleet), _anomalies(fleet), _analysed(fleet))
             if part]
 
 
@@ -107,15 +107,15 @@ def _analysed(fleet: Fleet) -> str:
     return ', '.join(parts) + '.'
 
 
-def _standing_out(fleet: Fleet) -> str:
+def _anomalies(fleet: Fleet) -> str:
     judged, text = fleet.judgement, ''
     drifting = sorted({t.vehicle for t in judged.drifting})
     odd = {judged.values[name].paths[k] for name, k in judged.odd_recordings()}
     vehicles = sorted({judged.vehicles[name].names[k] for name, k in judged.odd_vehicles()})
     if drifting:
-        text += f' Drift over the flights: {_listed(drifting)}.'
+        text += f' Drift over the flights: {_short_list(drifting)}.'
     if vehicles:
-        text += f' Unlike the rest of the fleet: {_listed(vehicles)}.'
+        text += f' Unlike the rest of the fleet: {_short_list(vehicles)}.'
     if odd:
         text += f' Unlike the other flights of their vehicle: {counted(len(odd), "recording")}.'
     if not (drifting or vehicles or odd):
@@ -126,7 +126,7 @@ def _standing_out(fleet: Fleet) -> str:
     return text.strip()
 
 
-def _listed(names: list[str], most: int = 5) -> str:
+def _short_list(names: list[str], most: int = 5) -> str:
     more = len(names) - most
     return ', '.join(names[:most]) + (f' and {more} more' if more > 0 else '')
 
@@ -168,7 +168,7 @@ def finding_words(fleet: Fleet) -> list[str]:
         values, out = judged.values[name], judged.recordings[name]
         off = change(name, float(values.value[k] - out.centre[k]))
         found.append(f'{values.vehicles[k]}, {values.paths[k]}: {name} is '
-                     f'{shown(values, values.value[k])}{_at(values)} ({_measured(values, k)}), '
+                     f'{shown(values, values.value[k])}{_at(values)} ({_raw_value(values, k)}), '
                      f'{off} beside the other flights; p over the fleet '
                      f'{chance(float(out.chance[k]))}.')
     return found
@@ -198,7 +198,7 @@ def _at(values: Values) -> str:
     return f' at {100.0 * at:.0f} % throttle' if math.isfinite(at) else ''
 
 
-def _measured(values: Values, k: int) -> str:
+def _raw_value(values: Values, k: int) -> str:
     at = values.throttle[k]
     return (f'{number(float(values.measured[k]))} as measured'
             + (f' at {100.0 * at:.0f} %' if math.isfinite(at) else ''))
@@ -526,7 +526,7 @@ def _drift(fleet: Fleet) -> list[Part]:
         + (f' {more} less likely trends are not shown.' if more > 0 else ''), legend=True)]
 
 
-def _compared(name: str, fleet: Fleet) -> str:
+def _reference(name: str, fleet: Fleet) -> str:
     """Return the throttle at which a quantity is compared."""
     at = fleet.judgement.values[name].curve.reference
     return 'full throttle' if name == 'sag' else (
@@ -535,7 +535,7 @@ def _compared(name: str, fleet: Fleet) -> str:
 
 def _caption(trend: Trend, fleet: Fleet) -> str:
     return (f'{change(trend.quantity, trend.slope)} a flight; p over the fleet '
-            f'{chance(trend.p_family)}. At {_compared(trend.quantity, fleet)}, with its error.')
+            f'{chance(trend.p_family)}. At {_reference(trend.quantity, fleet)}, with its error.')
 
 
 def _trend_plot(values: Values, trend: Trend) -> Plot:

@@ -34,7 +34,7 @@ def reproduction_document(result: Reproduction, command: str = '') -> Document:
             'errors, or the range given) reaches it. Rounding: it agrees once the underlying '
             'readings move within their own rounding. Claims are written as bounds: "> 0" claims '
             'that something rises.', legend=True)]),
-        *[Section(f'{where}, {tally(rows)}', [_table(rows), _how(rows)], folded=True)
+        *[Section(f'{where}, {tally(rows)}', [_table(rows), _explanations(rows)], folded=True)
           for where, rows in result.parts()],
         Text(f'Random numbers from seed {result.seed}; another seed moves the simulated numbers '
              'within their standard errors.', legend=True)]
@@ -50,7 +50,7 @@ def _table(rows: Sequence[Row]) -> Table:
           recomputed(row), row.verdict.value] for row in rows], left=[0, 1, 4])
 
 
-def _how(rows: Sequence[Row]) -> Callable[[], list[Part]]:
+def _explanations(rows: Sequence[Row]) -> Callable[[], list[Part]]:
     """Return the meaning of each row and how it was recomputed, for a page."""
     return lambda: [Notes.of(f'{row.quantity}: {row.sentence} How: {row.how}.' for row in rows)]
 

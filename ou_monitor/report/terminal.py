@@ -37,17 +37,17 @@ def _part(part: Part) -> str:
     if isinstance(part, Notes):
         lines = [item(text if severity is Severity.INFO else f'{severity.name.lower()}: {text}')
                  for severity, text in part.notes[:part.most]]
-        return '\n'.join(lines + _more(len(part.notes), part.most))
+        return '\n'.join(lines + _left_out_line(len(part.notes), part.most))
     if isinstance(part, Table):
         return '\n'.join([table(part.heads, part.rows[:part.most], part.left),
-                          *_more(len(part.rows), part.most)]) if part.rows else ''
+                          *_left_out_line(len(part.rows), part.most)]) if part.rows else ''
     if isinstance(part, Section):
         inside = '\n\n'.join(text for text in map(_part, part.parts) if text)
         return f'{part.heading}:\n{inside}' if inside else ''
     return ''
 
 
-def _more(count: int, most: int | None) -> list[str]:
+def _left_out_line(count: int, most: int | None) -> list[str]:
     """Return a line with the number of entries left out."""
     return [] if most is None or count <= most else [
         f'and {count - most} more: --report and --json have all']

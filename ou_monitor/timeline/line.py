@@ -380,7 +380,7 @@ class TimeLine:
 
     def __init__(self) -> None:
         self._columns = np.empty((4, BATCH))
-        self._see()
+        self._make_views()
         # Whether the buffer's throttle and current columns hold values of this batch.
         self._loaded = [False, False]
         self._fill = 0
@@ -391,7 +391,7 @@ class TimeLine:
         self._tail = np.empty((4, 0))
         self._unseen, self._looked = 0, False
 
-    def _see(self) -> None:
+    def _make_views(self) -> None:
         # Copying into a slice takes half as long through a memoryview as through NumPy.
         self._into: tuple[Any, ...] = tuple(column.data for column in self._columns)
 
@@ -402,7 +402,7 @@ class TimeLine:
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a state and make new views of the buffers."""
         self.__dict__.update(state)
-        self._see()
+        self._make_views()
 
     @property
     def counters(self) -> Counters:
@@ -515,7 +515,7 @@ class TimeLine:
         if not math.isfinite(np.add.reduce(t) + np.add.reduce(y)):
             good = np.isfinite(t) & np.isfinite(y)
             self.count(non_finite=t.size - int(good.sum()))
-            t, y, u, i = _picked(good, t, y, u, i)
+            t, y, u, i = _select(good, t, y, u, i)
         if not t.size:
             return []
         first = float(t[0]) - self.newest
@@ -552,7 +552,7 @@ class TimeLine:
             later = jumps[jumps > 0]
             end = begin + int(later[0]) if later.size else t.size
             part = slice(begin, end)
-            batch = self._ordered(*_picked(part, t, y, u, i), restart)
+            batch = self._ordered(*_select(part, t, y, u, i), restart)
             if batch is not None:
                 batches.append(batch)
             begin = end
@@ -569,10 +569,10 @@ class TimeLine:
         if restart:
             self.newest = -math.inf
             self.count(resets=1)
-        t, y, u, i = _picked(np.argsort(t, kind='stable'), t, y, u, i)
+        t, y, u, i = _select(np.argsort(t, kind='stable'), t, y, u, i)
         keep = (np.diff(t, prepend=self.newest) > 0.0) & (t > self.newest)
         self.count(late=t.size - int(keep.sum()))
-        t, y, u, i = _picked(keep, t, y, u, i)
+        t, y, u, i = _select(keep, t, y, u, i)
         if not t.size:
             return None
         steps = np.diff(t, prepend=self.newest)
@@ -611,7 +611,7 @@ class TimeLine:
         return refresh_period(y, known)
 
 
-def _picked(which: Any, t: FloatArray, y: FloatArray, u: FloatArray | None, i: FloatArray | None,
+def _select(which: Any, t: FloatArray, y: FloatArray, u: FloatArray | None, i: FloatArray | None,
             ) -> tuple[FloatArray, FloatArray, FloatArray | None, FloatArray | None]:
     """Return the selected samples."""
     return (t[which], y[which], None if u is None else u[which],

@@ -124,15 +124,15 @@ class Row:
         interval reaches it. `ROUNDING`: it does once the inputs of either move
         within their own rounding. `DOES_NOT_HOLD`: not even then.
         """
-        if _meet(self.printed.ends, self.interval):
+        if _overlap(self.printed.ends, self.interval):
             return RowVerdict.AGREES
-        if _meet(_join(self.printed.ends, self.printed_inputs),
-                 _join(self.interval, self.inputs)):
+        if _overlap(_join(self.printed.ends, self.printed_inputs),
+                    _join(self.interval, self.inputs)):
             return RowVerdict.ROUNDING
         return RowVerdict.DOES_NOT_HOLD
 
 
-def _meet(a: Range, b: Range) -> bool:
+def _overlap(a: Range, b: Range) -> bool:
     return a[0] <= b[1] and b[0] <= a[1]
 
 

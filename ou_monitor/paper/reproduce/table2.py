@@ -40,7 +40,7 @@ def rows() -> list[Row]:
             'The arithmetic is right; its five digits come from the division; alpha has fewer.')]
     for state in (published.MEDIUM, published.HIGH):
         found += _of_load(state)
-    return found + _restated()
+    return found + _repetitions()
 
 
 def _of_load(state: published.PrintedLoad) -> list[Row]:
@@ -68,7 +68,7 @@ def _of_load(state: published.PrintedLoad) -> list[Row]:
             f'{1e-6 * high ** 2:.2g} V^2.')]
 
 
-def _restated() -> list[Row]:
+def _repetitions() -> list[Row]:
     line = paper_fit()
     said = {
         'Section 4.5': 'The number, from Fig. 5, shows a limit of the filtration only if the '

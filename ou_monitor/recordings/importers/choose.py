@@ -60,8 +60,8 @@ def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | 
         second = _current(log, volts)
     notes: list[str] = []
     if second is None and current is None and (
-            held := [one for one in _of(log, CURRENT) if not one.silent]):
-        notes.append('No current clearly belongs to this voltage: ' + _listed(held)
+            held := [one for one in _series_of(log, CURRENT) if not one.silent]):
+        notes.append('No current clearly belongs to this voltage: ' + _names_of(held)
                      + '; none taken (--current NAME).')
     chosen: list[Series | None] = []
     dropped: dict[str, list[str]] = {}
@@ -81,7 +81,7 @@ def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | 
     if chosen[0] is None:
         raise InputError(f'{path}: {volts.name} has no usable sample'
                          + ''.join(f' ({note})' for note in notes))
-    notes += _also(log, (volts, first), option)
+    notes += _alternatives(log, (volts, first), option)
     return Chosen(chosen[0], chosen[1], chosen[2], tuple(notes))
 
 
@@ -121,16 +121,16 @@ def _single(values: FloatArray) -> FloatArray:
 
 def default(log: Log, quantity: str) -> list[Series]:
     """Return the default series; several if the choice is not clear."""
-    ranked = [one for one in _of(log, quantity) if one.rank is not None and one.n]
+    ranked = [one for one in _series_of(log, quantity) if one.rank is not None and one.n]
     least = min((one.rank for one in ranked if one.rank is not None), default=None)
     return [one for one in ranked if one.rank == least]
 
 
-def _of(log: Log, quantity: str) -> list[Series]:
+def _series_of(log: Log, quantity: str) -> list[Series]:
     return [one for one in log.series if one.quantity == quantity]
 
 
-def _listed(series: list[Series]) -> str:
+def _names_of(series: list[Series]) -> str:
     shown = ', '.join(f'{one.name} ({one.words})' for one in series[:MOST])
     return shown + (f' and {len(series) - MOST} more, see --list' if len(series) > MOST else '')
 
@@ -142,7 +142,7 @@ def _pick(path: Path, log: Log, quantity: str, name: str | None, option: str
     if name is None:
         found = default(log, quantity)
         if len(found) > 1:
-            raise InputError(f'{path} has several: {_listed(found)}; choose with '
+            raise InputError(f'{path} has several: {_names_of(found)}; choose with '
                              f'{option.format(quantity)} NAME, see all with --list')
         return found[0] if found else None
     held = [one for one in log.series if one.quantity in (quantity, ANY)]
@@ -160,38 +160,38 @@ def _pick(path: Path, log: Log, quantity: str, name: str | None, option: str
 
 def _current(log: Log, voltage: Series) -> Series | None:
     """Return the current of the voltage's sensor, or the only one of a single battery."""
-    ranked = [one for one in _of(log, CURRENT) if one.rank is not None and one.n]
-    beside = [one for one in _of(log, CURRENT)
+    ranked = [one for one in _series_of(log, CURRENT) if one.rank is not None and one.n]
+    beside = [one for one in _series_of(log, CURRENT)
               if one.group and one.group == voltage.group and not one.silent]
     beside = [one for one in beside if one.rank is not None] or beside
     if beside:
         return beside[0]
-    batteries = [one for one in _of(log, VOLTAGE) if one.rank is not None]
+    batteries = [one for one in _series_of(log, VOLTAGE) if one.rank is not None]
     return ranked[0] if len(ranked) == 1 and len(batteries) < 2 else None
 
 
 def _no_voltage(path: Path, log: Log) -> str:
-    others = _of(log, VOLTAGE) + _of(log, ANY)
+    others = _series_of(log, VOLTAGE) + _series_of(log, ANY)
     why = ''.join(f' ({note})' for note in log.notes)
     if log.format == 'csv':
         return (f"{path}: no column 'voltage_v': name one with --voltage, see all with --list")
     if others:
         return (f'{path} has no battery voltage; choose another with --voltage NAME: '
-                f'{_listed(others)}{why}')
+                f'{_names_of(others)}{why}')
     return f'{path} holds no voltage{why}: there is nothing to convert'
 
 
-def _also(log: Log, chosen: tuple[Series, Series | None], option: str) -> list[str]:
+def _alternatives(log: Log, chosen: tuple[Series, Series | None], option: str) -> list[str]:
     """Return a note on the alternatives."""
     notes: list[str] = []
     for quantity, one in zip((VOLTAGE, THROTTLE), chosen):
-        others = [other for other in _of(log, quantity)
+        others = [other for other in _series_of(log, quantity)
                   if not other.silent and (one is None or other.name != one.name)]
         # Throttles that could be defaults; voltages, including rails.
         ranked = [other for other in others if other.rank is not None]
         others = ranked or others if quantity == THROTTLE else others
         if others:
-            notes.append(f'Also in the log: {_listed(others)} '
+            notes.append(f'Also in the log: {_names_of(others)} '
                          f'({option.format(quantity)} NAME).')
     return notes
 

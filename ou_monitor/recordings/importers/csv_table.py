@@ -128,7 +128,7 @@ def form_of(path: Path, wanted: CsvColumns) -> Form:
         for mark in (wanted.decimal,) if wanted.decimal else ('.', ','):
             if mark == delimiter or best and delimiter == ' ' and best[1].width > 1:
                 continue
-            found = _laid_out(lines, encoding, delimiter, mark == ',', wanted.skip_rows or 0)
+            found = _score_form(lines, encoding, delimiter, mark == ',', wanted.skip_rows or 0)
             if found and (best is None or found[0] > best[0]):
                 best = found
     if best is None:
@@ -155,8 +155,8 @@ def _encoding(path: Path, head: bytes) -> str:
     return 'utf-8'
 
 
-def _laid_out(lines: list[str], encoding: str, delimiter: str, comma: bool, skip: int,
-              ) -> tuple[float, Form] | None:
+def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool, skip: int,
+                ) -> tuple[float, Form] | None:
     """Return how well a delimiter and a decimal mark fit, and the form; None if they do not."""
     rows: list[list[str]] = []
     for line in lines:
@@ -587,7 +587,7 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
     for (quantity, column), column_values in zip(found.items(), values):
         si, guesses[quantity] = _in_si(quantity, column, column_values, units.get(quantity), volts)
         scaled[quantity] = column, si
-    note = _how(form, time, found, guesses)
+    note = _read_note(form, time, found, guesses)
     return _Table(form, t, scaled, dict(zip(others, values[len(found):])), note)
 
 
@@ -598,7 +598,7 @@ def _absent(path: Path, form: Form, name: str, option: str = '') -> str:
     return f"{path}:{form.line or form.skip + 1}: no column '{name}': {hint}" + option
 
 
-def _named(path: Path, form: Form, name: str, option: str) -> int:
+def _column_place(path: Path, form: Form, name: str, option: str) -> int:
     if name not in form.names:
         raise InputError(_absent(path, form, name, f' ({option} names another)'))
     return form.names.index(name)
@@ -645,7 +645,7 @@ def _time_of(path: Path, form: Form, wanted: CsvColumns) -> _Column:
     if wanted.sample_interval is not None:
         return _Column((), '--sample-interval', 's', wanted.sample_interval)
     if wanted.time is not None:
-        return _unit_column(form, _named(path, form, wanted.time, '--time-column'),
+        return _unit_column(form, _column_place(path, form, wanted.time, '--time-column'),
                             wanted.time_unit)
     numbered = bool(form.rows) and form.width > 1 and re.fullmatch(
         _INDEX_NAME, unit_of(form.names[0])[0].strip('# ').lower()) is not None
@@ -659,7 +659,7 @@ def _time_of(path: Path, form: Form, wanted: CsvColumns) -> _Column:
             return _Column((beside[0], first),
                            f'{form.names[beside[0]]}, {form.names[first]}', 's', 0.0)
         return _unit_column(form, first, wanted.time_unit)
-    filled = _unnamed(form)
+    filled = _nameless_columns(form)
     if len(filled) == 2:
         return _unit_column(form, filled[0], wanted.time_unit)
     if not math.isfinite(form.step):
@@ -668,7 +668,7 @@ def _time_of(path: Path, form: Form, wanted: CsvColumns) -> _Column:
     return _Column((), form.stated, 's', form.step)
 
 
-def _unnamed(form: Form) -> list[int]:
+def _nameless_columns(form: Form) -> list[int]:
     """Return the columns without a name that hold a number in each of the first rows."""
     return [] if form.line else [k for k in range(form.width) if form.rows and all(
         k < len(row) and is_value(row[k]) for row in form.rows)]
@@ -704,11 +704,11 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: _Column, needed
         if name == NONE and quantity != logs.VOLTAGE:
             continue
         if name is not None:
-            found[quantity] = _unit_column(form, _named(path, form, name, option), unit)
+            found[quantity] = _unit_column(form, _column_place(path, form, name, option), unit)
             continue
         places = _choose(form, quantity, taken)
         if not places and quantity == logs.VOLTAGE:
-            rest = [k for k in _unnamed(form) if k not in taken]
+            rest = [k for k in _nameless_columns(form) if k not in taken]
             places = rest if len(rest) == 1 else []
         if places:
             found[quantity] = _unit_column(form, places[0], unit)
@@ -866,7 +866,7 @@ def _throttle_unit(known: FloatArray, volts: FloatArray) -> str:
     return 'us' if low >= 800.0 and high <= 2200.0 else '1'
 
 
-def _how(form: Form, time: _Column, found: dict[str, _Column], units: dict[str, str]) -> str:
+def _read_note(form: Form, time: _Column, found: dict[str, _Column], units: dict[str, str]) -> str:
     """Return in one line how a file was read; '' if nothing was detected."""
     if time.name == TIME and not form.comma and form.encoding in ('utf-8', 'utf-8-sig') and all(
             column.name == {logs.VOLTAGE: VOLTAGE, logs.THROTTLE: THROTTLE,

@@ -185,7 +185,7 @@ def import_log(path: Path, request: Request) -> Log:
             f"'{path}' is {form.words}: reading it needs {form.package}: "
             f'{how_to_install(form.extra)}') from error
     if request.progress is not None:
-        request = replace(request, progress=_shown(request.progress))
+        request = replace(request, progress=_terminal_progress(request.progress))
     # Broken bytes give numbers that no cast accepts, and fields of any shape.
     with np.errstate(all='ignore'), quiet(path, form.package or 'ou_monitor'):
         log: Log = module.read(path, request)
@@ -199,7 +199,7 @@ def import_log(path: Path, request: Request) -> Log:
         names=tuple(printable(name, 200) for name in log.names))
 
 
-def _shown(progress: Progress) -> Progress:
+def _terminal_progress(progress: Progress) -> Progress:
     """Return a progress that reaches the terminal from where parsers are kept quiet."""
     terminal = sys.stderr
 
