@@ -107,34 +107,34 @@ RECORDING = Option(
     'recording', metavar='RECORDING',
     help='.mcap file, rosbag2 folder, CSV of any logger, or a log that convert reads (.bbl, .bin, '
     '.ulg)')
-# Which part of a recording is read.
+# Part of a recording to read.
 PART = (
     Option('--from', metavar='S', dest='start', type=TIME,
-           help='leave out what comes before, s after the first message'),
+           help='leave out earlier samples, s after the first message'),
     Option('--to', metavar='S', dest='end', type=TIME,
-           help='leave out what comes from here on, s after the first message'))
+           help='leave out samples from here on, s after the first message'))
 # How a bag is read.
 TOPICS = (
     Option('--msg-config', metavar='NAME',
-           help='msg_config that says which topic and field is the voltage'),
+           help='msg_config with topic and field of the voltage'),
     Option('--voltage-topic', metavar='TOPIC', help='topic of the voltage'),
     Option('--throttle-topic', metavar='TOPIC', help='topic of the throttle'),
-    Option('--partial', action='store_true', help='use what a truncated file still holds'))
+    Option('--partial', action='store_true', help='use the intact part of a damaged file'))
 
 
 # Format of a CSV, if it is not detected correctly.
 CSV = (
     Option('--time-column', metavar='NAME', help='column of a CSV (default: found by its name)'),
-    Option('--unit', choices=('V', 'mV'), help='of the voltage in a CSV (default: found)'),
+    Option('--unit', choices=('V', 'mV'), help='unit of the voltage in a CSV (default: found)'),
     Option('--time-unit', choices=('s', 'ms', 'us', 'ns'),
-           help='of the time in a CSV (default: found)'),
+           help='unit of the time in a CSV (default: found)'),
     Option('--throttle-unit', choices=('1', '%', 'us'),
-           help='of the throttle in a CSV: 0..1, percent, or a pulse of 1000 to 2000 us (default: '
-           'found)'),
+           help='unit of the throttle in a CSV: 0..1, percent, or a pulse of 1000 to 2000 us '
+           '(default: found)'),
     Option('--sample-interval', metavar='S', type=POSITIVE,
            help='time from row to row of a CSV, s, in place of a column'),
     Option('--delimiter', metavar='C',
-           help="what separates the cells of a CSV: a character, 'tab' or 'space' (default: "
+           help="separator of the cells of a CSV: a character, 'tab' or 'space' (default: "
            'found)'),
     Option('--decimal', choices=('.', ','), help='decimal mark of a CSV (default: found)'),
     Option('--skip-rows', metavar='N', type=whole('a number of lines, 0 or more', 0),
@@ -142,7 +142,7 @@ CSV = (
 # How a log or a CSV is read.
 FILES = (
     Option('--flight', metavar='N', type=FLIGHT,
-           help='which flight of a log with several, from 1 (default: the largest)'),
+           help='flight of a log with several, from 1 (default: the largest)'),
     Option('--voltage-column', metavar='NAME',
            help='column of a CSV (default: found by its name), or series of a log (default: the '
            'battery)'),
@@ -153,8 +153,8 @@ FILES = (
     *CSV)
 JSON = Option(
     '--json', metavar='FILE',
-    help="write the result as JSON ('-': to standard output, alone)")
-FORCE = Option('--force', action='store_true', help='overwrite files that exist already')
+    help="write the result as JSON ('-': to standard output, and nothing else)")
+FORCE = Option('--force', action='store_true', help='overwrite existing files')
 REPORT = Option('--report', metavar='FILE.html', help='write a self-contained HTML page')
 # Cells of the largest packs that fly, with a margin.
 _CELLS = whole('a number of cells, 1 to 28', 1, 28)
@@ -261,8 +261,8 @@ _COMPARE = Command(
             help='simulate this model, as discover --save-model writes it; its level is moved to '
             'the level of the first seconds'),
      Option('--fit-until', metavar='S', type=TIME,
-            help='begin of what is simulated, s after the first sample (default: half of the '
-            'recording; with --model its begin)'),
+            help='start of the simulation, s after the first sample (default: half of the '
+            'recording; with --model its start)'),
      Option('--seeds', metavar='N', type=whole('a whole number, 20 to 10000', 20, 10_000),
             default=50, help='simulations (default: %(default)s)'),
      seed(0, 'same seed, same simulations'),
@@ -276,24 +276,24 @@ _CONVERT = Command(
     'convert', 'a log becomes an MCAP bag', 'ou_monitor.cli.convert',
     'Convert a log to a bag with the topics /voltage, /throttle and /current (A, positive when '
     'the battery is drained), and of an autopilot /imu and, from eRPM or ESCs, /motor_speed. '
-    'Stamps count from the start of the log, in seconds; those of a CSV '
-    'stay as they are.',
-    (Option('log', metavar='LOG', type=path_argument, help='what to read'),
+    'Stamps count from the start of the log, in seconds; a CSV '
+    'keeps its own.',
+    (Option('log', metavar='LOG', type=path_argument, help='log to read'),
      Option('out', metavar='OUT', type=path_argument,
-            help='what to write: NAME.mcap for one file, NAME for a rosbag2 folder'),
+            help='bag to write: NAME.mcap for one file, NAME for a rosbag2 folder'),
      Option('--list', action=WithoutOut, nargs=0, default=False,
-            help='show what could be taken, * what would be, and write nothing (without OUT)'),
+            help='list the series, * those taken by default, and write nothing (without OUT)'),
      Option('--voltage', metavar='NAME',
-            help='which voltage (default: the battery, if there is one)'),
+            help='voltage (default: the battery, if there is one)'),
      Option('--throttle', metavar='NAME',
-            help="which throttle, or 'none' (default: motors, else what is asked of them, else "
+            help="throttle, or 'none' (default: motors, else the command to them, else "
             'the stick)'),
      Option('--current', metavar='NAME',
-            help="which current, or 'none' (default: from the sensor of the voltage)"),
+            help="current, or 'none' (default: from the sensor of the voltage)"),
      Option('--signal', metavar='NAME', action='append', default=[],
             help='any other series, as a topic of its own; may be given several times'),
      Option('--imu', metavar='NAME', action='append', default=[],
-            help="which gyro becomes /imu, or 'none'; may be given several times (default: the "
+            help="gyro for /imu, or 'none'; may be given several times (default: the "
             'first of the list)'),
      Option('--poles', metavar='N', type=whole('an even number from 2 on', 2, step=2),
             help='magnets of a rotor, for eRPM (default: as the log says)'),
@@ -333,13 +333,13 @@ _DESIGN = Command(
     'power network, over bulk capacitances, and the smallest one that meets a risk.',
     (Option('--from', metavar='RECORDING', dest='recording',
             help='take level, sag, resistance and noise from a flight (any recording that analyze '
-            'reads); --set goes first'),
+            'reads); --set overrides it'),
      Option('--risk', metavar='X', type=quantity(''), default='1e-3',
             help='probability of a brown-out allowed within the horizon, 0..1 (default: '
             '%(default)s)'),
      Option('--throttle', metavar='Y', type=number(
          'between 0 and 1; write 40 % as 0.4', lambda value: 0.0 <= value <= 1.0),
-            help='throttle, 0..1 (default with --from: the highest that was flown)'),
+            help='throttle, 0..1 (default with --from: the highest flown)'),
      Option('--rail', choices=('bus', 'regulated'), default='bus',
             help='the battery bus at the ESCs, or the regulated rail (default: %(default)s)'),
      Option('--voltage', metavar='V', type=quantity('V'),
@@ -357,7 +357,7 @@ _DESIGN = Command(
      Option('--set', metavar='NAME=VALUE', action='append', default=[],
             help='a component, such as bulk_capacitance=1000uF; may be repeated (see --list)'),
      Option('--network', metavar='FILE.yaml',
-            help='components as a YAML mapping of name to value; --set goes first'),
+            help='components as a YAML mapping of name to value; --set overrides it'),
      Option('--list', action='store_true', help='list the components and their defaults'),
      *TOPICS, *FILES, REPORT, JSON, FORCE),
     ('--from flight.bbl --set cells=4', '--risk 1e-3 --throttle 0.6 --set cells=4',
@@ -384,9 +384,9 @@ _FLEET = Command(
     'ou_monitor.cli.fleet',
     'Analyze many recordings on several processes: one Parquet table with a row for each '
     'recording and load level, and a report with outliers and with the drift of each vehicle over '
-    'its flights. A run that was stopped goes on where it was: start the same command again.',
+    'its flights. The same command, started again, resumes a stopped run.',
     (Option('recordings', metavar='RECORDING', nargs='+',
-            help='.mcap files, rosbag2 folders, .csv files, and folders to be searched for them'),
+            help='.mcap files, rosbag2 folders, .csv files, and folders to search for them'),
      Option('--output', metavar='DIR', required=True,
             help='folder for fleet.parquet, fleet.html and the parts of a run'),
      Option('--workers', metavar='N', help='local processes (default: one a core)',
@@ -395,14 +395,14 @@ _FLEET = Command(
             help='Dask scheduler whose workers are used instead, tls://HOST:8786; they need the '
             'recordings under the same paths'),
      Option('--insecure', action='store_true',
-            help='let the scheduler be on another machine without TLS'),
+            help='allow a scheduler on another machine without TLS'),
      Option('--vehicle-from', metavar='REGEX',
-            help="finds the vehicle in a recording's path (its first group) where the metadata "
-            'name none (default: the folder it lies in)'),
+            help="finds the vehicle in a recording's path (its first group) if the metadata "
+            'name none (default: its folder)'),
      Option('--discover', action='store_true',
-            help='also look for causes; some seconds a recording (default: off)'),
+            help='also look for causes; takes some seconds per recording (default: off)'),
      seed(0, 'of discover'), levels('found in each recording'),
-     *estimate('count dips below this voltage, V, and give the risk of them'), *TOPICS, JSON,
+     *estimate('count dips below this voltage, V, and give their risk'), *TOPICS, JSON,
      FORCE),
     ('logs/ --output fleet --cells 4', 'logs/ --output fleet --vehicle-from "(uav[0-9]+)"'))
 
@@ -412,8 +412,8 @@ _LIVE = Command(
     'Serve one read-only page: voltage and its limit, throttle and its budget, risk, sigma, the '
     'filter, and an alarm lamp, from the topics of the running nodes. Needs ROS 2.',
     (Option('--host', metavar='ADDRESS', default='127.0.0.1',
-            help='address to listen on (default: %(default)s); any other wants the token that is '
-            'printed'),
+            help='address to listen on (default: %(default)s); any other requires the printed '
+            'token'),
      Option('--port', metavar='N', default='8765',
             help='port; 0: any that is free (default: %(default)s)'),
      Option('--estimator', metavar='NODE', default='/ou_estimator',
@@ -435,7 +435,7 @@ _SIMULATE = Command(
     'Draw a recording from a model of a supply, exact in law at any rate. --list shows the '
     'presets and the throttle profiles.',
     ((Option('--preset', metavar='NAME',
-             help="what to simulate (default 'flight'; --list shows all)"),
+             help="preset to simulate (default 'flight'; --list shows all)"),
       Option('--model', metavar='FILE.yaml', type=path_argument,
              help='model file, as discover writes it')),
      Option('--duration', metavar='S', type=float, help='length, s'),
@@ -446,14 +446,14 @@ _SIMULATE = Command(
             'and throttle, or a recording, whose length is then the default'),
      *PART,
      Option('--capacity-left', metavar='X', type=float,
-            help='charge at the begin, 0..1, which throttle then draws, in place of drift; -1: '
-            'where the recording of the model began'),
+            help='charge at the start, 0..1, drawn by throttle, in place of drift; -1: '
+            "as at the start of the model's recording"),
      Option('--scale-resistance', metavar='X', type=float, default=1.0,
             help='factor on the answer to throttle: 1.4 is a pack aged by 40 %% (default '
             '%(default)s)'),
      Option('--export', metavar='TARGET', choices=('gazebo', 'px4', 'ardupilot', 'json'),
-            help='print the model in the parameters of another simulator, and what that cannot '
-            'express over --throttle: gazebo, px4, ardupilot, json'),
+            help='print the model in the parameters of another simulator, and the effects that it '
+            'cannot express over --throttle: gazebo, px4, ardupilot, json'),
      Option('--full-current', metavar='A', type=float, default=math.nan,
             help='with --export: current at full throttle'),
      Option('--output', metavar='PATH', type=path_argument,
@@ -461,7 +461,7 @@ _SIMULATE = Command(
      Option('--type', choices=TYPES,
             help='message of the voltage (default battery_state, adc_block from 5 kHz on)'),
      Option('--save-model', metavar='FILE.yaml', type=path_argument,
-            help='write the model that was simulated'),
+            help='write the simulated model'),
      Option('--list', action='store_true', help='list presets and profiles'), JSON, FORCE),
     ('--preset load_40 --output load_40.mcap',
      '--model flight.yaml --throttle flight.mcap --from 10 --to 70 --output again.mcap',

@@ -57,8 +57,8 @@ def run(args: argparse.Namespace) -> int:
                 scheduler=args.scheduler, insecure=args.insecure, pattern=pattern,
                 stated_options=more, comparing=comparing, progress=progress)
     except KeyboardInterrupt:
-        print(f"stopped; what is done is kept in '{folder}', and the same command goes on from "
-              'there', file=sys.stderr)
+        print(f"stopped; finished recordings are kept in '{folder}', and the same command "
+              'resumes', file=sys.stderr)
         raise
     _write(fleet, folder, args)
     if not fleet.analysed:

@@ -288,17 +288,17 @@ class ClusterWorkers(Workers):
                 wait(list(futures), timeout=_LOOK, return_when='FIRST_COMPLETED')
             except TimeoutError:
                 if self._client.status != 'running':
-                    raise InputError('the connection to the scheduler is lost; what is done is '
-                                     'kept, the same command goes on from there') from None
+                    raise InputError('the connection to the scheduler is lost; finished '
+                                     'recordings are kept, the same command resumes') from None
                 if self._client.nthreads():
                     alone_since = time.monotonic()
                 elif time.monotonic() - alone_since > _PATIENCE:
-                    raise InputError('no worker is left; what is done is kept, the same command '
-                                     'goes on from there') from None
+                    raise InputError('no worker is left; finished recordings are kept, the same '
+                                     'command resumes') from None
                 continue
             if any(future.status == 'cancelled' for future in futures):
-                raise InputError('the scheduler has dropped the work; what is done is kept, the '
-                                 'same command goes on from there')
+                raise InputError('the scheduler has dropped the work; finished recordings are '
+                                 'kept, the same command resumes')
             found = [future for future in futures if future.status in ('finished', 'error')]
             if found:
                 return found

@@ -220,7 +220,7 @@ def read_bag(
     specs = _specs(bag, choice)
     notes = [*bag.notes, *choice.notes]
     if bag.damage is not None:
-        notes.append(Note(f'The bag is damaged; what it still holds was read: {bag.damage}.',
+        notes.append(Note(f'The bag is damaged; its intact part was read: {bag.damage}.',
                           Defect.DAMAGED_FILE))
     if start is not None or end is not None:
         notes.append(part_words(start, end))

@@ -107,7 +107,7 @@ def _budget(analysis: Analysis) -> str:
         u, p = beyond[0]
         words += f'; at {100.0 * u:.0f} % it is {100.0 * p:.2g} %'
     elif curves.budget < 1.0:
-        words += '; more was not flown'
+        words += '; higher throttle was not flown'
     return words
 
 
@@ -115,7 +115,7 @@ def _why_none(analysis: Analysis) -> str:
     """Say why there is no budget: the supply at rest, or the flight before."""
     rest = analysis.overview.load.level
     if rest > analysis.by_throttle.voltage:
-        return (f'right after what was flown, though the supply at rest is at {number(rest, 4)} V')
+        return f'right after this flight, though the supply at rest is at {number(rest, 4)} V'
     return f'even at idle, as the supply at rest is at {number(rest, 4)} V'
 
 
@@ -140,7 +140,7 @@ def _numbers(ou: OuFacts) -> list[str]:
     if ou.status != 'ok':
         return []
     low, high = ou.alpha_95
-    return [f'Beside level and load the supply wanders with sigma = {number(ou.sigma)} (95 % '
+    return [f'Apart from level and load the supply wanders with sigma = {number(ou.sigma)} (95 % '
             f'{number(ou.sigma_95[0])} to {number(ou.sigma_95[1])}) V/sqrt(s) and relaxes in '
             f'tau = {number(1e3 / ou.alpha)} (95 % {number(1e3 / high)} to {number(1e3 / low)}) '
             f'ms: a standard deviation of {number(1e3 * math.sqrt(ou.var_inf))} mV.']

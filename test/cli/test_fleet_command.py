@@ -241,7 +241,7 @@ def test_what_is_done_is_kept(story):
     assert [code for code, *_ in stops] == [-signal.SIGKILL, 130]
     # One line for a person who pressed Ctrl-C, of all processes together, beside the progress.
     (line,) = (line for line in stops[1][1].splitlines() if 'analyzing: ' not in line)
-    assert 'is kept' in line
+    assert 'are kept' in line
     assert stops[1][3].items() <= parts(out).items() and len(parts(out)) == 2 * FLIGHTS + 1
     assert not list((out / 'parts').glob('*.draft'))
 

@@ -54,7 +54,7 @@ def test_the_table_over_throttle_is_that_of_the_facts():
     assert known['100 %\nnot flown']['noise, mV rms'] == '-'
 
 
-@pytest.mark.parametrize('level, words', [(14.0, 'right after what was flown'),
+@pytest.mark.parametrize('level, words', [(14.0, 'right after this flight'),
                                           (13.0, 'even at idle')])
 def test_no_budget_is_told_from_its_cause(level, words):
     """The supply at rest is below the limit, or what was flown just now takes it there."""

@@ -343,14 +343,14 @@ def _others(result: Design) -> str:
     found = [f'{lever.name} {number(lever.least, 3)} {lever.unit}'.rstrip()
              for lever in result.levers[1:] if math.isfinite(lever.least)]
     if found:
-        return 'What would: ' + ', or '.join(found) + '.'
-    return (f'Nothing within reach would: not {_PACKS} packs in parallel, not '
-            f'{_RESISTANCE:.0%} of the resistance, not {_THROTTLE:.0%} of the throttle; land '
-            'before the battery is at this level, take more cells, or allow a lower voltage.')
+        return 'What would help: ' + ', or '.join(found) + '.'
+    return (f'Nothing within reach would help: not {_PACKS} packs in parallel, '
+            f'{_RESISTANCE:.0%} of the resistance, or {_THROTTLE:.0%} of the throttle; land '
+            'before the battery is at this level, use more cells, or allow a lower voltage.')
 
 
 def effect(result: Design) -> str:
-    """Return what adding capacitance does, in words."""
+    """Return the effect of adding capacitance, in words."""
     a = result.present
     if a.var_inf == 0.0:
         return 'There is no noise at this throttle.'
@@ -372,12 +372,12 @@ def effect(result: Design) -> str:
             f'{_change(a.var_inf, b.var_inf, " V^2")}, sigma '
             f'{_change(a.sigma, b.sigma, " V/sqrt(s)")}, risk {_change(a.risk, b.risk)}.')
     if b.alpha < a.alpha and b.var_inf < a.var_inf:
-        text += ' The rail returns more slowly, and strays less far.'
+        text += ' The rail returns more slowly, but deviates less.'
     return text
 
 
 def _change(a: float, b: float, unit: str | None = None) -> str:
-    """Return how a value changes; a risk when there is no unit."""
+    """Return the change of a value; of a risk without a unit."""
     first, second = (probability(v) if unit is None else number(v) for v in (a, b))
     if first == second:
         return f'stays at {first}{unit or ""}'
@@ -389,12 +389,12 @@ def _uf(row: DesignRow) -> str:
 
 
 def remarks(result: Design) -> list[str]:
-    """Return what else must be known."""
+    """Return further remarks."""
     notes = []
     rail = rail_at(result.network, result.throttle, result.rail)
     if any(math.isclose(rail.alpha, rate, rel_tol=1e-6) for rate in rail.source_rates):
         notes.append('With the present capacitor alpha is the rate of the noise, not of the '
-                     'network: capacitance moves it only once the network is the slower one.')
+                     'network: capacitance changes it only once the network is slower.')
     if result.least is not None and result.least.risk_crossing > result.least.risk_ou:
         notes.append('The crossing rate of the whole process decides: part of the noise is '
                      'faster than the OU of the slowest pole.')

@@ -268,5 +268,5 @@ def _instrument(fitted: FloatArray) -> list[Row]:
             f'{fitted.size} simulated recordings, rails of {RAILS[0]:g} to {RAILS[-1]:g} 1/s, '
             f'{CORNER_HZ:g} Hz coupling',
             'The paper calls alpha a structural constant of the power network; behind an AC '
-            f'coupling it changes by {100.0 * slope:.1f} % of what the network does.',
+            f'coupling it changes by {100.0 * slope:.1f} % of the change in the network.',
             error=slope_se, point=2)]
