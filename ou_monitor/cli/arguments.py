@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from ou_monitor.recordings.importers.log import CsvColumns, Series
     from ou_monitor.records import Recording
 
-# Above the voltage of any charged lithium cell, V.
+# Maximum voltage of a cell, V: above any charged lithium cell.
 _CELL_MOST = 5.0
 # Fields of `CsvColumns`, and the options that give them.
 _COLUMNS = {'time': 'time_column', 'voltage': 'voltage_column', 'throttle': 'throttle_column',

@@ -55,6 +55,7 @@ USABLE = ('OK', 'SHORT_WINDOW')
 # Quantities compared -> unit; the first two on the log scale.
 QUANTITIES = {'sigma': 'V/sqrt(s)', 'alpha': '1/s', 'sag': 'V'}
 LOGARITHMIC = ('sigma', 'alpha')
+# Bend of Huber's function, in standard deviations (95 % efficiency); rounds of the fit.
 _HUBER = 1.345
 _ROUNDS = 30
 _MOST_BINS = 60.0

@@ -54,7 +54,7 @@ NEAR, ON_LINE = 0.1, 0.2
 # A source sends in bursts when half of its intervals are below this fraction of their mean (for a
 # Poisson source: below 0.69).
 SHORT = 0.25
-# Messages in a burst that is followed by a gap.
+# Minimum messages of a burst before a gap.
 LUMP = 8
 IN_BURSTS = (
     'The messages come in bursts without stamps, and no steady source was detected behind '
@@ -203,8 +203,8 @@ class SendClock:
         return expected - math.expm1(-self._period / FOLLOW) * error
 
 
-# Half a second at the usual 100 Hz: averages the jitter of single publications, and still follows
-# a change of the replay rate within half a second.
+# Pairs fitted: half a second at the usual 100 Hz averages the jitter of single publications, and
+# still follows a change of the replay rate within half a second.
 PAIRS = 50
 # A clock off the line by more than this, s of the sender's time, was stepped (next pass, seek): no
 # publication is that late.

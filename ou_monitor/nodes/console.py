@@ -9,7 +9,7 @@ from ou_monitor.nodes.base import MonitorNode
 from ou_monitor.online.risk.flag import FlagLevel, FlagState
 from ou_monitor.stream.samples import Publishers
 
-# Period of the reminder that a topic has no publisher, and the silence reported, s.
+# Period of reminders, and silence of a publisher before it is reported, s.
 AGAIN = 60.0
 MUTE = 10.0
 

@@ -58,7 +58,7 @@ _USUAL = {'voltage': 'sensor_msgs/msg/BatteryState', 'throttle': 'std_msgs/msg/F
 _EACH, _AHEAD = 200.0, 0.02
 # A throttle that falls silent is held for this time, s; then the craft idles.
 _HOLD = 1.0
-# Throttle beyond this is invalid (the estimator's rule); below, it is clipped to 0..1.
+# Throttle beyond this is invalid (as in the estimator); below, it is clipped to 0..1.
 _MOST_THROTTLE = 2.0
 # A clock that is this far from the next sample, s, was set: samples continue from its time.  A
 # machine under load pauses for a second.

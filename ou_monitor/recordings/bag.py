@@ -338,7 +338,7 @@ def batches(
 # Chunks are read together up to this size, bytes unpacked.
 _TOGETHER = 2 * 1024 * 1024
 
-# Small chunks: a recording cut off by a brown-out loses its last chunk, about a second at 1 kHz.
+# Small, because a brown-out costs a recording its last chunk, about a second at 1 kHz.
 CHUNK_SIZE = 128 * 1024  # bytes
 
 

@@ -40,7 +40,7 @@ Rows = npt.NDArray[np.uint8]
 # Representation identifier and options.
 _HEADER = 4
 
-# Steps of a walk beyond four for each byte: a few bytes may state 2^32 elements of no bytes.
+# Maximum steps of a walk beyond four per byte (a few bytes may state 2^32 empty elements); depth.
 _FREE_STEPS, _MOST_DEPTH = 1000, 50
 # Maximum layouts for messages of one length, and length words in one that is compared with others;
 # a topic with more has no recurring layout.

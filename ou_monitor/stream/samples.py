@@ -219,7 +219,7 @@ BoolArray = npt.NDArray[np.bool_]
 # spacing by at most 5e-4 (0.05 us at 10 kHz); a clock error of 100 ppm is followed 1 ms behind.
 FOLLOW = 10.0  # s
 
-# Difference from which (and from two blocks) there is a gap: a busy companion computer delays
+# Minimum difference, also two blocks, that counts as a gap: a busy companion computer delays
 # blocks by about 100 ms and then sends them all.
 GAP_LEAST = 0.25  # s
 

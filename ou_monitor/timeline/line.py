@@ -327,7 +327,7 @@ WILD = 0.05
 BATCH = 32768
 # Search for repeats: samples used, minimum number, new samples between two searches.
 TAIL, _ENOUGH, _LOOK = 1024, 64, 256
-# Samples behind for each step back from which the clock itself went back.
+# Samples behind per backward step above which the clock itself went back.
 _STRETCH = 20
 # Places of samples; all of them as a slice.
 Picked = npt.NDArray[np.intp] | slice

@@ -25,7 +25,7 @@ WHERE = 'Section 3.3'
 RATE, SPEED = 1000.0, 1.0
 # Multiplicative: dU = +-c U dt; c small beside the rate, so that the limit holds to c^2/(4 q^2).
 GROWTH = 100.0
-# An example, since the paper gives no values but alpha: rates 1/s, rad/s; two
+# An example, since the paper gives only alpha: rates 1/s, rad/s; two
 # states that switch as an ESC of 24 kHz does, each coefficient +-30 % about its mean.
 DAMPING, COUPLING, CARRIER = 100.0, 40.0, 2.0 * math.pi * 10.0
 _SWING = np.array([1.3, 0.7])

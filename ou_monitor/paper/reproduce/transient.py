@@ -30,6 +30,7 @@ CORNER_HZ = 10.0
 # 30 mOhm of its own relaxes at 3e4 1/s.
 RAILS = (500.0, 1000.0, 2000.0, 5000.0)
 TYPICAL_RAIL = 1000.0
+# Of a simulated release: rate, Hz, time under load and time recorded after it, s.
 _RATE, _HOLD, _WATCH = 10e3, 0.3, 0.06
 
 TIME = 1e-3 * np.array(published.FIG_5_MS)

@@ -436,7 +436,7 @@ MOST_COLUMNS = 300
 _BACK = 0.25
 # A time without a unit has the coarsest unit with steps, and span, of at most these, s.
 _USUAL_STEP, _USUAL_SPAN = 2.0, 43200.0
-# A voltage without a unit above this is in mV: no pack of a craft has so many volts.
+# A voltage without a unit above this is in mV: no craft's pack has that many volts.
 _MOST_VOLTS = 1000.0
 
 
