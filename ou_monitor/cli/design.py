@@ -41,8 +41,8 @@ def run(args: argparse.Namespace) -> int:
         _list(args)
         return 0
     if args.throttle is None and args.recording is None:
-        raise InputError('--throttle is missing: ou-monitor design --throttle 0.4 asks for 40 %, '
-                         'and --from RECORDING for the throttle of a flight')
+        raise InputError('--throttle is missing: ou-monitor design --throttle 0.4 means 40 %, '
+                         "and --from RECORDING takes a flight's throttle")
     values = {} if args.network is None else read_network(args.network)
     for word in args.set:
         name, separator, text = word.partition('=')

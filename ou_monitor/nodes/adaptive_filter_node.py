@@ -490,7 +490,7 @@ class AdaptiveFilterNode(MonitorNode):
         if not notch.settings.count:
             return ''
         if not notch.active:
-            return '; notches off, they would not pay' if notch.source == 'none' else ''
+            return '; notches off, they would not help' if notch.source == 'none' else ''
         at = ', '.join(f'{f:.0f}' for f in notch.frequencies)
         return f'; notches at {at} Hz by {notch.source}'
 

@@ -376,7 +376,7 @@ class EstimatorNode(MonitorNode):
         """Return the notes on the input that apply in every state."""
         notes = []
         if self._stream.thin > 1:
-            notes.append(f'Overload: one of {self._stream.thin} samples is estimated from; the '
+            notes.append(f'Overload: one of {self._stream.thin} samples enters the estimate; the '
                          'floor checks all.')
         notes += self.fault_notes
         if 'voltage' in self._inputs:

@@ -135,7 +135,7 @@ def _read(path: str) -> tuple[ModelFile, bytes]:
         with open_regular(path) as file:
             known = file.read(_LARGEST)
     except (OSError, ValueError) as error:
-        why = (error.strerror if isinstance(error, OSError) else None) or 'it is no path'
+        why = (error.strerror if isinstance(error, OSError) else None) or 'it is not a path'
         raise InputError(f'cannot read the model file {path_words(path)}: {why}') from error
     from ou_monitor.recordings.model_file import read_model
     return read_model(path), known

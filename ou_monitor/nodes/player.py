@@ -53,7 +53,7 @@ class Player(Node):
             ClockMessage, '/clock', 10) if options.clock > 0.0 else None
         if self._clock_output is not None and self._bag.end_ns > LAST_HEADER_NS:
             raise InputError(f"'{options.bag}' has log times after 2^31 s, which /clock cannot "
-                             'tell: play it with --clock 0')
+                             'represent: play it with --clock 0')
         self._sent = dict.fromkeys(self._outputs, 0)
         self._spacing = SpacingError()
         self._passes = 0

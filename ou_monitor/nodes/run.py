@@ -91,7 +91,7 @@ def run_node(name: str, about: str, work: Callable[[], int]) -> NoReturn:
         left = remove_ros_args(sys.argv)[1:]
         if left:
             # rclpy would start without it, for example with another fmin than requested.
-            raise InputError(f"'{left[0]}' is not taken: parameters and remappings go behind "
+            raise InputError(f"'{left[0]}' is not an option: parameters and remappings go after "
                              '--ros-args, as in --ros-args -p NAME:=VALUE -r FROM:=TO')
         return work()
 

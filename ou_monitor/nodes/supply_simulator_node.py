@@ -268,8 +268,8 @@ class SupplySimulatorNode(MonitorNode):
             if not abs(now - due) <= _JUMP + 1.0 / self._rate:
                 if not math.isnan(self._begin):
                     self._lost += max(0, int((now - due) * self._rate))
-                    self.get_logger().warning(f'the clock went by {now - due:+.3g} s: the supply '
-                                              'goes on from where it was')
+                    self.get_logger().warning(f'the clock jumped by {now - due:+.3g} s: the '
+                                              'supply goes on from its last state')
                 self._begin = now - run.samples / self._rate
             begin = self._begin
             times = run.times(1 if self._rate <= _EACH else int(_AHEAD * self._rate))

@@ -100,7 +100,7 @@ def find_files(path: Path, partial: bool) -> BagFiles:
     if path.name == FILE and path.is_file():
         path = path.parent
     if not path.exists():
-        raise InputError(f'{path} is a link that leads nowhere' if path.is_symlink()
+        raise InputError(f'{path} is a broken link' if path.is_symlink()
                          else f'there is no bag {path}: check the path')
     if not path.is_dir():
         return BagFiles([path], {}, '')

@@ -154,7 +154,7 @@ def _chunk_limit(size: int, stated: int | None) -> int:
 
 def _over_limit(what: str, length: int, limit: int) -> str:
     return (f'{what} {length / 1e6:.4g} MB, and {limit / 1e6:.4g} MB is the limit: set '
-            f'{_VARIABLE} if that is meant')
+            f'{_VARIABLE} to allow more')
 
 
 def moment(log_time_ns: int, origin_ns: int) -> str:
@@ -587,7 +587,7 @@ class McapFile:
                            for span in spans], np.uint64)
         low, high = np.repeat(limits, np.diff(np.searchsorted(places, begins)), axis=0).T
         if (table.log_time < low).any() or (table.log_time > high).any():
-            raise Damage('its messages are not of the time that its index states')
+            raise Damage('its messages do not have the times of its index')
         self._learn_all(data, others)
         return table
 

@@ -13,7 +13,7 @@ from ou_monitor.text import number
 # Colours: measured, simulated.
 _MEASURED, _SIMULATED = 7, 1
 _VOLTAGE = ('Line: measured. Band: 95 % of the simulations at each moment. Pale line: one '
-            'simulation. Broken lines: the levels whose falls are counted.')
+            'simulation. Dashed lines: the levels whose falls are counted.')
 # Range of the fit if a model was given.
 _NOTHING = (0.0, 0.0)
 

@@ -65,7 +65,7 @@ def fleet_document(fleet: Fleet, command: str = '') -> Document:
         Section('Lowest voltages', [lowest_table(fleet)]),
         Section('Not analysed: the next run tries them again', [
             Notes.of(failure_words(fleet), Severity.ERROR, _SHOWN)] if fleet.failed else []),
-        Section('There twice, analysed once', [Notes.of(copies, most=_SHOWN)] if copies else []),
+        Section('Duplicates, analysed once', [Notes.of(copies, most=_SHOWN)] if copies else []),
         Section('Vehicles', [
             vehicles,
             Text('The lowest of all flights, their dips together; the rest are medians of '
@@ -122,7 +122,7 @@ def _anomalies(fleet: Fleet) -> str:
         tested = judged.trends or any(np.isfinite(o.bound) for o in (
             *judged.recordings.values(), *[v.outliers for v in judged.vehicles.values()]))
         text += (' Nothing stands out.' if tested else
-                 ' There are too few recordings a vehicle to tell what stands out.')
+                 ' There are too few recordings per vehicle to tell what stands out.')
     return text.strip()
 
 
@@ -162,14 +162,14 @@ def finding_words(fleet: Fleet) -> list[str]:
         centre = float(one.outliers.centre[k])
         values = judged.values[name]
         found.append(f'{one.names[k]}: {name} is {shown(values, one.value[k])}{_at(values)}, '
-                     f'{change(name, float(one.value[k]) - centre)} beside the median of the '
+                     f'{change(name, float(one.value[k]) - centre)} from the median of the '
                      f'vehicles; p over the fleet {chance(float(one.outliers.chance[k]))}.')
     for name, k in judged.odd_recordings():
         values, out = judged.values[name], judged.recordings[name]
         off = change(name, float(values.value[k] - out.centre[k]))
         found.append(f'{values.vehicles[k]}, {values.paths[k]}: {name} is '
                      f'{shown(values, values.value[k])}{_at(values)} ({_raw_value(values, k)}), '
-                     f'{off} beside the other flights; p over the fleet '
+                     f'{off} from the other flights; p over the fleet '
                      f'{chance(float(out.chance[k]))}.')
     return found
 
@@ -233,7 +233,7 @@ def comparison_words(fleet: Fleet) -> list[str]:
         notes.append('No vehicle has the 5 flights that a test for drift needs.')
     if any(np.isfinite(o.bound) for o in judged.recordings.values()):
         notes.append(
-            f'Outliers: a fleet with nothing wrong shows any with chance '
+            f'Outliers: a fleet with nothing wrong shows one with probability '
             f'{100 * OUTLIER_RATE:g} % (all quantities, recordings and vehicles together, where '
             'the scatter between good recordings is normal).')
     else:

@@ -84,7 +84,7 @@ def read_yaml(path: str | Path, what: str, *, most_bytes: int = MOST_BYTES,
         with open_regular(path) as file:
             data = file.read(most_bytes + 1)
     except (OSError, ValueError) as error:
-        why = (error.strerror if isinstance(error, OSError) else None) or 'it is no path'
+        why = (error.strerror if isinstance(error, OSError) else None) or 'it is not a path'
         raise InputError(f'cannot read {what} {where}: {why}') from error
     if len(data) > most_bytes:
         raise InputError(f'cannot read {what} {where}: it holds more than '
@@ -128,7 +128,7 @@ def _without_content(error: yaml.MarkedYAMLError) -> str:
     """Return the place and reason of a YAML error, without PyYAML's quotes of the file."""
     why = re.split(r'[\'":<]|,? but found', error.problem or '')[0].strip()
     if why in ('', 'found character', 'expected'):
-        why = 'something cannot stand there'
+        why = 'unexpected content'
     mark = error.problem_mark or error.context_mark
     return why if mark is None else f'{why} (line {mark.line + 1}, column {mark.column + 1})'
 
@@ -151,7 +151,7 @@ class _BoundedLoader(yaml.SafeLoader):
             if self._aliases > MOST_ALIASES:
                 self._refuse(f'it has more than {MOST_ALIASES} aliases', event)
             if event.anchor in self.anchors and event.anchor not in self._sizes:
-                self._refuse('an alias stands for what it is in itself', event)
+                self._refuse('an alias contains itself', event)
             self._count(self._sizes.get(event.anchor, 0), event)
             return super().compose_node(parent, index)
         before = self._nodes

@@ -642,7 +642,7 @@ def in_order(t: FloatArray, rows: FloatArray, most: float, unit: str = '',
     line = TimeLine()
     batches = line.order(stamps, np.flatnonzero(good).astype(np.float64), None, None, math.inf)
     if line.counters.late:
-        notes.append(Note(f'{counted(line.counters.late)} dropped: the stamp was there before; '
+        notes.append(Note(f'{counted(line.counters.late)} dropped: repeated stamp; '
                           'the first of each was kept.', Defect.REPEATED_STAMPS))
     return (batches[0].y if batches else np.empty(0)).astype(np.intp), notes
 
@@ -652,11 +652,11 @@ def _late_words(steps: int, t: FloatArray) -> str:
     ahead = np.maximum.accumulate(t) - t
     behind = int(np.count_nonzero(ahead))
     if behind < _STRETCH * steps:
-        return f'{counted(steps)} came before the stamp ahead of them: sorted by stamp.'
+        return f'{counted(steps)} came after a later stamp: sorted by stamp.'
     times = 'once' if steps == 1 else f'{steps} times'
     return (f'The clock went back {times}, by {float(ahead.max()):.3g} s at most: '
-            f'{counted(behind)} lie where others were before, and were mixed with them; take a '
-            'part before or after, or mend the stamps.')
+            f'{counted(behind)} overlap earlier ones and were mixed with them; take a '
+            'part before or after, or repair the stamps.')
 
 
 def as_column(values: npt.ArrayLike) -> FloatArray:

@@ -148,8 +148,8 @@ def test_samples_in_order_and_finite():
     assert t.tolist() == [0.0, 0.1, 0.2, 0.3, 0.6] and v.tolist() == [5.0, 5.1, 5.2, 5.3, 5.6]
     assert u is None
     assert '2 samples dropped' in notes[0]
-    assert '1 sample came before the stamp ahead of them' in notes[1]
-    assert '1 sample dropped: the stamp was there before' in notes[2]
+    assert '1 sample came after a later stamp' in notes[1]
+    assert '1 sample dropped: repeated stamp' in notes[2]
     assert counted(1, 'stamp') == '1 stamp' and counted(0, 'stamp') == '0 stamps'
 
 

@@ -69,7 +69,7 @@ QUIET = {
     'nothing': '', 'no throttle': 'Throttle is not recorded', 'gaps': '2 gaps',
     'constant throttle': 'Throttle is constant', 'NaN voltage': '429 samples dropped',
     'NaN stamps': '429 samples dropped', 'NaN throttle': 'Throttle is unknown at 10 samples',
-    'stamps swapped': '99 samples came before', 'stamps decreasing': '2999 samples came before',
+    'stamps swapped': '99 samples came after', 'stamps decreasing': '2999 samples came after',
     'inf': '3 samples dropped', 'huge unit': '', 'tiny noise': '', 'epoch': '',
     'white': 'only a lower bound'}
 

@@ -57,7 +57,7 @@ def test_a_row_each(odd, tmp_path, one_process):
         assert row['error'].isprintable() and len(row['error']) < 500
     errors = {row['recording']: row['error'] for row in fleet.failed}
     assert all('not a regular file' in errors[name] for name in ('fifo.mcap', 'fifo.csv', 'zero'))
-    assert all('leads nowhere' in errors[name] for name in ('loop.mcap', 'gone.mcap'))
+    assert all('broken link' in errors[name] for name in ('loop.mcap', 'gone.mcap'))
     assert all(note.isprintable() for note in fleet.notes)
 
 

@@ -43,7 +43,7 @@ def test_arguments_that_rclpy_would_pass_over(world, name):
     """A parameter without --ros-args is refused, not ignored; --help helps."""
     process = world.start(name, 'fmin:=30.0', '--ros-args', '-p', 'publish_rate:=5.0')
     assert process.wait() == 2
-    assert "'fmin:=30.0' is not taken" in process.err and '--ros-args -p' in process.err
+    assert "'fmin:=30.0' is not an option" in process.err and '--ros-args -p' in process.err
     process = world.start(name, '--help')
     assert process.wait() == 0
     assert not process.err

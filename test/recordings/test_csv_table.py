@@ -96,8 +96,8 @@ def test_repairs_are_noted(tmp_path):
     assert recording.throttle.tolist() == [0.0, 0.0, 0.0, 0.6]
     assert len(recording.notes) == 3
     assert recording.notes[0].startswith('4 samples dropped: not a finite')
-    assert recording.notes[1].startswith('1 sample came before')
-    assert recording.notes[2].startswith('1 sample dropped: the stamp was there')
+    assert recording.notes[1].startswith('1 sample came after')
+    assert recording.notes[2].startswith('1 sample dropped: repeated stamp')
 
 
 def test_one_sample(tmp_path):

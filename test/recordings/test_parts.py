@@ -86,7 +86,7 @@ def test_whole(bag, rows):
     np.testing.assert_array_equal(recording.throttle, throttle)
     notes = ' '.join(recording.notes)
     assert '31 samples dropped: not a finite' in notes
-    assert 'sorted by stamp' in notes and 'the stamp was there before' in notes
+    assert 'sorted by stamp' in notes and 'repeated stamp' in notes
 
 
 @pytest.mark.parametrize('compression', list(CompressionType))

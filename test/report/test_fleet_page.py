@@ -76,11 +76,11 @@ def test_plain_data_agrees(odd):
 
 @pytest.mark.parametrize('rows, words', [
     ([{'path': '/f/bad', 'error': 'no bag'}], 'could not be'),
-    (table(np.random.default_rng(2), 1, 1), 'too few recordings a vehicle'),
+    (table(np.random.default_rng(2), 1, 1), 'too few recordings per vehicle'),
     ([{'path': '/f/a', 'vehicle': 'v', 'flight': 1, 'status': 'TOO_SHORT', 'flags': ['TREND']}],
      'no estimate of sigma at any level'),
     ([{**row, 'vehicle': None, 'flight': None} for row in table(
-        np.random.default_rng(3), 1, 8)], 'too few recordings a vehicle'),
+        np.random.default_rng(3), 1, 8)], 'too few recordings per vehicle'),
 ])
 def test_little_is_known(rows, words):
     """A fleet of failures, of one recording, without estimates or vehicles has its report."""

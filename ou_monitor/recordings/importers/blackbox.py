@@ -249,7 +249,7 @@ def _battery(t: FloatArray, columns: Fields, headers: Headers,
     volts, amperes = _battery_scales(headers)
     for field, quantity, words, rank in (
             ('vbatLatest', VOLTAGE, 'battery', 0), ('vbat', VOLTAGE, 'battery', 0),
-            ('sagCompensatedVBat', VOLTAGE, 'battery, sag taken out by INAV', None),
+            ('sagCompensatedVBat', VOLTAGE, 'battery, sag compensated by INAV', None),
             ('amperageLatest', CURRENT, 'battery', 0), ('amperage', CURRENT, 'battery', 0)):
         if field not in columns:
             continue
@@ -284,7 +284,7 @@ def _throttles(t: FloatArray, columns: Fields,
                      'stick', 1)
     if 'setpoint[3]' in columns:
         yield Series('setpoint[3]', THROTTLE, t, columns['setpoint[3]'] / 1000.0, '0.001',
-                     'throttle asked for', 2)
+                     'throttle command', 2)
     for name in motors:
         yield Series(name, THROTTLE, t, (columns[name] - low) / (high - low),
                      f'(x - {low:g}) / {high - low:g}', 'one motor')
@@ -377,7 +377,7 @@ def _signals(t: FloatArray, columns: Fields, headers: Headers, known: set[str], 
         elif stem == ACCELEROMETER and one_g:
             scale, unit, words = GRAVITY / one_g, 'm/s^2', 'accelerometer'
         elif stem == 'setpoint':
-            scale, unit, words = rates, 'rad/s', 'rate asked for'
+            scale, unit, words = rates, 'rad/s', 'rate command'
         elif stem == 'BaroAlt':
             scale, unit, words = 0.01, 'm', 'altitude by the barometer'
         yield Series(name, SIGNAL, t, values * scale, f'{scale:.6g}', words, own_unit=unit)

@@ -43,7 +43,7 @@ _PLAIN = {
     'pm.extVbat': (VOLTAGE, 1.0, None, 'external voltage of a BigQuad deck', 'pm.ext'),
     'pm.extVbatMV': (VOLTAGE, 1e-3, None, 'external voltage of a BigQuad deck', 'pm.ext'),
     'pm.extCurr': (CURRENT, 1.0, None, 'external current of a BigQuad deck', 'pm.ext'),
-    'stabilizer.thrust': (THROTTLE, 1.0 / 65535.0, 1, 'thrust asked of the mixer', ''),
+    'stabilizer.thrust': (THROTTLE, 1.0 / 65535.0, 1, 'thrust command to the mixer', ''),
     **{f'motor.m{k}': (THROTTLE, 1.0 / 65535.0, None, 'one motor', '') for k in range(1, 5)},
 }
 # Groups of three axes: forwards, left, up, as in `base_link`.

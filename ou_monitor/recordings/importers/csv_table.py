@@ -525,7 +525,7 @@ def read(path: Path, request: Request) -> Log:
     notes: list[str] = [table.note] if table.note else []
     late = int(np.count_nonzero(np.diff(t) < 0.0))
     if late:
-        notes.append(Note(f'{counted(late, "line")} came before the stamp ahead of them: sorted '
+        notes.append(Note(f'{counted(late, "line")} came after a later stamp: sorted '
                           'by stamp.', Defect.UNORDERED))
         order = np.argsort(t, kind='stable')
         series = [replace(one, t=t[order], values=one.values[order]) for one in series]

@@ -320,7 +320,7 @@ def _speeds(table: Table) -> Motion | None:
         last = np.maximum(np.searchsorted(own, t, 'right') - 1, 0)
         values.append(np.array(columns[field])[last] * RPM)
     return Motion('', t, {VELOCITY: np.column_stack(values)}, f'rpm {RPM:.6g}',
-                  'speed as the ESC reports it, the last report held',
+                  'speed reported by the ESC, the last report held',
                   motors=tuple(f'motor_{instance or 0}' for instance in found))
 
 

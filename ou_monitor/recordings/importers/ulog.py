@@ -49,7 +49,7 @@ PLAIN = (
     ('system_power', 'voltage_payload_v', VOLTAGE, None, 'payload rail'),
     ('power_monitor', 'voltage_v', VOLTAGE, None, 'power monitor'),
     ('power_monitor', 'current_a', CURRENT, None, 'power monitor'),
-    ('actuator_controls_0', 'control[3]', THROTTLE, 3, 'thrust asked of the mixer'),
+    ('actuator_controls_0', 'control[3]', THROTTLE, 3, 'thrust command to the mixer'),
     ('manual_control_setpoint', 'z', THROTTLE, 4, 'stick'),
 )
 
@@ -206,7 +206,7 @@ def _speeds(topic: str, columns: dict[str, Any]) -> Motion | None:
     values = np.column_stack([np.asarray(columns[name], dtype=np.float64) for name in fields])
     return Motion(
         '', np.asarray(columns['timestamp'], dtype=np.float64) * 1e-6,
-        {VELOCITY: np.abs(values) * RPM}, f'rpm {RPM:.6g}', 'speed as the ESC reports it',
+        {VELOCITY: np.abs(values) * RPM}, f'rpm {RPM:.6g}', 'speed reported by the ESC',
         motors=tuple(f'motor_{name[4:name.index("]")]}' for name in fields))
 
 

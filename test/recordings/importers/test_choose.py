@@ -78,7 +78,7 @@ def test_clean():
     np.testing.assert_array_equal(mended.values[:5], [1, 2, 6, 7, 9])
     assert [note.split('dropped: ')[1].split(';')[0].rstrip('.') for note in notes] == [
         'not a finite number', 'the stamp is over 3600 s away from all others',
-        'the stamp was there before']
+        'repeated stamp']
     assert 24 - mended.n == sum(int(note.split()[0]) for note in notes)
 
 
