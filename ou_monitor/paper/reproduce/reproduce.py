@@ -52,7 +52,7 @@ class Point:
 
     @property
     def outcome(self) -> str:
-        """Number of its rows by verdict, in words."""
+        """Return the number of rows by verdict, in words."""
         return tally(self.rows)
 
 
