@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from ou_monitor.analysis.coupling import Coupling
     from ou_monitor.analysis.supply import SupplyFacts
     from ou_monitor.model.supply import SupplyModel
-    from ou_monitor.paper.network.components import PowerNetwork
-    from ou_monitor.paper.network.design import Flight
+    from ou_monitor.paper.design import Flight
+    from ou_monitor.paper.network import PowerNetwork
     from ou_monitor.recordings.importers.log import Series
     from ou_monitor.recordings.model_file import ModelFile
     from ou_monitor.simulation import Profile, Run
@@ -376,8 +376,8 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
 
     """
     from ou_monitor.analysis.crafts import check_cells
-    from ou_monitor.paper.network.components import completed, PowerNetwork
-    from ou_monitor.paper.network.design import (
+    from ou_monitor.paper.network import completed, PowerNetwork
+    from ou_monitor.paper.design import (
         as_data, default_voltage, design as designed, LEAST, MOST, network_of)
     from ou_monitor.report.design_document import design_document, taken_words
 
@@ -412,7 +412,7 @@ def _flight(recording: Recording) -> tuple[Flight, Any]:
     """Return what a recording says of its supply, and the facts."""
     from ou_monitor.analysis.crafts import cells_of, full_voltage
     from ou_monitor.analysis.supply import facts_and_end
-    from ou_monitor.paper.network.design import Flight
+    from ou_monitor.paper.design import Flight
 
     if not recording.has_throttle:
         raise InputError(f'--from {recording.name}: the recording has no throttle')
@@ -448,7 +448,7 @@ def reproduce(*, seed: int = 1, progress: Progress | None = None) -> Result:
     ['AGREES', 'DOES_NOT_HOLD', 'ROUNDING']
 
     """
-    from ou_monitor.paper.reproduce.reproduce import as_data, reproduce as reproduced
+    from ou_monitor.paper.reproduce import as_data, reproduce as reproduced
     from ou_monitor.report.reproduction_document import reproduction_document
 
     found = reproduced(seed, progress)

@@ -19,7 +19,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / 'benchmarks')]
 
 from ou_monitor.model.supply import SupplyModel  # noqa: E402
 from ou_monitor.model.terms.catalogue import catalogue  # noqa: E402
-from ou_monitor.paper.reproduce import published  # noqa: E402
+from ou_monitor.paper import published  # noqa: E402
 from tables import drawing  # noqa: E402
 
 # Cause: its parameters, and the seconds shown.

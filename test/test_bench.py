@@ -13,7 +13,7 @@ from ou_monitor import (
     analyze, compare, coupling, design, discover, InputError, read_recording, Recording,
     reproduce, Result, simulate, supply_facts)
 from ou_monitor.cli.main import main
-from ou_monitor.paper.reproduce import reproduce as reproduction
+from ou_monitor.paper import reproduce as reproduction
 from ou_monitor.report.terminal import terminal
 from project import ROOT
 import pytest

@@ -9,7 +9,7 @@ import sys
 import ou_monitor
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.term import Term
-from ou_monitor.paper.reproduce import reproduce as reproduction
+from ou_monitor.paper import reproduce as reproduction
 import pytest
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]

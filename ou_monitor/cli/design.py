@@ -12,7 +12,7 @@ from ou_monitor.cli import output
 from ou_monitor.cli.arguments import check_outputs, read_given
 from ou_monitor.cli.commands import quantity
 from ou_monitor.errors import InputError, nearest
-from ou_monitor.paper.network.components import PowerNetwork, UNITS
+from ou_monitor.paper.network import PowerNetwork, UNITS
 from ou_monitor.report.document import Document, Table
 from ou_monitor.stream.files import read_yaml
 

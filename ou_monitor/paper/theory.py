@@ -434,12 +434,15 @@ class SwitchedSystem:
         return cls(generator, np.array([one.matrix for one in systems]),
                    np.array([one.offset for one in systems]))
 
+    def switched_average(self) -> tuple[FloatArray, FloatArray]:
+        """Return sum_x pi(x) A_x and sum_x pi(x) a_x."""
+        pi = self.generator.stationary
+        return np.tensordot(pi, self.matrices, 1), pi @ self.offsets
+
     def averaged(self) -> AffineSystem:
         """Return the averaged system du/dt = C_hat(u) = sum_x pi(x) C(u; x)."""
-        pi = self.generator.stationary
-        return AffineSystem(
-            self.drift_matrix + np.tensordot(pi, self.matrices, 1),
-            self.drift_offset + pi @ self.offsets)
+        matrix, offset = self.switched_average()
+        return AffineSystem(self.drift_matrix + matrix, self.drift_offset + offset)
 
     def balanced(self) -> SwitchedSystem:
         """
@@ -448,12 +451,10 @@ class SwitchedSystem:
         At eps = 1 nothing changes; the switched part meets the balance
         condition, so the diffusion limit exists.
         """
-        mean = self.averaged()
-        pi = self.generator.stationary
+        matrix, offset = self.switched_average()
         return replace(
-            self, drift_matrix=mean.matrix, drift_offset=mean.offset,
-            matrices=self.matrices - np.tensordot(pi, self.matrices, 1),
-            offsets=self.offsets - pi @ self.offsets)
+            self, drift_matrix=self.drift_matrix + matrix, drift_offset=self.drift_offset + offset,
+            matrices=self.matrices - matrix, offsets=self.offsets - offset)
 
     def scaled(self, eps: float, scaling: Scaling) -> SwitchedSystem:
         """Return the system at eps with clock and speed built in, nothing left unswitched."""
@@ -510,8 +511,7 @@ class LinearDiffusion:
 
 def require_balance(system: SwitchedSystem) -> None:
     """Refuse a system whose switched part does not have zero average."""
-    pi = system.generator.stationary
-    matrix, offset = np.tensordot(pi, system.matrices, 1), pi @ system.offsets
+    matrix, offset = system.switched_average()
     cure = '; SwitchedSystem.balanced() moves the average to the unswitched drift'
     worst = np.unravel_index(int(np.argmax(np.abs(matrix))), matrix.shape)
     if abs(matrix[worst]) > BALANCE_TOLERANCE * float(np.abs(system.matrices).max()):

@@ -6,9 +6,9 @@ import math
 from typing import Any
 
 import numpy as np
-from ou_monitor.paper.network.components import PowerNetwork
-from ou_monitor.paper.network.design import (
+from ou_monitor.paper.design import (
     answer, Design, effect, Flight, probability, remarks)
+from ou_monitor.paper.network import PowerNetwork
 from ou_monitor.report.document import Document, Figure, Table, Text
 from ou_monitor.report.svg import Plot
 from ou_monitor.text import number

@@ -7,13 +7,11 @@ import math
 
 import numpy as np
 from ou_monitor.criticism.curves import outline
-from ou_monitor.paper.reproduce import published, transient
-from ou_monitor.paper.reproduce.crest import crest
-from ou_monitor.paper.reproduce.network import share_above
-from ou_monitor.paper.reproduce.published import Row
-from ou_monitor.paper.reproduce.reproduce import (
+from ou_monitor.paper import published, transient
+from ou_monitor.paper.published import Row
+from ou_monitor.paper.reproduce import (
     headline, lorentzian, recomputed, Reproduction, tally)
-from ou_monitor.paper.reproduce.table2 import sigma_of
+from ou_monitor.paper.tables import share_above
 from ou_monitor.report.document import (
     Document, Figure, Notes, Pair, Part, Section, Table, Text)
 from ou_monitor.report.svg import Plot, span
@@ -57,7 +55,7 @@ def _explanations(rows: Sequence[Row]) -> Callable[[], list[Part]]:
 
 def _screens(result: Reproduction) -> list[Part]:
     drawn = []
-    for k, screen in enumerate(result.figures.screens):
+    for k, screen in enumerate(result.screens):
         state = screen.state
         plot = Plot(f'{state.label}: one OU', 'time, ms', 'mV', width=450, height=230)
         half = 0.5 * state.vpp.value
@@ -76,9 +74,8 @@ def _screens(result: Reproduction) -> list[Part]:
 
 
 def _transient() -> list[Part]:
-    line = transient.paper_fit()
-    plain, shifted = (transient.fit_curve(transient.TIME, transient.VALUE, offset)
-                      for offset in (False, True))
+    line = transient.PAPER_FIT
+    plain, shifted = transient.decay_fits()
     t = np.linspace(0.0, 0.055, 221)
     rail = transient.TYPICAL_RAIL
     behind, worst = transient.fitted_through_coupling(t)
@@ -108,9 +105,9 @@ def _spectrum(result: Reproduction) -> list[Part]:
                 log_y=True, legend_low=True)
     wide = np.geomspace(1.0, 5e5, 200)
     lines = []
-    for k, found in enumerate(result.figures.spectra):
+    for k, found in enumerate(result.spectra):
         state = found.state
-        curve = lorentzian(wide, published.ALPHA.value, sigma_of(state))
+        curve = lorentzian(wide, published.ALPHA.value, state.sigma)
         lines += [curve, found.density]
         plot.line(found.frequency, found.density, f'{state.label}, simulated', k, 'faint')
         plot.line(wide, curve, f'{state.label}, Lorentzian', k, 'dash thick')
@@ -138,7 +135,7 @@ def _crest_and_factor(result: Reproduction) -> list[Part]:
         crests.line(*outline(edges, share), f'{ms} ms', k)
     crests.limits(x=(2.5, 10.0), y=(0.0, 1.15))
     for state in published.LOADED:
-        crests.mark(crest(state)[0], state.label)
+        crests.mark(state.crest, state.label)
     s = result.spreading
     t = 1e3 * s.t
     factor = Plot('Variance under telegraph noise', 'time, ms', '10\u207b\u2076 V\u00b2',

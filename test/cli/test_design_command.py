@@ -7,7 +7,7 @@ import re
 import numpy as np
 from ou_monitor.cli.commands import quantity
 from ou_monitor.cli.main import main
-from ou_monitor.paper.network.components import PowerNetwork
+from ou_monitor.paper.network import PowerNetwork
 import pytest
 
 QUESTION = ['design', '--risk', '1e-3', '--throttle', '0.4']

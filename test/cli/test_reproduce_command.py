@@ -4,7 +4,7 @@ from xml.etree import ElementTree
 
 from command_line import failure, strict
 from ou_monitor.cli.main import main
-from ou_monitor.paper.reproduce import reproduce as module
+from ou_monitor.paper import reproduce as module
 import pytest
 
 

@@ -6,10 +6,9 @@ import math
 from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor.model.passage.law import mean_first_passage
-from ou_monitor.paper.network.components import PowerNetwork
-from ou_monitor.paper.network.design import (
+from ou_monitor.paper.design import (
     answer, default_voltage, design, DesignVerdict, effect, remarks, row_of, with_capacitance)
-from ou_monitor.paper.network.rail import rail_at
+from ou_monitor.paper.network import PowerNetwork, rail_at
 import pytest
 
 QUESTION = {'voltage': 19.8, 'horizon': 5.0, 'risk': 1e-3}

@@ -4,9 +4,9 @@ import math
 import re
 
 import numpy as np
-from ou_monitor.paper.reproduce import (
-    network, probability, published, switching, table1, table2, transient)
-from ou_monitor.paper.reproduce.published import Printed, RowVerdict
+from ou_monitor.paper import published, switching, tables, transient
+from ou_monitor.paper.network import PowerNetwork
+from ou_monitor.paper.published import Printed, RowVerdict
 import pytest
 from scipy.integrate import trapezoid
 from scipy.signal import lsim
@@ -23,7 +23,7 @@ def by_quantity(rows):
 @pytest.fixture(scope='module')
 def first_table():
     """Return the rows of Table 1, for white noise of a crest factor of 8.77."""
-    return by_quantity(table1.rows(8.77, 0.02))
+    return by_quantity(tables.table_1(8.77, 0.02))
 
 
 @pytest.fixture(scope='module')
@@ -34,7 +34,7 @@ def fig5():
 
 def test_steps_of_the_oscilloscope():
     """6.25 mV and 9.375 mV, and by hand how many of them each reading is."""
-    vpp, vrms = table1.vpp_step(), table1.vrms_step()
+    vpp, vrms = published.VPP_STEP, published.VRMS_STEP
     assert vpp.low <= 6.25 * (1 + 1e-9) and 6.25 <= vpp.high < 6.26
     assert vrms.low <= 9.375 * (1 + 1e-9) and 9.375 <= vrms.high < 9.39
     assert vpp.multiples == (10, 13, 36, 46) and vrms.multiples == (1, 3, 6)
@@ -42,7 +42,7 @@ def test_steps_of_the_oscilloscope():
 
 def test_step_of_readings_drawn_with_a_known_one():
     """Multiples of 0.8 rounded to two digits give it back, and chance is small."""
-    step = table1.common_step([Printed(f'{0.8 * k:.2f}') for k in (7, 12, 31)])
+    step = published.common_step([Printed(f'{0.8 * k:.2f}') for k in (7, 12, 31)])
     assert step.low <= 0.8 <= step.high and step.multiples == (7, 12, 31)
 
 
@@ -54,12 +54,12 @@ def test_chance_of_a_step_is_about_right():
     twice of it; 5000 triples.
     """
     rng = np.random.default_rng(3)
-    claimed = table1.vrms_step().chance
+    claimed = published.VRMS_STEP.chance
     hits = 0
     for second, third in rng.uniform([20.0, 50.0], [38.0, 62.0], (5_000, 2)):
         readings = [Printed('9.38'), Printed(f'{second:.1f}'), Printed(f'{third:.1f}')]
         try:
-            hits += table1.common_step(readings).size > 9.0
+            hits += published.common_step(readings).size > 9.0
         except ValueError:
             pass
     assert 0.2 * claimed * 5_000 < hits < 2.0 * claimed * 5_000
@@ -69,7 +69,7 @@ def test_chance_of_a_step_is_about_right():
 def test_half_a_step_of_vrms(label, percent):
     """As THEORY has it: +-50, 17 and 8 %."""
     state = next(s for s in published.LOADED if s.label == label)
-    low, high = table1.vrms_range(state)
+    low, high = state.vrms_range
     assert round(50.0 * (high - low) / state.vrms.value) == percent
 
 
@@ -92,7 +92,7 @@ def test_exponents_of_growth():
     """From the steps ln 3 / ln 2 = 1.585 and ln 2 / ln 4 = 0.5; ranges by brute force."""
     for pair, exact in (((published.LOW, published.MEDIUM), math.log(3) / math.log(2)),
                         ((published.MEDIUM, published.HIGH), 0.5)):
-        value, (low, high) = table1.exponent(*pair)
+        value, (low, high) = tables.exponent(*pair)
         assert value == pytest.approx(exact, abs=0.003)
         span = math.log(pair[1].load / pair[0].load)
         corners = [math.log((pair[1].vrms.value + a) / (pair[0].vrms.value + b)) / span
@@ -108,7 +108,7 @@ def test_alpha_by_least_squares(fig5):
     beta = normal @ design.T @ y
     residual = y - design @ beta
     se = math.sqrt(residual @ residual / 2.0 * normal[1, 1])
-    line = transient.paper_fit()
+    line = transient.PAPER_FIT
     assert line.alpha == pytest.approx(-beta[1]) == pytest.approx(63.046, abs=5e-4)
     assert line.alpha_se == pytest.approx(se)
     assert line.scatter == pytest.approx(math.sqrt(residual @ residual / 2.0))
@@ -141,8 +141,7 @@ def test_exponential_with_offset():
 
     grid = np.arange(40.0, 80.0, 0.01)
     best = {offset: min(grid, key=lambda a: profile(a, offset)[0]) for offset in (False, True)}
-    shifted = transient.fit_curve(t, u, offset=True)
-    plain = transient.fit_curve(t, u, offset=False)
+    plain, shifted = transient.decay_fits()
     assert shifted.parameters[1] == pytest.approx(best[True], abs=0.02)
     assert plain.parameters[1] == pytest.approx(best[False], abs=0.02)
     assert shifted.parameters[2] == pytest.approx(profile(best[True], True)[1][1], abs=0.02)
@@ -150,7 +149,7 @@ def test_exponential_with_offset():
     assert plain.rss / shifted.rss == pytest.approx(
         profile(best[False], False)[0] / profile(best[True], True)[0], rel=1e-3)
     # With (1, 2) degrees of freedom P(F > f) = 1 - sqrt(f / (f + 2)).
-    test, p = transient.offset_test(plain, shifted)
+    test, p = transient.offset_test()
     assert test == pytest.approx(2.0 * (plain.rss / shifted.rss - 1.0))
     assert p == pytest.approx(1.0 - math.sqrt(test / (test + 2.0)))
 
@@ -171,7 +170,7 @@ def test_coupling_hides_the_rail():
     rates = [transient.fitted_rate(rail) for rail in (20.0, 100.0, 300.0, 1e3, 1e4, 1e6)]
     assert rates == sorted(rates) and rates[-1] < w
     assert rates[-1] == pytest.approx(w, rel=1e-3) and rates[0] < 25.0
-    line = transient.paper_fit()
+    line = transient.PAPER_FIT
     assert transient.fitted_rate(transient.slowest_rail()) == pytest.approx(
         line.alpha - line.half_width)
 
@@ -196,7 +195,7 @@ def test_coupling_by_simulation(fig5):
 
 def test_table_2():
     """sigma, Var_inf, tau and their errors, by hand."""
-    rows = by_quantity([r for r in table2.rows() if r.where in ('Table 2', 'Section 5')])
+    rows = by_quantity([r for r in tables.table_2() if r.where in ('Table 2', 'Section 5')])
     assert rows['sqrt(2 alpha)'].recomputed == pytest.approx(11.2249722)
     assert rows['tau'].recomputed == pytest.approx(15.8730159)
     assert rows['sigma, 10 %'].recomputed == pytest.approx(0.3154217, abs=1e-6)
@@ -218,8 +217,8 @@ def test_table_2():
 def test_probability_three_ways(delta, var):
     """Closed form, printed integral, and the normal law."""
     exact = 2.0 * norm.sf(delta / math.sqrt(var))
-    assert probability.beyond(delta, var) == pytest.approx(exact, rel=1e-12)
-    assert probability.beyond_by_quadrature(delta, var) == pytest.approx(exact, rel=1e-9)
+    assert tables.beyond(delta, var) == pytest.approx(exact, rel=1e-12)
+    assert tables.beyond_by_quadrature(delta, var) == pytest.approx(exact, rel=1e-9)
 
 
 def test_probability_by_simulation():
@@ -228,7 +227,7 @@ def test_probability_by_simulation():
 
     200000 samples at 50 mV and 40 %: an error of 0.3 % of P; d ln P / d ln var is 0.64 there.
     """
-    rows = by_quantity(probability.rows(np.random.default_rng(5), draws=200_000))
+    rows = by_quantity(tables.probabilities(np.random.default_rng(5), draws=200_000))
     row = rows['P(|U| > 50 mV), 40 %']
     exact, off = (2.0 * norm.sf(0.05 / (0.0563 * math.sqrt(f))) for f in (1.0, 1.03))
     assert row.printed.value == pytest.approx(exact, rel=1e-3)
@@ -253,7 +252,7 @@ def test_falls_by_first_passage():
             int(alive.sum()))
         time[alive] += dt
         alive &= u < level
-    row = by_quantity(probability.rows(rng, 1000))['falls by 100 mV a second, 40 over 10 %']
+    row = by_quantity(tables.probabilities(rng, 1000))['falls by 100 mV a second, 40 over 10 %']
     said = float(re.search(r'([0-9.]+) s at 40 %', row.sentence).group(1))
     assert abs(time.mean() - said) < 4.0 * time.std() / math.sqrt(2000) + 0.02 * said
     assert row.verdict is RowVerdict.AGREES
@@ -261,14 +260,14 @@ def test_falls_by_first_passage():
 
 def test_capacitance():
     """1/(R C) and S R/(2 C); both elasticities are -1, so alpha falls."""
-    alpha, var = network.rc_rail(0.05, 2e-3, 3e-6)
+    alpha, var = tables.rc_rail(0.05, 2e-3, 3e-6)
     assert alpha == pytest.approx(1e4) and var == pytest.approx(3e-6 * 0.05 / (2.0 * 2e-3))
-    rows = by_quantity(network.rows())
+    rows = by_quantity(tables.hardware_and_growth())
     assert rows['d ln alpha / d ln C'].recomputed == pytest.approx(-1.0)
     assert rows['d ln alpha / d ln C'].verdict is RowVerdict.DOES_NOT_HOLD
     assert rows['d ln Var_inf / d ln C'].recomputed == pytest.approx(-1.0)
     assert rows['d ln Var_inf / d ln C'].verdict is RowVerdict.AGREES
-    before, after = network.doubled(network.PowerNetwork())
+    before, after = tables.doubled(PowerNetwork())
     assert after.alpha < before.alpha and after.var_inf < before.var_inf
 
 
@@ -277,7 +276,7 @@ def test_share_of_the_variance_at_the_esc_lines():
     f = np.geomspace(24e3, 1e12, 20001)
     density = 4.0 * 63.0 / (63.0 ** 2 + (2.0 * math.pi * f) ** 2)
     above = float(trapezoid(density * f, np.log(f)))
-    assert network.share_above(24e3) == pytest.approx(above, rel=1e-4)
+    assert tables.share_above(24e3) == pytest.approx(above, rel=1e-4)
 
 
 def test_matrix_as_printed_and_averaged():

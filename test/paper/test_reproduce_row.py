@@ -3,7 +3,7 @@
 import math
 
 from hypothesis import given, strategies as st
-from ou_monitor.paper.reproduce.published import Printed, Row, RowVerdict
+from ou_monitor.paper.published import Printed, Row, RowVerdict
 import pytest
 
 

@@ -3,8 +3,8 @@
 import math
 
 import numpy as np
-from ou_monitor.paper.reproduce import crest, published, switching
-from ou_monitor.paper.reproduce.published import RowVerdict
+from ou_monitor.paper import crest, published, switching
+from ou_monitor.paper.published import RowVerdict
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.signal import lfilter

@@ -3,9 +3,9 @@
 from collections import Counter
 import re
 
-from ou_monitor.paper.reproduce import published, reproduce as module
-from ou_monitor.paper.reproduce.published import Printed, Row, RowVerdict
-from ou_monitor.paper.reproduce.reproduce import as_data, headline, recomputed
+from ou_monitor.paper import published, reproduce as module
+from ou_monitor.paper.published import Printed, Row, RowVerdict
+from ou_monitor.paper.reproduce import as_data, headline, recomputed
 from ou_monitor.report.page import html
 from ou_monitor.report.reproduction_document import reproduction_document
 from pages import self_contained
@@ -112,7 +112,7 @@ def test_screens_are_in_steps_and_near_their_vrms(result):
 
     About 100 ms / (2 tau) = 3 independent values: the rms about zero scatters by some 35 %.
     """
-    for screen in result.figures.screens:
+    for screen in result.screens:
         steps = screen.u / 6.2503e-3
         assert abs(steps - steps.round()).max() < 0.01
         if screen.state is not published.IDLE:
@@ -126,7 +126,7 @@ def test_spectra_follow_the_lorentzian(result):
 
     Bins there average 7 segments and several lines, so each scatters by 12 % at most.
     """
-    for found in result.figures.spectra:
+    for found in result.spectra:
         use = (found.frequency > 100.0) & (found.frequency < 1e4)
         sigma = 1e-3 * found.state.vrms.value * (2.0 * 63.0) ** 0.5
         exact = 2.0 * sigma ** 2 / (63.0 ** 2 + (2.0 * 3.141592653589793

@@ -17,17 +17,15 @@ from ou_monitor.model.ou import simulate
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ac_coupling import ACCoupling
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.paper.network.components import PowerNetwork
-from ou_monitor.paper.reproduce import (
-    network, probability, published, switching, table1, table2, transient)
-from ou_monitor.paper.reproduce.crest import (
-    crest, Crests, impulse_height, jump_rows, JUMP_SCREENS_MS, JumpCrest, largest, mean_and_error,
+from ou_monitor.paper import published, switching, tables, transient
+from ou_monitor.paper.crest import (
+    Crests, impulse_height, jump_rows, JUMP_SCREENS_MS, JumpCrest, largest, mean_and_error,
     rows as crest_rows, simulate_crests, simulate_jumps)
-from ou_monitor.paper.reproduce.published import Row, RowVerdict
-from ou_monitor.paper.reproduce.switching import Spreading
-from ou_monitor.paper.reproduce.table1 import exponent, vpp_step, vrms_step
-from ou_monitor.paper.reproduce.table2 import sigma_half_width, sigma_of
-from ou_monitor.paper.reproduce.transient import CORNER_HZ
+from ou_monitor.paper.network import PowerNetwork
+from ou_monitor.paper.published import over, Row, RowVerdict
+from ou_monitor.paper.switching import Spreading
+from ou_monitor.paper.tables import exponent, sigma_half_width
+from ou_monitor.paper.transient import CORNER, CORNER_HZ, PAPER_FIT
 from ou_monitor.records import FloatArray
 from ou_monitor.text import number
 from scipy.signal import welch
@@ -108,12 +106,11 @@ def _factor(rows: Sequence[Row]) -> str:
 
 
 def _coupling(rows: Sequence[Row]) -> str:
-    line = transient.paper_fit()
+    line = PAPER_FIT
     fitted = _row(rows, f'alpha fitted, rail of {transient.TYPICAL_RAIL:g}')
     slope = _row(rows, 'd ln(alpha fitted)')
-    corner = 2.0 * math.pi * transient.CORNER_HZ
     # Variance of an OU behind a high-pass: alpha / (alpha + corner) of its own.
-    kept = math.sqrt(published.ALPHA.value / (published.ALPHA.value + corner))
+    kept = math.sqrt(published.ALPHA.value / (published.ALPHA.value + CORNER))
     alpha = published.ALPHA.text
     return (f'{alpha} 1/s is 2 pi x {published.ALPHA.value / (2.0 * math.pi):.2f} Hz, and '
             f'AC coupling is a first-order high-pass, on many oscilloscopes at 10 Hz. Behind '
@@ -130,9 +127,8 @@ def _coupling(rows: Sequence[Row]) -> str:
 
 def _exponential(rows: Sequence[Row]) -> str:
     rates = transient.local_rates()
-    plain, shifted = (transient.fit_curve(transient.TIME, transient.VALUE, offset)
-                      for offset in (False, True))
-    test, p = transient.offset_test(plain, shifted)
+    plain, shifted = transient.decay_fits()
+    test, p = transient.offset_test()
     low, high = shifted.band(1)
     outside = [row.quantity.partition(', ')[2] for row in rows
                if row.quantity.startswith('rate, ') and row.verdict is RowVerdict.DOES_NOT_HOLD]
@@ -149,11 +145,11 @@ def _exponential(rows: Sequence[Row]) -> str:
 
 
 def _steps() -> str:
-    vpp, vrms = vpp_step(), vrms_step()
+    vpp, vrms = published.VPP_STEP, published.VRMS_STEP
     halves = ', '.join(f'{50.0 * vrms.size / s.vrms.value:.0f} % at {s.label}'
                        for s in published.LOADED)
     sigmas = ', '.join(
-        f'{sigma_of(s):.2f} +- {sigma_half_width(s, transient.paper_fit()):.2f} at {s.label}'
+        f'{s.sigma:.2f} +- {sigma_half_width(s):.2f} at {s.label}'
         for s in published.LOADED)
     return (f'Every Vpp is a multiple ({", ".join(map(str, vpp.multiples))}) of {vpp.low:.4g} to '
             f'{vpp.high:.4g} mV, and every Vrms ({", ".join(map(str, vrms.multiples))}) of '
@@ -171,7 +167,7 @@ def _crests(crests: Crests) -> str:
     limit = crests.quantile(longest, 0.95)
     parts = []
     for state in published.LOADED:
-        value, (low, high) = crest(state)
+        value, (low, high) = state.crest, state.crest_range
         if low > limit:
             said = f'not even half a step of each reading, which leaves {low:.2f}, brings it there'
         elif value > limit:
@@ -198,7 +194,7 @@ def _growth() -> str:
 
 
 def _capacitance() -> str:
-    before, after = network.doubled(PowerNetwork())
+    before, after = tables.doubled(PowerNetwork())
     return (f'For an RC rail alpha = 1/(R C) and Var_inf = S R/(2 C) under white current noise: '
             f'both are halved by a second capacitor, sigma = sqrt(S)/C too. In a 6S network of '
             f'typical parts at 40 %, a second {1e6 * before.network.bulk_capacitance:.0f} uF in '
@@ -220,15 +216,16 @@ def _jumps(crests: Crests, found: list[JumpCrest]) -> str:
             f'{best.kurtosis:.0f})')
     heights = ', '.join(f'{impulse_height(s, crests):.0f} mV at {s.label}'
                         for s in published.LOADED)
-    (low, low_in), (high, high_in) = crest(published.LOW), crest(published.HIGH)
+    low, medium, high = (state.crest for state in published.LOADED)
+    quotient = over(published.HIGH.crest_range, published.LOW.crest_range)
     return ('The paper says that its data justify diffusion and jump components, and fits no '
             'jump. Of the compound Poisson jumps tried, relaxing at alpha, the best show '
             f'a mean crest factor of {" and ".join(parts)}; {low:.1f} (5 %) and '
-            f'{crest(published.MEDIUM)[0]:.1f} (10 %) are what the readings require. Impulses '
+            f'{medium:.1f} (10 %) are what the readings require. Impulses '
             f'too short to count in Vrms would need a height, peak to peak over the OU, of '
             f'{heights}. '
             f'From 5 to 40 % the crest factor goes from {low:.1f} to {high:.1f} (quotient '
-            f'{high_in[0] / low_in[1]:.2f} to {high_in[1] / low_in[0]:.2f} within half a step): '
+            f'{quotient[0]:.2f} to {quotient[1]:.2f} within half a step): '
             'the readings do not show impulses that come with load. '
             'Two readings a load cannot decide between these; a recording can: see '
             'ou-monitor discover.')
@@ -243,7 +240,8 @@ class Reproduction:
     points: tuple[Point, ...]  # The eight points
     crests: Crests  # Simulated crest factors
     spreading: Spreading  # Variance of the integral of telegraph noise
-    figures: Figures  # Further series to draw
+    screens: tuple[Screen, ...]  # One per load state
+    spectra: tuple[DrawnSpectrum, ...]  # Of 10 and 40 %
 
     def parts(self) -> list[tuple[str, list[Row]]]:
         """Return the rows by table, figure and whole section of the paper; no empty ones."""
@@ -266,22 +264,23 @@ def reproduce(seed: int = 1, progress: Progress | None = None) -> Reproduction:
     rngs = np.random.default_rng(seed).spawn(8)
     crests = simulate_crests(rngs[0], CREST_PATHS, within(0.0, 0.35))
     found = simulate_jumps(rngs[1], JUMP_SECONDS, within(0.35, 0.6))
-    rows = [*table1.rows(*mean_and_error(crests.white)), *crest_rows(crests),
-            *table2.rows(), *network.rows(), *jump_rows(found, crests)]
+    rows = [*tables.table_1(*mean_and_error(crests.white)), *crest_rows(crests),
+            *tables.table_2(), *tables.hardware_and_growth(), *jump_rows(found, crests)]
     rows += transient.rows(rngs[2])
     report(0.76)
-    rows += probability.rows(rngs[3])
+    rows += tables.probabilities(rngs[3])
     report(0.8)
     rows += switching.rows(rngs[4])
     report(0.86)
     rows += switching.averaging_rows(rngs[5])
     spreading = switching.spreading(rngs[6], 20_000)
     report(0.92)
-    figures = draw(rngs[7])
+    screens = tuple(_screen(state, rngs[7]) for state in published.TABLE_1)
+    spectra = tuple(_spectrum(state, rngs[7]) for state in (published.MEDIUM, published.HIGH))
     report(1.0)
     ordered = tuple(sorted(rows, key=lambda row: _ORDER.index(row.where)))
     return Reproduction(seed, ordered, eight_points(ordered, crests, found), crests, spreading,
-                        figures)
+                        screens, spectra)
 
 
 def headline(result: Reproduction) -> str:
@@ -354,42 +353,25 @@ class DrawnSpectrum:
     coupled: FloatArray  # Of the same OU through an AC coupling of 10 Hz, V^2/Hz; shape (k,)
 
 
-@dataclass(frozen=True, eq=False)
-class Figures:
-    """All series."""
-
-    screens: tuple[Screen, ...]  # One per load state
-    spectra: tuple[DrawnSpectrum, ...]  # Of 10 and 40 %
-
-
-def sigma_shown(state: published.PrintedLoad) -> float:
-    """Return the sigma to draw, V/sqrt(s); motors off, half a step of Vrms."""
-    if state is published.IDLE:
-        return 0.5e-3 * vrms_step().size * math.sqrt(2.0 * published.ALPHA.value)
-    return sigma_of(state)
-
-
 def lorentzian(frequency: FloatArray, alpha: float, sigma: float) -> FloatArray:
     """Return the one-sided density of an OU (frequency in Hz)."""
     return np.asarray(2.0 * sigma ** 2 / (alpha ** 2 + (2.0 * math.pi * frequency) ** 2))
 
 
-def draw(rng: np.random.Generator) -> Figures:
-    """Simulate the figures."""
+def _screen(state: published.PrintedLoad, rng: np.random.Generator) -> Screen:
+    """Return a screen of a load state; motors off, Vrms is half a step."""
     t = np.arange(round(SCREEN * published.SAMPLING_HZ)) / published.SAMPLING_HZ
-    step = 1e-3 * vpp_step().size
-    screens = tuple(
-        Screen(state, t, step * np.round(
-            simulate(t, published.ALPHA.value, sigma_shown(state), rng) / step))
-        for state in published.TABLE_1)
-    return Figures(screens, tuple(
-        _spectrum(state, rng) for state in (published.MEDIUM, published.HIGH)))
+    step = 1e-3 * published.VPP_STEP.size
+    sigma = state.sigma or 0.5e-3 * published.VRMS_STEP.size * math.sqrt(
+        2.0 * published.ALPHA.value)
+    return Screen(state, t, step * np.round(
+        simulate(t, published.ALPHA.value, sigma, rng) / step))
 
 
 def _spectrum(state: published.PrintedLoad, rng: np.random.Generator) -> DrawnSpectrum:
     """Return the spectrum of a simulated recording at 1 MHz, even on a log axis."""
     t = np.arange(round(_SPECTRUM * published.SAMPLING_HZ)) / published.SAMPLING_HZ
-    ou = OU(published.ALPHA.value, sigma_of(state), 0.0)
+    ou = OU(published.ALPHA.value, state.sigma, 0.0)
     plain = _density(simulate(t, ou.alpha, ou.sigma, rng))
     coupled = _density(SupplyModel((ou, ACCoupling(CORNER_HZ, 0.0))).simulate(t, rng))
     return DrawnSpectrum(state, plain[0], plain[1], coupled[1])

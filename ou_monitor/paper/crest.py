@@ -18,9 +18,8 @@ from ou_monitor.model.ou import simulate, transition
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.shocks import Jumps
-from ou_monitor.paper.reproduce import published
-from ou_monitor.paper.reproduce.published import Printed, Range, Row
-from ou_monitor.paper.reproduce.table1 import over, vpp_range, vrms_range
+from ou_monitor.paper import published
+from ou_monitor.paper.published import over, Printed, Range, Row
 from ou_monitor.records import FloatArray
 from scipy.signal import lfilter
 
@@ -105,11 +104,6 @@ def _draw(rng: np.random.Generator, paths: int) -> dict[int, FloatArray]:
     return found
 
 
-def crest(state: published.PrintedLoad) -> tuple[float, Range]:
-    """Return Vpp/Vrms of a load state and its range within half a step of either."""
-    return (state.vpp.value / state.vrms.value, over(vpp_range(state), vrms_range(state)))
-
-
 def screen_for(crest_factor: float) -> float:
     """
     Return the screen length at which an OU shows a crest factor, s.
@@ -131,7 +125,7 @@ def rows(crests: Crests) -> list[Row]:
     count = crests.by_screen[TYPICAL_MS].shape[0]
     found = []
     for state in published.LOADED:
-        value, inputs = crest(state)
+        value, inputs = state.crest, state.crest_range
         beyond = ('' if inputs[0] <= crests.band[1] else
                   f'; the least would take a screen of {screen_for(inputs[0]):.2g} s')
         found.append(Row(
@@ -204,9 +198,8 @@ def simulate_jumps(rng: np.random.Generator, seconds: float,
                 low, high = np.quantile(values, [TAIL, 1.0 - TAIL])
                 # Neighbouring screens are almost independent: a screen is many tau long.
                 found.append(JumpCrest(
-                    ms, rate, share, float(values.mean()),
-                    float(values.std(ddof=1) / math.sqrt(values.size)),
-                    (float(low), float(high)), excess_kurtosis(rate, share)))
+                    ms, rate, share, *mean_and_error(values), (float(low), float(high)),
+                    excess_kurtosis(rate, share)))
         progress((k + 1) / len(RATES))
     return found
 
@@ -223,15 +216,15 @@ def impulse_height(state: published.PrintedLoad, crests: Crests) -> float:
 
 def jump_rows(found: list[JumpCrest], crests: Crests) -> list[Row]:
     """Return the rows of section 5 on jumps."""
-    (low, low_in), (high, high_in) = crest(published.LOW), crest(published.HIGH)
-    inputs = (high_in[0] / low_in[1], high_in[1] / low_in[0])
+    low, high = published.LOW.crest, published.HIGH.crest
+    inputs = over(published.HIGH.crest_range, published.LOW.crest_range)
     result = [Row(
         WHERE, 'Vpp/Vrms, 40 % over 5 %', '', Printed('> 1'), high / low, 'quotient from Table 1',
         f'"From Gaussian noise to impulse disturbances with load" would raise it; it falls from '
         f'{low:.1f} to {high:.1f}, a quotient that half a step of each reading lets lie within '
         f'{inputs[0]:.2f} to {inputs[1]:.2f}.', inputs=inputs, point=8)]
     for state in (published.LOW, published.MEDIUM):
-        value, inputs = crest(state)
+        value, inputs = state.crest, state.crest_range
         for ms in JUMP_SCREENS_MS:
             best = largest(found, ms)
             result.append(Row(

@@ -8,6 +8,7 @@ An AC-coupled oscilloscope is a first-order high-pass: it shows a step of the ra
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 import math
 
 import numpy as np
@@ -15,9 +16,8 @@ from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ac_coupling import ACCoupling
 from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.paper.reproduce import published
-from ou_monitor.paper.reproduce.published import Printed, Range, Row
-from ou_monitor.paper.reproduce.table1 import vrms_step
+from ou_monitor.paper import published
+from ou_monitor.paper.published import Printed, Range, Row
 from ou_monitor.records import FloatArray
 from ou_monitor.text import Z95
 from scipy import stats
@@ -26,6 +26,7 @@ from scipy.optimize import brentq, least_squares
 WHERE = 'Fig. 5'
 # Corner of the AC coupling of many hand-held oscilloscopes, Hz.
 CORNER_HZ = 10.0
+CORNER = 2.0 * math.pi * CORNER_HZ
 # Rates of rails fitted through it, 1/s.  A bulk capacitor of 470 uF behind 40 mOhm of battery and
 # 30 mOhm of its own relaxes at 3e4 1/s.
 RAILS = (500.0, 1000.0, 2000.0, 5000.0)
@@ -35,6 +36,8 @@ _RATE, _HOLD, _WATCH = 10e3, 0.3, 0.06
 
 TIME = 1e-3 * np.array(published.FIG_5_MS)
 VALUE = np.array([p.value for p in published.FIG_5_MV])
+# Points that the paper fits.
+USED = slice(0, published.FIG_5_USED)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,10 +108,22 @@ def fit_curve(time: FloatArray, value: FloatArray, offset: bool) -> DecayFit:
                     float(stats.t.ppf(0.975, free)))
 
 
-def paper_fit() -> LogLine:
-    """Return the paper's own fit: ln|U| over 0..35 ms."""
-    used = slice(0, published.FIG_5_USED)
-    return fit_log_line(TIME[used], VALUE[used])
+# The paper's own fit: ln|U| over 0..35 ms.
+PAPER_FIT = fit_log_line(TIME[USED], VALUE[USED])
+
+
+@cache
+def decay_fits() -> tuple[DecayFit, DecayFit]:
+    """Return the fits of all five voltages, without and with an offset."""
+    return fit_curve(TIME, VALUE, offset=False), fit_curve(TIME, VALUE, offset=True)
+
+
+def offset_test() -> tuple[float, float]:
+    """Return F and its p-value for the offset of the fits to the five points."""
+    plain, shifted = decay_fits()
+    free = VALUE.size - 3
+    test = (plain.rss - shifted.rss) / (shifted.rss / free)
+    return test, float(stats.f.sf(test, 1, free))
 
 
 def local_rates() -> FloatArray:
@@ -116,43 +131,38 @@ def local_rates() -> FloatArray:
     return np.asarray(-np.diff(np.log(VALUE)) / np.diff(TIME))
 
 
-def through_coupling(time: FloatArray, rail: float, corner: float = CORNER_HZ) -> FloatArray:
-    """
-    Return a unit step of a rail through a high-pass, in closed form.
+def through_coupling(time: FloatArray, rail: float) -> FloatArray:
+    """Return a unit step of a rail, 1/s, through the high-pass in closed form (time in s)."""
+    return np.asarray(rail / (rail - CORNER) * (np.exp(-CORNER * time) - np.exp(-rail * time)))
 
-    time in s, rail in 1/s, corner in Hz.
-    """
-    w = 2.0 * math.pi * corner
-    return np.asarray(rail / (rail - w) * (np.exp(-w * time) - np.exp(-rail * time)))
+
+def peak_of(rail: float) -> float:
+    """Return when a step of a rail, 1/s, shows its peak behind the high-pass, s."""
+    return math.log(rail / CORNER) / (rail - CORNER)
 
 
 def fitted_through_coupling(time: FloatArray) -> tuple[FloatArray, float]:
     """
     Return the typical rail behind the coupling, scaled to the points of the paper's fit.
 
-    time in s from the turning point of the curve; mV, and the largest relative misfit.
+    time in s from the peak of the curve; mV, and the largest relative misfit.
     """
-    pole = 2.0 * math.pi * CORNER_HZ
-    turning = math.log(TYPICAL_RAIL / pole) / (TYPICAL_RAIL - pole)
-    used = slice(0, published.FIG_5_USED)
-    misfit = np.log(VALUE[used] / through_coupling(turning + TIME[used], TYPICAL_RAIL))
+    peak = peak_of(TYPICAL_RAIL)
+    misfit = np.log(VALUE[USED] / through_coupling(peak + TIME[USED], TYPICAL_RAIL))
     scale = math.exp(float(misfit.mean()))
-    return (scale * through_coupling(turning + time, TYPICAL_RAIL),
+    return (scale * through_coupling(peak + time, TYPICAL_RAIL),
             float(np.abs(np.expm1(misfit - misfit.mean())).max()))
 
 
-def fitted_rate(rail: float, corner: float = CORNER_HZ) -> float:
-    """Return the rate that the paper's fit gives for a step behind a high-pass, 1/s."""
-    w = 2.0 * math.pi * corner
-    peak = math.log(rail / w) / (rail - w)
-    used = TIME[:published.FIG_5_USED]
-    return fit_log_line(used, through_coupling(peak + used, rail, corner)).alpha
+def fitted_rate(rail: float) -> float:
+    """Return the rate that the paper's fit gives for a step behind the high-pass, 1/s."""
+    used = TIME[USED]
+    return fit_log_line(used, through_coupling(peak_of(rail) + used, rail)).alpha
 
 
 def slowest_rail() -> float:
     """Return the lowest rate of a rail that Fig. 5 allows behind a 10 Hz coupling, 1/s."""
-    line = paper_fit()
-    least = line.alpha - line.half_width
+    least = PAPER_FIT.alpha - PAPER_FIT.half_width
     return float(brentq(lambda rail: fitted_rate(rail) - least, 70.0, 1e5))
 
 
@@ -169,9 +179,8 @@ def simulate_fitted(rng: np.random.Generator, draws: int) -> FloatArray:
     t = np.arange(round((_HOLD + _WATCH) * _RATE)) / _RATE
     throttle = np.where(t <= _HOLD, published.TRANSIENT_LOAD, 0.0)
     sag = 1e-3 * VALUE[0]
-    noise = 0.5e-3 * vrms_step().size
-    used = TIME[:published.FIG_5_USED]
-    w = 2.0 * math.pi * CORNER_HZ
+    noise = 0.5e-3 * published.VRMS_STEP.size
+    used = TIME[USED]
     found = np.empty((len(RAILS), draws))
     for row, rail in zip(found, RAILS):
         model = SupplyModel((
@@ -179,8 +188,7 @@ def simulate_fitted(rng: np.random.Generator, draws: int) -> FloatArray:
             LoadSag(sag / published.TRANSIENT_LOAD, 0.0),
             LoadTransient(sag / published.TRANSIENT_LOAD, 1.0 / rail, 0.0),
             ACCoupling(CORNER_HZ, 0.0)))
-        peak = _HOLD + math.log(rail / w) / (rail - w)
-        at = np.round((peak + used) * _RATE).astype(np.intp)
+        at = np.round((_HOLD + peak_of(rail) + used) * _RATE).astype(np.intp)
         for k in range(draws):
             row[k] = fit_log_line(used, model.simulate(t, rng, throttle)[at]).alpha
     return found
@@ -192,7 +200,7 @@ def rows(rng: np.random.Generator, draws: int = 60) -> list[Row]:
 
 
 def _fit() -> list[Row]:
-    line = paper_fit()
+    line = PAPER_FIT
     return [
         Row(WHERE, 'alpha', '1/s', published.ALPHA, line.alpha,
             'least squares of ln|U| over 0..35 ms',
@@ -210,7 +218,7 @@ def _fit() -> list[Row]:
 
 
 def _shape() -> list[Row]:
-    line = paper_fit()
+    line = PAPER_FIT
     found = []
     for k, rate in enumerate(local_rates().tolist()):
         step = float(TIME[k + 1] - TIME[k])
@@ -223,8 +231,8 @@ def _shape() -> list[Row]:
         found.append(Row(
             WHERE, f'rate, {ends}', '1/s', published.ALPHA, rate, 'two neighbouring points',
             said + '.', band=(rate - reach, rate + reach), point=3))
-    plain, shifted = (fit_curve(TIME, VALUE, offset) for offset in (False, True))
-    test, p = offset_test(plain, shifted)
+    plain, shifted = decay_fits()
+    test, p = offset_test()
     found.append(Row(
         WHERE, 'level that the decay settles at', 'mV', Printed('0', 0.0),
         float(shifted.parameters[2]),
@@ -235,16 +243,8 @@ def _shape() -> list[Row]:
     return found
 
 
-def offset_test(plain: DecayFit, shifted: DecayFit) -> tuple[float, float]:
-    """Return F and its p-value for the offset, of fits to the five points."""
-    free = VALUE.size - 3
-    test = (plain.rss - shifted.rss) / (shifted.rss / free)
-    return test, float(stats.f.sf(test, 1, free))
-
-
 def _instrument(fitted: FloatArray) -> list[Row]:
-    line = paper_fit()
-    corner = 2.0 * math.pi * CORNER_HZ
+    line = PAPER_FIT
     typical = fitted[RAILS.index(TYPICAL_RAIL)]
     mean, spread = float(typical.mean()), float(typical.std(ddof=1))
     # Elasticity: slope of ln(fitted) over ln(rail), one value per draw.
@@ -253,11 +253,11 @@ def _instrument(fitted: FloatArray) -> list[Row]:
     slope, slope_se = float(slopes.mean()), float(slopes.std(ddof=1) / math.sqrt(slopes.size))
     return [
         Row(WHERE, f'alpha of a {CORNER_HZ:g} Hz corner', '1/s', published.ALPHA,
-            corner, '2 pi times the corner; interval of the fit to Fig. 5',
+            CORNER, '2 pi times the corner; interval of the fit to Fig. 5',
             f'{published.ALPHA.text} 1/s is 2 pi times '
             f'{published.ALPHA.value / (2 * math.pi):.2f} Hz: the AC coupling of the '
             'oscilloscope alone gives this rate.',
-            band=(corner - line.half_width, corner + line.half_width), point=2),
+            band=(CORNER - line.half_width, CORNER + line.half_width), point=2),
         Row(WHERE, f'alpha fitted, rail of {TYPICAL_RAIL:g} 1/s', '1/s',
             published.ALPHA, mean,
             f"{typical.size} simulations behind that corner, fitted the paper's way",

@@ -6,6 +6,7 @@ Units are the paper's own: mV, ms, 1/s, V/sqrt(s), V^2.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 import enum
@@ -17,6 +18,8 @@ Range = tuple[float, float]
 STANDARD_ERRORS = 3.0
 # A number half a unit from the true one is correctly rounded either way.
 _TIE = 1e-9
+# Finest step of an instrument that is tried: the smallest reading over this.
+_FINEST = 64
 
 
 class RowVerdict(enum.Enum):
@@ -140,6 +143,51 @@ def _join(a: Range, b: Range | None) -> Range:
     return a if b is None else (min(a[0], b[0]), max(a[1], b[1]))
 
 
+def over(top: Range, below: Range) -> Range:
+    """Return the range of a quotient of two positive ranges."""
+    return top[0] / below[1], top[1] / below[0]
+
+
+@dataclass(frozen=True)
+class ReadingStep:
+    """The largest step of which all readings are multiples, within their rounding."""
+
+    # Range of the step, in the unit of the readings.
+    low: float
+    high: float
+    multiples: tuple[int, ...]  # Steps in each reading
+    chance: float  # Approximate probability that readings without steps show one this large
+
+    @property
+    def size(self) -> float:
+        """Middle of the range."""
+        return 0.5 * (self.low + self.high)
+
+    def around(self, reading: Printed) -> Range:
+        """Return half a step each way of a reading."""
+        return reading.value - 0.5 * self.size, reading.value + 0.5 * self.size
+
+
+def common_step(readings: Sequence[Printed]) -> ReadingStep:
+    """Find the step of an instrument from its readings."""
+    first, *others = sorted(readings, key=lambda r: r.value)
+    for tried in range(1, _FINEST + 1):
+        low, high = (end / tried for end in first.ends)
+        chance = float(tried)
+        for reading in others:
+            k = round(reading.value / (0.5 * (low + high)))
+            width = 2.0 * (reading.half_unit + first.half_unit * reading.value / first.value)
+            chance *= min(1.0, width / (first.value / tried))
+            low, high = max(low, reading.ends[0] / k), min(high, reading.ends[1] / k)
+            if low > high:
+                break
+        else:
+            size = 0.5 * (low + high)
+            return ReadingStep(low, high, tuple(round(r.value / size) for r in readings),
+                               min(chance, 1.0))
+    raise ValueError('the readings have no common step')
+
+
 @dataclass(frozen=True)
 class PrintedLoad:
     """One row of Table 1."""
@@ -151,6 +199,31 @@ class PrintedLoad:
     amp: Printed
     vrms: Printed
     called: str  # Type of process according to the paper
+
+    @property
+    def vrms_range(self) -> Range:
+        """Return Vrms within half a step of the oscilloscope, mV."""
+        return VRMS_STEP.around(self.vrms)
+
+    @property
+    def crest(self) -> float:
+        """Return Vpp/Vrms."""
+        return self.vpp.value / self.vrms.value
+
+    @property
+    def crest_range(self) -> Range:
+        """Return Vpp/Vrms within half a step of either."""
+        return over(VPP_STEP.around(self.vpp), self.vrms_range)
+
+    @property
+    def variance(self) -> float:
+        """Return Vrms squared, V^2."""
+        return (1e-3 * self.vrms.value) ** 2
+
+    @property
+    def sigma(self) -> float:
+        """Return Vrms sqrt(2 alpha), V/sqrt(s), for the printed Vrms and alpha."""
+        return 1e-3 * self.vrms.value * math.sqrt(2.0 * ALPHA.value)
 
 
 TABLE_1 = (
@@ -165,6 +238,9 @@ TABLE_1 = (
 IDLE, LOW, MEDIUM, HIGH = TABLE_1
 # Load states with a Vrms.
 LOADED = (LOW, MEDIUM, HIGH)
+# Of the oscilloscope, mV.
+VPP_STEP = common_step([state.vpp for state in TABLE_1])
+VRMS_STEP = common_step([state.vrms for state in LOADED])
 
 # Fig. 5: ms and |U| in mV; the paper does not use the last point.
 FIG_5_MS = (0.0, 10.0, 25.0, 35.0, 50.0)

@@ -30,8 +30,8 @@ from typing import Any
 
 import numpy as np
 from ou_monitor.model.passage.law import mean_first_passage
-from ou_monitor.paper.network.components import completed, PowerNetwork
-from ou_monitor.paper.network.rail import Rail, rail_at, UnstableNetworkError
+from ou_monitor.paper.network import (
+    completed, PowerNetwork, Rail, rail_at, UnstableNetworkError)
 from ou_monitor.text import number
 from scipy.optimize import brentq
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from ou_monitor.paper.reproduce import published
-from ou_monitor.paper.reproduce.crest import mean_and_error
-from ou_monitor.paper.reproduce.published import Printed, Row
+from ou_monitor.paper import published
+from ou_monitor.paper.crest import mean_and_error
+from ou_monitor.paper.published import Printed, Row
 from ou_monitor.paper.theory import (
     CORRECT_FACTOR, diffusion_limit, Generator, MatrixModel, PRINTED_FACTOR, SwitchedSystem,
     switching_drift)
@@ -148,19 +148,6 @@ def _drift(rng: np.random.Generator, paths: int) -> list[Row]:
             'the factor 2 in B.', error=log_se, point=1)]
 
 
-def printed_matrix() -> MatrixModel:
-    """Return the matrix of 3.1 as printed, with the paper's alpha as gamma."""
-    return MatrixModel.as_printed(DAMPING, CARRIER, 0.0, published.ALPHA.value)
-
-
-def switched() -> SwitchedSystem:
-    """Return the matrix model as the text intends it, its coefficients switched by an ESC."""
-    rate = 2.0 * published.ESC_HZ[0]
-    return SwitchedSystem.of_matrix_model(
-        Generator.telegraph(rate, rate), alpha=DAMPING * _SWING, omega=CARRIER * _SWING,
-        beta=COUPLING * _SWING, alpha_p=published.ALPHA.value * _SWING)
-
-
 def _late_over_early(path: FloatArray) -> FloatArray:
     log = np.log(path)
     return np.asarray((log[2] - log[1]) / (log[1] - log[0]))
@@ -169,12 +156,17 @@ def _late_over_early(path: FloatArray) -> FloatArray:
 def averaging_rows(rng: np.random.Generator, paths: int = 400) -> list[Row]:
     """Return the rows of sections 3.1 and 8."""
     tau = 1.0 / published.ALPHA.value
-    printed = printed_matrix()
+    # The matrix as printed, with the paper's alpha as gamma.
+    printed = MatrixModel.as_printed(DAMPING, CARRIER, 0.0, published.ALPHA.value)
     grown = float(printed.solve([0.0, tau], [1.0, 0.0, 1.0])[1, 2])
     half = 1.0 / CARRIER
     phase = printed.solve([0.0, half, 2.0 * half], [0.0, 1.0, 0.0])[:, 1]
     turned = float((phase[2] - phase[1]) / (phase[1] - phase[0]))
-    system = switched()
+    # As the text intends it, its coefficients switched by an ESC.
+    rate = 2.0 * published.ESC_HZ[0]
+    system = SwitchedSystem.of_matrix_model(
+        Generator.telegraph(rate, rate), alpha=DAMPING * _SWING, omega=CARRIER * _SWING,
+        beta=COUPLING * _SWING, alpha_p=published.ALPHA.value * _SWING)
     t = np.array([0.0, 0.5 * tau, tau])
     u = system.simulate(t, [1.0, 0.0, 1.0], rng, paths=paths)
     amplitude, amplitude_se = _of_mean(u[:, :, 0])

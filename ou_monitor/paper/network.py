@@ -1,0 +1,446 @@
+"""
+A multirotor's power network: components, the load at a throttle, and a rail as an OU.
+
+    battery -- R --+-- bus --+-- [ L, DCR --+-- filter ] --+-- regulator -- Ro --+-- regulated
+                   |         |              |                                    |
+               ESC current   C + ESR        Cf + ESR                   Co + ESR, MCU current
+
+The network is linear about its operating point, dx = A x dt + B dW, and the rail's deviation is
+c x.  Noise is coloured, with one state per source, so that the variance stays finite where a
+capacitor's ESR turns current directly into voltage.
+
+Limits: leads have no inductance, so edges faster than R/L (0.1 to 1 us) are not modelled.  The
+battery is one resistance without polarisation, so recovery over 0.3 s and more is missing.  The
+random part of the ESC current is the paper's Markov switching, which spreads over all frequencies
+the power that a regular PWM keeps at its multiples: it is an upper bound until `switching_scale`
+is set from a measured rail.
+
+Effect of more bulk capacitance.  Without LC filter the bus carries the ESC
+current through |Z(f)|^2 = R^2 (1 + (w r C)^2) / (1 + (w (R + r) C)^2), which
+falls with C at every frequency: Var_inf falls for noise of any colour, on both
+rails, and so does the pole 1/((R + r) C), although the paper's section 4.5 says that alpha
+rises.  These poles are fast: with 40 mOhm the paper's 63 1/s would take 0.4 F.
+Exceptions:
+
+- Slow noise.  When the noise relaxes more slowly than the pole (a small C, or
+  flutter), alpha is the rate of the noise and does not move with C.
+- ESR.  With r fixed, fast noise leaves (R r / (R + r))^2 times its variance
+  however large C is, and the pole carries less and less of it; below
+  1 %, alpha jumps up to the next pole, the rate of the noise.  With r C
+  fixed (capacitors of one series in parallel), neither happens on the
+  bus.
+- LC filter.  C shorts the battery resistance that damps L; the resonance rises,
+  and where it is excited Var_inf of either rail may rise with C.  A constant-power
+  regulator can then turn it into an oscillation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from ou_monitor.records import FloatArray
+from scipy.linalg import solve_continuous_lyapunov
+
+RAILS = ('bus', 'regulated')
+# Lower limit of the duty: at 0 and 1 a telegraph has no noise and an infinite rate.
+LEAST_DUTY = 0.01
+# A lithium cell at rest, V.
+NOMINAL_CELL = 3.7
+# A pole counts as excited when its share of Var_inf is at least this.
+EXCITED = 0.01
+# Noise currents are the last states, in this order.
+SOURCES = ('switching', 'flutter', 'mcu')
+ComplexArray = npt.NDArray[np.complex128]
+
+
+def completed(values: dict[str, Any]) -> dict[str, Any]:
+    """Return components with derived values: voltage from cells, a rail below a cell."""
+    found = dict(values)
+    if 'cells' in found:
+        found.setdefault('battery_voltage', NOMINAL_CELL * found['cells'])
+    if found.get('battery_voltage', math.inf) <= PowerNetwork.regulator_voltage:
+        # The rail of a Crazyflie.
+        found.setdefault('regulator_voltage', 3.0)
+    return found
+
+
+def _part(default: Any, unit: str = '', *, zero: bool = False) -> Any:
+    """Return a number of the network: its unit, and whether it may be zero."""
+    return field(default=default, metadata={'unit': unit, 'zero': zero})
+
+
+@dataclass(frozen=True, kw_only=True)
+class PowerNetwork:
+    """Components in SI units; the defaults are a typical 6S multirotor."""
+
+    cells: int = _part(6)  # LiPo cells in series; sets the default brown-out level of the bus.
+    battery_voltage: float = _part(22.2, 'V')  # Open-circuit voltage, V (6 x 3.7 V nominal).
+    # Battery, connector and leads, Ohm (a 6S pack of 1.3..2.2 Ah has 20..60 mOhm; PX4
+    # assumes 5 mOhm a cell).
+    battery_resistance: float = _part(0.04, 'Ohm')
+    # Capacitor at the ESC's battery pads, F and Ohm (470 uF..1000 uF of a low-ESR 35 V
+    # series have 20..40 mOhm).
+    bulk_capacitance: float = _part(470e-6, 'F')
+    bulk_esr: float = _part(0.03, 'Ohm', zero=True)
+    # Mean current of the motors is current_max * throttle**current_exponent, A; 4 x 30 A,
+    # exponent 1..3 (typical values; 1.5 puts the most ripple at a throttle of 2/3,
+    # recordings show 0.65..0.75).
+    current_max: float = _part(120.0, 'A')
+    current_exponent: float = _part(1.5)
+    escs: int = _part(4)  # ESCs that switch independently.
+    # PWM frequency, Hz (24..48 kHz, the paper's section 4.5).
+    esc_frequency: float = _part(48e3, 'Hz')
+    # Measured rms of the random ESC current over the telegraph's; 1 is the telegraph.
+    switching_scale: float = _part(1.0, zero=True)
+    # Slow fluctuation of the motor current (control loop, gusts): rms as a share of the
+    # mean, and its rate, 1/s (motor and propeller, 30 ms). Left out by default.
+    flutter: float = _part(0.0, zero=True)
+    flutter_rate: float = _part(33.3, '1/s')
+    # Optional LC filter between bus and regulator, H, Ohm, F, Ohm; without it the inductance is 0;
+    # the two resistances damp it.
+    filter_inductance: float = _part(0.0, 'H', zero=True)
+    filter_resistance: float = _part(0.05, 'Ohm', zero=True)
+    filter_capacitance: float = _part(100e-6, 'F')
+    filter_esr: float = _part(0.1, 'Ohm', zero=True)
+    # Set voltage, V, and output resistance within the bandwidth, Ohm.
+    regulator_voltage: float = _part(5.0, 'V')
+    regulator_resistance: float = _part(0.03, 'Ohm')
+    # The regulator rejects changes of its input slower than this, Hz, and passes faster ones times
+    # `line_gain`; None: the duty of a buck converter, regulator_voltage over battery_voltage,
+    # which is its open-loop gain (Erickson & Maksimovic, Fundamentals of Power Electronics,
+    # section 8.2).
+    regulator_bandwidth: float = _part(20e3, 'Hz')
+    regulator_efficiency: float = _part(0.9)  # Output power over input power, 0..1.
+    line_gain: float | None = _part(None, zero=True)
+    # Whether the regulator draws constant power: its input then has the incremental resistance
+    # -V^2/P.
+    constant_power: bool = True
+    # Capacitor of the regulated rail, F and Ohm (2 x 22 uF ceramic).
+    output_capacitance: float = _part(44e-6, 'F')
+    output_esr: float = _part(0.003, 'Ohm', zero=True)
+    # Mean current of the regulated rail, rms of its fluctuation, A, and the fluctuation's
+    # relaxation rate, 1/s.
+    mcu_current: float = _part(0.5, 'A', zero=True)
+    mcu_noise: float = _part(0.05, 'A', zero=True)
+    mcu_noise_rate: float = _part(1e6, '1/s')
+
+    def __post_init__(self) -> None:
+        """Refuse values that no component can have."""
+        for part in fields(self):
+            self._check(part.name, getattr(self, part.name), part.metadata)
+        if self.regulator_efficiency > 1.0:
+            raise ValueError(
+                f'regulator_efficiency must be at most 1, got {self.regulator_efficiency}')
+        if self.regulator_voltage >= self.battery_voltage:
+            raise ValueError(f'regulator_voltage must be below battery_voltage (a step-down), got '
+                             f'{self.regulator_voltage} V of {self.battery_voltage} V')
+        if self.current_exponent < 1.0:
+            raise ValueError('current_exponent must be at least 1 (the phase current does not '
+                             f'rise as throttle falls), got {self.current_exponent}')
+
+    def _check(self, name: str, value: object, about: Mapping[str, Any]) -> None:
+        if name == 'line_gain' and value is None:
+            return
+        if name == 'constant_power':
+            if not isinstance(value, bool):
+                raise ValueError(f'constant_power must be true or false, got {value!r}')
+            return
+        unit = f' {about["unit"]}'.rstrip()
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise ValueError(f'{name} must be a number{unit and f" in{unit}"}, got {value!r}')
+        if name in ('cells', 'escs') and value != int(value if math.isfinite(value) else 0):
+            raise ValueError(f'{name} must be a whole number, got {value}')
+        if not math.isfinite(value) or value < 0.0 or (value == 0.0 and not about['zero']):
+            least = 'zero or positive' if about['zero'] else 'positive'
+            raise ValueError(f'{name} must be {least} and finite, got {value}{unit}')
+
+    @property
+    def lc_corner(self) -> float:
+        """Corner 1/(2 pi sqrt(L C)) of the LC filter, Hz; inf without one."""
+        if self.filter_inductance == 0.0:
+            return math.inf
+        return 1.0 / (2.0 * math.pi * math.sqrt(self.filter_inductance * self.filter_capacitance))
+
+    @property
+    def line_feedthrough(self) -> float:
+        """Gain of the regulator from its input to its output above its bandwidth."""
+        if self.line_gain is None:
+            return self.regulator_voltage / self.battery_voltage
+        return self.line_gain
+
+    @property
+    def regulator_power(self) -> float:
+        """Power that the regulator draws, W."""
+        return self.regulator_voltage * self.mcu_current / self.regulator_efficiency
+
+    @property
+    def series_resistance(self) -> float:
+        """Resistance between bus and regulator, Ohm; 0 without LC filter."""
+        return self.filter_resistance if self.filter_inductance > 0.0 else 0.0
+
+    def current_at(self, throttle: float) -> float:
+        """Return the mean current of the motors, A, at a throttle 0..1."""
+        return float(self.current_max * throttle**self.current_exponent)
+
+    def regulator_current(self, bus: float) -> float:
+        """Return the mean current, A, that the regulator draws at a mean bus voltage, V."""
+        power = self.regulator_power
+        root = bus**2 - 4.0 * self.series_resistance * power
+        if bus <= 0.0 or root < 0.0:
+            raise ValueError(f'a bus at {bus:g} V cannot give the regulator {power:g} W')
+        return 2.0 * power / (bus + math.sqrt(root))
+
+
+# Units of the numbers of a network.
+UNITS = {part.name: part.metadata['unit'] for part in fields(PowerNetwork) if part.metadata}
+
+
+@dataclass(frozen=True)
+class Load:
+    """The load and the mean voltages at one throttle."""
+
+    throttle: float  # 0..1.
+    current: float  # Mean current of the motors, A.
+    # Random ESC current: rms, A, and rate of its exponential covariance, 1/s.
+    switching_rms: float
+    switching_rate: float
+    flutter_rms: float  # Rms of the slow fluctuation of the current, A.
+    # Mean voltages, V.
+    bus: float
+    regulated: float
+    sag: float  # Battery voltage less the mean of the bus, V.
+    # Incremental conductance P/V^2 of the constant-power load, 1/Ohm, counted positive; otherwise
+    # 0.
+    input_conductance: float
+
+    def mean(self, rail: str) -> float:
+        """Return the mean of a rail, V."""
+        return {'bus': self.bus, 'regulated': self.regulated}[rail]
+
+
+def load_at(network: PowerNetwork, throttle: float) -> Load:
+    """
+    Return the load at a throttle.
+
+    An ESC draws the phase current I_m during the on-time of its PWM and
+    nothing else, so that the mean is I = D I_m with the duty D = throttle.  As
+    a telegraph with f cycles per second it has the variance I_m^2 D (1 - D) and
+    a covariance that decays at f / (D (1 - D)).
+    """
+    if not 0.0 <= throttle <= 1.0:
+        raise ValueError(f'throttle must be within 0..1, got {throttle}')
+    current = network.current_at(throttle)
+    duty = min(max(throttle, LEAST_DUTY), 1.0 - LEAST_DUTY)
+    # Phase current of one ESC; zero duty has no current and no noise.
+    phase = current / throttle / network.escs if throttle > 0.0 else 0.0
+    rms = network.switching_scale * phase * math.sqrt(
+        network.escs * throttle * (1.0 - throttle))
+    power = network.regulator_power
+    resistance = network.battery_resistance
+    # The regulator's input v solves v = V - R (I + P/v) - series P/v.
+    free = network.battery_voltage - resistance * current
+    root = free**2 - 4.0 * (resistance + network.series_resistance) * power
+    source = (free + math.sqrt(root)) / 2.0 if free > 0.0 and root >= 0.0 else 0.0
+    if source <= network.regulator_voltage:
+        raise ValueError(
+            f'the battery cannot give the load at throttle {throttle:g}: {current:.4g} A through '
+            f'battery_resistance {resistance:g} Ohm takes {resistance * current:.4g} V of '
+            f'{network.battery_voltage:g} V and leaves the regulator less than '
+            f'{network.regulator_voltage:g} V')
+    drawn = power / source
+    bus = free - resistance * drawn
+    return Load(
+        throttle=throttle, current=current, switching_rms=rms,
+        switching_rate=network.esc_frequency / (duty * (1.0 - duty)),
+        flutter_rms=network.flutter * current, bus=bus,
+        regulated=network.regulator_voltage - network.regulator_resistance * network.mcu_current,
+        sag=network.battery_voltage - bus,
+        input_conductance=power / source**2 if network.constant_power else 0.0)
+
+
+class UnstableNetworkError(ValueError):
+    """The network has a pole in the right half-plane; the text names it."""
+
+
+@dataclass(frozen=True)
+class RailResonance:
+    """A complex pair of poles."""
+
+    frequency: float  # |p| / (2 pi), Hz.
+    damping: float  # Damping ratio -Re p / |p|, 0..1.
+    share: float  # Its part of Var_inf; parts of overlapping modes may exceed 1 or be negative.
+
+    @property
+    def q(self) -> float:
+        """Quality factor, 1 / (2 damping)."""
+        return 0.5 / self.damping
+
+
+@dataclass(frozen=True)
+class Rail:
+    """One rail at one throttle, as `rail_at` returns it."""
+
+    network: PowerNetwork  # Components.
+    load: Load  # Load and mean voltages.
+    name: str  # ``bus`` or ``regulated``.
+    a: FloatArray  # Rates between the states (voltages, V, and currents, A), 1/s and mixed.
+    b: FloatArray  # Intensities of the independent white noises that drive the sources.
+    c: FloatArray  # The rail's deviation from its mean, V, is c x.
+
+    @property
+    def mean(self) -> float:
+        """Mean voltage of the rail, V."""
+        return self.load.mean(self.name)
+
+    @property
+    def source_rates(self) -> FloatArray:
+        """Rates of the noise sources, 1/s, shape (3,), in the order of `SOURCES`."""
+        return np.asarray(-np.diag(self.a)[-len(SOURCES):])
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Stationary covariance of the states, shape (n, n), by Lyapunov's equation."""
+        p = solve_continuous_lyapunov(self.a, -self.b @ self.b.T)
+        return np.asarray(0.5 * (p + p.T))
+
+    @cached_property
+    def var_inf(self) -> float:
+        """Stationary variance of the rail, V^2."""
+        return max(0.0, float(self.c @ self.covariance @ self.c))
+
+    @cached_property
+    def _modes(self) -> tuple[ComplexArray, ComplexArray]:
+        """Poles, slowest first, and their parts of the covariance at lag 0, V^2."""
+        poles, vectors = np.linalg.eig(self.a)
+        parts = (self.c @ vectors) * np.linalg.solve(vectors, self.covariance @ self.c)
+        order = np.argsort(np.abs(poles.real), kind='stable')
+        return (np.asarray(poles[order], dtype=np.complex128),
+                np.asarray(parts[order], dtype=np.complex128))
+
+    @property
+    def poles(self) -> ComplexArray:
+        """Poles, 1/s, shape (n,), slowest first, including the noise sources' poles."""
+        return self._modes[0]
+
+    @property
+    def shares(self) -> FloatArray:
+        """Share of Var_inf that each pole carries, shape (n,); zeros without noise."""
+        if self.var_inf == 0.0:
+            return np.zeros(self.poles.size)
+        return np.asarray(self._modes[1].real / self.var_inf)
+
+    @cached_property
+    def alpha(self) -> float:
+        """
+        Relaxation rate, 1/s: the slowest pole that carries 1 % of Var_inf or more.
+
+        For a complex pair, the rate of its envelope; NaN without noise.
+
+        """
+        excited = np.flatnonzero(np.abs(self.shares) >= EXCITED)
+        return float(-self.poles[excited[0]].real) if excited.size else math.nan
+
+    @property
+    def tau(self) -> float:
+        """Relaxation time 1 / alpha, s."""
+        return 1.0 / self.alpha
+
+    @property
+    def sigma(self) -> float:
+        """Intensity of the OU with this alpha and Var_inf, sqrt(2 alpha Var_inf), V/sqrt(s)."""
+        return math.sqrt(2.0 * self.alpha * self.var_inf)
+
+    @property
+    def resonance(self) -> RailResonance | None:
+        """Return the complex pair that carries most of Var_inf; None when all poles are real."""
+        above = np.flatnonzero(self.poles.imag > 1e-9 * np.abs(self.poles))
+        if not above.size:
+            return None
+        k = above[np.argmax(np.abs(self.shares[above]))]
+        pole = self.poles[k]
+        return RailResonance(frequency=float(abs(pole)) / (2.0 * math.pi),
+                             damping=float(-pole.real / abs(pole)),
+                             share=2.0 * float(self.shares[k]))
+
+    def crossing_rate(self, voltage: float) -> float:
+        """
+        Return the rate of passages below a voltage at high levels, 1/s.
+
+        For the whole Gaussian process, not its OU: with d the distance in
+        standard deviations, q the quadratic variation of the rail per second
+        and v the variance of the smooth part of its slope, the larger of
+        q/(2 Var) d/sqrt(2 pi) exp(-d^2/2) (rough paths: Pickands, Trans. AMS
+        145 (1969) 51) and sqrt(v/Var)/(2 pi) exp(-d^2/2) (smooth paths: Rice,
+        Bell Syst. Tech. J. 24 (1945) 46).  For an OU the first equals the
+        rate of its mean first passage.
+
+        voltage in V.
+        """
+        if self.mean <= voltage:
+            return math.inf
+        if self.var_inf == 0.0:
+            return 0.0
+        d = (self.mean - voltage) / math.sqrt(self.var_inf)
+        kick = self.c @ self.b
+        slope = self.c @ self.a
+        rough = float(kick @ kick) / (2.0 * self.var_inf) * d / math.sqrt(2.0 * math.pi)
+        smooth = math.sqrt(max(0.0, float(slope @ self.covariance @ slope)) / self.var_inf)
+        return max(rough, smooth / (2.0 * math.pi)) * math.exp(-0.5 * d * d)
+
+
+def rail_at(network: PowerNetwork, throttle: float, rail: str = 'bus') -> Rail:
+    """Return a rail of a network at a throttle."""
+    if rail not in RAILS:
+        raise ValueError(f"rail must be 'bus' or 'regulated', got {rail!r}")
+    load = load_at(network, throttle)
+    a, outputs = _circuit(network, load.input_conductance)
+    b = np.zeros((a.shape[0], len(SOURCES)))
+    rms = (load.switching_rms, load.flutter_rms, network.mcu_noise)
+    rates = (load.switching_rate, network.flutter_rate, network.mcu_noise_rate)
+    for k, (size, rate) in enumerate(zip(rms, rates)):
+        row = a.shape[0] - len(SOURCES) + k
+        a[row, row] = -rate
+        b[row, k] = size * math.sqrt(2.0 * rate)
+    poles = np.linalg.eigvals(a)
+    worst = poles[np.argmax(poles.real)]
+    if worst.real >= 0.0:
+        raise UnstableNetworkError(
+            f'the network is unstable at throttle {throttle:g}: pole at {worst.real:.4g} '
+            f'+- {abs(worst.imag):.4g}i 1/s; the regulator as a constant-power load is a negative '
+            f'resistance of {-1.0 / load.input_conductance:.4g} Ohm at its input: damp the filter '
+            '(raise filter_resistance or filter_esr) or raise filter_capacitance')
+    return Rail(network, load, rail, a, b, outputs[rail])
+
+
+def _circuit(net: PowerNetwork, g: float) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Return the rates of the states, without the noise sources', and the rails as rows."""
+    filtered = net.filter_inductance > 0.0
+    names = ['bulk', *(['inductor', 'filter'] if filtered else []), 'line', 'output', *SOURCES]
+    unit = dict(zip(names, np.eye(len(names))))
+    rate = {name: np.zeros(len(names)) for name in names}
+    r, esr = net.battery_resistance, net.bulk_esr
+    drawn = unit['switching'] + unit['flutter']
+    if filtered:
+        current = unit['inductor']
+        bus = (r * unit['bulk'] - r * esr * (drawn + current)) / (r + esr)
+        # The capacitor's current is the inductor's less -g v of the regulator.
+        source = (unit['filter'] + net.filter_esr * current) / (1.0 - net.filter_esr * g)
+        rate['inductor'] = (bus - net.filter_resistance * current - source) / net.filter_inductance
+        rate['filter'] = (current + g * source) / net.filter_capacitance
+    else:
+        bus = source = (r * unit['bulk'] - r * esr * drawn) / (r + esr - r * esr * g)
+        current = -g * source
+    rate['bulk'] = (-bus / r - drawn - current) / net.bulk_capacitance
+    # `line` is the part of its input that the regulator rejects; the rest passes.
+    rate['line'] = 2.0 * math.pi * net.regulator_bandwidth * (source - unit['line'])
+    passed = net.line_feedthrough * (source - unit['line'])
+    ro, eso = net.regulator_resistance, net.output_esr
+    regulated = (ro * unit['output'] + eso * passed - ro * eso * unit['mcu']) / (ro + eso)
+    rate['output'] = ((passed - regulated) / ro - unit['mcu']) / net.output_capacitance
+    return np.array([rate[name] for name in names]), {'bus': bus, 'regulated': regulated}

@@ -1,1 +1,0 @@
-"""A power network from its components: battery, capacitor, filter, regulator, ESCs."""
