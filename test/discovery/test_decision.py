@@ -110,9 +110,14 @@ def test_measured_inputs_and_white_noise_come_first():
 def test_every_kind_of_the_catalogue_is_tried_once():
     """First or later, but for the OU, what is known without a model, and the regression's."""
     both = [tried(first=first, kinds=KINDS.values()) for first in (True, False)]
+    # The shape of something waits until it is there.
+    shapes = [kind for kind in KINDS.values()
+              if kind.ROLE is Role.LAW and kind.CHANGES is not None]
+    beside = [tried([kind.CHANGES], kinds=[kind]) for kind in shapes]
+    assert beside == [[kind.NAME] for kind in shapes] != []
     assert not set(both[0]) & set(both[1])
     assert set(KINDS) - {*both[0], *both[1]} == {
-        'ou', 'load_sag', 'load_transient',
+        'ou', 'load_sag', 'load_transient', *(kind.NAME for kind in shapes),
         *(name for name, kind in KINDS.items() if kind.ROLE is Role.EXACT)}
 
 
