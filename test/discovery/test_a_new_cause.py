@@ -17,8 +17,8 @@ import hidden_registry
 from hidden_registry import effect
 import numpy as np
 from ou_monitor import discover, Recording
-from ou_monitor.cli.recorded import model_text
 from ou_monitor.cli.main import main
+from ou_monitor.cli.recorded import model_text
 from ou_monitor.model.supply import SupplyModel
 import ou_monitor.model.terms.catalogue as terms
 from ou_monitor.model.terms.catalogue import catalogue
