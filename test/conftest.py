@@ -1,8 +1,8 @@
 """Which tests may run beside each other: files may, but all that starts ROS goes one by one."""
 
+import compileall
 import os
 from pathlib import Path
-import shutil
 import signal
 
 from hypothesis import HealthCheck, settings
@@ -16,13 +16,13 @@ settings.register_profile('suite', deadline=None, suppress_health_check=[HealthC
 settings.load_profile('suite')
 
 
-def pytest_configure():
-    """Let what the tests start hear Ctrl-C, which a background job does not; have no byte code."""
-    # A process whose files are limited, as by a full disk, leaves byte code that is cut short.
+def pytest_configure(config):
+    """Compile the package once; let processes that the tests start receive Ctrl-C."""
+    # A process whose files are limited, as by a full disk, would leave byte code cut short.
     os.environ['PYTHONDONTWRITEBYTECODE'] = '1'
-    for folder in (Path(__file__).parents[1] / 'ou_monitor').rglob('__pycache__'):
-        # What an earlier run has left.
-        shutil.rmtree(folder, ignore_errors=True)
+    # A worker of pytest-xdist finds what the controller has compiled.
+    if not hasattr(config, 'workerinput'):
+        compileall.compile_dir(Path(__file__).parents[1] / 'ou_monitor', force=True, quiet=1)
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 

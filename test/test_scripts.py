@@ -93,79 +93,86 @@ def test_an_interpreter_without_venv_is_refused(tree, tmp_path):
     refused(run(tree, PATH=path), 'venv', 'python3.12-venv')
 
 
-def test_no_registry_is_refused_and_the_next_run_tries_again(tree):
-    """Pip's trouble is one line with its cause and its log; nothing counts as installed."""
-    offline = {'PIP_INDEX_URL': NOWHERE, 'PIP_CONFIG_FILE': os.devnull, 'PIP_NO_CACHE_DIR': '1',
-               'PYTHON': sys.executable}
-    for _ in range(2):
-        done = run(tree, 'demo', **offline)
-        assert done.returncode == 2
-        last = done.stderr.splitlines()[-1]
-        assert 'registry' in last and 'connection' in last, last
-        log = Path(last.rpartition('log: ')[2])
-        assert NOWHERE.split('/')[2].split(':')[0] in log.read_text()
-        assert 'installing' in done.stderr and 'Traceback' not in done.stderr
-        assert not list((tree / '.venv').glob('.installed-*'))
+OFFLINE = {'PIP_INDEX_URL': NOWHERE, 'PIP_CONFIG_FILE': os.devnull, 'PIP_NO_CACHE_DIR': '1',
+           'PYTHON': sys.executable}
 
 
-def made_by_hand(tree: Path) -> None:
-    """Make an environment as the scripts would, without what is in the lists."""
+@pytest.fixture(scope='module')
+def made(tmp_path_factory) -> tuple[Path, subprocess.CompletedProcess]:
+    """Return a tree with an environment that the demo has made, with empty lists; and that run."""
+    tree = tmp_path_factory.mktemp('made') / 'a clone'
+    shutil.copytree(ROOT / 'scripts', tree / 'scripts')
     for name in ('requirements-run.txt', 'requirements-live.txt', 'requirements-test.txt',
                  'build.lock', 'run.lock', 'test.lock'):
         (tree / 'scripts' / name).write_text('', encoding='utf-8')
     (tree / 'scripts/run_demo.py').write_text(
         'import os, sys\nprint(sys.prefix, os.getcwd(), *sys.argv[1:], sep="|")\n',
         encoding='utf-8')
+    return tree, run(tree, 'demo', '--bag', 'some bag', **OFFLINE)
 
 
-def test_nothing_is_installed_twice_and_a_broken_environment_is_mended(tree):
+def test_nothing_is_installed_twice_and_a_broken_environment_is_mended(made):
     """A second run makes nothing; one whose interpreter has gone makes it all again."""
-    made_by_hand(tree)
-    offline = {'PIP_INDEX_URL': NOWHERE, 'PIP_CONFIG_FILE': os.devnull, 'PYTHON': sys.executable}
+    tree, first = made
     expected = f'{tree}/.venv|{tree}|--bag|some bag\n'
-    first = run(tree, 'demo', '--bag', 'some bag', **offline)
     assert (first.returncode, first.stdout) == (0, expected), first.stderr
     assert 'making .venv' in first.stderr and 'installing' in first.stderr
-    second = run(tree, 'demo', '--bag', 'some bag', **offline)
+    second = run(tree, 'demo', '--bag', 'some bag', **OFFLINE)
     assert (second.returncode, second.stdout, second.stderr) == (0, expected, '')
     (tree / '.venv/bin/python').unlink()
-    third = run(tree, 'demo', '--bag', 'some bag', **offline)
+    third = run(tree, 'demo', '--bag', 'some bag', **OFFLINE)
     assert (third.returncode, third.stdout) == (0, expected), third.stderr
     assert 'making .venv' in third.stderr
     # A list that has changed is installed; the environment stays.
     (tree / 'scripts/run.lock').write_text('# nothing\n', encoding='utf-8')
-    fourth = run(tree, 'demo', **offline)
+    fourth = run(tree, 'demo', **OFFLINE)
     assert fourth.returncode == 0
     assert 'installing' in fourth.stderr and 'making .venv' not in fourth.stderr
 
 
+def failed_install(tree: Path, lock: str, content: str, **changes: str) -> tuple[str, str]:
+    """Run the demo, which must fail to install a list; return its last line, and pip's log."""
+    (tree / 'scripts' / lock).write_text(content, encoding='utf-8')
+    installed = tree / '.venv/.installed-run'
+    before = installed.read_text()
+    done = run(tree, 'demo', **changes)
+    assert done.returncode == 2 and installed.read_text() == before
+    assert 'installing' in done.stderr and 'Traceback' not in done.stderr
+    (tree / 'scripts' / lock).write_text('', encoding='utf-8')
+    last = done.stderr.splitlines()[-1]
+    return last, Path(last.rpartition('log: ')[2]).read_text(encoding='utf-8')
+
+
+def test_no_registry_is_refused_and_the_next_run_tries_again(made):
+    """Pip's trouble is one line with its cause and its log; nothing counts as installed."""
+    build = (ROOT / 'scripts/build.lock').read_text(encoding='utf-8')
+    for _ in range(2):
+        last, log = failed_install(made[0], 'build.lock', build, **OFFLINE)
+        assert 'registry' in last and 'connection' in last, last
+        assert NOWHERE.split('/')[2].split(':')[0] in log
+
+
 @pytest.mark.parametrize('line', [
     'wheel', 'wheel==0.48.0', 'wheel==0.48.0 --hash=sha256:' + 64 * '0'])
-def test_a_package_without_its_hash_is_refused(tree, line):
+def test_a_package_without_its_hash_is_refused(made, line):
     """Neither without a version, nor without a hash, nor with that of another file."""
-    made_by_hand(tree)
-    (tree / 'scripts/run.lock').write_text(line + '\n', encoding='utf-8')
-    done = run(tree, 'demo', PYTHON=sys.executable)
-    assert done.returncode == 2 and 'could not fetch' in done.stderr.splitlines()[-1]
-    assert not list((tree / '.venv').glob('.installed-*'))
-    log = (tree / '.venv/install.log').read_text(encoding='utf-8').lower()
-    assert 'hash' in log
+    last, log = failed_install(made[0], 'run.lock', line + '\n', PYTHON=sys.executable)
+    assert 'could not fetch' in last and 'hash' in log.lower()
 
 
-def test_a_sourced_jazzy_is_used(tree, tmp_path):
+def test_a_sourced_jazzy_is_used(made, tmp_path):
     """Where rclpy is there already no wheel is asked for, and the machine's packages count."""
-    made_by_hand(tree)
+    tree, _ = made
+    kind = tree / '.venv/pyvenv.cfg'
+    assert 'include-system-site-packages = false' in kind.read_text()
     (tree / 'scripts/run.lock').write_text('no-such-package\n', encoding='utf-8')
     path = fake(tmp_path / 'bin', python3=f'exec "{sys.executable}" "$@"')
     done = run(tree, 'demo', PATH=path, ROS_DISTRO='jazzy', PIP_INDEX_URL=NOWHERE,
                PIP_CONFIG_FILE=os.devnull)
     assert done.returncode == 0, done.stderr
-    assert 'include-system-site-packages = true' in (tree / '.venv/pyvenv.cfg').read_text()
-    # In a shell without that ROS the same folder gets an environment of the other kind.
-    (tree / 'scripts/run.lock').write_text('', encoding='utf-8')
-    done = run(tree, 'demo', PYTHON=sys.executable)
+    # The environment of the other kind is replaced.
     assert 'making .venv' in done.stderr
-    assert 'include-system-site-packages = false' in (tree / '.venv/pyvenv.cfg').read_text()
+    assert 'include-system-site-packages = true' in kind.read_text()
 
 
 def test_versions_other_than_noble_are_refused(tree, tmp_path):
