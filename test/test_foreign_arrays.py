@@ -106,18 +106,17 @@ CALLS = {
 @pytest.mark.parametrize('call', CALLS)
 def test_stamps_in_disorder_are_sorted_as_of_a_file(call):
     """Decreasing, repeated, unknown or negative: the same answer as in order; others no answer."""
-    t = np.arange(1200) * 0.01
+    t = np.arange(600) * 0.01 - 5.0
     throttle = np.where(t % 2.0 < 1.0, 0.2, 0.5)
     volts = 15.0 - throttle + 0.01 * np.random.default_rng(2).standard_normal(t.size)
-    again = np.append(t, [t[5], np.nan])
+    part = [*range(t.size)[::-1], 7, 9]
     facts = []
-    for stamps, part in ((t, slice(None)), (t - 5.0, slice(None)),
-                         (t[::-1], slice(None, None, -1)), (again, [*range(t.size), 7, 9])):
-        found = CALLS[call](Recording(stamps, volts[part], throttle[part]))
+    for recording in (Recording(t, volts, throttle), Recording(
+            np.append(t[::-1], [t[5], np.nan]), volts[part], throttle[part])):
+        found = CALLS[call](recording)
         facts.append(getattr(found, 'supply', found).to_dict())
     assert facts[0]['ou']['status'] == 'not_visible' and facts[0]['sag']['known']
-    assert facts[2] == facts[3] == facts[0]
-    assert facts[1]['lowest'] == pytest.approx(facts[0]['lowest'])
+    assert facts[1] == facts[0]
     with pytest.raises(InputError, match='1e.04 s apart: are the stamps in ms, us or ns'):
         CALLS[call](Recording(1e6 * t, volts, throttle))
 

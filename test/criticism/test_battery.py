@@ -58,13 +58,14 @@ def test_an_effect_of_throttle_that_grows_is_detected():
 
 def test_large_ones_are_the_first_of_each_group_and_what_laws_have_found():
     errors = np.zeros(200)
-    errors[[20, 25, 60, 150]] = 5.0, -6.0, -5.0, 4.5
+    # One 20 samples after the last belongs to its group, 21 after it does not; 3.99 is not large.
+    errors[[0, 20, 41, 62, 150]] = 5.0, -6.0, -4.01, 3.99, 4.5
     found = np.zeros(200, bool)
     found[100] = True
     errors[100] = -1.0
     large = large_ones(errors, found)
-    assert_allclose(np.flatnonzero(large), [20, 60, 100, 150])
-    assert_allclose(large[[20, 60, 100, 150]], [1.0, -1.0, -1.0, 1.0])
+    assert_allclose(np.flatnonzero(large), [0, 41, 100, 150])
+    assert_allclose(large[[0, 41, 100, 150]], [1.0, -1.0, -1.0, 1.0])
 
 
 def test_after_large_errors_of_independent_scores_nothing_follows():

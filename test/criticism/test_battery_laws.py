@@ -4,7 +4,7 @@ from itertools import combinations
 import math
 
 import numpy as np
-from ou_monitor.criticism.battery import Covariates, is_sign, large_ones, statistics
+from ou_monitor.criticism.battery import Covariates, is_sign, statistics
 import pytest
 from scipy import stats
 
@@ -170,10 +170,3 @@ def test_signs():
             ('band', 'band 3, 1 to 2 Hz', -1.0, True), ('band', 'band 0, 1 to 2 Hz', 1.0, True),
             ('band', 'order line', 1.0, False)):
         assert is_sign(sign, name, value) is wanted, (sign, name, value)
-
-
-def test_large_ones_count_from_the_first_sample_and_after_20():
-    errors = np.zeros(100)
-    errors[[0, 20, 41, 62]] = 5.0, 5.0, -4.01, 3.99
-    # 20 after the last one belongs to it, 21 does not; so it is from one to the next.
-    assert np.flatnonzero(large_ones(errors)).tolist() == [0, 41]

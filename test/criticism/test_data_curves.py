@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 from ou_monitor.criticism.curves import (
-    _averages, _bins, _by_throttle, _curves, _density, bin_width, outline)
+    _averages, _bins, _by_throttle, _curves, _density, bin_width, outline, seen_range, stray)
 from ou_monitor.criticism.samples import Samples
 import pytest
 
@@ -17,9 +17,10 @@ def test_bins_after_freedman_and_diaconis(n, spread):
 
 
 @pytest.mark.parametrize('code', [0.0, 0.01, 0.1])
-def test_edges_hold_all_values_and_room_for_tails(code):
+@pytest.mark.parametrize('middle', [5.0, -2.0])
+def test_edges_hold_all_values_and_room_for_tails(code, middle):
     """A density integrates to 1; codes lie half-way between edges, as many in each bin."""
-    y = np.round(np.random.default_rng(3).normal(5.0, 0.2, 2000), 2)
+    y = np.round(np.random.default_rng(3).normal(middle, 0.2, 2000), 2)
     y = np.round(y / code) * code if code else y
     edges = _bins(y, code)
     width = np.diff(edges)
@@ -66,3 +67,13 @@ def test_the_corners_of_a_histogram():
     x, y = outline(np.array([0.0, 1.0, 3.0]), [2.0, 1.0])
     assert float(np.sum(np.diff(x) * 0.5 * (y[1:] + y[:-1]))) == pytest.approx(4.0)
     assert x[0] == 0.0 and x[-1] == 3.0 and y.max() == 2.0
+
+
+def test_half_the_range_of_levels_is_room():
+    """Seen 14 to 16 V: 13 to 17 V may be simulated, and what is farther is said in volts."""
+    seen = np.array([14.0, 15.0, 16.0])
+    assert seen_range(seen) == (13.0, 17.0)
+    assert stray(np.array([[13.0, 17.0], [15.0, 15.5]]), seen) == 0.0
+    assert stray(np.array([[15.0, 17.3], [15.0, 15.5]]), seen) == pytest.approx(0.3)
+    assert stray(np.array([12.5, 17.2]), seen) == pytest.approx(0.5)
+    assert stray(np.array([np.nan, 15.0]), seen) == float('inf')

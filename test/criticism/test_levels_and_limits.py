@@ -8,8 +8,7 @@ from numpy.testing import assert_allclose
 from ou_monitor.analysis.level_tests import _correlated, _mean_drift
 from ou_monitor.criticism.adc import find_rails, redraw
 from ou_monitor.criticism.composite import _same
-from ou_monitor.criticism.curves import _bins, compare_curves
-from ou_monitor.criticism.readings import why_nothing
+from ou_monitor.criticism.curves import compare_curves
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate, Events, solved
 from ou_monitor.model.terms.ou import OU
@@ -67,21 +66,6 @@ def test_portmanteau_is_a_sum_of_squared_scores(name, shift, freedom):
     found = _correlated(name, parts, 3)
     assert found.p_value == pytest.approx(stats.chi2.sf(q, freedom))
     assert found.effect == pytest.approx(math.sqrt(effect))
-
-
-@pytest.mark.parametrize('code, low, high', ((0.0, 0.0, 1.0), (0.001, 0.0, 1.0),
-                                             (0.5, 3.0, 9.0), (0.5, -4.0, -1.0)))
-def test_bins_hold_the_range_and_a_margin_beside_it(code, low, high):
-    """15 % on either side and not much more; with codes, edges half-way between them."""
-    edges = _bins(np.array([low, high]), code)
-    width = edges[1] - edges[0]
-    assert_allclose(np.diff(edges), width)
-    room = 0.15 * (high - low)
-    for beside in (low - edges[0], edges[-1] - high):
-        assert room - 1e-9 <= beside <= room + 2.0 * width + code
-    if code:
-        assert (low - edges[0]) / code % 1.0 == pytest.approx(0.5)
-        assert width / code == pytest.approx(round(width / code))
 
 
 def test_uneven_samples_are_compared_on_a_grid_to_their_end():
@@ -171,21 +155,6 @@ def test_least_squares_of_few_and_of_many_columns(width):
     columns[:, 1] = 0.0
     columns *= np.geomspace(1.0, 1e3, width)
     assert_allclose(solved(columns, y), np.linalg.pinv(columns) @ y, atol=1e-9)
-
-
-def test_why_nothing_can_be_fitted():
-    rng = np.random.default_rng(8)
-    v = 5.0 + 0.01 * rng.standard_normal(1000)
-    stuck = np.full(1000, 5.0)
-    stuck[500] = 5.1
-    assert why_nothing(v) == ''
-    assert why_nothing(np.full(9, 5.0)).startswith('The voltage does not change')
-    assert why_nothing(stuck).startswith('All but 1 of its 1000 samples read 5 V')
-    assert why_nothing(1e31 * v).startswith('The voltage reaches')
-    assert why_nothing(1e-31 * v).startswith('The voltage moves by')
-    stuck[:3] = 5.2
-    assert why_nothing(stuck) == ''
-    assert 'straight line' in why_nothing(np.linspace(4.0, 5.0, 1000))
 
 
 def test_events_add_to_the_joint_normal_law():

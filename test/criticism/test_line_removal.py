@@ -9,6 +9,7 @@ from ou_monitor.model.spectral_lines import find_lines, without_lines
 from ou_monitor.records import Estimate, Recording, Severity, Status
 import pytest
 from scipy.signal import lfilter
+from simulated_recordings import as_one_level
 
 RATE, ALPHA, SIGMA = 1000.0, 63.0, 0.3
 
@@ -52,7 +53,7 @@ def test_a_faint_tone_does_not_bias_alpha_and_sigma():
     """
     holds = {'alpha': 0, 'sigma': 0}
     for seed in range(20):
-        (level,) = analyze(simulated(0.004, seed)).levels
+        level = as_one_level(simulated(0.004, seed))
         assert level.lines.lines
         assert level.with_lines.sigma > level.estimate.sigma
         for name, truth in (('alpha', ALPHA), ('sigma', SIGMA)):

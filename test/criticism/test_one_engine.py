@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 from ou_monitor.analysis.level_comparison import alpha_constancy, sigma_change
-from ou_monitor.analysis.level_result import fit_level, fit_parts
-from ou_monitor.analysis.levels import LoadLevel, Stay
+from ou_monitor.analysis.level_result import fit_parts
+from ou_monitor.analysis.levels import Stay
 from ou_monitor.criticism.battery import covariates_of, statistics
 from ou_monitor.criticism.composite import fit_composite, view_of
 from ou_monitor.criticism.innovations import FAMILY_WISE, innovations, other_pole
@@ -29,10 +29,10 @@ from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.slow import SecondRelaxation
 from ou_monitor.recordings.importers.csv_table import CsvColumns
 from ou_monitor.recordings.read import read_recording
-from ou_monitor.records import NAN, Recording
+from ou_monitor.records import Recording
 from project import ROOT
 import pytest
-from simulated_recordings import bare
+from simulated_recordings import as_one_level, bare
 
 REAL = Path(os.environ.get('OU_MONITOR_REALDATA', 'nowhere'))
 PATHS = [*sorted(path.parent for path in (ROOT / 'bags').glob('**/metadata.yaml')),
@@ -40,12 +40,6 @@ PATHS = [*sorted(path.parent for path in (ROOT / 'bags').glob('**/metadata.yaml'
 BATTERY = 'battery_status[0].voltage_v'
 # A line this unlikely by chance is clear: the two models whiten a little differently.
 CLEAR = 1e-3 * FALSE_ALARM
-
-
-def as_one_level(recording):
-    """Return what `analyze` says of a recording as one load level."""
-    whole = LoadLevel(NAN, (Stay(0, recording.n),))
-    return fit_level(recording, bare(recording), whole, 1)
 
 
 @pytest.fixture(scope='module', params=PATHS, ids=lambda path: path.name)
@@ -60,7 +54,7 @@ def both(request):
         assert not as_one_level(whole).estimate.usable
         pytest.skip(kept.reason)
     samples = Samples(kept.samples.t, kept.samples.voltage, None)
-    level = as_one_level(Recording(samples.t, samples.voltage, np.full(samples.n, NAN), 'same'))
+    level = as_one_level(Recording(samples.t, samples.voltage, np.full(samples.n, np.nan), 'same'))
     # Lines were found before they were taken out of the fit.
     fit = level.with_lines or level.estimate
     if fit.usable:

@@ -4,7 +4,7 @@ import math
 import warnings
 
 import numpy as np
-from ou_monitor.criticism.readings import find_bad, usable, why_nothing
+from ou_monitor.criticism.readings import find_bad, why_nothing
 from ou_monitor.discovery.discover import discover
 from ou_monitor.discovery.finding import Verdict
 from ou_monitor.model.ou import simulate
@@ -80,12 +80,6 @@ def test_what_goes_far_by_degrees_or_often_stays():
     assert not find_bad(v).any()
 
 
-@pytest.mark.parametrize('n', [0, 1, 2, 3])
-def test_few_samples_have_no_others(n):
-    """Nothing is far from nothing."""
-    assert find_bad(np.array([0.0, 5.0, 65535.0])[:n]).size == n
-
-
 NOTHING = {
     'constant': (np.full(N, 5.0), 'does not change'),
     'but one': (np.where(np.arange(N) == 50, 5.2, 5.0), 'All but 1 of its 6000 samples read 5 V'),
@@ -115,50 +109,18 @@ def test_a_recording_that_starts_with_a_stuck_sensor_is_still_looked_at():
     assert found.baseline is not None and [c.name for c in found.causes][0] == 'held_samples'
 
 
-@pytest.mark.parametrize('scale, offset, part', [
-    (100.0, 0.0, 'percent'), (1000.0, 1000.0, 'microseconds'), (1.0, 0.0, '')])
-def test_throttle_in_other_units_gives_the_same_sag(scale, offset, part):
-    """Taken as 0..1, which a note says; so is the model."""
+def test_throttle_in_other_units_gives_the_same_sag():
+    """Taken as 0..1, which a note says; so is the model.  Counts are not used."""
     u = np.repeat(np.random.default_rng(4).random(N // 50), 50)
     u[:100] = np.repeat([0.0, 1.0], 50)
     v = SupplyModel((OU(20.0, 0.178, 5.0), LoadSag(0.3, 0.0))).simulate(
         T, np.random.default_rng(5), u)
-    found = discover(Recording(T, v, offset + scale * u, 'unit'))
+    found = discover(Recording(T, v, 100.0 * u, 'unit'))
     (cause,) = found.causes
     # Its error is stated; without the unit it is off by a factor of 100 at least.
     assert cause.name == 'load_sag'
     assert abs(cause.term.linear + cause.term.square - 0.3) < 0.05
-    notes = [note for note in found.notes if 'taken as' in note]
-    assert (part in notes[0]) if part else not notes
-
-
-def test_throttle_of_no_known_unit_and_wild_values_are_not_used():
-    """65535 counts are no throttle; a single wild value is a hole."""
-    u = np.linspace(0.0, 1.0, N)
-    notes = []
-    assert usable(Recording(T, rail(), 65535.0 * u, 'counts'), notes)[2] is None
-    assert 'no unit known here' in ' '.join(notes)
-    said = discover(Recording(T, rail(), 65535.0 * u, 'counts')).notes
+    (note,) = [note for note in found.notes if 'taken as' in note]
+    assert 'percent' in note
+    said = discover(Recording(T, rail(), 65535.0 * np.linspace(0.0, 1.0, N), 'counts')).notes
     assert any('Throttle is not usable: load_dependent_alpha' in note for note in said)
-    notes = []
-    wild = np.where(np.arange(N) == 70, 1e30, u)
-    assert usable(Recording(T, rail(), wild, 'wild'), notes)[2][70] == u[69]
-    assert 'far outside its range at 1 sample' in ' '.join(notes)
-
-
-def test_millivolts_are_said_to_be_taken_as_volts():
-    """One note; the numbers are not touched."""
-    notes = []
-    v = 1000.0 * rail()
-    assert np.array_equal(usable(Recording(T, v, np.full(N, math.nan), 'mV'), notes)[1], v)
-    assert any('millivolts' in note for note in notes)
-
-
-def test_a_note_gives_the_length_of_unknown_throttle():
-    """Two holes: all of it, and the longest."""
-    u = np.linspace(0.0, 1.0, N)
-    u[100:300] = u[1000:1900] = math.nan
-    notes = []
-    held = usable(Recording(T, rail(), u, 'holes'), notes)[2]
-    assert held[1500] == u[999] and 'unknown at 1100 samples (11.0 of 60.0 s' in notes[0]
-    assert 'longest gap 9.00 s' in notes[0]

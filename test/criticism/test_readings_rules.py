@@ -72,6 +72,7 @@ def test_values_with_most_of_them_equal_use_the_wider_quantiles():
     for value, bad in ((50.0, 0), (60.0, 1)):
         assert find_bad(np.append(v, value)).sum() == bad
     assert not find_bad(np.append(np.full(50, 5.0), 9.0)).any()
+    assert not find_bad(np.array([0.0, 5.0, 65535.0])).any()
 
 
 def throttle(u, t=None):
@@ -156,10 +157,9 @@ def test_samples_in_order_and_finite():
 @pytest.mark.parametrize('level, said', [(999.0, False), (1001.0, True), (-1001.0, True),
                                          (1e31, False)])
 def test_voltages_above_a_thousand_may_be_millivolts(level, said):
-    notes = []
-    usable(Recording(np.arange(9.0), level + 0.0 * np.arange(9.0), np.full(9, math.nan), ''),
-           notes)
-    assert any('millivolts' in note for note in notes) == said
+    notes, v = [], level + 0.0 * np.arange(9.0)
+    found = usable(Recording(np.arange(9.0), v, np.full(9, math.nan), ''), notes)[1]
+    assert any('millivolts' in note for note in notes) == said and (found == v).all()
 
 
 @pytest.mark.parametrize('n, odd, stuck', [(100, 3, True), (100, 4, False), (5000, 5, True),

@@ -153,12 +153,13 @@ def test_three_states():
     """
     Shares of the states, by detailed balance of up and down; each adds its level once.
 
-    With q = up/down: 0 is left at 2 up, 1 at up + down, 2 at 2 down.
+    With q = up/down: 0 is left at 2 up, 1 at up + down, 2 at 2 down.  Samples 6 relaxations of
+    the chain apart correlate by exp(-6): half a percent of a variance.
     """
     up, down, count = 20.0, 30.0, 60_000
     three = term('regime_switching', rate_up=up, rate_down=down, level=0.5, sigma_ratio=1.0,
                  at_once=1.0, states=3.0)
-    x = clusters(still(three), np.array([0.0]), 0.5, count, 4)[:, 0]
+    x = clusters(still(three), np.array([0.0]), 6.0 / (up + down), count, 4)[:, 0]
     # Flow into each state is flow out of it.
     flow = np.array([[-2.0 * up, down, down], [up, -up - down, down], [1.0, 1.0, 1.0]])
     for k, share in enumerate(np.linalg.solve(flow, [0.0, 0.0, 1.0])):
