@@ -1,10 +1,12 @@
 """
 A model of one flight, fitted to a part of it, that can be drawn over any throttle.
 
-Fitted first is the load where it predicts, then the noise of what is left.
+Fitted first is the load where it predicts, then what it leaves: an OU beside white noise, whose
+size follows the load and its changes (`model.ou_fit`).
 
 Limits: four parts are left out one after the other, so a flight that changes for good after
-the part fitted is not foreseen; what has memory is one OU, whatever made it.
+the part fitted is not foreseen; what has memory is one OU, whatever made it, which changes its
+size with the white noise; readings of the part fitted count as evenly spaced.
 """
 
 from __future__ import annotations
@@ -16,10 +18,12 @@ from typing import Protocol
 
 import numpy as np
 from ou_monitor.criticism.adc import find_step
+from ou_monitor.model.arma import theta_at
+from ou_monitor.model.innovations import Filter, StateSpace
 from ou_monitor.model.load import lowpass
-from ou_monitor.model.load_fit import fit_load, level_evidence, LoadFit
-from ou_monitor.model.residual import (
-    fit_noise_law, fit_residual_ou, innovations, NoiseLaw, ResidualOU, SLOW_TIME)
+from ou_monitor.model.load_fit import fit_load, level_evidence, LoadFit, SLOW_TIME
+from ou_monitor.model.ou import simulate
+from ou_monitor.model.ou_fit import fit_pieces, load_signs, NoiseSize, stretches, usual_walk
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.reading import Quantization
 from ou_monitor.records import FloatArray
@@ -89,6 +93,100 @@ class Damping:
         return np.asarray(path - self.share * (path - lowpass(path, t, self.time)))
 
 
+# Errors are drawn from those whose size is alike: this share of all to either side, and at least
+# so many; sizes that differ by rounding are the same.
+_ALIKE, _FEWEST, _ROUNDING = 0.02, 50, 1e-9
+# White noise has at least this share of the variance: the filter needs some.
+_LEAST_WHITE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class FlightNoise:
+    """An OU beside white noise: independent errors of one size law, coloured by a filter."""
+
+    sizes: NoiseSize  # Size of the errors over the load and its changes
+    logs: FloatArray  # ln of the size, V, at the readings of the fit, rising; shape (n,)
+    # Errors there, V: the shape of their law, tails included; shape (n,).
+    errors: FloatArray
+    # Autoregressive and moving-average coefficient of the filter; 0 where no OU is visible.
+    phi: float
+    theta: float
+    spacing: float  # From one reading to the next, s
+
+    def draw(self, n: int, load: FloatArray | None, rng: np.random.Generator) -> FloatArray:
+        """Return n samples of noise, V, under that throttle or current."""
+        wanted = np.log(self.sizes.of(load_signs(n, self.spacing, load)))
+        # Any of those that are as large, and its neighbours: as many at the ends as between.
+        # By rounding the same size comes out in two ways.
+        first = np.searchsorted(self.logs, wanted - _ROUNDING, side='left')
+        last = np.searchsorted(self.logs, wanted + _ROUNDING, side='right')
+        at = first + (rng.random(wanted.size) * (last - first)).astype(np.int64)
+        most = self.errors.size - 1
+        reach = min(max(_FEWEST, int(_ALIKE * self.errors.size)), most // 2)
+        near = np.clip(at, reach, most - reach) + rng.integers(-reach, reach + 1, at.size)
+        # As they were, not scaled: an outlier in a calm does not become a larger one in a storm.
+        return np.asarray(lfilter([1.0, -self.theta], [1.0, -self.phi], self.errors[near]))
+
+    def mean_error(self, duration: float) -> float:
+        """Return the standard error of a mean over that time, s, in V."""
+        variance = float(np.mean(self.errors ** 2)) * self.spacing / duration
+        return (1.0 - self.theta) / (1.0 - self.phi) * math.sqrt(variance)
+
+
+def fit_noise(samples: Readings, left: FloatArray, load: FloatArray | None, slow: float
+              ) -> FlightNoise:
+    """
+    Fit the noise to what is left of readings, V, under that throttle or current.
+
+    slow: variance, V^2, of the process of `SLOW_TIME` that is in it as well, and not in the noise.
+    """
+    dt, lsb = samples.spacing, samples.lsb
+    left = left - left.mean()
+    ou = fit_pieces([(left[part], np.ones(part.stop - part.start))
+                     for part in stretches(samples.t)], dt, usual_walk(samples.voltage))
+    alpha, variance = (ou.alpha, ou.var_inf) if ou.status == 'ok' else (1.0 / dt, 0.0)
+    phi = math.exp(-alpha * dt)
+    # By the steps between readings, in which nothing slow is.
+    white = max(0.5 * float(np.mean(np.diff(left) ** 2)) - variance * (1.0 - phi),
+                _LEAST_WHITE * float(left @ left) / left.size, 1e-18)
+    errors, predicted = _predicted(
+        left, dt, white, {alpha: variance, 1.0 / SLOW_TIME: slow})
+    # What the readings add by rounding is simulated by itself.
+    own, theta = max(white - lsb * lsb / 12.0, _LEAST_WHITE * white), 0.0
+    if variance > 0.0:
+        theta = theta_at(alpha * dt, 1, 0.5 * own / (variance * alpha * dt))
+        own *= phi / theta
+    signs = load_signs(left.size, dt, load)
+    sizes = NoiseSize(signs)
+    sizes.fit(errors)
+    size = sizes.of(signs)
+    order = np.argsort(size, kind='stable')
+    other = max(0.0, predicted - own)
+    share = np.maximum(0.0, 1.0 - other / np.maximum(size * size, 1e-300))
+    return FlightNoise(sizes, np.log(size[order]), (errors * np.sqrt(share))[order],
+                       phi if variance > 0.0 else 0.0, theta, dt)
+
+
+def _predicted(x: FloatArray, dt: float, white: float, parts: dict[float, float]
+               ) -> tuple[FloatArray, float]:
+    """
+    Return the errors of predicting each reading from those before, V, and their variance, V^2.
+
+    x in V, spacing dt in s, white in V^2; parts: variances of OUs, V^2, by rates, 1/s.
+    """
+    rates = np.array([rate for rate, variance in parts.items() if variance > 0.0])
+    if not rates.size:
+        return x, white
+    variances = np.array([parts[rate] for rate in rates])
+    # Until then the gain has settled.
+    n = min(x.size, max(3, math.ceil(SLOW_TIME / dt)))
+    keep = np.exp(-rates * dt)
+    f, q = (np.tile(np.diag(row), (n, 1, 1)) for row in (keep, variances * (1.0 - keep ** 2)))
+    q[0] = np.diag(variances)
+    run = Filter(StateSpace(f, q, np.ones(rates.size), np.full(n, white)), x.size)
+    return run.innovations(x), float(run.variance[-1])
+
+
 @dataclass(frozen=True, eq=False)
 class FlightModel:
     """Load model, slow process, OU and white noise, as fitted to a part of a recording."""
@@ -102,8 +200,7 @@ class FlightModel:
     # from their prediction than the fit says.
     spread: float
     sag_error: float  # Relative error of the sag, as parts that were left out show it
-    noise: NoiseLaw  # White noise
-    ou: ResidualOU  # What has memory in the residuals
+    noise: FlightNoise  # What else the load leaves
     until: float  # End of the part fitted, s
 
     @property
@@ -113,8 +210,8 @@ class FlightModel:
         if self.load is not None:
             found += ['load_sag', 'load_transient',
                       *(['drift'] if math.isnan(self.load.model.stands) else [])]
-        follows = self.noise.limits[0] < self.noise.limits[1]
-        return [*found, 'measurement_noise', *(['load_dependent_noise'] if follows else [])]
+        return [*found, 'measurement_noise',
+                *(['load_dependent_noise'] if self.noise.sizes.follows else [])]
 
     @property
     def alone(self) -> bool:
@@ -131,7 +228,6 @@ class FlightModel:
     def draw(self, samples: Readings, rng: np.random.Generator) -> FloatArray:
         """Return one simulated voltage, V; the errors of the parameters are drawn too."""
         n = samples.t.size
-        throttle = np.zeros(n) if samples.throttle is None else samples.throttle
         slow = 0.0
         if self.load is None:
             voltage = np.full(n, self.level + self.level_se * rng.standard_normal())
@@ -145,29 +241,16 @@ class FlightModel:
             path = other - float((other - path)[samples.t <= self.until].mean())
             voltage = self.damping.of(path, samples.t)
             slow = self.spread * self.load.slow_std ** 2
-        dt = np.diff(samples.t, prepend=samples.t[0])
-        white, variance, tau = self.ou.draw(rng)
-        for var, time in ((slow, SLOW_TIME), (variance, tau)):
-            if var > 0.0:
-                voltage = voltage + math.sqrt(var) * _ou(dt, time, rng)
-        factor = math.sqrt(white / self.ou.white) if self.ou.white > 0.0 else 1.0
-        return np.asarray(voltage + factor * self.noise.draw(samples.t, throttle, rng))
+        if slow > 0.0:
+            voltage = voltage + simulate(
+                samples.t, 1.0 / SLOW_TIME, math.sqrt(2.0 * slow / SLOW_TIME), rng)
+        return np.asarray(voltage + self.noise.draw(
+            n, _simulated_load(self.load, samples), rng))
 
 
-def _ou(dt: FloatArray, tau: float, rng: np.random.Generator) -> FloatArray:
-    """Return an OU of variance 1; steps are taken as even, but for gaps."""
-    usual = float(np.median(dt))
-    keep = math.exp(-usual / tau)
-    kicks = math.sqrt(1.0 - keep * keep) * rng.standard_normal(dt.size)
-    begins = [0, *np.flatnonzero(dt > 3.0 * usual).tolist(), dt.size]
-    out, state = np.empty(dt.size), float(rng.standard_normal())
-    for first, last in zip(begins, begins[1:]):
-        over = math.exp(-float(dt[first]) / tau) if first else 1.0
-        state = over * state + math.sqrt(1.0 - over * over) * float(rng.standard_normal())
-        kicks[first] = state
-        out[first:last] = lfilter([1.0], [1.0, -keep], kicks[first:last])
-        state = float(out[last - 1])
-    return out
+def _simulated_load(fit: LoadFit | None, samples: Readings) -> FloatArray | None:
+    by_current = fit is not None and fit.model.full_current != 0.0
+    return samples.current if by_current else samples.throttle
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,7 +294,7 @@ _DRAWN = 16
 def fit_flight(samples: Readings, progress: Callable[[float], None] | None = None) -> FlightModel:
     """Fit a model to samples: at least 100, over more than some seconds."""
     report = progress or (lambda share: None)
-    mean, lsb = float(samples.voltage.mean()), samples.lsb
+    mean = float(samples.voltage.mean())
     best = _best(samples, lambda share: report(0.4 * share))
     if best is not None:
         parts = []
@@ -224,20 +307,15 @@ def fit_flight(samples: Readings, progress: Callable[[float], None] | None = Non
     path = np.full(samples.t.size, mean) if best is None else _path(
         samples, best.fit, best.current)
     damped = Damping() if load is None else damping(samples, path)
-    slow = 0.0 if load is None else load.slow_std ** 2
-    left = samples.voltage - damped.of(path, samples.t)
-    dt = samples.spacing
-    ou = fit_residual_ou(left, dt, slow)
-    errors, state = innovations(left, dt, ou, slow)
-    throttle = np.zeros(samples.t.size) if samples.throttle is None else samples.throttle
-    noise = fit_noise_law(samples.t, errors, throttle, state + lsb * lsb / 12.0)
+    noise = fit_noise(samples, samples.voltage - damped.of(path, samples.t),
+                      _simulated_load(load, samples),
+                      0.0 if load is None else load.slow_std ** 2)
     duration = float(samples.t[-1] - samples.t[0])
-    level_var = (ou.white * dt + 2.0 * ou.variance * ou.tau) / duration
     report(1.0)
     spread, sag_error = (1.0, 0.0) if best is None else (
         _spread(samples, best), _sag_error(samples, best))
     return FlightModel(
-        load, mean, math.sqrt(level_var), damped, spread, sag_error, noise, ou,
+        load, mean, noise.mean_error(duration), damped, spread, sag_error, noise,
         float(samples.t[-1]))
 
 

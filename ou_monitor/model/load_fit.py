@@ -44,8 +44,9 @@ _REACH = 3.0
 # Mean of the data over this time, s, before the fit: OU and polarisation are slower;
 # but of a short recording this share, and fewest samples.
 _BIN, _BIN_SHARE, _LEAST = 0.05, 0.01, 20
-# Time constant of the residual OU, s, and the deviations tried, V a cell (cap: doc/load.md).
-_SLOW_TIME = 20.0
+# Time constant, s, of the slow error of a load, an OU, and the deviations tried, V a cell
+# (cap: doc/load.md).
+SLOW_TIME = 20.0
 _SLOW_STDS = np.geomspace(0.001, 0.00464, 5)
 # White and slow noise at the start, V a cell: the order of the recordings.
 _WHITE_START, _SLOW_START = 0.02, 0.01
@@ -149,7 +150,7 @@ class _Noise:
     """White noise and OU: whitens residuals of binned data; stamps in s."""
 
     def __init__(self, t: FloatArray, cells: int) -> None:
-        self._keep = np.exp(-np.diff(t) / _SLOW_TIME)
+        self._keep = np.exp(-np.diff(t) / SLOW_TIME)
         self._tried = (_SLOW_STDS * cells) ** 2
         self.white = (_WHITE_START * cells) ** 2
         self.slow = (_SLOW_START * cells) ** 2

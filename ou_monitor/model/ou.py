@@ -12,7 +12,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.records import FloatArray
-from scipy.signal import lfilter
+from scipy.linalg import solve_banded
 
 
 def stationary_variance(alpha: float, sigma: float) -> float:
@@ -61,11 +61,8 @@ def simulate(
         first = start
         if first is None:
             first = math.sqrt(stationary_variance(alpha, float(intensity[0]))) * noise[0]
-        x[0] = first
-        kicks = noise[1:] * intensity[1:] * np.sqrt(unit_q)
-        if phi.size and np.ptp(phi) < 1e-12:
-            x[1:] = lfilter([1.0], [1.0, -phi[0]], kicks, zi=[phi[0] * first])[0]
-        else:
-            for k in range(1, n):
-                x[k] = phi[k - 1] * x[k - 1] + kicks[k - 1]
+        kicks = np.append(first, noise[1:] * intensity[1:] * np.sqrt(unit_q))
+        bands = np.ones((2, n))
+        bands[1] = np.append(-phi, 0.0)
+        x = solve_banded((1, 0), bands, kicks, check_finite=False)
     return x + np.asarray(u0, dtype=np.float64)

@@ -96,6 +96,11 @@ _SPANNED = 1e-5
 _POWER = 1.8
 
 
+def usual_walk(v: FloatArray) -> float:
+    """Return the usual walk of the level of a voltage, V per sqrt(s)."""
+    return _WALK * max(abs(float(v.mean())), 1e-3) / CELL
+
+
 def stretches(t: FloatArray) -> list[slice]:
     """Return the stretches without a gap; a few lost messages are none."""
     steps = np.diff(t)
@@ -220,7 +225,7 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
         found: list[FloatArray] = regressors(_moved(x, late))
         return found
 
-    walk = _WALK * max(abs(float(v.mean())), 1e-3) / CELL
+    walk = usual_walk(v)
     v = v - v.mean()
     if i is not None:
         columns = [*columns, *best(i, answers, max(_DELAYS, min(_FAR, round(reach / dt))))]
@@ -235,12 +240,12 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
         columns = [*columns, *(np.exp((t[0] - t) / tau) for tau in taus)]
     rows, v = np.stack([c[places] for c in columns]), v[places]
     size = np.ones(v.size)
-    signs = [sign[places] for x in (u, i) if x is not None for sign in _activity(x, dt)]
+    law = NoiseSize(load_signs(t.size, dt, u, i)[:, places])
     # First all readings count alike, then each by the size of its noise.
     left = v
-    for again in range(3 if signs and v.size else 1):
+    for again in range(3 if law.follows and v.size else 1):
         if again:
-            size = _size(left, signs)
+            size = law.fit(left)
         basis, left = _basis(rows / size), v / size
         # Twice, against rounding.
         for _ in range(2):
@@ -250,30 +255,65 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
                       walk, 0.5 * float(knots[1] - knots[0]))
 
 
-def _activity(x: FloatArray, dt: float) -> list[FloatArray]:
-    """Return the size of a load and of its changes over several times, each at least 0."""
-    held = [x, *(_lagged(x, -math.expm1(-dt / tau)) for tau in _CHANGES)]
-    return [np.abs(one) for one in (
-        x, np.diff(x, prepend=x[0]), *(a - b for a, b in zip(held, held[1:])))]
+def load_signs(n: int, dt: float, *loads: FloatArray | None) -> FloatArray:
+    """Return loads and their changes over several times, each by its size; shape (k, n)."""
+    rows: list[FloatArray] = []
+    for x in loads:
+        if x is not None:
+            held = [x, *(_lagged(x, -math.expm1(-dt / tau)) for tau in _CHANGES)]
+            rows += [x, np.diff(x, prepend=x[0]), *(a - b for a, b in zip(held, held[1:]))]
+    return np.abs(np.stack(rows)) if rows else np.zeros((0, n))
 
 
-def _size(left: FloatArray, signs: list[FloatArray]) -> FloatArray:
-    """Return the noise's size beside its rms: a law, linear in its logarithm, of the signs."""
-    mean = float(left @ left) / max(1, left.size)
-    if not signs or not mean > 1e-18:
-        return np.ones(left.size)
-    laws = [np.log1p(sign / (0.3 * math.sqrt(float(sign @ sign) / sign.size)))
-            for sign in signs if sign.any()]
-    X = np.stack([np.ones(left.size), *(law - law.mean() for law in laws)])
-    square = left * left / mean
-    prior = np.append(0.0, np.full(len(laws), 2.0 / _SIZE_SD ** 2))
-    beta, H = np.zeros(len(X)), X @ X.T + np.diag(prior)
-    for _ in range(_SIZE_ROUNDS):
-        # A score of the Gamma law of squares.
-        score = X @ (square * np.exp(-np.clip(beta @ X, -6.0, 6.0)) - 1.0) - prior * beta
-        beta = beta + np.clip(np.linalg.solve(H, score), -1.0, 1.0)
-    variance = np.exp(np.clip(beta @ X, -6.0, 6.0))
-    return np.asarray(np.sqrt(variance / variance.mean()))
+class NoiseSize:
+    """
+    The noise's size over loads and their changes: a law, linear in its logarithm, of their signs.
+
+    Beyond the sizes of the fit it stays at their edge.
+    """
+
+    def __init__(self, signs: FloatArray) -> None:
+        n = max(1, signs.shape[1])
+        # One that stays as it is says nothing.
+        self._used = (signs != signs[:, :1]).any(axis=1)
+        self._scale = 0.3 * np.sqrt((signs[self._used] ** 2).sum(axis=1, keepdims=True) / n)
+        laws = self._laws(signs)
+        self._mean = laws.sum(axis=1, keepdims=True) / n
+        self._X = np.vstack([np.ones(signs.shape[1]), laws - self._mean])
+        self._beta, self._rms, self._ends = np.zeros(len(self._X)), 1.0, (0.0, 0.0)
+
+    @property
+    def follows(self) -> bool:
+        """Return whether any load moves."""
+        return len(self._X) > 1
+
+    def _laws(self, signs: FloatArray) -> FloatArray:
+        return np.asarray(np.log1p(signs[self._used] / self._scale))
+
+    def fit(self, left: FloatArray) -> FloatArray:
+        """Fit the law to noise, V; return the sizes there beside their rms."""
+        X, n = self._X, left.size
+        mean = float(left @ left) / max(1, n)
+        if not self.follows or not mean > 1e-18:
+            self._rms = math.sqrt(max(mean, 1e-300))
+            return np.ones(n)
+        square = left * left / mean
+        prior = np.append(0.0, np.full(len(X) - 1, 2.0 / _SIZE_SD ** 2))
+        beta, H = np.zeros(len(X)), X @ X.T + np.diag(prior)
+        for _ in range(_SIZE_ROUNDS):
+            # A score of the Gamma law of squares.
+            score = X @ (square * np.exp(-np.clip(beta @ X, -6.0, 6.0)) - 1.0) - prior * beta
+            beta = beta + np.clip(np.linalg.solve(H, score), -1.0, 1.0)
+        log = np.clip(beta @ X, -6.0, 6.0)
+        variance = np.exp(log)
+        self._beta, self._ends = beta, (float(log.min()), float(log.max()))
+        self._rms = math.sqrt(max(mean, 1e-300))
+        return np.asarray(np.sqrt(variance / variance.mean()))
+
+    def of(self, signs: FloatArray) -> FloatArray:
+        """Return the sizes, V, that the last fit gives to such signs."""
+        X = np.vstack([np.ones(signs.shape[1]), self._laws(signs) - self._mean])
+        return np.asarray(self._rms * np.exp(0.5 * np.clip(self._beta @ X, *self._ends)))
 
 
 class _Likelihood:
