@@ -25,7 +25,7 @@ def test_a_steep_load_hunts_even_at_the_defaults():
     loop = Loop(steepness=3.0)
     assert not judge(replace(loop, coupling=0.3), SECONDS).cycle
     above = judge(replace(loop, coupling=1.5), SECONDS)
-    assert above.cycle and above.swing > 0.7 and above.quiet < 0.1
+    assert above.cycle and above.swing > max(0.7, 5.0 * above.quiet)
 
 
 def test_a_kalman_filter_of_limited_lag_does_not_hunt():

@@ -4,15 +4,11 @@ From the cutoff that a law wants to the cutoff in force.
 limits -> dead band -> smoothing in ln(fc), fast for a certain sigma -> slew limit -> 0.45 of the
 sample rate, but not below fmin.  An unknown cutoff gives the fallback.  The cutoff in force never
 leaves fmin..fmax, whatever the rate is.
-
-Over many samples, the distance to the aim, in ln(cutoff), falls linearly while slewing and then as
-exp(-t / constant). A search finds the transition; two numbers give all samples of a stretch, and
-all stretches are computed at once.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_left
+from collections.abc import Sequence
 import enum
 import math
 
@@ -22,100 +18,6 @@ from ou_monitor.records import FloatArray
 
 # Convergence tolerance, in ln(cutoff).
 ARRIVED = 1e-6
-
-
-class CutoffWay:
-    """
-    Stretches of the way to the aims; `slewing`: whether the slew limit cut the last move, or None.
-
-    elapsed, shape (n + 1,): s before each of n samples and at the end; dt: of each, s; most: 1/s.
-    """
-
-    def __init__(self, elapsed: FloatArray, dt: FloatArray, most: float) -> None:
-        self.slewing: bool | None = None
-        self._elapsed, self._dt, self._most = elapsed, dt, most
-        # Floats of Python one by one, without a list of all.
-        self._time: memoryview[float] = elapsed.data  # type: ignore[assignment]
-        self._shortest, self._longest = float(dt.min()), float(dt.max())
-        self._bounds: dict[float, tuple[float, float]] = {}
-        # Of each stretch: first sample, ln of the aim, distance, its line's slope and its rate.
-        self._first: list[int] = []
-        self._parts: list[tuple[float, float, float, float]] = []
-
-    def go(self, first: int, last: int, aim: float, gap: float, constant: float) -> float:
-        """Approach an aim, Hz, over samples first..last - 1; return the remaining distance."""
-        time, most, end = self._time, self._most, math.log(aim)
-        bounds = self._bounds.get(constant)
-        if bounds is None:
-            bounds = self._bounds[constant] = (
-                self._limit(self._shortest, constant), self._limit(self._longest, constant))
-        low, high = bounds
-        k = first
-        while k < last and gap:
-            far, now = abs(gap), time[k]
-            line = rate = 0.0
-            if far > high * (1.0 + 1e-12):
-                self.slewing = True
-                line = math.copysign(most, gap)
-                after = bisect_left(time, now + (far - high) / most, k + 1, last)
-                left = gap - line * (time[after] - now)
-            elif far > low * (1.0 - 1e-12):
-                # The length of the step decides whether it is cut.
-                after, dt = k + 1, float(self._dt[k])
-                self.slewing = far > self._limit(dt, constant)
-                if self.slewing:
-                    line = math.copysign(most, gap)
-                    left = gap - line * dt
-                else:
-                    rate = 1.0 / constant if constant > 0.0 else 0.0
-                    left = gap * math.exp(-rate * dt) if constant > 0.0 else 0.0
-            else:
-                self.slewing = False
-                if constant <= 0.0:
-                    gap = 0.0
-                    break
-                rate, after = 1.0 / constant, last
-                left = gap * math.exp(-rate * (time[last] - now))
-                if abs(left) < ARRIVED:
-                    after = bisect_left(time, now + constant * math.log(far / ARRIVED),
-                                        k + 1, last)
-                    left = 0.0
-            if abs(left) < ARRIVED:
-                # The last of them is at the aim.
-                left, after = 0.0, after - 1
-            if after > k:
-                self._first.append(k)
-                self._parts.append((end, gap, line, rate))
-            gap, k = left, after
-        if k < last and not gap:
-            self._first.append(k)
-            self._parts.append((end, 0.0, 0.0, 0.0))
-        return gap
-
-    def cutoff(self) -> FloatArray:
-        """Return the cutoff at each sample, Hz, shape (n,)."""
-        n = self._dt.size
-        parts = np.array(self._parts)
-        first = np.array(self._first)
-        if not parts[:, 1].any():
-            return np.repeat(np.exp(parts[:, 0]), np.diff(first, append=n))
-        sizes = np.diff(first, append=n)
-        aim, gap, line, rate = (np.repeat(one, sizes) for one in parts.T)
-        gone = self._elapsed[1:] - np.repeat(self._elapsed[first], sizes)
-        rate *= -gone
-        line *= gone
-        gap *= np.exp(rate)
-        gap -= line
-        aim -= gap
-        return np.asarray(np.exp(aim, out=aim))
-
-    def _limit(self, dt: float, constant: float) -> float:
-        """Return the distance beyond which a step is cut by the slew limit."""
-        if math.isinf(self._most):
-            return math.inf
-        return self._most * dt / (-math.expm1(-dt / constant) if constant > 0.0 else 1.0)
-
-
 LN2 = math.log(2.0)
 # Highest cutoff as a share of the sample rate (Betaflight allows 0.475).
 OF_RATE = 0.45
@@ -266,7 +168,7 @@ class CutoffControl:
         if not self._started:
             self._started, self._moving = True, self._aim
         elif self._moving != self._aim and dt > 0.0:
-            self._move(error, dt)
+            self._approach(time_constant(self._settings, error), (dt,))
         self._limit(interval)
         return self._cutoff
 
@@ -279,23 +181,14 @@ class CutoffControl:
 
         wanted in Hz, dt and interval in s, shape (n,), result in Hz.
         """
-        s = self._settings
-        elapsed = np.concatenate(([0.0], np.cumsum(dt)))
-        way = CutoffWay(elapsed, dt, s.slew * LN2 if s.slew else math.inf)
-        aim, gap = math.nan, 0.0
+        moving = np.empty(dt.size)
         for first, last, one, of in zip(begin, [*begin[1:], dt.size], wanted, error):
-            old = self._aim
             self._choose(one)
-            if first == 0 or old != self._aim:
-                gap += math.log(self._aim / (self._moving if first == 0 else old))
-            if gap or self._aim != aim:
-                aim = self._aim
-                gap = way.go(first, last, aim, gap, time_constant(s, of))
-        if way.slewing is not None:
-            self._slewing = way.slewing
-        self._moving = self._aim * math.exp(-gap) if gap else self._aim
-        cutoff = np.minimum(way.cutoff(), OF_RATE / interval)
-        np.clip(cutoff, self._lowest, s.fmax, out=cutoff)
+            moving[first:last] = self._aim * np.exp(
+                self._approach(time_constant(self._settings, of), dt[first:last].tolist())
+                if self._moving != self._aim else 0.0)
+        cutoff = np.minimum(moving, OF_RATE / interval)
+        np.clip(cutoff, self._lowest, self._settings.fmax, out=cutoff)
         self._limit(float(interval[-1]))
         return cutoff
 
@@ -314,18 +207,22 @@ class CutoffControl:
             self._aim = inside
         self._follow_exactly = False
 
-    def _move(self, error: float, dt: float) -> None:
-        s = self._settings
-        gap = math.log(self._aim / self._moving)
-        constant = time_constant(s, error)
-        step = gap * -math.expm1(-dt / constant) if constant > 0.0 else gap
-        most = s.slew * LN2 * dt if s.slew else math.inf
-        self._slewing = abs(step) > most
-        if self._slewing:
-            step = math.copysign(most, step)
-        # Stop at the tolerance instead of creeping on.
-        arrived = abs(gap - step) < ARRIVED
-        self._moving = self._aim if arrived else self._moving * math.exp(step)
+    def _approach(self, constant: float, steps: Sequence[float]) -> list[float]:
+        """Move towards the aim over steps, s; return ln(cutoff / aim) after each."""
+        slew = self._settings.slew * LN2 or math.inf
+        rate = 1.0 / constant if constant else math.inf
+        off, found = math.log(self._moving / self._aim), [0.0] * len(steps)
+        for k, dt in enumerate(steps):
+            step, most = off * math.expm1(-dt * rate), slew * dt
+            self._slewing = slewing = not -most <= step <= most
+            off += math.copysign(most, step) if slewing else step
+            # Stop at the tolerance instead of creeping on.
+            if -ARRIVED < off < ARRIVED:
+                off = 0.0
+                break
+            found[k] = off
+        self._moving = self._aim * math.exp(off)
+        return found
 
     def _limit(self, interval: float) -> None:
         """Bring the moving cutoff into force (interval in s; 0: not known)."""

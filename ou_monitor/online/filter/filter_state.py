@@ -15,29 +15,19 @@ Between samples the input is linear.  Held at the newest value instead, it
 would lead by half a sample (18 degrees at a tenth of the sample rate); linear
 it has no phase error and an amplitude that falls short by (pi f dt)^2 / 3.
 
-Many samples at once: a cutoff that moves only stretches time, and an input that is linear in a
-step has the steady response x - sqrt(2) r (order 1: x - r) with r its rise over the angle of the
-step.  What is left of a state beside that turns and decays by exp(lambda theta), whatever the
-cutoff, and jumps only where r or x does.  With Theta the sum of the angles so far
-
-    z_k = exp(lambda Theta_k) (z_0 + sum_j exp(-lambda Theta_(j-1)) jump_j),
-
-lambda = (-1 + i) / sqrt(2), or -1: a sum over a block, in which the exponential stays finite, and
-one step from block to block.  Coefficients that change with every sample cost no more than fixed
-ones.  Rounding: r is large where the angle is small, so that below `_LEAST` samples go one by one.
-
-Samples are worked on together while they are finite and their intervals even to a factor of
-five; the others go one by one.  The output is that of the samples one by one, to rounding.
+Many samples at once: a step of any cutoff turns a state z into F z + g, so that all states solve
+one triangular system with three bands below the diagonal.  Samples are worked on together while
+they are finite and their intervals even to a factor of five; the others go one by one.  The output
+is that of the samples one by one, to rounding.
 """
 
 from __future__ import annotations
 
-import cmath
 import math
 from typing import NamedTuple
 
 import numpy as np
-from ou_monitor.online.filter.cutoff_control import INTERVALS, ODD, OF_RATE
+from ou_monitor.online.filter.cutoff_control import INTERVALS, ODD
 from ou_monitor.records import FloatArray
 
 _ROOT2 = math.sqrt(2.0)
@@ -73,100 +63,32 @@ class LowPassState:
         return self.y
 
 
-# Samples that are worked on together: the arrays stay in the cache.
-_CHUNK = 16384
-# Angle of a block: exp(100) is far from the largest number, and 100 rounds by 1e-14.
-_SPAN = 100.0
-_LEAST = 1e-4
-# Angle of a step, above which only fmin holds the cutoff above 0.45 of the sample rate: so much
-# of the state decays that sums over many lose it.
-_MOST = 2.0 * math.pi * OF_RATE * ODD
-
-
 def filter_sequence(state: LowPassState, order: int, angle: FloatArray, start: FloatArray,
                     end: FloatArray) -> FloatArray:
-    """
-    Return the output at each sample (all of shape (n,)); the state goes on from the last.
-
-    `start` is `end` of the sample before, or each its own `end` (the slopes of a derivative).
-    """
-    out: FloatArray = np.empty_like(angle)
-    for k in range(0, angle.size, _CHUNK):
-        at = slice(k, k + _CHUNK)
-        lowest, highest = float(angle[at].min()), float(angle[at].max())
-        if lowest < _LEAST or highest > _MOST:
-            out[at] = [state.advance(order, *one) for one in zip(
-                angle[at].tolist(), start[at].tolist(), end[at].tolist(), strict=True)]
-        else:
-            out[at] = _summed(state, order, angle[at], start[at], end[at])
-    return out
-
-
-def _summed(state: LowPassState, order: int, angle: FloatArray, start: FloatArray,
-            end: FloatArray) -> FloatArray:
-    """Filter by sums, in blocks of an angle of `_SPAN` at most, one block a row."""
-    n = angle.size
-    length = min(max(int(_SPAN / float(angle.max())), 1), n)
-    count = -(-n // length)
-    late = _ROOT2 if order == 2 else 1.0
-    held = np.array_equal(start, end)
-    slope = None if held else (end - start) / angle
-    steady = end if slope is None else end - late * slope
-    source = -end if slope is None else slope
-    last = 0.0 if slope is None else float(slope[-1])
-    # What is beyond the end does not move.
-    p, jump = np.zeros((2, count, length))
-    np.divide(angle, late, out=p.reshape(-1)[:n])
-    np.subtract(source[1:], source[:-1], out=jump.reshape(-1)[1:n])
-    np.cumsum(p, axis=1, out=p)
-    grow = np.exp(p)
-    off = state.y - (float(end[0]) if slope is None else
-                     float(start[0]) - late * float(slope[0]))
+    """Return the output at each sample (all of shape (n,)); the state goes on from the last."""
+    # Here, for a node that filters one by one needs none of it: SciPy costs it 35 MB.
+    from scipy.linalg.lapack import dtbtrs
+    n, rise = angle.size, end - start
+    bands, right = np.zeros((n, 2, 4)), np.zeros((n, 2))
+    # As in `LowPassState.advance`; columns of F go with the sample before.
     if order == 1:
-        a = _sums(jump, grow)
-        left = off
-        for row, (total, angle_) in enumerate(zip(
-                a[:, -1].tolist(), p[:, -1].tolist(), strict=True)):
-            a[row] += left
-            left = math.exp(-angle_) * (left + total)
-        a /= grow
-        out = a.reshape(-1)[:n] + steady
-        state.y, state.slope = float(out[-1]), 0.0
-        return np.asarray(out)
-    cos, sin = np.cos(p), np.sin(p)
-    a, b = _sums(jump, grow * cos), _sums(jump, grow * sin, 0.0)
-    turn = state.slope - (0.0 if slope is None else float(slope[0]))
-    # The frame in which the jumps are real: d = u + v, s = -sqrt2 v; turned by pi / 4 for slopes.
-    z = complex(off + turn / _ROOT2, -turn / _ROOT2) if slope is None else complex(
-        off / _ROOT2, -turn - off / _ROOT2)
-    for row, (total, other, angle_) in enumerate(zip(
-            a[:, -1].tolist(), b[:, -1].tolist(), p[:, -1].tolist(), strict=True)):
-        a[row] += z.real
-        b[row] -= z.imag
-        z = cmath.exp(complex(-angle_, angle_)) * (z + complex(total, -other))
-    if slope is None:
-        along, across = cos + sin, sin - cos
-        size, state.slope = 1.0, -_ROOT2 * z.imag
+        lost = np.expm1(-angle)
+        step = np.stack([[1.0 + lost, np.zeros(n)], np.zeros((2, n))])
+        right[:, 0] = rise * (1.0 + lost / angle) - lost * start
     else:
-        along, across = cos, sin
-        size, state.slope = _ROOT2, last - z.real - z.imag
-    a *= along
-    b *= across
-    a += b
-    a /= grow
-    a *= size
-    out = a.reshape(-1)[:n] + steady
-    state.y = float(out[-1])
-    return np.asarray(out)
-
-
-def _sums(jump: FloatArray, weight: FloatArray, first: float = 1.0) -> FloatArray:
-    """Return the sums along the rows of jumps, each by the weight before it."""
-    found = np.empty_like(jump)
-    found[:, 0] = first * jump[:, 0]
-    np.multiply(jump[:, 1:], weight[:, :-1], out=found[:, 1:])
-    np.cumsum(found, axis=1, out=found)
-    return found
+        p = angle / _ROOT2
+        s = np.exp(-p) * np.sin(p)
+        c = np.expm1(-p) * np.cos(p) - 2.0 * np.sin(0.5 * p) ** 2
+        step = np.stack([[1.0 + c + s, _ROOT2 * s], [-_ROOT2 * s, 1.0 + c - s]])
+        right[:, 0] = rise * (1.0 + c / p) - (c + s) * start
+        right[:, 1] = _ROOT2 * s * start - rise * (c + s) / angle
+    right[0] += step[:, :, 0] @ (state.y, state.slope)
+    bands[:, :, 0] = 1.0
+    bands[:-1, 0, 2:] = -step[:, 0, 1:].T
+    bands[:-1, 1, 1:3] = -step[:, 1, 1:].T
+    found = dtbtrs(bands.reshape(2 * n, 4).T, right.reshape(2 * n, 1), uplo='L', diag='U')[0]
+    state.y, state.slope = found[-2:, 0].tolist()
+    return np.asarray(found[::2, 0])
 
 
 # Samples of a piece from which it is worth it.
