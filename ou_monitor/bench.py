@@ -35,7 +35,7 @@ Given = Union[Recording, str, Path]
 Progress = Callable[[float], None]
 Pairs = tuple[npt.ArrayLike, npt.ArrayLike]
 
-# Minimum number of samples: one more than mean and trend take.
+# Minimum number of samples: one more than the parameters of mean and trend.
 _FEWEST = 3
 # Rate from which samples are written in blocks by default, Hz.
 _BLOCKS_FROM = 5000.0
@@ -72,9 +72,9 @@ def analyze(recording: Given, *, levels: tuple[float, ...] | None = None, window
     Parameters
     ----------
     recording : Recording or path
-        What to look at.
+        Voltage, V, and throttle, 0..1.
     levels : tuple of float, optional
-        Throttles, 0..1, of the load levels; found when left out.
+        Throttles, 0..1, of the load levels; by default they are detected.
     window : float
         Window of the sliding estimate, s.
     brownout_voltage : float, optional
@@ -82,9 +82,9 @@ def analyze(recording: Given, *, levels: tuple[float, ...] | None = None, window
     brownout_horizon : float
         Horizon of the risk, s.
     cells : int
-        Cells in series; without a voltage the limit is 3.3 V for each.
+        Cells in series; without a voltage the limit is 3.3 V per cell.
     progress : callable, optional
-        Takes the share that is done, 0..1.
+        Called with the share done, 0..1.
 
     Returns
     -------
@@ -145,20 +145,20 @@ def compare(recording: Given, model: SupplyModel | str | Path | None = None, *,
     recording : Recording or path
         Voltage, V, and throttle, 0..1.
     model : SupplyModel or path, optional
-        What is simulated; without it, a model is fitted to the part before fit_until.
+        Model to simulate; by default a model fitted to the part before fit_until.
     fit_until : float, optional
-        Start of the simulated part, s after the first sample; by default half-way, or with a model
-        the first sample.
+        Start of the simulated part, s after the first sample; by default the middle, or with a
+        model the first sample.
     seeds : int
-        Simulations, 20 to 10000.
+        Number of simulations, 20 to 10000.
     seed : int
-        The same one gives the same simulations.
+        Equal seeds give equal simulations.
     levels : tuple of float
         Further voltages, V, whose crossings are counted.
     brownout_voltage, cells
         As for `analyze`; its crossings are counted too.
     progress : callable, optional
-        Takes the share that is done, 0..1.
+        Called with the share done, 0..1.
 
     Returns
     -------
@@ -202,7 +202,7 @@ def coupling(recording: Given, signal: str | Series | Pairs, *,
              band: tuple[float, float] | None = None, level: float = 0.05,
              brownout_voltage: float | None = None, cells: int = 0) -> Result:
     """
-    Estimate how much of a signal is noise of the supply.
+    Estimate how much of a signal is supply noise.
 
     Parameters
     ----------
@@ -264,7 +264,7 @@ def coupling(recording: Given, signal: str | Series | Pairs, *,
                                   throttle=recording.throttle, band=band, level=level)
     except InputError as error:
         raise InputError(f"'{recording.name}', signal '{name}': {error}") from error
-    # From here on as `analyze` reads it.
+    # The rest uses the readings without repeats, as `analyze` does.
     read = readings_of(recording)
     seen = overview(read, limit, cells=cells)
     return Result(
@@ -281,14 +281,14 @@ def _spectrum(found: Coupling) -> dict[str, Any]:
 def discover(recording: Given, *, seed: int = 0, brownout_voltage: float | None = None,
              cells: int = 0, progress: Progress | None = None) -> Result:
     """
-    Criticise the simulation of a recording, name the cause, extend, measure the gain.
+    Find what a simulation of a recording gets wrong, name the cause, and extend the model.
 
     Parameters
     ----------
     recording : Recording or path
-        What to look at.
+        Voltage, V, and throttle, 0..1.
     seed : int
-        Same seed, same result.
+        Equal seeds give equal results.
     brownout_voltage, cells
         As for `analyze`; dips below that voltage are counted.
     progress : callable, optional
@@ -318,7 +318,7 @@ def discover(recording: Given, *, seed: int = 0, brownout_voltage: float | None 
 
     recording = _read(recording)
     limit, cells = _limit(recording, brownout_voltage, cells)
-    # The search refuses values that overflow; NumPy's warning of them would not help a user.
+    # The search refuses values that overflow; NumPy's warnings about them would not help a user.
     with np.errstate(all='ignore'):
         found = discovered(recording, seed=seed, progress=progress)
     seen = overview(recording, limit, cells=cells)
@@ -331,7 +331,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
            voltage: float | None = None, horizon: float = 5.0, risk: float = 1e-3,
            capacitances: tuple[float, float] | None = None, esr_fixed: bool = False) -> Result:
     """
-    Find the bulk capacitance that brings the brown-out risk of a rail under a target.
+    Find the smallest bulk capacitance that keeps the brown-out risk of a rail below a target.
 
     Parameters
     ----------
@@ -345,7 +345,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     rail : {'bus', 'regulated'}
         The battery bus at the ESCs, or the regulated rail.
     voltage : float, optional
-        Brown-out level, V; 3.3 V a cell on the bus when left out.
+        Brown-out level, V; by default 3.3 V per cell on the bus.
     horizon : float
         Horizon of the risk, s.
     risk : float
@@ -353,7 +353,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     capacitances : tuple of float, optional
         Smallest and largest capacitance tried, F.
     esr_fixed : bool
-        Whether the ESR stays; else it falls as 1/C.
+        Whether the ESR is constant; by default it falls as 1/C.
 
     Returns
     -------
@@ -396,7 +396,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
         flight, values = flown[0], dict(network or {})
         cells = values.setdefault('cells', flight.cells)
         if not cells:
-            raise InputError(f'{flight.full:.4g} V is no pack of cells: --set cells=N')
+            raise InputError(f'{flight.full:.4g} V fits no number of cells: give --set cells=N')
         check_cells(flight.full, cells)
         circuit = network_of(flight, throttle, values)
         taken = taken_words(flight, circuit, throttle, values)
@@ -409,7 +409,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
 
 
 def _flight(recording: Recording) -> tuple[Flight, Any]:
-    """Return what a recording says of its supply, and the facts."""
+    """Return the measured properties of a supply, and its facts."""
     from ou_monitor.analysis.crafts import cells_of, full_voltage
     from ou_monitor.analysis.supply import facts_and_end
     from ou_monitor.paper.design import Flight
@@ -431,9 +431,9 @@ def reproduce(*, seed: int = 1, progress: Progress | None = None) -> Result:
     Parameters
     ----------
     seed : int
-        The same one gives the same simulations.
+        Equal seeds give equal simulations.
     progress : callable, optional
-        Takes the share that is done, 0..1.
+        Called with the share done, 0..1.
 
     Returns
     -------
@@ -462,35 +462,35 @@ def simulate(model: SupplyModel | ModelFile | str | Path | None = None, *,
              scale_resistance: float = 1.0, output: str | Path | None = None,
              message: str | None = None, progress: Progress | None = None) -> Result:
     """
-    Draw a recording from a model of a supply, exact in distribution at any rate.
+    Simulate a recording of a supply, exact in distribution at any rate.
 
     Parameters
     ----------
     model : SupplyModel or path, optional
-        What to simulate; a model file as `discover` writes it.
+        Model of the supply, or a model file by `discover`.
     preset : str, optional
-        Name of a supply, where there is no model; 'flight' when left out.
+        Name of a preset, used without a model; by default 'flight'.
     throttle : str, float, Recording, path or callable, optional
         Name of a profile, throttle 0..1, points 'T:U,T:U,...', a recording, or a function of
-        stamps, s; that of the preset when left out.
+        stamps, s; by default the preset's.
     start, end : float, optional
         Part of the recording that `throttle` names, s.
     duration : float, optional
-        Length, s; of the preset or of the recorded throttle when left out.
+        Length, s; by default that of the preset or of the recorded throttle.
     rate : float, optional
         Samples per second, Hz.
     seed : int
-        The same one gives the same recording.
+        Equal seeds give equal recordings.
     capacity_left : float, optional
         Initial charge, 0..1; -1: as at the start of the model's recording.
     scale_resistance : float
-        Factor on the answer to throttle.
+        Factor on the response to throttle.
     output : path, optional
-        Bag to write, piece by piece; without it, samples are drawn on demand.
+        Bag to write, piece by piece; without it, samples are simulated on demand.
     message : str, optional
         Message of the voltage in the bag.
     progress : callable, optional
-        Takes the share of the bag that is written, 0..1.
+        Called with the share of the bag written, 0..1.
 
     Returns
     -------

@@ -1,10 +1,10 @@
 """
-The two kinds of trouble that are not a property of the data.
+Errors: `InputError` for mistakes of the user, and hints for its text.
 
-A caller's bug raises `ValueError` with the value and its unit.  Something a
-*user* can mend (a file, a topic, a key in a YAML) raises `InputError`, whose
-text is the one line that the user sees: what was wrong, where, what to do.
-A property of the data is neither: it is a `Status` in the result.
+A bug of the caller raises `ValueError` with the value and its unit.  A mistake that the *user* can
+correct (a file, a topic, a key in a YAML file) raises `InputError`; its text is the one line that
+the user sees: what is wrong, where, and what to do.  A property of the data is not an error, but a
+`Status` in the result.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ import itertools
 
 from ou_monitor.text import printable
 
-# Words that a hint is looked for among, such as the columns of a table, and that it names.
+# Maximum number of valid words that a hint is chosen from (columns of a table), and that it lists.
 _MOST_CHOICES, _MOST_SHOWN = 1000, 60
 
 
 class InputError(Exception):
     """
-    Something the user gave cannot be used; the text is one line for them.
+    An input of the user cannot be used; the text is one line for the user.
 
-    Command-line programs print it after their name and exit with status 2;
-    nodes log it at FATAL and exit with status 2.  What came into it from a file or
-    from its name cannot command a terminal (`text.printable`).
+    Command-line programs print it after their name and exit with status 2; nodes log it at FATAL
+    and exit with status 2.  Text from a file or a file name in it is escaped, so that it cannot
+    control a terminal (`text.printable`).
 
     Examples
     --------
@@ -39,12 +39,12 @@ class InputError(Exception):
     """
 
     def __init__(self, text: str) -> None:
-        """Keep the line."""
+        """Join the text to one printable line."""
         super().__init__(printable(' '.join(str(text).splitlines())))
 
 
 def refusal(error: OSError) -> str:
-    """Return what the system refused, in one line."""
+    """Return the reason of an error of the operating system, in one line."""
     why = ' '.join((error.strerror or str(error)).split())
     return printable(why if error.filename is None else f"cannot use '{error.filename}': {why}")
 
@@ -55,7 +55,7 @@ def how_to_install(extra: str) -> str:
 
 
 def closest(word: str, valid: Iterable[str]) -> str | None:
-    """Return the valid word that one begins, or that a misspelt one is most like."""
+    """Return the valid word that starts with a word, or else is most similar to it, or None."""
     choices = list(itertools.islice(valid, _MOST_CHOICES))
     begun = [choice for choice in choices if word.strip('-') and choice.startswith(word)]
     return next(iter(begun or difflib.get_close_matches(word, choices, n=1, cutoff=0.5)), None)

@@ -1,8 +1,8 @@
 """
-What travels along the arrows: small frozen records, SI units.
+Records that all folders share: small, frozen, in SI units.
 
-Limits first: a record says what was found and how well, never how it was
-found; unknown numbers are NaN, never 0.
+A record states results and their errors, not how they were computed.  Unknown numbers are NaN,
+never 0.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ NAN = float('nan')
 # Largest factor between a positive parameter and an end of its 95 % interval: beyond it the
 # parameter is unknown.
 LARGEST_FACTOR = 10.0
-# The same as a standard error of the parameter's logarithm.
+# The corresponding standard error of the parameter's logarithm.
 LARGEST_LOG_SE = math.log(LARGEST_FACTOR) / Z95
 # Exponent beyond which a factor counts as infinite: exp(709.78) is the largest float.
 _INFINITE = 709.0
@@ -38,7 +38,7 @@ LONGEST_STEP = 100.0
 
 
 def as_numbers(values: npt.ArrayLike) -> FloatArray:
-    """Return values as float64, masked ones as NaN; dates and text are a ValueError."""
+    """Return values as float64, masked ones as NaN; raise ValueError for dates and text."""
     if type(values) is np.ndarray and values.dtype == np.float64:
         return values
     data = np.asarray(np.ma.getdata(values))
@@ -53,17 +53,17 @@ def as_numbers(values: npt.ArrayLike) -> FloatArray:
 
 
 def clock_unit(stamp: float) -> str:
-    """Return the unit in which a stamp since 1970 is a date of 2000 to 2100; '' for none."""
+    """Return the unit in which a stamp since 1970 is a date of 2000 to 2100; '': there is none."""
     return next((unit for unit, scale in TIME_UNITS.items()
                  if _CLOCKS[0] <= stamp * scale <= _CLOCKS[1]), '')
 
 
 def as_seconds(values: npt.ArrayLike) -> FloatArray:
     """
-    Return stamps in s; dates are counted from 1970 (UTC), NaT and masked are NaN.
+    Return stamps in s; dates count from 1970 (UTC), NaT and masked stamps become NaN.
 
-    Numbers are seconds, unless all are dates of 2000 to 2100 in ms, us or ns since 1970.  Spans,
-    and times with a zone, as pandas and xarray have them, are understood too.
+    Numbers are seconds, unless all are dates of 2000 to 2100 in ms, us or ns since 1970.  Time
+    spans, and dates with a time zone as in pandas and xarray, are accepted too.
     """
     plain = type(values) is np.ndarray and values.dtype == np.float64
     data = np.asarray(values if plain else np.ma.getdata(values))
@@ -73,7 +73,7 @@ def as_seconds(values: npt.ArrayLike) -> FloatArray:
         data = data.astype(f'datetime64[{unit}]')
     elif plain:
         return data
-    # A date that is none is not itself.
+    # NaT is not equal to itself.
     dates = [one for one in data.flat if one == one] if data.dtype.kind == 'O' else []
     if dates and all(hasattr(one, 'timestamp') for one in dates):
         if dates[0].tzinfo is not None:
@@ -84,14 +84,14 @@ def as_seconds(values: npt.ArrayLike) -> FloatArray:
         return as_numbers(values)
     if np.datetime_data(data.dtype)[0] == 'generic':
         raise ValueError('stamps without a unit: timedelta64 needs one, such as [ns]')
-    # Whole seconds apart from the rest: 1.7e18 ns are beyond float64, and 1e19 ns beyond int64.
+    # Whole seconds and the rest separately: float64 cannot hold 1.7e18 ns exactly, int64 not 1e19.
     whole = data.astype(f'{data.dtype.kind}8[s]')
     seconds = whole.astype(np.int64) + (data - whole) / np.timedelta64(1, 's')
     return np.where(np.isnat(data) | np.ma.getmaskarray(values), NAN, seconds)
 
 
 def _fine_unit(stamps: npt.NDArray[Any], masked: npt.NDArray[np.bool_] | np.bool_) -> str:
-    """Return the unit below a second of stamps that are all dates since 1970; '': they are not."""
+    """Return 'ms', 'us' or 'ns' if all stamps are dates since 1970 in that unit, else ''."""
     most = float(stamps.max(initial=0))
     # Also false for NaN.
     if most <= MOST_STAMP:
@@ -121,11 +121,10 @@ def determined(value: float, low: float, high: float) -> bool:
 
 class Status(enum.Enum):
     """
-    What became of an estimate; the value is the sentence for the pilot.
+    Outcome of an estimate; the value is the sentence for the pilot.
 
-    Only `OK` and `SHORT_WINDOW` carry numbers that may be acted on
-    (`Estimate.usable`); with every other status the numbers that could not be
-    had are NaN.
+    The numbers are usable only with `OK` and `SHORT_WINDOW` (`Estimate.usable`); with any other
+    status the unknown ones are NaN.
 
     Examples
     --------
@@ -155,27 +154,25 @@ class Status(enum.Enum):
         'No restoring force visible: the voltage wanders through the whole window; lengthen '
         'the window, or look for drift and load changes.')
     BURIED = (
-        'The relaxation is buried in measurement noise: alpha is uncertain by more than a '
-        'factor; lengthen the window or use a finer ADC.')
+        'The relaxation is buried in measurement noise: alpha is uncertain by a factor of more '
+        'than 2.6; lengthen the window or use a finer ADC.')
     NO_RELAXATION = (
         'No relaxation visible at this rate: neighbouring samples are uncorrelated, so '
-        'the rail is faster than the sampling, or the noise is that of the sensor; raise '
-        'the sampling rate.')
+        'the rail is faster than the sampling, or this is sensor noise; raise the sampling rate.')
     UNTIMED = (
-        'The times of the samples are not trusted, and no rate can be had of them: see the reason '
-        'beside it.')
+        'The sample times are not trusted, so no rate can be estimated: see the reason.')
 
 
 class Severity(enum.IntEnum):
-    """How much a note matters."""
+    """Severity of a note."""
 
     ERROR = 3  # There are no numbers
-    WARNING = 2  # They are doubtful
-    INFO = 1  # Good to know
+    WARNING = 2  # The numbers are doubtful
+    INFO = 1  # The numbers are valid
 
 
 class Defect(enum.Enum):
-    """What a note of a reader is about; the value is how much it matters."""
+    """Defect that a reader's note reports; the value is its name and severity."""
 
     DAMAGED_FILE = 'damaged', Severity.WARNING
     GAPS = 'gaps', Severity.WARNING
@@ -187,17 +184,17 @@ class Defect(enum.Enum):
 
     @property
     def severity(self) -> Severity:
-        """Return how much it matters."""
+        """Return the severity."""
         return self.value[1]
 
     @property
     def drops(self) -> bool:
-        """Return whether samples are missing for it."""
+        """Return whether samples were dropped because of it."""
         return self in (Defect.REPEATED_STAMPS, Defect.NON_FINITE, Defect.DROPPED)
 
 
 class Note(str):
-    """A sentence of a reader that knows what it is about."""
+    """A sentence of a reader, with the defect that it reports."""
 
     defect: Defect
 
@@ -209,12 +206,12 @@ class Note(str):
 
 
 def defect_of(note: str) -> Defect:
-    """Return what a note is about; a bare sentence is about nothing in particular."""
+    """Return the defect that a note reports; `Defect.READER` for a plain string."""
     return note.defect if isinstance(note, Note) else Defect.READER
 
 
 def led(name: str, notes: Iterable[str]) -> list[str]:
-    """Return notes led by the name of what they are about."""
+    """Return notes with a name before each."""
     return [Note(f'{name}: {note}', defect_of(note)) for note in notes]
 
 
@@ -240,18 +237,18 @@ class Flag(enum.Enum):
     """
 
     SLOW_RATE = (
-        'Sampling is slower than the rail (alpha dt > 1): alpha and sigma rest on few '
-        'correlated samples; raise the rate of the voltage topic.')
+        'Sampling is slower than the rail (alpha dt > 1): few samples are correlated, so alpha '
+        'and sigma are uncertain; raise the rate of the voltage topic.')
     QUANTIZED = (
-        'The step of the ADC is larger than the noise: sigma is decided by rounding; use '
-        'a finer ADC range or AC coupling.')
+        'The ADC step is larger than the noise: rounding determines sigma; use a finer ADC range '
+        'or AC coupling.')
     LOWPASS_UPSTREAM = (
         'Neighbouring increments rise together, as after a low-pass: something upstream '
         'filters the voltage and sigma is too small; switch that filter off.')
     HELD_SAMPLES = (
         'The source repeats its last value between refreshes; the repeats were dropped.')
     NO_EXCITATION = (
-        'Throttle did not move in the window: sag cannot be told from the level.')
+        'Throttle did not move in the window: sag and level cannot be separated.')
     SATURATED = (
         'The voltage sits at the end of the ADC range: the true excursion is larger; '
         'rescale the input.')
@@ -263,14 +260,14 @@ class Flag(enum.Enum):
 
 @dataclass(frozen=True)
 class Counters:
-    """Samples pushed so far: used, non-finite, late and held ones add up to them."""
+    """Numbers of samples; `pushed` is the sum of `used`, `non_finite`, `late` and `held`."""
 
     pushed: int = 0  # Given to `push`
     used: int = 0  # Entered the window
     non_finite: int = 0  # NaN or infinite stamps or voltages, dropped
     late: int = 0  # Stamps at or before one already used, dropped
-    # Repeats of the last value by a logger that is faster than its source, dropped.  Repeats in
-    # the window when that is found out are counted then; those that left it before stay in `used`.
+    # Repeats of the last value by a logger that is faster than its source, dropped.  When repeats
+    # are first recognised, those in the window are counted; earlier ones stay in `used`.
     held: int = 0
     resets: int = 0  # Times the window was cleared (gap, or a clock that jumped back)
 
@@ -284,7 +281,7 @@ class Estimate:
     """
     The OU parameters of the window that ends at `t`.
 
-    dU = -alpha (U - u0) dt + sigma dW, seen through white noise `noise_std`.
+    dU = -alpha (U - u0) dt + sigma dW, measured with white noise `noise_std`.
 
     Standard errors of `alpha`, `sigma`, `var_inf` are those of the *logarithm*
     (dimensionless, relative): the 95 % interval is
@@ -322,7 +319,7 @@ class Estimate:
     throttle : float
         Newest throttle, 0..1; NaN when unknown.
     status : Status
-        What became of the fit.
+        Outcome of the fit.
     flags : tuple of Flag
         Cautions about the input.
     n : int
@@ -332,7 +329,7 @@ class Estimate:
     rate : float
         Mean rate of the samples in the window, Hz.
     counters : Counters
-        What became of the samples pushed so far.
+        Samples pushed so far, by outcome.
 
     Examples
     --------
@@ -381,7 +378,7 @@ class Estimate:
 
     @property
     def usable(self) -> bool:
-        """Whether the numbers may be acted on."""
+        """Whether the numbers are usable."""
         return self.status in (Status.OK, Status.SHORT_WINDOW) and all(
             map(math.isfinite, (self.alpha, self.sigma, self.var_inf, self.u0)))
 
@@ -417,8 +414,8 @@ class Estimate:
         return log_interval(getattr(self, name), getattr(self, name + '_se'), z)
 
 
-# Windows at the end of the readings in which a relaxation is looked for, s, and how many readings
-# at most: a minute at 1 kHz.
+# Windows at the end of the readings in which a relaxation is searched, s, and maximum number of
+# readings: a minute at 1 kHz.
 OU_WINDOWS, MOST_READINGS = (2.0, 8.0, 30.0, 60.0), 65536
 
 
@@ -432,7 +429,7 @@ class OuFacts:
     """
 
     status: str  # ok, not_visible, too_short or no_data
-    window_s: float = NAN  # the readings used end the recording, s
+    window_s: float = NAN  # length of the window at the end of the recording, s
     alpha: float = NAN  # 1/s
     alpha_95: tuple[float, float] = (NAN, NAN)  # 1/s
     sigma: float = NAN  # V/sqrt(s)
@@ -451,7 +448,7 @@ class OuFacts:
 @dataclass(frozen=True, eq=False)
 class Recording:
     """
-    One recording of a supply, whatever file it came from.
+    One recording of a supply, from a file of any format.
 
     Attributes
     ----------
@@ -462,15 +459,15 @@ class Recording:
     throttle : ndarray, shape (n,)
         Throttle 0..1, the last value known at each stamp; NaN where unknown.
     name : str
-        Where it came from, for people.
+        Name for messages and pages.
     source : dict
         Topics, types, units and files it was read from.
     notes : tuple of str
-        What was dropped or mended on the way in, one sentence each.
+        What the reader dropped or repaired, one sentence each.
     current : ndarray, shape (n,), or None
         Current drawn, A, the last value known at each stamp, NaN where unknown; None without.
     held : int
-        Samples left out because the logger repeated a reading in them.
+        Number of samples left out because they repeat a reading.
 
     Examples
     --------
@@ -493,9 +490,9 @@ class Recording:
     held: int = 0
 
     def __post_init__(self) -> None:
-        """Take dates and masked values for what they are; refuse what cannot be one recording."""
+        """Convert dates and masked values; refuse arrays that cannot be one recording."""
         object.__setattr__(self, 't', as_seconds(self.t))
-        # Without the copy that `abs` would make of an hour of stamps.
+        # `abs` would copy the stamps.
         far = (self.t > MOST_STAMP) | (self.t < -MOST_STAMP)
         if (beyond := self.t[np.isfinite(self.t) & far]).size:
             raise ValueError(f'a stamp of {beyond[0]:.4g} s is implausible: give all stamps in s, '
@@ -518,7 +515,7 @@ class Recording:
 
     @property
     def duration(self) -> float:
-        """Time from the first to the last sample, s; in whatever order they are."""
+        """Time from the earliest to the latest sample, s."""
         known = self.t[np.isfinite(self.t)]
         return float(np.ptp(known)) if known.size else 0.0
 

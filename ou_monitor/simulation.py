@@ -1,9 +1,9 @@
 """
-Throttle over time, supplies and flights to simulate, and their recordings, piece by piece.
+Presets, throttle profiles, and simulated recordings, piece by piece.
 
-A profile is a function of time, so that memory does not grow with the length of a recording.
-Supplies are the paper's load states, and a flight: parameters are those of its Tables 1 and 2
-unless said otherwise.
+A profile is a function of time, so memory does not grow with the length of a recording.  The
+presets are the paper's load states, and a flight; parameters are from the paper's Tables 1 and 2
+unless stated otherwise.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ LOADS = ((0.0, 0.0), (10.0, 0.0), (10.0, 0.05), (20.0, 0.05), (20.0, 0.10), (30.
 def through(points: Sequence[tuple[float, float]], period: float | None = None,
             stick_rate: float | None = None) -> Profile:
     """
-    Return the profile through points, level beyond the last one.
+    Return the profile of straight lines through points, constant beyond the last one.
 
     points in s, period in s, stick_rate in Hz.
     """
@@ -62,10 +62,10 @@ def through(points: Sequence[tuple[float, float]], period: float | None = None,
 
 def _through(points: FloatArray, period: float | None, stick_rate: float | None, t: FloatArray,
              ) -> FloatArray:
-    # Several times as fast as t % period, and as exact as needed: one rounding.
+    # Several times as fast as t % period; its only error is one rounding.
     at = t if period is None else t - np.floor(t / period) * period
     if stick_rate is not None:
-        # A hair more, so that a stamp at the very update is not before it.
+        # A margin for rounding: a stamp at an update has the new value.
         at = np.floor(at * stick_rate + 1e-6) / stick_rate
     found: FloatArray = np.interp(at, *points)
     return found
@@ -93,7 +93,7 @@ PROFILES: dict[str, tuple[Profile, str]] = {
 
 
 def read_profile(text: str) -> Profile:
-    """Return the profile that a user asks for (text in A)."""
+    """Return the profile that a user asks for."""
     if text in PROFILES:
         return PROFILES[text][0]
     if text.lower().endswith('.csv'):
@@ -129,7 +129,7 @@ def _checked(points: list[tuple[float, float]], where: str) -> list[tuple[float,
         if not math.isfinite(time):
             raise InputError(f'{where}: times must be finite')
         _check_throttle(value, where)
-    # A profile needs a stretch to be on.
+    # A profile needs at least two points.
     return points if len(points) > 1 else [points[0], (points[0][0] + 1.0, points[0][1])]
 
 
@@ -166,14 +166,14 @@ _HEAD = 4096
 class RecordedThrottle:
     """Throttle as it was recorded."""
 
-    # Stamps, s after the begin of the part, to throttle 0..1; each value holds until the next.
+    # Stamps, s from the start of the part -> throttle 0..1; each value holds until the next.
     profile: Profile
     duration: float  # Length of the part, s
     recording: Recording  # The part
 
 
 def is_recording(text: str) -> bool:
-    """Return whether a throttle that a user asks for is a recording: a bag, a log, a CSV of it."""
+    """Return whether the text for a throttle is the path of a recording."""
     path = Path(text)
     if text in PROFILES or not path.exists():
         return False
@@ -190,23 +190,23 @@ def is_recording(text: str) -> bool:
 
 def read_throttle(text: str, start: float | None = None, end: float | None = None
                   ) -> RecordedThrottle:
-    """Return the throttle of a recording, of the part from start to end, s after its begin."""
+    """Return the throttle of a recording from start to end, s after its first sample."""
     return recorded_throttle(read_recording(text, start=start, end=end), text)
 
 
 def recorded_throttle(recording: Recording, name: str) -> RecordedThrottle:
-    """Return the throttle of a recording; name: what it was asked for by."""
+    """Return the throttle of a recording (name: for the error)."""
     known = np.isfinite(recording.throttle)
     if not known.any():
         raise InputError(f"--throttle '{name}': the recording has no throttle")
     t, u = recording.t[known] - recording.t[0], recording.throttle[known]
-    # The reader has refused percent and pulses; calibrations reach a little beyond.
+    # The reader has refused percent and pulses; calibrated sticks may slightly exceed 0..1.
     return RecordedThrottle(partial(_held, t, np.clip(u, 0.0, 1.0)),
                             float(recording.t[-1] - recording.t[0]), recording)
 
 
 def _held(t: FloatArray, u: FloatArray, at: FloatArray) -> FloatArray:
-    # A hair later, so that a stamp that is rounded is not before its own value.
+    # A margin for rounding: a value holds from its own stamp on.
     return np.asarray(u[np.maximum(np.searchsorted(t, at + 1e-9, side='right') - 1, 0)])
 
 
@@ -232,9 +232,9 @@ FLIGHT_NOISE = 2e-3
 class Preset:
     """A supply, and how it is flown and sampled."""
 
-    text: str  # What it is
+    text: str  # Description
     model: SupplyModel  # The supply
-    throttle: str  # Its throttle, as `read_profile` takes it
+    throttle: str  # Throttle, as text for `read_profile`
     rate: float  # Samples per second, Hz
     duration: float  # Length, s
 
@@ -245,7 +245,7 @@ def _load(throttle: float) -> Preset:
 
 
 def _intensity() -> LoadDependentSigma:
-    """Return the paper's intensities, as factors on that of idle."""
+    """Return the paper's intensities, as factors on the intensity at idle."""
     return LoadDependentSigma(tuple(SIGMA),
                               tuple(math.log(s / SIGMA[0.0]) for s in SIGMA.values()))
 
@@ -255,7 +255,7 @@ PRESETS: dict[str, Preset] = {
     'load_05': _load(0.05),
     'load_10': _load(0.10),
     'load_40': _load(0.40),
-    # A sag that comes and goes with the relaxation of the rail, not at once.
+    # The sag follows throttle with the relaxation time of the rail.
     'transient': Preset(
         'the auxiliary recording 0 -> 20 -> 0 % of Fig. 5',
         SupplyModel((OU(ALPHA, SIGMA[0.05], U0), LoadSag(TRANSIENT_SAG / 0.2, 0.0),
@@ -276,16 +276,16 @@ PRESETS: dict[str, Preset] = {
 }
 
 
-# Far beyond any supply, V, and within what messages hold.
+# Largest voltage, V: far above any supply, and within the range of messages.
 LARGEST = 1e9
 
 
 class RunningSupply:
     """
-    A supply that runs: sample k is taken at k/rate, under the throttle that is given with it.
+    A running simulation of a supply; sample k is taken at k/rate.
 
-    `simulate` and the node `supply_simulator` both draw from here, so that a seed gives one path,
-    whatever the pieces.  rate in Hz; charge and resistance as in `Simulation`.
+    `simulate` and the node `supply_simulator` both use it, so a seed gives the same path for any
+    size of pieces.  rate in Hz; charge and resistance as in `Simulation`.
     """
 
     def __init__(self, model: SupplyModel, *, rate: float, seed: int,
@@ -304,7 +304,7 @@ class RunningSupply:
         with np.errstate(over='ignore', invalid='ignore'):
             voltage = self.simulation.advance(
                 self.times(throttle.size),
-                # As a message holds it, so that the truth is what the bag says.
+                # Rounded as in a message: the bag then has the throttle that was simulated.
                 throttle.astype(np.float32).astype(np.float64))
         if not (np.abs(voltage) <= LARGEST).all():
             raise ValueError(
@@ -314,11 +314,11 @@ class RunningSupply:
 
 
 def lacks(model: SupplyModel) -> tuple[str, ...]:
-    """Return what a simulation of the model leaves out of a supply under load."""
+    """Return the properties of a supply under load that the model lacks, in words."""
     names = {term.NAME for term in model.terms}
     missing = []
     if not any(term.FAMILY == 'load' for term in model.terms):
-        missing.append('no answer to throttle (load_sag)')
+        missing.append('no response to throttle (load_sag)')
     if model.load is None:
         missing.append('no charge (load)' + ('' if 'drift' in names else ' and no drift')
                        + ': it does not run empty')
@@ -340,24 +340,24 @@ def simulated(model: SupplyModel, profile: Profile, *, duration: float, rate: fl
         raise InputError(str(error)) from error
 
 
-# Above it stamps would fall together, Hz; after the other they would not fit into a bag, s.
+# Maximum rate, Hz, above which stamps would coincide, and maximum duration of a bag, s.
 _RATE_MOST, _DURATION_MOST = 1e9, 9e9
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A recording to be drawn."""
+    """A recording to be simulated."""
 
     file: ModelFile  # The supply
-    name: str  # Of the preset or of the model file
+    name: str  # Name of the preset or of the model file
     profile: Profile  # Throttle, 0..1, over stamps, s
-    throttle: str  # What it was asked for by
-    flown: Recording | None  # Where the throttle is from; None: no recording
+    throttle: str  # Throttle as the user named it
+    flown: Recording | None  # Recording of the throttle; None: not recorded
     duration: float  # s
     rate: float  # Hz
     seed: int
-    charge: float | None  # At the begin, as `RunningSupply` takes it
-    resistance: float  # Factor on the answer to throttle
+    charge: float | None  # Initial charge, as for `RunningSupply`
+    resistance: float  # Factor on the response to throttle
 
     @property
     def n(self) -> int:
@@ -379,7 +379,7 @@ class Run:
         return Recording(t, voltage, throttle, self.name)
 
     def as_data(self) -> dict[str, Any]:
-        """Return what is drawn, for JSON."""
+        """Return the parameters of the simulation, for JSON."""
         return {'duration_s': self.duration, 'rate_hz': self.rate, 'seed': self.seed,
                 'throttle': self.throttle, 'n': self.n,
                 'model': [{'term': term.NAME, 'params': term.values()}
@@ -390,7 +390,7 @@ def plan(model: SupplyModel | ModelFile | str | Path | None = None, *, preset: s
          throttle: Any = None, start: float | None = None, end: float | None = None,
          duration: float | None = None, rate: float | None = None, seed: int = 1,
          capacity_left: float | None = None, resistance: float = 1.0) -> Run:
-    """Return what `simulate` is asked for: see `ou_monitor.simulate`."""
+    """Return the run that the arguments of `ou_monitor.simulate` describe."""
     name = 'flight' if preset is None else preset
     if name not in PRESETS:
         raise InputError(f"no preset '{name}': {nearest(name, PRESETS)}")
@@ -422,7 +422,7 @@ def plan(model: SupplyModel | ModelFile | str | Path | None = None, *, preset: s
 
 def _throttle_of(throttle: Any, start: float | None, end: float | None,
                  ) -> tuple[Profile, str, Recording | None]:
-    """Return a profile, what it was asked for by, and the recording that it is from."""
+    """Return the profile of a throttle, its name, and the recording that it is from."""
     if isinstance(throttle, Recording):
         return recorded_throttle(throttle, throttle.name).profile, throttle.name, throttle
     if callable(throttle):

@@ -11,11 +11,10 @@ Z95 = 1.959963984540054
 
 def printable(text: object, most: int | None = None) -> str:
     """
-    Return a text that may come from a file, as one line that a terminal shows as it is.
+    Return a text, which may come from a file, as one line that is safe to print.
 
-    Control characters, line ends, marks that change the direction of writing and bytes
-    that are no text become escapes; beyond `most` characters the middle is
-    left out.
+    Control characters, line ends, marks of the writing direction and bytes that are not text
+    become escapes; beyond `most` characters the middle is left out.
     """
     found = str(text)
     if not found.isprintable():
@@ -29,19 +28,19 @@ def printable(text: object, most: int | None = None) -> str:
 
 
 def some(names: Iterable[str], most: int = 40) -> str:
-    """Return names in one line; beyond `most` only their number."""
+    """Return at most `most` names in one line, and the number of the others."""
     held = list(names)
     more = len(held) - most
     return ', '.join(held[:most]) + (f' and {more} more' if more > 0 else '')
 
 
 def number(value: float, digits: int = 3) -> str:
-    """Return a number to some significant digits, zeros at the end included."""
+    """Return a number with some significant digits, trailing zeros included."""
     if not math.isfinite(value):
         return '-'
     if value == 0.0:
         return '0'
-    # By way of the exponent form, which rounds first: 99.96 is 1.00e+02.
+    # The exponent form rounds first: 99.96 is 1.00e+02.
     mantissa, exponent = f'{value:.{digits - 1}e}'.split('e')
     size = int(exponent)
     if -3 <= size < 6:
@@ -60,7 +59,7 @@ def counted(count: int, word: str = 'sample') -> str:
 
 
 def chance(p: float) -> str:
-    """Return a probability to two digits, as far as one may be believed: down to 0.001."""
+    """Return a probability with two digits, or '< 0.001': smaller ones are not reliable."""
     if not math.isfinite(p):
         return '-'
     return '< 0.001' if p < 0.001 else f'{p:.2g}'
@@ -72,5 +71,5 @@ def p_words(p: float) -> str:
 
 
 def volts(value: float) -> str:
-    """Return a difference of voltage in V, or in mV where that reads better."""
+    """Return a difference of voltage in V, or in mV below 1 V."""
     return f'{number(value)} V' if abs(value) >= 1.0 else f'{number(1e3 * value)} mV'

@@ -38,7 +38,7 @@ def read_attribute(path: Path) -> str:
     try:
         return path.read_text(encoding='ascii', errors='replace').strip()
     except OSError as error:
-        raise InputError(f'cannot read {path}: {why(error)}') from error
+        raise InputError(f'cannot read {path}: {reason_of(error)}') from error
 
 
 def number_of(path: Path) -> float:
@@ -60,10 +60,10 @@ def write_attribute(path: Path, value: object) -> None:
         finally:
             os.close(handle)
     except OSError as error:
-        raise InputError(f"cannot set {path} to '{value}': {why(error)}") from error
+        raise InputError(f"cannot set {path} to '{value}': {reason_of(error)}") from error
 
 
-def why(error: OSError) -> str:
+def reason_of(error: OSError) -> str:
     """Return the reason of a file error, and what to do."""
     if error.errno in (errno.EACCES, errno.EPERM):
         return ('not permitted; give the user of this node the right by a udev rule or a group '
@@ -270,8 +270,8 @@ class IioBuffer:
     The buffer of one IIO device: its folder in sysfs and its character device.
 
     `channel` is 'in_voltage0' or empty (the only one); `block` samples are read at a time (0: as
-    many as in 10 ms); `rate`, Hz, and `trigger` are set unless 0 or empty.  Afterwards `rate` is
-    the device's, NaN if unknown, and `holes` counts the gaps in its stamps.
+    many as in 10 ms); `rate`, Hz, and `trigger` are set unless 0 or empty.  The attributes: `rate`
+    of the device, NaN if unknown, and `holes`, the number of gaps in its stamps.
     """
 
     def __init__(self, folder: Path, character: Path, channel: str = '', block: int = 0,
@@ -311,7 +311,7 @@ class IioBuffer:
         self._handle = self._open()
 
     def _enable(self) -> list[Element]:
-        """Enable the channel and the timestamp alone; return the elements."""
+        """Enable only the channel and the timestamp; return the elements."""
         scan = self._folder / 'scan_elements'
         wanted = []
         for path in sorted(scan.glob('*_en')):
@@ -337,7 +337,7 @@ class IioBuffer:
         try:
             handle = os.open(self._character, os.O_RDONLY | os.O_NONBLOCK)
         except OSError as error:
-            raise InputError(f'cannot open {self._character}: {why(error)}') from error
+            raise InputError(f'cannot open {self._character}: {reason_of(error)}') from error
         try:
             write_attribute(self._folder / 'buffer/enable', 1)
         except InputError:
@@ -365,9 +365,9 @@ class IioBuffer:
             except BlockingIOError:
                 continue
             except OSError as error:
-                raise InputError(f'cannot read {self._character}: {why(error)}') from error
+                raise InputError(f'cannot read {self._character}: {reason_of(error)}') from error
             if not data:
-                # The device is gone, or the writer has closed its end.
+                # The device was removed, or the writer has closed its end.
                 time.sleep(NAP)
                 yield None
                 continue

@@ -3,8 +3,7 @@ Find recordings: files, bags, and folders searched for both.
 
 Limits: links to folders are not followed, and hidden folders are not entered.  A FIFO, a
 device or a broken link with the name of a recording counts as an unreadable recording.
-Two recordings are the same when every byte of their data is; a recompressed copy
-is another recording.
+Two recordings are equal if every byte of their data is; a recompressed copy is another recording.
 """
 
 from __future__ import annotations

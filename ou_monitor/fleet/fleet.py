@@ -36,7 +36,7 @@ class Parts:
     """
     The results in the folder of a fleet, which is created; InputError if that fails.
 
-    options: what the results depend on, including the package version, as JSON holds it.
+    options: everything that the results depend on, including the package version, as in JSON.
     """
 
     def __init__(self, folder: Path, options: Mapping[str, Any]) -> None:
@@ -76,7 +76,7 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True, eq=False)
 class Fleet:
-    """A fleet, analysed."""
+    """Result of analysing a fleet."""
 
     rows: list[Row]  # The table, in order of vehicle, flight, path and level
     judgement: Judgement  # What stands out

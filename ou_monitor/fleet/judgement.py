@@ -5,22 +5,21 @@ Drift: the Mann-Kendall test, exact for few flights, which only assumes that fli
 without drift come in any order.  The slope and its interval are Theil and Sen's.  Holm's
 procedure keeps all tests of the fleet at one family rate.
 
-Outliers: a value's score is its distance from the median of its group (or from the group's
-drift line) over sqrt(s^2 + se^2): se is its standard error, and s the scatter between
-recordings that gives these ratios the median of a normal law (as a median absolute
-deviation).  The bound is
-where the largest ratio of the whole fleet lies when nothing is wrong, by
-simulation of fleets of the same groups and errors, estimated in the same way
-(with s at its upper 90 % bound, so that the rate is rather below than above).
+Outliers: the score of a value is its distance from the median of its group (or from the group's
+drift line) divided by sqrt(s^2 + se^2).  se is its standard error; s is the scatter between
+recordings for which these ratios have the median of a normal law (a median absolute deviation).
+The bound is the quantile of the largest ratio in fleets with nothing wrong, which are simulated
+with the same groups and errors and evaluated in the same way (with s at its upper 90 % bound, so
+that there are fewer false alarms than stated, rather than more).
 
 Limits of drift: consecutive flights that share a cause (a season, a battery) look like a
-drift.  Below a certain number of flights no order of them is rare enough in a
-fleet of many tests; `fewest` returns that number.
+drift.  A minimum number of flights is needed before any order of them is rare enough in a fleet
+with many tests; `fewest` returns it.
 
 Limits of outliers: the scatter between good recordings is assumed normal and equal
 on every vehicle.  Heavier tails give more alarms than
-stated; where a large part of a group is off, its median follows.  A median of
-few deviations is vague, so its bound is wide: see doc/fleet.md.
+stated.  If a large part of a group is off, its median is too.  The scatter of a small group is
+uncertain, so its bound is wide: see doc/fleet.md.
 
 Recordings are compared at one common throttle.
 
@@ -30,10 +29,9 @@ for each vehicle; a recording's distance above it, averaged over its levels by
 time, is its deviation.  Measured values are shown; compared values include the
 error of the curve between their own throttle and the usual one.
 
-Limits of the curve: its shape is assumed equal on all vehicles, and
-throttle to mean the same load on each.  Recordings without throttle are
-compared unchanged.  Sag is compared at full throttle, as accurately
-as the form of the load allows (doc/load.md).
+Limits of the curve: it assumes the same shape on all vehicles, and that throttle means the same
+load on each.  Recordings without throttle are compared unchanged.  Sag is compared at full
+throttle, extrapolated by the load model (doc/load.md).
 """
 
 from __future__ import annotations
@@ -76,7 +74,7 @@ class CommonCurve:
     covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __call__(self, throttle: FloatArray) -> FloatArray:
-        """Return what is added to the logarithm at the reference; 0 where unknown."""
+        """Return the difference to the logarithm at the reference throttle; 0 where unknown."""
         u = np.asarray(throttle, dtype=np.float64)
         if not self.knots:
             return np.zeros(u.shape)
@@ -343,7 +341,7 @@ def fewest(tests: int, rate: float) -> int:
 
 # The median of |z| of a normal law.
 _MEDIAN = 0.6744897501960817
-# Minimum size of a group: in a smaller one it is unclear which member is off.
+# Minimum size of a group: in a smaller one it is unclear which member is the outlier.
 LEAST = 4
 SIMULATIONS = 4000
 # Maximum number of cells simulated at once; limits memory.
@@ -354,7 +352,7 @@ _UPPER = 1.2815515655446004
 
 @dataclass(frozen=True, eq=False)
 class Outliers:
-    """How far each value is off."""
+    """Distance of each value from its group."""
 
     # Distance from the group in standard deviations; NaN where the group is too small; shape (n,).
     score: FloatArray
@@ -377,7 +375,7 @@ class Outliers:
 def outliers(value: FloatArray, error: FloatArray, groups: Sequence[str], rate: float,
              trend: FloatArray | None = None, *, least: int = LEAST, seed: int = 0,
              simulations: int = SIMULATIONS) -> Outliers:
-    """Find the values that are off (rate 0..1)."""
+    """Find outliers (rate 0..1)."""
     n = value.size
     names, of = np.unique(np.asarray(groups, dtype=str), return_inverse=True)
     count = np.bincount(of, minlength=names.size)
@@ -443,7 +441,7 @@ def _scatter(rest: FloatArray, error: FloatArray, share: float = 0.5) -> FloatAr
 # Probability of any false drift in a fleet with nothing wrong, and of any false outlier.
 DRIFT_RATE = 0.05
 OUTLIER_RATE = 0.05
-# Minimum number of vehicles to find which of them is off.
+# Minimum number of vehicles to find which of them is an outlier.
 LEAST_VEHICLES = 6
 # Standard error of a median over the mean's, for many normal values.
 _MEDIAN_ERROR = 1.2533141373155
@@ -478,13 +476,13 @@ class Judgement:
         return tuple(t for t in self.trends if t.p_family <= DRIFT_RATE)
 
     def odd_recordings(self) -> list[tuple[str, int]]:
-        """Return (quantity, index) of the recordings that are off, furthest first."""
+        """Return (quantity, index) of the outlying recordings, furthest first."""
         found = [(name, int(k)) for name, o in self.recordings.items()
                  for k in np.flatnonzero(o.found)]
         return sorted(found, key=lambda f: -abs(float(self.recordings[f[0]].score[f[1]])))
 
     def odd_vehicles(self) -> list[tuple[str, int]]:
-        """Return (quantity, index) of the vehicles that are off, furthest first."""
+        """Return (quantity, index) of the outlying vehicles, furthest first."""
         found = [(name, int(k)) for name, v in self.vehicles.items()
                  for k in np.flatnonzero(v.outliers.found)]
         return sorted(found, key=lambda f: -abs(float(

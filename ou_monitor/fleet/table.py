@@ -35,10 +35,9 @@ _LOG = 'standard error of its logarithm'
 
 COLUMNS = (
     Column('vehicle', 'text', '', 'vehicle; null if unknown'),
-    Column('vehicle_from', 'text', '', 'where the name of the vehicle is from: metadata, pattern, '
-           'folder'),
+    Column('vehicle_from', 'text', '', 'origin of that name: metadata, pattern, folder'),
     Column('flight', 'count', '', 'number of the flight of this vehicle, from 1'),
-    Column('start', 'time', '', 'first sample; null if its clock has no date'),
+    Column('start', 'time', '', 'time of the first sample; null if its clock has no date'),
     Column('recording', 'text', '', 'name of the recording'),
     Column('path', 'text', '', 'file or folder'),
     Column('level', 'text', '', "load level, such as '40 %', or 'all' for the whole recording"),
@@ -57,8 +56,10 @@ COLUMNS = (
     Column('u0', 'number', 'V', 'mean level of the fit'),
     Column('u0_se', 'number', 'V', 'standard error of u0'),
     Column('noise_std', 'number', 'V', 'white noise of the sensor'),
-    Column('excess_kurtosis', 'number', '1', 'of the innovations; 0 for a Gaussian'),
-    Column('impulses', 'count', '', 'innovations above the largest expected of a normal law'),
+    Column('excess_kurtosis', 'number', '1', 'excess kurtosis of the innovations; 0 for a '
+           'Gaussian'),
+    Column('impulses', 'count', '', 'number of innovations above the largest expected from a '
+           'normal law'),
     Column('line_hz', 'number', 'Hz', 'frequency of the strongest spectral line; null: none '
            'found'),
     Column('line_rms', 'number', 'V', 'its rms'),
@@ -68,26 +69,26 @@ COLUMNS = (
     Column('status', 'text', '', 'result of the fit: OK, SHORT_WINDOW, or why it failed'),
     Column('flags', 'texts', '', 'cautions about the input'),
     Column('duration_s', 'number', 's', 'length of the recording'),
-    Column('samples', 'count', '', 'samples of the recording'),
+    Column('samples', 'count', '', 'number of samples in the recording'),
     Column('rate_hz', 'number', 'Hz', 'mean rate of the recording'),
     Column('lowest', 'number', 'V', 'lowest voltage of the recording'),
-    Column('lowest_at', 'number', 's', 'when, from the first sample'),
-    Column('lowest_throttle', 'number', '1', 'throttle then, 0..1'),
-    Column('dips', 'count', '', 'dips below the limit; one lasts until a reading is clearly above '
-           'it; needs --brownout-voltage or --cells'),
+    Column('lowest_at', 'number', 's', 'time of the lowest voltage, from the first sample'),
+    Column('lowest_throttle', 'number', '1', 'throttle at that time, 0..1'),
+    Column('dips', 'count', '', 'number of dips below the limit; a dip ends when a reading is '
+           'clearly above it; needs --brownout-voltage or --cells'),
     Column('below_s', 'number', 's', 'time below the limit; needs the same'),
     Column('sag_throttle', 'number', '1', 'highest throttle flown, to a tenth; null where the sag '
            'is unknown'),
-    Column('sag', 'number', 'V', 'sag there, positive, as in analyze'),
+    Column('sag', 'number', 'V', 'sag at that throttle, positive, as in analyze'),
     Column('sag_se', 'number', 'V', 'standard error of sag'),
-    Column('sag_full', 'number', 'V', 'sag at full throttle, if its form holds up to there; '
-           'recordings are compared by it'),
+    Column('sag_full', 'number', 'V', 'sag extrapolated to full throttle; recordings are compared '
+           'by it'),
     Column('sag_full_se', 'number', 'V', 'standard error of sag_full'),
-    Column('supply', 'json', '', 'the facts that all commands share, as JSON'),
-    Column('alpha_p', 'number', '1', 'p-value of alpha being the same at all levels'),
+    Column('supply', 'json', '', 'the supply facts that all commands share, as JSON'),
+    Column('alpha_p', 'number', '1', 'p-value of the test that alpha is the same at all levels'),
     Column('quality', 'texts', '', 'defects of the recording, worst first'),
-    Column('risk_max', 'number', '1', 'highest risk that the node would have published on the '
-           'way; needs --brownout-voltage'),
+    Column('risk_max', 'number', '1', 'highest risk that the node would have published during '
+           'the recording; needs --brownout-voltage'),
     Column('verdict', 'text', '', 'verdict of discover; null without --discover'),
     Column('causes', 'texts', '', 'causes that discover names; null without --discover'),
     Column('gain', 'number', 'nat', 'gain of the extended model, per held-out sample'),
@@ -95,8 +96,8 @@ COLUMNS = (
     Column('notes', 'texts', '', 'what was dropped, repaired or left out of the recording'),
     Column('duplicate_of', 'text', '', 'path of the recording with the same content; this one '
            'was not analysed again'),
-    Column('error', 'text', '', 'why there are no numbers; null when there are'),
-    Column('size_bytes', 'count', 'byte', 'size of its data'),
+    Column('error', 'text', '', 'reason why there are no numbers; otherwise null'),
+    Column('size_bytes', 'count', 'byte', 'size of the recording on disk'),
 )
 NAMES = tuple(column.name for column in COLUMNS)
 # Columns of the recording that its result lacks.

@@ -74,7 +74,7 @@ class Workers(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Cancel what is under way, and release the workers."""
+        """Cancel the running tasks, and release the workers."""
 
     def each(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]
              ) -> Iterator[Outcome]:
@@ -106,7 +106,7 @@ class Workers(ABC):
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Cancel what is under way."""
+        """Cancel the running tasks."""
         self.close()
 
 

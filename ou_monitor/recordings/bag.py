@@ -220,7 +220,7 @@ class BagReader:
         return sorted(spans, key=lambda pair: pair[0].start_ns)
 
     def tables(self, topics: Iterable[str], end_ns: int | None = None) -> Iterator[Part]:
-        """Yield where the messages are, chunk by chunk; none that begins after `end_ns`, ns."""
+        """Yield the places of messages, chunk by chunk, up to `end_ns`, ns, or the end."""
         wanted = self._wanted(topics)
         spans = [(span, file) for span, file in self._spans(wanted)
                  if end_ns is None or span.start_ns < end_ns]
@@ -292,8 +292,8 @@ def batches(
     """
     Yield fields of a bag by log time, batch by batch, at least to `end_ns`, ns.
 
-    `beside`: a second field of the messages of a name.  `broken` is called with the reason for
-    each message that cannot be decoded; None: the first is an InputError.
+    `beside` names a second field to read from the same messages.  `broken` is called with the
+    reason for each message that cannot be decoded; if it is None, the first raises InputError.
     """
     def reader_of(spec: FieldSpec, second: FieldSpec | None) -> FieldReader:
         def refuse(log_time: int, why: str) -> None:

@@ -33,11 +33,11 @@ class TopicChoice:
 
     # The source.
     config: MsgConfig
-    # With the topics of this bag; throttle and current may be None.
+    # With the topics of this bag; None if there is no throttle or current.
     voltage: FieldSpec
     throttle: FieldSpec | None
     current: FieldSpec | None
-    # One sentence for each surprise.
+    # Notes on unexpected choices, one sentence each.
     notes: tuple[str, ...]
 
 
@@ -195,7 +195,7 @@ def span_words(start: float | None, end: float | None) -> str:
 
 
 def outside_words(name: str, start: float | None, end: float | None, length: float) -> str:
-    """Return the error that a recording of a length, s, has no sample in a part."""
+    """Return the words of the error that a part holds no sample (length of the recording in s)."""
     return f'{name} holds no sample {span_words(start, end)}: it lasts {length:.3f} s'
 
 

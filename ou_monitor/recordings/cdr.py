@@ -305,8 +305,7 @@ def gather(data: bytes, at: IntArray, kind: str) -> npt.NDArray[Any]:
     size = np.dtype(kind).itemsize
     if not at.size:
         return np.empty(0, kind)
-    # One item at every byte: NumPy picks from such a view far faster than it
-    # puts single bytes together.
+    # One item at every byte: indexing such a view is far faster than combining single bytes.
     everywhere: npt.NDArray[Any] = np.ndarray(
         (len(data) - size + 1,), kind, data, 0, (1,))
     return everywhere[at]
@@ -408,7 +407,7 @@ class FieldReader:
         # A damaged message may hold a signalling NaN, of which NumPy would warn.
         with np.errstate(invalid='ignore'):
             for picked, rows, layout in self._groups(table, refused):
-                # A slice is written far faster than places are.
+                # Writing to a slice is far faster than writing to indices.
                 at = slice(None) if picked.size == n else picked
                 stamp[at] = self._stamps(layout, rows)
                 block, *other = (self._values(layout, rows, spec, path)

@@ -69,8 +69,8 @@ MOST_BYTES, MOST_NODES = 8_000_000, 200_000
 _MOST_METADATA, _MOST_TABLES = 10_000_000, 3
 # Maximum size of a definition (usual: some kB) and of a name (DDS: 256 characters).
 _MOST_DEFINITION, _MOST_OF_NAME = 256 * 1024, 256
-# Damages after which the walk ends, topics left out that are named, and records of a chunk beside
-# its messages: one schema and one channel for each number.
+# Maximum number of damages before the walk ends, of left-out topics that are named, and of records
+# in a chunk that are not messages (one schema and one channel for each number).
 _MOST_BREAKS, _MOST_NOTES, _MOST_OTHERS = 10_000, 20, 2 * 65536
 # Block size for messages outside of chunks, bytes.
 _BLOCK = 64 * 1024
@@ -86,7 +86,7 @@ _VARIABLE = 'OU_MONITOR_MAX_CHUNK_MB'
 
 
 class Damage(Exception):
-    """A part of the file that is broken."""
+    """A part of the file is damaged."""
 
 
 class Break(NamedTuple):

@@ -2,8 +2,8 @@
 Read any recording (bag, CSV or autopilot log) as a `Recording`, and any scalar beside it.
 
 Limits: stamps of a bag are float64 seconds of its own clock, with a resolution of 0.24 us for a
-clock from 1970.  A signal has the stamps of its messages' headers, or else the bag's log times;
-beside a voltage with the other kind it is off by the transmission delay.
+clock from 1970.  A signal has the stamps of its messages' headers, or else the bag's log times; if
+the voltage has the other kind, the two differ by the transmission delay.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ def tidy(raw: RawColumns) -> Recording:
     notes, t = [*raw.notes, *said], t[which]
     if not t.size:
         raise InputError(_unusable(name, notes))
-    # A median this large needs half of it on average.
+    # Cheap test first: with this median spacing, the mean is at least half of it.
     if t.size > 2 and t[-1] - t[0] >= 0.5 * _SPARSE * (t.size - 1) - 1.0 and (
             spacing := float(np.median(np.diff(t)))) >= _SPARSE:
         notes.append(f'The samples are {spacing:.4g} s apart: is the time in ms, us or ns? '

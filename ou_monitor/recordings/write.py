@@ -204,7 +204,7 @@ class RecordingWriter:
 
 def check_steady(name: str, since_first: npt.NDArray[np.int64], before: int,
                  sample_rate: float) -> None:
-    """Refuse a spacing that blocks without stamps cannot hold: any but the stated one."""
+    """Refuse a spacing other than the stated one, because blocks have no stamps for it."""
     grid = (before + np.arange(since_first.size)) * (1e9 / sample_rate)
     if np.abs(since_first - grid).max() > 0.5e9 / sample_rate:
         raise InputError(

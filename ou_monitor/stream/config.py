@@ -69,7 +69,7 @@ class MsgConfig:
 
     # Name of the file without its ending.
     name: str
-    # One sentence for people, limits included.
+    # Description in one sentence, with limits.
     description: str
     # ROS package that defines the voltage's type.
     package: str
@@ -273,7 +273,7 @@ class ZeroRule:
 
 
 def walk(msg: object, steps: FieldPath, path: str, kind: str) -> Any:
-    """Follow a path, of a message of a type, step by step; None where an array is too short."""
+    """Follow a field path in a message (kind: its type); None if an array is too short."""
     at: Any = msg
     for step in steps:
         if isinstance(step, str):

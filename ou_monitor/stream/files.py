@@ -58,10 +58,10 @@ def open_regular(path: str | Path) -> BinaryIO:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file so that it is there whole or not at all."""
+    """Write a file whole or not at all."""
     draft = path.with_name(f'.{path.name}.{os.getpid()}.draft')
     try:
-        # What is there may be a FIFO, which would wait for its reader, or a link to elsewhere.
+        # The path may be a FIFO, which would wait for its reader, or a link to another folder.
         draft.unlink(missing_ok=True)
         draft.write_bytes(content)
         os.replace(draft, path)
@@ -75,7 +75,7 @@ def write_whole(path: Path, content: bytes) -> None:
 def read_yaml(path: str | Path, what: str, *, most_bytes: int = MOST_BYTES,
               most_nodes: int = MOST_NODES) -> Any:
     """
-    Return the content of a YAML file; `what` names it where it cannot be read.
+    Return the content of a YAML file; `what` names its kind in errors.
 
     Raises InputError: one line of at most `MOST_CHARACTERS`, without content of the file.
     """
@@ -99,7 +99,7 @@ def read_yaml(path: str | Path, what: str, *, most_bytes: int = MOST_BYTES,
 
 def parse_yaml(text: str, where: str, *, most_bytes: int = MOST_BYTES,
                most_nodes: int = MOST_NODES) -> Any:
-    """Return the content of a YAML text; InputError as of `read_yaml`."""
+    """Return the content of a YAML text; raise InputError as `read_yaml` does."""
     if len(text) > most_bytes:
         raise InputError(f'{path_words(where)} holds more than {most_bytes / 1e6:g} MB')
     try:

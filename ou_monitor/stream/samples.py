@@ -6,8 +6,8 @@ publishers apart; two with equal numbers and times cannot be told apart.
 
 Throttle: one rule for node and bench.  A throttle holds from its own stamp on if its clock is the
 voltage's, otherwise from the next voltage message on.  The clocks are compared at each throttle
-message, with the newest voltage stamp received by then.  A throttle holds for ever; the caller,
-who knows the present time, decides when it is too old.  Samples handed to the monitor are final: a
+message, with the newest voltage stamp received by then.  A throttle has no maximum age; the caller
+knows the present time and decides when it is too old.  Samples handed to the monitor are final: a
 throttle that arrives later applies to later samples only.
 
 Blocks: the stamp of a block of ADC samples is the *arrival* time of its last sample, late by some
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from ou_monitor.online.monitor import SupplyMonitor
 
 
-# Largest lead and lag of a stamp that is taken from the receiver's clock, s: unsynchronized clocks
-# and queues.
+# Largest lead and lag of a stamp that counts as one of the receiver's clock, s: unsynchronized
+# clocks and queues.
 AHEAD, BEHIND = 0.25, 5.0
 # Largest delay once the clock is known, s: no queue holds ten minutes.
 MOST_DELAY = 600.0
@@ -284,14 +284,14 @@ class BlockClock:
         return 0.0, 1 - n, self._dt
 
 
-# Distance of voltage and throttle stamps, s, from which their clocks differ (an autopilot's boot
-# time and a wall clock differ by years).
+# Difference of voltage and throttle stamps, s, above which they are from different clocks (an
+# autopilot's boot time and a wall clock differ by years).
 APART = 5.0
 # The same, s, if only one of the two has its own stamp and the other its time of sending or
 # logging: transmission takes milliseconds, and unsynchronized clocks may differ by little.
 APART_MIXED = 0.25
-# Tolerance of a sample's stamp against a throttle's, as a share of a step: stamps within a block
-# are computed and may be a rounding too early.
+# Tolerance between the stamps of a sample and of a throttle, as a share of a step: stamps within a
+# block are computed, and may be too early by a rounding error.
 SLACK = 0.1
 
 
@@ -300,8 +300,8 @@ class ThrottleHold:
 
     def __init__(self, sample_rate: float | None = None) -> None:
         self._slack = 0.0 if sample_rate is None else SLACK / sample_rate
-        # Stamps from which values hold, and the values: of each call; joined and in order where
-        # there is one of each.
+        # Stamps from which values hold, and the values: one array for each call, until they are
+        # joined in order into one.
         self._places, self._values = [np.empty(0)], [np.empty(0)]
         self._latest, self._newest, self._own = -math.inf, -math.inf, False
 
@@ -369,7 +369,7 @@ class ThrottleHold:
         return int(self.held()[0].size)
 
 
-# Backward step of a stamp, s, from which a clock or a bag went back.  One publisher's messages
+# Backward step of a stamp, s, above which the clock or the bag went back.  Messages of a publisher
 # arrive in order; interleaved publishers differ by milliseconds.
 BACK = 0.1
 # Throttle values kept until the next voltage: 20 s of a 50 Hz stick, or 1 s at 1 kHz.
@@ -407,12 +407,12 @@ class SampleStream:
         self.messages = self.unplaced = 0
 
     def open_voltage(self, spec: FieldSpec) -> None:
-        """Set what the messages of the voltage hold."""
+        """Set the field of the voltage's messages."""
         self._block = None if spec.sample_rate is None else BlockClock(spec.sample_rate)
         self._hold = ThrottleHold(spec.sample_rate)
 
     def open_throttle(self, spec: FieldSpec) -> None:
-        """Set what the messages of the throttle hold."""
+        """Set the field of the throttle's messages."""
         self._drop = spec.nan == 'drop'
         self._throttle_block = (
             None if spec.sample_rate is None else BlockClock(spec.sample_rate))

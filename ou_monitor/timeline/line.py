@@ -107,7 +107,7 @@ def refresh_period(y: FloatArray, known: float = 1.0) -> float:
     usual = float(np.median(gaps))
     if usual < 2.0:
         return 1.0
-    # Where few readings change the ADC code, gaps span several periods: try no longer ones.
+    # If few readings change the ADC code, gaps span several periods: do not try longer gaps.
     evidence, period = 0.0, 1.0
     for first in np.unique(gaps[gaps <= 1.5 * usual])[:_TRIED].tolist():
         about = _period(gaps, float(gaps[np.abs(gaps - first) <= max(1.0, 0.1 * first)].mean()))
@@ -337,7 +337,7 @@ _TIED = 0.25
 
 def plausible(values: FloatArray, most: float) -> FloatArray:
     """Return values with NaN where the magnitude exceeds `most`."""
-    # NaN is not beyond, and stays.
+    # Comparisons with NaN are false, so NaN stays.
     beyond = (values > most) | (values < -most)
     return np.where(beyond, NAN, values) if beyond.any() else values
 
@@ -511,7 +511,7 @@ class TimeLine:
               pause: float) -> list[Batch]:
         """Process samples as `take` does, but keep repeats."""
         self.count(pushed=t.size)
-        # One pass checks that all are finite: then their sum is.
+        # The sum is finite only if all values are: one pass.
         if not math.isfinite(np.add.reduce(t) + np.add.reduce(y)):
             good = np.isfinite(t) & np.isfinite(y)
             self.count(non_finite=t.size - int(good.sum()))
@@ -545,7 +545,7 @@ class TimeLine:
         fresh = (t < newest - pause) | (t > newest + pause)
         batches: list[Batch] = []
         begin = 0
-        # Where time jumps, the running maximum starts again: one split at a time.
+        # One split at a time, because the running maximum starts again at each jump.
         while begin < t.size:
             jumps = np.flatnonzero(fresh[begin:])
             restart = bool(jumps.size and jumps[0] == 0) and math.isfinite(self.newest)

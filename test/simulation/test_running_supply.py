@@ -17,7 +17,7 @@ PACK = SupplyModel((OU(5.0, 0.0, 15.6), Drift(-0.01, 0.0), LoadSag(2.0, 0.5),
                     LoadTransient(-1.0, 0.1, 0.0)), LOAD)
 
 
-def test_steps_are_the_batch():
+def test_step_by_step_equals_one_batch():
     """Whatever the pieces: the path of `simulated`, with the same seed."""
     profile = read_profile('flight')
     batch = np.concatenate([piece.voltage for piece in simulated(
@@ -32,8 +32,8 @@ def test_steps_are_the_batch():
     np.testing.assert_allclose(steps, batch[:steps.size], rtol=0.0, atol=1e-9)
 
 
-def test_resistance_scales_the_answer_alone():
-    """An old pack answers more to throttle, from the next sample on; all else stays as it was."""
+def test_resistance_scales_only_the_response():
+    """The response to throttle grows from the next sample on; everything else is unchanged."""
     paths = {}
     for resistance in (1.0, 1.4):
         run = RunningSupply(SupplyModel((*PACK.terms, MeasurementNoise(0.02))), rate=100.0, seed=3)
@@ -46,7 +46,7 @@ def test_resistance_scales_the_answer_alone():
 
 
 @pytest.mark.parametrize('charge', [np.nan, 0.5])
-def test_the_pack_empties_by_what_is_drawn(charge):
+def test_the_pack_empties_by_the_charge_drawn(charge):
     """Level after 30 s of half throttle; the recording's drift is not added to it."""
     pieces = list(simulated(PACK, read_profile('0:0,10:0,10:0.5,40:0.5'), duration=60.0,
                             rate=100.0, seed=0, charge=charge))
@@ -60,10 +60,10 @@ def test_the_pack_empties_by_what_is_drawn(charge):
     assert voltage[-1] == pytest.approx(offset + at_end - (2.0 * 0.5 + 0.5 * 0.25), abs=2e-3)
 
 
-def test_what_a_model_lacks():
-    """It is simulated with what it has; the charge of a model without one cannot be set."""
+def test_missing_parts_of_a_model_are_named():
+    """The other terms are simulated; charge cannot be set in a model without it."""
     assert lacks(PACK) == ()
     assert [words.split(' (')[0] for words in lacks(SupplyModel((OU(5.0, 0.1, 5.0),)))] == [
-        'no answer to throttle', 'no charge']
+        'no response to throttle', 'no charge']
     with pytest.raises(ValueError, match="no entry 'load'"):
         RunningSupply(FLIGHT, rate=10.0, seed=0, charge=0.5)

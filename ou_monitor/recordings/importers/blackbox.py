@@ -1,7 +1,7 @@
 """
 Betaflight and INAV blackbox, read by orangebox.
 
-Limits first: the ADC is read more slowly than the log is written, so most voltages are
+Limits: the ADC is read more slowly than the log is written, so most voltages are
 repeats.  Frames predicted from damaged ones are
 left out up to the next key frame.  orangebox is under GPL-3; other formats
 load nothing of it.  Betaflight's axes (x forwards, y left, z up)
@@ -61,7 +61,7 @@ def _sizes(path: Path) -> list[int]:
 
 
 def read(path: Path, request: Request) -> Log:
-    """Read one flight of a blackbox file; the largest when none is named."""
+    """Read one flight of a blackbox file, by default the largest."""
     held = _sizes(path)
     wanted = request.flight or (held.index(max(held)) + 1 if held else 1)
     notes = []

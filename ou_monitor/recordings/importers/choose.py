@@ -1,8 +1,8 @@
 """
 Selection from a log: voltage, throttle, current, gyros, speeds, named series.
 
-The default is the battery, never a rail behind a regulator; of
-several batteries the user chooses.  The default throttle has the smallest
+The default is the battery, never a rail behind a regulator; if there are
+several batteries, the user must choose.  The default throttle has the smallest
 rank: motor outputs before stick commands.
 
 Rows of gyro and accelerometer with a non-finite number are dropped whole.

@@ -1,7 +1,7 @@
 """
 Crazyflie logs of the micro-SD deck, read without a library.
 
-Limits first: the battery is read at 100 Hz or less, so a faster log repeats it.  The format has
+Limits: the battery is read at 100 Hz or less, so a faster log repeats it.  The format has
 one checksum over the whole file: a mismatch does not locate the wrong bytes, and a
 note reports it.  The firmware's own events are read only by name.
 

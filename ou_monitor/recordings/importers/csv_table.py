@@ -1,7 +1,7 @@
 """
 Read a table of text, such as a CSV: time, voltage and, where present, throttle and current.
 
-Limits first: one file is one flight, lines of one width, each a row.  The format is detected in
+Limits: a file is one flight; all rows have the same number of cells.  The format is detected in
 the first 64 kB: the encoding, delimiter, decimal mark, header lines and stated units with which
 most cells of the first lines are numbers, dates or times.  Columns and units are found by names
 and sizes and reported in one note; fields of `CsvColumns` override them.  A unit in a name or
@@ -47,7 +47,7 @@ TIME, VOLTAGE, THROTTLE, CURRENT = 'time_s', 'voltage_v', 'throttle', 'current_a
 
 # Words of loggers for a missing number.
 MISSING = frozenset(('', 'nan', 'null', 'none', 'na', 'n/a', '#n/a', '-', '--', 'x'))
-# Added to an error if a cell looks like it.
+# Added to the error about a cell with a decimal comma.
 _MARK = ': the decimal mark is a point'
 # Maximum characters of a cell that are shown.
 _LONGEST = 40
@@ -196,7 +196,7 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool, sk
 
 
 def _prepared(lines: list[str], delimiter: str, comma: bool) -> list[str]:
-    """Return lines for the reader: decimal points; one blank where blanks separate."""
+    """Return lines with decimal points, and single blanks if blanks separate the cells."""
     if comma:
         # A point becomes a comma, so that a thousands separator is not taken for a decimal mark.
         lines = ['\0'.join(line.split('.')).replace(',', '.').replace('\0', ',')
@@ -467,7 +467,7 @@ _PATTERNS = {
         r'(?:bus|input|supply|main)_?current|curr',
         r'i|amps?|current|strom|courant|corriente'),
 }
-# A table with this column -> units of its columns, which its maker does not write.  Betaflight's
+# Column that identifies a program -> units of its columns, not stated there.  Betaflight's
 # blackbox explorer writes the numbers of the log: us, 0.01 V and 0.01 A from version 4.0 on.
 _MAKERS: dict[str, dict[str, tuple[float, str]]] = {
     'loopIteration': {'time': (1e-6, 'us'), 'vbatLatest': (0.01, '0.01 V'),

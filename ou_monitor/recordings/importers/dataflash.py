@@ -1,7 +1,7 @@
 """
 ArduPilot dataflash, binary and text, read by pymavlink.
 
-Limits first: ArduPilot averages the battery's ADC before logging it, by default
+Limits: ArduPilot averages the battery's ADC before logging it, by default
 at 10 Hz.  The parameters `SERVOn_FUNCTION` of the log identify the motor
 outputs; without them outputs are taken by name only.
 """

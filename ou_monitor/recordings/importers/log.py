@@ -1,7 +1,7 @@
 """
-What an importer returns: a `Log`, candidate `Series`, motion, with where each is from.
+Result of an importer: a `Log` with candidate `Series` and motion, each with its origin.
 
-Limits first: the wanted fields of a log are read into memory at once.  Stamps are seconds from the
+Limits: the wanted fields of a log are read into memory at once.  Stamps are seconds from the
 start of the log, or of the flight in it; absolute time is not kept.  Importers do not
 depend on the bag format.
 """
@@ -43,7 +43,7 @@ RATE, FORCE, VELOCITY = 'angular_velocity', 'linear_acceleration', 'velocity'
 class Motion:
     """A gyro with its accelerometer, if it has one, or the speeds of all motors."""
 
-    # How the user names it.
+    # Name for the user.
     name: str
     # Stamps, s from the start of the log; shape (n,).
     t: FloatArray
@@ -91,7 +91,7 @@ Progress = Callable[[float], None]
 class Series:
     """One quantity over time, in SI units."""
 
-    # How the user names it, unique in the log: ``BAT[0].Volt``.
+    # Name for the user, unique in the log: ``BAT[0].Volt``.
     name: str
     # VOLTAGE, THROTTLE, CURRENT, SIGNAL or ANY.
     quantity: str

@@ -1,7 +1,7 @@
 """
 PX4 ULog, read by pyulog.
 
-Limits first: ULog has no end mark and no checksums, so a log truncated
+Limits: ULog has no end mark and no checksums, so a log truncated
 between two messages looks complete.  PX4 may have low-passed the voltage
 (`BATn_V_FILT`).  The log does not say which `actuator_outputs` are motors: they
 are taken by name only.
