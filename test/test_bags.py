@@ -88,7 +88,7 @@ def test_truth_says_what_is_in_the_bag(bag):
     assert {'seed', 'made_by', 'units', 'parameters', 'description'} <= set(truth)
 
 
-def test_every_type_is_among_them():
+def test_every_message_type_has_a_bag():
     """One bag at least for each generic msg config."""
     assert {truth_of(name)['msg_config'] for name in NAMES} == {
         'std_float32', 'std_float64', 'adc_block', 'battery_state'}
@@ -129,7 +129,7 @@ def test_steady_bags_hold_their_law(name):
     check_ou(recording.voltage - p['u0'], 1.0 / truth['rate'], p['alpha'], p['sigma'])
 
 
-def test_the_paper_is_met():
+def test_bags_of_the_paper_have_its_values():
     """Vrms of Table 1 within half a display step, Var_inf of Table 2 as printed."""
     for name, vrms in (('load_05', 9.38e-3), ('load_10', 28.1e-3), ('load_40', 56.3e-3)):
         assert math.sqrt(truth_of(name)['parameters']['var_inf']) == pytest.approx(
@@ -198,7 +198,7 @@ def made(tmp_path_factory):
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_made_anew_they_are_the_same(made, name):
+def test_the_script_reproduces_the_bags(made, name):
     """The script in the repository makes these bags, message by message."""
     assert (made / name / 'truth.yaml').read_text() == (BAGS / name / 'truth.yaml').read_text()
     for ours, theirs in zip(independent(made / name), independent(BAGS / name), strict=True):

@@ -66,7 +66,7 @@ def test_a_design_of_a_flight_has_its_facts(tmp_path):
     assert result.supply == supply_facts(read_recording(GECKO))
 
 
-def test_a_simulation_is_that_of_the_command(tmp_path):
+def test_simulate_equals_the_command(tmp_path):
     """The samples of its bag, and its JSON; drawn in memory or written."""
     bag, other = tmp_path / 'a.mcap', tmp_path / 'b.mcap'
     assert main(['simulate', '--preset', 'flight_full', '--duration', '3', '--seed', '4',
@@ -102,7 +102,7 @@ def test_a_result_is_pickled_and_copied(found):
             assert repr(again.supply) == repr(result.supply)
 
 
-def test_attributes_are_those_of_the_record(found):
+def test_a_result_has_the_attributes_of_its_record(found):
     """And what is printed is what the command prints."""
     finding = found['discover']
     assert finding.causes is finding.record.causes and not hasattr(finding, 'nonsense')
@@ -175,8 +175,8 @@ def test_without_the_extras_one_line_says_so(found, monkeypatch):
             call()
 
 
-def test_pandas_and_matplotlib_take_it(found):
-    """Where they are installed."""
+def test_results_convert_to_pandas_and_matplotlib(found):
+    """If these are installed."""
     pandas, matplotlib = pytest.importorskip('pandas'), pytest.importorskip('matplotlib')
     matplotlib.use('Agg')
     for result in found.values():

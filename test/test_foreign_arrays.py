@@ -121,7 +121,7 @@ def test_stamps_in_disorder_are_sorted_as_of_a_file(call):
         CALLS[call](Recording(1e6 * t, volts, throttle))
 
 
-def test_what_is_masked_is_unknown():
+def test_masked_values_are_unknown():
     """In voltage, throttle and time; NaT too."""
     masked = np.ma.masked_array(VOLTS, VOLTS > 15.01)
     recording = Recording(SECONDS, masked, np.ma.masked_less(np.full(N, 0.3), 0.5))
@@ -144,7 +144,7 @@ def test_what_is_masked_is_unknown():
     (SECONDS, DATES), (SECONDS, VOLTS.astype(str)), (SECONDS.astype(str), VOLTS),
     (SECONDS, VOLTS.astype(complex)),
     (SECONDS, Axis(np.array([object()] * N)))])
-def test_what_is_none_of_these_is_refused(t, volts):
+def test_other_arrays_are_refused(t, volts):
     """Dates as voltage, text, complex numbers, objects."""
     for use in (lambda: Recording(t, volts, np.full(N, 0.3)),
                 lambda: SlidingEstimator().push(t, volts),

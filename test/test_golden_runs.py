@@ -33,7 +33,7 @@ def differences(found, wanted, where=''):
 
 
 @pytest.mark.parametrize('name', RUNS)
-def test_no_number_moves(name):
+def test_golden_runs_are_unchanged(name):
     wanted = json.loads((ROOT / 'test/golden' / f'{name}.json').read_text(encoding='utf-8'),
                         parse_int=float)
     found = json.loads(json.dumps(RUNS[name]()), parse_int=float)

@@ -80,7 +80,7 @@ def part_of(module: str) -> str:
 
 def wrong_imports(source: str, module: str) -> list[str]:
     """
-    Return one sentence for each import that the house does not allow.
+    Return one sentence for each import that goes against the arrows.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def wrong_imports(source: str, module: str) -> list[str]:
             if other == '__init__' and part != '__init__' and name != f'{PACKAGE}.__version__':
                 wrong.append(f'{where}: import from the module that holds it, not the package')
             elif other_level > level or (other_level == level and other != part and level):
-                wrong.append(f'{where}: {part} may not know {other}')
+                wrong.append(f'{where}: {part} may not import {other}')
         elif top in sys.stdlib_module_names:
             continue
         elif part == 'nodes' and top not in PLOTTING | MCAP | set(EXTRAS):
@@ -134,14 +134,14 @@ def modules() -> dict[str, Path]:
         for path in sorted((ROOT / PACKAGE).rglob('*.py'))}
 
 
-def test_the_arrows_hold():
+def test_imports_follow_the_arrows():
     """No module imports against the arrows."""
     wrong = [sentence for module, path in modules().items()
              for sentence in wrong_imports(path.read_text(encoding='utf-8'), module)]
     assert not wrong, '\n'.join(wrong)
 
 
-def test_the_walk_sees_the_house():
+def test_every_part_is_on_disk():
     """Every part is on disk, so that the test above cannot pass on nothing."""
     parts = {part_of(module) for module in modules()}
     assert parts == set(LEVEL) | {'__init__'}
@@ -246,7 +246,7 @@ def test_a_wrong_import_is_found(module, source):
     ('ou_monitor.__init__', 'from ou_monitor.online.estimator.estimator import SlidingEstimator'),
 ])
 def test_a_right_import_passes(module, source):
-    """What the house allows is no finding."""
+    """An allowed import gives no finding."""
     assert wrong_imports(source, module) == []
 
 

@@ -299,14 +299,14 @@ def test_changelog_is_of_this_version():
 
 @pytest.mark.parametrize('name', ['adaptive_filter', 'estimator', 'replay'])
 def test_nodes_without_ros_say_so(offline, tmp_path, name):
-    """An executable that needs ROS says that it is missing, in one line, with status 2."""
+    """The error is one line, with status 2."""
     done = run(offline / name, *(['some.mcap'] if name == 'replay' else []), cwd=tmp_path)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1 and 'ROS 2' in done.stderr
 
 
-def test_offline_analyze(offline, tmp_path):
-    """The installed command reads a bag of the library; its page has the script of the plots."""
+def test_the_installed_analyze_reads_a_bag(offline, tmp_path):
+    """Its page has the script of the plots."""
     done = run(offline / 'ou-monitor', 'analyze', ROOT / 'bags' / 'load_10', '--json', '-',
                '--report', tmp_path / 'r.html', cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -16,8 +16,8 @@ ROOT = pathlib.Path(__file__).resolve().parents[1]
 
 
 @pytest.mark.parametrize('name', ou_monitor.__all__)
-def test_every_public_name_is_there(name):
-    """It can be had, is listed, and is the same the second time."""
+def test_every_public_name_can_be_imported(name):
+    """It is listed, and is the same object the second time."""
     value = getattr(ou_monitor, name)
     assert name in dir(ou_monitor) and getattr(ou_monitor, name) is value
 

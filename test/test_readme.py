@@ -1,4 +1,4 @@
-"""The documents name only what exists: files, links, options, keys, and examples that run."""
+"""The documents name only existing files, links, options and keys, and their examples run."""
 
 import argparse
 import importlib.util
@@ -56,13 +56,13 @@ def test_the_quick_start_is_the_two_commands():
 
 
 def test_readme_is_short():
-    """The README is read in one go."""
+    """At most 150 lines."""
     assert len(README.splitlines()) <= 150
 
 
 @pytest.mark.parametrize('path', PAGES, ids=lambda path: path.name)
 def test_page_is_short(path):
-    """A page has one job, so it is short; the README or another page leads to it."""
+    """At most 250 lines, and the README or another page links it."""
     assert len(path.read_text(encoding='utf-8').splitlines()) < 250
     others = [other for other in LINKED if other != path]
     assert any(re.search(rf'\]\([\w./]*\b{path.name}[)#]', other.read_text(encoding='utf-8'))

@@ -112,7 +112,7 @@ def made(tmp_path_factory) -> tuple[Path, subprocess.CompletedProcess]:
 
 
 def test_nothing_is_installed_twice_and_a_broken_environment_is_mended(made):
-    """A second run makes nothing; one whose interpreter has gone makes it all again."""
+    """A second run installs nothing; without its interpreter the environment is made again."""
     tree, first = made
     expected = f'{tree}/.venv|{tree}|--bag|some bag\n'
     assert (first.returncode, first.stdout) == (0, expected), first.stderr

@@ -35,7 +35,7 @@ def feed(character, data, pieces=7):
     return done
 
 
-def test_set_up_and_blocks(tmp_path):
+def test_a_buffer_is_set_up_and_gives_blocks(tmp_path):
     """Only the channel and the timestamp are enabled; blocks have the stamp of the last one."""
     folder, character = iio_device(tmp_path)
     counts = np.arange(-300, 300)
@@ -72,7 +72,7 @@ def test_a_hole_splits_a_block(tmp_path):
 
 @pytest.mark.parametrize('block', [1, 2, 25, 100])
 def test_samples_lost_between_two_blocks_are_a_hole(tmp_path, block):
-    """50 of them, at every length of a block; a clock that is set back is none."""
+    """50 samples, at every length of a block; a clock that is set back is not a hole."""
     folder, character = iio_device(tmp_path)
     places = np.concatenate([np.arange(100), np.arange(150, 250), np.arange(-1000, -900)])
     done = feed(character, scans(np.arange(300), T0 + 100_000 * places))
@@ -149,7 +149,7 @@ def test_the_channel_must_be_known(tmp_path, channel, words):
 
 
 def test_missing_permission_is_reported(tmp_path, monkeypatch):
-    """In the place of a file that root could write all the same."""
+    """Simulated, because root may write any file."""
     folder, character = iio_device(tmp_path)
 
     def refuse(*args, **kwargs):
@@ -160,7 +160,7 @@ def test_missing_permission_is_reported(tmp_path, monkeypatch):
         IioBuffer(folder, character, 'in_voltage1')
 
 
-def test_polled_channels(tmp_path):
+def test_polled_channels_are_in_volts(tmp_path):
     """Hwmon counts in mV; a raw IIO channel in counts of a scale."""
     folder, _ = iio_device(tmp_path)
     assert PolledChannel(folder, 'in_voltage1').read() == pytest.approx((2 + 0.0) * 2.5e-3 + 0.025)

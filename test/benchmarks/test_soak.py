@@ -59,8 +59,8 @@ def heard(critical=(), lost=0, flags=None, stops=(), reason=FLOOR, counted=0, dr
     # A message was lost, but the node counted nothing.
     (heard(dropped=[10.1]), 'missed'),
 ])
-def test_dips(made, fate):
-    """Told by the floor on both topics within a second of the node's own time, or why not."""
+def test_a_dip_counts_as_reported_within_a_second(made, fate):
+    """The floor reports it on both topics, within a second of the node's own time."""
     found = dips_of(made)
     kinds = ('lost', 'unheard', 'missed')
     counts = {'in_time': found['in_time'], **{kind: len(found[kind]) for kind in kinds}}

@@ -22,7 +22,7 @@ def version() -> str:
 
 
 def twice(value: int) -> int:
-    """Return the double; of 3 there is none."""
+    """Return the double; fail for 3."""
     if value == 3:
         raise ValueError('three')
     return 2 * value

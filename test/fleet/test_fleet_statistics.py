@@ -48,7 +48,7 @@ def test_the_curve_knows_its_error():
 
 
 def test_recordings_without_throttle_or_estimate():
-    """The one is compared as it is, the other not at all; an empty table is no error."""
+    """Without throttle they are compared unchanged, without an estimate not at all."""
     rng = np.random.default_rng(2)
     rows = table(rng, 1, 6, levels=((None, 20.0),))
     rows[0] |= {'status': 'TOO_SHORT', 'sigma': None, 'alpha': None, 'sag_full': None}
@@ -102,8 +102,8 @@ def test_small_groups_and_unknown_vehicles_are_not_judged():
     assert not outliers(np.ones(8), np.zeros(8), ['a'] * 8, 0.05, simulations=50).found.any()
 
 
-def test_fewest_flights():
-    """With one fewer, even a perfect order is not rare enough."""
+def test_fewer_flights_cannot_show_a_drift():
+    """With one flight less, even a perfect order is not rare enough."""
     for tests in (1, 24, 150):
         n = fewest(tests, 0.05)
         assert 2.0 / math.factorial(n) <= 0.05 / tests

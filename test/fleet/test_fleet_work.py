@@ -1,4 +1,4 @@
-"""The parts of a fleet that touch disk and processes: workers that die, parts, what is found."""
+"""The fleet's disk and processes: workers that die, saved results, search."""
 
 import errno
 import json
@@ -34,7 +34,7 @@ def deadly(task: int, folder: str) -> dict:
 
 
 def test_a_worker_that_dies_is_one_row(tmp_path):
-    """What kills its worker twice is lost, after a retry alone; all the others are done."""
+    """A recording that kills its worker twice is lost; all others are done."""
     with LocalWorkers(2) as pool:
         done = list(pool.each(deadly, [(k, str(tmp_path)) for k in range(8)]))
     results = {k: result for k, result, why in done if not why}
@@ -65,8 +65,8 @@ def look(_: int) -> dict:
             'memory': resource.getrlimit(resource.RLIMIT_DATA)[0]}
 
 
-def test_nothing_listens():
-    """Neither the workers nor this process open a socket, of a network or of this machine."""
+def test_no_process_opens_a_socket():
+    """Neither the workers nor this process open a network or local socket."""
     before = sockets('self')
     with LocalWorkers(2) as pool:
         done = [result for _, result, why in pool.each(look, [(k,) for k in range(4)]) if not why]
@@ -85,7 +85,7 @@ def fill(size: int) -> str:
 
 
 def test_a_worker_has_its_share_of_the_memory(monkeypatch):
-    """What does not fit is refused where it is asked for, and the worker goes on."""
+    """A larger allocation fails in the worker, which continues."""
     monkeypatch.setattr('ou_monitor.fleet.workers.usable_memory', lambda: 2 << 30)
     with LocalWorkers(2) as pool:
         done = {k: result for k, result, _ in pool.each(fill, [(1 << 20,), (3 << 29,), (9,)])}
@@ -170,7 +170,7 @@ def test_bags_are_found_as_bags(tmp_path):
 
 
 def test_logs_are_read_as_analyze_reads_them(tmp_path, monkeypatch):
-    """Told by their first bytes, whatever their name; what cannot be read costs its own row."""
+    """They are recognised by their first bytes; an unreadable log costs only its own row."""
     monkeypatch.syspath_prepend(str(ROOT / 'test/recordings/importers'))
     from made_logs import crazyflie, hover
     events, records, _ = hover(3000, refresh=5)
@@ -259,8 +259,8 @@ def paths(*names: str) -> dict[Path, str]:
     return {Path(name): '' for name in names}
 
 
-def test_vehicle_rules():
-    """Metadata, then the pattern, then the folder, with more of its path where two share it."""
+def test_a_vehicle_is_named_by_metadata_pattern_or_folder():
+    """In this order; folders with equal names get more of their paths."""
     found, notes = assign({**paths('/f/uav1/a.csv', '/x/logs/a.csv', '/y/logs/a.csv'),
                            Path('/z/b.mcap'): 'SN42'})
     assert [v.name for v in found.values()] == ['uav1', 'x/logs', 'y/logs', 'SN42']
@@ -285,7 +285,7 @@ def test_ambiguous_vehicles_are_not_pooled():
 
 
 def test_flights_are_in_order_of_date_or_else_of_name():
-    """A date that is missing or there twice makes it the order of the names, and is told."""
+    """If a date is missing or occurs twice, the order is by name, with a note."""
     nan = float('nan')
     names = [Path(f'/u/flight_{k}.csv') for k in (10, 9, 1)]
     vehicles, _ = assign(dict.fromkeys(names, ''))

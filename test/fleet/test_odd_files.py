@@ -1,4 +1,4 @@
-"""What is no recording by the name of one: a row each, and nothing hangs or ends the others."""
+"""Files that only have the name of a recording: one row each, and the others are analysed."""
 
 import os
 from pathlib import Path
@@ -42,8 +42,8 @@ def odd(tmp_path):
     return folder
 
 
-def test_a_row_each(odd, tmp_path, one_process):
-    """The flight is analysed; every other has a row that says what it is."""
+def test_each_failure_is_one_row(odd, tmp_path, one_process):
+    """The flight is analysed; every other file has a row with the reason."""
     began = time.monotonic()
     found = find_recordings([str(odd)])
     assert duplicates(found.sources) == {}
@@ -61,7 +61,7 @@ def test_a_row_each(odd, tmp_path, one_process):
     assert all(note.isprintable() for note in fleet.notes)
 
 
-def test_folders_in_folders_without_end(odd):
+def test_very_deep_folders_are_not_searched(odd):
     """Hundreds of levels are not searched, and what lies beside them is."""
     before = len(find_recordings([str(odd)]).sources)
     # Not more: Python 3.12's rmtree, with which pytest clears up, recurses once a level.
@@ -75,8 +75,8 @@ def test_folders_in_folders_without_end(odd):
     assert len(found.sources) == before and 'more than 50 deep' in ' '.join(found.notes)
 
 
-def test_a_folder_that_may_be_listed_and_not_entered(odd, monkeypatch):
-    """What the system refuses about one folder is no end of the search."""
+def test_a_folder_without_permission_to_enter_is_noted(odd, monkeypatch):
+    """The search continues, and a note reports the folder."""
     is_file = Path.is_file
 
     def refuse(self):
@@ -89,8 +89,8 @@ def test_a_folder_that_may_be_listed_and_not_entered(odd, monkeypatch):
 
 @pytest.mark.parametrize('content', [
     None, '[' * 100_000, '{}', '[]', '"x"', '{"error": 0}', '1' * 9999])
-def test_results_that_are_none(odd, tmp_path, content):
-    """A part of an earlier run that is a FIFO, or none of ours, is made again."""
+def test_invalid_saved_results_are_computed_again(odd, tmp_path, content):
+    """A saved result that is a FIFO or foreign is computed again."""
     (source,) = find_recordings([str(odd / 'flight.csv')]).sources
     parts = Parts(tmp_path / 'out', {})
     parts.save(source, {'error': '', 'levels': []})
@@ -104,7 +104,7 @@ def test_results_that_are_none(odd, tmp_path, content):
 
 
 @pytest.mark.parametrize('text', ['(' * 900, 'a{99999999999999999999}', '*'])
-def test_a_pattern_that_is_none(text):
+def test_an_invalid_pattern_is_refused(text):
     """Too deep, too large: one line."""
     with pytest.raises(InputError, match='--vehicle-from') as caught:
         read_pattern(text)
@@ -112,7 +112,7 @@ def test_a_pattern_that_is_none(text):
 
 
 def test_the_vehicle_that_a_pattern_finds():
-    """The group `vehicle`, else the first one; what is no text is escaped."""
+    """The group `vehicle`, else the first one; bytes that are not text are escaped."""
     path = Path('/f/uav7_\x1b\udcff.csv')
     for text, name in ((r'/(uav\d+)_(.)', 'uav7'), (r'uav\d', 'uav7'), ('none', ''),
                        (r'_(?P<vehicle>..)', '\\x1b\\udcff')):

@@ -23,7 +23,7 @@ def rows(reader, topics=None):
 
 
 def write_two(path, n=2000):
-    """Write a fast and a slow topic; return what was written, in time order."""
+    """Write a fast and a slow topic; return the messages in time order."""
     expected = []
     with BagWriter(path) as bag:
         bag.add_topic('voltage', FLOAT32)
@@ -41,8 +41,8 @@ def write_two(path, n=2000):
 
 
 @pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
-def test_round_trip(tmp_path, name):
-    """Every message comes back, in the order of log times, by topic if asked."""
+def test_a_written_bag_reads_back(tmp_path, name):
+    """Every message is read back, in the order of log times, by topic on request."""
     expected = write_two(tmp_path / name)
     reader = BagReader(tmp_path / name)
     assert reader.topics == {'/voltage': FLOAT32, '/throttle': FLOAT32}
@@ -56,8 +56,8 @@ def test_round_trip(tmp_path, name):
     assert rows(BagReader(tmp_path / name, partial=True)) == expected
 
 
-def test_rosbags_reads_it(tmp_path):
-    """The independent library sees the same messages, types, times and QoS."""
+def test_rosbags_reads_a_written_bag(tmp_path):
+    """The independent library reads the same messages, types, times and QoS."""
     expected = write_two(tmp_path / 'bag')
     with AnyReader([tmp_path / 'bag']) as reader:
         found = [(c.topic, c.msgtype, t, bytes(data)) for c, t, data in reader.messages()]
@@ -149,7 +149,7 @@ def test_topics_that_are_not_ros2(tmp_path):
 
 
 def test_the_writer_refuses(tmp_path):
-    """What exists is not touched; what cannot be written is said in one line."""
+    """Existing files are not touched; an error is one line."""
     existing = tmp_path / 'there.mcap'
     existing.write_text('mine')
     with pytest.raises(InputError, match='exists already'):
@@ -166,8 +166,8 @@ def test_the_writer_refuses(tmp_path):
 
 
 @pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
-def test_a_failed_write_leaves_nothing(tmp_path, name):
-    """Half a bag would be taken for a whole one by the next reader."""
+def test_a_failed_write_removes_the_bag(tmp_path, name):
+    """The next reader would take half a bag for a whole one."""
     with pytest.raises(RuntimeError, match='power'):
         with BagWriter(tmp_path / name) as bag:
             bag.add_topic('u', FLOAT32)
@@ -187,7 +187,7 @@ def test_a_full_disk_is_one_line(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_writers_caller_errs(tmp_path):
+def test_an_error_in_the_block_removes_the_bag(tmp_path):
     """Bugs of the caller are not the user's."""
     with BagWriter(tmp_path / 'bag.mcap') as bag:
         bag.add_topic('u', FLOAT32)

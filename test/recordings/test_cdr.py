@@ -254,7 +254,7 @@ BATTERY = FieldSpec('/v', cdr.BATTERY_STATE, 'voltage', stamp_field='header.stam
 
 
 def read_all(spec, messages, times=None, text=None):
-    """Return the column, and the log times and reasons of what was left out."""
+    """Return the column, and log times and reasons of the messages left out."""
     broken = []
     reader = reader_of(spec, text or SCHEMAS[spec.type], lambda *why: broken.append(why))
     return reader.read(table_of(messages, times)), broken
@@ -280,14 +280,14 @@ def test_frames_of_any_length(frames):
 @pytest.mark.parametrize('stamp, counts', [((5, 7), True), ((0, 0), False), ((0, 1), True),
                                            ((-1, 10**9), False)])
 def test_stamps_and_their_absence(stamp, counts):
-    """A zero stamp is none: the log time counts."""
+    """A zero stamp is missing: the log time is used."""
     column, _ = read_all(BATTERY, [battery('', 5.0, stamp=stamp)], [3 * 10**9])
     assert column.stamp[0] == (stamp[0] + 1e-9 * stamp[1] if counts else 3.0)
     assert column.stamped.tolist() == [counts]
 
 
-def test_unusual_messages():
-    """Big endian is read; XCDR2, no text, cut off are left out with the reason, in order."""
+def test_big_endian_is_read_and_bad_messages_are_left_out():
+    """XCDR2, invalid text and truncated messages are left out with a reason, in order."""
     good = cdr.encode_scalars(cdr.FLOAT32, [1.0, 2.0, 4.0])
     big = b'\0\0\0\0' + np.array([8.0], '>f4').tobytes()
     xcdr2 = b'\0\x07' + good[0][2:]
@@ -317,8 +317,8 @@ def test_blocks_of_any_layout_and_length(labels):
     assert column.values.tolist() == [0, 1, 2, 2, 3, 4, 3, 4, 5, 6, 7, 4, 5, 6, 7, 8, 5]
 
 
-def test_in_time_order_keeps_what_belongs_together():
-    """Blocks move as a whole; those of one time stay as they are."""
+def test_time_order_keeps_the_fields_of_a_message_together():
+    """Blocks move as a whole; blocks of equal time keep their order."""
     messages = [encode_block([float(k)] * n) for k, n in enumerate((2, 1, 3, 0, 2))]
     spec = FieldSpec('/v', cdr.FLOAT32_ARRAY, 'data', sample_rate=10.0)
     column = read_all(spec, messages, [30, 10, 10, 5, 20])[0].in_time_order()
@@ -330,7 +330,7 @@ def test_in_time_order_keeps_what_belongs_together():
 
 
 def test_log_times_of_any_size():
-    """The largest log time that a bag can hold is no overflow."""
+    """The largest log time that a bag can hold does not overflow."""
     assert seconds(np.array([0, 1, 2**64 - 1], np.uint64)).tolist() == [
         0.0, 1e-9, 18446744073 + 0.709551615]
 
@@ -375,7 +375,7 @@ def test_units_and_stamps():
     assert column.stamp.tolist() == [12.25] * 3
 
 
-def test_a_signalling_nan_is_a_nan():
+def test_a_signalling_nan_gives_no_warning():
     """Of which NumPy warns where it is scaled or widened, and a warning is an error here."""
     spec = FieldSpec('x', KIND, 'x', unit_factor=0.1)
     column, _ = read_all(spec, [bytes.fromhex('000100000100807f')], text='float32 x\n')

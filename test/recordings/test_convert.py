@@ -25,8 +25,8 @@ def log(tmp_path):
 
 @pytest.mark.parametrize('name', ['out', 'out.mcap'])
 @pytest.mark.parametrize('kind', ['battery_state', 'float32', 'float64'])
-def test_convert(log, tmp_path, capsys, name, kind):
-    """The bag reads back, and what was mended is said."""
+def test_a_converted_log_reads_back(log, tmp_path, capsys, name, kind):
+    """The bag reads back, and repairs are reported."""
     out = tmp_path / name
     assert main(['convert', str(log), str(out), '--type', kind]) == 0
     text = ' '.join(capsys.readouterr().out.split())
@@ -37,8 +37,8 @@ def test_convert(log, tmp_path, capsys, name, kind):
     np.testing.assert_allclose(back.throttle, [0.1, 0.1, 0.3], rtol=1e-7)
 
 
-def test_json(log, tmp_path, capsys):
-    """To standard output, and nothing else there; to a file."""
+def test_json_goes_to_standard_output_or_a_file(log, tmp_path, capsys):
+    """With `-` standard output has nothing else."""
     assert main(['convert', str(log), str(tmp_path / 'a'), '--json', '-']) == 0
     content = json.loads(capsys.readouterr().out)
     assert content['n'] == 3
@@ -79,7 +79,7 @@ def test_json(log, tmp_path, capsys):
      ['throttle runs from 400 to 500', 'percentage']),
     ('time_s,bus\n0,5\n1,5\n', ['log.csv', 'out'], ["no column 'voltage_v'", '--voltage']),
 ])
-def test_bad_input(tmp_path, monkeypatch, capsys, log_text, arguments, words):
+def test_bad_input_exits_with_2(tmp_path, monkeypatch, capsys, log_text, arguments, words):
     """Exit status 2, one line on standard error, no bag."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'there').mkdir()
@@ -109,8 +109,8 @@ def test_file_name_of_invalid_text(tmp_path, capsys):
         assert source['log_file'] == '\\udcff.csv'
 
 
-def test_blocks(tmp_path):
-    """A steady 10 kHz goes into blocks, the last of which may be shorter."""
+def test_10_khz_is_written_in_blocks(tmp_path):
+    """A steady 10 kHz is written in blocks; the last block may be shorter."""
     path = tmp_path / 'a.csv'
     rows = ''.join(f'{k * 1e-4:.4f},{5 + k % 7 / 8},{k % 3 / 4}\n' for k in range(250))
     path.write_text('time_s,voltage_v,throttle\n' + rows)

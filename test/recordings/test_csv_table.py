@@ -23,7 +23,7 @@ def written(tmp_path, text, encoding='utf-8'):
     'time_s,voltage_v,throttle,note\n0,5.0,0.1,"two\nlines"\n1,5.5,0.2,x\n',
     'time_s,voltage_v,throttle\n0,5.0,0.1,\n1,5.5,0.2,, \n',
 ])
-def test_good_ones(tmp_path, text):
+def test_valid_csv_variants_are_read(tmp_path, text):
     """Delimiters, order, extra columns, comments, blank lines and quotes."""
     raw = read_csv(written(tmp_path, text))
     t, voltage, throttle = raw.t, raw.voltage, raw.throttle
@@ -33,7 +33,7 @@ def test_good_ones(tmp_path, text):
     assert t.dtype == voltage.dtype == throttle.dtype == np.float64
 
 
-def test_without_throttle(tmp_path):
+def test_missing_throttle_is_unknown(tmp_path):
     """Unknown, not zero."""
     recording = read_recording(written(tmp_path, 'time_s,voltage_v\n0,5\n1,5.5\n'))
     assert not recording.has_throttle
@@ -63,8 +63,8 @@ def test_without_throttle(tmp_path):
     ('time_s,voltage_v\n', ['no usable sample']),
     ('time_s,voltage_v\n0,nan\nnan,5\n', ['no usable sample', '2 samples', 'finite']),
 ])
-def test_bad_ones(tmp_path, text, words):
-    """One line with the place."""
+def test_a_malformed_csv_is_refused_with_the_place(tmp_path, text, words):
+    """The error is one line with the place."""
     path = written(tmp_path, text)
     with pytest.raises(InputError) as caught:
         read_recording(path)
@@ -75,7 +75,7 @@ def test_bad_ones(tmp_path, text, words):
         assert word in found
 
 
-def test_not_text(tmp_path):
+def test_a_binary_file_named_csv_is_refused(tmp_path):
     """A binary file by the name of a CSV."""
     path = tmp_path / 'log.csv'
     path.write_bytes(bytes(range(256)))
@@ -100,13 +100,13 @@ def test_repairs_are_noted(tmp_path):
     assert recording.notes[2].startswith('1 sample dropped: repeated stamp')
 
 
-def test_one_sample(tmp_path):
-    """It is a recording; what can be said about it is not decided here."""
+def test_a_single_sample_is_a_recording(tmp_path):
+    """The reader does not judge whether it is enough."""
     recording = read_recording(written(tmp_path, 'time_s,voltage_v\n3,5\n'))
     assert (recording.n, recording.duration) == (1, 0.0)
 
 
-def test_options_of_bags(tmp_path):
+def test_options_of_bags_are_refused_for_a_csv(tmp_path):
     """A CSV has no topics."""
     path = written(tmp_path, 'time_s,voltage_v\n3,5\n')
     with pytest.raises(InputError, match='--msg-config is for bags'):

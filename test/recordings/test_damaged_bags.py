@@ -49,7 +49,7 @@ def at_time(ns):
 
 
 def check_cut(path, data, cut):
-    """Cut a file: what was whole before the cut is read, and the byte and the time reported."""
+    """Cut a file: everything complete before the cut is read, and byte and time are reported."""
     path.write_bytes(data[:cut])
     whole = [r for r in records(data) if r[1] <= cut]
     left = sum(r[2] for r in whole)
@@ -269,7 +269,7 @@ def complaint(path, **options):
     return line
 
 
-def test_nothing_there(tmp_path):
+def test_missing_and_empty_paths_are_refused(tmp_path):
     """A missing file, an empty file and an empty folder."""
     assert 'there is no bag' in complaint(tmp_path / 'no.mcap')
     (tmp_path / 'empty.mcap').touch()
@@ -295,8 +295,8 @@ def test_nothing_there(tmp_path):
     (bytes(range(128, 192)), '80 81 82'),
     (MAGIC[:5], 'not an MCAP file'),
 ])
-def test_foreign_files(tmp_path, content, words):
-    """What it seems to be, and what to do; --partial makes no difference."""
+def test_foreign_files_are_refused_with_their_likely_kind(tmp_path, content, words):
+    """The error says what to do; --partial makes no difference."""
     path = tmp_path / 'foreign.mcap'
     path.write_bytes(content)
     for partial in (False, True):
@@ -339,7 +339,7 @@ def test_a_recording_that_was_cut_off_has_no_metadata(folder):
     ({'relative_file_paths': []}, 'relative_file_paths'),
     ({'relative_file_paths': 'x'}, 'relative_file_paths')])
 def test_mismatched_metadata_is_refused(folder, change, words):
-    """What is wrong in metadata.yaml is named."""
+    """The error names the defect in metadata.yaml."""
     content = yaml.safe_load((folder / 'metadata.yaml').read_text())
     content['rosbag2_bagfile_information'] |= change
     (folder / 'metadata.yaml').write_text(yaml.safe_dump(content))
@@ -354,7 +354,7 @@ def test_wrong_metadata_is_refused(folder, text):
 
 
 def test_file_without_permission_is_refused(tmp_path, monkeypatch):
-    """The reason is that of the system, in one line."""
+    """The error is the operating system's reason, in one line."""
     path = write(tmp_path / 'bag.mcap', ROWS)
 
     def refuse(*_, **__):

@@ -21,8 +21,8 @@ REAL = os.environ.get('OU_MONITOR_REALDATA')
 @pytest.mark.parametrize('file,package,voltage', [
     ('bf_3s_erpm2.bbl', 'orangebox', None), ('ac_erle_althold2.BIN', 'pymavlink', None),
     ('px_sample_log_small.ulg', 'pyulog', 'battery_status[1].voltage_v')])
-def test_a_log_is_what_its_bag_would_be(file, package, voltage, tmp_path):
-    """Samples, throttle, and the notes of the conversion; the name is that of the log."""
+def test_a_log_equals_its_converted_bag(file, package, voltage, tmp_path):
+    """Equal samples, throttle and notes; the name is the log's."""
     pytest.importorskip(package)
     log = Path(REAL) / 'raw' / file
     assert main(['convert', str(log), str(tmp_path / 'bag'),
@@ -75,7 +75,7 @@ def test_one_flight_as_log_csv_and_bag_is_one_recording(file, rate, tmp_path):
 
 
 @pytest.mark.skipif(REAL is None, reason='OU_MONITOR_REALDATA names no folder of recordings')
-def test_a_csv_refreshed_slower_than_logged_has_the_rate_of_its_readings():
+def test_repeats_in_a_csv_do_not_raise_its_rate():
     """A Crazyflie logged at 500 Hz reads its battery at 100 Hz."""
     found = read_recording(Path(REAL) / 'cf_bl00.csv')
     assert found.n == 924 and found.held == 3710

@@ -1,4 +1,4 @@
-"""Bags made to harm: what they claim is checked before anything is taken or believed."""
+"""Hostile bags: every stated size is checked before it is used."""
 
 import os
 import resource
@@ -52,7 +52,7 @@ def lz4_bomb():
 
 
 def test_a_file_made_by_hand_is_read(tmp_path):
-    """The others are refused for what is wrong with them."""
+    """The following tests change one thing in it each, and expect that error."""
     path = by_hand(tmp_path / 'a.mcap', chunk(schema() + channel() + messages(N)))
     assert read_recording(path).n == N
 
@@ -63,7 +63,7 @@ def test_a_file_made_by_hand_is_read(tmp_path):
 ], ids=['zstd', 'zstd, size stated', 'lz4', 'lz4 without end'])
 @pytest.mark.parametrize('stated', [N, 2 * GB])
 def test_a_chunk_that_unpacks_to_more(tmp_path, compression, packed, stated):
-    """Neither what is stated nor what is real is believed; memory stays where it was."""
+    """Neither a stated nor an actual size beyond the limit is unpacked; memory does not grow."""
     path = by_hand(tmp_path / 'a.mcap', schema(), channel(), messages(N), chunk(
         b'', compression=compression, packed=packed(), stated=stated))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -114,7 +114,7 @@ LIES = {
 @pytest.mark.parametrize('lie', LIES)
 @pytest.mark.parametrize('times', [1, 50])
 def test_false_index_is_refused(tmp_path, lie, times):
-    """What it says is read as the walk finds it, or refused; nothing is read twice."""
+    """A false index is replaced by the walk, or refused; nothing is read twice."""
     one = chunk(schema() + channel() + messages(N))
     at = len(MAGIC) + len(record(Op.HEADER, text('ros2'), text('')))
     place = {'chunk_at': at, 'chunk_length': len(one), 'unpacked': len(one) - 9 - 40,
@@ -335,7 +335,7 @@ def test_much_of_it_takes_no_time(tmp_path, junk):
 
 
 def test_a_channel_many_times(tmp_path):
-    """All 65 535 numbers are of one topic: a chunk costs what is in it."""
+    """All 65 535 numbers are of one topic: reading a chunk costs no more than its content."""
     many = b''.join(channel('/voltage', k) for k in range(1, 65536))
     path = by_hand(tmp_path / 'a.mcap', chunk(schema() + many), *[chunk(messages(N))] * 50)
     began = time.process_time()
@@ -391,7 +391,7 @@ def test_columns_without_end_are_listed_in_part(tmp_path):
 
 
 def test_names_in_a_csv_do_not_reach_the_terminal(tmp_path):
-    """In errors, in the list of columns, and in what is said of one that holds text."""
+    """In errors, in the list of columns, and in the error about a column of text."""
     path = tmp_path / 'a.csv'
     path.write_text('time_s,voltage_v,a\x9b2J,b\u202e\n0,5,1,x\n1,5,1,x\n')
     log = import_log(path, Request(everything=True))

@@ -31,8 +31,8 @@ def failure(data, where='m.yaml'):
     return text
 
 
-def test_round_trip(tmp_path):
-    """Every digit of parameters, errors and provenance, through a file."""
+def test_a_model_file_reads_back_exactly(tmp_path):
+    """Every digit of parameters, errors and provenance survives."""
     rng = np.random.default_rng(1)
     third, tiny = 1.0 / 3.0, 1.234567890123456e-17
     supply = model(('ou', {'alpha': 63.0 + third, 'sigma': tiny, 'u0': -5.0}),
@@ -78,8 +78,8 @@ def test_the_text_is_that_of_the_contract():
     assert yaml.safe_load(as_yaml(ModelFile(file.model))) == {'model': [OU, SAG]}
 
 
-def test_standard_errors():
-    """Not known is null in the file and NaN when read; whole numbers are numbers."""
+def test_unknown_standard_errors_are_null():
+    """Unknown errors are null in the file and NaN when read; whole numbers are valid."""
     file = parse_model({'model': [{**OU, 'se': {'alpha': None, 'u0': 1}},
                                   {**KNOTS, 'se': {'log_factor': [None, 0.5]}}]}, 'x')
     assert math.isnan(file.se[0]['alpha']) and file.se[0]['u0'] == 1.0
@@ -98,7 +98,7 @@ def test_standard_errors():
     ({**OU, 'se': {'alpha': math.inf}}, ['standard error of ou.alpha', 'inf']),
 ])
 def test_bad_standard_errors(entry, words):
-    """One line with the file, the term and what is wrong."""
+    """One line with the file, the term and the error."""
     text = failure({'model': [entry]})
     assert 'term 1' in text and all(word in text for word in words), text
 
@@ -139,8 +139,8 @@ def test_numbers_with_an_exponent_need_no_point(tmp_path):
     ({'term': 'load_dependent_sigma', 'params': {'throttle': 0.1, 'log_factor': [0.0]}},
      ['load_dependent_sigma.throttle', 'list']),
 ])
-def test_bad_terms(entry, words):
-    """File, which of the terms, its name, the parameter, and the nearest valid word."""
+def test_a_wrong_term_is_named_with_the_nearest_word(entry, words):
+    """The error names file, place and name of the term, parameter, and the nearest valid word."""
     text = failure({'model': [OU, entry]})
     assert 'term 2' in text and all(word in text for word in words), text
 
@@ -157,8 +157,8 @@ def test_bad_terms(entry, words):
     ({'model': [OU], 'provenance': ['x']}, "'provenance'"),
     ({'model': [OU], 'provenance': 'x'}, "'provenance'"),
 ])
-def test_bad_files(data, words):
-    """Also what is missing, misspelt, out of order or there twice."""
+def test_a_malformed_model_file_is_refused(data, words):
+    """Keys that are missing, misspelt, out of order or repeated are refused too."""
     assert words in failure(data)
 
 

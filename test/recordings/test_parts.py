@@ -76,8 +76,8 @@ def expected(rows):
     return stamps, [samples[t] for t in stamps], held
 
 
-def test_whole(bag, rows):
-    """Every sample, sorted by stamp, each stamp once; the last throttle held."""
+def test_a_whole_bag_is_sorted_with_throttle_held(bag, rows):
+    """Every sample, sorted by stamp, each stamp once, with the last throttle."""
     recording = read_recording(bag)
     stamps, voltage, throttle = expected(rows)
     np.testing.assert_allclose(recording.t - START * 1e-9, (np.array(stamps) - START) * 1e-9,
@@ -106,8 +106,8 @@ def test_every_way_of_writing(bag, rows, tmp_path, compression, options):
         assert other.notes == whole.notes
 
 
-def test_several_files(bag, rows, tmp_path):
-    """A rosbag2 directory of several files that overlap in time is one recording."""
+def test_overlapping_files_of_a_bag_are_one_recording(bag, rows, tmp_path):
+    """A rosbag2 directory with files that overlap in time."""
     folder = tmp_path / 'bag'
     folder.mkdir()
     parts = [rows[:1000], rows[1000:2500], rows[2500:]]
@@ -122,7 +122,7 @@ def test_several_files(bag, rows, tmp_path):
 @pytest.mark.parametrize('stamped', [True, False])
 @pytest.mark.parametrize('start, end', [(0.0, 0.5), (0.5, 1.0), (1.0, None), (2.9, 99.0),
                                         (0.001, 0.004)])
-def test_a_part_is_that_part_of_the_whole(tmp_path, start, end, stamped):
+def test_a_part_equals_that_part_of_the_whole(tmp_path, start, end, stamped):
     """By log time; the throttle of before is held."""
     rows = flight(stamped=stamped)
     path = write(tmp_path / 'bag.mcap', rows)
@@ -159,7 +159,7 @@ def test_empty_parts_are_refused(bag, start, end, words):
         read_recording(bag, start=start, end=end)
 
 
-def test_csv(tmp_path):
+def test_a_part_of_a_csv_is_read(tmp_path):
     """A CSV is read in part, too."""
     path = tmp_path / 'log.csv'
     path.write_text('time_s,voltage_v\n' + ''.join(f'{5 + k},{k}\n' for k in range(10)))
@@ -179,7 +179,7 @@ def test_progress_ends_at_one(bag, monkeypatch):
 
 
 def test_fewer_messages_than_stated(bag, tmp_path):
-    """A summary without its checksum that misses messages is not believed."""
+    """A summary without a checksum that counts too few messages is not used."""
     path = tmp_path / 'bag.mcap'
     data = bytearray(bag.read_bytes())
     start = int.from_bytes(data[-28:-20], 'little')

@@ -1,4 +1,4 @@
-"""Bags -> Recording: which topics, which stamps, what was mended."""
+"""Bags -> Recording: topics, stamps and repairs."""
 
 import tracemalloc
 
@@ -82,14 +82,14 @@ def with_metadata(path, name, content):
     ('rosbag2', {'serialized_metadata': 'custom_data: vehicle'}, None),
     ('rosbag2', {}, None), ('other', {'vehicle': 'uav7'}, None)])
 def test_the_vehicle_of_a_bag(tmp_path, name, content, vehicle, partial):
-    """The metadata of a bag tell it; those of programs not known do not."""
+    """It comes from the metadata of the bag, unless an unknown program wrote them."""
     found = read_recording(with_metadata(tmp_path / 'a.mcap', name, content), partial=partial)
     assert found.source.get('vehicle') == vehicle and found.notes == ()
     assert found.source['file'] == 'a.mcap' and 'pilot' not in found.source
 
 
 def test_unreadable_metadata_is_ignored_or_refused(tmp_path):
-    """The messages are read all the same, and a note says what is not known."""
+    """The messages are still read, and a note says what is unknown."""
     path = with_metadata(tmp_path / 'a.mcap', 'ou_monitor', {'vehicle': 'uav7'})
     content = path.read_bytes()
     path.write_bytes(content.replace(b'uav7', b'uav\xff', 1))
@@ -101,7 +101,7 @@ def test_unreadable_metadata_is_ignored_or_refused(tmp_path):
 
 
 @pytest.mark.parametrize('kind, config', [(FLOAT32, 'std_float32'), (FLOAT64, 'std_float64')])
-def test_scalars(tmp_path, kind, config):
+def test_scalar_topics_are_stamped_by_log_time(tmp_path, kind, config):
     """The log time is the stamp; the throttle is the last at or before it."""
     path = make(tmp_path / 'bag.mcap', ('voltage', kind, scalars([5.0, 5.5, 4.5], kind)),
                 ('throttle', FLOAT32, scalars([0.25, 0.75], start=2 * MS)))
@@ -115,8 +115,8 @@ def test_scalars(tmp_path, kind, config):
     assert recording.notes == ()
 
 
-def test_header_stamps(tmp_path):
-    """The header's stamp is the stamp; a zero one is none, and the log time counts."""
+def test_header_stamps_are_used_unless_zero(tmp_path):
+    """A zero stamp is missing, and the log time is used."""
     path = make(tmp_path / 'bag.mcap', (
         'voltage', BATTERY_STATE, battery([100 * MS, 101 * MS, 0], [5.0, 5.1, 5.2], 200 * MS)))
     recording = read_recording(path)
@@ -125,7 +125,7 @@ def test_header_stamps(tmp_path):
     assert 'throttle is unknown' in recording.notes[0]
 
 
-def test_blocks(tmp_path):
+def test_samples_of_a_block_end_at_its_stamp(tmp_path):
     """Samples are spread over the time before the stamp of their block; NaN keeps its place."""
     blocks = [[5.0] * 100, [5.0] * 99 + [np.nan], [4.0] * 100]
     path = make(tmp_path / 'bag.mcap', ('voltage', FLOAT32_ARRAY, [
@@ -160,8 +160,8 @@ def px4(tmp_path, version=''):
 
 
 @pytest.mark.parametrize('version, config', [('_v1', 'px4'), ('', 'px4_1_16')])
-def test_px4(tmp_path, version, config):
-    """A type nobody has installed here is read by the definition in the bag."""
+def test_a_type_that_is_not_installed_is_read(tmp_path, version, config):
+    """The definition in the bag is enough."""
     recording = read_recording(px4(tmp_path, version))
     assert recording.source['msg_config'] == config
     np.testing.assert_allclose(recording.t, [1e-3, 2e-3, 3e-3], rtol=0, atol=1e-12)
@@ -193,8 +193,8 @@ def test_by_type_alone(tmp_path):
     assert 'no topic looks like a supply voltage' in complaint(path)
 
 
-def test_several_choices(tmp_path):
-    """The bag leaves two configs: they are listed, and one is taken when named."""
+def test_two_fitting_configs_need_a_choice(tmp_path):
+    """Both are listed; one is used when named."""
     path = make(tmp_path / 'bag.mcap', ('/voltage', FLOAT32, scalars([5.0])),
                 ('/mavros/battery', BATTERY_STATE, battery([MS], [12.0])))
     text = complaint(path)
@@ -205,7 +205,7 @@ def test_several_choices(tmp_path):
 
 
 def test_missing_topics_are_refused(tmp_path):
-    """What there is is listed; a misspelt topic gets the nearest."""
+    """The existing topics are listed; for a misspelt topic the nearest is suggested."""
     path = make(tmp_path / 'bag.mcap', ('/camera', STRING, [(MS, {'data': 'x'})]))
     text = complaint(path)
     assert 'no topic looks like' in text and '/camera (std_msgs/msg/String)' in text
@@ -216,8 +216,8 @@ def test_missing_topics_are_refused(tmp_path):
     assert "no msg config 'px5'" in complaint(path, msg_config='px5')
 
 
-def test_wrong_types(tmp_path):
-    """The type in the bag and the type expected are both named."""
+def test_an_unexpected_type_is_refused(tmp_path):
+    """The error names the type in the bag and the expected one."""
     path = make(tmp_path / 'bag.mcap', ('/voltage', STRING, [(MS, {'data': '5 V'})]))
     assert '/voltage (std_msgs/msg/String)' in complaint(path)
     text = complaint(path, msg_config='std_float32')
@@ -236,7 +236,7 @@ def test_throttle_by_name(tmp_path):
     assert STRING in complaint(path, throttle_topic='/name')
 
 
-def test_a_config_of_ones_own(tmp_path):
+def test_an_own_config_is_read(tmp_path):
     """A YAML file by its path: unit, sign, offset and a nested field."""
     kind = 'my_msgs/msg/Pack'
     TEXT[kind] = 'Cell[] cells\n' + 80 * '=' + '\nMSG: my_msgs/Cell\nint32 mv\n'
@@ -277,7 +277,7 @@ def test_repairs_are_noted(tmp_path, kind):
     assert (np.diff(recording.t) > 0).all()
 
 
-def test_no_sample_and_one(tmp_path):
+def test_a_bag_with_no_sample_is_refused_and_one_is_enough(tmp_path):
     """None usable is refused, one is a recording."""
     path = make(tmp_path / 'nan.mcap', ('voltage', FLOAT32, scalars([np.nan, np.inf])))
     assert 'no usable sample: 2 samples dropped' in complaint(path)
@@ -296,7 +296,7 @@ def test_throttle_of_nan_is_unknown(tmp_path):
     assert '1 throttle value dropped' in recording.notes[0]
 
 
-def test_epochs_are_kept_to_what_a_float_holds(tmp_path):
+def test_stamps_since_1970_keep_float64_resolution(tmp_path):
     """Seconds since 1970 in float64: 0.24 us, and no more is lost."""
     stamps = 1_704_067_200_000_000_000 + np.arange(1000, dtype=np.int64) * 100_000
     path = make(tmp_path / 'bag.mcap', (
@@ -351,7 +351,7 @@ def test_backward_clock_is_noted_with_its_step(tmp_path, kind):
     assert 'went back once, by 0.0385 s at most: 39 samples' in note and recording.n == 200
 
 
-def test_another_topic_that_would_fit_is_named(tmp_path):
+def test_a_second_fitting_topic_is_noted(tmp_path):
     path = make(tmp_path / 'a.mcap', ('/voltage', FLOAT32, scalars([5.0])),
                 ('/bec/voltage', FLOAT32, scalars([6.0])))
     recording = read_recording(path)

@@ -21,8 +21,8 @@ def test_schemas_are_those_of_jazzy(kind):
 
 
 @pytest.mark.parametrize('kind', [cdr.FLOAT32, cdr.FLOAT64])
-def test_scalars(kind):
-    """Bytes are those of the independent encoder, and come back."""
+def test_scalars_equal_an_independent_encoder(kind):
+    """The bytes are equal, and decode to the same values."""
     messages = cdr.encode_scalars(kind, VOLTS)
     for data, volts in zip(messages, VOLTS, strict=True):
         theirs = STORE.deserialize_cdr(data, kind)
@@ -31,8 +31,8 @@ def test_scalars(kind):
         assert decode(kind, data).data == volts
 
 
-def test_battery():
-    """Every field: stamp, voltage, and all the rest not measured."""
+def test_unmeasured_battery_fields_are_unknown():
+    """Stamp and voltage are set; every other field says "not measured"."""
     messages = cdr.encode_battery(STAMPS, VOLTS)
     for data, ns, volts in zip(messages, STAMPS.tolist(), VOLTS, strict=True):
         theirs = STORE.deserialize_cdr(data, cdr.BATTERY_STATE)
@@ -48,8 +48,8 @@ def test_battery():
 
 
 @pytest.mark.parametrize('n', [0, 1, 100])
-def test_block(n):
-    """Samples and layout as the independent decoder sees them."""
+def test_an_independent_decoder_reads_blocks(n):
+    """Samples and layout are equal."""
     samples = np.linspace(4.0, 5.0, n).astype(np.float32)
     data = encode_block(samples)
     theirs = STORE.deserialize_cdr(data, cdr.FLOAT32_ARRAY)
@@ -59,8 +59,8 @@ def test_block(n):
 
 
 @pytest.mark.parametrize('absent', [None, 'angular_velocity', 'linear_acceleration'])
-def test_imu(absent):
-    """In base_link, -1 for what is not measured, 0 for a covariance not known."""
+def test_imu_covariances_say_unmeasured_or_unknown(absent):
+    """In base_link; -1 means not measured, 0 an unknown covariance."""
     values = {'angular_velocity': np.arange(9.0).reshape(3, 3),
               'linear_acceleration': -np.arange(9.0).reshape(3, 3)}
     messages = cdr.encode_imu(STAMPS, {name: rows for name, rows in values.items()
@@ -81,8 +81,8 @@ def test_imu(absent):
 
 
 @pytest.mark.parametrize('names', [('motor_0',), ('motor_0', 'b', 'motor_10'), ('',)])
-def test_joints(names):
-    """Names of any length before the velocities; no positions, no efforts."""
+def test_joint_names_of_any_length_precede_velocities(names):
+    """No positions, no efforts."""
     speeds = np.arange(3.0 * len(names)).reshape(3, -1)
     for data, ns, row in zip(cdr.encode_joints(STAMPS, names, speeds), STAMPS.tolist(), speeds,
                              strict=True):

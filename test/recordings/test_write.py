@@ -22,7 +22,7 @@ def recording(n=2500, start=0.0, throttle=True):
 
 @pytest.mark.parametrize('type', sorted(TYPES))
 @pytest.mark.parametrize('start', [0.0, 100.0])
-def test_round_trip(tmp_path, type, start):  # noqa: A002
+def test_a_written_recording_reads_back(tmp_path, type, start):  # noqa: A002
     """Stamps to the ns, voltage to the resolution of the message, throttle exactly."""
     rec = recording(start=start)
     assert write_recording(rec, tmp_path / 'bag', type=type) == ()
@@ -56,7 +56,7 @@ def test_throttle_is_sent_when_it_changes_and_once_a_second(tmp_path):
     assert [m.topic for m in messages[:2]] == ['/throttle', '/voltage']
 
 
-def test_without_throttle(tmp_path):
+def test_unknown_throttle_is_not_written(tmp_path):
     """Nothing is made up."""
     write_recording(recording(throttle=False), tmp_path / 'bag')
     assert list(BagReader(tmp_path / 'bag').topics) == ['/voltage']
@@ -79,7 +79,7 @@ def test_negative_stamps_are_moved(tmp_path):
     np.testing.assert_allclose(back.t, rec.t + 2.0, rtol=0, atol=1.1e-9)
 
 
-def test_what_does_not_fit(tmp_path):
+def test_samples_that_a_bag_cannot_hold_are_refused(tmp_path):
     """One line, and nothing is left behind."""
     uneven = recording(100)
     uneven.t[50:] += 1e-3
@@ -96,7 +96,7 @@ def test_what_does_not_fit(tmp_path):
     write_recording(recording(100, start=2.0**31), tmp_path / 'late', type='float32')
 
 
-def test_progress(tmp_path):
+def test_progress_grows_to_1(tmp_path):
     """It grows from 0 towards 1."""
     shares = []
     write_recording(recording(10_000), tmp_path / 'bag', progress=shares.append)

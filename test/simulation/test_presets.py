@@ -21,7 +21,7 @@ def drawn(name, seconds, seed=1, rate=None):
                  for key in ('t', 'voltage', 'throttle'))
 
 
-def test_names():
+def test_the_presets_and_profiles_have_these_names():
     """What users can ask for."""
     assert set(PRESETS) == {'idle', 'load_05', 'load_10', 'load_40', 'transient', 'loads',
                             'flight', 'flight_full'}
@@ -31,7 +31,7 @@ def test_names():
 
 
 @pytest.mark.parametrize('name', sorted(VRMS))
-def test_stated_numbers(name):
+def test_presets_have_the_rms_of_the_paper(name):
     """
     Vrms = sigma / sqrt(2 alpha) within the last digit printed; throttle as labelled.
 
@@ -123,7 +123,7 @@ def test_flight_sags_and_is_noisy():
     assert abs(own.var() / truth - 1.0) < 4.0 * math.sqrt(3.0 / own.size)
 
 
-def test_flight_full_is_coded():
+def test_flight_full_has_adc_steps():
     """Whole steps of 10 mV, discharge of 1 mV/s."""
     _, voltage, _ = drawn('flight_full', 10.0)
     codes = voltage / 10e-3

@@ -1,4 +1,4 @@
-"""Throttle over time: names, numbers, points, CSV; and one line for what is none of them."""
+"""Throttle over time: names, numbers, points, CSV; one line for anything else."""
 
 import numpy as np
 from ou_monitor.errors import InputError
@@ -37,8 +37,8 @@ def test_the_transient_of_the_paper():
 
 
 @pytest.mark.parametrize('name', sorted(PROFILES))
-def test_named_profiles(name):
-    """Within 0..1, defined at all times, the same from one array or sample by sample."""
+def test_named_profiles_stay_within_0_and_1(name):
+    """Defined at all times, and equal from one array or sample by sample."""
     assert set(PROFILES) == {'flight', 'hover', 'loads', 'transient'}
     profile = read_profile(name)
     t = np.arange(0.0, 100.0, 0.013)
@@ -58,7 +58,7 @@ def test_the_stick_moves_fifty_times_a_second(name):
     assert changes.size > 100 and np.all(changes % 20 == 0)
 
 
-def test_flight_repeats():
+def test_the_flight_profile_repeats_every_40_s():
     """Every 40 s."""
     t = np.arange(0.0, 40.0, 0.02)
     flight = read_profile('flight')
@@ -68,14 +68,14 @@ def test_flight_repeats():
 
 @pytest.mark.parametrize('text, value', [('0', 0.0), ('1', 1.0), ('0.4', 0.4), ('4e-1', 0.4),
                                          (' 0.25 ', 0.25)])
-def test_numbers(text, value):
+def test_a_number_is_a_constant_profile(text, value):
     """A constant."""
     assert at(read_profile(text), -1.0, 0.0, 1e9) == [value] * 3
     assert at(constant(value), 0.0) == [value]
 
 
-def test_points():
-    """Straight lines between points, level outside; two at one time are a step."""
+def test_points_are_joined_by_straight_lines():
+    """Constant beyond the last one; two points at one time are a step."""
     assert at(read_profile('1:0.2,3:0.6,3:0.1,5:0.1'), 0.0, 1.0, 2.0, 2.5, 3.0, 4.0, 99.0) == (
         pytest.approx([0.2, 0.2, 0.4, 0.5, 0.1, 0.1, 0.1]))
     assert at(read_profile('2:0.3'), 0.0, 2.0, 9.0) == [0.3] * 3
@@ -89,7 +89,7 @@ def test_period_and_hold():
         [0.0, 0.0, 0.1, 0.1, 0.9, 0.0, 0.2])
 
 
-def test_csv(tmp_path):
+def test_a_csv_is_a_profile(tmp_path):
     """Columns by name in any order; others are ignored."""
     path = tmp_path / 'stick.CSV'
     path.write_text('throttle,x,time_s\n0.0,9,0\n0.5,9,1\n0.5,9,2\n0.1,9,2\n')
@@ -109,7 +109,7 @@ def test_csv(tmp_path):
     ('0:nan,1:0', ['0..1']), ('nan:0.5', ['finite']), ('0:0,inf:0', ['finite']),
     ('0:0,nan:0', ['fall']),
 ])
-def test_bad_profiles(text, words):
+def test_a_wrong_profile_is_named_in_one_line(text, words):
     """One line that names what was given."""
     line = refused(text)
     assert all(word in line for word in words), line
@@ -127,8 +127,8 @@ def test_bad_profiles(text, words):
     (b'\xff\xfe\x00time', 'not a CSV of numbers'), (b'# nothing\n', 'stick.csv'),
     (None, 'cannot read'),
 ])
-def test_bad_csv(tmp_path, content, words):
-    """One line that names the file; a missing one, an empty one and bytes as well."""
+def test_a_wrong_profile_csv_is_named_in_one_line(tmp_path, content, words):
+    """Also a missing file, an empty one, and bytes."""
     path = tmp_path / 'stick.csv'
     if content is not None:
         path.write_bytes(content)

@@ -12,8 +12,8 @@ import pytest
 SAGGING = SupplyModel((OU(63.0, 0.3, 5.0), LoadSag(0.5, 0.0)))
 
 
-def test_pieces():
-    """Together they have the stamps k/rate, none longer than a stretch."""
+def test_pieces_have_consecutive_stamps():
+    """Together they have the stamps k/rate, and none is longer than a segment."""
     pieces = list(simulated(SAGGING, read_profile('loads'), duration=3.0, rate=50_000.0, seed=1,
                             name='made'))
     assert sum(piece.n for piece in pieces) == 150_000
@@ -34,8 +34,8 @@ def test_samples_are_those_of_the_model():
         SAGGING.simulate(t, np.random.default_rng(7), throttle), rtol=0, atol=1e-9)
 
 
-def test_seeds():
-    """Same seed, same samples; another seed, others; nothing is drawn before it is asked for."""
+def test_equal_seeds_give_equal_samples():
+    """Another seed gives others; nothing is drawn before it is needed."""
     def first(seed):
         return next(simulated(SAGGING, constant(0.2), duration=1e9, rate=1000.0, seed=seed))
 
@@ -48,7 +48,7 @@ def test_seeds():
     ((OU(1e-300, 1e30, 0.0),), 'beyond'),
     ((OU(63.0, 1e3, 5.0), NonlinearRestoring(-1e6, 1e-3)), 'runs away'),
 ])
-def test_what_cannot_be_simulated(terms, words):
+def test_an_impossible_simulation_is_refused(terms, words):
     """One line; no warning of NumPy, no infinity in the recording."""
     with pytest.raises(InputError, match=words):
         list(simulated(SupplyModel(terms), constant(0.0), duration=2.0, rate=1000.0, seed=1))

@@ -21,7 +21,7 @@ def test_the_stamp_is_that_of_the_last_sample():
     np.testing.assert_allclose(t, [4.9997, 4.9998, 4.9999, 5.0], rtol=0, atol=1e-12)
 
 
-def test_jitter_does_not_show():
+def test_jitter_of_stamps_does_not_reach_the_samples():
     """Arrival 0..8 ms late leaves an even spacing, within the lean of 8 ms over FOLLOW."""
     rng = np.random.default_rng(3)
     ends = LENGTH * np.arange(1, 3001) + rng.uniform(0.0, 8e-3, 3000)
@@ -52,7 +52,7 @@ def test_drift_is_followed(drift):
 
 @pytest.mark.parametrize('gap', [0.255, 0.5, -0.3])
 def test_a_gap_is_kept(gap):
-    """Beyond max(2 blocks, 0.25 s) the time line starts anew where the stamp says."""
+    """Beyond max(2 blocks, 0.25 s) the time line restarts at the stamp."""
     ends = LENGTH * np.arange(1, 21)
     ends[10:] += gap
     clock = BlockClock(RATE)
@@ -87,7 +87,7 @@ def test_blocks_of_any_length():
     np.testing.assert_allclose(t, np.arange(1, 14) / 1000.0, rtol=0, atol=1e-12)
 
 
-def test_a_clock_since_1970_is_no_worse():
+def test_a_clock_since_1970_is_as_accurate():
     """Adding up must not collect the rounding of large stamps: one of 2^-22 s remains."""
     ends = 1_704_067_200.0 + LENGTH * np.arange(1, 2001)
     t = run(ends)
@@ -95,8 +95,8 @@ def test_a_clock_since_1970_is_no_worse():
     assert np.abs(t - 1_704_067_200.0 - exact).max() <= 1.02 * 2.0**-22
 
 
-def test_reset_forgets():
-    """After a reset the next stamp counts, and it is no gap."""
+def test_a_reset_starts_a_new_time_line():
+    """The next stamp starts it, and this is not a gap."""
     clock = BlockClock(RATE)
     run([100.0], clock)
     clock.reset()
@@ -120,7 +120,7 @@ def test_wrong_stamps_are_refused():
 
 
 @pytest.mark.parametrize('lengths', [[100], [100, 100, 7, 0, 1, 250]])
-def test_many_at_once(lengths):
+def test_many_blocks_at_once_equal_single_ones(lengths):
     """The same bits as one by one, over gaps and batches, and the same gaps counted."""
     rng = np.random.default_rng(5)
     n = np.array(lengths * 12, dtype=np.int64)

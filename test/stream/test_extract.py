@@ -8,14 +8,14 @@ import pytest
 @pytest.mark.parametrize('path, steps', [
     ('data', ('data',)), ('header.stamp', ('header', 'stamp')),
     ('channels[0].value', ('channels', 0, 'value')), ('a[1][20]', ('a', 1, 20))])
-def test_paths(path, steps):
-    """Names and indices, outermost first."""
+def test_a_field_path_has_names_and_indices(path, steps):
+    """Outermost first."""
     assert parse_field_path(path) == steps
 
 
 @pytest.mark.parametrize('path', ['', '.', 'a.', 'a[', 'a[-1]', 'a[0', '[0]', 'a b', '1a', 'a..b'])
-def test_malformed_paths(path):
-    """Said at once, not at the first message."""
+def test_a_malformed_path_is_refused_at_once(path):
+    """Not only at the first message."""
     with pytest.raises(InputError, match='field path'):
         parse_field_path(path)
 
@@ -37,8 +37,8 @@ ESCS = Message(esc=[Message(rpm=1000), Message(rpm=2000.5)], all=[1.0, 2.0, 3.0]
 @pytest.mark.parametrize('field, values', [
     ('esc[].rpm', [100.0, 200.05]), ('all', [0.1, 0.2, 0.3]), ('all[]', [0.1, 0.2, 0.3]),
     ('esc[1].rpm', [200.05]), ('one', [0.4]), ('esc[7].rpm', [])])
-def test_several_numbers(field, values):
-    """A field of each element, an array, an element, a number; none where there is none."""
+def test_several_numbers_are_extracted(field, values):
+    """A field of each element, an array, an element, a number; empty if there is none."""
     extractor = ManyExtractor(FieldSpec('rpm', 'my_msgs/msg/Escs', field, unit_factor=0.1))
     assert extractor.extract(ESCS).tolist() == pytest.approx(values)
 

@@ -1,4 +1,4 @@
-"""Files that users name: what is refused, and that nothing of a file is told."""
+"""Files that users name: which are refused, and that errors quote nothing of them."""
 
 import os
 import time
@@ -95,7 +95,7 @@ def test_irregular_files_are_refused_at_once(tmp_path, read):
 
 
 def test_a_long_path_is_shortened(tmp_path):
-    """The line keeps its end, which says what is wrong."""
+    """The line keeps its end, which has the reason."""
     folder = tmp_path.joinpath(*['x' * 100] * 5)
     folder.mkdir(parents=True)
     (folder / 'model.yaml').write_text('a: [')
@@ -111,8 +111,8 @@ def test_honest_yaml_is_read():
     assert found['number'] == pytest.approx(4.0 / 3.0)
 
 
-def test_printable():
-    """Escapes for what a terminal would obey; plain text, umlauts among it, as it is."""
+def test_printable_escapes_control_characters():
+    """Printable text, also with umlauts, is unchanged."""
     assert printable('Spannung der Zelle µV ± 5 Ω') == 'Spannung der Zelle µV ± 5 Ω'
     assert printable('\x1b[2Ja\nb\t\x9b\u202e\u2028\udcff') == (
         '\\x1b[2Ja\\nb\\t\\x9b\\u202e\\u2028\\udcff')

@@ -1,4 +1,4 @@
-"""What msg_config/*.yaml says, and what is said about one that is wrong."""
+"""Reading msg_config/*.yaml, and errors in them."""
 
 import shutil
 
@@ -28,7 +28,7 @@ def written(tmp_path, change=None, part=None, name='rail.yaml'):
     return path
 
 
-def test_the_shipped_ones_load():
+def test_the_shipped_msg_configs_load():
     """Every file of the package is valid, and all that were promised are there."""
     configs = list_msg_configs()
     assert set(configs) >= SHIPPED
@@ -39,7 +39,7 @@ def test_the_shipped_ones_load():
         assert config.generic == (not config.voltage.topic.startswith('/') and name != 'adc')
 
 
-def test_a_file_says_what_it_says(tmp_path):
+def test_a_msg_config_is_read_as_written(tmp_path):
     """Every key reaches the record."""
     config = load_msg_config(written(tmp_path))
     spec = config.voltage
@@ -91,7 +91,7 @@ def test_a_mistake_is_named(tmp_path, part, change, expected):
 
 @pytest.mark.parametrize('key', ['topic', 'type', 'field'])
 def test_a_missing_key_is_named(tmp_path, key):
-    """A source without a topic, type or field is none."""
+    """A source needs a topic, a type and a field."""
     content = {**GOOD, 'voltage': {k: v for k, v in GOOD['voltage'].items() if k != key}}
     path = tmp_path / 'rail.yaml'
     path.write_text(yaml.safe_dump(content), encoding='utf-8')
@@ -120,7 +120,7 @@ def test_unknown_name_and_missing_file(tmp_path):
         list_msg_configs(tmp_path / 'nowhere')
 
 
-def test_a_folder_of_ones_own(tmp_path):
+def test_an_own_folder_of_msg_configs_is_read(tmp_path):
     """Names are looked up in the folder given."""
     written(tmp_path)
     assert list(list_msg_configs(tmp_path)) == ['rail']
@@ -132,7 +132,7 @@ def test_a_folder_of_ones_own(tmp_path):
 @pytest.mark.parametrize('layout', [
     'lib/python3.12/site-packages', 'local/lib/python3.12/dist-packages',
     'install/ou_monitor/lib/python3.12/site-packages'])
-def test_found_when_installed(tmp_path, monkeypatch, layout):
+def test_msg_configs_are_found_when_installed(tmp_path, monkeypatch, layout):
     """It is found from the package's place under a prefix, as pip and colcon lay it out."""
     package = tmp_path / layout / 'ou_monitor' / 'messages'
     package.mkdir(parents=True)
@@ -143,7 +143,7 @@ def test_found_when_installed(tmp_path, monkeypatch, layout):
     assert msg_config_dir() == share
 
 
-def test_not_found_is_one_line(tmp_path, monkeypatch):
+def test_a_missing_folder_of_msg_configs_is_one_line(tmp_path, monkeypatch):
     """An installation without its data says so."""
     monkeypatch.setattr('ou_monitor.stream.config.__file__', str(tmp_path / 'a/b/c/config.py'))
     with pytest.raises(InputError, match='no msg_config folder'):

@@ -1,4 +1,4 @@
-"""Who sent a message, what was lost, and how old the newest sample is."""
+"""Publishers of messages, losses, and the age of the newest sample."""
 
 import numpy as np
 from ou_monitor.stream.samples import Publishers, SourceClock
@@ -24,8 +24,8 @@ def follow(publishers, *streams, count, batch=20):
     return kept
 
 
-def test_one_publisher():
-    """Every tenth is lost, and all are counted; a start anew is no loss."""
+def test_losses_of_one_publisher_are_counted():
+    """Every tenth message is lost; a restart is not a loss."""
     publishers = Publishers()
     assert follow(publishers, sent(1, 1000, 1e3, 0.0, set(range(5, 1000, 10))),
                   count=1) == {0: 900}
@@ -36,7 +36,7 @@ def test_one_publisher():
 
 @pytest.mark.parametrize('offset', [0, 3, 700])
 @pytest.mark.parametrize('rate', [1000.0, 137.0])
-def test_of_two_the_first_is_followed(offset, rate):
+def test_the_first_of_two_publishers_is_followed(offset, rate):
     """Whatever their numbers, with a pause that loses the messages of both."""
     publishers = Publishers()
     gap = set(range(1000, 1030))
@@ -48,21 +48,21 @@ def test_of_two_the_first_is_followed(offset, rate):
     assert publishers.foreign >= len(other) - 10 and abs(publishers.lost - 30) <= 10
 
 
-def test_a_second_one_that_comes_later():
+def test_a_later_publisher_is_ignored():
     publishers = Publishers()
     kept = follow(publishers, sent(1, 1000, 1e3, 0.0), count=1)
     kept = follow(publishers, sent(1001, 1000, 1e3, 1.0), sent(1, 900, 1e3, 1.1003), count=2)
     assert kept == {0: 1000, 1: 0} and publishers.foreign == 900
 
 
-def test_when_the_first_ends_the_other_is_followed():
+def test_if_the_first_publisher_ends_the_other_is_followed():
     publishers = Publishers()
     follow(publishers, sent(1, 1000, 1e3, 0.0), sent(1, 100, 100.0, 0.0004), count=2)
     kept = follow(publishers, sent(101, 500, 100.0, 1.0004), count=2)
     assert 380 <= kept[0] <= 420
 
 
-def test_without_numbers_nothing_is_known():
+def test_without_sequence_numbers_losses_are_unknown():
     publishers = Publishers()
     assert publishers.follow([None] * 3, np.arange(3.0), np.arange(3.0), 2).all()
     assert not publishers.numbered
@@ -80,13 +80,13 @@ def test_age_counts_from_the_stamp_of_the_nodes_clock():
 
 
 @pytest.mark.parametrize('stamp', [12.0, 1.7e9 + 3.0, 1.7e9 - 20.0])
-def test_of_a_foreign_clock_only_the_arrival_counts(stamp):
+def test_age_counts_from_arrival_for_a_foreign_clock(stamp):
     clock = SourceClock()
     clock.take(np.array([stamp]), np.array([1.7e9]), 5.0)
     assert clock.name == 'foreign' and clock.age(5.5) == pytest.approx(0.5)
 
 
-def test_clock_set_during_the_run_counts_as_the_nodes():
+def test_a_clock_set_during_the_run_is_the_nodes():
     clock = SourceClock()
     clock.take(np.array([12.0]), np.array([1.7e9]), 5.0)
     clock.take(np.array([1.7e9]), np.array([1.7e9 + 0.01]), 6.0)
@@ -94,7 +94,7 @@ def test_clock_set_during_the_run_counts_as_the_nodes():
 
 
 @pytest.mark.parametrize('first', [0, 1])
-def test_after_a_stall_the_first_is_followed_still(first):
+def test_after_a_stall_the_first_publisher_is_still_followed(first):
     """Both were silent for 1.5 s, as everything was; whose message comes first decides nothing."""
     publishers = Publishers()
     follow(publishers, sent(1, 1000, 1e3, 0.0), sent(1, 200, 200.0, 0.0004), count=2)
@@ -115,7 +115,7 @@ def test_first_publisher_is_followed_after_a_pause(pause):
 
 
 def test_two_restarted_publishers_are_told_apart():
-    """The first ends and begins anew beside another: it is followed within a batch."""
+    """The first ends and restarts beside another: it is followed within a batch."""
     publishers = Publishers()
     follow(publishers, sent(1, 1000, 1e3, 0.0), sent(1, 100, 100.0, 0.0004), count=2)
     kept = follow(publishers, sent(1, 1000, 1e3, 1.5), sent(101, 150, 100.0, 1.0004), count=2)
@@ -132,7 +132,7 @@ def test_restart_of_the_only_publisher_counts_no_loss():
     assert kept[0] == 2000 and publishers.foreign == foreign
 
 
-def test_numbers_of_any_order_cost_little():
+def test_sequence_numbers_in_any_order_are_handled_fast():
     """Each smaller than the one before, as of publishers without end: no more tracks than that."""
     publishers = Publishers()
     times = np.arange(2000) * 1e-3

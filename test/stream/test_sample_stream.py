@@ -1,4 +1,4 @@
-"""Messages to samples: pairing, jumps, blocks, what is missing."""
+"""Messages to samples: pairing, jumps, blocks, missing values."""
 
 import math
 from types import SimpleNamespace
@@ -87,7 +87,7 @@ def test_pairs_by_stamp_when_only_one_is_stamped_and_the_clocks_agree():
     np.testing.assert_array_equal(sink.u, [math.nan, math.nan, 0.3, 0.3])
 
 
-def test_throttle_without_voltage_takes_no_more_memory_than_it_may():
+def test_memory_for_throttle_without_voltage_is_bounded():
     """The newest are kept, and hold when the voltage comes."""
     stream, sink = stream_of()
     for k in range(5000):
@@ -100,7 +100,7 @@ def test_throttle_without_voltage_takes_no_more_memory_than_it_may():
 
 
 def test_backward_throttle_restarts_the_pairing():
-    """As in a bag that is replayed in a loop: what came before does not hold after it."""
+    """As in a bag replayed in a loop: earlier throttle does not hold after the step."""
     stream, sink = stream_of('stamp', 'stamp')
     stream.take_throttle(stamped(4.0, 0.9), None)
     stream.take_voltage(stamped(4.01, 5.0), None)
@@ -131,16 +131,16 @@ def test_missing_values_go_on_as_nan():
     assert sink.v[0] == 5.0 and all(map(math.isnan, sink.v[1:])) and len(sink.v) == 3
 
 
-def test_without_a_time_nothing_is_placed():
-    """Under use_sim_time before /clock came."""
+def test_samples_without_a_time_are_not_placed():
+    """Under use_sim_time before the first /clock."""
     stream, sink = stream_of()
     assert not stream.take_voltage(plain(5.0), lambda: math.nan)
     stream.flush()
     assert sink.v == [] and stream.unplaced == 1
 
 
-def test_without_a_time_the_floor_gets_them():
-    """Behind what came before, each with its arrival; blocks value by value."""
+def test_samples_without_a_time_are_checked_against_the_floor():
+    """After the earlier samples, each with its arrival; blocks value by value."""
     for rate, counts in ((None, [1, 1, 1]), (1000.0, [2, 0, 3])):
         stream, sink = stream_of(sample_rate=rate)
         stream.take_voltage(plain(5.0), lambda: 1.0)
@@ -154,7 +154,7 @@ def test_without_a_time_the_floor_gets_them():
 
 
 def test_stamps_that_go_back_clear_the_window_once():
-    """What came before the step is handed over first, then cleared."""
+    """Samples before the step are handed over first; then the window is cleared."""
     stream, sink = stream_of('stamp')
     for stamp in (10.0, 10.1, 10.05, 3.0, 3.1):
         stream.take_voltage(stamped(stamp, 5.0), None)
@@ -166,7 +166,7 @@ def test_stamps_that_go_back_clear_the_window_once():
     assert sink.resets[1:] == ['twice']
 
 
-def test_a_step_back_within_what_came_at_once_clears_the_window_once():
+def test_a_step_back_within_one_call_clears_the_window_once():
     """All that follows the step stays."""
     stream, sink = stream_of()
     t = np.concatenate([10.0 + 0.001 * np.arange(50), 3.0 + 0.001 * np.arange(300)])

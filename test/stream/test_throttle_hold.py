@@ -51,14 +51,14 @@ def test_unneeded_throttles_are_dropped():
                                   [np.nan, 0.989, 0.99, 0.999])
 
 
-def test_unknown_holds_too():
+def test_unknown_throttle_is_held_too():
     """A NaN says "unknown from here on"."""
     hold = hold_of([(1.0, 0.5), (2.0, math.nan)])
     np.testing.assert_array_equal(hold.at(np.array([0.5, 1.5, 2.5])), [np.nan, 0.5, np.nan])
 
 
-def test_nothing():
-    """An empty hold knows nothing, and a new time line begins with what is said to hold."""
+def test_an_empty_hold_gives_unknown_throttle():
+    """A new time line starts with the value given."""
     hold = ThrottleHold()
     assert np.isnan(hold.at(np.array([1.0]))).all() and hold.at(np.empty(0)).shape == (0,)
     hold = hold_of([(1.0, 0.3)])
@@ -72,7 +72,7 @@ def test_nothing():
     (True, True, APART), (False, False, APART), (True, False, APART_MIXED),
     (False, True, APART_MIXED)])
 @pytest.mark.parametrize('side', [-1.0, 1.0])
-def test_clocks_that_differ(own, voltage_own, apart, side):
+def test_throttle_of_another_clock_counts_from_its_arrival(own, voltage_own, apart, side):
     """Beyond what two messages of one clock can differ by, a throttle holds from its arrival."""
     at = np.array([9.0, 10.0, 10.001, 20.0])
     near = hold_of([(10.0 + side * 0.99 * apart, 0.5)], 10.0, own, voltage_own)
@@ -165,7 +165,7 @@ def node(config, messages, flushes):
 
 @st.composite
 def recordings(draw):
-    """Draw messages in order of arrival: any rates, late by any amount that is no step back."""
+    """Draw messages in order of arrival, of any rates and delays without a backward step."""
     blocks = draw(st.tuples(st.booleans(), st.booleans()))
     stamped = {'voltage': draw(st.booleans()), 'throttle': draw(st.booleans())}
     # Seconds between the throttle's own clock and the voltage's.
@@ -205,7 +205,7 @@ ONE = [('voltage', EPOCH * 10**9, EPOCH + 0.1, 1.0)]
 @example(([('voltage', EPOCH * 10**9 + k, EPOCH + 0.1 - 0.09 * k, [4.0 * k + j for j in range(4)])
            for k in range(2)], (True, False), 'drop', set()))
 def test_node_and_bench_pair_alike(tmp_path, drawn):
-    """What the node knew when it handed a sample on is what the bench reads up to there."""
+    """The bench reads what the node knew when it handed on each sample."""
     messages, blocks, nan, flushes = drawn
     config = config_of(tmp_path, blocks, nan)
     if blocks[0] and not any(name == 'voltage' and data for name, _, _, data in messages) or (
@@ -222,8 +222,8 @@ def test_node_and_bench_pair_alike(tmp_path, drawn):
             np.testing.assert_array_equal(*zip(*alike, strict=True))
 
 
-def test_late_throttle(tmp_path):
-    """It changes what the bench reads, and what the node has not handed on yet; no more."""
+def test_late_throttle_changes_only_samples_not_yet_handed_on(tmp_path):
+    """In a recording it changes all samples from its stamp on."""
     messages = [('throttle', EPOCH * 10**9, EPOCH + 0.0, 0.1)]
     messages += [('voltage', EPOCH * 10**9 + k, EPOCH + 0.01 * k, float(k)) for k in range(1, 7)]
     messages += [('throttle', EPOCH * 10**9 + 9, EPOCH + 0.025, 0.7)]

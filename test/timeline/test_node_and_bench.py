@@ -132,7 +132,7 @@ TOGETHER = KINDS[:-1]
                          ids=lambda kinds: ', '.join(kinds) if len(kinds) < 2 else 'together')
 def test_node_and_bench_take_the_same_readings(tmp_path, monkeypatch, period, kinds, source):
     """
-    Count, stamps, voltages, throttle and current of each; and what became of all samples.
+    Equal number, stamps, voltages, throttle and current, and equal counters.
 
     Where the period is no whole number the bench puts the stamps on the grid of the source, which
     takes the whole recording: by less than 1.5 logged steps.

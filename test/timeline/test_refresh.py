@@ -1,4 +1,4 @@
-"""Loggers that repeat their last value: told, told from coarse ADCs, and dropped without bias."""
+"""Repeats by loggers: recognised, distinguished from coarse ADCs, and dropped without bias."""
 
 import math
 
@@ -61,7 +61,7 @@ def test_repeats_through_a_coarse_adc(factor):
 
 
 @pytest.mark.parametrize('factor', [5.0, 10 / 3 * 2, 20.0])
-def test_readings_that_seldom_change_the_code(factor):
+def test_repeats_are_found_if_readings_seldom_change_the_code(factor):
     """
     Steps of the ADC three times the deviation of the readings: nearly all changes are by one code.
 
@@ -76,7 +76,7 @@ def test_readings_that_seldom_change_the_code(factor):
     assert np.median(found) == pytest.approx(factor, rel=0.02)
 
 
-def test_a_logger_that_loses_samples():
+def test_repeats_are_found_if_the_logger_loses_samples():
     """One sample in 200 lost: gaps of 9 among those of 10."""
     rng = np.random.default_rng(3)
     for _ in range(20):
@@ -85,7 +85,7 @@ def test_a_logger_that_loses_samples():
         assert refresh_period(y) == pytest.approx(10.0, rel=0.02)
 
 
-def test_a_source_with_jitter():
+def test_repeats_of_a_source_with_jitter_are_found():
     """Refreshes early or late by 5 % of a period of 16 samples."""
     rng = np.random.default_rng(4)
     for _ in range(20):
@@ -180,7 +180,7 @@ def test_refreshes_stay_where_they_were():
 
 @settings(deadline=None, max_examples=60)
 @given(st.integers(0, 10 ** 6), st.floats(2.0, 12.0), st.lists(st.integers(0, 30), max_size=40))
-def test_batches_of_any_size(seed, period, sizes):
+def test_batches_of_any_size_give_equal_readings(seed, period, sizes):
     """The same refreshes, whatever the pieces they come in."""
     rng = np.random.default_rng(seed)
     y = rng.integers(0, 3, 400)[which(rng, 400, period)]
@@ -234,7 +234,7 @@ def test_dropping_leaves_no_bias(factor):
 
 
 def test_counters_of_repeats():
-    """Used and held add up; they say what is left: one in ten."""
+    """`used` and `held` add up; one sample in ten is used."""
     rng = np.random.default_rng(8)
     y = np.repeat(paths(rng, 1, 800)[0], 10)
     t = 1e-4 * np.arange(y.size)
@@ -252,7 +252,7 @@ def test_counters_of_repeats():
     assert e.n <= 510 and Flag.HELD_SAMPLES in e.flags
 
 
-def test_nothing_is_held_where_nothing_repeats():
+def test_no_sample_is_dropped_without_repeats():
     """A coarse ADC of 2 increments, and the clean rail: no sample is dropped."""
     rng = np.random.default_rng(9)
     for code in (2.0 * INCREMENT, 1e-6):

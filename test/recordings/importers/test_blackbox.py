@@ -21,8 +21,8 @@ def load(tmp_path, content, flight=None):
     return path, import_log(path, Request(flight))
 
 
-def test_a_flight(tmp_path):
-    """Voltage, motors and current are those that were written, on the clock of the log."""
+def test_voltage_motors_and_current_are_read(tmp_path):
+    """Voltage, motors and current are the written ones, with the stamps of the log."""
     rows = quad()
     path, log = load(tmp_path, blackbox(rows))
     chosen = choose(path, log)
@@ -38,8 +38,8 @@ def test_a_flight(tmp_path):
     np.testing.assert_allclose(stick.values, (rows[:, STICK] - 1000) / 1000, rtol=1e-12)
 
 
-def test_a_stick_below_its_lowest_pulse(tmp_path):
-    """Written without its sign it is 4 thousand million; it is no throttle, not full throttle."""
+def test_a_stick_below_its_lowest_pulse_is_zero_throttle(tmp_path):
+    """Logged without its sign it is 4e9; it means zero throttle, not full throttle."""
     rows = quad()
     rows[:8, STICK] = (988, 2 ** 32 - 12, 2 ** 16 - 12, 1000, 2000, 2012, 1500, 1250)
     path, log = load(tmp_path, blackbox(rows))
@@ -57,7 +57,7 @@ def test_a_stick_below_its_lowest_pulse(tmp_path):
     ('EmuFlight 0.3.4 (x)', {'vbatcellvoltage': '33,35,43'}, 0.1, None),
     ('', {'vbatcellvoltage': '33,35,43'}, 0.1, None),
 ])
-def test_units(tmp_path, firmware, headers, volts, amperes):
+def test_the_firmware_determines_the_voltage_unit(tmp_path, firmware, headers, volts, amperes):
     """The unit of the voltage follows the firmware, as in Betaflight's own viewer."""
     rows = quad(64)
     path, log = load(tmp_path, blackbox(rows, headers={'Firmware revision': firmware, **headers}))
@@ -73,16 +73,16 @@ def test_units(tmp_path, firmware, headers, volts, amperes):
             found['amperageLatest'].values, rows[:, AMPERES] * amperes, rtol=1e-12)
 
 
-def test_no_sensor(tmp_path):
-    """A current that is always zero is no measurement."""
+def test_a_current_of_zero_is_not_a_measurement(tmp_path):
+    """A current that is always zero means that there is no sensor."""
     rows = quad(64)
     rows[:, AMPERES] = 0
     path, log = load(tmp_path, blackbox(rows))
     assert choose(path, log).current is None
 
 
-def test_several_flights(tmp_path):
-    """The largest is read, and a note says so; each is read on its own when it is named."""
+def test_the_largest_flight_is_the_default(tmp_path):
+    """A note says that the largest flight was read; each one can be chosen."""
     first, second = quad(100), quad(160, start_us=1000)
     second[:, VOLTS] += 50
     content = b''.join(blackbox(first)) + b''.join(blackbox(second))
@@ -102,7 +102,7 @@ def test_several_flights(tmp_path):
 
 @pytest.mark.parametrize('before_wrap', [1, 31, 32, 33, 100, 299])
 def test_the_clock_wraps(tmp_path, before_wrap):
-    """After 71.6 minutes the 32 bits begin anew; the stamps go on."""
+    """The 32-bit clock wraps after 71.6 minutes; the stamps continue."""
     rows = quad(300)
     rows[:, TIME] = (2**32 - 2000 * before_wrap + 2000 * np.arange(300)) % 2**32
     path, log = load(tmp_path, blackbox(rows))
@@ -122,8 +122,8 @@ def test_a_pause_of_the_log(tmp_path):
     assert np.diff(voltage.t).max() == pytest.approx(100.002)
 
 
-def test_frames_before_the_first_key_frame(tmp_path):
-    """What only adds to a frame that is not there is dropped, and told."""
+def test_frames_before_the_first_key_frame_are_dropped(tmp_path):
+    """Frames that add to a missing frame are dropped, with a note."""
     pieces = blackbox(quad(128))
     path, log = load(tmp_path, [pieces[0], *pieces[5:]])
     assert choose(path, log).voltage.n == 96
@@ -139,8 +139,8 @@ def test_readings_of_the_adc(tmp_path):
     np.testing.assert_allclose(found.voltage, rows[5::5, VOLTS] / 100, rtol=1e-6)
 
 
-def test_cut_anywhere(tmp_path):
-    """What came before the cut is read, and the cut is told."""
+def test_a_truncated_log_is_read_up_to_its_end(tmp_path):
+    """Everything before the cut is read, and the cut is reported."""
     rows = quad(200)
     pieces = blackbox(rows)
     whole = b''.join(pieces)
@@ -169,8 +169,8 @@ def test_cut_within_the_header(tmp_path):
     assert refused == len(range(60, len(head), 17))
 
 
-def test_broken_anywhere(tmp_path):
-    """Flipped bytes end in one line or in a read of sound frames; what went is told."""
+def test_flipped_bytes_give_an_error_or_sound_frames(tmp_path):
+    """Flipped bytes give a one-line error, or sound frames and a note on the lost ones."""
     rows = quad(600)
     truth = dict(zip(((rows[:, TIME] - rows[0, TIME]) * 1e-6).round(6), rows[:, VOLTS] / 100))
     pieces = blackbox(rows)
@@ -195,7 +195,7 @@ def test_broken_anywhere(tmp_path):
 
 
 def test_leftovers_after_the_end(tmp_path):
-    """Bytes after the end mark are told, unless they are those of erased flash."""
+    """Bytes after the end mark are reported, unless they are erased flash."""
     _, log = load(tmp_path, b''.join(blackbox(quad(64))) + b'\xff' * 9000)
     assert log.notes == ()
     _, log = load(tmp_path, b''.join(blackbox(quad(64))) + b'I\x01' * 45)

@@ -1,4 +1,4 @@
-"""What is taken from a log, what is dropped on the way, and how held samples go."""
+"""Selection of series from a log, and unusable or repeated samples."""
 
 from pathlib import Path
 
@@ -18,8 +18,8 @@ def series(name='v', quantity=VOLTAGE, t=(0.0, 1.0, 2.0), values=(5.0, 5.1, 5.2)
     return Series(name, quantity, np.array(t), np.array(values), '1', 'words', rank, group)
 
 
-def test_ranks():
-    """The smallest rank is taken; none at all is never taken unasked."""
+def test_the_smallest_rank_is_the_default():
+    """The smallest rank is chosen; a series without a rank only by name."""
     log = Log('x', (series('a', rank=None), series('b', rank=1), series('c', rank=0)))
     assert choose(PATH, log).voltage.name == 'c'
     assert choose(PATH, log, voltage='a').voltage.name == 'a'
@@ -27,8 +27,8 @@ def test_ranks():
         choose(PATH, Log('x', (series('a', rank=None),)))
 
 
-def test_names():
-    """A name that is not there has the nearest one; a throttle is no voltage."""
+def test_an_unknown_name_is_refused_with_the_nearest():
+    """An error names the nearest series; a throttle cannot be the voltage."""
     log = Log('x', (series('battery'), series('gas', THROTTLE)))
     with pytest.raises(InputError, match="did you mean 'battery'"):
         choose(PATH, log, voltage='batery')
@@ -38,7 +38,7 @@ def test_names():
 
 
 def test_a_name_lost_with_the_end_of_a_log():
-    """What was read of the log stands beside the name that is not there."""
+    """The error about the missing name also says how far the log was read."""
     log = Log('x', (), notes=('The log was cut off at byte 7.',))
     with pytest.raises(InputError, match=r"no voltage 'v': there is none \(The log was cut off"):
         choose(PATH, log, voltage='v')
@@ -49,15 +49,15 @@ def test_values_that_no_message_holds_are_dropped():
     assert mended.values.tolist() == [5.0, 5.2] and 'beyond 1e+09' in notes[0]
 
 
-def test_several_throttles():
-    """Two of one rank are put to the user."""
+def test_two_throttles_of_one_rank_need_a_choice():
+    """If two series have the smallest rank, the user must choose."""
     log = Log('x', (series(), series('a', THROTTLE), series('b', THROTTLE)))
     with pytest.raises(InputError, match='several: a .*b .*--throttle'):
         choose(PATH, log)
 
 
 def test_the_current_beside_the_voltage():
-    """The current of the same sensor is taken; that of another only with a lone battery."""
+    """The current of the same sensor is used; another sensor's only with a single battery."""
     log = Log('x', (series('v0', group='0'), series('v1', rank=None, group='1'),
                     series('i0', CURRENT, group='0'), series('i1', CURRENT, group='1')))
     assert choose(PATH, log, voltage='v1').current.name == 'i1'
@@ -70,8 +70,8 @@ def test_the_current_beside_the_voltage():
     assert any('--current' in note for note in chosen.notes)
 
 
-def test_clean():
-    """What cannot be a sample goes, each kind with its own sentence."""
+def test_unusable_samples_are_dropped_with_a_note():
+    """Each kind of unusable sample is dropped, with a sentence of its own."""
     t = [0.0, 1.0, 1.0, np.nan, 2.0, 1.5, 3.0, 1e9, 4.0, *range(5, 20)]
     mended, notes = clean(series(t=t, values=[1, 2, 3, 4, np.inf, 6, 7, 8, 9.0, *range(15)]))
     np.testing.assert_array_equal(mended.t[:5], [0.0, 1.0, 1.5, 3.0, 4.0])
@@ -100,7 +100,7 @@ def test_a_lone_wrong_stamp_costs_one_sample():
 
 
 def test_throttle_is_a_share():
-    """Beyond 0..1 it is set to the end, and told when it is more than rounding."""
+    """Values beyond 0..1 are clipped, with a note if the excess is more than rounding."""
     mended, notes = clean(series('u', THROTTLE, values=(-0.001, 0.5, 1.002)))
     np.testing.assert_array_equal(mended.values, [0.0, 0.5, 1.0])
     assert notes == ()
@@ -109,8 +109,8 @@ def test_throttle_is_a_share():
     assert '2 values outside 0..1' in notes[0]
 
 
-def test_nothing_left():
-    """A voltage without a usable sample is refused; a throttle is left out, and told."""
+def test_a_voltage_without_usable_samples_is_refused():
+    """A voltage without usable samples is refused; a throttle is left out with a note."""
     bad = series(values=(np.nan,) * 3)
     with pytest.raises(InputError, match='no usable sample'):
         choose(PATH, Log('x', (bad,)))
@@ -120,7 +120,7 @@ def test_nothing_left():
 
 
 def test_stamps_count_from_the_start():
-    """The start is that of the log, or an earlier sample; not one of broken bytes."""
+    """The start is the log's, or an earlier sample, but not one from corrupt bytes."""
     one, two = series(t=(100.0, 101.0, 102.0)), series(t=(99.0, 101.0, 102.0))
     for given, firsts in ((99.5, [1.0, 0.0]), (90.0, [10.0, 9.0])):
         log = log_of('x', [one, two], {}, [], [], start=given)

@@ -40,8 +40,8 @@ def test_values_and_stamps(tmp_path, version, unit):
         'rad/s', 'm/s^2', '?')
 
 
-def test_it_is_analyzed_and_converted_as_any_log(tmp_path, capsys):
-    """The battery and the mean of the motors are taken, its repeats dropped; a gyro beside."""
+def test_a_crazyflie_log_is_analyzed_and_converted(tmp_path, capsys):
+    """Battery, mean of the motors and gyro are read, without repeats."""
     events, records, table = hover(3000, refresh=5)
     path, _ = load(tmp_path, crazyflie(events, records))
     assert main(['convert', str(path), str(tmp_path / 'bag')]) == 0
@@ -60,7 +60,7 @@ def test_it_is_analyzed_and_converted_as_any_log(tmp_path, capsys):
 
 @pytest.mark.parametrize('cut', [1, 4, 30, 3001])
 def test_a_log_that_was_cut_off(tmp_path, cut):
-    """What is whole is read, and the note says that the checksum is missing."""
+    """All complete records are read, and a note says that the checksum is missing."""
     events, records, table = hover()
     content = b''.join(crazyflie(events, records))
     path, log = load(tmp_path, [content[:-cut]])

@@ -219,7 +219,7 @@ def test_options_of_the_command_line(tmp_path, capsys):
     (b'<SALEAE>' + bytes(50), 'export it as CSV'), (b'SQLite format 3\0', 'ros2 bag convert'),
     (b'\x1f\x8b\x08\0' + bytes(50), 'gunzip'), (b'{"t": [0, 1]}\n', 'JSON'),
     (b'\x7fELF' + bytes(50), 'is not text')])
-def test_a_wrong_file_is_named_for_what_it_is(content, words, tmp_path):
+def test_a_file_of_another_kind_is_named(content, words, tmp_path):
     """Whatever its name ends in; a log of an autopilot in a .csv is read as the log it is."""
     for name in ('a.csv', 'a'):
         if (name, words) == ('a', 'is not text'):
@@ -231,7 +231,7 @@ def test_a_wrong_file_is_named_for_what_it_is(content, words, tmp_path):
 @pytest.mark.parametrize('content, words', [
     ('Zeit;U\n04.05.2024 10:00:00;12,5\nnoon;12,6\n', "'noon'"), ('t,U\n0,12\n1,1_5\n', "'1_5'"),
     ('date,U\n2024-13-01,12\n2024-13-02,12\n', 'month')])
-def test_what_is_no_time_or_number_is_refused(content, words, tmp_path):
+def test_cells_that_are_no_time_or_number_are_refused(content, words, tmp_path):
     """With the cell, and never misread."""
     with pytest.raises(InputError, match=words):
         read_recording(written(tmp_path, content))

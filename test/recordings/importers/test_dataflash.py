@@ -1,4 +1,4 @@
-"""ArduPilot dataflash: what is found, how it is scaled, and logs that are cut or broken."""
+"""ArduPilot dataflash: series, scales, and truncated or damaged logs."""
 
 import struct
 
@@ -24,8 +24,8 @@ def named(log):
 
 
 @pytest.mark.parametrize('form', ['dataflash', 'dataflash_text'])
-def test_a_flight(tmp_path, form):
-    """Binary and text give the battery, the throttle and the current, bit for bit."""
+def test_binary_and_text_logs_are_read_exactly(tmp_path, form):
+    """Binary and text give the same battery, throttle and current, bit for bit."""
     made, t, volts, share, amperes, pulses = copter()
     path, log = load(tmp_path, made.binary if form == 'dataflash' else made.text)
     chosen = choose(path, log)
@@ -55,8 +55,8 @@ def test_the_rail_by_name(tmp_path):
     assert chosen.throttle.name == 'RCOU.C3'
 
 
-def test_two_batteries(tmp_path):
-    """Instances are kept apart, and put to the user."""
+def test_two_batteries_need_a_choice(tmp_path):
+    """Instances are read separately, and the user must choose."""
     made, _, volts, *_ = copter(batteries=2)
     path, log = load(tmp_path, made.binary)
     with pytest.raises(InputError, match=r'BAT\[0\].Volt.*BAT\[1\].Volt.*--voltage'):
@@ -77,13 +77,13 @@ def test_scales_of_the_throttle(tmp_path, factor):
 
 
 def test_outputs_without_parameters(tmp_path):
-    """Without parameters nobody knows which outputs are motors."""
+    """Without parameters it is unknown which outputs are motors."""
     _, log = load(tmp_path, copter(parameters=False)[0].binary)
     assert 'RCOU.motors' not in named(log)
     assert named(log)['RCOU.C1'].rank is None
 
 
-def test_old_logs(tmp_path):
+def test_units_of_old_logs_are_converted(tmp_path):
     """Milliseconds, and hundredths of a volt in whole numbers (CURR of 2013)."""
     log = Dataflash()
     log.form(9, 'CURR', 'IhIhhhf', 'TimeMS,ThrOut,ThrInt,Volt,Curr,Vcc,CurrTot')
@@ -96,8 +96,8 @@ def test_old_logs(tmp_path):
     np.testing.assert_allclose(chosen.voltage.t, 0.1 * np.arange(50), atol=1e-9)
 
 
-def test_nothing_in_it(tmp_path):
-    """A log without the messages says which were looked for."""
+def test_a_log_without_a_battery_names_the_missing_messages(tmp_path):
+    """The error names the messages that were searched."""
     log = Dataflash()
     log.form(1, 'MSG', 'QZ', 'TimeUS,Message')
     log.put('MSG', 1, 'ArduCopter V4.5.1')
@@ -105,8 +105,8 @@ def test_nothing_in_it(tmp_path):
         load(tmp_path, log.binary)
 
 
-def test_cut_anywhere(tmp_path):
-    """A cut inside a message is told with the byte; what came before is read."""
+def test_a_truncated_log_is_read_up_to_its_end(tmp_path):
+    """A cut inside a message is reported with its byte; everything before is read."""
     made, _, volts, *_ = copter(40)
     ends = np.cumsum([len(piece) for piece in made.pieces])
     first = int(ends[-60])
@@ -132,8 +132,8 @@ def test_erased_page_is_not_damage(tmp_path):
 
 
 @pytest.mark.parametrize('form', ['binary', 'text'])
-def test_broken_anywhere(tmp_path, form):
-    """Flipped bytes end in one line or in a read; samples that went are told."""
+def test_flipped_bytes_give_an_error_or_a_note(tmp_path, form):
+    """Flipped bytes give a one-line error, or samples and a note on the lost ones."""
     whole = getattr(copter(60)[0], form)
     start = whole.index(b'ArduCopter') if form == 'binary' else 0
     rng = np.random.default_rng(9)
@@ -166,15 +166,15 @@ def test_text_log_with_binary_bytes(tmp_path):
                          '1 line left out: no message of this log.')
 
 
-def test_nothing_is_printed_by_the_parser(tmp_path, capfd):
-    """Its words on broken bytes go nowhere, also those from C."""
+def test_messages_of_the_parser_are_suppressed(tmp_path, capfd):
+    """Nothing that it prints about damaged bytes appears, also not from C."""
     whole = copter(30)[0].binary
     load(tmp_path, whole[:3000] + bytes(400) + whole[3000:])
     assert capfd.readouterr() == ('', '')
 
 
 def test_a_text_log_cut_off(tmp_path):
-    """The last line is told."""
+    """The incomplete last line is reported."""
     text = copter(30)[0].text
     path, log = load(tmp_path, text[:-7], 'a.log')
     assert log.notes == (

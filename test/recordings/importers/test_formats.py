@@ -1,4 +1,4 @@
-"""The table of formats: told by their first bytes, and what is said when one cannot be read."""
+"""The table of formats: recognition by the first bytes, and errors."""
 
 import subprocess
 import sys
@@ -41,7 +41,7 @@ def test_the_first_bytes_decide(tmp_path, name, ending):
     (b'nothing here', "no column 'time_s'"),
 ])
 def test_other_files_are_not_logs(tmp_path, content, words):
-    """One line says what it is, or what is read."""
+    """The error is one line with the likely kind, or with the formats that can be read."""
     path = tmp_path / 'a.ulg'
     path.write_bytes(content)
     with pytest.raises(InputError, match=words):
@@ -50,7 +50,7 @@ def test_other_files_are_not_logs(tmp_path, content, words):
 
 @pytest.mark.parametrize('name', [one.name for one in FORMATS if one.name not in (BAG, 'csv')])
 def test_a_log_given_as_a_recording(tmp_path, name):
-    """`analyze` reads it; who replays it as a bag is told to convert it first."""
+    """`analyze` reads it; `replay` asks to convert it first."""
     path = tmp_path / 'flight.log'
     path.write_bytes(made(name))
     with pytest.raises(InputError, match='not a recording: convert it first') as refused:
@@ -58,7 +58,7 @@ def test_a_log_given_as_a_recording(tmp_path, name):
     assert f'with ou-monitor convert {path} flight' in str(refused.value)
 
 
-def test_no_file(tmp_path):
+def test_a_missing_file_and_a_folder_are_refused(tmp_path):
     """A missing file, and a folder."""
     with pytest.raises(InputError, match='there is no log'):
         detect(tmp_path / 'none.ulg')

@@ -46,7 +46,7 @@ def load(tmp_path, content, name='a.bbl', **request):
     ({'acc_1G': None}, DEGREE, None),
 ])
 def test_blackbox_is_scaled_by_its_header(tmp_path, headers, gyro, force):
-    """Gyro in rad/s and acceleration in m/s^2; what has no scale is told and left out."""
+    """Gyro in rad/s and acceleration in m/s^2; series without a scale are left out with a note."""
     rows, moving = frames()
     path, log = load(tmp_path, blackbox(rows, FIELDS, {**HEADERS, **headers}))
     one = choose_extras(path, log).inertial['imu']
@@ -150,7 +150,7 @@ def test_dataflash_states_units_and_holds_escs(tmp_path):
     np.testing.assert_allclose(rpm[5], [605.0, 1204.0], rtol=1e-6)
 
 
-def test_what_a_bag_gets(tmp_path, capsys):
+def test_topics_and_units_of_a_converted_log(tmp_path, capsys):
     """Topics, units and values come back; the list names what convert takes."""
     rows, moving = frames()
     path, _ = load(tmp_path, blackbox(rows, FIELDS, HEADERS))
@@ -203,7 +203,7 @@ def test_missing_series_are_refused_in_one_line(tmp_path, capsys, arguments, wor
 
 
 def test_bad_rows_gaps_and_jumps_of_rate():
-    """Rows with NaN and stamps that go back are dropped whole; pauses and a new rate are told."""
+    """Rows with NaN or backward stamps are dropped; pauses and changes of rate are reported."""
     t = np.concatenate([np.arange(100) * 0.001, 0.5 + np.arange(100) * 0.004])
     gyro = np.ones((200, 3))
     gyro[5, 1], t[50] = np.nan, 0.02
@@ -224,8 +224,8 @@ def test_topics_are_names_that_ros_takes(name, topic):
     assert topic_of(name) == topic
 
 
-def test_a_signal_does_not_take_a_topic_that_is_there(tmp_path):
-    """A column called throttle travels beside the throttle."""
+def test_a_signal_never_takes_an_existing_topic(tmp_path):
+    """A column called throttle is written beside the throttle."""
     t = np.arange(3.0)
     log = Log('csv', tuple(Series(name, 'any', t, t, '1') for name in ('throttle', 'a.b', 'a/b')))
     found = choose_extras(tmp_path, log, signals=['throttle', 'a.b', 'a/b'])

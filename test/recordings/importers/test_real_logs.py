@@ -22,7 +22,7 @@ def folder():
     return Path(found)
 
 
-def test_blackbox_gives_the_table_that_others_made_of_it(folder, tmp_path):
+def test_a_blackbox_log_equals_its_published_table(folder, tmp_path):
     """
     The 200 Hz table of the flight follows from its raw log of 500 Hz.
 
@@ -52,8 +52,8 @@ def test_blackbox_gives_the_table_that_others_made_of_it(folder, tmp_path):
     assert np.corrcoef(held, table[:, 2])[0, 1] > 0.999
 
 
-def test_px4(folder, tmp_path, capsys):
-    """Two batteries are put to the user; one converts, the 5 V rail as well."""
+def test_a_px4_log_with_two_batteries_converts(folder, tmp_path, capsys):
+    """The user must choose one of two batteries; it converts, and so does the 5 V rail."""
     log = str(folder / 'raw' / 'px_sample_log_small.ulg')
     assert main(['convert', log, str(tmp_path / 'a')]) == 2
     said = capsys.readouterr().err

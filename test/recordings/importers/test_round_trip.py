@@ -33,14 +33,14 @@ def px4():
 
 
 def ardupilot():
-    """Return a dataflash log, and what is in it."""
+    """Return a dataflash log, and its content."""
     made, t, volts, share, amperes, _ = copter()
     return (made.binary, (t, volts[0]), (t + 5e-4, share), (t, amperes), 'BAT[0].Volt',
             'ArduCopter V4.5.1 (abcd1234)')
 
 
 def betaflight():
-    """Return a blackbox log, and what is in it."""
+    """Return a blackbox log, and its content."""
     t = (ROWS[:, 1] - ROWS[0, 1]) * 1e-6
     return (b''.join(blackbox(ROWS)), (t, ROWS[:, 3] / 100),
             (t, (ROWS[:, 5:7].mean(axis=1) - 100) / 2000), (t, ROWS[:, 4] / 100), 'vbatLatest',
@@ -154,8 +154,8 @@ def test_a_fleet_is_grouped_by_the_vehicle_of_its_logs(tmp_path, one_process):
         'five': 'Maker'}
 
 
-def test_other_libraries_open_it(tmp_path):
-    """The rosbags library reads every topic; metadata.yaml and the MCAP record say the source."""
+def test_rosbags_reads_a_converted_log(tmp_path):
+    """The rosbags library reads every topic; the bag and its metadata.yaml state the source."""
     path, out = tmp_path / 'a.log', tmp_path / 'bag'
     path.write_bytes(betaflight()[0])
     assert main(['convert', str(path), str(out)]) == 0
@@ -190,8 +190,8 @@ sys.exit(main(['convert', {log!r}, {out!r}]))
 
 @pytest.mark.parametrize('size', [0, 12_000])
 @pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
-def test_disk_full(tmp_path, name, size):
-    """When the disk refuses, at whatever byte, one line says so and nothing stays behind."""
+def test_a_full_disk_gives_one_line_and_no_bag(tmp_path, name, size):
+    """Whichever byte the disk refuses, one line reports it and no file stays behind."""
     assert hasattr(resource, 'RLIMIT_FSIZE') and hasattr(signal, 'SIGXFSZ')
     path, out = tmp_path / 'a.log', tmp_path / name
     path.write_bytes(b''.join(blackbox(quad(3000))))
@@ -203,8 +203,8 @@ def test_disk_full(tmp_path, name, size):
     assert not out.exists()
 
 
-def test_no_permission(tmp_path, capsys):
-    """A folder that nobody may write to is one line."""
+def test_a_read_only_folder_gives_one_line(tmp_path, capsys):
+    """A folder without write permission gives a one-line error."""
     path = tmp_path / 'a.csv'
     path.write_text('time_s,voltage_v\n0,5\n1,5.1\n')
     for out in ('/proc/bag', '/proc/bag.mcap'):

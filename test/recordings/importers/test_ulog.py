@@ -1,4 +1,4 @@
-"""PX4 ULog: what is found, how it is scaled, and logs that are cut or broken."""
+"""PX4 ULog: series, scales, and truncated or damaged logs."""
 
 import signal
 
@@ -23,8 +23,8 @@ def named(log):
     return {one.name: one for one in log.series}
 
 
-def test_a_flight(tmp_path):
-    """The battery and the motors are taken, bit for bit, on the clock of the header."""
+def test_battery_and_motors_are_read_exactly(tmp_path):
+    """Battery and motors are read bit for bit, with stamps counted from the header's."""
     topics, t, volts, motors, amperes = px4_flight()
     path, log = load(tmp_path, ulog(topics, start_us=4_000_000, info={
         'sys_name': 'PX4', 'ver_sw_branch': 'main', 'ver_hw': 'BOARD_7'}))
@@ -46,7 +46,7 @@ def test_a_flight(tmp_path):
 @pytest.mark.parametrize('uuid, fact', [
     ('00060038', {'vehicle': 'BOARD_7 00060038'}), ('00000000', {'board': 'BOARD_7'})])
 def test_a_vehicle_has_a_number_of_its_own(tmp_path, uuid, fact):
-    """The kind of board is no vehicle, and neither is the number 0 of a simulator."""
+    """Neither the kind of board nor the number 0 of a simulator identifies a vehicle."""
     _, log = load(tmp_path, ulog(px4_flight()[0], info={
         'sys_name': 'PX4', 'ver_sw_branch': 'main', 'ver_hw': 'BOARD_7', 'sys_uuid': uuid}))
     assert log.facts == {'firmware': 'PX4 main', **fact}
@@ -59,8 +59,8 @@ def test_a_sample_before_the_start_is_the_start(tmp_path):
     assert min(one.t[0] for one in log.series) == 0.0
 
 
-def test_several_batteries(tmp_path):
-    """Two connected batteries are put to the user; one that never was connected is not."""
+def test_two_connected_batteries_need_a_choice(tmp_path):
+    """Only connected batteries count: with two of them the user must choose."""
     topics, t, volts, *_ = px4_flight()
     second = ('battery_status', 1, BATTERY,
               [(int(a), b + 1, -1.0, True) for a, b in zip(t, volts)])
@@ -86,8 +86,8 @@ def test_several_batteries(tmp_path):
     ([('uint32_t', 'noutputs'), ('float[2]', 'output')], (1, 1250.0, 0.0),
      'actuator_outputs[0].output[0]', 0.25),
 ])
-def test_throttles(tmp_path, fields, row, name, value):
-    """Each source of throttle is brought to 0..1."""
+def test_every_source_of_throttle_becomes_0_to_1(tmp_path, fields, row, name, value):
+    """Each source of throttle is converted to 0..1."""
     topics, *_ = px4_flight(20)
     topic = name.split('[')[0]
     fields = [('uint64_t', 'timestamp'), *fields]
@@ -99,8 +99,8 @@ def test_throttles(tmp_path, fields, row, name, value):
     assert taken is None if topic == 'actuator_outputs' else taken.name == name
 
 
-def test_no_battery(tmp_path):
-    """A log with only the rail says so; with nothing at all as well."""
+def test_a_log_without_a_battery_is_refused(tmp_path):
+    """The error differs for a log with only the rail and for one with no voltage."""
     topics, *_ = px4_flight()
     path, log = load(tmp_path, ulog(topics[1:]))
     with pytest.raises(InputError, match='no battery voltage.*voltage5v_v'):
@@ -111,14 +111,14 @@ def test_no_battery(tmp_path):
 
 
 def test_dropouts_are_reported(tmp_path):
-    """What the logger lost is in the notes."""
+    """A note reports messages that the logger lost."""
     topics, *_ = px4_flight()
     _, log = load(tmp_path, ulog(topics, extra=ulog_message('O', b'\x2c\x01')))
     assert log.notes == ('The logger lost data 1 time, 0.300 s in all.',)
 
 
-def test_cut_anywhere(tmp_path):
-    """A cut inside a message is told with its byte; what came before is read."""
+def test_a_truncated_log_is_read_up_to_its_end(tmp_path):
+    """A cut inside a message is reported with its byte; everything before is read."""
     topics, _, volts, *_ = px4_flight(40)
     pieces = ulog(topics)
     ends = np.cumsum([len(piece) for piece in pieces])
@@ -139,8 +139,8 @@ def test_cut_anywhere(tmp_path):
             np.testing.assert_array_equal(found.values, volts[:found.n].astype(float))
 
 
-def test_broken_anywhere(tmp_path):
-    """Flipped bytes end in one line or in a read; samples that went are told."""
+def test_flipped_bytes_give_an_error_or_a_note(tmp_path):
+    """Flipped bytes give a one-line error, or samples and a note on the lost ones."""
     topics, *_ = px4_flight(60)
     whole = b''.join(ulog(topics))
     rng = np.random.default_rng(7)
