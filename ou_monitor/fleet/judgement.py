@@ -375,7 +375,7 @@ class Outliers:
 def outliers(value: FloatArray, error: FloatArray, groups: Sequence[str], rate: float,
              trend: FloatArray | None = None, *, least: int = LEAST, seed: int = 0,
              simulations: int = SIMULATIONS) -> Outliers:
-    """Find outliers (rate 0..1)."""
+    """Find the outlying values (rate 0..1)."""
     n = value.size
     names, of = np.unique(np.asarray(groups, dtype=str), return_inverse=True)
     count = np.bincount(of, minlength=names.size)
