@@ -416,6 +416,7 @@ def plan(model: SupplyModel | ModelFile | str | Path | None = None, *, preset: s
                              f'{value:g}')
     if capacity_left is not None and capacity_left != -1.0 and not 0.0 <= capacity_left <= 1.0:
         raise InputError(f'--capacity-left must lie within 0..1, or be -1, got {capacity_left:g}')
+    resistance = _positive('--scale-resistance', resistance, '')
     charge = math.nan if capacity_left == -1.0 else capacity_left
     return Run(file, name, profile, words, flown, duration, rate, seed, charge, resistance)
 
@@ -439,5 +440,6 @@ def _throttle_of(throttle: Any, start: float | None, end: float | None,
 
 def _positive(name: str, value: float, unit: str) -> float:
     if not (math.isfinite(value) and value > 0.0):
-        raise InputError(f'{name} must be a positive number of {unit}, got {value:g}')
+        raise InputError(f'{name} must be a positive number{unit and f" of {unit}"}, '
+                         f'got {value:g}')
     return value

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass
 import math
 from typing import Any
 
@@ -274,12 +274,9 @@ def _at_the_end(recording: Recording, limit: float | None, monitor: SupplyMonito
         deque(parts, 0)
     if limit is None:
         return monitor.load_filter.load(), None, None
-    asked, usual = monitor.settings, MonitorSettings()
-    monitor.configure(replace(usual, window=asked.window, brownout_voltage=limit))
-    budget = Budget(monitor.report(0.0).budget, limit, usual.brownout_horizon, usual.budget_limit)
-    monitor.configure(asked)
-    last = monitor.report(0.0)
-    return last.load, budget, last
+    last, asked = monitor.report(0.0), monitor.settings
+    return last.load, Budget(
+        last.budget, limit, asked.brownout_horizon, asked.budget_limit), last
 
 
 def _dips(t: FloatArray, v: FloatArray, u: FloatArray, limit: float, noise: Noise) -> Dips:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from typing import Any, TYPE_CHECKING
 
 from ou_monitor.cli import output
@@ -30,9 +31,9 @@ def check_outputs(args: argparse.Namespace, *names: str, **inputs: Any) -> None:
     for option, target in targets.items():
         if target == output.STDOUT:
             raise InputError(f"{option} needs a file: '-' is not supported")
-    output.check_paths(inputs, {'--json': args.json, **targets}, args.force)
     for target in (args.json, *targets.values()):
         output.check_writable(target)
+    output.check_paths(inputs, {'--json': args.json, **targets}, args.force)
 
 
 def read_given(args: argparse.Namespace, signal: str | None = None
@@ -93,6 +94,18 @@ def brownout_limit(args: argparse.Namespace) -> float | None:
             f'--brownout-voltage: with --cells {args.cells} it is volts a cell, and no cell has '
             f'{voltage:g} V: write {voltage / args.cells:.3g}, or leave --cells out')
     return float(args.cells * voltage)
+
+
+def check_ranges(given: Mapping[str, Any]) -> None:
+    """Refuse options that the node would refuse as its parameters."""
+    from ou_monitor.online.settings import ESTIMATOR_PARAMETERS
+
+    for parameter in ESTIMATOR_PARAMETERS:
+        value = given.get(parameter.name.replace('.', '_'))
+        if (value is not None and parameter.low is not None and parameter.high is not None
+                and not parameter.low <= value <= parameter.high):
+            raise InputError(f"--{parameter.name.replace('.', '-')}: {value:g} is not within "
+                             f'{parameter.low:g} to {parameter.high:g}')
 
 
 def part_of_recording(args: argparse.Namespace) -> tuple[float | None, float | None]:

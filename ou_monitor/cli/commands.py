@@ -58,6 +58,8 @@ def number(what: str, fits: Callable[[float], bool]) -> Callable[[str], float]:
 
 # Divisors, because they are exact: 10u is 1e-5 to the last digit.
 _PREFIX = {'': 1.0, 'p': 1e12, 'n': 1e9, 'u': 1e6, 'µ': 1e6, 'm': 1e3, 'k': 1e-3, 'M': 1e-6}
+# No component, time or level is as large; products of such numbers stay finite.
+_QUANTITY_MOST = 1e15
 _QUANTITY = re.compile(r'([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([pnuµmkM]?)'
                        r'(F|H|[Oo]hm|Ω|V|A|Hz|W|s|1/s)?')
 
@@ -66,7 +68,7 @@ def quantity(unit: str) -> Callable[[object], float]:
     """Return a parser of numbers with an optional SI prefix and unit."""
     def read(text: object) -> float:
         match = None if isinstance(text, bool) else _QUANTITY.fullmatch(str(text).strip())
-        if not match or math.isinf(float(match[1])):
+        if not match or not abs(float(match[1])) < _QUANTITY_MOST:
             raise argparse.ArgumentTypeError(f"'{text}' is not a number; write it as " + (
                 f'0.00047, 470u or 470u{unit}' if unit else '0.4 or 1e-3'))
         given = {'ohm': 'Ohm', 'Ω': 'Ohm'}.get(match[3], match[3])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import math
+import os
 from pathlib import Path
 import shlex
 import sys
@@ -12,7 +13,7 @@ from typing import Any, TYPE_CHECKING
 
 from ou_monitor import __version__
 from ou_monitor.cli import output
-from ou_monitor.cli.arguments import brownout_limit, repeated
+from ou_monitor.cli.arguments import brownout_limit, check_ranges, repeated
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import how_to_install, InputError
 
@@ -34,20 +35,25 @@ def run(args: argparse.Namespace) -> int:
     folder = Path(args.output)
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--output '{folder}' is a file: name a folder")
-    output.check_paths({}, {'--json': args.json}, args.force)
-    if not (folder / 'parts').is_dir():
-        # These two files of an earlier run are written again; other files are not ours.
-        output.check_paths({}, {f'--output ({name})': folder / name for name in (REPORT, TABLE)},
-                           args.force)
-    output.check_writable(args.json)
-
     from ou_monitor.fleet.find import find_recordings
-    from ou_monitor.fleet.fleet import run_fleet
+    from ou_monitor.fleet.fleet import is_own, run_fleet
     from ou_monitor.fleet.vehicles import read_pattern
+
+    made = {f'--output ({name})': folder / name for name in (REPORT, TABLE)}
+    for path in made.values():
+        if os.path.lexists(path) and not path.is_file():
+            raise InputError(f"'{path}' is not a file: remove it, or name another folder")
+    output.check_paths({}, {**made, '--json': args.json}, force=True)
+    output.check_paths({}, {'--json': args.json}, args.force)
+    # These two files of an earlier run are written again; other files are not ours.
+    output.check_paths({}, made, args.force or is_own(folder))
+    output.check_writable(args.json)
 
     options, more = _options(args)
     pattern = None if args.vehicle_from is None else read_pattern(args.vehicle_from)
     found = find_recordings(args.recordings, leave_out=folder)
+    output.check_paths({f'recording {k}': source.path for k, source in enumerate(
+        found.sources, 1)}, {'--json': args.json}, force=True)
     try:
         quiet = args.json == output.STDOUT
         with Progress('comparing', quiet) as comparing, \
@@ -124,9 +130,12 @@ def _options(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
                                  ) from error
         from ou_monitor.stream.config import load_msg_config
         load_msg_config(config)
+    limit = brownout_limit(args)
+    check_ranges({'window': args.window, 'brownout_voltage': limit,
+                  'brownout_horizon': args.brownout_horizon})
     return Options(
         levels=args.levels, window=args.window,
-        brownout_voltage=math.nan if (limit := brownout_limit(args)) is None else limit,
+        brownout_voltage=math.nan if limit is None else limit,
         brownout_horizon=args.brownout_horizon,
         msg_config=config, voltage_topic=args.voltage_topic, throttle_topic=args.throttle_topic,
         partial=args.partial, discover=args.discover, seed=args.seed), more

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from contextlib import suppress
 from io import TextIOWrapper
 import os
+import signal
 import sys
 from typing import NoReturn
 
@@ -21,6 +23,17 @@ PROGRAM = 'ou-monitor'
 BAD_INPUT = 2
 # Exit status that a shell reports for a program ended by Ctrl-C.
 INTERRUPTED = 130
+
+
+def _complain(text: str) -> None:
+    """Write one line to standard error, whatever a file name or a library's message contains."""
+    with suppress(OSError, ValueError):
+        print(' '.join(text.split()), file=sys.stderr, flush=True)
+
+
+def _end(number: int, frame: object) -> NoReturn:
+    """End as by an error, so that what was moved aside comes back."""
+    sys.exit(128 + number)
 
 
 class Parser(argparse.ArgumentParser):
@@ -76,6 +89,8 @@ def _options(parser: argparse.ArgumentParser, command: str) -> list[str]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command."""
+    if argv is None:
+        signal.signal(signal.SIGTERM, _end)
     given = list(sys.argv[1:] if argv is None else argv)
     where = PROGRAM
     for name in ('stdout', 'stderr'):
@@ -99,8 +114,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             say('', end='')
             return stop.code if isinstance(stop.code, int) else 0
     except InputError as error:
-        # One line, whatever a file name or a library's message contains.
-        print(f"{where}: {' '.join(str(error).split())}", file=sys.stderr)
+        _complain(f'{where}: {error}')
         return BAD_INPUT
     except KeyboardInterrupt:
         return INTERRUPTED
@@ -113,19 +127,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     except OSError as error:
         # Refusals by the system, such as searching a folder, may come from any call.
-        print(f'{where}: {refusal(error)}', file=sys.stderr)
+        _complain(f'{where}: {refusal(error)}')
         return BAD_INPUT
     except MemoryError:
-        print(f'{where}: not enough memory: take a part of the recording (--from, --to)',
-              file=sys.stderr)
+        _complain(f'{where}: not enough memory: take a part of the recording (--from, --to)')
         return BAD_INPUT
     except Exception as error:
         from ou_monitor.model.terms.catalogue import blamed
 
         if not (names := blamed(error)):
             raise
-        print(f"{where}: the cause '{names[0]}' of another package failed: "
-              f"{type(error).__name__}: {' '.join(str(error).split())}", file=sys.stderr)
+        _complain(f"{where}: the cause '{names[0]}' of another package failed: "
+                  f'{type(error).__name__}: {error}')
         return BAD_INPUT
 
 

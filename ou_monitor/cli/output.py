@@ -107,8 +107,8 @@ _NO_FILE = 'Nothing was written: --report FILE.html draws it, --json FILE keeps 
 _STORAGE = ('.mcap', '.db3', '.zst', '.zstd', '.lz4')
 
 
-def write_json(data: Mapping[str, Any], target: str) -> None:
-    """Write strict JSON."""
+def write_json(data: Mapping[str, Any], target: str, force: bool = False) -> None:
+    """Write strict JSON; with `force` over a file that is there."""
     # Imported here, so that `--help` needs no NumPy.
     from ou_monitor.report.result import plain
 
@@ -117,7 +117,7 @@ def write_json(data: Mapping[str, Any], target: str) -> None:
     if target == STDOUT:
         say(text)
     else:
-        write_text(text + '\n', target)
+        write_text(text + '\n', target, force)
 
 
 def say(text: str, end: str = '\n') -> None:
@@ -140,17 +140,21 @@ def abandon_stdout() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def write_text(text: str, target: str | Path) -> None:
-    """Write a text file in UTF-8."""
+def write_text(text: str, target: str | Path, force: bool = False) -> None:
+    """Write a text file in UTF-8; with `force` over a file that is there."""
     from ou_monitor.stream.files import write_whole
 
     # A file name may hold bytes that are not valid text.
     path, content = Path(target), text.encode('utf-8', 'backslashreplace')
     if not _is_device(path):
-        write_whole(path, content)
+        write_whole(path, content, over=force)
         return
     try:
-        path.write_bytes(content)
+        # A FIFO without a reader refuses, instead of waiting for one.
+        with open(path, 'wb', opener=lambda name, flags: os.open(
+                name, os.O_WRONLY | os.O_NONBLOCK)) as file:
+            os.set_blocking(file.fileno(), True)
+            file.write(content)
     except OSError as error:
         raise InputError(f"cannot write '{target}': {error.strerror or error}") from error
 
@@ -183,9 +187,15 @@ def check_paths(inputs: Mapping[str, str | Path | None],
             if _same(target, earlier):
                 raise InputError(f"{other} and {name} are both '{target}': give each its own "
                                  'name')
+            inner, outer = sorted((target.resolve(), earlier.resolve()),
+                                  key=lambda path: -len(path.parts))
+            if outer in inner.parents and (
+                    not outer.is_dir() or (outer / 'metadata.yaml').exists()):
+                raise InputError(f"{other} and {name}: '{inner.name}' would lie in the bag "
+                                 f"'{outer.name}': give it a name elsewhere")
     for name, target in written:
         # `check_writable` reports a folder in place of a file.
-        if target.is_file() and not force:
+        if os.path.lexists(target) and not target.is_dir() and not force:
             raise InputError(f"{name} '{target}' exists already: --force overwrites it, or give "
                              'another name')
 
@@ -198,9 +208,15 @@ def replacing(bag: Path | None, force: bool) -> Iterator[None]:
         return
     if not force:
         raise InputError(f"'{bag}' exists already: --force overwrites it, or give another name")
-    if bag.is_dir() and not all(
-            one.name == 'metadata.yaml' or one.name.endswith(_STORAGE) for one in bag.iterdir()):
-        raise InputError(f"'{bag}' is a folder that holds more than a bag: it is not overwritten")
+    from ou_monitor.recordings.bag import read_metadata, remove_bag
+
+    if bag.is_dir() and not bag.is_symlink():
+        files = read_metadata(bag).paths
+        if {*bag.iterdir()} != {bag / 'metadata.yaml', *files}:
+            raise InputError(f"'{bag}' is a folder that holds more than one bag: it is not "
+                             'overwritten')
+    elif not bag.is_symlink() and not bag.is_file():
+        raise InputError(f"'{bag}' is neither a file nor a folder: it is not overwritten")
     aside = bag.with_name(f'.{bag.name}.{os.getpid()}.old')
     os.rename(bag, aside)
     try:
@@ -209,7 +225,7 @@ def replacing(bag: Path | None, force: bool) -> Iterator[None]:
         os.rename(aside, bag)
         raise
     if aside.is_dir() and not aside.is_symlink():
-        shutil.rmtree(aside)
+        remove_bag([aside / file.name for file in files], aside)
     else:
         aside.unlink()
 
@@ -228,7 +244,7 @@ def _same(first: Path, second: Path) -> bool:
 
 def _overwrites(target: Path, source: Path) -> bool:
     """Return whether writing the target would harm the source: a file, or a bag's folder."""
-    if _same(target, source):
+    if _same(target, source) or target.is_dir() and target.resolve() in source.resolve().parents:
         return True
     if not source.is_dir() or source.resolve() not in target.resolve().parents:
         return False
@@ -249,12 +265,17 @@ def check_writable(target: str | None) -> None:
 
 def deliver(args: argparse.Namespace, found: Result, command: str = '',
             report: str | Path | None = None, **files: object) -> None:
-    """Write a command's result to the page, JSON file and terminal that its arguments name."""
+    """
+    Write a command's result to the page, JSON file and terminal that its arguments name.
+
+    report: a page whose place was checked, and which may be overwritten.
+    """
+    force = args.force or report is not None
     report = report or getattr(args, 'report', None)
     document = found.document(command)
     if report is not None:
         from ou_monitor.report.page import html
-        write_text(html(document), report)
+        write_text(html(document), report, force)
     tell(args, document, found.to_dict)
     if args.json != STDOUT:
         summary(document.answer, **files, report=report, json=args.json)
@@ -266,7 +287,7 @@ def tell(args: argparse.Namespace, document: Document,
     from ou_monitor.report.terminal import terminal
 
     if args.json is not None:
-        write_json(data(), args.json)
+        write_json(data(), args.json, args.force)
     if args.json != STDOUT:
         say(terminal(document))
 

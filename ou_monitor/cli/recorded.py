@@ -12,7 +12,8 @@ from typing import Any, TYPE_CHECKING
 
 from ou_monitor import __version__, bench
 from ou_monitor.cli import output
-from ou_monitor.cli.arguments import brownout_limit, check_outputs, read_given, repeated
+from ou_monitor.cli.arguments import (
+    brownout_limit, check_outputs, check_ranges, read_given, repeated)
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
 
@@ -73,7 +74,7 @@ def discover(args: argparse.Namespace) -> int:
         if finding.refused and not args.force:
             raise InputError(f'no model saved: {finding.refused[0].lower()}{finding.refused[1:]}; '
                              '--force saves it all the same')
-        output.write_text(model_text(finding.record, recording), args.save_model)
+        output.write_text(model_text(finding.record, recording), args.save_model, args.force)
     return 0
 
 
@@ -88,21 +89,12 @@ def reproduce(args: argparse.Namespace) -> int:
 
 def _bench_arguments(args: argparse.Namespace, *names: str) -> dict[str, Any]:
     """Return some arguments and the limit for a function of `bench`; check paths and ranges."""
-    from ou_monitor.online.settings import ESTIMATOR_PARAMETERS
-
     check_outputs(args, *(name for name in ('save_model', 'report') if name in args),
                   RECORDING=args.recording, **{
                       '--msg-config': args.msg_config, '--model': getattr(args, 'model', None)})
     given = {name: getattr(args, name) for name in names}
     given.update(brownout_voltage=brownout_limit(args), cells=args.cells or 0)
-    for parameter in ESTIMATOR_PARAMETERS:
-        # The node would refuse it too.
-        value = given.get(parameter.name.replace('.', '_'))
-        if (parameter.name.startswith('brownout.') and value is not None
-                and parameter.low is not None and parameter.high is not None
-                and not parameter.low <= value <= parameter.high):
-            raise InputError(f"--{parameter.name.replace('.', '-')}: {value:g} is not within "
-                             f'{parameter.low:g} to {parameter.high:g}')
+    check_ranges(given)
     return given
 
 

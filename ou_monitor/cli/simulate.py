@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
         if args.json is not None:
             raise InputError('--json says what was simulated: it needs --output PATH.mcap')
     if args.save_model is not None:
-        output.write_text(as_yaml(found.file), args.save_model)
+        output.write_text(as_yaml(found.file), args.save_model, args.force)
     if args.output is None:
         return 0
     said = found.document('')

@@ -77,7 +77,9 @@ def export(model: SupplyModel, target: str, *, throttle: FloatArray, rate: float
                 'load': None if model.load is None else model.load.values()}
         return Export(json.dumps(data, indent=1, allow_nan=False), (), model)
     n = _numbers(model, throttle)
-    known = math.isfinite(full_current) and full_current > 0.0
+    known = not math.isnan(full_current)
+    if known and not 0.0 < full_current < math.inf:
+        raise InputError(f'--full-current must be above 0 A, got {full_current:g}')
     if target != 'px4' and not known:
         raise InputError(f'--export {target} needs --full-current A, the current at full '
                          'throttle: the model knows throttle alone')

@@ -14,6 +14,7 @@ import hashlib
 import json
 from pathlib import Path
 import re
+from tempfile import TemporaryFile
 from typing import Any
 
 from ou_monitor.errors import InputError
@@ -28,8 +29,19 @@ from ou_monitor.stream.files import open_regular, write_whole
 from ou_monitor.text import printable
 
 FOLDER = 'parts'
+# File in it that says whose it is, and its text.
+_MARK, _MARK_TEXT = 'ou_monitor_fleet.txt', b'Results of ou-monitor fleet, one a recording.\n'
 # Maximum size of a result that is read, bytes; one has some 10 kB.
 _MOST = 50_000_000
+
+
+def is_own(folder: Path) -> bool:
+    """Return whether a fleet has written into a folder before."""
+    try:
+        with open_regular(folder / FOLDER / _MARK) as file:
+            return file.read(len(_MARK_TEXT) + 1) == _MARK_TEXT
+    except OSError:
+        return False
 
 
 class Parts:
@@ -44,12 +56,13 @@ class Parts:
         self._options = json.dumps(dict(options), sort_keys=True)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
+            # An unwritable output folder must fail before the work, not after it.
+            with TemporaryFile(dir=self._folder) as probe:
+                probe.write(b' ' * 4096)
         except OSError as error:
             raise InputError(f"cannot write into '{folder}': {error.strerror or error}") from error
-        # An unwritable output folder must fail before the work, not after it.
-        probe = self._folder / '.probe'
-        write_whole(probe, b' ' * 4096)
-        probe.unlink()
+        if not is_own(folder):
+            write_whole(self._folder / _MARK, _MARK_TEXT, over=False)
 
     def _path(self, source: FoundRecording) -> Path:
         text = json.dumps([str(source.path), source.size, source.stamp, self._options])

@@ -41,6 +41,8 @@ _ALIVE = 5.0
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
     port = _port(args.port)
+    if not args.host:
+        raise InputError('--host: the address is empty; 0.0.0.0 listens on all')
     try:
         import tornado.web  # noqa: F401
     except ImportError as error:

@@ -16,7 +16,6 @@ import bisect
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
-import shutil
 from types import TracebackType
 from typing import Any, NamedTuple
 
@@ -121,6 +120,15 @@ def find_files(path: Path, partial: bool) -> BagFiles:
                 'recording that was cut off, use --partial')
         raise InputError(f'{path}: {missing}; use --partial to read the intact part')
     return BagFiles(files, {}, missing)
+
+
+def remove_bag(files: Iterable[Path], folder: Path | None) -> None:
+    """Remove files and metadata of a bag, and its folder if that is empty then."""
+    for file in (*files, *(() if folder is None else [folder / FILE])):
+        file.unlink(missing_ok=True)
+    if folder is not None:
+        with suppress(OSError):
+            folder.rmdir()
 
 
 class RawMessage(NamedTuple):
@@ -445,10 +453,7 @@ class BagWriter:
         # On a full disk closing fails too, because the buffer cannot be flushed.
         with suppress(OSError):
             self._file.close()
-        if self._folder is not None:
-            shutil.rmtree(self._folder)
-        else:
-            self._mcap.unlink()
+        remove_bag([self._mcap], self._folder)
 
     def __enter__(self) -> BagWriter:
         """Return itself."""

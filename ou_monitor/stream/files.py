@@ -57,13 +57,16 @@ def open_regular(path: str | Path) -> BinaryIO:
     return file
 
 
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all."""
+def write_whole(path: Path, content: bytes, *, over: bool = True) -> None:
+    """Write a file whole or not at all; without `over`, only if none is there."""
     draft = path.with_name(f'.{path.name}.{os.getpid()}.draft')
     try:
         # The path may be a FIFO, which would wait for its reader, or a link to another folder.
         draft.unlink(missing_ok=True)
         draft.write_bytes(content)
+        if not over:
+            # Take the name; this fails if a file has appeared since the output was checked.
+            os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
         os.replace(draft, path)
     except OSError as error:
         # The folder itself may refuse.

@@ -111,7 +111,8 @@ def test_unknown_is_null(tmp_path, capsys):
     (['--levels', '5,10'], "'5'"), (['--levels', 'a'], "'a'"), (['--levels', ''], "''"),
     (['--levels', '0.1,0.1'], 'twice'), (['--levels', 'nan'], "'nan'"),
     (['--window', '0'], '--window'), (['--window', 'inf'], '--window'),
-    (['--window', 'x'], '--window'), (['--brownout-voltage', 'x'], '--brownout-voltage'),
+    (['--window', 'x'], '--window'), (['--window', '7200'], '--window: 7200 is not within'),
+    (['--brownout-voltage', 'x'], '--brownout-voltage'),
     (['--brownout-horizon', '-1'], '--brownout-horizon'),
     (['--brownout-horizon', '1e6'], '--brownout-horizon: 1e+06 is not within 0.001 to 3600'),
     (['--brownout-voltage', '5000'], '--brownout-voltage: 5000 is not within 0 to 1000'),
@@ -156,6 +157,14 @@ def test_text_says_which_voltage_must_not_be_undershot(flight, capsys):
     assert (found['brownout']['voltage'], found['brownout']['voltage_source']) == (4.7, 'given')
     # The sag of 0.2 V at 40 % leaves 0.1 V, two standard deviations.
     assert found['brownout']['throttle_budget'] < 0.4
+
+
+def test_a_horizon_asked_for_is_that_of_every_budget(flight, capsys):
+    assert main(['analyze', str(flight), '--brownout-voltage', '4.5', '--brownout-horizon', '1',
+                 '--json', '-']) == 0
+    data = strict(capsys.readouterr().out)
+    budget = data['supply']['budget']
+    assert (budget['throttle'], budget['horizon_s']) == (data['brownout']['throttle_budget'], 1.0)
 
 
 def test_a_part_is_analyzed_alone(flight, tmp_path, capsys):

@@ -285,6 +285,10 @@ def refused(capsys, *arguments: object) -> str:
     (['LOGS', '--output', 'OUT', '--seed', '-1'], ['--seed']),
     (['LOGS', '--output', 'OUT', '--msg-config', 'no_such'], ['no_such']),
     (['LOGS', '--output', 'OUT', '--levels', '2'], ['--levels']),
+    (['LOGS', '--output', 'OUT', '--window', '1e-9'], ['--window', 'not within']),
+    (['LOGS', '--output', 'OUT', '--json', 'OUT/fleet.html'], ['--json', 'are both']),
+    (['LOGS', '--output', 'OUT', '--force', '--json', 'LOGS/uav1/bad.mcap'],
+     ['would overwrite']),
 ])
 def test_bad_input_is_one_line(arguments, words, logs, tmp_path, capsys):
     """What was wrong, where, what to do; exit status 2, and nothing is left behind."""
@@ -292,6 +296,16 @@ def test_bad_input_is_one_line(arguments, words, logs, tmp_path, capsys):
              for a in arguments]
     said = refused(capsys, *given)
     assert all(word in said for word in words), said
+
+
+@pytest.mark.parametrize('name', ['fleet.html', 'fleet.parquet', 'parts/ou_monitor_fleet.txt'])
+def test_files_in_a_folder_of_that_shape_are_not_its_own(name, logs, tmp_path, capsys):
+    """A folder is a fleet's own where the mark in it says so, not where it has `parts`."""
+    out = tmp_path / 'out'
+    (out / 'parts').mkdir(parents=True)
+    (out / name).write_text('precious')
+    refused(capsys, str(logs), '--output', str(out))
+    assert (out / name).read_text() == 'precious'
 
 
 def test_a_fleet_of_bad_files_alone_is_refused(tmp_path, one_process, capsys):

@@ -110,7 +110,7 @@ def test_what_was_there_stays_when_the_disk_is_full(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, 'No space left on device')
     monkeypatch.setattr(Path, 'write_bytes', full)
     with pytest.raises(InputError, match='No space left'):
-        output.write_text('new page', target)
+        output.write_text('new page', target, force=True)
     assert target.read_text() == 'old' and list(tmp_path.iterdir()) == [target]
 
 
@@ -127,7 +127,9 @@ def test_what_is_there_is_overwritten_when_forced_only(tmp_path):
 def bag_folder(path: Path, content: str) -> Path:
     """Make a rosbag2 folder of sorts."""
     path.mkdir()
-    (path / 'metadata.yaml').write_text(content)
+    (path / 'metadata.yaml').write_text(
+        'rosbag2_bagfile_information: {storage_identifier: mcap, '
+        f'relative_file_paths: [{path.name}_0.mcap]}}')
     (path / f'{path.name}_0.mcap').write_text(content)
     return path
 
@@ -142,17 +144,65 @@ def test_a_bag_makes_room_for_the_next(tmp_path):
         with output.replacing(bag, force=True):
             assert not bag.exists()
             raise KeyboardInterrupt
-    assert (bag / 'metadata.yaml').read_text() == 'old'
+    assert (bag / 'bag_0.mcap').read_text() == 'old'
     with output.replacing(bag, force=True):
         bag_folder(bag, 'new')
-    assert (bag / 'metadata.yaml').read_text() == 'new' and list(tmp_path.iterdir()) == [bag]
-    (bag / 'notes.txt').write_text('mine')
-    with pytest.raises(InputError, match='holds more than a bag'):
-        with output.replacing(bag, force=True):
-            pytest.fail('nothing of a user is taken away')
-    assert (bag / 'notes.txt').read_text() == 'mine'
+    assert (bag / 'bag_0.mcap').read_text() == 'new' and list(tmp_path.iterdir()) == [bag]
     with output.replacing(tmp_path / 'other.mcap', force=False):
         pass
+
+
+@pytest.mark.parametrize('foreign', ['notes.txt', 'monday.mcap', 'backup.tar.zst', 'bag_1.mcap'])
+@pytest.mark.parametrize('whole', [True, False])
+def test_a_folder_that_is_not_one_bag_stays(tmp_path, foreign, whole):
+    """With a file that its metadata does not name, or without metadata."""
+    bag = bag_folder(tmp_path / 'bag', 'old')
+    (bag / foreign).write_text('mine')
+    if not whole:
+        (bag / 'metadata.yaml').unlink()
+    there = {path: path.read_text() for path in bag.iterdir()}
+    with pytest.raises(InputError, match='more than one bag|cannot read the metadata'):
+        with output.replacing(bag, force=True):
+            pytest.fail('nothing of a user is taken away')
+    assert {path: path.read_text() for path in bag.iterdir()} == there
+
+
+def test_a_fifo_is_no_bag_and_hangs_nothing(tmp_path):
+    fifo = tmp_path / 'fifo'
+    os.mkfifo(fifo)
+    with pytest.raises(InputError, match='neither a file nor a folder'):
+        with output.replacing(fifo, force=True):
+            pytest.fail('it is not replaced')
+    with pytest.raises(InputError, match='cannot write'):
+        output.write_text('nobody reads this', fifo, force=True)
+
+
+def test_an_output_within_another_or_around_an_input_is_refused(tmp_path):
+    bag, log = bag_folder(tmp_path / 'bag', 'old'), tmp_path / 'logs' / 'log.csv'
+    log.parent.mkdir()
+    log.write_text('x')
+    for inner in ('bag_0.mcap', 'metadata.yaml', 'deep/x.json'):
+        with pytest.raises(InputError, match='would lie in the bag'):
+            output.check_paths({}, {'--output': bag, '--json': bag / inner}, force=True)
+    with pytest.raises(InputError, match='would overwrite LOG'):
+        output.check_paths({'LOG': log}, {'OUT': log.parent}, force=True)
+
+
+def test_what_appears_during_the_work_is_not_overwritten(tmp_path):
+    """Nor is a link, wherever it leads; with force both are."""
+    late, link = tmp_path / 'late.json', tmp_path / 'link.json'
+    late.write_text('mine')
+    link.symlink_to(tmp_path / 'nowhere')
+    for path in (late, link):
+        with pytest.raises(InputError, match='File exists'):
+            output.write_text('new', path)
+    with pytest.raises(InputError, match='exists already'):
+        output.check_paths({}, {'--json': link})
+    assert late.read_text() == 'mine' and link.is_symlink()
+    for path in (late, link):
+        output.write_text('new', path, force=True)
+        assert path.read_text() == 'new'
+    assert {path.name for path in tmp_path.iterdir()} == {'late.json', 'link.json'}
 
 
 class Screen(io.StringIO):

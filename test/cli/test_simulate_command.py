@@ -193,6 +193,8 @@ def test_throttle_of_blocks(tmp_path):
     (['--rate', '2e9', '--duration', '1e-6'], '--rate must be at most 1e+09 Hz'),
     (['--rate', '1e10', '--duration', '1e-6', '--type', 'float32'], '--rate'),
     (['--rate', '1e-7', '--duration', '1e11', '--type', 'float64'], '--duration must be at most'),
+    (['--scale-resistance', '-1'], '--scale-resistance'),
+    (['--scale-resistance', 'nan'], '--scale-resistance'),
     (['--seed', '-1'], '--seed'), (['--seed', '1.5'], '--seed'), (['--throttle', '2'], '0..1'),
     (['--throttle', 'flihgt'], "'flight'"), (['--throttle', 'none.csv'], 'none.csv'),
     (['--type', 'float16'], 'float16'), (['--model', 'none.yaml'], 'none.yaml'),
@@ -244,30 +246,33 @@ def test_an_error_half_way_leaves_nothing(tmp_path, name, model, words, capsys):
     assert [p.name for p in tmp_path.iterdir()] == ['m.yaml']
 
 
+@pytest.mark.parametrize('number, status', [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 @pytest.mark.parametrize('name', ['a.mcap', 'a'])
-def test_ctrl_c(tmp_path, name):
+def test_a_signal_brings_the_old_bag_back(tmp_path, name, number, status):
     """
-    Interrupted while it writes: status 130, no traceback, no bag.
+    Ended while it writes: no traceback, no new bag, and the old one in its place.
 
     An hour at 20 kHz lasts far longer than the test; the signal goes out once
     the bag has grown.
     """
     path = tmp_path / name
+    assert main(['simulate', '--preset', 'idle', '--duration', '1', '--output', str(path)]) == 0
+    old = {p: p.stat().st_mtime_ns for p in tmp_path.rglob('*')}
     process = subprocess.Popen(
         [sys.executable, '-m', 'ou_monitor.cli.main', 'simulate', '--duration', '3600', '--rate',
-         '20000', '--output', str(path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        text=True, env={**os.environ, 'PYTHONPATH': str(ROOT)})
+         '20000', '--force', '--output', str(path)], stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True, env={**os.environ, 'PYTHONPATH': str(ROOT)})
     try:
         end = time.monotonic() + 60.0
-        while sum(p.stat().st_size for p in tmp_path.rglob('*.mcap')) < 100_000:
+        while sum(p.stat().st_size for p in [path, *path.glob('*.mcap')] if p.is_file()) < 1e6:
             assert process.poll() is None and time.monotonic() < end, process.stderr.read()
             time.sleep(0.02)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         out, err = process.communicate(timeout=60)
     finally:
         process.kill()
-    assert (process.returncode, out, err) == (130, '', '')
-    assert list(tmp_path.iterdir()) == []
+    assert (process.returncode, out, err) == (status, '', '')
+    assert {p: p.stat().st_mtime_ns for p in tmp_path.rglob('*')} == old
 
 
 def test_the_writer_leaves_nothing_when_finishing_fails(tmp_path, monkeypatch):
