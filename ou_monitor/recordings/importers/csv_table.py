@@ -75,17 +75,26 @@ AMPERE_WORDS = {'a': 'A', 'amp': 'A', 'amps': 'A', 'ampere': 'A', 'amperes': 'A'
 SHARE_WORDS = {'%': '%', 'percent': '%', 'pct': '%', 'prozent': '%'}
 CURRENT_UNITS = {'A': 1.0, 'mA': 1e-3, 'uA': 1e-6}
 WORDS = {**TIME_WORDS, **VOLT_WORDS, **AMPERE_WORDS, **SHARE_WORDS}
+# A quantity with one of these words at the end of its name: first in brackets.  Without unbounded
+# repetitions after the quantity, so that long names cost no more than their length.
+_WORD = f"({'|'.join(sorted(WORDS, key=len, reverse=True))})"
+_WITH_UNIT = re.compile(
+    rf'(.*?) ?[\[({{] ?{_WORD} ?[\])}}]|(.+?) in {_WORD}|(.[^/]*?|.+? ) ?/ ?{_WORD}|'
+    rf'(.+?)[ _]{_WORD}')
 # Lines above the data that state the time between rows, or its inverse.
 _NUMBER = r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?'
+# Possessive, so that lines of blanks cost no more than their length.
 _INTERVAL = re.compile(
     r'(sampl(?:e|ing)[ _]*(?:interval|period|time)|t_?inc(?:rement)?|x[ _-]?inc(?:rement)?|'
-    r'increment|delta[ _]?t|sampl(?:e|ing)[ _]*(?:rate|frequency))\b["\s]*(?:[\[(](\w+)[\])])?'
-    rf'[\s"=:,;]*(?:\w+:)?[\s"]*({_NUMBER})\s*(n|u|µ|m|k|M|G)?(s|sec|hz|sa/s)?', re.IGNORECASE)
+    r'increment|delta[ _]?t|sampl(?:e|ing)[ _]*(?:rate|frequency))\b["\s]*+(?:[\[(](\w+)[\])])?+'
+    rf'[\s"=:,;]*+(?:\w+:)?[\s"]*+({_NUMBER})\s*+(n|u|µ|m|k|M|G)?(s|sec|hz|sa/s)?',
+    re.IGNORECASE)
 _PREFIX = {'n': 1e-9, 'u': 1e-6, 'µ': 1e-6, 'm': 1e-3, 'k': 1e3, 'M': 1e6, 'G': 1e9, '': 1.0}
+# Without a date hours may have gone by, up to 99; zones reach from -12:00 to +14:00.
 CLOCK = re.compile(
-    r'\s*(?:(\d{4})[-/.](\d\d?)[-/.](\d\d?)|(\d\d?)([./-])(\d\d?)[./-](\d{4}|\d\d))?[T ,]*'
-    r'(?:(\d\d?):(\d\d)(?::(\d\d)(?:[.,:](\d{1,9}))?)?)?\s*(Z|UTC|[-+]\d\d:?\d\d)?\s*'
-    r'([AaPp][Mm])?\s*')
+    r'\s*+(?:(\d{4})[-/.](\d\d?)[-/.](\d\d?)|(\d\d?)([./-])(\d\d?)[./-](\d{4}|\d\d))?+[T ,]*+'
+    r'(?:(\d\d?):([0-5]\d)(?::([0-5]\d|60)(?:[.,:](\d{1,9}))?)?)?+\s*+'
+    r'(Z|UTC|[-+](?:0\d|1[0-4]):?[0-5]\d)?+\s*+([AaPp][Mm])?+\s*+')
 CHANNEL = re.compile(r'(?:ch|channel|chan|kanal|analog)[_ ]?[0-9a-d]|a[0-3]', re.IGNORECASE)
 
 
@@ -115,16 +124,20 @@ def form_of(path: Path, wanted: CsvColumns) -> Form:
         raise InputError(f'cannot read {path}: {error.strerror}') from error
     encoding = _encoding(path, head)
     text = head.decode(encoding, 'ignore')
-    lines = text.splitlines(keepends=True)[:_HEAD_LINES]
+    lines = io.StringIO(text, newline=None).readlines()[:_HEAD_LINES]
     if len(head) == _HEAD and len(lines) > 1 and len(lines) < _HEAD_LINES:
         lines.pop()
     if max(map(len, lines), default=0) >= min(MOST_OF_LINE, _HEAD - 3):
         raise InputError(f'{path}:1: the line has more than {MOST_OF_LINE} characters')
     if not any(line.strip() and not line.lstrip().startswith('#') for line in lines):
         raise InputError(f'{path} is empty: expected a header with {TIME},{VOLTAGE}[,{THROTTLE}]')
-    given = DELIMITERS.get(wanted.delimiter or '', wanted.delimiter)
+    given = None if wanted.delimiter is None else DELIMITERS.get(
+        wanted.delimiter, wanted.delimiter)
+    if given is not None and (len(given) != 1 or given in '"\r\n'):
+        raise InputError(f"--delimiter: '{shown(given)}' is not one character that separates "
+                         "cells, 'tab' or 'space'")
     best: tuple[float, Form] | None = None
-    for delimiter in (given,) if given else (',', ';', '\t', '|', ' '):
+    for delimiter in (',', ';', '\t', '|', ' ') if given is None else (given,):
         for mark in (wanted.decimal,) if wanted.decimal else ('.', ','):
             if mark == delimiter or best and delimiter == ' ' and best[1].width > 1:
                 continue
@@ -180,7 +193,9 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool, sk
                   and any(row[j:j + 1] and is_value(row[j]) for j in places)
                   and all(not row[j:j + 1] or is_value(row[j]) or row[j].lower() in MISSING
                           for j in places)), None)
-    if first is None:
+    if first is not None:
+        first = _after_names(rows, skip, first, width, places)
+    else:
         # A header alone is a format without rows.
         first, places = len(rows), []
         if len(filled) != 1 or any(map(is_value, filled[0])):
@@ -193,6 +208,17 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool, sk
     return fit * (1.0 if width > 1 else 0.4) + 0.01 * min(width, 20) / 20, Form(
         encoding, delimiter, comma, first, at, names, units, width, first_rows, start, step,
         stated)
+
+
+def _after_names(rows: list[list[str]], skip: int, first: int, width: int, places: list[int],
+                 ) -> int:
+    """Return the first row below the names; `first` is the first without a bad cell."""
+    full = [k for k in range(skip, first) if len(rows[k]) == width]
+    numeric = [any(is_value(rows[k][place]) for place in places) for k in full]
+    names = max((k for k, some in zip(full, numeric) if not some and all(
+        rows[k][place] for place in places)), default=first)
+    return next((k for k, some in zip(full, numeric)
+                 if k > names and some and not _are_units(rows[k])), first)
 
 
 def _prepared(lines: list[str], delimiter: str, comma: bool) -> list[str]:
@@ -230,15 +256,14 @@ def swapped(cell: str) -> str:
 
 def unit_of(name: str) -> tuple[str, str]:
     """Split a name into its quantity and the unit it states, in small letters; '': none."""
-    text = name.strip().strip('\'"')
+    text = ' '.join(name.strip().strip('\'"').split())
     if found := re.match(r'(millis|micros|ms|us|ns)(?![A-Za-z])', text):
         return text, found[1]
-    for pattern in (r'(.*?)\s*[\[({]\s*([^\[\](){}]*?)\s*[\])}]$', r'(.+?) in (\S+)$',
-                    r'(.+?)\s*/\s*(\S+)$', r'(.+?)[ _]([A-Za-zµμ]+|%)$', r'(CH\d+)(V|A)$'):
-        if (found := re.fullmatch(pattern, text)) and found[2].lower() in WORDS \
-                and not CHANNEL.fullmatch(text):
-            return found[1], found[2].lower()
-    return text, ''
+    found = _WITH_UNIT.fullmatch(text.lower()) or re.fullmatch(r'(CH\d+)(V|A)', text)
+    if found is None or CHANNEL.fullmatch(text):
+        return text, ''
+    quantity, unit = (part for part in found.groups() if part is not None)
+    return quantity, unit.lower()
 
 
 def _header(rows: list[list[str]], lines: list[str], first: int, width: int, delimiter: str,
@@ -551,8 +576,7 @@ def read_column(path: Path, name: str, columns: CsvColumns | None = None,
     """Return the stamps, s, and one column of a CSV as written, NaN kept."""
     table = _table(path, columns or CsvColumns(), more=(name,))
     if name not in table.named:
-        raise InputError(f"{path}: '{name}' is the time, not a signal"
-                         if name in table.form.names else _absent(path, table.form, name))
+        raise InputError(_absent(path, table.form, name))
     return table.t, table.named[name]
 
 
@@ -571,10 +595,12 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
     form = form_of(path, wanted)
     time = _time_of(path, form, wanted)
     found = _supply_of(path, form, wanted, time, needed)
-    others = {name: form.names.index(name) for name in more
-              if name in form.names and form.names.index(name) not in time.place}
+    others = {name: form.names.index(name) for name in more if name in form.names}
+    for name, place in others.items():
+        if place in time.place:
+            raise InputError(f"{path}: '{name}' is the time, not a signal")
     places = [*(one.place[0] for one in found.values()), *others.values()]
-    for place in places:
+    for place in (*time.place, *places):
         if form.names.count(form.names[place]) > 1:
             raise InputError(f"{path}:{form.line}: column '{form.names[place]}' is there twice")
     t, values = _read(path, form, time, places)
@@ -693,12 +719,9 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: _Column, needed
     names = {logs.VOLTAGE: (wanted.voltage, '--voltage-column', wanted.unit),
              logs.THROTTLE: (wanted.throttle, '--throttle-column', wanted.throttle_unit),
              logs.CURRENT: (wanted.current, '--current-column', None)}
-    given = [name for name in (wanted.time, *(name for name, *_ in names.values()))
-             if name not in (None, NONE)]
-    if len(set(given)) < len(given):
-        raise InputError(f'{path}: one column cannot be two of time, voltage and throttle: '
-                         f"{', '.join(map(str, given))}")
-    taken = [*time.place, *(form.names.index(name) for name in given if name in form.names)]
+    given = [form.names.index(name) for name in (
+        wanted.time, *(name for name, *_ in names.values())) if name in form.names]
+    taken = [*time.place, *given]
     found: dict[str, _Column] = {}
     for quantity, (name, option, unit) in names.items():
         if name == NONE and quantity != logs.VOLTAGE:
@@ -708,11 +731,22 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: _Column, needed
             continue
         places = _choose(form, quantity, taken)
         if not places and quantity == logs.VOLTAGE:
+            # It may be what another option took, which is refused below.
+            places = [k for k in _choose(form, quantity) if k in given]
+        if not places and quantity == logs.VOLTAGE:
             rest = [k for k in _nameless_columns(form) if k not in taken]
             places = rest if len(rest) == 1 else []
         if places:
             found[quantity] = _unit_column(form, places[0], unit)
             taken.append(places[0])
+    owners = dict.fromkeys(time.place, 'time')
+    for quantity, column in found.items():
+        place = column.place[0]
+        if place in owners:
+            raise InputError(f"{path}: column '{column.name}' cannot be both {owners[place]} and "
+                             f'{quantity}: name another with --{quantity}-column or '
+                             f'--{owners[place]}-column')
+        owners[place] = quantity
     if needed and logs.VOLTAGE not in found:
         raise InputError(_absent(path, form, VOLTAGE, ' (--voltage-column names another)'))
     return found
@@ -778,6 +812,8 @@ def _clock_seconds(found: Sequence[re.Match[str] | None], day_first: bool) -> Fl
             days = _days(int(c), min(y, 12), x)
         t = 60.0 * int(minute or 0) + int(second or 0) + (float(f'0.{part}') if part else 0.0)
         hours = int(hour or 0)
+        if hours > 23 and (year or a):
+            raise ValueError('hour must be in 0..23')
         if half:
             hours = hours % 12 + 12 * (half.lower() == 'pm')
         if zone and zone[0] in '+-':

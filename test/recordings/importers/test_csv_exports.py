@@ -230,7 +230,11 @@ def test_a_file_of_another_kind_is_named(content, words, tmp_path):
 
 @pytest.mark.parametrize('content, words', [
     ('Zeit;U\n04.05.2024 10:00:00;12,5\nnoon;12,6\n', "'noon'"), ('t,U\n0,12\n1,1_5\n', "'1_5'"),
-    ('date,U\n2024-13-01,12\n2024-13-02,12\n', 'month')])
+    ('date,U\n2024-13-01,12\n2024-13-02,12\n', 'month'),
+    ('date,U\n2024-01-01 33:00,12\n2024-01-02 33:00,12\n', 'hour'),
+    ('time,U\n10:00:00,12\n10:00:99,12\n', "'10:00:99'"),
+    ('time,U\n10:00:00,12\n10:99:00,12\n', "'10:99:00'"),
+    ('time,U\n10:00:00,12\n10:00:01+99:99,12\n', r"'10:00:01\+99:99'")])
 def test_cells_that_are_no_time_or_number_are_refused(content, words, tmp_path):
     """With the cell, and never misread."""
     with pytest.raises(InputError, match=words):
