@@ -29,10 +29,9 @@ from typing import Any, NamedTuple
 from diagnostic_msgs.msg import DiagnosticArray
 from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import MonitorNode, PUBLISH_RATE
-from ou_monitor.nodes.console import Console
 from ou_monitor.nodes.filter_channels import CHANNELS, Channels, channels_of, IMU
 from ou_monitor.nodes.inputs import (
-    decode, INPUT_QOS, Silence, SourceFinder, Stamper, types_on, within)
+    Console, decode, INPUT_QOS, Silence, SourceFinder, Stamper, types_on, within)
 from ou_monitor.nodes.sources import message_class, MOTOR_PARAMETERS, Source
 from ou_monitor.online.filter.cutoff_control import Bound
 from ou_monitor.online.filter.lowpass import AdaptiveLowPass, FilterCounters
@@ -46,16 +45,14 @@ from std_msgs.msg import Float64
 AUTO = 'auto'
 # Fixed at run time: the mode decides the unit of the output.
 _MODE = next(p for p in FILTER_PARAMETERS if p.name == 'mode')
-RUN_TIME = (*(p for p in FILTER_PARAMETERS if p is not _MODE), *NOTCH_PARAMETERS)
-FIXED = (
+INPUT_PARAMETERS = (
     Parameter('input.type', AUTO, "Message type of `input`; auto: the publisher's type."),
     Parameter('input.field', '',
               'Field path of the signal; empty: data, voltage of a battery, angular velocity of '
               'an IMU.'),
     Parameter('input.acceleration', False,
-              'Filter the linear acceleration of an IMU beside its angular velocity.'),
-    _MODE, *MOTOR_PARAMETERS)
-OWN_TOPICS = ('input', 'sigma', 'state', '~/output', '~/cutoff', '~/lag', '/diagnostics', '/clock')
+              'Filter the linear acceleration of an IMU beside its angular velocity.'))
+OWN_TOPICS = ('input', 'sigma', 'state', '~/output', '~/cutoff', '~/lag')
 # Fields of the state that the filter uses unchanged.
 _FIELDS = ('alpha', 'throttle', 'u0', 'u0_se', 'load_noise')
 # A sigma whose window exceeds the sliding one by this ratio comes from a fit.
@@ -216,34 +213,28 @@ class MotorInputs:
             self._silence[source.quantity].record()
         self._node.create_subscription(
             message, source.topic, self._node.guarded(take), INPUT_QOS)
-        self._node.get_logger().info(
-            f'{source.quantity} from {self._node.resolve_topic_name(source.topic)}: '
-            f"{extractor.spec.type} field '{extractor.spec.field}'")
 
 
 class AdaptiveFilterNode(MonitorNode):
     """Low-pass with a cutoff driven by sigma, as a node."""
 
+    RUN_TIME = (*(p for p in FILTER_PARAMETERS if p is not _MODE), *NOTCH_PARAMETERS,
+                PUBLISH_RATE)
+    FIXED = (*INPUT_PARAMETERS, _MODE, *MOTOR_PARAMETERS)
     # `check` reads it from the beginning on.
     _channels: Channels | None = None
     _type = AUTO
     _topic = ''
 
-    def __init__(self, name: str, *, managed: bool = False) -> None:
-        super().__init__(name, (*RUN_TIME, PUBLISH_RATE), FIXED, managed=managed)
-        if not managed:
-            self.begin()
-
     def start(self) -> None:
         """Begin with no message filtered."""
         self._channels = None
         self._filters: list[AdaptiveLowPass] = []
+        values = self.values()
         # Replaces the filters until they exist.
-        self._idle = AdaptiveLowPass(**self._of_filter(self.values()))
-        self._notch = AdaptiveNotch(**notch_options(self.values()))
-        self._motors = MotorInputs(
-            self, {p.name: self.get_parameter(p.name).value for p in MOTOR_PARAMETERS},
-            self.steady_now)
+        self._idle = AdaptiveLowPass(**_of_filter(values))
+        self._notch = AdaptiveNotch(**notch_options(values))
+        self._motors = MotorInputs(self, values, self.steady_now)
         self._supply = SupplyInput(self.steady_now, (
             self.resolve_topic_name('sigma'), self.resolve_topic_name('state')))
         self._input_silence = Silence(self.steady_now)
@@ -254,7 +245,7 @@ class AdaptiveFilterNode(MonitorNode):
         self._unplaced = False
         self._console = Console(self)
         self._type, self._field, self._acceleration = (
-            self.get_parameter(f'input.{key}').value for key in ('type', 'field', 'acceleration'))
+            values[f'input.{key}'] for key in ('type', 'field', 'acceleration'))
         if self._acceleration:
             # Contradictions are reported at the start, before any message.
             self._channels_of(IMU)
@@ -275,7 +266,7 @@ class AdaptiveFilterNode(MonitorNode):
 
     def check(self, values: Mapping[str, Any]) -> None:
         """Raise `ValueError` when the parameters contradict each other or the signal."""
-        settings = FilterSettings(**self._of_filter(values))
+        settings = FilterSettings(**_of_filter(values))
         NotchSettings.from_options(notch_options(values))
         if self._channels is not None and _not_a_voltage(self._type, settings):
             raise ValueError(
@@ -286,18 +277,13 @@ class AdaptiveFilterNode(MonitorNode):
         """Bring checked parameters into force; the output does not move."""
         super().apply(values)
         for channel in (self._idle, *self._filters):
-            channel.configure(**self._of_filter(values))
+            channel.configure(**_of_filter(values))
         self._notch.configure(**notch_options(values))
 
     @property
     def low_pass(self) -> AdaptiveLowPass:
         """Filter of the first signal: all have one cutoff."""
         return self._filters[0] if self._filters else self._idle
-
-    def _of_filter(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the parameters that belong to the filter itself."""
-        mode = {_MODE.name: self.get_parameter(_MODE.name).value}
-        return {p.name: {**values, **mode}[p.name] for p in FILTER_PARAMETERS}
 
     # -- messages in
 
@@ -315,14 +301,14 @@ class AdaptiveFilterNode(MonitorNode):
             self._console.waiting(self._topic)
 
     def _channels_of(self, kind: str) -> Channels:
-        return channels_of(kind, self._field, mode=self.get_parameter(_MODE.name).value,
+        return channels_of(kind, self._field, mode=self._idle.settings.mode,
                            acceleration=self._acceleration)
 
     def _open(self, kind: str) -> None:
         channels = self._channels_of(kind)
         message = message_class(kind)
         self._type, self._channels = kind, channels
-        self._filters = [AdaptiveLowPass(**self._of_filter(self.values()))
+        self._filters = [AdaptiveLowPass(**_of_filter(self.values()))
                          for _ in channels.names]
         self._output = self.create_publisher(
             message_class(channels.output or kind), '~/output', 10)
@@ -399,7 +385,7 @@ class AdaptiveFilterNode(MonitorNode):
         if self.fault_notes:
             level, summary = Level.ERROR, ' '.join((*self.fault_notes, summary))
         counters: FilterCounters = low_pass.counters
-        values: dict[str, object] = {
+        fields: dict[str, object] = {
             'input_type': self._type, 'law': settings.law, 'mode': settings.mode,
             'order': settings.order, 'shadow': settings.shadow,
             'cutoff': low_pass.cutoff, 'cutoff_wanted': low_pass.wanted,
@@ -419,8 +405,6 @@ class AdaptiveFilterNode(MonitorNode):
             'stamps': self._input_clock.stamps.name,
             'placed_by_arrival': self._input_clock.by_arrival,
             'input_age': self._input_silence.age, 'callback_errors': self.faults}
-        fields = {key: repr(value) if isinstance(value, float) else str(value)
-                  for key, value in values.items()}
         self.diagnose('adaptive low-pass', level, summary, fields, self._topic)
 
     def _decided_by(self, supply: KnownSupply) -> str:
@@ -493,6 +477,11 @@ class AdaptiveFilterNode(MonitorNode):
             return '; notches off, they would not help' if notch.source == 'none' else ''
         at = ', '.join(f'{f:.0f}' for f in notch.frequencies)
         return f'; notches at {at} Hz by {notch.source}'
+
+
+def _of_filter(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the parameters that belong to the filter itself."""
+    return {p.name: values[p.name] for p in FILTER_PARAMETERS}
 
 
 def _not_a_voltage(kind: str, settings: FilterSettings) -> bool:

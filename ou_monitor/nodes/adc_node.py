@@ -22,9 +22,8 @@ from typing import Any
 
 from ou_monitor.adc.devices import Block, find_device, IioBuffer, PolledChannel
 from ou_monitor.errors import InputError
-from ou_monitor.nodes.base import MonitorNode, to_time
+from ou_monitor.nodes.base import MonitorNode, to_time, wait_until
 from ou_monitor.nodes.inputs import Silence
-from ou_monitor.nodes.pacing import wait_until
 from ou_monitor.online.settings import Parameter
 from ou_monitor.records import Level
 from sensor_msgs.msg import BatteryState, JointState
@@ -51,13 +50,11 @@ SILENT = 1.0
 class AdcNode(MonitorNode):
     """One voltage read from the kernel, as a node."""
 
-    def __init__(self, name: str) -> None:
-        super().__init__(name, (), ADC_PARAMETERS)
-        self.begin()
+    FIXED = ADC_PARAMETERS
 
     def start(self) -> None:
         """Open the device, and read it in a thread."""
-        values = {p.name: self.get_parameter(p.name).value for p in ADC_PARAMETERS}
+        values = self.values()
         self._gain, self._shift = values['gain'], values['offset']
         folder = find_device(values['device'], Path(values['sysfs']))
         self._device = folder.name
@@ -133,15 +130,15 @@ class AdcNode(MonitorNode):
         elif age is None or age > max(SILENT, 3.0 / self.rate if self.rate > 0.0 else 0.0):
             level, summary = Level.STALE, (
                 f'No samples of {self._channel} from {self._device}'
-                + ('' if age is None else f' for {age:.1f} s')
+                + self._silence.words
                 + ': does its trigger run?')
         elif holes:
             level, summary = Level.WARN, (
                 f'{summary} Samples were lost {holes} times: enlarge the block or lower the rate.')
         fields = {
-            'device': self._device, 'channel': self._channel, 'rate': repr(self.rate),
-            'measured_rate': repr(1.0 / self._interval if self._interval > 0.0 else math.nan),
-            'samples': str(self._samples), 'holes': str(holes),
+            'device': self._device, 'channel': self._channel, 'rate': self.rate,
+            'measured_rate': 1.0 / self._interval if self._interval > 0.0 else math.nan,
+            'samples': self._samples, 'holes': holes,
             'stamps': 'kernel' if self._interval > 0.0 else 'read'}
         self.diagnose('adc', level, summary, fields, self._device)
 

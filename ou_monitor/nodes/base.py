@@ -14,7 +14,7 @@ import inspect
 import math
 from threading import Event, Thread
 import time
-from typing import Any
+from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from ou_monitor.errors import InputError, nearest
@@ -32,6 +32,7 @@ from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverriding
 from rclpy.subscription import Subscription
 from rclpy.time import Time
 from rclpy.timer import Timer
+from std_srvs.srv import Trigger
 
 QOS = 'qos_overrides.'
 # Declared by rclpy itself.
@@ -41,6 +42,11 @@ LOCK = Parameter(
     'lock_parameters', False,
     'Whether to refuse at run time all that can disarm the node: every parameter but '
     'publish_rate, ~/clear_brownout and ~/save_model.')
+# Length of the spin before an instant, s: about the usual lateness of sleep, so that a 1 kHz bag
+# costs a tenth of a core.
+SPIN = 0.0001
+# Maximum single sleep, s: limits the delay in noticing a signal.
+NAP = 0.05
 # How long the diagnostics report an exception of a callback, s.
 TELL = 10.0
 PUBLISH_RATE = Parameter('publish_rate', 10.0, 'How often the outputs are published, Hz.',
@@ -49,19 +55,20 @@ PUBLISH_RATE = Parameter('publish_rate', 10.0, 'How often the outputs are publis
 
 class MonitorNode(Node):
     """
-    Node whose parameters come from a table.
+    Node whose parameters come from tables.
 
-    Changes to parameters in `table` are checked together (`check` raises `ValueError` with the
-    reason, and the old values stay), then passed to `apply`, which must keep all state. Parameters
-    in `fixed` are read at the start. A managed node (lifecycle) reads them and begins on each
-    activation; any other node calls `begin` at the end of its constructor.
+    Changes to `RUN_TIME` parameters are checked together (`check` raises `ValueError` with the
+    reason, and the old values stay), then passed to `apply`, which must keep all state. `FIXED`
+    ones are read at the start. A managed node (lifecycle) reads them and begins on each
+    activation; any other node begins at the end of its constructor.
     """
 
+    RUN_TIME: ClassVar[tuple[Parameter, ...]] = ()
+    FIXED: ClassVar[tuple[Parameter, ...]] = ()
     # True between `begin` and `stop`.
     running = False
 
-    def __init__(self, name: str, table: Sequence[Parameter],
-                 fixed: Sequence[Parameter] = (), *, managed: bool = False) -> None:
+    def __init__(self, name: str, *, managed: bool = False) -> None:
         Node.__init__(self, name)
         self.managed = managed
         self._made: list[Any] = []
@@ -77,13 +84,13 @@ class MonitorNode(Node):
         self._outputs_callback: Callable[[], None] | None = None
         self._polled: list[Subscription] = []
         self.steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._table = {parameter.name: parameter for parameter in table}
-        self._fixed = {parameter.name for parameter in fixed}
-        declared = [*table, *fixed, LOCK]
+        self._changeable = {parameter.name for parameter in self.RUN_TIME}
+        self._fixed = {parameter.name for parameter in self.FIXED}
+        declared = [*self.RUN_TIME, *self.FIXED, LOCK]
         self._widen_overrides(declared)
         for parameter in declared:
             self.declare_parameter(parameter.name, parameter.default, _descriptor(
-                parameter, read_only=not managed and parameter.name not in self._table))
+                parameter, read_only=not managed and parameter.name not in self._changeable))
         self._warn_misspelt()
         try:
             self.check(self.values())
@@ -93,6 +100,8 @@ class MonitorNode(Node):
         self.add_pre_set_parameters_callback(self._widen)
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self.guarded(self._after_set))
+        if not managed:
+            self.begin()
 
     def start(self) -> None:
         """Create publishers, subscriptions, services and timers."""
@@ -149,8 +158,8 @@ class MonitorNode(Node):
         super().destroy_node()
 
     def values(self) -> dict[str, Any]:
-        """Return the run-time parameters in force."""
-        return {name: self.get_parameter(name).value for name in self._table}
+        """Return the parameters in force."""
+        return {name: self.get_parameter(name).value for name in self._changeable | self._fixed}
 
     def check(self, values: Mapping[str, Any]) -> None:
         """Raise `ValueError` when the parameters contradict each other."""
@@ -208,18 +217,23 @@ class MonitorNode(Node):
         recent = self.steady_now() - self._faulted < TELL
         return [f'A callback failed ({self.faults} times so far): {self.fault}.'] if recent else []
 
-    def status(self, part: str, level: Level, summary: str, fields: Mapping[str, str],
+    def status(self, part: str, level: Level, summary: str, fields: Mapping[str, object],
                stamp: float, hardware_id: str) -> DiagnosticArray:
-        """Return the status of a part of the node as a stamped message (stamp in s)."""
+        """
+        Return the status of a part of the node as a stamped message (stamp in s).
+
+        Floats keep all their digits.
+        """
         message = DiagnosticArray()
         message.header.stamp = to_time(stamp)
         message.status = [DiagnosticStatus(
             level=bytes([level]), name=f'{self.get_fully_qualified_name()[1:]}: {part}',
             message=summary, hardware_id=hardware_id,
-            values=[KeyValue(key=key, value=value) for key, value in fields.items()])]
+            values=[KeyValue(key=key, value=repr(value) if isinstance(value, float)
+                             else str(value)) for key, value in fields.items()])]
         return message
 
-    def diagnose(self, part: str, level: Level, summary: str, fields: Mapping[str, str],
+    def diagnose(self, part: str, level: Level, summary: str, fields: Mapping[str, object],
                  hardware_id: str) -> None:
         """Publish the status of a part of the node in the diagnostics."""
         self._diagnostics.publish(self.status(
@@ -248,6 +262,16 @@ class MonitorNode(Node):
         self._keep(made)
         return made
 
+    def serve(self, name: str, work: Callable[[], str]) -> None:
+        """Offer a Trigger: `work` returns what was done, or raises `InputError` to refuse."""
+        def answer(request: Any, response: Any) -> Any:
+            try:
+                response.message, response.success = work(), True
+            except InputError as error:
+                response.message, response.success = str(error), False
+            return response
+        self.create_service(Trigger, name, self.guarded(answer))
+
     def create_service(self, kind: Any, name: str, callback: Any, **options: Any) -> Any:
         """Return a service."""
         made = super().create_service(kind, name, callback, **options)
@@ -267,8 +291,9 @@ class MonitorNode(Node):
                 } if wanted else {}
 
     def refuse_other_overrides(self, topics: Iterable[str]) -> None:
-        """Refuse `qos_overrides` for topics that this node does not use."""
-        known = [self.resolve_topic_name(topic) for topic in topics]
+        """Refuse `qos_overrides` for topics other than these and those of every node."""
+        known = [self.resolve_topic_name(topic) for topic in (
+            *topics, '/diagnostics', '/clock')]
         for name in self._parameter_overrides:
             if name.startswith(QOS) and not any(
                     name.startswith(f'{QOS}{topic}.') for topic in known):
@@ -326,7 +351,7 @@ class MonitorNode(Node):
                     f"parameter '{name}' does not exist and is ignored: {nearest(name, known)}")
 
     def _on_set(self, parameters: list[RosParameter]) -> SetParametersResult:
-        changed = {p.name: p.value for p in parameters if p.name in self._table}
+        changed = {p.name: p.value for p in parameters if p.name in self._changeable}
         if self.locked and (set(changed) - {PUBLISH_RATE.name}
                             or any(p.name == 'use_sim_time' for p in parameters)):
             return SetParametersResult(
@@ -344,7 +369,7 @@ class MonitorNode(Node):
         return SetParametersResult(successful=True)
 
     def _after_set(self, parameters: list[RosParameter]) -> None:
-        if self.running and any(p.name in self._table for p in parameters):
+        if self.running and any(p.name in self._changeable for p in parameters):
             self.apply(self.values())
 
 
@@ -385,6 +410,20 @@ def _descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
             descriptor.floating_point_range = [FloatingPointRange(
                 from_value=float(parameter.low), to_value=float(parameter.high), step=0.0)]
     return descriptor
+
+
+def wait_until(instant: float, going: Callable[[], bool]) -> bool:
+    """Wait until `time.monotonic()` reaches an instant (instant in s)."""
+    while True:
+        if not going():
+            return False
+        left = instant - time.monotonic()
+        if left <= SPIN:
+            break
+        time.sleep(min(left - SPIN, NAP))
+    while time.monotonic() < instant:
+        pass
+    return True
 
 
 def to_time(stamp: float) -> object:

@@ -33,9 +33,8 @@ from ou_monitor.errors import InputError
 from ou_monitor.model.load import LoadStart
 from ou_monitor.nodes.base import LOCK, MonitorNode, PUBLISH_RATE
 from ou_monitor.nodes.clocks import IN_BURSTS, SendClock
-from ou_monitor.nodes.console import Console, PublisherWatch
 from ou_monitor.nodes.inputs import (
-    Arrivals, PolledInput, Silence, SourceFinder, Stamper, within)
+    Arrivals, Console, PolledInput, PublisherWatch, Silence, SourceFinder, Stamper, within)
 from ou_monitor.nodes.node_files import LatchFile, ModelChoice
 from ou_monitor.nodes.sources import Source, SOURCE_PARAMETERS
 from ou_monitor.online.load.model_watch import ModelComparison
@@ -47,7 +46,6 @@ from ou_monitor.records import FloatArray, Level
 from ou_monitor.stream.samples import SampleStream, SourceClock
 from rclpy.logging import get_logging_directory
 from std_msgs.msg import Bool, Float64
-from std_srvs.srv import Trigger
 
 # Period of fetching the waiting messages, s, whatever `publish_rate` is.
 POLL = 0.02
@@ -73,23 +71,23 @@ STATE_FILE = Parameter(
 # Throttle above which the craft may fly.
 LANDED = 0.05
 OUTPUTS = ('alpha', 'sigma', 'var_inf', 'brownout_risk', 'throttle_budget')
-OWN_TOPICS = (*('~/' + key for key in OUTPUTS), '~/brownout', '~/state', '/diagnostics', '/clock')
 
 
 class EstimatorNode(MonitorNode):
     """Sliding OU estimate of one supply, as a node."""
 
+    RUN_TIME = (*ESTIMATOR_PARAMETERS, PUBLISH_RATE)
+    FIXED = (*SOURCE_PARAMETERS, STATE_FILE)
+
     def __init__(self, name: str, *, managed: bool = False) -> None:
         self._models = ModelChoice()
-        super().__init__(name, (*ESTIMATOR_PARAMETERS, PUBLISH_RATE),
-                         (*SOURCE_PARAMETERS, STATE_FILE), managed=managed)
-        if not managed:
-            self.begin()
+        super().__init__(name, managed=managed)
 
     def start(self) -> None:
         """Begin without data, except for a latched flag."""
         sys.setswitchinterval(SWITCH)
-        settings = _settings(self.values())
+        values = self.values()
+        settings = _settings(values)
         self._monitor = SupplyMonitor(settings, self._models.use(settings.model_file),
                                       background=True)
         self._stream = SampleStream(self._monitor)
@@ -97,7 +95,7 @@ class EstimatorNode(MonitorNode):
         self._arrived = Silence(self.steady_now)
         self._usable = Silence(self.steady_now)
         self._source_clock = SourceClock()
-        self._watched = PublisherWatch()
+        self._watched = PublisherWatch(self)
         self._settled = 0
         self._console = Console(self)
         # When the next estimate is due, and the load of pushing samples as a share of the time.
@@ -108,23 +106,22 @@ class EstimatorNode(MonitorNode):
         self._outputs = {key: self.create_publisher(Float64, '~/' + key, 10) for key in OUTPUTS}
         self._brownout = self.create_publisher(Bool, '~/brownout', 10)
         self._state = self.create_publisher(DiagnosticArray, '~/state', 10)
-        self.create_service(Trigger, '~/clear_brownout', self.guarded(self._clear))
-        self.create_service(Trigger, '~/save_model', self.guarded(self._save_model))
+        self.serve('~/clear_brownout', self._clear)
+        self.serve('~/save_model', self._save_model)
         self._stamper = Stamper(self, self._jumped)
-        self._send_clock = SendClock() if self.get_parameter('smooth_stamps').value else None
-        self._latch = self._open_latch()
-        self._sources = SourceFinder(self, ('voltage', 'throttle'), {
-            p.name: self.get_parameter(p.name).value for p in SOURCE_PARAMETERS}, self._open)
+        self._send_clock = SendClock() if values['smooth_stamps'] else None
+        self._latch = self._open_latch(values[STATE_FILE.name])
+        self._sources = SourceFinder(self, ('voltage', 'throttle'), values, self._open)
         self._sources.watch('voltage')
         self.every(0.2, self._watch)
         self.every(POLL, lambda: self._poll(HAND_OVER))
         self.every(1.0, self._diagnose)
         self.publish_every(lambda: self._publish(*self._report()))
-        self.refuse_other_overrides([*OWN_TOPICS, *self._sources.topics])
+        self.refuse_other_overrides([*('~/' + key for key in (*OUTPUTS, 'brownout', 'state')),
+                                     *self._sources.topics])
 
-    def _open_latch(self) -> LatchFile | None:
+    def _open_latch(self, name: str) -> LatchFile | None:
         """Open the file of the latch; restore a latched flag."""
-        name = self.get_parameter(STATE_FILE.name).value
         if not name:
             return None
         latch = LatchFile(Path(get_logging_directory()) / Path(name).expanduser(),
@@ -174,7 +171,7 @@ class EstimatorNode(MonitorNode):
     def _watch(self) -> None:
         """Check the publishers, 5 times a second."""
         self._stamper.follow()
-        self._check_publishers()
+        self._watched.look(self._inputs.get('voltage'))
         if self._arrived.age is None and not self._sources.problems['voltage']:
             self._console.waiting(self._voltage.topic)
         self._sources.watch()
@@ -182,7 +179,6 @@ class EstimatorNode(MonitorNode):
 
     def _open(self, source: Source) -> None:
         message, spec = source.open()
-        topic = self.resolve_topic_name(source.topic)
         if source.quantity == 'voltage':
             self._stream.open_voltage(spec)
             if spec.sample_rate is not None:
@@ -192,9 +188,6 @@ class EstimatorNode(MonitorNode):
             self._stream.open_throttle(spec)
         self._inputs[source.quantity] = PolledInput(
             self, message, source.topic, spec, source.current)
-        self.get_logger().info(
-            f"{source.quantity} from {topic}: {spec.type} field '{spec.field}' "
-            f"(msg_config '{source.config}')")
 
     # -- messages in
 
@@ -291,42 +284,32 @@ class EstimatorNode(MonitorNode):
         self._source_clock = SourceClock()
         self._stream.reset(reason)
 
-    def _clear(self, request: Any, response: Any) -> Any:
+    def _clear(self) -> str:
         if self.locked:
-            response.success, response.message = False, (
+            raise InputError(
                 f'{LOCK.name} is set: the flag is cleared only by starting the node anew without '
                 'it' + (', and without the file of state_file.' if self._latch else '.'))
-            return response
         done = self._monitor.clear_brownout()
-        response.success, response.message = bool(done), done or (
-            'Nothing to clear: the brown-out flag is not CRITICAL.')
-        return response
+        if not done:
+            raise InputError('Nothing to clear: the brown-out flag is not CRITICAL.')
+        return done
 
-    def _save_model(self, request: Any, response: Any) -> Any:
+    def _save_model(self) -> str:
         """Write what this flight has learned into `model_file`, once it has landed."""
         loads, model = self._monitor.load_filter, self._monitor.model
         learned = loads.learned()
-        response.success = False
         if self.locked:
-            response.message = f'{LOCK.name} is set: the model stays as it is.'
-        elif self._stream.throttle > LANDED:
-            response.message = 'Land first: throttle is not at rest.'
-        elif model is None:
-            response.message = 'There is no model_file.'
-        elif learned is None or not learned.noise > 0.0:
-            response.message = 'Nothing to save: throttle moved too little to know the sag well.'
-        else:
-            try:
-                path = self._models.save(
-                    learned, _entry(learned, loads.against(model.load)), self._meanwhile)
-            except InputError as error:
-                response.message = f'{error}.'
-            else:
-                self._monitor.set_model(self._models.use(path))
-                response.success, response.message = True, (
-                    f'{path} holds what this flight has learned, and {self._models.terms} of '
-                    'before.')
-        return response
+            raise InputError(f'{LOCK.name} is set: the model stays as it is.')
+        if self._stream.throttle > LANDED:
+            raise InputError('Land first: throttle is not at rest.')
+        if model is None:
+            raise InputError('There is no model_file.')
+        if learned is None or not learned.noise > 0.0:
+            raise InputError('Nothing to save: throttle moved too little to know the sag well.')
+        path = self._models.save(
+            learned, _entry(learned, loads.against(model.load)), self._meanwhile)
+        self._monitor.set_model(self._models.use(path))
+        return f'{path} holds what this flight has learned, and {self._models.terms} of before.'
 
     # -- reports out
 
@@ -383,13 +366,6 @@ class EstimatorNode(MonitorNode):
             notes += self._watched.notes(self._topic)
         return notes
 
-    def _check_publishers(self) -> None:
-        """Record who publishes the voltage, and the messages lost."""
-        voltage = self._inputs.get('voltage')
-        if voltage is not None:
-            self._watched.look(self.get_publishers_info_by_topic(self._topic),
-                               voltage.publishers, self.steady_now())
-
     def _why_unusable(self) -> str:
         """Say why arriving messages hold no usable voltage."""
         if self._stamper.waiting and self._stream.unplaced:
@@ -431,19 +407,19 @@ class EstimatorNode(MonitorNode):
 
     def _message(self, part: str, report: MonitorReport, level: Level, summary: str,
                  stamp: float) -> DiagnosticArray:
-        throttle_age = self._throttle_silence.age
-        arrived = self._arrived.age
+        throttle_age, arrived = (math.inf if silence.age is None else silence.age
+                                 for silence in (self._throttle_silence, self._arrived))
         fields = {**report.fields,
                   'msg_config': self._voltage.config,
-                  'messages': str(self._stream.messages),
-                  'smoothed_rate': repr(self._send_clock.rate if self._send_clock else math.nan),
-                  'throttle_age': repr(math.inf if throttle_age is None else throttle_age),
+                  'messages': self._stream.messages,
+                  'smoothed_rate': self._send_clock.rate if self._send_clock else math.nan,
+                  'throttle_age': throttle_age,
                   'throttle_problem': self._sources.problems.get('throttle', ''),
                   'model_terms': self._models.terms,
                   'clock': self._source_clock.name,
-                  'arrival_age': repr(math.inf if arrived is None else arrived),
+                  'arrival_age': arrived,
                   **self._watched.fields(),
-                  'callback_errors': str(self.faults)}
+                  'callback_errors': self.faults}
         return self.status(part, level, summary, fields, stamp, self._topic)
 
 

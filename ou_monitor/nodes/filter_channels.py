@@ -15,7 +15,7 @@ from typing import Any
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.nodes.sources import definition_of, message_class
 from ou_monitor.recordings.cdr import value_path
-from ou_monitor.stream.config import FieldPath, FieldSpec
+from ou_monitor.stream.config import FieldPath, FieldSpec, put, walk
 
 IMU = 'sensor_msgs/msg/Imu'
 # Types of derivatives: angular acceleration (rad/s^2); any other, as x, with a stamp, and without
@@ -53,7 +53,7 @@ class Channels:
         values: list[float] = []
         for group in self.groups:
             found = None if _is_absent(message, group) else [
-                _walk(message, path) for path in group.fields]
+                walk(message, path) for path in group.fields]
             if found is None or None in found:
                 if group.needed:
                     return ()
@@ -71,24 +71,16 @@ class Channels:
             if _is_absent(message, group):
                 continue
             for path, value in zip(group.fields, mine, strict=True):
-                _set(message, path, value)
+                put(message, path, value)
             if group.covariance is not None:
-                matrix = _walk(message, group.covariance)
+                matrix = walk(message, group.covariance)
                 for place, value in enumerate(matrix):
                     matrix[place] = value * left
         return message
 
 
 def _is_absent(message: Any, group: Group) -> bool:
-    return group.covariance is not None and _walk(message, group.covariance)[0] == -1.0
-
-
-def _set(message: Any, path: FieldPath, value: float) -> None:
-    holder, last = _walk(message, path[:-1]), path[-1]
-    if isinstance(last, str):
-        setattr(holder, last, value)
-    else:
-        holder[last] = value
+    return group.covariance is not None and walk(message, group.covariance)[0] == -1.0
 
 
 def _fill(vector: Any, values: Sequence[float]) -> None:
@@ -160,22 +152,9 @@ def _field_channel(kind: str, field: str) -> Channels:
     message = message_class(kind)()
     steps = value_path(FieldSpec('input', kind, field), definition_of(message_class(kind)))
     # None stands for an element that does not exist yet.
-    value = _walk(message, steps)
+    value = walk(message, steps)
     if value is not None and not isinstance(value, float):
         raise InputError(
             f"input.field: '{field}' of {kind} holds a {type(value).__name__}, which cannot take "
             'a filtered value: name a float field')
     return Channels((field,), (Group((steps,)),))
-
-
-def _walk(message: Any, steps: FieldPath) -> Any:
-    """Return the value at a path; None where an array is too short."""
-    at = message
-    for step in steps:
-        if isinstance(step, str):
-            at = getattr(at, step)
-        elif step < len(at):
-            at = at[step]
-        else:
-            return None
-    return at

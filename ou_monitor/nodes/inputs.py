@@ -1,5 +1,5 @@
 """
-Subscriptions: sources and types found on the graph, and the time of every message.
+Subscriptions: sources, types and publishers on the graph, and the time of every message.
 
 Time is the message's own stamp, or else the middleware's source
 timestamp, under `use_sim_time` mapped to simulated time through `/clock`.
@@ -18,6 +18,7 @@ from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import MonitorNode
 from ou_monitor.nodes.clocks import SendClock, SimClockMap
 from ou_monitor.nodes.sources import definition_of, find_source, Source
+from ou_monitor.online.risk.flag import FlagLevel, FlagState
 from ou_monitor.recordings.cdr import FieldColumn, FieldReader, MessageTable
 from ou_monitor.records import FloatArray
 from ou_monitor.stream.config import FieldSpec
@@ -42,6 +43,9 @@ BLOCK_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=200,
 MOST_TAKEN, MOST_BYTES = 2000, 2_000_000
 # Maximum wait of a message in the middleware, s: it keeps 2000.
 MOST_WAIT = 60.0
+# Period of reminders, and silence of a publisher before it is reported, s.
+AGAIN = 60.0
+MUTE = 10.0
 CLOCK_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
@@ -228,6 +232,11 @@ class Silence:
         """Seconds since the last arrival; None before the first."""
         return None if self._last == -math.inf else self._now() - self._last
 
+    @property
+    def words(self) -> str:
+        """Return ' for 3.2 s'; empty before the first arrival."""
+        return '' if self.age is None else f' for {self.age:.1f} s'
+
 
 def within(age: float | None, limit: float) -> bool:
     """Return whether something arrived within the limit, s."""
@@ -272,16 +281,25 @@ class SourceFinder:
             elif chosen is not None:
                 try:
                     self._open(chosen)
-                    self.opened[quantity] = chosen
                 except InputError as error:
                     if quantity == needed:
                         raise
                     problem = f'{topic} is not used: {error}'
+                else:
+                    self._take(chosen, topic)
             elif types:
                 problem = (f"{topic} carries {', '.join(types)}, which no generic msg_config "
                            f"describes ({', '.join(source.known_types)}): set {quantity}.type "
                            f'and {quantity}.field, or msg_config.')
             self._note(quantity, problem)
+
+    def _take(self, source: Source, topic: str) -> None:
+        """Record an opened source."""
+        assert source.spec is not None
+        self.opened[source.quantity] = source
+        self._node.get_logger().info(
+            f"{source.quantity} from {topic}: {source.spec.type} field '{source.spec.field}' "
+            f"(msg_config '{source.config}')")
 
     def _note(self, quantity: str, problem: str) -> None:
         """Log a problem once until it changes."""
@@ -294,3 +312,99 @@ def types_on(node: Node, topic: str) -> list[str]:
     """Return the types that publishers offer on a topic (resolved name), each once."""
     return list(dict.fromkeys(
         end.topic_type for end in node.get_publishers_info_by_topic(topic)))
+
+
+class Console:
+    """Logs changes with the node's logger."""
+
+    def __init__(self, node: MonitorNode) -> None:
+        self._node = node
+        self._waiting = self._muted = -math.inf
+        self._critical = False
+
+    def waiting(self, topic: str) -> None:
+        """
+        Say why a topic has brought no message yet.
+
+        Without a publisher: at once, then once a minute; with a silent publisher: after a while.
+        """
+        now, topic = self._node.steady_now(), self._node.resolve_topic_name(topic)
+        if self._node.count_publishers(topic):
+            self._mute(now, topic)
+            return
+        self._muted = -math.inf
+        if now - self._waiting < AGAIN:
+            return
+        self._waiting = now
+        alike = [name for name, _ in self._node.get_topic_names_and_types()
+                 if topic in name and name != topic]
+        hint = f" (there is {', '.join(alike)})" if alike else ''
+        self._node.get_logger().info(f'Waiting for a publisher on {topic}{hint}.')
+
+    def _mute(self, now: float, topic: str) -> None:
+        if self._muted == -math.inf:
+            self._muted = now + MUTE
+        if now < self._muted:
+            return
+        self._muted = now + AGAIN
+        self._node.get_logger().info(
+            f'{topic} has a publisher, but no message has come: it sends none, or runs as another '
+            'user, whose messages Fast DDS does not deliver (doc/deploy.md).')
+
+    def flag(self, state: FlagState) -> None:
+        """Log when the flag becomes CRITICAL, and when it ends."""
+        critical = state.level is FlagLevel.CRITICAL
+        if critical == self._critical:
+            return
+        self._critical = critical
+        if critical:
+            self._node.get_logger().error(f'The brown-out flag is CRITICAL: {state.reason}')
+        else:
+            self._node.get_logger().info(
+                f'The brown-out flag is no longer CRITICAL, but {state.level.name}.')
+
+
+class PublisherWatch:
+    """Names of the publishers of an input's topic, and counts of their messages, in words."""
+
+    def __init__(self, node: MonitorNode) -> None:
+        self._node = node
+        self._names: tuple[str, ...] = ()
+        self._publishers = Publishers()
+        self._lost = self._lost_of_late = 0
+        self._looked = -math.inf
+
+    def look(self, at: PolledInput | None) -> None:
+        """Take the publishers and their message counts, once there is an input."""
+        if at is None:
+            return
+        self._names = tuple(
+            f'{end.node_namespace.rstrip("/")}/{end.node_name} '
+            f'[{bytes(end.endpoint_gid).hex()[-8:]}]'
+            for end in self._node.get_publishers_info_by_topic(at.topic))
+        publishers, now = at.publishers, self._node.steady_now()
+        self._publishers = publishers
+        if now - self._looked >= 1.0:
+            self._lost_of_late, self._lost = publishers.lost - self._lost, publishers.lost
+            self._looked = now
+
+    def notes(self, topic: str) -> list[str]:
+        """Return notes on the publishers of a topic."""
+        notes = []
+        if self._lost_of_late:
+            notes.append(f'{self._lost_of_late} messages were lost within the last second.')
+        if len(self._names) > 1:
+            followed = ('the first is followed, the others are left out'
+                        if self._publishers.numbered else
+                        'the middleware does not number messages, so they are mixed')
+            notes.append(f"{len(self._names)} publishers on {topic} ({', '.join(self._names)}): "
+                         f'{followed}.')
+        return notes
+
+    def fields(self) -> dict[str, str]:
+        """Return the same as fields of a status."""
+        counted = self._publishers
+        return {'messages_lost': str(counted.lost),
+                'messages_lost_by': 'sequence numbers' if counted.numbered else 'not known',
+                'foreign_messages': str(counted.foreign),
+                'publishers': ', '.join(self._names)}

@@ -61,10 +61,6 @@ def managed(kind: type[MonitorNode]) -> Callable[[str], MonitorNode]:
             """Stop; the window is discarded."""
             return self._done('deactivated', self.stop)
 
-        def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-            """Do nothing: an inactive node holds nothing."""
-            return SUCCESS
-
         def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
             """Stop, from any state."""
             return self._done('shut down', self.stop)

@@ -21,7 +21,7 @@ from threading import Thread
 from typing import Any
 
 from ou_monitor.errors import how_to_install, InputError
-from ou_monitor.nodes.run import make_executor, NAP, run as run_ros
+from ou_monitor.nodes.run import make_executor, run as run_ros, turn
 
 NAME = 'ou_live'
 # Period of checking for new rows and for the end of the context, s.
@@ -65,16 +65,8 @@ def _serve(host: str, port: int, estimator: str, low_pass: str) -> int:
     executor = make_executor()
     executor.add_node(node)
 
-    def spin() -> None:
-        from rclpy.executors import ExternalShutdownException
-        try:
-            while node.context.ok():
-                executor.spin_once(timeout_sec=NAP)
-        except ExternalShutdownException:
-            # The server ends with the context.
-            return
-
-    thread = Thread(target=spin)
+    # The server ends with the context.
+    thread = Thread(target=lambda: turn(executor, node))
     thread.start()
     try:
         asyncio.run(_page(node, host, port))

@@ -107,7 +107,7 @@ class ModelChoice:
         """
         path, file, known = self._used
         if file is None:
-            raise InputError('there is no model_file in force')
+            raise InputError('There is no model_file in force.')
         past = file.provenance.get('history')
         history = [*(past if isinstance(past, list) else []), dict(entry)][-_HISTORY:]
         file = replace(file, model=replace(file.model, load=load, date=str(entry['date'])),
@@ -116,10 +116,10 @@ class ModelChoice:
             written = self._wait(self._reader.submit(_save, path, file, known), meanwhile)
         except (OSError, ValueError) as error:
             raise InputError(f'model_file {path_words(path)} is left as it is: '
-                             f'{_words(error)}') from error
+                             f'{_words(error)}.') from error
         except NotReadyError as error:
             raise InputError(f'model_file {path_words(path)} was not written within '
-                             f'{PATIENCE:g} s') from error
+                             f'{PATIENCE:g} s.') from error
         self._used = path, file, written
         return path
 

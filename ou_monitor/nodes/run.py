@@ -183,7 +183,6 @@ def spin(make: Callable[[], Any]) -> int:
     The EventsExecutor takes 10 000 messages/s where the SingleThreadedExecutor
     loses most of them; it is used if this rclpy has it.
     """
-    from rclpy.executors import ExternalShutdownException
     executor = make_executor()
     loaded()
     _making.set()
@@ -201,11 +200,8 @@ def spin(make: Callable[[], Any]) -> int:
     gc.freeze()
     manager.tell('READY=1')
     try:
-        # Not spin(): in rclpy 7.1.6 the EventsExecutor's continues for ever after a signal.
-        while node.context.ok():
-            executor.spin_once(timeout_sec=NAP)
-    except ExternalShutdownException:
-        node.context.try_shutdown()
+        if turn(executor, node):
+            node.context.try_shutdown()
     finally:
         manager.tell('STOPPING=1')
         # A latch is already on disk; by default this signal ends the process.
@@ -214,6 +210,18 @@ def spin(make: Callable[[], Any]) -> int:
         executor.remove_node(node)
         node.destroy_node()
     return 0
+
+
+def turn(executor: Any, node: Any) -> bool:
+    """Serve a node until its context ends; return whether a signal has ended it."""
+    from rclpy.executors import ExternalShutdownException
+    try:
+        # Not spin(): in rclpy 7.1.6 the EventsExecutor's continues for ever after a signal.
+        while node.context.ok():
+            executor.spin_once(timeout_sec=NAP)
+    except ExternalShutdownException:
+        return True
+    return False
 
 
 def make_executor() -> Any:

@@ -21,16 +21,14 @@ from typing import Any
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import MonitorNode
-from ou_monitor.nodes.console import PublisherWatch
-from ou_monitor.nodes.inputs import PolledInput, Silence, SourceFinder, within
+from ou_monitor.nodes.inputs import PolledInput, PublisherWatch, Silence, SourceFinder, within
 from ou_monitor.nodes.sources import find_source, Source, SOURCE_PARAMETERS
 from ou_monitor.online.settings import Parameter
 from ou_monitor.recordings.model_file import read_model
 from ou_monitor.records import FloatArray, Level
 from ou_monitor.simulation import (
     is_recording, lacks, Profile, read_profile, read_throttle, RunningSupply, STICK_RATE)
-from ou_monitor.stream.config import parse_field_path, walk
-from std_srvs.srv import Trigger
+from ou_monitor.stream.config import parse_field_path, put, walk
 
 # Read again at each reset, except the last one, which takes effect at once.
 LIVE_PARAMETERS: tuple[Parameter, ...] = (
@@ -121,27 +119,19 @@ def _setter(message: Any, path: str, kind: str, stamp_factor: float = math.nan,
         def convert(value: float) -> Any:
             return value / stamp_factor if stamp_factor > 0.0 else value
 
-    def write(value: float) -> None:
-        if isinstance(last, int):
-            owner[last] = convert(value)
-        else:
-            setattr(owner, last, convert(value))
-    return write
+    return lambda value: put(owner, (last,), convert(value))
 
 
 class SupplySimulatorNode(MonitorNode):
     """The voltage of a model, as a node."""
 
-    def __init__(self, name: str) -> None:
-        self._lock = threading.Lock()
-        super().__init__(name, LIVE_PARAMETERS, (*_SOURCES, *FIXED_PARAMETERS))
-        self.begin()
+    RUN_TIME = LIVE_PARAMETERS
+    FIXED = (*_SOURCES, *FIXED_PARAMETERS)
 
     def start(self) -> None:
         """Read the model and begin."""
-        values = {p.name: self.get_parameter(p.name).value
-                  for p in (*_SOURCES, *FIXED_PARAMETERS)}
-        values['adc.sample_rate'] = 0.0
+        values = {**self.values(), 'adc.sample_rate': 0.0}
+        self._lock = threading.Lock()
         if not values['model_file']:
             raise InputError('model_file is needed: ou-monitor discover RECORDING --save-model '
                              'm.yaml makes one')
@@ -160,10 +150,9 @@ class SupplySimulatorNode(MonitorNode):
         self._input: PolledInput | None = None
         self._throttle_silence = Silence(self.steady_now)
         self._throttle, self._turn = 0.0, -1
-        self._watched = PublisherWatch()
-        self.create_service(Trigger, '~/reset', self.guarded(self._on_reset))
-        self.refuse_other_overrides(['/diagnostics', '/clock', self._voltage.source.topic,
-                                     *self._sources.topics])
+        self._watched = PublisherWatch(self)
+        self.serve('~/reset', self._reset)
+        self.refuse_other_overrides([self._voltage.source.topic, *self._sources.topics])
         self.get_logger().info(
             f"{', '.join(term.NAME for term in self._model.terms)} at {self._rate:g} Hz on "
             f'{self.resolve_topic_name(self._voltage.source.topic)}'
@@ -182,7 +171,8 @@ class SupplySimulatorNode(MonitorNode):
         if -1.0 < values['capacity_left'] < 0.0:
             raise ValueError('capacity_left must lie within 0..1, or be -1')
 
-    def _reset(self) -> None:
+    def _reset(self) -> str:
+        """Begin with the first sample; return what was done."""
         values = self.values()
         left = values['capacity_left']
         charge = math.nan if left < 0.0 else left
@@ -197,16 +187,7 @@ class SupplySimulatorNode(MonitorNode):
             # Stamp of the first sample, s; NaN: the clock's time then.
             self._begin = math.nan
             self.problem = ''
-
-    def _on_reset(self, request: Any, response: Any) -> Any:
-        try:
-            self._reset()
-        except InputError as error:
-            response.success, response.message = False, str(error)
-            return response
-        response.success = True
-        response.message = f"Begun anew with seed {self.values()['seed']}."
-        return response
+        return f"Begun anew with seed {values['seed']}."
 
     def _play(self, text: str) -> tuple[Profile, float, Sender] | None:
         """Return the throttle that is played, its length, s, and its publisher."""
@@ -226,9 +207,7 @@ class SupplySimulatorNode(MonitorNode):
         """Check who publishes throttle, 5 times a second."""
         if self._played is None:
             self._sources.watch('throttle')
-        if self._input is not None:
-            self._watched.look(self.get_publishers_info_by_topic(self._input.topic),
-                               self._input.publishers, self.steady_now())
+        self._watched.look(self._input)
 
     def _open(self, source: Source) -> None:
         kind, spec = source.open()
@@ -319,9 +298,8 @@ class SupplySimulatorNode(MonitorNode):
             self._throttle_source.topic)
         voltage = self.resolve_topic_name(self._voltage.source.topic)
         if self._played is None and self._needs_throttle and self._is_idle:
-            age = self._throttle_silence.age
             notes.append(f'No throttle {f"on {topic}" if topic else "in this msg_config"}'
-                         + ('' if age is None else f' for {age:.1f} s') + ': it idles.')
+                         f'{self._throttle_silence.words}: it idles.')
         notes += [*filter(None, self._sources.problems.values()), *self._watched.notes(topic)]
         if self.count_publishers(voltage) > 1:
             notes.append(f'{voltage} has another publisher.')
@@ -335,10 +313,10 @@ class SupplySimulatorNode(MonitorNode):
         run = self._run_now
         discharge = run.simulation.discharge
         fields = {
-            'rate': repr(self._rate), 'samples': str(self._sent), 'lost': str(self._lost),
-            'throttle': repr(self._throttle), 'seed': str(self.values()['seed']),
-            'charge': repr(math.nan if discharge is None else discharge.charge),
-            'scale_resistance': repr(run.simulation.resistance),
+            'rate': self._rate, 'samples': self._sent, 'lost': self._lost,
+            'throttle': self._throttle, 'seed': self.values()['seed'],
+            'charge': math.nan if discharge is None else discharge.charge,
+            'scale_resistance': run.simulation.resistance,
             'model_terms': ','.join(term.NAME for term in self._model.terms),
             'lacks': '; '.join(self._lacks), **self._watched.fields()}
         self.diagnose('supply', level, ' '.join(notes) or (

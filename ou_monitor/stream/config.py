@@ -272,8 +272,12 @@ class ZeroRule:
         return np.where(nothing, np.nan, values) if nothing.any() else values
 
 
-def walk(msg: object, steps: FieldPath, path: str, kind: str) -> Any:
-    """Follow a field path in a message (kind: its type); None if an array is too short."""
+def walk(msg: object, steps: FieldPath, path: str = '', kind: str = '') -> Any:
+    """
+    Follow a field path in a message; None if an array is too short.
+
+    path and kind: the path as given and the type of the message, for an InputError.
+    """
     at: Any = msg
     for step in steps:
         if isinstance(step, str):
@@ -291,6 +295,15 @@ def walk(msg: object, steps: FieldPath, path: str, kind: str) -> Any:
                                  'of something that is not an array') from error
             at = at[step]
     return at
+
+
+def put(msg: object, steps: FieldPath, value: Any) -> None:
+    """Write an existing element of a message."""
+    holder, last = walk(msg, steps[:-1]), steps[-1]
+    if isinstance(last, str):
+        setattr(holder, last, value)
+    else:
+        holder[last] = value
 
 
 class ManyExtractor:

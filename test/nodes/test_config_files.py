@@ -7,22 +7,16 @@ import sys
 from types import ModuleType
 
 from live import ROOT
-from ou_monitor.nodes.adaptive_filter_node import FIXED, RUN_TIME
-from ou_monitor.nodes.adc_node import ADC_PARAMETERS
-from ou_monitor.nodes.base import LOCK, PUBLISH_RATE
-from ou_monitor.nodes.estimator_node import STATE_FILE
-from ou_monitor.nodes.sources import SOURCE_PARAMETERS
-from ou_monitor.nodes.supply_simulator_node import FIXED_PARAMETERS, LIVE_PARAMETERS
-from ou_monitor.online.settings import ESTIMATOR_PARAMETERS
+from ou_monitor.nodes.adaptive_filter_node import AdaptiveFilterNode
+from ou_monitor.nodes.adc_node import AdcNode
+from ou_monitor.nodes.base import LOCK
+from ou_monitor.nodes.estimator_node import EstimatorNode
+from ou_monitor.nodes.supply_simulator_node import SupplySimulatorNode
 from project import metadata
 import pytest
 import yaml
 
-DECLARED = {
-    'ou_estimator': (
-        *ESTIMATOR_PARAMETERS, PUBLISH_RATE, *SOURCE_PARAMETERS, STATE_FILE, LOCK),
-    'ou_adaptive_filter': (*RUN_TIME, PUBLISH_RATE, *FIXED, LOCK),
-}
+NODES = {'ou_estimator': EstimatorNode, 'ou_adaptive_filter': AdaptiveFilterNode}
 FILE = ROOT / 'config' / 'ou_monitor.yaml'
 ADC_FILE = ROOT / 'config' / 'adc.yaml'
 LAUNCH = ROOT / 'launch' / 'ou_monitor_launch.py'
@@ -41,22 +35,16 @@ def flat(group, prefix=''):
     return found
 
 
-@pytest.mark.parametrize('node', DECLARED)
-def test_every_parameter_at_its_default(node):
+@pytest.mark.parametrize('file, kinds', [(FILE, list(NODES.values())), (ADC_FILE, [AdcNode])])
+def test_every_parameter_at_its_default(file, kinds):
     """No key that is not declared, none missing, same value, same type."""
-    content = yaml.safe_load(FILE.read_text())
-    assert set(content) == {f'/**/{name}' for name in DECLARED}
-    listed = flat(content[f'/**/{node}']['ros__parameters'])
-    defaults = {p.name: p.default for p in DECLARED[node]}
-    assert listed == defaults
-    assert {k: type(v) for k, v in listed.items()} == {k: type(v) for k, v in defaults.items()}
-
-
-def test_every_parameter_of_the_adc_at_its_default():
-    """As above."""
-    (listed,) = yaml.safe_load(ADC_FILE.read_text()).values()
-    assert listed['ros__parameters'] == {
-        p.name: p.default for p in (*ADC_PARAMETERS, LOCK)}
+    content = yaml.safe_load(file.read_text())
+    for kind, group in zip(kinds, content.values(), strict=True):
+        listed = flat(group['ros__parameters'])
+        defaults = {p.name: p.default for p in (*kind.RUN_TIME, *kind.FIXED, LOCK)}
+        assert listed == defaults
+        assert {k: type(v) for k, v in listed.items()} == {
+            k: type(v) for k, v in defaults.items()}
 
 
 @pytest.mark.parametrize('file', [FILE, ADC_FILE])
@@ -132,7 +120,8 @@ def test_the_nodes_are_found_on_this_machine_alone(described):
 def test_launch_nodes(described):
     """Executables of the package, names that the file has, sigma wired to the estimator."""
     nodes = of_kind(described, 'Node')
-    assert [n.kwargs['name'] for n in nodes] == list(DECLARED)
+    assert [n.kwargs['name'] for n in nodes] == list(NODES)
+    assert set(yaml.safe_load(FILE.read_text())) == {f'/**/{name}' for name in NODES}
     scripts = metadata()['scripts']
     for node in nodes:
         name = node.kwargs['executable']
@@ -200,10 +189,10 @@ def test_simulated(described):
         assert Path(arguments[name]).is_file()
     (values,) = node.kwargs['parameters']
     assert set(values) - {'use_sim_time'} <= {
-        p.name for p in (*LIVE_PARAMETERS, *FIXED_PARAMETERS)}
+        p.name for p in (*SupplySimulatorNode.RUN_TIME, *SupplySimulatorNode.FIXED)}
     own = yaml.safe_load((ROOT / 'config' / 'simulated.yaml').read_text())
     assert set(flat(own['/**/ou_estimator']['ros__parameters'])) <= {
-        p.name for p in DECLARED['ou_estimator']}
+        p.name for p in (*EstimatorNode.RUN_TIME, *EstimatorNode.FIXED)}
 
 
 def _arguments_of(path):

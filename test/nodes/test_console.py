@@ -2,7 +2,7 @@
 
 from types import SimpleNamespace
 
-from ou_monitor.nodes.console import AGAIN, Console, MUTE
+from ou_monitor.nodes.inputs import AGAIN, Console, MUTE
 
 
 def test_why_no_message_comes():

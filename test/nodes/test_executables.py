@@ -22,6 +22,14 @@ def names(probe):
     return probe.node.get_fully_qualified_node_names()
 
 
+def run_code(code, **environment):
+    """Run Python in a process of its own; variables that are None are not set."""
+    env = {**os.environ, 'PYTHONPATH': str(ROOT), **environment}
+    return subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, timeout=DEADLINE,
+        env={name: value for name, value in env.items() if value is not None})
+
+
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM], ids=['SIGINT', 'SIGTERM'])
 def test_signals_end_the_nodes(world, number):
     """Status 0, no traceback, and the nodes are gone from the graph."""
@@ -89,10 +97,7 @@ def test_a_signal_while_it_ends_is_only_noted(tmp_path):
             '    atexit.register(os.kill, os.getpid(), signal.SIGINT)\n'
             '    return 3\n'
             'run_node("one", "about", work)\n')
-    env = {**os.environ, 'PYTHONPATH': str(ROOT), 'ROS_LOG_DIR': str(tmp_path),
-           'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}
-    done = subprocess.run([sys.executable, '-c', code], env=env, capture_output=True, text=True,
-                          timeout=DEADLINE)
+    done = run_code(code, ROS_LOG_DIR=str(tmp_path), ROS_AUTOMATIC_DISCOVERY_RANGE='OFF')
     assert (done.returncode, done.stdout, done.stderr) == (3, 'destroyed ', '')
 
 
@@ -190,12 +195,7 @@ def test_the_nodes_have_one_thread_of_blas():
     code = ('import ou_monitor.nodes.run, os, sys; assert "numpy" not in sys.modules; '
             'print(os.environ["OPENBLAS_NUM_THREADS"])')
     for given, threads in ((None, '1'), ('2', '2')):
-        env = {**os.environ, 'PYTHONPATH': str(ROOT), 'OPENBLAS_NUM_THREADS': given or ''}
-        if given is None:
-            del env['OPENBLAS_NUM_THREADS']
-        done = subprocess.run([sys.executable, '-c', code], env=env, capture_output=True,
-                              text=True, check=True)
-        assert done.stdout == f'{threads}\n'
+        assert run_code(code, OPENBLAS_NUM_THREADS=given).stdout == f'{threads}\n'
 
 
 def test_no_thread_holds_up_the_end(tmp_path):
@@ -208,10 +208,7 @@ def test_no_thread_holds_up_the_end(tmp_path):
             '    print("done", end=" ")\n'
             '    return 3\n'
             'run_node("one", "about", work)\n')
-    env = {**os.environ, 'PYTHONPATH': str(ROOT), 'ROS_LOG_DIR': str(tmp_path),
-           'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}
-    done = subprocess.run([sys.executable, '-c', code], env=env, capture_output=True, text=True,
-                          timeout=DEADLINE)
+    done = run_code(code, ROS_LOG_DIR=str(tmp_path), ROS_AUTOMATIC_DISCOVERY_RANGE='OFF')
     assert (done.returncode, done.stdout, done.stderr) == (3, 'done at exit\n', '')
 
 
@@ -233,10 +230,7 @@ def test_a_middleware_that_does_not_let_go_is_left(tmp_path):
             '        return node\n'
             '    return run.spin(make)\n'
             'run.run_node("stuck", "about", work)\n')
-    env = {**os.environ, 'PYTHONPATH': str(ROOT), 'ROS_LOG_DIR': str(tmp_path),
-           'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}
-    done = subprocess.run([sys.executable, '-c', code], env=env, capture_output=True, text=True,
-                          timeout=DEADLINE)
+    done = run_code(code, ROS_LOG_DIR=str(tmp_path), ROS_AUTOMATIC_DISCOVERY_RANGE='OFF')
     assert (done.returncode, done.stdout) == (-signal.SIGALRM, 'ending\n')
 
 

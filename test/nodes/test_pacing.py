@@ -4,7 +4,8 @@ import math
 import threading
 import time
 
-from ou_monitor.nodes.pacing import Prefetch, SpacingError, wait_until
+from ou_monitor.nodes.base import wait_until
+from ou_monitor.nodes.player import Prefetch, SpacingError
 import pytest
 
 
