@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 from ou_monitor.cli import output
@@ -11,21 +10,17 @@ from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
 from ou_monitor.report.document import Document, Facts, Notes, Part, Table, Text
 
-# Endings that OUT must not have: a folder with such a name would mislead.
-LOG_ENDINGS = ('.csv', '.ulg', '.bin', '.bbl', '.bfl', '.log', '.db3', '.bag', '.txt')
-
 
 def run(args: argparse.Namespace) -> int:
     """Convert, or list."""
     if args.list:
         if args.out is not None:
             raise InputError(f"--list writes no bag: leave '{args.out}' out")
-    elif args.out.suffix.lower() in LOG_ENDINGS:
-        raise InputError(f"OUT '{args.out}' must end in .mcap, or be the name of a folder")
+    else:
+        # Before reading a long log.
+        output.check_bag('OUT', args.out, args.force)
     output.check_paths({'LOG': args.log}, {'OUT': args.out, '--json': args.json}, args.force)
     output.check_writable(args.json)
-    if args.out is not None:
-        _check_place(args.out, args.force)
 
     from ou_monitor.cli.arguments import columns_given
     from ou_monitor.recordings.importers.formats import import_log
@@ -37,15 +32,6 @@ def run(args: argparse.Namespace) -> int:
         log = import_log(args.log, Request(args.flight, names, args.poles, args.list, progress,
                                            columns_given(args)))
     return _list(args, log) if args.list else _convert(args, log)
-
-
-def _check_place(out: Path, force: bool) -> None:
-    """Refuse an OUT that cannot be written before reading a long log; writing checks again."""
-    if not force and (out.exists() or out.is_symlink()):
-        raise InputError(f"OUT '{out}' exists already: --force overwrites it, or give another "
-                         'name')
-    if not out.parent.is_dir():
-        raise InputError(f'cannot write {out}: there is no folder {out.parent}')
 
 
 def _convert(args: argparse.Namespace, log: Any) -> int:
@@ -129,8 +115,8 @@ def _list(args: argparse.Namespace, log: Any) -> int:
             ['*' if row['default'] else '', row['name'], str(row['n']), row['what']
              + ('' if row['acceleration'] else ', no accelerometer')] for row in gyros],
               left=(0, 1, 3)),
-        *([Text(f'* /motor_speed: {log.speeds.words}, {log.speeds.t.size} samples, '
-                f"{', '.join(speeds)}")] if speeds else []), Notes.of([*several, *log.notes])]
+        Text(f'* /motor_speed: {log.speeds.words}, {log.speeds.t.size} samples, '
+             f"{', '.join(speeds)}" if speeds else ''), Notes.of([*several, *log.notes])]
     output.tell(args, Document('A log', f'{args.log}: {log.format}' + ''.join(
         f', {name} {value}' for name, value in log.facts.items()), (), parts), lambda: {
             'log': str(args.log), 'format': log.format, 'facts': log.facts, 'series': rows,

@@ -107,6 +107,11 @@ _NO_FILE = 'Nothing was written: --report FILE.html draws it, --json FILE keeps 
 _STORAGE = ('.mcap', '.db3', '.zst', '.zstd', '.lz4')
 
 
+# Endings that a bag must not have: a folder with such a name would mislead.
+_NO_BAG = ('.bag', '.bbl', '.bfl', '.bin', '.csv', '.db3', '.json', '.log', '.txt', '.ulg',
+           '.yaml', '.yml')
+
+
 def write_json(data: Mapping[str, Any], target: str, force: bool = False) -> None:
     """Write strict JSON; with `force` over a file that is there."""
     # Imported here, so that `--help` needs no NumPy.
@@ -200,6 +205,17 @@ def check_paths(inputs: Mapping[str, str | Path | None],
                              'another name')
 
 
+def check_bag(name: str, bag: Path, force: bool) -> None:
+    """Refuse a bag that cannot be written, before the work starts; `replacing` checks again."""
+    if bag.suffix.lower() in _NO_BAG:
+        raise InputError(f"{name} '{bag}': {bag.suffix} is not written; give NAME.mcap for one "
+                         'file, or NAME for a rosbag2 folder')
+    if not force and (bag.exists() or bag.is_symlink()):
+        raise InputError(f"{name} '{bag}' exists already: --force overwrites it, or give another "
+                         'name')
+    check_folder(bag)
+
+
 @contextmanager
 def replacing(bag: Path | None, force: bool) -> Iterator[None]:
     """Move an existing bag aside while a new one is written; restore it if that fails."""
@@ -259,8 +275,13 @@ def check_writable(target: str | None) -> None:
     path = Path(target)
     if path.is_dir():
         raise InputError(f"cannot write '{target}': it is a folder; name a file in it")
+    check_folder(path)
+
+
+def check_folder(path: Path) -> None:
+    """Refuse an output in a folder that does not exist."""
     if not path.parent.is_dir():
-        raise InputError(f"cannot write '{target}': the folder '{path.parent}' does not exist")
+        raise InputError(f"cannot write '{path}': the folder '{path.parent}' does not exist")
 
 
 def deliver(args: argparse.Namespace, found: Result, command: str = '',

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from datetime import datetime, timezone
 import math
@@ -20,14 +20,13 @@ from ou_monitor.errors import InputError
 if TYPE_CHECKING:
     from ou_monitor.discovery.finding import Finding
     from ou_monitor.records import Recording
+    from ou_monitor.report.result import Result
 
 
 def analyze(args: argparse.Namespace) -> int:
     """Run `analyze`: the paper's Tables 1 and 2 for a recording."""
     given = _bench_arguments(args, 'levels', 'window', 'brownout_horizon')
-    recording, _ = read_given(args)
-    with Progress('analyzing', args.json == output.STDOUT) as progress:
-        found = bench.analyze(recording, progress=progress, **given)
+    _, found = _read_and_run(args, 'analyzing', bench.analyze, given)
     output.deliver(args, found, _command(args, given))
     return 0
 
@@ -38,9 +37,7 @@ def compare(args: argparse.Namespace) -> int:
 
     given = _bench_arguments(args, 'fit_until', 'seeds', 'seed')
     model = None if args.model is None else read_model(args.model).model
-    recording, _ = read_given(args)
-    with Progress('comparing', args.json == output.STDOUT) as progress:
-        found = bench.compare(recording, model, progress=progress, **given)
+    _, found = _read_and_run(args, 'comparing', bench.compare, {**given, 'model': model})
     output.deliver(args, found, _command(args, [*given, 'model']))
     return 0
 
@@ -64,9 +61,7 @@ def coupling(args: argparse.Namespace) -> int:
 def discover(args: argparse.Namespace) -> int:
     """Run `discover`: what the simulation gets wrong, why, and the gain."""
     given = _bench_arguments(args, 'seed')
-    recording, _ = read_given(args)
-    with Progress('discovering', args.json == output.STDOUT) as progress:
-        finding = bench.discover(recording, progress=progress, **given)
+    recording, finding = _read_and_run(args, 'discovering', bench.discover, given)
     output.deliver(args, finding, _command(args, given),
                    model=args.save_model if args.force or not finding.refused else None)
     if args.save_model is not None:
@@ -96,6 +91,14 @@ def _bench_arguments(args: argparse.Namespace, *names: str) -> dict[str, Any]:
     given.update(brownout_voltage=brownout_limit(args), cells=args.cells or 0)
     check_ranges(given)
     return given
+
+
+def _read_and_run(args: argparse.Namespace, label: str, function: Callable[..., Result],
+                  given: dict[str, Any]) -> tuple[Recording, Result]:
+    """Return the recording, and the result of a function of `bench`, with progress bars."""
+    recording, _ = read_given(args)
+    with Progress(label, args.json == output.STDOUT) as progress:
+        return recording, function(recording, progress=progress, **given)
 
 
 def _command(args: argparse.Namespace, names: Iterable[str]) -> str:

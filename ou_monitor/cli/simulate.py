@@ -14,8 +14,6 @@ from ou_monitor.recordings.model_file import as_yaml
 from ou_monitor.report.document import Document, Table
 from ou_monitor.simulation import is_recording, PRESETS, PROFILES, Run
 
-# Endings that a bag must not have: a folder with such a name would mislead.
-_NO_BAG = ('.bag', '.bin', '.csv', '.db3', '.json', '.txt', '.ulg', '.yaml', '.yml')
 # Maximum number of samples used to measure the loss of an export.
 _EXPORT_MOST = 200_000
 
@@ -44,9 +42,8 @@ def run(args: argparse.Namespace) -> int:
         {'--model': args.model, '--throttle': table},
         {'--output': args.output, '--save-model': args.save_model, '--json': args.json},
         args.force)
-    if args.output is not None and args.output.suffix.lower() in _NO_BAG:
-        raise InputError(f"--output '{args.output}': {args.output.suffix} is not written; give "
-                         'NAME.mcap for one file, or NAME for a rosbag2 folder')
+    if args.output is not None:
+        output.check_bag('--output', args.output, args.force)
     output.check_writable(args.json)
     output.check_writable(None if args.save_model is None else str(args.save_model))
     target = None if args.export is not None else args.output

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 import math
 
@@ -401,18 +402,26 @@ def _voltage(analysis: Analysis) -> Plot:
 
 def voltage_plot(recording: Recording, limit: float) -> Plot:
     """Return the voltage, with its limit, V."""
-    t = recording.t - (float(recording.t[0]) if recording.n else 0.0)
-    limits = (0.0, max(recording.duration, 1e-9))
-    plot = Plot('Voltage', 'time, s', 'V', height=230).limits(x=limits)
-    plot.line(t, recording.voltage, colour=0)
+    plot = _over(recording, 'Voltage', 'V', 230)
+    plot.line(_since_start(recording, recording.t), recording.voltage, colour=0)
     if math.isfinite(limit):
-        plot.line(np.array(limits), np.full(2, limit), f'limit {limit:g} V', 1, 'dash thick')
+        plot.level(plot.x_range, limit, f'limit {limit:g} V', style='dash thick')
     return plot
+
+
+def _over(recording: Recording, title: str, unit: str, height: int, log: bool = False) -> Plot:
+    """Return an empty plot over the time of a recording."""
+    return Plot(title, 'time, s', unit, height=height, log_y=log).limits(
+        x=(0.0, max(recording.duration, 1e-9)))
+
+
+def _since_start(recording: Recording, t: FloatArray) -> FloatArray:
+    return t - (float(recording.t[0]) if recording.n else 0.0)
 
 
 def _with_segments(plot: Plot, analysis: Analysis) -> Plot:
     """Shade the segments used for the load levels."""
-    t = analysis.recording.t - float(analysis.recording.t[0])
+    t = _since_start(analysis.recording, analysis.recording.t)
     for k, level in enumerate(_drawn(analysis)):
         for s in level.segments:
             plot.shade(float(t[s.start]), float(t[s.stop - 1]), k, level.label)
@@ -421,21 +430,19 @@ def _with_segments(plot: Plot, analysis: Analysis) -> Plot:
 
 def _over_time(analysis: Analysis) -> list[Part]:
     recording, sliding = analysis.recording, analysis.sliding
-    limits = (0.0, max(recording.duration, 1e-9))
     drawn: list[Part] = []
     if recording.has_throttle:
-        plot = Plot('Throttle, and the load levels found in it', 'time, s', '%', height=150)
-        plot.limits(x=limits, y=(-5.0, 105.0)).steps(
-            recording.t - float(recording.t[0]), 100.0 * recording.throttle, colour=7)
+        plot = _over(recording, 'Throttle, and the load levels found in it', '%', 150)
+        plot.limits(y=(-5.0, 105.0)).steps(
+            _since_start(recording, recording.t), 100.0 * recording.throttle, colour=7)
         drawn.append(Figure(_with_segments(plot, analysis), (
             'Shaded: the segments used for the load levels, in the colours of the plots of the '
             'shape. Every peak is shown.')))
     if np.isfinite(sliding.risk).any():
-        plot = Plot(f'Risk of going below {sliding.brownout_voltage:g} V within '
-                    f'{sliding.brownout_horizon:g} s', 'time, s', 'probability', height=170)
-        plot.limits(x=limits, y=(-0.02, 1.02))
-        drawn.append(Figure(plot.line(sliding.t - float(recording.t[0]), sliding.risk, colour=1,
-                                      style='thick')))
+        plot = _over(recording, f'Risk of going below {sliding.brownout_voltage:g} V within '
+                     f'{sliding.brownout_horizon:g} s', 'probability', 170)
+        drawn.append(Figure(plot.limits(y=(-0.02, 1.02)).line(
+            _since_start(recording, sliding.t), sliding.risk, colour=1, style='thick')))
     return drawn
 
 
@@ -446,32 +453,25 @@ def _sliding(analysis: Analysis) -> list[Part]:
         return [Text(
             f'No sliding estimate: the recording is shorter than half a window of '
             f'{sliding.window:g} s.', legend=True)]
-    start = float(recording.t[0])
-    limits = (0.0, max(recording.duration, 1e-9))
+    t = _since_start(recording, sliding.t)
     drawn: list[Part] = []
-    known = np.array([e.usable for e in sliding.estimates])
     for name, title, unit in (('sigma', 'Noise intensity \u03c3', 'V/\u221as'),
                               ('alpha', 'Relaxation rate \u03b1', '1/s')):
         value = sliding.series(name)
         if not np.isfinite(value).any():
             continue
         low, high = sliding.interval(name)
-        plot = Plot(f'{title} in a sliding window of {sliding.window:g} s', 'time, s', unit,
-                    height=200, log_y=True).limits(x=limits)
+        plot = _over(recording, f'{title} in a sliding window of {sliding.window:g} s', unit,
+                     200, log=True)
         # One window without information must not flatten the others.
         plot.limits(y=span([value, low, high], log=True, trim=0.01))
-        plot.band(sliding.t - start, low, high, '95 % interval')
-        plot.line(sliding.t - start, value, 'estimate', style='thick')
+        plot.band(t, low, high, '95 % interval').line(t, value, 'estimate', style='thick')
         drawn.append(Figure(plot))
-    lost = int((~known).sum())
+    lost = Counter(e.status.value for e in sliding.estimates if not e.usable)
     if lost:
-        counts: dict[str, int] = {}
-        for e in sliding.estimates:
-            if not e.usable:
-                counts[e.status.value] = counts.get(e.status.value, 0) + 1
-        drawn.append(Text(f'{lost} of {known.size} windows carry no estimate:'))
-        drawn.append(Notes.of((f'{n} windows: {text}' for text, n in counts.items()),
-                              Severity.WARNING))
+        drawn += [
+            Text(f'{lost.total()} of {len(sliding.estimates)} windows carry no estimate:'),
+            Notes.of((f'{n} windows: {text}' for text, n in lost.items()), Severity.WARNING)]
     return drawn
 
 
@@ -489,31 +489,24 @@ def _shape(analysis: Analysis) -> list[Part]:
                      'deviation / standard deviation', 'density', width=450, height=330,
                      log_y=True)
     drawn = _drawn(analysis)
-    fitted, counted = 0, 0
     for k, level in enumerate(drawn):
         measured = level.spectrum
         if measured.frequency.size:
-            fitted += 1
             spectrum.line(measured.frequency, measured.density, level.label, k, 'faint')
             spectrum.line(measured.frequency, measured.fitted, '', k, 'dash thick')
             for line in level.lines.lines[:_MAX_MARKED]:
                 spectrum.mark(line.frequency, f'{line.frequency:.4g} Hz')
         edges, density = level.density()
         if density.size:
-            counted += 1
             # An empty bin cannot be drawn on a logarithmic axis.
             histogram.line(*outline(edges, np.where(density > 0.0, density, np.nan)),
                            level.label, k)
+    figures = [Figure(plot) for plot in (spectrum, histogram) if plot.curves]
+    if not figures:
+        return [Text('No level holds enough samples for a spectrum.', legend=True)]
     z = np.linspace(-5.0, 5.0, 201)
     histogram.line(z, np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi), 'normal', 7, 'dash thick')
     histogram.limits(x=(-6.0, 6.0), y=(1e-5, 1.0))
-    figures = []
-    if fitted:
-        figures.append(Figure(spectrum))
-    if counted:
-        figures.append(Figure(histogram))
-    if not figures:
-        return [Text('No level holds enough samples for a spectrum.', legend=True)]
     text = ('An OU is flat below its corner \u03b1/(2\u03c0) and falls with the square of '
             'frequency above it; a line that stands out is a tone, a flat floor at high '
             'frequency is white noise of the sensor.')

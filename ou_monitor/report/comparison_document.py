@@ -92,7 +92,7 @@ def _voltage(found: Agreement) -> Plot:
     plot.line(at.t, at.simulated, 'one simulation', _SIMULATED, 'faint')
     plot.line(at.t, at.voltage, 'measured', 0)
     for level in found.levels:
-        plot.line(np.array([at.t[0], at.t[-1]]), np.full(2, level), '', _MEASURED, 'dash')
+        plot.level(at.t, level, '', _MEASURED)
     return plot
 
 

@@ -74,12 +74,12 @@ def _signal(recording: Recording, signal: tuple[FloatArray, FloatArray], name: s
 
 
 def _coherence(found: Coupling) -> Plot:
-    low, high = float(found.frequency[0]), float(found.frequency[-1])
+    ends = float(found.frequency[0]), float(found.frequency[-1])
     plot = Plot('What the voltage and the signal share', 'frequency, Hz', 'coherence', height=220)
-    plot.limits((low, high), (0.0, 1.05 * max(found.threshold, float(found.coherence.max()))))
+    plot.limits(ends, (0.0, 1.05 * max(found.threshold, float(found.coherence.max()))))
     plot.line(found.frequency, found.coherence, 'measured', 0)
-    return plot.line(np.array([low, high]), np.full(2, found.threshold),
-                     f'by chance up to {found.threshold:.2g}', 1, 'dash')
+    return plot.level(found.frequency, found.threshold,
+                      f'by chance up to {found.threshold:.2g}')
 
 
 def _gain(found: Coupling, per: str) -> Plot:

@@ -46,7 +46,7 @@ def design_document(result: Design, source: str, taken: str = '', command: str =
                 probability(lever.risk), number(lever.least)
                 if math.isfinite(lever.least) else 'out of reach'] for lever in result.levers],
               left=[0, 1]),
-        *(Text(text) for text in (effect(result), *remarks(result), taken) if text)], command)
+        *map(Text, (effect(result), *remarks(result), taken))], command)
 
 
 def _risk(result: Design) -> Plot:
@@ -56,7 +56,7 @@ def _risk(result: Design) -> Plot:
                 log_y=True, legend_row=True).limits(y=(_LEAST_RISK, 2.0))
     plot.line(1e6 * farads, np.maximum([row.risk for row in result.rows], _LEAST_RISK),
               f'within {result.horizon:g} s', 0, 'thick')
-    plot.line(1e6 * farads[[0, -1]], np.full(2, result.target), 'allowed', 1, 'dash')
+    plot.level(1e6 * farads, result.target, 'allowed')
     return plot.mark(1e6 * result.present.capacitance, 'present')
 
 

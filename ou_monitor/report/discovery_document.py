@@ -49,7 +49,7 @@ def discovery_document(finding: Finding, seen: Overview | None = None, command: 
         lambda: [] if samples is None else [Figure(_voltage(finding), (
             f'Band: range of {_DRAWS} simulations of the {_model_name(finding)} at each moment, '
             'with the throttle of the recording.') if finding.simulated else '')],
-        *([Facts(known)] if known else [])]
+        Facts(known)]
     if baseline is not None:
         after = ' before and after' if finding.causes else ''
         parts += [Section('Causes', _causes(finding)),
@@ -130,7 +130,6 @@ def _causes(finding: Finding) -> list[Part]:
     if not finding.causes:
         return [Text('No cause was named.')]
     found = cause_rows(finding.causes)
-    overlap = overlap_words(finding.causes, finding.gain)
     remarks = [f'Gain {remark}: ' + ', '.join(
         f'{row.label} ({row.gain})' for row in found if row.remark == remark)
         for remark in dict.fromkeys(row.remark for row in found if row.remark)]
@@ -138,7 +137,7 @@ def _causes(finding: Finding) -> list[Part]:
         Table(['cause', 'what it is', 'family', 'gain,\nmnat/sample', 'p', 'alternatives'],
               [[row.label, PLAIN_NAMES.get(row.name, row.name), row.family, row.gain, row.chance,
                 ', '.join(row.alternatives) or '-'] for row in found], left=[0, 1, 2, 5]),
-        Notes.of([*remarks, *([overlap] if overlap else []),
+        Notes.of([*remarks, overlap_words(finding.causes, finding.gain),
                   *(f'{row.label}: {row.explanation}' for row in found)]),
         Text(f'{MNAT} Gain: the loss of held-out score when the cause is left out and the rest is '
              'fitted again; its standard error comes from means of blocks and from the errors of '
@@ -160,9 +159,8 @@ def _gain(finding: Finding) -> list[Part]:
                          (c.extended, c.extended_se))), '-'])
     # If nothing was added to the plain OU, there is nothing to compare.
     kept = 5 if finding.causes else 3
-    felt = finding.felt.words
     return [Table(['', 'observed', 'plain OU', 'extended', 'gain'][:kept],
-                  [row[:kept] for row in rows], left=[0]), *([Text(felt)] if felt else []),
+                  [row[:kept] for row in rows], left=[0]), Text(finding.felt.words),
             Text(f'Plain OU, with nothing else in the model: {plain_model_words(baseline)}.')]
 
 
@@ -193,7 +191,7 @@ def _comparisons(finding: Finding) -> list[Part]:
                               np.random.default_rng(finding.seed))
     drawn = [Figure(_plot(curve, k, name))
              for curve in compared for k, name in enumerate(named)]
-    return [*[Pair(drawn[k:k + 2]) for k in range(0, len(drawn), 2)], Text(
+    return [*Pair.two_by_two(drawn), Text(
         'Line or dots: the data. Band or bars: the range of 40 simulations with the stamps and '
         'the throttle of the data; about one point in twenty of a correct model lies outside.',
         legend=True)]

@@ -1,8 +1,9 @@
 """
 The report of a command, as records; `page` and `terminal` write them.
 
-Texts are ASCII: '+-', 'sigma' and 'V/sqrt(s)' in the head of a table become signs on a page.  In a
-cell or a head, text after a line break is small on a page and continues the line on a terminal.
+Empty parts are left out.  Texts are ASCII: '+-', 'sigma' and 'V/sqrt(s)' in the head of a table
+become signs on a page.  In a cell or a head, text after a line break is small on a page and
+continues the line on a terminal.
 """
 
 from __future__ import annotations
@@ -49,8 +50,8 @@ class Notes:
     @classmethod
     def of(cls, texts: Iterable[str], severity: Severity = Severity.INFO,
            most: int | None = None) -> Notes:
-        """Return notes of one severity."""
-        return cls([(severity, text) for text in texts], most)
+        """Return notes of one severity; empty texts are left out."""
+        return cls([(severity, text) for text in texts if text], most)
 
 
 # An unknown cell.

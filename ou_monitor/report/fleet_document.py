@@ -10,6 +10,7 @@ import re
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from ou_monitor.criticism.curves import outline
 from ou_monitor.fleet.fleet import Fleet
 from ou_monitor.fleet.judgement import (
@@ -20,7 +21,7 @@ from ou_monitor.records import FloatArray, NAN, Severity
 from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text, UNKNOWN)
 from ou_monitor.report.svg import Plot
-from ou_monitor.text import chance, counted, number, p_words, volts
+from ou_monitor.text import chance, counted, number, p_words, some, volts
 
 _TITLES = {'sigma': 'Noise intensity \u03c3', 'alpha': 'Relaxation rate \u03b1',
            'sag': 'Sag at full throttle'}
@@ -113,9 +114,9 @@ def _anomalies(fleet: Fleet) -> str:
     odd = {judged.values[name].paths[k] for name, k in judged.odd_recordings()}
     vehicles = sorted({judged.vehicles[name].names[k] for name, k in judged.odd_vehicles()})
     if drifting:
-        text += f' Drift over the flights: {_short_list(drifting)}.'
+        text += f' Drift over the flights: {some(drifting, 5)}.'
     if vehicles:
-        text += f' Unlike the rest of the fleet: {_short_list(vehicles)}.'
+        text += f' Unlike the rest of the fleet: {some(vehicles, 5)}.'
     if odd:
         text += f' Unlike the other flights of their vehicle: {counted(len(odd), "recording")}.'
     if not (drifting or vehicles or odd):
@@ -124,11 +125,6 @@ def _anomalies(fleet: Fleet) -> str:
         text += (' Nothing stands out.' if tested else
                  ' There are too few recordings per vehicle to tell what stands out.')
     return text.strip()
-
-
-def _short_list(names: list[str], most: int = 5) -> str:
-    more = len(names) - most
-    return ', '.join(names[:most]) + (f' and {more} more' if more > 0 else '')
 
 
 def change(name: str, value: float) -> str:
@@ -366,9 +362,7 @@ def sentences(fleet: Fleet) -> list[str]:
     rows = once(fleet)
     if not rows:
         return []
-    low = min(rows, key=lambda row: row['lowest'])
-    lowest = (f'{number(low["lowest"], 4)} V at {number(low["lowest_at"])} s of '
-              f'{_name(low)}')
+    _, lowest = _lowest_of(rows)
     found = dips_of(rows)
     if found is None:
         text = f'The lowest voltage was {lowest}'
@@ -389,14 +383,22 @@ def sentences(fleet: Fleet) -> list[str]:
             f'{100.0 * row["sag_throttle"]:.0f} % throttle.']
 
 
+def _lowest_of(rows: Sequence[Row]) -> tuple[Row, str]:
+    """Return the recording with the lowest voltage, and where and when in words."""
+    low = min(rows, key=lambda row: row['lowest'])
+    return low, (f'{number(low["lowest"], 4)} V at {number(low["lowest_at"])} s of '
+                 f'{_name(low)}')
+
+
 def facts(fleet: Fleet) -> list[tuple[str, str]]:
     """Return the facts of a fleet: pairs of name and words."""
     rows = once(fleet)
     if not rows:
         return []
-    low = min(rows, key=lambda row: row['lowest'])
-    lines = [('Lowest voltage', f'{number(low["lowest"], 4)} V at {number(low["lowest_at"])} s of '
-              f'{_name(low)}' + _throttle(low['lowest_throttle']))]
+    low, lowest = _lowest_of(rows)
+    u = low['lowest_throttle']
+    lines = [('Lowest voltage',
+              lowest + ('' if u is None else f', at {100.0 * u:.0f} % throttle'))]
     found = dips_of(rows)
     if found is not None:
         lines.append((f'Below {fleet.limit:g} V', (
@@ -419,10 +421,6 @@ def _name(row: Row) -> str:
     """Return the name of a recording, with its vehicle."""
     vehicle = '' if row['vehicle'] is None else f' ({row["vehicle"]})'
     return f'{row["recording"]}{vehicle}'
-
-
-def _throttle(value: float | None) -> str:
-    return '' if value is None else f', at {100.0 * value:.0f} % throttle'
 
 
 def short_names(names: Sequence[str]) -> dict[str, str]:
@@ -454,30 +452,31 @@ def _lowest(fleet: Fleet, rows: list[Row]) -> Plot:
     """Return the lowest voltage of each recording over the vehicles, and the limit."""
     names = [*fleet.vehicles, *(['unknown'] if any(row['vehicle'] is None for row in rows)
                                 else [])]
-    at = np.array([names.index(row['vehicle'] or 'unknown') + 1.0 for row in rows])
-    low = np.array([row['lowest'] for row in rows])
     under = np.array([bool(row['dips']) for row in rows])
-    x = at + _side_by_side(at, np.array([float(row['flight'] or 0) for row in rows]))
-    plot = Plot('Lowest voltage of every recording', 'vehicle', 'V', height=240).places(
-        list(short_names(names).values()))
-    plot.markers(x[~under], low[~under], 'recordings' if under.any() else '', 0)
-    if under.any():
-        plot.markers(x[under], low[under], 'with dips', 1)
+    plot = Plot('Lowest voltage of every recording', 'vehicle', 'V', height=240)
+    _dots(plot, names, [row['vehicle'] or 'unknown' for row in rows],
+          np.array([float(row['flight'] or 0) for row in rows]),
+          np.array([row['lowest'] for row in rows]), under,
+          ('recordings' if under.any() else '', 'with dips'))
     if math.isfinite(fleet.limit):
-        plot.line(np.array([0.4, len(names) + 0.6]), np.full(2, fleet.limit),
-                  f'limit {fleet.limit:g} V', 1, 'dash')
+        plot.level((0.4, len(names) + 0.6), fleet.limit, f'limit {fleet.limit:g} V')
     return plot
 
 
-def _side_by_side(at: FloatArray, flights: FloatArray) -> FloatArray:
-    """Return the offsets of dots at one place, in the order of their flights."""
-    moved = np.zeros(at.size)
-    for place in np.unique(at[np.isfinite(at)]):
-        mine = np.flatnonzero(at == place)
+def _dots(plot: Plot, names: Sequence[str], vehicles: Sequence[str], flights: FloatArray,
+          y: FloatArray, marked: npt.NDArray[np.bool_], words: tuple[str, str]) -> None:
+    """Draw a dot for each recording above its vehicle, in the order of their flights."""
+    plot.places(list(short_names(names).values()))
+    x = np.array([names.index(v) + 1.0 if v else np.nan for v in vehicles])
+    for place in np.unique(x[np.isfinite(x)]):
+        mine = np.flatnonzero(x == place)
         if mine.size > 1:
-            moved[mine[np.argsort(flights[mine], kind='stable')]] = np.linspace(
+            # Side by side, so that a drift shows as a slope.
+            x[mine[np.argsort(flights[mine], kind='stable')]] += np.linspace(
                 -0.32, 0.32, mine.size)
-    return moved
+    for chosen, text, colour in ((~marked, words[0], 0), (marked, words[1], 1)):
+        if chosen.any() or not colour:
+            plot.markers(x[chosen], y[chosen], text, colour)
 
 
 def _strips(fleet: Fleet) -> list[Part]:
@@ -488,20 +487,13 @@ def _strips(fleet: Fleet) -> list[Part]:
 
 def _by_vehicle(fleet: Fleet, values: Values) -> Plot:
     """Return a strip of dots for each vehicle."""
-    names = fleet.vehicles
-    out = fleet.judgement.recordings[values.name]
-    x = np.array([names.index(v) + 1.0 if v else np.nan for v in values.vehicles])
-    # Flights lie side by side in order, so that a drift shows as a slope.
-    spread = _side_by_side(x, values.flights.astype(np.float64))
-    y, odd = values.measured, out.found
     plot = Plot(f'{_TITLES[values.name]} of every recording', 'vehicle', _UNITS[values.name],
                 height=260, log_y=values.name in LOGARITHMIC)
-    plot.places(list(short_names(names).values()))
-    for k in range(0, len(names), 2):
+    for k in range(0, len(fleet.vehicles), 2):
         plot.shade(k + 0.5, k + 1.5, 7)
-    plot.markers((x + spread)[~odd], y[~odd], 'recordings', 0)
-    if odd.any():
-        plot.markers((x + spread)[odd], y[odd], 'outliers of their vehicle', 1)
+    _dots(plot, fleet.vehicles, values.vehicles, values.flights.astype(np.float64),
+          values.measured, fleet.judgement.recordings[values.name].found,
+          ('recordings', 'outliers of their vehicle'))
     return plot
 
 

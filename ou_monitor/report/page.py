@@ -302,11 +302,11 @@ def _joined(parts: Sequence[Part], live: bool = True) -> str:
 def _part(part: Part, live: bool = True) -> str:
     """Return one part of a document; live: with the data of its plots."""
     if isinstance(part, Text):
-        return f'<p{_SOFT if part.legend else ""}>{_set(part.text)}</p>'
+        return '' if not part.text else f'<p{_SOFT if part.legend else ""}>{_set(part.text)}</p>'
     if isinstance(part, Code):
         return f'<p><code>{escape(part.text)}</code></p>'
     if isinstance(part, Facts):
-        return '<dl class="facts">' + ''.join(
+        return '' if not part.pairs else '<dl class="facts">' + ''.join(
             f'<dt>{_set(name)}</dt><dd>{_set(words)}</dd>' for name, words in part.pairs) + '</dl>'
     if isinstance(part, Notes):
         return '' if not part.notes else '<ul>' + ''.join(

@@ -62,8 +62,7 @@ def _screens(result: Reproduction) -> list[Part]:
         plot.limits(x=(0.0, 1e3 * float(screen.t[-1])), y=(-1.3 * half, 1.3 * half))
         plot.line(1e3 * screen.t, 1e3 * screen.u, colour=k)
         for sign, label in ((1.0, 'Vpp as printed'), (-1.0, '')):
-            plot.line(np.array([0.0, 1e3 * screen.t[-1]]), np.full(2, sign * half), label, 7,
-                      'dash')
+            plot.level((0.0, 1e3 * float(screen.t[-1])), sign * half, label, 7)
         drawn.append(Figure(
             plot, f'Vpp {1e3 * float(np.ptp(screen.u)):.4g} mV here, '
             f'{state.vpp.text} mV printed.'))

@@ -195,6 +195,11 @@ class Plot:
         """Add a line; NaN breaks it."""
         return self._add('line', x, y, None, label, colour, style)
 
+    def level(self, x: FloatArray | Sequence[float], y: float, label: str = '', colour: int = 1,
+              style: str = 'dash') -> Plot:
+        """Add a straight line at a height, from the first to the last of some places."""
+        return self.line(np.array([x[0], x[-1]]), np.full(2, y), label, colour, style)
+
     def steps(self, x: FloatArray, y: FloatArray, label: str = '', colour: int = 0) -> Plot:
         """Add a line that holds each value until the next point."""
         return self._add('steps', x, y, None, label, colour)

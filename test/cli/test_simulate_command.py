@@ -225,7 +225,8 @@ def test_nothing_is_overwritten(tmp_path, name, capsys):
     assert 'exists already' in failure(capsys, 'simulate', '--preset', 'idle',
                                        '--duration', '2', '--output', path)
     assert {p: p.read_bytes() for p in tmp_path.rglob('*') if p.is_file()} == before
-    assert 'no folder' in failure(capsys, 'simulate', '--output', tmp_path / 'none' / 'b.mcap')
+    assert 'does not exist' in failure(
+        capsys, 'simulate', '--output', tmp_path / 'none' / 'b.mcap')
 
 
 @pytest.mark.parametrize('name', ['a.mcap', 'a'])

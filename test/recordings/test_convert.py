@@ -55,7 +55,7 @@ def test_json_goes_to_standard_output_or_a_file(log, tmp_path, capsys):
     (None, ['no.csv', 'out'], ["no log 'no.csv'"]),
     (GOOD, ['log.csv', 'log.csv'], ['.mcap', 'folder']),
     (GOOD, ['log.csv', 'there'], ['exists already']),
-    (GOOD, ['log.csv', 'no/out'], ['no folder']),
+    (GOOD, ['log.csv', 'no/out'], ['does not exist']),
     (GOOD, ['log.csv', '/sys/out.mcap'], ['cannot write']),
     (GOOD, ['log.csv', 'out', '--json', 'no/x.json'], ['no/x.json']),
     (GOOD, ['log.csv', 'out', '--type', 'adc_block'], ['steady 10000 Hz']),
