@@ -96,7 +96,6 @@ class Fleet:
     # Sources of the vehicles' names, skipped files, and the like.
     notes: tuple[str, ...]
     recordings: int  # Recordings found
-    kept: int  # Of these, finished by an earlier run
     limit: float = NAN  # Voltage below which dips are counted, V; NaN when none was given
 
     @property
@@ -138,14 +137,12 @@ def run_fleet(found: Found, folder: Path, options: Options, version: Callable[[]
             missing.append(source)
         else:
             results[source.path] = known
-    kept = len(results)
     if missing:
         with _workers(min(workers, len(missing)), scheduler, version, insecure) as pool:
             _work(missing, results, parts, options, pool, progress)
     rows, notes = _table(found.sources, results, twice, pattern)
     notes = list(map(printable, (*found.notes, *notes)))
-    return Fleet(rows, judge(rows), tuple(notes), len(found.sources), kept,
-                 options.brownout_voltage)
+    return Fleet(rows, judge(rows), tuple(notes), len(found.sources), options.brownout_voltage)
 
 
 def _workers(count: int, scheduler: str | None, version: Callable[[], str], insecure: bool

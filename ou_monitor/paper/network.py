@@ -273,13 +273,7 @@ class RailResonance:
     """A complex pair of poles."""
 
     frequency: float  # |p| / (2 pi), Hz.
-    damping: float  # Damping ratio -Re p / |p|, 0..1.
-    share: float  # Its part of Var_inf; parts of overlapping modes may exceed 1 or be negative.
-
-    @property
-    def q(self) -> float:
-        """Quality factor, 1 / (2 damping)."""
-        return 0.5 / self.damping
+    q: float  # Quality factor, -|p| / (2 Re p).
 
 
 @dataclass(frozen=True)
@@ -364,9 +358,8 @@ class Rail:
             return None
         k = above[np.argmax(np.abs(self.shares[above]))]
         pole = self.poles[k]
-        return RailResonance(frequency=float(abs(pole)) / (2.0 * math.pi),
-                             damping=float(-pole.real / abs(pole)),
-                             share=2.0 * float(self.shares[k]))
+        return RailResonance(float(abs(pole)) / (2.0 * math.pi),
+                             0.5 / float(-pole.real / abs(pole)))
 
     def crossing_rate(self, voltage: float) -> float:
         """

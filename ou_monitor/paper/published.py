@@ -198,7 +198,6 @@ class PrintedLoad:
     vpp: Printed
     amp: Printed
     vrms: Printed
-    called: str  # Type of process according to the paper
 
     @property
     def vrms_range(self) -> Range:
@@ -227,14 +226,10 @@ class PrintedLoad:
 
 
 TABLE_1 = (
-    PrintedLoad(0.0, 'motors off', Printed('62.5'), Printed('25.0'), Printed('~0'),
-                'quasi-stationary noise'),
-    PrintedLoad(0.05, '5 %', Printed('81.3'), Printed('62.5'), Printed('9.38'),
-                'Gaussian process'),
-    PrintedLoad(0.10, '10 %', Printed('225.0'), Printed('75.0'), Printed('28.1'),
-                'stationary stochastic process'),
-    PrintedLoad(0.40, '40 %', Printed('287.5'), Printed('66.7'), Printed('56.3'),
-                'diffusion process'))
+    PrintedLoad(0.0, 'motors off', Printed('62.5'), Printed('25.0'), Printed('~0')),
+    PrintedLoad(0.05, '5 %', Printed('81.3'), Printed('62.5'), Printed('9.38')),
+    PrintedLoad(0.10, '10 %', Printed('225.0'), Printed('75.0'), Printed('28.1')),
+    PrintedLoad(0.40, '40 %', Printed('287.5'), Printed('66.7'), Printed('56.3')))
 IDLE, LOW, MEDIUM, HIGH = TABLE_1
 # Load states with a Vrms.
 LOADED = (LOW, MEDIUM, HIGH)

@@ -15,7 +15,7 @@ from ou_monitor.paper import published
 from ou_monitor.paper.crest import mean_and_error
 from ou_monitor.paper.published import Printed, Row
 from ou_monitor.paper.theory import (
-    CORRECT_FACTOR, diffusion_limit, Generator, MatrixModel, PRINTED_FACTOR, SwitchedSystem,
+    CORRECT_FACTOR, diffusion_limit, Generator, matrix_model, PRINTED_FACTOR, SwitchedSystem,
     switching_drift)
 from ou_monitor.records import FloatArray
 from scipy.integrate import quad
@@ -157,7 +157,7 @@ def averaging_rows(rng: np.random.Generator, paths: int = 400) -> list[Row]:
     """Return the rows of sections 3.1 and 8."""
     tau = 1.0 / published.ALPHA.value
     # The matrix as printed, with the paper's alpha as gamma.
-    printed = MatrixModel.as_printed(DAMPING, CARRIER, 0.0, published.ALPHA.value)
+    printed = matrix_model(DAMPING, CARRIER, 0.0, published.ALPHA.value, printed=True)
     grown = float(printed.solve([0.0, tau], [1.0, 0.0, 1.0])[1, 2])
     half = 1.0 / CARRIER
     phase = printed.solve([0.0, half, 2.0 * half], [0.0, 1.0, 0.0])[:, 1]

@@ -156,53 +156,34 @@ def check_state(u0: npt.ArrayLike, d: int) -> FloatArray:
     return state
 
 
-@dataclass(frozen=True)
-class MatrixModel:
+def matrix_model(alpha: float, omega: float, beta: float, alpha_p: float, *,
+                 printed: bool = False) -> AffineSystem:
     """
-    The deterministic matrix model of amplitude, phase and power (paper, 3.1).
+    Return the deterministic matrix model of amplitude, phase and power (paper, 3.1).
 
-    u = (A, phi, P), du/dt = C u.  Two entries of the printed matrix contradict the text around
-    them: with +gamma on the diagonal the power grows as exp(gamma t), and relaxes only with
+    u = (A, phi, P), du/dt = C u: damping of the amplitude alpha >= 0, 1/s, angular frequency of
+    the carrier omega, rad/s, coupling beta of the amplitude to the power, unit of P per unit of A
+    per second, and the power's relaxation rate alpha_p > 0, 1/s: the alpha of the
+    Ornstein-Uhlenbeck supply voltage.  Two entries of the printed matrix contradict the text
+    around them: with +gamma on the diagonal the power grows as exp(gamma t), and relaxes only with
     -alpha_p there; and dphi/dt = omega phi is a phase that grows as exp(omega t), where a carrier
-    has dphi/dt = omega.  This class follows the text; `as_printed` follows the print.
+    has dphi/dt = omega.  This follows the text; `printed` follows the print, and alpha_p is then
+    the paper's gamma, of any sign.
     """
-
-    alpha: float  # Damping of the amplitude, 1/s, >= 0
-    omega: float  # Angular frequency of the carrier, rad/s
-    beta: float  # Coupling of the amplitude to the power, unit of P per unit of A per second
-    # Relaxation rate of the power, 1/s, > 0: the alpha of the Ornstein-Uhlenbeck supply voltage;
-    # as printed the paper's gamma, of any sign.
-    alpha_p: float
-    printed: bool = False  # Whether the matrix is as the paper prints it
-
-    def __post_init__(self) -> None:
-        """Check the coefficients."""
-        for name in ('alpha', 'omega', 'beta', 'alpha_p'):
-            if not math.isfinite(getattr(self, name)):
-                raise ValueError(f'{name} must be finite, got {getattr(self, name)}')
-        if self.alpha < 0.0:
-            raise ValueError(f'alpha must be zero or positive, got {self.alpha} 1/s')
-        if not self.printed and not self.alpha_p > 0.0:
-            raise ValueError(
-                f'alpha_p must be positive, got {self.alpha_p} 1/s: the diagonal entry is '
-                "-alpha_p; `as_printed` puts the paper's +gamma there")
-
-    @classmethod
-    def as_printed(cls, alpha: float, omega: float, beta: float, gamma: float) -> MatrixModel:
-        """Return the model with the matrix exactly as the paper prints it (in 1/s)."""
-        return cls(alpha, omega, beta, gamma, printed=True)
-
-    @property
-    def affine(self) -> AffineSystem:
-        """Return du/dt = C u + c; c = (0, omega, 0) for a carrier, else zeros."""
-        turning, power = (self.omega, self.alpha_p) if self.printed else (0.0, -self.alpha_p)
-        return AffineSystem(
-            np.array([[-self.alpha, 0.0, 0.0], [0.0, turning, 0.0], [self.beta, 0.0, power]]),
-            np.array([0.0, 0.0 if self.printed else self.omega, 0.0]))
-
-    def solve(self, t: npt.ArrayLike, u0: npt.ArrayLike) -> FloatArray:
-        """Return amplitude, phase and power at the given times, exactly (t in s)."""
-        return self.affine.solve(t, u0)
+    for name, value in (('alpha', alpha), ('omega', omega), ('beta', beta),
+                        ('alpha_p', alpha_p)):
+        if not math.isfinite(value):
+            raise ValueError(f'{name} must be finite, got {value}')
+    if alpha < 0.0:
+        raise ValueError(f'alpha must be zero or positive, got {alpha} 1/s')
+    if not printed and not alpha_p > 0.0:
+        raise ValueError(
+            f'alpha_p must be positive, got {alpha_p} 1/s: the diagonal entry is -alpha_p; '
+            "`printed` puts the paper's +gamma there")
+    turning, power, carrier = (omega, alpha_p, 0.0) if printed else (0.0, -alpha_p, omega)
+    return AffineSystem(
+        np.array([[-alpha, 0.0, 0.0], [0.0, turning, 0.0], [beta, 0.0, power]]),
+        np.array([0.0, carrier, 0.0]))
 
 
 IntArray = npt.NDArray[np.intp]
@@ -430,7 +411,7 @@ class SwitchedSystem:
                     f'{name} must be one number or have shape ({generator.size},), got '
                     f'{array.shape}')
             columns.append(np.broadcast_to(array, (generator.size,)).tolist())
-        systems = [MatrixModel(*row).affine for row in zip(*columns, strict=True)]
+        systems = [matrix_model(*row) for row in zip(*columns, strict=True)]
         return cls(generator, np.array([one.matrix for one in systems]),
                    np.array([one.offset for one in systems]))
 

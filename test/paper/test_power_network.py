@@ -84,8 +84,7 @@ def test_lc_filter_rings_at_its_corner():
     rail = rail_at(network, 0.4, 'regulated')
     assert network.lc_corner == pytest.approx(5032.92, rel=1e-6)
     assert rail.resonance.frequency == pytest.approx(network.lc_corner, rel=1e-5)
-    assert rail.resonance.damping == pytest.approx(0.025 * math.sqrt(100e-6 / 10e-6), rel=1e-5)
-    assert rail.resonance.q == pytest.approx(0.5 / rail.resonance.damping)
+    assert 0.5 / rail.resonance.q == pytest.approx(0.025 * math.sqrt(100e-6 / 10e-6), rel=1e-5)
     assert math.isinf(RC.lc_corner) and rail_at(RC, 0.4).resonance is None
 
 
@@ -225,7 +224,6 @@ def test_where_capacitance_does_not_help():
                     for c in (100e-6, 200e-6))
     assert strong.resonance.q > 4.0 * weak.resonance.q
     assert strong.var_inf > 4.0 * weak.var_inf
-    assert strong.resonance.share == pytest.approx(1.0, abs=0.01)
     with pytest.raises(UnstableNetworkError):
         rail_at(replace(ringing, bulk_capacitance=1e-3), 0.4)
 

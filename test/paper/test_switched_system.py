@@ -4,7 +4,7 @@ import math
 
 from chains import CYCLE, drawn, moments_of_switched, PAPER
 import numpy as np
-from ou_monitor.paper.theory import flow, Generator, MatrixModel, SwitchedSystem
+from ou_monitor.paper.theory import flow, Generator, matrix_model, SwitchedSystem
 import pytest
 from scipy.linalg import expm
 
@@ -37,10 +37,10 @@ def test_flow_is_the_matrix_exponential(matrix):
 def test_averaging_the_matrix_model_averages_its_coefficients():
     """C is linear in them, so the average is the model of the averages, solution and all."""
     pi = CYCLE.stationary
-    mean = MatrixModel(pi @ [1, 2, 6], pi @ [3, 6, 9], pi @ [1, 0, 2], pi @ [4, 5, 9])
+    mean = matrix_model(pi @ [1, 2, 6], pi @ [3, 6, 9], pi @ [1, 0, 2], pi @ [4, 5, 9])
     t = np.linspace(0.0, 1.0, 5)
     averaged = PAPER.averaged()
-    assert averaged.matrix == pytest.approx(mean.affine.matrix, abs=1e-14)
+    assert averaged.matrix == pytest.approx(mean.matrix, abs=1e-14)
     assert averaged.solve(t, U0) == pytest.approx(mean.solve(t, U0), rel=1e-11, abs=1e-13)
 
 

@@ -20,7 +20,7 @@ def fleet(rows: list[dict]) -> Fleet:
     """Return a fleet of rows; what a row leaves out is not known."""
     whole = [{**dict.fromkeys(NAMES), 'recording': 'r', **row} for row in rows]
     return Fleet(whole, judge(whole), ('Vehicles: by <hand> & eye.',),
-                 len({row['path'] for row in whole}), 0)
+                 len({row['path'] for row in whole}))
 
 
 @pytest.fixture(scope='module')
