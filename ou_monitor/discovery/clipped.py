@@ -1,8 +1,8 @@
 """
-Readings beyond the end of a range, drawn from a model of what was measured.
+Draw clipped readings from a model of the other samples.
 
-Which value a clipped sample had, its neighbours, the throttle and the noise say together.  So a
-path of the rail is drawn given all readings, and then each clipped reading given the path.
+Adjacent samples, throttle and noise together determine the law of a clipped value.  A path of the
+rail is drawn given all readings, and then each clipped reading given the path.
 """
 
 from __future__ import annotations
@@ -18,10 +18,9 @@ from ou_monitor.model.terms.reading import Saturation
 from ou_monitor.records import FloatArray
 from scipy.special import log_ndtr, ndtr, ndtri
 
-# White noise at least, as a share of what a step adds: without any, a reading would be the path.
+# Minimum white noise, as a share of the noise of a step: without it a reading would be the path.
 _LEAST = 0.1
-# Sweeps of the approximation; white noise, so many times as large, in which a
-# reading says nothing.
+# Sweeps of the approximation; factor on the white noise at which a reading carries no information.
 _SWEEPS, _NOTHING = 8, 1e6
 
 
@@ -126,7 +125,7 @@ class _Path:
         return np.asarray(out[::-1])
 
     def drawn(self, y: FloatArray, rng: np.random.Generator | None = None) -> FloatArray:
-        """Return a path; the mean of all paths without a source of draws."""
+        """Return a random path, or without `rng` the mean of all paths."""
         means, last = [], 0.0
         for keep, gain, value in zip(self._phi, self._gain, y.tolist(), strict=True):
             last = keep * last

@@ -1,5 +1,5 @@
 """
-What the search decides: which causes are tried, accepted, kept, withdrawn.
+Decisions of the search: which causes are tried, accepted, kept, withdrawn.
 
 Pure functions of evidence (nats), statistics (normal scores by name) and the attributes of the
 causes; this module fits nothing.
@@ -20,10 +20,11 @@ from ou_monitor.model.terms.term import Role, Term
 Statistics = Mapping[str, float]
 Kind = type[Term]
 
-# Evidence from which a cause is accepted, nats.  Parameters (BIC) and what was searched are
-# subtracted before, so that odds of e^6 = 403 leave 5 % of false names to 22 kinds tried.
+# Minimum evidence of a cause, nats, after the prices of its parameters (BIC) and of its search:
+# odds of e^6 = 403 give 5 % false names over 22 kinds.
 ACCEPT = 6.0
-# Evidence within which two causes are a tie, nats: odds below 20.  What stays has to bring it.
+# Difference in evidence below which two causes tie, nats: odds of 20.  A cause must gain it to
+# stay.
 TIE = 3.0
 # Share of a larger effect's evidence below which a term of its kind may only mend its form:
 # another answer of the mean, or a second curve of intensity over throttle.  A form that is right
@@ -31,14 +32,14 @@ TIE = 3.0
 # further terms brought 0.8 % at most where the form was right.
 FORM = 0.005
 CURVE = 0.1
-# Relaxation times in a recording from which the rate is one, and no trend: it is then known to
-# sqrt(2/20) = 30 %.
+# Minimum number of relaxation times in a recording; with fewer the rate is a trend.  It is then
+# known to sqrt(2/20) = 30 %.
 RELAXES = 20.0
-# Chance from which a cause is not named: it does not show beside the others.
+# Largest p-value of a named cause.
 CHANCE = 0.05
-# Most causes accepted one by one: no recording of test/hidden, with two effects at most, has more.
+# Maximum number of causes accepted one by one: no recording of test/hidden has more effects.
 MOST = 8
-# Time of the filters after which the search tries no more kinds that take seconds, s.
+# Filter time after which kinds that take seconds are no longer tried, s.
 MOST_COST = 10.0
 # A statistic beyond this fails: of 70, one by chance in 2300 recordings (3 of 8700 simulated).
 FAILS = 4.8
@@ -115,7 +116,7 @@ def is_answer(kind: Kind) -> bool:
 
 
 def is_latent(kind: Kind) -> bool:
-    """Return whether a cause is inferred only: neither from a measured input nor from time."""
+    """Return whether a cause is only inferred, not from a measured input or time."""
     return not (kind.NEEDS_THROTTLE or kind.MEASURED)
 
 
@@ -128,49 +129,49 @@ def is_shared(gains: npt.ArrayLike, errors: float = 1.0) -> bool:
     """
     parts = np.asarray(gains, dtype=np.float64)
     error = math.sqrt(parts.size) * float(parts.std(ddof=1))
-    # A hair more: one part alone is on the edge.
+    # A margin for rounding: one part alone is on the limit.
     return bool(float(parts.sum()) > errors * error * (1.0 + 1e-9))
 
 
 def rivals_of(best: str, evidence: Sequence[tuple[str, float]]) -> list[str]:
-    """Return the causes of a round that do as well as the best one (evidence in nats)."""
+    """Return the causes of a round that tie with the best (evidence in nats)."""
     top = next(value for name, value in evidence if name == best)
     return [name for name, value in evidence if name != best and value > top - TIE]
 
 
 def is_plainer(one: Kind, other: Kind) -> bool:
-    """Return whether a cause is named before another that does as well: less was searched."""
+    """Return whether a cause is preferred to another in a tie, because less was searched."""
     return one.SEARCH < other.SEARCH and one.FAMILY == other.FAMILY
 
 
 def only_to_changes(answers: Iterable[Kind]) -> bool:
     """
-    Return whether a mean answers to throttle by transients alone.
+    Return whether a mean responds to throttle by transients alone.
 
-    What was behind a coupling does: no steady current is seen there.
+    This is so behind an AC coupling, which removes steady currents.
     """
     names = {kind.NAME for kind in answers}
     return LoadTransient.NAME in names and LoadSag.NAME not in names
 
 
 def relaxes(rate: float, duration: float) -> bool:
-    """Return whether a recording shows a rate (1/s; duration in s), and no trend."""
+    """Return whether a rate (1/s) is not a trend in a recording (duration in s)."""
     return rate * duration >= RELAXES
 
 
 def earns(gain: float, error: float, chance: float) -> bool:
     """
-    Return whether a cause earns its place on blocks that were kept back (gain, error in nats).
+    Return whether a cause improves predictions of held-out blocks (gain, error in nats).
 
-    If the gain is unknown, the chance, which is then that of the fit alone, decides.
+    If the gain is unknown, the p-value of the fit decides.
     """
     return chance <= CHANCE and not gain < -error
 
 
-# Which of those accepted stay.
+# Which accepted causes stay.
 
 def failing(before: Statistics, after: Statistics) -> list[str]:
-    """Return the statistics that the causes should have brought into their band and did not."""
+    """Return the statistics that are outside their band in spite of the causes."""
     return [name for name, value in after.items()
             if abs(value) > max(FAILS, OWN_SHARE * abs(before.get(name, 0.0)))]
 
@@ -178,7 +179,7 @@ def failing(before: Statistics, after: Statistics) -> list[str]:
 def withdrawn(before: Statistics, after: Statistics, accepted: Sequence[Kind],
               asked: Mapping[str, Statistics] = MappingProxyType({})) -> list[int]:
     """
-    Return which of the accepted causes claim what they do not explain.
+    Return which accepted causes do not explain their statistics.
 
     Beside measured causes, whose form is never complete on a real flight, something always fails:
     there a latent cause answers for its own signs, as the measured ones left them (`before`), or

@@ -1,4 +1,4 @@
-"""A recording -> what the simulation gets wrong, why, and what the extended model gains."""
+"""A recording -> errors of its simulation, their causes, and the gain of the extended model."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.records import Recording
 from ou_monitor.text import listed, number, Z95
 
-# Why the gain of a line is not known that was found in all samples, of which some are used.
+# Reason why the gain of a line is unknown that was found in samples which the fit does not use.
 FAST = 'the samples that are used are too few to show a line so fast.'
-# Times that clipped samples are drawn from a load, which is fitted to them in turn.
+# Alternations between drawing clipped samples and fitting the load to them.
 _REDRAWN = 2
 # Steps of more relaxation times than this hide the relaxation.
 _BLIND = 1.0
@@ -143,7 +143,7 @@ def _start(samples: Samples, state: Integrity) -> Composite:
 
 def _unclipped(samples: Samples, state: Integrity, start: Composite
                ) -> tuple[Samples, Composite]:
-    """Return the samples with clipped ones as the load and its noise say, and where to start."""
+    """Return the samples with clipped ones redrawn, and the start of the search."""
     assert state.drawn is not None
     ends = next(term for term in state.exact if isinstance(term, Saturation))
     rng = np.random.default_rng(0)
@@ -251,14 +251,14 @@ def _notes(state: Integrity, named: Named, model: Composite, dropped: Sequence[s
     return tuple(notes)
 
 
-# Chance that any statistic of a right model lies outside its band.
+# Probability that any statistic of a correct model lies outside its band.
 NOTHING = 0.01
 # Step, in a coordinate, that a parameter at the end of its range cannot take.
 _STEP = 1e-4
 
 
 def judge(remaining: Sequence[Criticism], causes: int, doubts: Sequence[str] = ()) -> Verdict:
-    """Return the verdict on a number of causes: by what remains, and doubts beside it."""
+    """Return the verdict for a number of causes, by remaining statistics and doubts."""
     if causes == 0:
         return Verdict.UNEXPLAINED if remaining else Verdict.NO_EFFECT
     return Verdict.PARTLY_EXPLAINED if remaining or doubts else Verdict.EXPLAINED
@@ -267,7 +267,7 @@ def judge(remaining: Sequence[Criticism], causes: int, doubts: Sequence[str] = (
 def doubts(terms: Sequence[Term], crossing: CrossingRate, duration: float, step: float,
            larger: bool = False) -> tuple[str, ...]:
     """
-    Return what speaks against a model beside its statistics, for people (times in s).
+    Return objections to a model besides its statistics, in words (times in s).
 
     larger: whether its one-step errors are larger than those of the plain OU.
     """
@@ -284,7 +284,7 @@ def doubts(terms: Sequence[Term], crossing: CrossingRate, duration: float, step:
 
 
 def _at_ends(term: Term, duration: float, step: float) -> list[str]:
-    """Return the parameters of a term that stand at the end of their range."""
+    """Return the parameters of a term at the end of their range."""
     if isinstance(term, LoadTransient) and not term.delay:
         return [] if SHORTEST * step < term.tau < 0.25 * duration else ['tau']
     return [name for name in term.free()

@@ -1,8 +1,8 @@
 """
-Which of the causes named earn their place, and whether the model does.
+Remove causes that do not improve predictions of held-out blocks, and judge the model.
 
-A cause is left out again where the rest, fitted again, predicts blocks that were kept back as
-well without it; then the others are asked again, for what one explains another may take over.
+A cause is removed if the rest, fitted again, predicts held-out blocks as well without it.  Then
+the others are tested again, because another cause may take over its effect.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from ou_monitor.records import FloatArray, NAN
 MANY = 4
 # Rounds of leaving out.
 _ROUNDS = 4
-# Simulations whose range is looked at.
+# Number of simulations whose range is compared.
 _DRAWS = 16
 
 
 @dataclass(frozen=True)
 class Worth:
-    """What the model loses without a group of terms."""
+    """Loss of the model without a group of terms."""
 
     # nats per sample.
     gain: float = NAN
@@ -47,7 +47,7 @@ class Worth:
 
 @dataclass(eq=False)
 class Earned:
-    """The model that is left, and what each of its causes is worth."""
+    """The remaining model, and the gain of each of its causes."""
 
     full: HeldOut  # The model
     names: list[str]  # Its causes, in the order of acceptance
@@ -58,7 +58,7 @@ class Earned:
 def earned(samples: Samples, model: Composite, names: Sequence[str], plain: HeldOut,
            scored: npt.NDArray[np.bool_], progress: Callable[[float], None]) -> Earned:
     """
-    Leave out the causes that do not earn their place, the worst first.
+    Remove the causes that do not improve held-out predictions, the worst first.
 
     Interrupted (Ctrl-C), it returns what there is, gains that were not measured yet as unknown.
     """
@@ -86,7 +86,7 @@ def earned(samples: Samples, model: Composite, names: Sequence[str], plain: Held
 
 
 def _leave_out(state: Earned, worst: int) -> None:
-    """Go on without a cause, and what goes with it."""
+    """Remove a cause, and the terms that depend on it."""
     less = state.worth[worst].less
     assert less is not None
     kept = {term.NAME for term in less.model.terms}
@@ -102,7 +102,7 @@ def _leave_out(state: Earned, worst: int) -> None:
 
 def _straying(samples: Samples, state: Earned) -> int | None:
     """
-    Return the cause without which simulations stay within what was seen; None for none.
+    Return the cause without which simulations stay within the recorded range; None: there is none.
 
     One-step predictions say little of how far a process goes: an intensity or an event that fits
     them may still be none that the recording shows.  Answers of the mean are not asked.  Half of
@@ -126,7 +126,7 @@ def _straying(samples: Samples, state: Earned) -> int | None:
 
 def _far(samples: Samples, terms: Sequence[Term]) -> FloatArray:
     """
-    Return how far the level of each simulation leaves what was seen, V; always the same ones.
+    Return how far the level of each simulation leaves the recorded range, V (fixed seeds).
 
     The level is a median of five: single wrong or wild samples do not move it.
     """
@@ -141,7 +141,7 @@ def _far(samples: Samples, terms: Sequence[Term]) -> FloatArray:
 
 
 def _as_trend(samples: Samples, state: Earned, k: int) -> bool:
-    """Return whether the `ou` only takes the place of an answer of the mean, as a trend."""
+    """Return whether the `ou` is only a trend in place of a term of the mean."""
     less = state.worth[k].less
     return (decision.is_answer(catalogue()[state.names[k]]) and less is not None
             and is_trend(samples, less.model) and not is_trend(samples, state.full.model))
@@ -181,7 +181,7 @@ def group_of(model: Composite, names: Sequence[str], k: int) -> tuple[int, ...]:
 def refusal(samples: Samples, terms: Sequence[Term], gain: float, gain_se: float,
             larger: bool = False) -> str:
     """
-    Return why a model has not earned its place, for people; empty where it has.
+    Return why a model is refused, in words; empty: it is not.
 
     gain, gain_se in nats per sample; larger: whether its one-step errors are.
     """

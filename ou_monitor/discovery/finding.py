@@ -1,4 +1,4 @@
-"""What a discovery found: frozen records, and the same as plain data."""
+"""Result of `discover`: frozen records, and the same as plain data."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ou_monitor.text import number, Z95
 
 
 class Verdict(enum.Enum):
-    """What became of a recording."""
+    """Verdict on a recording."""
 
     NO_EFFECT = 'no_effect'
     EXPLAINED = 'explained'
@@ -30,17 +30,16 @@ class Verdict(enum.Enum):
 
 @dataclass(frozen=True)
 class Criticism:
-    """One statistic of the data, and where simulations put it."""
+    """One statistic of the data, compared with simulations."""
 
     statistic: str  # Name
     # Normal score of the data under the plain and under the extended model.
     before: float
     after: float
-    # Band that simulations of the right model leave once in a hundred recordings, all statistics
-    # taken together.
+    # Band that a correct model leaves in one of a hundred recordings, over all statistics.
     low: float
     high: float
-    # Chance that any statistic of a right model is as far off.
+    # Probability that any statistic of a correct model is as far off.
     p_before: float
     p_after: float
 
@@ -61,10 +60,10 @@ class Cause:
 
     term: Term  # With its parameters
     se: Mapping[str, Any]  # Standard errors, in the units of the parameters; NaN where not known
-    # What is lost of the held-out score without it, nats per sample.
+    # Loss of the held-out score without it, nats per sample.
     gain: float
     gain_se: float
-    p_value: float  # See `gain.cause_gain`; 0 for exact findings, which have no chance at all
+    p_value: float  # See `gain.cause_gain`; 0 for exact findings
     alternatives: tuple[str, ...]  # Causes that this recording cannot separate from it
     explanation: str  # For people
     exact: bool  # Found without a model
@@ -82,7 +81,7 @@ class Cause:
 
 @dataclass(frozen=True)
 class CrossingRate:
-    """How often the voltage falls through a level, on the part kept."""
+    """How often the voltage falls through a level, on the held-out part."""
 
     level: float = NAN  # V
     # Crossings per minute in the data and on average in simulations.
@@ -109,37 +108,36 @@ class Finding:
     recording: str  # Name
     n: int  # Samples of the recording
     duration: float  # s
-    verdict: Verdict  # What became of it
-    sentence: str  # The same in a sentence
+    verdict: Verdict
+    sentence: str  # The verdict in a sentence
     baseline: OU | None = None  # The plain model, fitted on everything
-    # Mean log predictive density of blocks kept back in turn, nats per sample.
+    # Mean log predictive density of held-out blocks, nats per sample.
     baseline_score: float = NAN
     criticism: tuple[Criticism, ...] = ()  # All statistics
     causes: tuple[Cause, ...] = ()  # As accepted
     model: SupplyModel | None = None  # The extended model, fitted on everything
     se: tuple[Mapping[str, Any], ...] = ()  # Its standard errors, a dict a term
-    # Of the extended model on blocks kept back in turn, nats per sample.
+    # The same of the extended model, nats per sample.
     score: float = NAN
     gain: float = NAN
     gain_se: float = NAN
-    # Share by which the rms of its one-step errors on those blocks is smaller than that of the
-    # plain OU.
+    # Relative reduction of the rms of one-step errors on those blocks against the plain OU.
     shrink: float = NAN
-    larger: bool = False  # Whether they are larger than those of the plain OU, by their error
-    crossing: CrossingRate = field(default_factory=CrossingRate)  # What a pilot feels
+    larger: bool = False  # Whether these errors are larger than the plain OU's, by their error
+    crossing: CrossingRate = field(default_factory=CrossingRate)  # Falls through a low level
     notes: tuple[str, ...] = ()  # What was dropped, left out or cannot be decided
-    samples: Samples | None = None  # What was fitted
-    # The extended model as it makes `samples`: without what was undone in them, such as repeats.
+    samples: Samples | None = None  # Samples that were fitted
+    # The extended model of `samples`, without effects that were undone in them, such as repeats.
     simulated: SupplyModel | None = None
-    # Why the extended model has not earned its place, in words; empty where it has.
+    # Why the extended model is refused, in words; empty: it is not.
     refused: str = ''
-    # What is called throttle: 'throttle', or 'current' where the measured current is the load.
+    # Name of the load: 'throttle', or 'current' if the measured current is the load.
     load: str = 'throttle'
     seed: int = 0  # Of all randomness
 
     @property
     def size_gain(self) -> float:
-        """Return what of the gain is not in smaller errors: their size is better known, nats."""
+        """Return the gain from knowing the size of the errors better, nats."""
         return self.gain + math.log1p(-self.shrink) if self.shrink < 1.0 else NAN
 
     @property
@@ -149,18 +147,18 @@ class Finding:
 
     @property
     def discrepancies(self) -> tuple[Criticism, ...]:
-        """Return what the plain model gets wrong, worst first."""
+        """Return the statistics outside the band under the plain model, worst first."""
         return tuple(sorted((c for c in self.criticism if c.was_off),
                             key=lambda c: -abs(c.before)))
 
     @property
     def remaining(self) -> tuple[Criticism, ...]:
-        """Return what the extended model gets wrong, worst first."""
+        """Return the statistics outside the band under the extended model, worst first."""
         return tuple(sorted((c for c in self.criticism if c.is_off), key=lambda c: -abs(c.after)))
 
     @cached_property
     def felt(self) -> Felt:
-        """Return what the extended model says in units that a pilot feels."""
+        """Return what the extended model predicts for punch-outs and dips."""
         if self.samples is None or self.simulated is None:
             return Felt()
         return felt(self.samples, self.simulated.terms, self.crossing.level)
@@ -241,11 +239,12 @@ def _plain(value: Any) -> Any:
 # Throttle flown: shares of the samples below; seconds before and after a punch-out, and samples
 # of it at most.
 _FLOWN, _BEFORE, _AFTER, _MOST = (0.01, 0.99), 1.0, 5.0, 6000
-# Shares of what comes back after which it has, and of the dip from which it counts.
+# Share of the recovery that counts as complete, and minimum recovery as a share of the dip.
 _BACK, _COUNTS = 0.9, 0.1
-# Falls that are closer than that, s, are one dip; where its bottom is looked for in the path.
+# Time between falls below which they are one dip, s; also the range in which its minimum is
+# searched.
 _APART, _NEAR = 0.2, 0.05
-# Share of a dip's depth from which throttle has made it.
+# Share of a dip's depth above which throttle has caused it.
 _MADE = 0.5
 
 
@@ -259,11 +258,11 @@ class Felt:
     # Deepest point of the mean after it, V below the voltage before, and when, s.
     dip: float = NAN
     after: float = NAN
-    # What comes back while throttle is held, V, and 90 % of it within, s; 0 and NaN for none.
+    # Recovery while throttle is held, V, and time to 90 % of it, s; 0 and NaN without any.
     recovered: float = 0.0
     within: float = NAN
     level: float = NAN  # Voltage, V, below which dips are counted
-    # Dips, and those of which throttle made more than half.
+    # Number of dips, and of dips of which throttle caused more than half.
     dips: int = 0
     made: int = 0
 
@@ -277,7 +276,7 @@ class Felt:
 
     @property
     def words(self) -> str:
-        """Return it in a sentence or two; empty where throttle does nothing."""
+        """Return it in a sentence or two; empty if throttle has no effect."""
         if not self.dip > 0.0:
             return ''
         found = (f'A punch-out from throttle {number(self.low, 2)} to {number(self.high, 2)} '
@@ -294,7 +293,7 @@ class Felt:
 
 
 def felt(samples: Samples, terms: Sequence[Term], level: float) -> Felt:
-    """Return what a model says of punch-outs, and of the dips below a level, V."""
+    """Return what a model predicts for punch-outs and for dips below a level, V."""
     answers = [term for term in terms if term.ROLE is Role.MEAN and term.MEASURED]
     u = samples.throttle
     if u is None or not any(term.NEEDS_THROTTLE for term in answers):
@@ -318,7 +317,7 @@ def felt(samples: Samples, terms: Sequence[Term], level: float) -> Felt:
 
 
 def _path(samples: Samples, answers: Sequence[Term]) -> FloatArray:
-    """Return what throttle and time do to the mean, V."""
+    """Return the effect of throttle and time on the mean, V."""
     s = samples.segment(1.0, 0.0)
     path = np.zeros(samples.n)
     for term in answers:
@@ -327,7 +326,7 @@ def _path(samples: Samples, answers: Sequence[Term]) -> FloatArray:
 
 
 def _dips(samples: Samples, path: FloatArray, level: float) -> tuple[int, int]:
-    """Return the number of dips below a level, V, and of those that the path makes."""
+    """Return the number of dips below a level, V, and of dips caused by the path."""
     v, t = samples.logged, samples.t
     below = np.flatnonzero(v < level)
     if not below.size:

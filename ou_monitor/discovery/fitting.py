@@ -1,8 +1,8 @@
 """
-Candidates beside what was accepted before: their starting points, tried and fitted.
+Candidates for the next cause: their starting points, tried and fitted beside the accepted causes.
 
-Most starts are compared on some thousand samples.  Evidence is the gain in
-log-likelihood on the part fitted, less its price, plus that on the part kept.
+Most starts are compared on some thousand samples.  Evidence is the gain in log-likelihood on the
+fitted part, minus its price, plus the gain on the held-out part.
 """
 
 from __future__ import annotations
@@ -25,13 +25,14 @@ from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.model.whittle import Ordinates
 from ou_monitor.records import FloatArray, NAN
 
-# Starting points that are fitted, samples that decide which, and kinds that are fitted in full.
+# Number of starting points that are fitted, of samples that select them, and of kinds fitted in
+# full.
 _FULL, _GLANCE, _FEW = 2, 8000, 4
-# Share of the best that a glance has to see: what is fitted in full gains at most twice as much.
+# Minimum share of the best first estimate: a full fit gains at most twice the estimate.
 _WITHIN = 0.5
 # Times that a term finds its parameters beside those of the fit.
 _AGAIN = 3
-# Nats by which two fits to one spectrum differ at least.
+# Minimum difference of two fits to one spectrum, nats.
 _ALIKE = 0.1
 
 
@@ -41,7 +42,7 @@ _Glance = tuple[float, type[Term], Composite | None]
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """A candidate, fitted beside what was accepted before."""
+    """A candidate, fitted beside the accepted causes."""
 
     name: str  # Of the cause
     composite: Composite  # The model with it
@@ -55,7 +56,7 @@ class Fitter:
 
     samples: Samples  # The recording
     cost: float = 0.0  # Processor time of the fits, s, estimated from their filters
-    # Kinds that were tried in vain, and what score tests said of them, nats.
+    # Kinds tried in vain, and their gain by score tests, nats.
     failed: dict[str, float] = field(default_factory=dict)
 
     def evidence(self, composite: Composite) -> float:
@@ -63,7 +64,7 @@ class Fitter:
         return composite.score(self.samples)
 
     def view(self, composite: Composite) -> View:
-        """Return what a model leaves over."""
+        """Return the residuals of a model."""
         return view_of(self.samples, composite.gaussian, composite.z, self.samples.train)
 
     def holds(self, composite: Composite) -> bool:
@@ -73,7 +74,7 @@ class Fitter:
 
     def fit(self, terms: Sequence[Term | type[Term]], known: Composite | None,
             rough: bool = False, begun: bool = False) -> Composite | None:
-        """Return a fit to the first part, its mean to everything; None where there is none."""
+        """Return a fit to the first part, its mean fitted to everything; None if it fails."""
         try:
             found = fit_composite(self.samples, terms, self.samples.train, known,
                                   whole_mean=True, rough=rough, begun=begun)
@@ -102,7 +103,7 @@ class Fitter:
         return found
 
     def whole(self, model: Composite) -> Composite:
-        """Return a model fitted to everything; as it is where that cannot be done."""
+        """Return a model fitted to everything, or unchanged if that fails."""
         try:
             # What its laws have found is that of all samples already.
             again = fit_composite(self.samples, model.terms, slice(0, self.samples.n), model)
@@ -155,7 +156,7 @@ class Fitter:
 
     def _glances(self, composite: Composite, kinds: Sequence[type[Term]], least: float
                  ) -> list[_Glance]:
-        """Return what kinds gain at first sight, if it is enough, nats."""
+        """Return the estimated gains of kinds, if they are large enough, nats."""
         view, before = self.view(composite), self.evidence(composite)
         found = []
         for kind in kinds:
@@ -171,7 +172,7 @@ class Fitter:
 
     def _in_full(self, composite: Composite, glances: Sequence[_Glance], known: list[Trial]
                  ) -> list[Trial]:
-        """Return the trials of the best glances, fitted in full, those known as they are."""
+        """Return the trials with the best estimates, fitted in full; known fits are reused."""
         found, names = list(known), {trial.name for trial in known}
         best = sorted(glances, key=lambda glance: -glance[0])[:_FEW]
         for gain, kind, start in best:
@@ -205,7 +206,7 @@ class Fitter:
 
     def best_start(self, composite: Composite, kind: type[Term], view: View, least: float = 0.0
                    ) -> Composite | None:
-        """Return the best fit with one more term of a kind, if its spectrum gains so many nats."""
+        """Return the best fit with one more term of a kind, if its spectrum gains enough nats."""
         if kind.ROLE is Role.LAW:
             found = self.fit([*composite.terms, kind], composite)
             return found if found is not None and found.terms[-1].holds(view) else None
@@ -325,7 +326,7 @@ def from_spectrum(samples: Samples, composite: Composite, starts: Sequence[Term]
 
 
 class _Spectrum:
-    """What models say of a spectrum, what throttle does to alpha, sigma and noise as in one."""
+    """Spectra of models, with the effect of throttle on alpha, sigma and noise."""
 
     def __init__(self, samples: Samples, terms: Sequence[Term], omega: FloatArray) -> None:
         self._turn = np.exp(1j * omega)
@@ -367,7 +368,7 @@ def standard_errors(samples: Samples, model: Composite, part: slice) -> tuple[di
 
 
 def with_reach(term: Term, se: dict[str, Any], samples: Samples) -> dict[str, Any]:
-    """Return errors with an infinite one for each parameter that no such recording can show."""
+    """Return errors, infinite for each parameter that this recording cannot determine."""
     duration = float(samples.t[-1] - samples.t[0])
     values = term.values()
     far = [name for name, value in values.items() if isinstance(value, float) and (
@@ -394,7 +395,7 @@ def _gathered(term: Term, se: dict[str, float]) -> dict[str, Any]:
 
 
 def _of_mean(samples: Samples, model: Composite, part: slice) -> dict[int, dict[str, Any]]:
-    """Return errors of the level and of what multiplies known columns."""
+    """Return errors of the level and of the coefficients of known columns."""
     terms = model.gaussian.terms
     where = [(k, j) for k, term in enumerate(terms) for j in range(len(coefficients(term)))]
     base = evaluate(samples, terms)
@@ -402,12 +403,12 @@ def _of_mean(samples: Samples, model: Composite, part: slice) -> dict[int, dict[
     through = np.empty((weight.size, len(where)))
     for column, (k, j) in enumerate(where):
         beta = coefficients(terms[k])
-        # Innovations are linear in these, so any step will do.
+        # Innovations are linear in these, so the step may have any size.
         beta[j] += 1.0
         moved = evaluate(samples, (*terms[:k], _with(terms[k], beta), *terms[k + 1:]))
         through[:, column] = weight * (base.innovation - moved.innovation)[part]
     norm = np.sqrt((through * through).sum(axis=0))
-    # What the instrument does not show (the level behind a high-pass) has no error.
+    # Parameters hidden by the instrument (the level behind a high-pass) have no error.
     norm = np.where(norm > 1e-9 * norm.max(), norm, np.inf)
     through /= norm
     covariance = np.linalg.pinv(through.T @ through) / np.outer(norm, norm)

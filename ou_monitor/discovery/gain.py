@@ -1,5 +1,5 @@
 """
-What a model gains on samples that it was not fitted on.
+Gain of a model on samples that were not used for its fit.
 
 Blocked cross-validation (Bergmeir & Benitez, Inf. Sci. 191 (2012) 192): each block in turn is
 predicted, one step ahead, by parameters found on the others.  These are one step of scoring from
@@ -34,12 +34,12 @@ from ou_monitor.text import Z95
 from scipy.special import ndtr
 from scipy.stats import chi2
 
-# Blocks of the samples kept; the fewest with which a spread is estimated well.
+# Number of blocks of the held-out samples: the minimum for a good estimate of their spread.
 BLOCKS = 24
-# A gain whose error is so many times as large, and so many nats per sample, is not measured.
+# Error of an unknown gain: at least this many times the gain, and this many nats per sample.
 _VAGUE, _WIDE = 10.0, 0.1
 # Level of the crossings: standard deviations below the mean, lowered in steps
-# until both the part fitted and the part kept cross it so often.
+# until the fitted and the held-out part both cross it at least this often.
 _DEEP, _LOWER, _SHALLOW, _OFTEN = 2.5, 0.25, 0.5, 5
 # Simulations of each model.
 _DRAWS = 8
@@ -66,19 +66,19 @@ def mean_difference(new: FloatArray, old: FloatArray) -> tuple[float, float]:
 
 
 def if_known(gain: float, error: float) -> tuple[float, float]:
-    """Return a gain and its error; NaN for both where the error says that nothing is known."""
+    """Return a gain and its error; NaN for both if the error is too large."""
     return (NAN, NAN) if error > max(_VAGUE * abs(gain), _WIDE) else (gain, error)
 
 
 def without(samples: Samples, model: Composite, *indices: int, plain: Composite | None = None
             ) -> Composite | None:
     """
-    Return the model fitted again to everything without some of its terms; None for none.
+    Return the model fitted again to everything without some of its terms; None if that fails.
 
     A fit that is worse than the plain one has gone astray, and is tried from elsewhere.
     """
     kept = [term for k, term in enumerate(model.terms) if k not in indices]
-    # What changes a term that is gone has gone with it.
+    # Terms that modify a removed term are removed too.
     names = {term.NAME for term in kept}
     kept = [term for term in kept if term.CHANGES is None or term.CHANGES.NAME in names]
     laws = any(model.terms[k].ROLE is Role.LAW for k in indices)
@@ -87,7 +87,7 @@ def without(samples: Samples, model: Composite, *indices: int, plain: Composite 
     if first is not None and plain is not None and (
             float(first.density.sum()) >= float(plain.density.sum())):
         return first
-    # Without white noise or an answer to throttle the rail itself has to be what they were.
+    # Without white noise or a response to throttle, the rail has to explain their effects.
     second = _fitted(samples, (guess(samples), *kept[1:]), known)
     return max((fit for fit in (first, second) if fit is not None), default=None,
                key=lambda fit: float(fit.density.sum()))
@@ -95,7 +95,7 @@ def without(samples: Samples, model: Composite, *indices: int, plain: Composite 
 
 def _fitted(samples: Samples, terms: Sequence[Term], known: Composite | None
             ) -> Composite | None:
-    """Return a fit to everything; None where there is none."""
+    """Return a fit to everything; None if it fails."""
     try:
         found = fit_composite(samples, terms, slice(0, samples.n), known, rough=True)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):
@@ -115,7 +115,7 @@ def guess(samples: Samples) -> OU:
 
 
 def gain_of(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_]) -> tuple[float, float]:
-    """Return the gain of one model over another and its error, nats; NaN where it is not known."""
+    """Return the gain of one model over another and its error, nats; NaN if unknown."""
     both = scored & new.known & old.known
     if int(both.sum()) < BLOCKS:
         return NAN, NAN
@@ -123,7 +123,7 @@ def gain_of(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_]) -> tuple[
 
 
 def shrink_of(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_]) -> float:
-    """Return the share by which the rms of one-step errors shrinks; NaN where it is not known."""
+    """Return the relative reduction of the rms of one-step errors; NaN if unknown."""
     both = scored & new.known & old.known
     if int(both.sum()) < BLOCKS or not old.error[both].any():
         return NAN
@@ -131,14 +131,14 @@ def shrink_of(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_]) -> floa
 
 
 def grown(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_], errors: float) -> bool:
-    """Return whether one-step errors are larger than before by so many errors of that."""
+    """Return whether one-step errors are significantly larger than before."""
     both = scored & new.known & old.known
     return errors_grow(new.error[both], old.error[both], new.model.gaussian.variance[both], errors)
 
 
 def why_unknown(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_],
                 throttle: bool) -> str:
-    """Return why a gain cannot be measured, for people; empty where it can."""
+    """Return why a gain cannot be measured, in words; empty if it can."""
     count = int((scored & new.known & old.known).sum())
     return unmeasured_words(BLOCKS, count, throttle) if count < BLOCKS else ''
 
@@ -161,14 +161,14 @@ def cause_gain(full: HeldOut, less: HeldOut, scored: npt.NDArray[np.bool_]
 
 def crossings(t: FloatArray, voltage: FloatArray, level: float,
               scored: npt.NDArray[np.bool_] | None = None) -> float:
-    """Return downward crossings of a level per minute, between neighbours that are scored."""
+    """Return downward crossings of a level per minute, between adjacent scored samples."""
     pairs = np.ones(t.size - 1, dtype=np.bool_) if scored is None else scored[1:] & scored[:-1]
     span = float(np.diff(t)[pairs].sum())
     return 60.0 * _falls(voltage, level, pairs) / span if span > 0.0 else NAN
 
 
 def crossing_level(samples: Samples, scored: npt.NDArray[np.bool_] | None = None) -> float:
-    """Return a level that is crossed now and then in both parts, V."""
+    """Return a level that both parts cross sometimes, V."""
     v = samples.logged
     fitted, kept = np.zeros((2, samples.n), dtype=np.bool_)
     fitted[samples.train] = True
@@ -181,7 +181,7 @@ def crossing_level(samples: Samples, scored: npt.NDArray[np.bool_] | None = None
         depth -= _LOWER
     level = mean - depth * spread
     below, above = v[v < level], v[v >= level]
-    # Half-way between codes of an ADC: there rounding changes no crossing.
+    # Half-way between ADC codes, so that rounding changes no crossing.
     return 0.5 * float(below.max() + above.min()) if below.size and above.size else level
 
 
@@ -192,7 +192,7 @@ def _falls(v: FloatArray, level: float, pairs: npt.NDArray[np.bool_]) -> int:
 def crossing_rates(samples: Samples, baseline: Sequence[Term], extended: Sequence[Term],
                    rng: np.random.Generator, scored: npt.NDArray[np.bool_] | None = None
                    ) -> CrossingRate:
-    """Compare how often a level is crossed, in the data and in simulations."""
+    """Compare crossing rates of a level in the data and in simulations."""
     scored = np.ones(samples.n, dtype=np.bool_) if scored is None else scored
     if int(scored.sum()) < BLOCKS:
         return CrossingRate()
@@ -201,7 +201,7 @@ def crossing_rates(samples: Samples, baseline: Sequence[Term], extended: Sequenc
     for terms in (baseline, extended):
         try:
             model = SupplyModel(tuple(terms))
-            # Drift and tones count from the first sample of all.
+            # Drift and tones count from the very first sample.
             found = [crossings(t, model.simulate(t, rng, samples.throttle), level, scored)
                      for _ in range(_DRAWS)]
         except ValueError:
@@ -215,11 +215,11 @@ def crossing_rates(samples: Samples, baseline: Sequence[Term], extended: Sequenc
                         rates[1][1])
 
 
-# Blocks: with more, each is predicted from more of the recording, at more cost.
+# Number of blocks: more blocks are predicted from more of the recording, at a higher cost.
 FOLDS = 6
 # Step of the numerical derivatives, in the logarithm of a parameter.
 _STEP = 1e-4
-# A parameter moves by this at most, in its logarithm, as in a fit.
+# Maximum change of a parameter, in its logarithm, as in a fit.
 _FAR = 1.5
 # Mean loss by errors of parameters, nats per sample, from which the other blocks do not
 # determine them: predictions are then as far off by them as by the noise.
@@ -227,30 +227,30 @@ _UNKNOWN = 0.5
 # Samples count up to this far outside of the throttle that the other blocks have been through: a
 # share of its range, and what is no change of throttle at all.
 _BEYOND, _STILL = 0.05, 0.01
-# The rail answers for so long, s, to throttle that no other block has been through: most lags of
-# recorded flights are shorter.
+# Duration of the response to throttle that no other block contains, s: most lags of recorded
+# flights are shorter.
 _AFTER = 0.2
 
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """A model, scored on what it was not fitted on."""
+    """A model, scored on held-out samples."""
 
     model: Composite  # Fitted on everything
-    # Log predictive density of each sample, its block kept back, nats; shape (n,).
+    # Log predictive density of each sample with its block held out, nats; shape (n,).
     density: FloatArray
     known: npt.NDArray[np.bool_]  # Where the other blocks determine the parameters; shape (n,)
-    error: FloatArray  # Error of each prediction, its block kept back, V; shape (n,)
+    error: FloatArray  # Error of each prediction with its block held out, V; shape (n,)
 
 
 def blocks_of(n: int) -> list[slice]:
-    """Return the blocks of so many samples."""
+    """Return the blocks of `n` samples."""
     edges = np.linspace(0, n, FOLDS + 1).round().astype(int).tolist()
     return [slice(a, b) for a, b in zip(edges[:-1], edges[1:])]
 
 
 def held_out(samples: Samples, model: Composite) -> HeldOut:
-    """Score a model that was fitted on everything on each block as if it had been kept back."""
+    """Score a model fitted to everything on each block, as if the block had been held out."""
     data = samples if model.offset is None else samples.part(
         slice(None), samples.voltage - model.offset)
     terms, events = model.gaussian.terms, model.events
@@ -271,7 +271,7 @@ def held_out(samples: Samples, model: Composite) -> HeldOut:
                      for b in blocks])
     gram = np.array([columns[b].T @ columns[b] for b in blocks])
     density, known = model.density.copy(), np.ones(samples.n, dtype=np.bool_)
-    # What a law believes of the level it has from what comes after, too.
+    # The law's estimate of the level uses later samples too.
     error = e.copy() if model.offset is None else evaluate(samples, terms, events).innovation
     for b, own, mean in zip(blocks, info, gram, strict=True):
         others, rest = info.sum(axis=0) - own, gram.sum(axis=0) - mean
@@ -346,7 +346,7 @@ def _solved(gram: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def covered(samples: Samples) -> npt.NDArray[np.bool_]:
-    """Return which samples are at, or soon after, throttle that other blocks have been through."""
+    """Return which samples are at, or soon after, throttle that other blocks contain."""
     found = np.ones(samples.n, dtype=np.bool_)
     u = samples.throttle
     if u is None:

@@ -1,8 +1,8 @@
 """
-What is named: the causes of a search, less those that a second criticism refutes.
+Named causes: the causes of a search, without those that a second criticism refutes.
 
-The search is criticised on everything; what claims more than it explains is withdrawn, and the
-search goes on without it.
+The result of the search is criticised on everything; a cause that does not explain its statistics
+is withdrawn, and the search continues without it.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from ou_monitor.model.terms.slow import Drift, SecondRelaxation
 from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.model.terms.tones import Resonance, Tone
 
-# Searches, each without what the criticism of those before withdrew.
+# Maximum number of searches, each without the causes withdrawn before.
 _TURNS = 3
-# Standard errors from which a line is there, whatever else is left.
+# Standard errors from which a line always stays.
 _SURE = 25.0
 
-# Note where the search was cut short.
+# Note if the search was cut short.
 STOPPED = ('The search for causes was cut short where the next ones would have taken long; there '
            'may be more than are named.')
 
-# Note where it was stopped by hand.
+# Note if the user stopped the search.
 INTERRUPTED = ('The search for causes was stopped by hand: these are the causes found until then, '
                'and there may be more.')
 
@@ -44,9 +44,9 @@ INTERRUPTED = ('The search for causes was stopped by hand: these are the causes 
 @dataclass(frozen=True, eq=False)
 class Named:
     """
-    What the search left: a model fitted on everything, its causes, statistics before and after.
+    Result of the search: a model fitted to everything, its causes, statistics before and after.
 
-    `bank` is what the statistics are measured by.
+    `bank` calibrates the statistics.
 
     """
 
@@ -62,7 +62,7 @@ class Named:
 
 def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
                  exact: tuple[Term, ...], progress: Progress) -> Named:
-    """Search for causes; withdraw those that claim what they do not explain."""
+    """Search for causes; withdraw those that do not explain their statistics."""
     phi = float(np.median(start.gaussian.phi[1:]))
     if len(start.terms) > 1:
         bank = simulate_bank_of(samples, start, rng)
@@ -114,7 +114,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
 
 @dataclass(frozen=True)
 class _Result:
-    """A search, its model fitted to everything, and what that leaves."""
+    """A search, its model fitted to everything, and the residuals."""
 
     search: Search
     whole: Composite
@@ -128,7 +128,7 @@ def _finished(fitter: Fitter, search: Search, bank: NullBank) -> _Result:
 
 
 def _withdrawn(fitter: Fitter, found: _Result, begun: _Result) -> list[int]:
-    """Return the causes that claim what they do not explain, or are something else by now."""
+    """Return the causes that do not explain their statistics, or no longer fit their name."""
     names = found.search.accepted
     out = decision.withdrawn(begun.after, found.after, kinds_of(names), found.search.asked)
     # Noise that the load needs is part of it.
@@ -139,7 +139,7 @@ def _withdrawn(fitter: Fitter, found: _Result, begun: _Result) -> list[int]:
 
 def _with_trends(samples: Samples, whole: Composite, rivals: Mapping[str, list[str]]
                  ) -> dict[str, list[str]]:
-    """Return the rivals of each cause; of a pole that is a trend, a drift of any form is one."""
+    """Return the rivals of each cause; a drift is a rival of a relaxation that is a trend."""
     duration = float(samples.t[-1] - samples.t[0])
     slow = not whole.has(Drift.NAME) and any(
         isinstance(term, SecondRelaxation) and not decision.relaxes(term.alpha, duration)
@@ -150,7 +150,7 @@ def _with_trends(samples: Samples, whole: Composite, rivals: Mapping[str, list[s
 
 def _in_doubt(samples: Samples, whole: Composite, names: Sequence[str], out: Sequence[int]
               ) -> list[int]:
-    """Return those to withdraw, less the lines that are there whatever else is left."""
+    """Return the causes to withdraw, without strong lines, which always stay."""
     errors: Sequence[Mapping[str, float]] = ()
     if any(names[k] == Tone.NAME for k in out):
         errors = standard_errors(samples, whole, slice(0, samples.n))
@@ -172,7 +172,7 @@ def _in_doubt(samples: Samples, whole: Composite, names: Sequence[str], out: Seq
 
 
 def _other(fitter: Fitter, whole: Composite, names: Sequence[str]) -> list[int]:
-    """Return the states that are something else by now than their name says."""
+    """Return the states that no longer fit their name."""
     view = fitter.view(whole)
     return [k for k, kind in enumerate(kinds_of(names)) if kind.ROLE is Role.BLOCK
             and not whole.terms[position(whole, names, k)].holds(view)]

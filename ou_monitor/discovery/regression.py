@@ -1,5 +1,5 @@
 """
-What the mean answers to: throttle, its lags, time; by regression on whitened samples.
+Response of the mean to throttle, its lags, and time, by regression on whitened samples.
 
 The recording and the columns of all candidates go through the filter of the noise found so far;
 then any set of terms is a small linear system.  Its evidence is the less of two: the likelihood
@@ -31,13 +31,13 @@ from ou_monitor.model.terms.slow import Drift
 from ou_monitor.model.terms.term import NEXT_TO_ZERO, Role, Term
 from ou_monitor.records import FloatArray
 
-# Blocks kept back in turn.
+# Number of blocks that are held out in turn.
 FOLDS = 10
-# Means that the load model is fitted to at most: its time constants are 20 ms and more.
+# Maximum number of means that the load model is fitted to: its time constants are 20 ms and more.
 _MOST = 2000
-# Time constants nearer than this factor are one: half an octave, as the list has them.
+# Factor below which two time constants are equal: half an octave, the spacing of the list.
 _ALIKE = 1.5
-# Terms that come and go at most.
+# Maximum number of changes.
 _ROUNDS = 40
 
 
@@ -67,16 +67,16 @@ def load_terms(samples: Samples) -> tuple[Term, ...]:
 
 @dataclass(frozen=True)
 class Answer:
-    """Terms of the mean, and what each is worth."""
+    """Terms of the mean, and the evidence of each."""
 
-    terms: tuple[Term, ...]  # In the order of what is lost without them, the largest first
+    terms: tuple[Term, ...]  # In the order of their evidence, the largest first
     worth: tuple[float, ...]  # Evidence lost without each, nats
-    rivals: tuple[tuple[str, ...], ...]  # For each, the other causes that do as well in its place
+    rivals: tuple[tuple[str, ...], ...]  # For each, the causes that tie in its place
 
 
 def mean_answer(samples: Samples, composite: Composite, view: View,
                 start: Sequence[Term] = ()) -> Answer:
-    """Return the terms of the mean that a recording shows beside the others of a model."""
+    """Return the terms of the mean in a recording, beside the other terms of a model."""
     own = [term for term in composite.terms if _measured(term)]
     pool = [*(term for term in start if not _there(term, own)), *own]
     pool += [term for term in _candidates(view) if not _there(term, pool)]
@@ -139,7 +139,7 @@ class _Regression:
         self._known: dict[tuple[int, ...], tuple[float, FloatArray]] = {}
 
     def search(self, start: Sequence[int]) -> Answer:
-        """Let terms come and go until none of them makes it better."""
+        """Add and remove terms until no change improves the evidence."""
         chosen = self._one_of_a_kind(start)
         for _ in range(_ROUNDS):
             better = self._best_move(chosen)
@@ -155,13 +155,13 @@ class _Regression:
                       tuple(self._rivals(chosen, k) for k in found))
 
     def _best_move(self, chosen: tuple[int, ...]) -> tuple[int, ...] | None:
-        """Return the set after the best change; None where none helps."""
+        """Return the set after the best change; None if no change helps."""
         value = self._value(chosen)
         largest = value - self._value(())
         best, most = None, 0.0
         for k in chosen:
             less = self._less(chosen, k)
-            # What goes spares its price: it has to be worth it.
+            # Removing a term saves its price, so the term has to be worth it.
             gain = self._least(less, k, largest) - (value - self._value(less))
             if not self._steady(less, chosen):
                 gain = max(gain, 1e-6)
@@ -181,7 +181,7 @@ class _Regression:
         return best or self._best_exchange(chosen, value)
 
     def _best_exchange(self, chosen: tuple[int, ...], value: float) -> tuple[int, ...] | None:
-        """Return the set with a time constant nearby in the place of a worse one."""
+        """Return the set with one time constant replaced by a better nearby one."""
         others = [tuple(sorted((*self._less(chosen, j), k))) for j in chosen
                   for k in range(len(self._pool))
                   if k not in chosen and _nearby(self._pool[j], self._pool[k])]
@@ -189,7 +189,7 @@ class _Regression:
         return best if best is not None and self._value(best) > value + 0.1 else None
 
     def _least(self, beside: tuple[int, ...], k: int, largest: float) -> float:
-        """Return the evidence that a term must bring beside others, nats."""
+        """Return the minimum evidence of a term beside others, nats."""
         kind = type(self._pool[k])
         again = any(type(self._pool[j]) is kind for j in beside)
         return decision.least_evidence(kind, max(largest, 0.0), again)
@@ -215,7 +215,7 @@ class _Regression:
         return self._evaluated(chosen)[0]
 
     def _evaluated(self, chosen: tuple[int, ...]) -> tuple[float, FloatArray]:
-        """Return evidence, and what each block kept back costs, nats."""
+        """Return the evidence, and the cost of each held-out block, nats."""
         if chosen not in self._known:
             at = np.concatenate([[1], *(self._at[k] for k in chosen)]).astype(int)
             lost = np.array([_lost(self._all - block, block, at) for block in self._blocks])
@@ -226,11 +226,11 @@ class _Regression:
         return self._known[chosen]
 
     def _steady(self, less: tuple[int, ...], more: tuple[int, ...]) -> bool:
-        """Return whether the larger set gains in more than one of the blocks."""
+        """Return whether the larger set gains in more than one block."""
         return decision.is_shared(self._evaluated(less)[1] - self._evaluated(more)[1])
 
     def _plainest(self, chosen: tuple[int, ...]) -> tuple[int, ...]:
-        """Return a set in which a cause that does as well stands for one that was searched."""
+        """Return a set in which tied causes with less search replace others."""
         for k in chosen:
             plain = [j for j in self._as_good(chosen, k)
                      if decision.is_plainer(type(self._pool[j]), type(self._pool[k]))]

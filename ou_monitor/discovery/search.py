@@ -1,7 +1,7 @@
 """
 The search for causes: which ones a recording shows.
 
-It begins with the answer of the mean to throttle and time, and the noise of a load: on real
+It begins with the response of the mean to throttle and time, and the noise of a load: on real
 flights that is nearly all of the variance, so that nothing else can be seen before.
 Every candidate of the catalogue is fitted beside the model so far, and the one of most evidence is
 accepted; then what is no longer worth its price goes, and a law of throttle in the place of
@@ -35,17 +35,17 @@ from ou_monitor.text import Z95
 
 Progress = Callable[[float], None]
 
-# Laws of throttle: in errors of one step each can stand for another.
+# Laws of throttle: in one-step errors each can replace another.
 LAWS: tuple[type[Term], ...] = (LoadDependentSigma, LoadDependentNoise, LoadDependentAlpha)
-# Intensities that follow throttle: each may only mend the form of the other.
+# Intensities that follow throttle: each may only correct the form of the other.
 _CURVES = {LoadDependentSigma.NAME: LoadDependentNoise.NAME,
            LoadDependentNoise.NAME: LoadDependentSigma.NAME}
-# Nats that a fit of few rounds may lack.
+# Maximum loss of a fit with few rounds, nats.
 _ROUGH = 20.0
-# Time of one fit, s, up to which the mean is chosen anew after each cause.
+# Maximum time of one fit, s, for which the mean is chosen again after each cause.
 _SOON = 1.0
-# Turns in which lines are joined to a tone: three motors or converters, each with its harmonics;
-# and lines joined at once.
+# Maximum number of rounds in which lines are added to a tone: three motors or converters, each
+# with its harmonics; and of lines added at once.
 _LINE_TURNS, _MOST_LINES = 3, 12
 
 
@@ -55,7 +55,7 @@ class Search:
 
     composite: Composite  # The model so far
     accepted: list[str] = field(default_factory=list)  # Causes in the order of their acceptance
-    # For each cause, those that did as well in its round.
+    # For each cause, the causes that tied in its round.
     rivals: dict[str, list[str]] = field(default_factory=dict)
     log: list[str] = field(default_factory=list)  # Trials and their results, one line each
     # For each latent cause, the statistics before it was accepted.
@@ -63,7 +63,7 @@ class Search:
     stopped: bool = False  # Whether the search ended because it took too long
 
     def copy(self) -> Search:
-        """Return a search that goes on from here and leaves this one as it is."""
+        """Return an independent copy of the search."""
         return replace(self, accepted=list(self.accepted), rivals=dict(self.rivals),
                        log=list(self.log), asked=dict(self.asked))
 
@@ -71,7 +71,7 @@ class Search:
 def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
                 given: Sequence[str] = (), latent: bool = True,
                 progress: Progress | None = None) -> None:
-    """Accept causes one after the other, the best first, beside those found so far."""
+    """Accept causes one after the other, the best first."""
     for turn in range(decision.MOST):
         if progress is not None:
             progress(turn / decision.MOST)
@@ -94,14 +94,14 @@ def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
 
 
 def backward(fitter: Fitter, search: Search) -> None:
-    """Take out or exchange causes, the move that is best first, while one of them pays."""
+    """Remove or exchange causes, the best change first, while a change gains."""
     for _ in range(2 * decision.MOST):
         if not _moved(fitter, search):
             return
 
 
 def without_causes(fitter: Fitter, search: Search, out: Sequence[int]) -> Search | None:
-    """Return a search that has not accepted some of its causes; None where that has no fit."""
+    """Return the search without some of its causes; None if the fit fails."""
     at = {position(search.composite, search.accepted, k) for k in out}
     kept = [term for k, term in enumerate(search.composite.terms) if k not in at]
     fit = fitter.fit(kept, None)
@@ -110,7 +110,7 @@ def without_causes(fitter: Fitter, search: Search, out: Sequence[int]) -> Search
 
 
 def choose_answer(fitter: Fitter, search: Search, start: Sequence[Term]) -> None:
-    """Choose the answers of the mean to what is measured anew, beside the noise found so far."""
+    """Choose the measured terms of the mean again, with the noise found so far."""
     composite = search.composite
     answer = mean_answer(fitter.samples, composite, fitter.view(composite), start)
     own = [term for term in composite.terms if decision.is_answer(type(term))]
@@ -167,7 +167,7 @@ def _round(fitter: Fitter, search: Search, bank: NullBank, given: Sequence[str],
         if first and steady:
             return steady
     trials.sort(key=lambda trial: -trial.evidence)
-    # Time is measured: a trend comes before a latent cause that does as well.
+    # Time is measured: in a tie a trend precedes a latent cause.
     return sorted(trials, key=lambda trial: not (
         catalogue()[trial.name].MEASURED and trial.evidence > trials[0].evidence - decision.TIE))
 
@@ -178,7 +178,7 @@ def _is_steady(trial: Trial, search: Search) -> bool:
 
 
 def _price(fitter: Fitter, beside: Composite, name: str, least: float = decision.ACCEPT) -> float:
-    """Return the evidence that a cause must bring beside a model, at least, nats."""
+    """Return the minimum evidence of a cause beside a model, nats."""
     other = _CURVES.get(name, '')
     if not beside.has(other):
         return least
@@ -188,7 +188,7 @@ def _price(fitter: Fitter, beside: Composite, name: str, least: float = decision
 
 
 def _accept(search: Search, best: Trial, trials: Sequence[Trial]) -> None:
-    """Accept a trial; what did as well is its rival."""
+    """Accept a trial; the ones that tie are its rivals."""
     search.rivals[best.name] = decision.rivals_of(
         best.name, [(trial.name, trial.evidence) for trial in trials])
     search.log.append(f'{best.name}: {best.evidence:.1f} nats; '
@@ -199,7 +199,7 @@ def _accept(search: Search, best: Trial, trials: Sequence[Trial]) -> None:
 
 
 def _more_lines(fitter: Fitter, search: Search) -> bool:
-    """Add the lines that come with the one accepted last, as harmonics do."""
+    """Add lines beside the one accepted last, such as its harmonics."""
     composite, samples = search.composite, fitter.samples
     view = fitter.view(composite)
     # An amplitude, a phase, and what was searched for the frequency.
@@ -222,13 +222,13 @@ class _Move:
     """A model without a cause, or with another one in its place."""
 
     name: str  # Of the cause
-    instead: str  # Name of the other one; empty where it goes
+    instead: str  # Name of its replacement; empty: none
     model: Composite
-    gain: float  # By what its evidence is more than it has to be, nats
+    gain: float  # Evidence above the required minimum, nats
 
 
 def _moved(fitter: Fitter, search: Search) -> bool:
-    """Take out or exchange one cause, the move that is best; return whether there was one."""
+    """Make the best removal or exchange of one cause; return whether there was one."""
     value, moves = fitter.evidence(search.composite), []
     names = dict.fromkeys(name for name in search.accepted
                           if not decision.is_answer(catalogue()[name]))
@@ -264,7 +264,7 @@ def _moved(fitter: Fitter, search: Search) -> bool:
 
 
 def _instead(less: Composite, name: str) -> list[type[Term]]:
-    """Return what may stand in the place of a law of throttle: another one, or other knots."""
+    """Return possible replacements of a law of throttle: another one, or other knots."""
     return [kind for kind in LAWS if kind.NAME in catalogue() and not less.has(kind.NAME)
             and (kind.CHANGES is None or less.has(kind.CHANGES.NAME))
             and (kind.NAME != name or kind is LoadDependentSigma)
@@ -272,7 +272,7 @@ def _instead(less: Composite, name: str) -> list[type[Term]]:
 
 
 def _without(fitter: Fitter, composite: Composite, name: str) -> Composite | None:
-    """Return the fit without the last term of a name, and without what changes it."""
+    """Return the fit without the last term of a name and the terms that modify it."""
     terms = list(composite.terms)
     del terms[max(k for k, term in enumerate(terms) if term.NAME == name)]
     kinds = {type(term) for term in terms}
@@ -282,19 +282,19 @@ def _without(fitter: Fitter, composite: Composite, name: str) -> Composite | Non
 
 
 def _in_full(fitter: Fitter, found: Composite) -> Composite:
-    """Return the better of a rough fit and one in full."""
+    """Return the better of a rough and a full fit."""
     full = fitter.fit(found.terms, found)
     return full if full is not None and fitter.evidence(full) > fitter.evidence(found) else found
 
 
-# Rate, 1/s, from which a fit finds what the load leaves: minutes and tenths of a second are both
-# within reach of it.
+# Initial rate of the residual after load, 1/s: a fit reaches minutes and tenths of a second from
+# it.
 _SLOW = 1.0
 
 
 def under_load(fitter: Fitter, search: Search) -> None:
     """
-    Start from the load model: the answer to throttle, and noise that follows it, at once.
+    Start from the load model: response to throttle, and noise that follows it, at once.
 
     In a flight they are nearly all of the variance: one by one, each would be fitted to what the
     others leave.  Nothing is accepted that the mean without them does not need.
@@ -332,7 +332,7 @@ def under_load(fitter: Fitter, search: Search) -> None:
 
 
 def _coupled(fitter: Fitter, search: Search) -> None:
-    """Let a coupled sag stand for transients alone where it does better; a tie makes rivals."""
+    """Replace transients by a sag behind an AC coupling if that fits better; ties are rivals."""
     composite = search.composite
     means = [term for term in composite.terms if decision.is_answer(type(term))]
     if ACCoupling.NAME not in catalogue() or not decision.only_to_changes(map(type, means)):
@@ -348,7 +348,7 @@ def _coupled(fitter: Fitter, search: Search) -> None:
     laws = [term for term in others if term.ROLE is Role.LAW]
     fit = fitter.fit([coupling.beside(ou), *structural, LoadSag(0.0, 0.0), coupling, *laws],
                      composite)
-    # A rail that does not relax within the recording is, coupled, one that does.
+    # Behind a coupling, a rail that does not relax within the recording appears to relax.
     if fit is None or is_trend(fitter.samples, fit):
         return
     gain = fitter.evidence(fit) - fitter.evidence(composite)
@@ -368,13 +368,13 @@ def _coupled(fitter: Fitter, search: Search) -> None:
 
 
 def whole_load(fitter: Fitter, plain: Composite, load: Sequence[Term]) -> Composite | None:
-    """Return a model with all terms of a load and the noise beside them; None for no load."""
+    """Return a model with all terms of a load and its noise; None without a load."""
     full = fitter.fit([*plain.terms, *load], plain, rough=True) if load else None
     return None if full is None else _noise_beside(fitter, full)
 
 
 def _noise_beside(fitter: Fitter, composite: Composite) -> Composite:
-    """Return a model with the noise that a recording under load shows beside its mean."""
+    """Return a model with the noise of a recording under load."""
     best = composite
     ou = composite.terms[0]
     assert isinstance(ou, OU)

@@ -1,5 +1,5 @@
 """
-The ARMA(1,1) that a sampled or block-averaged OU with white noise is: what can be known of it.
+The ARMA(1,1) of a sampled or block-averaged OU with white noise, and the errors of its parameters.
 
 Samples of an OU are AR(1); white noise on top, or averaging over blocks, makes
 them ARMA(1,1): z_j - phi z_{j-1} = e_j - theta e_{j-1}, with phi = exp(-alpha D)

@@ -14,12 +14,12 @@ import math
 import numpy as np
 from ou_monitor.records import FloatArray
 
-# Products, and levels of products of two, between two scalings: far from the smallest
-# number, for the largest density of each sample is scaled to 1.
+# Products, and levels of pairwise products, between two scalings: no underflow, because the
+# largest density of each sample is scaled to 1.
 _EVERY, _LEVELS = 8, 3
-# Samples in a block, in roots of their number: a turn over blocks is the dearer one.
+# Samples per block, in square roots of their number: an iteration over blocks costs more.
 _SHORT = 0.4
-# Probability that counts as none: a sample out of reach of all states that are possible.
+# Probability that counts as 0: no possible state explains the sample.
 _NONE = 1e-300
 
 
@@ -53,7 +53,7 @@ def smoothed(log_density: FloatArray, transition: FloatArray, start: FloatArray)
 
 
 def log_likelihood(log_density: FloatArray, transition: FloatArray, start: FloatArray) -> float:
-    """Return the sum of the evidence of `forward`, at a small part of its cost."""
+    """Return the summed evidence of `forward`, at a small part of its cost."""
     k = transition.shape[0]
     log: FloatArray = log_density.transpose(1, 2, 0)
     top = _largest(log)
@@ -98,7 +98,7 @@ def _in_blocks(log_density: FloatArray, transition: FloatArray) -> tuple[FloatAr
     blocks = -(-n // size)
     top = _largest(log)
     padded = np.empty((size, k, k, blocks))
-    # The last block is filled up with samples that say nothing.
+    # The last block is padded with samples without information.
     row = np.zeros(blocks * size)
     for i, j in np.ndindex(k, k):
         np.exp(log[i, j] - top, out=row[:n])
@@ -125,7 +125,7 @@ def _through(padded: FloatArray, start: FloatArray) -> FloatArray:
 
 
 def _law(weight: FloatArray, start: FloatArray) -> FloatArray:
-    """Return weights, shape (k, blocks), as laws; as the first where all are too small."""
+    """Return weights, shape (k, blocks), as laws; the first law where all are too small."""
     total = weight.sum(axis=0)
     fresh = (start / start.sum())[:, None]
     law: FloatArray = np.where(total >= _NONE, weight / np.maximum(total, _NONE), fresh)

@@ -29,12 +29,12 @@ from scipy.signal import lfilter
 class StateSpace:
     """A model over n samples with d states."""
 
-    # Transition into each sample; that into the first one is not used; shape (n, d, d).
+    # Transition into each sample; the first is not used; shape (n, d, d).
     f: FloatArray
-    # Covariance of what the noise adds in that step, V^2; for the first sample that of the state
-    # itself; shape (n, d, d).
+    # Covariance of the noise added in that step, V^2; for the first sample the covariance of the
+    # state; shape (n, d, d).
     q: FloatArray
-    h: FloatArray  # What is observed; shape (d,)
+    h: FloatArray  # Observation vector; shape (d,)
     r: FloatArray  # Variance of the measurement noise, V^2, > 0; shape (n,)
 
 
@@ -42,7 +42,7 @@ class Filter:
     """
     Gains and predictive variances of a model; filters any number of series of n samples.
 
-    Beyond the samples of the model it is taken as constant and settled.  `variance`, V^2, shape
+    Beyond its samples the model is assumed constant and its gain settled.  `variance`, V^2, shape
     (n,), is that of the innovations; `shape`: samples with gains of their own, and states.
     ValueError when the precision is not positive definite.
     """
@@ -94,7 +94,7 @@ class Filter:
             for i, j in np.argwhere(_pattern(loop)).tolist():
                 band[first - 1:end - 1, j, d + i - j] = -loop[i, j, first - begin:]
             if end - begin > 1:
-                # The last gain does not know that a step follows; the one before does.
+                # Use the gain before the last, because the last one assumes that no step follows.
                 self._last_loop = loop[..., -2].copy()
         self._band_of_loop = band.reshape(n * d, 2 * d).T
         return variance
@@ -108,7 +108,7 @@ class Filter:
         else:
             e = np.empty_like(columns, dtype=np.float64)
             e[:length], state = self._states(columns[:length])
-            # The gain at the last sample solved is not that of one inside.
+            # The gain at the last sample solved differs from an inner one.
             e[length - 1:] = self._steady.innovations(columns[length - 1:], state[-2])
         return e[:, 0] if y.ndim == 1 else e
 
@@ -265,7 +265,7 @@ def _inverse(a: FloatArray) -> FloatArray:
     return result
 
 
-# Elements of matrices that are worked on at once, about: bounds memory.
+# Approximate number of matrix elements processed at once; limits memory.
 _ELEMENTS = 2e6
 
 

@@ -1,16 +1,16 @@
 """
-The voltage of a battery under load, from throttle alone, and what a flight knows of the next.
+The voltage of a battery under load, from throttle alone, and the start values for the next flight.
 
-Limits first: the form and its constants were chosen on nine recordings (doc/load.md);
-charge is counted from throttle, so wind and payload are errors; one motor law for the craft.
+Limits: the form and its constants were chosen on nine recordings (doc/load.md); charge is computed
+from throttle, so wind and payload are errors; one motor law for the craft.
 
 v = N E(s0 - q) - S [x + f1 LP(x, t1) + f2 LP(x, t2)] - S K (ul - LP(ul, 20 ms))_+
 x = ul^p (E/3.8)^(p-1) exp(-2 h), ul = LP(u, lag), dq = x dt / (mean x T), dh = (sag/V) dq,
 with LP(x, tau) a first-order low-pass of time constant tau.
 
-What a flight knows of the next one, the answer to throttle at take-off, is that of one craft and
-one pack on one day; who takes it doubts it by what packs differ.  The level is not in it: a pack
-comes charged or not.
+The start of the next flight, the response to throttle at take-off, is from one craft and one pack
+on one day; the filter increases its errors by the difference between packs.  It has no level,
+because the charge at take-off is unknown.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from ou_monitor.records import FloatArray, NAN
 
 Number = TypeVar('Number', float, FloatArray)
 
-# Voltage, V, at which the size of the sag is counted: the plateau of a lithium-polymer cell.
+# Voltage at which the size of the sag is defined, V: the plateau of a lithium-polymer cell.
 CELL = 3.8
-# A full cell stands at 4.20 V; 50 mV are for the error of the sensor.
+# A full cell has 4.20 V; 50 mV allow for the error of the sensor.
 FULL_CELL = 4.25
 # E(s) = a exp(-35 s) + b + c s + d s^2 + e s^3, the form of Chen & Rincon-Mora (2006), fitted
-# to a usual table for hobby cells (7.7 mV rms).
+# to a common table for hobby cells (7.7 mV rms).
 _KNEE_SIZE, _KNEE_RATE = -0.39705, 35.0
 _CUBIC = (3.66631, 0.35371, -0.22145, 0.41052)
-# Below this charge the curve goes on as a line of that slope, V: a prediction whose charge is
-# a few per cent wrong must not fall down the knee.  Slopes of 0.6 to 2.0 V do.
+# Charge below which the curve is a straight line, and its slope, V: a prediction with a charge
+# wrong by a few per cent must not fall down the knee.  Slopes of 0.6 to 2.0 V work.
 _KNEE, _KNEE_SLOPE = 0.079, 1.2
-# Inrush ends within this time, s: a motor's current settles in some 20 ms.
+# Time constant of the inrush, s: a motor's current settles in about 20 ms.
 INRUSH_TIME = 0.02
 # Fall of ln resistance per unit of charge and relative sag.  An adiabatic pack (150 Wh/kg,
 # 1 kJ/kg/K) of -1.5 %/K would have 8; cooling and wires leave 2, chosen on the recordings.
@@ -59,12 +59,12 @@ SLOPES = np.gradient(LEVELS, CHARGES)
 
 
 def charge_at(cell: float) -> float:
-    """Return the charge, 0..1, at which a cell stands at that open-circuit voltage, V."""
+    """Return the charge, 0..1, of a cell with that open-circuit voltage, V."""
     return float(np.interp(cell, LEVELS, CHARGES))
 
 
 def cells_in_series(voltage: float) -> int:
-    """Return the least number of cells that can show that voltage, V."""
+    """Return the smallest number of cells that can have that voltage, V."""
     return max(1, int(np.ceil(voltage / FULL_CELL)))
 
 
@@ -75,7 +75,7 @@ def ripple(throttle: Number) -> Number:
 
 def lowpass(x: FloatArray, t: FloatArray, tau: float, start: float | None = None) -> FloatArray:
     """Return x after a first-order low-pass of tau, s; exact for x held over each step."""
-    # Here, for the nodes need none of it: SciPy costs them 35 MB.
+    # Imported here, because the nodes do not need it: SciPy takes 35 MB.
     from scipy.linalg import solve_banded
     keep = np.exp(-np.diff(t) / tau)
     bands = np.ones((2, x.size))
@@ -92,7 +92,7 @@ class LoadModel:
     """The parameters of the voltage under load."""
 
     cells: int  # Cells in series, N
-    mean_load: float  # Mean of x over the recording, which gives `endurance` its meaning
+    mean_load: float  # Mean of x over the recording, the load to which `endurance` refers
     charge: float = 0.7  # Charge at the first sample, s0, 0..1
     size: float = 0.12  # Relative sag at full throttle at once, S/(3.8 N)
     power: float = 1.8  # Exponent p of current over throttle
@@ -106,14 +106,14 @@ class LoadModel:
     lag: float = 0.01  # Lag of the sag behind throttle, s
     endurance: float = 350.0  # Time at the mean load that would empty a full pack, T, s
     before: float = 0.3  # Load before the first sample, relative to the mean load
-    # Current that counts as full load, A, negative where discharge is; 0 where throttle is the
+    # Current that counts as full load, A, negative if discharge is negative; 0 if throttle is the
     # load.
     full_current: float = 0.0
-    delay: float = 0.0  # How late the load is read behind the voltage that answers to it, s
-    stands: float = NAN  # Level that stands, V; NaN where a lithium pack of that charge empties
+    delay: float = 0.0  # Delay of the load behind the voltage, s
+    stands: float = NAN  # Constant level, V; NaN: the level of a discharging lithium pack
 
     def sag(self, throttle: npt.ArrayLike, cell: float = CELL) -> FloatArray:
-        """Return the sag, V, of a throttle that is held; of cold cells at that voltage, V."""
+        """Return the sag, V, at constant throttle, of cold cells at that voltage, V."""
         if self.full_current:
             raise ValueError('the load of this model is a current, not throttle')
         x = np.asarray(throttle, dtype=np.float64) ** self.power * (cell / CELL) ** (
@@ -136,7 +136,7 @@ class LoadModel:
         lagged = lowpass(np.interp(t + self.delay, t, read), t, self.lag)
         x = lagged / (self.full_current or 1.0)
         if not self.full_current:
-            # A propeller draws the less the lower the voltage: I ~ u (u V)^(p - 1).
+            # A propeller draws less at a lower voltage: I ~ u (u V)^(p - 1).
             x = lagged ** self.power
             if math.isnan(self.stands):
                 level = open_circuit(np.clip(self.charge - np.cumsum(x * dt) / full, 0.0, 1.0))
@@ -157,32 +157,31 @@ class LoadModel:
 
 # Coefficients of x, u, u^3, x after three lags, and inrush, with x = u^1.8 (load/load_filter.py).
 SIZE = 7
-# Its last entries may be left out of a model file.
+# A model file may omit the last entries.
 _OPTIONAL = 6
 _COLUMNS = ('coefficients', 'covariance', 'log_variance', 'flown')
 
 
 @dataclass(frozen=True)
 class LoadStart:
-    """The answer to throttle, as `LoadFilter` learned it."""
+    """The response to throttle, as learned by `LoadFilter`."""
 
     cells: float  # Cells in series.
     volts: float  # Open-circuit voltage when it was learned, V.
-    # Fall of the voltage at full throttle by x, u, u^3, x after 0.06, 2 and 15 s, and
-    # inrush, V.
+    # Voltage drop at full throttle due to x, u, u^3, x after 0.06, 2 and 15 s, and inrush, V.
     coefficients: tuple[float, ...]
     covariance: tuple[tuple[float, ...], ...]  # Of the coefficients, V^2.
     discharge: float  # Charge drawn per time at full load, 1/s.
     # ln of the variance, V^2, of white noise: constant, ripple, and by sqrt|du|.
     log_variance: tuple[float, float, float]
     flown: tuple[float, float]  # Throttles between which 80 % were flown.
-    delay: float = 0.0  # How late throttle was heard, s.
-    resistance: float = 0.0  # Ohm; 0: without a current that moves the voltage.
+    delay: float = 0.0  # Delay of throttle, s.
+    resistance: float = 0.0  # Ohm; 0: no current that affects the voltage.
     resistance_se: float = 0.0  # Its standard error, Ohm.
-    # Rms, V, of what the answer leaves while throttle moves, and its standard error; 0: unknown.
+    # Residual rms while throttle moves, V, and its standard error; 0: unknown.
     noise: float = 0.0
     noise_se: float = 0.0
-    size_se: float = 0.0  # Relative standard error of the size of the answer; 0: unknown.
+    size_se: float = 0.0  # Relative standard error of the size of the response; 0: unknown.
 
     def __post_init__(self) -> None:
         """Check shapes and signs."""
@@ -215,7 +214,7 @@ class LoadStart:
 
     @classmethod
     def read(cls, values: dict[str, Any]) -> LoadStart:
-        """Return what the entries of a model file say."""
+        """Return the start with the entries of a model file."""
         names = [f.name for f in fields(cls)]
         for name in values:
             if name not in names:

@@ -1,8 +1,8 @@
 """
 The load model of a recording: a maximum a posteriori fit.
 
-Limits first: the priors are narrow, so that no parameter can run away where the recording does
-not decide it; a parameter at three prior deviations says that the form does not hold.
+Limits: the priors are narrow, so that a parameter cannot run away if the recording does not
+determine it; a parameter at three prior deviations shows that the form is wrong.
 Residuals are white noise and an Ornstein-Uhlenbeck process of 20 s and of a few mV.
 """
 
@@ -20,7 +20,7 @@ from ou_monitor.records import determined, FloatArray, log_interval, NAN
 from scipy.linalg import solve_banded
 from scipy.optimize import least_squares
 
-# Centre and deviation of each parameter; of its logarithm, but for those of _LINEAR.  Usual
+# Centre and deviation of each parameter, or of its logarithm unless it is in _LINEAR.  Usual
 # figures of lithium-polymer packs with two RC pairs, tightened on the recordings (doc/load.md).
 _PRIOR = {
     'size': (math.log(0.12), 0.7), 'power': (math.log(1.8), 0.1),
@@ -31,18 +31,18 @@ _PRIOR = {
 }
 _NAMES = tuple(_PRIOR)
 _LINEAR = {'charge': (0.0, 1.05), 'before': (0.0, 1.5)}
-# Deviations where the load is a current: neither its scale nor what it feeds is known.
+# Deviations for a current as the load: its scale, and the loads that it includes, are unknown.
 _OF_CURRENT = {'size': 2.0, 'fast_share': 0.7, 'slow_share': 0.7, 'endurance': 1.0}
 _CENTRE = {'endurance': math.log(2000.0)}
-# A level that stands, in the place of the charge: deviation, V a cell.
+# Deviation of a constant level, in place of the charge, V per cell.
 _STANDS = 0.2
-# Delay of the load: steps tried either way at most, and s; share of the rest that another one
-# must leave; what is slower than this, s, is no answer.
+# Delay of the load: maximum steps tried either way, and s; ratio of residuals below which another
+# delay is used; changes slower than this, s, are not a response.
 _SHIFTS, _LATEST, _PAYS, _SLOWER, _LATE = 10, 0.2, 0.95, 1.0, 0.06
 # Bounds of the others: prior deviations from the centre.
 _REACH = 3.0
 # Mean of the data over this time, s, before the fit: OU and polarisation are slower;
-# but of a short recording this share, and fewest samples.
+# but for a short recording this share, and the minimum number of samples.
 _BIN, _BIN_SHARE, _LEAST = 0.05, 0.01, 20
 # Time constant, s, of the slow error of a load, an OU, and the deviations tried, V a cell
 # (cap: doc/load.md).
@@ -58,7 +58,7 @@ _ROUNDS, _EVALUATIONS = 4, 30
 
 @dataclass(frozen=True)
 class LoadFit:
-    """A fitted load model, and how well it is known."""
+    """A fitted load model, and its errors."""
 
     model: LoadModel  # The parameters
     # Covariance of the parameters as fitted (logarithms, but for charge and before); shape (11,
@@ -70,14 +70,14 @@ class LoadFit:
     evidence: float  # Log evidence (Laplace) for the load and the law of the level, nat
 
     def draw(self, rng: np.random.Generator) -> LoadModel:
-        """Return a model within the errors of this one."""
+        """Draw a model within the errors of this one."""
         low, high, _, _ = _bounds(self.model)
         moved = rng.multivariate_normal(_theta(self.model), self.covariance)
         return _moved(self.model, np.clip(moved, low, high))
 
     @property
     def at_bounds(self) -> tuple[str, ...]:
-        """Return the parameters that stand at a bound."""
+        """Return the parameters that are at a bound."""
         low, high, _, deviation = _bounds(self.model)
         theta = _theta(self.model)
         edge = np.minimum(theta - low, high - theta) < 1e-3 * deviation
@@ -94,7 +94,7 @@ class LoadFit:
 
 
 def _theta(model: LoadModel) -> FloatArray:
-    """Return the parameters as they are fitted: a level that stands, V a cell, is the charge."""
+    """Return the parameters as fitted; a constant level, V per cell, replaces the charge."""
     return np.array([
         model.stands / model.cells if name == 'charge' and math.isfinite(model.stands)
         else getattr(model, name) if name in _LINEAR
@@ -128,7 +128,7 @@ def _bounds(model: LoadModel) -> tuple[FloatArray, FloatArray, FloatArray, Float
 
 
 def timing(t: FloatArray, v: FloatArray, load: FloatArray) -> tuple[float, float]:
-    """Return how late a load is read, s, and 1 where the voltage falls with it, else -1."""
+    """Return the delay of a load, s, and 1 if the voltage falls with it, else -1."""
     dt = float(np.median(np.diff(t)))
     slow = min(_SLOWER, 0.3 * float(t[-1] - t[0]))
     left = v - lowpass(v, t, slow)
@@ -154,7 +154,7 @@ class _Noise:
         self._tried = (_SLOW_STDS * cells) ** 2
         self.white = (_WHITE_START * cells) ** 2
         self.slow = (_SLOW_START * cells) ** 2
-        # What the last two variances gave: a fit asks for them hundreds of times.
+        # Results for the last two variances: a fit needs them hundreds of times.
         self._found: tuple[tuple[float, float], tuple[FloatArray, FloatArray, FloatArray]] | None
         self._found = None
 
@@ -168,7 +168,7 @@ class _Noise:
         return innovations / np.sqrt(variance), variance, innovations
 
     def _predictor(self, q: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return variances of innovations, V^2, the recursion, and what passes to the next."""
+        """Return variances of innovations, V^2, and the coefficients of the recursion."""
         if self._found is None or self._found[0] != (self.white, q):
             n = self._keep.size + 1
             keep, values, p, white = self._keep.tolist(), [], q, self.white
@@ -186,7 +186,7 @@ class _Noise:
     def evidence(self, residuals: FloatArray) -> float:
         """Return the log-likelihood, nat, of innovations with Student's t of 4 degrees."""
         z, variance, _ = self.whiten(residuals)
-        # As few punch-outs would decide by their squares: their law has heavy tails.
+        # Heavy tails, because a few punch-outs would otherwise decide by their squares.
         return float(max(np.sum(-2.5 * np.log1p(0.25 * (z / size) ** 2)) + z.size * math.log(
             0.375 / size) for size in _SIZES) - 0.5 * np.log(variance).sum())
 
@@ -203,7 +203,7 @@ class _Noise:
 
 def _template(t: FloatArray, voltage: FloatArray, throttle: FloatArray | None,
               current: FloatArray | None, stands: bool) -> LoadModel:
-    """Return what of a model is not fitted: cells, the load's scale, sign and delay."""
+    """Return the parts of a model that are not fitted: cells, and the load's scale and delay."""
     load = throttle if current is None else current
     if load is None:
         raise ValueError('a fit of the load needs throttle or current')
@@ -221,7 +221,7 @@ def _template(t: FloatArray, voltage: FloatArray, throttle: FloatArray | None,
 
 
 def _bins(t: FloatArray) -> tuple[Callable[[FloatArray], FloatArray], npt.NDArray[np.intp]]:
-    """Return what takes means of bins of samples, and the first sample of each."""
+    """Return a function for means over bins of samples, and the first sample of each bin."""
     width = min(_BIN, _BIN_SHARE * float(t[-1] - t[0]))
     index = np.floor((t - t[0]) / width + 1e-9).astype(int)
     starts = np.concatenate(([0], np.flatnonzero(np.diff(index)) + 1))
@@ -230,7 +230,7 @@ def _bins(t: FloatArray) -> tuple[Callable[[FloatArray], FloatArray], npt.NDArra
 
 
 def level_evidence(t: FloatArray, voltage: FloatArray) -> float:
-    """Return the log evidence for a level that stands without a load, as in `LoadFit`."""
+    """Return the log evidence for a constant level without a load, as in `LoadFit`."""
     mean, _ = _bins(t)
     cells = cells_in_series(float(np.quantile(voltage, 0.99)))
     noise, left = _Noise(mean(t), cells), mean(voltage - np.median(voltage))

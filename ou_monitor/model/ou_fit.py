@@ -1,5 +1,5 @@
 """
-An Ornstein-Uhlenbeck process beside white noise in what the load leaves of a voltage.
+Fit an Ornstein-Uhlenbeck process and white noise to a voltage, together with level and load.
 
 `known_ou` fits the shortest window in which alpha is known well.  `regress` takes a flexible
 level (linear hats every 5 s), throttle and measured current, each at once and after a bank of
@@ -39,26 +39,26 @@ from ou_monitor.records import determined, FloatArray, MOST_READINGS, OU_WINDOWS
 # Evidence against white noise alone from which a relaxation is visible, nats: more than white
 # noise showed in any window of 120 simulated recordings (test_ou_fit.py repeats a part).
 VISIBLE = 12.0
-# Distance of the level's knots, s; parts between them at least.
+# Distance of the level's knots, s; minimum number of parts.
 _HATS, _PARTS = 5.0, 3
 # Lags, s, of throttle and current: from an ESC to polarisation.
 _LAGS = (0.004, 0.02, 0.06, 0.3, 1.0, 4.0)
-# Samples by which throttle and current are tried late or early, and readings for that.
+# Maximum shift of throttle and current, samples, and number of readings used to find it.
 _DELAYS, _DELAY_READINGS = 4, 8000
-# ... and a current at most, where it is looked for.
+# Maximum shift of a current, if one is searched.
 _FAR = 20
-# A throttle that spans less does not move.
+# Minimum range of a throttle that moves.
 _MOVED = 0.01
-# A gap is a step of this many usual ones: to begin anew at each lost message costs more than the
-# time line is wrong by.  Stretches of fewer readings are left out.
+# Minimum gap, in usual steps: a restart at each lost message would cost more than the error of the
+# time line.  Minimum number of readings in a stretch.
 _GAP, _STRETCH = 5.0, 16
-# Share of the readings that pieces of one length must hold.
+# Minimum share of the readings in pieces of equal length.
 _HELD = 0.8
 # The shortest of OU_WINDOWS in which alpha is known within this factor counts, else the longest.
 # Precision stops the search, not visibility: whether chance makes a relaxation visible in a short
 # window depends on its estimate, which would then be biased.
 PRECISE = 1.5
-# Fewest readings beyond the number of regressors from which anything is fitted.
+# Minimum number of readings beyond the number of regressors.
 FEWEST = 40
 # Numbers in one array of the likelihood: 16 MB of complex ones.
 _AT_ONCE = 1 << 20
@@ -66,14 +66,14 @@ _AT_ONCE = 1 << 20
 # white noise of 1e-3 of the variance is half of the spectrum at the highest frequency of an OU of
 # alpha D = 0.004.
 _GRID, _LOGIT = (24, 16, 5), (-7.0, 12.0)
-# Bounds: distances in logit(share) from the best of the grid that are tried beside the grid's,
-# and steps by which the walk is refined.
+# Bounds: additional distances in logit(share) from the best point of the grid, and steps that
+# refine the walk.
 _ASIDE = np.linspace(-1.2, 1.2, 17)
 _REFINE = (1.2, 0.6, 0.3, 0.15)
 # Law of the noise's size: lags of the load whose differences enter, s; deviation of its
 # coefficients by the prior; rounds.
 _CHANGES, _SIZE_SD, _SIZE_ROUNDS = (0.03, 0.2, 1.0), 0.5, 12
-# Steps towards the maximum at most, and the size of a step that ends them.
+# Maximum number of steps towards the maximum, and convergence tolerance of a step.
 _LOOKS, _NEAR = 40, 0.05
 # Draws about the maximum in each round, and rounds.
 _DRAWS, _ROUNDS = 1000, 4
@@ -102,7 +102,7 @@ def usual_walk(v: FloatArray) -> float:
 
 
 def stretches(t: FloatArray) -> list[slice]:
-    """Return the stretches without a gap; a few lost messages are none."""
+    """Return the stretches without a gap; a few lost messages do not count."""
     steps = np.diff(t)
     gaps = np.flatnonzero(steps > _GAP * np.median(steps))
     edges = [0, *(gaps + 1).tolist(), t.size]
@@ -110,7 +110,7 @@ def stretches(t: FloatArray) -> list[slice]:
 
 
 def _lagged(x: FloatArray, share: float) -> FloatArray:
-    """Return a first-order lag that goes `share` of the way with each sample."""
+    """Return a first-order lag that moves by `share` of the difference with each sample."""
     # 1 / (1 - r z) is the product of all 1 + (r z)^(2^k).
     lagged = share * (x - x[0])
     step, rest = 1, 1.0 - share
@@ -121,7 +121,7 @@ def _lagged(x: FloatArray, share: float) -> FloatArray:
 
 
 def _filled(t: FloatArray, x: FloatArray | None) -> FloatArray | None:
-    """Return a load without its gaps; None: it is not known, or does not move."""
+    """Return a load with its gaps filled; None: it is unknown or does not move."""
     if x is None:
         return None
     known = np.isfinite(x)
@@ -132,7 +132,7 @@ def _filled(t: FloatArray, x: FloatArray | None) -> FloatArray | None:
 
 
 def _basis(rows: FloatArray) -> FloatArray:
-    """Return an orthonormal basis of rows, which stand in order of importance."""
+    """Return an orthonormal basis of rows, given in order of importance."""
     size = np.sqrt(np.mean(rows * rows, axis=1))
     rows = rows[size > 0.0] / size[size > 0.0, None]
     R = np.linalg.qr(rows.T, mode='r')
@@ -142,7 +142,7 @@ def _basis(rows: FloatArray) -> FloatArray:
 
 
 def _beside(basis: FloatArray, rows: FloatArray) -> FloatArray:
-    """Return an orthonormal basis of what rows add to an orthonormal one."""
+    """Return an orthonormal basis of rows, orthogonal to a given one."""
     size = np.sqrt(np.mean(rows * rows, axis=1))
     rows = rows[size > 0.0] / size[size > 0.0, None]
     # Twice, against rounding.
@@ -153,7 +153,7 @@ def _beside(basis: FloatArray, rows: FloatArray) -> FloatArray:
 
 
 def _moved(x: FloatArray, late: int) -> FloatArray:
-    """Return what `x` is `late` samples later; its ends hold."""
+    """Return `x` shifted by `late` samples; the end values are held."""
     if not late:
         return x
     moved = np.roll(x, -late)
@@ -163,7 +163,7 @@ def _moved(x: FloatArray, late: int) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Regression:
-    """What level and load leave of a voltage, and what was taken out."""
+    """Residual of a voltage after level and load, and the regressors."""
 
     dt: float  # mean step within the stretches, s
     places: npt.NDArray[np.intp]  # of the readings in stretches without gaps, shape (n,)
@@ -174,7 +174,7 @@ class Regression:
     basis: FloatArray
     lengths: list[int]  # of the stretches
     walk: float  # usual walk of the level, V per sqrt(s)
-    slowest: float  # half the distance of the level's knots, s: slower is the level
+    slowest: float  # half the distance of the level's knots, s: slower changes are the level's
 
     @property
     def free(self) -> int:
@@ -185,9 +185,9 @@ class Regression:
 def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | None,
             reach: float = 0.0) -> Regression:
     """
-    Take level and load out of a voltage, V; stamps in s, throttle 0..1, current in A.
+    Regress level and load out of a voltage, V; stamps in s, throttle 0..1, current in A.
 
-    reach: the current is also tried late or early by up to so much, s.
+    reach: maximum shift of the current, late or early, s.
     """
     parts = stretches(t)
     dt = float(np.median(np.diff(t)))
@@ -211,16 +211,16 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
     last = slice(-_DELAY_READINGS, None)
 
     def best(x: FloatArray, regressors: Any, most: int = _DELAYS) -> list[FloatArray]:
-        """Return the regressors of a load at the delay that leaves least."""
+        """Return the regressors of a load at the delay with the smallest residual."""
         left, held = {}, _basis(np.stack(columns)[:, last])
         rest = v[last] - (held @ v[last]) @ held
         for late in sorted(range(-most, most + 1), key=abs):
-            # Those before the last ones are for the lags to settle.
+            # Earlier samples only let the lags settle.
             loads = regressors(_moved(x[-2 * _DELAY_READINGS:], late))[:5]
             Q = _beside(held, np.stack([c[last] for c in loads]))
             left[late] = float(rest @ rest - np.sum((Q @ rest) ** 2))
         least = min(left, key=left.__getitem__)
-        # A delay must pay, or noise would choose it.
+        # A delay must improve the fit clearly, or noise would choose it.
         late = least if left[least] < left[0] * (1.0 - 10.0 / rest.size) else 0
         found: list[FloatArray] = regressors(_moved(x, late))
         return found
@@ -236,12 +236,12 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
     places = np.concatenate([np.arange(s.start, s.stop) for s in parts] or [
         np.zeros(0)]).astype(np.intp)
     if u is not None or i is not None:
-        # What the load was before the window is unknown.
+        # The load before the window is unknown.
         columns = [*columns, *(np.exp((t[0] - t) / tau) for tau in taus)]
     rows, v = np.stack([c[places] for c in columns]), v[places]
     size = np.ones(v.size)
     law = NoiseSize(load_signs(t.size, dt, u, i)[:, places])
-    # First all readings count alike, then each by the size of its noise.
+    # First all readings have equal weights, then weights by the size of their noise.
     left = v
     for again in range(3 if law.follows and v.size else 1):
         if again:
@@ -256,7 +256,7 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
 
 
 def load_signs(n: int, dt: float, *loads: FloatArray | None) -> FloatArray:
-    """Return loads and their changes over several times, each by its size; shape (k, n)."""
+    """Return normalised loads and their changes over several times; shape (k, n)."""
     rows: list[FloatArray] = []
     for x in loads:
         if x is not None:
@@ -274,7 +274,7 @@ class NoiseSize:
 
     def __init__(self, signs: FloatArray) -> None:
         n = max(1, signs.shape[1])
-        # One that stays as it is says nothing.
+        # A constant one carries no information.
         self._used = (signs != signs[:, :1]).any(axis=1)
         self._scale = 0.3 * np.sqrt((signs[self._used] ** 2).sum(axis=1, keepdims=True) / n)
         laws = self._laws(signs)
@@ -317,7 +317,7 @@ class NoiseSize:
 
 
 class _Likelihood:
-    """Restricted log-likelihood of an OU beside white noise, and what it integrates out."""
+    """Restricted log-likelihood of an OU and white noise, with integrated regressors."""
 
     def __init__(self, part: Regression) -> None:
         self._cross = CrossSpectrum(
@@ -334,7 +334,7 @@ class _Likelihood:
         if half and points.shape[0] * self._cross.size > _AT_ONCE:
             value, variance = zip(self.at(points[:half]), self.at(points[half:]))
             return np.concatenate(value), np.concatenate(variance)
-        # A grid has few rates, and the spectrum of each is dear.
+        # A grid has few rates, and each spectrum is expensive.
         rates, of = np.unique(points[:, 0], return_inverse=True)
         share = 1.0 / (1.0 + np.exp(-points[:, 1:2]))
         excess = self._cross.ou(np.exp(rates)[:, None]) - 1.0
@@ -349,9 +349,9 @@ def _points(*axes: FloatArray) -> FloatArray:
 
 def fit_ou(part: Regression, span: float, *, precise: bool = False) -> OuFacts:
     """
-    Fit the noise to a window of so many s.
+    Fit the noise to a window (s).
 
-    precise: no bounds and no intervals where alpha would not be known within PRECISE.
+    precise: omit bounds and intervals if alpha would not be known within PRECISE.
     """
     dt = part.dt
     total = float(part.voltage @ part.voltage)
@@ -483,7 +483,7 @@ def _pair(ends: Sequence[float]) -> tuple[float, float]:
 
 def _minimum(cost: Callable[[FloatArray], FloatArray], point: FloatArray, step: FloatArray,
              ) -> tuple[FloatArray, float]:
-    """Return the lowest point about one, and its cost: of 27 the lowest, then of half the step."""
+    """Return the lowest of 27 points about one, then with half the step, and its cost."""
     around = _points(*(np.array([-1.0, 0.0, 1.0]),) * 3)
     lowest = math.inf
     for _ in range(_LOOKS):
@@ -499,7 +499,7 @@ def _minimum(cost: Callable[[FloatArray], FloatArray], point: FloatArray, step: 
 
 
 def _curvature(cost: Callable[[FloatArray], FloatArray], centre: FloatArray) -> FloatArray:
-    """Return a root of the covariance that the curvature of a cost says, at most 2 a direction."""
+    """Return a root of the covariance by the curvature of a cost, at most 2 in each direction."""
     step = 0.15 * np.eye(3)
     signs = ((1, 1, 1.0), (1, -1, -1.0), (-1, 1, -1.0), (-1, -1, 1.0))
     H = np.zeros((3, 3))

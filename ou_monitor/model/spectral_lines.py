@@ -1,5 +1,5 @@
 """
-Spectral lines: found by a test, measured with their error, taken out.
+Spectral lines: detected by a test, measured with their error, and removed.
 
 The one finder of the package: `analyze` asks it of each load level, `discover` of the scores that
 a model leaves and of samples that it leaves out.
@@ -40,23 +40,24 @@ from scipy.special import betaincinv, chndtrinc, gammaincc, gammaincinv
 
 # Probability that a recording without lines has one reported at any of its levels.
 FALSE_ALARM = 0.01
-# Lowest frequency, in periods of a piece: below, what removing mean and trend has left.
+# Lowest frequency, in periods of a piece: lower ones are affected by the removal of mean and
+# trend.
 FIRST = 4
-# A short piece is at most so long, s; a long one holds at most so many samples, which bounds
-# memory and time.
+# Maximum length of a short piece, s, and maximum number of samples of a long one (memory and
+# time).
 _SHORT, _LONGEST = 4.0, 1 << 20
 _FEWEST = 128
-# Ordinates that are enough to tell the noise from.
+# Sufficient number of ordinates to estimate the noise.
 _FEWEST_TESTED = 32
 # Neighbours: every second ordinate (those next to each other are correlated by the window),
 # from this many bins away on, so many in all; in long pieces, whose bins are narrower, up to
 # so many times as many.
 _GUARD, _NEIGHBOURS, _MORE = 4, 64, 4
-# Bins that the window spreads a steady line over, either side.
+# Number of bins on either side over which the window spreads a steady line.
 _LOBE = 2
 _QUANTILES = 0.5 * (np.polynomial.legendre.leggauss(64)[0] + 1.0)
 _WEIGHTS = 0.5 * np.polynomial.legendre.leggauss(64)[1]
-# Missing samples are put in up to so many in all for each that is there.
+# Maximum ratio of samples with missing ones filled in to samples given.
 _FILLED = 4.0
 # Parts of a piece whose phases are compared, and frequencies tried for each bin of the piece.
 _PHASES, _TRIED = 64, 32
@@ -67,32 +68,32 @@ class Line:
     """A line in the spectrum."""
 
     frequency: float  # Hz, below half the sampling rate
-    resolution: float  # Width of a bin, Hz: what the frequency is known to
+    resolution: float  # Width of a bin, Hz: the error of the frequency
     # Its root mean square and the 95 % interval, V.
     rms: float
     rms_low: float
     rms_high: float
     share: float  # Share of the variance of the segments in which it is measured
-    p_value: float  # Of an ordinate so large, times the ordinates tested at all levels
+    p_value: float  # p-value of the ordinate, times the ordinates tested at all levels
 
 
 @dataclass(frozen=True)
 class LineSearch:
-    """What was looked for and found."""
+    """Result of a search for lines."""
 
     lines: tuple[Line, ...] = ()  # Strongest first
     tested: int = 0  # Ordinates tested at this level
-    # Frequencies looked at, Hz.
+    # Frequencies searched, Hz.
     lowest: float = NAN
     highest: float = NAN
     # RMS of a line that is found with 90 % probability where the noise is at its median, V.
     detectable: float = NAN
-    why_not: str = ''  # Why nothing was looked for; empty when it was
+    why_not: str = ''  # Why there was no search; empty if there was one
 
 
 @dataclass(frozen=True, eq=False)
 class EvenGrid:
-    """Samples on an even clock, those that are missing put in on straight lines."""
+    """Samples on an even clock, with missing ones interpolated."""
 
     values: FloatArray  # Samples
     where: npt.NDArray[np.intp]  # Which of them were given
@@ -105,7 +106,7 @@ def on_grid(t: FloatArray, values: FloatArray) -> EvenGrid:
     usual = float(np.median(step)) if step.size else math.inf
     number = np.maximum(1.0, np.rint(step / usual))
     if number.sum() > _FILLED * t.size:
-        # Pauses are most of it: the samples follow each other as if there were none.
+        # Mostly pauses: the samples are joined without them.
         number = np.ones(step.size)
     where = np.append(0.0, np.cumsum(number)).astype(np.intp)
     rate = float(where[-1] / (t[-1] - t[0])) if step.size else NAN
@@ -157,7 +158,7 @@ def find_lines(parts: Sequence[FloatArray], rate: float, *, false_alarm: float =
 
 def _search(parts: Sequence[FloatArray], whites: Sequence[FloatArray], rate: float, length: int,
             where: np.ndarray, chance: float) -> tuple[list[Line], float]:
-    """Return lines among ordinates, each by chance so often; and the RMS that is found, V."""
+    """Return lines among ordinates, at a false-alarm level, and the detectable rms, V."""
     pieces = sum(part.size // length for part in parts)
     raw, white = (sum(part.size // length * welch(
         part, rate, nperseg=length, noverlap=0, detrend='linear')[1]
@@ -205,7 +206,7 @@ def threshold(pieces: float, neighbours: int, level: float) -> float:
 
 
 def _piece_length(sizes: Sequence[int], most: int) -> int:
-    """Return the length of pieces, at most so long, for which a line is found best."""
+    """Return the length of pieces, up to a maximum, at which a line is detected best."""
     longest = max(sizes, default=0)
     if longest < _FEWEST:
         return 0
@@ -303,7 +304,7 @@ def without_lines(voltage: FloatArray, rate: float, lines: Sequence[Line]) -> Fl
 
 @dataclass(frozen=True)
 class Sinusoid:
-    """A line as it runs through a piece."""
+    """A line within a piece."""
 
     amplitude: float  # Peak, V
     frequency: float  # Hz
@@ -337,6 +338,6 @@ def fit_sinusoid(piece: FloatArray, rate: float, frequency: float, reach: float)
 
 
 def _turning(turns: float, count: int) -> npt.NDArray[np.complex128]:
-    """Return a unit vector that turns back so many times a sample."""
+    """Return a unit vector that rotates backwards by a number of turns per sample."""
     found: npt.NDArray[np.complex128] = np.exp(-2j * math.pi * (turns * np.arange(count) % 1.0))
     return found

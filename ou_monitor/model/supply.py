@@ -22,12 +22,12 @@ from ou_monitor.records import FloatArray
 # and what the terms touch stays in the processor's caches.
 SEGMENT = 15_000
 
-# An array of that many, allocated and dropped, has the GNU allocator keep the memory of
-# segments for the next ones.  Else it returns and fetches it page by page, which
-# can cost more than the arithmetic.
+# After an array of this size was allocated and freed, the GNU allocator keeps the memory of
+# segments for the next ones.  Otherwise it returns and requests it page by page, which can cost
+# more than the arithmetic.
 _KEPT = 2**18
 
-# Steps that differ by less than this share differ by the rounding of stamps.
+# Relative difference below which steps are equal: rounding of stamps.
 _ROUNDING = 1e-6
 
 
@@ -90,7 +90,7 @@ class SupplyModel:
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """Return names of terms that move the supply, and that a risk onboard knows not of."""
+        """Return names of terms that affect the supply and that the risk onboard ignores."""
         return tuple(term.NAME for term in self.terms
                      if term.STAGE in (Stage.DRIVE, Stage.STATE, Stage.LEVEL) and not term.LIVE)
 
@@ -141,7 +141,7 @@ _POWER = 1.8
 
 
 class Discharge:
-    """The level that a pack loses as throttle draws its charge; `charge` is what is left, 0..1."""
+    """Fall of the level as throttle draws charge; `charge` is the remaining charge, 0..1."""
 
     def __init__(self, load: LoadStart, level: float, charge: float = math.nan) -> None:
         self._load = load
@@ -162,7 +162,7 @@ class Simulation:
     A simulation that goes on from segment to segment; each term gets a child of `rng`.
 
     The same seed gives the same samples, to rounding, whatever the segments.  `resistance`
-    multiplies the answer to throttle, and may change on the way: an old pack.  `charge`, 0..1,
+    multiplies the response to throttle, and may change meanwhile: an old pack.  `charge`, 0..1,
     at the first sample has the level follow the charge that throttle draws (`model.load`), in
     place of the recording's drift; NaN: the charge at which the recording began.
     """
@@ -229,7 +229,7 @@ class Simulation:
         return effects
 
     def _scaled(self, effect: Effect) -> Effect:
-        """Return the effect of an answer to throttle, times the resistance."""
+        """Return the effect of a response to throttle, times the resistance."""
         def scaled(s: Segment) -> None:
             if self.resistance == 1.0:
                 effect(s)

@@ -1,5 +1,5 @@
 """
-Fits to a periodogram: of all time scales of a recording at once, in milliseconds.
+Fits to a periodogram: all time scales of a recording at once, in milliseconds.
 
 The ordinates of a long series are nearly independent exponentials with the spectrum for their
 means (Whittle, Ark. Mat. 2 (1953) 423); in bins they are gamma.  `Ordinates` are those of scores;
@@ -17,14 +17,14 @@ import math
 import numpy as np
 from ou_monitor.records import FloatArray
 
-# Ordinates taken one by one, at the slow end, and bins to the octave above.
+# Number of single ordinates at the slow end, and bins per octave above.
 _SINGLE, _TO_OCTAVE = 16, 10
-# Scores beyond this say nothing of a spectrum: outliers.
+# Scores beyond this are outliers, and ignored.
 _FAR = 5.0
-# Rounds of scoring, the step of its numerical derivatives, a gain that is none, nats, and how far
-# a coordinate moves at once.
+# Rounds of scoring, step of the numerical derivatives, convergence tolerance, nats, and maximum
+# step of a coordinate.
 _ROUNDS, _STEP, _SETTLED, _MOST = 25, 1e-3, 0.01, 1.0
-# Damping of a step at first and at most.
+# Initial and maximum damping of a step.
 _DAMPED, _STUCK = 1e-3, 1e4
 
 
@@ -39,7 +39,7 @@ class Ordinates:
 
     @classmethod
     def of(cls, z: FloatArray) -> Ordinates:
-        """Return those of a series of scores, outliers cut."""
+        """Return the ordinates of a series of scores, without outliers."""
         z = np.clip(z, -_FAR, _FAR)
         power = np.abs(np.fft.rfft(z - z.mean())[1:-1]) ** 2 / z.size
         first = min(_SINGLE, power.size)
@@ -58,7 +58,7 @@ class Ordinates:
     def climb(self, log_of: Callable[[FloatArray], FloatArray], start: FloatArray
               ) -> tuple[FloatArray, float]:
         """
-        Return the coordinates of the likeliest spectrum near a start, and its gain.
+        Return the coordinates of the most likely spectrum near a start, and its gain.
 
         log_of gives the logarithm of a spectrum; the gain is over white scores, nats.
         """
@@ -88,7 +88,7 @@ class Ordinates:
         return x, value - self.likelihood(np.zeros(self.power.size))
 
 
-# Ordinates of a cross spectrum taken one by one; relative width of the bins above.
+# Number of single ordinates of a cross spectrum; relative width of the bins above.
 _ONE_BY_ONE, _WIDTH = 24, 0.06
 
 

@@ -1,8 +1,8 @@
 """
-Everything the node knows, without ROS: estimate, risk, and the health of the input.
+Everything that the node computes, without ROS: estimate, risk, and the health of the input.
 
-The node pushes samples and asks for a report; the offline tools do the same
-with a recording, so both say the same thing of the same data.
+The node pushes samples and asks for a report.  The offline tools do the same with a recording, so
+both give the same results for the same data.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class SupplyMonitor:
 
     @property
     def settings(self) -> MonitorSettings:
-        """Return the settings in force."""
+        """Return the present settings."""
         return self._settings
 
     @property
@@ -114,16 +114,16 @@ class SupplyMonitor:
 
     @property
     def load_filter(self) -> LoadFilter:
-        """Return the voltage under load; a parameter never resets it, an error begins anew."""
+        """Return the load filter; parameters never reset it, errors of the estimator do."""
         return self._load_filter
 
     @property
     def model(self) -> SupplyModel | None:
-        """Return the terms of the supply in force."""
+        """Return the present terms of the supply."""
         return self._model
 
     def set_model(self, model: SupplyModel | None) -> None:
-        """Change the terms of the supply; window and flag stay."""
+        """Change the terms of the supply; window and flag are kept."""
         self._model = model
         self._load_filter.begin_with(None if model is None else model.load)
 
@@ -133,19 +133,19 @@ class SupplyMonitor:
         """
         Add samples; see `SlidingEstimator.push`.
 
-        Voltages beyond 1e6 V and throttles beyond 2 are no readings, and count as NaN.
+        Voltages beyond 1e6 V and throttles beyond 2 are implausible and become NaN.
 
         Parameters
         ----------
         t, voltage, throttle : array_like, shape (n,), or float
-            Stamps, s; voltage, V; throttle, 0..1 (a number for all, or left out: unknown).
+            Stamps, s; voltage, V; throttle, 0..1 (one number for all samples; None: unknown).
         arrival : array_like, shape (n,), optional
-            When each sample arrived, s, on the clock of `now` of `report`.  By it the floor
-            judges samples whose stamps are late.
+            Arrival of each sample, s, on the clock of `now` of `report`.  The floor uses it for
+            samples whose stamps are late.
         current : array_like, shape (n,), or float, optional
             Current drawn from the supply, A, positive; NaN where unknown.
         thin : int
-            Of so many samples one goes to the estimator; the floor judges all.
+            Only every `thin`-th sample goes to the estimator; the floor checks all of them.
 
         Raises
         ------
@@ -174,14 +174,14 @@ class SupplyMonitor:
                 if not batch.again:
                     self._forecast.take(batch, came)
         except Exception as error:
-            # Whatever it is: a monitor that ends with it says nothing any more.
+            # Any error: a monitor that ended with it would report nothing any more.
             self.restart(error)
 
     def watch(self, voltage: npt.ArrayLike, arrival: npt.ArrayLike) -> None:
         """
-        Hold samples whose time nobody knows against the floor alone.
+        Check samples without a time stamp against the voltage floor only.
 
-        Voltage in V and arrival in s, shape (n,), as of `push`.
+        Voltage in V and arrival in s, shape (n,), as for `push`.
         """
         volts = np.atleast_1d(np.asarray(voltage, dtype=np.float64))
         unknown, volts, _ = plausible_samples(np.full_like(volts, NAN), volts, None)
@@ -190,7 +190,7 @@ class SupplyMonitor:
         self._flag.push(unknown, volts, times, self._trust.interval)
 
     def restart(self, error: BaseException) -> None:
-        """Begin with nothing known because of an error; the flag stays held, and it is told."""
+        """Restart after an error, which the next reports name; the flag keeps its state."""
         words = ' '.join(str(error).split())[:200]
         self._fault = f'{type(error).__name__}: {words}' if words else type(error).__name__
         self._faulty = True
@@ -205,20 +205,20 @@ class SupplyMonitor:
 
     def distrust(self, reason: str) -> None:
         """
-        Report nothing that rests on the stamps, and say why, until called with an empty reason.
+        Do not use the stamps, for this reason, until called with an empty reason.
 
-        The floor holds all the same.
+        The floor still works.
         """
         self._trust.outside = reason
 
     def clear_brownout(self) -> str:
         """
-        Drop a CRITICAL that is latched or held; the next report judges anew.
+        Clear a CRITICAL that is latched or held; the next report decides again.
 
         Returns
         -------
         str
-            What was cleared; empty when there was nothing.
+            What was cleared; empty if there was nothing to clear.
 
         """
         old = self._flag.state
@@ -226,15 +226,15 @@ class SupplyMonitor:
                 if self._flag.clear() else '')
 
     def set_brownout(self, reason: str) -> None:
-        """Set the flag CRITICAL, as before a restart; latch, hold and clearing act as ever."""
+        """Set the flag CRITICAL, as before a restart; latch, hold and clearing work as usual."""
         self._flag.set_critical(reason)
 
     def doubt_brownout(self, reason: str) -> None:
-        """Report the flag as UNKNOWN for this reason wherever it is not CRITICAL."""
+        """Report the flag as UNKNOWN for this reason, unless it is CRITICAL."""
         self._flag.doubt(reason)
 
     def reset(self, reason: str) -> None:
-        """Clear the window, and remember why for the next reports; the flag stays held."""
+        """Clear the window; the next reports state the reason, and the flag keeps its state."""
         self._estimator.reset()
         self._relaxation.forget()
         self._flag.new_time_line()
@@ -251,16 +251,16 @@ class SupplyMonitor:
         Parameters
         ----------
         age : float or None
-            Age of the newest voltage, s; None when none ever came.
+            Age of the newest voltage, s; None before the first one.
         now : float, optional
-            The clock by which the flag counts hold and delay, s; when left
-            out the stamp of the newest sample plus `age`.
+            The clock by which the flag counts hold and delay, s; by default the stamp of the
+            newest sample plus `age`.
         arrived : float, optional
-            Time since a voltage last arrived, s, however old it was; `age` when left out.  The
-            floor holds for voltages that arrive.
+            Time since the last voltage arrived, s, regardless of its stamp; by default `age`.
+            The floor counts arriving voltages.
         again : bool
-            Whether the window is estimated again; if not, the numbers are those of the last
-            report, and only floor, flag and ages are new.
+            Whether to estimate again; if not, the numbers of the last report are kept, and only
+            floor, flag and ages are updated.
 
         Returns
         -------
@@ -291,8 +291,8 @@ class SupplyMonitor:
             fresh = (silent <= limit and e.status is not Status.NO_DATA and doubt is Doubt.NONE)
             if again or not fresh:
                 self._load = self._load_filter.load()
-                # The better sigma of a longer window, but only where the short one sees an OU too:
-                # elsewhere the load tells more.
+                # Use the better sigma of a longer window only if the short one sees an OU too;
+                # otherwise the load model is more accurate.
                 self._forecast.follow(*((told, ou.window_s, ou_age) if e.usable and told.usable
                                         else (e, e.duration)))
                 self._ahead = look_ahead(self._forecast, self._load, self._settings) if (
@@ -329,20 +329,20 @@ class SupplyMonitor:
 
     def risk(self, voltage: float | None = None, horizon: float | None = None) -> float:
         """
-        Return P(below `voltage` within `horizon`) from the newest sample on; changes nothing.
+        Return P(below `voltage` within `horizon`) from the newest sample on.
 
         Parameters
         ----------
         voltage : float, optional
-            V; `brownout_voltage` when left out.
+            V; by default `brownout_voltage`.
         horizon : float, optional
-            Time ahead, s; `brownout_horizon` when left out.
+            Time ahead, s; by default `brownout_horizon`.
 
         Returns
         -------
         float
-            Probability, the pilot's throttle to come included; NaN without voltage, in the first
-            second, and where the input is not trusted.
+            Probability, including the pilot's future throttle; NaN without voltage, in the first
+            second, and if the input is not trusted.
 
         Raises
         ------
@@ -372,7 +372,7 @@ class SupplyMonitor:
         Returns
         -------
         float
-            Probability; NaN where the load is not known or the input not trusted.
+            Probability; NaN if the load is unknown or the input is not trusted.
 
         Raises
         ------
@@ -391,7 +391,7 @@ class SupplyMonitor:
 
     @property
     def _trusted(self) -> bool:
-        """Whether the readings are trusted, whatever limit is asked for."""
+        """Whether the readings are trusted, regardless of the limit."""
         return self._trust.doubt(self._stamps, math.inf)[0] is Doubt.NONE
 
     def _asked(self, voltage: float | None, horizon: float | None) -> tuple[float, float]:
@@ -486,42 +486,41 @@ RISK_CURVE = tuple(k / 10.0 for k in range(11))
 
 @dataclass(frozen=True)
 class MonitorReport:
-    """What is known at one instant."""
+    """Result of the monitor at one instant."""
 
     estimate: Estimate  # Newest estimate; its alpha, sigma and var_inf are those of `ou`
-    risk: float  # Probability of a brown-out within the horizon; NaN when not known
-    # Highest throttle, 0..1, that keeps the risk under `brownout.budget_limit`; NaN when not
-    # known.
+    risk: float  # Probability of a brown-out within the horizon; NaN if unknown
+    # Highest throttle, 0..1, with a risk below `brownout.budget_limit`; NaN if unknown.
     budget: float
-    budget_reason: str  # What ends the budget, or why it is not known
-    # Terms of the model file that move the supply and that the risk does not know of.
+    budget_reason: str  # Cause that limits the budget, or why it is unknown
+    # Terms of the model file that the risk does not include.
     left_out: tuple[str, ...]
-    flag: FlagState  # The brown-out flag, and why
+    flag: FlagState  # The brown-out flag, with its reason
     level: Level  # Level for the diagnostics
     summary: str  # One line for the pilot
     age: float  # Age of the newest voltage, s; inf when none ever came
     # Age from which the input is stale, s: `stale_after`, less for a fast source, more for a slow
     # one.
     patience: float
-    stamps: StampOrder  # What the stamps are good for
+    stamps: StampOrder  # Quality of the stamps
     doubt: Doubt  # Why the input is not trusted
     fresh: bool  # Whether the numbers rest on samples that are trusted and not too old
-    # Samples that only the floor has judged, because there were more than could be estimated from.
+    # Samples that were only checked against the floor, because of overload.
     thinned: int
-    restarts: int  # Times the estimator was started anew because of an error
+    restarts: int  # Restarts of the estimator after an error
     fault: str  # The last such error, in one line; empty when there was none
-    # Level, sag and noise under load, as far as they are known; needs no relaxation.
+    # Level, sag and noise under load; needs no relaxation.
     load: SupplyLoad = SupplyLoad()
-    # Leg on which the risk stands: ``first_passage``, ``load``, ``excursions`` or ``none``.
+    # Method of the risk: ``first_passage``, ``load``, ``excursions`` or ``none``.
     risk_basis: str = 'none'
-    # What makes most of the risk: noise, load now, or throttle to come; empty: not known.
+    # Main cause of the risk: noise, load now, or throttle to come; empty: unknown.
     risk_cause: str = ''
-    # Risk if throttle goes to each of `RISK_CURVE` and stays for the horizon; empty or NaN: not
-    # known.
+    # Risk if throttle goes to each of `RISK_CURVE` and stays for the horizon; empty or NaN:
+    # unknown.
     risk_curve: tuple[float, ...] = ()
-    ou: OuFacts = OuFacts('no_data')  # Relaxation, or its bounds, and the window that it is of
-    ou_age: float = 0.0  # How long before the newest sample that window ended, s
-    model: ModelComparison | None = None  # This flight beside the model; None without one
+    ou: OuFacts = OuFacts('no_data')  # Relaxation or its bounds, and their window
+    ou_age: float = 0.0  # Time from the end of that window to the newest sample, s
+    model: ModelComparison | None = None  # This flight compared with the model; None without one
 
     @property
     def brownout(self) -> bool | None:

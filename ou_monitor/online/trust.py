@@ -19,22 +19,23 @@ import numpy as np
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import FloatArray, NAN
 
-# A source of so many Hz or more that has missed so many samples is silent, whatever
-# `stale_after` is; not before so many s: a busy machine pauses that long.
+# A fast source is silent after this many missing samples, whatever `stale_after` is, but not
+# before this time, s: a busy machine pauses that long.
 MISSED, LEAST_PATIENCE = 300, 0.3
-# Samples from which an interval is known well enough to say that.
+# Minimum number of samples to know the interval of a source.
 _MEASURED = 20
-# A slow source is silent after so many of its intervals: two messages missed, and half an interval
-# of jitter.
+# Number of intervals after which a slow source is silent: two missed messages, and half an
+# interval of jitter.
 SLOW_MISSED = 2.5
-# Steps between arrivals, s, that can make a source slow: shorter ones lie within LEAST_PATIENCE.
+# Minimum step between arrivals of a slow source, s: shorter steps lie within LEAST_PATIENCE.
 _SLOW_STEP = LEAST_PATIENCE / SLOW_MISSED
-# Slow steps whose median is the interval, the fewest of them, and their least share of the time.
+# Number of slow steps whose median is the interval, their minimum number, and their minimum share
+# of the time.
 _SLOW_KEPT, _SLOW_FEWEST, _SLOW_SHARE = 5, 2, 0.5
-# Messages looked at for the share of late ones; a judgement needs the fewest.
+# Number of messages for the share of late ones, and minimum number for a decision.
 _LOOK, _FEWEST = 200, 20
 _IRREGULAR = 0.1
-# A stamp this far behind the newest, s, begins a new time line (as in `stream.samples`).
+# A stamp this far behind the newest, s, starts a new time line (as in `stream.samples`).
 BACK = 0.1
 # Stamps of the filter's input are frozen after this time, s: 10 ticks of a clock of 10 ms.
 FROZEN_AFTER = 0.1
@@ -44,7 +45,7 @@ def patience(settings: MonitorSettings, rate: float, n: int, interval: float = 0
     """
     Return the silence after which a source is stale, s.
 
-    rate, Hz: of its n samples in the window; interval, s: between arrivals of a slow source, else
+    rate: of its n samples in the window, Hz; interval: between arrivals of a slow source, s, else
     0.
     """
     limit = settings.stale_after
@@ -63,11 +64,11 @@ class SourceInterval:
     def __init__(self) -> None:
         self.value = 0.0
         self._last = NAN
-        # Begin and length of each of the last slow steps, s.
+        # Start and length of each of the last slow steps, s.
         self._steps: deque[tuple[float, float]] = deque(maxlen=_SLOW_KEPT)
 
     def push(self, times: FloatArray) -> None:
-        """Take times in order of arrival, s; steps back begin anew."""
+        """Take times in order of arrival, s; a step back starts again."""
         now = float(times[-1])
         if not 0.0 <= now - self._last <= _SLOW_STEP:
             steps = np.diff(times, prepend=self._last)
@@ -95,7 +96,7 @@ class SourceInterval:
 
 
 class StampOrder(enum.Enum):
-    """What the stamps are good for; the value is the sentence for the pilot."""
+    """Quality of the stamps; the value is the sentence for the pilot."""
 
     GOOD = 'The stamps increase.'
     FROZEN = (
@@ -107,20 +108,20 @@ class StampOrder(enum.Enum):
 
     @property
     def by_arrival(self) -> str:
-        """Return the sentence where samples are placed by their arrival."""
+        """Return the sentence for samples that are placed by their arrival."""
         found, _, advice = self.value.partition(': no estimate can be made of them')
         return f'{found}: their arrival counts{advice}'
 
 
 class StampWatch:
-    """Whether the stamps of arriving samples advance; `newest`: of the present time line, s."""
+    """Whether the stamps of arriving samples advance; `newest` stamp of this time line, s."""
 
     def __init__(self) -> None:
         self.newest = -math.inf
-        # Of the last batches: samples, and how many of them were late or began anew.
+        # Samples in the last batches, and how many of them were late or started a new time line.
         self._batches: deque[tuple[int, int]] = deque()
         self._looked = self._late = 0
-        # Samples since the newest stamp, and since when, by arrival.
+        # Samples since the newest stamp, and arrival of the first of them.
         self._since = 0
         self._advanced = self._arrived = NAN
 
@@ -163,17 +164,17 @@ class StampWatch:
             self._late -= late
 
     def start_anew(self) -> None:
-        """Take stamps that start anew: a step back counts as one that is late."""
+        """Start a new time line; a step back counts as one late sample."""
         self.newest = -math.inf
         self._count(1, 1)
 
     def judge(self, limit: float, interval: float) -> StampOrder:
-        """Return what the stamps are good for (limit of what is fresh and interval in s)."""
+        """Return the quality of the stamps (age limit and interval in s)."""
         if self._since >= _FEWEST:
             stopped = self._arrived - self._advanced
             if math.isnan(stopped):
                 stopped = self._since * interval
-            # Where no interval was ever known the stamps never advanced.
+            # If no interval was ever known, the stamps never advanced.
             if not stopped <= limit:
                 return StampOrder.FROZEN
         if self._looked >= _FEWEST and self._late > _IRREGULAR * self._looked:
@@ -183,7 +184,7 @@ class StampWatch:
 
 class InputClock:
     """
-    Time of messages that must all be used: their stamps, or their arrival where these are no time.
+    Time of messages that must all be used: their stamps, or their arrival if stamps are invalid.
 
     `stamps`: what the stamps are good for; `by_arrival`: messages placed by their arrival.
     """
@@ -207,7 +208,7 @@ class InputClock:
         if StampOrder.GOOD is before is self.stamps or math.isnan(self._time):
             self._time = stamp + self._shift
         else:
-            # Where the stamps are good again they go on from here.
+            # Valid stamps continue from here.
             self._time += max(arrived - self._arrived, 0.0)
             self._shift = self._time - stamp
         self._arrived = arrived
@@ -219,14 +220,14 @@ class InputClock:
 # still readings of sources that worked: 2.81 s (139 readings) on the ground, in_xr_141340; 1.70 s
 # (172) in flight, cf_solo_large; 3 readings at 1 Hz in flight, ac_jd_2004.
 _STUCK, _STUCK_READINGS = 5.0, 10
-# While throttle stands still too, so many times the longest still time that ended by one step of
-# the ADC: a coarse ADC on a slow discharge.
+# While throttle is constant too, the limit is this many times the longest constant reading that
+# ended by one ADC step: a coarse ADC on a slow discharge.
 _QUIET = 4.0
-# Throttle stands still within this, of 1 (cf_solo_large: 0.019 within 1.06 s of hover).
+# Range within which throttle counts as constant (cf_solo_large: 0.019 within 1.06 s of hover).
 _STILL = 0.05
-# A change of up to so many smallest changes is one step: printed digits round them (5 or 6 mV).
+# Largest ADC step in units of the smallest change: printed digits round steps (5 or 6 mV).
 _ONE_STEP = 1.5
-# Longest step between two readings that counts, s: a gap is not a reading that stands still.
+# Longest step between two readings that counts, s: a gap is not a constant reading.
 _COUNTED = 1.0
 # Smallest change, as a share of the reading: float32 rounds by 6e-8.
 _CHANGE = 1e-6
@@ -295,12 +296,12 @@ class StillReading:
                 f'{self._time:.1f} s ({self._n} readings; accepted: {limit:.1f} s).')
 
 
-# Readings whose median is held against unit and limit.
+# Number of readings whose median is compared with unit and limit.
 _RECENT = 21
-# No supply here has more, V: the highest brownout.voltage that can be set.
+# Highest plausible voltage, V: the largest brownout.voltage that can be set.
 MOST_SUPPLY = 1000.0
-# Readings of so many times the limit are of another unit, or the limit guards nothing.  Above a
-# full pack of 24 cells beside the default limit (22), below hundredths of a volt (100).
+# Ratio of readings to the limit above which the unit or the limit is wrong: above a full pack of
+# 24 cells with the default limit (22), below hundredths of a volt (100).
 _UNIT = 50.0
 
 
@@ -316,19 +317,19 @@ class Doubt(enum.Enum):
 
 
 class InputTrust:
-    """Every reason for which an input is not trusted, in one place."""
+    """All reasons for which an input is not trusted."""
 
     def __init__(self) -> None:
         self._stamps = StampWatch()
         self._interval = SourceInterval()
         self._still = StillReading()
         self._recent = np.empty(0)
-        #: A reason from outside; empty: none.
+        #: External reason; empty: none.
         self.outside = ''
 
     def push(self, t: FloatArray, voltage: FloatArray, throttle: FloatArray | None,
              arrival: FloatArray | None) -> None:
-        """Take samples in order of arrival (t in s, V, 0..1, arrival in s); NaN: no reading."""
+        """Take samples in order of arrival (t in s, V, 0..1, arrival in s); NaN: unknown."""
         if not t.size:
             return
         self._stamps.push(t, arrival)
@@ -352,7 +353,7 @@ class InputTrust:
                         np.concatenate((self._recent, voltage))[-_RECENT:])
 
     def start_anew(self) -> None:
-        """Take stamps that start anew."""
+        """Start a new time line."""
         self._stamps.start_anew()
 
     @property
@@ -361,11 +362,11 @@ class InputTrust:
         return self._interval.value
 
     def stamps(self, limit: float, interval: float) -> StampOrder:
-        """Return what the stamps are good for; see `StampWatch.judge`."""
+        """Return the quality of the stamps; see `StampWatch.judge`."""
         return self._stamps.judge(limit, interval)
 
     def doubt(self, stamps: StampOrder, limit: float) -> tuple[Doubt, str]:
-        """Return why the input is not trusted beside a voltage limit, V, and the sentence."""
+        """Return why the input is not trusted with a voltage limit, V, and the sentence."""
         if self.outside:
             return Doubt.OTHER, self.outside
         if stamps is not StampOrder.GOOD:
@@ -385,7 +386,7 @@ class InputTrust:
 
 
 def _unit_of(ratio: float) -> str:
-    """Name the unit that readings of so many times the limit may have."""
+    """Return the likely unit of readings at this ratio to the limit."""
     if ratio < 0.5 * _UNIT * 10.0:
         return ', as hundredths of a volt would'
     return ', as millivolts would' if ratio < 1e4 else ''

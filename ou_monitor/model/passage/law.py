@@ -1,5 +1,5 @@
 """
-First passage of the OU to a level: its mean time, and the law within a span of time.
+First passage of the OU to a level: mean time, and probability within a time span.
 
 A continuous OU path has no finite crossing rate, so risk is stated as first passage.
 
@@ -36,7 +36,7 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.records import FloatArray
 
-# The table: barrier, w and lambda; each axis is even in a coordinate of its own,
+# The table over barrier, w and lambda; each axis is evenly spaced in a transformed coordinate,
 # b = 4 sinh(u), w = 2 sinh(v).
 _B_SCALE, _W_SCALE = 4.0, 2.0
 _B_LOW, _B_HIGH, _B_NODES = -6.0, 30.0, 58
@@ -44,25 +44,25 @@ _W_HIGH, _W_NODES = 30.0, 55
 _S_LOW, _S_HIGH, _S_NODES = 1e-5, 9.0, 88
 # Nodes of the solver from one node of the table to the next, in w and in lambda.
 _FINE_W, _FINE_S = 2, 4
-# Where the solver begins, in lambda before the table.
+# Start of the solver, in lambda before the table.
 _LEAD = 1.0
-# Nodes added at each end of each axis, so that the splines do not feel the ends.
+# Nodes added at each end of each axis, so that the ends do not affect the splines.
 _PAD = 5
 
 T = TypeVar('T')
 _LOG_TWO_PI = math.log(2.0 * math.pi)
-# Beyond this level the mean time exceeds 1e150 tau: never.
+# Level above which the mean time exceeds 1e150 tau, which counts as never.
 _NEVER = 26.0
 
 
-# Below this ln Phi comes from the asymptotic series, 1e-12 off at most (Abramowitz & Stegun
+# Below this ln Phi comes from the asymptotic series, with errors up to 1e-12 (Abramowitz & Stegun
 # 26.2.12, last term first); erfc loses digits from -37 on.
 _FAR = -20.0
 _SERIES = (10395.0, -945.0, 105.0, -15.0, 3.0, -1.0, 1.0)
 
 
 def normal_below(x: npt.ArrayLike) -> FloatArray:
-    """Return Phi(x), elementwise; SciPy's would cost the nodes 35 MB."""
+    """Return Phi(x), elementwise; SciPy's function would take 35 MB in the nodes."""
     z = np.asarray(x, dtype=np.float64) * -math.sqrt(0.5)
     values = np.array([math.erfc(each) for each in z.ravel().tolist()])
     return np.asarray(0.5 * values.reshape(z.shape))
@@ -94,7 +94,7 @@ def mean_first_passage(start: float, barrier: float) -> float:
         return 0.0
     if barrier > _NEVER:
         return math.inf
-    # Here, for the nodes need none of it: SciPy costs them 60 MB.
+    # Imported here, because the nodes do not need it: SciPy takes 60 MB.
     from scipy.integrate import quad
     from scipy.special import erfcx
     total, _ = quad(lambda z: float(erfcx(-z / math.sqrt(2.0))), start, barrier,
@@ -104,14 +104,14 @@ def mean_first_passage(start: float, barrier: float) -> float:
 
 def passage_probability(start: npt.ArrayLike, barrier: npt.ArrayLike, span: npt.ArrayLike
                         ) -> FloatArray:
-    """Return the chance that a unit OU goes up through a barrier within a span."""
+    """Return the probability that a unit OU rises through a barrier within a span."""
     x, b, s = np.broadcast_arrays(np.asarray(start, np.float64), np.asarray(barrier, np.float64),
                                   np.asarray(span, np.float64))
     if (s < 0.0).any():
         raise ValueError('span must be zero or positive, in relaxation times')
     shape = x.shape
     x, b, s = x.ravel(), b.ravel(), s.ravel()
-    # Also leaves out what is NaN.
+    # Also false for NaN.
     inside = (x < b) & (s > 0.0) & (x > -np.inf) & (b < np.inf)
     if inside.all():
         return prepare().probability(x, b, s).reshape(shape)
@@ -124,7 +124,7 @@ def passage_probability(start: npt.ArrayLike, barrier: npt.ArrayLike, span: npt.
 
 @dataclass(frozen=True, eq=False)
 class PassageTable:
-    """What is made once."""
+    """The table, made once."""
 
     coefficients: FloatArray  # Spline coefficients of R; shape (barriers, w, lambda)
     # Spline coefficients of the logarithm of the long-run rate of passages, 1/tau; shape
@@ -161,7 +161,7 @@ class PassageTable:
 
 def prepare() -> PassageTable:
     """
-    Make the table unless it is there, a few tenths of a second, and return it.
+    Return the table; the first call makes it, in a few tenths of a second.
 
     Safe to be called by several threads.
     """

@@ -13,8 +13,8 @@ from ou_monitor.model.terms.segment import Effect, first_order, Segment, Stage
 from ou_monitor.model.terms.term import parameter, Role, Term
 from ou_monitor.records import FloatArray
 
-# Rates nearer to each other than this are taken apart by it: the closed forms
-# below divide by their difference.
+# Minimum relative difference of two rates, which is enforced because the closed forms below divide
+# by their difference.
 _APART = 1e-4
 
 
@@ -95,7 +95,7 @@ class ACCoupling(Term):
         return ou.read({**ou.values(), 'alpha': 0.3 * math.pi * self.corner})
 
     def pass_through(self, columns: FloatArray, s: Segment) -> FloatArray:
-        """Return columns of the mean as the instrument shows them."""
+        """Return columns of the mean after the instrument."""
         shown = np.empty_like(columns)
         for k in range(columns.shape[1]):
             alone = replace(s, x=np.zeros(s.t.size), sigma=np.zeros(s.t.size),

@@ -1,5 +1,5 @@
 """
-Every term there is: the classes with a NAME in a module here, and causes of other packages.
+All terms: the classes with a NAME in a module of this folder, and causes of other packages.
 
 The names are those of model files and of findings.  Another package declares its causes as entry
 points of the group `ou_monitor.causes`.  One that cannot be used is left out with a reason, and
@@ -45,7 +45,7 @@ def catalogue() -> Mapping[str, type[Term]]:
         try:
             kind = entry.load()
             _check(kind, entry.name, found)
-        # What a package does on its way, and that is anything, must not end a command.
+        # Any error in another package must not end a command.
         except (Exception, SystemExit) as error:
             _leave_out(entry.name, error)
         else:
@@ -60,14 +60,14 @@ def left_out() -> tuple[str, ...]:
 
 
 def blamed(error: BaseException) -> tuple[str, ...]:
-    """Return the causes of other packages in whose code an error arose."""
+    """Return the causes of other packages whose code raised an error."""
     modules = {frame.f_globals.get('__name__') for one in _chain(error)
                for frame, _ in traceback.walk_tb(one.__traceback__)}
     return tuple(name for name in _installed() if catalogue()[name].__module__ in modules)
 
 
 def withdraw(error: BaseException) -> bool:
-    """Leave out the causes that an error is from, or else all installed; False without any."""
+    """Remove the causes that raised an error, or else all installed; False without any."""
     names = blamed(error) or _installed()
     for name in names:
         _leave_out(name, error)
@@ -94,7 +94,7 @@ def _leave_out(name: str, error: BaseException) -> None:
 
 
 def _check(kind: object, name: str, known: Mapping[str, type[Term]]) -> None:
-    """Refuse what is no cause of this name."""
+    """Refuse anything that is not a cause of this name."""
     if not (isinstance(kind, type) and issubclass(kind, Term)):
         raise TypeError('it is not a class derived from Term')
     if name != kind.NAME or not re.fullmatch('[a-z][a-z0-9_]*', name) or name in known:

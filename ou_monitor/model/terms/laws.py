@@ -1,4 +1,4 @@
-"""What laws of the innovations are fitted to, what a fit of one is, and what they share."""
+"""Laws of the innovations: input of their fits, results, and common functions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _EDGE = 1e-15
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What a candidate may look at before it is fitted."""
+    """Input of a candidate before it is fitted."""
 
     z: FloatArray  # Normal scores of the one-step innovations under the model so far; shape (n,)
     variance: FloatArray  # Predictive variance of each sample, V^2; shape (n,)
@@ -68,7 +68,7 @@ def climb(value: Callable[[FloatArray], float], start: Sequence[float] | FloatAr
 
 def curvature_se(value: Callable[[FloatArray], float], at: FloatArray, step: float = 0.05
                  ) -> FloatArray:
-    """Return standard errors from the curvature of a log-likelihood along each axis."""
+    """Return standard errors by the curvature of a log-likelihood along each axis."""
     top = value(at)
     errors = np.full(at.size, math.nan)
     for k in range(at.size):
@@ -100,7 +100,7 @@ def refine(values: Callable[[FloatArray], FloatArray], start: Sequence[float] | 
             return None
         top, up, down = found[0], found[1:size + 1], found[size + 1:2 * size + 1]
         gradient, bend = (up - down) / (2.0 * step), np.diag((up - 2.0 * top + down) / step**2)
-        # From both sides: a third derivative would tilt what one side says.
+        # Two-sided, because a third derivative would bias one-sided differences.
         sides = found[2 * size + 1:].reshape(2, -1).sum(axis=0)
         alone = up + down - top
         bend[pairs] = (sides - alone[pairs[0]] - alone[pairs[1]]) / (2.0 * step**2)

@@ -1,4 +1,4 @@
-"""What lines of a model share: their states, and where broad and moving ones stand in scores."""
+"""Common functions of lines: their states, and detection of broad and moving lines in scores."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ou_monitor.model.terms.laws import View
 from ou_monitor.records import FloatArray
 from scipy.signal import welch
 
-# Lines that follow throttle looked into.
+# Number of lines that follow throttle examined.
 _MOST = 3
 
 
@@ -95,7 +95,7 @@ def prominence(z: FloatArray, rate: float, frequency: float, width: float) -> fl
 
 
 def broad_peaks(z: FloatArray, rate: float) -> list[tuple[float, float]]:
-    """Return the broad peaks of scores (rate in Hz)."""
+    """Return the broad spectral peaks of scores (rate in Hz)."""
     found = []
     for length in (64, 256, 1024, 4096):
         if z.size < 4 * length:
@@ -179,7 +179,7 @@ def _hough(z: FloatArray, u: FloatArray, rate: float, length: int) -> list[_Line
         return []
     shape = z[:count * length].reshape(count, length)
     power = np.abs(np.fft.rfft(shape * np.hanning(length), 2 * length, axis=1)) ** 2
-    # What every segment has at a frequency does not follow throttle.
+    # Power that every segment has at a frequency does not follow throttle.
     power = (power / power.mean(axis=0)).astype(np.float32)
     load = u[:count * length].reshape(count, length).mean(axis=1)
     width = rate / (2.0 * length)

@@ -1,4 +1,4 @@
-"""The mean answers throttle: its fall at once, lag, inrush, slow polarisation."""
+"""Response of the mean to throttle: immediate sag, lag, inrush, slow polarisation."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class LoadSag(Term):
         return cls(0.0, 0.0), cls(0.0, NEXT_TO_ZERO)
 
 
-# Stamps nearer than this are one, s: bags count in ns.
+# Difference below which stamps are equal, s: bags count in ns.
 _HAIR = 1e-9
 
 
@@ -109,7 +109,7 @@ class LoadTransient(Term):
                 # What was set `delay` ago; before the first sample, what it had.
                 times = np.concatenate((times, s.at))
                 values = np.concatenate((values, throttle))
-                # A hair later, so that a delay of whole steps does not miss by rounding.
+                # A margin for rounding, for delays of whole steps.
                 hair = _HAIR + 2.0 * np.spacing(np.abs(s.at))
                 then = np.searchsorted(times, s.at - self.delay + hair, side='right') - 1
                 throttle = values[np.maximum(then, 0)]
@@ -150,5 +150,5 @@ SHORTEST = 0.5
 _INRUSH = 0.2
 # Delays tried, and the longest of them, s.
 _DELAYS, _LATEST = 12, 0.1
-# Durations of a recording in which an answer loses a hundredth: it follows no trend.
+# Share of a recording's duration in which a response loses a hundredth: it cannot follow a trend.
 _FOR_GOOD = 100.0

@@ -1,4 +1,4 @@
-"""The pull back is not linear: constant-power load, softening near brown-out."""
+"""A restoring force that is not linear: constant-power load, softening near brown-out."""
 
 from __future__ import annotations
 
@@ -109,9 +109,9 @@ class NonlinearRestoring(Term):
         errors = dict(zip(powers, error[1:].tolist(), strict=True))
         square, cube = by.get(2, 0.0), by.get(3, 0.0)
         if cube < 0.0:
-            # It would push away: no term does that, and what it scores is not that of one.
+            # It would push away, which no term can represent, so its scores are not used.
             return None
-        # A square that would push away at large deviations is held just short of it.
+        # A square that would push away at large deviations is limited to just below that.
         cube = max(cube, _HOLDS * square * square / alpha)
         return LawFit(cls(square, cube), {'square': errors.get(2, math.nan),
                                           'cube': errors.get(3, math.nan)}, scores,

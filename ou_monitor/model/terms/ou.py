@@ -17,7 +17,7 @@ from ou_monitor.records import FloatArray
 # law is of second order in it.  More parts than that are refused.
 _PART = 0.05
 _PARTS_MOST = 1_000_000
-# Parts whose random numbers are held at once.
+# Maximum number of parts whose random numbers are stored at once.
 _DRAWS = 100_000
 
 
@@ -61,7 +61,7 @@ class OU(Term):
 
 
 def _law(s: Segment) -> tuple[FloatArray, FloatArray]:
-    """Return what is left of the state after each step, and the deviation of what is added, V."""
+    """Return the decay of the state in each step, and the deviation of the added noise, V."""
     n = s.step.size
     # Of equal steps at one alpha two will do: the first, which may come after
     # a gap or be the first of all, and any other.
@@ -139,7 +139,7 @@ def _bundles(parts: npt.NDArray[np.int64]) -> list[slice]:
 
 
 def _stiffness(s: Segment) -> FloatArray:
-    """Return what the bend adds to the rate at one standard deviation, 1/s, shape (n,)."""
+    """Return the rate that the bend adds at one standard deviation, 1/s, shape (n,)."""
     square, cube = s.bend
     var = s.sigma * s.sigma / (2.0 * s.alpha)
     if cube > 0.0:

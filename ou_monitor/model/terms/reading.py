@@ -1,4 +1,4 @@
-"""What reading the voltage adds: white noise, steps and ends of the ADC, repeats, wrong stamps."""
+"""Effects of the measurement: white noise, ADC steps and limits, repeats, wrong stamps."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class MeasurementNoise(Term):
         return [cls(0.1 * error), cls(0.4 * error)]
 
     def holds(self, view: View) -> bool:
-        """Return whether it is there at all beside the one-step error."""
+        """Return whether it is a measurable share of the one-step error."""
         return self.variance() > _LEAST * float(np.median(view.variance))
 
     def variance(self) -> float:
@@ -64,7 +64,7 @@ class MeasurementNoise(Term):
         return self.variance() * np.square(s.noise)
 
 
-# Share of the one-step variance below which white noise is none: it moves the likelihood of n
+# Share of the one-step variance below which white noise counts as 0: it moves the likelihood of n
 # samples by n/4 of its square, so that 10^7 samples would not show it.
 _LEAST = 1e-3
 
@@ -257,7 +257,7 @@ class HeldSamples(Term):
 
         def effect(s: Segment) -> None:
             nonlocal last, turn
-            # A hair more, so that a stamp at the very turn does not miss it by rounding.
+            # A margin for rounding: a stamp at a refresh has the new value.
             hair = 1e-6 + 2.0 * self.rate * np.spacing(np.abs(s.t))
             turns = np.floor((s.t - s.origin) * self.rate + hair)
             fresh = np.diff(turns, prepend=turn) > 0.0

@@ -271,7 +271,7 @@ def _settled(keep: float, power: float, white: float) -> tuple[float, float]:
     return 0.5 * (-b + math.sqrt(b * b + 4.0 * drive * white)), white
 
 
-# Events drawn for one segment at most: bounds time and memory.
+# Maximum number of events in one segment; limits time and memory.
 _MOST = 5_000_000
 
 
@@ -574,17 +574,17 @@ def _slow_levels(view: View) -> tuple[FloatArray | None, float, int]:
 
 # How much faster the rail may relax than it seems to with levels on it.
 _FASTER = 1.0, 3.0, 9.0
-# Evidence from which slow levels are tried, nats.
+# Minimum evidence to try slow levels, nats.
 _SLOW_AHEAD = 8.0
-# Samples on which starts are tried, and on which the best is fitted.
+# Number of samples for trying starts, and for fitting the best.
 _SHORT, _LONG = 8000, 30000
 # Largest rate of switching, 1/s.
 _FASTEST = 30.0
-# Changes in the part fitted, at least.
+# Minimum number of changes in the fitted part.
 _CHANGES = 8.0
-# Evidence from which there are three states, nats.
+# Minimum evidence for three states, nats.
 _THIRD = 10.0
-# A ratio of which the logarithm is less than this is 1.
+# Logarithm of a ratio below which the ratio is 1.
 _NO_RATIO = 0.05
 
 
@@ -594,7 +594,7 @@ def _fastest(view: View) -> float:
 
 
 def _inside(x: FloatArray, view: View) -> bool:
-    """Return whether coordinates are in their range."""
+    """Return whether coordinates are within their ranges."""
     return bool(max(x[0], x[1]) <= _fastest(view) and min(x[0], x[1]) >= -12.0
                 and abs(x[3]) <= 3.0 and abs(x[4]) <= 2.0)
 

@@ -1,5 +1,5 @@
 """
-Consecutive samples in the making, and first-order recursions that run along them.
+Segments of simulated samples, and first-order recursions along them.
 
 Segments pass through the terms of a model in the order of their `Stage`.
 """
@@ -32,7 +32,7 @@ class Stage(enum.IntEnum):
 
 @dataclass
 class Segment:
-    """Consecutive samples in the making; terms change it in place."""
+    """Consecutive samples during a simulation; terms change it in place."""
 
     t: FloatArray  # Stamps, s; shape (n,)
     at: FloatArray  # Instants at which the samples are really taken, s; shape (n,)
@@ -49,10 +49,10 @@ class Segment:
     # Coefficients of x^2, 1/(V s), and x^3, 1/(V^2 s), in the restoring force, beside alpha x.
     bend: tuple[float, float]
     x: FloatArray  # OU deviation, V; shape (n,)
-    level: FloatArray  # All else that the rail does, V; shape (n,)
+    level: FloatArray  # Everything else in the voltage of the rail, V; shape (n,)
     noise: FloatArray  # Factor on the deviation of the white noise of the measurement; shape (n,)
     voltage: FloatArray  # What is logged, V; shape (n,)
-    # What becomes of the normal draws of the white noise; none: they stay normal.
+    # Transformations of the normal draws of the white noise; empty: they stay normal.
     shape: list[Callable[[FloatArray], FloatArray]] = field(default_factory=list)
 
 
@@ -80,7 +80,7 @@ def first_order(phi: FloatArray, e: FloatArray, before: float) -> FloatArray:
 
 
 def steady(values: FloatArray) -> bool:
-    """Tell whether all values are the same."""
-    # The last one first: what varies mostly differs there.
+    """Return whether all values are equal."""
+    # Compare the last one first: varying values mostly differ there.
     return not values.size or values.strides == (0,) or bool(
         values[0] == values[-1] and (values == values[0]).all())

@@ -16,9 +16,9 @@ from ou_monitor.records import FloatArray
 from scipy.special import gammainccinv, gammaincinv, ndtr
 
 
-# Events drawn for one segment at most: bounds time and memory.
+# Maximum number of events in one segment; limits time and memory.
 _MOST = 5_000_000
-# Share of samples with a jump in them from which jumps overlap.
+# Share of samples with a jump above which jumps overlap.
 _OFTEN = 0.05
 
 
@@ -80,7 +80,7 @@ class Jumps(Term):
             return None
         share, mean, spread, unit = found
         if share > _OFTEN:
-            # So many are no events: the noise itself is of another law.
+            # This many are not events: the noise itself has another law.
             return None
         log_calm, log_jump = _parts(z, var, share, mean, spread, unit)
         both = np.logaddexp(log_calm, log_jump)
@@ -253,7 +253,7 @@ def _lengths(bad: npt.NDArray[np.bool_]) -> FloatArray:
 def bad_samples(view: View, share: float, spread: float, lengths: FloatArray
                 ) -> npt.NDArray[np.bool_]:
     """
-    Return which samples are off while the rail went on.
+    Return which samples are wrong while the rail continued.
 
     Of all sets of runs of up to three samples, with a good sample between any
     two, that which explains most.

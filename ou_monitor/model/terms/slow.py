@@ -56,7 +56,7 @@ class Drift(Term):
         return cls(0.0, 0.0), cls(0.0, NEXT_TO_ZERO)
 
 
-# Relaxation times in a recording, at least.
+# Minimum number of relaxation times in a recording.
 _LEAST = 3.0
 
 
@@ -109,7 +109,7 @@ class SecondRelaxation(Term):
         return [*found, cls(6.0 * rate, 0.3 * spread * math.sqrt(12.0 * rate))]
 
     def holds(self, view: View) -> bool:
-        """Return whether it relaxes within the recording: else it is a trend."""
+        """Return whether it relaxes within the recording; otherwise it is a trend."""
         return self.alpha * float(view.at[-1]) > _LEAST
 
     def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -149,7 +149,7 @@ class FlickerNoise(Term):
     DEAR: ClassVar[bool] = True
     BROAD: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('band', 'autocorrelation')
-    # At least: one to every three octaves.
+    # Minimum: one every three octaves.
     STATES: ClassVar[int] = 4
     IMITATES: ClassVar[tuple[str, ...]] = ('regime_switching', 'second_relaxation')
     MEANING: ClassVar[str] = '1/f noise: there is no single relaxation time.'
@@ -227,7 +227,7 @@ class FlickerNoise(Term):
         return (cls(spread * math.sqrt(0.3 / math.log(_CORNER * high / low)), low, high),)
 
     def holds(self, view: View) -> bool:
-        """Return whether 1/f goes on for so long that it is not a relaxation."""
+        """Return whether the range of 1/f is too wide for a relaxation."""
         return bool(_CORNER * self.high > _LEAST_SPAN * self.low)
 
     def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -1,7 +1,7 @@
 """
-What every term is: named parameters with units, a simulator, a likelihood, words.
+Base of all terms: named parameters with units, a simulator, a likelihood, words.
 
-A term says what it does to a `Segment` of samples.  A simulator draws from its own
+A term defines its effect on a `Segment` of samples.  A simulator draws from its own
 generator and keeps its state from segment to segment, so a recording does not
 depend on the segments it is simulated in, nor one term's draws on another's.
 
@@ -60,7 +60,7 @@ def parameters(unit: str, text: str) -> Any:
 
 
 class _ByParameters(Generic[Value]):
-    """What a class says of its terms, and each term from its own parameters."""
+    """An attribute with a value for a class, and another for each term by its parameters."""
 
     def __init__(self, usual: Value, own: Callable[[Any], Value]) -> None:
         self._usual, self._own = usual, own
@@ -70,7 +70,7 @@ class _ByParameters(Generic[Value]):
 
 
 def by_parameters(usual: Value, own: Callable[[Any], Value]) -> Value:
-    """Declare an attribute of a class that a term works out from its parameters."""
+    """Declare an attribute of a class that a term computes from its parameters."""
     return cast('Value', _ByParameters(usual, own))
 
 
@@ -228,7 +228,7 @@ class Term:
         return ()
 
     def holds(self, view: View) -> bool:
-        """Return whether fitted parameters still mean what the name says; the default: yes."""
+        """Return whether fitted parameters still fit the name; by default they do."""
         return True
 
     def beside(self, ou: Term) -> Term:
@@ -237,7 +237,7 @@ class Term:
 
     def columns(self, s: Segment) -> FloatArray:
         """
-        Return what the linear parameters multiply.
+        Return the columns that the linear parameters multiply.
 
         Parameters
         ----------
@@ -406,8 +406,8 @@ class LawFit:
     # Factor on the variance of what the noise adds in the step before each sample, as the law
     # believes it was: the inverse of the mean precision; shape (n,).
     power: FloatArray | None = None
-    # What the law believes to be added to the level, V: the Gaussian part is fitted to what is
-    # left without it; shape (n,).
+    # Voltage that the law adds to the level, V; the Gaussian part is fitted to the rest; shape
+    # (n,).
     offset: FloatArray | None = None
 
 

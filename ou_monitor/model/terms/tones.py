@@ -298,7 +298,7 @@ class ThrottleTone(Term):
 
 # Lines that throttle moves by fewer than this many widths of a bin are tones.
 _MOVES = 30.0
-# What throttle moves it by, of a standard deviation, in widths of the line.
+# Minimum movement of the line by one standard deviation of throttle, in widths of the line.
 _MORE = 1.0
-# A line narrower than this would be no noise at all, Hz.
+# Minimum width of a line as noise, Hz.
 _NARROWEST = 1e-4

@@ -146,7 +146,7 @@ def _scores(z: FloatArray, before: FloatArray, levels: FloatArray, size: int) ->
     padded = np.zeros(count * size)
     padded[:z.size] = z
     z = padded.reshape(count, size, 1)
-    # Levels that no segment believes in.
+    # Levels without weight in any segment.
     some = before.max(axis=0) > _BELIEVED
     before, levels = before[:, some], levels[some]
     std = np.exp(levels)

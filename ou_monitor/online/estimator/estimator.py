@@ -1,5 +1,5 @@
 """
-Alpha, sigma and Var_inf online: `SlidingEstimator`, and `Relaxation` in as long as it takes.
+Alpha, sigma and Var_inf online: `SlidingEstimator`, and `RelaxationFits` for `window: auto`.
 
 voltage = level + response to throttle + OU(alpha, sigma) + white noise, all
 estimated together.  Limits: one relaxation (no second pole, no resonance);
@@ -39,7 +39,7 @@ from ou_monitor.records import (
     MOST_READINGS, MOST_STAMP, NAN, OU_WINDOWS, OuFacts, Status)
 from ou_monitor.timeline.line import as_column, BATCH, Batch, TAIL, TimeLine
 
-# Samples from which a fit is tried.
+# Minimum number of samples for a fit.
 MIN_SAMPLES = 20
 # Readings in even runs of at least so many count as evenly spaced; share of the readings below
 # which the window counts as uneven.
@@ -51,16 +51,16 @@ _JITTER = 0.1
 _HAIR = 1e-6
 # Increments that vary by less than this share of their mean square are one: a ramp.
 _RAMP = 1e-9
-# The quality of the input is looked at this many times per window.
+# Number of checks of the input's quality per window.
 _LOOKS = 4
 _DOUBLE = np.dtype(np.float64)
 # Length of the sliding estimate beside the fit, s.
 SLIDING = OU_WINDOWS[0]
-# A fit is made anew after this share of its window, and no sooner than so many s.
+# Time between two fits, as a share of the window, and its minimum, s.
 _SHARE, _SOONEST = 0.25, 1.0
 # Share of one core that fits in the background may take.
 _CPU = 0.05
-# What an estimate without a relaxation is called where the window is too short for a fit.
+# Status of an estimate without a relaxation in a window that is too short for a fit.
 _SHORT = (Status.TOO_FEW_SAMPLES, Status.TOO_SHORT)
 # Cautions about the model of the sliding estimate, which the fit does not share.
 _SLIDING_ONLY = frozenset({Flag.TREND, Flag.SLOW_RATE})
@@ -124,14 +124,14 @@ class SlidingEstimator:
 
     @window.setter
     def window(self, value: float) -> None:
-        """Change the length; samples still inside the new length stay."""
+        """Change the length; keep samples within the new length."""
         self._work_off()
         self._window = _positive('window', value, 's')
         self._slide()
         self._cached = self._last = None
 
     def reset(self) -> None:
-        """Clear the window; the counters go on."""
+        """Clear the window; keep the counters."""
         self._work_off()
         self._line.forget()
         self._line.count(resets=1)
@@ -204,7 +204,7 @@ class SlidingEstimator:
             used = self._line.used
             self._work_off()
             if self._last is not None and self._line.used == used == self._last.counters.used:
-                # Nothing new in the window: the same numbers, not merely close ones.
+                # Nothing new in the window: return exactly the same numbers.
                 self._last = recount(self._last, self._line.counters)
             else:
                 self._last = self._estimate()
@@ -213,18 +213,18 @@ class SlidingEstimator:
 
     @property
     def counters(self) -> Counters:
-        """Return what became of the samples worked off so far."""
+        """Return the samples processed so far, by outcome."""
         return self._line.counters
 
     def _work_off(self) -> None:
-        """Move what has been pushed into the window."""
+        """Move the pushed samples into the window."""
         if not self._line.waiting:
             return
         for batch in self._line.work_off(self._window):
             self.take(batch)
 
     def take(self, batch: Batch) -> None:
-        """Take readings in order, as `TimeLine` gives them."""
+        """Take readings in order, from a `TimeLine`."""
         self._cached = None
         if batch.restart:
             self._forget()
@@ -253,13 +253,13 @@ class SlidingEstimator:
         self._before = None
 
     def _slide(self) -> None:
-        """Let the window end at the newest reading; what has left it does not come back."""
+        """Move the end of the window to the newest reading; earlier readings are lost."""
         t = self._kept.columns[0]
         if t.size:
             self._begin = max(self._begin, t.item(-1) - (1.0 + _HAIR) * self._window)
 
     def _look(self, t: FloatArray) -> Quality:
-        """Examine the raw samples, now and then."""
+        """Examine the raw samples, some times per window."""
         if not 0.0 <= self._line.newest - self._looked < self._window / _LOOKS:
             self._quality = examine(self._tail, self._line.period)
             steps = np.diff(t[-TAIL:])
@@ -311,7 +311,7 @@ class SlidingEstimator:
 
     def _fit(self, t: FloatArray, y: FloatArray, load: FloatArray, quality: Quality,
              ) -> tuple[Fitted, float]:
-        """Return the fit, and how much smoother than it neighbouring increments are."""
+        """Return the fit, and the excess smoothness of adjacent increments."""
         m = self._thinner.m
         steps = np.diff(t)
         usual = float(np.median(steps))
@@ -386,7 +386,7 @@ class RelaxationFits:
         self.forget()
 
     def forget(self) -> None:
-        """Begin with no readings."""
+        """Forget all readings."""
         # Stamp, voltage, throttle and current of each reading.
         self._kept = Kept(4)
         self._line += 1
@@ -409,7 +409,7 @@ class RelaxationFits:
         self._kept.append(batch.columns()[:, -MOST_READINGS:], OU_WINDOWS[-1], MOST_READINGS)
 
     def update(self) -> None:
-        """Fit where that is due; in the background, take what the thread has found."""
+        """Fit if it is due; in the background, take the result of the thread."""
         if self._found is not None:
             (line, found, end), self._found = self._found, None
             if line == self._line:
@@ -445,7 +445,7 @@ class RelaxationFits:
         self._due = end + max(_SOONEST, _SHARE * found.window_s)
 
     def in_force(self, e: Estimate) -> tuple[Estimate, OuFacts, float]:
-        """Return the sliding estimate with what is known of the relaxation, and its age, s."""
+        """Return the sliding estimate with the fitted relaxation, and its age, s."""
         facts, age = self.facts, e.t - self.end
         sliding = of_estimate(e)
         # Newer readings than those fitted.
@@ -474,7 +474,7 @@ class RelaxationFits:
 
 
 def of_estimate(e: Estimate) -> OuFacts:
-    """Return what a sliding estimate knows of the relaxation; it has no bounds."""
+    """Return the relaxation of a sliding estimate; it has no bounds."""
     if e.usable:
         return OuFacts('ok', e.duration, e.alpha, e.interval('alpha'), e.sigma,
                        e.interval('sigma'), e.var_inf, e.interval('var_inf'))
@@ -483,13 +483,13 @@ def of_estimate(e: Estimate) -> OuFacts:
 
 
 def untimed(e: Estimate) -> Estimate:
-    """Return the estimate of samples whose times are worth nothing."""
+    """Return the estimate for samples without trusted times."""
     return e if e.status is Status.NO_DATA else replace(_unknown(e, e.status),
                                                         status=Status.UNTIMED)
 
 
 def _unknown(e: Estimate, status: Status) -> Estimate:
-    """Return an estimate without a relaxation; why the input has none goes before `status`."""
+    """Return an estimate without a relaxation; defects of the input precede `status`."""
     return replace(e, alpha=NAN, alpha_se=NAN, sigma=NAN, sigma_se=NAN, var_inf=NAN,
                    var_inf_se=NAN, status=status if e.usable else e.status)
 

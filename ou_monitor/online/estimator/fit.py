@@ -35,8 +35,8 @@ _UNSEEN = 1e-5
 _STILL = 1e-12
 # Neighbouring samples correlated by less than this many standard errors are not correlated.
 _CORRELATED = 4.0
-# alpha D beyond which neighbouring samples say nothing of relaxation; relaxations in the window
-# below which a drift may be chance.
+# alpha D above which adjacent samples carry no information on the relaxation; number of
+# relaxations in the window below which a drift may be chance.
 _FASTEST, _DOUBTFUL = 4.6, 25.0
 
 
@@ -61,20 +61,19 @@ def independent(cov: FloatArray) -> FloatArray:
     return found
 
 
-# A trend is taken into the model from this many standard errors on: by chance
-# once in 16 000 long windows.
+# Standard errors from which a trend enters the model: by chance once in 16 000 long windows.
 TREND_SCORE = 4.0
 # A few relaxations look like a trend more often, so the score asked for grows by 1 + 6/x, x =
 # alpha T. A false trend then remains in 1 % of windows of 4 to 13 relaxations, and in 5 % of
 # random walks (16 apparent relaxations). A drift of 8 standard deviations over 25 relaxations is
 # missed in one window of 12; twice the constant would miss it in one of 5.
 _FEW = 6.0
-# From this score on a trend is looked into (by chance once in 22 windows).
+# Score from which a trend is examined (by chance once in 22 windows).
 SUSPECT = 2.0
 
 
 class FitEnd(enum.Enum):
-    """How a fit ended."""
+    """Outcome of a fit."""
 
     FOUND = 'alpha found'
     UNCORRELATED = 'neighbouring samples are uncorrelated'
@@ -85,12 +84,12 @@ class FitEnd(enum.Enum):
 class Fitted:
     """Parameters before correction for the length of the window."""
 
-    outcome: FitEnd  # How it ended; other than FOUND the numbers may be NaN
+    outcome: FitEnd  # Outcome; unless it is FOUND the numbers may be NaN
     # 1/s and V/sqrt(s), as maximised.
     alpha: float
     sigma: float
     noise_var: float  # Variance of the white noise of one raw sample, V^2
-    noise_score: float  # How many standard errors the noise is from none
+    noise_score: float  # Noise in units of its standard error
     log_var: tuple[float, float, float]  # Variances of ln(alpha), ln(sigma), ln(Var_inf)
     level: FloatArray  # Means of voltage and load variables; shape (c,)
     # Load coefficients, V per unit, and covariance, V^2.
@@ -106,8 +105,7 @@ class Fitted:
 _FAR = 300.0
 # Unknowns of a tridiagonal system that are eliminated at once: fewer steps of NumPy calls.
 _DENSE = 24
-# A step that gains less than this, nats, is not taken: the optimum is then within 1e-4 standard
-# errors, wherever the search began.
+# Minimum gain of a step, nats: the optimum is then within 1e-4 standard errors, for any start.
 _SETTLED = 1e-9
 # Evaluations that a fit may take after the first; 4 to 8 are usual, more where nothing tells
 # alpha from noise.
@@ -426,8 +424,7 @@ _DITHER = 0.7
 # sigma^2 / (2 alpha) is convex in alpha, and users divide one by the other, so that one correction
 # serves both: it leaves Var_inf high by 0.5/(alpha T) and 1.3/(alpha T).
 _HIGH_BY = (0.5, 1.5)
-# What regression leaves, or a diffusion of one step, below this share of the mean square is
-# rounding.
+# Share of the mean square below which a residual, or the diffusion of one step, is rounding.
 _EXACT = 1e-14
 
 
@@ -452,7 +449,7 @@ def fit_window(t: FloatArray, y: FloatArray, load: FloatArray, m: int, adc: floa
     time = time - time.mean() - within @ known
     used, apart = 1 + len(known), float(time @ time) > _APART * t.size / 12.0
     rows = np.stack([np.ones(t.size), *known, *([time] if apart else []), y - level[0]])
-    # What least squares leaves, against rounding; the fit adds what it changes.
+    # Fit the residuals of least squares, against rounding, and add the change afterwards.
     plain = np.linalg.lstsq(rows[:used].T, rows[-1], rcond=None)[0]
     rows[-1] -= plain @ rows[:used]
     left = rows[-1]
@@ -471,12 +468,12 @@ def fit_window(t: FloatArray, y: FloatArray, load: FloatArray, m: int, adc: floa
             found = maximise(likelihood, used, before)
         while not exact and found.edge == 0 and likelihood.n >= _FACTOR * _FEWEST and (
                 likelihood.step < (_DITHER * adc / found.sigma) ** 2):
-            # Coarser where an ADC step hides what neighbours differ by.
+            # Use a coarser grid if an ADC step hides the differences of adjacent samples.
             held *= _FACTOR
             likelihood = _spectral(t, rows, m, held // m)
             found = maximise(likelihood, used)
         doubtful = found.a * likelihood.n < _DOUBTFUL
-        # Where there may be another optimum the next search begins anew.
+        # If there may be another optimum, the next search starts from the grid.
         again = None if doubtful or found.edge or held > m else found
         if apart and found.edge <= 0 and (
                 doubtful or abs(_score(found.gram, used, likelihood.n)) > SUSPECT):
@@ -522,7 +519,7 @@ def _spectral(t: FloatArray, rows: FloatArray, m: int, factor: int = 1) -> Spect
 
 
 def _correlated(left: FloatArray) -> bool:
-    """Whether neighbours are correlated at all."""
+    """Whether adjacent samples are correlated."""
     square = float(left @ left)
     return square > 0.0 and float(left[1:] @ left[:-1]) > (
         _CORRELATED * square / math.sqrt(left.size))

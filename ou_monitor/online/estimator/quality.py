@@ -1,8 +1,8 @@
 """
-What the input and the fit are good for: ADC steps, bias, honest errors, status, flags.
+Quality of the input and the fit: ADC steps, bias, corrected errors, status, flags.
 
-In a diffusion equal neighbours have probability zero, so repeats, lattices and mass at the
-extremes are exact findings, told from the samples before any model.
+In a diffusion equal adjacent values have probability zero, so repeats, grids and accumulations at
+the extremes are exact findings, made without a model.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from ou_monitor.online.estimator.fit import FitEnd, Fitted
 from ou_monitor.records import Counters, Estimate, Flag, FloatArray, NAN, Status
 
-# Fewest samples from which anything is told.
+# Minimum number of samples for any finding.
 _ENOUGH = 64
 # A lattice needs this many different steps, all whole multiples of one, and
 # at most this many codes: fewer distinct steps are chance, more are a fine ADC.
@@ -41,7 +41,7 @@ class Quality:
 
 
 def examine(y: FloatArray, held: float = 1.0) -> Quality:
-    """Return what readings show (y in V, samples a reading before repeats were left out)."""
+    """Return the findings about readings (y in V, samples per reading with repeats)."""
     if y.size < _ENOUGH:
         return Quality(held=held)
     steps = np.diff(y)
@@ -98,7 +98,7 @@ _BURIED_BY = 2.0
 _WIDER, _MUCH_WIDER, _AS_FITTED = 1.5, 70.0, 1.5
 # Width of the zone beside "no noise" in which errors of sigma shrink (measured).
 _NEAR = 0.75
-# Throttle that moves less than this (standard deviation) cannot tell sag.
+# Minimum standard deviation of throttle to estimate the sag.
 MIN_THROTTLE_STD = 0.005
 # Correlation of neighbouring increments, above that of an OU, from which a
 # low-pass upstream is suspected, and in standard errors.
@@ -171,7 +171,7 @@ def judge(fit: Fitted, measured: Mapping[str, Any], quality: Quality, throttle_s
 
 
 def input_flags(counters: Counters, quality: Quality, throttle_std: float) -> list[Flag]:
-    """Return the cautions that need no fit."""
+    """Return the flags that need no fit."""
     flags: list[Flag] = []
     if quality.step > quality.rms_increment:
         flags.append(Flag.QUANTIZED)

@@ -1,7 +1,7 @@
 """
 The readings of a sliding window: kept, thinned where the source is fast, with lagged throttle.
 
-Limits: a source whose step changes by a third or more begins anew with blocks of another size.
+Limits: if the step of a source changes by a third or more, it restarts with another block size.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ UNEVEN = 0.5
 NEW_RATE = 1.3
 # Stamps remembered for that from batch to batch.
 MEMORY = 32
-# Samples averaged to one at most: 10 MHz; stamps that lie closer are no time.
+# Maximum samples per block: 10 MHz; stamps that are closer are invalid.
 MOST_BLOCK = 1000.0
 
 
@@ -55,7 +55,7 @@ class Kept:
         """Add readings; those of the last `reach`, s, are kept, the last `most` at most."""
         count = columns.shape[1]
         if self._size + count > self._store.shape[1]:
-            # One more, so that a window which is shorter than all is known to be.
+            # One more, to know that the window is shorter than the data.
             first = max(0, int(np.searchsorted(
                 self.columns[0], columns[0, -1] - reach)) - 1, self._size + count - most - 1)
             old = self.columns[:, first:]
@@ -143,7 +143,7 @@ class Thinner:
         return abs(step - self.step) <= UNEVEN * self.step
 
     def _learn(self, stamps: FloatArray) -> bool:
-        """Take the usual step anew; return whether the block size changed."""
+        """Update the usual step; return whether the block size changed."""
         if stamps.size < MIN_FOR_RATE:
             return False
         step = float(np.median(np.diff(stamps[-BATCH:])))
@@ -154,7 +154,7 @@ class Thinner:
         return before not in (0, self.m)
 
     def _blocks(self, columns: FloatArray) -> FloatArray:
-        """Average whole blocks; what is left waits, or is left out before a break."""
+        """Average whole blocks; an incomplete block waits, or is dropped before a break."""
         m = self.m
         gaps = np.flatnonzero(np.abs(np.diff(columns[0]) - self.step) > UNEVEN * m * self.step) + 1
         parts = []

@@ -1,5 +1,5 @@
 """
-What one block of samples tells: its voltage, how late its throttle is, and its noise.
+Blocks of samples: voltage, delay of throttle, and noise.
 
 Blocks have equal throttle and come at most some 50 times a second.  Limits first: a block that
 still fills is not given out, so a fast source is followed 20 ms late; of several changes of
@@ -25,13 +25,13 @@ import numpy as np
 from ou_monitor.model.load import ripple
 from ou_monitor.records import FloatArray, NAN
 
-# Width, s, of the bins: the motors and the pack answer more slowly than that.
+# Width of the bins, s: motors and pack respond more slowly.
 WIDTH = 0.02
-# Samples further apart than this, s, stand alone.
+# Samples further apart than this, s, are blocks of their own.
 _APART = 0.75 * WIDTH
-# Throttles that differ by less are equal: the sag's difference is below the ADC's step.
+# Difference below which throttles are equal: the sag differs by less than an ADC step.
 _EQUAL = 0.01
-# So many changes of throttle within a bin end a block.
+# Number of throttle changes within a bin that end a block.
 _CHANGES = 3
 
 
@@ -53,15 +53,15 @@ class LoadBlocks:
     """
     Collects samples into blocks.
 
-    A sample that follows 15 ms or more after the last is a block at once: a slow source waits
-    for nothing.
+    A sample that follows 15 ms or more after the last is a block at once, so a slow source is not
+    delayed.
     """
 
     def __init__(self) -> None:
         self.forget()
 
     def forget(self) -> None:
-        """Take the next sample as the first one; the block that fills is left out."""
+        """Start again with the next sample; drop the incomplete block."""
         self._sums: FloatArray | None = None
         # Of the last sample: stamp, throttle, step to it, changes in its bin so far.
         self._last = (-math.inf, NAN, math.inf, 0)
@@ -120,23 +120,24 @@ class LoadBlocks:
 
 
 DELAYS = (0.0, 0.05, 0.1, 0.15, 0.2)  # s
-# What is slower than this, s, is no answer to a stick but discharge and recovery.
+# Changes slower than this, s, are discharge and recovery, not a response to the stick.
 _SLOW = 1.0
 # A third of the answer lags by 60 ms: the prior of the filter.
 _SHARE, _LAG = 1.0 / 3.0, 0.06
-# Time compared, s, before a first answer, and memory, s.
+# Minimum time compared, s, and memory, s.
 _FIRST, _MEMORY = 10.0, 60.0
-# Residual variance of another delay over that of the present one at which it is taken.
+# Ratio of residual variances, another delay to the present one, below which it replaces it.
 _BETTER = 0.75
 # Time, s, for which it must be so.
 _LASTING = 3.0
-# Pieces of a test of relation, s: answers in them are as good as independent; memory, s; fewest.
+# Length of the segments of a test, s, in which responses are nearly independent; memory, s;
+# minimum number.
 _PIECE, _PIECES_MEMORY, _FEWEST = 2.0, 120.0, 5.0
-# A load that moves less than this, rms, tells of no relation.
+# Minimum rms of a load for a test of its relation to the voltage.
 _MOVED = 0.01
-# Standard errors of a relation: one false alarm in 700 looks.
+# Standard errors of a significant relation: one false alarm in 700 tests.
 _SIGNIFICANT = 3.0
-# Longest step between blocks, s, that tells these delays apart.
+# Longest step between blocks, s, that distinguishes these delays.
 _LONGEST = 0.15
 
 
@@ -154,7 +155,7 @@ class LoadDelay:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew after a break in time; the delay stays."""
+        """Start again after a break in time; keep the delay."""
         self._t = math.nan
         self._past: deque[tuple[float, float]] = deque()
         self._seen = self._better = 0.0
@@ -167,7 +168,7 @@ class LoadDelay:
         self._pieces, self._sum, self._squares = 0.0, none, none
 
     def take(self, t: float, v: float, x: float) -> bool:
-        """Take a block, s, V, load as it was heard; return whether the delay is another one."""
+        """Take a block, s, V, load as received; return whether the delay has changed."""
         dt = t - self._t
         if not 0.0 < dt <= _LONGEST:
             self.forget()
@@ -206,13 +207,13 @@ class LoadDelay:
                 self._sum = [keep * old + one for old, one in zip(self._sum, r)]
                 self._squares = [keep * old + one * one for old, one in zip(self._squares, r)]
             self._filled, self._own = 0.0, (0.0, [0.0] * len(volts), [0.0] * len(volts))
-        # The load must have changed, by a stick and not by rounding.
+        # Count only changes of the load beyond rounding.
         self._seen += dt * (x * x > 1e-6)
         return self._seen >= _FIRST and self._choose(dt)
 
     @property
     def unrelated(self) -> bool:
-        """Whether the correlations in pieces of 2 s are not below zero, by a t-test."""
+        """Whether the correlations in segments of 2 s are not below zero, by a t-test."""
         if self._pieces < _FEWEST:
             return False
         now = DELAYS.index(self.delay)
@@ -237,12 +238,12 @@ class LoadDelay:
 
 # Standard scores beyond this are weighed down; they score this much, squared, in the noise.
 CLIP, _OUTLIER = 4.0, 16.0
-# Variance of a prediction, V^2, beyond which a filter has left the ground, as after a sensor that
-# said megavolts: it begins anew.
+# Variance of a prediction, V^2, above which the filter has diverged, as after readings of
+# megavolts, and restarts.
 DIVERGED = 1e12
 # Voltages that differ by less, V, are one reading of an ADC.
 _SAME = 1e-6
-# A change of throttle below that is none.
+# Minimum change of throttle.
 _HELD = 1e-3
 # Corrections after which the noise is forgotten; at first sooner, by a third of all so far, as the
 # coefficients are wrong then.
@@ -331,7 +332,7 @@ class LoadNoise:
         f = 1.0, ripple(u), math.sqrt(du)
         R = self.variance(u, du, n)
         square = min(e * e / (s + R), _OUTLIER)
-        # What the state does not know is not noise.
+        # The uncertainty of the state is not noise.
         share = max(R / (s + R), 0.05)
         grown = 1.0 + 1.0 / min(_NOISE_MEMORY, _NOISE_FIRST + _NOISE_SHARE * self._n)
         C = [[grown * one for one in row] for row in self._covariance]
@@ -353,5 +354,5 @@ class LoadNoise:
 
 
 def log_density(z: float, variance: float) -> float:
-    """Return the log density of a block, nat, but for a constant; a clipped z counts less."""
+    """Return the log density of a block, nat, up to a constant; a clipped z counts less."""
     return -0.5 * (z * z + math.log(variance))

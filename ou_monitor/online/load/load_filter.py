@@ -1,12 +1,12 @@
 """
 The voltage under load, learned in flight by a Kalman filter that needs no relaxation rate.
 
-Limits first: throttle that is late biases the sag low (100 ms: by a third on a racing quad);
-outside the throttles that were flown the sag is a guess; a change of the true sag is followed
-within minutes.  doc/load.md has the equations and the figures.
+Limits: late throttle makes the sag too small (100 ms: by a third on a racing quad); outside the
+throttles flown the sag is extrapolated; changes of the true sag are followed within minutes.
+doc/load.md has the equations and the figures.
 
-Under a measured current: scale and sign of it are taken as they come, and with the scale the
-resistance; a current that does not move says nothing.
+With a measured current: its scale and sign are not corrected, so a wrong scale makes the
+resistance wrong; a constant current gives no information.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from ou_monitor.online.load.supply_load import (
 from ou_monitor.records import FloatArray, NAN
 
 
-# Largest current so far at which the filter begins, A, and the rise of it that begins anew.
+# Minimum largest current to start the filter, A, and relative rise of it that restarts the filter.
 _LEAST, _MORE = 1e-2, 4.0
-# Prior deviation, relative to the voltage, of the fall at the largest current; of it at once and
-# after each of LAGS the shares, and their deviations.
+# Prior deviation of the voltage drop at the largest current, relative to the voltage; shares of
+# the drop that appear at once and after each of LAGS, and their deviations.
 _FALL = 0.3
 _SHARES = np.array([1.0, 0.1, 0.2, 0.3])
 _SHARE_STD = (0.3, 0.3, 0.1, 0.15)
@@ -39,12 +39,12 @@ _PRIOR = _FALL ** 2 * (np.outer(_SHARES, _SHARES) + np.diag(np.square(_SHARE_STD
 _DRAWN_STATES = 2 + _SHARES.size
 # Level: V per sqrt(s) and cell, twice that under throttle, as charge is counted from a guess.
 _DRAWN_WALK = 0.003
-# Least time to empty a pack at the largest current, s; the level stands where nothing discharges.
+# Minimum time to empty a pack at the largest current, s; without discharge the level is constant.
 _EMPTY = 100.0
 # Change of each coefficient: 2 % of a fall of 12 % in 100 s.
 _DRAWN_DRIFT = (0.02 * 0.12) ** 2 / 100.0 * np.eye(_SHARES.size)
-# Known: relative error of the resistance below this; its least one, as the filter's own does not
-# count how a pack warms.
+# Largest relative error of a known resistance, and minimum relative error, because the filter's
+# own error omits the warming of a pack.
 _KNOWN, LEAST_ERROR = 0.33, 0.1
 # Throttle at which an ESC ripples most (`ripple`).
 _LOUDEST = 0.7
@@ -62,14 +62,14 @@ class CurrentFilter:
         # Current at once and after each of LAGS, A.
         self._drawn: list[float] = []
         self.lost = False
-        # Of the last block: voltage with the load's answer taken out, V, and log density, nat.
+        # Last block: voltage without the response to load, V, and log density, nat.
         self.rest = self.density = NAN
         self.delay = LoadDelay(either=True)
         # Of current over throttle: time-weighted squares of 1, x, u, u^3, and of them and current.
         self._squares = np.zeros((5, 5))
 
     def time(self, block: LoadBlock) -> None:
-        """Look how late the current is, of a block as it was heard."""
+        """Update the delay of the current from a block as received."""
         self._peak = max(self._peak, abs(block.current))
         if self._peak >= _LEAST and math.isfinite(block.current) and self.delay.take(
                 block.t, block.voltage, block.current / self._peak):
@@ -96,7 +96,7 @@ class CurrentFilter:
         return np.array([1.0, 0.0, *(-x / self._unit for x in self._drawn)])
 
     def take(self, block: LoadBlock, cells: float, *, fresh: bool) -> None:
-        """Take a block (cells in series); fresh: time or supply may be another."""
+        """Take a block (cells in series); fresh: a new time line, or perhaps another supply."""
         x, self.density = block.current, NAN
         if not math.isfinite(x):
             if not block.t - self._heard <= _HOLD:
@@ -105,7 +105,7 @@ class CurrentFilter:
         lost, self.lost, self._heard = self.lost or fresh, False, block.last
         self._largest = max(self._largest, abs(x))
         if lost or not self._drawn:
-            # As if steady: a current that does not move then tells nothing.
+            # Start as if steady: a constant current then gives no information.
             self._drawn = [x] * (1 + len(LAGS))
         else:
             self._drawn = _lagged(self._drawn, x, block.t - self._t)
@@ -136,7 +136,7 @@ class CurrentFilter:
         P[2:, 2:] += _DRAWN_DRIFT * (self._volts ** 2 * dt)
         h = self._regressors()
         noise = self.noise
-        # The noise follows the current as it follows throttle: most at the largest.
+        # The noise depends on current as on throttle, and is largest at the largest current.
         now = self._drawn[0] / self._largest
         u, du = _LOUDEST * abs(now), abs(now - self._load)
         R = noise.variance(u, du, block.n)
@@ -158,7 +158,7 @@ class CurrentFilter:
 
     @property
     def resistance(self) -> tuple[float, float]:
-        """Return the resistance within 0.1 s, Ohm, and its standard error; NaN: not known."""
+        """Return the resistance within 0.1 s, Ohm, and its standard error; NaN: unknown."""
         if math.isnan(self._unit):
             return NAN, NAN
         value = abs(float(self._m[2] + self._m[3]))
@@ -168,7 +168,7 @@ class CurrentFilter:
         return value / self._unit, max(error, LEAST_ERROR * value) / self._unit
 
     def sag(self, throttle: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the sag, V, by the current that goes with throttle, and its standard error."""
+        """Return the sag, V, from the current at full throttle, and its standard error."""
         ohm, ohm_se = self.resistance
         A = self._squares[:4, :4] + np.diag([0.0, *[_ONE / _WIDE ** 2] * 3])
         inverse = np.linalg.pinv(A)
@@ -212,29 +212,28 @@ _WARMING, _CHANGE = 0.25 ** 2 / 100.0, 0.02 ** 2 / 100.0
 # Time, s, in which the load's scale follows the level: faster, the regressors of a held throttle
 # would move with every correction, and the filter would learn from that.
 _RESIZE = 30.0
-# Time, s, after which the throttle flown is forgotten.
+# Memory of the throttle flown, s.
 _FLOWN_MEMORY = 120.0
 # Known: the error of the sag over the throttle flown is below that share of it, or of the noise.
 # The share was widened from 0.25 so that one recording reached 95 %.
 _SAG_SHARE, _NOISE_SHARE = 0.33, 0.5
-# Throttle that spans less than this has not moved.
+# Minimum range of throttle that has moved.
 _MOVED = 0.02
 # Least relative error of the sag: that of the filter does not count change over a flight, and
 # was up to 9 of its own too small.
 _LEAST_ERROR = 0.1
-# A stamp earlier by the first, s, or later by the second, begins a new time line: a battery may
-# have been changed in it.
+# Backward and forward step of a stamp, s, above which a new time line starts: the battery may have
+# been changed meanwhile.
 _BACKWARDS, _PAUSE = 1.0, 60.0
-# A level that is so many times the last one, or less by that, is no battery of this craft.
+# Factor between two levels, up or down, above which the battery is another craft's.
 _OTHER_CRAFT = 1.6
 # Relative variance of the size of the sag on another day.
 _OTHER_DAY = 0.2 ** 2
-# Throttle or current that was unknown for so long, s, holds no more; beyond the second throttle is
-# none.
+# Time for which unknown throttle or current is held, s; largest plausible throttle.
 _HOLD, _MOST_THROTTLE = 1.0, 2.0
-# Largest current that is taken for one, in whatever unit.
+# Largest plausible current, in any unit.
 _MOST_CURRENT = 1e7
-# Bins of the throttle flown, and how many are taken together for the noise: 0.1.
+# Number of throttle bins, and number of bins combined for the noise: 0.1.
 _BINS, _NEAR = 50, 5
 # dE/ds, V, of a cell at each 10 mV of open-circuit voltage from 3.4 V.
 _LOWEST, _PER_VOLT = 3.4, 100.0
@@ -246,9 +245,9 @@ _DRIFT = _CHANGE * np.eye(_MEAN.size) * _SIZE ** 2
 
 class FastLevel:
     """
-    A level that walks faster than the filter's, taken once it predicts better.
+    A level with a faster random walk than the filter's, used once it predicts better.
 
-    It is followed from the voltage at rest; what the filter has learned stays as it is.
+    It follows the voltage at rest; the coefficients of the filter are unchanged.
     """
 
     def __init__(self) -> None:
@@ -261,7 +260,7 @@ class FastLevel:
         self._better = False
 
     def fall(self, volts: float) -> None:
-        """Let the level fall by charge that was drawn, V."""
+        """Lower the level by the charge drawn, V."""
         self._drawn += volts
 
     def take(self, t: float, rest: float, variance: float, level: float, walk: float) -> None:
@@ -287,7 +286,7 @@ class FastLevel:
             self._better = self._since > _LEAST_COMPARED and fast < _PAYS * slow
 
     def of(self, level: float, variance: float) -> tuple[float, float]:
-        """Return the better level, V, and its variance, V^2, of the filter's and this."""
+        """Return the better of the filter's level and this one, V, and its variance, V^2."""
         return (self._level - self._drawn, self._variance) if self._better else (level, variance)
 
 
@@ -320,7 +319,7 @@ class LoadFilter:
         """
         Add samples, s, V, 0..1, A.
 
-        NaN voltage is no sample, and a stamp that does not rise is late; both are left out.
+        Samples with NaN voltage or a stamp that does not rise are left out.
         NaN throttle, or one beyond 2, is unknown: the last one holds for a second; so is a current
         beyond 1e7 A, in whatever unit.  A stamp that
         is earlier by more than 1 s, or later by more than a minute, begins a new time line.
@@ -346,13 +345,13 @@ class LoadFilter:
             columns = columns[:, end:]
 
     def begin_with(self, start: LoadStart | None) -> None:
-        """Begin with what another flight has learned; once a voltage has come it is too late."""
+        """Start from the model of another flight; only before the first voltage."""
         if not math.isfinite(self._t):
             self._start = start
             self._delay = LoadDelay(0.0 if start is None else start.delay)
 
     def new_time_line(self) -> None:
-        """Let the next stamp be anything: coefficients and noise are kept, the level is open."""
+        """Start a new time line: keep coefficients and noise, re-estimate the level."""
         self._newest = -math.inf
         self._blocks.forget()
         self._waiting.clear()
@@ -363,10 +362,10 @@ class LoadFilter:
         self._opening = math.isfinite(self._t)
 
     def _arrive(self, block: LoadBlock) -> None:
-        """Give each block the throttle and the current that are heard their `delay` after it."""
+        """Pair each block with the throttle and the current received `delay` later."""
         if math.isfinite(block.throttle) and self._delay.take(
                 block.t, block.voltage, block.throttle ** POWER):
-            # What was learned from another delay is wrong, and certain of it.
+            # Coefficients learned with another delay are wrong, and their errors too small.
             self._forget()
         if self._current is None and math.isfinite(block.current):
             self._current = CurrentFilter()
@@ -388,7 +387,7 @@ class LoadFilter:
             self._take(replace(first, throttle=throttle.throttle, current=current.current))
 
     def _take(self, block: LoadBlock) -> None:
-        """Take one block: the first of all, of a new time line, or what follows."""
+        """Take one block: the very first, the first of a new time line, or a later one."""
         u, before, self._density = block.throttle, self._t, NAN
         fresh = self._opening or not block.t - self._t <= _PAUSE
         if not math.isfinite(self._t):
@@ -417,7 +416,7 @@ class LoadFilter:
         self._heard = block.last if math.isfinite(block.throttle) else self._heard
 
     def _compare(self, current: CurrentFilter, dt: float) -> None:
-        """Follow by how much the log density of current is larger than that of throttle."""
+        """Update the difference in log density between current and throttle."""
         if current.lost:
             self._better, self._compared = NAN, 0.0
         gain = current.density - self._density
@@ -427,7 +426,7 @@ class LoadFilter:
             self._better = gain if share == 1.0 else self._better + share * (gain - self._better)
 
     def _begin(self, v: float, u: float) -> None:
-        """Begin a flight with the prior, scaled by the first voltage."""
+        """Start a flight with the prior, scaled by the first voltage."""
         self._volts = max(v, 1e-3)
         # Below 2.5 V no lithium cell: the curve is scaled.
         self._cells = float(cells_in_series(self._volts)) if self._volts > 2.5 else \
@@ -449,9 +448,9 @@ class LoadFilter:
         self._settle(v, u)
 
     def _forget(self) -> None:
-        """Take coefficients and noise back to the prior; the next block opens the level."""
+        """Reset coefficients and noise to the prior; the next block starts the level."""
         self._contrasts = LoadContrasts()
-        # Noise under a known throttle, and under an unknown one, which is what throttle does.
+        # Noise with known throttle, and with unknown throttle, whose effect is then noise too.
         self._noise, self._other = LoadNoise(self._volts), LoadNoise(self._volts)
         self._opening = True
         m, P = np.zeros(_STATES), np.zeros((_STATES, _STATES))
@@ -468,7 +467,7 @@ class LoadFilter:
             P[2:, 2:] = start.covariance + _OTHER_DAY * np.outer(m[2:], m[2:])
 
     def _open(self, v: float, u: float) -> None:
-        """Open the level: a pause, a new time line, or throttle that came or went."""
+        """Re-estimate the level after a pause, a new time line, or a start or end of throttle."""
         here = float(self._m[0])
         other = self._opening and not here / _OTHER_CRAFT < v < here * _OTHER_CRAFT
         if other or (math.isfinite(u) and not self._loaded):
@@ -482,7 +481,7 @@ class LoadFilter:
         self._settle(v, u)
 
     def _settle(self, v: float, u: float) -> None:
-        """Take the level from one voltage, V, and the coefficients."""
+        """Set the level from one voltage, V, and the coefficients."""
         self._opening, self._bias, self._throttle = False, 0.0, u
         self._fast = FastLevel()
         held = u if math.isfinite(u) else 0.0
@@ -508,13 +507,13 @@ class LoadFilter:
     def _regressors(self) -> FloatArray:
         u, g = self._lagged, -self._factor
         if math.isnan(self._throttle):
-            # The level is then that under the load of the moment.
+            # The level is then the voltage under the present load.
             g = 0.0
         return np.array([1.0, 0.0, g * u ** POWER, g * u, g * u ** 3,
                          *(g * x for x in self._lags), g * max(u - self._settled, 0.0)])
 
     def _advance(self, dt: float, u: float) -> float:
-        """Move the regressors on by dt, s, exact once the lag has settled; return the load."""
+        """Advance the regressors by dt, s, exact once the lag has settled; return the load."""
         self._lagged = u + (self._lagged - u) * math.exp(-dt / _LAG)
         self._settled = self._lagged + (self._settled - self._lagged) * math.exp(
             -dt / INRUSH_TIME)
@@ -528,7 +527,7 @@ class LoadFilter:
         return self._cells * float(_SLOPE_AT[min(len(_SLOPE_AT) - 1, max(0, place))])
 
     def _predict(self, legs: list[tuple[float, float]]) -> None:
-        """Go on to the last of some stamps, s, each with the throttle until then."""
+        """Predict to the last of some stamps, s, each with the throttle before it."""
         m, P, used = self._m, self._P, 0.0
         dt = legs[-1][0] - self._t
         if math.isnan(self._throttle):
@@ -575,7 +574,7 @@ class LoadFilter:
         noise.learn(e, s, u, du, block.n, block.within)
         if math.isfinite(self._throttle):
             self._contrasts.take(block.t, block.voltage, h[2:], total)
-            # What the state does not know is not noise.
+            # The uncertainty of the state is not noise.
             share = R / (s + R)
             square = share * block.n * min(abs(e), self._volts) ** 2
             square += (block.n - 1) * block.within if block.n > 1 else 0.0
@@ -583,7 +582,7 @@ class LoadFilter:
         clipped = max(-CLIP, min(CLIP, score))
         noise.follow(clipped)
         self._density = log_density(clipped, s + R * scale)
-        # Far out on one side for half a second: another battery, so the level is open again.
+        # Far out on one side for half a second: another battery, so re-estimate the level.
         self._bias += 0.1 * (max(-6.0, min(6.0, score)) - self._bias)
         if abs(self._bias) > 3.0:
             P[0, 0] += (0.05 * self._volts) ** 2
@@ -595,20 +594,20 @@ class LoadFilter:
         self._rest = block.voltage - float(h[2:] @ m[2:])
 
     def _deviations(self) -> tuple[float, ...]:
-        """Return the rms of what the load does not explain, V, at each bin of throttle."""
+        """Return the rms that the load does not explain, V, in each bin of throttle."""
         b, u = self._noise.log_variance, np.arange(_BINS + 1) / _BINS
         if math.isnan(self._throttle):
             return (math.exp(0.5 * b[0]),) * u.size
         law = np.exp(b[0] + b[1] * ripple(u))
         seconds, samples, squares = self._flown
-        # Where a throttle was flown for less than a second, that of one which stands still counts.
+        # For throttles flown for less than a second, use the rms at constant throttle.
         known = float(samples.sum()) / max(float(seconds.sum()), 1.0)
         near = [np.convolve(one, np.ones(_NEAR), 'same') for one in (samples, squares)]
         return tuple(np.sqrt((near[1] + known * law) / (near[0] + known)).tolist()) if known \
             else tuple(np.sqrt(law).tolist())
 
     def _between(self, share: float) -> tuple[float, float]:
-        """Return the throttles flown, but for that share at each end."""
+        """Return the range of throttles flown, without a share at each end."""
         total = np.cumsum(self._flown[0])
         if not total[-1] > 0.0:
             return self._throttle, self._throttle
@@ -616,7 +615,7 @@ class LoadFilter:
         return float(low) / _BINS, float(high) / _BINS
 
     def load(self) -> SupplyLoad:
-        """Return what is known now."""
+        """Return the present result."""
         if not math.isfinite(self._t):
             return SupplyLoad()
         a, C = self._m[2:6] * self._factor, self._P[2:6, 2:6] * self._factor ** 2
@@ -624,7 +623,7 @@ class LoadFilter:
         H = static(TABLE)
         raw = H @ a
         sag = np.maximum.accumulate(np.maximum(raw, 0.0))
-        # What had to be mended, a sag below zero or one that falls, is an error too.
+        # A correction of a negative or decreasing sag counts as an error too.
         error = np.sqrt(np.maximum(np.einsum('ij,jk,ik->i', H, C, H), 0.0) + (sag - raw) ** 2)
         low, high = self._between(0.1)
         if high - low < _MOVED and self._start is not None:
@@ -664,11 +663,11 @@ class LoadFilter:
 
     @property
     def _level(self) -> float:
-        """Return the level, V, of the rate that predicts better."""
+        """Return the level, V, that predicts better."""
         return self._fast.of(float(self._m[0]), 0.0)[0]
 
     def _by_current(self, load: SupplyLoad, current: CurrentFilter, most: float) -> SupplyLoad:
-        """Return the sag by the current that goes with throttle."""
+        """Return the sag from the current at each throttle."""
         raw, se = current.sag(TABLE)
         sag = np.maximum.accumulate(np.maximum(raw, 0.0))
         error = np.maximum(np.hypot(se, sag - raw), _LEAST_ERROR * sag)
@@ -679,7 +678,7 @@ class LoadFilter:
                        _sag=tuple(sag.tolist()), _sag_se=tuple(error.tolist()))
 
     def state(self) -> LoadState | None:
-        """Return what there is to look ahead from; None before any voltage or any throttle."""
+        """Return the state for prediction; None before the first voltage and throttle."""
         if not (math.isfinite(self._t) and math.isfinite(self._throttle)):
             return None
         mean, covariance = self._m.copy(), self._P * max(1.0, self._noise.scale)
@@ -690,7 +689,7 @@ class LoadFilter:
             self._noise.log_variance, self._noise.ripple_se, self._between(0.02))
 
     def learned(self) -> LoadStart | None:
-        """Return what the next flight of this craft may begin with; None: the sag is unknown."""
+        """Return the start of the next flight of this craft; None: the sag is unknown."""
         load = self.load()
         if not (load.known and self._m[0] > 0.0):
             return None
@@ -712,7 +711,7 @@ class LoadFilter:
             noise, noise_se, size_se)
 
     def against(self, start: LoadStart | None, date: str = '') -> ModelComparison:
-        """Return this flight beside what another one has learned, of that date."""
+        """Return the comparison of this flight with the model of another, of that date."""
         if start is None or not math.isfinite(self._t) or math.isnan(self._first):
             return ModelComparison()
         ohm = (NAN, NAN) if self._current is None else self._current.resistance
@@ -722,7 +721,7 @@ class LoadFilter:
     def path(self, t: FloatArray, throttle: FloatArray | None,
              current: FloatArray | None = None) -> FloatArray:
         """
-        Return the mean voltage, V, ahead of the last sample, from throttle; changes nothing.
+        Return the predicted mean voltage, V, after the last sample, from throttle.
 
         With current, A, from that.  NaN while throttle is unknown, as the level is then one under
         load, or while no current has been measured.

@@ -54,12 +54,12 @@ class ModelVerdict(enum.Enum):
 
 @dataclass(frozen=True)
 class ModelComparison:
-    """This flight beside the model of its supply; ratios are now over then."""
+    """This flight compared with the model of its supply; ratios are this flight over the model."""
 
     verdict: ModelVerdict = ModelVerdict.CANNOT_TELL
-    sag_ratio: float = NAN  # Of the answer to throttle
+    sag_ratio: float = NAN  # Of the response to throttle
     sag_ratio_se: float = NAN  # Its standard error, the model's included
-    resistance_ratio: float = NAN  # NaN without a current, now or then
+    resistance_ratio: float = NAN  # NaN without a current in either flight
     resistance_ratio_se: float = NAN
     # Of the residual while throttle moves; NaN where the model has none.
     noise_ratio: float = NAN
@@ -81,7 +81,7 @@ class ModelComparison:
 
 @dataclass(frozen=True)
 class Contrast:
-    """Measured answer to throttle against the predicted one; NaN: too few stretches."""
+    """Measured response to throttle against the predicted one; NaN: too few stretches."""
 
     ratio: float = NAN  # Slope of the voltage over the answer
     se: float = NAN
@@ -135,7 +135,7 @@ class LoadContrasts:
 
 
 def other_pack(start: LoadStart, first: float, level: float) -> str:
-    """Return why the level, V, at the first sample or now shows another pack; '': it does not."""
+    """Return why the first or present level, V, indicates another pack; '': it does not."""
     cells = start.cells
     # The number of cells means nothing for a rail.
     lithium = _EMPTY <= start.volts / cells <= _FULL

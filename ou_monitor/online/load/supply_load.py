@@ -1,8 +1,8 @@
 """
-What is known of the voltage under load: level, sag, noise, and whether the sag is known.
+The voltage under load: level, sag, noise, and whether the sag is known.
 
-Limits first: outside the throttles that were flown the sag is a guess; its error does not count
-how the sag changes over a flight, and is at least a tenth of it.
+Limits: outside the throttles flown the sag is extrapolated.  Its error omits changes of the sag
+during the flight, and is at least a tenth of the sag.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.records import Estimate, FloatArray, NAN, Status
 
-# Lags, s, of the load: of the motors, and of polarisation (the batch's medians, rounded).
+# Time constants of the load, s: motors, and polarisation (rounded medians of `load_fit`).
 LAGS = (0.06, 2.0, 15.0)
-# Exponent of the load over throttle, and of the load over the level: the batch's prior.
+# Exponents of the load over throttle and over the level: the prior of `load_fit`.
 POWER = 1.8
 # Throttle at which the sag is tabled.
 TABLE = np.linspace(0.0, 1.0, 101)
-# Where level, sag and noise are known all the same: what to say of the relaxation.
+# Sentences on the relaxation, used if level, sag and noise are known without it.
 _NO_ALPHA = {
     Status.NO_RELAXATION: 'The relaxation is not visible{at}: only a higher rate can show it.',
     Status.BURIED: 'The relaxation is buried in noise{at}.',
@@ -37,7 +37,7 @@ def static(throttle: npt.ArrayLike) -> FloatArray:
 
 
 class LoadStatus(enum.Enum):
-    """What is known of the answer to throttle; the value is the sentence for the pilot."""
+    """State of the response to throttle; the value is the sentence for the pilot."""
 
     KNOWN = 'The sag is known over the throttles flown.'
     NO_DATA = 'No voltage has arrived.'
@@ -49,7 +49,7 @@ class LoadStatus(enum.Enum):
 
 
 class Basis(enum.Enum):
-    """From what the level follows: whichever predicted the last half minute better."""
+    """Input of the level: the one that predicted the last half minute best."""
 
     NONE = 'neither throttle nor current'
     THROTTLE = 'throttle'
@@ -58,20 +58,19 @@ class Basis(enum.Enum):
 
 @dataclass(frozen=True)
 class SupplyLoad:
-    """What is known of the voltage under load."""
+    """Result of the load filter."""
 
     status: LoadStatus = LoadStatus.NO_DATA  # Whether the sag is known, and why not.
-    # Open-circuit voltage, V, or without throttle that under load; NaN without voltage.
+    # Open-circuit voltage, V; without throttle the voltage under load; NaN without voltage.
     level: float = NAN
-    # Last voltage with the load's answer taken out (sag-compensated), V; the level is its
-    # mean.
+    # Last voltage without the response to load (sag-compensated), V; the level is its mean.
     rest: float = NAN
-    # Resistance at once, Ohm; NaN without a current that moves the voltage.
+    # Instantaneous resistance, Ohm; NaN without a current that affects the voltage.
     resistance: float = NAN
     resistance_se: float = NAN  # Its standard error, Ohm.
-    time_constants: tuple[float, ...] = LAGS  # Time constants of the answer, s; fixed.
-    delay: float = 0.0  # How late throttle is heard behind the voltage that answers to it, s.
-    # From what the level follows; the sag too, where throttle does not give it.
+    time_constants: tuple[float, ...] = LAGS  # Time constants of the response, s; fixed.
+    delay: float = 0.0  # Delay of throttle behind the voltage, s.
+    # Input of the level, and of the sag if throttle does not determine it.
     basis: Basis = Basis.NONE
     # Throttles between which 80 % of the last two minutes were flown.
     flown: tuple[float, float] = (0.0, 1.0)
@@ -87,9 +86,9 @@ class SupplyLoad:
 
     def sag(self, throttle: npt.ArrayLike) -> FloatArray:
         """
-        Return the sag, V, positive, of a held throttle before polarisation; NaN: unknown.
+        Return the sag, V, positive, of constant throttle without polarisation; NaN: unknown.
 
-        Without `known` a number is a guess: that of the prior, or of before throttle was lost.
+        Unless `known`, the value is that of the prior, or from before throttle was lost.
         """
         return self._read(throttle, self._sag)
 
@@ -99,15 +98,15 @@ class SupplyLoad:
 
     def noise(self, throttle: npt.ArrayLike) -> FloatArray:
         """
-        Return the rms of what the load does not explain, V, its changes as flown included.
+        Return the rms that the load does not explain, V, including throttle changes as flown.
 
-        Beyond the throttles flown that of the edge.
+        Beyond the throttles flown the value is that of the nearest one.
         """
         u = np.clip(np.asarray(throttle, dtype=np.float64), *np.nan_to_num(self._range))
         return np.asarray(np.interp(u, np.linspace(0.0, 1.0, len(self._noise)), self._noise))
 
     def fields(self, throttle: float) -> dict[str, object]:
-        """Return what is published, noise at a throttle; V, Ohm, s."""
+        """Return the published values, with noise at a throttle; V, Ohm, s."""
         return {
             'load_status': self.status.name, 'load_status_text': self.status.value,
             'load_level': self.level, 'load_rest': self.rest, 'sag': float(self.sag(1.0)),
@@ -140,13 +139,13 @@ class SupplyLoad:
 
 @dataclass(frozen=True, eq=False)
 class LoadState:
-    """What the load filter knows now, to look ahead from."""
+    """Present state of the load filter, for prediction."""
 
     # Stamp, s, and throttle now.
     t: float
     throttle: float
-    # Of level, V, discharge per load, and the coefficients, V, of x, u, u^3, x after three
-    # lags, and inrush; the covariance with what the scores of the innovations say of it.
+    # Mean of level, V, discharge per load, and the coefficients, V, of x, u, u^3, x after three
+    # lags, and inrush; the covariance is corrected by the scores of the innovations.
     mean: FloatArray
     covariance: FloatArray
     lags: tuple[float, ...]  # x after the three lags.

@@ -1,30 +1,30 @@
 """
-The last minutes of a flight, what throttle may do next, and the lowest voltage of each course.
+The last minutes of a flight, possible future throttle, and the lowest voltage of each course.
 
-A course is three groups of samples: throttle goes to a peak at once, with the inrush of a rise,
-stays, and goes to a rest.  Its lowest voltage has nearly the mean mu = min over groups of
-(mean path - sd a(n)) and the variance of the path there plus (sd b(n))^2; a and b are mean and
+A course has three groups of samples: throttle goes to a peak at once, with the inrush of a rise,
+stays, and goes to a rest.  The lowest voltage has approximately the mean mu = min over groups of
+(mean path - sd a(n)), and the variance of the path there plus (sd b(n))^2; a and b are mean and
 deviation of the largest of n running medians of three normal samples.  Limits: the mean path
-within a group is its average; groups count as if only the lowest could be the lowest of all;
-samples of noise are independent, as the load filter takes them.
+within a group is its average; only the lowest group counts; samples of noise are independent, as
+in the load filter.
 
 The pilot: each completed horizon is one course, with its highest throttle, the time spent there,
-and the mean of the rest.  It weighs the more the nearer its first throttle is to the present one
-and the more recent it is.  One horizon's worth of courses is never flown: a rise into each fifth
-of the throttle that is left (rule of succession).  Limits: what a pilot has never done has the
-weight of one horizon; the order within a horizon is peak first.
+and the mean of the rest.  Its weight is larger if its first throttle is near the present one, and
+if it is recent.  Courses never flown, a rise into each fifth of the remaining throttle, together
+have the weight of one horizon (rule of succession).  Limits: the order within a horizon is peak
+first.
 
-Excursions are the risk from the margin in units of the flight's own drops, where not even the
-load is known: P = expit(b0 + b1 z1 + b2 z2), z1 = (now - L - m)/S within -4..8, z2 = (now - L)/S
-within 0..8, with m and S mean and deviation of the drops of completed horizons, and one more of
-twice the deviation of the last 5 s.  The coefficients were fitted on eight quadcopters.  Limits:
-it knows nothing of throttle; between 1, 2 and 5 s the coefficients are interpolated in ln h, and
-beyond those of the end are taken, with the drops of the horizon itself.  Beyond 8 S the risk
-falls with the fifth power of the margin, as the tail of Student's t that the other laws have; it
-was not fitted there.
+Excursions give the risk from the margin alone, in units of the drops of this flight, if even the
+load is unknown: P = expit(b0 + b1 z1 + b2 z2), z1 = (now - L - m)/S within -4..8, z2 = (now - L)/S
+within 0..8.  m and S are mean and deviation of the drops of completed horizons, with one more drop
+of twice the deviation of the last 5 s.  The coefficients were fitted on eight quadcopters.
+Limits: throttle is not used; between 1, 2 and 5 s the coefficients are interpolated in ln h,
+beyond these horizons the nearest ones apply, with the drops of the horizon itself.  Beyond 8 S the
+risk falls with the fifth power of the margin, like the tail of Student's t in the other laws; this
+part was not fitted.
 
-Limits of the blocks: a source slower than them fills them by holding its last value; across a
-longer silence nothing is held, and no horizon that contains it is complete.
+Limits of the blocks: a source slower than a block fills blocks with its last value.  A longer
+silence is not filled, and a horizon that contains it is not complete.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ from ou_monitor.records import FloatArray, NAN
 
 # The first group after a rise, in time constants of the inrush.
 _RISE = 2.0
-# Share of a rise of throttle that counts for the inrush: pilots ramp, in 0.2 s or so, and a ramp
-# has its time constant over its length of the inrush of a step.
+# Share of a throttle rise that counts for the inrush: pilots ramp in about 0.2 s, and the inrush
+# of a ramp is that of a step times time constant / ramp length.
 _SHARE_OF_RISE = INRUSH_TIME / 0.2
 
 
 def _integral(y: FloatArray, x: FloatArray) -> float:
-    """Return the integral by trapezoids (NumPy's is called otherwise in 1.26 and in 2)."""
+    """Return the integral by trapezoids (NumPy's function has different names in 1.26 and 2)."""
     return float(0.5 * np.sum(np.diff(x) * (y[1:] + y[:-1])))
 
 
@@ -84,22 +84,22 @@ _LN_N, _MEAN, _DEVIATION = _largest_medians()
 
 @dataclass(frozen=True, eq=False)
 class Courses:
-    """Throttle to come, in k ways."""
+    """Possible future throttle: k courses."""
 
-    # Throttle at first, and after that, 0..1.
+    # Throttle at the peak, and after it, 0..1.
     peak: FloatArray
     dwell: FloatArray  # Time at the peak, s.
     rest: FloatArray
 
     def after(self, first: Courses) -> Courses:
-        """Return the first and then these."""
+        """Return another set of courses followed by these."""
         return Courses(*(np.concatenate(pair) for pair in (
             (first.peak, self.peak), (first.dwell, self.dwell), (first.rest, self.rest))))
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """Interval of the samples, s, and the usual sqrt|du| from one to the next."""
+    """Interval of the samples, s, and the mean sqrt|du| between them."""
 
     interval: float
     activity: float
@@ -166,9 +166,9 @@ def lowest(state: LoadState, courses: Courses, horizon: float, sampling: Samplin
     return low[k, j], np.sqrt(known + noise ** 2)
 
 
-# Length of a block, s, how much is kept, s, and the silence that is not bridged, s.
+# Length of a block, s, time that is kept, s, and silence that is not filled, s.
 BLOCK, KEPT, SILENCE = 0.05, 300.0, 2.5
-# Throttle within this of the highest counts as at the peak.
+# Throttle within this distance of the highest counts as the peak.
 AT_PEAK = 0.05
 
 
@@ -196,7 +196,7 @@ class Past:
         """Add samples with rising stamps, s, finite voltages, V, and throttles, 0..1."""
         pauses = np.flatnonzero(np.diff(t, prepend=self.end if self._tail.size else t[0]) > KEPT)
         if pauses.size:
-            # Nothing from before is kept.
+            # Earlier blocks are too old to be kept.
             self._clear()
             t, voltage, throttle = (x[pauses[-1]:] for x in (t, voltage, throttle))
         v = np.concatenate((self._tail, voltage))
@@ -216,10 +216,10 @@ class Past:
         self._place(at[begin], rows, count)
 
     def _place(self, at: np.ndarray, rows: FloatArray, count: np.ndarray) -> None:
-        """Put rows where they belong; what lies between is held, or unknown."""
+        """Put rows at their places; rows between are filled with the last, or unknown."""
         old = self.table.shape[1]
         if at[0] < old:
-            # The block was begun by the samples before.
+            # Earlier samples have started this block.
             last = self.table[:, at[0]]
             rows[0, 0] = min(rows[0, 0], last[0])
             rows[3, 0] = max(rows[3, 0], last[3])
@@ -242,19 +242,19 @@ class Past:
         return (float(known[0].min()), float(known[1].max())) if known.size else (NAN, NAN)
 
     def throttles(self, seconds: float, ago: float) -> FloatArray:
-        """Return the mean throttle of each block of some seconds that ended so long ago, s."""
+        """Return the mean throttle of each block in a time span, s, that ended earlier, s."""
         end = self.table.shape[1] - round(ago / BLOCK)
         mean = self.table[2, max(0, end - round(seconds / BLOCK)):max(0, end)]
         return np.asarray(mean[np.isfinite(mean)])
 
     def used(self, seconds: float, share: float) -> float:
-        """Return the throttle that was passed for a share of the last seconds; NaN without any."""
+        """Return the throttle exceeded for a share of the last seconds; NaN without any."""
         high = self.table[3, -round(seconds / BLOCK):]
         high = high[np.isfinite(high)]
         return float(np.quantile(high, 1.0 - share)) if high.size else NAN
 
     def activity(self) -> float:
-        """Return the usual sqrt|du| from one block to the next in the last minute."""
+        """Return the mean sqrt|du| between blocks in the last minute."""
         change = np.abs(np.diff(self.table[2, -round(60.0 / BLOCK):]))
         change = change[np.isfinite(change)]
         return float(np.sqrt(change).mean()) if change.size else 0.0
@@ -277,7 +277,7 @@ class Past:
         return lowest, peak, max(at, 1) * BLOCK
 
     def drops(self, horizon: float) -> FloatArray:
-        """Return how far below its beginning each completed horizon, s, went, V; oldest first."""
+        """Return the drop below the start of each completed horizon (s), V; oldest first."""
         width = max(1, round(horizon / BLOCK))
         low, last = self.table[0], self.table[1]
         if low.size <= width:
@@ -287,7 +287,7 @@ class Past:
 
 
 def sliding(least: np.ufunc, x: FloatArray, width: int) -> FloatArray:
-    """Return the minimum, or the maximum, of each run of so many values, by doubling."""
+    """Return the minimum or maximum of each window of `n` values, by doubling."""
     size, out = 1, x
     while 2 * size <= width:
         out = least(out[:-size], out[size:])
@@ -298,14 +298,14 @@ def sliding(least: np.ufunc, x: FloatArray, width: int) -> FloatArray:
 
 _LN_HORIZON = np.log([1.0, 2.0, 5.0])
 _COEFFICIENTS = np.array([(-0.90, -0.62, -0.34), (-0.52, -0.12, -0.68), (-1.08, 0.23, -0.52)])
-# Margin, S, up to which they were fitted, and the power with which the risk falls beyond.
+# Largest margin of the fit, in S, and power with which the risk falls beyond it.
 _FARTHEST, _POWER = 8.0, 5.0
 _RECENT = 5.0
-# Least deviation, as a share of the voltage: that of a source that does not move.
+# Minimum deviation as a share of the voltage, for a constant source.
 _LEAST = 1e-3
-# And of a voltage of nothing, V.
+# Minimum deviation at 0 V, V.
 _SMALLEST = 1e-6
-# Blocks from which on something is known: a second.
+# Minimum number of blocks: one second.
 _FEWEST = round(1.0 / BLOCK)
 
 
@@ -339,11 +339,11 @@ def excursion_risk(now: float, levels: FloatArray, horizon: float, mean: float, 
         1.0 + np.exp(-score)))
 
 
-# Throttle that makes a past instant like the present, and s in which it is forgotten.
+# Scale of the weight in throttle (of 1) and in age, s.
 _LIKE, _MEMORY = 0.25, 100.0
-# Share of the throttle that is left to which courses never flown rise, and their dwell.
+# Rises of the courses never flown, as shares of the remaining throttle, and their dwell.
 _RISES, _RISE_DWELL = (0.1, 0.3, 0.5, 0.7, 0.9), 0.2
-# Starts are so far apart, s and in horizons, and no more than so many.
+# Minimum distance of starts, s and in horizons, and their maximum number.
 _APART, _SHARE, _MOST = 0.2, 0.1, 320
 
 
@@ -359,7 +359,7 @@ class Flown:
 
 
 def flown(past: Past, horizon: float) -> Flown:
-    """Return what throttle did in completed horizons, s."""
+    """Return throttle in completed horizons, s."""
     width = max(1, round(horizon / BLOCK))
     mean, high = past.table[2], past.table[3]
     n = mean.size - width

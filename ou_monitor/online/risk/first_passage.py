@@ -1,9 +1,9 @@
 """
 First-passage risk: the probability that the supply goes below a voltage within a horizon.
 
-Limits: throttle is taken to stay as it is, and so are alpha and sigma; their
-errors, that of the level and that of the present voltage are averaged over.
-The continuous path is meant, which the hardware feels, not its samples.
+Limits: throttle, alpha and sigma are assumed constant.  The risk is averaged over the errors of
+alpha, sigma, the level and the present voltage.  It refers to the continuous path, which acts on
+the hardware, not to its samples.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import numpy.typing as npt
 from ou_monitor.model.passage.law import passage_probability
 from ou_monitor.records import Estimate, FloatArray, NAN
 
-# Nodes over where the supply is now; those of the other averages are below.
+# Quadrature nodes over the present voltage; those of the other averages are below.
 _START_NODES = 3
 
 
 @dataclass(frozen=True)
 class Supply:
-    """What a risk is computed from: the OU at one throttle, and how well it is known."""
+    """Input of a risk: the OU at one throttle, and its errors."""
 
     # Level and its standard error, V.
     u0: float
@@ -38,7 +38,7 @@ class Supply:
 
     @classmethod
     def of(cls, e: Estimate) -> Supply:
-        """Return what an estimate knows; errors that it does not give count as none."""
+        """Return the OU of an estimate; unknown errors count as zero."""
         alpha_se, sigma_se = _error(e.alpha_se), _error(e.sigma_se)
         # From var_inf = sigma^2 / (2 alpha).
         both = 0.25 * (4.0 * sigma_se**2 + alpha_se**2 - _error(e.var_inf_se)**2)
@@ -114,7 +114,7 @@ def risk_of(supply: Supply, voltage: npt.ArrayLike, horizon: float, now: float |
 
 
 class _Paths:
-    """Where the path begins and how it moves, over the errors of what is known of both."""
+    """Start and parameters of the path at the quadrature nodes over their errors."""
 
     def __init__(self, supply: Supply, now: float | None, noise_std: float, grid: FloatArray,
                  weights: FloatArray) -> None:
@@ -122,7 +122,7 @@ class _Paths:
         sd, alpha = np.exp(ln_sigma - 0.5 * ln_alpha) / math.sqrt(2.0), np.exp(ln_alpha)
         start = np.zeros_like(u0) if now is None else (u0 - now) / sd
         if now is not None and noise_std > 0.0:
-            # Where the path may be, given one noisy look at it.
+            # Distribution of the present voltage, given one noisy reading.
             keep = 1.0 / (1.0 + (noise_std / sd) ** 2)
             nodes, shares = _hermite(_START_NODES)
             u0, sd, alpha = (np.repeat(x, nodes.size, axis=-1) for x in (u0, sd, alpha))
@@ -142,7 +142,7 @@ class _Paths:
 
 @dataclass(frozen=True)
 class Passage:
-    """The law of the lowest voltage within a horizon, from one instant on; V."""
+    """The law of the lowest voltage, V, within a horizon from one instant on."""
 
     supply: Supply
     now: float
@@ -153,7 +153,7 @@ class Passage:
         return _Paths(self.supply, self.now, self.noise_std, *_FEW)
 
     def density(self, low: float, horizon: float) -> float:
-        """Return the density, 1/V, at a lowest voltage, over what noise or a tenth of it hides."""
+        """Return the density, 1/V, at a lowest voltage, smoothed over the noise."""
         sd = math.exp(float(np.asarray(self.supply.ln_sigma)) - 0.5 * float(
             np.asarray(self.supply.ln_alpha))) / math.sqrt(2.0)
         half = max(self.noise_std, 0.1 * sd)

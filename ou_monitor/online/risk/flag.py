@@ -1,22 +1,21 @@
 """
-The brown-out flag: from risks, and a voltage floor, to a level that can be acted on.
+The brown-out flag: a level from risks and a voltage floor.
 
-CRITICAL: the limit is undershot, or will be within 1 s with throttle as it is now.  WARN: the risk
-over `brownout.horizon` is high, or the throttle budget is below what is flown.
+CRITICAL: the voltage is below the limit, or is expected to be within 1 s at the present throttle.
+WARN: the risk within `brownout.horizon` is high, or the throttle budget is below the throttle in
+use.
 
-Rising takes `brownout.delay`, three reports by default; falling waits for
-`brownout.hold` and for the risk to fall below `brownout.leave` times the
-probability at which the level is entered; `brownout.latch` keeps CRITICAL until it is
-cleared.  Limits: a flag is as good as its risk; an unknown risk is UNKNOWN,
-never OK, and never a flag that says false.
+A level is entered after `brownout.delay`, three reports by default.  It is left after
+`brownout.hold`, once the risk is below `brownout.leave` times the probability at which the level
+is entered.  `brownout.latch` keeps CRITICAL until it is cleared.  Limits: a flag is as good as its
+risk; with an unknown risk the level is UNKNOWN, never OK, and the flag is never false.
 
-The voltage floor is a threshold on the samples that needs no model: the median of
-the last `brownout.floor_time` seconds decides, so that a lone bad sample does not;
-every sample is judged, also those between two reports, and also those whose stamps are
-late, frozen, irregular or missing: these count in order of arrival.  Samples that come at once,
-stamped as they were sent, lie as far apart as they usually arrive.  A dip is told by the next
-update, though nothing may have arrived since.  A bad value that a logger repeats for more than
-half of that time counts.
+The voltage floor is a threshold on the samples that needs no model.  The median of the last
+`brownout.floor_time` seconds decides, so a single wrong sample does not.  Every sample is checked,
+also between two reports, and also if its stamp is late, frozen, irregular or missing: then it
+counts in order of arrival.  Samples that arrive together with stamps of that time are spaced by
+their usual interval.  The next update reports a dip, even if nothing has arrived since.  A wrong
+value that a logger repeats for more than half of `brownout.floor_time` counts.
 """
 
 from __future__ import annotations
@@ -31,25 +30,25 @@ from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.online.trust import SLOW_MISSED
 from ou_monitor.records import FloatArray, NAN
 
-# Samples that decide when fewer lie within the time: the median of three outvotes one.
+# Minimum number of samples for the median: three outvote a single wrong one.
 _FEWEST = 3
-# A whole batch older than the newest sample by more than this, s, belongs to another time line.
+# If a whole batch is older than the newest sample by more than this, s, a new time line starts.
 _BACK = 1.0
-# Arrivals over which the usual interval is averaged.
+# Number of arrivals over which the usual interval is averaged.
 _USUAL = 200
-# Samples kept at most: the longest floor_time, 10 s, at 20 kHz.
+# Maximum number of samples kept: the longest floor_time, 10 s, at 20 kHz.
 _MOST = 200_000
-# A step forward counts as so many `patience` at most: twice what is judged together.  Or stamps
-# at random would move the time line on until a float no longer tells its milliseconds.
+# Maximum step forward, in units of `patience`: twice the span of three samples.  Without it,
+# random stamps would move the time line until a float no longer resolves milliseconds.
 _FAR = 4.0
 
 
 class FloorWatch:
     """
-    Whether the voltage is at or below the floor; `dips`: how often it has gone down to it.
+    Whether the voltage is at or below the floor; `dips` counts how often it has reached it.
 
-    Three samples further apart than twice `stale_after` are not judged together, unless their
-    source is slower: `interval`, s, between its samples, 0 for a fast one.
+    Three samples that span more than twice `stale_after` are not combined in a median, unless the
+    source is slower: `interval` is the time between its samples, s, 0 for a fast one.
     """
 
     def __init__(self, settings: MonitorSettings) -> None:
@@ -60,7 +59,7 @@ class FloorWatch:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the samples: what follows is another time line."""
+        """Forget the samples, and start a new time line."""
         self._newest = self._arrived = -math.inf
         # What is added to stamps, s: late samples move the time line on, and what follows.
         self._shift = 0.0
@@ -98,7 +97,7 @@ class FloorWatch:
 
     def _placed(self, t: FloatArray, v: FloatArray, arrival: FloatArray | None
                 ) -> tuple[FloatArray, FloatArray]:
-        """Return where the samples lie on a time line that never goes back, s, and volts."""
+        """Return the samples' places on a time line that never goes back, s, and their volts."""
         if arrival is None:
             if t.max() < self._newest - _BACK:
                 self.reset()
@@ -127,11 +126,11 @@ class FloorWatch:
 
     @property
     def _together(self) -> float:
-        """Longest time, s, between two of three samples that are judged together."""
+        """Longest time, s, between two samples that are combined in a median."""
         return max(self.settings.stale_after, SLOW_MISSED * self.interval)
 
     def _waits(self, arrival: FloatArray | None) -> FloatArray | float:
-        """Return how far late samples move the time line on, s."""
+        """Return the time by which late samples advance the time line, s."""
         if arrival is None or self._arrived == -math.inf:
             # Not known: two samples fill the time, and two of three decide.
             return (0.5 * self.settings.brownout_floor_time if math.isnan(self._usual)
@@ -173,9 +172,9 @@ class FloorWatch:
         begin = np.minimum(begin, np.maximum(ends - _FEWEST + 1, near))
         below = np.concatenate([[0], np.cumsum(v <= s.floor)])
         count = below[ends + 1] - below[begin]
-        # The median is at or below the floor where more than half of the samples are.
+        # The median is at or below the floor if more than half of the samples are.
         low = (count > 1) & (2 * count > ends + 1 - begin)
-        # A sample alone in its time ends no dip, and begins none.
+        # A sample alone in the window neither starts nor ends a dip.
         sure = low[ends > begin]
         self.dips += int(np.count_nonzero(sure & ~np.append(self._in_dip, sure)[:-1]))
         self._in_dip = bool(sure[-1]) if sure.size else self._in_dip
@@ -189,7 +188,7 @@ class FloorWatch:
         return int(self._t.size)
 
     def take(self, arriving: bool = True) -> bool:
-        """Return whether a sample since the last call was low, or the last is and more arrive."""
+        """Return whether a sample since the last call was low, or a still arriving source is."""
         low, self._was_low = self._was_low or (self._low and arriving), False
         return low and self.settings.floor > 0.0
 
@@ -215,7 +214,7 @@ class FlagState:
     # True at CRITICAL; False at OK and WARN when the risk is known; None when it is not.
     brownout: bool | None = None
     since: float = NAN  # When the level was entered, s, on the caller's clock
-    reason: str = 'nothing is known yet'  # Why: a clause without a full stop
+    reason: str = 'nothing is known yet'  # Reason: a clause without a full stop
     age: float = NAN  # Time spent in the level, s
     low: bool = False  # Whether the voltage is at or below the floor, or was since the last update
     dips: int = 0  # How often it has gone down to the floor so far
@@ -229,9 +228,9 @@ class BrownoutFlag:
         self._floor = FloorWatch(self._settings)
         self._now = self._last = NAN
         self._level = FlagLevel.UNKNOWN
-        # When the level was entered, and when it last rested on something known.
+        # When the level was entered, and when its risk was last known.
         self._since = self._known = NAN
-        # Since when the risk is without a break at or above what a level is entered at.
+        # Time since which the risk has always been at or above the entry value of a level.
         self._above: dict[FlagLevel, float] = {}
         self._state = FlagState()
         # Why nothing but CRITICAL is reported; empty: no such reason.
@@ -239,21 +238,21 @@ class BrownoutFlag:
 
     @property
     def settings(self) -> MonitorSettings:
-        """Return the settings in force."""
+        """Return the present settings."""
         return self._settings
 
     @property
     def state(self) -> FlagState:
-        """Return what the last update found."""
+        """Return the result of the last update."""
         return self._state
 
     def configure(self, settings: MonitorSettings) -> None:
-        """Change settings; level, hold and samples stay.  Latch off ends the latch."""
+        """Change settings; keep level, hold and samples.  Switching the latch off ends it."""
         self._settings = self._floor.settings = settings
 
     def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike,
              arrival: npt.ArrayLike | None = None, interval: float = 0.0) -> None:
-        """Hold samples against the floor; see `FloorWatch` (interval in s)."""
+        """Check samples against the floor; see `FloorWatch` (interval in s)."""
         self._floor.interval = interval
         self._floor.push(t, voltage, arrival)
 
@@ -262,7 +261,7 @@ class BrownoutFlag:
         self._floor.new_time_line()
 
     def clear(self) -> bool:
-        """Drop a CRITICAL that is latched or held; the next update judges anew."""
+        """Clear a CRITICAL that is latched or held; the next update decides again."""
         if self._level is not FlagLevel.CRITICAL:
             return False
         self._enter(FlagLevel.UNKNOWN)
@@ -272,7 +271,7 @@ class BrownoutFlag:
         return True
 
     def set_critical(self, reason: str) -> None:
-        """Set CRITICAL for a reason from outside: a latch that outlasts a restart."""
+        """Set CRITICAL for an external reason: a latch restored after a restart."""
         self._enter(FlagLevel.CRITICAL)
         self._state = FlagState(FlagLevel.CRITICAL, True, self._since, reason)
 
@@ -333,7 +332,7 @@ class BrownoutFlag:
 
     def _wanted(self, risk: float, soon: float, tight: bool, known: bool, low: bool
                 ) -> tuple[FlagLevel, str]:
-        """Return the level that risks and floor ask for, hold and latch aside."""
+        """Return the level by risks and floor, before hold and latch."""
         s = self._settings
         asks = {FlagLevel.CRITICAL: (soon, s.brownout_critical, f'risk {soon:.2g} within 1 s, '
                                      'throttle as it is'),
@@ -363,7 +362,7 @@ class BrownoutFlag:
         return FlagLevel.OK, f'risk {risk:.2g} (brownout.warn: {s.brownout_warn:g})'
 
     def _waits(self, level: FlagLevel) -> bool:
-        """Whether a level that is not reached yet has to wait for `brownout.delay`."""
+        """Whether a level that is not entered yet has to wait for `brownout.delay`."""
         return (self._level.value < level.value
                 and self._now - self._above[level] < self._settings.brownout_delay)
 

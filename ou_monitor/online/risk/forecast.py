@@ -1,25 +1,25 @@
 """
-Risk of a brown-out on the leg that predicts this flight best, and what a throttle would do.
+Brown-out risk by the method that predicts this flight best, and the risk if throttle changes.
 
-Legs: `first_passage` (the OU that the window sees, throttle as it is), `load` (the answer to
-throttle, with the pilot's throttle to come, and the excursions, in equal parts), and
-`excursions` (the flight's own drops, alone where the load is not known).  First passage and the
-other leg are averaged by how well they have predicted the lowest voltages of horizons that are
-complete (Bayes, with forgetting).  First passage gives a share to the excursions, as often as it
-was wrong; the conditional risk gives such a share to a law as wide as they are.
+Methods: `first_passage` (the OU in the window, at the present throttle), `load` (half the response
+to the pilot's future throttle, half the excursions), and `excursions` (the drops of this flight,
+used alone if the load is unknown).  First passage and the other method are averaged with weights
+from their predictions of completed horizons' lowest voltages (Bayes, with forgetting).  First
+passage gives a share to the excursions, equal to the share of horizons in which it was wrong; the
+conditional risk gives such a share to a law as wide as the excursions.
 
-The flight's own law, from horizons that are complete: (lowest - start) / s = b0 + b1 (mu - start)
-/ s + k e with mean mu and deviation s as of `lowest`: least squares that forget, e of Student's t
-with five degrees of freedom.  Now and then a law is wrong: a share of horizons is then as the
-excursions are.  That share is counted with the rule of succession, each horizon as likely as the
-two make it.  Overlapping horizons count as step / horizon each.
+The law learned in flight, from completed horizons: (lowest - start) / s = b0 + b1 (mu - start) / s
++ k e, with mean mu and deviation s of `lowest`, by least squares with forgetting; e has Student's
+t distribution with five degrees of freedom.  In a share of horizons the law is wrong, and the
+excursions apply.  This share is counted by the rule of succession, each horizon weighted by the
+probability that it belongs to it.  Overlapping horizons count as step / horizon each.
 
-Limits: below is meant of the middle one of three samples, except in the first-passage leg;
-nothing is known in the first second; one bias and one gain for all throttles; between two horizons
-all is interpolated.
+Limits: "below" refers to the median of three samples, except in first passage; nothing is known in
+the first second; all throttles share one bias and one gain; values between two horizons are
+interpolated.
 
-`look_ahead` says what lies ahead by the settings: the risk, its curve over throttle, and the
-throttle budget; no throttle above the highest flown in the last minutes is called safe.
+`look_ahead` computes the risk, its curve over throttle, and the throttle budget for the present
+settings; no throttle above the highest flown in the last minutes is called safe.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, FloatArray, NAN
 from ou_monitor.timeline.line import Batch
 
-# Degrees of freedom: tails of a model that is wrong now and then.
+# Degrees of freedom: heavy tails for a model that is sometimes wrong.
 FREEDOM = 5.0
 _NORM = math.exp(math.lgamma(0.5 * FREEDOM + 0.5) - math.lgamma(0.5 * FREEDOM)) / math.sqrt(
     math.pi * (FREEDOM - 2.0))
@@ -54,23 +54,23 @@ _TAIL = [8.0 / (3.0 * math.pi) * math.comb(2 * k, k) / 4.0**k / (2 * k + 5)
 _PRIOR, _PRIOR_VARIANCE = 5.0, 3.0
 _BIAS, _GAIN = 0.5, 0.4
 _PRECISION = (_BIAS ** -2, 0.0, _GAIN ** -2)
-# Memory, s; largest square of a miss that counts; misses beyond 3 deviations weigh less.
+# Memory, s; maximum squared error that counts: errors beyond 3 deviations weigh less.
 MEMORY, _LARGEST, _HUBER = 120.0, 36.0, 3.0
 # Error of the model as a share of the drop.
 _SHARE = 0.1
 
 
 def density(x: FloatArray, mean: FloatArray, deviation: FloatArray) -> FloatArray:
-    """Return the density of Student's t of that mean and deviation, elementwise."""
+    """Return the density of Student's t with a mean and a deviation, elementwise."""
     z = (x - mean) / deviation
     return np.asarray(_NORM / deviation * (1.0 + z * z / (FREEDOM - 2.0)) ** (
         -0.5 * (FREEDOM + 1.0)))
 
 
 def below(level: float, mean: FloatArray, deviation: FloatArray) -> FloatArray:
-    """Return P(x < level) of that Student's t, elementwise."""
+    """Return P(x < level) for the same Student's t, elementwise."""
     t = (level - mean) / deviation * math.sqrt(FREEDOM / (FREEDOM - 2.0))
-    # Abramowitz & Stegun 26.7.4; far out its terms cancel, and the tail is summed.
+    # Abramowitz & Stegun 26.7.4; its terms cancel in the far tail, which is summed instead.
     angle = np.arctan2(math.sqrt(FREEDOM), np.abs(t))
     c = np.sin(angle)
     tail = (angle - np.cos(angle) * c * (1.0 + 2.0 / 3.0 * c * c)) / math.pi
@@ -133,7 +133,7 @@ class Calibrator:
 
 
 class FarShare:
-    """Share of horizons that are not as a law says; `right` count as right before any."""
+    """Share of horizons that contradict a law; initially `right` horizons count as agreeing."""
 
     def __init__(self, right: float = 1.0) -> None:
         self._right, self._wrong = right, 1.0
@@ -145,7 +145,7 @@ class FarShare:
         return self._wrong / (self._wrong + self._right)
 
     def add(self, law: float, far: float, weight: float, elapsed: float) -> float:
-        """Learn from the densities, 1/V, of a lowest voltage; return that of both together."""
+        """Learn from the two densities, 1/V, of a lowest voltage; return that of the mixture."""
         keep = math.exp(-elapsed / MEMORY)
         share = self.value
         both = share * far + (1.0 - share) * law
@@ -160,36 +160,37 @@ RUNGS = (0.5, 1.0, 2.0, 5.0, 15.0)
 _LN_RUNGS = np.log(RUNGS)
 # Time from one look to the next, s, and as a share of the horizon.
 LOOK, _LOOK_SHARE = 0.2, 0.2
-# By arrival, s, no sooner: stamps may run, or jump, a thousand times too fast, and a look takes
-# 1 ms.  A replay at four times its speed is looked at as ever.
+# Minimum time between updates by arrival, s: stamps may run a thousand times too fast, and an
+# update takes 1 ms.  A replay at four times the speed is not affected.
 _REST = 0.05
-# Largest error of ln sigma that is averaged over: beyond it sigma is unknown.
+# Largest error of ln sigma for averaging; with a larger one sigma is unknown.
 _LARGEST_ERROR = 1.0
-# The window's own tests have found the OU: odds, and horizons that it counts as right.
+# Prior of first passage, since the tests of the window have found an OU: odds, and number of
+# horizons that count as predicted correctly.
 _ODDS = 10.0
-# What the pilot does next is his own: of the load leg, the part of the excursions.  Half: two
-# forecasts whose errors differ, and no flight is long enough to weigh them (on ten flights of
-# seven quadcopters, weights learned in flight were worse).
+# Share of the excursions in the method `load`, because the pilot's next throttle is unknown.
+# Half: the errors of the two forecasts differ, and no flight is long enough to learn weights (on
+# ten flights of seven quadcopters, weights learned in flight were worse).
 _HALF = 0.5
-# Time, s, of which the throttle used is taken.
+# Time over which the throttle in use is determined, s.
 _USED = 30.0
-# What may make most of a risk.
+# Possible main causes of a risk.
 DOMINANT = ('noise', 'load now', 'throttle to come')
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """A risk and what it stands on."""
+    """A risk, its method and its main cause."""
 
-    risk: float = NAN  # Probability, 0..1; NaN when not known.
+    risk: float = NAN  # Probability, 0..1; NaN if unknown.
     basis: str = 'none'  # ``first_passage``, ``load``, ``excursions`` or ``none``.
-    # What makes most of it: noise, load now, or throttle to come; empty when not known.
+    # Main cause: noise, load now, or throttle to come; empty if unknown.
     cause: str = ''
 
 
 @dataclass(frozen=True, eq=False)
 class _Look:
-    """What was known at one time, until a horizon from there on is complete."""
+    """State at one time, kept until a horizon from there on is complete."""
 
     t: float
     voltage: float
@@ -201,7 +202,7 @@ class _Look:
 
 
 class _Rung:
-    """What completed horizons of one length have taught."""
+    """Laws learned from completed horizons of one length."""
 
     def __init__(self, horizon: float) -> None:
         self.horizon = horizon
@@ -209,7 +210,7 @@ class _Rung:
         self.next = self.learned = -math.inf
         self.calibrator = Calibrator()
         self.held, self.passage = FarShare(), FarShare(_ODDS - 1.0)
-        # Log likelihood of first passage less that of the other leg.
+        # Log-likelihood ratio of first passage to the other method.
         self.evidence = 0.0
 
     @property
@@ -220,7 +221,7 @@ class _Rung:
 
     def learn(self, look: _Look, low: float, peak: float, dwell: float, sampling: Sampling
               ) -> None:
-        """Take what a horizon became: lowest voltage, V, highest throttle, time there, s."""
+        """Learn from a completed horizon: lowest voltage, V, highest throttle, time there, s."""
         weight = min(1.0, (look.t - self.learned) / self.horizon) if math.isfinite(
             self.learned) else 1.0
         elapsed = max(look.t - self.learned, 0.0) if math.isfinite(self.learned) else 0.0
@@ -248,13 +249,13 @@ class _Rung:
 
 class Forecast:
     """
-    Risk with throttle to come, and what a throttle would do.
+    Risk with the pilot's future throttle, and with a given throttle.
 
     `take` feeds the load filter, `follow` tells the newest estimate; look: time between looks, s.
     """
 
     def __init__(self, loads: LoadFilter, look: float = LOOK) -> None:
-        # A third of a second, once: not while samples are coming.
+        # Takes a third of a second once; not while samples arrive.
         prepare()
         self._loads, self._look_time = loads, look
         self.follow(Estimate(), 0.0)
@@ -266,7 +267,7 @@ class Forecast:
         self._sampling = Sampling(0.02, 0.1)
 
     def new_time_line(self) -> None:
-        """Begin a past; what has been learned stays."""
+        """Clear the past; keep the learned laws."""
         self._past = Past()
         self._newest = -math.inf
         self._last: FloatArray = np.empty(0)
@@ -319,21 +320,21 @@ class Forecast:
 
     @property
     def voltage(self) -> float:
-        """Where the supply is now, V: the middle one of the last three samples; NaN of one."""
+        """Present voltage, V: the median of the last three samples; NaN with a single one."""
         return median(self._last.tolist()) if self._last.size > 1 else NAN
 
     def follow(self, e: Estimate, window: float, ago: float = 0.0) -> None:
-        """Take the newest estimate; alpha and sigma are of a window, s, that ended so long ago."""
+        """Take the newest estimate; alpha and sigma are of a window, s, that ended earlier, s."""
         self.estimate, self._window = e, (window, ago)
 
     def supply(self) -> Supply | None:
-        """Return the OU at the present throttle, by window and load; None when not known."""
+        """Return the OU at the present throttle, from window and load; None if unknown."""
         if not self.estimate.usable:
             return None
         plain, state = Supply.of(self.estimate), self._loads.state()
         if state is None:
             return plain
-        # sigma is that of all throttles of the window; the load knows how noise goes with them.
+        # sigma averages over the throttles of the window; the load model scales it to the present.
         flown = np.clip(np.append(self._past.throttles(*self._window), state.throttle),
                         *state.flown)
         apart = ripple(flown) - ripple(flown[-1])
@@ -342,14 +343,14 @@ class Forecast:
             plain.ln_sigma_se, 0.5 * state.ripple_se * float(apart.mean())), _LARGEST_ERROR))
 
     def passage(self) -> Passage | None:
-        """Return the law of the lowest voltage from here on; None when not known."""
+        """Return the law of the lowest voltage from now on; None if unknown."""
         supply, now = self.supply(), self.voltage
         noise = self.estimate.noise_std
         return None if supply is None or math.isnan(now) else Passage(
             supply, now, noise if noise > 0.0 else 0.0)
 
     def _look(self) -> None:
-        """Complete horizons, and begin new ones."""
+        """Complete horizons, and start new ones."""
         self._kept.clear()
         self._laws.clear()
         self._known = self._loads.load().known
@@ -376,13 +377,13 @@ class Forecast:
                 None if state is None else pilot(done, state.throttle, rung.horizon), passage))
 
     def _flight(self, horizon: float) -> tuple[float, float, Flown]:
-        """Return excursions and courses of the flight, found once between two looks."""
+        """Return excursions and courses of the flight, computed once between two updates."""
         if horizon not in self._kept:
             self._kept[horizon] = *excursions(self._past, horizon), flown(self._past, horizon)
         return self._kept[horizon]
 
     def _learned(self, horizon: float) -> tuple[LowestLaw, float, float, float]:
-        """Return law, shares of held and first passage, and evidence, for a horizon."""
+        """Return the law, both shares, and the evidence for a horizon."""
         if horizon not in self._laws:
             place = float(np.interp(math.log(horizon), _LN_RUNGS, np.arange(_LN_RUNGS.size)))
             low = min(int(place), _LN_RUNGS.size - 2)
@@ -392,7 +393,7 @@ class Forecast:
         return self._laws[horizon]
 
     def risk(self, voltage: float, horizon: float) -> Outcome:
-        """Return P(below `voltage`, V, within `horizon`, s), the throttle to come included."""
+        """Return P(below `voltage`, V, within `horizon`, s), including future throttle."""
         now = self.voltage
         state = self._state()
         law, _, missed, evidence = self._learned(horizon)
@@ -403,7 +404,7 @@ class Forecast:
         risk, basis, cause = far, 'excursions', ''
         if state is not None and not math.isnan(far):
             courses, shares = pilot(done, state.throttle, horizon)
-            # Idle, throttle as it is, and what the pilot may do.
+            # At idle, at the present throttle, and with the pilot's future throttle.
             every = courses.after(held([0.0, state.throttle], horizon, state.throttle))
             each = below(voltage, *law.moments(*lowest(state, every, horizon, self._sampling),
                                                mean_now(state)))
@@ -427,7 +428,7 @@ class Forecast:
         return Outcome(min(max(risk, 0.0), 1.0), 'none' if math.isnan(risk) else basis, cause)
 
     def risk_held(self, voltage: float, horizon: float) -> float:
-        """Return the risk with throttle as it is now; NaN where the load is not known."""
+        """Return the risk at the present throttle; NaN if the load is unknown."""
         state = self._state()
         return NAN if state is None else float(
             self.risk_if(state.throttle, horizon, voltage, horizon)[0])
@@ -455,13 +456,13 @@ class Forecast:
                           + (1.0 - wrong) * below(voltage, middle, spread))
 
     def _state(self) -> LoadState | None:
-        """Return what there is to look ahead from; None where the load is not known."""
+        """Return the state from which to predict; None if the load is unknown."""
         return self._loads.state() if self._known else None
 
 
 # Throttles at which the risk is computed.
 _GRID = np.linspace(0.0, 1.0, 51)
-# Time ahead, s, for which the flag asks what happens if throttle stays as it is.
+# Horizon of the flag's risk at the present throttle, s.
 SOON = 1.0
 
 
@@ -469,18 +470,18 @@ SOON = 1.0
 class Ahead:
     """Risk and budget of one instant."""
 
-    outcome: Outcome = Outcome()  # Risk, its leg, and what makes most of it.
-    budget: float = NAN  # Throttle budget, 0..1; NaN when not known.
-    budget_reason: str = ''  # What ends it, or why it is not known.
-    # Risk if throttle goes to each tenth and stays for the horizon; empty when not known.
+    outcome: Outcome = Outcome()  # Risk, its method and its main cause.
+    budget: float = NAN  # Throttle budget, 0..1; NaN if unknown.
+    budget_reason: str = ''  # Cause that limits it, or why it is unknown.
+    # Risk if throttle goes to each tenth and stays for the horizon; empty if unknown.
     curve: tuple[float, ...] = ()
-    soon: float = NAN  # Risk within `SOON` with throttle as it is now; NaN when not known.
-    # Whether the budget is below the throttle that was passed for a tenth of the last 30 s.
+    soon: float = NAN  # Risk within `SOON` at the present throttle; NaN if unknown.
+    # Whether the budget is below the throttle exceeded for a tenth of the last 30 s.
     tight: bool = False
 
 
 def look_ahead(forecast: Forecast, load: SupplyLoad, settings: MonitorSettings) -> Ahead:
-    """Return what lies ahead by the settings."""
+    """Return risk, risk curve and throttle budget for the settings."""
     s = settings
     voltage, horizon = s.brownout_voltage, s.brownout_horizon
     outcome = forecast.risk(voltage, horizon)
@@ -503,7 +504,7 @@ def throttle_budget(risks: FloatArray, highest: float, limit: float) -> tuple[fl
 
     risks: at `_GRID`; highest: throttle flown.  0 when even idle is above the limit.
     """
-    # A risk that falls again beyond a peak is no way through.
+    # The budget ends at the first throttle above the limit, even if the risk falls again beyond.
     risks = np.maximum.accumulate(risks)
     within = int(np.searchsorted(risks, limit, 'right'))
     if within == 0:
