@@ -7,10 +7,10 @@ sigma constant within the window; alpha known no better than sqrt(2/(alpha T));
 sources faster than `fastest` are averaged down to it.  Measured accuracy and
 cost: doc/estimation.md.
 
-`Relaxation` is `window: auto`: it keeps the readings of a minute, and `known_ou` of `ou_fit`,
-which serves `supply_facts` too, fits the shortest of 2, 8, 30 and 60 s in which alpha is known
-well.  A fit costs 30 to 600 ms of CPU, so it is made anew only after a quarter of its window, 1 s
-at least; in the background it runs in a thread, which takes 5 % of a core at most.
+`RelaxationFits` keeps the readings of a minute.  `known_ou` of `ou_fit`, which `supply_facts` uses
+too, fits the shortest of 2, 8, 30 and 60 s in which alpha is known well.  A fit costs 30 to 600 ms
+of CPU, so it is repeated only after a quarter of its window, at least 1 s; in the background it
+runs in a thread that takes at most 5 % of a core.
 
 Between two fits of a window of 2 s the sliding estimate of 2 s goes on from the fit as long as
 their intervals overlap.  Limits: those of that fit; of a source above 1 kHz the last 65 536
@@ -41,15 +41,15 @@ from ou_monitor.timeline.line import as_column, BATCH, Batch, TAIL, TimeLine
 
 # Minimum number of samples for a fit.
 MIN_SAMPLES = 20
-# Readings in even runs of at least so many count as evenly spaced; share of the readings below
-# which the window counts as uneven.
+# Minimum length of a run of evenly spaced readings, and share of such readings below which the
+# window counts as uneven.
 _LAGS, _EVEN = 24, 0.5
-# Jitter of the stamps, in relaxation times, from which they are taken as they
-# are: an even grid is then wrong by its square.
+# Jitter of the stamps, in relaxation times, above which the exact stamps are used: the error of an
+# even grid is its square.
 _JITTER = 0.1
 # Share of the window by which stamps miss its edge through rounding.
 _HAIR = 1e-6
-# Increments that vary by less than this share of their mean square are one: a ramp.
+# Share of the mean square below which the variance of increments is a ramp's.
 _RAMP = 1e-9
 # Number of checks of the input's quality per window.
 _LOOKS = 4
@@ -324,7 +324,7 @@ class SlidingEstimator:
             jitters = math.isfinite(a) and self._jitter * a / step > _JITTER
             return bool(m == 1 and t.size <= MOST and (uneven or jitters))
 
-        # Of two windows that share half of their samples one is near the other.
+        # The fits of two windows that share half of their samples are near each other.
         near = t.item(t.size // 2) < self._before_end
         before = self._before if near else None
         fit, self._before = fit_window(t, y, load, m, quality.step, stamps, before)

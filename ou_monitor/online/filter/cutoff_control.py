@@ -1,5 +1,5 @@
 """
-From the cutoff that a law wants to the cutoff in force.
+From the wanted cutoff of a law to the cutoff in force.
 
 limits -> dead band -> smoothing in ln(fc), fast for a certain sigma -> slew limit -> 0.45 of the
 sample rate, but not below fmin.  An unknown cutoff gives the fallback.  The cutoff in force never
@@ -21,15 +21,15 @@ ARRIVED = 1e-6
 LN2 = math.log(2.0)
 # Highest cutoff as a share of the sample rate (Betaflight allows 0.475).
 OF_RATE = 0.45
-# Samples over which the sample rate is averaged; factor off the mean that makes an interval odd;
-# odd intervals in a row that mean a new rate.
+# Number of samples over which the sample rate is averaged; factor from the mean above which an
+# interval is odd; number of odd intervals in a row that mean a new rate.
 INTERVALS = 100
 ODD = 5.0
 _NEW = 5
 
 
 class Bound(enum.Enum):
-    """What decides the cutoff at this sample; the value is its text."""
+    """What determines the cutoff at this sample; the value is its text."""
 
     NONE = 'the law'
     LOWEST = 'fmin'
@@ -126,12 +126,12 @@ class CutoffControl:
 
     @property
     def wanted(self) -> float:
-        """Cutoff that the law wants, within fmin..fmax, Hz; NaN when it does not know."""
+        """Wanted cutoff of the law, within fmin..fmax, Hz; NaN if unknown."""
         return self._clip(self._wanted)
 
     @property
     def bound(self) -> Bound:
-        """Return what decides the cutoff in force."""
+        """Return what determines the cutoff in force."""
         s = self._settings
         if self._cutoff < self._moving:
             if self._cutoff > self._lowest:
@@ -148,7 +148,7 @@ class CutoffControl:
         return Bound.NONE if self._wanted == self._aim else Bound.DEAD_BAND
 
     def configure(self, settings: FilterSettings) -> None:
-        """Change settings; the cutoff stays where it is, inside the new limits."""
+        """Change settings; keep the cutoff, within the new limits."""
         self._settings = settings
         self._lowest = settings.lowest
         self._moving = self._clip(self._moving)
@@ -225,7 +225,7 @@ class CutoffControl:
         return found
 
     def _limit(self, interval: float) -> None:
-        """Bring the moving cutoff into force (interval in s; 0: not known)."""
+        """Put the moving cutoff into force (interval in s; 0: unknown)."""
         most = OF_RATE / interval if interval > 0.0 else math.inf
         self._cutoff = self._clip(min(self._moving, most))
 

@@ -1,5 +1,5 @@
 """
-Laws from sigma to the cutoff that is wanted, each derived where it is.
+Laws from sigma to the wanted cutoff, each with its derivation.
 
 With w = 2 pi fc, the supply U an Ornstein-Uhlenbeck process of intensity
 sigma and rate alpha, and `coupling` times its deviation in the signal, the
@@ -75,7 +75,7 @@ def white_noise(mode: str, order: int, angle: float) -> float:
 
 @lru_cache(maxsize=256)
 def noise_left(order: int, angle: int) -> float:
-    """Return what a low-pass leaves of the variance of white samples (log of w dt, in 1 %)."""
+    """Return the share of the variance of white samples after a low-pass (log of w dt, to 1 %)."""
     return white_noise('lowpass', order, math.exp(angle / 100.0))
 
 
@@ -255,7 +255,7 @@ def _least(error: Callable[[float], float], lowest: float, highest: float) -> fl
 def wanted_cutoff(settings: FilterSettings, sigma: float, alpha: float, throttle: float,
                   interval: float) -> float:
     """
-    Return the cutoff that the law in force asks for.
+    Return the wanted cutoff of the present law.
 
     sigma in V/sqrt(s), alpha in 1/s, throttle 0..1, interval in s.
     """
@@ -338,7 +338,7 @@ def relative_cutoff(mode: str, order: int, fmax: float, times: float, interval: 
 
 
 def _held(fmax: float, times: float, interval: float) -> bool:
-    """Tell whether the table of white noise has the cutoff."""
+    """Return whether the table of white noise has the cutoff."""
     return interval > 0.0 and 1e-6 < TWO_PI * fmax * interval < 1e2 and times < 1e3
 
 

@@ -66,7 +66,7 @@ class LowPassState:
 def filter_sequence(state: LowPassState, order: int, angle: FloatArray, start: FloatArray,
                     end: FloatArray) -> FloatArray:
     """Return the output at each sample (all of shape (n,)); the state goes on from the last."""
-    # Here, for a node that filters one by one needs none of it: SciPy costs it 35 MB.
+    # Imported here, because a node that filters one by one does not need it: SciPy takes 35 MB.
     from scipy.linalg.lapack import dtbtrs
     n, rise = angle.size, end - start
     bands, right = np.zeros((n, 2, 4)), np.zeros((n, 2))
@@ -91,12 +91,12 @@ def filter_sequence(state: LowPassState, order: int, angle: FloatArray, start: F
     return np.asarray(found[::2, 0])
 
 
-# Samples of a piece from which it is worth it.
+# Minimum number of samples for a piece.
 WORTH = 48
 
 
 class Piece(NamedTuple):
-    """Samples that can be worked on together."""
+    """Samples that are processed together."""
 
     size: int  # Number
     # Interval before each, and mean interval at each, s; shape (size,).
@@ -106,7 +106,7 @@ class Piece(NamedTuple):
 
 def sound_piece(t: FloatArray, x: FloatArray, before: float, mean: float,
                 limits: tuple[float, float, float]) -> Piece:
-    """Return the samples from the first on of which none is odd (before in s, mean in s)."""
+    """Return the leading samples without an odd one (before in s, mean in s)."""
     from scipy.signal import lfilter
     largest, latest, shortest = limits
     # NaN is neither.
@@ -128,7 +128,7 @@ def sound_piece(t: FloatArray, x: FloatArray, before: float, mean: float,
 
 
 def changes(heard: list[FloatArray], size: int) -> list[int]:
-    """Return where a run of one value of all that is heard begins, the first at 0."""
+    """Return the starts of runs in which all inputs are constant, the first at 0."""
     moved = np.zeros(size - 1, dtype=np.bool_)
     for one in heard:
         moved |= (one[1:] != one[:-1]) & ~(np.isnan(one[1:]) & np.isnan(one[:-1]))

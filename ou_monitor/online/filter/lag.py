@@ -29,7 +29,7 @@ def delay(lag: float, frequency: float) -> float:
 
 
 def most_lag(order: int) -> float:
-    """Return the lag, degrees, that a low-pass never reaches."""
+    """Return the upper limit of the lag of a low-pass, degrees, which it never reaches."""
     return 90.0 * order
 
 
@@ -55,7 +55,7 @@ def cutoff_for_lag(order: int, lag: float, frequency: float) -> float:
 
 def share_for_lag(response: complex, raw: complex, most: float) -> float:
     """
-    Return the share of an unfiltered signal that brings a lag down to a limit.
+    Return the share of the unfiltered signal that reduces a lag to a limit.
 
     With the angle of the mixture (1 - m) H + m R turned by the limit p, its
     imaginary part is that of H e^(ip) and R e^(ip) in the same shares, and 0

@@ -1,35 +1,35 @@
 """
-The law `kalman` of a signal in the noise of the supply: the best filter, learned in flight.
+The law `kalman` for a signal in supply noise: the best filter, learned in flight.
 
-Nothing is told of the signal.  The outputs z of four low-passes and the input (`LowPassSpan`)
-are signal and noise, z = z_s + z_n, and the noise is known: `coupling` times the supply's, an OU
-of sigma and alpha, and white noise n0.  Of all linear combinations of z
+The signal is unknown.  The outputs z of four low-passes and the input (`LowPassSpan`) are signal
+and noise, z = z_s + z_n, and the noise is known: `coupling` times the supply's noise, an OU with
+sigma and alpha, and white noise n0.  Of all linear combinations of z
 
     w = (C_s + C_n)^-1 c_s,    C_s = C_z - C_n,
 
 has the least mean square error to the last of z_s, the signal or its slope: the multichannel
 Wiener filter (Doclo & Moonen 2002, IEEE Trans. Signal Process. 50, 2230).  C_z is a running mean
-of z z^T over `_MEMORY`; a hop counts by the inverse of its noise squared, as the variance of z z^T
-goes.  C_s is what of C_z - C_n is larger than its sampling error, direction by direction.
+of z z^T over `_MEMORY`; a hop has the weight 1 / noise^2, because the variance of z z^T grows with
+noise^2.  C_s is the part of C_z - C_n that exceeds its sampling error, in each direction.
 
-- Noise that is told too large, so that the signal would be negative, is made as small as it must
-  be.  For a slope, whose power is finite, some direction holds next to no signal, and noise that
-  is told too small is made as large as what is there.
+- If the stated noise is too large, so that the power of the signal would be negative, the noise is
+  reduced accordingly.  For a slope, whose power is finite, some direction has almost no signal; if
+  the stated noise is too small, it is increased to the power found there.
 - A hop that does not fit C_s + C_n (its largest normalised square lies above the 99.9 % quantile
   of chi squared) opens the filter at once: C_s grows in proportion, as in a manoeuvre after calm.
 
-Its lag is that of the combination; where it exceeds the limit, the input is mixed in, just so far
-that the limit is kept (`lag.share_for_lag`).
+The lag is that of the combination.  If it exceeds the limit, just enough of the input is mixed in
+to keep the limit (`lag.share_for_lag`).
 
 The low-passes are those of `filter_state`: a step is z' = F z + a start + b end, exact for an
 input that is linear between samples; for a derivative the input is the difference quotient.
 
-What noise with r(k) = phi^k makes of all outputs is a covariance: with the noise p' = phi p + e
-as a state beside z it solves P = A P A^T + q g g^T, which is summed by doubling, A -> A A.
+The covariance of all outputs for noise with r(k) = phi^k: with the noise p' = phi p + e as a state
+beside z it solves P = A P A^T + q g g^T, which is summed by doubling, A -> A A.
 
-Limits: for a signal, noise that is told too small passes as signal.  The gain at frequency 0 is
-below 1.  What moves slower than 2 Hz, or faster than 128 Hz, is filtered no better than by those.
-Intervals within 1 % of each other count as one.
+Limits: for a signal, the excess of noise over its stated value passes as signal.  The gain at
+frequency 0 is below 1.  Motions slower than 2 Hz, or faster than 128 Hz, are filtered no better
+than by these low-passes.  Intervals within 1 % of each other count as equal.
 """
 
 from __future__ import annotations
@@ -46,15 +46,15 @@ from ou_monitor.online.settings import FilterSettings
 from ou_monitor.records import FloatArray, NAN
 
 Complexes = npt.NDArray[np.complex128]
-# Hz: what vehicles do lies within; two octaves apart (benchmarks/learned.py says on which
-# recordings that was chosen).
+# Cutoffs, Hz: they span the motions of vehicles; two octaves apart (benchmarks/learned.py names
+# the recordings on which they were chosen).
 CUTOFFS = (2.0, 8.0, 32.0, 128.0)
 COUNT = len(CUTOFFS) + 1
 _TWO_PI = 2.0 * math.pi
 _ORDER, _SAME = 2, 0.01
-# Steps of different length that are kept.
+# Maximum number of step lengths whose matrices are kept.
 _STEPS = 64
-# Below this nothing of a state is left.
+# Share of a state that counts as 0.
 _GONE = 1e-18
 
 
@@ -69,7 +69,7 @@ class LowPassSpan:
         self._response: Complexes = np.zeros(COUNT, dtype=np.complex128)
 
     def step(self, dt: float) -> FloatArray:
-        """Return what makes the next states of (states, start, end), shape (8, 10)."""
+        """Return the matrix from (states, start, end) to the next states, shape (8, 10)."""
         key = round(math.log(dt) / _SAME)
         found = self._steps.get(key)
         if found is None:
@@ -94,7 +94,7 @@ class LowPassSpan:
         return found
 
     def response(self, interval: float, frequency: float) -> Complexes:
-        """Return what each output makes of a wave, shape (5,) (interval in s, Hz)."""
+        """Return the response of each output to a wave, shape (5,) (interval in s, Hz)."""
         key = (round(math.log(interval) / _SAME), frequency)
         if key != self._at:
             self._at, self._response = key, self._respond(interval, frequency)
@@ -151,17 +151,17 @@ def _step_matrix(dt: float) -> FloatArray:
 # s between new weights, over which the output moves to them, and of what is remembered; chosen
 # on bf3s, roma, jd and gecko (benchmarks/learned.py).
 _HOP, _MEMORY = 0.01, 5.0
-# s of no signal that are counted before the first sample.
+# Prior weight of no signal before the first sample, s.
 _BEFORE = 1.0
 # 99.9 % quantile of chi squared with 5 degrees of freedom.
 _MISFIT = 20.515
-# Samples of a hop at most, for fast inputs.
+# Maximum number of samples per hop, for fast inputs.
 _ROWS = 256
-# Noise of each output that is added for the arithmetic: as a share of its noise and of its power.
+# Regularisation: noise added to each output, as a share of its noise and of its power.
 _FLOOR, _FLOOR_OF_ALL, _TINY = 1e-9, 1e-12, 1e-200
-# Least share of the noise that is believed; nothing beyond the largest is learned from.
+# Minimum share of the stated noise that is used; values above the largest are not learned from.
 _LEAST, _LARGEST = 1e-3, 1e60
-# Samples further apart than so many intervals count as if they were not.
+# Maximum step in intervals; longer steps count as this one.
 _GAP = 5.0
 _RAW = np.eye(COUNT)[-1]
 
@@ -193,18 +193,18 @@ class LearnedWiener:
         self._power = self._noise = np.zeros((COUNT, COUNT))
         self._sum = self._squares = self._level = 0.0
         self._whiten: FloatArray | None = None
-        # Share of the noise that is believed at most.
+        # Maximum share of the stated noise that is used.
         self._most = _LARGEST if self._slope else 1.0
 
     def __copy__(self) -> LearnedWiener:
-        """Return one that goes its own way; what is kept of steps and noise is shared."""
+        """Return an independent copy that shares the cached steps and noise."""
         other = object.__new__(LearnedWiener)
         other.__dict__.update(self.__dict__)
         other._state, other._rows = self._state.copy(), self._rows.copy()
         return other
 
     def configure(self, settings: FilterSettings) -> None:
-        """Change settings; the estimate goes on."""
+        """Change settings; keep the estimate."""
         self._settings = settings
 
     def advance(self, dt: float, interval: float, x: float, slope: float, sigma: float,
@@ -228,7 +228,7 @@ class LearnedWiener:
         return self.y
 
     def _learn(self, interval: float, sigma: float, error: float, alpha: float) -> None:
-        """Take a hop into what is known, and make new weights of it."""
+        """Learn from a hop, and compute new weights."""
         rows = self._rows[:self._n]
         if not np.max(np.abs(rows)) < _LARGEST:
             return
@@ -238,14 +238,14 @@ class LearnedWiener:
         try:
             found = self._best(noise, misfit)
         except np.linalg.LinAlgError:
-            # Rounding after noise that was larger by many powers of ten: what is remembered goes.
+            # Rounding after noise larger by many powers of ten: forget the means.
             self._sum, self._whiten = 0.0, None
             return
         if np.all(np.isfinite(found)):
             self._limit(found, interval)
 
     def _best(self, noise: FloatArray, misfit: float) -> FloatArray:
-        """Return the weights of least error beside the noise of now."""
+        """Return the weights of least error with the present noise."""
         # A floor, in the signal as measured and in the noise.
         floor = np.diag(_FLOOR * np.diag(self._noise + noise)
                         + _FLOOR_OF_ALL * np.diag(self._power) + _TINY)
@@ -281,7 +281,7 @@ class LearnedWiener:
         return found
 
     def _misfit(self, rows: FloatArray) -> float:
-        """Return by how much the signal exceeds what is known of it; 1: it fits."""
+        """Return the factor by which the signal exceeds its model; 1: it fits."""
         if self._whiten is None:
             return 1.0
         squares = np.sum((rows @ self._whiten)**2, axis=1)
@@ -312,7 +312,7 @@ class LearnedWiener:
             response = response / (1j * _TWO_PI * s.lag_frequency)
         h, raw = complex(weights @ response), complex(response[-1])
         if not abs(h) > 1e-9 * abs(raw):
-            # Nothing comes through: there is no lag to tell.
+            # No output: the lag is undefined.
             self._weights, self.lag, self.mixed = weights, NAN, 0.0
             return
         most = math.radians(phase_lag(s.order, s.lowest, s.lag_frequency))

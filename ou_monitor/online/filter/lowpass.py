@@ -4,27 +4,25 @@ A low-pass, or filtered derivative, whose cutoff follows the noise of the supply
 sigma -> law (`cutoff_laws`) -> wanted cutoff -> limits, smoothing, slew
 (`cutoff_control`) -> cutoff in force -> filter (`filter_state`) -> output.
 
-The derivative is the same low-pass with the slope of the input for its input:
-no term of it jumps when the cutoff moves, and it is the exact response to an
-input that is linear between samples.
+The derivative is the same low-pass, applied to the slope of the input.  No term of it jumps when
+the cutoff moves, and it is the exact response to an input that is linear between samples.
 
-With the law `kalman` the output is that of `VoltageKalman` or `learned_wiener`; the low-pass runs
-beside it at the cutoff of the same lag, and takes over where sigma is not known.
+With the law `kalman` the output comes from `VoltageKalman` or `learned_wiener`.  The low-pass runs
+in parallel at the cutoff of equal lag, and takes over while sigma is unknown.
 
-The law `kalman` of the voltage itself: an OU around its level, seen in white noise.  The level is
-the estimator's and has an error, which is an OU of `LEVEL_TIME` beside the voltage's own; without
-a level the voltage counts as a random walk.  The state is the deviation from the level and the
-error of the level, both exact over a step of any length.  The estimate is the one of
-least mean square error (Kalman 1960; Anderson & Moore, Optimal Filtering, 1979, ch. 3), with sigma
-where the truth would have to stand.
+The law `kalman` for the voltage itself: an OU around its level, measured with white noise.  The
+level is the estimator's; its error is a second OU, with time constant `LEVEL_TIME`.  Without a
+level the voltage counts as a random walk.  The state is the deviation from the level and the error
+of the level, both exact over a step of any length.  The estimate has the least mean square error
+(Kalman 1960; Anderson & Moore, Optimal Filtering, 1979, ch. 3), with the estimated sigma in place
+of the true one.
 
-Its lag is that of the steady filter with the gain of the moment, over the mean step.  Where it
-exceeds the limit the output is mixed with what is unfiltered, just so far that the limit is kept
-(`lag.share_for_lag`).
+Its lag is that of the steady filter with the present gain, over the mean step.  If it exceeds the
+limit, just enough of the unfiltered input is mixed in to keep the limit (`lag.share_for_lag`).
 
-Limits: the cutoff is constant within a step; sampling folds what lies above half the sample rate
-down before any filter sees it.  The gain of `kalman` at frequency 0 is below 1; steps within 1 %
-of each other count as equal.
+Limits: the cutoff is constant within a step; frequencies above half the sample rate are aliased
+before any filter.  The gain of `kalman` at frequency 0 is below 1; steps within 1 % of each other
+count as equal.
 """
 
 from __future__ import annotations
@@ -49,20 +47,21 @@ from ou_monitor.records import FloatArray, NAN
 
 # Time over which what is not told of the level moves, s: ten of the default windows.
 LEVEL_TIME = 20.0
-# Relative change of sigma, alpha or the step that is worth another model; of the error of the
-# level, as a factor.
+# Relative change of sigma, alpha or the step, and factor in the error of the level, above which
+# the model is computed again.
 _SAME = 0.01
 _SAME_LEVEL = 1.5
-# Relative change of the gain below which it has settled, and that for which the lag is told anew.
+# Relative change of the gain below which it has settled, and above which the lag is computed
+# again.
 _SETTLED, _TOLD = 1e-9, 1e-3
-# Models of different steps that are kept.
+# Maximum number of step lengths whose models are kept.
 _MODELS = 64
-# Nothing beyond this can overflow when it is squared and multiplied by what it may be.
+# Magnitude up to which squares and products cannot overflow.
 _HIGHEST = 1e60
 
 
 class Known(NamedTuple):
-    """What is known of the supply."""
+    """Known properties of the supply."""
 
     sigma: float  # Noise intensity, V/sqrt(s)
     alpha: float  # Relaxation rate, 1/s
@@ -97,7 +96,7 @@ class VoltageKalman:
         self._forget()
 
     def _forget(self) -> None:
-        """Have models, gain and lag made anew."""
+        """Forget models, gain and lag."""
         self._models: dict[int, KalmanStep] = {}
         self._key: int | None = None
         self._moving = True
@@ -112,7 +111,7 @@ class VoltageKalman:
                 error: float, alpha: float, level: float, level_se: float) -> float:
         """Take a sample (dt in s, interval in s, alpha in 1/s, level in V, level_se in V)."""
         if level == level and level != self._level:
-            # The error of the level takes it up, so that what comes out stays.
+            # The error of the level absorbs the change, so that the output does not jump.
             self._x[1] -= level - self._level
             self._level = level
         self._learn(sigma, error, alpha, level, level_se, dt)
@@ -131,7 +130,7 @@ class VoltageKalman:
 
     def _learn(self, sigma: float, error: float, alpha: float, level: float, level_se: float,
                dt: float) -> None:
-        """Follow sigma in its logarithm; make new models for what has changed enough."""
+        """Follow sigma in its logarithm; compute new models after sufficient changes."""
         wanted = math.log(min(max(sigma, 1.0 / _HIGHEST), _HIGHEST))
         if self._log_sigma != self._log_sigma:
             self._log_sigma = wanted
@@ -163,7 +162,7 @@ class VoltageKalman:
         return step
 
     def _correct(self, step: KalmanStep, interval: float) -> None:
-        """Bring the covariance over a step, and the gain; the same until it has settled."""
+        """Advance covariance and gain by a step, until they have settled."""
         white = self._settings.n0 / interval
         before = self._gain
         gain, self._cov = self._gain_over(step, white)
@@ -187,14 +186,14 @@ class VoltageKalman:
         return gain, p - np.outer(gain, seen)
 
     def _tell(self, phi: FloatArray, gain: FloatArray, interval: float) -> None:
-        """Tell the lag of the filter as it stands, and what share of the input bounds it."""
+        """Compute the present lag, and the share of the input that limits it."""
         s = self._settings
         back = cmath.exp(-2j * math.pi * s.lag_frequency * interval)
         loop = (np.eye(2) - gain[:, None]) * phi
         try:
             h = complex(np.linalg.solve(np.eye(2) - loop * back, gain).sum())
         except np.linalg.LinAlgError:
-            # Nothing is corrected, nothing decays: it has no response.
+            # No correction and no decay: the response is undefined.
             return
         most = math.radians(phase_lag(s.order, s.lowest, s.lag_frequency))
         self.mixed = share_for_lag(h, 1.0 + 0.0j, most)
@@ -214,7 +213,7 @@ def step_model(known: Known, dt: float) -> KalmanStep:
 def _ou(rate: float, intensity: float, dt: float) -> tuple[float, float, float]:
     """Return transition, driving and stationary variance of an OU; of a random walk at rate 0."""
     if rate == 0.0:
-        # Nothing is known of where it starts: the first sample decides.
+        # Its start is unknown: the first sample determines it.
         drive = intensity * intensity * dt
         return 1.0, drive, 1e6 * drive
     still = intensity * intensity / (2.0 * rate)
@@ -222,7 +221,7 @@ def _ou(rate: float, intensity: float, dt: float) -> tuple[float, float, float]:
 
 
 def _alike(one: float, other: float) -> bool:
-    """Tell whether two errors of the level are about the same, or both not known."""
+    """Return whether two errors of the level are nearly equal, or both unknown."""
     if one != one or other != other:
         return one != one and other != other
     return other / _SAME_LEVEL <= one <= other * _SAME_LEVEL
@@ -231,9 +230,9 @@ def _alike(one: float, other: float) -> bool:
 _TWO_PI = 2.0 * math.pi
 # Signals and stamps beyond this, and steps below it, overflow in the filter.
 _LARGEST, _LATEST, _SHORTEST = 1e150, 1e18, 1e-12
-# A step of so many mean intervals is counted as a gap, once the mean stands on so many samples.
+# Minimum gap in mean intervals, and minimum number of samples in the mean to count one.
 _GAP, _KNOWN = 5.0, 10
-# Samples of an array that are worked on together: what they need stays in the cache.
+# Number of samples of an array that are processed together, so that they stay in the cache.
 _PIECE = 16384
 # Change of the mean interval, as a share, at which the law is asked anew: five standard
 # deviations of the mean over 100 intervals that are uniform within half of themselves.
@@ -244,7 +243,7 @@ _Maybe = npt.ArrayLike | None
 
 @dataclass
 class FilterCounters:
-    """Samples that came, and those that were not used."""
+    """Numbers of samples by outcome."""
 
     samples: int = 0  # Samples used
     # Samples that were NaN, infinite or beyond 1e150, or whose stamp was or lay beyond 1e18 s.
@@ -289,7 +288,7 @@ class AdaptiveLowPass:
         self._kalman: VoltageKalman | LearnedWiener | None = None
         self._known = False
         self._sigma = NAN
-        # As it was before a parameter changed, until the next sample.
+        # State before a parameter changed, until the next sample.
         self._before: VoltageKalman | LearnedWiener | None = None
         self._interval = SampleInterval()
         self.counters = FilterCounters()
@@ -299,12 +298,12 @@ class AdaptiveLowPass:
         self._out = NAN
         self._asked: tuple[float, ...] | None = None
         self._wanted = NAN
-        # Mean interval with which the law was asked, s.
+        # Mean interval at the last evaluation of the law, s.
         self._interval_asked = 0.0
 
     @property
     def settings(self) -> FilterSettings:
-        """Return the settings in force."""
+        """Return the present settings."""
         return self._settings
 
     @property
@@ -325,7 +324,7 @@ class AdaptiveLowPass:
 
     @property
     def highest(self) -> float:
-        """Highest cutoff that the sample rate allows, Hz; inf while it is not known."""
+        """Highest cutoff that the sample rate allows, Hz; inf while the rate is unknown."""
         return OF_RATE / self._interval.mean if self._interval.mean > 0.0 else math.inf
 
     def _within(self, cutoff: float) -> float:
@@ -346,7 +345,7 @@ class AdaptiveLowPass:
 
     @property
     def phase_lag(self) -> float:
-        """Lag of what is in force at `lag_frequency`, degrees."""
+        """Lag of the present filter at `lag_frequency`, degrees."""
         s = self._settings
         if self._kalman is not None and self._known and self._kalman.lag == self._kalman.lag:
             return self._kalman.lag
@@ -354,7 +353,7 @@ class AdaptiveLowPass:
 
     @property
     def delay(self) -> float:
-        """Phase delay of what is in force at `lag_frequency`, s."""
+        """Phase delay of the present filter at `lag_frequency`, s."""
         return delay(self.phase_lag, self._settings.lag_frequency)
 
     @property
@@ -474,7 +473,7 @@ class AdaptiveLowPass:
 
     def _many(self, t: FloatArray, x: FloatArray, others: list[FloatArray], k: int,
               out: FloatArray) -> int:
-        """Filter samples from the k-th on together where that can be; return how many."""
+        """Filter samples from the k-th on together, as far as possible; return their number."""
         s = self._settings
         if (s.law == 'kalman' or self._t is None or not self._interval.settled
                 or t.size - k < WORTH):
@@ -522,7 +521,7 @@ class AdaptiveLowPass:
     def step(self, t: float, x: float, sigma: float, sigma_se: float = NAN,
              alpha: float = NAN, throttle: float = NAN, level: float = NAN,
              level_se: float = NAN) -> float:
-        """Filter one sample; as `filter`, NaN for what is not known (the node's short way)."""
+        """Filter one sample as `filter` does, NaN for unknown inputs (faster, for the node)."""
         if not (abs(x) < _LARGEST and abs(t) < _LATEST):
             self.counters.non_finite += 1
             return self._out
@@ -531,7 +530,7 @@ class AdaptiveLowPass:
         if self._t is None:
             self.counters.samples += 1
             if self._settings.law == 'kalman':
-                # Its lag is not known before it has run.
+                # Its lag is unknown before it has run.
                 self._start_kalman(x, sigma, level)
             self._control.update(self._ask(sigma, alpha, throttle, 0.0), error, 0.0, 0.0)
             self._state.y = self._raw = self._out = 0.0 if derivative else x
@@ -563,7 +562,7 @@ class AdaptiveLowPass:
         return self._out
 
     def _stay(self, t: float, x: float, dt: float) -> None:
-        """Take a sample that has no time of its own."""
+        """Process a sample with a repeated or backward stamp."""
         if dt < 0.0:
             # The slope from here to the next sample is of the new time line.
             self._t, self._x = t, x
@@ -572,7 +571,7 @@ class AdaptiveLowPass:
             self.counters.repeated += 1
 
     def _source(self) -> float:
-        """Return what comes out when no switch of `shadow` is being smoothed over."""
+        """Return the output without the transition after a switch of `shadow`."""
         if self._settings.shadow:
             return self._raw
         return self._kalman.y if self._kalman is not None and self._known else self._state.y
@@ -588,7 +587,7 @@ class AdaptiveLowPass:
 
     def _run_kalman(self, dt: float, interval: float, x: float, sigma: float, error: float,
                     alpha: float, level: tuple[float, float]) -> None:
-        """Run the Kalman filter; where sigma is not known it is kept warm at the last one."""
+        """Run the Kalman filter; while sigma is unknown, with the last one."""
         begun = self._kalman is None
         if self._kalman is None:
             self._start_kalman(x, sigma, level[0])
@@ -612,7 +611,7 @@ class AdaptiveLowPass:
                 self._kalman.y - self._state.y)
 
     def _ask(self, sigma: float, alpha: float, throttle: float, interval: float) -> float:
-        """Return what the law wants; asked again only when something it reads has changed."""
+        """Return the wanted cutoff of the law, evaluated again only if an input has changed."""
         s = self._settings
         if s.law == 'kalman':
             return self._of_its_lag()
@@ -628,7 +627,7 @@ class AdaptiveLowPass:
         return self._wanted
 
     def _of_its_lag(self) -> float:
-        """Return the cutoff of the low-pass that lags as the Kalman filter does, Hz."""
+        """Return the cutoff of the low-pass with the lag of the Kalman filter, Hz."""
         s = self._settings
         if self._kalman is None or not self._known:
             return NAN

@@ -1,13 +1,13 @@
 """
 Blocks of samples: voltage, delay of throttle, and noise.
 
-Blocks have equal throttle and come at most some 50 times a second.  Limits first: a block that
-still fills is not given out, so a fast source is followed 20 ms late; of several changes of
-throttle within 20 ms the first three are told apart.
+Blocks have equal throttle, at most about 50 per second.  Limits: an incomplete block is not
+returned, so a fast source is followed 20 ms late; of several throttle changes within 20 ms only
+the first three are resolved.
 
-Delay: the answer, over what is faster than a second, is compared with throttles that are 0 to
-200 ms late; the largest correlation wins.  A source slower than 7 Hz cannot tell, and a delay is
-taken only where it leaves a quarter less of the variance than the present one.
+Delay: the voltage, without changes slower than a second, is correlated with throttle 0 to 200 ms
+late; the largest correlation wins.  A source slower than 7 Hz does not determine the delay.  A new
+delay is used only if it leaves a quarter less variance than the present one.
 
 Noise: ln variance = b . (1, ripple(u), sqrt|du|), learned by Fisher scoring; of a mean of n
 samples the part that scatters within a block counts 1/n.
@@ -37,7 +37,7 @@ _CHANGES = 3
 
 @dataclass(frozen=True, slots=True)
 class LoadBlock:
-    """Samples in a row with one throttle."""
+    """Consecutive samples with one throttle."""
 
     # Mean and last stamp, s.
     t: float
@@ -122,13 +122,13 @@ class LoadBlocks:
 DELAYS = (0.0, 0.05, 0.1, 0.15, 0.2)  # s
 # Changes slower than this, s, are discharge and recovery, not a response to the stick.
 _SLOW = 1.0
-# A third of the answer lags by 60 ms: the prior of the filter.
+# A third of the response lags by 60 ms: the prior of the filter.
 _SHARE, _LAG = 1.0 / 3.0, 0.06
 # Minimum time compared, s, and memory, s.
 _FIRST, _MEMORY = 10.0, 60.0
 # Ratio of residual variances, another delay to the present one, below which it replaces it.
 _BETTER = 0.75
-# Time, s, for which it must be so.
+# Minimum duration of that, s.
 _LASTING = 3.0
 # Length of the segments of a test, s, in which responses are nearly independent; memory, s;
 # minimum number.
@@ -222,7 +222,7 @@ class LoadDelay:
         return bool(mean > -_SIGNIFICANT * math.sqrt(max(0.0, variance) / (self._pieces - 1.0)))
 
     def _choose(self, dt: float) -> bool:
-        # Of a load of one sign only what falls with it counts.
+        # For a load of known sign, count only voltages that fall with it.
         falls = self._xv if self._either else [min(one, 0.0) for one in self._xv]
         left = [1.0 - one * one / max(self._xx * other, 1e-300)
                 for one, other in zip(falls, self._vv)]
@@ -241,7 +241,7 @@ CLIP, _OUTLIER = 4.0, 16.0
 # Variance of a prediction, V^2, above which the filter has diverged, as after readings of
 # megavolts, and restarts.
 DIVERGED = 1e12
-# Voltages that differ by less, V, are one reading of an ADC.
+# Difference below which voltages are one reading of an ADC, V.
 _SAME = 1e-6
 # Minimum change of throttle.
 _HELD = 1e-3
@@ -298,7 +298,7 @@ class LoadNoise:
         return self.b[0], self.b[1], self.b[2]
 
     def see(self, voltage: float) -> None:
-        """Look at the steps of the ADC in the means of blocks, V."""
+        """Update the ADC step from the means of blocks, V."""
         step = abs(voltage - self._held)
         self._held = voltage
         changed = step > _SAME
@@ -308,14 +308,14 @@ class LoadNoise:
 
     @property
     def rounding(self) -> float:
-        """Return the variance of rounding, V^2; of a value that is held all is one rounding."""
+        """Return the variance of rounding, V^2; a constant value is rounded once."""
         if math.isinf(self._step):
             # It has never changed: the step may be anything.
             return self._unseen
         return self._step ** 2 / 12.0 / max(self._changing, 0.002)
 
     def follow(self, score: float) -> None:
-        """Take a clipped standard score: innovations in a row on one side are no news."""
+        """Take a clipped standard score, to measure the correlation of innovations."""
         self.correlation += max(0.002, 1.0 / (self._n + 50.0)) * (
             score * self._last - self.correlation)
         self.correlation = max(0.0, min(0.9, self.correlation))

@@ -1,37 +1,36 @@
 """
-Notches that follow the motors: from their speed, else from throttle; off where they do not pay.
+Notches that follow the motors, by speed or else by throttle, and are off if they do not help.
 
 samples -> frames -> spectrum -> law (throttle to frequency) and choice (which notches, or none)
 -> frequency, width and share of each notch, sample by sample -> output.
 
-Frequencies of the motors: as their speeds come, else from throttle by a law that is learned.
+Frequencies of the motors: from their speeds if known, else from throttle by a learned law.
 
-The law is f = a + b sqrt(u), learned from the noise itself.  A motor in hover gives thrust in
-proportion to its speed squared, so that f grows with the square root of throttle where the
-controller makes throttle a thrust, and with an offset where it does not.  Each pair of a frequency
-at `LOW` and one at `HIGH` is a law; each frame tells how much of its noise a notch at each
-frequency would take away; a law is as good as the share of all noise so far that it would have
-taken away, old frames forgotten.  The best one is in force: a median of the data would follow the
-most frequent peak, this follows the loud ones, which are what is to be removed.  No data of the
-future enter.
+The law is f = a + b sqrt(u), learned from the noise itself.  The thrust of a motor in hover is
+proportional to its speed squared, so f grows with the square root of throttle if the controller's
+throttle is a thrust, and with an offset otherwise.  Each pair of a frequency at `LOW` and one at
+`HIGH` is a law.  Each frame gives the share of its noise that a notch at each frequency would
+remove; the score of a law is the share of all noise so far that it would have removed, with old
+frames forgotten.  The best law is in force.  A median of the data would follow the most frequent
+peak; this follows the loud peaks, which have to be removed.  No future data are used.
 
-Limits of that: lines that fold at half the sample rate fall with throttle and are not followed;
-speeds of single motors are not told apart.
+Limits of the law: lines aliased at half the sample rate fall with throttle and are not followed;
+speeds of single motors are not resolved.
 
-Which notches pay: the noise of a D term at equal lag, by the signal's own spectrum.
+Choice of the notches: by the noise of a D term at equal lag, from the signal's own spectrum.
 
-The noise of a candidate is the power that its notches and a low-pass of order 2 leave of the
-derivative above `fmin`, the cutoff of the low-pass so much higher that both lag as much as the
-low-pass alone.  Running means of it, of frames that the law had not seen yet, tell what
-each candidate would have come to behind a slower and a faster low-pass too; "no notch" is one of
-them.  A channel takes the best where that leaves less than `_ON` of the rms of none, and harms
-behind none of the low-passes; it changes for one that is better by a tenth in power, and gives
-up where `_OFF` or more is left or harm is done.
+The noise of a candidate is the power of the derivative above `fmin` after its notches and a
+low-pass of order 2, whose cutoff is raised so that both together lag as much as the low-pass
+alone. Its running means, over frames that the law had not yet learned from, show what each
+candidate would have achieved, also with a slower and a faster low-pass; "no notch" is a
+candidate.  A channel uses the best candidate if it leaves less than `_ON` of the rms without
+notches, and is not worse with any of the low-passes.  It changes to one that is better by a tenth
+in power, and switches off if `_OFF` or more remains or any low-pass becomes worse.
 
-Limits: it takes away what follows the motors, and nothing else.  It needs motor speeds or
-throttle.  What lies above half the sample rate has folded down and is followed by neither.
-A change of the vehicle is learned within half a minute.  The past decides what is worth a notch.
-A frame with a gap of more than five intervals is thrown away; smaller unevenness is interpolated.
+Limits: only lines that follow the motors are removed.  Motor speeds or throttle are needed.  Lines
+above half the sample rate are aliased and not followed.  A change of the vehicle is learned within
+half a minute.  The choice depends on the past.  A frame with a gap of more than five intervals is
+dropped; smaller unevenness is interpolated.
 
 The notches themselves: state-variable filters whose coefficients may move.
 
@@ -78,8 +77,8 @@ from ou_monitor.online.filter.lowpass import FilterCounters
 from ou_monitor.online.settings import NotchSettings
 from ou_monitor.records import FloatArray
 
-# A speed that has changed so often, and then not for so many mean times between changes (and
-# never less than s), has stopped coming: no motor in flight holds its speed to the last digit.
+# Number of changes after which a speed counts as frozen if it is constant for this many mean times
+# between changes, and for this time, s: no motor in flight holds its speed to the last digit.
 _CHANGES, _FROZEN, _STUCK = 20, 50.0, 1.0
 
 
@@ -93,13 +92,13 @@ class NewestSpeeds:
         self._changes = 0
 
     def configure(self, per_unit: float, stale_after: float) -> None:
-        """Change the unit, and the age that is too old, s."""
+        """Change the unit, and the maximum age, s."""
         if per_unit != self._per_unit:
             self._speeds = []
         self._per_unit, self._stale_after = per_unit, stale_after
 
     def take(self, t: float, values: Sequence[float]) -> None:
-        """Take what came at t, s; nothing that is a number: nothing came."""
+        """Take the speeds received at t, s; without a finite number nothing was received."""
         speeds = [abs(one) * self._per_unit if math.isfinite(one) else NAN for one in values]
         if all(one != one for one in speeds):
             return
@@ -113,7 +112,7 @@ class NewestSpeeds:
         self._speeds, self._heard = speeds, t
 
     def now(self, t: float, most: int) -> list[float]:
-        """Return the speeds of at most so many groups of motors, Hz; empty: not known."""
+        """Return the speeds of at most `most` groups of motors, Hz; empty: unknown."""
         if not most or not t - self._heard <= self._stale_after:
             return []
         if self._changes >= _CHANGES:
@@ -122,7 +121,7 @@ class NewestSpeeds:
                 return []
         if len(self._speeds) <= most:
             return self._speeds
-        # Places of motors that are not there stay 0.
+        # Elements of missing motors stay 0.
         known = sorted(one for one in self._speeds if one > 0.0)
         if len(known) <= most:
             return known
@@ -131,12 +130,12 @@ class NewestSpeeds:
         return [sum(known[a:b]) / (b - a) for a, b in zip(edges, edges[1:])]
 
 
-# Square roots of throttle at which a law is told: the middle of what is flown.
+# Square roots of throttle that define a law: the middle of the range flown.
 LOW, HIGH = 0.4, 0.85
 _GRID = 48
 # Width of the notch that weighs the laws, over frequency.
 _WIDTH = 0.5
-# s over which frames are forgotten: the speed at one throttle falls with the charge, in minutes.
+# Memory of frames, s: the speed at one throttle falls with the charge, in minutes.
 _LAW_MEMORY = 30.0
 # Share of noise that the prior gives to the law f ~ sqrt(u), frames that it counts for, and
 # its spread in a / f(HIGH).
@@ -144,7 +143,7 @@ _PRIOR, _FRAMES, _SPREAD = 0.1, 8.0, 0.3
 
 
 class MotorLaw:
-    """The law in force, `a` and `b` in Hz, NaN while not known, and all others (all in Hz)."""
+    """The law in force, `a` and `b`, Hz, NaN while unknown, and all other laws (all in Hz)."""
 
     def __init__(self, frequencies: FloatArray, fmin: float, rate: float) -> None:
         highest = HIGHEST * rate
@@ -247,7 +246,7 @@ class NotchFrames:
         return power, rows[:, channels:].mean(axis=0)
 
 
-# Bandwidths over frequency that are tried, of one notch and of one notch for each motor.
+# Bandwidths over frequency tried for one notch and for one notch per motor.
 WIDTHS: FloatArray = np.array([1.0, 0.66, 0.45, 0.3, 0.2, 0.13, 0.085])
 # Low-passes behind, over `cutoff`; none is faster than that share of the sample rate.
 _BEHIND, _FASTEST = (0.5, 1.0, 1.5), 0.25
@@ -264,11 +263,11 @@ _TINY = 1e-300
 
 
 class Family(NamedTuple):
-    """Notches but for their width."""
+    """Notches without their width."""
 
     source: str  # 'rpm' or 'throttle'
-    many: bool  # Whether each motor has its own
-    times: int  # How often the same notch
+    many: bool  # Whether each motor has its own notch
+    times: int  # Number of equal notches in series
 
 
 class Candidate(NamedTuple):
@@ -279,7 +278,7 @@ class Candidate(NamedTuple):
 
 
 def families(count: int) -> tuple[Family, ...]:
-    """Return what is tried with at most so many notches."""
+    """Return the families with at most `most` notches."""
     found = [Family(source, False, times) for source in ('throttle', 'rpm')
              for times in range(1, min(count, 2) + 1)]
     return (*found, Family('rpm', True, 1)) if count > 1 else tuple(found)
@@ -397,10 +396,10 @@ _LARGEST, _LATEST, _SHORTEST = 1e150, 1e18, 1e-12
 # A step of so many intervals is a gap; samples from which the interval is known; a change of it
 # that is a new rate.
 _GAP, _KNOWN, _OTHER = 5.0, 64, 0.1
-# s: motors follow a step of throttle with it (25 ms on a 5 inch propeller); notches are faded,
-# and moved in width and frequency.
+# Time constant, s, of motors after a step of throttle (25 ms on a 5 inch propeller), and of
+# changes of a notch's share, width and frequency.
 _SPIN_UP, _FADE, _WIDEN, _MOVE = 0.03, 0.2, 0.05, 0.004
-# Throttle is taken as it was for so long, s.
+# Time for which the last throttle is held, s.
 _HELD = 1.0
 _LAG_FREQUENCY = 10.0
 
@@ -447,14 +446,14 @@ class AdaptiveNotch:
         self._frames: NotchFrames | None = None
         self._law: MotorLaw | None = None
         self._choice: NotchChoice | None = None
-        # Square root of throttle as the motors follow it, and when throttle was heard.
+        # Square root of throttle as the motors follow it, and time of the last throttle.
         self._root, self._asked, self._heard = NAN, NAN, -math.inf
         self._motors: list[float] = []
         self._sources: set[str] = set()
 
     @property
     def settings(self) -> NotchSettings:
-        """Return the settings in force."""
+        """Return the present settings."""
         return self._settings
 
     @property
@@ -471,12 +470,12 @@ class AdaptiveNotch:
 
     @property
     def rate(self) -> float:
-        """Sample rate, Hz; NaN while not known."""
+        """Sample rate, Hz; NaN while unknown."""
         return 1.0 / self._interval.mean if self._interval.mean > 0.0 else NAN
 
     @property
     def law(self) -> tuple[float, float]:
-        """Return a and b of f = a + b sqrt(throttle), Hz; NaN while not known."""
+        """Return a and b of f = a + b sqrt(throttle), Hz; NaN while unknown."""
         return (NAN, NAN) if self._law is None else (self._law.a, self._law.b)
 
     @property
@@ -572,7 +571,7 @@ class AdaptiveNotch:
 
     def step(self, t: float, values: Sequence[float], throttle: float = NAN,
              rpm: Sequence[float] = ()) -> list[float]:
-        """Filter one sample of each channel; as `filter` (the node's short way)."""
+        """Filter one sample of each channel as `filter` does (faster, for the node)."""
         if self._out and len(values) != len(self._out):
             raise ValueError(f'the number of channels changed from {len(self._out)} to '
                              f'{len(values)}: make a new notch for another signal')
@@ -608,7 +607,7 @@ class AdaptiveNotch:
         return self._out
 
     def _time(self, dt: float) -> None:
-        """Follow the interval; a new rate begins anew."""
+        """Follow the interval; restart at a new rate."""
         mean = self._interval.add(dt)
         if self._frames is None:
             self._since += 1
@@ -651,7 +650,7 @@ class AdaptiveNotch:
             passed = self._frames.hop * self._frames.interval
             root, motors = float(rest[0]), rest[1:]
             power, lost = self._choice.usual(power, passed)
-            # First what the law as it was would have come to, then the law learns.
+            # Score the law before it learns.
             self._choice.take(power, self._law.frequency(root), motors[np.isfinite(motors)],
                               passed)
             if root == root:
@@ -661,7 +660,7 @@ class AdaptiveNotch:
             self._choice.decide(sources)
 
     def _wanted(self, chosen: Candidate | None) -> list[float]:
-        """Return the frequencies that a candidate has now, Hz; NaN: none."""
+        """Return the present frequencies of a candidate, Hz; NaN: none."""
         if chosen is None or self._law is None:
             return []
         if chosen.family.source == 'throttle':
@@ -726,7 +725,7 @@ class Notch:
             self._g = math.tan(math.pi * self._ratio)
 
     def restart(self, x: float) -> None:
-        """Forget what was: as if this sample had always been there."""
+        """Restart as if the input had always been this sample."""
         self._s1, self._s2 = 0.0, x
 
     def advance(self, x: float) -> float:
@@ -739,7 +738,7 @@ class Notch:
         return x - self.share * k * v1
 
     def response(self, ratio: float) -> complex:
-        """Return the response to a frequency over the sample rate, coefficients standing."""
+        """Return the response to a frequency over the sample rate, with constant coefficients."""
         if not self._g:
             return 1.0 + 0.0j
         p = 1j * math.tan(math.pi * ratio) / self._g
@@ -748,5 +747,5 @@ class Notch:
 
 
 def phase_lag(notches: Iterable[Notch], ratio: float) -> float:
-    """Return by how much a cascade lags at a frequency over the sample rate, rad."""
+    """Return the lag of a cascade at a frequency over the sample rate, rad."""
     return -sum(cmath.phase(one.response(ratio)) for one in notches)

@@ -158,7 +158,7 @@ class FarShare:
 # Horizons, s, from which the flight learns; those between are interpolated in ln h.
 RUNGS = (0.5, 1.0, 2.0, 5.0, 15.0)
 _LN_RUNGS = np.log(RUNGS)
-# Time from one look to the next, s, and as a share of the horizon.
+# Time between updates, s, and as a share of the horizon.
 LOOK, _LOOK_SHARE = 0.2, 0.2
 # Minimum time between updates by arrival, s: stamps may run a thousand times too fast, and an
 # update takes 1 ms.  A replay at four times the speed is not affected.
@@ -251,7 +251,8 @@ class Forecast:
     """
     Risk with the pilot's future throttle, and with a given throttle.
 
-    `take` feeds the load filter, `follow` tells the newest estimate; look: time between looks, s.
+    `take` feeds the load filter, `follow` gives the newest estimate; look: time between updates,
+    s.
     """
 
     def __init__(self, loads: LoadFilter, look: float = LOOK) -> None:
@@ -262,7 +263,7 @@ class Forecast:
         self._rungs = tuple(_Rung(horizon) for horizon in RUNGS)
         self.new_time_line()
         self._known = False
-        # Arrival from which on the next look may be, s.
+        # Earliest arrival for the next update, s.
         self._rested = -math.inf
         self._sampling = Sampling(0.02, 0.1)
 
@@ -315,7 +316,7 @@ class Forecast:
 
     @property
     def used(self) -> float:
-        """Return the throttle that was passed for a tenth of the last 30 s; NaN without any."""
+        """Return the throttle exceeded for a tenth of the last 30 s; NaN without any."""
         return self._past.used(_USED, 0.1)
 
     @property
@@ -512,7 +513,7 @@ def throttle_budget(risks: FloatArray, highest: float, limit: float) -> tuple[fl
     end = 1.0
     if within < _GRID.size:
         low, high = risks[within - 1], risks[within]
-        # The logarithm of the risk is nearly straight over so short a way.
+        # Interpolate the logarithm of the risk, which is nearly straight over this distance.
         end = float(_GRID[within - 1] + (_GRID[within] - _GRID[within - 1]) * (
             math.log(limit / low) / math.log(high / low) if low > 0.0 else 0.0))
     if end <= highest:
