@@ -24,7 +24,7 @@ ARGUMENTS = (
     ('model_file', str(HERE.parent / 'models' / 'gecko.yaml'), 'Model of the supply.'),
     ('rate', '100.0', 'Samples per second, Hz.'),
     ('play', 'flight', 'Throttle that is played: a profile, a number, points or a recording.'),
-    ('scale_resistance', '1.0', 'Factor on the answer to throttle: 1.4 is an old pack.'),
+    ('scale_resistance', '1.0', 'Factor on the response to throttle: 1.4 is an old pack.'),
 )
 # Handed on as they are.
 COMMON = (

@@ -230,7 +230,7 @@ def make_old(node: Any) -> None:
     from rclpy.parameter_client import AsyncParameterClient
     AsyncParameterClient(node, '/supply_simulator').set_parameters(
         [Parameter('scale_resistance', value=OLD)])
-    print(f'The pack grows old: its answer to throttle is {OLD:g} times as large', flush=True)
+    print(f'The pack grows old: its response to throttle is {OLD:g} times as large', flush=True)
 
 
 def watch(bag: str, seconds: float, logs: Path, limit: float | None,

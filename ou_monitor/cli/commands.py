@@ -255,8 +255,8 @@ _ANALYZE = Command(
 _COMPARE = Command(
     'compare', 'a recording beside simulations of it: what the simulation gets wrong most',
     'ou_monitor.cli.recorded:compare',
-    'Simulate a recording over its own throttle many times, and show both side by side: mean '
-    'path, lowest voltage, falls through low levels, spectrum, answer to throttle, distribution. '
+    'Simulate a recording many times under its own throttle, and compare: mean path, lowest '
+    'voltage, falls through low levels, spectrum, response to throttle, distribution. '
     'Without --model, a model is fitted to the part before S, and the rest is simulated.',
     (RECORDING, *PART,
      Option('--model', metavar='FILE.yaml', type=path_argument,
@@ -451,7 +451,7 @@ _SIMULATE = Command(
             help='charge at the start, 0..1, drawn by throttle, in place of drift; -1: '
             "as at the start of the model's recording"),
      Option('--scale-resistance', metavar='X', type=float, default=1.0,
-            help='factor on the answer to throttle: 1.4 is a pack aged by 40 %% (default '
+            help='factor on the response to throttle: 1.4 is a pack aged by 40 %% (default '
             '%(default)s)'),
      Option('--export', metavar='TARGET', choices=('gazebo', 'px4', 'ardupilot', 'json'),
             help='print the model in the parameters of another simulator, and the effects that it '

@@ -37,7 +37,7 @@ LIVE_PARAMETERS: tuple[Parameter, ...] = (
               'Charge of the pack at the start, 0..1, from the next ~/reset on; -1: as where the '
               "model's recording began.", -1.0, 1.0),
     Parameter('scale_resistance', 1.0,
-              'Factor on the answer to throttle: 1.4 is a pack aged by 40 %; in force at once.',
+              'Factor on the response to throttle: 1.4 is a pack aged by 40 %; in force at once.',
               0.0, 100.0),
 )
 FIXED_PARAMETERS: tuple[Parameter, ...] = (

@@ -14,7 +14,7 @@ import pytest
 
 
 def answer(tau, delay=0.0):
-    """Return an answer to throttle with a time constant and a delay, s."""
+    """Return a response to throttle with a time constant and a delay, s."""
     return LoadTransient(-0.1, tau, delay)
 
 

@@ -54,7 +54,7 @@ class White(Cheap):
 
 
 class Mean(Cheap):
-    """A mean that answers to throttle."""
+    """A mean that responds to throttle."""
 
     NAME = 'mean'
     ROLE = Role.MEAN
@@ -64,7 +64,7 @@ class Mean(Cheap):
 
 
 class Intensity(Mean):
-    """A sigma that answers to throttle."""
+    """A sigma that responds to throttle."""
 
     NAME = 'intensity'
     FAMILY = 'intensity'

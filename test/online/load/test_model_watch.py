@@ -20,7 +20,7 @@ FLOWN: Profile = read_throttle(str(ROOT / 'bags' / 'recorded' / 'gecko.csv')).pr
 
 
 def flight(duration, seed, *, age=1.0, throttle=FLOWN):
-    """Return a simulated flight of a pack with `age` times the answer to throttle."""
+    """Return a simulated flight of a pack with `age` times the response to throttle."""
     (piece,) = simulated(GECKO, throttle, duration=duration, rate=100.0, seed=seed,
                          charge=math.nan, resistance=age)
     return piece
