@@ -56,7 +56,6 @@ def one_process(monkeypatch):
             """Take no notice."""
 
         def each(self, function, arguments):
-            """Yield as `Workers.each` does."""
             for k, given in enumerate(arguments):
                 yield k, function(*given), ''
 

@@ -76,7 +76,6 @@ def run(copy: Path, *command: object) -> str:
 
 
 def test_a_cause_can_be_simulated(copy):
-    """Its class is enough for model files and the catalogue."""
     (copy / 'm.yaml').write_text(
         'model:\n- {term: ou, params: {alpha: 40.0, sigma: 0.5, u0: 12.0}}\n'
         '- {term: leak, params: {rate: -0.1, curvature: 0.0}}\n')
@@ -85,7 +84,6 @@ def test_a_cause_can_be_simulated(copy):
 
 
 def test_a_format_is_read_and_a_fact_is_told(copy):
-    """By a command that knows neither."""
     t = np.arange(400) / 100.0
     rows = '\n'.join(f'{a:.2f} {5.0 + 0.01 * np.sin(a * a):.4f}' for a in t)
     (copy / 'a.log').write_text(f'MINE 1\n{rows}\n')
@@ -105,6 +103,5 @@ def test_a_parameter_is_declared_and_checked(copy):
 
 
 def test_a_command_is_listed_and_runs(copy):
-    """With its help."""
     assert run(copy, '-m', 'ou_monitor.cli.main', 'mine') == 'done\n'
     assert '  mine ' in run(copy, '-m', 'ou_monitor.cli.main', '--help')

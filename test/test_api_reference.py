@@ -22,7 +22,6 @@ def built(tmp_path_factory):
 
 
 def test_public_names_are_documented(built):
-    """Each is there with an anchor of its own, and with text."""
     page = (built / 'api.html').read_text(encoding='utf-8')
     names = {f'ou_monitor.{name}' for name in ou_monitor.__all__ if name != '__version__'} | {
         'ou_monitor.model.supply.SupplyModel', 'ou_monitor.model.terms.term.Term'}
@@ -36,7 +35,6 @@ def test_public_names_are_documented(built):
 
 
 def test_every_page_is_in_the_table_of_contents(built):
-    """The index leads to each page of doc/."""
     index = (built / 'index.html').read_text(encoding='utf-8')
     for path in (ROOT / 'doc').glob('*.md'):
         assert f'href="{path.stem}.html"' in index, path.name

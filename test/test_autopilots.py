@@ -13,7 +13,6 @@ BLOCKS = re.findall(r'```yaml\n(description:.*?)```', PAGE, re.DOTALL)
 
 @pytest.mark.parametrize('block', BLOCKS)
 def test_a_description_loads(block, tmp_path):
-    """Voltage and throttle have a topic, a type and a field."""
     path = tmp_path / 'own.yaml'
     path.write_text(block, encoding='utf-8')
     found = load_msg_config(path)
@@ -36,7 +35,6 @@ class Port:
         self.broken, self.rest = broken, b''
 
     def write(self, data):
-        """Answer a request."""
         assert data[:3] == b'$M<' and data[3] ^ data[4] == data[5]
         payload = {110: self.analog, 104: self.motors}[data[4]]
         check = len(payload) ^ data[4]
@@ -46,12 +44,10 @@ class Port:
             ((check + self.broken) % 256,))
 
     def read(self, size):
-        """Return what waits."""
         found, self.rest = self.rest[:size], self.rest[size:]
         return found
 
     def reset_input_buffer(self):
-        """Forget what waits."""
         self.rest = b''
 
 

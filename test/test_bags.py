@@ -24,7 +24,6 @@ SIGMA = {'idle': 4.7e-3 * math.sqrt(126.0), 'load_05': 9.38e-3 * math.sqrt(126.0
 
 
 def truth_of(name):
-    """Return truth.yaml."""
     with (BAGS / name / 'truth.yaml').open(encoding='utf-8') as file:
         return yaml.safe_load(file)
 
@@ -77,7 +76,6 @@ def test_both_readers_agree(bag):
 
 
 def test_truth_says_what_is_in_the_bag(bag):
-    """Topics, types, config and counts."""
     _, truth, recording, _ = bag
     assert truth['topics'] == {
         recording.source['voltage_topic']: recording.source['voltage_type'],

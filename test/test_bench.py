@@ -58,7 +58,6 @@ def test_to_dict_is_the_json_of_the_command(name, found, tmp_path):
 
 
 def test_a_design_of_a_flight_has_its_facts(tmp_path):
-    """With what is given going before what was measured."""
     assert main(['design', '--from', GECKO, '--throttle', '0.5', '--set', 'cells=4', '--json',
                  str(tmp_path / 'x.json')]) == 0
     result = design(0.5, recording=GECKO, network={'cells': 4})
@@ -111,7 +110,6 @@ def test_a_result_has_the_attributes_of_its_record(found):
 
 
 def frame(monkeypatch, result):
-    """Return what a table is made of."""
     monkeypatch.setitem(sys.modules, 'pandas', SimpleNamespace(DataFrame=lambda rows: rows))
     return result.to_dataframe()
 

@@ -72,7 +72,6 @@ def test_dates_far_from_today_and_whole_numbers_to_the_microsecond():
 
 
 def test_one_clock_sample_by_sample():
-    """Each stamp alone is in ms, as a callback has it."""
     estimator, monitor = SlidingEstimator(), SupplyMonitor(MonitorSettings())
     for t, volts in zip((1e3 * (BEGIN.timestamp() + SECONDS)).tolist(), VOLTS.tolist()):
         estimator.push(t, volts)

@@ -85,5 +85,4 @@ def test_no_machine_paths():
 
 
 def test_python_is_supported():
-    """The suite runs on one of the two versions that the package is for."""
     assert sys.version_info[:2] in ((3, 11), (3, 12))

@@ -72,7 +72,6 @@ def python(tmp_path_factory) -> Path:
 
 
 def colcon(python: Path, workspace: Path, *arguments: object) -> subprocess.CompletedProcess:
-    """Run colcon in a workspace."""
     return run(python, '-m', 'colcon', '--log-base', workspace / 'log', *arguments,
                cwd=workspace)
 
@@ -88,7 +87,6 @@ def installed(request, tree, python, tmp_path_factory) -> Path:
 
 
 def test_colcon_recognises_the_package(tree, python):
-    """Colcon takes the repository for an ament_python package."""
     assert colcon(python, tree, 'list').stdout.split() == ['ou_monitor', '.', '(ros.ament_python)']
 
 
@@ -269,7 +267,6 @@ def test_pip_gives_the_offline_half(offline, tmp_path):
 
 
 def test_pip_installs_the_message_descriptions(offline, tmp_path):
-    """The installed package finds all of msg_config."""
     code = 'from ou_monitor.stream.config import list_msg_configs as f; print(*f())'
     done = run(offline / 'python', '-c', code, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -331,7 +328,6 @@ def test_package_xml_agrees_with_the_metadata(tree):
 
 
 def test_requirements_agree_with_the_metadata():
-    """The demo's requirements are the package's requirements."""
     listed = [line for line in (ROOT / 'scripts/requirements-run.txt').read_text().splitlines()
               if line and not line.startswith('#')]
     assert sorted(metadata()['dependencies']) == sorted(listed)
@@ -398,7 +394,6 @@ def test_locks_have_hashes_and_no_host(level):
 
 
 def test_extras_have_the_bounds_of_the_test_list():
-    """What pyproject.toml bounds as an extra the tests install within the same bounds."""
     listed = {one.name: one.specifier for one in requirements('requirements-test.txt')}
     extras = metadata()['optional-dependencies']
     declared = [Requirement(text) for name in extras for text in extras[name] if name != 'logs']
@@ -412,6 +407,5 @@ def test_extras_have_the_bounds_of_the_test_list():
 
 
 def test_parameter_files_are_yaml():
-    """Each file of parameters can be read."""
     files = sorted((ROOT / 'config').glob('*.yaml'))
     assert files and all(isinstance(yaml.safe_load(path.read_text()), dict) for path in files)

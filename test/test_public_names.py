@@ -38,7 +38,6 @@ def test_the_example_of_every_public_name_runs(value, monkeypatch):
 
 
 def test_unknown_names_are_attribute_errors():
-    """As of any module; hasattr and `from ... import` behave."""
     assert not hasattr(ou_monitor, 'no_such_name')
     with pytest.raises(AttributeError, match='no_such_name'):
         ou_monitor.no_such_name

@@ -26,12 +26,10 @@ OTHERS = {'my_adc.yaml', 'flight.yaml', 'rail.yaml', 'metadata.yaml', 'px4_motor
 
 
 def page(name: str) -> str:
-    """Return the text of a page in doc/."""
     return (ROOT / 'doc' / name).read_text(encoding='utf-8')
 
 
 def blocks(language: str, text: str = README) -> list[str]:
-    """Return the fenced blocks in one language."""
     return re.findall(rf'^```{language}\n(.*?)^```', text, re.MULTILINE | re.DOTALL)
 
 
@@ -43,13 +41,11 @@ def anchors(path: Path) -> set[str]:
 
 
 def run(*command: str) -> subprocess.CompletedProcess:
-    """Run a command in the repository."""
     return subprocess.run([sys.executable, *command], cwd=ROOT, capture_output=True, text=True,
                           timeout=120)
 
 
 def test_the_quick_start_is_the_two_commands():
-    """The first commands are the demo and the tests, and both can be started."""
     first = blocks('console')[0].split()
     assert first == ['./scripts/demo', './scripts/test']
     assert all((ROOT / path).stat().st_mode & 0o111 for path in first)
@@ -83,7 +79,6 @@ def test_links_resolve(path):
 
 
 def test_links_are_seen():
-    """The patterns above see the links and the headings that there are."""
     assert len(re.findall(r'\]\(([^)\s]+)\)', README)) > 20
     assert 'which-capacitance' in anchors(ROOT / 'doc/theory.md')
 
@@ -91,7 +86,6 @@ def test_links_are_seen():
 @pytest.mark.parametrize('path', [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *PAGES],
                          ids=lambda path: path.name)
 def test_what_is_named_exists(path):
-    """Every file and folder that a document names is there."""
     text = path.read_text(encoding='utf-8')
     named = set(re.findall(
         r'(?<![\w/.])((?:bags|doc|scripts|msg_config|launch|config|benchmarks|test|ou_monitor)'
@@ -116,14 +110,12 @@ def test_tables_of_benchmarks_have_their_place(path):
 
 
 def test_launch_file_exists():
-    """The launch file that is started is there."""
     for name in re.findall(r'ros2 launch ou_monitor (\S+)', README):
         assert (ROOT / 'launch' / name).is_file()
 
 
 @pytest.mark.parametrize('command', sorted(set(re.findall(r'ou-monitor ([a-z]+)', README))))
 def test_commands_exist(command):
-    """Each command that is named has its help, with the options named beside it anywhere."""
     shown = run('-m', 'ou_monitor.cli.main', command, '--help')
     assert shown.returncode == 0, shown.stderr
     for path in [ROOT / 'README.md', *PAGES]:
@@ -134,7 +126,6 @@ def test_commands_exist(command):
 
 
 def test_no_command_is_missing():
-    """The table lists every command there is."""
     from ou_monitor.cli.main import COMMANDS
     assert set(COMMANDS) == set(re.findall(r'^\| `ou-monitor (\w+)', README, re.MULTILINE))
 
@@ -170,7 +161,6 @@ def test_brownout_parameters_are_listed():
 
 
 def test_filter_parameters_are_listed():
-    """Each with its default, on the page of the filter."""
     from ou_monitor.online.settings import NOTCH_PARAMETERS
     from ou_monitor.online.settings import FILTER_PARAMETERS
     section = page('filter.md').split('## Parameters')[1].split('\n## ')[0]
@@ -190,7 +180,6 @@ def test_filter_parameters_are_listed():
 
 
 def test_filter_laws_are_listed():
-    """Every law has a row, and there are no others."""
     from ou_monitor.online.settings import LAWS
     section = page('filter.md').split('| law | cutoff |')[1].split('\n\n')[0]
     assert set(re.findall(r'^\| `(\w+)` \|', section, re.MULTILINE)) == set(LAWS)
@@ -237,13 +226,11 @@ def test_log_example_is_true(tmp_path):
 
 
 def test_picture_is_a_picture():
-    """The report of the example: a PNG of some size."""
     data = (ROOT / 'doc/report.png').read_bytes()
     assert data.startswith(b'\x89PNG') and 20_000 < len(data) < 300_000
 
 
 def test_python_example_runs():
-    """The example runs and its intervals hold the values it was made with."""
     (code,) = blocks('python', page('commands.md'))
     scope: dict[str, object] = {}
     exec(compile(code, 'commands.md', 'exec'), scope)
@@ -256,7 +243,6 @@ def test_python_example_runs():
 
 
 def test_message_example_is_accepted(tmp_path):
-    """The example of a message description is one that the package reads."""
     from ou_monitor.stream.config import load_msg_config
     (text,) = blocks('yaml', page('messages.md'))
     path = tmp_path / 'my_adc.yaml'
@@ -266,7 +252,6 @@ def test_message_example_is_accepted(tmp_path):
 
 
 def test_options_are_seen():
-    """The pattern above sees an option that is named."""
     line = next(line for line in README.splitlines() if 'ou-monitor analyze R' in line)
     assert re.findall(r'(?<![\w-])--[a-z][\w-]*', line) == ['--report']
 
@@ -286,7 +271,6 @@ def test_the_glossary_has_the_words_of_the_screens():
 
 
 def test_every_cause_has_a_formula_and_a_sketch():
-    """A row of the glossary for each term of the catalogue, and a picture for each row."""
     from ou_monitor.model.terms.catalogue import catalogue
     rows = re.findall(r'^\| `(\w+)` \| [^|]+ \| !\[\1\]\((causes/\w+\.svg)\) \| [^|]+ \|$',
                       page('glossary.md'), re.M)
@@ -296,13 +280,11 @@ def test_every_cause_has_a_formula_and_a_sketch():
 
 
 def test_continuous_integration_runs_the_suite():
-    """The workflow and .ci/run start the same script."""
     for path in ('.github/workflows/test.yml', '.ci/run'):
         assert './scripts/test' in (ROOT / path).read_text(encoding='utf-8')
 
 
 def test_the_limit_is_documented_as_it_is():
-    """The volts a cell of --cells alone, and what no cell has."""
     text = ' '.join((ROOT / 'doc/commands.md').read_text().split())
     assert f'`--cells N` alone means {CELL_LIMIT:g} V per cell' in text
     args = argparse.Namespace(brownout_voltage=3.5, cells=4)

@@ -61,7 +61,6 @@ def test_another_ros_is_refused(tree, name):
 
 
 def test_jazzy_without_rclpy_is_refused(tree, tmp_path):
-    """A variable alone is no ROS."""
     path = fake(tmp_path / 'bin', python3='exit 1')
     refused(run(tree, ROS_DISTRO='jazzy', PATH=path), 'cannot import rclpy', 'source')
 
@@ -155,7 +154,6 @@ def test_no_registry_is_refused_and_the_next_run_tries_again(made):
 @pytest.mark.parametrize('line', [
     'wheel', 'wheel==0.48.0', 'wheel==0.48.0 --hash=sha256:' + 64 * '0'])
 def test_a_package_without_its_hash_is_refused(made, line):
-    """Neither without a version, nor without a hash, nor with that of another file."""
     last, log = failed_install(made[0], 'run.lock', line + '\n', PYTHON=sys.executable)
     assert 'could not fetch' in last and 'hash' in log.lower()
 
@@ -176,7 +174,6 @@ def test_a_sourced_jazzy_is_used(made, tmp_path):
 
 
 def test_versions_other_than_noble_are_refused(tree, tmp_path):
-    """What is not known is refused, and Ubuntu's versions want Ubuntu's Python."""
     refused(run(tree, 'test', '--versions', 'jammy'), 'noble', "'jammy'")
     old = 'echo 3.11'
     path = fake(tmp_path / 'bin', python3_12=old, python3_11=old, python3=old)
@@ -184,7 +181,6 @@ def test_versions_other_than_noble_are_refused(tree, tmp_path):
 
 
 def test_demo_refuses_a_missing_bag():
-    """The driver says which bag there is not."""
     done = subprocess.run([sys.executable, 'scripts/run_demo.py', '--bag', 'bags/none'],
                           cwd=ROOT, capture_output=True, text=True, timeout=60)
     refused(done, 'bags/none')
@@ -231,7 +227,6 @@ def marked(folder: Path) -> list[int]:
 
 @pytest.mark.parametrize('source', [(), ('--simulated',)], ids=['recorded', 'simulated'])
 def test_demo_shows_estimates_and_leaves_a_report(tmp_path, source):
-    """A short demo hears estimates and filtered samples, and writes its report."""
     report = tmp_path / 'report.html'
     environment = dict(os.environ)
     environment.pop('ROS_DOMAIN_ID', None)

@@ -68,7 +68,6 @@ def test_the_loop_is_closed():
 
 
 def test_same_seed_same_flight():
-    """Deterministic."""
     one, other = (fly(Loop(), 3.0, 7) for _ in range(2))
     np.testing.assert_array_equal(one.cutoff, other.cutoff)
     np.testing.assert_array_equal(one.turn, other.turn)

@@ -191,7 +191,6 @@ def test_the_command_prints_the_orders(capsys):
 
 
 def test_the_examples_of_the_document_give_their_output(capsys):
-    """Words as printed, numbers to five digits."""
     text = (ROOT / 'doc/theory.md').read_text(encoding='utf-8')
     blocks = re.findall(r'```python\n(.*?)```\s*```text\n(.*?)```', text, flags=re.S)
     assert len(blocks) == 4

@@ -91,7 +91,6 @@ def test_dips_that_nobody_could_see_do_not_count(change):
 
 
 def test_silence_without_the_time_of_stops():
-    """The longest of each, which need not be the same gap."""
     stops = [(1.0, 1.9), (1.95, 2.0)]
     assert overlap(0.5, 1.97, stops) == pytest.approx(0.92)
     assert overlap(2.0, 3.0, stops) == 0.0

@@ -1,11 +1,11 @@
 """`ou-monitor coupling`: columns and topics in, table and JSON out, bad input one line."""
 
 import json
-from pathlib import Path
 import re
 
 from command_line import failure
 from made_bags import encode
+from made_logs import blackbox
 import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.model.ou import simulate
@@ -186,15 +186,8 @@ def test_a_signal_that_a_bag_lacks_is_one_line(bag, signal, words, capsys):
     assert words in failure(capsys, 'coupling', bag, '--signal', signal)
 
 
-@pytest.fixture
-def logs(monkeypatch):
-    """Let the writers of logs be imported."""
-    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[1] / 'recordings/importers'))
-
-
-def test_a_log_is_taken_as_it_is(logs, tmp_path, capsys):
+def test_a_log_is_taken_as_it_is(tmp_path, capsys):
     """Series and topics of a blackbox, its refresh of the voltage, its part; what is missing."""
-    from made_logs import blackbox
     rng = np.random.default_rng(4)
     n, held = 10_000, 4
     t = 0.002 * np.arange(n)

@@ -42,7 +42,6 @@ def test_a_step_is_eight_roundings_of_single_precision():
 
 
 def test_values_of_which_most_come_once_have_no_step():
-    """Half as many values as samples, at most."""
     v = np.arange(1000.0)
     # Without the lowest and the highest value, which may be rails.
     assert find_step(np.append(np.repeat(v, 2), [1000.0])) == pytest.approx(1.0)
@@ -71,7 +70,6 @@ def clipped(side, share, seed=3, **more):
 @pytest.mark.parametrize('side', (1.0, -1.0))
 @pytest.mark.parametrize('step', (0.0, 0.1))
 def test_rails_are_where_samples_pile_up(side, step):
-    """One in fifty at the end; the other end is free."""
     v = clipped(side, 0.02)
     v = step * np.round(v / step) if step else v
     low, high = find_rails(v, step, 1.0)
@@ -114,7 +112,6 @@ def test_a_stage_that_clips_before_the_noise_of_the_adc(side, later):
 
 
 def test_a_bell_of_few_codes_is_no_rail():
-    """A rail at rest in three codes, above those of a flight."""
     rng = np.random.default_rng(8)
     rest = np.rint(0.7 * rng.standard_normal(4000))
     v = np.concatenate((rest, -3.0 - rng.integers(0, 60, 6000)))

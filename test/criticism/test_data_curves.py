@@ -46,7 +46,6 @@ def test_few_throttles_are_taken_as_they_are():
 
 @pytest.mark.parametrize('levels, separate', [(2, True), (12, True), (13, False), (400, False)])
 def test_a_line_joins_what_lies_between_only_where_levels_are_many(levels, separate):
-    """Points of few levels are drawn apart."""
     u = np.arange(2400) % levels / levels
     rng = np.random.default_rng(1)
     found = _curves(Samples(1e-3 * np.arange(u.size), 5.0 + rng.standard_normal(u.size), u))
@@ -56,7 +55,6 @@ def test_a_line_joins_what_lies_between_only_where_levels_are_many(levels, separ
 
 
 def test_averages_need_five_samples():
-    """Mean of each bin; NaN of fewer."""
     which = np.repeat([0, 1], [5, 4])
     means = _averages(np.arange(9.0), which, np.array([5.0, 4.0]))
     assert means[0] == 2.0 and math.isnan(means[1])

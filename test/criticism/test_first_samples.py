@@ -41,7 +41,6 @@ def test_a_model_that_runs_away_has_no_band():
             self.left = good
 
         def simulate(self, t, rng, throttle):
-            """Return noise, or fail."""
             self.left -= 1
             if self.left < 0:
                 raise ValueError('runs away')
@@ -59,7 +58,6 @@ def test_a_model_that_runs_away_has_no_band():
 
 
 def test_rivals_are_within_a_tie():
-    """Not at its edge; the best one is none."""
     evidence = [('a', 5.0 + TIE), ('b', 5.0), ('c', 5.0 + 0.01), ('d', 9.0 + TIE)]
     assert rivals_of('a', evidence) == ['c', 'd'] and rivals_of('d', evidence) == []
 

@@ -16,7 +16,6 @@ def wander(seed, sd=1.0, phi=0.9):
 
 
 def coded(x, code=CODE):
-    """Return codes."""
     return code * np.round(x / code)
 
 
@@ -82,7 +81,6 @@ def test_a_rail_at_rest_is_not_held():
 
 @pytest.mark.parametrize('noise', [0.2, 0.4])
 def test_turning_points_of_a_line_are_not_squeezed(noise):
-    """Its frequency follows load, and at the highest it is slow."""
     for seed in range(3):
         load = np.abs(wander(seed, phi=0.99))
         v = (3.0 * np.sin(2.0 * np.pi * np.cumsum(0.06 + 0.05 * load)) + noise * wander(seed + 20)

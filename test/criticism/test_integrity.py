@@ -17,18 +17,15 @@ STEP_STD = SIGMA * math.sqrt(-math.expm1(-2.0 * ALPHA / RATE) / (2.0 * ALPHA))
 
 
 def rail(seed, n=20_000, rate=RATE, alpha=ALPHA, u0=5.0):
-    """Return stamps and an OU."""
     t = np.arange(n) / rate
     return t, simulate(t, alpha, SIGMA, np.random.default_rng(seed), u0=u0)
 
 
 def examined(t, v, u=None):
-    """Examine a recording."""
     return examine(Recording(t, v, np.full(t.size, np.nan) if u is None else u, 'made'))
 
 
 def names(found):
-    """Return the names of the exact findings."""
     return [term.NAME for term in found.exact]
 
 

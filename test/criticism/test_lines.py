@@ -20,7 +20,6 @@ def noise(seed, n=3000):
 
 
 def tone(frequency, rms, n=3000, phase=0.3):
-    """Return a steady tone."""
     return rms * math.sqrt(2.0) * np.sin(2.0 * math.pi * frequency * np.arange(n) / RATE + phase)
 
 
@@ -123,13 +122,11 @@ def test_a_line_in_pieces_of_a_level_is_found_though_few_show_it():
 
 @pytest.mark.parametrize('parts', [[], [np.zeros(0)], [np.zeros(127)], [np.ones(60)] * 9])
 def test_short_levels_are_not_searched(parts):
-    """It says why."""
     found = find_lines(parts, RATE)
     assert found.why_not and not found.lines and math.isnan(found.detectable)
 
 
 def test_a_constant_has_no_lines():
-    """Nor warnings."""
     assert not find_lines([np.full(500, 5.0)], RATE).lines
 
 

@@ -30,7 +30,6 @@ def test_a_score_by_a_spread_of_few_draws_has_heavy_tails():
 @pytest.mark.parametrize('chance', [0.05, 0.01, 0.001])
 @pytest.mark.parametrize('count', [1, 30, 70])
 def test_the_edge_is_where_the_chance_is(chance, count):
-    """There and back."""
     assert family_chance(family_edge(chance, count), count) == pytest.approx(chance, rel=1e-9)
     assert family_chance(-family_edge(chance, count), count) == pytest.approx(chance, rel=1e-9)
 

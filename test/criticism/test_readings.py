@@ -92,7 +92,6 @@ NOTHING = {
 
 @pytest.mark.parametrize('what', sorted(NOTHING))
 def test_what_cannot_be_fitted_says_why_without_a_warning(what):
-    """In the sentence, and nothing on standard error."""
     v, part = NOTHING[what]
     with warnings.catch_warnings():
         warnings.simplefilter('error')

@@ -76,7 +76,6 @@ def test_values_with_most_of_them_equal_use_the_wider_quantiles():
 
 
 def throttle(u, t=None):
-    """Return what throttle is taken for, and the notes."""
     u = np.asarray(u, dtype=float)
     t = np.arange(u.size) * 0.01 if t is None else t
     notes = []
@@ -126,7 +125,6 @@ def test_what_is_beyond_the_unit_is_unknown(unit, inside, outside):
 
 
 def test_holes_of_throttle_are_held_and_measured():
-    """At first the first value; all of it and the longest, s."""
     raw = np.linspace(0.2, 0.8, 100)
     raw[:10] = raw[30:50] = raw[95:] = math.nan
     u, notes = throttle(raw)

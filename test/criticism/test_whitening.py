@@ -82,7 +82,6 @@ def test_too_few_samples_are_not_tested():
 
 
 def test_where_none_is_found_nothing_is_said():
-    """And the family-wise level is that of the other tests."""
     assert second_items([]) == coupling_items([]) == [] and FAMILY_WISE == 0.01
 
 

@@ -17,7 +17,6 @@ pytestmark = pytest.mark.skipif(shutil.which('openssl') is None,
 
 
 def version() -> str:
-    """Return a version, here and there."""
     return '1.2.3'
 
 

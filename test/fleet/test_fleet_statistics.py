@@ -126,7 +126,6 @@ def test_drift_keeps_its_rate():
 
 
 def test_drift_and_outliers_are_told_apart():
-    """One vehicle drifts, one is off the fleet, a flight is off its vehicle: each by its name."""
     rng = np.random.default_rng(6)
     right = slopes = 0
     for _ in range(8):

@@ -9,6 +9,7 @@ import resource
 import signal
 from types import SimpleNamespace
 
+from made_logs import crazyflie, hover
 from ou_monitor.errors import InputError
 from ou_monitor.fleet.analysis import Options, work
 from ou_monitor.fleet.find import duplicates, find_recordings
@@ -18,7 +19,6 @@ from ou_monitor.fleet.workers import check_address, LocalWorkers, LOST, usable_m
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.report.fleet_document import failure_words
 from ou_monitor.stream.files import write_whole
-from project import ROOT
 import pytest
 
 
@@ -47,7 +47,6 @@ def test_a_worker_that_dies_is_one_row(tmp_path):
 
 
 def sockets(process: int | str) -> set[str]:
-    """Return the sockets that a process has open."""
     found = set()
     for link in Path(f'/proc/{process}/fd').iterdir():
         try:
@@ -98,7 +97,6 @@ def unpicklable(_: int) -> object:
 
 
 def test_a_result_that_cannot_come_back_is_one_row():
-    """The others are done, by the same worker."""
     with LocalWorkers(1) as pool:
         found = list(pool.each(unpicklable, [(0,), (1,)]))
     assert [k for k, _, _ in found] == [0, 1]
@@ -121,7 +119,6 @@ def test_a_scheduler_of_another_machine_wants_tls(address, fine):
 
 
 def test_a_failure_names_its_path_once():
-    """A line of a file and a file of a folder stay with it."""
     errors = {'/f/a.csv': '/f/a.csv:1: no column', '/f/bag': '/f/bag/bag_0.mcap is damaged',
               '/f/b.mcap': '/f/b.mcap is empty', '/f/c': 'something else'}
     fleet = SimpleNamespace(failed=[{'path': p, 'error': e} for p, e in errors.items()])
@@ -143,7 +140,6 @@ def test_work_never_raises(tmp_path, monkeypatch):
 
 
 def csv_file(path: Path, value: float = 1.0) -> Path:
-    """Write a short recording."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text('time_s,voltage_v\n' + ''.join(f'{k},{value}\n' for k in range(3)))
     return path
@@ -239,7 +235,6 @@ def test_a_disk_that_fills_up_leaves_the_old_file(tmp_path, monkeypatch):
 
 
 def test_a_fifo_in_the_place_of_a_draft_hangs_nothing(tmp_path):
-    """It and a link are removed, not opened; what the link leads to stays."""
     target, elsewhere = tmp_path / 'report.html', tmp_path / 'elsewhere'
     draft = tmp_path / f'.report.html.{os.getpid()}.draft'
     os.mkfifo(draft)

@@ -162,7 +162,6 @@ def _regimes(bench: Bench, dwell: list[float], shape: float = 1.0) -> np.ndarray
 
     Dwell times have the given means (s) and a gamma law of the given shape, 1 being Markov; the
     next state is any other, all alike.
-
     """
     state = int(bench.path.integers(len(dwell)))
     pieces, total = [], 0
@@ -234,7 +233,6 @@ def _change(bench: Bench, gain: float) -> float:
     Draw by how much the restoring force differs from the linear one at two deviations.
 
     0.4..0.8, but not so small on a slow rail, of which a minute holds few relaxations.
-
     """
     least = max(0.4, math.sqrt(8 / bench.alpha0))
     return min(bench.draw.uniform(least, 0.8) * gain, 0.85)
@@ -247,7 +245,6 @@ def restoring(bench: Bench, gain: float) -> dict[str, object]:
 
     A source that limits its current: i = I tanh(x/(I R)), softer on both sides. Or one behind an
     OR-ing diode: i = I (exp(-x/V) - 1), stiffer when the rail is low.
-
     """
     change, two = _change(bench, gain), 2 * bench.stationary
     if bench.draw.random() < 0.5:

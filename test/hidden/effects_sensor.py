@@ -135,7 +135,6 @@ def ac_coupling(bench: Bench, gain: float) -> dict[str, object]:
     Read a rail of 1..5 1/s through a series capacitor, corner 5..12 Hz.
 
     Strength scales the rail's own rate, to which the evidence is proportional.
-
     """
     alpha = bench.draw.uniform(1.6, 5.0) * gain
     # The same innovation as the rail that was drawn, so that only the relaxation is slower.
@@ -204,7 +203,6 @@ def _latency(bench: Bench, gain: float) -> tuple[np.ndarray, dict[str, object]]:
     Draw delays, s, inside nine tenths of each sample's own slot: a symmetric beta law.
 
     So conversions keep their order, and no two fall on one instant of the fine grid.
-
     """
     spread, slot = min(bench.draw.uniform(0.22, 0.35) * gain, 0.35), 0.9
     shape = 0.5 * (slot**2 / (4 * spread**2) - 1)

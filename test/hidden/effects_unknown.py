@@ -129,7 +129,6 @@ def slew_limit(bench: Bench, gain: float) -> dict[str, object]:
 
     It settles in half a sample when it may, and follows no faster than about one innovation a
     sample.
-
     """
     limit = bench.draw.uniform(0.9, 1.4) * bench.innovation / gain**0.5
     step, scale, tanh = limit / bench.substeps, 0.5 * limit, math.tanh
@@ -160,7 +159,6 @@ def chaotic_converter(bench: Bench, gain: float) -> dict[str, object]:
     Run a converter of constant slope past its stability: heights by the logistic map, r = 3.9.
 
     A higher ripple takes longer, so the chaos is in the times too and no line stands out.
-
     """
     cycle = bench.draw.uniform(6.0, 15.0) / bench.rate
     volts = bench.draw.uniform(2.0, 3.0) * gain * bench.innovation

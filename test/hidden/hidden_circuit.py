@@ -9,7 +9,6 @@ The sensed voltage is ``level + u(t) + series sources``, where ``u`` is the volt
 fed through a resistance and shaken by a white current::
 
     C du/dt = -(u - setpoint) / R + K dW/dt       alpha = 1/(R C), sigma = K/C
-
 """
 
 from collections.abc import Callable
@@ -32,40 +31,25 @@ Stage = Callable[[np.ndarray], np.ndarray]
 
 @dataclass
 class Bench:
-    """
-    One set-up under construction: effects change it, `run` reads it.
+    """One set-up under construction: effects change it, `run` reads it."""
 
-    Attributes
-    ----------
-    rate, duration : float
-        Samples per second and length in s.
-    substeps : int
-        Fine steps for each sample.
-    draw, path : numpy.random.Generator
-        Physical parameters come from `draw`, noise and events from `path`, so that the same
-        components can be simulated on another grid.
-    resistance, capacitance : float
-        Of the rail, ohm and farad.
-    sigma : float or ndarray, shape (n_fine,)
-        Intensity of the noise, K/C, in V/sqrt(s).
-    level : float
-        Quiescent voltage, V.
-    alpha : float or ndarray, shape (n_fine,)
-        1/(R C), 1/s.
-
-    """
-
+    # Samples per second, and length, s.
     rate: float
     duration: float
+    # Fine steps a sample.
     substeps: int
+    # Physical parameters come from `draw`, noise and events from `path`, so that the same
+    # components can be simulated on another grid.
     draw: np.random.Generator
     path: np.random.Generator
+    # Of the rail: ohm, farad, K/C in V/sqrt(s), quiescent voltage in V.
     resistance: float
     capacitance: float
     intensity: float
     level: float
     commands: np.ndarray
     pieces: list[str]
+    # 1/(R C), 1/s, and K/C, V/sqrt(s): numbers, or one a fine step.
     alpha: float | np.ndarray = 0.0
     sigma: float | np.ndarray = 0.0
     setpoint: np.ndarray | None = None
@@ -118,13 +102,8 @@ class Bench:
         """
         Return the log-likelihood that knowing an additive signal gains, nats.
 
-        Parameters
-        ----------
-        signal : ndarray, shape (n_fine,)
-            V on the fine grid.
-        *known : ndarray, shape (n_fine,)
-            Signals whose linear effect is explained already; a constant always is.
-
+        Signals are in V on the fine grid; the linear effect of those that are known, and a
+        constant, are explained already.
         """
         def whitened(fine: np.ndarray) -> np.ndarray:
             at = self.samples(fine)
@@ -215,15 +194,7 @@ class Bench:
         return np.array(out) + target
 
     def run(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """
-        Simulate the circuit and read the instrument.
-
-        Returns
-        -------
-        t, voltage, throttle : ndarray, shape (n,)
-            Stamps in s, volts, and throttle 0..1 at the stamps.
-
-        """
+        """Simulate the circuit and read the instrument: stamps (s), voltage (V), throttle."""
         work = {name: self.stages.get(name, []) for name in STAGES}
         v = self.level + self.capacitor() + sum(self.series, np.zeros(self.n_fine))
         for front_end in work['front_end']:
@@ -244,22 +215,9 @@ class Bench:
 def make_bench(duration: float, rate: float, substeps: int,
                rng: np.random.Generator) -> Bench:
     """
-    Draw a plain rail and a flight.
+    Draw a plain rail and a flight: length in s, rate in Hz, fine steps a sample.
 
-    Parameters
-    ----------
-    duration, rate : float
-        Length in s and samples per second.
-    substeps : int
-        Fine steps a sample; raised where the fine grid would be coarser than FINE_RATE.
-    rng : numpy.random.Generator
-        Source of everything drawn.
-
-    Returns
-    -------
-    Bench
-        Relaxation 20..120 1/s, innovation of 5..30 mV at 1 kHz, level 3.3..25 V.
-
+    Relaxation 20..120 1/s, innovation of 5..30 mV at 1 kHz, level 3.3..25 V.
     """
     flight, draw, path = (np.random.default_rng(rng.integers(2**63)) for _ in range(3))
 

@@ -3,7 +3,6 @@ Recordings with a hidden effect, made at the level of the circuit and the instru
 
 `draw` makes one; `causes`, `variants` and `unknowns` list what exists. Nothing here is known to
 the program under test: neither its formulas nor its code is used.
-
 """
 
 from dataclasses import dataclass
@@ -49,40 +48,28 @@ _APART = [
 
 @dataclass(frozen=True)
 class Hidden:
-    """
-    A recording and what is hidden in it.
+    """A recording and what is hidden in it."""
 
-    Attributes
-    ----------
-    t, voltage, throttle : ndarray, shape (n,)
-        Stamps in s, volts, and throttle 0..1.
-    truth : tuple of str
-        Names of the causes, sorted; empty for a plain rail and for what has no name.
-    kind : str
-        One of KINDS.
-    detail : dict
-        Physical parameters, by part: 'rail', and one entry for each effect. 'nats', where an
-        effect has it, is what knowing its signal would add to the log-likelihood.
-    families : tuple of str
-        Family of each name in `truth`.
-    name : str
-        Which realisation: names in the table of effects, joined by '+'; 'none' if none.
-    accepted : tuple of tuple of str
-        Lists of names, sorted, that describe this circuit as truly as `truth`, which is first.
-    near : tuple of str
-        For 'unknown': names that describe a part, acceptable beside "not explained".
-
-    """
-
+    # Stamps, s.
     t: np.ndarray
+    # V.
     voltage: np.ndarray
+    # 0..1.
     throttle: np.ndarray
+    # Names of the causes, sorted; empty for a plain rail and for what has no name.
     truth: tuple[str, ...]
+    # One of KINDS.
     kind: str
+    # Physical parameters of the rail ('rail') and of each effect; 'nats' of an effect is what
+    # knowing its signal would add to the log-likelihood.
     detail: dict[str, dict[str, object]]
+    # Family of each name in `truth`.
     families: tuple[str, ...]
+    # Realisation: names in the table of effects, joined by '+'; 'none' if none.
     name: str
+    # Lists of names, sorted, that describe this circuit as truly as `truth`, which is first.
     accepted: tuple[tuple[str, ...], ...]
+    # For 'unknown': names that describe a part, acceptable beside "not explained".
     near: tuple[str, ...]
 
 
@@ -163,35 +150,14 @@ def draw(kind: str, rng: np.random.Generator, *,
          cause: str | tuple[str, str] | None = None, duration: float = 60.0,
          rate: float = 1000.0, strength: float = 1.0, substeps: int | None = None) -> Hidden:
     """
-    Draw a recording with something hidden in it.
+    Draw a recording of one of KINDS: rail, flight, effect and noise are drawn from `rng`.
 
-    Parameters
-    ----------
-    kind : str
-        'single', 'pair', 'none', 'variant' or 'unknown'.
-    rng : numpy.random.Generator
-        Source of everything drawn: rail, flight, effect and noise.
-    cause : str or pair of str, optional
-        What to hide instead of any: a cause; for 'pair' two of them; for 'variant' and
-        'unknown' a name from `variants` or `unknowns`, or the cause or shape in it.
-    duration, rate : float
-        Length in s and samples per second.
-    strength : float
-        1 is moderate: found almost always in a minute at 1 kHz with the right likelihood. It
-        scales amplitudes, the logarithms of ratios, and the inverse of degrees of freedom; on
-        top of it the strength of each effect varies by 30 % either way.
-    substeps : int, optional
-        Fine steps a sample; what the effects need if not given.
-
-    Returns
-    -------
-    Hidden
-
-    Raises
-    ------
-    ValueError
-        If the kind or cause does not exist, or a number is not positive.
-
+    `cause` is what to hide instead of any: a cause; for 'pair' two of them; for 'variant' and
+    'unknown' a name from `variants` or `unknowns`, or the cause or shape in it.  Length in s, rate
+    in Hz.  Strength 1 is moderate: found almost always in a minute at 1 kHz with the right
+    likelihood.  It scales amplitudes, the logarithms of ratios, and the inverse of degrees of
+    freedom; on top of it the strength of each effect varies by 30 % either way.  `substeps` are
+    fine steps a sample, by default what the effects need.
     """
     if not (duration > 0 and rate > 0 and strength > 0):
         raise ValueError(f'duration {duration} s, rate {rate} 1/s and strength {strength} '

@@ -73,7 +73,6 @@ def signs(h: Hidden) -> dict[str, float]:
     Return z-scores that are about N(0,1) on a plain rail, and large where something is hidden.
 
     They know the true alpha and innovation; all but 'line' and the bands are plain averages.
-
     """
     e = whitened(h)
     n = e.size

@@ -22,36 +22,21 @@ Apply = Callable[[Bench, float], dict[str, object]]
 
 @dataclass(frozen=True)
 class Effect:
-    """
-    One physical realisation of something hidden.
+    """One physical realisation of something hidden."""
 
-    Attributes
-    ----------
-    name : str
-        ``cause`` for the straightforward realisation, ``cause/shape`` for another one,
-        ``unknown/shape`` for what the catalogue does not have.
-    cause : str
-        Name in the catalogue, or 'unknown'.
-    apply : callable
-        Changes a bench at a strength; returns the physical parameters. A key 'truth' in what it
-        returns overrides the names below.
-    truth : tuple of str
-        The names that a program must report.
-    also : tuple of tuple of str
-        Other lists of names that describe this circuit as truly.
-    near : tuple of str
-        For 'unknown': names that describe a part of it, acceptable beside "not explained".
-    substeps : int
-        Fine steps a sample that it needs.
-
-    """
-
+    # ``cause``, ``cause/shape`` for another realisation, ``unknown/shape`` outside the catalogue.
     name: str
+    # Name in the catalogue, or 'unknown'.
     cause: str
+    # Changes a bench at a strength; returns the physical parameters.
     apply: Apply
+    # Names that a program must report.
     truth: tuple[str, ...]
+    # Other lists of names that describe this circuit as truly.
     also: tuple[tuple[str, ...], ...] = ()
+    # For 'unknown': names that describe a part of it, acceptable beside "not explained".
     near: tuple[str, ...] = ()
+    # Fine steps a sample that it needs.
     substeps: int = 8
 
 

@@ -61,23 +61,10 @@ KINDS = {'hover': (_hover, 0.3), 'mission': (_mission, 0.25), 'aggressive': (_ag
 
 def draw_commands(duration: float, rng: np.random.Generator) -> tuple[np.ndarray, list[str]]:
     """
-    Draw the commands of one flight, one for each update.
+    Draw the commands of a flight of that length (s), one for each update, and its pieces in order.
 
-    Parameters
-    ----------
-    duration : float
-        Length in s.
-    rng : numpy.random.Generator
-        Source of everything drawn.
-
-    Returns
-    -------
-    commands : ndarray, shape (ceil(UPDATE_RATE * duration) + 1,)
-        Throttle, 0..1. Its standard deviation is at least 0.08 and its 2..98 % range at least
-        0.3, so that what depends on throttle has something to show itself by.
-    kinds : list of str
-        The pieces in order of flight.
-
+    Throttle, 0..1, has a standard deviation of at least 0.08 and a 2..98 % range of at least 0.3,
+    so that what depends on it has something to show itself by.
     """
     n = int(np.ceil(UPDATE_RATE * duration)) + 1
     while True:

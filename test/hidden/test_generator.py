@@ -144,7 +144,6 @@ def test_other_shapes_and_unknowns_show(kind, cause):
 
 @pytest.mark.parametrize('cause', ['load_sag', 'tone', 'measurement_noise', 'glitches'])
 def test_strength_scales(cause):
-    """Half the strength is half the volts, with all else the same."""
     key = {'load_sag': 'sag_v_per_unit', 'tone': 'amplitude_v', 'measurement_noise': 'std_v',
            'glitches': 'mean_size_v'}[cause]
     full, half = (simulated('single', cause, 3, duration=5.0, strength=s).detail[cause][key]
@@ -205,7 +204,6 @@ def test_grids_share_their_components():
     ('pair', {'cause': 'tone'}, 'compatible'), ('single', {'rate': 0.0}, 'positive'),
     ('single', {'strength': -1.0}, 'positive'), ('single', {'duration': 0.01}, 'at least 100')])
 def test_what_cannot_be_drawn_is_refused(kind, options, words):
-    """Say what was wrong."""
     with pytest.raises(ValueError, match=words):
         simulated(kind, **options)
 

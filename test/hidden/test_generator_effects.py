@@ -3,7 +3,6 @@ Each hidden effect of noise and instrument is there at the size that the generat
 
 Measured directly: regressions, spectra, counts and moments, by the true rail. A size is the mean
 of several draws over what was claimed, and its error is that of the draws.
-
 """
 
 from hidden_measures import (
@@ -40,7 +39,6 @@ def test_a_rail_of_two_poles_rings_where_it_should():
 
 
 def test_tone():
-    """The amplitude at the alias of the PWM is the claimed one."""
     for h, claimed, rail in each('tone', 5):
         waves = [w(2 * np.pi * claimed['pwm_hz'] * h.t) for w in (np.sin, np.cos)]
         found, error = regress(h, *waves)
@@ -107,7 +105,6 @@ def test_held_samples():
 
 @pytest.mark.parametrize('cause, sides', [('saturation', 1), ('saturation/two_sided', 2)])
 def test_saturation(cause, sides):
-    """The claimed share of samples lies on each limit."""
     for h, claimed, _ in each(cause, 4):
         on = [np.mean(h.voltage == limit) for limit in (h.voltage.min(), h.voltage.max())]
         assert sum(share > 1e-3 for share in on) == sides
@@ -188,7 +185,6 @@ def test_glitches(cause, run):
 
 
 def test_heavy_tails():
-    """Innovations are Student's, and not correlated in size."""
     for h, claimed, _ in each('heavy_tails', 4):
         e, dof = whitened(h), claimed['dof']
         scaled = e * np.sqrt(dof / (dof - 2))
@@ -203,7 +199,6 @@ def test_heavy_tails():
     ('heavy_tails/laplace', lambda c: 3 / c['gamma_shape']),
     ('heavy_tails/nig', lambda c: 3 / c['ig_shape'])])
 def test_other_heavy_tails(cause, excess):
-    """The fourth moment is that of the claimed mixture."""
     assert_as_claimed([(np.mean(whitened(h)**4) - 3) / excess(c) for h, c, _ in each(cause)],
                       room=0.02)
 
@@ -294,7 +289,6 @@ def test_clock_jitter():
 
 
 def test_irregular_stamps():
-    """In the other shape the stamps are wrong and the samples on time."""
     h = simulated('clock_jitter/stamps')
     spread = np.std(h.t * rate(h) - np.arange(h.t.size))
     assert spread == pytest.approx(h.detail['clock_jitter/stamps']['std_steps'], rel=0.02)

@@ -3,7 +3,6 @@ Each hidden effect of the load is there at the size that the generator claims.
 
 Measured directly: regressions, spectra, counts and moments, by the true rail. A size is the mean
 of several draws over what was claimed, and its error is that of the draws.
-
 """
 
 from hidden_measures import (
@@ -23,7 +22,6 @@ def test_sag(cause, exponent):
 
 
 def test_sag_at_the_capacitor_comes_at_the_rate_alpha():
-    """The response is that of the rail itself."""
     for h, claimed, rail in each('load_sag/at_capacitor', 4):
         assert_regression(h, [late(h, h.throttle, 1 / rail['alpha'])], -claimed['sag_v_per_unit'])
 
@@ -106,7 +104,6 @@ def test_white_noise_of_throttle():
     ('load_dependent_alpha/resistance', lambda load, c: 1 / (1 + (1 / c['ratio'] - 1) * load)),
     ('load_dependent_alpha/step', lambda load, c: np.where(load > c['step_at'], c['ratio'], 1))])
 def test_alpha_of_throttle(cause, shape):
-    """The pull towards the mean varies with throttle as claimed."""
     ratios = []
     for h, claimed, rail in each(cause, 6):
         curve = shape((h.throttle - h.throttle.min()) / np.ptp(h.throttle), claimed)
@@ -123,7 +120,6 @@ def test_alpha_of_throttle(cause, shape):
 
 @pytest.mark.parametrize('cause', ['drift', 'drift/exponential', 'drift/square_root'])
 def test_drift(cause):
-    """The trend has the claimed slope or loss."""
     for h, claimed, _ in each(cause, 4):
         loss = claimed['slope_v_s'] * 60
         curve = {'drift': h.t / 60, 'drift/square_root': np.sqrt(h.t / 60)}.get(

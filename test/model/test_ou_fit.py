@@ -171,7 +171,6 @@ def test_a_rail_without_white_noise_sampled_fast():
 
 
 def test_a_constant_signal_has_no_noise():
-    """Not visible, with bounds of nothing."""
     t = np.arange(1000) / 100.0
     found = fit_ou(regress(t, np.full(1000, 12.0), np.zeros(1000), None), 10.0)
     assert found.status == 'not_visible' and found.var_inf_below == 0.0

@@ -13,7 +13,6 @@ T = np.arange(300) / 1000.0
 
 
 def test_the_ou_comes_first():
-    """And something must come."""
     with pytest.raises(ValueError, match="must be 'ou', got no term at all"):
         SupplyModel(())
     with pytest.raises(ValueError, match="must be 'ou', got 'drift'"):
@@ -82,7 +81,6 @@ def test_seeds():
 
 
 def test_long_recordings_are_made_in_segments():
-    """One longer than a segment is what `Simulation` gives in other segments."""
     t = np.arange(SEGMENT + 1000) / 1e4
     whole = supply().simulate(t, np.random.default_rng(6))
     run = Simulation(supply(), np.random.default_rng(6))

@@ -84,7 +84,6 @@ def stamps(n=1500, uneven=False):
 
 
 def throttle(t):
-    """Return a throttle that steps and ramps."""
     return np.where((t - 7.0) % 0.5 < 0.2, 0.1, 0.2 + 0.5 * ((t - 7.0) % 0.5))
 
 
@@ -113,7 +112,6 @@ def test_values_and_read_are_inverse(name):
 
 @pytest.mark.parametrize('name', EACH)
 def test_missing_and_unknown_parameters_are_named(name):
-    """One line each that names the term and the parameter."""
     cls, params = catalogue()[name], EXAMPLES[name]
     for key in params.keys() - cls.usual().keys():
         with pytest.raises(ValueError, match=f"'{name}' lacks '{key}'"):
@@ -136,14 +134,12 @@ def test_what_is_no_finite_number_is_refused(name):
 @pytest.mark.parametrize('value', [0.5, 'abc', None, [0.0, math.nan, 1.0], [0.0, '1', 2.0]],
                          ids=repr)
 def test_lists_hold_finite_numbers(key, value):
-    """Also within a list."""
     with pytest.raises(ValueError, match=rf'^load_dependent_sigma\.{key} must be'):
         term('load_dependent_sigma', **{**EXAMPLES['load_dependent_sigma'], key: value})
 
 
 @pytest.mark.parametrize('name, key, value, words', OUT_OF_RANGE)
 def test_out_of_range_is_refused_with_the_unit(name, key, value, words):
-    """Term, parameter, what is wanted with its unit, and what was given."""
     with pytest.raises(ValueError) as caught:
         term(name, **{**EXAMPLES[name], key: value})
     text = str(caught.value)
@@ -161,7 +157,6 @@ def test_out_of_range_is_refused_with_the_unit(name, key, value, words):
     ('nonlinear_restoring', {'cube': 0.0}, 'runs away'),
 ])
 def test_parameters_that_contradict_each_other(name, change, words):
-    """One line with the term."""
     with pytest.raises(ValueError, match=words) as caught:
         term(name, **{**EXAMPLES[name], **change})
     assert str(caught.value).startswith(name)

@@ -11,7 +11,6 @@ VAR = SIGMA ** 2 / (2.0 * ALPHA)
 
 
 def jumps(rate=50.0, mean=-0.05, std=0.03):
-    """Return a jump term."""
     return term('jumps', rate=rate, mean=mean, std=std)
 
 
@@ -195,7 +194,6 @@ def test_switching_of_sigma_within_a_step(dt):
 
 
 def test_switching_of_sigma_alone_leaves_the_level():
-    """No level: a mean as without, and the variance of the mixture."""
     n = 200_000
     x = supply(term('regime_switching', rate_up=UP, rate_down=DOWN, level=0.0, sigma_ratio=2.0,
                     at_once=1.0, states=2.0),
@@ -211,6 +209,5 @@ def test_switching_of_sigma_alone_leaves_the_level():
           at_once=1.0, states=2.0),
      'regime_switching: 1.8')])
 def test_more_events_than_can_be_drawn_are_refused(wild, words):
-    """At once, with the rate; nothing hangs."""
     with pytest.raises(ValueError, match=words):
         supply(wild).simulate(np.arange(1000) / 1000.0, np.random.default_rng(0))

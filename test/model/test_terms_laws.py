@@ -37,7 +37,6 @@ def test_the_climb_finds_the_top_of_a_parabola():
 
 
 def test_a_mixture_has_the_weighted_chance():
-    """Two normals, by the distribution of SciPy."""
     z = np.linspace(-4.0, 5.0, 19)
     weight, mean, std = np.array([0.3, 0.7]), np.array([-1.0, 2.0]), np.array([0.5, 3.0])
     assert mixture_cdf(z, weight, mean, std) == pytest.approx(
@@ -68,7 +67,6 @@ def test_best_runs_are_the_best_of_all_choices(seed):
 
 @pytest.mark.parametrize('start', [(0.0, 0.0), (0.9, -1.6), (0.4, -1.0)])
 def test_newton_finds_the_top_that_is_near(start):
-    """A parabola in a step or two, with the errors of its curvature."""
     bend = np.array([[40.0, 12.0], [12.0, 9.0]])
     top = np.array([0.4, -1.0])
 

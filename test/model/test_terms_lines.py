@@ -72,7 +72,6 @@ def test_wide_tone():
 
 
 def test_throttle_tone_at_constant_throttle():
-    """Frequency idle + slope throttle."""
     t = np.arange(3000) / 1000.0
     tone = term('throttle_tone', amplitude=0.1, idle=20.0, slope=300.0, phase=0.3, linewidth=0.0)
     found = still(tone).simulate(

@@ -43,7 +43,6 @@ def test_transient_of_a_step(gain, tau):
 
 
 def test_transient_of_uneven_stamps():
-    """The same closed form, whatever the spacing."""
     t = np.cumsum(np.random.default_rng(3).exponential(DT, 400))
     found = level(term('load_transient', gain=0.4, tau=0.03, delay=0.0), throttle=step_at(100),
                   t=t)

@@ -27,7 +27,6 @@ def is_white(noise):
 
 
 def test_measurement_noise_is_white_and_normal():
-    """Its variance, whiteness and law; independent of the ou."""
     noise = drawn(term('measurement_noise', std=0.02)) - drawn()
     agrees(noise.var(), 4e-4, 4e-4 * VAR_ERROR, 0.02)
     is_white(noise)

@@ -36,7 +36,6 @@ def files_of(calls):
 
 @pytest.mark.parametrize('moving', [False, True])
 def test_one_voltage_message_to_one_report(moving):
-    """Throttle still or moving."""
     rng = np.random.default_rng(1)
     monitor = SupplyMonitor(MonitorSettings(brownout_voltage=4.5, brownout_horizon=1.0))
     stream = SampleStream(monitor)

@@ -33,18 +33,15 @@ def flown(seed, deviation, white, seconds=20.0, rate=200.0):
 
 
 def push(monitor, recording, begin=0.0, end=math.inf):
-    """Push a part, s, of a recording."""
     part = (recording.t >= begin) & (recording.t < end)
     monitor.push(recording.t[part], recording.voltage[part], recording.throttle[part])
 
 
 def ou_of(recording):
-    """Return the fit of the bench."""
     return known_ou(recording.t, recording.voltage, recording.throttle, None)
 
 
 def gecko():
-    """Return a flight that ships."""
     return Recording(GECKO['time_s'], GECKO['voltage_v'], GECKO['throttle'])
 
 
@@ -86,7 +83,6 @@ def test_windows_grow_in_flight():
 
 
 def test_the_fit_in_the_background_is_the_same():
-    """A report does not wait for the fit, and has it when it is there."""
     recording = flown(1, 0.03, 0.005)
     monitor = SupplyMonitor(background=True)
     push(monitor, recording)
@@ -183,7 +179,6 @@ def test_the_state_has_the_facts():
     ('long', "unknown 'long'"), (True, 'a finite number or auto'), (None, 'or auto'),
     (math.nan, 'or auto'), (0.01, '0.05..3600'), (1e9, '0.05..3600')])
 def test_a_window_is_a_word_or_a_number(window, words):
-    """Neither passes for the other."""
     with pytest.raises(ValueError, match=f'window.*{words}'):
         MonitorSettings(window=window)
     for good in ('auto', 2, 0.05, 3600.0):

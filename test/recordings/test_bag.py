@@ -177,7 +177,6 @@ def test_a_failed_write_removes_the_bag(tmp_path, name):
 
 
 def test_a_full_disk_is_one_line(tmp_path, monkeypatch):
-    """An error of the disk at the end removes the bag and names it."""
     def full(*_):
         raise OSError(28, 'No space left on device')
     monkeypatch.setattr(bag_module.Writer, 'finish', full)

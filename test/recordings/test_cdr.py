@@ -79,12 +79,10 @@ def refuse(log_time, why):
 
 
 def reader_of(spec, text, broken=refuse):
-    """Return a reader of a field."""
     return FieldReader(spec, parse_definition(spec.type, text), broken)
 
 
 def in_bulk(spec, text, table):
-    """Return the same in bulk."""
     try:
         column = reader_of(spec, text).read(table)
     except InputError:
@@ -93,7 +91,6 @@ def in_bulk(spec, text, table):
 
 
 def assert_same(found, expected):
-    """All bits are the same."""
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_array_equal(one.astype(np.float64).view(np.uint64),
                                       other.astype(np.float64).view(np.uint64))
@@ -126,7 +123,6 @@ class Maker:
         self.make_type('Top', 2)
 
     def make_type(self, name, depth):
-        """Define a type and those in it."""
         fields = []
         for k in range(self.rnd.randint(0 if depth < 2 else 1, 5)):
             kind = self.rnd.choice((*INTS, 'bool', 'float32', 'float64', 'string', 'nested'))
@@ -149,7 +145,6 @@ class Maker:
         return one('Top') + ''.join(rest)
 
     def value(self, kind):
-        """Return a random value of a type."""
         if kind == 'string':
             return self.rnd.choice(TEXTS)
         if kind == 'bool':
@@ -164,7 +159,6 @@ class Maker:
         return self.message(kind)
 
     def message(self, name='Top'):
-        """Return a random message as a dict."""
         out = {}
         for field, kind, array in self.types[name]:
             size = {'': None, '[2]': 2, '[3]': 3}.get(array, self.rnd.randint(0, 3))
@@ -269,7 +263,6 @@ def shapes(count):
     20 * ['', 'base_link', 'bat', 'base_linl'], shapes(40), ['été', 'ete', '\u4e2d'] * 20],
     ids=['alike', 'unlike', 'not ASCII'])
 def test_frames_of_any_length(frames):
-    """Shapes that recur are learned; others are walked one by one."""
     messages = [battery(frame, k + 0.5, (3.7,) * (k % 3), (k, k))
                 for k, frame in enumerate(frames)]
     column, broken = read_all(BATTERY, messages)

@@ -1,6 +1,5 @@
 """`ou-monitor convert`: a CSV becomes a bag."""
 
-import csv
 import json
 import os
 from pathlib import Path
@@ -9,15 +8,12 @@ import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.recordings.read import read_recording, read_signal
 import pytest
-from rosbags.highlevel import AnyReader
-from rosbags.typesys import get_typestore, Stores
 
 GOOD = 'time_s,voltage_v,throttle\n0.5,5.0,0.1\n0.6,5.1,0.1\n0.6,5.2,0.2\n0.7,5.3,0.3\n'
 
 
 @pytest.fixture
 def log(tmp_path):
-    """Return a small CSV."""
     path = tmp_path / 'log.csv'
     path.write_text(GOOD)
     return path
@@ -99,7 +95,6 @@ def test_bad_input_exits_with_2(tmp_path, monkeypatch, capsys, log_text, argumen
 
 
 def test_file_name_of_invalid_text(tmp_path, capsys):
-    """Bytes of a file name are shown as what they are, in the bag as in the JSON."""
     path = os.path.join(os.fsencode(tmp_path), b'\xff.csv')
     Path(os.fsdecode(path)).write_text(GOOD)
     for out in ('out', 'out.mcap', os.fsdecode(b'\xfe'), os.fsdecode(b'\xfe.mcap')):
@@ -135,37 +130,3 @@ def test_columns_of_a_csv(tmp_path, capsys):
     np.testing.assert_allclose(back.throttle, [0.1, 0.2, 0.3], rtol=1e-7)
     assert back.source['voltage_field'] == 'bus'
     np.testing.assert_allclose(read_signal(tmp_path / 'b', '/current/data').values, [2, 3, 4])
-
-
-@pytest.fixture
-def real():
-    """Return a real flight; its folder is not part of the project."""
-    folder = os.environ.get('OU_MONITOR_REALDATA')
-    if folder is None:
-        pytest.skip('OU_MONITOR_REALDATA is not set: recordings of others are not shipped')
-    return Path(folder) / 'bf_gecko_a.csv'
-
-
-def test_a_real_flight(real, tmp_path):
-    """Every row of a real log is a message for the independent library."""
-    with real.open(newline='') as file:
-        table = [(float(r['time_s']), float(r['voltage_v']), float(r['throttle']))
-                 for r in csv.DictReader(file)]
-    assert main(['convert', str(real), str(tmp_path / 'bag')]) == 0
-    found, throttle, held = [], float('nan'), []
-    with AnyReader([tmp_path / 'bag'],
-                   default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
-        for connection, t, data in reader.messages():
-            message = reader.deserialize(data, connection.msgtype)
-            if connection.topic == '/throttle':
-                throttle = message.data
-            else:
-                stamp = message.header.stamp
-                assert stamp.sec * 1_000_000_000 + stamp.nanosec == t
-                found.append((t, message.voltage))
-                held.append(throttle)
-    assert [t for t, _ in found] == [round(row[0] * 1e9) for row in table]
-    np.testing.assert_array_equal(
-        [v for _, v in found], np.array([row[1] for row in table], dtype=np.float32))
-    # rosbags gives messages of one instant in the order of the file: throttle first.
-    np.testing.assert_array_equal(held, np.array([row[2] for row in table], dtype=np.float32))

@@ -10,7 +10,6 @@ import pytest
 
 
 def written(tmp_path, text, encoding='utf-8'):
-    """Write a CSV."""
     path = tmp_path / 'log.csv'
     path.write_bytes(text.encode(encoding))
     return path

@@ -30,20 +30,17 @@ def bag(path, battery_current, currents=None):
 
 
 def test_the_current_of_a_battery_is_drawn_when_negative(tmp_path):
-    """Discharge is negative in a BatteryState, and NaN as not measured."""
     path = bag(tmp_path / 'a.mcap', [-1.0, np.nan, -3.0, -4.0, 5.0])
     np.testing.assert_array_equal(read_recording(path).current, [1.0, np.nan, 3.0, 4.0, -5.0])
     np.testing.assert_array_equal(read_recording(path, start=0.15).current, [3.0, 4.0, -5.0])
 
 
 def test_a_topic_of_its_own_goes_first_and_holds(tmp_path):
-    """As `convert` writes it; the last value known holds."""
     path = bag(tmp_path / 'a.mcap', [9.0] * 5, {1: 20.0, 3: 30.0})
     np.testing.assert_array_equal(read_recording(path).current, [np.nan, 20.0, 20.0, 30.0, 30.0])
 
 
 def test_missing_current_is_none(tmp_path):
-    """All NaN, or no column."""
     assert read_recording(bag(tmp_path / 'a.mcap', [np.nan] * 5)).current is None
     path = tmp_path / 'a.csv'
     path.write_text('time_s,voltage_v\n0,5\n1,5\n')
@@ -54,7 +51,6 @@ def test_missing_current_is_none(tmp_path):
     ('time_s,voltage_v,current_a', '{},5,{}'), ('current_a,time_s,throttle,voltage_v',
                                                 '{1},{0},0.5,5')])
 def test_a_column_of_a_csv(tmp_path, header, row):
-    """With throttle and without; in the order of time."""
     path = tmp_path / 'a.csv'
     path.write_text('\n'.join([header, *(row.format(t, t * 10) for t in (0, 2, 1))]) + '\n')
     recording = read_recording(path)
@@ -70,7 +66,6 @@ def test_each_message_of_a_battery_has_a_current_of_its_own(tmp_path, monkeypatc
 
 
 def test_a_broken_message_counts_once(tmp_path):
-    """Voltage and current are read from it together."""
     path, message = tmp_path / 'a.mcap', encode_battery(STAMPS, np.full(5, 16.0))
     with BagWriter(path) as writer:
         writer.add_topic('voltage', BATTERY_STATE)

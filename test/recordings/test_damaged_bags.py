@@ -213,7 +213,6 @@ def test_a_private_record(tmp_path, counted):
 
 
 def test_an_unknown_compression(tmp_path):
-    """It is named, not taken for plain bytes."""
     path = write(tmp_path / 'bag.mcap', ROWS, enable_crcs=False)
     path.write_bytes(path.read_bytes().replace(b'zstd', b'zsTd'))
     assert "unknown compression 'zsTd'" in refusal(lambda: read(path))
@@ -305,7 +304,6 @@ def test_foreign_files_are_refused_with_their_likely_kind(tmp_path, content, wor
 
 
 def test_a_bag_without_messages(tmp_path):
-    """A topic alone is nothing to work on."""
     with BagWriter(tmp_path / 'bag') as bag:
         bag.add_topic('voltage', FLOAT64)
     assert 'holds no messages (topics: /voltage)' in complaint(tmp_path / 'bag')
@@ -348,7 +346,6 @@ def test_mismatched_metadata_is_refused(folder, change, words):
 
 @pytest.mark.parametrize('text', ['', 'a: [', 'a: 1', '- 1', '\x00'])
 def test_wrong_metadata_is_refused(folder, text):
-    """Empty or broken YAML is one line."""
     (folder / 'metadata.yaml').write_text(text)
     assert 'metadata.yaml' in complaint(folder)
 
@@ -364,7 +361,6 @@ def test_file_without_permission_is_refused(tmp_path, monkeypatch):
 
 
 def test_two_definitions_of_one_type(tmp_path):
-    """Files of a bag that define a type differently are not read by one of the two."""
     folder = shutil.copytree(tmp_path, tmp_path / 'bag')
     for k, text in enumerate(('float64 data\n', 'float32 other\nfloat32 data\n')):
         with BagWriter(folder / f'bag_{k}.mcap') as bag:

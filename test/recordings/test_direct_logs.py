@@ -19,7 +19,7 @@ REAL = os.environ.get('OU_MONITOR_REALDATA')
 
 @pytest.mark.skipif(REAL is None, reason='OU_MONITOR_REALDATA names no folder of recordings')
 @pytest.mark.parametrize('file,package,voltage', [
-    ('bf_3s_erpm2.bbl', 'orangebox', None), ('ac_erle_althold2.BIN', 'pymavlink', None),
+    ('ac_erle_althold2.BIN', 'pymavlink', None),
     ('px_sample_log_small.ulg', 'pyulog', 'battery_status[1].voltage_v')])
 def test_a_log_equals_its_converted_bag(file, package, voltage, tmp_path):
     """Equal samples, throttle and notes; the name is the log's."""
@@ -33,7 +33,7 @@ def test_a_log_equals_its_converted_bag(file, package, voltage, tmp_path):
     np.testing.assert_array_equal(found.t, wanted.t)
     np.testing.assert_array_equal(found.voltage, wanted.voltage)
     np.testing.assert_array_equal(found.throttle, wanted.throttle)
-    assert found.name == file and found.source['format'] in ('blackbox', 'dataflash', 'ulog')
+    assert found.name == file and found.source['format'] in ('dataflash', 'ulog')
     part = read_recording(log, start=1.0, end=2.0, columns=columns)
     assert 0 < part.n < found.n and part.duration < 1.0
 
@@ -43,7 +43,9 @@ def test_a_log_equals_its_converted_bag(file, package, voltage, tmp_path):
 def test_one_flight_as_log_csv_and_bag_is_one_recording(file, rate, tmp_path):
     """With every repeat of its logger in each: the same readings, and the same analysis."""
     pytest.importorskip('orangebox')
-    path = Path(REAL) / 'raw' / file
+    path = tmp_path / file
+    # Seconds are enough: the reader of blackbox logs takes one for each 300 kB.
+    path.write_bytes((Path(REAL) / 'raw' / file).read_bytes()[:500_000])
     log = import_log(path, Request())
     raw = columns_of(path, log, choose(path, log))
     sheet, bag = tmp_path / 'flight.csv', tmp_path / 'flight.mcap'

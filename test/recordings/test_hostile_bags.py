@@ -41,7 +41,6 @@ def zeros(compressor):
 
 
 def zstd(**options):
-    """Return the compressor of zstd."""
     return zstandard.ZstdCompressor(level=1).compressobj(**options)
 
 
@@ -75,7 +74,6 @@ def test_a_chunk_that_unpacks_to_more(tmp_path, compression, packed, stated):
 
 
 def test_the_limit_of_a_chunk(tmp_path, monkeypatch):
-    """By argument, by environment; a malformed one is one line."""
     path = by_hand(tmp_path / 'a.mcap', chunk(schema() + channel() + messages(N)))
     assert BagReader(path).message_count == N
     assert 'MAX_CHUNK_MB' in complaint(BagReader, path, max_chunk=1000)
@@ -89,7 +87,6 @@ def test_the_limit_of_a_chunk(tmp_path, monkeypatch):
 
 
 def index_of(chunk_at, chunk_length, unpacked, *, index_length=0, offset=None):
-    """Return a chunk index."""
     behind = (chunk_at + chunk_length) % 2**64
     offsets = struct.pack('<HQ', 1, behind if offset is None else offset)
     return record(Op.CHUNK_INDEX, struct.pack('<QQQQ', 1000, 1000 * N, chunk_at, chunk_length),
@@ -98,7 +95,6 @@ def index_of(chunk_at, chunk_length, unpacked, *, index_length=0, offset=None):
 
 
 def statistics():
-    """Return statistics that count the messages."""
     return record(Op.STATISTICS, struct.pack('<QHIIIIQQ', N, 1, 1, 0, 0, 1, 1000, 1000 * N),
                   text(struct.pack('<HQ', 1, N)))
 
@@ -178,7 +174,6 @@ def test_a_message_index_is_verified_or_left(tmp_path, index):
 
 @pytest.mark.parametrize('length', [2**63 - 1, 2**63, 2**64 - 1, 2**64 - 9, 2**31, 21, 0])
 def test_a_length_within_a_chunk(tmp_path, length):
-    """No sum of it wraps around, with the index or without."""
     content = bytearray(schema() + channel() + messages(N))
     struct.pack_into('<Q', content, PLACES[2] + 1, length)
     one = chunk(bytes(content))
@@ -209,7 +204,6 @@ BOMB = message(0, bytes(2**20 - 100), 1)
       for encoding in (b'\x00\x07', b'\x00\x09', b'\x00\x02', b'\x01\x01')),
 ], ids=lambda value: value.replace(' ', '-') if isinstance(value, str) else '')
 def test_what_is_refused(tmp_path, monkeypatch, parts, words):
-    """In one line, before long, whatever follows."""
     monkeypatch.setenv('OU_MONITOR_MAX_CHUNK_MB', '10')
     if words.startswith('and those'):
         monkeypatch.setenv('OU_MONITOR_MAX_CHUNK_MB', str(2**20 / 1e6))
@@ -241,7 +235,6 @@ def rosbag2(content):
     ([chunk(schema('a/msg/B', 'float64 data\n' * 100_000, 2) + channel('/b', 2, 2) + SOUND)],
      {}, 1)])
 def test_what_is_left_out(tmp_path, parts, about, notes):
-    """The messages are read; notes are few and short."""
     bag = BagReader(by_hand(tmp_path / 'a.mcap', *parts))
     assert (bag.counts, bag.about, len(bag.notes)) == ({'/voltage': N}, about, notes)
     assert all(len(note) < 400 for note in bag.notes)
@@ -282,7 +275,6 @@ def test_names_do_not_reach_the_terminal(tmp_path):
 
 
 def test_topics_of_any_number(tmp_path):
-    """A refusal names some of them."""
     many = b''.join(channel(f'/x{k}', k + 2) for k in range(3000))
     path = by_hand(tmp_path / 'a.mcap', chunk(
         schema() + many + b''.join(message(k, bytes(12), 2 + k) for k in range(3000))))
@@ -358,7 +350,6 @@ def test_endless_recordings_are_refused(tmp_path, name):
 
 
 def test_wrong_metadata_and_parts_are_refused(tmp_path):
-    """A bag whose files are FIFOs."""
     folder = tmp_path / 'bag'
     with BagWriter(folder) as bag:
         bag.add_topic('voltage', FLOAT64)
@@ -382,7 +373,6 @@ def test_csv_lines_have_an_end(tmp_path):
 
 
 def test_columns_without_end_are_listed_in_part(tmp_path):
-    """The file is not read once for each of thousands."""
     names = [f'c{k}' for k in range(5000)]
     path = tmp_path / 'a.csv'
     path.write_text(','.join(['time_s', *names]) + '\n' + ','.join(['1'] * 5001) + '\n')

@@ -18,7 +18,6 @@ KNOTS = {'term': 'load_dependent_sigma',
 
 
 def model(*names_and_params):
-    """Return a model of terms of the catalogue."""
     return SupplyModel(tuple(catalogue()[n](**p) for n, p in names_and_params))
 
 
@@ -54,7 +53,6 @@ def test_a_model_file_reads_back_exactly(tmp_path):
 
 @pytest.mark.parametrize('name', sorted(set(catalogue()) - {'ou'}))
 def test_every_term_goes_through_a_file(name):
-    """With a number for every parameter that all ranges allow."""
     cls = catalogue()[name]
     params = {key: [0.25, 0.5] if key in ('at', 'throttle', 'log_factor')
               else 0.5 + 2.0 * k + 2.0 * (key == 'dof')
@@ -173,7 +171,6 @@ def test_a_malformed_model_file_is_refused(data, words):
 ], ids=['empty', 'comment', 'syntax', 'tab', 'binary', 'nul', 'python', 'date', 'deep', 'two',
         'loop'])
 def test_files_of_other_kinds_are_refused(tmp_path, content, words):
-    """One line that names the file, whatever its bytes."""
     path = tmp_path / 'bad.yaml'
     path.write_bytes(content)
     with pytest.raises(InputError) as caught:
@@ -183,7 +180,6 @@ def test_files_of_other_kinds_are_refused(tmp_path, content, words):
 
 
 def test_unreadable_files_are_refused(tmp_path):
-    """Missing, and a folder."""
     for path in (tmp_path / 'none.yaml', tmp_path):
         with pytest.raises(InputError, match='cannot read the model file') as caught:
             read_model(path)

@@ -47,7 +47,6 @@ def same(one, other):
 
 @pytest.fixture(scope='module')
 def rows():
-    """Return the messages."""
     return flight()
 
 
@@ -138,7 +137,6 @@ def test_a_part_equals_that_part_of_the_whole(tmp_path, start, end, stamped):
 
 
 def test_parts_side_by_side_are_the_whole(tmp_path):
-    """Each message belongs to exactly one part."""
     path = write(tmp_path / 'bag.mcap', [row for row in flight(stamped=False)
                                          if row[0] != '/voltage' or row[2] % 3])
     edges = [0.0, 0.02, 0.7, 0.71, 1.9, 2.6, None]
@@ -154,7 +152,6 @@ def test_parts_side_by_side_are_the_whole(tmp_path):
     (None, 0.0, 'not after'), (50.0, None, 'no sample from 50 s to the end: it lasts 3.0'),
     (50.0, 60.0, 'no sample from 50 s to 60 s')])
 def test_empty_parts_are_refused(bag, start, end, words):
-    """One line says why."""
     with pytest.raises(InputError, match=words):
         read_recording(bag, start=start, end=end)
 
@@ -198,7 +195,6 @@ def test_fewer_messages_than_stated(bag, tmp_path):
 
 
 def test_two_publishers_of_one_topic(tmp_path):
-    """Two channels of one topic are one series, by log time."""
     path = tmp_path / 'bag.mcap'
     data = encode_scalars(FLOAT32, np.arange(300.0))
     with path.open('wb') as file:

@@ -139,7 +139,6 @@ def test_samples_of_a_block_end_at_its_stamp(tmp_path):
 
 
 def test_a_gap_between_blocks_is_noted(tmp_path):
-    """It stays in the stamps."""
     path = make(tmp_path / 'bag.mcap', ('voltage', FLOAT32_ARRAY, [
         (t * MS, encode_block([5.0] * 100)) for t in (10, 20, 1020)]))
     recording = read_recording(path)
@@ -288,7 +287,6 @@ def test_a_bag_with_no_sample_is_refused_and_one_is_enough(tmp_path):
 
 
 def test_throttle_of_nan_is_unknown(tmp_path):
-    """The last value that was one holds."""
     path = make(tmp_path / 'bag.mcap', ('voltage', FLOAT32, scalars([5.0, 5.1, 5.2])),
                 ('throttle', FLOAT32, scalars([0.5, np.nan])))
     recording = read_recording(path)
@@ -309,7 +307,6 @@ def test_stamps_since_1970_keep_float64_resolution(tmp_path):
 
 @pytest.mark.parametrize('kind', ['csv', 'mcap'])
 def test_implausible_samples_are_dropped_and_noted(tmp_path, kind):
-    """One value that would overflow everything behind."""
     values = np.full(50, 5.0)
     values[7] = 1e300
     path = tmp_path / f'a.{kind}'

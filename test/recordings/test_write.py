@@ -44,7 +44,6 @@ def test_start_is_added(tmp_path):
 
 
 def test_throttle_is_sent_when_it_changes_and_once_a_second(tmp_path):
-    """First sample, each change, and once a second at least; ahead of its sample."""
     t = np.arange(400) / 100.0
     throttle = np.where(t < 2.505, 0.25, 0.75)
     write_recording(Recording(t, np.full(400, 5.0), throttle), tmp_path / 'bag')
@@ -63,7 +62,6 @@ def test_unknown_throttle_is_not_written(tmp_path):
 
 
 def test_throttle_known_only_later(tmp_path):
-    """Before its first value it is unknown."""
     rec = recording(100)
     rec.throttle[:10] = np.nan
     write_recording(rec, tmp_path / 'bag')

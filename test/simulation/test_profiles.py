@@ -137,7 +137,6 @@ def test_a_wrong_profile_csv_is_named_in_one_line(tmp_path, content, words):
 
 
 def test_a_folder_is_no_csv(tmp_path):
-    """Named so or not."""
     folder = tmp_path / 'a.csv'
     folder.mkdir()
     assert 'cannot read' in refused(str(folder)) and str(folder) in refused(str(folder))

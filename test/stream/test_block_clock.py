@@ -16,7 +16,6 @@ def run(ends, clock=None, n=N):
 
 
 def test_the_stamp_is_that_of_the_last_sample():
-    """The first block is laid out backwards from its stamp."""
     t = run([5.0], n=4)
     np.testing.assert_allclose(t, [4.9997, 4.9998, 4.9999, 5.0], rtol=0, atol=1e-12)
 
@@ -81,7 +80,6 @@ def test_two_long_blocks_are_not_a_gap():
 
 
 def test_blocks_of_any_length():
-    """The time line goes on over blocks of changing and of no length."""
     clock = BlockClock(1000.0)
     t = run([0.010, 0.010, 0.013], clock, n=[10, 0, 3])
     np.testing.assert_allclose(t, np.arange(1, 14) / 1000.0, rtol=0, atol=1e-12)
@@ -106,13 +104,11 @@ def test_a_reset_starts_a_new_time_line():
 
 @pytest.mark.parametrize('rate', [0.0, -1.0, float('nan'), float('inf')])
 def test_wrong_rates_are_refused(rate):
-    """A caller's bug."""
     with pytest.raises(ValueError, match='Hz'):
         BlockClock(rate)
 
 
 def test_wrong_stamps_are_refused():
-    """A caller's bug."""
     with pytest.raises(ValueError, match='finite'):
         run([float('nan')], n=1)
     with pytest.raises(ValueError, match='-1'):

@@ -3,9 +3,11 @@
 import shutil
 
 from ou_monitor.errors import InputError
-from ou_monitor.stream.config import list_msg_configs, load_msg_config, msg_config_dir
+from ou_monitor.stream.config import (
+    FieldSpec, list_msg_configs, load_msg_config, ManyExtractor, msg_config_dir, parse_field_path)
 import pytest
 import yaml
+
 
 SHIPPED = {'std_float32', 'std_float64', 'adc_block', 'battery_state', 'px4', 'mavros',
            'ardupilot_dds'}
@@ -79,7 +81,6 @@ def test_px4_throttle_is_mapped_to_0_1():
     ('voltage', {'stamp_field': 3}, ["'stamp_field'", 'text or null', '3']),
 ])
 def test_a_mistake_is_named(tmp_path, part, change, expected):
-    """One line: file, key, and what to write instead."""
     path = written(tmp_path, change, part)
     with pytest.raises(InputError) as caught:
         load_msg_config(path)
@@ -102,7 +103,6 @@ def test_a_missing_key_is_named(tmp_path, key):
 @pytest.mark.parametrize('text, expected', [
     ('a: [', 'not YAML'), ('', 'expected keys'), ('- 1\n', 'expected keys')])
 def test_file_without_a_mapping_is_refused(tmp_path, text, expected):
-    """Broken YAML and empty files are one line."""
     path = tmp_path / 'rail.yaml'
     path.write_text(text, encoding='utf-8')
     with pytest.raises(InputError, match=expected) as caught:
@@ -111,7 +111,6 @@ def test_file_without_a_mapping_is_refused(tmp_path, text, expected):
 
 
 def test_unknown_name_and_missing_file(tmp_path):
-    """The nearest name is offered."""
     with pytest.raises(InputError, match="no msg config 'batery_state'.*'battery_state'"):
         load_msg_config('batery_state')
     with pytest.raises(InputError, match='nowhere.yaml'):
@@ -148,3 +147,47 @@ def test_a_missing_folder_of_msg_configs_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr('ou_monitor.stream.config.__file__', str(tmp_path / 'a/b/c/config.py'))
     with pytest.raises(InputError, match='no msg_config folder'):
         msg_config_dir()
+
+
+@pytest.mark.parametrize('path, steps', [
+    ('data', ('data',)), ('header.stamp', ('header', 'stamp')),
+    ('channels[0].value', ('channels', 0, 'value')), ('a[1][20]', ('a', 1, 20))])
+def test_paths(path, steps):
+    assert parse_field_path(path) == steps
+
+
+@pytest.mark.parametrize('path', ['', '.', 'a.', 'a[', 'a[-1]', 'a[0', '[0]', 'a b', '1a', 'a..b'])
+def test_malformed_paths(path):
+    with pytest.raises(InputError, match='field path'):
+        parse_field_path(path)
+
+
+class Message:
+    """Looks like an rclpy message."""
+
+    def __init__(self, **fields):
+        self.__dict__ |= fields
+
+    def get_fields_and_field_types(self):
+        """Return what rclpy would, by instance here."""
+        return dict.fromkeys(self.__dict__, 'float')
+
+
+ESCS = Message(esc=[Message(rpm=1000), Message(rpm=2000.5)], all=[1.0, 2.0, 3.0], one=4, name='x')
+
+
+@pytest.mark.parametrize('field, values', [
+    ('esc[].rpm', [100.0, 200.05]), ('all', [0.1, 0.2, 0.3]), ('all[]', [0.1, 0.2, 0.3]),
+    ('esc[1].rpm', [200.05]), ('one', [0.4]), ('esc[7].rpm', [])])
+def test_several_numbers(field, values):
+    """A field of each element, an array, an element, a number; none where there is none."""
+    extractor = ManyExtractor(FieldSpec('rpm', 'my_msgs/msg/Escs', field, unit_factor=0.1))
+    assert extractor.extract(ESCS).tolist() == pytest.approx(values)
+
+
+@pytest.mark.parametrize('field, words', [
+    ('esc[].rp', "did you mean 'rpm'"), ('name', 'holds no numbers'), ('esc', 'holds no numbers'),
+    ('esc[]]', 'not of the form'), ('one[]', 'holds no numbers'), ('one[0]', 'not an array')])
+def test_lists_without_numbers_are_refused(field, words):
+    with pytest.raises(InputError, match=words):
+        ManyExtractor(FieldSpec('rpm', 'my_msgs/msg/Escs', field)).extract(ESCS)

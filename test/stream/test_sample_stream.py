@@ -18,7 +18,6 @@ class Sink:
         self.watched = []
 
     def push(self, t, voltage, throttle, arrival=None, *, current=None, thin=1):
-        """Note samples."""
         self.t += t.tolist()
         self.v += voltage.tolist()
         self.u += throttle.tolist()
@@ -29,7 +28,6 @@ class Sink:
         self.watched += list(zip(voltage.tolist(), arrival.tolist()))
 
     def reset(self, reason):
-        """Note a reset."""
         self.resets.append(reason)
 
 
@@ -39,7 +37,6 @@ def plain(value):
 
 
 def stamped(stamp, value):
-    """Return a message with a stamp."""
     whole = math.floor(stamp)
     time = SimpleNamespace(sec=whole, nanosec=round((stamp - whole) * 1e9))
     return SimpleNamespace(data=value, stamp=time)
@@ -78,7 +75,6 @@ def test_pairs_by_arrival_when_only_one_is_stamped():
 
 
 def test_pairs_by_stamp_when_only_one_is_stamped_and_the_clocks_agree():
-    """As the bench does with a bag of such messages."""
     stream, sink = stream_of('stamp', None)
     for k in range(4):
         stream.take_voltage(stamped(1.0 + 0.01 * k, 5.0), None)
@@ -113,7 +109,6 @@ def test_backward_throttle_restarts_the_pairing():
 
 
 def test_pairs_by_arrival_when_the_clocks_differ():
-    """Microseconds since boot beside the wall clock."""
     stream, sink = stream_of('stamp', 'stamp')
     stream.take_throttle(stamped(12.0, 0.2), None)
     stream.take_voltage(stamped(1.7e9, 5.0), None)
@@ -177,7 +172,6 @@ def test_a_step_back_within_one_call_clears_the_window_once():
 
 
 def test_blocks_are_spread_over_the_time_line():
-    """The stamp is that of the last sample."""
     stream, sink = stream_of(sample_rate=100.0)
     stream.take_voltage(plain([1.0, 2.0, math.nan, 4.0]), lambda: 10.0)
     assert stream.take_voltage(plain([]), lambda: 10.0) is False
@@ -187,7 +181,6 @@ def test_blocks_are_spread_over_the_time_line():
 
 
 def test_a_block_of_nan_is_not_usable():
-    """Every sample is counted, none is a voltage."""
     stream, sink = stream_of(sample_rate=100.0)
     assert not stream.take_voltage(plain([math.nan, math.nan]), lambda: 10.0)
     assert stream.take_voltage(plain([math.nan, 5.0]), lambda: 10.02)

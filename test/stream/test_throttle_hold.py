@@ -135,12 +135,10 @@ class Sink:
         self.come = 0
 
     def push(self, t, voltage, throttle, arrival=None, *, current=None, thin=1):
-        """Note samples."""
         self.pairs += [(self.come, *row) for row in zip(
             t.tolist(), voltage.tolist(), throttle.tolist(), strict=True)]
 
     def reset(self, reason):
-        """Note a reset."""
         self.resets += 1
 
 

@@ -2,7 +2,6 @@
 Recordings drawn blind, and what a program said of them: right, in the set, false.
 
 Shared by the tests and by `benchmarks/discover.py`.
-
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -10,10 +9,8 @@ from dataclasses import asdict, dataclass
 from hashlib import sha256
 from typing import Any
 
-from hidden_effects import draw, Hidden, labels  # noqa: E402
-import numpy as np  # noqa: E402
-
-# The generator of hidden effects is no package: its folder is.
+from hidden_effects import draw, Hidden, labels
+import numpy as np
 
 
 # Verdicts that say that something is left that no cause explains.
@@ -23,21 +20,9 @@ OPEN = ('unexplained', 'partly_explained')
 def hide(kind: str, effect: str, seed: int, number: int, *, duration: float, rate: float,
          strength: float) -> Hidden:
     """
-    Hide an effect; all but its name comes from the seed.
+    Hide an effect; all but its name comes from the seed and the number of this effect.
 
-    Parameters
-    ----------
-    kind, effect : str
-        As `draw` takes them; for a pair two names joined by '+', for 'none' ''.
-    seed, number : int
-        Of the run, and which of this effect.
-    duration, rate, strength : float
-        As `draw` takes them: s, Hz, 1 for moderate.
-
-    Returns
-    -------
-    Hidden
-
+    Kind and effect as `draw` takes them: for a pair two names joined by '+', for 'none' ''.
     """
     word = int.from_bytes(sha256(f'{kind} {effect}'.encode()).digest()[:8], 'big')
     cause = tuple(effect.split('+')) if kind == 'pair' else effect or None
@@ -47,29 +32,17 @@ def hide(kind: str, effect: str, seed: int, number: int, *, duration: float, rat
 
 @dataclass(frozen=True)
 class Outcome:
-    """
-    What was hidden and what was reported.
+    """What was hidden and what was reported."""
 
-    Attributes
-    ----------
-    kind, effect : str
-        Kind of recording, and the entry of the generator's table.
-    accepted : tuple of tuple of str
-        Lists of names that are equally right; the first is the truth.
-    near : tuple of str
-        For 'unknown': names acceptable beside "not explained".
-    verdict : str
-        As in the JSON of `discover`; empty when there is none.
-    named : dict of str to tuple of str
-        Causes named, each with its alternatives.
-
-    """
-
+    # Kind of recording, and the entry of the generator's table.
     kind: str
     effect: str
+    # As in `Hidden`.
     accepted: tuple[tuple[str, ...], ...]
     near: tuple[str, ...]
+    # As in the JSON of `discover`; empty when there is none.
     verdict: str
+    # Causes named, each with its alternatives.
     named: Mapping[str, tuple[str, ...]]
 
     @property
@@ -85,7 +58,6 @@ class Outcome:
         A true name is reported when it is named or an alternative of what is;
         a name is false unless it, or one of its alternatives, stands for a
         true name that no other does.
-
         """
         return bool(self.verdict) and any(
             set(way) <= self.reported and _each_stands(list(self.named.items()), set(way))
@@ -130,7 +102,6 @@ class Outcome:
         return set(self.named).union(*self.named.values())
 
     def as_data(self) -> dict[str, Any]:
-        """Return the same for JSON."""
         return asdict(self)
 
 
@@ -144,21 +115,9 @@ def from_data(data: Mapping[str, Any]) -> Outcome:
 
 def outcome(hidden: Hidden, verdict: str = '', causes: Iterable[Any] = ()) -> Outcome:
     """
-    Return what became of a recording.
+    Return what became of a recording; no verdict where the program failed.
 
-    Parameters
-    ----------
-    hidden : Hidden
-        The recording and the truth.
-    verdict : str
-        Value of the verdict; empty where the program failed.
-    causes : iterable of Cause
-        Causes of the finding; one named twice counts once.
-
-    Returns
-    -------
-    Outcome
-
+    A cause that is named twice counts once.
     """
     named: dict[str, tuple[str, ...]] = {}
     for cause in causes:
@@ -177,20 +136,10 @@ def _each_stands(named: Sequence[tuple[str, tuple[str, ...]]], true: set[str]) -
 
 def confusion(outcomes: Iterable[Outcome]) -> dict[str, dict[str, int]]:
     """
-    Return how often each name was given to each truth.
+    Return how often each name was given to each truth: truth to counts by name.
 
-    Parameters
-    ----------
-    outcomes : iterable of Outcome
-        Recordings.
-
-    Returns
-    -------
-    dict
-        Truth ('+' between two, 'none', 'unknown') to counts by name; 'nothing'
-        where none was named, 'failed' where there is no verdict, and 'of' for
-        the recordings.  One with several names is counted under each.
-
+    Truth is '+' between two, 'none' or 'unknown'; 'nothing' counts recordings without a name,
+    'failed' those without a verdict, 'of' all.  One with several names is counted under each.
     """
     table: dict[str, dict[str, int]] = {}
     for one in outcomes:

@@ -125,7 +125,6 @@ class Browser:
         self.until(wanted)
 
     def until(self, expression):
-        """Wait until an expression is true."""
         end = time.monotonic() + _TIMEOUT
         while not self.run(f'Boolean({expression})'):
             assert time.monotonic() < end, (expression, self.errors)
@@ -154,7 +153,6 @@ class Browser:
         self.mouse('mouseReleased', *stop, **more)
 
     def key(self, name, **more):
-        """Press and release a key."""
         for kind in ('keyDown', 'keyUp'):
             self.send('Input.dispatchKeyEvent', type=kind, key=name, **more)
 

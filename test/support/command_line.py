@@ -8,7 +8,6 @@ from ou_monitor.cli.main import main
 
 
 def write_csv(path, t, voltage, throttle=None):
-    """Write a CSV as the contract has it."""
     columns = [t, voltage] if throttle is None else [t, voltage, throttle]
     np.savetxt(path, np.column_stack(columns), '%.9g', ',', comments='',
                header=','.join(['time_s', 'voltage_v', 'throttle'][:len(columns)]))

@@ -27,26 +27,9 @@ def ou_covariance(t, alpha, sigma, noise_var):
 
 def restricted(cov, y, x):
     """
-    Return the restricted log-likelihood, profiled over scale, and more.
+    Return the restricted log-likelihood, nats, profiled over scale; the scale; beta, covariance.
 
-    Parameters
-    ----------
-    cov : ndarray, shape (n, n)
-        Covariance up to a factor.
-    y : ndarray, shape (n,)
-        Data.
-    x : ndarray, shape (n, p)
-        Regressors.
-
-    Returns
-    -------
-    value : float
-        Log-likelihood of the contrasts, nats.
-    scale : float
-        The factor.
-    beta, beta_cov : ndarray
-        Coefficients and covariance.
-
+    `cov` is the covariance up to that scale, `x` the regressors.
     """
     factor = cho_factor(cov, lower=True)
     log_det = 2.0 * np.log(factor[0].diagonal()).sum()

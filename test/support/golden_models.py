@@ -5,7 +5,6 @@ import math
 
 from golden_runs import flight, table
 import numpy as np
-from ou_monitor import discover
 from ou_monitor.analysis.level_tests import examine_level, holm
 from ou_monitor.criticism.battery import (
     covariates_of, criticise, simulate_bank, simulate_bank_of, statistics)
@@ -225,22 +224,5 @@ def discovery():
     return found
 
 
-def findings():
-    """Return what `discover` says of short recordings with one effect each."""
-    found = {}
-    for name, others in (
-            ('sag', [term('load_sag', linear=0.3, square=0.1)]),
-            ('glitches', [term('glitches', probability=0.01, std=0.5)])):
-        s = samples_of(2500, *others, seed=97)
-        made = discover(Recording(s.t, s.voltage, s.throttle, name))
-        found[name] = table({
-            'verdict': made.verdict.name, 'gain': [made.gain, made.gain_se, made.score],
-            'causes': [[one.name, one.gain, one.gain_se, one.alternatives, one.exact]
-                       for one in made.causes],
-            'criticism': [[one.statistic.replace(' ', '_'), one.before, one.after]
-                          for one in made.criticism][:12]})
-    return found
-
-
 RUNS = {run.__name__: run for run in (
-    terms, laws, integrity, criticism, discovery, findings)}
+    terms, laws, integrity, criticism, discovery)}

@@ -168,7 +168,6 @@ def risk():
 
 
 def number(text):
-    """Return a field as a number where it is one."""
     try:
         return float(text)
     except ValueError:

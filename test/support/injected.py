@@ -55,7 +55,6 @@ def _often(recording: Recording, rate: float) -> float:
 
 
 def tone(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
-    """Add a steady line."""
     rate = 1.0 / _step(recording)
     at = rng.uniform(0.1, 0.4) * rate
     return _added(recording, 0.8 * noise * np.sin(2.0 * np.pi * at * recording.t))

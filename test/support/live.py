@@ -122,16 +122,13 @@ class Process:
 
     @property
     def out(self) -> str:
-        """Return what it has written to stdout."""
         return self._out.read_text()
 
     @property
     def err(self) -> str:
-        """Return what it has written to stderr."""
         return self._err.read_text()
 
     def wait(self, timeout: float = DEADLINE) -> int:
-        """Return the exit status."""
         try:
             return self.popen.wait(timeout)
         except subprocess.TimeoutExpired:
@@ -143,7 +140,6 @@ class Process:
         return self.wait()
 
     def kill(self) -> None:
-        """End it whatever it does."""
         if self.popen.poll() is None:
             self.popen.kill()
             self.popen.wait()
@@ -163,7 +159,6 @@ class Starved:
     ----------
     stops : list of tuple of float
         When it was stopped, and when it went on, by the monotonic clock, s.
-
     """
 
     def __init__(self, pid: int, stopped: float = 0.02, running: float = 0.01) -> None:
@@ -185,12 +180,10 @@ class Starved:
             time.sleep(self._running)
 
     def start(self) -> Starved:
-        """Begin."""
         self._thread.start()
         return self
 
     def stop(self) -> None:
-        """Let it go on."""
         self._end.set()
         if self._thread.is_alive():
             self._thread.join()
@@ -261,7 +254,6 @@ class Probe:
         self.node.create_subscription(kind, topic, call, qos)
 
     def publisher(self, topic: str, kind: Any, qos: Any = 10) -> Any:
-        """Return a publisher."""
         return self.node.create_publisher(kind, topic, qos)
 
     def call(self, kind: Any, service: str, request: Any) -> Any:
@@ -295,7 +287,6 @@ class Probe:
         return self.call(SetParameters, f'{node}/set_parameters', request).results[0]
 
     def close(self) -> None:
-        """End it."""
         self._closing = True
         self._thread.join(5.0)
         self._executor.remove_node(self.node)
@@ -318,13 +309,11 @@ class World:
         os.environ['ROS_LOG_DIR'] = str(folder)
 
     def start(self, name: str, *arguments: str) -> Process:
-        """Start an executable."""
         self._processes.append(Process(name, [str(a) for a in arguments], self.domain,
                                        self.folder, self.reach))
         return self._processes[-1]
 
     def probe(self) -> Probe:
-        """Return a new probe."""
         self._probes.append(Probe(self.domain))
         return self._probes[-1]
 
@@ -374,7 +363,6 @@ class Estimator:
 
     def send(self, voltage: float, stamp: float, output: Any = None,
              current: float = math.nan) -> None:
-        """Send one BatteryState with a stamp, s."""
         from builtin_interfaces.msg import Time
         from sensor_msgs.msg import BatteryState
         whole, rest = divmod(round(stamp * 1e9), 10**9)
@@ -393,11 +381,9 @@ class Estimator:
 
     @property
     def status(self) -> Any:
-        """Return the newest status."""
         return self.states[-1].status[0]
 
     def field(self, name: str) -> str:
-        """Return a field of the newest state."""
         return values_of(self.status)[name]
 
     def count(self, name: str) -> int:

@@ -57,7 +57,6 @@ def decode(kind, data, text=None):
 
 
 def encode_block(samples):
-    """Return one block of samples."""
     return encode_blocks(np.asarray(samples, dtype=float)[None])[0]
 
 
@@ -94,31 +93,26 @@ def records(data):
 
 
 def text(value):
-    """Return a text as a record holds it."""
     data = value.encode() if isinstance(value, str) else value
     return struct.pack('<I', len(data)) + data
 
 
 def record(op, *parts, length=None):
-    """Return a record."""
     content = b''.join(parts)
     return struct.pack('<BQ', op, len(content) if length is None else length) + content
 
 
 def schema(name=FLOAT64, definition='float64 data\n', key=1):
-    """Return a schema."""
     return record(Op.SCHEMA, struct.pack('<H', key), text(name), text('ros2msg'),
                   text(definition))
 
 
 def channel(topic='/voltage', key=1, of=1, **metadata):
-    """Return a channel."""
     pairs = b''.join(text(k) + text(v) for k, v in metadata.items())
     return record(Op.CHANNEL, struct.pack('<HH', key, of), text(topic), text('cdr'), text(pairs))
 
 
 def message(k, data, key=1):
-    """Return a message."""
     return record(Op.MESSAGE, struct.pack('<HIQQ', key, k, 1000 * (k + 1), 0), data)
 
 

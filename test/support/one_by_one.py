@@ -20,17 +20,14 @@ class OneByOne(SampleStream):
     """Takes message objects."""
 
     def open_voltage(self, spec):
-        """Set the field of the voltage."""
         super().open_voltage(spec)
         self.voltage = spec
 
     def open_throttle(self, spec):
-        """Set the field of the throttle."""
         super().open_throttle(spec)
         self.loads = spec
 
     def take_voltage(self, message, source_time):
-        """Take one message of the voltage."""
         values, stamp = extracted(self.voltage, message)
         values = values if values.size or self._block else np.array([np.nan])
         end = source_time() if stamp is None else stamp
@@ -38,7 +35,6 @@ class OneByOne(SampleStream):
                                        np.array([values.size]), values)[0])
 
     def take_throttle(self, message, source_time):
-        """Take one message of the throttle."""
         values, stamp = extracted(self.loads, message)
         end = source_time() if stamp is None else stamp
         return self.take_throttles(end, stamp is not None, values)

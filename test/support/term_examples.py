@@ -45,7 +45,6 @@ EXAMPLES = {
 
 
 def term(name, **params):
-    """Return a term of the catalogue."""
     return catalogue()[name](**params)
 
 
@@ -67,7 +66,6 @@ def clusters(model, offsets, gap, count, seed, throttle=None):
     -------
     ndarray, shape (count, len(offsets))
         Voltage, V; the group at the very start is left out.
-
     """
     t = (np.arange(count + 1)[:, None] * gap + np.asarray(offsets)[None, :]).ravel()
     voltage = model.simulate(t, np.random.default_rng(seed), throttle)

@@ -11,6 +11,7 @@ import pytest
 from scipy.signal import lfilter
 from simulated_windows import ALPHA, DT, errors, estimate, LEVEL, paths, SIGMA, stamps
 
+
 # Standard deviation of the increments of the OU over DT, V.
 INCREMENT = SIGMA * math.sqrt(DT)
 FACTORS = [2, 3, 5, 8, 10, 16, 25, 50]
@@ -188,7 +189,6 @@ def test_batches_of_any_size_give_equal_readings(seed, period, sizes):
 
 
 def test_steps_and_throttle_of_refreshes():
-    """A batch of refreshes says its own steps, from the one before on."""
     repeats = Repeats()
     repeats.period = 4.0
     y = np.repeat([0.0, 1.0, 2.0, 3.0, 4.0], 4)
@@ -317,3 +317,56 @@ def test_ties_without_a_period_are_readings():
     values = np.rint(rng.standard_normal(3000)) / 100 + 5
     one = Recording(0.01 * np.arange(3000), values, np.full(3000, math.nan))
     assert readings_of(one) is one and one.held == 0
+
+
+def series(gaps, sizes=(1.0, 2.0, 5.0)):
+    """Return values that change after these gaps, by steps of several sizes, up and down."""
+    steps = np.resize(sizes, len(gaps) + 1) * np.resize((1.0, -1.0, -1.0, 1.0), len(gaps) + 1)
+    return np.repeat(np.concatenate(([0.0], np.cumsum(steps))), [1, *gaps, 1])
+
+
+@pytest.mark.parametrize('period', [2, 3, 4, 7])
+def test_a_period_needs_twenty_nats(period):
+    """Against changes at random, of which a gap is a whole number of periods by chance."""
+    gaps = np.arange(1, 2000)
+    law = (1.0 - 1.0 / period) ** (gaps - 1) / period
+    chance = law[gaps % period == 0].sum()
+    divergence = 0.95 * math.log(0.95 / chance) + 0.05 * math.log(0.05 / (1.0 - chance))
+    enough = math.ceil(20.0 / divergence)
+    assert refresh_period(series([period] * enough)) == period
+    assert refresh_period(series([period] * (enough - 1))) == 1.0
+
+
+@pytest.mark.parametrize('gaps, period', [
+    # Two neighbouring lengths, also with a refresh that gave the same value; one in twenty odd.
+    ([3, 3, 4] * 20, 10 / 3), ([3, 4, 3, 7, 3, 3] * 10, 23 / 7), ([5] * 57 + [3] * 3, None),
+    # 7 to 13 where 10 is meant; 6 and 14 are one and two periods.
+    ([7, 13, 10, 10] * 30, 10.0), ([6, 14] * 60, 20 / 3), ([6, 15] * 60, 1.0),
+    # One in two samples changes at least; 1.5 times the usual gap is no double one.
+    ([2, 2] * 30, 2.0), ([1, 2, 2, 1, 1] * 30, 1.0)])
+def test_periods_by_the_gaps(gaps, period):
+    found = refresh_period(series(gaps))
+    if period is None:
+        # The odd ones are left out.
+        period = (57 * 5 + (9 if abs(3 - 5) <= 1.75 else 0)) / 57
+    assert found == pytest.approx(period)
+
+
+@pytest.mark.parametrize('odd, kept', [(4, True), (5, False)])
+def test_a_known_period_is_kept_while_eight_in_ten_gaps_are_regular(odd, kept):
+    """3.5 of 10 samples off are regular, 4 are not; those do not count in the mean."""
+    found = refresh_period(series([10] * (20 - odd) + [14] * odd), 10.0)
+    assert (found == 10.0) is kept
+    assert refresh_period(series([10] * 16 + [13] * 4), 10.0) == pytest.approx(10.6)
+    assert refresh_period(series([2] * 15 + [5] * 5), 2.0) == pytest.approx(55 / 25)
+
+
+@pytest.mark.parametrize('same, found', [(90, 5.0), (91, 1.0)])
+def test_a_tenth_of_the_steps_has_another_size(same, found):
+    """Sizes within a thousandth are one."""
+    # Counted is what lies between two changes: the first step of all included.
+    sizes = [1.0, 1.0005] * 46
+    steps = np.array([*sizes[:same], *[2.0 + 0.01 * k for k in range(100 - same)]])
+    steps = np.random.default_rng(1).permutation(steps) * np.resize((1.0, -1.0), 100)
+    y = np.repeat(np.concatenate(([0.0], np.cumsum(steps))), 5)
+    assert refresh_period(y) == found

@@ -27,7 +27,6 @@ def alike(a, b, rel=1e-9):
     (T, Y[:-1], None), (T[:, None], Y[:, None], None), (T, 5.0, None), (T, Y, [0.1, 0.2]),
     (0.0, Y, None), (T, Y, np.zeros((N, 1)))])
 def test_shapes_that_differ_are_refused(t, y, u):
-    """With both shapes in the message, and nothing counted."""
     estimator = SlidingEstimator(2.0)
     with pytest.raises(ValueError, match=r'\('):
         estimator.push(t, y, u)
@@ -47,7 +46,6 @@ def test_windows_that_are_none_are_refused(window):
 
 
 def test_nothing_and_one_sample():
-    """Empty pushes count for nothing; one sample is shown, not fitted."""
     estimator = SlidingEstimator(2.0)
     estimator.push([], [])
     estimator.push(np.empty(0), np.empty(0), 0.5)
@@ -68,7 +66,6 @@ def test_a_fit_needs_twenty_samples():
 
 
 def test_non_finite_samples_are_dropped_and_counted():
-    """The estimate is that of the samples that are left."""
     t, y = T.copy(), Y.copy()
     y[[3, 500]] = np.nan, np.inf
     t[[10, 700]] = -np.inf, np.nan

@@ -180,7 +180,6 @@ def test_rate_that_changes_is_learnt_anew():
 
 
 def test_var_inf_belongs_to_alpha_and_sigma():
-    """Users divide one by the other."""
     e = estimate(T, paths(np.random.default_rng(32), 1, N)[0])
     assert e.var_inf == pytest.approx(e.sigma ** 2 / (2.0 * e.alpha), rel=1e-12)
     assert e.var_inf == pytest.approx(VAR_INF, rel=0.6)

@@ -16,7 +16,6 @@ U = 0.2 + 0.5 * (np.floor(T / 0.7) % 2)
 
 
 def numbers(e):
-    """Return what a fit decides."""
     return [getattr(e, name) for name in NAMES]
 
 
@@ -53,7 +52,6 @@ def test_sliding_is_the_fit_of_what_is_left():
 
 @pytest.mark.parametrize('seconds', [1.0, 2.0, 5.0])
 def test_the_window_is_as_long_as_asked(seconds):
-    """Over many lengths of the past, to one step."""
     estimator = SlidingEstimator(seconds)
     for begin in range(0, 6000, 13):
         estimator.push(T[begin:begin + 13], Y[begin:begin + 13])

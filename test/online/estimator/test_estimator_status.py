@@ -16,7 +16,6 @@ NUMBERS = ('alpha', 'sigma', 'var_inf')
 
 
 def clean(seed=1, n=N, dt=DT):
-    """Return one clean window."""
     return paths(np.random.default_rng(seed), 1, n, dt)[0]
 
 
@@ -29,7 +28,6 @@ def lowpassed(corner):
 
 
 def steps():
-    """Return a throttle that moves."""
     return 0.2 + 0.5 * (np.floor(T / 0.3) % 2)
 
 
@@ -55,7 +53,6 @@ FLAGGED = {
 @pytest.mark.parametrize('flag, number', [
     (flag, i) for flag, cases in FLAGGED.items() for i in range(len(cases))])
 def test_flag_is_raised(flag, number):
-    """By its own case, and with a sentence."""
     e = estimate(*FLAGGED[flag][number]())
     assert flag in e.flags
     assert len(flag.value.split()) > 5
@@ -213,7 +210,6 @@ def test_buried_is_told():
 
 
 def test_ramp_alone_is_not_an_ou():
-    """No restoring force, or no relaxation: never a number."""
     for noise in (0.0, 0.01):
         e = estimate(T, 5.0 - 0.1 * T + noise * np.random.default_rng(9).standard_normal(N))
         assert not e.usable and math.isnan(e.alpha)

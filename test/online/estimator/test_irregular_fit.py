@@ -20,7 +20,6 @@ def made(seed, n=120, noise=0.02, alpha=8.0, sigma=0.6, dt=0.02):
 
 
 def likelihood_of(t, y, x):
-    """Return the likelihood at the stamps."""
     return StampLikelihood(t, np.concatenate([x.T, [y]]))
 
 

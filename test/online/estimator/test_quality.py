@@ -1,9 +1,13 @@
-"""Findings about raw samples: lattices, repeats, piles at an extreme."""
+"""Findings about raw samples: lattices, repeats, piles at an extreme; ramps."""
+
+import math
 
 import numpy as np
+from ou_monitor import SlidingEstimator
 from ou_monitor.online.estimator.quality import examine, lattice, Quality
+from ou_monitor.records import Flag, Status
 import pytest
-from simulated_windows import DT, paths
+from simulated_windows import DT, estimate, LEVEL, paths, stamps
 
 
 def path(seed=1, n=1024, dt=DT):
@@ -45,7 +49,6 @@ def test_saturation(side):
 
 @pytest.mark.parametrize('multiples, told', [((1, 2), False), ((1, 2, 5), True)])
 def test_lattice_needs_three_different_steps(multiples, told):
-    """Two sizes of step may be chance, three multiples of one are not."""
     assert (lattice(0.01 * np.array(multiples)) > 0.0) == told
 
 
@@ -59,3 +62,90 @@ def test_the_extreme_code_of_a_coarse_adc_is_not_saturation():
 def test_too_little_to_tell(y):
     """Below 64 samples, or without changes, nothing is said."""
     assert repr(examine(y)) == repr(Quality())
+
+
+N = 2000
+T = stamps(N)
+
+
+@pytest.mark.parametrize('n', [100, 200, 500, 1000, 2000, 6000])
+@pytest.mark.parametrize('kind', [np.float64, np.float32])
+@pytest.mark.parametrize('noise', [0.0, 1e-5])
+def test_a_ramp_is_a_trend(n, kind, noise):
+    """From the first hundred samples on; noiseless increments are all equal, not smooth."""
+    y = LEVEL - 0.1 * stamps(n) + noise * np.random.default_rng(1).standard_normal(n)
+    e = estimate(stamps(n), y.astype(kind).astype(np.float64))
+    assert Flag.TREND in e.flags and Flag.LOWPASS_UPSTREAM not in e.flags
+    assert not e.usable and math.isnan(e.alpha) and math.isnan(e.var_inf)
+
+
+def test_a_ramp_that_slides_through():
+    """In every report, while the window fills and after."""
+    estimator = SlidingEstimator(1.0)
+    for begin in range(0, 4000, 100):
+        t = (begin + np.arange(100)) * DT
+        estimator.push(t, LEVEL - 0.1 * t)
+        e = estimator.estimate()
+        assert e.flags == (Flag.TREND,) and not e.usable
+
+
+def test_a_random_walk_does_not_drift():
+    """
+    Its net change is chance: more than four standard deviations in 1 of 16 000.
+
+    Two of 400 would be a chance of 3e-4; a limit of two deviations would make it five in each
+    100, and none or one with a chance of 4 %.  Where a trend and a restoring force are found
+    together, that is the fit's doing, and looked at in test_estimator_limits.
+    """
+    rng = np.random.default_rng(2)
+    for n, count in ((60, 400), (200, 400), (2000, 100)):
+        walks = LEVEL + np.cumsum(0.01 * rng.standard_normal((count, n)), axis=1)
+        found = [estimate(stamps(n), y) for y in walks]
+        told = [e for e in found if e.status is Status.UNBOUND and Flag.TREND in e.flags]
+        assert len(told) <= 1
+        # The same with a drift of six standard deviations of the walk.
+        drift = 6.0 * 0.01 / math.sqrt(n) * np.arange(n)
+        found = [estimate(stamps(n), y + drift) for y in walks[:100]]
+        # 6 - 4 = 2 standard deviations: 97 %, less what is judged by other means.
+        assert sum(Flag.TREND in e.flags for e in found) >= 80
+
+
+def test_windows_that_hold_a_few_relaxations_do_not_drift():
+    """Three to ten: an OU comes back, so its net change is less than that of a walk."""
+    rng = np.random.default_rng(3)
+    for n in (50, 100, 160):
+        found = [estimate(stamps(n), y) for y in paths(rng, 100, n)]
+        assert sum(e.status in (Status.UNBOUND, Status.TOO_SHORT) for e in found) > 3
+        assert not any(Flag.TREND in e.flags for e in found if e.status is Status.UNBOUND)
+
+
+@pytest.mark.parametrize('load', [lambda t: 0.2 + 0.05 * t, lambda t: 0.2 + 0.4 * (t > 1.0)])
+def test_what_throttle_explains_to_the_last_digit(load):
+    """Nothing is left that relaxes: no alpha of rounding errors, and no trend either."""
+    e = estimate(T, LEVEL - 0.6 * load(T), load(T))
+    assert not e.usable and math.isnan(e.alpha) and math.isnan(e.var_inf)
+    assert e.status in (Status.NO_RELAXATION, Status.UNBOUND)
+    assert Flag.TREND not in e.flags
+
+
+def test_tiny_noise_on_a_large_voltage_is_measured():
+    """An OU of 1 uV on 5 V is one: a million times less than usual is not rounding."""
+    y = LEVEL + 1e-6 * (paths(np.random.default_rng(4), 1, N)[0] - LEVEL)
+    e = estimate(T, y)
+    assert e.status is Status.OK and e.sigma == pytest.approx(0.632e-6, rel=0.1)
+
+
+def test_what_is_dropped_is_said_though_the_numbers_stand():
+    """A late sample after an estimate changes counters and flag, nothing else."""
+    estimator = SlidingEstimator(2.1)
+    estimator.push(T, paths(np.random.default_rng(5), 1, N)[0])
+    before = estimator.estimate()
+    estimator.push(1.0, 5.0)
+    after = estimator.estimate()
+    assert before.flags == () and after.flags == (Flag.IRREGULAR,)
+    assert (after.counters.late, after.alpha) == (1, before.alpha)
+    # Samples that wait for the rate are said to wait, with what was dropped.
+    waits = SlidingEstimator(2.0)
+    waits.push(T[:4], [5.0, math.nan, 5.1, 5.2])
+    assert waits.estimate().status is Status.TOO_FEW_SAMPLES
+    assert waits.estimate().flags == (Flag.IRREGULAR,)

@@ -62,7 +62,6 @@ def test_an_estimate_holds_what_is_known(value, error):
 
 @given(z=st.floats(allow_nan=True, allow_infinity=True))
 def test_an_interval_of_any_width(z):
-    """From empty to everything."""
     low, high = Estimate(alpha=3.0, alpha_se=0.5).interval('alpha', z=z)
     assert math.isnan(z) or z < 0.0 or (0.0 <= low <= 3.0 <= high)
 
@@ -106,7 +105,6 @@ def test_a_ratio_follows_the_same_rule():
 
 @pytest.mark.parametrize('seed', [3, 122])
 def test_the_estimator_publishes_nothing_of_it(seed):
-    """The same samples in flight."""
     recording = nearly_white(seed)
     estimator = SlidingEstimator(window=10.0)
     estimator.push(recording.t, recording.voltage)

@@ -85,7 +85,6 @@ def test_two_half_steps_are_one_in_a_gap(throttle, tolerance):
 
 
 def test_looking_changes_nothing():
-    """What is asked of the filter leaves it as it was."""
     t, v, u = flight()
     loads = LoadFilter()
     loads.push(t, v, u)
@@ -97,7 +96,6 @@ def test_looking_changes_nothing():
 
 
 def test_a_throttle_that_never_moved_says_nothing_of_the_sag():
-    """Level and noise are known, the sag is not."""
     t, v, u = flight()
     load = loaded(t, 16.0 + 0.05 * np.random.default_rng(1).standard_normal(t.size), 0.0 * u + 0.3)
     assert load.status is LoadStatus.STILL and not load.known
@@ -107,14 +105,12 @@ def test_a_throttle_that_never_moved_says_nothing_of_the_sag():
 
 @pytest.mark.parametrize('seed', range(4))
 def test_throttle_of_another_vehicle_is_no_relation(seed):
-    """Noise that does not know of throttle has no sag to be known."""
     t, _, u = flight(60.0)
     v = 16.0 + 0.05 * np.random.default_rng(seed + 10).standard_normal(t.size)
     assert not loaded(t, v, u).known
 
 
 def test_throttle_of_the_wrong_sign_is_no_relation():
-    """A voltage that rises with throttle is said, not fitted."""
     t, v, u = flight(60.0)
     assert loaded(t, v, 1.0 - u).status is LoadStatus.NO_RELATION
 
@@ -226,7 +222,6 @@ def test_another_battery_in_flight():
 
 
 def test_nothing_is_known_of_nothing():
-    """Before the first sample all is NaN."""
     load = LoadFilter().load()
     assert load == SupplyLoad() and load.status is LoadStatus.NO_DATA and not load.known
     assert np.isnan([load.level, load.sag(0.5), load.sag_se(0.5), load.noise(0.5)]).all()

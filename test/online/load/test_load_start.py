@@ -28,7 +28,6 @@ def flight(seed, model=TRUE):
 
 @pytest.fixture(scope='module')
 def learned():
-    """Return what a flight has learned."""
     loads = LoadFilter()
     loads.push(*flight(1))
     return loads.learned()
@@ -95,7 +94,6 @@ def test_a_model_file_carries_it(learned, tmp_path):
 
 
 def test_a_file_without_it_is_as_before():
-    """Models of before have no such entry, and none is written."""
     text = as_yaml(ModelFile(SupplyModel((OU(63.0, 0.3, 16.0),))))
     assert 'load' not in text and parse_model(yaml.safe_load(text), 'file').model.load is None
 
@@ -106,7 +104,6 @@ def test_a_file_without_it_is_as_before():
     ({'flown': [0.5, 0.2]}, 'flown'), ({'discharge': float('nan')}, 'finite'),
     ({'covariance': (-np.eye(7)).tolist()}, 'negative'), ({'log_variance': [0.0]}, '3 numbers')])
 def test_a_broken_entry_is_refused_by_name(learned, change, words):
-    """One line says what is wrong."""
     data = yaml.safe_load(as_yaml(ModelFile(SupplyModel((OU(63.0, 0.3, 16.0),), learned))))
     data['load'].update(change)
     with pytest.raises(InputError, match=words):
@@ -114,7 +111,6 @@ def test_a_broken_entry_is_refused_by_name(learned, change, words):
 
 
 def test_nothing_is_learned_of_nothing(learned):
-    """No samples, or a throttle that rests."""
     loads = LoadFilter()
     assert loads.learned() is None
     t = np.arange(0.0, 10.0, 0.02)

@@ -54,7 +54,6 @@ def test_a_pack_that_has_aged_is_found_within_a_minute(age, verdict):
 
 @pytest.mark.parametrize('voltage', [0.75, 1.5])
 def test_another_number_of_cells_is_said_within_five_seconds(voltage):
-    """Three or six cells in place of four."""
     report = watched(GECKO, flight(5.0, 3), voltage)
     assert report.model.verdict is ModelVerdict.OTHER_PACK
     assert report.level is Level.WARN and 'another pack' in report.summary

@@ -42,7 +42,6 @@ def flown(monitor, steps, *, seed=1, throttle=True, begin=0.0, sag=0.1):
 
 
 def test_after_a_step_the_intensity_is_that_of_the_new_throttle():
-    """A tenth of a second after the step the window is still of the old one."""
     monitor = SupplyMonitor(replace(SETTINGS, brownout_voltage=4.75))
     flown(monitor, [(0.8, 4.0), (0.2, 4.0)])
     report = flown(monitor, [(0.8, 0.1)], seed=2, begin=8.0)
@@ -84,7 +83,6 @@ def test_one_bad_sample_is_no_brownout_and_three_are():
 
 
 def model(*terms):
-    """Return a model of an OU and more."""
     return SupplyModel((OU(ALPHA, 0.2, 5.0), *terms))
 
 

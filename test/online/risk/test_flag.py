@@ -28,7 +28,6 @@ def line(flag, risks, step=1.0, start=0.0):
 
 
 def check(states, letters):
-    """Compare levels with letters."""
     assert [s.level for s in states] == [LETTER[c] for c in letters.replace(' ', '')]
 
 
@@ -37,7 +36,6 @@ def test_nothing_yet_is_unknown():
 
 
 def test_levels_are_entered_at_their_probability():
-    """At or above: the bounds belong to the higher level."""
     states = line(made(), [0.0, 0.00999, 0.01, 0.0999, 0.1, 1.0])
     check(states, 'o o w w c c')
     assert [s.brownout for s in states] == [False] * 4 + [True] * 2
@@ -107,7 +105,6 @@ def test_clear_begins_the_delay_anew():
 
 
 def test_latch_switched_off_ends_it_and_on_begins_it():
-    """Hysteresis and hold go on as they are."""
     flag = made(brownout_latch=True)
     check(line(flag, [0.5, 0.0]), 'c c')
     flag.configure(replace(flag.settings, brownout_latch=False))
@@ -153,7 +150,6 @@ def test_parameters_do_not_reset_it():
 
 @pytest.mark.parametrize('back', [0.01, 5.0, 1e6])
 def test_time_back_is_no_time(back):
-    """The hold goes on from where it was: not shorter, and not for ever."""
     flag = made(brownout_hold=3.0)
     flag.update(1000.0, 0.5)
     assert flag.update(1001.0, 0.0).age == 1.0
@@ -192,7 +188,6 @@ def test_no_probability_is_refused(risk):
 
 
 def test_floor_decides_without_a_risk():
-    """And, like everything else, is held and latched."""
     flag = made(brownout_hold=2.0)
     flag.push([0.0, 0.01, 0.02], [4.3, 4.2, 4.3])
     state = flag.update(0.0, NAN)
@@ -280,7 +275,6 @@ def test_whatever_happens_it_is_never_silently_fine(changes, happened):
 @given(st.lists(st.floats(0.0, 0.2), min_size=1, max_size=40), st.floats(0.0, 0.2))
 @hypothesis_settings(max_examples=100, deadline=None)
 def test_more_risk_never_gives_a_lower_level(risks, more):
-    """Adding to every risk of a time line lowers no level of it, at any time."""
     pairs = zip(line(made(), risks), line(made(), [risk + more for risk in risks]))
     assert all(a.level.value <= b.level.value for a, b in pairs)
 

@@ -16,7 +16,6 @@ def watch(**changes):
 
 
 def push(floor, voltages, rate=1000.0, start=0.0):
-    """Push samples at a rate, Hz."""
     floor.push(start + np.arange(len(voltages)) / rate, voltages)
 
 
@@ -235,7 +234,6 @@ def test_a_dip_is_one_whatever_its_stamps_are():
 
 
 def test_old_samples_do_not_outvote_a_new_one():
-    """Two low ones, an hour, a good one: good."""
     floor = watch()
     floor.push([0.0, 0.5], [4.0, 4.0])
     assert floor.take()

@@ -84,7 +84,6 @@ def test_what_is_not_known_of_the_level_is_in_the_deviation():
 
 
 def test_the_level_falls_as_charge_is_drawn():
-    """With the discharge per load and the fall of the level per charge."""
     coefficients = COEFFICIENTS.copy()
     coefficients[1], coefficients[2] = 1.0 / 80.0, 0.0
     known = state(mean=coefficients, fall=8.0, log_variance=(2.0 * math.log(1e-6), 0.0, 0.0))

@@ -2,7 +2,7 @@
 
 import re
 
-from made_logs import blackbox, END, quad
+from made_logs import blackbox, END, load, named, quad
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.choose import choose
@@ -61,7 +61,7 @@ def test_the_firmware_determines_the_voltage_unit(tmp_path, firmware, headers, v
     """The unit of the voltage follows the firmware, as in Betaflight's own viewer."""
     rows = quad(64)
     path, log = load(tmp_path, blackbox(rows, headers={'Firmware revision': firmware, **headers}))
-    found = {one.name: one for one in log.series}
+    found = named(log)
     np.testing.assert_allclose(found['vbatLatest'].values, rows[:, VOLTS] * volts, rtol=1e-12)
     if amperes is None:
         # What cannot be scaled is told, not guessed: by name it can be had as logged.
@@ -91,13 +91,13 @@ def test_the_largest_flight_is_the_default(tmp_path):
     assert re.match(r'The file holds 2 flights \(1: about \d+ s; 2: about \d+ s\); this is ',
                     log.notes[0]) and '--flight N' in log.notes[0]
     for number, rows in ((1, first), (2, second)):
-        path, log = load(tmp_path, content, number)
+        path, log = load(tmp_path, content, flight=number)
         np.testing.assert_allclose(choose(path, log).voltage.values, rows[:, VOLTS] / 100)
         assert log.facts['flight'] == f'{number} of 2' and log.notes == ()
     listed = import_log(path, Request(everything=True))
     assert listed.series[0].n == 160 and 'holds 2 flights' in listed.notes[0]
     with pytest.raises(InputError, match='no flight 3'):
-        load(tmp_path, content, 3)
+        load(tmp_path, content, flight=3)
 
 
 @pytest.mark.parametrize('before_wrap', [1, 31, 32, 33, 100, 299])
@@ -156,7 +156,6 @@ def test_a_truncated_log_is_read_up_to_its_end(tmp_path):
 
 
 def test_cut_within_the_header(tmp_path):
-    """Without its header a flight is one line."""
     head = blackbox(quad(10))[0]
     refused = 0
     for at in range(60, len(head), 17):

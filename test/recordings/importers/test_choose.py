@@ -14,7 +14,6 @@ PATH = Path('a.ulg')
 
 def series(name='v', quantity=VOLTAGE, t=(0.0, 1.0, 2.0), values=(5.0, 5.1, 5.2), rank=0,
            group=''):
-    """Return a small series."""
     return Series(name, quantity, np.array(t), np.array(values), '1', 'words', rank, group)
 
 
@@ -83,14 +82,12 @@ def test_unusable_samples_are_dropped_with_a_note():
 
 
 def test_a_sample_every_few_hours():
-    """Slow is not wrong."""
     t = 7200.0 * np.arange(50)
     mended, notes = clean(series(t=t, values=np.arange(50.0)))
     assert mended.n == 50 and notes == ()
 
 
 def test_a_lone_wrong_stamp_costs_one_sample():
-    """Ahead or behind, it does not take the others with it."""
     for wrong in (0.0, 500.0):
         t = np.arange(100.0)
         t[50] = wrong

@@ -2,21 +2,12 @@
 
 import json
 
-from made_logs import crazyflie, FIXED, hover
+from made_logs import crazyflie, FIXED, hover, load
 import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.errors import InputError
-from ou_monitor.recordings.importers.formats import import_log
-from ou_monitor.recordings.importers.log import Request
 from ou_monitor.recordings.read import read_beside, read_recording
 import pytest
-
-
-def load(tmp_path, pieces):
-    """Write a log and import it."""
-    path = tmp_path / 'log00'
-    path.write_bytes(b''.join(pieces))
-    return path, import_log(path, Request())
 
 
 @pytest.mark.parametrize('version, unit', [(1, 1e-3), (2, 1e-6)])
@@ -90,7 +81,6 @@ def test_wrong_bytes_are_reported(tmp_path):
     ([(FIXED, 'fixedFrequency', ['pm.vbat(f)']), (FIXED, 'a', ['b(f)'])], 'two events 65535'),
     ([(FIXED, 'fixedFrequency', ['pm.vbat(z)'])], "no type for 'pm.vbat.z.'")])
 def test_senseless_header_is_refused(tmp_path, events, words):
-    """One line; nothing is guessed."""
     with pytest.raises(InputError, match=words):
         load(tmp_path, crazyflie(events, []))
     content = b''.join(crazyflie([(1, 'a', ['pm.vbat(f)'])], []))

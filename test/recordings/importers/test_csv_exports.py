@@ -141,7 +141,6 @@ FORMS = {
 
 
 def written(tmp_path, content, name='export.csv'):
-    """Write a table."""
     path = tmp_path / name
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     return path
@@ -202,7 +201,6 @@ def test_the_unit_of_a_throttle(tmp_path):
 
 
 def test_options_of_the_command_line(tmp_path, capsys):
-    """The same by options, for `analyze` and `convert`."""
     path = written(tmp_path, 'x;U\n' + ''.join(f'{k};12,{k % 9}\n' for k in range(300)), 'a.txt')
     given = ['--sample-interval', '0.01', '--delimiter', ';', '--decimal', ',', '--unit', 'mV']
     assert main(['analyze', str(path), *given, '--json', str(tmp_path / 'a.json')]) == 0

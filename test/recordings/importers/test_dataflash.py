@@ -2,25 +2,11 @@
 
 import struct
 
-from made_logs import copter, Dataflash
+from made_logs import copter, Dataflash, load, named
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.choose import choose
-from ou_monitor.recordings.importers.formats import import_log
-from ou_monitor.recordings.importers.log import Request
 import pytest
-
-
-def load(tmp_path, content, name='a.bin'):
-    """Write a log and import it."""
-    path = tmp_path / name
-    path.write_bytes(content)
-    return path, import_log(path, Request())
-
-
-def named(log):
-    """Return the series by name."""
-    return {one.name: one for one in log.series}
 
 
 @pytest.mark.parametrize('form', ['dataflash', 'dataflash_text'])
@@ -126,7 +112,6 @@ def test_a_truncated_log_is_read_up_to_its_end(tmp_path):
 
 
 def test_erased_page_is_not_damage(tmp_path):
-    """Flash is read to the end of a page, which may be empty."""
     _, log = load(tmp_path, copter(30)[0].binary + b'\xff' * 200)
     assert log.notes == ()
 
@@ -157,7 +142,6 @@ def test_flipped_bytes_give_an_error_or_a_note(tmp_path, form):
 
 
 def test_text_log_with_binary_bytes(tmp_path):
-    """They cost their line, not the log."""
     text = copter(30)[0].text
     at = text.index(b'BAT, ', len(text) // 2)
     path, log = load(tmp_path, text[:at] + b'\xfe\xff' + text[at + 2:], 'a.log')

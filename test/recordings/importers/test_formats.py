@@ -27,7 +27,6 @@ def made(name):
 @pytest.mark.parametrize('name', [one.name for one in FORMATS if one.module])
 @pytest.mark.parametrize('ending', ['.ulg', '.bin', '.log', '.bbl', '.csv', ''])
 def test_the_first_bytes_decide(tmp_path, name, ending):
-    """A wrong ending with the right contents is read as what it is."""
     path = tmp_path / ('a' + ending)
     path.write_bytes(made(name))
     assert detect(path).name == name
@@ -67,7 +66,6 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path):
 
 
 def test_missing_flight_is_refused(tmp_path):
-    """Formats with one flight a file have no second one."""
     path = tmp_path / 'a'
     for name in ('ulog', 'dataflash', 'csv'):
         path.write_bytes(made(name))

@@ -2,15 +2,14 @@
 
 import json
 
-from made_logs import blackbox, Dataflash, px4_flight, quad, ulog
+from made_logs import blackbox, Dataflash, load, named, px4_flight, quad, ulog
 import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.choose import (
     choose_extras, clean_motion, pace_notes, topic_of)
-from ou_monitor.recordings.importers.formats import import_log
 from ou_monitor.recordings.importers.log import (
-    FORCE, gyro_of, Log, RATE, Request, Series, VELOCITY)
+    FORCE, gyro_of, Log, RATE, Series, VELOCITY)
 from ou_monitor.recordings.read import read_signal
 import pytest
 
@@ -27,13 +26,6 @@ def frames(n=400):
     rng = np.random.default_rng(6)
     moving = rng.integers(0, 2000, (n, 12))
     return np.column_stack([quad(n), moving]), moving
-
-
-def load(tmp_path, content, name='a.bbl', **request):
-    """Write a log and import it."""
-    path = tmp_path / name
-    path.write_bytes(content if isinstance(content, bytes) else b''.join(content))
-    return path, import_log(path, Request(**request))
 
 
 @pytest.mark.parametrize('headers, gyro, force', [
@@ -58,13 +50,12 @@ def test_blackbox_is_scaled_by_its_header(tmp_path, headers, gyro, force):
 
 
 def test_a_gyro_without_scale_is_left_out(tmp_path):
-    """No guess: a note, and no topic."""
     rows, _ = frames()
     path, log = load(tmp_path, blackbox(rows, FIELDS, {**HEADERS, 'gyro_scale': None,
                                                        'debug_mode': '3'}))
     assert log.inertial == () and any('gyro_scale' in note for note in log.notes)
     assert any('no topic /imu' in note for note in choose_extras(path, log).notes)
-    found = {one.name: one for one in log.series}
+    found = named(log)
     assert found['gyroADC[0]'].unit == '?'
 
 
@@ -117,7 +108,7 @@ def test_ulog_is_turned_to_base_link(tmp_path):
     assert any('sensor_gyro[1]' in note for note in chosen.notes)
     other = choose_extras(path, log, imus=['sensor_gyro[1]']).inertial['imu']
     assert FORCE not in other.vectors
-    found = {one.name: one for one in log.series}
+    found = named(log)
     assert found['sensor_combined[0].gyro_rad[1]'].unit == 'rad/s'
     assert found['sensor_combined[0].accelerometer_m_s2[2]'].unit == 'm/s^2'
 
@@ -190,7 +181,6 @@ def test_topics_and_units_of_a_converted_log(tmp_path, capsys):
     (['--poles', '7'], 'even number'),
 ])
 def test_missing_series_are_refused_in_one_line(tmp_path, capsys, arguments, words):
-    """With the nearest name, and no bag."""
     rows, _ = frames(100)
     path, _ = load(tmp_path, blackbox(rows, FIELDS, HEADERS))
     try:
@@ -220,7 +210,6 @@ def test_bad_rows_gaps_and_jumps_of_rate():
     ('gyroADC[0]', 'gyroADC_0'), ('IMU[1].GyrX', 'IMU_1/GyrX'), ('5 V rail', 'n5_V_rail'),
     ('..', 'unnamed'), ('a--b', 'a_b')])
 def test_topics_are_names_that_ros_takes(name, topic):
-    """Letters, digits and single underscores, a letter first."""
     assert topic_of(name) == topic
 
 

@@ -15,7 +15,6 @@ import pytest
 
 @pytest.fixture
 def folder():
-    """Return the folder of real recordings."""
     found = os.environ.get('OU_MONITOR_REALDATA')
     if found is None:
         pytest.skip('OU_MONITOR_REALDATA is not set: recordings of others are not shipped')
@@ -29,7 +28,6 @@ def test_a_blackbox_log_equals_its_published_table(folder, tmp_path):
     The table was made by others with another parser: its stamps are smoothed, so
     they agree to the spacing of the log (2 ms) but for a constant; its throttle is
     the mean of the motors.
-
     """
     out = tmp_path / 'gecko'
     assert main(['convert', str(folder / 'raw' / 'ie_btfl_002.bbl'), str(out)]) == 0
@@ -95,7 +93,6 @@ def test_cut_at_random(folder, tmp_path, capsys, name):
 
 
 def test_broken_at_random(folder, tmp_path):
-    """Whatever is broken in whatever log: a read, or one line."""
     rng = np.random.default_rng(17)
     read = refused = 0
     for path in sorted((folder / 'raw').iterdir()):

@@ -2,7 +2,7 @@
 
 import signal
 
-from made_logs import BATTERY, px4_flight, ulog, ulog_message
+from made_logs import BATTERY, load, named, px4_flight, ulog, ulog_message
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.choose import choose
@@ -53,7 +53,6 @@ def test_a_vehicle_has_a_number_of_its_own(tmp_path, uuid, fact):
 
 
 def test_a_sample_before_the_start_is_the_start(tmp_path):
-    """No stamp is negative."""
     topics, t, *_ = px4_flight()
     _, log = load(tmp_path, ulog(topics, start_us=int(t[0]) + 70_000))
     assert min(one.t[0] for one in log.series) == 0.0

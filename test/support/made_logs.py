@@ -10,12 +10,25 @@ import struct
 import zlib
 
 import numpy as np
+from ou_monitor.recordings.importers.formats import import_log
+from ou_monitor.recordings.importers.log import Request
+
+
+def load(folder, content, name='a.log', **request):
+    """Write a log, whole or in pieces; return its path, and what the importer makes of it."""
+    path = folder / name
+    path.write_bytes(content if isinstance(content, bytes) else b''.join(content))
+    return path, import_log(path, Request(**request))
+
+
+def named(log):
+    """Return the series by name."""
+    return {one.name: one for one in log.series}
 
 
 # --- PX4 ULog -------------------------------------------------------------------------------
 
 def ulog_message(kind, content):
-    """Return one ULog message."""
     return struct.pack('<HB', len(content), ord(kind)) + content
 
 
@@ -90,13 +103,11 @@ class Dataflash:
         self.form(FMT, 'FMT', 'BBnNZ', 'Type,Length,Name,Format,Columns')
 
     def form(self, number, name, letters, columns):
-        """Announce a message."""
         layout = '<' + ''.join(SIZES[letter] for letter in letters)
         self.known[name] = number, layout, letters
         self.put('FMT', number, 3 + struct.calcsize(layout), name, letters, columns)
 
     def put(self, name, *values):
-        """Add a message."""
         number, layout, letters = self.known[name]
         packed = [value.encode() if isinstance(value, str) else value for value in values]
         raw = [round(value * 100) if letter == 'c' else value
@@ -108,12 +119,10 @@ class Dataflash:
 
     @property
     def binary(self):
-        """Return the .bin file."""
         return b''.join(self.pieces)
 
     @property
     def text(self):
-        """Return the .log file."""
         return ''.join(self.lines).encode()
 
 
