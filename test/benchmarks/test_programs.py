@@ -1,12 +1,11 @@
 """Benchmarks on a case that is quick."""
 
-import os
-from pathlib import Path
 import sys
 
 from alarms import ardupilot_low, dips_of, fly_loop, px4_charge
 import attack_files
 import numpy as np
+from project import needs_recordings, REAL
 import pytest
 from scipy import stats
 
@@ -78,15 +77,13 @@ def bench():
 @pytest.fixture(scope='module')
 def flights(bench):
     """Return recordings by name; their folder is not part of the project."""
-    folder = os.environ.get('OU_MONITOR_REALDATA')
-    if folder is None:
-        pytest.skip('OU_MONITOR_REALDATA is not set: recordings of others are not shipped')
     kept = [one for one in bench.LOGS if one[0] == 'nazgul']
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(bench, 'LOGS', kept)
-        return {one.name: one for one in bench.flights(Path(folder))}
+        return {one.name: one for one in bench.flights(REAL)}
 
 
+@needs_recordings
 def test_false_alarms_and_a_gain_of_five(bench, flights):
     """
     At most what a test of 5 % exceeds once in 10^4; the gain is seen in six of six.
@@ -105,6 +102,7 @@ def test_false_alarms_and_a_gain_of_five(bench, flights):
     assert len(power) == 12 and all(power)
 
 
+@needs_recordings
 def test_the_voltage_of_a_log_is_taken_where_it_was_read(bench, flights):
     """The quad's at 50 Hz of a log of 1 kHz."""
     from ou_monitor.analysis.coupling import estimate_coupling
@@ -115,10 +113,6 @@ def test_the_voltage_of_a_log_is_taken_where_it_was_read(bench, flights):
     assert found.frequency[-1] < 12.6
 
 
-pytestmark = pytest.mark.skipif('OU_MONITOR_REALDATA' not in os.environ,
-                                reason='OU_MONITOR_REALDATA names the recordings')
-
-
 def ratios(name, seconds, cutoff):
     """Return the cells of one row of the table as numbers, all axes; NaN for a dash."""
     import gyros
@@ -127,6 +121,7 @@ def ratios(name, seconds, cutoff):
     return [float(cell.split(' ')[0]) if cell != '-' else np.nan for cell in row[4:]]
 
 
+@needs_recordings
 def test_a_loud_craft():
     """Half and a third of the noise are left, on what was not learned from."""
     pytest.importorskip('orangebox')
@@ -134,6 +129,7 @@ def test_a_loud_craft():
     assert throttle < 0.5 and nothing < 0.6 and rpm < 0.42
 
 
+@needs_recordings
 def test_a_quiet_craft():
     """It may not cost more than 2 %."""
     pytest.importorskip('orangebox')

@@ -7,8 +7,6 @@ every bag and of every recorded run there is, tables and raw logs.
 """
 
 import math
-import os
-from pathlib import Path
 
 import numpy as np
 from ou_monitor.analysis.level_comparison import alpha_constancy, sigma_change
@@ -30,11 +28,10 @@ from ou_monitor.model.terms.slow import SecondRelaxation
 from ou_monitor.recordings.importers.csv_table import CsvColumns
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import Recording
-from project import ROOT
+from project import REAL, ROOT
 import pytest
 from simulated_recordings import as_one_level, bare
 
-REAL = Path(os.environ.get('OU_MONITOR_REALDATA', 'nowhere'))
 PATHS = [*sorted(path.parent for path in (ROOT / 'bags').glob('**/metadata.yaml')),
          *sorted(REAL.glob('*.csv')), *sorted((REAL / 'raw').glob('*.[bBu]*'))]
 BATTERY = 'battery_status[0].voltage_v'

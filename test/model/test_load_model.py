@@ -1,15 +1,13 @@
 """The voltage under load: closed forms, recovery of a simulated pack, no degenerate fit."""
 
 from dataclasses import replace
-import os
-from pathlib import Path
 
 import numpy as np
 from ou_monitor.model.load import (
     CELL, cells_in_series, charge_at, LoadModel, lowpass, open_circuit)
 from ou_monitor.model.load_fit import fit_load
 from ou_monitor.recordings.read import read_recording
-from project import ROOT
+from project import needs_recordings, REAL, ROOT
 import pytest
 
 
@@ -125,11 +123,7 @@ def test_what_cannot_be_fitted_is_refused(t):
         fit_load(t, np.full(3, 16.0), np.full(3, 0.3))
 
 
-FOLDER = os.environ.get('OU_MONITOR_REALDATA')
-
-
-@pytest.mark.skipif(FOLDER is None, reason='OU_MONITOR_REALDATA is not set: recordings of others '
-                                           'are not shipped')
+@needs_recordings
 @pytest.mark.parametrize('name', ['cf_solo_large', 'cf_pair_large', 'cf_takeoff'])
 def test_a_fit_stays_physical(name):
     """
@@ -137,7 +131,7 @@ def test_a_fit_stays_physical(name):
 
     An extended model of sums of poles held +25.8 V beside -19 V on one of these.
     """
-    flight = read_recording(Path(FOLDER) / f'{name}.csv')
+    flight = read_recording(REAL / f'{name}.csv')
     t, v, u = flight.t - flight.t[0], flight.voltage, np.clip(flight.throttle, 0.0, 1.0)
     t, v, u = t[::3], v[::3], u[::3]
     half = t <= 0.5 * t[-1]

@@ -1,8 +1,6 @@
 """What the monitor says of an input that cannot be trusted, and of a slow one that can."""
 
 import math
-import os
-from pathlib import Path
 
 import numpy as np
 from ou_monitor import AdaptiveLowPass, read_recording
@@ -12,9 +10,8 @@ from ou_monitor.online.risk.flag import FlagLevel
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.online.trust import Doubt, InputClock, SourceInterval, StampOrder, StillReading
 from ou_monitor.records import Level
+from project import needs_recordings, REAL
 import pytest
-
-REAL = os.environ.get('OU_MONITOR_REALDATA', '')
 
 
 def fed(volts, dt=0.01, *, start=0.0, monitor=None, throttle=None, **settings):
@@ -98,11 +95,11 @@ def test_a_gap_is_no_still_reading():
     assert not watch.why
 
 
-@pytest.mark.skipif(not REAL, reason='needs OU_MONITOR_REALDATA')
+@needs_recordings
 def test_no_recorded_source_is_called_stuck():
     """The first 20 000 readings, 1 Hz to 5 kHz, of sources that are still for up to 2.81 s."""
     looked = 0
-    for path in sorted([*Path(REAL).glob('*.csv'), *Path(REAL).glob('raw/*')]):
+    for path in sorted([*REAL.glob('*.csv'), *REAL.glob('raw/*')]):
         if path.suffix == '.ulg':
             continue
         recording = read_recording(path)

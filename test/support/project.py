@@ -1,11 +1,18 @@
-"""The files of the project, for the tests that look at or copy all of them."""
+"""Files of the project for the tests that look at or copy all of them; recordings of others."""
 
+import os
 from pathlib import Path
 import subprocess
 import tomllib
 from typing import Any
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[2]
+# Recordings of others are not shipped.
+REAL = Path(os.environ.get('OU_MONITOR_REALDATA', 'nowhere'))
+needs_recordings = pytest.mark.skipif(
+    not REAL.is_dir(), reason='OU_MONITOR_REALDATA names no folder of recordings')
 # What running the project makes; in an unpacked archive there is no git to say so.
 GENERATED = {'.venv', '.venv-noble', 'build', 'install', 'log', 'out', '__pycache__', '.git',
              '.hypothesis', '.pytest_cache', '.mypy_cache', 'ou_monitor.egg-info'}

@@ -1,8 +1,6 @@
 """Real logs, read as a user would; their folder is not part of the project."""
 
 import json
-import os
-from pathlib import Path
 
 import numpy as np
 from ou_monitor.cli.main import main
@@ -10,15 +8,11 @@ from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.formats import import_log
 from ou_monitor.recordings.importers.log import Request
 from ou_monitor.recordings.read import read_recording, read_signal
+from project import needs_recordings, REAL
 import pytest
 
-
-@pytest.fixture
-def folder():
-    found = os.environ.get('OU_MONITOR_REALDATA')
-    if found is None:
-        pytest.skip('OU_MONITOR_REALDATA is not set: recordings of others are not shipped')
-    return Path(found)
+pytestmark = needs_recordings
+RAW = REAL / 'raw'
 
 
 def test_a_blackbox_log_equals_its_published_table(folder, tmp_path):
@@ -30,8 +24,8 @@ def test_a_blackbox_log_equals_its_published_table(folder, tmp_path):
     the mean of the motors.
     """
     out = tmp_path / 'gecko'
-    assert main(['convert', str(folder / 'raw' / 'ie_btfl_002.bbl'), str(out)]) == 0
-    table = np.loadtxt(folder / 'bf_gecko_a.csv', delimiter=',', skiprows=1)
+    assert main(['convert', str(RAW / 'ie_btfl_002.bbl'), str(out)]) == 0
+    table = np.loadtxt(REAL / 'bf_gecko_a.csv', delimiter=',', skiprows=1)
     back = read_recording(out)
     assert back.source['log_vehicle'] == back.source['vehicle'] == 'Gecko'
     assert back.source['voltage_field'] == 'vbatLatest'
@@ -74,9 +68,9 @@ def test_a_px4_log_with_two_batteries_converts(folder, tmp_path, capsys):
 
 
 @pytest.mark.parametrize('name', ['px_sample_log_small.ulg', 'ie_btfl_002.bbl'])
-def test_cut_at_random(folder, tmp_path, capsys, name):
+def test_cut_at_random(tmp_path, capsys, name):
     """However short it is cut, a log is one line, or a bag with a note."""
-    whole = (folder / 'raw' / name).read_bytes()[:60_000 if name.endswith('bbl') else None]
+    whole = (RAW / name).read_bytes()[:60_000 if name.endswith('bbl') else None]
     rng = np.random.default_rng(14)
     for k, at in enumerate(rng.integers(1, len(whole), 8).tolist()):
         path = tmp_path / f'{k}.log'
@@ -92,10 +86,10 @@ def test_cut_at_random(folder, tmp_path, capsys, name):
             assert status == 2 and said.err.count('\n') == 1 and not out.exists()
 
 
-def test_broken_at_random(folder, tmp_path):
+def test_broken_at_random(tmp_path):
     rng = np.random.default_rng(17)
     read = refused = 0
-    for path in sorted((folder / 'raw').iterdir()):
+    for path in sorted(RAW.iterdir()):
         # The head holds what the rest is read by.
         head = path.read_bytes()[:250_000 if path.suffix == '.ulg' else 40_000]
         for _ in range(5):
