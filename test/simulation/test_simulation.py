@@ -167,7 +167,7 @@ def test_a_simulation_over_a_recording(flight, tmp_path, capsys):
     two = read_recording(again)
     assert two.n == pytest.approx(200, abs=1)
     np.testing.assert_allclose(two.throttle[[50, 150]], [0.1, 0.6], atol=1e-6)
-    assert '4 s at 100 Hz' in capsys.readouterr().out
+    assert '4 s at 100 Hz' in ' '.join(capsys.readouterr().out.split())
 
 
 def test_what_cannot_be_flown(flight, tmp_path, capsys):
