@@ -180,7 +180,7 @@ def test_polled_channels_are_in_volts(tmp_path):
     ('be:s12/16>>4', b'\x80\x0f', -2048), ('be:u24/32>>8', b'\x01\x02\x03\xff', 0x010203),
     ('le:s24/32', b'\xff\xff\xff\x00', -1), ('le:s64/64', b'\xff' * 8, -1),
     ('le:s16/16', b'\x00\x80', -32768), ('le:u8/8', b'\xff', 255), ('le:s7/8>>1', b'\x81', -64)])
-def test_bits_to_numbers(kind, stored, expected):
+def test_stored_bits_become_numbers(kind, stored, expected):
     """Shift first, then mask or sign, in either order of bytes."""
     scan = Scan([parse_element('in_voltage0', 0, kind)])
     assert scan.size == len(stored)
@@ -188,6 +188,7 @@ def test_bits_to_numbers(kind, stored, expected):
 
 
 def test_elements_lie_at_multiples_of_their_size():
+    """By their index; the scan is padded to its largest element."""
     scan = Scan([parse_element('in_timestamp', 5, 'le:s64/64'),
                  parse_element('in_voltage1', 2, 'le:u16/16'),
                  parse_element('in_voltage0', 1, 'le:u8/8')])
@@ -201,7 +202,8 @@ def test_elements_lie_at_multiples_of_their_size():
     assert Scan([parse_element('a', 0, 'le:u16/16')]).size == 2
 
 
-def test_volts():
+def test_raw_counts_become_volts():
+    """(raw + offset) * scale is in mV."""
     scan = Scan([parse_element('in_voltage0', 0, 'le:s16/16')])
     data = np.array([-100, 1000], '<i2').tobytes()
     assert scan.volts(data, 'in_voltage0', 2.5, 100.0) == pytest.approx([0.0, 2.75])

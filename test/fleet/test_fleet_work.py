@@ -165,10 +165,8 @@ def test_bags_are_found_as_bags(tmp_path):
         'a/cut', 'a/whole', 'b/one.mcap', 'b/two.MCAP']
 
 
-def test_logs_are_read_as_analyze_reads_them(tmp_path, monkeypatch):
+def test_logs_are_read_as_analyze_reads_them(tmp_path):
     """They are recognised by their first bytes; an unreadable log costs only its own row."""
-    monkeypatch.syspath_prepend(str(ROOT / 'test/recordings/importers'))
-    from made_logs import crazyflie, hover
     events, records, _ = hover(3000, refresh=5)
     log = tmp_path / 'LOG.TXT'
     log.write_bytes(b''.join(crazyflie(events, records)))

@@ -72,7 +72,7 @@ PACK = SupplyModel((OU(5.0, 0.0, 15.6), Drift(-0.01, 0.0), LoadSag(2.0, 0.5),
                     LoadTransient(-1.0, 0.1, 0.0)), LOAD)
 
 
-def test_steps_are_the_batch():
+def test_step_by_step_equals_one_batch():
     """Whatever the pieces: the path of `simulated`, with the same seed."""
     profile = read_profile('flight')
     batch = np.concatenate([piece.voltage for piece in simulated(
@@ -87,8 +87,8 @@ def test_steps_are_the_batch():
     np.testing.assert_allclose(steps, batch[:steps.size], rtol=0.0, atol=1e-9)
 
 
-def test_resistance_scales_the_answer_alone():
-    """An old pack answers more to throttle, from the next sample on; all else stays as it was."""
+def test_resistance_scales_only_the_response():
+    """The response to throttle grows from the next sample on; everything else is unchanged."""
     paths = {}
     for resistance in (1.0, 1.4):
         run = RunningSupply(SupplyModel((*PACK.terms, MeasurementNoise(0.02))), rate=100.0, seed=3)
@@ -101,7 +101,7 @@ def test_resistance_scales_the_answer_alone():
 
 
 @pytest.mark.parametrize('charge', [np.nan, 0.5])
-def test_the_pack_empties_by_what_is_drawn(charge):
+def test_the_pack_empties_by_the_charge_drawn(charge):
     """Level after 30 s of half throttle; the recording's drift is not added to it."""
     pieces = list(simulated(PACK, read_profile('0:0,10:0,10:0.5,40:0.5'), duration=60.0,
                             rate=100.0, seed=0, charge=charge))
@@ -115,10 +115,11 @@ def test_the_pack_empties_by_what_is_drawn(charge):
     assert voltage[-1] == pytest.approx(offset + at_end - (2.0 * 0.5 + 0.5 * 0.25), abs=2e-3)
 
 
-def test_what_a_model_lacks():
+def test_missing_parts_of_a_model_are_named():
+    """The other terms are simulated; charge cannot be set in a model without it."""
     assert lacks(PACK) == ()
     assert [words.split(' (')[0] for words in lacks(SupplyModel((OU(5.0, 0.1, 5.0),)))] == [
-        'no answer to throttle', 'no charge']
+        'no response to throttle', 'no charge']
     with pytest.raises(ValueError, match="no entry 'load'"):
         RunningSupply(FLIGHT, rate=10.0, seed=0, charge=0.5)
 
@@ -167,10 +168,12 @@ def test_a_simulation_over_a_recording(flight, tmp_path, capsys):
     two = read_recording(again)
     assert two.n == pytest.approx(200, abs=1)
     np.testing.assert_allclose(two.throttle[[50, 150]], [0.1, 0.6], atol=1e-6)
+    # Words, because a long path wraps the line.
     assert '4 s at 100 Hz' in ' '.join(capsys.readouterr().out.split())
 
 
-def test_what_cannot_be_flown(flight, tmp_path, capsys):
+def test_throttle_of_an_unusable_recording_is_refused(flight, tmp_path, capsys):
+    """No throttle, throttle in percent, a part outside the recording: one line each."""
     none = tmp_path / 'none.csv'
     none.write_text('time_s,voltage_v\n0,5\n1,5\n', encoding='utf-8')
     with pytest.raises(InputError, match='has no throttle'):

@@ -1,4 +1,4 @@
-"""Reading msg_config/*.yaml, and errors in them."""
+"""Descriptions of messages, and the fields that they name."""
 
 import shutil
 
@@ -81,6 +81,7 @@ def test_px4_throttle_is_mapped_to_0_1():
     ('voltage', {'stamp_field': 3}, ["'stamp_field'", 'text or null', '3']),
 ])
 def test_a_mistake_is_named(tmp_path, part, change, expected):
+    """One line: file, key, and what to write instead."""
     path = written(tmp_path, change, part)
     with pytest.raises(InputError) as caught:
         load_msg_config(path)
@@ -103,6 +104,7 @@ def test_a_missing_key_is_named(tmp_path, key):
 @pytest.mark.parametrize('text, expected', [
     ('a: [', 'not YAML'), ('', 'expected keys'), ('- 1\n', 'expected keys')])
 def test_file_without_a_mapping_is_refused(tmp_path, text, expected):
+    """Broken YAML and empty files are one line."""
     path = tmp_path / 'rail.yaml'
     path.write_text(text, encoding='utf-8')
     with pytest.raises(InputError, match=expected) as caught:
@@ -111,6 +113,7 @@ def test_file_without_a_mapping_is_refused(tmp_path, text, expected):
 
 
 def test_unknown_name_and_missing_file(tmp_path):
+    """The nearest name is offered."""
     with pytest.raises(InputError, match="no msg config 'batery_state'.*'battery_state'"):
         load_msg_config('batery_state')
     with pytest.raises(InputError, match='nowhere.yaml'):
@@ -152,12 +155,14 @@ def test_a_missing_folder_of_msg_configs_is_one_line(tmp_path, monkeypatch):
 @pytest.mark.parametrize('path, steps', [
     ('data', ('data',)), ('header.stamp', ('header', 'stamp')),
     ('channels[0].value', ('channels', 0, 'value')), ('a[1][20]', ('a', 1, 20))])
-def test_paths(path, steps):
+def test_a_field_path_has_names_and_indices(path, steps):
+    """Outermost first."""
     assert parse_field_path(path) == steps
 
 
 @pytest.mark.parametrize('path', ['', '.', 'a.', 'a[', 'a[-1]', 'a[0', '[0]', 'a b', '1a', 'a..b'])
-def test_malformed_paths(path):
+def test_a_malformed_path_is_refused_at_once(path):
+    """Not only at the first message."""
     with pytest.raises(InputError, match='field path'):
         parse_field_path(path)
 
@@ -179,8 +184,8 @@ ESCS = Message(esc=[Message(rpm=1000), Message(rpm=2000.5)], all=[1.0, 2.0, 3.0]
 @pytest.mark.parametrize('field, values', [
     ('esc[].rpm', [100.0, 200.05]), ('all', [0.1, 0.2, 0.3]), ('all[]', [0.1, 0.2, 0.3]),
     ('esc[1].rpm', [200.05]), ('one', [0.4]), ('esc[7].rpm', [])])
-def test_several_numbers(field, values):
-    """A field of each element, an array, an element, a number; none where there is none."""
+def test_several_numbers_are_extracted(field, values):
+    """A field of each element, an array, an element, a number; empty if there is none."""
     extractor = ManyExtractor(FieldSpec('rpm', 'my_msgs/msg/Escs', field, unit_factor=0.1))
     assert extractor.extract(ESCS).tolist() == pytest.approx(values)
 
@@ -189,5 +194,6 @@ def test_several_numbers(field, values):
     ('esc[].rp', "did you mean 'rpm'"), ('name', 'holds no numbers'), ('esc', 'holds no numbers'),
     ('esc[]]', 'not of the form'), ('one[]', 'holds no numbers'), ('one[0]', 'not an array')])
 def test_lists_without_numbers_are_refused(field, words):
+    """Refused in one line."""
     with pytest.raises(InputError, match=words):
         ManyExtractor(FieldSpec('rpm', 'my_msgs/msg/Escs', field)).extract(ESCS)

@@ -14,13 +14,6 @@ import pytest
 TIME, STICK, VOLTS, AMPERES = 1, 2, 3, 4
 
 
-def load(tmp_path, content, flight=None):
-    """Write a log and import it."""
-    path = tmp_path / 'a.bbl'
-    path.write_bytes(content if isinstance(content, bytes) else b''.join(content))
-    return path, import_log(path, Request(flight))
-
-
 def test_voltage_motors_and_current_are_read(tmp_path):
     """Voltage, motors and current are the written ones, with the stamps of the log."""
     rows = quad()

@@ -11,18 +11,6 @@ from ou_monitor.recordings.importers.log import Request
 import pytest
 
 
-def load(tmp_path, pieces, name='a.ulg'):
-    """Write a log and import it."""
-    path = tmp_path / name
-    path.write_bytes(pieces if isinstance(pieces, bytes) else b''.join(pieces))
-    return path, import_log(path, Request())
-
-
-def named(log):
-    """Return the series by name."""
-    return {one.name: one for one in log.series}
-
-
 def test_battery_and_motors_are_read_exactly(tmp_path):
     """Battery and motors are read bit for bit, with stamps counted from the header's."""
     topics, t, volts, motors, amperes = px4_flight()
