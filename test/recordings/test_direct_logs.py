@@ -74,7 +74,7 @@ def test_one_flight_as_log_csv_and_bag_is_one_recording(file, rate, tmp_path):
     assert 'sag' in json.dumps(answers[0])
 
 
-@pytest.mark.skipif(REAL is None, reason='OU_MONITOR_REALDATA names no folder of recordings')
+@needs_recordings
 def test_repeats_in_a_csv_do_not_raise_its_rate():
     """A Crazyflie logged at 500 Hz reads its battery at 100 Hz."""
     found = read_recording(REAL / 'cf_bl00.csv')

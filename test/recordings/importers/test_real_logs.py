@@ -15,7 +15,7 @@ pytestmark = needs_recordings
 RAW = REAL / 'raw'
 
 
-def test_a_blackbox_log_equals_its_published_table(folder, tmp_path):
+def test_a_blackbox_log_equals_its_published_table(tmp_path):
     """
     The 200 Hz table of the flight follows from its raw log of 500 Hz.
 
@@ -44,9 +44,9 @@ def test_a_blackbox_log_equals_its_published_table(folder, tmp_path):
     assert np.corrcoef(held, table[:, 2])[0, 1] > 0.999
 
 
-def test_a_px4_log_with_two_batteries_converts(folder, tmp_path, capsys):
+def test_a_px4_log_with_two_batteries_converts(tmp_path, capsys):
     """The user must choose one of two batteries; it converts, and so does the 5 V rail."""
-    log = str(folder / 'raw' / 'px_sample_log_small.ulg')
+    log = str(RAW / 'px_sample_log_small.ulg')
     assert main(['convert', log, str(tmp_path / 'a')]) == 2
     said = capsys.readouterr().err
     assert said.count('\n') == 1
