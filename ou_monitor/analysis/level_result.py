@@ -43,7 +43,7 @@ from ou_monitor.analysis.levels import LoadLevel, Stay
 from ou_monitor.analysis.supply import Remainder
 from ou_monitor.criticism.curves import bin_width, even_on_log
 from ou_monitor.criticism.innovations import FAMILY_WISE, innovations
-from ou_monitor.model.ou_fit import fit_pieces
+from ou_monitor.model.ou_fit import fit_pieces, white_variance
 from ou_monitor.model.spectral_lines import (
     EvenGrid, find_lines, LineSearch, on_grid, without_lines)
 from ou_monitor.online.estimator.quality import examine, input_flags
@@ -343,11 +343,9 @@ def fit_parts(recording: Recording, left: Remainder, segments: Sequence[Stay],
                   Status.CONSTANT if not ou.var_inf_below else
                   Status.UNBOUND if 0.5 * steps < _WANDERS * square else Status.NO_RELAXATION)
         return ou, replace(blank, status=status)
-    # Of the mean square of steps, what the relaxation does not make.
-    white = math.sqrt(max(0.0, 0.5 * steps + ou.var_inf * math.expm1(-ou.alpha * left.dt)))
     errors: dict[str, Any] = {f'{name}_se': ou.log_se(name) for name in LOG_NAMES}
     e = replace(blank, status=Status.OK, alpha=ou.alpha, sigma=ou.sigma, var_inf=ou.var_inf,
-                noise_std=white, **errors)
+                noise_std=math.sqrt(white_variance(ou, steps, left.dt)), **errors)
     flags = (*e.flags, Flag.SLOW_RATE) if ou.alpha * left.dt > 1.0 else e.flags
     return ou, replace(e, flags=flags, u0_se=math.sqrt(mean_variance(time, n, e, NAN)))
 

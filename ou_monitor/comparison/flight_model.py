@@ -23,7 +23,8 @@ from ou_monitor.model.innovations import Filter, StateSpace
 from ou_monitor.model.load import lowpass
 from ou_monitor.model.load_fit import fit_load, level_evidence, LoadFit, SLOW_TIME
 from ou_monitor.model.ou import simulate
-from ou_monitor.model.ou_fit import fit_pieces, load_signs, NoiseSize, stretches, usual_walk
+from ou_monitor.model.ou_fit import (
+    fit_pieces, load_signs, NoiseSize, stretches, usual_walk, white_variance)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.reading import Quantization
 from ou_monitor.records import FloatArray
@@ -145,15 +146,14 @@ def fit_noise(samples: Readings, left: FloatArray, load: FloatArray | None, slow
     ou = fit_pieces([(left[part], np.ones(part.stop - part.start))
                      for part in stretches(samples.t)], dt, usual_walk(samples.voltage))
     alpha, variance = (ou.alpha, ou.var_inf) if ou.status == 'ok' else (1.0 / dt, 0.0)
-    phi = math.exp(-alpha * dt)
-    # By the steps between readings, in which nothing slow is.
-    white = max(0.5 * float(np.mean(np.diff(left) ** 2)) - variance * (1.0 - phi),
+    white = max(white_variance(ou, float(np.mean(np.diff(left) ** 2)), dt),
                 _LEAST_WHITE * float(left @ left) / left.size, 1e-18)
     errors, predicted = _predicted(
         left, dt, white, {alpha: variance, 1.0 / SLOW_TIME: slow})
     # What the readings add by rounding is simulated by itself.
-    own, theta = max(white - lsb * lsb / 12.0, _LEAST_WHITE * white), 0.0
+    own, phi, theta = max(white - lsb * lsb / 12.0, _LEAST_WHITE * white), 0.0, 0.0
     if variance > 0.0:
+        phi = math.exp(-alpha * dt)
         theta = theta_at(alpha * dt, 1, 0.5 * own / (variance * alpha * dt))
         own *= phi / theta
     signs = load_signs(left.size, dt, load)
@@ -164,7 +164,7 @@ def fit_noise(samples: Readings, left: FloatArray, load: FloatArray | None, slow
     other = max(0.0, predicted - own)
     share = np.maximum(0.0, 1.0 - other / np.maximum(size * size, 1e-300))
     return FlightNoise(sizes, np.log(size[order]), (errors * np.sqrt(share))[order],
-                       phi if variance > 0.0 else 0.0, theta, dt)
+                       phi, theta, dt)
 
 
 def _predicted(x: FloatArray, dt: float, white: float, parts: dict[float, float]

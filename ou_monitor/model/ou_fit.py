@@ -452,6 +452,16 @@ def fit_pieces(parts: Sequence[tuple[FloatArray, FloatArray]], dt: float, walk: 
         np.zeros((0, voltage.size)), [n] * len(cut), walk, 0.5 * n * dt), span)
 
 
+def white_variance(ou: OuFacts, steps: float, dt: float) -> float:
+    """
+    Return the variance of the white noise beside an OU, V^2.
+
+    steps: mean square of the steps between readings of spacing dt, s: they hold nothing slow.
+    """
+    relaxed = ou.var_inf * math.expm1(-ou.alpha * dt) if ou.status == 'ok' else 0.0
+    return max(0.0, 0.5 * steps + relaxed)
+
+
 def known_ou(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | None) -> OuFacts:
     """Fit the shortest of OU_WINDOWS, at the end of the readings, that is precise enough."""
     if not t.size:

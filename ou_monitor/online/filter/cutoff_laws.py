@@ -358,43 +358,32 @@ def supply_noise(mode: str, order: int, cutoff: float, alpha: float) -> float:
     return w ** 3 / spread
 
 
+# ln of the cutoffs, Hz, between which one is looked for.
+_LOGS = -14.0, 21.0
+
+
 def cutoff_for_noise(mode: str, order: int, rms: float, intensity: float,
                      alpha: float) -> float:
     """
     Return the cutoff at which the supply's noise comes out with a wanted rms.
 
-    Solves intensity^2 V(w) = rms^2 (V: head of this module): linear or
-    quadratic in w, a cubic for the derivative of order 2 (one positive root,
-    by Newton's iteration from above, where the cubic is convex).
+    By bisection of intensity^2 V(w) = rms^2 (V: head of this module), which rises with w.
 
-    alpha in 1/s.
+    alpha in 1/s, result in Hz; infinite where no cutoff lets as much through.
     """
     if intensity <= 1e-12 * rms:
         return math.inf
-    v = (rms / intensity) ** 2
-    if v == 0.0:
-        return 0.0
-    if mode == 'lowpass':
-        q = 2.0 * alpha * v
-        if q >= 1.0:
-            return math.inf
-        if order == 1:
-            return alpha * q / (1.0 - q) / TWO_PI
-        # sqrt2 (1 - q) u^2 + (1 - 2 q) u - sqrt2 q = 0 with u = w / alpha.
-        b, root = 1.0 - 2.0 * q, math.sqrt(1.0 + 4.0 * q - 4.0 * q * q)
-        u = 4.0 * q / (_ROOT2 * (b + root)) if b > 0.0 else (root - b) / (_ROOT8 * (1.0 - q))
-        return alpha * u / TWO_PI
-    if order == 1:
-        return 0.5 * (2.0 * v + math.sqrt(4.0 * v * v + 8.0 * v * alpha)) / TWO_PI
-    q = _ROOT8 * v
-    w = q + math.sqrt(_ROOT2 * q * alpha) + math.cbrt(q * alpha * alpha)
-    for _ in range(60):
-        off = w ** 3 - q * (w * w + _ROOT2 * w * alpha + alpha * alpha)
-        step = off / (3.0 * w * w - q * (2.0 * w + _ROOT2 * alpha))
-        w -= step
-        if abs(step) <= 1e-12 * w:
-            break
-    return w / TWO_PI
+    wanted = (rms / intensity) ** 2
+    low, high = _LOGS
+    if supply_noise(mode, order, math.exp(high), alpha) <= wanted:
+        return math.inf
+    while high - low > 1e-12:
+        middle = 0.5 * (low + high)
+        if supply_noise(mode, order, math.exp(middle), alpha) <= wanted:
+            low = middle
+        else:
+            high = middle
+    return math.exp(low)
 
 
 def wiener_law(settings: FilterSettings, sigma: float, alpha: float, interval: float) -> float:
