@@ -11,7 +11,8 @@ what a load model misses while the load moves would otherwise pass for a fast OU
 white noise, the OU, and a random walk of the level, which may be nil and has a usual size that it
 hardly exceeds: without it, what the hats leave of the level would pass for a slow OU. The fit is a
 restricted likelihood in the frequency domain (`whittle.CrossSpectrum`). Intervals are quantiles by
-importance sampling; prior: flat in ln(alpha), arcsine in the share of the OU.
+importance sampling about all its maxima over the rate; prior: flat in ln(alpha), arcsine in the
+share of the OU.
 
 Limits: samples count as evenly spaced within a stretch without gaps; a relaxation slower than 2.5
 s (a sixth of a window below 15 s) is the level's; OU and white noise change their size together,
@@ -75,8 +76,11 @@ _REFINE = (1.2, 0.6, 0.3, 0.15)
 _CHANGES, _SIZE_SD, _SIZE_ROUNDS = (0.03, 0.2, 1.0), 0.5, 12
 # Maximum number of steps towards the maximum, and convergence tolerance of a step.
 _LOOKS, _NEAR = 40, 0.05
-# Draws about the maximum in each round, and rounds.
-_DRAWS, _ROUNDS = 1000, 4
+# Draws about the maxima in each round, and rounds; the least share of one maximum.
+_DRAWS, _ROUNDS, _FEWEST_DRAWN = 1000, 4, 0.05
+# Dips of the grid's profile over the rate that are searched, and maxima that count beside the
+# largest, nats: one of e^-6 of its height has none of the 95 %.
+_TRIED, _RIVAL = 10.0, 6.0
 # Sd of ln(alpha) by the curvature at the maximum, widened by 1.2, above which no interval within
 # PRECISE was seen: at most 0.28 in 190 precise ones of 437 simulated windows.
 _IMPRECISE = 0.37
@@ -378,40 +382,42 @@ def fit_ou(part: Regression, span: float, *, precise: bool = False) -> OuFacts:
     value, variance = costs(points)
     white = float(costs(_points(np.zeros(1), np.full(1, -60.0),
                                 np.linspace(low[2], high[2], 40)))[0].min())
-    start = points[np.argmin(value)]
-    top, lowest = _minimum(cost, start, (high - low) / (np.array(_GRID) - 1))
-    least = min(lowest, white)
-    if precise and white - least < VISIBLE:
-        return OuFacts('not_visible', span)
+    step = (high - low) / (np.array(_GRID) - 1)
+    peaks = [_minimum(cost, points[np.argmin(value)], step)]
+    least = min(peaks[0][1], white)
     if white - least < VISIBLE:
-        return _unseen(costs, low, high, least, dt, span)
-    # Points from a wide law about maximum and grid, weighted by their likelihood; the next law
-    # has the moments of the last points.
-    weight = np.exp(least - value)
-    peak = np.clip(top, low, high)
-    centre = (peak + weight @ points) / (1.0 + weight.sum())
-    off, root = points - centre, _curvature(cost, peak)
-    if precise and math.sqrt(float(root[0] @ root[0])) > _IMPRECISE:
+        return OuFacts('not_visible', span) if precise else _unseen(
+            costs, low, high, least, dt, span)
+    roots = [_curvature(cost, np.clip(peaks[0][0], low, high))]
+    if precise and math.sqrt(float(roots[0][0] @ roots[0][0])) > _IMPRECISE:
         return OuFacts('not_visible', span)
-    root = np.linalg.cholesky(root @ root.T + (
-        (off * weight[:, None]).T @ off + np.outer(peak - centre, peak - centre)) / (
-        1.0 + weight.sum()))
+    for rival in _rivals(cost, points, value, peaks[0], step):
+        peaks.append(rival)
+        roots.append(_curvature(cost, np.clip(rival[0], low, high)))
+    if precise and len(peaks) > 1:
+        return OuFacts('not_visible', span)
+    # Points from wide laws, one about each maximum with the grid nearest to it, weighted by their
+    # likelihood; the next laws have the moments of the last points.
+    nearest = np.abs(points[:, :1] - [peak[0] for peak, _ in peaks]).argmin(axis=1)
+    laws = [(1.0 / len(peaks), *_moments(
+        np.vstack([np.clip(peak, low, high), points[nearest == k]]),
+        np.append(1.0, np.exp(lowest - value[nearest == k])), root @ root.T))
+        for k, ((peak, lowest), root) in enumerate(zip(peaks, roots))]
     rng = np.random.default_rng(0)
     for _ in range(_ROUNDS):
-        z = rng.standard_normal((_DRAWS, 3)) / np.sqrt(rng.chisquare(5.0, (_DRAWS, 1)) / 5.0)
-        points = centre + z @ root.T
-        inside = np.all((points >= low) & (points <= high), axis=1)
-        points, z = points[inside], z[inside]
+        points = np.concatenate([_drawn(rng, *law) for law in laws])
+        points = points[np.all((points >= low) & (points <= high), axis=1)]
         value, variance = costs(points)
         share = 1.0 / (1.0 + np.exp(-points[:, 1]))
-        # 4: (5 + 3) / 2 of Student's t with 5 degrees of freedom.
-        log_weight = (4.0 * np.log1p(np.sum(z * z, axis=1) / 5.0) - value
-                      + 0.5 * np.log(share * (1.0 - share)))
+        of = np.stack([_log_density(points, *law) for law in laws])
+        total = np.logaddexp.reduce(of)
+        log_weight = 0.5 * np.log(share * (1.0 - share)) - value - total
         weight = np.exp(log_weight - log_weight.max())
         weight /= weight.sum()
-        centre = weight @ points
-        off = points - centre
-        root = np.linalg.cholesky((off * weight[:, None]).T @ off + 1e-4 * np.eye(3))
+        own = weight * np.exp(of - total)
+        parts = np.maximum(own.sum(axis=1), _FEWEST_DRAWN)
+        laws = [(float(part), *_moments(points, one, 1e-4 * np.eye(3)))
+                for part, one in zip(parts / parts.sum(), own)]
     log_alpha, log_var = points[:, 0] - math.log(dt), np.log(share * variance)
     spread = math.sqrt(2.0 / part.free)
     alpha, *alpha_95 = np.exp(_quantiles(log_alpha, weight, 0.0))
@@ -506,6 +512,48 @@ def _minimum(cost: Callable[[FloatArray], FloatArray], point: FloatArray, step: 
         if (step < _NEAR).all():
             break
     return point, lowest
+
+
+def _rivals(cost: Callable[[FloatArray], FloatArray], points: FloatArray, value: FloatArray,
+            peak: tuple[FloatArray, float], step: FloatArray) -> list[tuple[FloatArray, float]]:
+    """Return minima of the cost at other rates than the lowest, and their costs."""
+    by_rate = value.reshape(_GRID[0], -1)
+    profile = np.pad(by_rate.min(axis=1), 1, constant_values=math.inf)
+    dips = np.flatnonzero((profile[1:-1] <= profile[:-2]) & (profile[1:-1] < profile[2:])
+                          & (profile[1:-1] < peak[1] + _TRIED))
+    found = [peak]
+    for k in (dips * by_rate.shape[1] + by_rate[dips].argmin(axis=1)).tolist():
+        if abs(points[k, 0] - peak[0][0]) > 2.0 * step[0]:
+            rival = _minimum(cost, points[k], step)
+            if rival[1] < peak[1] + _RIVAL and all(
+                    abs(rival[0][0] - other[0]) > step[0] for other, _ in found):
+                found.append(rival)
+    return found[1:]
+
+
+def _moments(points: FloatArray, weight: FloatArray, more: FloatArray
+             ) -> tuple[FloatArray, FloatArray]:
+    """Return the mean of weighted points, and a root of their covariance and more."""
+    weight = weight / max(float(weight.sum()), 1e-300)
+    centre = weight @ points
+    off = points - centre
+    return centre, np.linalg.cholesky((off * weight[:, None]).T @ off + more)
+
+
+def _drawn(rng: np.random.Generator, part: float, centre: FloatArray, root: FloatArray
+           ) -> FloatArray:
+    """Draw so many of `_DRAWS` from Student's t with 5 degrees of freedom."""
+    n = round(part * _DRAWS)
+    z = rng.standard_normal((n, 3)) / np.sqrt(rng.chisquare(5.0, (n, 1)) / 5.0)
+    return np.asarray(centre + z @ root.T)
+
+
+def _log_density(points: FloatArray, part: float, centre: FloatArray, root: FloatArray
+                 ) -> FloatArray:
+    """Return the log density of `_drawn`, up to a constant."""
+    z = np.linalg.solve(root, (points - centre).T)
+    return np.asarray(math.log(part) - np.log(root.diagonal()).sum()
+                      - 4.0 * np.log1p(np.sum(z * z, axis=0) / 5.0))
 
 
 def _curvature(cost: Callable[[FloatArray], FloatArray], centre: FloatArray) -> FloatArray:
