@@ -95,7 +95,7 @@ class CrossingRate:
 
     @property
     def worse(self) -> bool:
-        """Whether the extended model is wrong by its errors, and more so than the plain OU."""
+        """Whether the extended model is significantly wrong, and more so than the plain OU."""
         off = abs(self.extended - self.observed)
         return (off > Z95 * math.hypot(self.extended_se, self.observed_se)
                 and off > abs(self.baseline - self.observed))
@@ -133,7 +133,7 @@ class Finding:
     refused: str = ''
     # Name of the load: 'throttle', or 'current' if the measured current is the load.
     load: str = 'throttle'
-    seed: int = 0  # Of all randomness
+    seed: int = 0  # Random seed
 
     @property
     def size_gain(self) -> float:
@@ -142,7 +142,7 @@ class Finding:
 
     @property
     def closer(self) -> bool:
-        """Whether the extended model is nowhere worse than the plain OU: errors and falls."""
+        """Whether neither errors nor falls of the extended model are worse than the plain OU's."""
         return bool(self.causes) and not self.larger and not self.crossing.worse
 
     @property
@@ -165,13 +165,12 @@ class Finding:
 
     def as_data(self) -> dict[str, Any]:
         """
-        Return the finding as JSON holds it.
+        Return the finding for JSON.
 
         Returns
         -------
         dict
-            As CONTRACT section 5, and beside it `sentence`, `remaining`,
-            `felt`, `notes`, and `se` and `units` beside all `params`.
+            The keys of doc/discovery.md; `se` and `units` stand beside all `params`.
 
         """
         baseline = self.baseline
@@ -267,7 +266,7 @@ class Felt:
     made: int = 0
 
     def as_data(self) -> dict[str, Any]:
-        """Return it as JSON holds it."""
+        """Return the fields for JSON."""
         return {
             'punch_out': {'from': self.low, 'to': self.high, 'dip_v': self.dip,
                           'dip_after_s': self.after, 'recovered_v': self.recovered,

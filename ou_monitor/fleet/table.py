@@ -125,7 +125,7 @@ def rows_of(source: FoundRecording, result: Mapping[str, Any], vehicle: Vehicle,
 
 
 def _null_if_unknown(value: Any) -> Any:
-    """Return a value; None for an unknown number."""
+    """Return a value, or None for an unknown number."""
     return None if isinstance(value, float) and math.isnan(value) else value
 
 

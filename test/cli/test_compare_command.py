@@ -13,7 +13,7 @@ from ou_monitor.model.terms.ou import OU
 from ou_monitor.recordings.model_file import as_yaml, ModelFile
 import pytest
 
-# CONTRACT, section 9: names, and what a value is.
+# Keys of the JSON, and the type of each value.
 BAND = {'measured': float, 'simulated_low': float, 'simulated_median': float,
         'simulated_high': float}
 CONTRACT = {

@@ -63,7 +63,7 @@ class LoadDependentSigma(Term):
         return effect
 
     def free(self) -> tuple[str, ...]:
-        """Return all knots but the first, where the OU's sigma is the level."""
+        """Return all knots but the first, at which sigma is that of the OU."""
         return tuple(f'log_factor {k}' for k in range(1, len(self.log_factor)))
 
     def moved(self, name: str, by: float) -> LoadDependentSigma:
@@ -79,7 +79,7 @@ class LoadDependentSigma(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return the two likeliest of a straight line, single steps, and as many knots as pay."""
+        """Return the two most likely of a straight line, single steps, and several knots."""
         if view.throttle is None:
             return ()
         u = view.throttle[view.train]
@@ -128,7 +128,7 @@ Bins = tuple[FloatArray, FloatArray, FloatArray]
 
 
 def _binned(square: FloatArray, x: FloatArray, edges: FloatArray) -> Bins:
-    """Return mean input, ln of the scores' deviation, and count, of each bin with enough."""
+    """Return mean input, ln of the scores' deviation, and count of each bin with enough scores."""
     last = edges.size - 2
     where = np.clip(np.searchsorted(edges, x, side='right') - 1, 0, last)
     count = np.bincount(where, minlength=last + 1).astype(np.float64)
@@ -228,24 +228,25 @@ class LoadDependentAlpha(Term):
         return () if view.throttle is None else (cls(0.0),)
 
 
-# Spans of the means of throttle from which its changes are counted, s.
+# Spans of the moving means of throttle from which changes are measured, s.
 _FAST, _SLOW = 0.03, 0.2
 # What the noise may follow, by number, and the span, s: throttle; its distance from its mean of
 # the last 30 ms; its change from sample to sample; the distance between its means of the last 30
 # and 200 ms; and its rises and falls as they are remembered.
 INPUTS = (('throttle', 0.0), ('fast', _FAST), ('step', 0.0), ('slow', _SLOW), *(
     (what, span) for span in (0.1, 0.5, 2.5) for what in ('rises', 'falls')))
-# What the choice of an input costs, nats: ln of their number.
+# Price of choosing an input, nats: ln of their number.
 _INPUT_PRICE = math.log(len(INPUTS))
 # Share of white noise in the one-step errors below which it is not separated.
 _LEAST_WHITE = 0.05
 # Quantiles that bound the bins of an input: most changes are zero.
 _SHARES = np.array([*np.linspace(0.0, 0.95, 39), 0.97, 0.98, 0.985, 0.99, 0.995, 0.998, 1.0])
-# Largest square that counts once the curves are roughly known, so that bad samples shape no law.
+# Maximum squared score once the curves are roughly known, which limits the effect of wrong
+# samples.
 _LARGEST = 25.0
 # Rounds of fitting each curve given the others; minimum distance of knots over the range.
 _ROUNDS, _SPACING = 2, 0.02
-# The number of the curve over the sum of the others.
+# Input number of the curve over the sum of the other curves.
 SUM = len(INPUTS)
 
 
@@ -363,7 +364,7 @@ class LoadDependentNoise(Term):
         square = view.z[view.train] ** 2
         white = 1.0 - np.broadcast_to(view.trust, view.z.shape)[view.train]
         if float(white.mean()) > _LEAST_WHITE:
-            # The term does not scale the rail's part.
+            # The term does not scale the noise of the rail.
             square = np.maximum(square - (1.0 - white), 0.0) / np.maximum(white, _LEAST_WHITE)
         square = square * np.exp(2.0 * self.log_of(inputs))
         few = max(1, math.ceil(2.0 * _IN_BIN * _SHARES.size / square.size))
@@ -408,7 +409,7 @@ class Inputs:
         known: dict[tuple[str, float], FloatArray] = {}
 
         def through(what: str, span: float) -> FloatArray:
-            """Return throttle averaged, or its rises or falls remembered, over a span (s)."""
+            """Return the mean of throttle, or its decaying rises or falls, over a span (s)."""
             if (what, span) not in known:
                 keep = np.exp(-step / span)
                 added = ((1.0 - keep) * throttle if what == 'mean' else

@@ -146,9 +146,8 @@ class SlidingEstimator:
         Parameters
         ----------
         t : float or array_like, shape (n,)
-            Stamps, s.  Late samples are sorted in when they come in one batch
-            with what they are late for, else dropped and counted; a step back
-            or a pause longer than the window clears it.
+            Stamps, s.  Late samples are sorted within one call, else dropped and
+            counted; a step back or a pause longer than the window clears it.
         voltage : float or array_like, shape (n,)
             Voltage, V.  NaN and infinite samples are dropped and counted.
         throttle : float or array_like, shape (n,), optional

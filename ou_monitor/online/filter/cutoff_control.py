@@ -81,7 +81,7 @@ class SampleInterval:
         return self._n == INTERVALS
 
     def went_on(self, mean: float, samples: int) -> None:
-        """Take a number of normal intervals by their mean (mean in s)."""
+        """Take several normal intervals at once (mean in s)."""
         self.mean = mean
         self._short, self._long = 0, max(self._long - samples, 0)
 
@@ -95,7 +95,7 @@ def time_constant(settings: FilterSettings, error: float) -> float:
     """
     Return the time constant of the cutoff for a relative error of sigma.
 
-    A level that wanders as a random walk of intensity q, seen with an error e
+    A random walk of intensity q, measured with an error e
     over a correlation time T, is tracked best (steady Kalman filter) with the
     time constant e sqrt(T) / q: proportional to the error.  So it is
     `smoothing` at `smoothing_error`, in proportion elsewhere, within a factor
