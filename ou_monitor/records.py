@@ -33,8 +33,9 @@ TIME_UNITS = {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9}
 _CLOCKS = 946_684_800.0, 4_102_444_800.0
 # Largest magnitude accepted as a stamp, s: the year 5138, below any clock in ms.
 MOST_STAMP = 1.0e11
-# Median step above which the unit of the time is wrong, s: no logger of a supply is slower.
-LONGEST_STEP = 100.0
+# Median steps below and above which the unit of the time is wrong, s: no oscilloscope is faster,
+# no logger of a supply is slower.
+LEAST_STEP, LONGEST_STEP = 1e-12, 100.0
 
 
 def as_numbers(values: npt.ArrayLike) -> FloatArray:

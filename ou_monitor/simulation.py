@@ -23,9 +23,13 @@ from ou_monitor.model.terms.load_dependent import LoadDependentSigma
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise, Quantization
 from ou_monitor.model.terms.slow import Drift
+from ou_monitor.recordings.importers.csv_table import (
+    form_of, numbers, THROTTLE, TIME, VOLTAGE)
+from ou_monitor.recordings.importers.log import CsvColumns
 from ou_monitor.recordings.model_file import ModelFile, read_model
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import FloatArray, Recording
+from ou_monitor.text import plain_number, printable
 
 # Stamps (s) -> throttle 0..1.
 Profile = Callable[[FloatArray], FloatArray]
@@ -99,12 +103,12 @@ def read_profile(text: str) -> Profile:
     if text.lower().endswith('.csv'):
         return _from_csv(Path(text))
     try:
-        number = float(text)
+        number = plain_number(text)
     except ValueError:
         if ':' not in text:
             raise InputError(
-                f"no throttle profile '{text}': {nearest(text, PROFILES)} (or give a number 0..1, "
-                'points T:U,T:U,..., a CSV file or a recording)') from None
+                f"no throttle profile '{printable(text, 60)}': {nearest(text, PROFILES)} (or give "
+                'a number 0..1, points T:U,T:U,..., a CSV file or a recording)') from None
         return through(_checked(_points(text), f"throttle '{text}'"))
     _check_throttle(number, f"throttle '{text}'")
     return constant(number)
@@ -114,9 +118,10 @@ def _points(text: str) -> list[tuple[float, float]]:
     points = []
     for part in text.split(','):
         try:
-            time, value = (float(word) for word in part.split(':'))
+            time, value = (plain_number(word) for word in part.split(':'))
         except ValueError:
-            raise InputError(f"throttle point '{part}' is not T:U, seconds and 0..1") from None
+            raise InputError(f"throttle point '{printable(part, 60)}' is not T:U, seconds and "
+                             '0..1') from None
         points.append((time, value))
     return points
 
@@ -139,27 +144,14 @@ def _check_throttle(value: float, where: str) -> None:
 
 
 def _from_csv(path: Path) -> Profile:
-    try:
-        if not path.read_text(encoding='utf-8').strip():
-            raise InputError(f'{path} is empty: expected the columns time_s and throttle')
-        table: Any = np.genfromtxt(path, delimiter=',', names=True, dtype=np.float64, ndmin=1)
-    except OSError as error:
-        raise InputError(f'cannot read the throttle profile {path}: {error.strerror}') from error
-    except ValueError as error:
-        raise InputError(f'{path} is not a CSV of numbers: '
-                         f"{' '.join(str(error).split())}") from error
-    names = table.dtype.names or ()
-    if 'time_s' not in names or 'throttle' not in names:
-        raise InputError(f'{path} needs the columns time_s and throttle, it has: '
-                         f"{', '.join(names) or 'none'}")
-    points = list(zip(table['time_s'].tolist(), table['throttle'].tolist(), strict=True))
-    if not points:
+    form = form_of(path, CsvColumns())
+    if not {TIME, THROTTLE} <= set(form.names):
+        raise InputError(f'{path} needs the columns {TIME} and {THROTTLE}, it has: '
+                         f"{', '.join(form.names)}")
+    t, throttle = numbers(path, form, [form.names.index(name) for name in (TIME, THROTTLE)])
+    if not t.size:
         raise InputError(f'{path} holds no row')
-    return through(_checked(points, str(path)))
-
-
-# Bytes of a CSV that hold its header.
-_HEAD = 4096
+    return through(_checked(list(zip(t.tolist(), throttle.tolist())), str(path)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,12 +172,10 @@ def is_recording(text: str) -> bool:
     if path.suffix.lower() != '.csv':
         return True
     try:
-        with path.open('rb') as file:
-            head = file.read(_HEAD).splitlines()
-    except OSError:
+        # Without voltage it is a profile: times from 0 s on, joined by straight lines.
+        return VOLTAGE in form_of(path, CsvColumns()).names
+    except InputError:
         return False
-    # Without voltage it is a profile: times from 0 s on, joined by straight lines.
-    return bool(head) and b'voltage_v' in head[0]
 
 
 def read_throttle(text: str, start: float | None = None, end: float | None = None

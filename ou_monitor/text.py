@@ -27,6 +27,13 @@ def printable(text: object, most: int | None = None) -> str:
     return found
 
 
+def plain_number(text: str) -> float:
+    """Return a number as files and options hold it; ValueError also for 5_01 and an Arabic 5."""
+    if '_' in text or not text.isascii():
+        raise ValueError(f"'{printable(text, 60)}' is not a number")
+    return float(text)
+
+
 def some(names: Iterable[str], most: int = 40) -> str:
     """Return at most `most` names in one line, and the number of the others."""
     held = list(names)

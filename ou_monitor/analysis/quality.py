@@ -86,6 +86,10 @@ def _of_units(recording: Recording) -> list[QualityItem]:
             'volts: is this mV, or counts of an ADC? Alpha and tau hold; figures in V are in '
             'that unit instead, and no risk is computed. --unit mV reads a CSV in mV; for a bag '
             'there is unit_factor in a msg config.')))
+    if recording.n and float(recording.voltage.max()) < 0.0:
+        items.append(QualityItem('VOLTAGE_SIGN', Severity.WARNING, (
+            'The voltage is negative throughout: swap the leads of the sensor, or the sign; '
+            'lowest voltage, sag and risk have no meaning otherwise.')))
     step = float(np.median(np.diff(recording.t))) if recording.n > 1 else 0.0
     if step > _LONG_STEP or (step > _SLOW and recording.duration > _LONG_FLIGHT):
         items.append(QualityItem('TIME_UNIT', Severity.WARNING, (
@@ -97,8 +101,9 @@ def _of_units(recording: Recording) -> list[QualityItem]:
     if low < -_TRIM or high > 1.0 + _TRIM:
         items.append(QualityItem('THROTTLE_RANGE', Severity.WARNING, (
             f'Throttle runs from {low:.3g} to {high:.3g} instead of 0 to 1: curves, risk and '
-            'throttle budget end at 0 and 1, and sag counts from the lowest throttle. Use '
-            '(x + 1) / 2 for a stick from -1 to 1, the absolute value for reverse thrust.')))
+            'throttle budget end at 0 and 1, and sag counts from the lowest throttle. Check the '
+            'sign; use (x + 1) / 2 for a stick from -1 to 1, the absolute value for reverse '
+            'thrust.')))
     return items
 
 

@@ -11,6 +11,7 @@ import re
 from typing import Any
 
 from ou_monitor.cli.output import path_argument
+from ou_monitor.text import plain_number, printable
 
 
 class Option:
@@ -33,13 +34,18 @@ class WithoutOut(argparse.Action):
                 action.required = False
 
 
+# Maximum digits of a whole number: those of the largest of 64 bits.
+_DIGITS = 18
+
+
 def whole(what: str, low: int, high: float = math.inf, step: int = 1) -> Callable[[str], int]:
     """Return a parser of whole numbers within a range and a multiple of a step; what: in words."""
     def read(text: str) -> int:
-        if not (text.isascii() and text.isdigit() and low <= int(text) <= high
-                and int(text) % step == 0):
-            raise argparse.ArgumentTypeError(f"'{text}' is not {what}")
-        return int(text)
+        # More digits than any number of these has.
+        value = int(text) if text.isascii() and text.isdigit() and len(text) <= _DIGITS else -1
+        if not low <= value <= high or value % step:
+            raise argparse.ArgumentTypeError(f"'{printable(text, 60)}' is not {what}")
+        return value
     return read
 
 
@@ -47,11 +53,11 @@ def number(what: str, fits: Callable[[float], bool]) -> Callable[[str], float]:
     """Return a parser of numbers that fit; what: in words."""
     def read(text: str) -> float:
         try:
-            value = float(text)
+            value = plain_number(text)
         except ValueError:
             value = math.nan
         if not fits(value):
-            raise argparse.ArgumentTypeError(f"'{text}' is not {what}")
+            raise argparse.ArgumentTypeError(f"'{printable(text, 60)}' is not {what}")
         return value
     return read
 
@@ -60,8 +66,8 @@ def number(what: str, fits: Callable[[float], bool]) -> Callable[[str], float]:
 _PREFIX = {'': 1.0, 'p': 1e12, 'n': 1e9, 'u': 1e6, 'µ': 1e6, 'm': 1e3, 'k': 1e-3, 'M': 1e-6}
 # No component, time or level is as large; products of such numbers stay finite.
 _QUANTITY_MOST = 1e15
-_QUANTITY = re.compile(r'([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([pnuµmkM]?)'
-                       r'(F|H|[Oo]hm|Ω|V|A|Hz|W|s|1/s)?')
+_QUANTITY = re.compile(r'([+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?)\s*([pnuµmkM]?)'
+                       r'(F|H|[Oo]hm|Ω|V|A|Hz|W|s|1/s)?', re.ASCII)
 
 
 def quantity(unit: str) -> Callable[[object], float]:
@@ -69,8 +75,9 @@ def quantity(unit: str) -> Callable[[object], float]:
     def read(text: object) -> float:
         match = None if isinstance(text, bool) else _QUANTITY.fullmatch(str(text).strip())
         if not match or not abs(float(match[1])) < _QUANTITY_MOST:
-            raise argparse.ArgumentTypeError(f"'{text}' is not a number; write it as " + (
-                f'0.00047, 470u or 470u{unit}' if unit else '0.4 or 1e-3'))
+            raise argparse.ArgumentTypeError(
+                f"'{printable(text, 60)}' is not a number; write it as " + (
+                    f'0.00047, 470u or 470u{unit}' if unit else '0.4 or 1e-3'))
         given = {'ohm': 'Ohm', 'Ω': 'Ohm'}.get(match[3], match[3])
         if given is not None and given != unit:
             raise argparse.ArgumentTypeError(f"'{text}' must be in {unit}" if unit else
@@ -92,7 +99,7 @@ def throttles(text: str) -> tuple[float, ...]:
 def band(text: str) -> tuple[float, float]:
     """Read two frequencies, Hz."""
     try:
-        low, high = (float(word) for word in text.split(','))
+        low, high = (plain_number(word) for word in text.split(','))
     except ValueError:
         raise argparse.ArgumentTypeError(
             f"'{text}' is not LOW,HIGH in Hz, such as 10,100") from None
@@ -102,6 +109,7 @@ def band(text: str) -> tuple[float, float]:
 
 
 FLIGHT = whole('a number from 1 on', 1)
+NUMBER = number('a number', math.isfinite)
 POSITIVE = number('a positive number', lambda value: 0.0 < value < math.inf)
 TIME = number('a time in seconds, 0 or more', lambda value: 0.0 <= value < math.inf)
 
@@ -440,23 +448,23 @@ _SIMULATE = Command(
              help="preset to simulate (default 'flight'; --list shows all)"),
       Option('--model', metavar='FILE.yaml', type=path_argument,
              help='model file, as discover writes it')),
-     Option('--duration', metavar='S', type=float, help='length, s'),
-     Option('--rate', metavar='HZ', type=float, help='samples per second'),
+     Option('--duration', metavar='S', type=POSITIVE, help='length, s'),
+     Option('--rate', metavar='HZ', type=POSITIVE, help='samples per second'),
      seed(1, 'same seed, same recording'),
      Option('--throttle', metavar='PROFILE',
             help='name of a profile, a number 0..1, points T:U,T:U,..., a CSV file with time_s '
             'and throttle, or a recording, whose length is then the default'),
      *PART,
-     Option('--capacity-left', metavar='X', type=float,
+     Option('--capacity-left', metavar='X', type=NUMBER,
             help='charge at the start, 0..1, drawn by throttle, in place of drift; -1: '
             "as at the start of the model's recording"),
-     Option('--scale-resistance', metavar='X', type=float, default=1.0,
+     Option('--scale-resistance', metavar='X', type=NUMBER, default=1.0,
             help='factor on the response to throttle: 1.4 is a pack aged by 40 %% (default '
             '%(default)s)'),
      Option('--export', metavar='TARGET', choices=('gazebo', 'px4', 'ardupilot', 'json'),
             help='print the model in the parameters of another simulator, and the effects that it '
             'cannot express over --throttle: gazebo, px4, ardupilot, json'),
-     Option('--full-current', metavar='A', type=float, default=math.nan,
+     Option('--full-current', metavar='A', type=POSITIVE, default=math.nan,
             help='with --export: current at full throttle'),
      Option('--output', metavar='PATH', type=path_argument,
             help='NAME.mcap for one file, NAME for a rosbag2 folder'),

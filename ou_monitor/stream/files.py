@@ -137,7 +137,7 @@ def _without_content(error: yaml.MarkedYAMLError) -> str:
 
 
 class _BoundedLoader(yaml.SafeLoader):
-    """PyYAML's safe loader, with limits on depth, aliases, nodes and digits."""
+    """PyYAML's safe loader: each key once, with limits on depth, aliases, nodes and digits."""
 
     def __init__(self, text: str, most_nodes: int) -> None:
         super().__init__(text)
@@ -166,6 +166,17 @@ class _BoundedLoader(yaml.SafeLoader):
         self._depth -= 1
         if event.anchor is not None:
             self._sizes[event.anchor] = self._nodes - before
+        return node
+
+    def compose_mapping_node(self, anchor: Any) -> Any:
+        """Compose a mapping; refuse a key that is there twice, of which YAML takes the last."""
+        node = super().compose_mapping_node(anchor)
+        known = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode):
+                if (key.tag, key.value) in known:
+                    self._refuse('a key is there twice', key)
+                known.add((key.tag, key.value))
         return node
 
     def construct_object(self, node: Any, deep: bool = False) -> Any:

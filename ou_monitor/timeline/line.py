@@ -31,7 +31,8 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.records import (
-    as_numbers, Counters, Defect, FloatArray, LONGEST_STEP, MOST_STAMP, NAN, Note, Recording)
+    as_numbers, Counters, Defect, FloatArray, LEAST_STEP, LONGEST_STEP, MOST_STAMP, NAN, Note,
+    Recording)
 from ou_monitor.text import counted
 
 # Share of gaps that may differ from the pattern: lost samples, late logger.
@@ -309,7 +310,8 @@ def ordered(recording: Recording) -> Recording:
     """Return a recording in the order of its stamps, each once; notes count dropped samples."""
     which, said = in_order(recording.t, recording.voltage[:, None], MOST_VOLTAGE, ' V')
     recording = part_of(recording, which, *said) if said else recording
-    if recording.n > 1 and (step := float(np.median(np.diff(recording.t)))) > LONGEST_STEP:
+    if recording.n > 1 and not LEAST_STEP <= (
+            step := float(np.median(np.diff(recording.t)))) <= LONGEST_STEP:
         raise InputError(f"the samples of '{recording.name}' are {step:.4g} s apart: are the "
                          'stamps in ms, us or ns? Give them in s, or as dates')
     return recording

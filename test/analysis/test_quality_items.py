@@ -65,12 +65,16 @@ def test_the_stage_of_samples_says_what_it_notes():
     assert defect_of(back) is Defect.UNORDERED
 
 
-@pytest.mark.parametrize('factor, named', [(1.0, False), (80.0, False), (1e3, True), (3e3, True)])
-def test_millivolts_are_called_so(factor, named):
-    """A rail of 5 V, a battery of 400 V; 5000 and 15000 are no volts."""
+@pytest.mark.parametrize('factor, named', [
+    (1.0, None), (80.0, None), (1e3, 'VOLTAGE_UNIT'), (3e3, 'VOLTAGE_UNIT'),
+    (-1.0, 'VOLTAGE_SIGN'), (1e-300, None)])
+def test_voltages_of_no_supply_are_called_so(factor, named):
+    """A rail of 5 V, a battery of 400 V; 5000 and 15000 are no volts, nor is -5."""
     simulated = recording(3, ((0.1, 0.3),))
-    items = names(listed(replace(simulated, voltage=factor * simulated.voltage)))
-    assert (items.get('VOLTAGE_UNIT') is Severity.WARNING) == named
+    lattice = 0.005 * np.round(simulated.voltage / 0.005)
+    items = names(listed(replace(simulated, voltage=factor * lattice)))
+    assert [name for name in items if name.startswith('VOLTAGE')] == [named] * (named is not None)
+    assert items.get(named, Severity.WARNING) is Severity.WARNING
 
 
 @pytest.mark.parametrize('low, high, named', [

@@ -109,7 +109,11 @@ def test_unknown_is_null(tmp_path, capsys):
 
 @pytest.mark.parametrize('options, word', [
     (['--levels', '5,10'], "'5'"), (['--levels', 'a'], "'a'"), (['--levels', ''], "''"),
-    (['--levels', '0.1,0.1'], 'twice'), (['--levels', 'nan'], "'nan'"),
+    (['--levels', '0.1,0.1'], 'twice'), (['--levels', '1_0e-2'], "'1_0e-2'"),
+    (['--window', '1_0'], "'1_0' is not"), (['--window', '\u0663'], "'\u0663' is not"),
+    (['--cells', '9' * 5000], '9...99999'),
+    (['--sample-interval', '1e-320'], 'outside 1e-12 to 100 s'),
+    (['--sample-interval', '1e308'], 'outside 1e-12 to 100 s'), (['--levels', 'nan'], "'nan'"),
     (['--window', '0'], '--window'), (['--window', 'inf'], '--window'),
     (['--window', 'x'], '--window'), (['--window', '7200'], '--window: 7200 is not within'),
     (['--brownout-voltage', 'x'], '--brownout-voltage'),

@@ -150,7 +150,8 @@ def test_quantities(text, unit, value):
     assert quantity(unit)(text) == pytest.approx(value, rel=1e-14)
 
 
-@pytest.mark.parametrize('text', ['', 'uF', '1e', '1..2', 'inf', 'nan', '1xF', '1 2', True, None])
+@pytest.mark.parametrize('text', [
+    '', 'uF', '1e', '1..2', 'inf', 'nan', '1xF', '1 2', '\u0663', '9' * 100_000 + 'x', True, None])
 def test_what_is_no_quantity(text):
     """Refused."""
     with pytest.raises(ArgumentTypeError, match='is not a number|must'):

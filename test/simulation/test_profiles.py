@@ -1,8 +1,11 @@
 """Throttle over time: names, numbers, points, CSV; one line for anything else."""
 
+import os
+from pathlib import Path
+
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.simulation import constant, PROFILES, read_profile, through
+from ou_monitor.simulation import constant, is_recording, PROFILES, read_profile, through
 import pytest
 
 
@@ -107,7 +110,7 @@ def test_a_csv_is_a_profile(tmp_path):
     ('0:0:0', ["'0:0:0'", 'T:U']), ('a:0', ["'a:0'"]), ('0:b', ["'0:b'"]),
     ('0:0,1:2', ['0..1', 'got 2']), ('1:0,0:0', ['not fall', '0 s comes after 1 s']),
     ('0:nan,1:0', ['0..1']), ('nan:0.5', ['finite']), ('0:0,inf:0', ['finite']),
-    ('0:0,nan:0', ['fall']),
+    ('0:0,nan:0', ['fall']), ('0:0,1_0:0', ["'1_0:0'"]), ('\u0660', ['valid: flight']),
 ])
 def test_a_wrong_profile_is_named_in_one_line(text, words):
     """One line that names what was given."""
@@ -123,8 +126,9 @@ def test_a_wrong_profile_is_named_in_one_line(text, words):
     (b'time_s,throttle\n0,0.1\nx,0.1\n', 'times'),
     (b'time_s,throttle\n0,0.1\n1,40\n', 'got 40'),
     (b'time_s,throttle\n1,0.1\n0,0.1\n', 'must not fall'),
-    (b'time_s,throttle\n0,0.1\n1,0.1,5\n', 'not a CSV of numbers'),
-    (b'\xff\xfe\x00time', 'not a CSV of numbers'), (b'# nothing\n', 'stick.csv'),
+    (b'time_s,throttle\n0,0.1\n1,1_0\n', ":3: column 'throttle' holds '1_0'"),
+    (b'time_s,throttle\n0,0.1\n1,0.1,5\n', ':3: 3 cells'),
+    (b'\xff\xfe\x00time', 'time_s and throttle'), (b'# nothing\n', 'stick.csv'),
     (None, 'cannot read'),
 ])
 def test_a_wrong_profile_csv_is_named_in_one_line(tmp_path, content, words):
@@ -136,7 +140,10 @@ def test_a_wrong_profile_csv_is_named_in_one_line(tmp_path, content, words):
     assert str(path) in line and words in line, line
 
 
-def test_a_folder_is_no_csv(tmp_path):
-    folder = tmp_path / 'a.csv'
-    folder.mkdir()
-    assert 'cannot read' in refused(str(folder)) and str(folder) in refused(str(folder))
+@pytest.mark.parametrize('make', [Path.mkdir, os.mkfifo])
+def test_a_profile_is_a_regular_file(tmp_path, make):
+    """No folder, and no FIFO, which would wait for its writer."""
+    path = tmp_path / 'a.csv'
+    make(path)
+    assert not is_recording(str(path))
+    assert f'cannot read {path}: ' in refused(str(path))

@@ -41,6 +41,7 @@ BAD = {
     'python': f'!!python/name:{SECRET} x', 'date': '2026-99-99', 'two': f'a: 1\n---\n{SECRET}: 2',
     'escape': '"\\x1b[31m', 'control': f'{SECRET}: \x1b[31m', 'key': f'? [{SECRET}]\n: 1',
     'long_line': f'{SECRET}' * 5000 + ': [', 'duplicate': f'a: &{SECRET} 1\nb: &{SECRET} 2',
+    'key_twice': f'{SECRET}: 1\n{SECRET}: 2', 'keys_deep': 'a: [{"b": 1, b: 2}]',
     'binary': f'!!binary "é{SECRET}"', 'indicator': f'- >{SECRET}',
 }
 

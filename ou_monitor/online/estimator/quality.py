@@ -50,8 +50,10 @@ def examine(y: FloatArray, held: float = 1.0) -> Quality:
         return Quality(held=held)
     # Where many neighbours are equal, a few different steps are a lattice, too.
     tied = changes.size < _TIED * steps.size
-    return Quality(lattice(np.abs(steps[changes]), 1 if tied else _FEWEST_STEPS), held,
-                   _piles_up(y), float(np.sqrt(np.mean(steps * steps))))
+    rms = float(np.sqrt(np.mean(steps * steps)))
+    # Steps whose squares are zero have no size to compare with.
+    step = lattice(np.abs(steps[changes]), 1 if tied else _FEWEST_STEPS) if rms > 0.0 else 0.0
+    return Quality(step, held, _piles_up(y), rms)
 
 
 def lattice(sizes: FloatArray, fewest: int = _FEWEST_STEPS) -> float:

@@ -27,8 +27,8 @@ from ou_monitor.timeline.line import check_throttle
 # Word that leaves a quantity out.
 NONE = 'none'
 
-# Maximum series named in one line; --list shows the others.
-MOST = 4
+# Maximum series named in one line, and what shows the others.
+MOST, _LIST = 4, 'see convert LOG --list'
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | 
     """Choose series, and drop unusable samples (option: the option that chooses a quantity)."""
     volts = _pick(path, log, VOLTAGE, voltage, option)
     if volts is None:
-        raise InputError(_no_voltage(path, log))
+        raise InputError(_no_voltage(path, log, option))
     first = _pick(path, log, THROTTLE, throttle, option)
     if first is not None and log.format == 'csv':
         # Importers of autopilot logs know the scale; a column does not state it.
@@ -58,11 +58,15 @@ def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | 
         second = _pick(path, log, CURRENT, current, option)
     else:
         second = _current(log, volts)
+    names = [one.name for one in (volts, first, second) if one is not None]
+    if len(set(names)) < len(names):
+        raise InputError(f'{path}: one series cannot be two of voltage, throttle and current: '
+                         + ', '.join(names))
     notes: list[str] = []
     if second is None and current is None and (
             held := [one for one in _series_of(log, CURRENT) if not one.silent]):
         notes.append('No current clearly belongs to this voltage: ' + _names_of(held)
-                     + '; none taken (--current NAME).')
+                     + f'; none taken ({option.format(CURRENT)} NAME).')
     chosen: list[Series | None] = []
     dropped: dict[str, list[str]] = {}
     for one in (volts, first, second):
@@ -132,7 +136,7 @@ def _series_of(log: Log, quantity: str) -> list[Series]:
 
 def _names_of(series: list[Series]) -> str:
     shown = ', '.join(f'{one.name} ({one.words})' for one in series[:MOST])
-    return shown + (f' and {len(series) - MOST} more, see --list' if len(series) > MOST else '')
+    return shown + (f' and {len(series) - MOST} more, {_LIST}' if len(series) > MOST else '')
 
 
 def _pick(path: Path, log: Log, quantity: str, name: str | None, option: str
@@ -143,7 +147,7 @@ def _pick(path: Path, log: Log, quantity: str, name: str | None, option: str
         found = default(log, quantity)
         if len(found) > 1:
             raise InputError(f'{path} has several: {_names_of(found)}; choose with '
-                             f'{option.format(quantity)} NAME, see all with --list')
+                             f'{option.format(quantity)} NAME, {_LIST}')
         return found[0] if found else None
     held = [one for one in log.series if one.quantity in (quantity, ANY)]
     for one in held:
@@ -153,7 +157,7 @@ def _pick(path: Path, log: Log, quantity: str, name: str | None, option: str
         if one.name == name:
             raise InputError(f"{path}: '{name}' is a {one.quantity}, not a {quantity}")
     hint = 'there is none' if not held else (
-        nearest(name, [one.name for one in held]) if len(held) < 8 else 'see --list')
+        nearest(name, [one.name for one in held]) if len(held) < 8 else _LIST)
     raise InputError(f"{path} has no {quantity} '{name}': {hint}"
                      + ''.join(f' ({note})' for note in log.notes))
 
@@ -170,14 +174,14 @@ def _current(log: Log, voltage: Series) -> Series | None:
     return ranked[0] if len(ranked) == 1 and len(batteries) < 2 else None
 
 
-def _no_voltage(path: Path, log: Log) -> str:
+def _no_voltage(path: Path, log: Log, option: str) -> str:
     others = _series_of(log, VOLTAGE) + _series_of(log, ANY)
     why = ''.join(f' ({note})' for note in log.notes)
     if log.format == 'csv':
-        return (f"{path}: no column 'voltage_v': name one with --voltage, see all with --list")
+        return (f"{path}: no column 'voltage_v': name one with --voltage, {_LIST}")
     if others:
-        return (f'{path} has no battery voltage; choose another with --voltage NAME: '
-                f'{_names_of(others)}{why}')
+        return (f'{path} has no battery voltage; choose another with {option.format(VOLTAGE)} '
+                f'NAME: {_names_of(others)}{why}')
     return f'{path} holds no voltage{why}: there is nothing to convert'
 
 
@@ -270,14 +274,14 @@ def named_series(path: Path, log: Log, name: str) -> Series:
     known = list(dict.fromkeys([*log.names, *(one.name for one in log.series)]))
     hint = nearest(name, known) if known else 'it holds none'
     if hint.startswith('valid:'):
-        hint = 'see --list of convert'
+        hint = _LIST
     raise InputError(f"{path} has no series '{name}': {hint}")
 
 
 def signal_of(path: Path, log: Log, signal: str) -> tuple[Series, tuple[str, ...]]:
     """Return a series by its name or by the topic that `convert` gives it, and notes on it."""
     if not signal:
-        raise InputError('the name of the signal is empty: see convert LOG --list')
+        raise InputError('the name of the signal is empty: ' + _LIST)
     series, said = clean(_of_topic(path, log, signal) or named_series(path, log, signal))
     if not series.n:
         raise InputError(f'{path}: {signal} has no usable sample' + ''.join(

@@ -38,9 +38,9 @@ from ou_monitor.recordings.importers.formats import kind_of_foreign
 from ou_monitor.recordings.importers.log import (
     ANY, CsvColumns, Log, one_flight, RawColumns, Request, Series)
 from ou_monitor.records import (
-    clock_unit, Defect, FloatArray, LONGEST_STEP, Note, TIME_UNITS)
+    clock_unit, Defect, FloatArray, LEAST_STEP, LONGEST_STEP, Note, TIME_UNITS)
 from ou_monitor.stream.files import open_regular
-from ou_monitor.text import counted, printable
+from ou_monitor.text import counted, plain_number, printable
 from ou_monitor.timeline.line import hold, MOST_THROTTLE, WILD
 
 TIME, VOLTAGE, THROTTLE, CURRENT = 'time_s', 'voltage_v', 'throttle', 'current_a'
@@ -232,10 +232,10 @@ def _prepared(lines: list[str], delimiter: str, comma: bool) -> list[str]:
 
 def is_number(cell: str) -> bool:
     try:
-        float(cell)
+        plain_number(cell)
     except ValueError:
         return False
-    return '_' not in cell and cell.isascii()
+    return True
 
 
 def is_value(cell: str) -> bool:
@@ -422,7 +422,7 @@ def _floats(cells: Sequence[str], where: Callable[[int], str], comma: bool) -> F
     """Return cells as numbers (where: words for the place of one)."""
     try:
         values = np.fromiter(map(float, cells), np.float64, len(cells))
-        # Python reads 5_01 as 501, and an Arabic five as 5.
+        # As in `plain_number`.
         if '_' not in (text := ''.join(cells)) and text.isascii():
             return values
     except ValueError:
@@ -758,6 +758,9 @@ def _read(path: Path, form: Form, time: _Column, places: list[int],
     sample = [row[time.place[-1]] for row in form.rows
               if time.place and time.place[-1] < len(row) and row[time.place[-1]]]
     if not time.place:
+        if not LEAST_STEP <= time.scale <= LONGEST_STEP:
+            raise InputError(f"{path}: '{time.name}' says rows {time.scale:g} s apart, outside "
+                             f'{LEAST_STEP:g} to {LONGEST_STEP:g} s')
         values = numbers(path, form, places or [0])
         return time.scale * np.arange(float(values[0].size)) + form.start * (
             time.name == form.stated), values

@@ -21,6 +21,7 @@ from ou_monitor.recordings.importers.log import (
     CURRENT, FRD_TO_FLU, gyro_of, Log, log_of, Motion, one_flight, quiet, quiet_process, Request,
     RPM, Series, SIGNAL, three_axes, THROTTLE, UNKNOWN, VELOCITY, VOLTAGE)
 from ou_monitor.records import FloatArray
+from ou_monitor.stream.files import open_regular
 from pymavlink import DFReader
 
 # Message, field, quantity, rank, words.
@@ -68,7 +69,7 @@ Table = dict[tuple[str, str], dict[str, list[float]]]
 def read(path: Path, request: Request) -> Log:
     """Read a dataflash log, binary or text."""
     one_flight(path, request)
-    with path.open('rb') as file:
+    with open_regular(path) as file:
         text = not file.read(2).startswith(b'\xa3\x95')
     with quiet(path, 'pymavlink'), _plain_text(path, text) as (name, mended):
         reader = DFReader.DFReader_text if text else DFReader.DFReader_binary
@@ -109,7 +110,10 @@ def read(path: Path, request: Request) -> Log:
 @contextmanager
 def _plain_text(path: Path, text: bool) -> Iterator[tuple[str, list[str]]]:
     """Yield the name of a log that pymavlink can decode, and notes on changes."""
-    content = path.read_bytes() if text else b''
+    content = b''
+    if text:
+        with open_regular(path) as file:
+            content = file.read()
     if content.isascii():
         yield str(path), []
         return

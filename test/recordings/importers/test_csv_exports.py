@@ -200,6 +200,16 @@ def test_the_unit_of_a_throttle(tmp_path):
     assert not read_recording(path, columns=CsvColumns(throttle='none')).has_throttle
 
 
+def test_one_column_is_one_series(tmp_path):
+    """A time is no signal, a column of unknown kind not two quantities."""
+    path = written(tmp_path, 'time_s,x\n0,0.5\n1,0.6\n')
+    with pytest.raises(InputError, match="'time_s' is the time, not a signal"):
+        import_log(path, Request(names=frozenset(('time_s',))))
+    log = import_log(path, Request(names=frozenset('x')))
+    with pytest.raises(InputError, match='cannot be two of voltage, throttle and current: x, x'):
+        choose(path, log, voltage='x', throttle='x')
+
+
 def test_options_of_the_command_line(tmp_path, capsys):
     path = written(tmp_path, 'x;U\n' + ''.join(f'{k};12,{k % 9}\n' for k in range(300)), 'a.txt')
     given = ['--sample-interval', '0.01', '--delimiter', ';', '--decimal', ',', '--unit', 'mV']
