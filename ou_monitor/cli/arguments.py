@@ -32,7 +32,8 @@ def check_outputs(args: argparse.Namespace, *names: str, **inputs: Any) -> None:
         if target == output.STDOUT:
             raise InputError(f"{option} needs a file: '-' is not supported")
     for target in (args.json, *targets.values()):
-        output.check_writable(target)
+        # `check_paths` names the option of an empty path.
+        output.check_writable(target or None)
     output.check_paths(inputs, {'--json': args.json, **targets}, args.force)
 
 
