@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 import sys
 import tempfile
@@ -63,15 +64,16 @@ def row(name: str, seeds: int) -> list[str]:
     model, foreign = filed.model, Counter[str]()
     alike = clean = found = 0
     rate = 1.0 / float(np.median(np.diff(recording.t)))
+    draw = partial(simulate, throttle=recording, rate=rate)
     size = AMPLITUDE * float(np.diff(recording.voltage).std())
     hummed = replace(filed, model=SupplyModel((*model.terms, Tone(size, SHARE * rate, 0.0))))
     for seed in range(seeds):
-        drawn = simulate(filed, throttle=recording, seed=seed).recording
+        drawn = draw(filed, seed=seed).recording
         alike += compare(drawn, model).verdict is Likeness.LOOKS_LIKE_IT
         new = named(drawn, model)
         clean += not new
         foreign.update(new)
-        found += 'tone' in named(simulate(hummed, throttle=recording, seed=seed).recording, model)
+        found += 'tone' in named(draw(hummed, seed=seed).recording, model)
         print(name, seed, alike, clean, dict(foreign), found, file=sys.stderr, flush=True)
     return [name, ', '.join(term.NAME for term in model.terms), f'{alike} of {seeds}',
             f'{clean} of {seeds}', ', '.join(f'{k} {n}' for k, n in foreign.most_common()) or '-',
