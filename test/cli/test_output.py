@@ -217,7 +217,7 @@ class Screen(io.StringIO):
 def test_the_width_of_the_terminal_is_kept(monkeypatch, width):
     """Paragraphs end there, or at 100; tables come in parts, the first column in each."""
     monkeypatch.setattr('sys.stdout', Screen())
-    monkeypatch.setattr('shutil.get_terminal_size', lambda *_: os.terminal_size((width, 24)))
+    monkeypatch.setattr('shutil.get_terminal_size', lambda *_, **__: os.terminal_size((width, 24)))
     words = ' '.join(['word'] * 60)
     for text in (terminal.paragraph(words), terminal.item(words),
                  terminal.facts([('Sag', words), ('Noise', words)])):
