@@ -92,7 +92,7 @@ def test_columns_and_units_of_a_csv(tmp_path):
     np.testing.assert_allclose(found.throttle, [0.25, 0.5, 0.75])
     for columns, words in (
             (CsvColumns('when', 'mv', 'gas'), "no column 'gas'"),
-            (CsvColumns('when', 'mv', 'mv'), 'cannot be two of'),
+            (CsvColumns('when', 'mv', 'mv'), 'cannot be both voltage and throttle'),
             (CsvColumns(voltage='mv'), r"no column 'time_s'.*--time-column")):
         with pytest.raises(InputError, match=words):
             read_recording(path, columns=columns)
