@@ -88,13 +88,13 @@ def read_recording(
 
     """
     return readings_of(_read(
-        Path(path), Options(
+        Path(path), ReadOptions(
             msg_config=msg_config, voltage_topic=voltage_topic, throttle_topic=throttle_topic,
             partial=partial, start=start, end=end, flight=flight, columns=columns,
             progress=progress))[0])
 
 
-class Options(TypedDict, total=False):
+class ReadOptions(TypedDict, total=False):
     """Options of `read_recording`."""
 
     msg_config: str | Path | None
@@ -108,7 +108,8 @@ class Options(TypedDict, total=False):
     progress: Callable[[float], None] | None
 
 
-def _read(path: Path, options: Options, signal: str | None = None) -> tuple[Recording, Log | None]:
+def _read(path: Path, options: ReadOptions, signal: str | None = None,
+          ) -> tuple[Recording, Log | None]:
     """Read a recording with the repeats of its logger, and a log with a signal by name."""
     start, end, columns = (options.get('start'), options.get('end'), options.get('columns'))
     flight = options.get('flight')
@@ -203,7 +204,7 @@ def _cut(recording: Recording, start: float | None, end: float | None) -> Record
     return part_of(recording, part, part_words(start, end))
 
 
-def read_beside(path: str | Path, signal: str, **options: Unpack[Options],
+def read_beside(path: str | Path, signal: str, **options: Unpack[ReadOptions],
                 ) -> tuple[Recording, Series]:
     """
     Read a recording, and one whole scalar beside it; options as for `read_recording`.
