@@ -87,11 +87,14 @@ def export(model: SupplyModel, target: str, *, throttle: FloatArray, rate: float
     left = SupplyModel((replace(model.ou, sigma=0.0, u0=n.full - (
         n.usual_sag if target == 'gazebo' else 0.0)), *(
         () if math.isinf(n.drain) else (Drift((n.empty - n.full) / n.drain, 0.0),)), *(
-        t for t in model.terms if target == 'ardupilot' and isinstance(t, LoadSag))))
+        t.at(0.0) for t in model.terms if target == 'ardupilot' and isinstance(t, LoadSag))))
     notes = _lost(model, target, throttle, rate)
     if target == 'gazebo' and n.usual_sag:
         notes.append(f'load_sag is that of a constant load, {n.usual_sag:.3g} V: throttle does '
                      'not move it')
+    notes += [f'load_sag is that of the begin: the model grows by {t.growth:.3g} V/s at full '
+              'throttle' for t in model.terms
+              if target != 'px4' and isinstance(t, LoadSag) and t.growth]
     if recording is not None:
         notes += _cost(model, left, recording)
     return Export(text, tuple(notes), left)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.load_answer import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.records import FloatArray, NAN
@@ -249,7 +250,7 @@ _MADE = 0.5
 
 @dataclass(frozen=True)
 class Felt:
-    """A model in units that a pilot feels."""
+    """A model in units that a pilot feels; the punch-out is at half time."""
 
     # Throttle before and after a punch-out.
     low: float = NAN
@@ -300,7 +301,9 @@ def felt(samples: Samples, terms: Sequence[Term], level: float) -> Felt:
     low, high = np.quantile(u, _FLOWN).tolist()
     step = max(float(np.median(samples.step[1:])), (_BEFORE + _AFTER) / _MOST)
     t = step * np.arange(math.ceil((_BEFORE + _AFTER) / step), dtype=np.float64)
-    held = [term for term in answers if term.NEEDS_THROTTLE]
+    half = 0.5 * float(samples.t[-1] - samples.t[0])
+    held = [term.at(half) if isinstance(term, LoadSag) else term
+            for term in answers if term.NEEDS_THROTTLE]
     path = _path(Samples(t, t, np.where(t < _BEFORE, low, high)), held)
     begin = int(np.searchsorted(t, _BEFORE))
     fall = path[begin - 1] - path[begin:]

@@ -79,7 +79,9 @@ def mean_answer(samples: Samples, composite: Composite, view: View,
     """Return the terms of the mean in a recording, beside the other terms of a model."""
     own = [term for term in composite.terms if _measured(term)]
     pool = [*(term for term in start if not _there(term, own)), *own]
-    pool += [term for term in _candidates(view) if not _there(term, pool)]
+    # Beside the noise of a first look, a sag that grows stands for other terms.
+    pool += [term for term in _candidates(view) if not _there(term, pool)
+             and not (start and isinstance(term, LoadSag) and term.growth)]
     if not pool:
         return Answer((), (), ())
     return _Regression(samples, composite, pool).search([
@@ -93,7 +95,7 @@ def _measured(term: Term) -> bool:
 def _there(term: Term, others: Sequence[Term]) -> bool:
     """Return whether a term, or one that is nearly the same, is among others."""
     for other in others:
-        if type(other) is not type(term) or len(other.LINEAR) != len(term.LINEAR):
+        if type(other) is not type(term) or other.LINEAR != term.LINEAR:
             continue
         if not isinstance(term, LoadTransient) or not isinstance(other, LoadTransient):
             return True

@@ -1,5 +1,6 @@
 """A model for other simulators: their parameters, what is lost, what it costs."""
 
+from dataclasses import replace
 import json
 import re
 import xml.etree.ElementTree as ElementTree
@@ -68,6 +69,19 @@ def test_ardupilot_has_charge_and_resistance():
         export(GECKO, 'ardupilot', throttle=HOVER, rate=100.0)
 
 
+@pytest.mark.parametrize('target', ['gazebo', 'ardupilot'])
+def test_a_sag_that_grows_is_exported_as_it_begins(target):
+    """The resistance is one number: the note says what it leaves out."""
+    steady, grows = (replace(GECKO, terms=tuple(
+        replace(term, growth=growth) if isinstance(term, LoadSag) else term
+        for term in GECKO.terms)) for growth in (0.0, -0.004))
+    found = export(grows, target, throttle=HOVER, rate=100.0, full_current=60.0)
+    other = export(steady, target, throttle=HOVER, rate=100.0, full_current=60.0)
+    assert (found.text, found.model.terms) == (other.text, other.model.terms)
+    assert set(found.notes) - set(other.notes) == {
+        'load_sag is that of the begin: the model grows by -0.004 V/s at full throttle'}
+
+
 def test_each_term_left_out_is_named_with_its_size():
     """White noise by its deviation; and a recording shows what the whole export explains."""
     recording = read_recording(ROOT / 'bags' / 'recorded' / 'gecko.csv', start=20.0, end=50.0)
@@ -86,4 +100,5 @@ def test_json_is_the_model():
     found = export(SupplyModel((OU(5.0, 0.1, 5.0), LoadSag(1.0, 0.0))), 'json', throttle=HOVER,
                    rate=100.0)
     assert json.loads(found.text)['model'][1] == {
-        'term': 'load_sag', 'params': {'linear': 1.0, 'square': 0.0}} and not found.notes
+        'term': 'load_sag', 'params': {'linear': 1.0, 'square': 0.0, 'growth': 0.0}}
+    assert not found.notes

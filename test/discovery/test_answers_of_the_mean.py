@@ -4,10 +4,15 @@ import math
 from types import SimpleNamespace
 
 import numpy as np
+from ou_monitor.criticism.composite import fit_composite, view_of
+from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import decision, regression
-from ou_monitor.discovery.regression import _candidates, _lost, _nearby, _Regression, _there, FOLDS
+from ou_monitor.discovery.regression import (
+    _candidates, _lost, _nearby, _Regression, _there, FOLDS, mean_answer)
+from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
+from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.slow import Drift
 from ou_monitor.model.terms.term import Role
 import pytest
@@ -145,6 +150,23 @@ def test_another_cause_that_does_as_well_is_a_rival(driven, monkeypatch):
     assert near < decision.TIE and found._rivals((0,), 0) == ('drift',)
     found, _ = made([pool[0], pool[4]], [columns[0], columns[4]], voltage, monkeypatch)
     assert found._rivals((0,), 0) == ()
+
+
+def test_a_sag_that_stays_is_not_said_to_grow():
+    """BIC of n = 2000 and 6 nats take a parameter without effect once in 10^5 recordings."""
+    n, rate = 2000, 100.0
+    model, grown = (OU(6.0, 0.2, 16.0), LoadSag(1.4, 0.5)), 0
+    t = np.arange(n) / rate
+    for seed in range(200):
+        rng = np.random.default_rng([21, seed])
+        throttle = np.repeat(rng.uniform(0.1, 0.9, n // 50), 50)
+        samples = Samples(t, SupplyModel(model).simulate(t, rng, throttle), throttle)
+        composite = fit_composite(samples, model, samples.train)
+        view = view_of(samples, composite.gaussian, composite.z, samples.train)
+        (sag,) = (term for term in mean_answer(samples, composite, view).terms
+                  if isinstance(term, LoadSag))
+        grown += sag.growth != 0.0
+    assert grown == 0
 
 
 @pytest.mark.parametrize('size, named', [(8.0, LoadSag), (20.0, LoadTransient)])

@@ -58,9 +58,10 @@ def test_json_is_that_of_the_contract():
     assert [c['observed'] for c in data['remaining']] == [-9.0]
     (cause,) = data['causes']
     assert {'name': 'load_sag', 'family': 'load', 'gain': 0.015, 'gain_se': 0.002,
-            'p_value': 1e-9, 'params': {'linear': 0.5, 'square': 0.0},
+            'p_value': 1e-9, 'params': {'linear': 0.5, 'square': 0.0, 'growth': 0.0},
             'alternatives': ['load_transient'], 'explanation': 'It sags.'}.items() <= cause.items()
-    assert cause['units'] == {'linear': 'V', 'square': 'V'} and cause['exact'] is False
+    assert cause['units'] == {'linear': 'V', 'square': 'V', 'growth': 'V/s'}
+    assert cause['exact'] is False
     extended = data['extended']
     assert list(extended['params']) == ['ou', 'load_sag', 'tone', 'tone 2']
     assert (extended['heldout_score'], extended['gain'], extended['gain_se']) == (

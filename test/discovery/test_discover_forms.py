@@ -66,6 +66,21 @@ def test_rail_that_relaxes_to_where_throttle_puts_it():
     assert transient.tau == pytest.approx(1.0 / 30.0, rel=0.3)
 
 
+def test_a_sag_that_shrinks_as_the_pack_warms():
+    """Within the errors given, and simulated by the model that is saved."""
+    rng, n, rate = np.random.default_rng(5), 12000, 200.0
+    throttle = 0.5 + rail(rng, n, 2.0, rate, 0.15)
+    made = SupplyModel((OU(6.0, 0.2, 16.0), LoadSag(1.4, 0.5, -0.01)))
+    t = np.arange(n) / rate
+    finding = discover(Recording(t, made.simulate(t, rng, throttle), throttle))
+    assert [cause.name for cause in finding.causes] == ['load_sag']
+    (cause,) = finding.causes
+    for name, value in made.terms[1].values().items():
+        assert abs(getattr(cause.term, name) - value) < 4.0 * cause.se[name] < 0.5
+    assert cause.term.growth < -10.0 * cause.se['growth']
+    assert 'growth = -0.010' in cause.explanation and finding.model.terms[1] == cause.term
+
+
 def test_levels_that_hide_how_fast_the_rail_relaxes():
     """With levels of 6 deviations the plain OU seems to relax at the rate of the switching."""
     rng, n, rate, alpha, std = np.random.default_rng(3), 40000, 2000.0, 180.0, 0.046

@@ -47,6 +47,9 @@ def test_a_sag_stays():
     found = felt(flown(INRUSH[0]), (OU(1.0, 0.01, 15.0), INRUSH[0]), 14.5)
     assert found.recovered == 0.0 and math.isnan(found.within)
     assert 'come back' not in found.words and 'costs 1.0 V' in found.words
+    # One that grows is that of half time, 30 s.
+    grown = felt(flown(INRUSH[0]), (OU(1.0, 0.01, 15.0), LoadSag(1.0, 0.0, 0.02)), 14.5)
+    assert grown.dip == pytest.approx(1.6, rel=1e-3) and grown.recovered == 0.0
 
 
 def test_without_an_answer_to_throttle_nothing_is_said():

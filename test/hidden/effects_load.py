@@ -67,6 +67,18 @@ def sag_quadratic(bench: Bench, gain: float) -> dict[str, object]:
     return {**found, 'exponent': 2.0}
 
 
+@effect('load_sag/growing', also=(('drift', 'load_sag'),))
+def sag_growing(bench: Bench, gain: float) -> dict[str, object]:
+    """Let the resistance change with the charge drawn: a pack empties, or it warms up."""
+    ohm, ampere, found = _battery(bench, gain)
+    ratio = bench.draw.uniform(1.6, 2.2)**bench.draw.choice([-1.0, 1.0])
+    exponent = bench.draw.uniform(1.0, 2.0)
+    current = ampere * bench.throttle**exponent
+    drawn = np.cumsum(np.where(bench.time > 0.0, current, 0.0))
+    _drop(bench, ohm * (1.0 + (ratio - 1.0) * drawn / drawn[-1]) * current, found)
+    return {**found, 'exponent': exponent, 'ratio': ratio}
+
+
 @effect('load_sag/at_capacitor', also=(BOTH, ('load_transient',)))
 def sag_at_capacitor(bench: Bench, gain: float) -> dict[str, object]:
     """Draw the current at the rail's own capacitor: the sag is reached at the rate alpha."""

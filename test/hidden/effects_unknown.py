@@ -143,16 +143,6 @@ def slew_limit(bench: Bench, gain: float) -> dict[str, object]:
     return {'slew_v_s': limit * bench.rate, 'settling_s': 0.5 / bench.rate}
 
 
-@effect('unknown/growing_resistance', near=('load_sag', 'second_relaxation'))
-def growing_resistance(bench: Bench, gain: float) -> dict[str, object]:
-    """Let a contact warm up: a sag that a calibration at half time made zero on the average."""
-    volts = bench.draw.uniform(0.2, 0.5) * gain * math.sqrt(bench.innovation / 12e-3)
-    centred = bench.throttle - bench.throttle.mean()
-    signal = volts * (2 * bench.time / bench.duration - 1) * centred
-    bench.series.append(-signal)
-    return {'sag_change_v_per_unit': 2 * volts, 'nats': bench.nats(signal)}
-
-
 @effect('unknown/chaotic_converter', near=('resonance', 'tone', 'measurement_noise'))
 def chaotic_converter(bench: Bench, gain: float) -> dict[str, object]:
     """

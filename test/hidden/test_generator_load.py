@@ -21,6 +21,16 @@ def test_sag(cause, exponent):
         assert_regression(h, [h.throttle**exponent], -volts)
 
 
+def test_growing_sag():
+    """The coefficient of the current changes by the claimed ratio, in step with the charge."""
+    for h, claimed, _ in each('load_sag/growing', 4):
+        current = h.throttle**claimed['exponent']
+        share = np.cumsum(current) / current.sum()
+        volts = claimed['sag_v_per_unit']
+        assert_regression(h, [current, share * current],
+                          [-volts, -volts * (claimed['ratio'] - 1.0)])
+
+
 def test_sag_at_the_capacitor_comes_at_the_rate_alpha():
     for h, claimed, rail in each('load_sag/at_capacitor', 4):
         assert_regression(h, [late(h, h.throttle, 1 / rail['alpha'])], -claimed['sag_v_per_unit'])

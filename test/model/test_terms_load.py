@@ -19,12 +19,16 @@ def step_at(k, low=0.0, high=1.0):
     return np.where(np.arange(T.size) < k, low, high)
 
 
-def test_sag():
-    """-(linear u + square u^2), at once."""
+@pytest.mark.parametrize('start', [0.0, 1000.0])
+def test_sag(start):
+    """-((linear + growth t) u + square u^2), at once, t from the first sample."""
     throttle = np.random.default_rng(1).random(T.size)
+    sag = term('load_sag', linear=0.3, square=0.07, growth=-0.4)
     np.testing.assert_allclose(
-        level(term('load_sag', linear=0.3, square=0.07), throttle=throttle),
-        -0.3 * throttle - 0.07 * throttle ** 2, rtol=0, atol=1e-14)
+        level(sag, throttle=throttle, t=start + T),
+        -(0.3 - 0.4 * T) * throttle - 0.07 * throttle ** 2, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(level(sag.at(0.2), throttle=throttle),
+                               -(0.3 - 0.08) * throttle - 0.07 * throttle ** 2, atol=1e-14)
 
 
 @pytest.mark.parametrize('gain, tau', [(0.4, 0.03), (-0.2, 0.005), (0.1, 2.0)])

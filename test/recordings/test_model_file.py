@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 OU = {'term': 'ou', 'params': {'alpha': 63.0, 'sigma': 0.3156, 'u0': 5.0}}
-SAG = {'term': 'load_sag', 'params': {'linear': 0.3, 'square': 0.0}}
+SAG = {'term': 'load_sag', 'params': {'linear': 0.3, 'square': 0.0, 'growth': 0.0}}
 KNOTS = {'term': 'load_dependent_sigma',
          'params': {'throttle': [0.1, 0.4], 'log_factor': [0.0, 0.7]}}
 

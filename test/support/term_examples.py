@@ -12,7 +12,7 @@ OU = {'alpha': ALPHA, 'sigma': SIGMA, 'u0': U0}
 # One of each, none of them neutral.
 EXAMPLES = {
     'ou': OU,
-    'load_sag': {'linear': 0.3, 'square': 0.1},
+    'load_sag': {'linear': 0.3, 'square': 0.1, 'growth': -0.02},
     'load_transient': {'gain': -0.2, 'tau': 0.03, 'delay': 0.0125, 'rise': 0.1},
     'load_dependent_sigma': {'throttle': [0.0, 0.4, 1.0], 'log_factor': [0.0, 0.7, 0.4]},
     'load_dependent_alpha': {'slope': 0.8},
