@@ -10,6 +10,7 @@ recursion itself).
 from __future__ import annotations
 
 import math
+from operator import mul
 
 import numpy as np
 from ou_monitor.records import FloatArray
@@ -109,19 +110,22 @@ def _in_blocks(log_density: FloatArray, transition: FloatArray) -> tuple[FloatAr
 
 def _through(padded: FloatArray, start: FloatArray) -> FloatArray:
     """Return the law before each block."""
-    size, k, _, blocks = padded.shape
+    size = padded.shape[0]
     whole = padded[0]
     for j in range(1, size):
         whole = (whole[:, :, None] * padded[j][None]).sum(axis=1)
         if j % _EVERY == 0:
             total = whole.sum(axis=(0, 1))
             whole = whole / np.where(total > 0.0, total, 1.0)
-    first = np.empty((blocks, k))
-    law = start / start.sum()
-    for b, product in enumerate(np.ascontiguousarray(whole.transpose(2, 0, 1))):
-        first[b] = law
-        law = _law((law @ product)[:, None], start)[:, 0]
-    return first
+    # Sums of a few numbers: not worth arrays.
+    fresh = law = (start / start.sum()).tolist()
+    first = []
+    for product in whole.transpose(2, 0, 1).tolist():
+        first.append(law)
+        weight = [sum(map(mul, law, column)) for column in zip(*product)]
+        total = sum(weight)
+        law = [one / total for one in weight] if total >= _NONE else fresh
+    return np.array(first)
 
 
 def _law(weight: FloatArray, start: FloatArray) -> FloatArray:

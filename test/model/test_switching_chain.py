@@ -5,7 +5,8 @@ import math
 import numpy as np
 from ou_monitor.model.hidden_chain import forward, log_likelihood, smoothed
 from ou_monitor.model.terms.laws import normal_scores, View
-from ou_monitor.model.terms.regime_switching import calm_levels, chain_of, Scores, without_levels
+from ou_monitor.model.terms.regime_switching import (
+    calm_levels, chain_of, rates_between, Scores, stationary_law, step_chances, without_levels)
 import pytest
 from scipy.signal import lfilter
 from scipy.special import ndtr
@@ -66,6 +67,33 @@ def test_scores_of_the_true_levels_are_standard_normal(height, at_once):
     # As if the filter followed at once, the levels are hardly seen.
     blind = log_likelihood(*chain_of(scores.at_once, x, at_once)[0])
     assert float(density.sum()) > blind + (300.0 if at_once else 80.0)
+
+
+@pytest.mark.parametrize('at_once', [0.0, 1.0])
+def test_what_is_followed_of_two_states(at_once):
+    """The recursion, sample by sample and pair by pair."""
+    view = filtered(drawn(0.4, at_once, 6)[0], DRIVE)
+    x = np.array([math.log(UP), math.log(DOWN), 4.0, 0.2, 0.0])
+    scores = Scores.of(view)
+    chances, law = step_chances(x, scores.step, 2), stationary_law(rates_between(UP, DOWN, 2))
+    middle, std = law[1], np.exp(0.2 * np.arange(2))
+    before, followed, moved, wanted = law.copy(), 0.0, 0.0, []
+    for k in range(N):
+        keep, draw = view.phi[k] * np.array([1.0 - scores.trust[k], scores.trust[k]])
+        behind = keep * (followed if at_once else followed - moved)
+        wanted.append(behind)
+        known, after = before[1] - middle, np.zeros(2)
+        for i, j in np.ndindex(2, 2):
+            mean = ((j - middle) - draw * (i - middle) if at_once
+                    else (1.0 - view.phi[k]) * (i - middle)) - behind
+            off = (view.z[k] - x[2] * scores.unit[k] * mean) / std[j]
+            after[j] += before[i] * chances[i, j] / std[j] * math.exp(-0.5 * off * off)
+        before = after / after.sum()
+        followed = keep * followed + draw * (known if at_once else moved)
+        moved = view.phi[k] * moved + (1.0 - view.phi[k]) * known
+    found = scores.following(x, at_once).followed
+    assert np.ptp(found) > 0.05
+    np.testing.assert_allclose(found, wanted, atol=1e-12)
 
 
 def test_without_white_noise_nothing_is_behind():

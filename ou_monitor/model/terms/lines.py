@@ -43,14 +43,19 @@ def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float,
     """
     shrink = np.exp(-damping * step)
     f, q = np.empty((step.size, 2, 2)), np.zeros((step.size, 2, 2))
-    f[:, 0, 0] = f[:, 1, 1] = shrink * np.cos(turn)
-    f[:, 1, 0] = shrink * np.sin(turn)
-    f[:, 0, 1] = -f[:, 1, 0]
+    along, across = shrink * np.cos(turn), shrink * np.sin(turn)
+    f[:, 0, 0] = f[:, 1, 1] = along
+    f[:, 1, 0], f[:, 0, 1] = across, -across
+    left = std * std * -np.expm1(-2.0 * damping * step)
     if lag == 0.0:
-        q[:, 0, 0] = q[:, 1, 1] = std * std * -np.expm1(-2.0 * damping * step)
+        q[:, 0, 0] = q[:, 1, 1] = left
     else:
-        own = np.array([[1.0, -lag], [-lag, 1.0 + 2.0 * lag * lag]])
-        q[:] = std * std * (own - f @ own @ f.transpose(0, 2, 1))
+        # What is left of a covariance of 1, -lag and 1 + 2 lag^2 when it has turned.
+        more, mixed = 2.0 * lag * lag * std * std, 2.0 * lag * std * std * along * across
+        q[:, 0, 0] = left - more * across * across - mixed
+        q[:, 1, 1] = left + more * (1.0 - along * along) + mixed
+        q[:, 0, 1] = q[:, 1, 0] = (more * along * across - lag * std * std * (
+            1.0 - along * along + across * across))
     return f, q, np.array([1.0, 0.0])
 
 

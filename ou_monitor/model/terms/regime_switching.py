@@ -97,38 +97,43 @@ class Scores:
         law = stationary_law(rates_between(math.exp(x[0]), math.exp(x[1]), states))
         middle = float(law @ np.arange(states))
         std = np.exp(x[4] + x[3] * np.arange(states))
-        # What each pair expects, but for what was followed; in sizes that a loop takes.
+        # What each pair of states leaves of a score, but for what was followed, and the exponent.
         direct = _direct(self, at_once, middle, states)
-        height = (x[2] * self.unit).tolist()
-        scale = [(float(-0.5 / s**2), float(1.0 / s)) for s in std]
-        weights = [[float(chances[i, j]) for j in range(states)] for i in range(states)]
-        before = law.tolist()
+        height = x[2] * self.unit
         pairs = list(np.ndindex(states, states))
-        kept = (self.phi * (1.0 - self.trust)).tolist()
-        drawn = (self.phi * self.trust).tolist()
-        phi = self.phi.tolist()
-        rows = [direct[i, j].tolist() for i, j in pairs]
-        z, found = self.z.tolist(), [0.0] * self.z.size
+        rows = np.array([self.z - height * direct[pair] for pair in pairs])
+        kept, drawn = self.phi * (1.0 - self.trust), self.phi * self.trust
+        columns = zip(rows.T.tolist(), height.tolist(), kept.tolist(), drawn.tolist(),
+                      self.phi.tolist())
+        weights, scales = (chances / std).ravel().tolist(), (-0.5 / std**2).tolist()
+        exp, found, before = math.exp, [], law.tolist()
         followed = moved = 0.0
-        for k in range(len(z)):
-            known = sum(p * s for s, p in enumerate(before)) - middle
+        for off, high, keep, draw, slow in columns:
             # The state before the sample: the level itself, or the rail that goes there.
-            found[k] = behind = kept[k] * (followed if at_once else followed - moved)
-            logs = []
-            for m, (i, j) in enumerate(pairs):
-                off = z[k] - height[k] * (rows[m][k] - behind)
-                logs.append(scale[j][0] * off * off)
-            top = max(logs)
-            tops = [0.0] * states
-            for m, (i, j) in enumerate(pairs):
-                tops[j] += before[i] * weights[i][j] * scale[j][1] * math.exp(logs[m] - top)
+            behind = keep * (followed if at_once else followed - moved)
+            found.append(behind)
+            more = high * behind
+            if states == 2:
+                # Written out: half of the time of a search for causes went here.
+                known = before[1] - middle
+                low, top = before
+                (a, b, c, d), (e, f) = off, scales
+                a, b, c, d = a + more, b + more, c + more, d + more
+                tops = [low * weights[0] * exp(e * a * a) + top * weights[2] * exp(e * c * c),
+                        low * weights[1] * exp(f * b * b) + top * weights[3] * exp(f * d * d)]
+            else:
+                known = sum(p * s for s, p in enumerate(before)) - middle
+                tops = [0.0] * states
+                for m, (i, j) in enumerate(pairs):
+                    tops[j] += before[i] * weights[m] * exp(scales[j] * (off[m] + more) ** 2)
             total = sum(tops)
+            # Where no state explains the sample, as at the begin.
             before = [p / total for p in tops] if total > 0.0 else law.tolist()
             if at_once:
-                followed = kept[k] * followed + drawn[k] * known
+                followed = keep * followed + draw * known
             else:
-                followed = kept[k] * followed + drawn[k] * moved
-                moved = phi[k] * moved + (1.0 - phi[k]) * known
+                followed = keep * followed + draw * moved
+                moved = slow * moved + (1.0 - slow) * known
         return replace(self, followed=np.array(found))
 
 
