@@ -8,7 +8,7 @@ fitted again.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 import math
 
@@ -27,6 +27,8 @@ _POWERS = 1e-3, 1e3
 _ALIKE = 0.03
 # Processor time of the fit of a dear law, s a sample: of the fastest of them.
 LAW_COST = 1e-5
+# Fits a law for the first time.
+Look = Callable[[type[Term], View], LawFit | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,12 +59,13 @@ class Composite:
 
 def fit_composite(samples: Samples, terms: Sequence[Term | type[Term]], part: slice,
                   known: Composite | None = None, *, whole_mean: bool = False,
-                  rough: bool = False, begun: bool = False) -> Composite | None:
+                  rough: bool = False, begun: bool = False, first: Look | None = None
+                  ) -> Composite | None:
     """
     Fit a model on a part; None where a law cannot be fitted.
 
-    A law that was never fitted is given as its class; events and offset of `known`, a
-    model with the same laws, are taken over.
+    A law that was never fitted is given as its class, and fitted by `first`; events and offset of
+    `known`, a model with the same laws, are taken over.
     """
     structural = [term for term in terms
                   if isinstance(term, Term) and term.ROLE is not Role.LAW]
@@ -81,7 +84,8 @@ def fit_composite(samples: Samples, terms: Sequence[Term | type[Term]], part: sl
         power = np.ones(samples.n)
         for k, law in enumerate(laws):
             view = replace(view_of(samples, gaussian, z, part), variance=gaussian.variance * power)
-            fit = law.refit_law(view) if isinstance(law, Term) else law.fit_law(view)
+            fit = (law.refit_law(view) if isinstance(law, Term) else
+                   first(law, view) if first else law.fit_law(view))
             if law.DEAR:
                 cost += LAW_COST * samples.n
             if fit is None:

@@ -21,7 +21,7 @@ from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import Saturation
-from ou_monitor.model.terms.term import Role, Term
+from ou_monitor.model.terms.term import LawFit, Role, Term
 from ou_monitor.model.whittle import Ordinates
 from ou_monitor.records import FloatArray, NAN
 
@@ -32,8 +32,8 @@ _FULL, _GLANCE, _FEW = 2, 8000, 4
 _WITHIN = 0.5
 # Times that a term finds its parameters beside those of the fit.
 _AGAIN = 3
-# Minimum difference of two fits to one spectrum, nats.
-_ALIKE = 0.1
+# Minimum difference of two fits to one spectrum, nats, and of two scores.
+_ALIKE, _SAME = 0.1, 1e-6
 
 
 # Nats that a kind gains at first sight, the kind, and a start; None for a law, which has none.
@@ -56,6 +56,8 @@ class Fitter:
 
     samples: Samples  # The recording
     cost: float = 0.0  # Processor time of the fits, s, estimated from their filters
+    # For each law, the scores at which it was last looked for, and what was found.
+    looks: dict[type[Term], tuple[FloatArray, LawFit | None]] = field(default_factory=dict)
     # Kinds tried in vain, and their gain by score tests, nats.
     failed: dict[str, float] = field(default_factory=dict)
 
@@ -77,7 +79,7 @@ class Fitter:
         """Return a fit to the first part, its mean fitted to everything; None if it fails."""
         try:
             found = fit_composite(self.samples, terms, self.samples.train, known,
-                                  whole_mean=True, rough=rough, begun=begun)
+                                  whole_mean=True, rough=rough, begun=begun, first=self.look)
         except (ValueError, ArithmeticError, np.linalg.LinAlgError):
             # Parameters have left what a term allows, or numbers can hold.
             return None
@@ -192,12 +194,19 @@ class Fitter:
                     kind.CHANGES.NAME if kind.CHANGES and with_it else ''))
         return found
 
+    def look(self, kind: type[Term], view: View) -> LawFit | None:
+        """Return a law fitted to a view: where the scores are as they were, as it was found."""
+        last = self.looks.get(kind)
+        if last is None or not np.allclose(last[0], view.z, rtol=0.0, atol=_SAME):
+            last = self.looks[kind] = view.z, kind.fit_law(view)
+        return last[1]
+
     def _law_gain(self, kind: type[Term], view: View) -> float:
         """Return the evidence for a law of scores, nats."""
         if kind.DEAR:
             self.cost += LAW_COST * self.samples.n
         try:
-            fit = kind.fit_law(view)
+            fit = self.look(kind, view)
         except (ValueError, ArithmeticError, np.linalg.LinAlgError):
             return -math.inf
         return -math.inf if fit is None else (
@@ -216,7 +225,7 @@ class Fitter:
             return self._by_spectrum(composite, starts, view, least)
         known = [term for term in starts if term.ROLE is Role.MEAN]
         hidden = [term for term in starts if term.ROLE is not Role.MEAN]
-        if len(known) > _FULL:
+        if known:
             known = _by_scores(self.samples, known, view)
         if len(hidden) > _FULL:
             hidden = self._by_likelihood(composite, hidden)
@@ -278,9 +287,14 @@ def _joined(composite: Composite) -> Term:
 
 
 def _by_scores(samples: Samples, starts: list[Term], view: View) -> list[Term]:
-    """Return starts in the order of how much of the scores they explain."""
+    """
+    Return starts in the order of what they gain in scores, lines only where that may pay.
+
+    What is slow, the rail has absorbed: its scores say little of it.
+    """
     s = samples.segment(1.0, 0.0)
     scale = np.sqrt(view.variance)
+    price = 0.5 * math.log(samples.train.stop)
 
     def explained(term: Term) -> float:
         columns = term.columns(s)
@@ -291,9 +305,11 @@ def _by_scores(samples: Samples, starts: list[Term], view: View) -> list[Term]:
         z = view.z[view.train]
         beta = np.linalg.lstsq(through, z, rcond=1e-10)[0]
         rest: FloatArray = z - through @ beta
-        return float(z @ z - rest @ rest)
+        return 0.5 * float(z @ z - rest @ rest)
 
-    return sorted(starts, key=lambda term: -explained(term))
+    gains = [(explained(term), term) for term in starts]
+    return [term for gain, term in sorted(gains, key=lambda pair: -pair[0])
+            if term.FAMILY != 'line' or gain > _WITHIN * (price * len(term.LINEAR) + term.SEARCH)]
 
 
 def from_spectrum(samples: Samples, composite: Composite, starts: Sequence[Term]

@@ -1,5 +1,6 @@
 """The order and bookkeeping of fits in a search, with models that are names and evidence."""
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +13,7 @@ from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_answer import LoadSag
 from ou_monitor.model.terms.load_dependent import LoadDependentNoise, LoadDependentSigma
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.reading import MeasurementNoise
+from ou_monitor.model.terms.reading import LopsidedNoise, MeasurementNoise
 from ou_monitor.model.terms.slow import Drift, SecondRelaxation
 from ou_monitor.model.terms.tones import Tone
 import pytest
@@ -136,6 +137,7 @@ def test_the_best_start_is_of_those_that_hold(held, best, monkeypatch):
     starts = [Drift(0.1, 0.0), Drift(0.2, 0.0)]
     monkeypatch.setattr(Drift, 'candidates', classmethod(lambda cls, view: starts))
     monkeypatch.setattr(Drift, 'holds', lambda self, view: held[starts.index(self)])
+    monkeypatch.setattr(fitting, '_by_scores', lambda samples, known, view: known)
     fitter = Table({})
     fitter.fit = lambda terms, known, rough: Model(terms, starts.index(terms[-1]))
     found = fitter.best_start(Model([BASE], 0.0), Drift, None)
@@ -171,6 +173,27 @@ def test_what_scores_explain():
     sag, drift = LoadSag(0.1, 0.0), Drift(0.1, 0.0)
     assert fitting._by_scores(samples, [drift, sag], view) == [sag, drift]
     assert fitting._by_scores(samples, [sag, drift], view) == [sag, drift]
+    # A line that gains less than half of its price is not fitted; what is slow may gain later.
+    line = Tone(0.1, 7.0, 0.0, 0.0)
+    price = len(line.LINEAR) * 0.5 * math.log(n) + line.SEARCH
+    for gain in (0.4 * price, 0.6 * price):
+        view.z = math.sqrt(4.0 * gain / n) * np.sin(2.0 * math.pi * 7.0 * t)
+        assert fitting._by_scores(samples, [line, drift], view) == (
+            [drift] if gain < 0.5 * price else [line, drift])
+
+
+def test_a_law_is_fitted_once_to_the_same_scores(monkeypatch):
+    """To others it is fitted again; what cannot be fitted is known as well."""
+    made = []
+    monkeypatch.setattr(LopsidedNoise, 'fit_law', classmethod(
+        lambda cls, view: made.append(view) or (None if view.z[0] else SimpleNamespace())))
+    fitter = Fitter(SimpleNamespace(n=9))
+    one, same, other = (SimpleNamespace(z=np.full(9, z)) for z in (0.0, 1e-9, 1.0))
+    found = fitter.look(LopsidedNoise, one)
+    assert fitter.look(LopsidedNoise, same) is found is not None and made == [one]
+    assert fitter.look(LopsidedNoise, other) is None and fitter.look(LopsidedNoise, other) is None
+    assert made == [one, other]
+    assert fitter.look(LopsidedNoise, one) is not found and made == [one, other, one]
 
 
 def test_positions_of_causes_that_recur():
