@@ -96,7 +96,9 @@ def test_values_are_the_truth(states, name):
 def test_standard_errors_have_power(states):
     """An estimator that says `I do not know` would pass the test before."""
     fields = states[-1][1]
-    assert float(fields['sigma_se']) < 0.03 and float(fields['alpha_se']) < 0.2
+    # Twice the floor of the samples used: a machine that is slow thins them.
+    floor = 1.0 / math.sqrt(2.0 * float(fields['n']))
+    assert float(fields['sigma_se']) < 2.0 * floor and float(fields['alpha_se']) < 0.2
 
 
 def test_the_mean_level(states):
@@ -183,7 +185,8 @@ def test_diagnostics(run):
     mine = [m for m in run['diagnostics'] if m.status[0].name == 'uav1/ou_estimator: supply']
     assert len(mine) >= 5
     fields = values_of(mine[-1].status[0])
-    assert fields['messages'] == fields['pushed'] and fields['non_finite'] == '0'
+    assert fields['non_finite'] == '0'
+    assert int(fields['messages']) == int(fields['pushed']) + int(fields['samples_thinned'])
     bag = BagReader(BAG)
     # The last tick shows the moment at which it was sent: a machine that held the replay for 1 s
     # before it adds 4 s of the bag.
