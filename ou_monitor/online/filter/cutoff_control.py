@@ -8,13 +8,10 @@ leaves fmin..fmax, whatever the rate is.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 import enum
 import math
 
-import numpy as np
 from ou_monitor.online.settings import FilterSettings
-from ou_monitor.records import FloatArray
 
 # Convergence tolerance, in ln(cutoff).
 ARRIVED = 1e-6
@@ -74,16 +71,6 @@ class SampleInterval:
             self._n += 1
         self.mean += (dt - self.mean) / self._n
         return self.mean
-
-    @property
-    def settled(self) -> bool:
-        """Whether the mean covers its full number of samples."""
-        return self._n == INTERVALS
-
-    def went_on(self, mean: float, samples: int) -> None:
-        """Take several normal intervals at once (mean in s)."""
-        self.mean = mean
-        self._short, self._long = 0, max(self._long - samples, 0)
 
     def _restart(self, dt: float) -> float:
         self.mean, self._n = dt, 1
@@ -168,29 +155,9 @@ class CutoffControl:
         if not self._started:
             self._started, self._moving = True, self._aim
         elif self._moving != self._aim and dt > 0.0:
-            self._approach(time_constant(self._settings, error), (dt,))
+            self._approach(time_constant(self._settings, error), dt)
         self._limit(interval)
         return self._cutoff
-
-    def run(self, begin: list[int], wanted: list[float], error: list[float],
-            dt: FloatArray, interval: FloatArray) -> FloatArray:
-        """
-        Take the law's cutoffs from some samples on; return what `update` would have returned.
-
-        begin: where each wanted cutoff begins, the first 0.
-
-        wanted in Hz, dt and interval in s, shape (n,), result in Hz.
-        """
-        moving = np.empty(dt.size)
-        for first, last, one, of in zip(begin, [*begin[1:], dt.size], wanted, error):
-            self._choose(one)
-            moving[first:last] = self._aim * np.exp(
-                self._approach(time_constant(self._settings, of), dt[first:last].tolist())
-                if self._moving != self._aim else 0.0)
-        cutoff = np.minimum(moving, OF_RATE / interval)
-        np.clip(cutoff, self._lowest, self._settings.fmax, out=cutoff)
-        self._limit(float(interval[-1]))
-        return cutoff
 
     def _choose(self, wanted: float) -> None:
         """Set the aim: the wanted cutoff once it is outside the dead band around the old aim."""
@@ -207,22 +174,15 @@ class CutoffControl:
             self._aim = inside
         self._follow_exactly = False
 
-    def _approach(self, constant: float, steps: Sequence[float]) -> list[float]:
-        """Move towards the aim over steps, s; return ln(cutoff / aim) after each."""
+    def _approach(self, constant: float, dt: float) -> None:
+        """Move towards the aim over a step, s."""
         slew = self._settings.slew * LN2 or math.inf
-        rate = 1.0 / constant if constant else math.inf
-        off, found = math.log(self._moving / self._aim), [0.0] * len(steps)
-        for k, dt in enumerate(steps):
-            step, most = off * math.expm1(-dt * rate), slew * dt
-            self._slewing = slewing = not -most <= step <= most
-            off += math.copysign(most, step) if slewing else step
-            # Stop at the tolerance instead of creeping on.
-            if -ARRIVED < off < ARRIVED:
-                off = 0.0
-                break
-            found[k] = off
-        self._moving = self._aim * math.exp(off)
-        return found
+        off, most = math.log(self._moving / self._aim), slew * dt
+        step = off * math.expm1(-dt / constant) if constant else -off
+        self._slewing = not -most <= step <= most
+        off += math.copysign(most, step) if self._slewing else step
+        # Stop at the tolerance instead of creeping on.
+        self._moving = self._aim * math.exp(off) if abs(off) >= ARRIVED else self._aim
 
     def _limit(self, interval: float) -> None:
         """Put the moving cutoff into force (interval in s; 0: unknown)."""

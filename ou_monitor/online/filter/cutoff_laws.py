@@ -104,21 +104,20 @@ def _table(mode: str, order: int) -> tuple[FloatArray, FloatArray, float]:
             1.0 if mode == 'lowpass' else 1.0 + order)
 
 
-def held_cutoffs(mode: str, order: int, fmax: float, times: FloatArray, interval: float,
-                 ) -> FloatArray:
+def held_cutoff(mode: str, order: int, fmax: float, times: float, interval: float) -> float:
     """
-    Return the cutoffs, Hz, at which `times` as much white noise comes out as it did at fmax.
+    Return the cutoff, Hz, at which `times` as much white noise comes out as it did at fmax.
 
-    fmax in Hz, interval in s; shape (n,).
+    fmax in Hz, interval in s.
     """
     angle, noise, power = _table(mode, order)
     log = math.log(TWO_PI * fmax * interval)
     before = math.log(white_noise(mode, order, math.exp(log))) if log > angle[-1] else (
         np.interp(log, angle, noise) + power * min(log - angle[0], 0.0))
-    wanted = before - 2.0 * np.log(times)
-    found = np.where(wanted < noise[0], angle[0] + (wanted - noise[0]) / power,
-                     np.interp(wanted, noise, angle))
-    return np.asarray(np.exp(found) / (TWO_PI * interval))
+    wanted = before - 2.0 * math.log(times)
+    found = angle[0] + (wanted - noise[0]) / power if wanted < noise[0] else (
+        np.interp(wanted, noise, angle))
+    return math.exp(found) / (TWO_PI * interval)
 
 
 TWO_PI = 2.0 * math.pi
@@ -268,27 +267,6 @@ def wanted_cutoff(settings: FilterSettings, sigma: float, alpha: float, throttle
     return min(max(wanted, settings.lowest), settings.fmax)
 
 
-def wanted_cutoffs(settings: FilterSettings, heard: FloatArray, interval: float) -> FloatArray:
-    """
-    Return `wanted_cutoff` of each row of heard (sigma, alpha, throttle), shape (n,).
-
-    heard in V/sqrt(s), 1/s and 0..1; interval in s; result in Hz.
-    """
-    s = settings
-    sigma = heard[:, 0]
-    known = (sigma >= 0.0) & (sigma < math.inf)
-    times = np.where(known, sigma, s.sigma_ref) / s.sigma_ref
-    if (s.law != 'constant_noise' or s.coupling
-            or not _held(s.fmax, float(times.max()), interval)):
-        # NaN never equals itself.
-        rows = list(map(tuple, np.where(np.isnan(heard), math.inf, heard).tolist()))
-        found = {(a, b, c): wanted_cutoff(s, a, b, c, interval) for a, b, c in set(rows)}
-        return np.array([found[row] for row in rows])
-    wanted = held_cutoffs(s.mode, s.order, s.fmax, np.maximum(times, 1.0), interval)
-    wanted = np.clip(np.where(times > 1.0, wanted, s.fmax), s.lowest, s.fmax)
-    return np.where(known, wanted, NAN)
-
-
 def threshold_law(settings: FilterSettings, sigma: float, alpha: float,
                   interval: float) -> float:
     """Return fmax up to `sigma_ref` and the lowest cutoff above it (the paper, section 6)."""
@@ -322,7 +300,7 @@ def relative_cutoff(mode: str, order: int, fmax: float, times: float, interval: 
     """
     Return the cutoff, Hz, that makes `times` as much white noise come out as at fmax once did.
 
-    Of the sampled filter, see `held_cutoffs`; interval in s, 0: as if sampled without
+    Of the sampled filter, see `held_cutoff`; interval in s, 0: as if sampled without
     end.  Far below the sample rate: white noise of two-sided density N through a low-pass has the
     variance N w / 2 (order 1) or N w / (2 sqrt 2) (order 2): rms ~ sqrt(fc), so fc = fmax /
     times^2 for both.  Derivative, order 2: N int w'^2 |H|^2 dw' / 2 pi = N w^3 / (2 sqrt 2), so
@@ -330,16 +308,12 @@ def relative_cutoff(mode: str, order: int, fmax: float, times: float, interval: 
     the sample rate makes it finite; independent samples of variance v give v w^2, so fc = fmax /
     times.
     """
-    if _held(fmax, times, interval):
-        return float(held_cutoffs(mode, order, fmax, np.array([times]), interval)[0])
+    # Within the table of white noise.
+    if interval > 0.0 and 1e-6 < TWO_PI * fmax * interval < 1e2 and times < 1e3:
+        return held_cutoff(mode, order, fmax, times, interval)
     if mode == 'lowpass':
         return fmax / (times * times)
     return float(fmax * times ** (-2.0 / 3.0)) if order == 2 else fmax / times
-
-
-def _held(fmax: float, times: float, interval: float) -> bool:
-    """Return whether the table of white noise has the cutoff."""
-    return interval > 0.0 and 1e-6 < TWO_PI * fmax * interval < 1e2 and times < 1e3
 
 
 def supply_noise(mode: str, order: int, cutoff: float, alpha: float) -> float:

@@ -37,9 +37,8 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.online.filter.cutoff_control import (
     Bound, CutoffControl, OF_RATE, SampleInterval, time_constant)
-from ou_monitor.online.filter.cutoff_laws import noise_left, wanted_cutoff, wanted_cutoffs
-from ou_monitor.online.filter.filter_state import (
-    changes, filter_sequence, LowPassState, sound_piece, WORTH)
+from ou_monitor.online.filter.cutoff_laws import noise_left, wanted_cutoff
+from ou_monitor.online.filter.filter_state import LowPassState
 from ou_monitor.online.filter.lag import cutoff_for_lag, delay, most_lag, phase_lag, share_for_lag
 from ou_monitor.online.filter.learned_wiener import LearnedWiener
 from ou_monitor.online.settings import FilterSettings
@@ -232,7 +231,7 @@ _TWO_PI = 2.0 * math.pi
 _LARGEST, _LATEST, _SHORTEST = 1e150, 1e18, 1e-12
 # Minimum gap in mean intervals, and minimum number of samples in the mean to count one.
 _GAP, _KNOWN = 5.0, 10
-# Number of samples of an array that are processed together, so that they stay in the cache.
+# Number of samples of an array that become Python's numbers at once; limits memory.
 _PIECE = 16384
 # Change of the mean interval, as a share, at which the law is asked anew: five standard
 # deviations of the mean over 100 intervals that are uniform within half of themselves.
@@ -459,64 +458,12 @@ class AdaptiveLowPass:
         if stamps.ndim == 0:
             return self.step(float(stamps), float(signal), *map(float, others))
         out: FloatArray = np.empty(stamps.size)
-        k = 0
-        while k < stamps.size:
-            many = self._many(stamps, signal, others, k, out)
-            if not many:
-                many = WORTH
-                at = slice(k, k + many)
-                wide = [np.broadcast_to(one, stamps.shape)[at].tolist() for one in others]
-                out[at] = [self.step(*one) for one in zip(
-                    stamps[at].tolist(), signal[at].tolist(), *wide, strict=True)]
-            k += many
+        columns = np.broadcast_arrays(stamps, signal, *others)
+        for begin in range(0, stamps.size, _PIECE):
+            part = slice(begin, begin + _PIECE)
+            out[part] = [self.step(*one) for one in zip(
+                *(column[part].tolist() for column in columns))]
         return out
-
-    def _many(self, t: FloatArray, x: FloatArray, others: list[FloatArray], k: int,
-              out: FloatArray) -> int:
-        """Filter samples from the k-th on together, as far as possible; return their number."""
-        s = self._settings
-        if (s.law == 'kalman' or self._t is None or not self._interval.settled
-                or t.size - k < WORTH):
-            return 0
-        at = slice(k, k + _PIECE)
-        size, dt, mean = sound_piece(t[at], x[at], self._t, self._interval.mean,
-                                     (_LARGEST, _LATEST, _SHORTEST))
-        if size < WORTH:
-            return 0
-        if abs(mean[0] - self._interval_asked) > _MOVED * self._interval_asked:
-            self._interval_asked = float(mean[0])
-        asked = self._interval_asked
-        if not asked * (1.0 - _MOVED) <= mean.min() <= mean.max() <= asked * (1.0 + _MOVED):
-            moved = np.abs(mean - asked) > _MOVED * asked
-            size = int(np.argmax(moved)) if moved.any() else size
-            if size < WORTH:
-                return 0
-            dt, mean = dt[:size], mean[:size]
-        at = slice(k, k + size)
-        begin = changes([one[at] for one in others[:4] if one.ndim], size)
-        # sigma, its error, alpha, throttle.
-        heard = np.empty((len(begin), 4))
-        for column, one in enumerate(others[:4]):
-            heard[:, column] = one[at][begin] if one.ndim else one
-        wanted = wanted_cutoffs(s, heard[:, [0, 2, 3]], asked)
-        error = np.where(heard[:, 1] >= 0.0, heard[:, 1], NAN)
-        cutoff = self._control.run(begin, wanted.tolist(), error.tolist(), dt, mean)
-        self._asked = None
-        angle = _TWO_PI * cutoff * dt
-        start, end = np.concatenate(([self._x], x[at][:-1])), x[at]
-        if s.mode == 'derivative':
-            start = end = (end - start) / dt
-        found = filter_sequence(self._state, s.order, angle, start, end)
-        out[at] = end if s.shadow else found
-        if self._offset:
-            fades = self._offset * np.exp(-np.cumsum(angle))
-            out[at] += fades
-            self._offset = float(fades[-1])
-        self._interval.went_on(float(mean[-1]), size)
-        self.counters.samples += size
-        self._t, self._x = float(t[k + size - 1]), float(x[k + size - 1])
-        self._raw, self._out = float(end[-1]), float(out[k + size - 1])
-        return size
 
     def step(self, t: float, x: float, sigma: float, sigma_se: float = NAN,
              alpha: float = NAN, throttle: float = NAN, level: float = NAN,

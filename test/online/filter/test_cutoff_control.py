@@ -163,16 +163,3 @@ def test_the_sample_interval_by_a_table(intervals, mean):
     for dt in intervals:
         got = interval.add(dt)
     assert got == interval.mean == pytest.approx(mean, rel=1e-12)
-
-
-def test_an_interval_is_settled_after_a_hundred():
-    """And again after a new rate has begun."""
-    interval = SampleInterval()
-    told = []
-    for _ in range(120):
-        interval.add(1e-3)
-        told.append(interval.settled)
-    assert told == [False] * 99 + [True] * 21
-    for _ in range(5):
-        interval.add(1e-2)
-    assert not interval.settled and interval.mean == pytest.approx(1e-2)
