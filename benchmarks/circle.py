@@ -32,13 +32,15 @@ from tables import deliver, recorded, table  # noqa: E402
 # Five flights and a robot: file below OU_MONITOR_REALDATA, and flight of a log.
 MODELS = {
     'gecko': ('bf_gecko_a.csv', None), 'nazgul': ('raw/bf_nazgul_4s.bbl', 1),
-    'roma': ('raw/bf_roma_6s.bbl', 3), 'bf3s': ('raw/bf_3s_erpm2.bbl', 2),
+    'hiro': ('raw/bf_hiro_4s.BFL', None), 'bf3s': ('raw/bf_3s_erpm2.bbl', 2),
     'cf_solo': ('cf_solo_large.csv', None), 'mm_bench_3': ('mm_bench_3.csv', None)}
 # Part of each recording that is drawn again, s.
 SECONDS = 60.0
 # The tone that is added: its peak over the rms of the readings' differences, and its share of the
 # sampling rate, where neither load nor OU have much.
 AMPLITUDE, SHARE = 1.0, 0.23
+# Relative error of a frequency that is called the same.
+NEAR = 1e-3
 
 
 def saved(name: str, path: Path) -> Recording:
@@ -66,14 +68,16 @@ def row(name: str, seeds: int) -> list[str]:
     rate = 1.0 / float(np.median(np.diff(recording.t)))
     draw = partial(simulate, throttle=recording, rate=rate)
     size = AMPLITUDE * float(np.diff(recording.voltage).std())
-    hummed = replace(filed, model=SupplyModel((*model.terms, Tone(size, SHARE * rate, 0.0))))
+    hum = SHARE * rate
+    hummed = replace(filed, model=SupplyModel((*model.terms, Tone(size, hum, 0.0, 0.0))))
     for seed in range(seeds):
         drawn = draw(filed, seed=seed).recording
         alike += compare(drawn, model).verdict is Likeness.LOOKS_LIKE_IT
         new = named(drawn, model)
         clean += not new
         foreign.update(new)
-        found += 'tone' in named(draw(hummed, seed=seed).recording, model)
+        found += any(isinstance(cause.term, Tone) and abs(cause.term.frequency / hum - 1.0) < NEAR
+                     for cause in discover(draw(hummed, seed=seed).recording).causes)
         print(name, seed, alike, clean, dict(foreign), found, file=sys.stderr, flush=True)
     return [name, ', '.join(term.NAME for term in model.terms), f'{alike} of {seeds}',
             f'{clean} of {seeds}', ', '.join(f'{k} {n}' for k, n in foreign.most_common()) or '-',

@@ -61,16 +61,21 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
     lsb = samples.lsb
     yardstick = Yardstick(own, lsb, levels)
     rng = np.random.default_rng(seed)
-    shift = 0.0 if drawn.alone else _shift(drawn, samples, part, rng, notes)
+    aligned = None if drawn.alone else _first(own)
+    shifts = np.zeros(seeds)
     stride = max(1, -(-own.t.size // _POINTS))
     measured: list[Measures] = []
     traces = np.empty((seeds, -(-own.t.size // stride)), dtype=np.float32)
     total, first = np.zeros(own.t.size), own.voltage
     strays = 0
     for k in range(seeds):
-        v = drawn.draw(samples, rng)[part] + shift
+        v = drawn.draw(samples, rng)[part]
         if not np.isfinite(v).all():
             raise InputError('the model runs away over this throttle: its voltage is not finite')
+        if aligned is not None:
+            # Each by itself: the bands then hold what the first seconds do not tell of the level.
+            shifts[k] = (own.voltage[aligned] - v[aligned]).mean()
+            v = v + shifts[k]
         total += v
         v = lsb * np.rint(v / lsb) if lsb > 0.0 else v
         first = v if k == 0 else first
@@ -78,6 +83,10 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
         measured.append(yardstick.measure(v))
         traces[k] = v[::stride]
         report(0.6 + 0.4 * (k + 1.0) / seeds if model is None else (k + 1.0) / seeds)
+    if aligned is not None:
+        notes.append(f'The level of the model is moved by {number(float(shifts.mean()), 3)} V (+- '
+                     f'{number(float(shifts.std()), 2)} V), each simulation so that its first '
+                     f'{_ALIGNED:g} s are those of the recording.')
     if strays:
         notes.append(f'{strays} of {seeds} simulations leave the range of the recording by more '
                      'than half of it.')
@@ -148,18 +157,9 @@ def _check_throttle(model: SupplyModel, samples: Readings) -> None:
                          'none')
 
 
-def _shift(drawn: Drawn, samples: Readings, part: slice, rng: np.random.Generator,
-           notes: list[str]) -> float:
-    """Return what brings the level of a model to that of the first seconds simulated, V."""
-    first = (samples.t >= samples.t[part][0]) & (
-        samples.t <= max(samples.t[part][0] + _ALIGNED, samples.t[part][min(9, _LEAST - 1)]))
-    means = [float(drawn.draw(samples, rng)[first].mean()) for _ in range(_FEWEST_SEEDS)]
-    shift = float(samples.voltage[first].mean()) - float(np.mean(means))
-    if not math.isfinite(shift):
-        raise InputError('the model runs away over this throttle: its voltage is not finite')
-    notes.append(f'The level of the model is moved by {number(shift, 3)} V, so that its first '
-                 f'{_ALIGNED:g} s are those of the recording.')
-    return shift
+def _first(own: Readings) -> slice:
+    """Return the samples that tell the level: the first seconds, and at least ten."""
+    return slice(0, max(10, int(np.searchsorted(own.t, own.t[0] + _ALIGNED, side='right'))))
 
 
 def _agreement(recording: Recording, samples: Readings, own: Readings, yardstick: Yardstick,
