@@ -55,6 +55,12 @@ def number(value: float, digits: int = 3) -> str:
     return f'{mantissa}e{size}'
 
 
+def with_se(value: float, se: float, digits: int = 3) -> str:
+    """Return a number with its standard error, if both are known."""
+    return number(value, digits) + (
+        f' +- {number(se, 2)}' if math.isfinite(value) and math.isfinite(se) else '')
+
+
 def listed(names: Sequence[str]) -> str:
     """Return names as a list in a sentence."""
     return names[0] if len(names) == 1 else ', '.join(names[:-1]) + ' and ' + names[-1]

@@ -1,9 +1,9 @@
-"""One recording -> its entry in the fleet table; this is what the workers run."""
+"""Analyse one recording for the fleet table; workers run this module."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 import math
 from typing import Any
 
@@ -15,21 +15,20 @@ from ou_monitor.errors import InputError
 from ou_monitor.online.risk.first_passage import brownout_probability
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import NAN, Recording
-from ou_monitor.text import printable
+from ou_monitor.text import counted, printable
 
-# A clock before the year 2000 counts from a start-up, not from 1970; one after 2100 does not count
-# seconds.
+# Valid dates: a time before 2000 is of a clock that counts from start-up; a time after 2100 is not
+# in seconds.
 _EPOCH, _LATEST = 946684800.0, 4102444800.0
 
 
 @dataclass(frozen=True)
 class Options:
-    """How every recording of the fleet is analysed."""
+    """Options of the analysis, the same for every recording of the fleet."""
 
-    # Throttles of the load levels; found in each recording when None.
-    levels: tuple[float, ...] | None = None
+    levels: tuple[float, ...] | None = None  # Throttles of the load levels; None: found in each
     window: float = 2.0  # Window of the sliding estimate, s
-    # Of the risk, V and s; a voltage of NaN leaves the risk unknown.
+    # Voltage, V, and horizon, s, of the risk; a voltage of NaN leaves the risk unknown.
     brownout_voltage: float = NAN
     brownout_horizon: float = 5.0
     # Arguments of `read_recording`.
@@ -39,10 +38,6 @@ class Options:
     partial: bool = False  # Whether to read the intact part of damaged bags
     discover: bool = False  # Whether to search for causes, which takes some seconds a recording
     seed: int = 0  # Seed of `discover`
-
-    def as_data(self) -> dict[str, Any]:
-        """Return the options as JSON holds them."""
-        return asdict(self)
 
 
 def work(path: str, options: Mapping[str, Any]) -> dict[str, Any]:
@@ -54,8 +49,7 @@ def work(path: str, options: Mapping[str, Any]) -> dict[str, Any]:
     except MemoryError:
         why = 'The recording does not fit into the memory of the worker: use fewer workers.'
     except Exception as error:
-        # A recording that our code cannot process must not stop the others; the kind of error is
-        # needed to report it.
+        # A defect of ours in one recording must not stop the others.
         why = (f'The analysis failed ({type(error).__name__}: {printable(error, 200)}): please '
                'report it.')
     return {'error': ' '.join(why.split()), 'levels': []}
@@ -66,9 +60,9 @@ def _analysed(path: str, options: Options) -> dict[str, Any]:
         path, msg_config=options.msg_config, voltage_topic=options.voltage_topic,
         throttle_topic=options.throttle_topic, partial=options.partial)
     if recording.n < 2:
-        raise InputError(f'{recording.name} holds {recording.n} usable sample: nothing can be '
-                         'estimated from it')
-    # Overflows become non-finite, which the analysis reports in its status.
+        raise InputError(f'{recording.name} has {counted(recording.n, "usable sample")}: nothing '
+                         'can be estimated from it')
+    # Overflows give non-finite values, which the analysis reports in its status.
     with np.errstate(all='ignore'):
         analysis = analyze(
             recording, levels=options.levels if recording.has_throttle else None,
@@ -108,7 +102,7 @@ def _level(level: LevelResult, options: Options) -> dict[str, Any]:
 
 
 def _facts(found: Overview) -> dict[str, float]:
-    """Return the facts that the table compares: lowest voltage, dips and sag."""
+    """Return the columns of lowest voltage, dips and sag."""
     lowest, dips, sag = found.facts.lowest, found.facts.dips, found.facts.sag
     there = found.sag if sag.known else (NAN, NAN, NAN)
     return {

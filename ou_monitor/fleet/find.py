@@ -1,9 +1,9 @@
 """
-Find recordings: files, bags, and folders searched for both.
+Find recordings: files, bags, and both in folders.
 
-Limits: links to folders are not followed, and hidden folders are not entered.  A FIFO, a
-device or a broken link with the name of a recording counts as an unreadable recording.
-Two recordings are equal if every byte of their data is; a recompressed copy is another recording.
+Limits: links to folders are not followed, and hidden folders are skipped.  A FIFO, a device or a
+broken link with the name of a recording counts as an unreadable recording.  Two recordings are
+duplicates if all bytes of their data are equal; a recompressed copy is not a duplicate.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ou_monitor.text import printable
 
 # Endings of autopilot logs; the first bytes decide whether a file is one.
 _LOGS = ('', '.ulg', '.bin', '.log', '.bbl', '.bfl', '.txt', '.db3')
-# Other files share these endings: they are skipped silently.
+# Endings shared by other files, which are skipped without a note.
 _COMMON = ('', '.log', '.txt')
 _BLOCK = 1 << 20
 # Maximum depth of the folders searched.
@@ -90,7 +90,7 @@ class _Search:
                        Path(os.path.realpath(path.parent)) / path.name)
 
     def walk(self, root: Path) -> None:
-        """Search a folder; a bag in it is one recording, whatever it holds."""
+        """Search a folder; a bag in it is one recording."""
         def closed(error: OSError) -> None:
             self._closed.append(f"'{error.filename}' ({error.strerror})")
 
@@ -128,26 +128,26 @@ class _Search:
         if self._csv:
             found.append(_skipped(self._csv, '.csv file', 'without columns of time and voltage'))
         if self._logs:
-            found.append(_skipped(self._logs, 'file', 'with the ending of a log, but not one that '
-                                  'can be read'))
+            found.append(_skipped(self._logs, 'file', 'with the ending of a log, but in no known '
+                                  'format'))
         found += [f'The folder {text} cannot be searched.' for text in self._closed]
         return found
 
 
 def _walk(root: Path, onerror: Callable[[OSError], None] | None = None,
           ) -> Iterator[tuple[str, list[str], list[str]]]:
-    """Yield as os.walk does, which recurses for each level, to a limited depth."""
+    """Yield as os.walk does, to a limited depth: os.walk recurses for each level."""
     for folder, inner, names in os.walk(root, onerror=onerror):
         if folder.count(os.sep) - str(root).count(os.sep) >= _MOST_DEPTH and inner:
             inner.clear()
             if onerror is not None:
-                onerror(OSError(0, f'what is in it lies more than {_MOST_DEPTH} deep', folder))
+                onerror(OSError(0, f'its content is more than {_MOST_DEPTH} folders deep', folder))
         yield folder, inner, names
 
 
 def _skipped(paths: Sequence[Path], what: str, why: str) -> str:
     many = '' if len(paths) == 1 else 's'
-    return f"{len(paths)} {what}{many} passed over, such as '{paths[0]}': {why}."
+    return f"{len(paths)} {what}{many} skipped, such as '{paths[0]}': {why}."
 
 
 def _is_bag(folder: Path) -> bool:
@@ -163,11 +163,11 @@ def _is_bag(folder: Path) -> bool:
 
 
 def _has_columns(path: Path) -> bool:
-    """Return whether the first lines of a file hold time and voltage."""
+    """Return whether the first lines of a file have columns of time and voltage."""
     try:
         open_regular(path).close()
     except OSError:
-        # Its name says that it is a recording; the reader reports the error.
+        # Accept it by its name; the reader reports the error.
         return True
     return holds_supply(path)
 
@@ -181,7 +181,7 @@ def _source(path: Path) -> FoundRecording:
         try:
             found = file.stat()
         except OSError:
-            # Deleted since it was found, a broken link, or unreadable: the reader reports it.
+            # Deleted, a broken link, or unreadable: the reader reports it.
             files.remove(file)
             continue
         if not stat.S_ISREG(found.st_mode):
@@ -195,7 +195,7 @@ def _source(path: Path) -> FoundRecording:
 
 def duplicates(sources: Sequence[FoundRecording],
                progress: Callable[[float], None] | None = None) -> dict[Path, Path]:
-    """Return the recordings whose data equal another's (progress 0..1)."""
+    """Return the duplicates, each with its original, the oldest one (progress 0..1)."""
     sizes: dict[int, list[FoundRecording]] = {}
     for source in sources:
         if source.size:
@@ -220,7 +220,7 @@ def duplicates(sources: Sequence[FoundRecording],
 
 
 def _digest(source: FoundRecording) -> bytes | None:
-    """Return a hash of the data; None if unreadable, which the reader reports."""
+    """Return a hash of the data; None if unreadable (the reader reports it)."""
     digest = hashlib.blake2b()
     try:
         for path in source.files:

@@ -1,15 +1,15 @@
 """
-Many recordings -> rows, reusing finished results.
+Analyse many recordings, and resume a stopped run.
 
-Results are saved as they come, a file for each recording, so that a run can be resumed.  A
-result is valid for a recording with the same path, size, time of change, options and version of
-the package.  Results with an error are not saved: those recordings are tried again.
+Each result is saved in a file of its own as soon as it is there.  It is valid for a recording with
+the same path, size, time of change, options and version of the package.  Failed recordings are not
+saved, so the next run tries them again.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 import hashlib
 import json
 from pathlib import Path
@@ -23,15 +23,15 @@ from ou_monitor.fleet.find import duplicates, Found, FoundRecording
 from ou_monitor.fleet.judgement import judge, Judgement
 from ou_monitor.fleet.table import Row, rows_of
 from ou_monitor.fleet.vehicles import assign, number_flights
-from ou_monitor.fleet.workers import LocalWorkers, Workers
+from ou_monitor.fleet.workers import ClusterWorkers, LocalWorkers, Workers
 from ou_monitor.records import NAN
 from ou_monitor.stream.files import open_regular, write_whole
 from ou_monitor.text import printable
 
 FOLDER = 'parts'
-# File in it that says whose it is, and its text.
+# Name and text of the file that marks this folder as written by fleet.
 _MARK, _MARK_TEXT = 'ou_monitor_fleet.txt', b'Results of ou-monitor fleet, one a recording.\n'
-# Maximum size of a result that is read, bytes; one has some 10 kB.
+# Maximum size of a result file, bytes; typical: 10 kB.
 _MOST = 50_000_000
 
 
@@ -46,9 +46,9 @@ def is_own(folder: Path) -> bool:
 
 class Parts:
     """
-    The results in the folder of a fleet, which is created; InputError if that fails.
+    The saved results in the folder of a fleet, which is created; InputError if that fails.
 
-    options: everything that the results depend on, including the package version, as in JSON.
+    options: everything that the results depend on, including the package version; plain data.
     """
 
     def __init__(self, folder: Path, options: Mapping[str, Any]) -> None:
@@ -56,7 +56,7 @@ class Parts:
         self._options = json.dumps(dict(options), sort_keys=True)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            # An unwritable output folder must fail before the work, not after it.
+            # Fail on an unwritable folder before the work, not after it.
             with TemporaryFile(dir=self._folder) as probe:
                 probe.write(b' ' * 4096)
         except OSError as error:
@@ -75,7 +75,7 @@ class Parts:
             with open_regular(self._path(source)) as file:
                 found = json.loads(file.read(_MOST + 1)[:_MOST])
         except (OSError, ValueError, RecursionError):
-            # Missing, truncated by a loss of power, or foreign: it is computed again.
+            # Missing, truncated by a power loss, or foreign: compute it again.
             return None
         return found if isinstance(found, dict) and found.get('error') == '' else None
 
@@ -93,8 +93,7 @@ class Fleet:
 
     rows: list[Row]  # The table, in order of vehicle, flight, path and level
     judgement: Judgement  # What stands out
-    # Sources of the vehicles' names, skipped files, and the like.
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # How vehicles were named, skipped files, and the like
     recordings: int  # Recordings found
     limit: float = NAN  # Voltage below which dips are counted, V; NaN when none was given
 
@@ -125,7 +124,7 @@ def run_fleet(found: Found, folder: Path, options: Options, version: Callable[[]
               pattern: re.Pattern[str] | None = None, stated_options: dict[str, Any] | None = None,
               comparing: Progress | None = None, progress: Progress | None = None) -> Fleet:
     """Analyse all unfinished recordings, and judge the fleet."""
-    parts = Parts(folder, {**options.as_data(), **(stated_options or {}), 'version': version()})
+    parts = Parts(folder, {**asdict(options), **(stated_options or {}), 'version': version()})
     twice = duplicates(found.sources, comparing)
     results: dict[Path, dict[str, Any]] = {}
     missing: list[FoundRecording] = []
@@ -138,31 +137,23 @@ def run_fleet(found: Found, folder: Path, options: Options, version: Callable[[]
         else:
             results[source.path] = known
     if missing:
-        with _workers(min(workers, len(missing)), scheduler, version, insecure) as pool:
+        with (LocalWorkers(min(workers, len(missing))) if scheduler is None else
+              ClusterWorkers(scheduler, version, insecure)) as pool:
             _work(missing, results, parts, options, pool, progress)
     rows, notes = _table(found.sources, results, twice, pattern)
     notes = list(map(printable, (*found.notes, *notes)))
     return Fleet(rows, judge(rows), tuple(notes), len(found.sources), options.brownout_voltage)
 
 
-def _workers(count: int, scheduler: str | None, version: Callable[[], str], insecure: bool
-             ) -> Workers:
-    if scheduler is None:
-        return LocalWorkers(count)
-    from ou_monitor.fleet.workers import ClusterWorkers
-
-    return ClusterWorkers(scheduler, version, insecure)
-
-
 def _work(missing: Sequence[FoundRecording], results: dict[Path, dict[str, Any]], parts: Parts,
           options: Options, pool: Workers, progress: Progress | None) -> None:
-    """Analyse unfinished recordings, and save each result as it comes."""
+    """Analyse unfinished recordings, and save each result."""
     kept = len(results)
-    # The largest first, so that the last one to end is short.
+    # The largest first, so that no long one is left at the end.
     order = sorted(missing, key=lambda source: (-source.size, source.path))
     tell = progress or (lambda share: None)
     tell(kept / (kept + len(order)))
-    tasks = [(str(source.path), options.as_data()) for source in order]
+    tasks = [(str(source.path), asdict(options)) for source in order]
     for done, (k, result, why) in enumerate(pool.each(work, tasks)):
         if result is None:
             result = {'error': why, 'levels': []}
@@ -176,15 +167,15 @@ def _table(sources: Sequence[FoundRecording], results: dict[Path, dict[str, Any]
            twice: dict[Path, Path], pattern: re.Pattern[str] | None
            ) -> tuple[list[Row], list[str]]:
     """Return all rows, and notes on how vehicles and flights were named."""
-    # A copy belongs to the vehicle that its content names, or else to its own path's.
+    # A copy belongs to the vehicle named by its content, else by its own path.
     whole = {s.path: results[twice.get(s.path, s.path)] for s in sources}
     vehicles, notes = assign({path: r.get('vehicle', '') for path, r in whole.items()}, pattern)
     starts = {path: r.get('start', NAN) for path, r in results.items() if not r['error']}
     flights, more = number_flights(vehicles, starts)
     for path, first in twice.items():
         if vehicles[path].name != vehicles[first].name:
-            notes.append(f"'{path}' has the same content as '{first}', but lies with another "
-                         f"vehicle ('{vehicles[path].name}' instead of "
+            notes.append(f"'{path}' has the same content as '{first}', but its path names "
+                         f"another vehicle ('{vehicles[path].name}' instead of "
                          f"'{vehicles[first].name}'): one of the two is in the wrong place.")
     rows = [row for source in sources for row in rows_of(
         source, whole[source.path], vehicles[source.path], flights.get(source.path),

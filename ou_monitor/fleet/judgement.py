@@ -1,37 +1,25 @@
 """
 The fleet table -> drifting vehicles, and outliers among recordings and vehicles.
 
-Drift: the Mann-Kendall test, exact for few flights, which only assumes that flights
-without drift come in any order.  The slope and its interval are Theil and Sen's.  Holm's
-procedure keeps all tests of the fleet at one family rate.
+Common throttle: the logarithms of sigma and alpha follow one curve over throttle for all vehicles
+(straight between knots, by Huber's estimate, with a level for each vehicle).  Recordings are moved
+along it to the median throttle; the error of the move is included.  Sag is compared at full
+throttle, extrapolated by the load model (doc/load.md).  Limits: the curve assumes the same shape,
+and the same load at a throttle, on all vehicles; recordings without throttle are not moved.
 
-Outliers: the score of a value is its distance from the median of its group (or from the group's
-drift line) divided by sqrt(s^2 + se^2).  se is its standard error; s is the scatter between
-recordings for which these ratios have the median of a normal law (a median absolute deviation).
-The bound is the quantile of the largest ratio in fleets with nothing wrong, which are simulated
-with the same groups and errors and evaluated in the same way (with s at its upper 90 % bound, so
-that there are fewer false alarms than stated, rather than more).
+Drift: the Mann-Kendall test, exact for few flights; it assumes only that without drift every order
+of the flights is equally likely.  Slope and interval: Theil and Sen.  Holm's procedure limits the
+probability of any false alarm in the fleet.  Limits: consecutive flights with a common cause (a
+season, a battery) look like a drift; `fewest` returns the minimum number of flights.
 
-Limits of drift: consecutive flights that share a cause (a season, a battery) look like a
-drift.  A minimum number of flights is needed before any order of them is rare enough in a fleet
-with many tests; `fewest` returns it.
-
-Limits of outliers: the scatter between good recordings is assumed normal and equal
-on every vehicle.  Heavier tails give more alarms than
-stated.  If a large part of a group is off, its median is too.  The scatter of a small group is
-uncertain, so its bound is wide: see doc/fleet.md.
-
-Recordings are compared at one common throttle.
-
-The logarithms of sigma and alpha follow a common curve over throttle (straight
-between knots), fitted to all levels by Huber's estimate with a separate level
-for each vehicle; a recording's distance above it, averaged over its levels by
-time, is its deviation.  Measured values are shown; compared values include the
-error of the curve between their own throttle and the usual one.
-
-Limits of the curve: it assumes the same shape on all vehicles, and that throttle means the same
-load on each.  Recordings without throttle are compared unchanged.  Sag is compared at full
-throttle, extrapolated by the load model (doc/load.md).
+Outliers: the score of a value is its distance from the median of its group (or from the drift line
+of the group) divided by sqrt(s^2 + se^2), with its standard error se and the scatter s between
+recordings, a median absolute deviation.  The bound is a quantile of the largest score in simulated
+fleets without faults, with the same groups and errors and the same evaluation (and with s at its
+upper 90 % bound, which errs towards fewer false alarms).  Limits: the scatter between good
+recordings is assumed normal and equal on all vehicles, heavier tails give more alarms than
+stated; if many members of a group are off, its median is too; small groups have wide bounds
+(doc/fleet.md).
 """
 
 from __future__ import annotations
@@ -53,7 +41,7 @@ USABLE = ('OK', 'SHORT_WINDOW')
 # Quantities compared -> unit; the first two on the log scale.
 QUANTITIES = {'sigma': 'V/sqrt(s)', 'alpha': '1/s', 'sag': 'V'}
 LOGARITHMIC = ('sigma', 'alpha')
-# Bend of Huber's function, in standard deviations (95 % efficiency); rounds of the fit.
+# Bend of Huber's function, in standard deviations (95 % efficiency); maximum rounds of the fit.
 _HUBER = 1.345
 _ROUNDS = 30
 _MOST_BINS = 60.0
@@ -65,12 +53,11 @@ _PIECES, _ROWS, _APART = 8, 12, 0.03
 class CommonCurve:
     """The common curve over throttle of the logarithm of a quantity: straight between knots."""
 
-    reference: float  # Throttle at which recordings are compared; NaN when none has any
-    # Throttles, and the logarithm there less its value at the reference; empty for a flat curve.
+    reference: float  # Throttle at which recordings are compared; NaN without throttle
+    # Throttles, and the difference there to the logarithm at the reference; empty: flat.
     knots: tuple[float, ...] = ()
     heights: tuple[float, ...] = ()
-    # Covariance of the slopes between k knots; recordings, not levels, count as independent; shape
-    # (k - 1, k - 1).
+    # Covariance of the slopes between k knots, with recordings as independent, shape (k-1, k-1).
     covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __call__(self, throttle: FloatArray) -> FloatArray:
@@ -82,7 +69,7 @@ class CommonCurve:
         return rise
 
     def pieces(self, throttle: FloatArray) -> FloatArray:
-        """Return the weight of each slope below some throttles, shape (n, k - 1)."""
+        """Return the derivative by each slope at some throttles, shape (n, k - 1)."""
         u = np.asarray(throttle, dtype=np.float64)
         known = np.where(np.isfinite(u), u, self.reference)
         return _pieces(known, self.knots)
@@ -96,19 +83,18 @@ class Values:
     paths: tuple[str, ...]  # Recordings
     vehicles: tuple[str, ...]  # Vehicle of each; empty where unknown
     flights: IntArray  # Number of the flight; 0 where unknown; shape (n,)
-    # Logarithm at the reference throttle (sag: V at full throttle) and its standard error,
-    # including the error of moving it from its own throttle rather than from the usual one; shape
-    # (n,).
+    # Logarithm at the reference throttle (sag: V at full throttle), and its standard error with
+    # the error of the move; shape (n,).
     value: FloatArray
     error: FloatArray
     curve: CommonCurve  # Curve that was subtracted
-    # Values as measured, in the unit of the quantity, and their throttle; means over the levels
-    # (by time; of the logarithm); NaN where throttle is unknown; shape (n,).
+    # Values as measured, in the unit of the quantity (of the mean logarithm, weighted by time),
+    # and their mean throttle, NaN where unknown; shape (n,).
     measured: FloatArray
     throttle: FloatArray
 
     def shown(self, value: FloatArray | float) -> FloatArray:
-        """Return values of `value` in the unit of the quantity."""
+        """Return numbers on the scale of `value` in the unit of the quantity."""
         data = np.asarray(value, dtype=np.float64)
         return np.exp(data) if self.name in LOGARITHMIC else data
 
@@ -164,10 +150,10 @@ def values_of(rows: Sequence[Row], name: str) -> Values:
 
 
 def _move_error(place: FloatArray, curve: CommonCurve) -> FloatArray:
-    """Return the error of moving each recording from its throttle to the usual one."""
+    """Return the error of moving each recording to the common throttle."""
     if not curve.knots or not place.size:
         return np.zeros(len(place))
-    # A common move cancels in the comparison.
+    # A move common to all recordings cancels in the comparison.
     move = place - np.median(place, axis=0)
     variance = np.einsum('ki,ij,kj->k', move, curve.covariance, move)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
@@ -187,7 +173,7 @@ def _values(name: str, rows: Sequence[Row], curve: CommonCurve, value: FloatArra
 
 
 def _pieces(u: FloatArray, knots: Sequence[float]) -> FloatArray:
-    """Return the part of each span between knots below throttles, shape (n, k - 1)."""
+    """Return the length of each span between knots that lies below u, shape (n, k - 1)."""
     columns = [np.clip(u - low, 0.0, high - low) for low, high in zip(knots, knots[1:])]
     return np.column_stack(columns) if columns else np.zeros((u.size, 0))
 
@@ -211,8 +197,7 @@ def _curve(y: FloatArray, u: FloatArray, vehicles: Sequence[str], recordings: In
     slopes = np.zeros(parts)
     inner, rest = np.zeros((y.size, parts + 1)), y
     for _ in range(_ROUNDS):
-        # Each vehicle has its own level, removed by centring.  A vehicle without throttle has
-        # weight 0, and no row.
+        # Centring removes the level of each vehicle; one without throttle has weight 0.
         count = np.maximum(np.bincount(of, weight, len(names)), 1e-300)
         inner = np.column_stack([
             column - (np.bincount(of, weight * column, len(names)) / count)[of]
@@ -237,11 +222,11 @@ def _curve(y: FloatArray, u: FloatArray, vehicles: Sequence[str], recordings: In
 def _jackknife(inner: FloatArray, rest: FloatArray, weight: FloatArray, of: IntArray,
                vehicle: IntArray) -> FloatArray:
     """
-    Return the covariance of slopes by leaving out one recording at a time.
+    Return the covariance of slopes by leaving out one recording (`of`) at a time.
 
-    Residuals within a recording (of) are correlated, and each vehicle takes a level.
+    Residuals within a recording are correlated, and the level of each vehicle is fitted too.
     """
-    # Derivative of Huber's function: residuals beyond its bend have no weight.
+    # Derivative of Huber's function: 0 beyond its bend.
     pulls = (weight >= 1.0).astype(np.float64)
     bread = np.linalg.pinv((inner * pulls[:, None]).T @ inner, rcond=1e-9)
     count = np.maximum(np.bincount(vehicle, pulls), 1.0)
@@ -266,13 +251,13 @@ def _knots(u: FloatArray) -> list[float]:
     for knot in wanted[1:]:
         if knot - knots[-1] >= _APART:
             knots.append(knot)
-    # The last knot is the end, so that the curve is not flat before it.
+    # The last knot is the highest throttle, so that the curve does not flatten before it.
     if len(knots) > 1:
         knots[-1] = wanted[-1]
     return [float(knot) for knot in knots]
 
 
-# With fewer flights even a single vehicle cannot reach 5 %: 2/4! is 0.08.
+# Minimum flights of a test for drift: with 4, the lowest possible p is 2/4! = 0.08.
 LEAST_FLIGHTS = 5
 
 
@@ -280,7 +265,6 @@ LEAST_FLIGHTS = 5
 class Trend:
     """Trend of one quantity of one vehicle."""
 
-    # Vehicle and quantity.
     quantity: str
     vehicle: str
     flights: int  # Number of flights used
@@ -310,7 +294,7 @@ def trends(all_values: Sequence[Values]) -> tuple[Trend, ...]:
 
 
 def _of_values(values: Values) -> list[Trend]:
-    # Takes a second to import, and the workers do not need it.
+    # Imported here because it takes a second and the workers do not need it.
     from scipy import stats
 
     found = []
@@ -326,7 +310,7 @@ def _of_values(values: Values) -> list[Trend]:
             y, x, 0.95, method='joint'))
         found.append(Trend(values.name, name, int(mine.size), slope, low, high, start,
                            int(x[0]), int(x[-1]),
-                           # All values equal: no order, no drift.
+                           # NaN if all values are equal.
                            p_value if math.isfinite(p_value) else 1.0))
     return found
 
@@ -339,14 +323,14 @@ def fewest(tests: int, rate: float) -> int:
     return n
 
 
-# The median of |z| of a normal law.
+# The median of |z| of a normal distribution.
 _MEDIAN = 0.6744897501960817
-# Minimum size of a group: in a smaller one it is unclear which member is the outlier.
+# Minimum size of a group: in a smaller one, any member may be the outlier.
 LEAST = 4
 SIMULATIONS = 4000
 # Maximum number of cells simulated at once; limits memory.
 _CELLS = 2_000_000
-# One-sided 90 % bound in standard deviations of a normal law.
+# One-sided 90 % bound of a normal distribution, in standard deviations.
 _UPPER = 1.2815515655446004
 
 
@@ -356,18 +340,17 @@ class Outliers:
 
     # Distance from the group in standard deviations; NaN where the group is too small; shape (n,).
     score: FloatArray
-    # Probability that any value of a fleet with nothing wrong is as far off; NaN without a score;
-    # shape (n,).
+    # Probability that a fleet without faults has a score as large; NaN without one; shape (n,).
     chance: FloatArray
     centre: FloatArray  # Value that each was compared with; shape (n,)
-    # Standard deviation between recordings of one group, without their errors; NaN when unknown.
+    # Standard deviation between recordings of one group, without their errors; NaN if unknown.
     scatter: float
-    bound: float  # Score reached with probability `rate` in a fleet with nothing wrong
+    bound: float  # Score exceeded with probability `rate` in a fleet without faults
     rate: float  # Probability of any false alarm
 
     @property
     def found(self) -> npt.NDArray[np.bool_]:
-        """Which values are outliers; shape (n,)."""
+        """Return which values are outliers, shape (n,)."""
         beyond: npt.NDArray[np.bool_] = np.abs(np.nan_to_num(self.score)) > self.bound
         return beyond
 
@@ -392,8 +375,8 @@ def outliers(value: FloatArray, error: FloatArray, groups: Sequence[str], rate: 
     centre[good] = middle[0] + (0.0 if trend is None else trend[good])
     rng = np.random.default_rng(seed)
     size = max(1, min(simulations, _CELLS // se.size))
-    # Where errors are as large as s, the estimate of s may be zero, and the scores of the best
-    # recordings too large: fleets are simulated with the largest s that the data allow.
+    # If errors are as large as s, its estimate may be zero and scores too large: simulate with the
+    # upper bound of s.
     share = min(0.5 + 0.5 * _UPPER / math.sqrt(se.size), 0.95)
     most = float(_scatter(rest, se, share)[0, 0])
     largest: list[FloatArray] = []
@@ -415,7 +398,7 @@ def _centred(value: FloatArray, members: Sequence[npt.NDArray[np.intp]]
     wide = np.empty(value.shape[1])
     for index in members:
         middle[:, index] = np.median(value[:, index], axis=1, keepdims=True)
-        # A value pulls its own median towards it; for a mean by exactly this much.
+        # A value pulls the median of its group towards itself; the factor is exact for a mean.
         wide[index] = np.sqrt(1.0 - 1.0 / index.size)
     return (value - middle) / wide, middle
 
@@ -429,21 +412,20 @@ def _scatter(rest: FloatArray, error: FloatArray, share: float = 0.5) -> FloatAr
     """
     Return s of each row; shape (k, 1).
 
-    The median of |rest| / sqrt(s^2 + se^2) equals a normal law's, `_MEDIAN`,
-    if s^2 is the median of rest^2 / `_MEDIAN`^2 - se^2.  A `share` above one
-    half gives an upper bound: the median of n values lies below their quantile
-    of share 0.5 + z / (2 sqrt(n)) as often as a normal value below z.
+    The median of |rest| / sqrt(s^2 + se^2) is that of a normal distribution, `_MEDIAN`, if s^2 is
+    the median of rest^2 / `_MEDIAN`^2 - se^2.  A share of 0.5 + z / (2 sqrt(n)) gives an upper
+    bound of one-sided level Phi(z).
     """
     excess = (rest / _MEDIAN) ** 2 - error[None, :] ** 2
     return np.sqrt(np.maximum(np.quantile(excess, share, axis=1)[:, None], 0.0))
 
 
-# Probability of any false drift in a fleet with nothing wrong, and of any false outlier.
+# Probability of any false drift in a fleet without faults, and of any false outlier.
 DRIFT_RATE = 0.05
 OUTLIER_RATE = 0.05
-# Minimum number of vehicles to find which of them is an outlier.
+# Minimum number of vehicles to compare them with each other.
 LEAST_VEHICLES = 6
-# Standard error of a median over the mean's, for many normal values.
+# Standard error of a median relative to the mean, for many normal values.
 _MEDIAN_ERROR = 1.2533141373155
 
 
@@ -466,9 +448,7 @@ class Judgement:
     trends: tuple[Trend, ...]  # All that were tested, lowest p-value first
     recordings: dict[str, Outliers]  # Quantity -> each recording in its vehicle
     vehicles: dict[str, VehicleValues]  # Quantity -> each vehicle among the others
-    # Probability of any false alarm in one of these comparisons, set so that it is `OUTLIER_RATE`
-    # for all together.
-    rate: float
+    rate: float  # Probability of any false alarm in one comparison; in all, `OUTLIER_RATE`
 
     @property
     def drifting(self) -> tuple[Trend, ...]:
@@ -476,13 +456,13 @@ class Judgement:
         return tuple(t for t in self.trends if t.p_family <= DRIFT_RATE)
 
     def odd_recordings(self) -> list[tuple[str, int]]:
-        """Return (quantity, index) of the outlying recordings, furthest first."""
+        """Return (quantity, index) of the outlying recordings, largest score first."""
         found = [(name, int(k)) for name, o in self.recordings.items()
                  for k in np.flatnonzero(o.found)]
         return sorted(found, key=lambda f: -abs(float(self.recordings[f[0]].score[f[1]])))
 
     def odd_vehicles(self) -> list[tuple[str, int]]:
-        """Return (quantity, index) of the outlying vehicles, furthest first."""
+        """Return (quantity, index) of the outlying vehicles, largest score first."""
         found = [(name, int(k)) for name, v in self.vehicles.items()
                  for k in np.flatnonzero(v.outliers.found)]
         return sorted(found, key=lambda f: -abs(float(
@@ -515,7 +495,7 @@ def _is_of_vehicle(values: Values, vehicle: str) -> npt.NDArray[np.bool_]:
 
 
 def _vehicles(values: Values, within: Outliers, rate: float, seed: int) -> VehicleValues:
-    """Return the comparison of the vehicles."""
+    """Compare the vehicles with each other."""
     names = tuple(sorted(set(values.vehicles) - {''}))
     scatter = float(np.nan_to_num(within.scatter))
     value, error = np.zeros(len(names)), np.zeros(len(names))

@@ -76,7 +76,7 @@ COLUMNS = (
     Column('lowest_throttle', 'number', '1', 'throttle at that time, 0..1'),
     Column('dips', 'count', '', 'number of dips below the limit; a dip ends when a reading is '
            'clearly above it; needs --brownout-voltage or --cells'),
-    Column('below_s', 'number', 's', 'time below the limit; needs the same'),
+    Column('below_s', 'number', 's', 'time below the limit; needs --brownout-voltage or --cells'),
     Column('sag_throttle', 'number', '1', 'highest throttle flown, to a tenth; null where the sag '
            'is unknown'),
     Column('sag', 'number', 'V', 'sag at that throttle, positive, as in analyze'),
@@ -93,14 +93,14 @@ COLUMNS = (
     Column('causes', 'texts', '', 'causes that discover names; null without --discover'),
     Column('gain', 'number', 'nat', 'gain of the extended model, per held-out sample'),
     Column('gain_se', 'number', 'nat', 'standard error of gain'),
-    Column('notes', 'texts', '', 'what was dropped, repaired or left out of the recording'),
-    Column('duplicate_of', 'text', '', 'path of the recording with the same content; this one '
-           'was not analysed again'),
+    Column('notes', 'texts', '', 'samples that were dropped or repaired, and other notes'),
+    Column('duplicate_of', 'text', '', 'path of the recording with the same content, which was '
+           'analysed instead'),
     Column('error', 'text', '', 'reason why there are no numbers; otherwise null'),
     Column('size_bytes', 'count', 'byte', 'size of the recording on disk'),
 )
 NAMES = tuple(column.name for column in COLUMNS)
-# Columns of the recording that its result lacks.
+# Columns that are not copied from the result of the recording.
 _OTHERWISE = ('vehicle', 'start', 'error')
 
 
@@ -125,12 +125,11 @@ def rows_of(source: FoundRecording, result: Mapping[str, Any], vehicle: Vehicle,
 
 
 def _null_if_unknown(value: Any) -> Any:
-    """Return a value, or None for an unknown number."""
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def _as_text(value: Any) -> Any:
-    """Return valid text, without bytes of a file name that are not; objects as JSON."""
+    """Return a value with valid UTF-8 text (invalid bytes escaped), and objects as JSON."""
     if isinstance(value, str):
         return value.encode('utf-8', 'backslashreplace').decode()
     if isinstance(value, dict):

@@ -1,9 +1,8 @@
 """
 Vehicle and flight number of a recording.
 
-The vehicle is the one that the recording names itself (its metadata), else the match of a
-pattern in its path, else its folder.  Recordings are compared within
-a vehicle only; a recording of an unknown vehicle is compared with nothing.
+The vehicle is named by the metadata of the recording, else by a pattern in its path, else by its
+folder.  Recordings are compared within a vehicle only; those of unknown vehicles are not compared.
 """
 
 from __future__ import annotations
@@ -15,9 +14,10 @@ from pathlib import Path
 import re
 
 from ou_monitor.errors import InputError
-from ou_monitor.text import counted, printable
+from ou_monitor.text import counted, printable, some
 
 METADATA, PATTERN, FOLDER = 'metadata', 'pattern', 'folder'
+# Maximum paths or vehicles named in a note.
 _SHOWN = 3
 
 
@@ -57,22 +57,22 @@ def assign(stated: Mapping[Path, str], pattern: re.Pattern[str] | None = None
             if not by_pattern:
                 unmatched.append(path)
         elif path.parent in named:
-            # Its neighbours name their vehicle, so the folder is not a vehicle.
+            # Other recordings of the folder name their vehicle, so the folder is not a vehicle.
             found[path] = Vehicle('', FOLDER)
             mixed.append(path)
         else:
             found[path] = Vehicle(folders[path.parent], FOLDER)
     notes = [_rule(found)]
     if differing:
-        notes.append(f'{_these(differing)}: the metadata name another vehicle than '
-                     '--vehicle-from finds; the metadata are used.')
+        notes.append(f'{_these(differing)}: metadata and --vehicle-from name different '
+                     'vehicles; the metadata are used.')
     if unmatched:
-        notes.append(f'{_these(unmatched)}: --vehicle-from finds no vehicle in the path; they '
-                     'are compared with nothing.')
+        notes.append(f'{_these(unmatched)}: --vehicle-from finds no vehicle in the path; these '
+                     'recordings are not compared.')
     if mixed:
-        notes.append(f'{_these(mixed)}: no vehicle in the metadata, while others in the same '
-                     'folder name theirs; they are compared with nothing. --vehicle-from names '
-                     'them by their path.')
+        notes.append(f'{_these(mixed)}: the metadata name no vehicle, though those of other '
+                     'recordings in the folder do; these recordings are not compared. '
+                     '--vehicle-from can name their vehicle by the path.')
     both = {v.name for v in found.values() if v.named_by == METADATA} & {
         v.name for v in found.values() if v.named_by != METADATA and v.name}
     if both:
@@ -91,7 +91,7 @@ def _match(pattern: re.Pattern[str] | None, path: Path) -> str:
 
 
 def _folder_names(folders: set[Path]) -> dict[Path, str]:
-    """Return a name for each folder: its last part, with more parts where others share it."""
+    """Return a name for each folder: its last part, with more parts if they are not unique."""
     names = {}
     for folder in folders:
         for depth in range(1, len(folder.parts) + 1):
@@ -103,9 +103,9 @@ def _folder_names(folders: set[Path]) -> dict[Path, str]:
 
 
 def _rule(found: Mapping[Path, Vehicle]) -> str:
-    """Say where the vehicles' names come from."""
+    """Return how many vehicles were named by which rule."""
     words = {METADATA: 'by their metadata', PATTERN: 'by --vehicle-from',
-             FOLDER: 'by the folder they lie in'}
+             FOLDER: 'by their folder'}
     parts = []
     for kind, text in words.items():
         of_kind = [v for v in found.values() if v.named_by == kind and v.name]
@@ -117,9 +117,7 @@ def _rule(found: Mapping[Path, Vehicle]) -> str:
 
 
 def _these(paths: Sequence[Path]) -> str:
-    names = ', '.join(f"'{path}'" for path in paths[:_SHOWN])
-    more = len(paths) - _SHOWN
-    return names + (f' and {more} more' if more > 0 else '')
+    return some((f"'{path}'" for path in paths), _SHOWN)
 
 
 def number_flights(vehicles: Mapping[Path, Vehicle], starts: Mapping[Path, float]
@@ -141,11 +139,8 @@ def number_flights(vehicles: Mapping[Path, Vehicle], starts: Mapping[Path, float
             flights[path] = k + 1
     notes = []
     if by_name:
-        some = ', '.join(sorted(by_name)[:_SHOWN])
-        more = len(by_name) - _SHOWN
-        some += f' and {more} more' if more > 0 else ''
-        notes.append(f'{some}: the flights are in the order of their names, because their '
-                     'dates are unknown or not distinct.')
+        notes.append(f'{some(sorted(by_name), _SHOWN)}: the flights are in the order of their '
+                     'names, because their dates are unknown or not distinct.')
     return flights, notes
 
 

@@ -1,12 +1,10 @@
 """
-Work on many processes: of this machine, or of a Dask scheduler.
+Run tasks in many processes: on this machine, or on the workers of a Dask scheduler.
 
-Local processes are reached over pipes: no port or socket to connect to.  This is
-the only module that imports Dask.
+Local processes are reached over pipes, so no port is open.  Only this module imports Dask.
 
-Limits: a worker that dies loses its tasks.  It may have been
-killed for memory that others used, so a recording is tried a second time
-alone, when nothing else runs, before it is given up.
+Limits: a worker that dies loses its tasks.  Other workers may have used up the memory for which it
+was killed, so its task is tried once more, alone, before it fails.
 """
 
 from __future__ import annotations
@@ -35,14 +33,15 @@ from ou_monitor.recordings.mcap_file import usable_memory
 # Several processes with several threads of linear algebra each are slower than with one.
 _ONE_THREAD = dict.fromkeys(
     ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'NUMBA_NUM_THREADS'), '1')
-# Share of the memory that all workers together may fill, and the minimum for one, bytes.
+# Share of the memory that all workers together may use, and the minimum for one, bytes.
 _MEMORY_SHARE, _MEMORY_LEAST = 0.9, 1 << 29
-# Timeouts for a scheduler and for a worker, s.
+# Timeout for a scheduler and for a worker, s.
 _PATIENCE = 30.0
 # Period of checking whether workers are left, s.
 _LOOK = 1.0
-LOST = ('The worker died while it did this recording, also in a second try alone: it was killed, '
+LOST = ('The worker died on this recording, also in a second attempt on its own: it was killed, '
         'or the recording does not fit into memory.')
+_RESUME = 'finished recordings are kept, and the same command resumes'
 # Index of a task in the list of arguments, its result, and its error.
 Outcome = tuple[int, Any, str]
 
@@ -58,7 +57,7 @@ class Workers(ABC):
 
     @abstractmethod
     def _room(self) -> int:
-        """Return the maximum number of tasks under way."""
+        """Return the maximum number of running tasks."""
 
     @abstractmethod
     def _submit(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
@@ -114,10 +113,10 @@ class LocalWorkers(Workers):
     """Processes of this machine, each with a share of the memory."""
 
     def __init__(self, count: int) -> None:
-        # The workers hold the reading end: they end when the other end closes, also if we die.
+        # The workers wait at the reading end: they exit when this process closes its end or dies.
         self._watched, self._alive = multiprocessing.get_context('spawn').Pipe(duplex=False)
         self._memory = max(int(_MEMORY_SHARE * usable_memory()) // count, _MEMORY_LEAST)
-        # One pool for each, so that a broken pool identifies its task and the others go on.
+        # One pool for each worker, so that a broken pool identifies its task.
         self._pools: list[ProcessPoolExecutor | None] = [None] * count
         self._at: dict[Future[Any], int] = {}
 
@@ -130,7 +129,7 @@ class LocalWorkers(Workers):
         if pool is not None:
             future = pool.submit(function, *arguments)
         else:
-            # Spawned, not forked: there are threads here.  The first task starts the process.
+            # Spawned, because forking with threads is unsafe.  The first task starts the process.
             pool = self._pools[k] = ProcessPoolExecutor(
                 1, multiprocessing.get_context('spawn'), _prepare, (self._watched, self._memory))
             with _environment_of_workers():
@@ -151,8 +150,7 @@ class LocalWorkers(Workers):
                 pool.shutdown()
             return None, LOST
         except Exception as error:
-            # The function itself raises nothing, so the error came on the way to or from the
-            # worker.
+            # The function catches its own errors: this one is of the transport.
             return None, failure(error)
 
     def close(self) -> None:
@@ -165,21 +163,21 @@ class LocalWorkers(Workers):
 
 
 def failure(error: Exception) -> str:
-    """Return the line for an error on the way to or from a worker."""
+    """Return the message for an error in the transport to or from a worker."""
     return ' '.join(f'The worker failed ({type(error).__name__}: {error}).'.split())
 
 
 @contextmanager
 def _environment_of_workers() -> Iterator[None]:
     """
-    Start processes with one thread each, and with Ctrl-C blocked from their first instruction.
+    Start processes with one thread each and with Ctrl-C blocked.
 
-    A terminal sends Ctrl-C to the whole group; the main process ends its
-    workers itself, and their messages would only hide its own.
+    A terminal sends Ctrl-C to all processes of the group; the main process ends its workers
+    itself, and their tracebacks would hide its message.
     """
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(_ONE_THREAD)
-    # A child inherits the mask; here Ctrl-C waits until the process has started.
+    # A child inherits the mask; in this process, Ctrl-C is delayed until the child has started.
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -207,14 +205,14 @@ def _prepare(watched: Connection, memory: int) -> None:
 
 
 def check_address(address: str, insecure: bool = False) -> None:
-    """Refuse a scheduler whose connection others can read and change."""
+    """Raise InputError if others can read and change the connection to a scheduler."""
     parts = urlsplit(address if '://' in address else f'tcp://{address}')
     if insecure or parts.scheme == 'tls' or _is_loopback(parts.hostname or ''):
         return
     raise InputError(
         f"--scheduler: '{address}' is not encrypted: anyone on that network can run programs "
-        'on its workers and on this machine. Use tls://HOST:PORT, or --insecure where nobody else '
-        'can reach it')
+        'on its workers and on this machine. Use tls://HOST:PORT, or --insecure on a network '
+        'that nobody else can reach')
 
 
 def _is_loopback(host: str) -> bool:
@@ -228,10 +226,9 @@ class ClusterWorkers(Workers):
     """
     The workers of a Dask scheduler, which have this package and the recordings at the same paths.
 
-    Dask's configuration (``distributed.comm.tls``) has the certificates of ``tls://``; the result
-    of `check` must be the same here and on every worker; `insecure` allows an address of
-    another machine without TLS.  InputError: the address is not safe, no scheduler or no
-    worker answers, or the workers have another version.
+    Dask's configuration (``distributed.comm.tls``) names the certificates for ``tls://``; `check`
+    must return the same here and on every worker; `insecure` allows another machine without TLS.
+    InputError: the address is not safe, no scheduler or worker answers, or the versions differ.
     """
 
     def __init__(self, address: str, check: Callable[[], str], insecure: bool = False) -> None:
@@ -253,13 +250,13 @@ class ClusterWorkers(Workers):
         except (OSError, TypeError, ValueError) as error:
             raise InputError(f"--scheduler: no scheduler answers at '{address}' "
                              f"({str(error).splitlines()[0] if str(error) else 'time-out'}); "
-                             "'dask scheduler' starts one; doc/security.md has its certificates"
+                             "start one by 'dask scheduler'; doc/security.md explains certificates"
                              ) from error
         try:
             client.wait_for_workers(1, timeout=_PATIENCE)
         except TimeoutError as error:
-            raise InputError(f"--scheduler: '{address}' has no worker; 'dask worker {address}' "
-                             'starts one') from error
+            raise InputError(f"--scheduler: '{address}' has no worker; start one by "
+                             f"'dask worker {address}'") from error
         try:
             there = set(client.run(check).values())
         except Exception as error:
@@ -268,12 +265,12 @@ class ClusterWorkers(Workers):
         if there != {check()}:
             raise InputError(
                 f"--scheduler: the workers of '{address}' have ou_monitor "
-                f"{', '.join(sorted(there))}, here it is {check()}: install the same")
+                f"{', '.join(sorted(there))}, this machine has {check()}: install the same "
+                'version')
         return client
 
     def _room(self) -> int:
-        # Two tasks a thread, so that no worker waits for the next one; a task that was lost with a
-        # worker before it began is tried again too.
+        # Two tasks a thread, so that no worker idles between tasks.
         return 2 * max(1, sum(int(count) for count in self._client.nthreads().values()))
 
     def _submit(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
@@ -288,21 +285,19 @@ class ClusterWorkers(Workers):
                 wait(list(futures), timeout=_LOOK, return_when='FIRST_COMPLETED')
             except TimeoutError:
                 if self._client.status != 'running':
-                    raise InputError('the connection to the scheduler is lost; finished '
-                                     'recordings are kept, the same command resumes') from None
+                    raise InputError(f'the connection to the scheduler is lost; {_RESUME}'
+                                     ) from None
                 if self._client.nthreads():
                     alone_since = time.monotonic()
                 elif time.monotonic() - alone_since > _PATIENCE:
-                    raise InputError('no worker is left; finished recordings are kept, the same '
-                                     'command resumes') from None
+                    raise InputError(f'no worker is left; {_RESUME}') from None
                 continue
             if any(future.status == 'cancelled' for future in futures):
-                raise InputError('the scheduler has dropped the work; finished recordings are '
-                                 'kept, the same command resumes')
+                raise InputError(f'the scheduler has cancelled the work; {_RESUME}')
             found = [future for future in futures if future.status in ('finished', 'error')]
             if found:
                 return found
-            # Work done on a worker that died is being done again.
+            # The scheduler is repeating the work of a worker that died.
             time.sleep(0.05)
 
     def _outcome(self, future: Any) -> tuple[Any, str]:
@@ -313,8 +308,6 @@ class ClusterWorkers(Workers):
         except (KilledWorker, TimeoutError):
             return None, LOST
         except Exception as error:
-            # The function itself raises nothing, so the error came on the way to or from the
-            # worker.
             return None, failure(error)
 
     def close(self) -> None:
@@ -323,7 +316,7 @@ class ClusterWorkers(Workers):
 
 
 def _quiet() -> None:
-    """Keep Dask's messages about workers off the terminal: the table has what matters."""
+    """Silence Dask's messages about workers: the table reports failures."""
     for name in ('distributed', 'distributed.core', 'distributed.client', 'distributed.batched',
                  'tornado', 'asyncio'):
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 import math
 
 import numpy as np
@@ -21,7 +22,7 @@ from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text, UNKNOWN,
     worst_first)
 from ou_monitor.report.svg import Plot, span
-from ou_monitor.text import chance, counted, listed, number
+from ou_monitor.text import chance, counted, listed, number, with_se
 
 # Maximum changes drawn in one plot, and its length in relaxation times.
 _MOST_DRAWN, _DRAWN_TAUS = 6, 8.0
@@ -113,7 +114,7 @@ def _budget(analysis: Analysis) -> str:
 
 
 def _why_none(analysis: Analysis) -> str:
-    """Say why there is no budget: the supply at rest, or the flight before."""
+    """Return why no throttle meets the limit: the flight just ended, or the supply at rest."""
     rest = analysis.overview.load.level
     if rest > analysis.by_throttle.voltage:
         return f'right after this flight, though the supply at rest is at {number(rest, 4)} V'
@@ -121,7 +122,7 @@ def _why_none(analysis: Analysis) -> str:
 
 
 def _origin(analysis: Analysis) -> list[tuple[str, str]]:
-    """Say which topics or columns voltage and throttle came from."""
+    """Return the topics or columns of voltage and throttle."""
     source, found = analysis.recording.source, []
     if 'voltage' in source:
         return [('Read from', f"voltage: {source['voltage']}; throttle: "
@@ -272,7 +273,7 @@ def _levels(levels: Sequence[LevelResult]) -> list[Part]:
         Table(['throttle', 'alpha, 1/s\n[95 %]', 'sigma, V/sqrt(s)\n[95 %]',
                'Var_inf, V^2\n[95 %]', 'tau, ms'], fits, left=[0]),
         Text('dU = \u2212\u03b1 (U \u2212 U\u2080) dt + \u03c3 dW; \u03c4 = 1/\u03b1; '
-             'Var\u221e = \u03c3\u00b2/(2\u03b1). Vpp, peak and Vrms are of the deviation from '
+             'Var\u221e = \u03c3\u00b2/(2\u03b1). Vpp, peak and Vrms describe the deviation from '
              'the mean of each segment.', legend=True)]
 
 
@@ -285,7 +286,7 @@ def _interval(level: LevelResult, name: str) -> str:
 
 
 def _process(analysis: Analysis) -> list[Part]:
-    """Return the tests behind the kind of process of each level, and the reasons in words."""
+    """Return the tests behind the type of process of each level, and the reasons."""
     rows = []
     for level in analysis.levels:
         cells = []
@@ -304,10 +305,10 @@ def _process(analysis: Analysis) -> list[Part]:
         reasons.append(f'{", ".join(level.label for level in levels)}, {kind}: {said}')
     return [
         lambda: [Table(['throttle', *_TESTS.values()], rows, left=[0]), Text(
-            'p-values, adjusted by Holm over all tests of all levels, and below each the effect; '
-            '* rejects: p below 0.01 and an effect of consequence. In one of a hundred recordings '
-            'of stationary OU levels any test but "Correlated" rejects; "Correlated" rejects '
-            'wherever the supply relaxes.')],
+            'p-values, Holm-adjusted over all tests of all levels; below each, the effect size. '
+            '* marks a rejection: p below 0.01 and an effect large enough to matter. With '
+            'stationary OU levels, one recording in a hundred shows a rejection other than '
+            '"Correlated"; "Correlated" rejects wherever the supply relaxes.')],
         Notes.of(reasons)]
 
 
@@ -322,10 +323,10 @@ def _lines(analysis: Analysis) -> list[Part]:
              chance(line.p_value)]
             for level in searched for line in level.lines.lines]
     least = max(level.lines.detectable for level in searched)
-    detectable = ('the smallest detectable one is unknown with so few samples'
+    detectable = ('there are too few samples to know the smallest detectable line'
                   if not math.isfinite(least) else
-                  f'one of {number(1e3 * least)} mV rms would have been detected at each of '
-                  'those searched (90 %)')
+                  f'a line of {number(1e3 * least)} mV rms would have been detected at every '
+                  'level searched (90 %)')
     return [Table(['throttle', 'line, Hz', 'rms, mV\n[95 %]', 'of variance', 'p'], rows,
                   left=[0], most=_MOST_LINES) if rows else
             Text(f'No spectral line at any level (1 % false alarms); {detectable}.')]
@@ -337,12 +338,8 @@ def _transients(analysis: Analysis) -> list[Part]:
         if fit.releases:
             parts.append(Text(_relaxation_sentence(analysis, k)))
         if fit.detected:
-            parts += [_drawn_relaxation(analysis, fit), _changes(analysis, fit)]
+            parts += [partial(_relaxation_plot, analysis, fit), _changes(analysis, fit)]
     return parts
-
-
-def _drawn_relaxation(analysis: Analysis, fit: Relaxation) -> Callable[[], list[Part]]:
-    return lambda: [Figure(_relaxation_plot(analysis, fit))]
 
 
 def _relaxation_sentence(analysis: Analysis, k: int) -> str:
@@ -357,7 +354,7 @@ def _relaxation_sentence(analysis: Analysis, k: int) -> str:
             f'{number(1e3 * fit.tau_high)}) ms. {caveat}{cause.sentence}')
 
 
-def _relaxation_plot(analysis: Analysis, fit: Relaxation) -> Plot:
+def _relaxation_plot(analysis: Analysis, fit: Relaxation) -> list[Part]:
     recording = analysis.recording
     what = 'falls' if fit.kind == 'release' else 'rises'
     plot = Plot(f'After throttle {what} (dashed: fit)', 'time since throttle arrived, ms', 'mV',
@@ -373,22 +370,18 @@ def _relaxation_plot(analysis: Analysis, fit: Relaxation) -> Plot:
                   f'{100.0 * change.throttle_before:.3g} to '
                   f'{100.0 * change.throttle_after:.3g} %', k, 'faint')
         plot.line(1e3 * since, 1e3 * fit.decay(change, since), '', k, 'dash thick')
-    return plot
+    return [Figure(plot)]
 
 
 def _changes(analysis: Analysis, fit: Relaxation) -> Table:
     start = float(analysis.recording.t[0])
     side = 'overshoot, mV' if fit.kind == 'release' else 'undershoot, mV'
 
-    def with_error(value: float, se: float, digits: int, scale: float) -> str:
-        return UNKNOWN if not math.isfinite(value) else (
-            f'{number(scale * value, digits)} +- {number(scale * se, 2)}')
-
     rows = [[number(change.t - start, 4),
              f'{100.0 * change.throttle_before:.3g} to {100.0 * change.throttle_after:.3g} %',
-             with_error(change.level_before, change.level_before_se, 4, 1.0),
-             with_error(change.level, change.level_se, 4, 1.0),
-             with_error(change.amplitude, change.amplitude_se, 3, 1e3),
+             with_se(change.level_before, change.level_before_se, 4),
+             with_se(change.level, change.level_se, 4),
+             with_se(1e3 * change.amplitude, 1e3 * change.amplitude_se),
              number(1e3 * change.beyond), chance(change.beyond_p)] for change in fit.clear]
     return Table(['at, s', 'throttle', 'before, V', 'after, V', 'A, mV', side, 'p of noise'],
                  rows, left=[1], most=_MOST_CHANGES)
@@ -436,8 +429,8 @@ def _over_time(analysis: Analysis) -> list[Part]:
         plot.limits(y=(-5.0, 105.0)).steps(
             _since_start(recording, recording.t), 100.0 * recording.throttle, colour=7)
         drawn.append(Figure(_with_segments(plot, analysis), (
-            'Shaded: the segments used for the load levels, in the colours of the plots of the '
-            'shape. Every peak is shown.')))
+            'Shaded: segments used for the load levels, in the colours of the plots under '
+            '"Shape".')))
     if np.isfinite(sliding.risk).any():
         plot = _over(recording, f'Risk of going below {sliding.brownout_voltage:g} V within '
                      f'{sliding.brownout_horizon:g} s', 'probability', 170)
@@ -447,7 +440,7 @@ def _over_time(analysis: Analysis) -> list[Part]:
 
 
 def _sliding(analysis: Analysis) -> list[Part]:
-    """Return the plots of the sliding estimate, and why some windows have none."""
+    """Return the plots of the sliding estimate, and how many windows failed for which reason."""
     recording, sliding = analysis.recording, analysis.sliding
     if not sliding.t.size:
         return [Text(
@@ -470,7 +463,7 @@ def _sliding(analysis: Analysis) -> list[Part]:
     lost = Counter(e.status.value for e in sliding.estimates if not e.usable)
     if lost:
         drawn += [
-            Text(f'{lost.total()} of {len(sliding.estimates)} windows carry no estimate:'),
+            Text(f'{lost.total()} of {len(sliding.estimates)} windows have no estimate:'),
             Notes.of((f'{n} windows: {text}' for text, n in lost.items()), Severity.WARNING)]
     return drawn
 
@@ -508,8 +501,8 @@ def _shape(analysis: Analysis) -> list[Part]:
     histogram.line(z, np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi), 'normal', 7, 'dash thick')
     histogram.limits(x=(-6.0, 6.0), y=(1e-5, 1.0))
     text = ('An OU is flat below its corner \u03b1/(2\u03c0) and falls with the square of '
-            'frequency above it; a line that stands out is a tone, a flat floor at high '
-            'frequency is white noise of the sensor.')
+            'frequency above it. A narrow peak is a tone; a flat floor at high frequency is '
+            'white noise of the sensor.')
     extra = len(analysis.levels) - len(drawn)
     if extra > 0:
         text += f' The {extra} shortest levels are in the tables only.'

@@ -13,13 +13,13 @@ from ou_monitor.text import number
 # Colours: measured, simulated.
 _MEASURED, _SIMULATED = 7, 1
 _VOLTAGE = ('Line: measured. Band: 95 % of the simulations at each moment. Pale line: one '
-            'simulation. Dashed lines: the levels whose falls are counted.')
+            'simulation. Dashed lines: levels at which falls are counted.')
 # Range of the fit if a model was given.
 _NOTHING = (0.0, 0.0)
 
 
 def comparison_document(found: Agreement, seen: Overview, command: str = '') -> Document:
-    """Return the report of a comparison; seen: the facts of the recording."""
+    """Return the report of a comparison; `seen` holds the facts of the recording."""
     first, last = found.simulated
     subject = (f'{found.recording or "recording"}: '
                + ('' if found.fitted == _NOTHING else
@@ -35,8 +35,8 @@ def comparison_document(found: Agreement, seen: Overview, command: str = '') -> 
                          folded=True)],
         Notes.of(found.notes),
         Text(f'{found.seeds} simulations with the stamps, throttle and ADC steps of the '
-             f'recording. {100.0 * found.p_value:.0f} % of them, counting the recording as one, '
-             'are as far off as the recording; below 5 % it is said to differ.',
+             f'recording. {100.0 * found.p_value:.0f} % of them (the recording included) deviate '
+             'at least as much as the recording; below 5 % the recording is reported to differ.',
              legend=True)]
     return Document('Beside its simulation', subject, _answer(found), parts, command)
 

@@ -14,7 +14,7 @@ from ou_monitor.text import chance, counted, number, p_words
 
 def coupling_document(found: Coupling, recording: Recording, signal: tuple[FloatArray, FloatArray],
                       name: str, unit: str, seen: Overview, command: str = '') -> Document:
-    """Return the report of a coupling; signal: stamps, s, and values."""
+    """Return the report of a coupling; `signal` holds stamps, s, and values."""
     grid, per = found.grid, f'{unit} per V'.lstrip()
     subject = (f'{recording.name or "recording"}, {name}: {grid.duration:.4g} s in common, '
                f'{found.segments:.0f} segments'
@@ -30,7 +30,7 @@ def coupling_document(found: Coupling, recording: Recording, signal: tuple[Float
                  Section('Signal and gain', [
                      Figure(_signal(recording, signal, name, unit)),
                      Figure(_gain(found, per),
-                            'Where the coherence is below its limit the gain is noise.')],
+                            'Where the coherence is below its limit, the gain is noise.')],
                          folded=True)],
         Section('What to know before using these numbers',
                 [Notes.of([*recording.notes, *lost, *gaps, *found.notes])])]
@@ -59,7 +59,7 @@ def _facts(found: Coupling, per: str) -> list[tuple[str, str]]:
     else:
         lines = [('Detectable', f'a gain of {number(found.limit, 4)} {per}, in '
                   f'{100.0 * POWER:.0f} % of such recordings'),
-                 ('For the filter', 'no law that follows sigma helps this signal')]
+                 ('For the filter', 'adapting the cutoff to sigma does not help this signal')]
     return [*lines, ('Chance', f'{p_words(found.p_value)}; detected if below '
                      f'{chance(found.level)}'),
             ('Largest coherence', f'{number(found.coherence[peak])} (squared) at '

@@ -1,4 +1,4 @@
-"""The report of `design`: the least capacitance, a table over others, and alternatives."""
+"""The report of `design`: the minimum capacitance, a table over others, and alternatives."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ _LEAST_RISK = 1e-9
 
 def design_document(result: Design, source: str, taken: str = '', command: str = '',
                     ) -> Document:
-    """Return the report of a design; taken: the values from a flight, if any."""
+    """Return the report of a design; `taken` describes the values from a flight, if any."""
     present = result.present
     chosen = [(present, 'present')]
     if result.least is not None:
-        chosen.append((result.least, 'least that meets it'))
+        chosen.append((result.least, 'minimum that meets it'))
     for row in result.rows[::_EVERY]:
         if not any(math.isclose(row.capacitance, r.capacitance, rel_tol=0.01) for r, _ in chosen):
             chosen.append((row, '' if row.stable else 'unstable'))

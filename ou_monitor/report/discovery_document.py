@@ -10,23 +10,23 @@ import math
 import numpy as np
 from ou_monitor.analysis.overview import known_lines, other_scale, Overview
 from ou_monitor.criticism.curves import compare_curves, Comparison
-from ou_monitor.discovery.finding import Criticism, Finding, Verdict
+from ou_monitor.discovery.finding import Finding, Verdict
 from ou_monitor.discovery.words import (
-    both_names, cause_rows, gain_words, MNAT, NOT_KNOWN, overlap_words, plain, plain_model_words,
+    both_names, cause_rows, gain_words, MNAT, overlap_words, plain, plain_model_words,
     PLAIN_NAMES, plain_words, with_error)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text)
 from ou_monitor.report.svg import Plot, span
-from ou_monitor.text import listed, number, Z95
+from ou_monitor.text import listed, number, with_se, Z95
 
-# Causes in the first sentence; remaining discrepancies shown on a terminal.
+# Maximum causes in the first sentence, and remaining discrepancies on a terminal.
 _FIRST, _SHOWN = 3, 8
 # Maximum rows of statistics drawn.
 _ROWS = 18
-# Rows of dots: sizes, in pixels.
+# Sizes of the drawing of statistics, pixels.
 _WIDTH, _LEFT, _RIGHT, _ROW, _TOP, _BOTTOM = 860, 250, 20, 22, 34, 40
-# Simulations behind the voltage.
+# Simulations that give the band of the voltage.
 _DRAWS = 20
 # Maximum score on the straight part of the scale; larger scores are logarithmic.
 _STRAIGHT = 4.0
@@ -35,7 +35,7 @@ _TICKS = (0.0, 4.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 10000.0)
 
 def discovery_document(finding: Finding, seen: Overview | None = None, command: str = '',
                        ) -> Document:
-    """Return the report of a discovery; seen: the facts of the recording."""
+    """Return the report of a discovery; `seen` holds the facts of the recording."""
     samples, baseline = finding.samples, finding.baseline
     used = '' if samples is None or samples.n == finding.n else f', {samples.n} used'
     subject = (f'{finding.recording or "recording"}: {finding.n} samples in '
@@ -72,7 +72,8 @@ def answer(finding: Finding) -> list[str]:
     more = len(names) - _FIRST
     others = [f'{more} more'] if more > 0 else []
     worse = [*(['one-step errors are larger'] if finding.larger else []),
-             *(['falls are further from those measured'] if finding.crossing.worse else [])]
+             *(['the rate of falls is further from the measured one']
+               if finding.crossing.worse else [])]
     closer = ('With them it passes every test.' if finding.verdict is Verdict.EXPLAINED else
               'With them it comes closer, but is not yet right.' if finding.closer else
               f'With them it does not come closer: {listed(worse)} than with the plain OU.')
@@ -83,24 +84,22 @@ def answer(finding: Finding) -> list[str]:
 
 
 def _gain_words(finding: Finding) -> str:
-    """Return a gain in two parts: smaller prediction errors, and their size better estimated."""
+    """Return a gain in two parts: smaller one-step errors, and their size better predicted."""
     gain, shrink, size = finding.gain, finding.shrink, finding.size_gain
     if not gain > Z95 * finding.gain_se or not math.isfinite(size):
         return gain_words(gain, finding.gain_se)
     errors = ('shrink by ' if shrink > 0.0 else 'grow by ') + f'{number(100.0 * abs(shrink), 2)} %'
     return (f'One-step errors on samples not used for the fit {errors} (rms), and their size is '
-            f'{"better" if size >= 0.0 else "worse"} known, by {number(1e3 * abs(size), 2)} of '
-            f'the {number(1e3 * gain)} +- {number(1e3 * finding.gain_se, 2)} mnat gained per '
-            'sample.')
+            f'{"better" if size >= 0.0 else "worse"} predicted, by '
+            f'{number(1e3 * abs(size), 2)} of the {number(1e3 * gain)} +- '
+            f'{number(1e3 * finding.gain_se, 2)} mnat gained per sample.')
 
 
 def _model_name(finding: Finding) -> str:
-    """Return the name of the simulated model."""
     return 'extended model' if finding.causes else 'plain OU'
 
 
 def _voltage(finding: Finding) -> Plot:
-    """Return the voltage over the band of simulations of the model."""
     samples = finding.samples
     assert samples is not None
     t = samples.t - samples.t[0]
@@ -120,12 +119,6 @@ def _voltage(finding: Finding) -> Plot:
     return plot.line(t, samples.logged, 'measured', 0)
 
 
-def _with_error(value: float, error: float) -> str:
-    if not math.isfinite(value):
-        return NOT_KNOWN
-    return number(value) + (f' +- {number(error, 2)}' if math.isfinite(error) else '')
-
-
 def _causes(finding: Finding) -> list[Part]:
     if not finding.causes:
         return [Text('No cause was named.')]
@@ -140,21 +133,21 @@ def _causes(finding: Finding) -> list[Part]:
         Notes.of([*remarks, overlap_words(finding.causes, finding.gain),
                   *(f'{row.label}: {row.explanation}' for row in found)]),
         Text(f'{MNAT} Gain: the loss of held-out score when the cause is left out and the rest is '
-             'fitted again; its standard error comes from means of blocks and from the errors of '
-             'the parameters. p: twice the smaller of two p-values, of the likelihood ratio on '
-             'the part fitted (corrected for the search) and of the gain. Exact findings show in '
-             'the samples themselves; those undone there share one gain. Terms of one kind that '
-             'share a gain are one row.', legend=True)]
+             'fitted again; its standard error combines the scatter of block means and the '
+             'errors of the parameters. p: twice the smaller of two p-values: the likelihood '
+             'ratio on the fitted part (corrected for the search) and the gain. "Exact" causes '
+             'are visible in the samples themselves; those corrected there share one gain. Terms '
+             'of one kind that share a gain are one row.', legend=True)]
 
 
 def _gain(finding: Finding) -> list[Part]:
     c, baseline = finding.crossing, finding.baseline
     assert baseline is not None
     rows = [['held-out score, nats/sample', '-', number(finding.baseline_score, 4),
-             number(finding.score, 4), _with_error(finding.gain, finding.gain_se)]]
+             number(finding.score, 4), with_se(finding.gain, finding.gain_se)]]
     if math.isfinite(c.level):
         rows.append([f'falls through {number(c.level, 4)} V, 1/min',
-                     *(_with_error(*pair) for pair in (
+                     *(with_se(*pair) for pair in (
                          (c.observed, c.observed_se), (c.baseline, c.baseline_se),
                          (c.extended, c.extended_se))), '-'])
     # If nothing was added to the plain OU, there is nothing to compare.
@@ -164,22 +157,17 @@ def _gain(finding: Finding) -> list[Part]:
             Text(f'Plain OU, with nothing else in the model: {plain_model_words(baseline)}.')]
 
 
-def _drawn_statistics(finding: Finding) -> list[Criticism]:
-    """Return the statistics of the rows: the largest, before or after."""
-    worst = sorted(finding.criticism, key=lambda c: -max(abs(c.before), abs(c.after)))
-    return worst[:_ROWS]
-
-
 def _statistics(finding: Finding) -> list[Part]:
-    rows = [(c.statistic, c.low, c.high, c.before, c.after) for c in _drawn_statistics(finding)]
+    worst = sorted(finding.criticism, key=lambda c: -max(abs(c.before), abs(c.after)))
+    rows = [(c.statistic, c.low, c.high, c.before, c.after) for c in worst[:_ROWS]]
     text = (f'{len(finding.discrepancies)} of {len(finding.criticism)} statistics of the '
             'one-step errors lie outside the band for the plain OU'
             + (f', {len(finding.remaining)} for the extended model. ' if finding.causes else '. '))
     dots = 'Hollow: plain OU. Full: extended model' if finding.causes else 'Dot: plain OU'
     return [Figure(
         _dot_rows(f'{dots}. Band: what simulations produce', 'standard scores', rows),
-        text + 'The band comes from simulations that pass through the same fit: under a correct '
-        'model one recording in a hundred has a statistic outside it.')]
+        text + 'The band comes from simulations that are fitted in the same way: with a correct '
+        'model, one recording in a hundred has a statistic outside it.')]
 
 
 def _comparisons(finding: Finding) -> list[Part]:
@@ -193,7 +181,7 @@ def _comparisons(finding: Finding) -> list[Part]:
              for curve in compared for k, name in enumerate(named)]
     return [*Pair.two_by_two(drawn), Text(
         'Line or dots: the data. Band or bars: the range of 40 simulations with the stamps and '
-        'the throttle of the data; about one point in twenty of a correct model lies outside.',
+        'throttle of the data; with a correct model about one point in twenty lies outside.',
         legend=True)]
 
 
@@ -225,15 +213,11 @@ def _plot(curve: Comparison, k: int, name: str) -> Plot:
 def _discrepancies(finding: Finding) -> Part:
     if not finding.remaining:
         return Text(f'Nothing: no statistic of the {_model_name(finding)} lies outside the band.')
-    rows = [[c.statistic, *([_number(c.before)] if finding.causes else []), _number(c.after),
+    rows = [[c.statistic, *([number(c.before)] if finding.causes else []), number(c.after),
              f'[{number(c.low)}, {number(c.high)}]', plain_words(c.statistic)]
             for c in finding.remaining]
     return Table(['statistic', *(['plain OU'] if finding.causes else []), 'score',
                   'band', 'in words'], rows, left=[0, len(rows[0]) - 1], most=_SHOWN)
-
-
-def _number(value: float) -> str:
-    return number(value) if math.isfinite(value) else NOT_KNOWN
 
 
 def _parameters(finding: Finding) -> list[Part]:
@@ -247,17 +231,16 @@ def _parameters(finding: Finding) -> list[Part]:
                          with_error(value, se.get(spec.name), positive=term.positive(spec.name)),
                          spec.metadata['unit'] or '-', spec.metadata['text']])
     about = ('Extended model: all terms fitted together on the whole recording. Its alpha and '
-             'sigma describe the relaxation and noise that the causes leave; those of the '
-             'plain OU above include the causes.'
-             if finding.causes else
-             'The plain OU is kept, as no cause was named: the model above.')
+             'sigma describe the relaxation and noise not explained by the causes; alpha and '
+             'sigma of the plain OU above include the causes.'
+             if finding.causes else 'No cause was named: this is the plain OU above.')
     return [Text(about), Table(['term', 'parameter', 'estimate +- standard error', 'unit',
                                 'what it is'], rows, left=[0, 1, 4])]
 
 
 def _dot_rows(title: str, x_label: str,
               rows: Sequence[tuple[str, float, float, float, float]]) -> str:
-    """Return a row for each statistic: a band, a hollow dot before, a full one after."""
+    """Return an SVG with a row for each statistic: name, low, high, before, after."""
     reach = max([1.5 * _STRAIGHT, *(abs(v) for row in rows for v in row[1:] if math.isfinite(v))])
     end = math.asinh(1.1 * reach / _STRAIGHT)
     middle, half = 0.5 * (_LEFT + _WIDTH - _RIGHT), 0.5 * (_WIDTH - _RIGHT - _LEFT)
@@ -302,7 +285,6 @@ def _dot_rows(title: str, x_label: str,
 
 
 def _dot_title(name: str, low: float, high: float, before: float, after: float) -> str:
-    """Return the known numbers of a row."""
     def text(value: float) -> str:
         return f'{value:.3g}'.replace('-', '\u2212')
 

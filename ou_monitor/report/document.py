@@ -1,9 +1,9 @@
 """
 The report of a command, as records; `page` and `terminal` write them.
 
-Empty parts are left out.  Texts are ASCII: '+-', 'sigma' and 'V/sqrt(s)' in the head of a table
-become signs on a page.  In a cell or a head, text after a line break is small on a page and
-continues the line on a terminal.
+Empty parts are left out.  Texts are ASCII; a page replaces '+-' by its sign, and 'sigma' and
+'V/sqrt(s)' in the heads of tables by symbols.  In a cell or a head, text after a line break is
+small on a page and continues the line on a terminal.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Notes:
         return cls([(severity, text) for text in texts if text], most)
 
 
-# An unknown cell.
+# Text of an unknown cell.
 UNKNOWN = '-'
 
 
@@ -78,7 +78,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Figure:
-    """A plot, or a drawing of its own as SVG, for a page."""
+    """A plot, or a finished SVG, for a page."""
 
     drawing: Plot | str
     caption: str = ''
@@ -105,7 +105,7 @@ class Section:
     folded: bool = False
 
 
-# Functions make the parts that only a page has, so that a terminal does not pay for them.
+# A function returns parts that only a page shows; the terminal does not compute them.
 Part = Union[Text, Code, Facts, Notes, Table, Figure, Pair, Section,
              Callable[[], 'Sequence[Part]']]
 

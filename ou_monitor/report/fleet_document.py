@@ -1,4 +1,4 @@
-"""The report of `fleet`: what stands out, the fleet, every recording; and its JSON."""
+"""The report of `fleet` (what stands out, the vehicles, every recording), and its JSON."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from ou_monitor.text import chance, counted, number, p_words, some, volts
 _TITLES = {'sigma': 'Noise intensity \u03c3', 'alpha': 'Relaxation rate \u03b1',
            'sag': 'Sag at full throttle'}
 _UNITS = {'sigma': 'V/\u221as', 'alpha': '1/s', 'sag': 'V'}
-# Maximum drifts drawn; number of most likely ones drawn if none is significant.
+# Maximum significant drifts drawn; if there are none, this number of the most likely ones.
 _DRAWN, _LIKELY = 8, 2
-# Trends in the table: at least, with those of p below 5 %, and at most.
+# Minimum trends in the table (further ones need p below `DRIFT_RATE`), and maximum.
 _LEAST, _MOST = 6, 30
-# Recordings in the table of the lowest voltages; rows and sentences on a terminal.
+# Maximum recordings in the table of the lowest voltages; rows and sentences on a terminal.
 _WORST, _SHOWN = 12, 10
 # Maximum sentences and recordings listed; the table has all of them.
 _SENTENCES, _RECORDINGS = 40, 500
-# Maximum ratio of mean voltages of one pack: full to empty under load, 4.35 V to 2.8 V.
+# Maximum ratio of mean voltages of one pack: 4.35 V a cell full to 2.8 V empty under load.
 _ONE_PACK = 1.6
 # Heads of the table of vehicles.
 VEHICLE_HEADS = ('vehicle', 'flights', 'lowest, V', 'dips', 'sag, V', '/flight',
@@ -69,9 +69,9 @@ def fleet_document(fleet: Fleet, command: str = '') -> Document:
         Section('Duplicates, analysed once', [Notes.of(copies, most=_SHOWN)] if copies else []),
         Section('Vehicles', [
             vehicles,
-            Text('The lowest of all flights, their dips together; the rest are medians of '
-                 'measured values, and changes a flight of compared values. A star marks what '
-                 'stands out.', legend=True), lambda: _strips(fleet)]
+            Text('Lowest voltage and total dips of all flights. sag, sigma and alpha: medians as '
+                 'measured; "/flight": drift of the values moved to the common throttle. A star '
+                 'marks what stands out.', legend=True), lambda: _strips(fleet)]
                 if vehicles.rows else [Text('No vehicle was identified.', legend=True)]),
         lambda: [Section('Drift over the flights', _drift(fleet)),
                  Section('Distributions', _distributions(fleet), folded=True),
@@ -86,11 +86,6 @@ def answer(fleet: Fleet) -> list[str]:
     """Return the answer: the lowest voltage, what stands out, and what was analysed."""
     return [part for part in (*sentences(fleet), _anomalies(fleet), _analysed(fleet))
             if part]
-
-
-def headline(fleet: Fleet) -> str:
-    """Return the answer as a paragraph."""
-    return ' '.join(answer(fleet))
 
 
 def _analysed(fleet: Fleet) -> str:
@@ -109,28 +104,29 @@ def _analysed(fleet: Fleet) -> str:
 
 
 def _anomalies(fleet: Fleet) -> str:
-    judged, text = fleet.judgement, ''
+    judged, parts = fleet.judgement, []
     drifting = sorted({t.vehicle for t in judged.drifting})
     odd = {judged.values[name].paths[k] for name, k in judged.odd_recordings()}
     vehicles = sorted({judged.vehicles[name].names[k] for name, k in judged.odd_vehicles()})
     if drifting:
-        text += f' Drift over the flights: {some(drifting, 5)}.'
+        parts.append(f'Drift over the flights: {some(drifting, 5)}.')
     if vehicles:
-        text += f' Unlike the rest of the fleet: {some(vehicles, 5)}.'
+        parts.append(f'Unlike the rest of the fleet: {some(vehicles, 5)}.')
     if odd:
-        text += f' Unlike the other flights of their vehicle: {counted(len(odd), "recording")}.'
-    if not (drifting or vehicles or odd):
+        parts.append(
+            f'Unlike the other flights of their vehicle: {counted(len(odd), "recording")}.')
+    if not parts:
         tested = judged.trends or any(np.isfinite(o.bound) for o in (
             *judged.recordings.values(), *[v.outliers for v in judged.vehicles.values()]))
-        text += (' Nothing stands out.' if tested else
-                 ' There are too few recordings per vehicle to tell what stands out.')
-    return text.strip()
+        parts.append('Nothing stands out.' if tested else
+                     'There are too few recordings per vehicle to tell what stands out.')
+    return ' '.join(parts)
 
 
 def change(name: str, value: float) -> str:
-    """Return a change of a quantity with its sign: in % on the log scale, else in mV."""
+    """Return a change of a quantity with its sign: in % of sigma and alpha, in V of a sag."""
     if not math.isfinite(value):
-        return '-'
+        return UNKNOWN
     if name not in LOGARITHMIC:
         return f'{1e3 * value:+.3g} mV' if abs(value) < 1.0 else f'{value:+.3g} V'
     percent = 100.0 * math.expm1(value)
@@ -157,21 +153,23 @@ def finding_words(fleet: Fleet) -> list[str]:
         one = judged.vehicles[name]
         centre = float(one.outliers.centre[k])
         values = judged.values[name]
-        found.append(f'{one.names[k]}: {name} is {shown(values, one.value[k])}{_at(values)}, '
+        found.append(f'{one.names[k]}: {name} is {shown(values, one.value[k])}'
+                     f'{_at(values, " at ")}, '
                      f'{change(name, float(one.value[k]) - centre)} from the median of the '
                      f'vehicles; p over the fleet {chance(float(one.outliers.chance[k]))}.')
     for name, k in judged.odd_recordings():
         values, out = judged.values[name], judged.recordings[name]
         off = change(name, float(values.value[k] - out.centre[k]))
         found.append(f'{values.vehicles[k]}, {values.paths[k]}: {name} is '
-                     f'{shown(values, values.value[k])}{_at(values)} ({_raw_value(values, k)}), '
+                     f'{shown(values, values.value[k])}{_at(values, " at ")} '
+                     f'({_raw_value(values, k)}), '
                      f'{off} from the other flights; p over the fleet '
                      f'{chance(float(out.chance[k]))}.')
     return found
 
 
 def failure_words(fleet: Fleet) -> list[str]:
-    """Return each recording without numbers and the reason, its path named once."""
+    """Return each failed recording with the reason, its path named once."""
     found = []
     for row in fleet.failed:
         error = str(row['error']).removeprefix(row['path'])
@@ -186,12 +184,12 @@ def shown(values: Values, value: float | FloatArray) -> str:
     return f'{number(float(values.shown(value)))} {QUANTITIES[values.name]}'
 
 
-def _at(values: Values) -> str:
-    """Return the throttle at which recordings are compared."""
+def _at(values: Values, before: str) -> str:
+    """Return the throttle at which recordings are compared, after `before`; empty without one."""
     if values.name == 'sag':
-        return ' at full throttle'
+        return f'{before}full throttle'
     at = values.curve.reference
-    return f' at {100.0 * at:.0f} % throttle' if math.isfinite(at) else ''
+    return f'{before}{100.0 * at:.0f} % throttle' if math.isfinite(at) else ''
 
 
 def _raw_value(values: Values, k: int) -> str:
@@ -201,7 +199,7 @@ def _raw_value(values: Values, k: int) -> str:
 
 
 def comparison_words(fleet: Fleet) -> list[str]:
-    """Return sentences on how recordings were compared, and on limits of small fleets."""
+    """Return how recordings were compared, and what a small fleet cannot show."""
     judged = fleet.judgement
     notes = []
     for vehicle in fleet.vehicles:
@@ -209,29 +207,30 @@ def comparison_words(fleet: Fleet) -> list[str]:
                  and row['mean'] is not None and row['mean'] > 0.0]
         if means and max(means) > _ONE_PACK * min(means):
             notes.append(f'{vehicle}: voltages of {number(min(means))} to {number(max(means))} V '
-                         'come from several supplies but are compared as one: --vehicle-from '
-                         'REGEX, or a folder each, separates them.')
+                         'come from different supplies but are compared as one vehicle; separate '
+                         'them by --vehicle-from REGEX or by a folder for each.')
     references = [judged.values[name].curve.reference for name in LOGARITHMIC]
     if all(map(math.isfinite, references)):
         notes.append('sigma and alpha are shown as measured. For comparison they are moved to '
                      + ' and '.join(dict.fromkeys(f'{100.0 * u:.0f} %' for u in references))
-                     + ' throttle along a curve common to all, whose error is included; '
-                     'sag is compared at full throttle.')
+                     + ' throttle along a curve common to all recordings; its error is '
+                     'included. sag is compared at full throttle.')
     tests = len(judged.trends)
     if tests:
         need = fewest(tests, DRIFT_RATE)
         few = sorted({t.vehicle for t in judged.trends if t.flights < need})
-        notes.append(f'Drift: {tests} tests, held to {100 * DRIFT_RATE:g} % for any false one '
-                     f'(Holm); with this number of tests a vehicle needs at least {need} flights '
-                     'to show one' + (f', which {counted(len(few), "vehicle")} of those tested '
-                                      'do not have.' if few else '.'))
+        notes.append(f'Drift: {counted(tests, "test")}, with {100 * DRIFT_RATE:g} % probability '
+                     f'of any false alarm (Holm). With this number of tests a vehicle needs at '
+                     f'least {need} flights to show a drift'
+                     + (f'; {counted(len(few), "tested vehicle")} '
+                        f'{"has" if len(few) == 1 else "have"} fewer.' if few else '.'))
     else:
         notes.append('No vehicle has the 5 flights that a test for drift needs.')
     if any(np.isfinite(o.bound) for o in judged.recordings.values()):
         notes.append(
-            f'Outliers: a fleet with nothing wrong shows one with probability '
-            f'{100 * OUTLIER_RATE:g} % (all quantities, recordings and vehicles together, where '
-            'the scatter between good recordings is normal).')
+            f'Outliers: a fleet without faults shows one with {100 * OUTLIER_RATE:g} % '
+            'probability (over all quantities, recordings and vehicles, if the scatter between '
+            'good recordings is normal).')
     else:
         notes.append(f'No vehicle has the {LEAST} flights that outliers among them need.')
     if len(fleet.vehicles) < LEAST_VEHICLES:
@@ -240,7 +239,7 @@ def comparison_words(fleet: Fleet) -> list[str]:
 
 
 def vehicle_table(fleet: Fleet) -> Table:
-    """Return the rows of the table of vehicles."""
+    """Return the table of vehicles."""
     judged = fleet.judgement
     found, seen = [], once(fleet)
     shown_as = short_names(fleet.vehicles)
@@ -305,7 +304,8 @@ def as_data(fleet: Fleet) -> dict[str, Any]:
              'p_family': float(judged.recordings[name].chance[k])}
             for name, k in judged.odd_recordings()]
     return {
-        'headline': headline(fleet), 'recordings': fleet.recordings, 'analysed': fleet.analysed,
+        'headline': ' '.join(answer(fleet)), 'recordings': fleet.recordings,
+        'analysed': fleet.analysed,
         'failed': len(fleet.failed), 'duplicates': len(fleet.duplicates),
         'brownout_voltage': fleet.limit,
         'vehicles': [{
@@ -353,7 +353,7 @@ def dips_of(rows: Sequence[Row]) -> DipCount | None:
 
 
 def worst(fleet: Fleet) -> list[Row]:
-    """Return the recordings: those with most dips first, then by their lowest voltage."""
+    """Return the recordings by number of dips, most first, then by lowest voltage."""
     return sorted(once(fleet), key=lambda row: (-(row['dips'] or 0), row['lowest'], row['path']))
 
 
@@ -418,13 +418,12 @@ def facts(fleet: Fleet) -> list[tuple[str, str]]:
 
 
 def _name(row: Row) -> str:
-    """Return the name of a recording, with its vehicle."""
     vehicle = '' if row['vehicle'] is None else f' ({row["vehicle"]})'
     return f'{row["recording"]}{vehicle}'
 
 
 def short_names(names: Sequence[str]) -> dict[str, str]:
-    """Return names for tables: long ones without their middle."""
+    """Return names for tables; long ones lose their middle if they stay unique."""
     short = {name: name if len(name) <= _NAME else f'{name[:13]}\u2026{name[13 - _NAME + 1:]}'
              for name in names}
     uses = Counter(short.values())
@@ -471,7 +470,7 @@ def _dots(plot: Plot, names: Sequence[str], vehicles: Sequence[str], flights: Fl
     for place in np.unique(x[np.isfinite(x)]):
         mine = np.flatnonzero(x == place)
         if mine.size > 1:
-            # Side by side, so that a drift shows as a slope.
+            # Side by side, so that a drift appears as a slope.
             x[mine[np.argsort(flights[mine], kind='stable')]] += np.linspace(
                 -0.32, 0.32, mine.size)
     for chosen, text, colour in ((~marked, words[0], 0), (marked, words[1], 1)):
@@ -503,7 +502,7 @@ def _drift(fleet: Fleet) -> list[Part]:
     if not drawn:
         return [Text('No vehicle has enough flights for a test.')]
     parts: list[Part] = [] if judged.drifting else [
-        Text('No drift is significant at the rate of the fleet; the most likely ones are drawn.')]
+        Text('No drift is significant over the fleet; the most likely ones are drawn.')]
     parts += Pair.two_by_two([
         Figure(_trend_plot(judged.values[t.quantity], t), _caption(t, fleet)) for t in drawn])
     listed = [t for k, t in enumerate(judged.trends) if k < _LEAST or t.p_value < DRIFT_RATE]
@@ -514,20 +513,14 @@ def _drift(fleet: Fleet) -> list[Part]:
     more = len(judged.trends) - len(rows)
     return [*parts, Table(['vehicle', 'quantity', 'flights', 'change a flight\n[95 %]', 'p',
                            'p over the fleet', 'stands'], rows, left=[0, 1]), Text(
-        'Theil-Sen slopes and intervals. p: Mann-Kendall; the next one after Holm.'
+        'Theil-Sen slopes and intervals. p: Mann-Kendall test; over the fleet: Holm-adjusted.'
         + (f' {more} less likely trends are not shown.' if more > 0 else ''), legend=True)]
 
 
-def _reference(name: str, fleet: Fleet) -> str:
-    """Return the throttle at which a quantity is compared."""
-    at = fleet.judgement.values[name].curve.reference
-    return 'full throttle' if name == 'sag' else (
-        f'{100.0 * at:.0f} % throttle' if math.isfinite(at) else 'the throttle of each')
-
-
 def _caption(trend: Trend, fleet: Fleet) -> str:
+    at = _at(fleet.judgement.values[trend.quantity], ' at ') or ' as measured'
     return (f'{change(trend.quantity, trend.slope)} a flight; p over the fleet '
-            f'{chance(trend.p_family)}. At {_reference(trend.quantity, fleet)}, with its error.')
+            f'{chance(trend.p_family)}. Values{at}, with 95 % intervals.')
 
 
 def _trend_plot(values: Values, trend: Trend) -> Plot:
@@ -550,7 +543,7 @@ def _distributions(fleet: Fleet) -> list[Part]:
         if values.value.size >= 5:
             edges, count = values.histogram()
             x, height = outline(edges, count)
-            # On a log axis the outline has its corners where the bins are even in the logarithm.
+            # On a log axis the bins are even in the logarithm.
             plot = Plot(f'{_TITLES[name]}, all recordings', _UNITS[name], 'recordings', width=450,
                         height=240, log_x=name in LOGARITHMIC)
             plot.limits(y=(0.0, 1.08 * float(count.max())))
@@ -566,7 +559,7 @@ def _distributions(fleet: Fleet) -> list[Part]:
     if over:
         parts.append(Text(
             'Histograms are at the reference throttle. Over throttle: every level of every '
-            'recording, and the common curve that is removed, through the median of all.',
+            'recording, and the common curve used to compare them, through their median.',
             legend=True))
     return parts
 
@@ -606,20 +599,20 @@ def _recordings(fleet: Fleet) -> list[Part]:
         flags.setdefault(row['path'], set()).update(row['flags'] or ())
     rows, names = [], short_names(fleet.vehicles)
     for path, first in list(firsts.items())[:_RECORDINGS]:
-        cells = [names.get(first['vehicle'], '-'), str(first['flight'] or '-'),
-                 f"{first['recording']}\n{_date(first)}",
-                 number(first['duration_s'] or math.nan)]
-        for name, values in judged.values.items():
-            cells.append(_cell(values, judged.recordings[name].score, places[name].get(path)))
-        cells[4:4] = ['-' if first['lowest'] is None else number(first['lowest'], 4),
-                      '-' if first['dips'] is None else f"{first['dips']:g}"]
-        rows.append([*cells, ', '.join(sorted(flags[path])) or '-'])
+        measured = [_cell(values, judged.recordings[name].score, places[name].get(path))
+                    for name, values in judged.values.items()]
+        rows.append([
+            names.get(first['vehicle'], UNKNOWN), str(first['flight'] or UNKNOWN),
+            f"{first['recording']}\n{_date(first)}", number(first['duration_s'] or NAN),
+            UNKNOWN if first['lowest'] is None else number(first['lowest'], 4),
+            UNKNOWN if first['dips'] is None else f"{first['dips']:g}", *measured,
+            ', '.join(sorted(flags[path])) or UNKNOWN])
     heads = ['vehicle', 'flight', 'recording', 's', 'lowest, V', 'dips', *[
         f'{name}, {_UNITS[name]}' for name in QUANTITIES], 'flags']
     more = len(firsts) - _RECORDINGS
     return [Table(heads, rows, left=[0, 2, 9]), Text(
-        'As measured. Small: at which throttle, and, if the vehicle has enough flights, the '
-        'distance from its other flights, in standard deviations.' + (
+        'As measured. Small print: the throttle and, if the vehicle has enough flights, the '
+        'distance from its other flights in standard deviations.' + (
             f' {more} more recordings are in the Parquet table.' if more > 0 else ''),
         legend=True)]
 
@@ -630,7 +623,7 @@ def _date(row: Mapping[str, Any]) -> str:
 
 def _cell(values: Values, score: FloatArray, k: int | None) -> str:
     if k is None:
-        return '-'
+        return UNKNOWN
     at = values.throttle[k]
     small = [f'at {100.0 * at:.0f} %'] if math.isfinite(at) else []
     small += [f'{score[k]:+.1f} sd'] if math.isfinite(score[k]) else []

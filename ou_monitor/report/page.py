@@ -1,15 +1,15 @@
 """
-The HTML page around the plots: skeleton, tables, lists, and the data of the plots; all is escaped.
+A document as an HTML page: skeleton, tables, lists and the data of the plots; all text is escaped.
 
 A page with plots has one script, which makes them interactive from the data embedded beside each.
-Its content security policy names that script by its hash and forbids all other scripts, and every
-request to a network.
+The content security policy allows that script by its hash, and forbids all other scripts and all
+network requests.
 
 The data of a plot: one JSON object with one block of bytes, compressed by zlib, in base64.
-Rounding: columns of up to 4096 values are exact (float64).  Longer ones: x to 1/2000 of the median
-distance of the points embedded, y to 1 part in 16 million (float32) of the value or, if less,
-of the range.  Beyond 150 000 points in a plot a curve is an envelope: the lowest and the
-highest of each group of samples, so that every peak stays; the page says so.
+Rounding: columns of up to 4096 values are exact (float64).  In longer ones, x is rounded to
+1/2000 of the median distance of its points, and y to 1 part in 16 million (float32) of its value
+or of its range, whichever is less.  If a plot has more than 150 000 points, its curves are reduced
+to the lowest and highest of each group of samples, which keeps every peak; the page says so.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _UNIT = re.compile(r'(10[\u207b\u00b2\u00b3\u00b9\u2070-\u2079]+ )?'
 
 
 def embed(plot: Plot, most: int = MOST) -> str:
-    """Return the data of a plot as a script element that is never run."""
+    """Return the data of a plot as a script element that browsers do not run."""
     block = bytearray()
     drawn = [_changes(c) if c.kind == 'steps' else _in_order(c) for c in plot.curves]
     share = most // max(len(drawn), 1)
@@ -105,7 +105,7 @@ def _changes(curve: Curve) -> Curve:
 
 
 def _in_order(curve: Curve) -> Curve:
-    """Return separate points in the order of x, for searching; lines unchanged."""
+    """Return markers and bars in the order of x, for searching; lines unchanged."""
     if curve.kind not in ('markers', 'bars'):
         return curve
     order = np.argsort(curve.x, kind='stable')
@@ -128,7 +128,7 @@ def _known(value: float) -> float | None:
 
 
 def _abscissa(x: FloatArray, log: bool, block: bytearray) -> list[float | str]:
-    """Append x; a long increasing one as second differences on a fine grid."""
+    """Append x; a long non-decreasing column as second differences on a fine grid."""
     if x.size > _EXACT and not log and np.isfinite(x).all():
         step = np.diff(x)
         by = float(np.median(step)) / _GRID
@@ -140,7 +140,7 @@ def _abscissa(x: FloatArray, log: bool, block: bytearray) -> list[float | str]:
 
 
 def _ordinate(y: FloatArray, log: bool, block: bytearray) -> list[float | str]:
-    """Append y; a long one as float32 from its middle, or from zero if nearer."""
+    """Append y; a long column as float32, less its median if that is larger than the range."""
     finite = y[np.isfinite(y)]
     if y.size > _EXACT and finite.size:
         middle, size = float(np.median(finite)), np.abs(finite[finite != 0.0])
@@ -160,8 +160,7 @@ def _append(kind: str, values: Any, block: bytearray, low: float = 0.0,
 
 # An unknown cell on a page.
 _DASH = '\u2013'
-# Hues of Okabe & Ito (2008), distinct with every common colour blindness; lighter for the dark
-# form.
+# Hues of Okabe & Ito (2008), distinct with every common colour blindness; lighter in dark mode.
 _LIGHT = ('#0072b2', '#d55e00', '#009e73', '#cc79a7', '#b07d00', '#3a9bd9', '#6b4fa0', '#5f6b6d')
 _DARK = ('#5cb3f0', '#ff8a45', '#35cfa0', '#ea9cc9', '#e6b84a', '#9bd2f7', '#b59cf0', '#a9b4b6')
 
@@ -244,33 +243,34 @@ def _file(name: str) -> str:
 
 @cache
 def _script() -> tuple[str, str]:
-    """Return the text of the script, and the source that names it in the policy."""
+    """Return the script, and its hash as a source of the content security policy."""
     code = ''.join(_file(f'plots_{part}.js') for part in ('draw', 'input', 'live'))
-    # A section of character data to an XML parser, comments to a script.
+    # XML parsers read these marks as character data, scripts as comments.
     text = f"//<![CDATA[\n'use strict';\n{{\n{code}}}\n//]]>"
     digest = base64.b64encode(hashlib.sha256(text.encode('utf-8')).digest()).decode('ascii')
     return text, f"'sha256-{digest}'"
 
 
-# A minus, except for a hyphen within a word or a range of dates; signs that a terminal may lack.
+# A hyphen that is a minus sign: not within a word or a range of dates.
 _MINUS = re.compile(r'(?<![\w.)^-])-(?=[\d.])')
+# Signs that a terminal may lack.
 _SIGNS = {'+-': '\u00b1', ' -> ': ' \u2192 '}
 _SOFT, _LEFT = ' class="soft"', ' class="left"'
-# In the heads of tables: symbols and units.
+# Symbols and units in the heads of tables.
 _SYMBOLS = {'alpha': '\u03b1', 'sigma': '\u03c3', 'tau': '\u03c4', 'Var_inf': 'Var\u221e',
             'V/sqrt(s)': 'V/\u221as', 'V^2': 'V\u00b2', 'uF': '\u00b5F', 'Ohm': '\u03a9'}
 _SYMBOL = re.compile(r'(?<!\w)(' + '|'.join(map(re.escape, _SYMBOLS)) + r')(?!\w)')
 
 
 def _set(text: str) -> str:
-    """Return an escaped text with the signs that a terminal may lack."""
+    """Return a text, escaped, with typographic signs."""
     for plain, sign in _SIGNS.items():
         text = text.replace(plain, sign)
     return escape(_MINUS.sub('\u2212', text))
 
 
 def _head(text: str) -> str:
-    """Return the head of a column, with symbols, its first word with a capital."""
+    """Return the head of a column, capitalised, with symbols."""
     text = _SYMBOL.sub(lambda found: _SYMBOLS[found[1]], text)
     first = re.split(r'\W', text, maxsplit=1)[0]
     return text[:1].upper() + text[1:] if first.isascii() and len(first) > 1 else text
@@ -286,8 +286,8 @@ def html(document: Document) -> str:
 
 
 def section(document: Document) -> str:
-    """Return a document for inclusion in another page: no script, and no data of plots."""
-    # Nested, the rules apply to this section alone.
+    """Return a document for inclusion in another page, with static plots."""
+    # Nesting limits the rules to this section.
     style = _stylesheet().replace(':root', 'article').replace('body {', 'article {')
     return (f'<div class="ou-monitor"><style>.ou-monitor {{{style}}}</style><article>\n'
             f'<h1>{escape(document.title)}</h1>\n<p{_SOFT}>{escape(document.subject)}</p>\n'

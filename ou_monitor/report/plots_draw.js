@@ -1,11 +1,11 @@
-// Data and drawing of the interactive plots. The figures are those of svg.py: same ticks, same
-// styles, colours from the variables of the page.
+// Data and drawing of the interactive plots, with the ticks and styles of svg.py and the colours
+// of the page.
 
 const LEFT = 62, RIGHT = 14, TOP = 8, BOTTOM = 42;
 const FONT = '12px system-ui, -apple-system, "Segoe UI", sans-serif';
 const DASH = [6, 4];
 
-// The columns of a figure: a block of bytes, compressed, in base64; see embedding.py.
+// Decode the columns of a figure: a compressed block of bytes in base64; see page.embed.
 async function unpack(figure) {
   const text = atob(figure.block), bytes = new Uint8Array(text.length);
   for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
@@ -39,7 +39,7 @@ function column(buffer, [kind, place, count, low, by]) {
   return out;
 }
 
-// One axis: data to pixels and back, over what is in view.
+// One axis: data to pixels and back, over the part in view.
 class Scale {
   constructor(axis) {
     this.axis = axis;
@@ -115,7 +115,7 @@ function numberText(value, step) {
   return text.replace(/-/g, '\u2212');
 }
 
-// What a cursor reads: fine enough for the view, no finer than a pixel is worth.
+// A value under the cursor, with the digits that a pixel resolves.
 function reading(value, scale) {
   if (scale.log) return numberText(value, Math.abs(value) / 1000);
   return numberText(value, (scale.high - scale.low) / 2000);
@@ -131,15 +131,15 @@ function lowerBound(x, value) {
   return a;
 }
 
-// What of a curve is in view, with a point more on either side.
+// The part of a curve in view, with one more point on either side.
 function inView(curve, x) {
   if (!curve.sorted) return [0, curve.x.length];
   return [Math.max(lowerBound(curve.x, x.low) - 1, 0),
     Math.min(lowerBound(curve.x, x.high) + 2, curve.x.length)];
 }
 
-// Pixels as [x, y, high] runs without gaps. Where samples lie closer than pixels, each column of
-// pixels has its first, lowest, highest and last: no peak is lost at any zoom.
+// Runs of [x, y, high] in pixels, without gaps. If samples lie closer than pixels, each column
+// of pixels keeps its first, lowest, highest and last sample: every peak stays at any zoom.
 function runs(curve, x, y) {
   const [from, to] = inView(curve, x);
   const crowded = curve.sorted && to - from > 3 * Math.abs(x.stop - x.start);
@@ -198,7 +198,6 @@ function drawCurve(pen, curve, x, y, colour) {
   if (curve.style.includes('dash')) pen.setLineDash(DASH);
   pen.beginPath();
   if (curve.kind === 'markers' || curve.kind === 'bars') {
-    const full = pen.globalAlpha;
     for (const run of runs({ ...curve, sorted: false }, x, y)) {
       for (const [px, a, b] of run) {
         if (curve.kind === 'markers') {
@@ -214,7 +213,6 @@ function drawCurve(pen, curve, x, y, colour) {
         }
       }
     }
-    pen.globalAlpha = full;
     if (curve.kind === 'markers') pen.fill(); else pen.stroke();
   } else if (curve.kind === 'band') {
     pen.globalAlpha = 0.22;
@@ -236,7 +234,7 @@ function drawCurve(pen, curve, x, y, colour) {
   pen.restore();
 }
 
-// Names cut to the pixels that each has; none where that is too little, as in svg.py.
+// Names cut to `room` pixels each; empty if that is too little, as in svg.py.
 function placeNames(names, room) {
   const most = Math.floor(room / 7) - 1, longest = Math.max(0, ...names.map((n) => n.length));
   if (most < Math.min(6, longest)) return [];

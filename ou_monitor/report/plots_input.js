@@ -1,4 +1,4 @@
-// What mouse, fingers and keys do to a plot.
+// Mouse, touch and keyboard input of a plot.
 
 function listen(plot) {
   const { view } = plot;
@@ -41,7 +41,7 @@ function listen(plot) {
   view.addEventListener('pointerup', end);
   view.addEventListener('pointercancel', end);
   view.addEventListener('pointerleave', (event) => {
-    // What a finger pointed at stays readable when it is lifted.
+    // Values read by touch stay when the finger is lifted.
     if (!plot.drag && event.pointerType !== 'touch') plot.point(null);
   });
   view.addEventListener('dblclick', () => plot.reset());
@@ -60,7 +60,7 @@ function listen(plot) {
   view.addEventListener('keydown', (event) => press(plot, event));
 }
 
-// Two fingers: what is under each stays under it.
+// Zoom with two fingers: the points under both stay there.
 function pinch(plot, id, px) {
   const [other] = [...plot.touches].filter(([key]) => key !== id).map(([, p]) => p);
   const before = plot.touches.get(id), span = before - other;

@@ -1,17 +1,17 @@
-// What a reader does with a plot: point, zoom, pan, hide. Every figure keeps its static drawing,
-// which is what paper shows, and what stays when anything here fails.
+// Interaction with a plot: point, zoom, pan, hide. Every figure keeps its static drawing for print
+// and as a fallback.
 
-const NEAR = 12; // pixels within which a cursor reads a sample and not the line between two
+const NEAR = 12; // maximum distance, pixels, at which the cursor snaps to a sample
 
 function element(kind, name, parent, text) {
   const made = document.createElement(kind);
   made.className = name;
-  if (text !== undefined) made.textContent = text; // Never as HTML: names are of anyone's making.
+  if (text !== undefined) made.textContent = text; // Never as HTML: names come from recordings.
   parent.append(made);
   return made;
 }
 
-// The colours of the page, as they are in its present theme.
+// The colours of the page in its current theme.
 function inks() {
   const style = getComputedStyle(document.documentElement);
   const read = (name) => style.getPropertyValue(`--${name}`).trim();
@@ -26,7 +26,7 @@ class LivePlot {
     this.y = new Scale(figure.y);
     this.group = [this];
     this.cursor = null; // of the x axis, data units
-    this.height = null; // of the pointer, pixels
+    this.height = null; // height of the pointer, pixels
     this.drag = null;
     this.touches = new Map();
     this.root = element('div', 'live', host);
@@ -62,7 +62,7 @@ class LivePlot {
     host.classList.add('is-live');
   }
 
-  // A button for each name; a curve without one belongs to the named curve of its colour.
+  // A button for each name; a curve without a name belongs to the named curve of its colour.
   legend(head) {
     const { curves } = this.figure;
     for (const curve of curves) {
@@ -114,7 +114,7 @@ class LivePlot {
     return [this.x, this.y].some((s) => s.low !== s.axis.low || s.high !== s.axis.high);
   }
 
-  // Cursor, dots at what it reads, and the stretch being dragged.
+  // Draw the cursor, dots at its values, and the rectangle being dragged.
   paintOver(spoken = false) {
     if (!this.box) return;
     const pen = this.size(this.over), ink = inks(), { top, bottom, right } = this.box;
@@ -169,14 +169,14 @@ class LivePlot {
       element('span', '', row, `${name ? `${name}: ` : ''}${text} ${y.unit}`.trim() + many);
     }
     if (rows.length > 10) element('div', 'live-where', this.tip, `and ${rows.length - 10} more`);
-    // Beside the line, on the side that has room.
+    // Beside the cursor, on the side with room.
     const wide = this.tip.offsetWidth, right = line + 12;
     const left = right + wide <= this.box.width ? right : Math.max(line - 12 - wide, 0);
     this.tip.style.left = `${left}px`;
   }
 
-  // What a curve shows at a pixel: all that lies in its column, the sample beside it, or the line
-  // between samples; nothing beyond its ends and in its gaps.
+  // The values of a curve at a pixel: all samples in that column, the nearest sample, or the line
+  // between two; null beyond its ends and in gaps.
   look(curve, at) {
     if (!curve.sorted || !curve.x.length) return null;
     const n = curve.x.length, value = this.x.value(at);
@@ -200,7 +200,7 @@ class LivePlot {
       }
       if (!count) return null;
       const flat = low === high;
-      // How many samples an envelope stands for is said below the plot.
+      // The note below the plot tells how many samples a point of an envelope stands for.
       const counted = !flat && curve.kind !== 'steps' && curve.every === 1;
       return { px: at, x: value, values: flat ? [low] : [low, high], count: counted ? count : 1 };
     }
@@ -223,7 +223,7 @@ class LivePlot {
     return { px: at, x: value, values: between, count: 1 };
   }
 
-  // Of separate points the one nearest to the pointer, in height as well where that is known.
+  // Index of the marker or bar nearest to the pointer, in height too if that is known.
   nearest(curve, at, known) {
     let best = -1, least = Infinity;
     const end = lowerBound(curve.x, this.x.value(at + NEAR));
@@ -237,7 +237,7 @@ class LivePlot {
     return best;
   }
 
-  // Show the cursor at a pixel in all linked plots; `height` is that of the pointer, if any.
+  // Show the cursor at a pixel in all linked plots; `height` is the height of the pointer, if any.
   point(at, height = null, spoken = false) {
     const inside = at !== null && at >= LEFT - 4 && at <= this.box.right + 4;
     const value = inside ? this.x.value(Math.min(Math.max(at, LEFT), this.box.right)) : null;
@@ -248,7 +248,7 @@ class LivePlot {
     }
   }
 
-  // Show a part of the x axis in all linked plots, no further than the whole of it.
+  // Show a part of the x axis in all linked plots, at most the whole axis.
   showX(a, b) {
     const whole = new Scale(this.figure.x), full = whole.b - whole.a;
     const width = Math.min(Math.max(b - a, 1e-9 * full), full);
@@ -276,7 +276,7 @@ class LivePlot {
     this.showX(-Infinity, Infinity);
   }
 
-  // The dragged stretch: of one axis while the pointer hardly moves along the other.
+  // The dragged rectangle; along one axis only while the pointer hardly moves along the other.
   selected() {
     const { x0, y0, x1, y1 } = this.drag, { top, bottom, right } = this.box;
     const hold = (v, low, high) => Math.min(Math.max(v, low), high);
@@ -290,15 +290,17 @@ class LivePlot {
   release() {
     const { left, width, up, height, wide, tall, moved } = this.selected();
     this.drag = null;
-    if (moved < 8) return this.paintOver();
+    if (moved < 8) {
+      this.paintOver();
+      return;
+    }
     if (tall) this.y.set(this.y.value(up + height), this.y.value(up));
     if (wide) this.showX(this.x.even(this.x.value(left)), this.x.even(this.x.value(left + width)));
     else this.paint();
-    return undefined;
   }
 }
 
-// Plots with one x axis (label, kind and ends within a hundredth) move together.
+// Link plots with the same x axis (label, kind, and ends within 1 %): they move together.
 function link(plots) {
   const groups = [];
   for (const plot of plots) {
@@ -311,7 +313,7 @@ function link(plots) {
   for (const group of groups) for (const plot of group) plot.group = group;
 }
 
-// Plots side by side have axes of one size, whatever their legends need.
+// Give plots side by side axes of equal size, whatever space their legends need.
 function level(pair) {
   const heads = [...pair.querySelectorAll('.live-head')];
   for (const head of heads) head.style.minHeight = '';

@@ -29,12 +29,12 @@ def reproduction_document(result: Reproduction, command: str = '') -> Document:
             for point in result.points]),
         Section('Every number', [Text(
             'Agrees: the recomputed number rounds to the printed one, or its interval (3 standard '
-            'errors, or the range given) reaches it. Rounding: it agrees once the underlying '
-            'readings move within their own rounding. Claims are written as bounds: "> 0" claims '
-            'that something rises.', legend=True)]),
+            'errors, or the range given) includes it. Rounding: it agrees if the underlying '
+            'readings are varied within their own rounding. Claims are written as bounds: "> 0" '
+            'means that something rises.', legend=True)]),
         *[Section(f'{where}, {tally(rows)}', [_table(rows), _explanations(rows)], folded=True)
           for where, rows in result.parts()],
-        Text(f'Random numbers from seed {result.seed}; another seed moves the simulated numbers '
+        Text(f'Random numbers from seed {result.seed}; another seed changes the simulated numbers '
              'within their standard errors.', legend=True)]
     return Document('The paper, recomputed', 'Deterministic and stochastic matrix modeling of '
                     'radiophysical processes in UAV microcontroller systems',
@@ -49,7 +49,7 @@ def _table(rows: Sequence[Row]) -> Table:
 
 
 def _explanations(rows: Sequence[Row]) -> Callable[[], list[Part]]:
-    """Return the meaning of each row and how it was recomputed, for a page."""
+    """Return the meaning of each row and how it was recomputed; on a page only."""
     return lambda: [Notes.of(f'{row.quantity}: {row.sentence} How: {row.how}.' for row in rows)]
 
 
@@ -67,9 +67,9 @@ def _screens(result: Reproduction) -> list[Part]:
             plot, f'Vpp {1e3 * float(np.ptp(screen.u)):.4g} mV here, '
             f'{state.vpp.text} mV printed.'))
     return [Pair(drawn), Text(
-        'As Figs. 1 to 4: an OU with the printed alpha and Vrms (motors off: half a step), 1 MHz, '
-        'in steps of the oscilloscope. Where the printed Vpp is much wider than the trace, '
-        'something faster rides on the rail.', legend=True)]
+        'As Figs. 1 to 4: an OU with the printed alpha and Vrms (motors off: half a step), at 1 '
+        'MHz, in steps of the oscilloscope. Where the printed Vpp is much wider than the trace, '
+        'the rail also carries something faster.', legend=True)]
 
 
 def _transient() -> list[Part]:
@@ -120,9 +120,9 @@ def _spectrum(result: Reproduction) -> list[Part]:
     plot.mark(low, '').mark(high, 'ESC 24..48 kHz')
     return [Figure(plot, (
         f'The ESC lines that section 4.5 expects would stand at {1e-3 * low:g} to '
-        f'{1e-3 * high:g} kHz, where the OU holds {100 * share_above(low):.2g} % of its variance; '
-        'an OU alone has no peak there. The AC coupling has its corner where the Lorentzian has '
-        'its own.'))]
+        f'{1e-3 * high:g} kHz, where the OU has {100 * share_above(low):.2g} % of its variance; '
+        'an OU alone has no peak there. The corners of the AC coupling and of the Lorentzian '
+        'coincide.'))]
 
 
 def _crest_and_factor(result: Reproduction) -> list[Part]:
@@ -146,6 +146,6 @@ def _crest_and_factor(result: Reproduction) -> list[Part]:
     factor.line(t, 1e6 * s.correct * s.t, '(6) with the 2', 2, 'dash thick')
     left = Figure(crests, 'Vertical: Table 1. Screens of 10, 100 and 500 ms at 1 MHz.')
     right = Figure(factor, (
-        'dU/dt = \u00b11 V/s, 1000 switches a second each way; the system itself lags (6) by the '
-        'memory of the chain.'))
+        'dU/dt = \u00b11 V/s, 1000 switches a second each way; the simulated variance lags behind '
+        '(6) by the memory of the chain.'))
     return [Pair([left, right])]

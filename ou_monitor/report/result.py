@@ -1,7 +1,7 @@
 """
-The result of a command for Python users: record, JSON, table, plot, HTML.
+The result of a command in Python: record, JSON, table, plot, HTML.
 
-Limits: the table and the plots are the command's main ones; `to_dict` has everything.
+Limits: the table and the plots are the main ones of the command; `to_dict` has everything.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ Rows = Sequence[Mapping[str, Any]] | Mapping[str, Any]
 
 class Result:
     """
-    The result of one of the functions `analyze`, `compare`, `coupling`, `design`, `discover`, ..
+    The result of a command such as `analyze`.
 
-    It has the attributes of its record: ``found.causes``.  Printing it shows the output of
-    the command; a notebook shows its page.
+    Attributes of the record are attributes of the result: ``found.causes``.  Printing it shows
+    the terminal output of the command; a notebook shows its page.
 
     Attributes
     ----------
@@ -58,10 +58,10 @@ class Result:
                  data: Callable[[], Mapping[str, Any]], rows: str | Callable[[], Rows],
                  supply: SupplyFacts | Callable[[], SupplyFacts] | None = None) -> None:
         """
-        Keep the record, and functions that make the rest; rows may be a name in the data.
+        Keep the record, and functions that compute the rest when asked.
 
-        A supply that a function returns is not in the JSON.  Functions are module-level:
-        closures cannot be pickled.
+        rows: a function, or the name of a list in the data.  A supply given as a function is left
+        out of the JSON.  Use module-level functions: closures cannot be pickled.
         """
         self.record = record
         self.document = document
@@ -176,7 +176,7 @@ class Result:
 
 
 def _cells(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield the cells of a row: scalars, and the two ends of an interval; no deeper data."""
+    """Yield the cells of a row: scalars, and the ends of intervals; deeper data are left out."""
     for name, value in row.items():
         if isinstance(value, (list, tuple)) and len(value) == 2 and all(
                 isinstance(end, (int, float)) for end in value):
@@ -197,7 +197,7 @@ def _plots(parts: Sequence[Part]) -> Iterator[Plot]:
 
 
 def plain(value: Any) -> Any:
-    """Return a value as strict JSON can hold it."""
+    """Return a value as strict JSON allows it: plain types, None for NaN and infinity."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray):

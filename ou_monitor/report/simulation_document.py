@@ -1,4 +1,4 @@
-"""The report of `simulate`: what was drawn, and from which terms."""
+"""The report of `simulate`: the simulated recording and its terms."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ou_monitor.simulation import Run
 
 def simulation_document(run: Run, output: str | Path | None = None, command: str = '',
                         ) -> Document:
-    """Return the report of a simulation; output: the bag, if one was written."""
+    """Return the report of a simulation; `output` is the bag, if one was written."""
     terms = run.file.model.terms
     said = (f"{run.n} samples of '{run.name}', {run.duration:g} s at {run.rate:g} Hz, "
             f"{', '.join(term.NAME for term in terms)}; seed {run.seed}")

@@ -1,9 +1,9 @@
 """
-Plots as inline SVG, drawn here: no plotting library, no network, shown without a script.
+Plots as inline SVG, without a plotting library.
 
-On a page, `page.figure` puts the data beside the drawing, and the script of the page makes it
-interactive; paper and browsers without scripts show what is drawn here.  Colours are CSS classes
-(``s0`` .. ``s7`` for series), so that `page` can give them a light and a dark form.
+`page.embed` puts the data beside the drawing, and the script of the page makes it interactive;
+print and browsers without scripts show this drawing.  Colours are CSS classes (``s0`` .. ``s7``
+for series), to which `page` gives colours for light and dark mode.
 """
 
 from __future__ import annotations
@@ -28,9 +28,7 @@ _CAP = 7.0
 _SHORTEST = 6
 # Height of a legend in a row of its own, pixels.
 _LEGEND = 18
-
-
-# Maximum magnitude of a value; larger ones are not drawn.
+# Maximum magnitude of a drawn value; larger ones would overflow in the arithmetic of the axis.
 _HUGE = 1e100
 
 
@@ -73,7 +71,7 @@ def linear_ticks(low: float, high: float, count: int = 6) -> list[float]:
 
 
 def log_ticks(low: float, high: float) -> list[float]:
-    """Return powers of ten; with 2 and 5 between them when the axis is short."""
+    """Return powers of ten, and their multiples of 2 and 5 if the axis is short."""
     first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
     decades = math.log10(high / low)
     if decades < 0.7:
@@ -101,10 +99,8 @@ def tick_text(value: float, step: float) -> str:
 
 def span(values: list[FloatArray], log: bool = False, pad: float = 0.05,
          trim: float = 0.0) -> tuple[float, float]:
-    """Return the ends of an axis that holds all finite values, with a margin."""
+    """Return the ends of an axis for all finite values, less a share `trim`, with a margin."""
     joined = np.concatenate([np.ravel(v) for v in values]) if values else np.zeros(0)
-    # Larger values, or smaller ones on a log axis, would overflow in the arithmetic of the axis,
-    # and are not voltages.
     joined = joined[np.abs(joined) < _HUGE]
     if log:
         joined = np.log10(joined[joined > 1.0 / _HUGE])
@@ -112,7 +108,7 @@ def span(values: list[FloatArray], log: bool = False, pad: float = 0.05,
         return (0.1, 10.0) if log else (0.0, 1.0)
     low, high = (float(v) for v in np.quantile(joined, [trim, 1.0 - trim]))
     room = high - low
-    # The range must stay wide beside the rounding of the values themselves.
+    # A range within the rounding of its values is widened.
     if room <= 1e-9 * max(abs(low), abs(high), 1e-12):
         room = 0.5 if log else max(0.1 * abs(low), 1e-6)
         low, high = low - 0.5 * room, high + 0.5 * room
@@ -121,7 +117,7 @@ def span(values: list[FloatArray], log: bool = False, pad: float = 0.05,
 
 
 def extremes(y: FloatArray, every: int) -> npt.NDArray[np.intp]:
-    """Return each group's lowest and highest sample, and where they break off (NaN)."""
+    """Return the indices of the lowest, highest and last NaN sample of each group of `every`."""
     start = np.arange(0, y.size, every)
     group = np.arange(y.size) // every
     kept = []
@@ -131,7 +127,6 @@ def extremes(y: FloatArray, every: int) -> npt.NDArray[np.intp]:
         where = np.flatnonzero(np.isfinite(y) & (value == least[group]))
         kept.append(where[np.unique(group[where], return_index=True)[1]])
     broken = np.flatnonzero(~np.isfinite(y))
-    # The last one of each group.
     kept.append(broken[::-1][np.unique(group[broken][::-1], return_index=True)[1]])
     return np.unique(np.concatenate(kept))
 
@@ -148,11 +143,11 @@ def thin(x: FloatArray, y: FloatArray, columns: int) -> tuple[FloatArray, FloatA
 class Curve:
     """One series."""
 
-    # Points; the lower edge where there is an upper one; shape (n,).
+    # Points, shape (n,); with `high`, y is the lower edge.
     x: FloatArray
     y: FloatArray
     high: FloatArray | None  # Upper edge of a band, upper ends of bars; shape (n,)
-    label: str  # Name in the legend; none when empty
+    label: str  # Name in the legend; empty without an entry
     # CSS classes; the first is ``s0`` .. ``s7``, the colour.
     style: str
     kind: str  # ``line``, ``steps``, ``band``, ``markers`` or ``bars``
@@ -160,11 +155,11 @@ class Curve:
 
 class Plot:
     """
-    One plot with two axes; its title is read by screen readers, its size is in pixels.
+    One plot with two axes; screen readers read its title; its size is in pixels.
 
-    legend_low: a legend that fits neither beside the title nor below it goes to the lower left of
-    the axes instead of the upper right.  legend_row: it has a row of its own below the title, as
-    of plots side by side that should have axes of one size.
+    The legend stands beside the title, else in a row below it, else in the upper right of the
+    axes.  legend_low: in the lower left instead.  legend_row: never beside the title, so that
+    plots side by side have axes of equal size.
     """
 
     def __init__(self, title: str, x_label: str, y_label: str, *, width: int = 860,
@@ -197,7 +192,7 @@ class Plot:
 
     def level(self, x: FloatArray | Sequence[float], y: float, label: str = '', colour: int = 1,
               style: str = 'dash') -> Plot:
-        """Add a straight line at a height, from the first to the last of some places."""
+        """Add a horizontal line from x[0] to x[-1]."""
         return self.line(np.array([x[0], x[-1]]), np.full(2, y), label, colour, style)
 
     def steps(self, x: FloatArray, y: FloatArray, label: str = '', colour: int = 0) -> Plot:
@@ -210,12 +205,12 @@ class Plot:
         return self._add('band', x, low, high, label, colour)
 
     def markers(self, x: FloatArray, y: FloatArray, label: str = '', colour: int = 0) -> Plot:
-        """Add a dot at each point; none where it is NaN."""
+        """Add a dot at each finite point."""
         return self._add('markers', x, y, None, label, colour)
 
     def bars(self, x: FloatArray, low: FloatArray, high: FloatArray, label: str = '',
              colour: int = 0) -> Plot:
-        """Add a bar from `low` to `high` at each point, with caps; none where one is NaN."""
+        """Add a bar with caps from `low` to `high` at each finite point."""
         return self._add('bars', x, low, high, label, colour)
 
     def shade(self, start: float, stop: float, colour: int = 0, label: str = '') -> Plot:
@@ -235,7 +230,7 @@ class Plot:
 
     def limits(self, x: tuple[float, float] | None = None,
                y: tuple[float, float] | None = None) -> Plot:
-        """Set the ends of an axis; what is not set follows the data."""
+        """Set the ends of an axis; otherwise they follow the data."""
         self._x_range = x or self._x_range
         self._y_range = y or self._y_range
         return self
@@ -256,7 +251,7 @@ class Plot:
         right, bottom = self.width - _RIGHT, self.height - _BOTTOM
         x = Scale(*self.x_range, _LEFT, right, self.log_x)
         y = Scale(*self.y_range, bottom, self._top, self.log_y)
-        # A nested drawing clips what leaves the axes, and needs no id.
+        # A nested SVG clips curves at the axes without a clip path and its id.
         inner = f'{_LEFT} {self._top} {right - _LEFT} {bottom - self._top}'
         parts = [
             f'<svg viewBox="0 0 {self.width} {self.height}" role="img" '
@@ -292,7 +287,7 @@ class Plot:
 
     @property
     def _legend_place(self) -> str:
-        """Return a place where the legend covers no curve; ``corner`` if there is none."""
+        """Return ``title``, ``row`` or, if neither has room, ``corner``."""
         size = sum(_LETTER * len(c.label) + 34.0 for c in self._named)
         right = self.width - _RIGHT
         beside = _LEFT + 1.15 * _LETTER * len(self.title) + size < right
@@ -391,7 +386,7 @@ def _legend_entry(curve: Curve, x: float, y: int) -> str:
 
 
 def short(names: Sequence[str], room: float) -> list[str]:
-    """Return names cut to the pixels that each has; empty if those are too few."""
+    """Return names cut to `room` pixels each; empty if that is too little."""
     most = int(room / _LETTER) - 1
     if most < min(_SHORTEST, max(map(len, names), default=0)):
         return []
@@ -399,7 +394,7 @@ def short(names: Sequence[str], room: float) -> list[str]:
 
 
 def _pixels(*columns: FloatArray) -> list[list[float]]:
-    """Return the rows without NaN, within what a renderer can draw."""
+    """Return the rows without NaN, clipped to coordinates that renderers can handle."""
     rows = np.clip(np.column_stack(columns), -1e4, 1e4)
     found: list[list[float]] = rows[np.isfinite(rows).all(axis=1)].tolist()
     return found
@@ -411,7 +406,4 @@ def _runs(good: np.ndarray) -> list[slice]:
 
 
 def _points(x: FloatArray, y: FloatArray) -> str:
-    # One wild value must not give a coordinate that a renderer cannot handle.
-    y = np.clip(y, -1e4, 1e4)
-    x = np.clip(x, -1e4, 1e4)
-    return 'L'.join(f'{a:.1f},{b:.1f}' for a, b in zip(x, y))
+    return 'L'.join(f'{a:.1f},{b:.1f}' for a, b in _pixels(x, y))

@@ -1,4 +1,4 @@
-"""A document as plain text: paragraphs, aligned tables, lists; without legends and plots."""
+"""A document as plain text: paragraphs, aligned tables and lists, without legends and plots."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from ou_monitor.records import Severity
 from ou_monitor.report.document import (
     Document, Facts, Notes, Part, Section, Table, Text)
 
-# Maximum and minimum width of text, letters; in between the terminal's own is used.
+# Maximum and minimum width of text, letters; between them the width of the terminal is used.
 COLUMNS, _NARROWEST = 100, 40
 
 
 def columns() -> int:
-    """Return the width to write for: the terminal's if there is one, at most `COLUMNS`."""
+    """Return the width of text: of the terminal if there is one, at most `COLUMNS`."""
     if not sys.stdout.isatty():
         return COLUMNS
     return max(_NARROWEST, min(COLUMNS, shutil.get_terminal_size().columns))
@@ -48,13 +48,12 @@ def _part(part: Part) -> str:
 
 
 def _left_out_line(count: int, most: int | None) -> list[str]:
-    """Return a line with the number of entries left out."""
     return [] if most is None or count <= most else [
         f'and {count - most} more: --report and --json have all']
 
 
 def paragraph(text: str, begin: str = '') -> str:
-    """Break a paragraph into lines; words and paths stay whole."""
+    """Break a paragraph into lines, indented below `begin`; words and paths stay whole."""
     return fill(text, columns(), initial_indent=begin, subsequent_indent=' ' * len(begin),
                 break_long_words=False, break_on_hyphens=False)
 
@@ -65,15 +64,13 @@ def item(text: str) -> str:
 
 
 def facts(pairs: Sequence[tuple[str, str]]) -> str:
-    """Lay out facts, the words broken beside their names."""
+    """Lay out facts in two columns."""
     width = max((len(name) for name, _ in pairs), default=0) + 2
-    return '\n'.join(fill(words, columns(), initial_indent=name.ljust(width),
-                          subsequent_indent=' ' * width, break_long_words=False,
-                          break_on_hyphens=False) for name, words in pairs)
+    return '\n'.join(paragraph(words, name.ljust(width)) for name, words in pairs)
 
 
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[int] = ()) -> str:
-    """Lay out an aligned table; one too wide for a terminal in parts."""
+    """Lay out an aligned table; split it if it is wider than the terminal."""
     grid = [[cell.replace('\n', ' ') for cell in line] for line in (heads, *rows)]
     if sys.stdout.isatty():
         return '\n\n'.join(_aligned([[line[k] for k in part] for line in grid],
@@ -83,7 +80,7 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[in
 
 
 def _parts(grid: Sequence[Sequence[str]], most: int) -> list[list[int]]:
-    """Return which columns stand together in `most` letters; the first leads each part."""
+    """Return groups of columns that fit `most` letters; each begins with the first column."""
     widths = [max(len(line[k]) for line in grid) for k in range(len(grid[0]))]
     parts = [[0]]
     for k in range(1, len(widths)):

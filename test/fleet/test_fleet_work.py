@@ -1,5 +1,6 @@
 """The fleet's disk and processes: workers that die, saved results, search."""
 
+from dataclasses import asdict
 import errno
 import json
 import os
@@ -130,13 +131,13 @@ def test_work_never_raises(tmp_path, monkeypatch):
     """A bad file, a bug and a lack of memory are errors in the result."""
     bad = tmp_path / 'bad.csv'
     bad.write_text('time_s,voltage_v\n')
-    assert 'bad.csv' in work(str(bad), Options().as_data())['error']
+    assert 'bad.csv' in work(str(bad), asdict(Options()))['error']
     for error, words in ((ZeroDivisionError('x'), 'ZeroDivisionError: x'),
                          (MemoryError(), 'fewer workers')):
         def broken(*_: object, error=error, **__: object) -> None:
             raise error
         monkeypatch.setattr('ou_monitor.fleet.analysis.read_recording', broken)
-        assert words in work(str(bad), Options().as_data())['error']
+        assert words in work(str(bad), asdict(Options()))['error']
 
 
 def csv_file(path: Path, value: float = 1.0) -> Path:
@@ -179,7 +180,7 @@ def test_logs_are_read_as_analyze_reads_them(tmp_path):
     assert [source.path.name for source in found.sources] == [
         'LOG.TXT', 'cut.bin', 'log00']
     assert len(found.notes) == 1 and 'other.bin' in found.notes[0]
-    results = {source.path.name: work(str(source.path), Options().as_data())
+    results = {source.path.name: work(str(source.path), asdict(Options()))
                for source in found.sources}
     assert results['LOG.TXT']['samples'] == results['log00']['samples'] == read_recording(log).n
     assert results['cut.bin']['error']
@@ -272,7 +273,7 @@ def test_ambiguous_vehicles_are_not_pooled():
     found, notes = assign({Path('/f/a.mcap'): 'SN1', Path('/f/b.mcap'): 'SN2',
                            Path('/f/c.mcap'): ''})
     assert [v.name for v in found.values()] == ['SN1', 'SN2', '']
-    assert any("'/f/c.mcap': no vehicle in the metadata" in note for note in notes)
+    assert any("'/f/c.mcap': the metadata name no vehicle" in note for note in notes)
     found, notes = assign({Path('/f/a.mcap'): 'uav1', Path('/uav1/b.mcap'): ''})
     assert any('check that it is one vehicle' in note for note in notes)
 

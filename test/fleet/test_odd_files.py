@@ -72,7 +72,7 @@ def test_very_deep_folders_are_not_searched(odd):
         os.close(above)
     os.close(at)
     found = find_recordings([str(odd)])
-    assert len(found.sources) == before and 'more than 50 deep' in ' '.join(found.notes)
+    assert len(found.sources) == before and 'more than 50 folders deep' in ' '.join(found.notes)
 
 
 def test_a_folder_without_permission_to_enter_is_noted(odd, monkeypatch):

@@ -8,7 +8,7 @@ from ou_monitor.fleet.fleet import Fleet
 from ou_monitor.fleet.judgement import judge
 from ou_monitor.fleet.table import NAMES
 from ou_monitor.report.fleet_document import (
-    as_data, facts, finding_words, fleet_document, headline, lowest_table, short_names,
+    as_data, facts, finding_words, fleet_document, lowest_table, short_names,
     vehicle_table, worst)
 from ou_monitor.report.page import html
 from ou_monitor.text import number
@@ -46,12 +46,13 @@ def test_the_page_tells_what_stands_out(odd):
     text = page_text(odd)
     found = finding_words(odd)
     assert len(found) >= 3
-    for sentence in (*found, headline(odd), '/f/bad: is no <bag>', '/f/copy is /f/uav1/1',
+    for sentence in (*found, fleet_document(odd).headline, '/f/bad: is no <bag>',
+                     '/f/copy is /f/uav1/1',
                      'Vehicles: by <hand> & eye.', "ou-monitor fleet 'a <b>'"):
         assert ' '.join(sentence.split()) in text
     for words in ('Drift over the flights: <b>uav2</b> & co.', 'rest of the fleet: uav4.',
                   'other flights of their vehicle: 1 recording.'):
-        assert words in headline(odd)
+        assert words in fleet_document(odd).headline
 
 
 def test_stars_mark_what_stands(odd):
@@ -85,7 +86,7 @@ def test_plain_data_agrees(odd):
 def test_little_is_known(rows, words):
     """A fleet of failures, of one recording, without estimates or vehicles has its report."""
     simulated = fleet(rows)
-    assert words in headline(simulated) and words in page_text(simulated)
+    assert words in fleet_document(simulated).headline and words in page_text(simulated)
 
 
 def seen(path: str, vehicle: str, lowest: float, dips: int | None, **more) -> dict:
@@ -101,7 +102,7 @@ def test_the_lowest_voltage_comes_first():
             seen('b', 'quad', 13.1, 3, lowest_throttle=0.8, sag=1.9, sag_se=0.2,
                  sag_throttle=0.95), seen('c', 'hexa', 13.4, 1)]
     known = replace(fleet(rows), limit=13.5)
-    assert headline(known).startswith(
+    assert fleet_document(known).headline.startswith(
         '4 dips below 13.5 V in 2 of 3 recordings, most in b (quad), 3: the lowest was 13.10 V '
         'at 12.0 s of b (quad). The rail sags by up to 1.90 V, at 95 % throttle.')
     assert facts(known) == [
@@ -122,12 +123,13 @@ def test_the_lowest_voltage_comes_first():
 
 def test_without_a_limit_no_dip_is_counted():
     """Not known is no column, not 0; and where a limit was kept, that is said."""
-    assert headline(fleet([seen('a', 'quad', 14.2, None)])).startswith(
+    assert fleet_document(fleet([seen('a', 'quad', 14.2, None)])).headline.startswith(
         'The lowest voltage was 14.20 V at 12.0 s of a (quad).')
     made = lowest_table(fleet([seen('a', 'quad', 14.2, None)]))
     assert made.heads == ['vehicle', 'recording', 'lowest, V', 'at, s']
     kept = replace(fleet([seen('a', 'quad', 14.2, 0)]), limit=14.0)
-    assert headline(kept).startswith('No recording fell below 14 V: the lowest was 14.20 V')
+    assert fleet_document(kept).headline.startswith(
+        'No recording fell below 14 V: the lowest was 14.20 V')
 
 
 def test_what_was_measured_is_shown():
