@@ -7,7 +7,7 @@ that a function loads only what it uses.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, TYPE_CHECKING, Union
@@ -510,7 +510,7 @@ def simulate(model: SupplyModel | ModelFile | str | Path | None = None, *,
     (5000, True)
 
     """
-    from ou_monitor.recordings.write import RecordingWriter
+    from ou_monitor.recordings.write import write_recording
     from ou_monitor.report.simulation_document import simulation_document
     from ou_monitor.simulation import plan
 
@@ -518,14 +518,15 @@ def simulate(model: SupplyModel | ModelFile | str | Path | None = None, *,
                rate=rate, seed=seed, capacity_left=capacity_left, resistance=scale_resistance)
     written: dict[str, Any] = {}
     if output is not None:
-        kind, done = message or ('adc_block' if run.rate >= _BLOCKS_FROM else 'battery_state'), 0
-        with RecordingWriter(output, type=kind, sample_rate=run.rate) as writer:
+        def pieces() -> Iterator[Recording]:
             for piece in run.pieces():
-                writer.write(piece)
-                done += piece.n
+                yield piece
                 if progress is not None:
-                    progress(done / run.n)
-        written = {'topics': writer.topics}
+                    progress(round(piece.t[-1] * run.rate + 1.0) / run.n)
+
+        kind = message or ('adc_block' if run.rate >= _BLOCKS_FROM else 'battery_state')
+        written = {'topics': write_recording(pieces(), output, type=kind,
+                                             sample_rate=run.rate)[0]}
 
     return Result(
         run, partial(simulation_document, run, output),

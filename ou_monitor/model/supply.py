@@ -36,20 +36,7 @@ class SupplyModel:
     """
     Terms that add up to a supply.
 
-    Attributes
-    ----------
-    terms : tuple of Term
-        The first is the `ou`, the only one of its kind.
-    load : LoadStart or None
-        What the load filter knows of this craft at take-off; None: nothing.
-    date : str
-        When it was learned, as the model file says; empty: unknown.
-
-    Raises
-    ------
-    ValueError
-        When the first term is not the `ou`, or a term that can be there once
-        is there twice.
+    ValueError: the first term is not the `ou`, or one that can be there once is there twice.
 
     Examples
     --------
@@ -65,8 +52,11 @@ class SupplyModel:
 
     """
 
+    # The first is the `ou`, the only one of its kind.
     terms: tuple[Term, ...]
+    # What the load filter knows of this craft at take-off; None: nothing.
     load: LoadStart | None = None
+    # When it was learned, as the model file says; empty: unknown.
     date: str = field(default='', compare=False)
 
     def __post_init__(self) -> None:
@@ -102,28 +92,9 @@ class SupplyModel:
     def simulate(self, t: npt.ArrayLike, rng: np.random.Generator,
                  throttle: npt.ArrayLike | None = None) -> FloatArray:
         """
-        Draw a recording.
+        Draw a recording, V (t in s, rising).
 
-        Parameters
-        ----------
-        t : array_like, shape (n,)
-            Stamps, s, rising.
-        rng : numpy.random.Generator
-            Source of randomness.
-        throttle : array_like, shape (n,), optional
-            0..1, held from the stamp before to its own stamp; one number
-            stands for all.
-
-        Returns
-        -------
-        ndarray, shape (n,)
-            What is logged, V.
-
-        Raises
-        ------
-        ValueError
-            As `Simulation.advance`.
-
+        throttle: 0..1, held from the stamp before to its own; one number stands for all.
         """
         stamps = np.asarray(t, dtype=np.float64)
         load = None if throttle is None else np.broadcast_to(

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 import heapq
 import math
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 import numpy.typing as npt
@@ -60,26 +59,90 @@ THROTTLE, VOLTAGE = 0, 1
 
 
 def write_recording(
-    rec: Recording, path: str | Path, *,
+    rec: Recording | Iterable[Recording], path: str | Path, *,
     type: str = 'battery_state',  # noqa: A002
     start_ns: int = 0, sample_rate: float = 10000.0, block: int = 100,
-    progress: Callable[[float], None] | None = None,
-) -> tuple[str, ...]:
+) -> tuple[dict[str, str], tuple[str, ...]]:
     """
     Write topics `/voltage` and, if throttle is known, `/throttle`.
 
-    start_ns in ns, sample_rate in Hz, progress 0..1.
+    rec: a recording or its pieces, of which only one is held in memory; start_ns in ns,
+    sample_rate in Hz.  Returns the topics with their message types, and notes on changes.  If
+    anything fails, the bag is removed.
     """
-    if rec.n == 0:
+    if type not in TYPES:
+        raise InputError(f"no bag type '{type}': {nearest(type, TYPES)}")
+    blocks = type == 'adc_block'
+    if blocks and not sample_rate > 0.0:
+        raise InputError(f'sample_rate must be above 0 Hz, got {sample_rate}')
+    if isinstance(rec, Recording) and rec.n == 0:
         raise InputError(f"'{rec.name}' holds no sample: there is nothing to write")
-    with RecordingWriter(path, type=type, start_ns=start_ns, sample_rate=sample_rate,
-                         block=block) as writer:
-        for first in range(0, rec.n, SLICE):
-            part = slice(first, first + SLICE)
-            writer.write(Recording(rec.t[part], rec.voltage[part], rec.throttle[part], rec.name))
-            if progress is not None:
-                progress(min(1.0, (first + SLICE) / rec.n))
-    return writer.notes
+    kind, count, first = TYPES[type], 0, 0
+    topics: dict[str, str] = {}
+    notes: tuple[str, ...] = ()
+    # Samples of an incomplete block; throttle and period of the last message.
+    rest: tuple[Stamps, FloatArray] = np.empty(0, np.int64), np.empty(0)
+    held, period = math.nan, -1
+    with BagWriter(path) as bag:
+        topics[bag.add_topic('voltage', kind, sample_rate=sample_rate if blocks else None)] = kind
+        for piece in _pieces(rec):
+            stamps = as_nanoseconds(piece.t, piece.name) + start_ns
+            if not count:
+                shift = max(0, -int(stamps[0]))
+                notes, start_ns, stamps = _moved(shift), start_ns + shift, stamps + shift
+                first = int(stamps[0])
+            _check_header(kind, piece.name, stamps)
+            volts = piece.voltage
+            whole = stamps.size
+            known = np.isfinite(piece.throttle)
+            times, values = stamps[known], piece.throttle[known].astype(np.float32)
+            if blocks:
+                check_steady(piece.name, stamps - first, count, sample_rate)
+                stamps, volts = np.append(rest[0], stamps), np.append(rest[1], volts)
+                whole = stamps.size - stamps.size % block
+                rest = stamps[whole:], volts[whole:]
+            count += piece.n
+            streams = [_timed(VOLTAGE, encode(kind, stamps[:whole], volts[:whole], block))]
+            if values.size:
+                if '/throttle' not in topics:
+                    topics[bag.add_topic('throttle', FLOAT32)] = FLOAT32
+                # One sample a period is written even if unchanged.
+                periods = times // THROTTLE_PERIOD_NS
+                sent = (np.diff(values, prepend=np.float32(held)) != 0.0) | (
+                    np.diff(periods, prepend=period) > 0)
+                held, period = float(values[-1]), int(periods[-1])
+                streams.append(_timed(THROTTLE, encode(FLOAT32, times[sent], values[sent])))
+            for t, topic, data in heapq.merge(*streams):
+                bag.write(('/throttle', '/voltage')[topic], t, data)
+        for t, data in encode(kind, *rest, block):
+            bag.write('/voltage', t, data)
+    return topics, notes
+
+
+def _pieces(rec: Recording | Iterable[Recording]) -> Iterator[Recording]:
+    """Yield the pieces of a recording that hold a sample."""
+    if not isinstance(rec, Recording):
+        yield from (piece for piece in rec if piece.n)
+        return
+    for first in range(0, rec.n, SLICE):
+        part = slice(first, first + SLICE)
+        yield Recording(rec.t[part], rec.voltage[part], rec.throttle[part], rec.name)
+
+
+def _timed(topic: int, messages: Iterable[tuple[int, bytes]]) -> Iterator[Timed]:
+    return ((t, topic, data) for t, data in messages)
+
+
+def _moved(shift: int) -> tuple[str, ...]:
+    """Return the note on stamps moved by a time, ns."""
+    return (f'Stamps were moved by {shift * 1e-9:.9f} s: a bag cannot hold negative ones.',
+            ) if shift else ()
+
+
+def _check_header(kind: str, name: str, stamps: Stamps) -> None:
+    if kind in (BATTERY_STATE, IMU, JOINT_STATE) and stamps[-1] > LAST_HEADER_NS:
+        raise InputError(f"'{name}' has stamps after 2^31 s, which a header cannot hold"
+                         + (': use another type' if kind == BATTERY_STATE else ''))
 
 
 def as_nanoseconds(t: FloatArray, name: str) -> npt.NDArray[np.int64]:
@@ -90,116 +153,6 @@ def as_nanoseconds(t: FloatArray, name: str) -> npt.NDArray[np.int64]:
         raise InputError(f"'{name}' has stamps up to {far * 1e-9:.4g} s, and a bag holds "
                          f'{_LAST_NS * 1e-9:.2g} s: are they in ms or us?')
     return stamps.astype(np.int64)
-
-
-class RecordingWriter:
-    """
-    Writes a recording that comes in pieces, as `write_recording`; memory does not grow with them.
-
-    A context manager; if its block fails, the bag is removed.  `topics`: their message
-    types; `notes`: changes made, one sentence each.
-    """
-
-    def __init__(self, path: str | Path, *, type: str = 'battery_state',  # noqa: A002
-                 start_ns: int = 0, sample_rate: float = 10000.0, block: int = 100) -> None:
-        if type not in TYPES:
-            raise InputError(f"no bag type '{type}': {nearest(type, TYPES)}")
-        if type == 'adc_block' and not sample_rate > 0.0:
-            raise InputError(f'sample_rate must be above 0 Hz, got {sample_rate}')
-        self._type, self._block, self._rate = type, block, sample_rate
-        self._shift = start_ns
-        self._first: int | None = None
-        self._written = 0
-        self._throttle = math.nan
-        self._period = -1
-        self._rest: tuple[npt.NDArray[np.int64], FloatArray] = (
-            np.empty(0, dtype=np.int64), np.empty(0))
-        self.notes: tuple[str, ...] = ()
-        self.topics: dict[str, str] = {}
-        self._bag = BagWriter(path)
-        self._names = {VOLTAGE: self._add('voltage', TYPES[type], sample_rate
-                                          if type == 'adc_block' else None)}
-
-    def _add(self, name: str, kind: str, sample_rate: float | None = None) -> str:
-        topic = self._bag.add_topic(name, kind, sample_rate=sample_rate)
-        self.topics[topic] = kind
-        return topic
-
-    def write(self, piece: Recording) -> None:
-        """Write the next samples."""
-        if not piece.n:
-            return
-        stamps = as_nanoseconds(piece.t, piece.name) + self._shift
-        if self._first is None:
-            if stamps[0] < 0:
-                self.notes += (f'Stamps were moved by {-stamps[0] * 1e-9:.9f} s: a bag cannot '
-                               'hold negative ones.',)
-                self._shift -= int(stamps[0])
-                stamps = stamps - stamps[0]
-            self._first = int(stamps[0])
-        if self._type == 'battery_state' and stamps[-1] > LAST_HEADER_NS:
-            raise InputError(f"'{piece.name}' has stamps after 2^31 s, which a header cannot "
-                             'hold: use another type')
-        if self._type == 'adc_block':
-            check_steady(piece.name, stamps - self._first, self._written, self._rate)
-        if THROTTLE not in self._names and piece.has_throttle:
-            self._names[THROTTLE] = self._add('throttle', FLOAT32)
-        self._written += piece.n
-        self._send(self._voltage(stamps, piece.voltage), self._throttles(stamps, piece.throttle))
-
-    def _send(self, *streams: Iterator[Timed]) -> None:
-        for t, topic, data in heapq.merge(*streams):
-            self._bag.write(self._names[topic], t, data)
-
-    def close(self) -> None:
-        """Finish the bag."""
-        stamps, samples = self._rest
-        self._rest = stamps[:0], samples[:0]
-        self._send(self._messages(VOLTAGE, TYPES[self._type], stamps, samples))
-        self._bag.close()
-
-    def __enter__(self) -> RecordingWriter:
-        """Return itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Finish the bag, or remove it when the block failed."""
-        if kind is None:
-            try:
-                self.close()
-            except BaseException as failure:
-                self._bag.__exit__(type(failure), failure, failure.__traceback__)
-                raise
-        self._bag.__exit__(kind, error, trace)
-
-    def _messages(self, topic: int, kind: str, stamps: Stamps, values: FloatArray,
-                  ) -> Iterator[Timed]:
-        for t, message in encode(kind, stamps, values, self._block):
-            yield t, topic, message
-
-    def _voltage(self, stamps: Stamps, voltage: FloatArray) -> Iterator[Timed]:
-        whole = stamps.size
-        if self._type == 'adc_block':
-            stamps = np.concatenate((self._rest[0], stamps))
-            voltage = np.concatenate((self._rest[1], voltage))
-            whole = stamps.size - stamps.size % self._block
-            self._rest = stamps[whole:], voltage[whole:]
-        return self._messages(VOLTAGE, TYPES[self._type], stamps[:whole], voltage[:whole])
-
-    def _throttles(self, stamps: npt.NDArray[np.int64], throttle: FloatArray) -> Iterator[Timed]:
-        known = np.isfinite(throttle)
-        times, values = stamps[known], throttle[known].astype(np.float32)
-        if not values.size:
-            return
-        changed = np.diff(values, prepend=np.float32(self._throttle)) != 0.0
-        # One sample a period is written even if unchanged.
-        periods = times // THROTTLE_PERIOD_NS
-        changed |= np.diff(periods, prepend=self._period) > 0
-        self._throttle, self._period = float(values[-1]), int(periods[-1])
-        yield from self._messages(THROTTLE, FLOAT32, times[changed], values[changed])
 
 
 def check_steady(name: str, since_first: npt.NDArray[np.int64], before: int,
@@ -239,8 +192,6 @@ def write_log(
     streams.append(_of_series('voltage', TYPES[kind], chosen.voltage))
     first = min(float(stream.t[0]) for stream in streams)
     shift = max(0, -round(first * 1e9))
-    notes = (f'Stamps were moved by {shift * 1e-9:.9f} s: a bag cannot hold negative ones.',
-             ) if shift else ()
     total = sum(stream.t.size for stream in streams)
     topics: dict[str, str] = {}
     # Refused before anything is written to disk.
@@ -249,10 +200,7 @@ def write_log(
     if kind == 'adc_block':
         check_steady(chosen.voltage.name, stamps[-1] - stamps[-1][0], 0, BLOCK_RATE)
     for stream, own in zip(streams, stamps):
-        if stream.kind in (BATTERY_STATE, IMU, JOINT_STATE) and own[-1] > LAST_HEADER_NS:
-            raise InputError(f"'{stream.origin[f'{stream.topic}_field']}' has stamps after 2^31 "
-                             's, which a header cannot hold'
-                             + (': use another type' if stream.kind == BATTERY_STATE else ''))
+        _check_header(stream.kind, stream.origin[f'{stream.topic}_field'], own)
     whole = {**about}
     for stream in streams:
         whole |= stream.origin
@@ -267,7 +215,7 @@ def write_log(
             bag.write('/' + streams[k].topic, t, data)
             if progress is not None and done % SLICE == 0:
                 progress(done / total)
-    return topics, notes
+    return topics, _moved(shift)
 
 
 def encode(kind: str, stamps: Stamps, values: FloatArray, block: int = BLOCK,
@@ -310,5 +258,4 @@ def _of_motion(topic: str, one: Motion) -> _Stream:
 def _messages(place: int, stamps: Stamps, stream: _Stream) -> Iterator[Timed]:
     for first in range(0, stamps.size, SLICE):
         part = slice(first, first + SLICE)
-        for t, message in stream.encode(stamps[part], part):
-            yield t, place, message
+        yield from _timed(place, stream.encode(stamps[part], part))

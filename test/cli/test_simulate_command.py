@@ -280,7 +280,7 @@ def test_a_signal_brings_the_old_bag_back(tmp_path, name, number, status):
 def test_the_writer_leaves_nothing_when_finishing_fails(tmp_path, monkeypatch):
     """A disk that is full at the last block: no bag is left that looks like one."""
     from ou_monitor.recordings.bag import BagWriter
-    from ou_monitor.recordings.write import RecordingWriter
+    from ou_monitor.recordings.write import write_recording
     from ou_monitor.records import Recording
 
     def full(*_):
@@ -288,9 +288,11 @@ def test_the_writer_leaves_nothing_when_finishing_fails(tmp_path, monkeypatch):
 
     t = np.arange(150) / 1e4
     with pytest.raises(InputError, match='disk full'):
-        with RecordingWriter(tmp_path / 'a.mcap', type='adc_block', sample_rate=1e4) as writer:
-            writer.write(Recording(t, t + 5.0, t * 0.0))
+        def pieces():
+            yield Recording(t, t + 5.0, t * 0.0)
             monkeypatch.setattr(BagWriter, 'write', full)
+
+        write_recording(pieces(), tmp_path / 'a.mcap', type='adc_block', sample_rate=1e4)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -79,65 +79,7 @@ class Term:
     """
     Base of all terms: a frozen record of parameters.
 
-    Attributes
-    ----------
-    NAME, FAMILY : str
-        As in a model file and in a finding.
-    MEANING, REMEDY, SEPARATED_BY : str
-        For people: what it is, what to do about it, which recording separates it
-        from other causes.
-    STAGE : Stage
-        When it acts.
-    NEEDS_THROTTLE : bool
-        Whether it needs throttle to act.
-    ROLE : Role
-        How it enters a likelihood.
-    LINEAR : tuple of str
-        Parameters that multiply known columns (`Role.MEAN`).
-    FREE : tuple of str
-        Positive parameters found by maximum likelihood, on a log scale
-        (`Role.DRIVE`, `BLOCK`, `NOISE`).
-    SIGNS : tuple of str
-        Statistics that show this term, by the beginning of their names,
-        after + or - where only one direction does.
-    MEASURED : bool
-        Whether it answers to throttle or time alone, so that the search tries
-        it before latent causes.
-    IMITATES : tuple of str
-        Causes that it imitates, and that imitate it: one beside the other would
-        only refine its form.  It suffices that one of the two names the other.
-    SEVERAL : bool
-        Whether a model can have several.
-    RECURS : bool
-        Whether the search looks for another one.
-    LEAST_SHARE : float
-        Evidence that it needs, as a share of the largest of any cause.
-    MAY_LEAVE : float
-        Share of its signs that it may leave without being withdrawn; with 0 it is
-        withdrawn where any statistic fails.
-    REFUTED_BY : tuple of str
-        Statistics that it cannot leave.
-    SEARCH : float
-        Penalty for what is searched beside the free parameters, nats.
-    APART : int
-        Parameters that the term finds from the scores, and not the fit (`apart`).
-    DEAR : bool
-        Whether a fit takes seconds, so that none is begun late in a search.
-    BROAD : bool
-        Whether its spectrum is broad and the same throughout, so that a fit starts from that of
-        the scores (`Role.BLOCK`).
-    STATES : int
-        States that it adds to the linear system (`Role.BLOCK`).
-    CHANGES : type of Term, or None
-        The term that it changes and that a model needs beside it; None for the `ou`.
-    LIVE : bool
-        Whether the live estimate has alpha, sigma or u0 as this term makes them at the present
-        throttle, so that the risk knows of it.
-
-    Raises
-    ------
-    ValueError
-        When a parameter is not a number or out of its range.
+    ValueError: a parameter is not a number, or out of its range.
 
     Examples
     --------
@@ -148,28 +90,50 @@ class Term:
 
     """
 
+    # As in a model file and in a finding.
     NAME: ClassVar[str] = ''
     FAMILY: ClassVar[str] = ''
+    # When it acts.
     STAGE: ClassVar[Stage] = Stage.LEVEL
     NEEDS_THROTTLE: ClassVar[bool] = False
+    # How it enters a likelihood.
     ROLE: ClassVar[Role] = Role.MEAN
+    # Parameters that multiply known columns (`Role.MEAN`).
     LINEAR: ClassVar[tuple[str, ...]] = ()
+    # Positive parameters found by maximum likelihood, on a log scale (`DRIVE`, `BLOCK`, `NOISE`).
     FREE: ClassVar[tuple[str, ...]] = ()
+    # Statistics that show this term, by the beginning of their names, after + or - where only
+    # one direction does.
     SIGNS: ClassVar[tuple[str, ...]] = ()
+    # Answers to throttle or time alone: the search tries it before latent causes.
     MEASURED: ClassVar[bool] = False
+    # Causes that it imitates or that imitate it: one beside the other would only refine its form.
+    # It suffices that one of the two names the other.
     IMITATES: ClassVar[tuple[str, ...]] = ()
+    # Whether a model can have several, and whether the search looks for another one.
     SEVERAL: ClassVar[bool] = False
     RECURS: ClassVar[bool] = False
+    # Evidence that it needs, as a share of the largest of any cause.
     LEAST_SHARE: ClassVar[float] = 0.0
+    # Share of its signs that it may leave; 0: it is withdrawn where any statistic fails.
     MAY_LEAVE: ClassVar[float] = 0.0
+    # Statistics that it cannot leave.
     REFUTED_BY: ClassVar[tuple[str, ...]] = ()
+    # Penalty for what is searched beside the free parameters, nats.
     SEARCH: ClassVar[float] = 0.0
+    # Number of parameters that the term finds from the scores, and not the fit (`apart`).
     APART: ClassVar[int] = 0
+    # A fit takes seconds: none is begun late in a search.
     DEAR: ClassVar[bool] = False
+    # Its spectrum is broad and the same throughout, so that a fit starts from that of the scores,
+    # and the number of states that it adds to the linear system (`Role.BLOCK`).
     BROAD: ClassVar[bool] = False
     STATES: ClassVar[int] = 0
+    # The term that it changes and that a model needs beside it; None for the `ou`.
     CHANGES: ClassVar[type[Term] | None] = None
+    # The live estimate has alpha, sigma or u0 as this term makes them at the present throttle.
     LIVE: ClassVar[bool] = False
+    # For people: what it is, what to do about it, which recording separates it from other causes.
     MEANING: ClassVar[str] = ''
     REMEDY: ClassVar[str] = ''
     SEPARATED_BY: ClassVar[str] = ''
@@ -193,38 +157,12 @@ class Term:
         """Check relations between parameters; the base has none."""
 
     def start(self, rng: np.random.Generator) -> Effect:
-        """
-        Begin a simulation.
-
-        Parameters
-        ----------
-        rng : numpy.random.Generator
-            This term's own source of randomness.
-
-        Returns
-        -------
-        callable
-            Changes one `Segment` after the other, in order.
-
-        """
+        """Return a function that changes one `Segment` after the other, in order."""
         raise NotImplementedError
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """
-        Return starting points for a fit to what the model so far leaves over.
-
-        Parameters
-        ----------
-        view : View
-            What is left over.
-
-        Returns
-        -------
-        sequence of Term
-            Best first; empty where there is nothing to start from.
-
-        """
+        """Return starting points for a fit to what the model leaves over, best first."""
         return ()
 
     def holds(self, view: View) -> bool:
@@ -236,20 +174,7 @@ class Term:
         return ou
 
     def columns(self, s: Segment) -> FloatArray:
-        """
-        Return the columns that the linear parameters multiply.
-
-        Parameters
-        ----------
-        s : Segment
-            All samples; not changed.
-
-        Returns
-        -------
-        ndarray, shape (n, p)
-            One column for each of `LINEAR`, V per unit.
-
-        """
+        """Return one column for each of `LINEAR`, V per unit, shape (n, p)."""
         columns = []
         rng = np.random.default_rng(0)
         for name in self.LINEAR:
@@ -285,21 +210,10 @@ class Term:
 
     def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
         """
-        Return the states that this term adds (`Role.BLOCK`).
+        Return the states that this term adds (`Role.BLOCK`): f, q, h.
 
-        Parameters
-        ----------
-        s : Segment
-            All samples.
-
-        Returns
-        -------
-        f, q : ndarray, shape (n, d, d)
-            Transition into each sample and covariance of what is added, V^2;
-            at the first sample the stationary covariance.
-        h : ndarray, shape (d,)
-            Shares of the states in the voltage.
-
+        f, q, shape (n, d, d): transition into each sample and covariance of what is added, V^2,
+        at the first sample the stationary one; h, shape (d,): shares of the states in the voltage.
         """
         raise NotImplementedError
 
@@ -313,20 +227,7 @@ class Term:
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
-        """
-        Fit another law to the normal scores (`Role.LAW`).
-
-        Parameters
-        ----------
-        view : View
-            What the model so far leaves over.
-
-        Returns
-        -------
-        LawFit or None
-            None where this law cannot be fitted.
-
-        """
+        """Fit another law to the normal scores (`Role.LAW`); None where it cannot be."""
         return None
 
     def refit_law(self, view: View) -> LawFit | None:
@@ -356,25 +257,7 @@ class Term:
 
     @classmethod
     def read(cls, params: Mapping[str, Any]) -> Self:
-        """
-        Return a term from named values.
-
-        Parameters
-        ----------
-        params : mapping
-            A value for every parameter, and for nothing else.
-
-        Returns
-        -------
-        Term
-            Checked.
-
-        Raises
-        ------
-        ValueError
-            Names what is missing, unknown or out of range.
-
-        """
+        """Return a term from a value for every parameter; ValueError names what is wrong."""
         names = cls.parameters()
         missing = [name for name in names if name not in {**cls.usual(), **params}]
         unknown = [name for name in params if name not in names]
