@@ -1,9 +1,7 @@
 """What the search decides, by tables: each constant held from both sides, each rule by a case."""
 
-import math
 from typing import ClassVar
 
-from ou_monitor.criticism.battery import family_chance
 from ou_monitor.discovery import decision
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.term import Role, Term
@@ -205,15 +203,6 @@ def test_an_ac_coupling_may_leave_three_quarters_of_the_slow_power_missing(left,
     kinds = [catalogue()['ac_coupling']]
     found = decision.withdrawn({'band 0': -60.0}, {'band 0': left}, kinds)
     assert found == ([0] if withdrawn else [])
-
-
-def test_the_origins_of_the_constants():
-    """What the comments say of chances is so, and there are a dozen at most."""
-    assert family_chance(decision.FAILS, 70) == pytest.approx(1 / 2300, rel=0.05)
-    assert 22.0 * math.exp(-decision.ACCEPT) == pytest.approx(0.05, rel=0.1)
-    assert math.exp(decision.TIE) == pytest.approx(20.0, rel=0.01)
-    constants = [name for name in vars(decision) if name.isupper()]
-    assert len(constants) <= 13, constants
 
 
 @pytest.mark.parametrize('gain, error, chance, earns', [

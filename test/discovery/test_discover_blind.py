@@ -28,7 +28,7 @@ from scipy.stats import binom
 
 BASE = int(os.environ.get('OU_MONITOR_BLIND_SEED', '20260131'))
 SEED = f'seed {BASE}'
-MINUTE, DURATION, RATE = 60.0, 20.0, 1000.0
+MINUTE, DURATION, SHORT, RATE = 60.0, 20.0, 10.0, 1000.0
 # The generator limits how far a force can bend: no strength makes up for a short recording.
 WHOLE = ('nonlinear_restoring',)
 # A count is too low, or too high, when the required level gives it so rarely.
@@ -38,7 +38,7 @@ TRIES = 3
 
 def drawn(kind: str, effect: str, number: int) -> tuple[Recording, object]:
     """Return a recording and what is hidden in it."""
-    duration = MINUTE if effect in WHOLE else DURATION
+    duration = MINUTE if effect in WHOLE else SHORT if kind in ('none', 'unknown') else DURATION
     hidden = hide(kind, effect, BASE, number, duration=duration, rate=RATE,
                   strength=math.sqrt(MINUTE / duration))
     return Recording(hidden.t, hidden.voltage, hidden.throttle, 'blind'), hidden

@@ -1,6 +1,7 @@
 """Gains, their errors, and crossings: against truth that is known."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 from ou_monitor.criticism.composite import fit_composite
@@ -9,8 +10,8 @@ from ou_monitor.criticism.structure import evaluate
 from ou_monitor.discovery import gain as gains
 from ou_monitor.discovery.fitting import standard_errors
 from ou_monitor.discovery.gain import (
-    BLOCKS, blocks_of, cause_gain, covered, crossing_level, crossing_rates, crossings, held_out,
-    if_known, mean_difference, mean_score, without)
+    BLOCKS, blocks_of, cause_gain, covered, crossing_level, crossing_rates, crossings, FOLDS,
+    gain_of, guess, held_out, HeldOut, if_known, mean_difference, mean_score, why_unknown, without)
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_answer import LoadSag
@@ -18,6 +19,7 @@ from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import Quantization
 import pytest
 from scipy.signal import lfilter
+from scipy.stats import chi2, norm
 
 ALPHA, SIGMA = 63.0, 0.3156
 
@@ -137,24 +139,6 @@ def test_errors_of_the_mean_are_its_scatter():
     assert np.mean(stated, axis=0) == pytest.approx(scatter, rel=0.34)
 
 
-def test_crossings_are_counted_downward():
-    """Two falls in two seconds are 60 per minute."""
-    t = np.array([0.0, 0.5, 1.0, 1.5, 2.0])
-    assert crossings(t, np.array([1.0, -1.0, 1.0, 0.5, -2.0]), 0.0) == 60.0
-
-
-def test_the_level_is_crossed_in_both_parts_and_lies_between_codes():
-    """Some crossings on either side; half-way between neighbouring codes."""
-    samples = simulated(2, 20_000)
-    step = 0.01
-    coded = Samples(samples.t, step * np.rint(samples.voltage / step), None)
-    level = crossing_level(coded)
-    assert level / step % 1.0 == pytest.approx(0.5, abs=1e-6)
-    assert level < coded.voltage.mean() - 0.5 * coded.voltage.std()
-    for part in (coded.train, coded.test):
-        assert crossings(coded.t[part], coded.voltage[part], level) > 0.0
-
-
 def test_crossing_rates_of_the_true_model_and_of_a_wrong_one():
     """The truth within 4 joint errors of its own expectation; half of sigma far below."""
     true = SupplyModel((OU(ALPHA, SIGMA, 5.0), Quantization(0.005)))
@@ -182,3 +166,118 @@ def test_an_error_that_leaves_nothing_known_is_no_gain(gain, error, known):
     """Ten times as large as the gain, and large beside any; small ones are just none."""
     found = if_known(gain, error)
     assert found == (gain, error) if known else all(map(math.isnan, found))
+
+
+def held(density, free=2, search=0.0, known=None):
+    """Return a model that was scored, as far as a gain looks at it."""
+    n = density.size
+    return HeldOut(SimpleNamespace(density=density, free=free, search=search), density,
+                   np.ones(n, bool) if known is None else known, np.zeros(n))
+
+
+@pytest.mark.parametrize('gain', (0.02, 0.0, -0.02))
+@pytest.mark.parametrize('search', (0.0, 2.0))
+def test_the_chance_of_a_cause_is_twice_the_smaller_of_two(gain, search):
+    """Of the likelihood ratio, a chi-square, with the price of the search; of the gain kept."""
+    rng = np.random.default_rng(1)
+    n = 2400
+    old = rng.standard_normal(n)
+    new = old + gain + 0.2 * rng.standard_normal(n)
+    scored = np.arange(n) >= 1200
+    found, error, chance = cause_gain(held(new, 4, search), held(old, 2), scored)
+    mean, se = mean_difference(new[1200:], old[1200:])
+    assert (found, error) == (mean, se)
+    fitted = min(1.0, chi2.sf(max(0.0, 2.0 * (new - old).sum()), 2) * math.exp(search))
+    assert chance == pytest.approx(min(1.0, 2.0 * min(fitted, norm.sf(mean / se))), rel=1e-9)
+
+
+def test_a_gain_needs_as_many_samples_as_blocks():
+    """Scored, and determined by the others in both models."""
+    n = 100
+    new, old = np.full(n, 1.0), np.zeros(n)
+    for count, known in ((BLOCKS, True), (BLOCKS - 1, False)):
+        few = np.arange(n) < count
+        for which in range(3):
+            every = np.ones(n, bool)
+            masks = [few if k == which else every for k in range(3)]
+            a, b = held(new, known=masks[0]), held(old, known=masks[1])
+            assert math.isfinite(gain_of(a, b, masks[2])[0]) == known
+            assert (why_unknown(a, b, masks[2], False) == '') == known
+
+
+def test_a_mean_and_the_error_of_its_blocks():
+    """24 blocks; a lag adds half of itself where it is positive; what is over is left out."""
+    rng = np.random.default_rng(2)
+    for keep in (0.9, -0.9):
+        blocks = np.zeros(24)
+        for k in range(1, 24):
+            blocks[k] = keep * blocks[k - 1] + rng.standard_normal()
+        d = np.concatenate((np.repeat(blocks, 3), [9.0] * 20))
+        mean, error = mean_difference(d, np.zeros(d.size))
+        c = blocks - blocks.mean()
+        shared = max(0.0, (c[1:] * c[:-1]).sum() / 23.0)
+        assert mean == pytest.approx(d.mean())
+        assert error == pytest.approx(math.sqrt((blocks.var(ddof=1) + shared) / 24.0))
+
+
+def test_crossings_count_between_neighbours_that_are_scored():
+    """From the level on is above; times of pairs that are left out do not count."""
+    t = np.array([0.0, 1.0, 2.0, 3.0, 13.0, 14.0])
+    v = np.array([0.0, -1.0, 1.0, -1.0, 1.0, -1.0])
+    assert crossings(t, v, 0.0) == 60.0 * 3 / 14.0
+    scored = np.array([True, True, True, True, False, True])
+    assert crossings(t, v, 0.0, scored) == 60.0 * 2 / 3.0
+    assert math.isnan(crossings(t, v, 0.0, np.zeros(6, bool)))
+
+
+def test_the_level_of_crossings_is_lowered_until_both_parts_cross_it_five_times():
+    """From 2.5 deviations in quarters; half-way between the samples beside it."""
+    n = 4000
+    v = 0.05 * np.sin(np.arange(n) * 1.7) + 5.0
+    v[100:2000:400] = v[2500:4000:300] = 4.0
+    samples = Samples(np.arange(n) * 1e-3, v, None)
+    level = crossing_level(samples)
+    below, above = v[v < 4.5].max(), v[v >= 4.5].min()
+    assert level == pytest.approx(0.5 * (below + above))
+    # One dip fewer in the part kept: the level lies within the sine, at a half or above.
+    w = v.copy()
+    w[3700] = 5.0
+    shallow = crossing_level(Samples(samples.t, w, None))
+    assert 4.94 < shallow < w.mean() - 0.4 * w.std()
+
+
+def test_rates_of_crossings_have_errors_of_counts():
+    t = np.arange(3000) * 1e-3
+    v = simulate(t, 63.0, 0.3, np.random.default_rng(3), u0=5.0)
+    samples = Samples(t, v, None)
+    rates = crossing_rates(samples, (OU(63.0, 0.3, 5.0),), (OU(63.0, 0.3, 5.0),),
+                           np.random.default_rng(4))
+    assert rates.observed == crossings(t, v, rates.level)
+    minutes = (t[-1] - t[0]) / 60.0
+    assert rates.observed_se == pytest.approx(math.sqrt(rates.observed * minutes) / minutes)
+    none = crossing_rates(samples, (OU(63.0, 0.3, 5.0),), (OU(63.0, 0.3, 5.0),),
+                          np.random.default_rng(4), np.arange(3000) < BLOCKS - 1)
+    assert math.isnan(none.level)
+
+
+def test_a_guess_is_that_of_an_autoregression():
+    t = np.arange(20_000) * 1e-3
+    v = simulate(t, 63.0, 0.3, np.random.default_rng(5), u0=5.0)
+    c = v - v.mean()
+    found = guess(Samples(t, v, None))
+    alpha = -1e3 * math.log((c[1:] @ c[:-1]) / (c @ c))
+    assert found.values() == pytest.approx(
+        {'alpha': alpha, 'sigma': v.std() * math.sqrt(2.0 * alpha), 'u0': v.mean()})
+    white = guess(Samples(t, np.random.default_rng(6).standard_normal(t.size), None))
+    assert white.alpha == pytest.approx(-1e3 * math.log(0.05))
+    slow = guess(Samples(t, np.cos(0.1 * t), None))
+    assert 0.1 < slow.alpha < 0.2
+
+
+@pytest.mark.parametrize('n', (10, 101, 1000))
+def test_blocks_are_all_samples_once(n):
+    parts = blocks_of(n)
+    assert len(parts) == FOLDS
+    assert np.concatenate([np.arange(n)[part] for part in parts]).tolist() == list(range(n))
+    sizes = [part.stop - part.start for part in parts]
+    assert max(sizes) - min(sizes) <= 1

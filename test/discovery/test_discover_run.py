@@ -16,8 +16,7 @@ from ou_monitor.errors import InputError
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_answer import LoadSag
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.reading import HeldSamples, MeasurementNoise, Quantization
-from ou_monitor.model.terms.slow import Drift
+from ou_monitor.model.terms.reading import HeldSamples, Quantization
 from ou_monitor.records import Recording
 from ou_monitor.report.discovery_document import answer, discovery_document
 from ou_monitor.report.page import html as page_of
@@ -51,17 +50,6 @@ def names(finding):
     return [cause.name for cause in finding.causes]
 
 
-def test_nothing_is_found_where_nothing_is():
-    """
-    Eight plain recordings: at most two alarms.
-
-    At 1 % for the statistics and 5 % for causes, three or more of eight have a chance of
-    1 %.
-    """
-    verdicts = [discover(drawn_from(seed=seed, n=5000)).verdict for seed in range(8)]
-    assert verdicts.count(Verdict.NO_EFFECT) >= 6
-
-
 def test_a_sag_is_found_and_its_gain_measured(sag):
     """0.5 V: named alone, within four errors, gain above zero, rail as it is without."""
     assert sag.verdict is Verdict.EXPLAINED and names(sag) == ['load_sag']
@@ -82,18 +70,6 @@ def test_crossings_come_nearer_to_the_data(sag):
     """The plain OU, its spread widened by the sag, misses by more."""
     c = sag.crossing
     assert abs(c.extended - c.observed) < abs(c.baseline - c.observed)
-
-
-def test_strong_noise_of_the_sensor_is_named():
-    """White noise as large as what a step of the rail adds."""
-    found = discover(drawn_from(MeasurementNoise(STEP_STD), n=6000))
-    assert 'measurement_noise' in names(found)
-    assert found.gain > 3.0 * found.gain_se
-
-
-def test_a_discharge_is_named():
-    """0.4 V in 10 s, fourteen standard deviations of the rail."""
-    assert 'drift' in names(discover(drawn_from(Drift(-0.04, 0.0), n=10_000)))
 
 
 def test_repeats_are_undone_and_the_rail_found_behind():
@@ -118,27 +94,6 @@ def test_steps_of_the_adc_are_named_and_in_the_model():
     assert term.step == pytest.approx(step, rel=1e-6)
     assert abs(math.log(found.model.ou.sigma / RAIL.sigma)) < abs(
         math.log(found.baseline.sigma / RAIL.sigma))
-
-
-@pytest.mark.parametrize('recording', [
-    Recording(np.array([0.0, 1.0]), np.array([5.0, 5.1]), np.array([0.0, 0.0]), 'two'),
-    Recording(np.arange(3000.0), np.full(3000, 3.3), np.full(3000, np.nan), 'constant'),
-    Recording(np.zeros(0), np.zeros(0), np.zeros(0), 'empty')])
-def test_too_little_is_said_so(recording):
-    """A verdict, its reason, JSON and a page; no exception."""
-    found = discover(recording)
-    assert found.verdict is Verdict.INSUFFICIENT_DATA and found.causes == ()
-    data = found.as_data()
-    json.dumps(data, allow_nan=False)
-    assert data['n'] == recording.n and data['extended']['params'] == {}
-    assert found.sentence in ''.join(parsed(page_of(discovery_document(found))).itertext())
-
-
-def test_without_throttle_its_causes_are_untestable():
-    """They are said to be so, and never named."""
-    found = discover(drawn_from(throttle=False, n=4000))
-    assert any('load_sag' in note and 'cannot be tested' in note for note in found.notes)
-    assert not any(cause.term.NEEDS_THROTTLE for cause in found.causes)
 
 
 def test_same_seed_same_finding_and_progress_to_the_end():

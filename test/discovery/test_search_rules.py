@@ -4,6 +4,7 @@ import math
 from types import SimpleNamespace
 
 import numpy as np
+from numpy.testing import assert_allclose
 from ou_monitor.criticism.composite import fit_composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import decision, fitting, search as rules
@@ -17,6 +18,7 @@ from ou_monitor.model.terms.reading import LopsidedNoise, MeasurementNoise
 from ou_monitor.model.terms.slow import Drift, SecondRelaxation
 from ou_monitor.model.terms.tones import Tone
 import pytest
+from scipy.signal import lfilter
 
 BASE = OU(50.0, 0.5, 5.0)
 NOISE, SLOW = MeasurementNoise(0.01), SecondRelaxation(3.0, 0.1)
@@ -257,3 +259,17 @@ def test_no_statistic_admits_a_cause():
     (found,) = Fitter(samples).trials(plain, [MeasurementNoise], lambda model: {})
     assert found.name == 'measurement_noise' and found.evidence > decision.ACCEPT
     assert found.composite.terms[1].std == pytest.approx(0.01, rel=0.15)
+
+
+def test_fits_add_up_their_cost():
+    """Each counts, of the first part or of everything; a fit that fails costs nothing."""
+    rng = np.random.default_rng(1)
+    keep = math.exp(-0.05)
+    v = 5.0 + lfilter([0.01 * math.sqrt(1.0 - keep**2)], [1.0, -keep],
+                      rng.standard_normal(2000))
+    fitter = Fitter(Samples(np.arange(2000) * 1e-3, v, None))
+    start = [OU(50.0, 0.1, 5.0)]
+    one = fitter.fit(start, None)
+    assert one.cost > 0.0 and fitter.cost == one.cost
+    two = fitter.whole(one)
+    assert_allclose(fitter.cost, one.cost + two.cost)

@@ -4,7 +4,6 @@ from types import SimpleNamespace
 
 import numpy as np
 from ou_monitor import discover, Recording
-from ou_monitor.discovery import decision
 from ou_monitor.discovery.fitting import Fitter
 from ou_monitor.discovery.search import backward, Search
 from ou_monitor.model.supply import SupplyModel
@@ -88,7 +87,6 @@ def test_the_best_law_is_named_whatever_was_tried_first(letters):
 @pytest.mark.parametrize('lost, told', [(2.9, ['load_dependent_noise']), (3.1, [])])
 def test_a_law_that_does_nearly_as_well_is_a_rival(lost, told):
     """Within three nats after a full fit in its place; one that does better takes the place."""
-    assert decision.TIE == 3.0
     search, left = compared({**ALONE, 'n': 30.0 - lost, 'ns': 30.5}, 's')
     assert left == 's' and search.rivals[LAWS['s'].NAME] == told
 
@@ -98,7 +96,6 @@ def test_two_curves_stay_where_each_explains_a_tenth_of_the_other(both, left):
     """Of 600 nats of the one, 60 of the other: less may be a matter of its form."""
     worth = {**ALONE, 's': 600.0, 'n': 400.0, 'as': 601.0, 'an': 401.0, 'ns': 600.0 + both - 5.0,
              'ans': 600.0 + both - 4.0}
-    assert decision.CURVE == 0.1
     assert compared(worth, 'ns')[1] == left
 
 

@@ -1,0 +1,172 @@
+"""Words of a finding: gains, chances and what is left, at the edges where they change."""
+
+from dataclasses import replace
+import math
+
+from ou_monitor.discovery.finding import Cause, Criticism, Verdict
+from ou_monitor.discovery.words import (
+    cause_rows, coupling_note, explain, gain_remark, gain_text, gain_words, overlap_words,
+    plain_words, remaining_words, verdict_sentence, why_named, with_error)
+from ou_monitor.model.terms.catalogue import catalogue
+from ou_monitor.model.terms.load_answer import LoadSag
+from ou_monitor.model.terms.tones import Tone
+import pytest
+
+NAN = math.nan
+SAG = Cause(LoadSag(0.5, 0.0), {}, 0.02, 0.003, 1e-3, (), 'It sags.', False)
+
+
+def left_over(name):
+    """Return a statistic that still fails."""
+    return Criticism(name, 9.0, 9.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize('gain, error, words, remark', [
+    (0.0197, 0.01, 'Gain on', ''), (0.0195, 0.01, 'No measurable', 'not distinguishable'),
+    (-0.0195, 0.01, 'No measurable', 'not distinguishable'), (-0.0197, 0.01, 'Worse on', 'worse'),
+    (NAN, 0.01, 'cannot be measured on this recording.', ''), (0.1, NAN, 'No measurable', '')])
+def test_a_gain_is_one_beyond_its_error(gain, error, words, remark):
+    """1.96 standard errors; in mnat."""
+    assert words in gain_words(gain, error)
+    found = gain_remark(gain, error)
+    assert found.startswith(remark) and bool(found) == bool(remark)
+    row, = cause_rows([replace(SAG, gain=gain, gain_se=error)])
+    if math.isfinite(gain):
+        assert row.remark.endswith('; named for what it explains in the recording as a whole'
+                                   ) == bool(remark)
+        assert f'{1e3 * gain:.3g}'[:4] in row.gain
+    else:
+        assert row.remark.startswith('not measurable here;') and row.gain == gain_text(NAN, 0.1)
+    assert cause_rows([replace(SAG, gain=gain, gain_se=error, exact=True)])[0].chance == 'exact'
+
+
+@pytest.mark.parametrize('value, error, text', [
+    (1.0, 9.99, '1.0 +- 10'), (1.0, 0.1, '1.00 +- 0.10'), (100.0, 0.1, '100.00 +- 0.10'),
+    (123456.0, 1e-3, '123456 +- 0.0010'), (0.0, 0.1, '0 +- 0.10'), (1.0, 0.0, '1.000'),
+    (-1.0, 9000.0, '-1.0 +- 9000'), ([0.0, 1.5], [NAN, 0.1], '[0, 1.50 +- 0.10]'),
+    (2.0, NAN, '2.000'), (1e-4, 0.02, '1.0e-4 +- 0.020')])
+def test_digits_follow_the_error(value, error, text):
+    assert with_error(value, error) == text
+
+
+@pytest.mark.parametrize('error, text', [
+    (1.17, '1.0 +- 1.2'), (1.18, 'not determined'), (1e300, 'not determined')])
+def test_what_is_positive_is_known_to_a_factor_of_10(error, text):
+    """A coefficient of either sign is shown with any error: it is known to be that small."""
+    assert with_error(1.0, error, positive=True) == text
+    assert with_error([1.0], [error], positive=True) == f'[{text}]'
+    assert '+-' in with_error(1.0, error)
+
+
+@pytest.mark.parametrize('chance, text', [
+    (0.9e-3, '< 0.001'), (1.1e-3, '0.0011'), (0.25, '0.25')])
+def test_chances_as_text(chance, text):
+    assert cause_rows([replace(SAG, p_value=chance)])[0].chance == text
+
+
+def test_causes_share_a_row_where_gain_and_chance_are_the_same():
+    other = replace(SAG, term=LoadSag(0.2, 0.1), alternatives=('drift', 'load_transient'))
+    row, = cause_rows([replace(SAG, alternatives=('drift',)), other])
+    assert row.alternatives == ('drift', 'load_transient') and row.label == 'load_sag x2'
+    assert len(cause_rows([SAG, replace(other, gain=0.021)])) == 2
+    assert len(cause_rows([SAG, replace(other, p_value=0.5)])) == 2
+
+
+def test_what_is_left_names_four_things():
+    """And says how many more; each thing once."""
+    def left(*names):
+        return remaining_words([left_over(name) for name in names])
+    five = left('skewness', 'kurtosis', 'throttle', 'clustering', 'time')
+    assert five.endswith('(1 more)') and 'time' not in five
+    assert '(2 more)' in left('skewness', 'kurtosis', 'throttle', 'clustering', 'time', 'bursts')
+    four = left('skewness', 'kurtosis', 'throttle', 'throttle change over 2 s', 'clustering')
+    assert 'more' not in four
+
+
+@pytest.mark.parametrize('gain, whole, said', [
+    (0.026, 0.02, True), (0.0258, 0.02, False), (0.006, -0.5, True), (0.0058, -0.5, False)])
+def test_single_gains_larger_than_the_whole_are_said(gain, whole, said):
+    """By 1.96 errors of 3 mnat; a whole that loses counts as none."""
+    cause = replace(SAG, gain=gain, gain_se=0.003)
+    assert bool(overlap_words([cause], whole)) == (said and cause.measurable)
+
+
+def tone_cause(frequency, explanation):
+    """Return a cause with a gain that all lines share."""
+    return Cause(Tone(0.01, frequency, 0.3, 0.0), {}, 0.02, 0.003, 1e-6, (), explanation, False)
+
+
+def test_terms_that_share_a_gain_are_one_row_with_the_estimates_of_all():
+    """The explanation is that of the first; its estimate gives way to those of all."""
+    first, other = tone_cause(31.0, ''), tone_cause(67.0, 'The second.')
+    (single,) = cause_rows([first])
+    estimate = single.estimates[0]
+    assert '31.00 Hz' in estimate
+    first = replace(first, explanation=f'The first. Estimate: {estimate}. Mend it.')
+    (row,) = cause_rows([first, other])
+    assert row.label == f'{first.name} x2' and len(row.estimates) == 2
+    assert row.explanation == (f'The first. Estimates: (1) {row.estimates[0]}. '
+                               f'(2) {row.estimates[1]}. Mend it.')
+    # One that holds no estimate has them added.
+    (added,) = cause_rows([replace(first, explanation='Bare.'), other])
+    assert added.explanation == (f'Bare. Estimates: (1) {row.estimates[0]}. '
+                                 f'(2) {row.estimates[1]}.')
+    assert single.label == first.name and cause_rows([other])[0].explanation == 'The second.'
+
+
+@pytest.mark.parametrize('verdict, left, begin, gain', (
+    (Verdict.NO_EFFECT, False, 'The plain OU simulates this recording', False),
+    (Verdict.UNEXPLAINED, True, 'The simulation deviates from the recording', False),
+    (Verdict.EXPLAINED, False, 'What the plain OU gets wrong is explained by tone', True),
+    (Verdict.PARTLY_EXPLAINED, False, 'tone explains a part of what the plain OU', True),
+    (Verdict.PARTLY_EXPLAINED, True, 'tone explains a part of what the plain OU', True)))
+def test_each_verdict_has_its_sentence(verdict, left, begin, gain):
+    some = [left_over('skewness')] if left else []
+    text = verdict_sentence(verdict, [tone_cause(31.0, '')], some, 0.02, 0.003)
+    assert text.startswith(begin) and ('mnat' in text) == gain
+    assert ('lopsided' in text) == left
+
+
+@pytest.mark.parametrize('name', [name for name in catalogue() if name != 'ou'])
+def test_every_cause_has_its_words(name):
+    """What it is and what to do; what would separate it is said where it is not alone."""
+    kind = catalogue()[name]
+    values = dict.fromkeys(kind.parameters(), 0.7)
+    values.update({'low': 0.1} if 'low' in values else {})
+    values.update({p: [0.7] for p in ('throttle', 'log_factor', 'at') if p in values})
+    values.update({'number': [0.0]} if 'number' in values else {})
+    values.update({p: v for p, v in (('dof', 5.0), ('states', 2.0)) if p in values})
+    text = explain(kind.read(values), {}, 0.01, 0.001, ['drift'], False)
+    assert len(text) > 120 and 'what would' in text and '(for drift)' in text
+    assert all(f'{p} = ' in text for p in kind.parameters())
+
+
+def test_the_verdict_counts_its_causes_and_says_what_is_left():
+    """Causes that repeat, the things that are left, the nearest entries, throttle never flown."""
+    some = [left_over('band 4, 1 to 2 Hz')]
+
+    def partly(causes, **more):
+        return verdict_sentence(Verdict.PARTLY_EXPLAINED, causes, some, 0.015, 0.002, **more)
+    assert 'load_sag (2 terms)' in partly([SAG, SAG]) and 'spectrum' in partly([SAG])
+    assert '900 samples' in partly([SAG], uncovered=900) and '900' not in partly([SAG])
+    lost = verdict_sentence(Verdict.UNEXPLAINED, [], some, 0.0, 0.0, ['jumps'])
+    assert 'jumps' in lost
+    refused = verdict_sentence(Verdict.EXPLAINED, [SAG], [], -0.015, 0.002, refused='It is worse')
+    assert 'It is worse' in refused
+    assert plain_words('throttle change over 2 s') == plain_words('throttle')
+    assert plain_words('order line') != plain_words('line')
+    # 0.24 alpha T = 6 nats; a corner is a rate over a turn.
+    note = coupling_note(20.0 * math.pi, 100.0)
+    assert 'exceeds 0.250 1/s' in note and 'corner at 10.0 Hz' in note
+
+
+@pytest.mark.parametrize('gain, error, chance, told', [
+    (0.0197, 0.01, 1e-9, ''), (0.0195, 0.01, 1e-9, 'p < 0.001'), (NAN, NAN, 1e-9, 'p < 0.001'),
+    (0.0, 0.01, 0.01, 'p = 0.01'), (0.0, 0.01, NAN, ''), (NAN, NAN, NAN, '')])
+def test_a_cause_without_a_gain_is_named_for_the_whole_recording(gain, error, chance, told):
+    """By its p; nothing where the gain says it, or where it is known without a model."""
+    said = why_named(gain, error, chance)
+    assert told in said and bool(said) == bool(told)
+    text = explain(SAG.term, {}, gain, error, [], False, chance=chance)
+    assert (f'{told})' in text) if told else '(p ' not in text
+    assert 'p = ' not in explain(SAG.term, {}, gain, error, [], True, chance=0.0)
