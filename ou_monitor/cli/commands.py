@@ -138,9 +138,9 @@ CSV = (
     Option('--unit', choices=('V', 'mV'), help='unit of the voltage in a CSV (default: found)'),
     Option('--time-unit', choices=('s', 'ms', 'us', 'ns'),
            help='unit of the time in a CSV (default: found)'),
-    Option('--throttle-unit', choices=('1', '%', 'us'),
-           help='unit of the throttle in a CSV: 0..1, percent, or a pulse of 1000 to 2000 us '
-           '(default: found)'),
+    Option('--throttle-unit', choices=('1', '%', 'us', '1024', '65535'),
+           help='unit of the throttle in a CSV: 0..1, percent, a pulse of 1000 to 2000 us, -1024 '
+           'to 1024, or 0 to 65535 (default: found)'),
     Option('--sample-interval', metavar='S', type=POSITIVE,
            help='time from row to row of a CSV, s, in place of a column'),
     Option('--delimiter', metavar='C',

@@ -57,7 +57,7 @@ def test_missing_throttle_is_unknown(tmp_path):
     ('time_s,voltage_v\n0,5\n1\n', [':3:', 'ends before', "'voltage_v'"]),
     ('time_s,voltage_v\n0,5\n1,0,5,1\n', [':3:', '4 cells', '2 columns', 'decimal mark']),
     ('time_s,voltage_v\n0,0,5,0\n', [':2:', '4 cells']),
-    ('time_s;voltage_v\n0,5;5,1\n1;1.200,5\n', [':3:', "'1.200,5'", 'decimal mark is a comma']),
+    ('time_s;voltage_v\n0,5;5,1\n1;1.20,5\n', [':3:', "'1.20,5'", 'decimal mark is a comma']),
     ('time_s,voltage_v\n0,5\n"1,5\n' + '2,5\n' * 99, [':102:', 'end of data']),
     ('time_s,voltage_v\n0,5\n"1 5\n' + '2 5\n' * 99 + '",5\n', [':3:']),
     ('time_s,voltage_v,note\n0,5,a\n1,5,"b\n2,5,c\n3,5,d"\n4,5,e\n',

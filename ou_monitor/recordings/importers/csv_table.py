@@ -40,7 +40,7 @@ from ou_monitor.recordings.importers.log import (
 from ou_monitor.records import (
     clock_unit, Defect, FloatArray, LEAST_STEP, LONGEST_STEP, Note, TIME_UNITS)
 from ou_monitor.stream.files import open_regular
-from ou_monitor.text import counted, plain_number, printable
+from ou_monitor.text import counted, plain_number, printable, some
 from ou_monitor.timeline.line import hold, MOST_THROTTLE, WILD
 
 TIME, VOLTAGE, THROTTLE, CURRENT = 'time_s', 'voltage_v', 'throttle', 'current_a'
@@ -57,23 +57,29 @@ MOST_OF_LINE = 65536
 _HEAD, _HEAD_LINES, _CHUNK, _BLOCK = 65536, 200, 1 << 20, 8192
 
 VOLTAGE_UNITS = {'V': 1.0, 'mV': 1e-3}
-# Unit -> the summand that is subtracted from a value, and the factor.
-THROTTLE_UNITS = {'1': (0.0, 1.0), '%': (0.0, 0.01), 'us': (1000.0, 1e-3)}
+# Unit -> the summand that is subtracted from a value, and the factor; '1024' are the sticks of
+# EdgeTX, -1024 to 1024, '65535' is the thrust of a Crazyflie.
+THROTTLE_UNITS = {'1': (0.0, 1.0), '%': (0.0, 0.01), 'us': (1000.0, 1e-3),
+                  '1024': (-1024.0, 1.0 / 2048.0), '65535': (0.0, 1.0 / 65535.0)}
 DELIMITERS = {'tab': '\t', 'space': ' '}
 NONE = 'none'
 
 # Words of units, in small letters -> name among the units above, or of a current.
 TIME_WORDS = {
     's': 's', 'sec': 's', 'secs': 's', 'second': 's', 'seconds': 's', 'sekunden': 's', 'ms': 'ms',
-    'msec': 'ms', 'millis': 'ms', 'milliseconds': 'ms', 'us': 'us', 'µs': 'us', 'μs': 'us',
-    'usec': 'us', 'micros': 'us', 'microseconds': 'us', 'ns': 'ns', 'nsec': 'ns',
-    'nanoseconds': 'ns'}
-VOLT_WORDS = {'v': 'V', 'volt': 'V', 'volts': 'V', 'mv': 'mV', 'millivolt': 'mV',
+    'msec': 'ms', 'millis': 'ms', 'millisecond': 'ms', 'milliseconds': 'ms', 'us': 'us',
+    'µs': 'us', 'μs': 'us', 'usec': 'us', 'micros': 'us', 'microseconds': 'us', 'ns': 'ns',
+    'nsec': 'ns', 'nanoseconds': 'ns'}
+VOLT_WORDS = {'v': 'V', 'volt': 'V', 'volts': 'V', 'vdc': 'V', 'mv': 'mV', 'millivolt': 'mV',
               'millivolts': 'mV'}
 AMPERE_WORDS = {'a': 'A', 'amp': 'A', 'amps': 'A', 'ampere': 'A', 'amperes': 'A', 'ma': 'mA',
                 'µa': 'uA', 'μa': 'uA', 'ua': 'uA'}
 SHARE_WORDS = {'%': '%', 'percent': '%', 'pct': '%', 'prozent': '%'}
 CURRENT_UNITS = {'A': 1.0, 'mA': 1e-3, 'uA': 1e-6}
+# Other units, which a line of units holds beside those.
+OTHER_WORDS = frozenset((
+    '', '-', 'sequence', 'w', 'wh', 'ah', 'mah', 'hz', 'khz', 'rpm', '1/min', '°', 'deg', '°c',
+    'degc', '°f', 'm', 'm/s', 'km/h', 'g', 'kg', 'n', 'nm', 'ohm', 'mohm'))
 WORDS = {**TIME_WORDS, **VOLT_WORDS, **AMPERE_WORDS, **SHARE_WORDS}
 # A quantity with one of these words at the end of its name: first in brackets.  Without unbounded
 # repetitions after the quantity, so that long names cost no more than their length.
@@ -81,12 +87,16 @@ _WORD = f"({'|'.join(sorted(WORDS, key=len, reverse=True))})"
 _WITH_UNIT = re.compile(
     rf'(.*?) ?[\[({{] ?{_WORD} ?[\])}}]|(.+?) in {_WORD}|(.[^/]*?|.+? ) ?/ ?{_WORD}|'
     rf'(.+?)[ _]{_WORD}')
+# A number with groups of thousands and decimals, or with a unit.
+_GROUPED = re.compile(r'[-+]?\d{1,3}(?:,\d{3})+\.\d+')
+_AND_UNIT = re.compile(r'(\S*[\d.])\s*+([^\d\s.]{1,12})')
 # Lines above the data that state the time between rows, or its inverse.
 _NUMBER = r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?'
 # Possessive, so that lines of blanks cost no more than their length.
 _INTERVAL = re.compile(
     r'(sampl(?:e|ing)[ _]*(?:interval|period|time)|t_?inc(?:rement)?|x[ _-]?inc(?:rement)?|'
-    r'increment|delta[ _]?t|sampl(?:e|ing)[ _]*(?:rate|frequency))\b["\s]*+(?:[\[(](\w+)[\])])?+'
+    r'increment|delta[ _]?t|h_?resolution|sampl(?:e|ing)[ _]*(?:rate|frequency))\b'
+    r'["\s]*+(?:[\[(](\w+)[\])])?+'
     rf'[\s"=:,;]*+(?:\w+:)?[\s"]*+({_NUMBER})\s*+(n|u|µ|m|k|M|G)?(s|sec|hz|sa/s)?',
     re.IGNORECASE)
 _PREFIX = {'n': 1e-9, 'u': 1e-6, 'µ': 1e-6, 'm': 1e-3, 'k': 1e3, 'M': 1e6, 'G': 1e9, '': 1.0}
@@ -230,9 +240,22 @@ def _prepared(lines: list[str], delimiter: str, comma: bool) -> list[str]:
     return [' '.join(line.split()) + '\n' for line in lines] if delimiter == ' ' else lines
 
 
+def number_of(cell: str) -> tuple[float, str]:
+    """Return a number and the unit written behind it, in small letters; '': none."""
+    try:
+        return plain_number(cell), ''
+    except ValueError:
+        pass
+    found = _AND_UNIT.fullmatch(cell.strip())
+    text, unit = (found[1], found[2].lower()) if found else (cell.strip(), '')
+    if unit and unit not in WORDS:
+        raise ValueError(cell)
+    return plain_number(text.replace(',', '') if _GROUPED.fullmatch(text) else text), unit
+
+
 def is_number(cell: str) -> bool:
     try:
-        plain_number(cell)
+        number_of(cell)
     except ValueError:
         return False
     return True
@@ -288,14 +311,19 @@ def _header(rows: list[list[str]], lines: list[str], first: int, width: int, del
     names = names or [f'column {k + 1}' for k in range(width)]
     stated = [units[k] if k < len(units) and units[k] in WORDS else unit_of(name)[1]
               for k, name in enumerate(names)]
+    # Else the unit behind the first number of the column.
+    for k, unit in enumerate(stated):
+        cell = next((row[k] for row in rows[first:] if k < len(row) and is_number(row[k])), '0')
+        stated[k] = unit or number_of(cell)[1]
     return tuple(names), tuple(stated), line
 
 
 def _are_units(row: list[str]) -> bool:
-    """Return whether cells are units, 'sequence', numbers, or blank, and some are units."""
+    """Return whether cells are units, in brackets, numbers, or blank, and some are units."""
     words = [cell.strip('[](){} ').lower() for cell in row]
     return any(word in WORDS for word in words) and all(
-        word in WORDS or word in ('', 'sequence') or is_number(word) for word in words)
+        word in WORDS or word in OTHER_WORDS or is_number(word) or cell[0] in '[({'
+        for cell, word in zip(row, words))
 
 
 def _stated_step(lines: list[str], above: list[list[str]]) -> tuple[float, float, str]:
@@ -338,7 +366,7 @@ def numbers(path: Path, form: Form, places: Sequence[int],
                     continue
                 for place, part in zip(places, parts):
                     where = partial(_place, path, form, place, begin, block)
-                    part.append(_floats(columns[place], where, form.comma))
+                    part.append(_floats(columns[place], where, form.comma, form.units[place]))
                 for place, cells in (texts or {}).items():
                     cells += columns[place]
     except OSError as error:
@@ -418,8 +446,9 @@ def _fitting(path: Path, rows: list[list[str]], width: int, last: int, form: For
     return [row[:last + 1] for row in rows if row]
 
 
-def _floats(cells: Sequence[str], where: Callable[[int], str], comma: bool) -> FloatArray:
-    """Return cells as numbers (where: words for the place of one)."""
+def _floats(cells: Sequence[str], where: Callable[[int], str], comma: bool, stated: str,
+            ) -> FloatArray:
+    """Return cells as numbers (where: words for the place of one; stated: their unit)."""
     try:
         values = np.fromiter(map(float, cells), np.float64, len(cells))
         # As in `plain_number`.
@@ -429,8 +458,12 @@ def _floats(cells: Sequence[str], where: Callable[[int], str], comma: bool) -> F
         pass
     found = array('d')
     for k, cell in enumerate(cells):
-        if is_number(cell):
-            found.append(float(cell))
+        try:
+            value, unit = number_of(cell)
+        except ValueError:
+            value, unit = math.nan, ''
+        if value == value and unit in ('', stated):
+            found.append(value)
         elif cell.strip().lower() in MISSING:
             found.append(math.nan)
         else:
@@ -484,8 +517,10 @@ _PATTERNS = {
         r'(?!.*(?:axis|cell|temp|limit|zelle|motor|servo|rssi|phase|cpu|mcu|5v|sag)).*(?:volt|'
         r'spannung|vbat).*'),
     logs.THROTTLE: (
-        r'throttle', r'thr(?:ottle)?_?(?:out|cmd|command|pct|percent)?|gas|duty(?:_cycle)?|tho?o',
-        r'rc_?command_3', r'pwm|throttle.*|thrust|stick_throttle'),
+        r'throttle', r'thr(?:ottle)?_?(?:out|cmd|command|pct|percent)?|gas|duty(?:_cycle)?|tho?o|'
+        r'tastgrad|tastverh.*',
+        r'rc_?command_3', r'pwm|thrust|gas_?kanal|esc(?:_signal)?|'
+        r'(?!.*(?:limit|trim|max|min)).*throttle.*'),
     logs.CURRENT: (
         r'current_a', r'amperage(?:_?latest)?|current_in|i_?bat(?:t|tery)?|'
         r'batt?(?:ery)?_?(?:i|curr(?:ent)?|amps?)|current_?batt?(?:ery)?|'
@@ -613,14 +648,15 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
     for (quantity, column), column_values in zip(found.items(), values):
         si, guesses[quantity] = _in_si(quantity, column, column_values, units.get(quantity), volts)
         scaled[quantity] = column, si
-    note = _read_note(form, time, found, guesses)
+    note = _read_note(form, time, found, guesses, wanted.throttle is None)
     return _Table(form, t, scaled, dict(zip(others, values[len(found):])), note)
 
 
 def _absent(path: Path, form: Form, name: str, option: str = '') -> str:
     """Return the error for a missing column."""
     hint = nearest(name, form.names) if form.line else (
-        f'the first line holds numbers; add a header line {TIME},{VOLTAGE}[,{THROTTLE}]')
+        f'the first line holds numbers; add a header {TIME},{VOLTAGE}[,{THROTTLE}] or give '
+        "'column 1'")
     return f"{path}:{form.line or form.skip + 1}: no column '{name}': {hint}" + option
 
 
@@ -675,7 +711,8 @@ def _time_of(path: Path, form: Form, wanted: CsvColumns) -> _Column:
                             wanted.time_unit)
     numbered = bool(form.rows) and form.width > 1 and re.fullmatch(
         _INDEX_NAME, unit_of(form.names[0])[0].strip('# ').lower()) is not None
-    found = [] if numbered and math.isfinite(form.step) else _choose(form, _TIME_NAME)
+    found = [] if numbered and math.isfinite(form.step) else (
+        _choose(form, _TIME_NAME) or _clock_columns(form))
     if found:
         first = found[0]
         beside = [k for k in range(min(form.width, len(form.names))) if k != first and any(
@@ -686,7 +723,7 @@ def _time_of(path: Path, form: Form, wanted: CsvColumns) -> _Column:
                            f'{form.names[beside[0]]}, {form.names[first]}', 's', 0.0)
         return _unit_column(form, first, wanted.time_unit)
     filled = _nameless_columns(form)
-    if len(filled) == 2:
+    if len(filled) > 1 and _rises(form, filled[0]):
         return _unit_column(form, filled[0], wanted.time_unit)
     if not math.isfinite(form.step):
         raise InputError(_absent(
@@ -698,6 +735,19 @@ def _nameless_columns(form: Form) -> list[int]:
     """Return the columns without a name that hold a number in each of the first rows."""
     return [] if form.line else [k for k in range(form.width) if form.rows and all(
         k < len(row) and is_value(row[k]) for row in form.rows)]
+
+
+def _clock_columns(form: Form) -> list[int]:
+    """Return the columns that hold a time of the day in each of the first rows."""
+    return [k for k in range(min(form.width, len(form.names))) if form.rows and all(
+        k < len(row) and ':' in row[k] and is_clock(row[k]) for row in form.rows)]
+
+
+def _rises(form: Form, place: int) -> bool:
+    """Return whether a column without a name never falls in the first rows."""
+    cells = [row[place] for row in form.rows]
+    return not all(map(is_number, cells)) or bool(
+        (np.diff([number_of(cell)[0] for cell in cells]) >= 0.0).all())
 
 
 def _has_day(cell: str) -> bool:
@@ -748,7 +798,7 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: _Column, needed
                              f'--{owners[place]}-column')
         owners[place] = quantity
     if needed and logs.VOLTAGE not in found:
-        raise InputError(_absent(path, form, VOLTAGE, ' (--voltage-column names another)'))
+        raise InputError(_absent(path, form, VOLTAGE, ' (--voltage-column)'))
     return found
 
 
@@ -876,7 +926,7 @@ def _in_si(quantity: str, column: _Column, values: FloatArray, given: str | None
         unit = given or SHARE_WORDS.get(column.unit) or ('us' if column.unit == 'us' else None)
         words = ''
         if unit is None:
-            unit = _throttle_unit(known, volts)
+            unit = _throttle_unit(values[np.isfinite(values)], volts)
             words = '' if unit == '1' else ', a guess: --throttle-unit'
         zero, scale = THROTTLE_UNITS[unit]
         return (values - zero) * scale if unit != '1' else values, (
@@ -893,8 +943,9 @@ def _in_si(quantity: str, column: _Column, values: FloatArray, given: str | None
     return values * VOLTAGE_UNITS[unit] if unit != 'V' else values, unit + words
 
 
-def _throttle_unit(known: FloatArray, volts: FloatArray) -> str:
+def _throttle_unit(values: FloatArray, volts: FloatArray) -> str:
     """Return the unit suggested by the sizes of a throttle; '1' by default."""
+    known = np.abs(values)
     beyond = known[known > MOST_THROTTLE]
     # With a voltage within 0 to 1 it may be the voltage: `check_throttle` reports it.
     if beyond.size <= WILD * known.size or float(np.nanmax(np.abs(volts), initial=0.0)) <= 1.0:
@@ -902,10 +953,17 @@ def _throttle_unit(known: FloatArray, volts: FloatArray) -> str:
     low, high = (float(np.quantile(known, q)) for q in (WILD, 1.0 - 0.1 * WILD))
     if high <= 110.0:
         return '%'
-    return 'us' if low >= 800.0 and high <= 2200.0 else '1'
+    if low >= 800.0 and high <= 2200.0:
+        return 'us'
+    if high <= 1024.0 and float(np.mean(values < -MOST_THROTTLE)) > WILD:
+        return '1024'
+    # Other counts end at 10 000 at most, and 16 bits hold whole numbers.
+    return '65535' if 10000.0 < high <= 65535.0 and values.min() >= 0.0 and (
+        values == np.rint(values)).all() else '1'
 
 
-def _read_note(form: Form, time: _Column, found: dict[str, _Column], units: dict[str, str]) -> str:
+def _read_note(form: Form, time: _Column, found: dict[str, _Column], units: dict[str, str],
+               search: bool) -> str:
     """Return in one line how a file was read; '' if nothing was detected."""
     if time.name == TIME and not form.comma and form.encoding in ('utf-8', 'utf-8-sig') and all(
             column.name == {logs.VOLTAGE: VOLTAGE, logs.THROTTLE: THROTTLE,
@@ -920,6 +978,14 @@ def _read_note(form: Form, time: _Column, found: dict[str, _Column], units: dict
     others = [form.names[k] for k in _choose(form, logs.VOLTAGE, time.place)[1:3]
               if form.names[k] not in {column.name for column in found.values()}]
     also = f'; also there: {", ".join(others)} (--voltage-column)' if others else ''
+    if search and logs.THROTTLE not in found:
+        # A throttle by another name is not lost in silence.
+        used = {*time.place, *(column.place[0] for column in found.values())}
+        rest = [name for k, name in enumerate(form.names[:form.width]) if form.line
+                and k not in used and name not in others
+                and not re.fullmatch(_INDEX_NAME, name.strip('# ').lower())
+                and all(k < len(row) and is_number(row[k]) for row in form.rows[:2])]
+        also += f'; not read: {some(rest, 3)} (--throttle-column)' if rest else ''
     return (f"Read {', '.join(parts)}{also}; cells between {between}, decimal "
             f"{'comma' if form.comma else 'point'}"
             + (f', {form.encoding}' if form.encoding not in ('utf-8', 'utf-8-sig') else '')

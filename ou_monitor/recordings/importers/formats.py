@@ -140,7 +140,7 @@ def detect(path: Path) -> Format:
 
 
 # Endings of text tables; their first bytes must not fit another format.
-_TABLES = ('.csv', '.tsv', '.tab', '.txt', '.dat', '.asc', '.log')
+_TABLES = ('.csv', '.tsv', '.tab', '.txt', '.dat', '.asc', '.log', '.lvm', '.prn')
 
 
 def _begins_as(path: Path) -> Format | None:

@@ -134,6 +134,27 @@ FORMS = {
                                                  f'{10 * k % 1000:03d} AM,{V[k]}'), 0.01, False,
                  False),
     'no_header': (table([], lambda k: f'{0.01 * k:.3f},{V[k]},', '\r\n'), 0.01, False, False),
+    'edgetx_sticks': (table(['Date,Time,RxBt(V),Thr,TxBat(V)'],
+                            lambda k: f"{clock(k, '%Y-%m-%d,%H:%M:%S.')}{10 * k % 1000:03d},"
+                                      f'{V[k]},{2048 * U[k] - 1024:.0f},7.9'), 0.01, True, False),
+    'cfclient': (table(['Timestamp,pm.vbat,stabilizer.thrust'],
+                       lambda k: f'{12345 + 10 * k},{V[k]},{65535 * U[k]:.0f}.0'), 0.01, True,
+                 False),
+    'units_behind_numbers': (table(['"time","voltage","throttle"'], lambda k: (
+        f'"{0.01 * k:.2f} s","{1e3 * V[k]:.0f} mV","{100 * U[k]:.1f}%"')), 0.01, True, False),
+    'line_of_units': (table(['t\tU_batt\tthr\tI\tn\ttemp', '[ms]\t[V]\t[-]\t[A]\t[1/min]\t[K]'],
+                            lambda k: f'{10 * k}\t{V[k]}\t{U[k]}\t{AMPS[k]}\t1\t300'), 0.01, True,
+                      True),
+    'thousands': (table(['Zeit [ms];Spannung [mV]'], lambda k: (
+        f'{10 * k + 5000:,}.5;{1e3 * V[k]:,.1f}'.translate(str.maketrans(',.', '.,')))), 0.01,
+                  False, False),
+    'clock_by_its_cells': (table(['clock,battery voltage,# of flight'], lambda k: (
+        f"{clock(k, '%H:%M:%S.')}{10 * k % 1000:03d},{V[k]},1")), 0.01, False, False),
+    'fluke': (table(['Fluke 289', 'Reading;Sample;Start Time'], lambda k: (
+        f"{k};{V[k]} VDC;{clock(k, '%m/%d/%Y %H:%M:%S.%f')}")), 0.01, False, False),
+    'rcbenchmark': (table(['Time (s),ESC signal (µs),Thrust (kgf),Voltage (V),Current (A)'],
+                          lambda k: f'{0.01 * k:.2f},{1000 + 1000 * U[k]:.0f},0.4,{V[k]},'
+                                    f'{AMPS[k]}'), 0.01, True, True),
     'hioki': (table(['"File name","WAVE0001.CSV","V 1.00"', '"Title comment",""', '"Trigger Time",'
                      '"\'12-07-01 09:14:03"', '"Time","CH1[V]","Event"'],
                     lambda k: f'{0.01 * k:.9E},{V[k]:.5E},0'), 0.01, False, False),
@@ -180,6 +201,7 @@ def test_an_export_is_read_without_an_option(form, tmp_path):
     ('1 2 3\n4 5 6\nt U\n0 12\n1 13\n', CsvColumns(skip_rows=2, delimiter='space'), 1.0, [12, 13]),
     ('t|U\n0|12\n1|13\n', CsvColumns(delimiter='|'), 1.0, [12, 13]),
     ('t,V1,V2\n0,5,12\n1,5,13\n', CsvColumns(voltage='V2'), 1.0, [12, 13]),
+    (' 0  12  0.1\n 1  13  0.2\n', CsvColumns(voltage='column 2'), 1.0, [12, 13]),
 ])
 def test_a_guess_is_overruled(content, columns, step, volts, tmp_path):
     """Units, delimiter, decimal mark, lines above and the time from row to row."""
@@ -198,6 +220,25 @@ def test_the_unit_of_a_throttle(tmp_path):
     found = read_recording(percent, columns=CsvColumns(throttle_unit='%', current='none'))
     assert found.throttle[0] == pytest.approx(0.01) and found.current is None
     assert not read_recording(path, columns=CsvColumns(throttle='none')).has_throttle
+
+
+def test_counts_of_unknown_size_and_mixed_units_are_refused(tmp_path):
+    """0 to 10 000 is no unit that is known; a cell in mV is not read in V."""
+    rows = 't,U,thr\n' + ''.join(f'{k},12 V,{100 * k}\n' for k in range(99))
+    with pytest.raises(InputError, match='throttle runs from 0 to 9800'):
+        read_recording(written(tmp_path, rows))
+    with pytest.raises(InputError, match="holds '12 mV', not a number"):
+        read_recording(written(tmp_path, rows.replace('9,12 V', '9,12 mV')))
+
+
+def test_a_column_that_may_be_the_throttle_is_named(tmp_path):
+    """Not lost in silence; nothing is said where it was found, or given as none."""
+    rows = 't,U,load\n' + ''.join(f'{k},12,{k / 9}\n' for k in range(9))
+    path = written(tmp_path, rows)
+    assert 'not read: load (--throttle-column)' in read_recording(path).notes[0]
+    for name in ('load', 'none'):
+        notes = read_recording(path, columns=CsvColumns(throttle=name)).notes
+        assert 'not read' not in notes[0]
 
 
 def test_one_column_is_one_series(tmp_path):
