@@ -325,7 +325,7 @@ MOST_CURRENT = 1.0e6
 MOST_THROTTLE = 2.0
 # Share of implausible throttles up to which they count as errors of single samples.
 WILD = 0.05
-# Buffer size, samples: NumPy's overhead per call vanishes, and the buffer stays in the cache.
+# Samples that are collected at most: NumPy's overhead per call vanishes.
 BATCH = 32768
 # Search for repeats: samples used, minimum number, new samples between two searches.
 TAIL, _ENOUGH, _LOOK = 1024, 64, 256
@@ -381,10 +381,8 @@ class TimeLine:
     """Buffer, order and counters of the samples of one source."""
 
     def __init__(self) -> None:
-        self._columns = np.empty((4, BATCH))
-        self._make_views()
-        # Whether the buffer's throttle and current columns hold values of this batch.
-        self._loaded = [False, False]
+        # Columns t, V, throttle and current of each push since the last `work_off`.
+        self._parts: list[FloatArray] = []
         self._fill = 0
         self._counts: dict[str, int] = {}
         self.newest = -math.inf
@@ -392,19 +390,6 @@ class TimeLine:
         # Last raw samples (t, V, throttle, current); new ones since the last search for repeats.
         self._tail = np.empty((4, 0))
         self._unseen, self._looked = 0, False
-
-    def _make_views(self) -> None:
-        # Copying into a slice takes half as long through a memoryview as through NumPy.
-        self._into: tuple[Any, ...] = tuple(column.data for column in self._columns)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the state without the views of the buffers."""
-        return {k: v for k, v in self.__dict__.items() if k != '_into'}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore a state and make new views of the buffers."""
-        self.__dict__.update(state)
-        self._make_views()
 
     @property
     def counters(self) -> Counters:
@@ -426,54 +411,14 @@ class TimeLine:
         """Return the samples per reading; 1 without repeats."""
         return self._repeats.period
 
-    def put(self, t: FloatArray, y: FloatArray, u: FloatArray | float | None,
-            i: FloatArray | None = None) -> bool:
-        """Copy samples into the buffer; return False, changing nothing, if they do not fit."""
-        begin = self._fill
-        end = begin + len(t)
-        if end > BATCH:
-            return False
-        into = self._into
-        try:
-            into[0][begin:end] = t
-            into[1][begin:end] = y
-            for k, more in enumerate((u, i)):
-                if type(more) is np.ndarray:
-                    into[2 + k][begin:end] = more
-        except ValueError:
-            # Unaligned arrays, for instance columns of packed records.
-            return self.put(t.copy(), y.copy(), u if u is None else u + 0.0,
-                            i if i is None else i + 0.0)
-        for k, more in enumerate((u, i)):
-            self._fill_load(k, more, begin, end)
-        self._fill = end
-        return True
-
-    def put_one(self, t: float, y: float, u: float | None) -> bool:
-        """Copy one sample into the buffer; return False, changing nothing, if it is full."""
-        at = self._fill
-        if at == BATCH:
-            return False
-        self._columns[0, at] = t
-        self._columns[1, at] = y
-        if u is not None or self._loaded[0]:
-            self._fill_load(0, u, at, at + 1)
-        if self._loaded[1]:
-            self._fill_load(1, None, at, at + 1)
-        self._fill = at + 1
-        return True
-
-    def _fill_load(self, k: int, more: FloatArray | float | None, begin: int, end: int) -> None:
-        """Fill the throttle (0) or current (1) column from `begin` to `end`."""
-        column = self._columns[2 + k]
-        if more is not None:
-            if not self._loaded[k]:
-                column[:begin] = NAN
-                self._loaded[k] = True
-            if type(more) is not np.ndarray:
-                column[begin:end] = more
-        elif self._loaded[k]:
-            column[begin:end] = NAN
+    def put(self, t: FloatArray, y: FloatArray, u: FloatArray | float | None) -> None:
+        """Keep samples, copied, for the next `work_off`."""
+        columns = np.full((4, t.size), NAN)
+        columns[0], columns[1] = t, y
+        if u is not None:
+            columns[2] = u
+        self._parts.append(columns)
+        self._fill += t.size
 
     def count(self, **more: int) -> None:
         """Add to the counters."""
@@ -493,12 +438,9 @@ class TimeLine:
 
     def work_off(self, pause: float) -> list[Batch]:
         """Empty the buffer; return its readings in order (pause in s)."""
-        n = self._fill
-        self._fill = 0
-        t, y = self._columns[0, :n], self._columns[1, :n]
-        u, i = (self._columns[2 + k, :n] if self._loaded[k] else None for k in (0, 1))
-        self._loaded = [False, False]
-        return self.take(t, y, u, i, pause)
+        parts, self._parts, self._fill = self._parts, [], 0
+        t, y, u, _ = np.concatenate(parts, axis=1)
+        return self.take(t, y, None if np.isnan(u).all() else u, None, pause)
 
     def take(self, t: FloatArray, y: FloatArray, u: FloatArray | None, i: FloatArray | None,
              pause: float) -> list[Batch]:

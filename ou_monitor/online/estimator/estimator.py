@@ -36,7 +36,7 @@ from ou_monitor.online.estimator.window import (
     Kept, lagged, LOAD_LAGS, LOOK_BACK, Thinner, UNEVEN)
 from ou_monitor.records import (
     as_numbers, as_seconds, Counters, Estimate, Flag, FloatArray, LARGEST_LOG_SE, LOG_NAMES,
-    MOST_READINGS, MOST_STAMP, NAN, OU_WINDOWS, OuFacts, Status)
+    MOST_READINGS, NAN, OU_WINDOWS, OuFacts, Status)
 from ou_monitor.timeline.line import as_column, BATCH, Batch, TAIL, TimeLine
 
 # Minimum number of samples for a fit.
@@ -53,7 +53,6 @@ _HAIR = 1e-6
 _RAMP = 1e-9
 # Number of checks of the input's quality per window.
 _LOOKS = 4
-_DOUBLE = np.dtype(np.float64)
 # Length of the sliding estimate beside the fit, s.
 SLIDING = OU_WINDOWS[0]
 # Time between two fits, as a share of the window, and its minimum, s.
@@ -160,42 +159,21 @@ class SlidingEstimator:
 
         """
         self._cached = None
-        # What the fast sources send, with as few steps as can be.
-        stamps: Any = t
-        volts: Any = voltage
-        if not (type(stamps) is np.ndarray is type(volts) and stamps.dtype is _DOUBLE
-                is volts.dtype and stamps.ndim == 1 == volts.ndim
-                and not (stamps.size and stamps[-1] > MOST_STAMP)):
-            if isinstance(stamps, float) and isinstance(volts, float) and (
-                    throttle is None or isinstance(throttle, (float, int))) and not (
-                    stamps > MOST_STAMP):
-                if not self._line.put_one(stamps, volts, throttle):
-                    self._work_off()
-                    self._line.put_one(stamps, volts, throttle)
-                return
-            stamps, volts = np.atleast_1d(as_seconds(stamps)), as_column(volts)
-        if len(stamps) != len(volts) or stamps.ndim != 1 or volts.ndim != 1:
+        stamps, volts = np.atleast_1d(as_seconds(t)), as_column(voltage)
+        if stamps.shape != volts.shape or stamps.ndim != 1:
             raise ValueError(
                 f't and voltage must have one shape (n,): got {stamps.shape} and {volts.shape}')
-        load: FloatArray | float | None = None
-        if type(throttle) is np.ndarray and throttle.dtype is _DOUBLE and (
-                throttle.shape == stamps.shape):
-            load = throttle
-        elif throttle is not None:
-            load = as_numbers(throttle)
-            if load.ndim == 0:
-                load = float(load)
-            elif load.shape != stamps.shape:
-                raise ValueError(
-                    f'throttle must be one number or have the shape of t, {stamps.shape}: got '
-                    f'{load.shape}')
-        put = self._line.put
-        if put(stamps, volts, load):
-            return
+        load = None if throttle is None else as_numbers(throttle)
+        if load is not None and load.shape not in ((), stamps.shape):
+            raise ValueError(
+                f'throttle must be one number or have the shape of t, {stamps.shape}: got '
+                f'{load.shape}')
         for begin in range(0, stamps.size, BATCH):
             part = slice(begin, begin + BATCH)
-            self._work_off()
-            put(stamps[part], volts[part], load[part] if isinstance(load, np.ndarray) else load)
+            if self._line.waiting + stamps[part].size > BATCH:
+                self._work_off()
+            self._line.put(stamps[part], volts[part],
+                           load[part] if load is not None and load.ndim else load)
 
     def estimate(self) -> Estimate:
         """Return the estimate for the window that ends at the newest sample."""

@@ -75,7 +75,7 @@ def test_trends_are_few_where_there_is_none_and_seen_where_there_is():
 def batches(t, y=None, window=1.0, intake=None, u=None):
     intake = intake or TimeLine()
     t = np.asarray(t, dtype=float)
-    assert intake.put(t, np.zeros(t.size) if y is None else np.asarray(y, dtype=float), u)
+    intake.put(t, np.zeros(t.size) if y is None else np.asarray(y, dtype=float), u)
     return intake.work_off(window), intake
 
 
@@ -107,9 +107,9 @@ def test_any_array_of_doubles_is_copied():
     fixed.setflags(write=False)
     for y in (np.repeat(plain, 3)[::3], plain[::-1].copy()[::-1], fixed, records['y']):
         intake = TimeLine()
-        assert intake.put(np.empty(0), np.empty(0), np.empty(0))
-        assert intake.put(0.1 * plain, y, y)
-        assert intake.put(0.1 * plain + 1.0, np.broadcast_to(2.0, 4), np.broadcast_to(0.5, 4))
+        intake.put(np.empty(0), np.empty(0), np.empty(0))
+        intake.put(0.1 * plain, y, y)
+        intake.put(0.1 * plain + 1.0, np.broadcast_to(2.0, 4), np.broadcast_to(0.5, 4))
         batch = intake.work_off(2.0)[0]
         assert batch.y.tolist() == [1.0, 2.0, 3.0, 4.0, 2.0, 2.0, 2.0, 2.0]
         assert batch.u.tolist() == [1.0, 2.0, 3.0, 4.0, 0.5, 0.5, 0.5, 0.5]
