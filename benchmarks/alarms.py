@@ -1,5 +1,5 @@
 """
-The brown-out flag on recorded flights, beside the battery alarms of PX4 and ArduPilot.
+The brown-out flag on recorded flights, beside the battery alarms of PX4 and ArduPilot (8 min).
 
 Reports at 10 Hz of one monitor a limit; limits passed by 1 and 5 % of the seconds, and 3.3 and
 3.5 V a cell.  A dip: the middle one of three readings at or below the limit; dips less than 0.3 s
@@ -44,7 +44,7 @@ from ou_monitor import MonitorSettings, read_recording, SupplyMonitor  # noqa: E
 from ou_monitor.online.risk.flag import FlagLevel  # noqa: E402
 from ou_monitor.records import Recording  # noqa: E402
 from ou_monitor.report.svg import Plot  # noqa: E402
-from tables import deliver, drawing, recorded, table  # noqa: E402
+from tables import deliver, drawing, median3, recorded, table  # noqa: E402
 
 # Name, file, flight of the log, cells.
 FLIGHTS = (('gecko', 'bf_gecko_a.csv', None, 4), ('nazgul', 'raw/bf_nazgul_4s.bbl', 1, 4),
@@ -62,12 +62,6 @@ ALARMS = (OURS, PX4, *ARDUPILOT)
 # Of the rows of a strip, WARN first.
 SHORT = ('WARN', 'CRITICAL', 'PX4', 'AP 10.5 V', 'AP limit', 'AP rest')
 SHADES = ('#e0b84c', '#d55e00', *4 * ['#444444'])
-
-
-def median3(v: np.ndarray) -> np.ndarray:
-    """Return the middle one of each sample and the two before."""
-    padded = np.concatenate((v[:1], v[:1], v))
-    return np.median(np.stack((padded[:-2], padded[1:-1], padded[2:])), axis=0)
 
 
 def dips_of(t: np.ndarray, middle: np.ndarray, limit: float, step: float) -> list[list[float]]:

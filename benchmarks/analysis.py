@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 """
-How often `analyze` finds what is not there, and what is: `benchmarks/analysis.py [RECORDINGS]`.
+How often `analyze` finds what is there, and what is not (10 min).
 
 Recordings of three load levels, 5 s each at 1 kHz, with the paper's alpha, white noise of 3 mV and
 a sag; half of them with one thing added.

@@ -1,5 +1,5 @@
 """
-Recorded flights beside their simulations: fitted on the first half, the second simulated.
+Recorded flights beside their simulations: fitted on the first half, the second simulated (1 min).
 
 Nothing is set for any one flight.  Flights that are not there are left out, with a word on stderr.
 """

@@ -1,5 +1,5 @@
 """
-How fast a switched supply tends to its limits as eps shrinks, and what an ESC makes of a rail.
+How fast a switched supply tends to its limits as eps shrinks, and a rail under an ESC (10 s).
 
     python benchmarks/convergence.py
 

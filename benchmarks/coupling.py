@@ -1,5 +1,5 @@
 """
-False alarms and power of `coupling` on recorded gyros, whose spectra change their shape.
+False alarms and power of `coupling` on recorded gyros, whose spectra change their shape (3 min).
 
 Nothing couples: a simulated supply of constant sigma, one whose sigma follows the throttle of
 another flight, or the flight's own voltage against its gyro turned in time.  Power: the same

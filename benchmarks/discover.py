@@ -1,8 +1,8 @@
 """
-What `discover` makes of hidden effects, of none, and of real recordings: one command, four parts.
+What `discover` makes of hidden effects, of none, and of real recordings (hours).
 
     python benchmarks/discover.py blind [--each 10] [--lines FILE] [--table FILE]
-    python benchmarks/discover.py nulls [--each 40] [--elsewhere FILE] [--lines FILE]
+    python benchmarks/discover.py nulls [--each 40] [--lines FILE]
     python benchmarks/discover.py flights [--table FILE] [NAME...]
     python benchmarks/discover.py injected [--table FILE] [--effects NAME...] [NAME...]
 
@@ -37,7 +37,7 @@ from hidden_effects import causes, KINDS, labels, pairs, unknowns, variants  # n
 from injected import EFFECTS  # noqa: E402
 import numpy as np  # noqa: E402
 from scipy.stats import binomtest  # noqa: E402
-from tables import number, put, table  # noqa: E402
+from tables import deliver, number, recorded, table  # noqa: E402
 
 SEED = 20260131
 
@@ -109,19 +109,14 @@ def blind(given: argparse.Namespace) -> int:
                        f'{given.duration:g} s at {given.rate:g} Hz, strength {given.strength:g}, '
                        'which the generator varies by 30 % either way')
     text = report(lines, setting)
-    print(text)
-    if given.table:
-        put(given.table, text, 'blind')
+    deliver(text, given.table, 'blind')
     return 0
 
 
 def flights(given: argparse.Namespace) -> int:
     """Run the recordings of real runs; write their table."""
-    folder = os.environ.get('OU_MONITOR_REALDATA')
-    if folder is None:
-        raise ValueError('OU_MONITOR_REALDATA is not set: it names the folder of the recordings')
     rows, agreed, spent = [], [], []
-    for name, found in runs.examine_recorded(Path(folder), given.names, not given.whole):
+    for name, found in runs.examine_recorded(recorded(), given.names, not given.whole):
         whole = found[0]
         extended, count = whole['extended'], Counter(one['name'] for one in whole['causes'])
         names = ', '.join(one if many == 1 else f'{one} x{many}' for one, many in count.items())
@@ -146,17 +141,15 @@ def flights(given: argparse.Namespace) -> int:
         f'\nCPU time: {median(spent):.1f} s at the median, {max(spent):.1f} s at most.'
         + (f' Halves name the same causes (Jaccard): {mean(agreed):.2f} in the mean of '
            f'{len(agreed)} recordings.\n' if agreed else '\n'))
-    print(text)
-    if given.table:
-        put(given.table, text, 'runs')
+    deliver(text, given.table, 'runs')
     return 0
 
 
 def nulls(given: argparse.Namespace) -> int:
     """Run recordings with nothing hidden; write their table."""
     lines = []
-    for line in runs.nulls_of(given.each, given.seed, given.elsewhere, given.generators,
-                              given.lines, not given.no_run):
+    for line in runs.nulls_of(given.each, given.seed, given.generators, given.lines,
+                              not given.no_run):
         lines.append(line)
         said = ', '.join(line['false']) or 'nothing false'
         say(f'{line["generator"]} {line["number"]}: {line["rate"]:g} Hz, {line["duration"]:g} s, '
@@ -165,25 +158,18 @@ def nulls(given: argparse.Namespace) -> int:
         say('no recording was run')
         return 1
     text = nulls_table(lines).strip()
-    print(text)
-    if given.table:
-        put(given.table, text, 'nulls')
+    deliver(text, given.table, 'nulls')
     return 0
 
 
 def injected(given: argparse.Namespace) -> int:
     """Hide effects in the recordings of real runs; write their table."""
-    folder = os.environ.get('OU_MONITOR_REALDATA')
-    if folder is None:
-        raise ValueError('OU_MONITOR_REALDATA is not set: it names the folder of the recordings')
-    results = runs.examine_injected(Path(folder), given.names, given.effects, given.seed, say)
+    results = runs.examine_injected(recorded(), given.names, given.effects, given.seed, say)
     if not results:
         say('no recording was run')
         return 1
     text = injected_table(results)
-    print(text)
-    if given.table:
-        put(given.table, text, 'injected')
+    deliver(text, given.table, 'injected')
     return 0
 
 
@@ -210,23 +196,12 @@ _LEVELS: tuple[tuple[str, str, float, Callable[[Outcome], bool]], ...] = (
 
 @dataclass(frozen=True)
 class Level:
-    """
-    A share of recordings beside the one required.
+    """A share of recordings beside the one required."""
 
-    Attributes
-    ----------
-    kind, what : str
-        Kind of recordings, and what is counted.
-    required : float
-        Share at least; negative: at most minus that; 0: not required.
-    hits, of : int
-        Recordings.
-
-    """
-
+    # Kind of recordings, and what is counted.
     kind: str
     what: str
-    required: float
+    required: float  # Share at least; negative: at most minus that; 0: not required.
     hits: int
     of: int
 
@@ -263,21 +238,7 @@ def levels(lines: Sequence[dict[str, Any]]) -> list[Level]:
 
 
 def report(lines: Sequence[dict[str, Any]], setting: str) -> str:
-    """
-    Return all tables as Markdown.
-
-    Parameters
-    ----------
-    lines : sequence of dict
-        Results, as `examine` of `discover_runs` gives them.
-    setting : str
-        Seed, date and what else the numbers depend on; one line.
-
-    Returns
-    -------
-    str
-
-    """
+    """Return all tables as Markdown, below one line with what the numbers depend on."""
     outcomes = [from_data(line) for line in lines]
     parts = [f'{setting}\n', '### Levels\n', _levels(levels(lines)),
              '### Time and memory of one recording\n', _cost(lines),
@@ -468,19 +429,19 @@ def _count(text: str) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parts = parser.add_subparsers(dest='part', required=True)
-    part = parts.add_parser('blind', help='hidden effects, drawn blind',
-                            description='hidden effects, drawn blind')
-    part.set_defaults(action=blind)
-    part.add_argument('--seed', type=_count, default=SEED, help='of all that is drawn')
+
+    def add(action: Callable[[argparse.Namespace], int], words: str) -> argparse.ArgumentParser:
+        part = parts.add_parser(action.__name__, help=words, description=words)
+        part.set_defaults(action=action)
+        part.add_argument('--table', type=Path, help='write the tables here, between its marks')
+        return part
+
+    part = add(blind, 'hidden effects, drawn blind')
+    _resumable(part, 10, 'effect')
     part.add_argument('--rate', type=_positive, default=1000.0, help='Hz')
     part.add_argument('--jobs', type=_count, default=2, help='recordings at once')
     part.add_argument('--limit', type=_positive, default=60.0,
                       help='s for one recording; more is a failure')
-    part.add_argument('--lines', type=Path, help='JSON lines: results, added one by one; what is '
-                      'in it is not run again')
-    part.add_argument('--no-run', action='store_true', help='only what is in --lines')
-    part.add_argument('--table', type=Path, help='write the tables here, between its marks')
-    part.add_argument('--each', type=_count, default=10, help='recordings of each effect')
     part.add_argument('--pairs', type=_count, help='recordings with two (default: 10 x each)')
     part.add_argument('--none', type=_count, help='recordings with none (default: 10 x each)')
     part.add_argument('--kinds', nargs='+', choices=KINDS, default=list(KINDS))
@@ -488,33 +449,25 @@ def _parser() -> argparse.ArgumentParser:
                       help='only these effects, causes or parts of a pair; none is left out')
     part.add_argument('--strength', type=_positive, default=1.0, help='1: moderate')
     part.add_argument('--duration', type=_positive, default=60.0, help='s')
-    part = parts.add_parser('nulls', help='recordings with nothing hidden',
-                            description='recordings with nothing hidden: false alarms')
-    part.set_defaults(action=nulls)
-    part.add_argument('--seed', type=_count, default=SEED, help='of all that is drawn')
-    part.add_argument('--each', type=_count, default=40, help='recordings of each generator')
-    part.add_argument('--elsewhere', type=Path, metavar='FILE',
-                      help="a generator of another hand: make('null', seed, T=duration) returns "
-                      'stamps, throttle and voltage at 1 kHz, its noise following throttle')
-    part.add_argument('--generators', nargs='+', help='only these: plain, flown, elsewhere')
-    part.add_argument('--lines', type=Path, help='JSON lines: results, added one by one; what is '
-                      'in it is not run again')
-    part.add_argument('--no-run', action='store_true', help='only what is in --lines')
-    part.add_argument('--table', type=Path, help='write the table here, between its marks')
-    part = parts.add_parser('flights', help='recordings of real runs',
-                            description='recordings of real runs, whole and in halves')
-    part.set_defaults(action=flights)
+    part = add(nulls, 'recordings with nothing hidden: false alarms')
+    _resumable(part, 40, 'generator')
+    part.add_argument('--generators', nargs='+', choices=runs.NULLS, default=list(runs.NULLS))
+    part = add(flights, 'recordings of real runs, whole and in halves')
     part.add_argument('names', nargs='*', help='recordings (default all)')
     part.add_argument('--whole', action='store_true', help='no halves')
-    part.add_argument('--table', type=Path, help='write the table here, between its marks')
-    part = parts.add_parser('injected', help='effects hidden in recordings of real runs',
-                            description='effects hidden in recordings of real runs')
-    part.set_defaults(action=injected)
+    part = add(injected, 'effects hidden in recordings of real runs')
     part.add_argument('names', nargs='*', help='recordings (default all)')
     part.add_argument('--effects', nargs='+', choices=EFFECTS, default=list(runs.HIDDEN))
     part.add_argument('--seed', type=_count, default=1, help='of all that is drawn')
-    part.add_argument('--table', type=Path, help='write the table here, between its marks')
     return parser
+
+
+def _resumable(part: argparse.ArgumentParser, each: int, what: str) -> None:
+    part.add_argument('--seed', type=_count, default=SEED, help='of all that is drawn')
+    part.add_argument('--each', type=_count, default=each, help=f'recordings of each {what}')
+    part.add_argument('--lines', type=Path, help='JSON lines: results, added one by one; what is '
+                      'in it is not run again')
+    part.add_argument('--no-run', action='store_true', help='only what is in --lines')
 
 
 def main() -> int:

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
-import importlib.util
 import json
 import multiprocessing
 from multiprocessing.connection import Connection, wait
@@ -46,24 +45,15 @@ _GRACE = 5.0
 
 @dataclass(frozen=True)
 class Task:
-    """
-    One recording to be made and looked at.
+    """One recording to be made and looked at."""
 
-    Attributes
-    ----------
-    kind, effect : str
-        What `draw` is asked for: for a pair two names joined by '+', for none ''.
-    seed, number : int
-        Of the run, and which of this effect; they seed all that is drawn.
-    duration, rate, strength : float
-        As `draw` takes them: s, Hz, 1 for moderate.
-
-    """
-
+    # What `draw` is asked for: for a pair two names joined by '+', for none ''.
     kind: str
     effect: str
+    # Of the run, and which of this effect; they seed all that is drawn.
     seed: int
     number: int
+    # As `draw` takes them: s, Hz, 1 for moderate.
     duration: float
     rate: float
     strength: float
@@ -85,21 +75,7 @@ def key_of(line: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def examine(task: Task) -> dict[str, Any]:
-    """
-    Draw the recording of a task and discover it.
-
-    Parameters
-    ----------
-    task : Task
-        What to do.
-
-    Returns
-    -------
-    dict
-        The outcome, the gain and its error (nats per sample), time and memory of
-        `discover` alone.
-
-    """
+    """Return outcome, gain and its error (nats), time and memory of `discover` alone."""
     hidden = task.hidden()
     recording = Recording(hidden.t, hidden.voltage, hidden.throttle, 'blind')
     wall, cpu = time.perf_counter(), time.process_time()
@@ -147,22 +123,10 @@ def _nothing(task: Task) -> dict[str, Any]:
 def run(next_task: Callable[[list[Task]], Task | None], jobs: int, limit: float
         ) -> Iterator[tuple[Task, dict[str, Any]]]:
     """
-    Run tasks side by side until there are none.
+    Run tasks side by side until there are none; yield each with its result, as they end.
 
-    Parameters
-    ----------
-    next_task : callable
-        Given those under way, returns one more, or None where there is none now.
-    jobs : int
-        Processes at once.
-    limit : float
-        Time for one recording, s; more is a failure.
-
-    Yields
-    ------
-    tuple of Task and dict
-        As they end; the dict as `examine` returns it.
-
+    `next_task`, given those under way, returns one more, or None where there is none now; a
+    recording that takes longer than `limit` (s) is a failure.
     """
     context = multiprocessing.get_context('fork')
     running: dict[Connection, tuple[Task, Any, float]] = {}
@@ -213,16 +177,7 @@ def _collect(pipe: Connection, task: Task, process: Any) -> dict[str, Any]:
 
 def examine_recorded(folder: Path, names: Iterable[str], halves: bool
                      ) -> Iterator[tuple[str, list[dict[str, Any]]]]:
-    """
-    Discover recordings of real runs.
-
-    Yields
-    ------
-    tuple of str and list of dict
-        Name, and for the whole, and for its halves if they are asked for: JSON of the finding,
-        and `cpu_s` beside it.
-
-    """
+    """Yield names of real runs, and JSON of what is found in the whole and in its halves."""
     for name, file, options in (*FLIGHTS, *BENCHES):
         if (names and name not in names) or not (folder / file).exists():
             continue
@@ -271,23 +226,10 @@ def sources() -> str:
 
 def read_lines(path: Path | None) -> list[dict[str, Any]]:
     """
-    Return the results in a JSON-lines file.
+    Return the results in a JSON-lines file in order; a file that is not there has none.
 
-    Parameters
-    ----------
-    path : Path or None
-        The file; one that is not there has none.
-
-    Returns
-    -------
-    list of dict
-        In order; the last line may be cut off by an interruption, and is left out.
-
-    Raises
-    ------
-    ValueError
-        When another line is no result; says which.
-
+    The last line may be cut off by an interruption and is left out; another one that is no result
+    raises a ValueError.
     """
     if path is None or not path.exists():
         return []
@@ -307,17 +249,7 @@ def read_lines(path: Path | None) -> list[dict[str, Any]]:
 
 
 class Results:
-    """
-    The results of a run: in memory, and in a JSON-lines file that can be resumed.
-
-    Parameters
-    ----------
-    path : Path or None
-        The file; None keeps nothing.
-    about : dict
-        Added to each new line, such as the commit.
-
-    """
+    """The results of a run: in memory, and in a JSON-lines file that can be resumed."""
 
     def __init__(self, path: Path | None, about: dict[str, Any]) -> None:
         self._path, self._about = path, about
@@ -351,28 +283,15 @@ RATES, DURATIONS = (50, 100, 200, 500, 1000), (20.0, 60.0, 120.0)
 
 @dataclass(frozen=True)
 class Null:
-    """
-    One recording with nothing hidden.
+    """One recording with nothing hidden."""
 
-    Attributes
-    ----------
-    name : str
-        Of its generator.
-    number : int
-        Which of it.
-    rate, duration : float
-        Hz, s.
-    truth : tuple of str
-        What is in its base.
-    recording : Recording
-
-    """
-
+    # Its generator, and which of it.
     name: str
     number: int
+    # Hz, s.
     rate: float
     duration: float
-    truth: tuple[str, ...]
+    truth: tuple[str, ...]  # What is in its base.
     recording: Recording
 
 
@@ -420,23 +339,6 @@ def _run(rng: np.random.Generator, rate: float, duration: float, throttle: np.nd
     return Recording(t, voltage, held, 'null'), tuple(sorted(truth))
 
 
-def elsewhere(file: Path) -> Draw:
-    """Return a generator written elsewhere: `make('null', seed, T)` at 1 kHz, sigma(throttle)."""
-    spec = importlib.util.spec_from_file_location('elsewhere', file)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-
-    def draw(rng: np.random.Generator, rate: float, duration: float
-             ) -> tuple[Recording, tuple[str, ...]]:
-        every = round(1000.0 / rate)
-        t, throttle, voltage = module.make('null', int(rng.integers(2**31)), T=duration)
-        return (Recording(t[::every], voltage[::every], throttle[::every], 'null'),
-                ('load_dependent_sigma',))
-
-    return draw
-
-
 def draw(name: str, make: Draw, seed: int, number: int) -> Null:
     """Draw one recording; all of it comes from seed, generator and number."""
     word = int.from_bytes(sha256(name.encode()).digest()[:8], 'big')
@@ -457,24 +359,24 @@ def examine_null(null: Null) -> dict[str, Any]:
             'named': named, 'false': false, 'cpu_s': time.process_time() - began}
 
 
-def nulls_of(each: int, seed: int, file: Path | None, chosen: Sequence[str] | None,
-             lines: Path | None, more: bool) -> Iterator[dict[str, Any]]:
+# Generators of recordings with nothing hidden.
+NULLS: dict[str, Draw] = {'plain': plain, 'flown': flown}
+
+
+def nulls_of(each: int, seed: int, chosen: Sequence[str], lines: Path | None, more: bool
+             ) -> Iterator[dict[str, Any]]:
     """Yield the results of all recordings, those known already from their file first."""
-    makers: dict[str, Draw] = {'plain': plain, 'flown': flown}
-    if file is not None:
-        makers['elsewhere'] = elsewhere(file)
     known: dict[tuple[Any, ...], dict[str, Any]] = {}
     if lines is not None and lines.exists():
         for text in lines.read_text().splitlines():
             line = json.loads(text)
             known[line['generator'], line['seed'], line['number']] = line
     for number in range(each):
-        for name, make in makers.items():
-            if chosen is not None and name not in chosen:
-                continue
+        for name in chosen:
             line = known.get((name, seed, number))
             if line is None and more:
-                line = {**examine_null(draw(name, make, seed, number)), 'seed': seed}
+                null = draw(name, NULLS[name], seed, number)
+                line = {**examine_null(null), 'seed': seed}
                 if lines is not None:
                     with lines.open('a') as out:
                         out.write(json.dumps(line) + '\n')
@@ -508,28 +410,16 @@ def pieces(folder: Path, names: Sequence[str]) -> Iterator[tuple[str, Recording]
 
 @dataclass(frozen=True)
 class Injected:
-    """
-    What came of one.
+    """What came of one."""
 
-    Attributes
-    ----------
-    recording, effect : str
-        What was hidden where; no effect: the piece as it is.
-    strength : float
-        Of the effect.
-    named, alternatives : tuple of str
-        Causes that were named, and those that did as well.
-    seconds : float
-        CPU time, s.
-
-    """
-
+    # What was hidden where; no effect: the piece as it is.
     recording: str
     effect: str
     strength: float
+    # Causes that were named, and those that did as well.
     named: tuple[str, ...]
     alternatives: tuple[str, ...]
-    seconds: float
+    seconds: float  # CPU time.
 
     def outcome(self, clean: Injected) -> str:
         """

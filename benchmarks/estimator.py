@@ -1,5 +1,5 @@
 """
-The sliding-window estimator against what users would pick: one command.
+The sliding-window estimator against what users would pick: one command (10 min).
 
     python benchmarks/estimator.py [--windows 500] [--quick] [--json FILE]
         [--accuracy doc/results/estimator.md] [--speed doc/results/estimator.md]

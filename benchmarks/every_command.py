@@ -1,5 +1,5 @@
 """
-Run every command on every recording of a folder: no traceback, status 0, or 2 with one line.
+Run every command on every recording of a folder: no traceback, one line of error (hours).
 
 python benchmarks/every_command.py FOLDER [--quick] [--only NAME ...]
 

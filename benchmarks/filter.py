@@ -1,5 +1,5 @@
 r"""
-The adaptive low-pass against hindsight, against the truth, in a loop.
+The adaptive low-pass against hindsight, against the truth, in a loop (15 min).
 
     python benchmarks/filter.py error --table doc/results/filter.md
     python benchmarks/filter.py dterm --table doc/results/filter.md \

@@ -1,5 +1,5 @@
 """
-Throughput of `ou-monitor fleet` against the number of workers.
+Throughput of `ou-monitor fleet` against the number of workers (10 min).
 
     python benchmarks/fleet.py --workers 1 2 --recordings 64 --markdown doc/results/fleet.md
 

@@ -1,5 +1,5 @@
 """
-Law `kalman` on recorded gyros: told the noise, and nothing of the signal.
+Law `kalman` on recorded gyros: told the noise, and nothing of the signal (4 min).
 
     OU_MONITOR_REALDATA=FOLDER python benchmarks/learned.py --page doc/results/learned.md
 

@@ -1,5 +1,5 @@
 r"""
-Notches that follow the motors, against low-passes of the same lag, on recorded gyros.
+Notches that follow the motors, against low-passes of the same lag, on recorded gyros (2 min).
 
     OU_MONITOR_REALDATA=FOLDER python benchmarks/notch.py --page doc/results/notch.md
 

@@ -1,5 +1,5 @@
 """
-Recordings with current: voltage a second ahead and resistance, beside recursive least squares.
+With current: voltage a second ahead and resistance, beside least squares (1 min).
 
 The peer fits voltage = level - R current to each reading with a forgetting factor of 0.95, as PX4
 does onboard (its pull request 23205); it leaves out the updates that do not shrink its covariance.

@@ -1,5 +1,5 @@
 """
-Reading bags: against the libraries that decode message by message; and memory.
+Reading bags: against the libraries that decode message by message; and memory (minutes).
 
     python benchmarks/reading.py peers --table doc/results/reading.md
     python benchmarks/reading.py files --table doc/results/reading.md
@@ -37,7 +37,7 @@ from ou_monitor.recordings.standard_types import (  # noqa: E402
 from ou_monitor.records import Recording  # noqa: E402
 from rosbags.highlevel import AnyReader  # noqa: E402
 from rosbags.typesys import get_typestore, Stores  # noqa: E402
-from tables import table  # noqa: E402
+from tables import deliver, table  # noqa: E402
 
 COMPRESSIONS = {'none': CompressionType.NONE, 'lz4': CompressionType.LZ4,
                 'zstd': CompressionType.ZSTD}
@@ -359,15 +359,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as name:
         text = {'peers': peers, 'files': files, 'memory': memory}[given.part](given, Path(name))
     text = f'{stamp()}\n\n{text}'
-    if given.table is None:
-        print(text)
-        return 0
-    begin, end = f'<!-- {given.part} begins -->', f'<!-- {given.part} ends -->'
-    old = given.table.read_text(encoding='utf-8')
-    if begin not in old or end not in old:
-        raise SystemExit(f'{given.table} has no lines "{begin}" and "{end}"')
-    given.table.write_text(f'{old.split(begin, 1)[0]}{begin}\n{text}\n{end}'
-                           f'{old.split(end, 1)[1]}', encoding='utf-8')
+    deliver(text, given.table, given.part)
     return 0
 
 

@@ -1,5 +1,5 @@
 """
-The load model on recorded flights: what of the voltage follows from throttle alone.
+The load model on recorded flights: what of the voltage follows from throttle alone (2 min).
 
 Simulated ahead: fitted on the first half, the second predicted from its throttle; offset included.
 One second ahead: the filter, on the second half, the throttle of that second given.

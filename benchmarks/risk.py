@@ -1,5 +1,5 @@
 """
-How the brown-out risk of simulated rails compares with what happens.
+How the brown-out risk of simulated rails compares with what happens (1 h).
 
     python benchmarks/risk.py --table doc/results/risk.md --figure doc/results/risk_reliability.svg
 
@@ -59,29 +59,13 @@ EDGES = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 
 @dataclass(frozen=True)
 class Horizon:
-    """
-    One prediction, and what happened.
-
-    Attributes
-    ----------
-    flight : int
-        Number of the flight.
-    t : float
-        When it was made, s.
-    predicted : dict of str to float
-        Probability by method.
-    happened : bool
-        Whether the path went below the level within the horizon.
-    steady : bool
-        Whether throttle did not change within the horizon.
-
-    """
+    """One prediction, and what happened."""
 
     flight: int
-    t: float
-    predicted: dict[str, float]
-    happened: bool
-    steady: bool
+    t: float  # When it was made, s.
+    predicted: dict[str, float]  # Probability by method.
+    happened: bool  # Whether the path went below the level within the horizon.
+    steady: bool  # Whether throttle did not change within the horizon.
 
 
 def monitor_settings(level: float, horizon: float) -> MonitorSettings:
@@ -104,26 +88,9 @@ def certain(e: Estimate, level: float, horizon: float) -> float:
 def predict(flights: Flights, levels: np.ndarray, horizon: float, every: float,
             progress: Callable[[], None]) -> Iterator[Horizon]:
     """
-    Predict, every so often, over horizons that do not overlap.
+    Predict each `every` s, over horizons (s) that do not overlap, with a level (V) a flight.
 
-    Parameters
-    ----------
-    flights : Flights
-        What is flown.
-    levels : ndarray, shape (flights,)
-        Brown-out voltage of each, V.
-    horizon : float
-        Time ahead, s.
-    every : float
-        From one prediction to the next, s; at least the horizon.
-    progress : callable
-        Called after each flight.
-
-    Yields
-    ------
-    Horizon
-        Where the estimate is usable and the rail not already below.
-
+    Only where the estimate is usable and the rail not already below.
     """
     count, ahead = flights.t.size, round(horizon * RATE)
     for f, level in enumerate(levels.tolist()):
@@ -189,31 +156,14 @@ def brier(predicted: np.ndarray, happened: np.ndarray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Flights:
-    """
-    Some flights of one length.
+    """Some flights of one length: shape (flights, n), or (flights,)."""
 
-    Attributes
-    ----------
-    t : ndarray, shape (n,)
-        Stamps, s.
-    voltage : ndarray, shape (flights, n)
-        What the ADC tells, V.
-    throttle : ndarray, shape (flights, n)
-        0..1.
-    low : ndarray, shape (flights, n)
-        Lowest point of the path from the sample before to this one, V.
-    path : ndarray, shape (flights, n)
-        The rail itself at the samples, V.
-    alpha, level, spread : ndarray, shape (flights,)
-        1/s; level at half throttle, V; stationary deviation there, V.
-
-    """
-
-    t: np.ndarray
-    voltage: np.ndarray
+    t: np.ndarray  # s, shape (n,).
+    voltage: np.ndarray  # What the ADC tells, V.
     throttle: np.ndarray
-    low: np.ndarray
-    path: np.ndarray
+    low: np.ndarray  # Lowest point of the path from the sample before to this one, V.
+    path: np.ndarray  # The rail itself at the samples, V.
+    # 1/s; level at half throttle, V; stationary deviation there, V.
     alpha: np.ndarray
     level: np.ndarray
     spread: np.ndarray
@@ -234,28 +184,10 @@ def throttle_steps(rng: np.random.Generator, flights: int, n: int) -> np.ndarray
 def fly(rng: np.random.Generator, flights: int, seconds: float, *, wander: float = 0.08,
         noise: float = 0.2, throttle: np.ndarray | None = None) -> Flights:
     """
-    Simulate.
+    Simulate; throttle in steps is drawn where it is not given.
 
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        Source of randomness.
-    flights : int
-        How many.
-    seconds : float
-        Length, s.
-    wander : float
-        Deviation of ln sigma after one second, 1/sqrt(s); it comes back within
-        a minute.
-    noise : float
-        Largest white noise of the ADC, in stationary deviations; drawn.
-    throttle : ndarray, shape (flights, n), optional
-        Steps are drawn when left out.
-
-    Returns
-    -------
-    Flights
-
+    wander: deviation of ln sigma after one second, 1/sqrt(s), which comes back within a minute;
+    noise: largest white noise of the ADC, in stationary deviations.
     """
     n = int(seconds * RATE)
     h = 1.0 / RATE / FINE

@@ -1,5 +1,5 @@
 """
-How late a process is that works 10 ms of each 100, beside busy loops, by its scheduling.
+How late a process of 10 ms each 100 ms is beside busy loops, by scheduling (2 min, root).
 
 python benchmarks/scheduling.py [--seconds 10]
 

@@ -1,5 +1,5 @@
 """
-Simulated samples per second against what users would write: one command.
+Simulated samples per second against what users would write: one command (1 min).
 
     python benchmarks/simulation.py [--quick] [--json FILE] [--markdown FILE]
 

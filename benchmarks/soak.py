@@ -1,5 +1,5 @@
 """
-An hour of chaos for the real `estimator`.
+An hour of chaos for the real `estimator` (1 h).
 
 1 kHz with dips, wrong stamps, values and types, parameters, publishers that come and go, and a
 CPU that is taken away.

@@ -1,5 +1,5 @@
 """
-How nodes end when SIGINT comes twice, as with Ctrl-C in a terminal that runs ros2 launch.
+How nodes end when SIGINT comes twice, as with Ctrl-C in a terminal that runs ros2 launch (4 min).
 
     .venv/bin/python benchmarks/soak_exits.py [--number 200] [--seed 1]
 

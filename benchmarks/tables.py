@@ -9,6 +9,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from windows import NAMES
 
 _TITLES = {'alpha': 'alpha', 'sigma': 'sigma', 'var_inf': 'Var_inf'}
@@ -66,6 +67,12 @@ def recorded() -> Path:
     if folder is None:
         raise SystemExit('OU_MONITOR_REALDATA is not set: it names the folder of the flights')
     return Path(folder)
+
+
+def median3(v: np.ndarray) -> np.ndarray:
+    """Return the middle one of each sample and the two before."""
+    padded = np.concatenate((v[:1], v[:1], v))
+    return np.median(np.stack((padded[:-2], padded[1:-1], padded[2:])), axis=0)
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -1,5 +1,5 @@
 """
-CPU of a report of the monitor on uneven samples, over that on even ones (all at 1 kHz).
+CPU of a report of the monitor on uneven samples, over that on even ones (all at 1 kHz) (1 min).
 
 A rail (alpha 63 1/s, 56 mV) under moving throttle for 40 s, reported ten times a second, the
 first 6 s not counted; this thread's CPU time, so that fits in the background are not in it.

@@ -12,10 +12,10 @@ from scipy import stats
 
 def test_dips_are_critical_within_100_ms_and_a_healthy_flight_is_quiet():
     """Each dip of 20 to 500 ms, none missed; nothing in half a minute without."""
-    wrong, delays, missed = fly_loop(3, 0.0, 6)
-    assert (wrong, missed, len(delays)) == (0, 0, 6)
+    wrong, delays, missed = fly_loop(3, 0.0, 4)
+    assert (wrong, missed, len(delays)) == (0, 0, 4)
     assert max(delays) <= 0.1 + 1e-9
-    assert fly_loop(4, 1.0, 0) == (0, [], 0)
+    assert fly_loop(4, 0.5, 0) == (0, [], 0)
 
 
 def test_ardupilot_waits_ten_seconds_without_a_break():
@@ -125,7 +125,7 @@ def ratios(name, seconds, cutoff):
 def test_a_loud_craft():
     """Half and a third of the noise are left, on what was not learned from."""
     pytest.importorskip('orangebox')
-    *_, throttle, nothing, _, rpm, _ = ratios('bf3s', np.inf, 80.0)
+    *_, throttle, nothing, _, rpm, _ = ratios('bf3s', 40.0, 80.0)
     assert throttle < 0.5 and nothing < 0.6 and rpm < 0.42
 
 
@@ -133,5 +133,5 @@ def test_a_loud_craft():
 def test_a_quiet_craft():
     """It may not cost more than 2 %."""
     pytest.importorskip('orangebox')
-    *_, throttle, nothing, _, _, _ = ratios('nazgul', 40.0, 80.0)
+    *_, throttle, nothing, _, _, _ = ratios('nazgul', 25.0, 80.0)
     assert throttle <= 1.02 and nothing <= 1.02

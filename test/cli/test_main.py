@@ -8,20 +8,11 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
+from command_line import failure
 import ou_monitor
 from ou_monitor.cli import main as cli
 from ou_monitor.errors import InputError
 import pytest
-
-
-def failure(capsys, *argv):
-    """Run a command that must fail; return its one line."""
-    assert cli.main(argv) == 2
-    out, err = capsys.readouterr()
-    assert out == ''
-    assert err.endswith('\n') and err.count('\n') == 1
-    assert 'Traceback' not in err
-    return err
 
 
 def test_version_and_help(capsys):
@@ -209,13 +200,6 @@ def test_commands_load_nothing_heavy_for_help():
     done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True,
                           timeout=60)
     assert (done.returncode, done.stderr) == (0, '')
-
-
-def test_module_runs_as_a_program():
-    """`python -m ou_monitor.cli.main` is the command."""
-    done = subprocess.run([sys.executable, '-m', 'ou_monitor.cli.main', 'bogus'],
-                          capture_output=True, text=True, timeout=60)
-    assert done.returncode == 2 and done.stderr.count('\n') == 1
 
 
 @pytest.mark.skipif(not os.path.exists('/dev/full'), reason='needs /dev/full')

@@ -1,71 +1,17 @@
-"""Tests of a level, limits of an ADC, bins and events: against formulas and dense algebra."""
+"""Limits of an ADC, bins and events: against formulas and dense algebra."""
 
 import math
 from types import SimpleNamespace
 
 import numpy as np
 from numpy.testing import assert_allclose
-from ou_monitor.analysis.level_tests import _correlated, _mean_drift
 from ou_monitor.criticism.adc import find_rails, redraw
 from ou_monitor.criticism.composite import _same
 from ou_monitor.criticism.curves import compare_curves
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate, Events, solved
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.records import Estimate, Status
 import pytest
-from scipy import stats
-from scipy.signal import lfilter
-
-
-def estimate(alpha_se, sigma_se):
-    return Estimate(alpha=50.0, sigma=0.3, var_inf=1e-3, u0=5.0, noise_std=0.0, alpha_se=alpha_se,
-                    sigma_se=sigma_se, var_inf_se=0.0, status=Status.OK, rate=1000.0)
-
-
-@pytest.mark.parametrize('n, steps, blocks', ((3000, (1,), 16), (350, (1,), 6),
-                                              (350, (1, 2, 4), 14)))
-@pytest.mark.parametrize('alpha_se, sigma_se', ((0.3, 0.4), (0.06, 0.08)))
-def test_drift_of_the_mean_is_an_f_test_of_blocks(n, steps, blocks, alpha_se, sigma_se):
-    """
-    Innovations of an OU about the mean of all, without the first of each part.
-
-    Blocks of at least 5 relaxation times and 50 samples, 16 at most.  The variance is known as
-    well as alpha and sigma: 2 / (2 error)^2 degrees of freedom.
-    """
-    alpha, var = 50.0, 1e-3
-    rng = np.random.default_rng(1)
-    t = 1e-3 * np.cumsum(rng.choice(steps, n))
-    keep = np.exp(-alpha * np.diff(t))
-    unit = math.exp(-alpha * 1e-3)
-    noise = lfilter([math.sqrt(var * (1.0 - unit**2))], [1.0, -unit],
-                    rng.standard_normal((2, n)))
-    parts = [(t, 5.0 + noise[0]), (t + 9.0, 5.01 + noise[1])]
-    found = _mean_drift(parts, estimate(alpha_se, sigma_se), alpha, var, 0.0, math.sqrt(var))
-    centre = np.concatenate([v for _, v in parts]).mean()
-    z = np.concatenate([(v[1:] - centre - keep * (v[:-1] - centre))
-                        / np.sqrt(var * (1.0 - keep**2)) for _, v in parts])
-    q = sum(piece.size * (piece.mean() - z.mean())**2 for piece in np.array_split(z, blocks))
-    freedom = max(2.0 / (2.0 * math.hypot(alpha_se, sigma_se))**2, 1.0)
-    assert found.p_value == pytest.approx(
-        stats.f.sf(q / (blocks - 1), blocks - 1, freedom), rel=1e-3)
-
-
-@pytest.mark.parametrize('name, shift, freedom', (
-    ('correlated', 1.0, 3.0), ('one_relaxation', 0.0, 2.0), ('other', 0.0, 3.0)))
-def test_portmanteau_is_a_sum_of_squared_scores(name, shift, freedom):
-    rng = np.random.default_rng(2)
-    parts = [rng.standard_normal(200), rng.standard_normal(150)]
-    total, n, q, effect = sum((d**2).sum() for d in parts), 350, 0.0, 0.0
-    for lag in (1, 2, 3):
-        products = np.concatenate([d[lag:] * d[:-lag] for d in parts])
-        r = products.sum() / total + shift * len(parts) / n
-        se = math.sqrt((products**2).sum()) / total
-        q += (r / se)**2
-        effect += max(0.0, r * r - se * se)
-    found = _correlated(name, parts, 3)
-    assert found.p_value == pytest.approx(stats.chi2.sf(q, freedom))
-    assert found.effect == pytest.approx(math.sqrt(effect))
 
 
 def test_uneven_samples_are_compared_on_a_grid_to_their_end():

