@@ -21,11 +21,11 @@ def strict(text):
     return json.loads(text, parse_constant=refuse)
 
 
-def failure(capsys, command, *argv):
+def failure(capsys, *argv):
     """Run a command that must fail; return its one line."""
-    assert main([command, *map(str, argv)]) == 2
+    assert main([*map(str, argv)]) == 2
     out, err = capsys.readouterr()
     # The finding is told even where its model is refused.
     assert out == '' or '--save-model' in argv
-    assert re.fullmatch(rf'ou-monitor( {command})?: [^\n]+\n', err), out + err
+    assert re.fullmatch(rf'ou-monitor( {argv[0] if argv else None})?: [^\n]+\n', err), out + err
     return err

@@ -375,16 +375,3 @@ def test_a_risk_that_falls_again_is_no_way_through():
 def test_above_the_limit_from_the_start():
     throttle, reason = budget(np.full(51, 0.3))
     assert throttle == 0.0 and 'idle' in reason
-
-
-def test_without_a_load_it_is_unknown_and_says_why():
-    monitor = SupplyMonitor()
-    assert math.isnan(monitor.report(None).budget)
-    t = np.arange(400) / 100.0
-    v = 5.0 + 0.01 * np.random.default_rng(2).standard_normal(400)
-    monitor.push(t, v)
-    report = monitor.report(0.0)
-    assert math.isnan(report.budget) and 'Throttle is not known' in report.budget_reason
-    monitor.push(t + 4.0, v, 0.4)
-    report = monitor.report(0.0)
-    assert math.isnan(report.budget) and 'Throttle has not moved' in report.budget_reason
