@@ -55,12 +55,15 @@ def _sticks(t, rng, pace):
 def load():
     """Return the load filter through a flight with everything: it is asked after each part."""
     rng = np.random.default_rng(31)
-    loads, found = LoadFilter(), []
+    loads, found, ends = LoadFilter(), [], [-np.inf]
 
     def part(t, u, offset=0.0, step=0.0, current=None):
         v = _pack(t, np.where(np.isfinite(u), u, 0.4), rng) + offset
         v = step * np.round(v / step) if step else v
         drawn = np.full(t.size, np.nan) if current is None else current
+        if t[0] < ends[-1]:
+            loads.new_time_line()
+        ends.append(t[-1])
         # What the first samples say, before they have taught it the rest.
         for n in (0, 1, 2, 4, 9):
             some = slice(n, max(2 * n, 1))

@@ -26,6 +26,7 @@ from ou_monitor.online.load.model_watch import (
 from ou_monitor.online.load.supply_load import (
     Basis, LAGS, LoadState, LoadStatus, POWER, static, SupplyLoad, TABLE)
 from ou_monitor.records import FloatArray, NAN
+from ou_monitor.timeline.line import MOST_CURRENT, MOST_THROTTLE, plausible
 
 
 # Minimum largest current to start the filter, A, and relative rise of it that restarts the filter.
@@ -222,17 +223,14 @@ _MOVED = 0.02
 # Least relative error of the sag: that of the filter does not count change over a flight, and
 # was up to 9 of its own too small.
 _LEAST_ERROR = 0.1
-# Backward and forward step of a stamp, s, above which a new time line starts: the battery may have
-# been changed meanwhile.
-_BACKWARDS, _PAUSE = 1.0, 60.0
+# Step of a stamp, s, above which the level is open: the battery may have been changed meanwhile.
+_PAUSE = 60.0
 # Factor between two levels, up or down, above which the battery is another craft's.
 _OTHER_CRAFT = 1.6
 # Relative variance of the size of the sag on another day.
 _OTHER_DAY = 0.2 ** 2
-# Time for which unknown throttle or current is held, s; largest plausible throttle.
-_HOLD, _MOST_THROTTLE = 1.0, 2.0
-# Largest plausible current, in any unit.
-_MOST_CURRENT = 1e7
+# Time for which unknown throttle or current is held, s.
+_HOLD = 1.0
 # Number of throttle bins, and number of bins combined for the noise: 0.1.
 _BINS, _NEAR = 50, 5
 # dE/ds, V, of a cell at each 10 mV of open-circuit voltage from 3.4 V.
@@ -302,7 +300,6 @@ class LoadFilter:
         self._start: LoadStart | None = None
         self._t = self._last = self._throttle = NAN
         self._blocks = LoadBlocks()
-        self._newest = -math.inf
         self._opening = False
         # None until a current has been measured.
         self._current: CurrentFilter | None = None
@@ -317,32 +314,18 @@ class LoadFilter:
              throttle: npt.ArrayLike | None = None,
              current: npt.ArrayLike | None = None) -> None:
         """
-        Add samples, s, V, 0..1, A.
+        Add samples in order, s, V, 0..1, A, of one time line.
 
-        Samples with NaN voltage or a stamp that does not rise are left out.
         NaN throttle, or one beyond 2, is unknown: the last one holds for a second; so is a current
-        beyond 1e7 A, in whatever unit.  A stamp that
-        is earlier by more than 1 s, or later by more than a minute, begins a new time line.
+        beyond 1e6 A, in whatever unit.
         """
         columns = np.stack(np.broadcast_arrays(*np.atleast_1d(*(
             np.asarray(NAN if x is None else x, dtype=np.float64)
             for x in (t, voltage, throttle, current)))))
-        columns = columns[:, np.isfinite(columns[0]) & np.isfinite(columns[1])]
-        u = columns[2]
-        columns[2] = np.where(np.abs(u) <= _MOST_THROTTLE, np.clip(u, 0.0, 1.0), NAN)
-        columns[3] = np.where(np.abs(columns[3]) <= _MOST_CURRENT, columns[3], NAN)
-        while columns.size:
-            stamps = columns[0]
-            highest = np.maximum.accumulate(np.concatenate(([self._newest], stamps)))
-            back = np.flatnonzero(stamps < highest[:-1] - _BACKWARDS)
-            end = int(back[0]) if back.size else stamps.size
-            keep = (stamps > highest[:-1])[:end]
-            for block in self._blocks.push(columns[:, :end][:, keep]):
-                self._arrive(block)
-            self._newest = float(highest[end])
-            if back.size:
-                self.new_time_line()
-            columns = columns[:, end:]
+        columns[2] = np.clip(plausible(columns[2], MOST_THROTTLE), 0.0, 1.0)
+        columns[3] = plausible(columns[3], MOST_CURRENT)
+        for block in self._blocks.push(columns):
+            self._arrive(block)
 
     def begin_with(self, start: LoadStart | None) -> None:
         """Start from the model of another flight; only before the first voltage."""
@@ -352,7 +335,6 @@ class LoadFilter:
 
     def new_time_line(self) -> None:
         """Start a new time line: keep coefficients and noise, re-estimate the level."""
-        self._newest = -math.inf
         self._blocks.forget()
         self._waiting.clear()
         self._heard_loads.clear()
