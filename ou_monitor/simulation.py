@@ -56,11 +56,7 @@ LOADS = ((0.0, 0.0), (10.0, 0.0), (10.0, 0.05), (20.0, 0.05), (20.0, 0.10), (30.
 
 def through(points: Sequence[tuple[float, float]], period: float | None = None,
             stick_rate: float | None = None) -> Profile:
-    """
-    Return the profile of straight lines through points, constant beyond the last one.
-
-    points in s, period in s, stick_rate in Hz.
-    """
+    """Return straight lines through points (s, 0..1), constant beyond them."""
     return partial(_through, np.array(points, dtype=np.float64).T, period, stick_rate)
 
 

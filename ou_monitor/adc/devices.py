@@ -74,12 +74,7 @@ def reason_of(error: OSError) -> str:
 
 
 def find_device(device: str, sysfs: Path) -> Path:
-    """
-    Return the folder of a device.
-
-    device: a path, or a name under `sysfs`: of the folder ('iio:device0', 'hwmon2') or of the
-    driver ('ads1015').
-    """
+    """Return the folder of a device by path, folder's name ('hwmon2') or driver ('ads1015')."""
     if not device:
         raise InputError(f'no device given; available: {_names(sysfs)}')
     if '/' in device:

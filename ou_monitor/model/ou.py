@@ -21,11 +21,7 @@ def stationary_variance(alpha: float, sigma: float) -> float:
 
 
 def transition(alpha: float, sigma: float, dt: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """
-    Return the exact one-step law over a time `dt`.
-
-    alpha in 1/s, sigma in V/sqrt(s), dt in s.
-    """
+    """Return the exact one-step law over dt, s (alpha in 1/s, sigma in V/sqrt(s))."""
     steps = np.asarray(dt, dtype=np.float64)
     if not alpha > 0.0 or not math.isfinite(alpha):
         raise ValueError(f'alpha must be positive and finite, got {alpha} 1/s')
@@ -42,11 +38,7 @@ def simulate(
     t: npt.ArrayLike, alpha: float, sigma: npt.ArrayLike, rng: np.random.Generator, *,
     u0: npt.ArrayLike = 0.0, start: float | None = None,
 ) -> FloatArray:
-    """
-    Draw a path at the given stamps, exact in law at any spacing.
-
-    t in s, alpha in 1/s, sigma in V/sqrt(s), u0 in V, start in V, result in V.
-    """
+    """Draw a path, V, at stamps, s, exact in law (alpha in 1/s, sigma in V/sqrt(s), u0 in V)."""
     stamps = np.asarray(t, dtype=np.float64)
     if stamps.ndim != 1:
         raise ValueError(f't must have shape (n,), got {stamps.shape}')

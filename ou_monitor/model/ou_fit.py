@@ -188,11 +188,7 @@ class Regression:
 
 def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | None,
             reach: float = 0.0) -> Regression:
-    """
-    Regress level and load out of a voltage, V; stamps in s, throttle 0..1, current in A.
-
-    reach: maximum shift of the current, late or early, s.
-    """
+    """Regress level and load out of a voltage; reach: most shift of the current, s."""
     parts = stretches(t)
     dt = float(np.median(np.diff(t)))
     if parts:
@@ -270,11 +266,7 @@ def load_signs(n: int, dt: float, *loads: FloatArray | None) -> FloatArray:
 
 
 class NoiseSize:
-    """
-    The noise's size over loads and their changes: a law, linear in its logarithm, of their signs.
-
-    Beyond the sizes of the fit it stays at their edge.
-    """
+    """The noise's size: ln is linear in signs of load; beyond those of the fit it is constant."""
 
     def __init__(self, signs: FloatArray) -> None:
         n = max(1, signs.shape[1])
@@ -352,11 +344,7 @@ def _points(*axes: FloatArray) -> FloatArray:
 
 
 def fit_ou(part: Regression, span: float, *, precise: bool = False) -> OuFacts:
-    """
-    Fit the noise to a window (s).
-
-    precise: omit bounds and intervals if alpha would not be known within PRECISE.
-    """
+    """Fit the noise to a window, s; precise: only a fit that knows alpha within PRECISE."""
     dt = part.dt
     total = float(part.voltage @ part.voltage)
     if not total > 1e-18 * part.voltage.size:

@@ -57,11 +57,7 @@ class Ordinates:
 
     def climb(self, log_of: Callable[[FloatArray], FloatArray], start: FloatArray
               ) -> tuple[FloatArray, float]:
-        """
-        Return the coordinates of the most likely spectrum near a start, and its gain.
-
-        log_of gives the logarithm of a spectrum; the gain is over white scores, nats.
-        """
+        """Return the coordinates of the best spectrum, and its gain over white scores, nats."""
         x = np.asarray(start, dtype=np.float64)
         log = log_of(x)
         value, damping = self.likelihood(log), _DAMPED

@@ -316,12 +316,7 @@ class FilterSettings:
     @classmethod
     def from_options(cls, options: Mapping[str, object],
                      base: FilterSettings | None = None) -> FilterSettings:
-        """
-        Return settings with the given options changed.
-
-        Where `fallback` is not given it is moved into fmin..fmax, so that a
-        caller who gives only the limits is not refused.
-        """
+        """Return settings with options changed; a fallback not given moves into fmin..fmax."""
         values = _known(options, cls, 'filter option')
         old = base or cls()
         if 'fallback' not in values:

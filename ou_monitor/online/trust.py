@@ -42,12 +42,7 @@ FROZEN_AFTER = 0.1
 
 
 def patience(settings: MonitorSettings, rate: float, n: int, interval: float = 0.0) -> float:
-    """
-    Return the silence after which a source is stale, s.
-
-    rate: of its n samples in the window, Hz; interval: between arrivals of a slow source, s, else
-    0.
-    """
+    """Return the silence after which a source is stale, s (interval, s, of a slow one)."""
     limit = settings.stale_after
     if n >= _MEASURED and rate > 0.0:
         limit = min(limit, max(LEAST_PATIENCE, MISSED / rate))
@@ -55,11 +50,7 @@ def patience(settings: MonitorSettings, rate: float, n: int, interval: float = 0
 
 
 class SourceInterval:
-    """
-    Interval between the arrivals of a slow source, s; 0 for a fast one, and while unknown.
-
-    A slow source spends most of its time in steps above 0.12 s; pauses of a fast one do not count.
-    """
+    """Interval between arrivals of a source slower than 0.12 s, s; 0: fast or unknown."""
 
     def __init__(self) -> None:
         self.value = 0.0

@@ -209,12 +209,7 @@ def read_bag(
     throttle_topic: str | None, start: float | None, end: float | None,
     progress: Callable[[float], None] | None,
 ) -> RawColumns:
-    """
-    Read voltage, throttle and current of a bag in the order of the log.
-
-    Topics as in `read_recording`; `start` and `end` in s after the first message.  InputError:
-    several topics fit, or there is no voltage.
-    """
+    """Read voltage, throttle and current of a bag, start and end in s; see `read_recording`."""
     choice = choose(bag.path, bag.topics, msg_config=msg_config, voltage_topic=voltage_topic,
                     throttle_topic=throttle_topic)
     specs = _specs(bag, choice)

@@ -151,11 +151,7 @@ class Place:
 
 
 class Layout:
-    """
-    The layout of one message, walked from front to back.
-
-    ValueError: it does not fit its type.
-    """
+    """The layout of one message, walked from front to back; ValueError: not of its type."""
 
     def __init__(self, data: bytes, kind: str, definitions: Definitions,
                  wanted: frozenset[FieldPath]) -> None:

@@ -706,11 +706,7 @@ def _decompressed(compression: str, data: bytes, stated: int,
 
 def _records(data: bytes, *, messages_only: bool = False, at: int = 0, end: int | None = None,
              ) -> tuple[IntArray, list[tuple[int, int, int]], int]:
-    """
-    Return the starts of message records in a block, the other records, and the end of the last.
-
-    The others are (opcode, begin, end) of the content.
-    """
+    """Return places of messages, (opcode, begin, end) of others, and the last end."""
     places = array('q')
     others: list[tuple[int, int, int]] = []
     end = len(data) if end is None else end

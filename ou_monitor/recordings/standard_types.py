@@ -196,11 +196,7 @@ def encode_scalars(kind: str, values: npt.ArrayLike) -> list[bytes]:
 
 
 def encode_battery(stamps_ns: npt.NDArray[np.int64], voltage: npt.ArrayLike) -> list[bytes]:
-    """
-    Return one sensor_msgs/BatteryState for each voltage; the rest is "not measured".
-
-    stamps_ns in ns, voltage in V.
-    """
+    """Return one BatteryState for each voltage, V, else "not measured" (stamps_ns in ns)."""
     return _encode(BATTERY_STATE, {'voltage': np.asarray(voltage)}, stamps_ns, present=True,
                    **dict.fromkeys(('temperature', 'current', 'charge', 'capacity',
                                     'design_capacity', 'percentage'), math.nan))
@@ -225,11 +221,7 @@ def encode_imu(stamps_ns: npt.NDArray[np.int64], vectors: Mapping[str, npt.NDArr
 
 def encode_joints(stamps_ns: npt.NDArray[np.int64], names: Sequence[str],
                   velocity: npt.NDArray[np.float64]) -> list[bytes]:
-    """
-    Return one sensor_msgs/JointState for each stamp, velocities only.
-
-    stamps_ns in ns, velocity of shape (n, m) in rad/s.
-    """
+    """Return one JointState for each stamp, ns, with velocities, rad/s, shape (n, m)."""
     return _encode(JOINT_STATE, {'velocity': velocity}, stamps_ns, name=list(names),
                    velocity=[0.0] * len(names))
 

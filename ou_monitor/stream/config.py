@@ -121,12 +121,7 @@ def parse_each_path(path: str) -> tuple[FieldPath, FieldPath | None]:
 
 
 def msg_config_dir() -> Path:
-    """
-    Return the folder of the shipped msg configs.
-
-    In a source tree it is beside the package; installed (colcon, a virtual environment,
-    /usr/local) it is ``share/ou_monitor/msg_config`` of the prefix, found by walking up.
-    """
+    """Return the folder of the shipped msg configs: beside the package, or below a prefix."""
     here = Path(__file__).resolve()
     root = here.parents[2]
     if (root / 'package.xml').is_file() and (root / 'msg_config').is_dir():
@@ -273,11 +268,7 @@ class ZeroRule:
 
 
 def walk(msg: object, steps: FieldPath, path: str = '', kind: str = '') -> Any:
-    """
-    Follow a field path in a message; None if an array is too short.
-
-    path and kind: the path as given and the type of the message, for an InputError.
-    """
+    """Follow a field path in a message; None: an array is too short (path, kind: for errors)."""
     at: Any = msg
     for step in steps:
         if isinstance(step, str):
@@ -307,11 +298,7 @@ def put(msg: object, steps: FieldPath, value: Any) -> None:
 
 
 class ManyExtractor:
-    """
-    Extracts several numbers: a number, an array, or a field of each element of an array.
-
-    'esc[].esc_rpm' is the field `esc_rpm` of each element of `esc`.  InputError: malformed path.
-    """
+    """Extracts numbers: one, an array, or a field of each element, 'esc[].esc_rpm'."""
 
     def __init__(self, spec: FieldSpec) -> None:
         self.spec = spec

@@ -45,11 +45,7 @@ def plain_texts(found: Any) -> dict[str, str]:
 
 
 def open_regular(path: str | Path) -> BinaryIO:
-    """
-    Open a regular file for reading, without waiting for a FIFO's writer.
-
-    Raises OSError, also if it is not a regular file.
-    """
+    """Open a regular file to read, never waiting for a FIFO; OSError: it is none."""
     file = open(path, 'rb', opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         file.close()
@@ -77,11 +73,7 @@ def write_whole(path: Path, content: bytes, *, over: bool = True) -> None:
 
 def read_yaml(path: str | Path, what: str, *, most_bytes: int = MOST_BYTES,
               most_nodes: int = MOST_NODES) -> Any:
-    """
-    Return the content of a YAML file; `what` names its kind in errors.
-
-    Raises InputError: one line of at most `MOST_CHARACTERS`, without content of the file.
-    """
+    """Return the content of a YAML file; `what` names its kind in one-line errors."""
     where = path_words(path)
     try:
         with open_regular(path) as file:

@@ -131,12 +131,7 @@ class Publishers:
 
     def follow(self, numbers: list[int | None], times: FloatArray, arrived: FloatArray,
                publishers: int) -> npt.NDArray[np.bool_]:
-        """
-        Return which messages are from the followed publisher.
-
-        numbers: sequence numbers; times and arrived: sending and arrival, s; publishers: their
-        present number.
-        """
+        """Return which messages (number, sending and arrival, s) are of the followed publisher."""
         kept = np.ones(len(numbers), dtype=np.bool_)
         if not numbers:
             return kept
@@ -225,12 +220,7 @@ GAP_LEAST = 0.25  # s
 
 
 class BlockClock:
-    """
-    Turns the stamps of blocks into stamps of samples at a rate, Hz.
-
-    `gaps` counts restarts of the time line, after a stamp more than max(2 blocks, 0.25 s) from
-    its expected place.
-    """
+    """Turns stamps of blocks into stamps of samples; `gaps` counts restarts of its time line."""
 
     def __init__(self, sample_rate: float) -> None:
         """Start without a time line: the first block sets it."""

@@ -444,11 +444,7 @@ class TimeLine:
 
     def take(self, t: FloatArray, y: FloatArray, u: FloatArray | None, i: FloatArray | None,
              pause: float) -> list[Batch]:
-        """
-        Process samples without the buffer; return their readings in order.
-
-        t in s, y in V, throttle 0..1, current in A, each of shape (n,); pause in s.
-        """
+        """Return the readings of samples, without the buffer (s, V, 0..1, A; pause in s)."""
         return [part for batch in self.order(t, y, u, i, pause) for part in self._readings(batch)]
 
     def order(self, t: FloatArray, y: FloatArray, u: FloatArray | None, i: FloatArray | None,

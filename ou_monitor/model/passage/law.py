@@ -160,11 +160,7 @@ class PassageTable:
 
 
 def prepare() -> PassageTable:
-    """
-    Return the table; the first call makes it, in a few tenths of a second.
-
-    Safe to be called by several threads.
-    """
+    """Return the table; the first call, from any thread, makes it in tenths of a second."""
     global _table
     if _table is None:
         with _lock:
@@ -359,12 +355,7 @@ def _lowest_energy(barrier: float) -> float:
 
 
 def _root(f: Callable[[float, T], float], argument: T, low: float, high: float) -> float:
-    """
-    Return the zero between two ends where f(x, argument) has different signs, to 1e-12.
-
-    False position, the weight of an end that stays halved (Illinois).  SciPy's costs the nodes
-    25 MB.
-    """
+    """Return the zero between two ends to 1e-12 (Illinois; SciPy costs the nodes 25 MB)."""
     f_low, f_high = f(low, argument), f(high, argument)
     side = 0
     while True:

@@ -82,12 +82,7 @@ def curvature_se(value: Callable[[FloatArray], float], at: FloatArray, step: flo
 
 def refine(values: Callable[[FloatArray], FloatArray], start: Sequence[float] | FloatArray,
            step: float = 0.1) -> tuple[FloatArray, float, FloatArray] | None:
-    """
-    Maximise a function from near its top (Newton's steps); None where it has no value.
-
-    `values` takes points, shape (points, parameters), side by side.  Returns where, how much,
-    and standard errors as `curvature_se`.
-    """
+    """Climb from near a top by Newton's steps; return place, height, errors, or None."""
     x = np.asarray(start, dtype=np.float64)
     size = x.size
     moves, pairs = step * np.eye(size), np.triu_indices(size, 1)

@@ -66,11 +66,7 @@ _FINE, _ENOUGH, _LEVEL = 4.0, 12, 1.25
 
 
 def keeps_its_height(view: View, frequency: float, linewidth: float) -> bool:
-    """
-    Return whether a line keeps its amplitude, as what is generated does and ringing does not.
-
-    frequency, linewidth in Hz.
-    """
+    """Return whether a line, Hz, keeps its amplitude, as ringing does not."""
     length = int(view.rate / (_FINE * max(linewidth, 1.0 / float(view.at[-1]))))
     v, at = view.residual[view.train], view.at[view.train]
     count = v.size // max(length, 1)
@@ -164,12 +160,7 @@ def _lengths(rate: float) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class _Line:
-    """
-    A line that follows throttle.
-
-    `rise` is such that exp(-rise) is the chance of one trial to be beaten; `length` are the
-    samples in a segment.
-    """
+    """A line that follows throttle."""
 
     rise: float
     idle: float

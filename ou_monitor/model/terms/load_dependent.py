@@ -17,11 +17,7 @@ from ou_monitor.records import FloatArray
 
 @dataclass(frozen=True)
 class LoadDependentSigma(Term):
-    """
-    Multiply sigma by a factor whose logarithm is linear between knots.
-
-    It is constant beyond the outer knots.
-    """
+    """Multiply sigma by a factor whose ln is linear between knots, constant beyond."""
 
     NAME: ClassVar[str] = 'load_dependent_sigma'
     FAMILY: ClassVar[str] = 'intensity'
@@ -116,11 +112,7 @@ _APART, _EDGE = 0.02, 0.002
 
 
 def _ends(throttle: FloatArray) -> FloatArray:
-    """
-    Return the knots of a straight line: its ends, so that no part of it is constant.
-
-    All throttle counts, also that of the held-out part.
-    """
+    """Return the ends of all throttle, the held-out part included: knots of a straight line."""
     return np.array([throttle.min(), throttle.max()])
 
 
@@ -167,11 +159,7 @@ def _to_bins(bins: Bins, knots: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _greedy(bins: Bins, knots: FloatArray, price: float, apart: float
             ) -> tuple[FloatArray, FloatArray, float]:
-    """
-    Return knots, factors there, and the misfit, nats.
-
-    From the ends on, add the best knot, not nearer than `apart`, while it gains `price`.
-    """
+    """Return knots, factors and misfit, nats; adds the best knot while it gains `price`."""
     factors, misfit = _to_bins(bins, knots[None])
     found = knots, factors[0], float(misfit[0])
     while found[0].size < _MOST_KNOTS:

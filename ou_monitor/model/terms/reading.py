@@ -270,12 +270,7 @@ class HeldSamples(Term):
 
 @dataclass(frozen=True)
 class ClockJitter(Term):
-    """
-    Take each sample a random time off its stamp.
-
-    Normal, but never so far that two samples change places: cut at 0.45 of the
-    step on either side.
-    """
+    """Take each sample a normal time off its stamp, cut at 0.45 of the step."""
 
     NAME: ClassVar[str] = 'clock_jitter'
     FAMILY: ClassVar[str] = 'sensor'

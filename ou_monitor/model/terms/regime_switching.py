@@ -149,11 +149,7 @@ def _direct(s: Scores, at_once: float, middle: float, states: int) -> FloatArray
 
 def chain_of(s: Scores, x: FloatArray, at_once: float, states: int = 2
              ) -> tuple[tuple[FloatArray, FloatArray, FloatArray], FloatArray, FloatArray]:
-    """
-    Return what a filter takes, and what each pair of states expects.
-
-    The mean of each pair, shape (states, states, n), and the deviation of each state.
-    """
+    """Return what `forward` takes, the mean of each pair, (states, states, n), and the stds."""
     state = np.arange(states, dtype=np.float64)
     chances = step_chances(x, s.step, states)
     law = stationary_law(rates_between(math.exp(x[0]), math.exp(x[1]), states))
@@ -174,11 +170,7 @@ def moving(view: View, size: int) -> slice:
 
 
 def relaxing(view: View, faster: float) -> View:
-    """
-    Return what a rail that relaxes faster leaves over.
-
-    The relaxation that was fitted without levels is that of both together.
-    """
+    """Return what a rail leaves over that relaxes faster than was fitted without levels."""
     if faster == 1.0:
         return view
     phi = view.phi**faster

@@ -252,12 +252,7 @@ def _lengths(bad: npt.NDArray[np.bool_]) -> FloatArray:
 
 def bad_samples(view: View, share: float, spread: float, lengths: FloatArray
                 ) -> npt.NDArray[np.bool_]:
-    """
-    Return which samples are wrong while the rail continued.
-
-    Of all sets of runs of up to three samples, with a good sample between any
-    two, that which explains most.
-    """
+    """Return the set of runs of up to three wrong samples that explains most."""
     z, phi, n = view.z, view.phi, view.z.size
     size = 0.5 * math.log1p(spread * spread / float(np.median(view.variance)))
     begins, ends, gains = [], [], []

@@ -17,11 +17,7 @@ from ou_monitor.records import FloatArray
 
 @dataclass(frozen=True)
 class Drift(Term):
-    """
-    Add rate * t + curvature * t^2, t counted from the first sample.
-
-    A curvature of exactly 0 stands for a straight line, in a fit too.
-    """
+    """Add rate * t + curvature * t^2, t from the first sample; a curvature of 0 is not fitted."""
 
     NAME: ClassVar[str] = 'drift'
     FAMILY: ClassVar[str] = 'slow'

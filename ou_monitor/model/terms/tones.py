@@ -19,12 +19,7 @@ from ou_monitor.records import FloatArray
 
 @dataclass(frozen=True)
 class Tone(Term):
-    """
-    Add amplitude * sin(2 pi frequency t + phase), whose phase may wander.
-
-    The phase does a random walk that widens the line to `linewidth` (full width at
-    half of its height).
-    """
+    """Add a sine whose phase wanders, so that its line is `linewidth` wide at half height."""
 
     NAME: ClassVar[str] = 'tone'
     FAMILY: ClassVar[str] = 'line'
@@ -228,12 +223,7 @@ _STEEP, _STEEPEST = 0.9, 0.99
 
 @dataclass(frozen=True)
 class ThrottleTone(Term):
-    """
-    Add amplitude * sin(phase), the phase running at idle + slope * throttle.
-
-    The phase also wanders, which widens the line to `linewidth` (full width at
-    half of its height).
-    """
+    """Add a sine at idle + slope * throttle, whose phase wanders as in `Tone`."""
 
     NAME: ClassVar[str] = 'throttle_tone'
     FAMILY: ClassVar[str] = 'line'

@@ -198,11 +198,7 @@ def _rouwenhorst(keep: float) -> FloatArray:
 
 def _grid(squares: FloatArray, sizes: FloatArray, span: float, points: FloatArray
           ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """
-    Return the law of the level before each segment, its log density, and the levels.
-
-    Of all points, shape (points, 3), which have one rate, side by side: they are the last axis.
-    """
+    """Return law before each segment, log density, levels; points of one rate side by side."""
     reach = math.sqrt(_LEVELS - 1.0)
     std = np.exp(points[:, :1])
     levels = points[:, 2:] + std * np.linspace(-reach, reach, _LEVELS)

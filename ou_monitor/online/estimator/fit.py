@@ -206,11 +206,7 @@ class StampLikelihood:
         self.low, self.high = _ends(self.n)
 
     def at(self, log_a: float, z: float, used: int) -> _Point:
-        """
-        Return the likelihood with the first `used` regressors.
-
-        a is alpha times the mean step; z, 0 or more, is `noise_scale` of the white noise.
-        """
+        """Return the likelihood with the first `used` regressors; z is `noise_scale`."""
         a, share = math.exp(log_a), _SMALL * math.expm1(z)
         # Q over 2 alpha: its diagonal and the one beside it.
         x = np.minimum(a / self.step * self.steps, _FAR)
@@ -341,11 +337,7 @@ class Maximum:
 
 
 def maximise(likelihood: _Likelihood, used: int, before: Maximum | None = None) -> Maximum:
-    """
-    Fit alpha, sigma, the white noise and the mean, of the first `used` regressors.
-
-    before: the fit of a nearly identical window.
-    """
+    """Fit rate, noise and mean, of `used` regressors (before: fit of a window nearly the same)."""
     low, high = likelihood.low, likelihood.high
     place, at, curved = _least(
         lambda p: likelihood.at(p.item(0), p.item(1), used),

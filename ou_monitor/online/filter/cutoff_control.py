@@ -146,11 +146,7 @@ class CutoffControl:
             self._aim = self._moving = self._cutoff = settings.fallback
 
     def update(self, wanted: float, error: float, dt: float, interval: float) -> float:
-        """
-        Take the law's cutoff; return the cutoff in force.
-
-        wanted in Hz, dt in s, interval in s, result in Hz.
-        """
+        """Take the law's cutoff, Hz; return that in force, Hz (dt, interval in s)."""
         self._choose(wanted)
         if not self._started:
             self._started, self._moving = True, self._aim

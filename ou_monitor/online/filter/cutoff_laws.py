@@ -89,11 +89,7 @@ def _step(order: int, angle: float, y: float, slope: float, start: float, end: f
 
 @cache
 def _table(mode: str, order: int) -> tuple[FloatArray, FloatArray, float]:
-    """
-    Return logarithms of angles and of the noise at them, both rising, and its power below.
-
-    Far below the sample rate the noise is a power of the angle; above it all of it passes.
-    """
+    """Return rising ln of angles and of noise there, and the power of the noise below."""
     count = math.ceil(math.log(_MOST_ANGLE / _LEAST_ANGLE) / _STEP) + 1
     angle = math.log(_LEAST_ANGLE) + _STEP * np.arange(count)
     noise = np.log([white_noise(mode, order, one) for one in np.exp(angle).tolist()])
@@ -105,11 +101,7 @@ def _table(mode: str, order: int) -> tuple[FloatArray, FloatArray, float]:
 
 
 def held_cutoff(mode: str, order: int, fmax: float, times: float, interval: float) -> float:
-    """
-    Return the cutoff, Hz, at which `times` as much white noise comes out as it did at fmax.
-
-    fmax in Hz, interval in s.
-    """
+    """Return the cutoff, Hz, for `times` the white noise at fmax, Hz (interval in s)."""
     angle, noise, power = _table(mode, order)
     log = math.log(TWO_PI * fmax * interval)
     before = math.log(white_noise(mode, order, math.exp(log))) if log > angle[-1] else (
@@ -201,12 +193,7 @@ def sampled_error(w: float, dt: float, alpha: float, var: float, white: float) -
 
 
 def least_error(settings: FilterSettings, sigma: float, alpha: float) -> float:
-    """
-    Return the cutoff of the least `squared_error` within the limits, Hz.
-
-    The signal is of rms `signal_rms`, bandwidth `signal_bandwidth` and
-    `signal_poles`, the supply's noise of `coupling` times sigma and rate alpha.
-    """
+    """Return the cutoff of the least `squared_error` within the limits, Hz."""
     s = settings
     rate = TWO_PI * s.signal_bandwidth
     size = s.signal_rms * (math.sqrt(2.0 * rate) if s.signal_poles == 1 else 1.0)
@@ -227,12 +214,7 @@ def least_sampled_error(settings: FilterSettings, sigma: float, alpha: float,
 
 
 def _least(error: Callable[[float], float], lowest: float, highest: float) -> float:
-    """
-    Return where an error over the cutoff is least, Hz, to 1e-4 of itself.
-
-    It may have two valleys (let the noise pass, or cut it), so a grid of an
-    eighth of an octave comes before the section search over the logarithm.
-    """
+    """Return where an error is least, Hz, to 1e-4: a grid finds which of two valleys."""
     def at(level: float) -> float:
         return error(math.exp(level))
 
@@ -253,11 +235,7 @@ def _least(error: Callable[[float], float], lowest: float, highest: float) -> fl
 
 def wanted_cutoff(settings: FilterSettings, sigma: float, alpha: float, throttle: float,
                   interval: float) -> float:
-    """
-    Return the wanted cutoff of the present law.
-
-    sigma in V/sqrt(s), alpha in 1/s, throttle 0..1, interval in s.
-    """
+    """Return the cutoff that the law wants, Hz (V/sqrt(s), 1/s, 0..1, interval in s)."""
     if settings.law == 'throttle':
         return throttle_law(settings, throttle)
     if not (math.isfinite(sigma) and sigma >= 0.0):
@@ -317,11 +295,7 @@ def relative_cutoff(mode: str, order: int, fmax: float, times: float, interval: 
 
 
 def supply_noise(mode: str, order: int, cutoff: float, alpha: float) -> float:
-    """
-    Return V of the head of this module: output variance over (coupling sigma)^2.
-
-    cutoff in Hz, alpha in 1/s.
-    """
+    """Return V of the head of this module (cutoff in Hz, alpha in 1/s)."""
     w = TWO_PI * cutoff
     if order == 1:
         return (0.5 * w / (alpha * (w + alpha)) if mode == 'lowpass' else
@@ -338,13 +312,7 @@ _LOGS = -14.0, 21.0
 
 def cutoff_for_noise(mode: str, order: int, rms: float, intensity: float,
                      alpha: float) -> float:
-    """
-    Return the cutoff at which the supply's noise comes out with a wanted rms.
-
-    By bisection of intensity^2 V(w) = rms^2 (V: head of this module), which rises with w.
-
-    alpha in 1/s, result in Hz; infinite where no cutoff lets as much through.
-    """
+    """Return the cutoff, Hz, at which the supply's noise has a wanted rms; inf: there is none."""
     if intensity <= 1e-12 * rms:
         return math.inf
     wanted = (rms / intensity) ** 2

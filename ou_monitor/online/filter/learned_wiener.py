@@ -79,11 +79,7 @@ class LowPassSpan:
         return found
 
     def noise(self, interval: float, decay: float) -> FloatArray:
-        """
-        Return the covariance of the outputs for noise of variance 1, shape (5, 5).
-
-        interval in s; decay in 1/s: of the noise's correlation, infinite for white noise.
-        """
+        """Return the covariance of the outputs for noise of variance 1 that decays, 1/s."""
         key = (round(math.log(interval) / _SAME), decay if math.isinf(decay) else
                round(math.log(decay) / _SAME))
         found = self._noise.get(key)

@@ -77,11 +77,7 @@ class KalmanStep(NamedTuple):
 
 
 class VoltageKalman:
-    """
-    Kalman filter of the voltage, V, from a first one x on (level of the supply in V, or NaN).
-
-    `y` is the output, V; `lag` and `mixed` are those of `LearnedWiener`.
-    """
+    """Kalman filter of the voltage, V; `y`, `lag` and `mixed` as of `LearnedWiener`."""
 
     def __init__(self, settings: FilterSettings, x: float, level: float) -> None:
         self._settings = settings

@@ -50,12 +50,7 @@ class LoadBlock:
 
 
 class LoadBlocks:
-    """
-    Collects samples into blocks.
-
-    A sample that follows 15 ms or more after the last is a block at once, so a slow source is not
-    delayed.
-    """
+    """Collects samples into blocks; one that comes 15 ms or more after the last is a block."""
 
     def __init__(self) -> None:
         self.forget()
@@ -68,11 +63,7 @@ class LoadBlocks:
         self._zero = NAN
 
     def push(self, columns: FloatArray) -> list[LoadBlock]:
-        """
-        Return the blocks that samples complete.
-
-        Columns of shape (4, n): t, s, and voltage, V, finite, t rising; throttle, 0..1; A.
-        """
+        """Return the blocks that samples complete (t, s, rising; V; 0..1; A; shape (4, n))."""
         t, voltage, throttle, current = columns
         if not t.size:
             return []
@@ -142,11 +133,7 @@ _LONGEST = 0.15
 
 
 class LoadDelay:
-    """
-    Running correlations of voltage and load, relative to full load, at several delays.
-
-    Lists rather than arrays: five numbers a block cost NumPy six times as much.
-    """
+    """Running correlations of voltage and load at several delays (lists: faster here)."""
 
     def __init__(self, delay: float = 0.0, *, either: bool = False) -> None:
         # Whether the load may have either sign.

@@ -242,11 +242,7 @@ _DRIFT = _CHANGE * np.eye(_MEAN.size) * _SIZE ** 2
 
 
 class FastLevel:
-    """
-    A level with a faster random walk than the filter's, used once it predicts better.
-
-    It follows the voltage at rest; the coefficients of the filter are unchanged.
-    """
+    """A level that walks faster than the filter's, used once it predicts better."""
 
     def __init__(self) -> None:
         # Stamp, s; level, V, before what was drawn, V; its variance, V^2; time compared, s.

@@ -165,11 +165,7 @@ def judge(ratio: float, se: float, date: str) -> tuple[ModelVerdict, str]:
 
 def compare(found: Contrast, start: LoadStart, ohm: float, ohm_se: float, other: str, date: str
             ) -> ModelComparison:
-    """
-    Compare this flight with the model that an earlier one, of that date, has learned.
-
-    ohm: resistance now, NaN where unknown; other: why it is another pack, else ''.
-    """
+    """Compare this flight with an earlier model (ohm: now; other: why another pack, or empty)."""
     ratio = found.ratio
     se = math.hypot(found.se, ratio * (start.size_se or SIZE_ERROR), ratio * _FORM)
     verdict, words = (ModelVerdict.OTHER_PACK, other) if other else judge(ratio, se, date)

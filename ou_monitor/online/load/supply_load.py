@@ -85,11 +85,7 @@ class SupplyLoad:
         return self.status is LoadStatus.KNOWN
 
     def sag(self, throttle: npt.ArrayLike) -> FloatArray:
-        """
-        Return the sag, V, positive, of constant throttle without polarisation; NaN: unknown.
-
-        Unless `known`, the value is that of the prior, or from before throttle was lost.
-        """
+        """Return the sag, V, of constant throttle; unless `known`, by the prior; NaN: unknown."""
         return self._read(throttle, self._sag)
 
     def sag_se(self, throttle: npt.ArrayLike) -> FloatArray:
@@ -97,11 +93,7 @@ class SupplyLoad:
         return self._read(throttle, self._sag_se)
 
     def noise(self, throttle: npt.ArrayLike) -> FloatArray:
-        """
-        Return the rms that the load does not explain, V, including throttle changes as flown.
-
-        Beyond the throttles flown the value is that of the nearest one.
-        """
+        """Return the rms that the load does not explain, V; beyond what was flown the nearest."""
         u = np.clip(np.asarray(throttle, dtype=np.float64), *np.nan_to_num(self._range))
         return np.asarray(np.interp(u, np.linspace(0.0, 1.0, len(self._noise)), self._noise))
 

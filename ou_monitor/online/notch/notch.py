@@ -169,12 +169,7 @@ class MotorLaw:
 
     def learn(self, power: FloatArray, root: float, passed: float,
               lost: float) -> None:
-        """
-        Take a frame.
-
-        power: share of the usual noise in each bin, summed over the channels, shape (K,);
-        passed in s; lost: factor by which what was counts for less.
-        """
+        """Take a frame: power in each bin, and the time passed, s; `lost` scales the past."""
         keep = float(np.exp(-passed / _LAW_MEMORY))
         removed = self._removed @ power
         f = self._a + self._b * root
@@ -285,11 +280,7 @@ def families(count: int) -> tuple[Family, ...]:
 
 
 class NotchChoice:
-    """
-    Choice of the candidate of each channel; `chosen`: one a channel, None: no notch.
-
-    frequencies of the bins, Hz; settings: `fmin` and `cutoff`, Hz; rate of the samples, Hz.
-    """
+    """Choice of the candidate of each channel; `chosen`: one a channel, None: no notch."""
 
     def __init__(self, frequencies: FloatArray, settings: tuple[float, float], rate: float,
                  channels: int, count: int) -> None:
@@ -334,11 +325,7 @@ class NotchChoice:
 
     def take(self, power: FloatArray, throttle: float, motors: FloatArray,
              passed: float) -> None:
-        """
-        Take a frame: power, shape (channels, K); frequencies by throttle and by the rpm, Hz.
-
-        throttle: NaN while not known; motors: empty while not known.
-        """
+        """Take a frame: power, (channels, K); Hz by throttle (NaN: unknown) and motors."""
         power = power[:, self._used]
         none = power @ self._low.T
         mean = motors.mean(keepdims=True) if motors.size else motors

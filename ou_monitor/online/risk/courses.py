@@ -173,11 +173,7 @@ AT_PEAK = 0.05
 
 
 class Past:
-    """
-    Blocks of the flight so far.
-
-    Rows of `table`: lowest and last median of three voltages, V; mean and highest throttle.
-    """
+    """Blocks: lowest and last median of three, V; mean and highest throttle (`table`)."""
 
     def __init__(self) -> None:
         self._clear()
@@ -260,11 +256,7 @@ class Past:
         return float(np.sqrt(change).mean()) if change.size else 0.0
 
     def became(self, t: float, horizon: float) -> tuple[float, float, float] | None:
-        """
-        Return what a horizon, s, from t on was: lowest voltage, V, highest throttle, s there.
-
-        None when it is not complete, or gone, or has a silence in it.
-        """
+        """Return lowest voltage, highest throttle and s there in a horizon; None: incomplete."""
         begin = math.floor((t - self._start) / BLOCK) + 1
         end = begin + max(1, round(horizon / BLOCK))
         if begin < 0 or end > self.table.shape[1]:

@@ -105,11 +105,7 @@ def brownout_probability(e: Estimate, voltage: float, horizon: float,
 
 def risk_of(supply: Supply, voltage: npt.ArrayLike, horizon: float, now: float | None = None,
             noise_std: float = 0.0, *, coarse: bool = False) -> FloatArray:
-    """
-    Return the probability that the continuous path goes below `voltage` within `horizon`.
-
-    voltage in V, of any shape; horizon in s, now and noise_std in V.
-    """
+    """Return P(the continuous path goes below `voltage`, V, of any shape, within `horizon`, s)."""
     return _Paths(supply, now, noise_std, *(_FEW if coarse else _MANY)).risk(voltage, horizon)
 
 

@@ -138,11 +138,7 @@ class FloorWatch:
         return np.maximum(np.diff(arrival, prepend=self._arrived), 0.0)
 
     def _paced(self, elapsed: FloatArray, arrival: FloatArray | None) -> FloatArray:
-        """
-        Return the time since the newest sample, s, of none less than its number demands.
-
-        A link or a driver that was held up sends at once what took its time.
-        """
+        """Return the time since the newest sample, s; what came at once is spaced as usual."""
         if arrival is None or math.isnan(self._usual):
             return elapsed
         least = self._usual * np.arange(1.0, elapsed.size + 1.0)

@@ -248,12 +248,7 @@ class _Rung:
 
 
 class Forecast:
-    """
-    Risk with the pilot's future throttle, and with a given throttle.
-
-    `take` feeds the load filter, `follow` gives the newest estimate; look: time between updates,
-    s.
-    """
+    """Risk with the pilot's future throttle, and with a given one (look: s between updates)."""
 
     def __init__(self, loads: LoadFilter, look: float = LOOK) -> None:
         # Takes a third of a second once; not while samples arrive.
@@ -436,11 +431,7 @@ class Forecast:
 
     def risk_if(self, throttle: npt.ArrayLike, dwell: float, voltage: float, horizon: float
                 ) -> FloatArray:
-        """
-        Return the risk if throttle goes to each of `throttle` and stays `dwell`, s; shape (k,).
-
-        NaN where the load is not known.
-        """
+        """Return the risk, (k,), if throttle goes there for `dwell`, s; NaN: load unknown."""
         u = np.clip(np.atleast_1d(np.asarray(throttle, dtype=np.float64)), 0.0, 1.0)
         state = self._state()
         _, deviation, _ = self._flight(horizon)
@@ -500,11 +491,7 @@ def look_ahead(forecast: Forecast, load: SupplyLoad, settings: MonitorSettings) 
 
 
 def throttle_budget(risks: FloatArray, highest: float, limit: float) -> tuple[float, str]:
-    """
-    Return the highest throttle that keeps the risk under a limit, and what ends it, in words.
-
-    risks: at `_GRID`; highest: throttle flown.  0 when even idle is above the limit.
-    """
+    """Return the highest throttle with risks, at `_GRID`, under a limit; 0: none; and why."""
     # The budget ends at the first throttle above the limit, even if the risk falls again beyond.
     risks = np.maximum.accumulate(risks)
     within = int(np.searchsorted(risks, limit, 'right'))

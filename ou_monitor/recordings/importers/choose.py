@@ -90,11 +90,7 @@ def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | 
 
 
 def columns_of(path: Path, log: Log, chosen: Chosen) -> RawColumns:
-    """
-    Return the samples of a log as `convert` writes them and a bag returns them.
-
-    Stamps to 1 ns, values as float32: a log and the bag made of it give equal results.
-    """
+    """Return the samples of a log exactly as the bag made of it returns them."""
     volts = chosen.voltage
     t = _in_a_bag(volts.t)
     held = {}
