@@ -74,16 +74,18 @@ def test_good_stamps_again_are_good_again():
     assert report.stamps is StampOrder.GOOD and report.brownout is False
 
 
-def test_repeats_and_a_few_late_samples_are_no_disorder():
-    """Each message twice, and one of 20 a little late."""
-    watch = StampWatch()
-    t = np.repeat(np.arange(1000) * DT, 2)
-    watch.push(t, t)
-    assert watch.judge(0.3, DT) is StampOrder.GOOD
-    late = 1.0 + np.arange(1000) * DT
-    late[::20] -= 0.0015
-    watch.push(late, 1.0 + np.arange(1000) * DT)
-    assert watch.judge(0.3, DT) is StampOrder.GOOD
+@pytest.mark.parametrize('every, order', [
+    (0, StampOrder.GOOD), (20, StampOrder.GOOD), (8, StampOrder.IRREGULAR)])
+def test_a_tenth_of_late_samples_is_disorder_and_repeats_are_none(every, order):
+    """Each message twice, or one of some a little late."""
+    watch, arrived = StampWatch(), np.arange(1000) * DT
+    stamps = arrived.copy()
+    if every:
+        stamps[every::every] -= 0.0015
+        watch.push(stamps, arrived)
+    else:
+        watch.push(np.repeat(stamps, 2), np.repeat(arrived, 2))
+    assert watch.judge(0.3, DT) is order
 
 
 def test_irregular_is_never_ok_and_ends():
