@@ -145,7 +145,6 @@ def test_parameter_change_keeps_the_window(rig):
 
 @pytest.mark.parametrize('name, value, words', [
     ('window', -1.0, 'must lie within 0.05..3600'),
-    ('window', math.nan, 'a finite number or auto'),
     ('window', 'long', "unknown 'long'"),
     ('window', True, 'a finite number or auto'),
     ('brownout.warn', 0.5, 'must be less than brownout.critical'),
@@ -174,11 +173,7 @@ def test_publish_rate_changes_at_run_time(rig):
         return len(rig.states) > states + 30
     # A busy machine may need more than one try.
     wait_until(many, what='50 Hz')
-    assert rig.probe.set_parameter(rig.node, 'publish_rate', 10.0).successful
-
-
-def test_a_slow_timer_that_is_made_fast_is_fast_at_once(rig):
-    """From one in 100 s to 10 Hz: not after the 100 s."""
+    # A slow timer that is made fast is fast at once: not after 100 s.
     assert rig.probe.set_parameter(rig.node, 'publish_rate', 0.01).successful
     states = len(rig.states)
     assert rig.probe.set_parameter(rig.node, 'publish_rate', 10.0).successful

@@ -119,9 +119,6 @@ def test_latch_off_clears(rig):
 
 @pytest.mark.parametrize('name, value, words', [
     ('brownout.floor', 4.6, 'must not exceed brownout.voltage'),
-    ('brownout.leave', 1.0, 'must be less than 1'),
-    ('brownout.budget_limit', 0.6, 'must not exceed brownout.critical'),
-    ('brownout.critical', 0.005, 'must be less than brownout.critical'),
     ('brownout.horizon', 0.0, 'out of range'),
     ('brownout.latch', 1.5, 'Wrong parameter type'),
     ('model_file', '/no/such/model.yaml', 'cannot read the model file'),

@@ -216,16 +216,6 @@ def test_what_is_refused(tmp_path, arguments, words):
 
 
 @pytest.mark.parametrize('arguments, words', [
-    ([], 'no bag missing.mcap'), (['--ros-args', '-p', 'x'], 'cannot read the ROS arguments')])
-def test_a_refusal_is_one_line(world, arguments, words):
-    """Exit status 2 and one line that says why, no traceback."""
-    process = world.start('replay', 'missing.mcap', *arguments)
-    assert process.wait() == 2
-    lines = [line for line in process.err.strip().splitlines() if '[rcl]' not in line]
-    assert len(lines) == 1 and words in lines[0], process.err
-
-
-@pytest.mark.parametrize('arguments, words', [
     ([], 'required: bag'),
     (['bag', '--rate', 'nan'], '--rate must be a positive number'),
     (['bag', '--rate', '0'], '--rate must be a positive number'),

@@ -10,6 +10,8 @@ import struct
 import zlib
 
 import numpy as np
+from ou_monitor.errors import InputError
+from ou_monitor.recordings.importers.choose import choose
 from ou_monitor.recordings.importers.formats import import_log
 from ou_monitor.recordings.importers.log import Request
 
@@ -19,6 +21,31 @@ def load(folder, content, name='a.log', **request):
     path = folder / name
     path.write_bytes(content if isinstance(content, bytes) else b''.join(content))
     return path, import_log(path, Request(**request))
+
+
+def outcomes_of_flipped_bytes(folder, whole, first, seed, tries, samples=60):
+    """
+    Return how many logs with three bytes flipped were refused, and how many mended with a note.
+
+    Each refusal is one line; what is read is in order, and what is lost is noted.
+    """
+    rng, refused, mended = np.random.default_rng(seed), 0, 0
+    for _ in range(tries):
+        broken = bytearray(whole)
+        for at in rng.integers(first, len(whole), 3):
+            broken[at] = rng.integers(0, 256)
+        try:
+            path, log = load(folder, bytes(broken))
+            chosen = choose(path, log)
+        except InputError as error:
+            assert '\n' not in str(error)
+            refused += 1
+            continue
+        assert (np.diff(chosen.voltage.t) > 0).all()
+        if chosen.voltage.n < samples:
+            assert log.notes or chosen.notes
+            mended += 1
+    return refused, mended
 
 
 def named(log):

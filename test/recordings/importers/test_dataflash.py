@@ -2,7 +2,7 @@
 
 import struct
 
-from made_logs import copter, Dataflash, load, named
+from made_logs import copter, Dataflash, load, named, outcomes_of_flipped_bytes
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.choose import choose
@@ -120,24 +120,8 @@ def test_erased_page_is_not_damage(tmp_path):
 def test_flipped_bytes_give_an_error_or_a_note(tmp_path, form):
     """Flipped bytes give a one-line error, or samples and a note on the lost ones."""
     whole = getattr(copter(60)[0], form)
-    start = whole.index(b'ArduCopter') if form == 'binary' else 0
-    rng = np.random.default_rng(9)
-    refused = mended = 0
-    for _ in range(50):
-        broken = bytearray(whole)
-        for at in rng.integers(3 if form == 'text' else start // 2, len(whole), 3):
-            broken[at] = rng.integers(0, 256)
-        try:
-            path, log = load(tmp_path, bytes(broken))
-            chosen = choose(path, log)
-        except InputError as error:
-            assert '\n' not in str(error)
-            refused += 1
-            continue
-        assert (np.diff(chosen.voltage.t) > 0).all()
-        if chosen.voltage.n < 60:
-            assert log.notes or chosen.notes
-            mended += 1
+    first = 3 if form == 'text' else whole.index(b'ArduCopter') // 2
+    refused, mended = outcomes_of_flipped_bytes(tmp_path, whole, first, 9, 50)
     assert mended and (refused or form == 'binary')
 
 
