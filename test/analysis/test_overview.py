@@ -19,11 +19,11 @@ def deviation(u):
     return 0.015 * np.exp(u * (1.4 - u) / 0.49)
 
 
-def flight(seed=3, sag=SAG, throttle=True):
+def flight(seed=3, sag=SAG, throttle=True, seconds=SECONDS):
     """Return 16 V less sag u^1.8, throttle 0.1 to 0.8 in steps of 0.5 s, and noise."""
     rng = np.random.default_rng(seed)
-    t = np.arange(int(RATE * SECONDS)) / RATE
-    u = np.repeat(rng.uniform(0.1, 0.8, int(2 * SECONDS)), int(RATE / 2))
+    t = np.arange(int(RATE * seconds)) / RATE
+    u = np.repeat(rng.uniform(0.1, 0.8, int(2 * seconds)), int(RATE / 2))
     noise = deviation(u) * rng.standard_normal(t.size)
     return Recording(t, 16.0 - sag * u ** 1.8 + noise,
                      u if throttle else np.full(t.size, math.nan))
@@ -71,15 +71,16 @@ def test_another_time_scale_is_told_by_both_intervals(alpha, se, other):
 
 def test_what_is_not_known_is_said_and_the_rest_stands():
     """Without throttle; with one that does nothing; without a limit; with a limit never met."""
-    blind = overview(flight(throttle=False))
+    blind = overview(flight(throttle=False, seconds=20.0))
     words = dict(known_lines(blind))
     assert words['Sag'] == 'unknown: the recording has no throttle'
     assert words['Noise'].endswith(' mV rms') and 'Below' not in ' '.join(words)
     assert answers(blind)[0].startswith('The voltage fell to ')
-    idle = dict(known_lines(overview(flight(sag=0.0), 3.0)))
+    idle = dict(known_lines(overview(flight(sag=0.0, seconds=20.0), 3.0)))
     assert idle['Sag'].startswith('unknown. ') and idle['Below 3 V'] == 'never'
-    assert answers(overview(flight(), 3.0))[0].startswith('The voltage stayed above 3 V')
-    one = flight()
+    high = answers(overview(flight(seconds=20.0), 3.0))[0]
+    assert high.startswith('The voltage stayed above 3 V')
+    one = flight(seconds=1.0)
     assert answers(overview(replace(one, t=one.t[:0], voltage=one.voltage[:0],
                                     throttle=one.throttle[:0]))) == []
 
@@ -92,5 +93,5 @@ def test_lines_are_part_of_the_answer_when_they_make_a_quarter_of_the_noise(shar
     lines = [SimpleNamespace(frequency=40.0 * k, rms=0.01 / k, share=share)
              for k, share in enumerate(shares, 1)]
     level = SimpleNamespace(label='all', lines=SimpleNamespace(lines=lines))
-    said = answers(overview(flight(), 15.2, [level]))
+    said = answers(overview(flight(seconds=10.0), 15.2, [level]))
     assert said[-1] == f'{words}.' if words else not any('line' in one for one in said)

@@ -13,9 +13,15 @@ from simulated_recordings import recording
 TRUTH = ((0.1, 0.3156), (0.4, 0.632))
 
 
+@pytest.fixture(scope='module')
+def analysis():
+    """Return the analysis of two levels with a limit."""
+    return analyze(recording(1, TRUTH), brownout_voltage=4.5)
+
+
 def test_headline_warns_of_what_changes_its_own_numbers():
     """Millivolts; nothing where nothing is wrong."""
-    simulated = recording(1, TRUTH)
+    simulated = recording(1, TRUTH, seconds=4.0)
     assert not any('Beware' in one for one in answer(analyze(simulated)))
     sentence = answer(analyze(replace(simulated, voltage=1e3 * simulated.voltage)))[-1]
     assert sentence == ('Beware: the voltages seem to be millivolts or counts, not volts.')
@@ -25,10 +31,8 @@ def test_headline_warns_of_what_changes_its_own_numbers():
     assert 'TIME_UNIT' in {item.name for item in found.quality}
 
 
-def test_the_same_caution_of_two_levels_is_said_once():
+def test_the_same_caution_of_two_levels_is_said_once(analysis):
     """It is led by both labels."""
-    analysis = analyze(recording(7, TRUTH))
-
     def said(**changes):
         items = quality_list(
             analysis.recording, [level.throttle for level in analysis.levels],
@@ -40,9 +44,8 @@ def test_the_same_caution_of_two_levels_is_said_once():
     assert said(flags=(), noise_std=0.001) == []
 
 
-def test_the_table_over_throttle_is_that_of_the_facts():
+def test_the_table_over_throttle_is_that_of_the_facts(analysis):
     """Sag and noise at the tenths of throttle, as `supply` has them; no others."""
-    analysis = analyze(recording(1, TRUTH), brownout_voltage=4.5)
     table, *_ = next(part for part in analysis_document(analysis).parts
                      if getattr(part, 'heading', '') == 'Over throttle').parts
     assert table.heads[0] == 'throttle' and table.heads[-1] == 'brown-out risk'
@@ -56,9 +59,8 @@ def test_the_table_over_throttle_is_that_of_the_facts():
 
 @pytest.mark.parametrize('level, words', [(14.0, 'right after this flight'),
                                           (13.0, 'even at idle')])
-def test_no_budget_is_told_from_its_cause(level, words):
+def test_no_budget_is_told_from_its_cause(analysis, level, words):
     """The supply at rest is below the limit, or what was flown just now takes it there."""
-    analysis = analyze(recording(1, TRUTH), brownout_voltage=4.5)
     curves = analysis.by_throttle
     none = replace(analysis, by_throttle=replace(
         curves, voltage=13.2, budget=0.0, risk=np.full(curves.throttle.size, 0.3)),

@@ -168,7 +168,8 @@ def test_least_error_is_the_least(order, sigma):
 
 
 @pytest.mark.parametrize('throttle, expected', [
-    (0.0, 75.0), (0.2, 75.0 + 75.0 * 0.28), (0.5, 75.0 + 75.0 * 0.625), (1.0, 150.0), (-0.2, 75.0), (1.7, 150.0)])
+    (0.0, 75.0), (0.2, 75.0 + 75.0 * 0.28), (0.5, 75.0 + 75.0 * 0.625), (1.0, 150.0),
+    (-0.2, 75.0), (1.7, 150.0)])
 def test_throttle_law_is_betaflights(throttle, expected):
     """Expo 5, D-term limits 75..150 Hz."""
     s = FilterSettings(law='throttle', fmin=75.0, fmax=150.0)
