@@ -31,9 +31,9 @@ _ROOT = Path(__file__).resolve().parent.parent
 # What is tested, and what counts as right.
 sys.path[:0] = [str(_ROOT), *(str(_ROOT / 'test' / name) for name in ('support', 'hidden'))]
 
-from blind_scores import confusion, from_data, Outcome  # noqa: E402
+from blind_scores import from_data, Outcome  # noqa: E402
 import discover_runs as runs  # noqa: E402
-from hidden_effects import causes, KINDS, labels, pairs, unknowns, variants  # noqa: E402
+from hidden_effects import causes, KINDS, pairs, unknowns, variants  # noqa: E402
 from injected import EFFECTS  # noqa: E402
 import numpy as np  # noqa: E402
 from scipy.stats import binomtest  # noqa: E402
@@ -239,16 +239,10 @@ def levels(lines: Sequence[dict[str, Any]]) -> list[Level]:
 
 def report(lines: Sequence[dict[str, Any]], setting: str) -> str:
     """Return all tables as Markdown, below one line with what the numbers depend on."""
-    outcomes = [from_data(line) for line in lines]
-    parts = [f'{setting}\n', '### Levels\n', _levels(levels(lines)),
-             '### Time and memory of one recording\n', _cost(lines),
-             '### Effect by effect\n', _effects(outcomes)]
-    for kinds, title in ((('single', 'none', 'unknown'), 'One effect, none, and one outside'),
-                         (('variant',), 'The same causes in other shapes')):
-        part = [one for one in outcomes if one.kind in kinds]
-        if part:
-            parts += [f'### Confusion: {title}\n', _matrix(part)]
-    return '\n'.join(parts)
+    return '\n'.join([
+        f'{setting}\n', '### Levels\n', _levels(levels(lines)),
+        '### Time and memory of one recording\n', _cost(lines),
+        '### Effect by effect\n', _effects([from_data(line) for line in lines])])
 
 
 def _levels(found: Sequence[Level]) -> str:
@@ -319,29 +313,6 @@ def _said(one: Outcome) -> str:
         return 'failed'
     names = ' + '.join(sorted(one.named)) or 'nothing'
     return names + ('' if one.verdict == 'explained' or not one.named else ' (partly)')
-
-
-def _rows(outcomes: Sequence[Outcome]) -> tuple[list[str], list[str], dict[str, dict[str, int]]]:
-    """Return truths and names in the order of the catalogue, and the counts."""
-    counts = confusion(outcomes)
-    order = [*labels, 'none', 'unknown']
-    truths = sorted(counts, key=order.index)
-    return truths, [*labels, 'nothing', 'failed'], counts
-
-
-def _matrix(outcomes: Sequence[Outcome]) -> str:
-    truths, names, counts = _rows(outcomes)
-    names = [name for name in names if any(name in row for row in counts.values())]
-    rows = [[f'{truth} ({counts[truth]["of"]})',
-             *(_cell(counts[truth].get(name, 0), truth == name) for name in names)]
-            for truth in truths]
-    return table(['hidden (recordings) \\ named', *(
-        name.replace('_', ' ') for name in names)], rows) + (
-        '\nA recording with several names is counted under each.\n')
-
-
-def _cell(count: int, diagonal: bool) -> str:
-    return '' if not count else f'**{count}**' if diagonal else str(count)
 
 
 def nulls_table(lines: Sequence[dict[str, Any]]) -> str:

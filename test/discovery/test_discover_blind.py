@@ -16,7 +16,7 @@ import math
 import os
 import sys
 
-from blind_scores import confusion, hide, Outcome, outcome
+from blind_scores import hide, Outcome, outcome
 from hidden_effects import causes, labels, pairs, unknowns
 import numpy as np
 from ou_monitor import discover
@@ -97,9 +97,6 @@ def test_most_causes_are_named_alone_or_in_the_set():
     Fewer have chances of 0.4 % each at those levels, and of 84 % and 97 % at 60 %.
     """
     found = [outcome_of('single', cause) for cause in causes()]
-    for truth, row in confusion(found).items():
-        print(f'{truth:>22}:', ', '.join(
-            f'{name} {count}' for name, count in row.items() if name != 'of'))
     alone, in_set = sum(one.alone for one in found), sum(one.in_set for one in found)
     print(f'{SEED}: {alone} of {len(found)} alone, {in_set} in the set')
     assert alone >= least(len(found), 0.90), summary([one for one in found if not one.alone])

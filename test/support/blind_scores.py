@@ -132,21 +132,3 @@ def _each_stands(named: Sequence[tuple[str, tuple[str, ...]]], true: set[str]) -
         return True
     (name, also), *rest = named
     return any(_each_stands(rest, true - {one}) for one in true & {name, *also})
-
-
-def confusion(outcomes: Iterable[Outcome]) -> dict[str, dict[str, int]]:
-    """
-    Return how often each name was given to each truth: truth to counts by name.
-
-    Truth is '+' between two, 'none' or 'unknown'; 'nothing' counts recordings without a name,
-    'failed' those without a verdict, 'of' all.  One with several names is counted under each.
-    """
-    table: dict[str, dict[str, int]] = {}
-    for one in outcomes:
-        truth = one.kind if one.kind in ('none', 'unknown') else '+'.join(
-            part.partition('/')[0] for part in one.effect.split('+'))
-        row = table.setdefault(truth, {'of': 0})
-        row['of'] += 1
-        for name in one.named or (['nothing'] if one.verdict else ['failed']):
-            row[name] = row.get(name, 0) + 1
-    return table
