@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 import math
 from numbers import Real
-from typing import Any
+from typing import Any, cast, TypeVar
 
 from ou_monitor.errors import nearest
 from ou_monitor.online.filter.lag import cutoff_for_lag, most_lag
@@ -51,6 +51,8 @@ def parameters_of(settings: type[Any], prefix: str = '') -> tuple[Parameter, ...
                  for one in fields(settings))
 
 
+_Settings = TypeVar('_Settings')
+
 # Window as long as it takes.
 AUTO = 'auto'
 
@@ -58,39 +60,20 @@ AUTO = 'auto'
 LAWS = ('constant_noise', 'kalman', 'threshold', 'throttle', 'wiener')
 
 
+def _documented(settings: type[_Settings]) -> type[_Settings]:
+    """Add the parameters to the docstring of settings, before the examples."""
+    head, mark, tail = str(settings.__doc__).partition('    Examples\n')
+    lines = [f'    {one.name} : {one.type}\n        {one.metadata["description"]}\n'
+             for one in fields(cast('Any', settings))]
+    settings.__doc__ = f'{head}    Attributes\n    ----------\n{"".join(lines)}\n{mark}{tail}'
+    return settings
+
+
+@_documented
 @dataclass(frozen=True)
 class MonitorSettings:
     """
     Settings of `SupplyMonitor`: the parameters of the node `estimator`.
-
-    Attributes
-    ----------
-    window : float or str
-        Length of the sliding window, s; ``auto``: the shortest of 2, 8, 30 and 60 s in which
-        alpha is known within a factor of 1.5, else the longest.
-    stale_after : float
-        Silence after which the input counts as stale, s.
-    brownout_voltage : float
-        Supply voltage that must not be undershot, V.
-    brownout_horizon : float
-        Time ahead of the risk, s.
-    brownout_warn, brownout_critical : float
-        Risk from which the diagnostics warn, and risk within 1 s, throttle held as it is, from
-        which the flag is set, 0..1.
-    brownout_leave : float
-        Share of these risks below which a level is left, less than 1.
-    brownout_hold, brownout_delay : float
-        Time for which a level stays at least, and for which a risk lasts before it, s.
-    brownout_latch : bool
-        Whether CRITICAL stays until it is cleared.
-    brownout_floor : float
-        Voltage at or below which the flag is CRITICAL, V; 0: off; negative: `brownout_voltage`.
-    brownout_floor_time : float
-        Time over which the median of the voltage is held against the floor, s.
-    brownout_budget_limit : float
-        Risk that the throttle budget keeps under, 0..1; 0: `brownout_warn`.
-    model_file : str
-        Model file of the supply; empty: none.
 
     Examples
     --------

@@ -1,7 +1,7 @@
 """
 The law `kalman` for a signal in supply noise: the best filter, learned in flight.
 
-The signal is unknown.  The outputs z of four low-passes and the input (`LowPassSpan`) are signal
+The signal is unknown.  The outputs z of four low-passes and the input (`step_of`) are signal
 and noise, z = z_s + z_n, and the noise is known: `coupling` times the supply's noise, an OU with
 sigma and alpha, and white noise n0.  Of all linear combinations of z
 
@@ -35,6 +35,7 @@ than by these low-passes.  Intervals within 1 % of each other count as equal.
 from __future__ import annotations
 
 import cmath
+from functools import lru_cache
 import math
 
 import numpy as np
@@ -52,84 +53,21 @@ CUTOFFS = (2.0, 8.0, 32.0, 128.0)
 COUNT = len(CUTOFFS) + 1
 _TWO_PI = 2.0 * math.pi
 _ORDER, _SAME = 2, 0.01
-# Maximum number of step lengths whose matrices are kept.
+# Maximum number of steps whose matrices are kept.
 _STEPS = 64
 # Share of a state that counts as 0.
 _GONE = 1e-18
 
 
-class LowPassSpan:
-    """The low-passes, the input last of `COUNT` outputs; slope: it is the difference quotient."""
-
-    def __init__(self, slope: bool) -> None:
-        self.slope = slope
-        self._steps: dict[int, FloatArray] = {}
-        self._noise: dict[tuple[int, float], FloatArray] = {}
-        self._at: tuple[int, float] | None = None
-        self._response: Complexes = np.zeros(COUNT, dtype=np.complex128)
-
-    def step(self, dt: float) -> FloatArray:
-        """Return the matrix from (states, start, end) to the next states, shape (8, 10)."""
-        key = round(math.log(dt) / _SAME)
-        found = self._steps.get(key)
-        if found is None:
-            if len(self._steps) >= _STEPS:
-                self._steps.clear()
-            found = self._steps[key] = _step_matrix(math.exp(_SAME * key))
-        return found
-
-    def noise(self, interval: float, decay: float) -> FloatArray:
-        """Return the covariance of the outputs for noise of variance 1 that decays, 1/s."""
-        key = (round(math.log(interval) / _SAME), decay if math.isinf(decay) else
-               round(math.log(decay) / _SAME))
-        found = self._noise.get(key)
-        if found is None:
-            if len(self._noise) >= _STEPS:
-                self._noise.clear()
-            found = self._noise[key] = self._covariance(math.exp(_SAME * key[0]), decay)
-        return found
-
-    def response(self, interval: float, frequency: float) -> Complexes:
-        """Return the response of each output to a wave, shape (5,) (interval in s, Hz)."""
-        key = (round(math.log(interval) / _SAME), frequency)
-        if key != self._at:
-            self._at, self._response = key, self._respond(interval, frequency)
-        return self._response
-
-    def _respond(self, interval: float, frequency: float) -> Complexes:
-        step = self.step(interval)
-        back = np.exp(-1j * _TWO_PI * frequency * interval)
-        raw = (1.0 - back) / interval if self.slope else 1.0 + 0.0j
-        start = raw if self.slope else back
-        states = np.linalg.solve(np.eye(step.shape[0]) - step[:, :-2] * back,
-                                 step[:, -2] * start + step[:, -1] * raw)
-        return np.append(states[::2], raw)
-
-    def _covariance(self, interval: float, decay: float) -> FloatArray:
-        step = self.step(interval)
-        size = step.shape[0]
-        phi = math.exp(-decay * interval)
-        first, second = step[:, -2], step[:, -1]
-        # State: noise, low-passes, input; what they make of the noise before, and of its news.
-        a, g = np.zeros((size + 2, size + 2)), np.ones(size + 2)
-        a[0, 0] = a[-1, 0] = phi
-        a[1:-1, 1:-1] = step[:, :-2]
-        if self.slope:
-            both = (first + second) / interval
-            a[1:-1, 0], g[1:-1] = both * (phi - 1.0), both
-            a[-1, 0], g[-1] = (phi - 1.0) / interval, 1.0 / interval
-        else:
-            a[1:-1, 0], g[1:-1] = first + second * phi, second
-        p = np.outer(g, g) * -math.expm1(-2.0 * decay * interval)
-        while np.max(np.abs(a)) > _GONE:
-            p += a @ p @ a.T
-            a = a @ a
-        outputs = [*range(1, size, 2), size + 1]
-        return np.asarray(p[np.ix_(outputs, outputs)])
+def _key(x: float) -> int:
+    """Return a number that values within 1 % of each other share."""
+    return round(math.log(x) / _SAME)
 
 
-def _step_matrix(dt: float) -> FloatArray:
-    """Return F, a and b of all low-passes, side by side."""
+@lru_cache(maxsize=_STEPS)
+def step_of(key: int) -> FloatArray:
+    """Return F, a and b of all low-passes over a step (key of s), side by side, shape (8, 10)."""
+    dt = math.exp(_SAME * key)
     size = 2 * len(CUTOFFS)
     found = np.zeros((size, size + 2))
     for k, cutoff in enumerate(CUTOFFS):
@@ -142,6 +80,46 @@ def _step_matrix(dt: float) -> FloatArray:
             one.advance(_ORDER, _TWO_PI * cutoff * dt, start, end)
             found[at:at + 2, column] = one.y, one.slope
     return found
+
+
+def response_of(interval: float, frequency: float, slope: bool) -> Complexes:
+    """Return the response of each output to a wave, shape (5,) (interval in s, Hz)."""
+    step = step_of(_key(interval))
+    back = np.exp(-1j * _TWO_PI * frequency * interval)
+    raw = (1.0 - back) / interval if slope else 1.0 + 0.0j
+    start = raw if slope else back
+    states = np.linalg.solve(np.eye(step.shape[0]) - step[:, :-2] * back,
+                             step[:, -2] * start + step[:, -1] * raw)
+    return np.append(states[::2], raw)
+
+
+@lru_cache(maxsize=_STEPS)
+def noise_of(key: int, decay: float, slope: bool) -> FloatArray:
+    """
+    Return the covariance of the outputs for noise of variance 1, shape (5, 5).
+
+    key of the interval, s; decay of the noise's correlation, 1/s, infinite for white noise.
+    """
+    interval, step = math.exp(_SAME * key), step_of(key)
+    size = step.shape[0]
+    phi = math.exp(-decay * interval)
+    first, second = step[:, -2], step[:, -1]
+    # State: noise, low-passes, input; what they make of the noise before, and of its news.
+    a, g = np.zeros((size + 2, size + 2)), np.ones(size + 2)
+    a[0, 0] = a[-1, 0] = phi
+    a[1:-1, 1:-1] = step[:, :-2]
+    if slope:
+        both = (first + second) / interval
+        a[1:-1, 0], g[1:-1] = both * (phi - 1.0), both
+        a[-1, 0], g[-1] = (phi - 1.0) / interval, 1.0 / interval
+    else:
+        a[1:-1, 0], g[1:-1] = first + second * phi, second
+    p = np.outer(g, g) * -math.expm1(-2.0 * decay * interval)
+    while np.max(np.abs(a)) > _GONE:
+        p += a @ p @ a.T
+        a = a @ a
+    outputs = [*range(1, size, 2), size + 1]
+    return np.asarray(p[np.ix_(outputs, outputs)])
 
 
 # s between new weights, over which the output moves to them, and of what is remembered; chosen
@@ -176,7 +154,6 @@ class LearnedWiener:
         self.y = 0.0 if self._slope else x
         self.lag, self.mixed = NAN, 0.0
         self._x = x
-        self._span = LowPassSpan(self._slope)
         # States of the low-passes, start and end of the step.
         self._state = np.zeros(2 * COUNT)
         self._state[:-2:2] = self.y
@@ -193,7 +170,7 @@ class LearnedWiener:
         self._most = _LARGEST if self._slope else 1.0
 
     def __copy__(self) -> LearnedWiener:
-        """Return an independent copy that shares the cached steps and noise."""
+        """Return an independent copy."""
         other = object.__new__(LearnedWiener)
         other.__dict__.update(self.__dict__)
         other._state, other._rows = self._state.copy(), self._rows.copy()
@@ -209,7 +186,7 @@ class LearnedWiener:
         state, raw = self._state, slope if self._slope else x
         state[-2], state[-1] = slope if self._slope else self._x, raw
         self._x = x
-        state[:-2] = self._span.step(dt) @ state
+        state[:-2] = step_of(_key(dt)) @ state
         row = self._rows[self._n]
         row[:-1], row[-1] = state[:-2:2], raw
         self._n += 1
@@ -270,10 +247,11 @@ class LearnedWiener:
             self._log_sigma = wanted
         self._log_sigma += (wanted - self._log_sigma) * (
             -math.expm1(-self._for / constant) if constant > 0.0 else 0.0)
-        found = s.n0 / interval * self._span.noise(interval, math.inf)
+        key = _key(interval)
+        found = s.n0 / interval * noise_of(key, math.inf, self._slope)
         if s.coupling:
             supply = (s.coupling * math.exp(self._log_sigma))**2 / (2.0 * alpha)
-            found = found + min(supply, _LARGEST) * self._span.noise(interval, alpha)
+            found = found + min(supply, _LARGEST) * noise_of(key, alpha, self._slope)
         return found
 
     def _misfit(self, rows: FloatArray) -> float:
@@ -302,7 +280,7 @@ class LearnedWiener:
 
     def _limit(self, weights: FloatArray, interval: float) -> None:
         s = self._settings
-        response = self._span.response(interval, s.lag_frequency)
+        response = response_of(interval, s.lag_frequency, self._slope)
         if self._slope:
             # Both behind the true derivative.
             response = response / (1j * _TWO_PI * s.lag_frequency)
