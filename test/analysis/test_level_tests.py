@@ -119,7 +119,7 @@ def relaxing(kicks):
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_power(name):
+def test_each_effect_is_seen_in_ten_of_ten(name):
     """Each effect is seen in all of 10 recordings (0.6^10 = 6e-3 for a power of 60 %)."""
     assert all(examined(with_effect(name, seed))[name].rejects for seed in range(10))
 

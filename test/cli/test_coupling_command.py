@@ -108,7 +108,7 @@ def test_a_csv_with_other_names_and_units(series, tmp_path, capsys):
                                      '--time-column', 'ms', '--voltage-column', 'mv')
 
 
-def test_a_part(table, bag, capsys):
+def test_only_the_part_asked_for_counts(table, bag, capsys):
     """--from and --to: only that part of both series counts, whatever the file."""
     for path, signal in ((table, 'gyro_x'), (bag, '/imu/angular_velocity.x')):
         data = found(capsys, path, '--signal', signal, '--from', '4', '--to', '16')
@@ -141,7 +141,7 @@ def test_seen_is_said_in_words(table, capsys):
     assert text.splitlines()[-1].startswith('Nothing was written')
 
 
-def test_the_page(table, tmp_path, capsys):
+def test_the_page_says_what_the_text_says(table, tmp_path, capsys):
     """Voltage with its limit first, then the coherence; well formed; the same words as in text."""
     target = tmp_path / 'coupling.html'
     assert main(['coupling', str(table), '--signal', 'gyro_x', '--brownout-voltage', '4.9',

@@ -79,7 +79,7 @@ def test_rails_levels_and_esr(capsys):
     assert [narrow['rows'][k]['capacitance'] for k in (0, -1)] == pytest.approx([1e-4, 1e-3])
 
 
-def test_list(capsys):
+def test_list_shows_every_component_with_its_unit(capsys):
     """Every component with its default and unit."""
     assert main(['design', '--list']) == 0
     out = capsys.readouterr().out
@@ -145,7 +145,7 @@ def test_bad_network_files_are_one_line(text, words, capsys, tmp_path):
     ('470uF', 'F', 470e-6), ('470 µF', 'F', 470e-6), ('470u', 'F', 470e-6), ('1e-3', 'F', 1e-3),
     ('24kHz', 'Hz', 24e3), ('40mOhm', 'Ohm', 0.04), ('40 mohm', 'Ohm', 0.04), ('2Ω', 'Ohm', 2.0),
     ('33 1/s', '1/s', 33.0), ('.5', '', 0.5), (7, 'V', 7.0), ('-3V', 'V', -3.0)])
-def test_quantities(text, unit, value):
+def test_quantities_are_read_with_prefix_and_unit(text, unit, value):
     """Prefix and unit as users write them."""
     assert quantity(unit)(text) == pytest.approx(value, rel=1e-14)
 

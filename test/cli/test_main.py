@@ -96,7 +96,7 @@ def test_a_file_name_that_the_terminal_cannot_show(tmp_path, encoding):
 
 
 @pytest.mark.parametrize('closed', ['>&-', '>&- 2>&-'])
-def test_closed_outputs(tmp_path, closed):
+def test_closed_outputs_are_no_failure(tmp_path, closed):
     """What a daemon has closed is no failure, and a bad input is one still."""
     def run(arguments):
         return subprocess.run(

@@ -66,7 +66,7 @@ def test_default_is_a_flight(tmp_path, capsys):
     assert PRESETS['flight'].duration == 120.0
 
 
-def test_list_as_json(tmp_path, capsys):
+def test_list_is_json_alone_on_standard_output(tmp_path, capsys):
     """For programs, alone on standard output."""
     simulate('--list', '--json', '-')
     listed = json.loads(capsys.readouterr().out)
@@ -75,7 +75,7 @@ def test_list_as_json(tmp_path, capsys):
     assert set(listed['profiles']) == {'flight', 'hover', 'loads', 'transient'}
 
 
-def test_json_file(tmp_path, capsys):
+def test_json_has_the_parameters_of_every_term(tmp_path, capsys):
     """What was made, with the parameters of every term."""
     target = tmp_path / 'a.json'
     simulate('--preset', 'load_10', '--duration', 2, '--rate', 500, '--seed', 7, '--throttle',

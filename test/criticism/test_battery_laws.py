@@ -91,7 +91,7 @@ def test_moments_and_tails():
             2.0 * (math.sqrt(count + 0.375) - math.sqrt(expected + 0.375)), rel=2e-4)
 
 
-def test_clusters():
+def test_clusters_are_correlations_of_squares():
     """Neighbouring squares, the nine before, blocks of a span, and the spread of their means."""
     n = 2100
     # Squares that rise and fall every 120 samples.
@@ -162,7 +162,7 @@ def test_bursts_of_noise_that_is_none():
         assert np.std(values) < spread * (1.0 + 4.0 / math.sqrt(200.0)), name
 
 
-def test_signs():
+def test_a_sign_has_its_direction():
     for sign, name, value, wanted in (
             ('+kurtosis', 'kurtosis', 1.0, True), ('+kurtosis', 'kurtosis', -1.0, False),
             ('-kurtosis', 'kurtosis', -1.0, True), ('-kurtosis', 'kurtosis', 1.0, False),

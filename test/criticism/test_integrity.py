@@ -131,7 +131,7 @@ def test_a_short_recording_tells_wrong_stamps_by_their_likelihood(seed):
     assert judge_stamps(stamps, simulate(stamps, 63.0, 0.3, rng)).error == 0.0
 
 
-def test_gaps_stay():
+def test_gaps_stay_and_are_counted():
     """Lost samples leave their gap, and the note counts it."""
     t, v = rail(8)
     keep = np.ones(t.size, bool)
@@ -160,7 +160,7 @@ def test_what_is_not_finite_or_not_in_order():
 
 
 @pytest.mark.parametrize('n, value', [(2, None), (LEAST - 1, None), (5000, 3.3), (0, None)])
-def test_too_little(n, value):
+def test_too_little_has_a_reason(n, value):
     """Two samples, a constant, none at all: a reason, no exception."""
     t = np.arange(n) / RATE
     v = rail(1, n)[1] if value is None and n else np.full(n, value or 0.0)

@@ -177,7 +177,7 @@ def test_rivals_are_those_within_a_tie_of_the_best():
 @pytest.mark.parametrize('before, after, fails', [
     ({'a': 0.0}, {'a': 4.79}, False), ({'a': 0.0}, {'a': -4.81}, True),
     ({'a': 100.0}, {'a': 6.9}, False), ({'a': 100.0}, {'a': 7.1}, True)])
-def test_what_fails(before, after, fails):
+def test_a_statistic_fails_beyond_its_band_and_share(before, after, fails):
     assert decision.failing(before, after) == (['a'] if fails else [])
 
 

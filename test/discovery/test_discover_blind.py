@@ -180,7 +180,7 @@ SAG, NOISE = 'load_sag', 'measurement_noise'
     # Any list that is accepted will do.
     ([['tone'], ['resonance']], {'resonance': ()}, True, True, True, True),
 ])
-def test_scores(accepted, named, alone, in_set, all_named, family):
+def test_outcomes_are_scored_by_what_is_true(accepted, named, alone, in_set, all_named, family):
     """What counts as right, as in the set, as named, and as of the family."""
     one = Outcome('single', 'x', tuple(map(tuple, accepted)), (), 'explained', named)
     assert (one.alone, one.in_set, one.all_named, one.family) == (

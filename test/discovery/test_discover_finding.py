@@ -79,7 +79,7 @@ def test_unknown_numbers_are_null():
 @pytest.mark.parametrize('remaining, causes, verdict', [
     ([], 0, 'no_effect'), ([WORSE], 0, 'unexplained'), ([], 2, 'explained'),
     ([WORSE], 2, 'partly_explained')])
-def test_verdicts(remaining, causes, verdict):
+def test_the_verdict_follows_causes_and_what_is_left(remaining, causes, verdict):
     """Passing or failing, with and without causes."""
     assert judge(remaining, causes).value == verdict
 

@@ -18,7 +18,7 @@ def simulated(kind, cause=None, seed=0, **options):
     return draw(kind, np.random.default_rng(seed), cause=cause, **options)
 
 
-def test_what_exists():
+def test_all_causes_shapes_and_pairs_are_there():
     """All causes, many other shapes and unknowns, all compatible pairs."""
     assert len(causes()) == 23 and set(causes()) == set(labels)
     assert {name.partition('/')[0] for name in variants()} <= set(causes())
@@ -143,7 +143,7 @@ def test_other_shapes_and_unknowns_show(kind, cause):
 
 
 @pytest.mark.parametrize('cause', ['load_sag', 'tone', 'measurement_noise', 'glitches'])
-def test_strength_scales(cause):
+def test_half_the_strength_is_half_the_size(cause):
     key = {'load_sag': 'sag_v_per_unit', 'tone': 'amplitude_v', 'measurement_noise': 'std_v',
            'glitches': 'mean_size_v'}[cause]
     full, half = (simulated('single', cause, 3, duration=5.0, strength=s).detail[cause][key]

@@ -14,7 +14,7 @@ def test_stationary_variance_solves_the_lyapunov_equation():
     assert stationary_variance(alpha, sigma) == pytest.approx(lyapunov[0, 0], rel=1e-12)
 
 
-def test_transition_composes():
+def test_two_half_steps_are_one_step():
     """Two half steps are one step: phi multiplies, variances add through phi."""
     phi, q = transition(63.0, 0.632, [0.004, 0.002])
     assert phi[1] ** 2 == pytest.approx(phi[0], rel=1e-14)
@@ -68,5 +68,5 @@ def test_bad_parameters_are_named(alpha, sigma, dt, word):
         transition(alpha, sigma, dt)
 
 
-def test_empty_path():
+def test_no_stamps_give_an_empty_path():
     assert simulate([], 63.0, 1.0, np.random.default_rng(0)).shape == (0,)

@@ -71,7 +71,7 @@ def test_everything_at_once():
     np.testing.assert_allclose(np.concatenate(parts), whole, rtol=0, atol=1e-9)
 
 
-def test_seeds():
+def test_equal_seeds_give_equal_samples():
     """The same seed, the same samples; a generator that was used gives others."""
     rng = np.random.default_rng(5)
     first, second = supply().simulate(T, rng), supply().simulate(T, rng)
@@ -100,7 +100,7 @@ def test_stamps_that_do_not_rise(t):
             run.advance([later])
 
 
-def test_shapes():
+def test_stamps_and_throttle_are_one_row_each():
     """Stamps are one row; throttle has as many; nothing gives nothing."""
     run = Simulation(supply(), np.random.default_rng(0))
     with pytest.raises(ValueError, match=r'shape \(n,\)'):

@@ -61,7 +61,7 @@ def test_jumps_are_a_poisson_process():
 
 
 @pytest.mark.parametrize('dof', [3.0, 5.0, 12.0])
-def test_heavy_tails(dof):
+def test_innovations_are_student_t(dof):
     """
     Innovations are Student-t of the stated degrees, scaled to the variance of the ou.
 
@@ -148,7 +148,7 @@ def test_a_level_that_comes_at_the_rate_alpha():
     agrees(x[:, 2].mean(), SHARE * level, math.sqrt(truth / x.shape[0]))
 
 
-def test_three_states():
+def test_three_states_keep_detailed_balance():
     """
     Shares of the states, by detailed balance of up and down; each adds its level once.
 

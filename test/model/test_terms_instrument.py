@@ -74,7 +74,7 @@ def test_first_sample_is_stationary():
 
 
 @pytest.mark.parametrize('corner', [2.0, 10.027, 50.0])
-def test_step_response(corner):
+def test_a_step_of_the_level_decays_at_the_corner(corner):
     """
     A step of the level decays as exp(-rate t); constant levels are gone from the start.
 

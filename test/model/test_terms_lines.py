@@ -13,7 +13,7 @@ from term_examples import agrees, clusters, has_covariance, still, term
 @pytest.mark.parametrize('frequency, damping, std, tilt', [
     (120.0, 40.0, 0.03, 0.0), (5.0, 90.0, 0.1, 0.0), (20.0, 60.0, 0.05, -1.0),
     (20.0, 60.0, 0.05, 1.0), (60.0, 120.0, 0.05, 0.5)])
-def test_resonance(frequency, damping, std, tilt):
+def test_resonance_has_its_damped_covariance(frequency, damping, std, tilt):
     """Covariance std^2 exp(-damping lag) (cos + tilt damping/w sin), uneven stamps."""
     offsets = np.array([0.0, 0.1, 0.9, 1.3]) / frequency
     groups = clusters(still(term('resonance', frequency=frequency, damping=damping, std=std,
@@ -45,7 +45,7 @@ def test_resonance_at_even_stamps():
 
 
 @pytest.mark.parametrize('start', [0.0, 1.7e9])
-def test_pure_tone(start):
+def test_a_pure_tone_is_a_sine_from_the_first_sample(start):
     """Amplitude sin(2 pi frequency t + phase), t from the first sample."""
     t = np.arange(5000) / 8192.0
     found = still(term('tone', amplitude=0.2, frequency=123.4, phase=0.7, linewidth=0.0)).simulate(
@@ -55,7 +55,7 @@ def test_pure_tone(start):
                                atol=1e-10)
 
 
-def test_wide_tone():
+def test_a_wide_tone_is_a_lorentzian():
     """
     Covariance A^2/2 cos(2 pi f lag) exp(-pi width lag): a Lorentzian, full width at half height.
 

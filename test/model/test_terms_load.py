@@ -20,7 +20,7 @@ def step_at(k, low=0.0, high=1.0):
 
 
 @pytest.mark.parametrize('start', [0.0, 1000.0])
-def test_sag(start):
+def test_sag_follows_throttle_at_once(start):
     """-((linear + growth t) u + square u^2), at once, t from the first sample."""
     throttle = np.random.default_rng(1).random(T.size)
     sag = term('load_sag', linear=0.3, square=0.07, growth=-0.4)
@@ -73,7 +73,7 @@ def test_transient_comes_after_its_delay(delay, later, start):
 
 
 @pytest.mark.parametrize('start', [0.0, 1.7e9])
-def test_drift(start):
+def test_drift_counts_from_the_first_sample(start):
     """Rate t + curvature t^2 from the first sample, whatever clock the stamps are of."""
     found = level(term('drift', rate=-0.5, curvature=0.3), t=start + T)
     np.testing.assert_allclose(found, -0.5 * T + 0.3 * T ** 2, rtol=0,

@@ -101,7 +101,7 @@ def test_throttle_acts_on_the_step_before_its_stamp():
     agrees(e[0::2].var(), quiet * math.e ** 2, quiet * math.e ** 2 * error)
 
 
-def test_volatility():
+def test_the_log_of_sigma_is_an_ou():
     """
     Ln sigma is an OU of the stated std and rate.
 

@@ -35,7 +35,7 @@ def test_measurement_noise_is_white_and_normal():
 
 
 @pytest.mark.parametrize('std', [0.05, 0.5])
-def test_quantization(std):
+def test_readings_are_whole_steps(std):
     """
     Whole steps from 0 V, within half a step; errors of step^2/12 where noise covers steps.
 
@@ -52,7 +52,7 @@ def test_quantization(std):
     assert abs(error.mean()) < 4.0 * step / math.sqrt(12.0 * N)
 
 
-def test_saturation():
+def test_samples_beyond_a_rail_read_the_rail():
     """Samples beyond a rail read the rail, the others are untouched; the shares are normal."""
     raw = drawn(t=T[:20_000] * 200.0)
     clipped = drawn(term('saturation', low=4.95, high=5.02), t=T[:20_000] * 200.0)
@@ -77,7 +77,7 @@ def test_order_of_the_chain():
 
 @pytest.mark.parametrize('start', [0.0, 12.345, 1.7e9])
 @pytest.mark.parametrize('rate', [1000, 500, 250, 400, 270, 999, 1])
-def test_held_samples(rate, start):
+def test_a_value_holds_until_the_source_has_the_next(rate, start):
     """
     A value holds until the source has the next one, counted in whole numbers here.
 
@@ -92,7 +92,7 @@ def test_held_samples(rate, start):
     assert fresh.mean() == pytest.approx(rate / 1000, rel=0.02)
 
 
-def test_glitches():
+def test_glitches_hit_their_share_and_no_other_sample():
     """
     The stated share of samples has a normal error; the others are untouched.
 
@@ -115,7 +115,7 @@ def clock_errors(std, t, seed=1):
     return ramp.simulate(t, np.random.default_rng(seed)) - (t - t[0])
 
 
-def test_clock_errors():
+def test_clock_errors_are_normal_and_independent():
     """Normal of the stated deviation, independent; the first sample is on its stamp."""
     error = clock_errors(5e-5, T)
     assert error[0] == 0.0

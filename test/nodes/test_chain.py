@@ -130,7 +130,7 @@ def test_output_is_the_filtered_input(chain):
     assert left == pytest.approx(wanted_of, rel=0.2)
 
 
-def test_reliable_outputs(chain):
+def test_outputs_are_reliable_and_of_the_contracts_type(chain):
     """One publisher each, reliable, of the type that the contract says."""
     kinds = {'/ou_adaptive_filter/output': 'std_msgs/msg/Float32',
              '/ou_adaptive_filter/cutoff': 'std_msgs/msg/Float64',

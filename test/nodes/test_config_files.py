@@ -94,7 +94,7 @@ def of_kind(described, kind):
     return [entry for entry in described if type(entry).__name__ == kind]
 
 
-def test_launch_arguments(described):
+def test_launch_takes_namespace_parameters_and_clock(described):
     """Namespace, parameter file, simulated time; the file is the shipped one."""
     arguments = {a.args[0]: a.kwargs['default_value']
                  for a in of_kind(described, 'DeclareLaunchArgument')}
@@ -117,7 +117,7 @@ def test_the_nodes_are_found_on_this_machine_alone(described):
     assert kinds.index('SetEnvironmentVariable') < kinds.index('Node')
 
 
-def test_launch_nodes(described):
+def test_launch_starts_executables_wired_to_each_other(described):
     """Executables of the package, names that the file has, sigma wired to the estimator."""
     nodes = of_kind(described, 'Node')
     assert [n.kwargs['name'] for n in nodes] == list(NODES)
@@ -157,7 +157,7 @@ def test_a_parameter_file_that_is_not_there_is_an_error(described, tmp_path):
 
 
 @pytest.mark.parametrize('described', [TWO], indirect=True)
-def test_two_batteries(described):
+def test_two_batteries_are_two_scopes_of_one_launch(described):
     """Each by the other launch file, with arguments that it has, in a scope of its own."""
     known = {name for name, _, _ in _arguments_of(LAUNCH)}
     declared = {a.args[0] for a in of_kind(described, 'DeclareLaunchArgument')}
@@ -174,7 +174,7 @@ def test_two_batteries(described):
 
 
 @pytest.mark.parametrize('described', [SIMULATED], indirect=True)
-def test_simulated(described):
+def test_the_simulated_launch_includes_the_other(described):
     """The other launch file first, with arguments that it has; parameters that the node has."""
     (include,), (node,) = of_kind(described, 'IncludeLaunchDescription'), of_kind(
         described, 'Node')

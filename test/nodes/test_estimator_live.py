@@ -74,7 +74,7 @@ def test_one_does_not_hear_the_other(rigs):
     assert math.isnan(silent.alpha[-1].data) and silent.flags == []
 
 
-def test_silence(rig):
+def test_silence_is_stale_and_never_false(rig):
     """After `stale_after`: STALE, NaN, and no flag that says false."""
     rig.feed(ou_path(500, DT, seed=2))
     wait_until(lambda: rig.status.level == STALE and 'No voltage for' in rig.status.message,

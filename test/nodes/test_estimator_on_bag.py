@@ -108,7 +108,7 @@ def test_the_mean_level(states):
         assert abs(float(fields['u0']) - TRUTH['u0']) < SIGMAS * spread
 
 
-def test_one_instant(states, run):
+def test_all_fields_are_of_one_instant(states, run):
     """All fields of a state belong together, and the plain topics say the same numbers."""
     sent = {name: {m.data for m in run[name]} for name in NUMBERS}
     for message, fields in states:
@@ -180,7 +180,7 @@ def test_stamps_are_those_of_the_bag(states):
     assert bag.start_ns * 1e-9 <= stamps[0] and stamps[-1] <= bag.end_ns * 1e-9 + 1e-6
 
 
-def test_diagnostics(run):
+def test_diagnostics_have_the_full_name_and_simulated_time(run):
     """On the absolute topic, by the full name of the node, at simulated time."""
     mine = [m for m in run['diagnostics'] if m.status[0].name == 'uav1/ou_estimator: supply']
     assert len(mine) >= 5

@@ -129,7 +129,7 @@ def test_a_step_is_answered_like_a_butterworth(rig):
 
 @pytest.mark.parametrize('sigma, cutoff', [
     (0.1, 150.0), (0.6, HELD), (10.0, 20.0), (math.nan, 75.0)])
-def test_cutoff_law(rig, sigma, cutoff):
+def test_the_cutoff_follows_sigma_and_falls_back(rig, sigma, cutoff):
     """The law fmax (sigma_ref / sigma)^2 within fmin..fmax; unknown: the fallback."""
     cutoff_becomes(rig, cutoff, sigma)
 

@@ -131,7 +131,7 @@ def test_contradictions_are_refused_at_run_time(rig, name, value, words):
     assert rig.get(name) == before
 
 
-def test_model_file(rig, shared_world):
+def test_a_bad_model_file_leaves_the_old_one(rig, shared_world):
     """Read when it is set; a bad one is refused with its line and the old one stays."""
     good, bad = shared_world.folder / 'good.yaml', shared_world.folder / 'bad.yaml'
     good.write_text(MODEL)

@@ -185,7 +185,7 @@ def test_half_open_connections_end_by_themselves():
     (['--port', '9' * 5000], 'is not a port'), (['--port', '70000'], 'is not a port'),
     (['--port', 'x'], 'is not a port'),
     (['--host', 'no.such.host.invalid'], 'cannot listen on no.such.host.invalid')])
-def test_bad_options(world, arguments, words):
+def test_bad_options_are_one_line(world, arguments, words):
     """One line that says what is wrong; status 2."""
     process = world.start('ou_monitor.cli.main', 'live', *arguments)
     assert process.wait() == 2 and words in process.err

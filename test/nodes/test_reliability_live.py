@@ -156,7 +156,7 @@ def test_what_comes_as_a_parameter_kills_nothing(rig):
     assert rig.field('restarts') == '0' and rig.process.popen.poll() is None
 
 
-def test_locked_parameters(world):
+def test_locked_parameters_refuse_what_can_disarm(world):
     """What can disarm is refused with the reason, at run time only."""
     rig = Rig(world, 'locked', '-p', 'lock_parameters:=true', '-p', 'brownout.voltage:=4.6')
     for name, value in (('brownout.voltage', 1.0), ('stale_after', 100.0), ('model_file', ''),

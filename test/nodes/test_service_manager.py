@@ -43,7 +43,7 @@ def test_an_abstract_socket(monkeypatch):
         assert found.recv(100) == b'STOPPING=1'
 
 
-def test_nobody_listens(monkeypatch, tmp_path):
+def test_no_listener_is_no_error(monkeypatch, tmp_path):
     """Neither without a socket, nor with one that is gone, is there an error."""
     monkeypatch.delenv('NOTIFY_SOCKET', raising=False)
     ServiceManager().tell('READY=1')

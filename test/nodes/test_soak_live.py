@@ -8,7 +8,7 @@ import sys
 from live import DEADLINE, new_domain, ROOT
 
 
-def test_six_seconds(tmp_path):
+def test_a_soak_of_six_seconds_writes_its_figures(tmp_path):
     """All processes come and go; the figures are written, and the table between its marks."""
     page = tmp_path / 'page.md'
     page.write_text('before\n<!-- soak begins -->\noutdated\n<!-- soak ends -->\nafter\n')

@@ -80,7 +80,7 @@ def test_a_config_without_throttle():
     ({'voltage__type': 'geometry_msgs/msg/Vector3'}, 'give voltage.field'),
     ({'voltage__type': 'px4_msgs/msg/X', 'voltage__field': 'v'}, 'ros-jazzy-px4-msgs'),
 ])
-def test_refusals(changed, words):
+def test_a_refusal_says_what_to_do(changed, words):
     """One line that says what to do."""
     with pytest.raises(InputError) as caught:
         find_source('voltage', values(**changed))
@@ -130,7 +130,7 @@ def test_a_bag_does_not_choose_what_is_imported(tmp_path, monkeypatch):
         message_class('std_msgs/msg/__loader__')
 
 
-def test_motor_speeds():
+def test_motor_speeds_are_scalars_arrays_or_fields():
     """By msg_config, by type, by hand; a scalar, an array, and a field of each element."""
     from ou_monitor.nodes.sources import MOTOR_PARAMETERS
     from std_msgs.msg import Float64MultiArray

@@ -124,7 +124,7 @@ def test_throttle_that_fails(world):
     (('throttle.play:=hoover',), 'hover'),
     (('rate:=5000.0',), 'rate'),
 ])
-def test_bad_input(tmp_path, options, words):
+def test_bad_input_is_named(tmp_path, options, words):
     """It is named."""
     if options and not options[0].startswith('model_file'):
         options = (*options, f'model_file:={saved(tmp_path, EXACT)}')

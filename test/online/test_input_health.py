@@ -186,7 +186,7 @@ STEPS = st.one_of(st.sampled_from([0.001, 0.0, -0.001, 1e-9, 1e-300, 1.0]), ANY)
 @example([(0.001, 0.0, None, 1, 0.0), (-1.0, 0.0, None, 1, 0.0)])
 @hypothesis_settings(max_examples=150, deadline=None)
 @pytest.mark.filterwarnings('ignore::RuntimeWarning')
-def test_arbitrary_floats(history):
+def test_no_float_breaks_the_monitor_or_is_called_fine(history):
     """Stamps, voltages and throttles of any kind, each in runs, with and without noise."""
     monitor = SupplyMonitor(MonitorSettings(window=0.2))
     rng = np.random.default_rng(2)

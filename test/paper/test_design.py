@@ -56,7 +56,7 @@ def test_parallel_capacitors_keep_esr_times_capacitance():
     assert with_capacitance(network, 940e-6, esr_follows=False).bulk_esr == 0.03
 
 
-def test_enough():
+def test_a_capacitor_that_is_large_enough_is_said_so():
     result = design(PowerNetwork(), 0.1, **QUESTION)
     assert result.verdict is DesignVerdict.ENOUGH
     assert result.least.capacitance == pytest.approx(10e-6)
@@ -90,7 +90,7 @@ def test_a_level_above_the_battery_has_no_resistance():
     assert regulated.verdict is DesignVerdict.LEVEL and 'regulator_voltage' in answer(regulated)
 
 
-def test_no_noise():
+def test_without_throttle_there_is_no_noise():
     result = design(PowerNetwork(), 0.0, **QUESTION)
     assert result.verdict is DesignVerdict.ENOUGH and result.present.risk == 0.0
     assert math.isinf(result.present.mean_time) and result.present.sigma == 0.0
@@ -150,7 +150,7 @@ def test_without_filter_capacitance_lowers_the_risk(
         assert b.alpha <= a.alpha * (1.0 + 1e-6)
 
 
-def test_default_levels():
+def test_default_levels_follow_cells_and_rail():
     assert default_voltage(PowerNetwork(cells=4, battery_voltage=14.8), 'bus')[0] == 4 * 3.3
     assert default_voltage(PowerNetwork(), 'regulated')[0] == 4.5
     assert default_voltage(PowerNetwork(regulator_voltage=3.3), 'regulated')[0] == 2.88

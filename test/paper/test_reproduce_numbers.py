@@ -119,7 +119,7 @@ def test_alpha_by_least_squares(fig5):
     assert fig5['|U(0)|'].recomputed == pytest.approx(math.exp(beta[0]))
 
 
-def test_local_rates(fig5):
+def test_only_one_local_rate_is_off_by_more_than_scatter(fig5):
     """61.0, 61.1, 69.3, 126.5: only the last is off by more than the points scatter."""
     found = [fig5[f'rate, {span} ms'] for span in ('0..10', '10..25', '25..35', '35..50')]
     exact = [math.log(368 / 200) / 0.010, math.log(200 / 80) / 0.015, math.log(2) / 0.010,
@@ -193,7 +193,7 @@ def test_coupling_by_simulation(fig5):
     assert slope.error < 0.05, 'so that 1 would be seen'
 
 
-def test_table_2():
+def test_table_2_is_recomputed_by_hand():
     """sigma, Var_inf, tau and their errors, by hand."""
     rows = by_quantity([r for r in tables.table_2() if r.where in ('Table 2', 'Section 5')])
     assert rows['sqrt(2 alpha)'].recomputed == pytest.approx(11.2249722)
@@ -258,7 +258,7 @@ def test_falls_by_first_passage():
     assert row.verdict is RowVerdict.AGREES
 
 
-def test_capacitance():
+def test_capacitance_lowers_alpha_and_variance():
     """1/(R C) and S R/(2 C); both elasticities are -1, so alpha falls."""
     alpha, var = tables.rc_rail(0.05, 2e-3, 3e-6)
     assert alpha == pytest.approx(1e4) and var == pytest.approx(3e-6 * 0.05 / (2.0 * 2e-3))

@@ -89,7 +89,7 @@ def test_logarithm_does_not_grow(formulas):
     assert row.verdict is RowVerdict.DOES_NOT_HOLD
 
 
-def test_potential(formulas):
+def test_the_potential_of_a_telegraph_agrees(formulas):
     """1/(4 q) = 0.25 ms."""
     row = formulas['R0(0, 0) of a telegraph']
     assert row.recomputed == pytest.approx(0.25) and row.verdict is RowVerdict.AGREES

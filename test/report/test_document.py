@@ -91,6 +91,6 @@ def test_signs_of_a_page():
     (0.0, 3, '0'), (math.nan, 3, '-'), (math.inf, 3, '-'), (15.0, 3, '15.0'), (0.02, 3, '0.0200'),
     (99.96, 3, '100'), (0.9999, 3, '1.00'), (123456.0, 3, '123456'), (1234567.0, 3, '1.23e6'),
     (7.91e-4, 3, '7.91e-4'), (0.00317, 3, '0.00317'), (-63.04, 3, '-63.0'), (4.9351, 4, '4.935')])
-def test_number(value, digits, text):
+def test_numbers_keep_their_significant_digits(value, digits, text):
     """Significant digits, zeros kept, rounding across a decade."""
     assert number(value, digits) == text

@@ -49,7 +49,7 @@ def test_log_ticks_lie_inside(low, decades):
     (0.0, 1.0, '0'), (10.0, 10.0, '10'), (0.2, 0.2, '0.2'), (4.85, 0.05, '4.85'),
     (-2.0, 1.0, '\u22122'), (1e-4, 1e-4, '1e\u22124'), (2e5, 1e5, '2e5'),
     (0.3 - 0.1 * 3, 0.1, '0')])
-def test_tick_text(value, step, text):
+def test_ticks_have_the_decimals_of_their_step(value, step, text):
     """Decimals as the step needs them; a true minus; no residue of rounding."""
     assert tick_text(value, step) == text
 

@@ -14,7 +14,7 @@ from scipy.special import log_ndtr, ndtr, pbdv
 
 @pytest.mark.parametrize('start, barrier, expected', [
     (0.0, 1.0, 2.0934066496783218), (0.0, 0.0, 0.0), (2.0, 1.0, 0.0)])
-def test_known_values(start, barrier, expected):
+def test_mean_first_passage_has_known_values(start, barrier, expected):
     assert mean_first_passage(start, barrier) == pytest.approx(expected, rel=1e-12)
 
 
@@ -121,7 +121,7 @@ def log_cylinder(p, z):
 @pytest.mark.parametrize('barrier', [-2.5, 0.0, 2.0, 5.0])
 @pytest.mark.parametrize('gap', [0.1, 1.0, 3.0])
 @pytest.mark.parametrize('p', [0.03, 1.0, 8.0, 60.0])
-def test_laplace_transform(barrier, gap, p):
+def test_the_laplace_transform_is_that_of_parabolic_cylinders(barrier, gap, p):
     """E exp(-p T) = exp((x^2 - b^2)/4) D_-p(-x) / D_-p(-b); as small as 1e-14."""
     x = barrier - gap
     expected = math.exp((x * x - barrier * barrier) / 4.0 + log_cylinder(p, -x)
@@ -134,7 +134,7 @@ def test_laplace_transform(barrier, gap, p):
 
 @pytest.mark.parametrize('barrier', [-3.0, 0.0, 2.0, 9.0, 25.0])
 @pytest.mark.parametrize('w', [0.1, 1.0, 3.0, 6.0])
-def test_short_spans(barrier, w):
+def test_short_spans_are_those_of_a_brownian_motion(barrier, w):
     """A Brownian motion with constant drift, to order w^2 s; within and below the table."""
     for span in (1e-5, 1e-7):
         gap = w * math.sqrt(2.0 * span)
@@ -194,7 +194,7 @@ spans = st.floats(-4.0 * math.log(10.0), 5.0 * math.log(10.0)).map(math.exp)
 
 @settings(max_examples=300, deadline=None)
 @given(levels, levels, levels, spans, spans)
-def test_monotone(x, b, c, s, r):
+def test_more_time_or_a_nearer_barrier_is_no_less_likely(x, b, c, s, r):
     """More time, a start nearer, a barrier nearer: no less likely, as far as the table goes."""
     near, far = min(b, c), max(b, c)
     short, long = min(s, r), max(s, r)
@@ -206,7 +206,7 @@ def test_monotone(x, b, c, s, r):
     assert q[0] <= q[1] * slack + 1e-13
 
 
-def test_ends():
+def test_the_ends_are_certain_impossible_or_unknown():
     """1 at or beyond the barrier, 0 without time, 1 for ever; NaN where something is unknown."""
     p = passage_probability([2.0, 3.0, 0.0, 0.0, math.nan, 0.0, 0.0, 0.0, -math.inf, 0.0],
                             [2.0, 2.0, 2.0, 2.0, 2.0, math.nan, 2.0, math.inf, 2.0, -math.inf],

@@ -174,7 +174,7 @@ def test_throttle_steps_do_not_become_noise(lag):
     assert all(not e.usable or e.var_inf > 2.0 * VAR_INF for e in blind), 'no sag in the test'
 
 
-def test_curved_sag():
+def test_a_curved_sag_is_taken_out_of_the_mean():
     """A mean of level + a u + b u^2 is taken out, and its slope told at the end."""
     rng = np.random.default_rng(17)
     throttle = 0.2 + 0.2 * (np.floor(T / 0.1) % 4)

@@ -150,7 +150,7 @@ def test_float32_and_lists():
         estimate(T, y + 1e-9).alpha, rel=1e-4)
 
 
-def test_epoch_stamps():
+def test_stamps_of_this_decade_cost_no_accuracy():
     """
     Stamps of this decade, 1.7e9 s, are only good to 0.24 us.
 

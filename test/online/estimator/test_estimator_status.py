@@ -100,7 +100,7 @@ STATUS = {
 
 
 @pytest.mark.parametrize('status', STATUS, ids=lambda s: s.name)
-def test_status(status):
+def test_each_status_has_numbers_only_where_they_may_be_used(status):
     """Each with its sentence, and numbers only where they may be acted on."""
     t, y = STATUS[status]()
     estimator = SlidingEstimator(2.1)

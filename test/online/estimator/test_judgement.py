@@ -22,7 +22,7 @@ def judged(fit=FIT, base=BASE, quality=CLEAN, throttle_std=NAN, smoothness=NAN, 
     return judge(replace(fit, **changes), base, quality, throttle_std, smoothness)
 
 
-def test_corrections():
+def test_bias_is_taken_off_alpha_and_variance():
     """The bias off alpha; Var_inf goes with it; sigma and the noise stay."""
     e = judged()
     assert e.alpha == pytest.approx(63.0 - 1.5 / 2.0)
@@ -58,7 +58,7 @@ def test_too_few_relaxations(found, status):
 
 
 @pytest.mark.parametrize('found, status', [(24.9, Status.SHORT_WINDOW), (25.3, Status.OK)])
-def test_relaxations(found, status):
+def test_enough_relaxations_are_needed(found, status):
     """With a standard error of nearly nothing; published ones are 1.5 fewer than fitted."""
     e = judged(alpha=(found + 1.5) / 2.0, log_var=(1e-6, 1e-6, 1e-6))
     assert e.status is status
@@ -73,7 +73,7 @@ def test_one_standard_error_is_granted():
 
 @pytest.mark.parametrize('alpha, se, buried', [
     (63.0, 0.49, False), (63.0, 0.51, True), (5.0, 0.95, False), (5.0, 1.0, True)])
-def test_buried(alpha, se, buried):
+def test_a_relaxation_below_half_a_nat_is_buried(alpha, se, buried):
     """Half a nat; in short windows (8.5 relaxations: 0.485) twice what the length makes."""
     assert (judged(alpha=alpha, log_var=(se ** 2, 0.1, se ** 2)).status is Status.BURIED) == buried
 
@@ -89,7 +89,7 @@ def test_no_relaxation_keeps_what_is_known():
 @pytest.mark.parametrize('smoothness, n, told', [
     (0.04, 10 ** 6, False), (0.06, 10 ** 6, True), (0.10, 2000, False), (0.12, 2000, True),
     (NAN, 2000, False)])
-def test_low_pass(smoothness, n, told):
+def test_a_low_pass_is_told_by_its_own_error(smoothness, n, told):
     """Above 0.05, and above five standard errors (0.112 for 2000 samples)."""
     assert (Flag.LOWPASS_UPSTREAM in judged(smoothness=smoothness, n=n).flags) == told
 
@@ -101,7 +101,7 @@ def test_slow_rate_and_trend():
 
 
 @pytest.mark.parametrize('std, told', [(0.0, True), (0.0045, True), (0.0055, False), (NAN, False)])
-def test_excitation(std, told):
+def test_jitter_of_a_stick_excites_nothing(std, told):
     """Half a percent of full scale is jitter of a stick."""
     assert (Flag.NO_EXCITATION in input_flags(Counters(), CLEAN, std)) == told
 
@@ -111,6 +111,6 @@ def test_excitation(std, told):
     (Quality(0.0, 2, False, 0.02), Counters(), Flag.HELD_SAMPLES),
     (Quality(0.0, 1, True, 0.02), Counters(), Flag.SATURATED),
     (CLEAN, Counters(late=1), Flag.IRREGULAR), (CLEAN, Counters(non_finite=1), Flag.IRREGULAR)])
-def test_input_flags(quality, counters, flag):
+def test_flags_follow_counters_and_quality(quality, counters, flag):
     assert input_flags(counters, quality, NAN) == [flag]
     assert input_flags(Counters(), Quality(0.019, 1, False, 0.02), NAN) == []

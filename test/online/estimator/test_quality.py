@@ -34,13 +34,13 @@ def test_no_lattice_no_finding(seed):
         assert (quality.step, quality.held, quality.saturated) == (0.0, 1, False)
 
 
-def test_rms_increment():
+def test_rms_increment_is_that_of_an_ou():
     """Of an OU: sigma sqrt(dt) (1 - alpha dt / 4) = 19.7 mV; 1023 increments give 2 %."""
     assert examine(path()).rms_increment == pytest.approx(0.0197, rel=0.07)
 
 
 @pytest.mark.parametrize('side', [-1, 1])
-def test_saturation(side):
+def test_clipped_samples_are_counted_at_their_end(side):
     """Clipped at one standard deviation, or at 1.7: 16 or 4 % of samples at the end."""
     for level in (0.056, 0.095):
         assert examine(5.0 + side * np.minimum(side * (path(4) - 5.0), level)).saturated

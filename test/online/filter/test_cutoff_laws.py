@@ -182,7 +182,7 @@ def test_throttle_law_with_full_expo_stays_within_fmax():
 
 
 @pytest.mark.parametrize('sigma, expected', [(0.3, 150.0), (0.301, 20.0), (0.0, 150.0)])
-def test_threshold_law(sigma, expected):
+def test_threshold_switches_at_sigma_ref(sigma, expected):
     s = FilterSettings(law='threshold')
     assert wanted_cutoff(s, sigma, NAN, NAN, 1e-3) == expected
 

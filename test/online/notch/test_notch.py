@@ -177,7 +177,7 @@ def test_what_is_above_half_the_sample_rate():
     assert np.allclose(notch.frequencies, f[-1], rtol=0.01)
 
 
-def test_bad_samples():
+def test_bad_samples_are_counted_and_do_not_move_the_output():
     """NaN, repeats, steps back and gaps are counted; the output stays near the input."""
     t, x, throttle, f = flight(4.0)
     t, x = t.copy(), x.copy()

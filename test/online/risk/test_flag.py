@@ -59,12 +59,12 @@ def test_levels_are_entered_at_their_probability():
     ({'latch': True}, [0.02, 0.0], 'w o'),
     # A single gap does not flicker.
     ({'hold': 2.0}, [0.5] * 9 + [NAN] + [0.5], 'c' * 11)])
-def test_time_lines(changes, risks, letters):
+def test_levels_follow_the_risk_over_time(changes, risks, letters):
     check(line(made(**{f'brownout_{name}': value for name, value in changes.items()}), risks),
           letters)
 
 
-def test_hold():
+def test_critical_is_held_and_then_left_at_once():
     """CRITICAL for 3 s though the risk is gone after one; then straight to where it belongs."""
     flag = made(brownout_hold=3.0)
     states = line(flag, [0.0, 0.5, 0.0, 0.0, 0.0, 0.0])

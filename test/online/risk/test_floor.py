@@ -75,7 +75,7 @@ def test_where_the_floor_is(settings, floor):
     assert MonitorSettings(**settings).floor == pytest.approx(floor, abs=1e-12)
 
 
-def test_switched_off():
+def test_a_floor_of_zero_never_trips():
     floor = watch(brownout_floor=0.0)
     push(floor, [0.0] * 100)
     assert not floor.take()

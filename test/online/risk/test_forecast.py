@@ -122,7 +122,7 @@ def asked(pilot, horizon=1.0):
 
 
 @pytest.mark.parametrize('pilot', list(PILOTS))
-def test_calibrated(pilot):
+def test_as_many_dips_happen_as_are_told(pilot):
     """
     As many dips as told, within 2.6 deviations and a factor of 1.5, in each third of the risk.
 
@@ -206,7 +206,7 @@ def test_asking_changes_nothing_and_is_quick():
 
 
 @pytest.mark.parametrize('horizon', [0.1, 0.3, 1.0, 3.0, 10.0, 60.0])
-def test_horizons(horizon):
+def test_risk_is_a_probability_at_any_horizon(horizon):
     """Known from 0.1 to 60 s, within 0..1, falling with the margin."""
     monitor, _ = monitor_of()
     risks = [monitor.risk(voltage, horizon) for voltage in (15.0, 14.0, 13.0, 10.0)]
@@ -271,7 +271,7 @@ def test_voltage_is_lost_in_a_dip():
     assert math.isnan(late.risk) and late.brownout is not False
 
 
-def test_another_battery():
+def test_another_battery_is_learned_within_seconds():
     """A pack 1 V higher: the risk is known at once, and small again within seconds."""
     monitor, t = monitor_of(brownout_voltage=14.6)
     u, v, _ = flight('telegraph')

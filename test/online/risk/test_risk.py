@@ -66,7 +66,7 @@ def test_monotone_in_horizon_level_and_present_voltage():
     assert low < brownout_probability(GOOD, 4.8, 1.0, now=4.81)
 
 
-def test_limits():
+def test_risk_is_0_far_away_and_1_at_the_level():
     assert brownout_probability(GOOD, 0.0, 1.0) < 1e-100
     assert brownout_probability(GOOD, 4.8, 1.0, now=4.8) == 1.0
     assert brownout_probability(GOOD, 5.5, 1.0) == 1.0
