@@ -267,12 +267,7 @@ LARGEST = 1e9
 
 
 class RunningSupply:
-    """
-    A running simulation of a supply; sample k is taken at k/rate.
-
-    `simulate` and the node `supply_simulator` both use it, so a seed gives the same path for any
-    size of pieces.  rate in Hz; charge and resistance as in `Simulation`.
-    """
+    """A simulation, sample k at k/rate, Hz; charge, resistance as in `Simulation`."""
 
     def __init__(self, model: SupplyModel, *, rate: float, seed: int,
                  charge: float | None = None, resistance: float = 1.0) -> None:

@@ -10,12 +10,7 @@ Z95 = 1.959963984540054
 
 
 def printable(text: object, most: int | None = None) -> str:
-    """
-    Return a text, which may come from a file, as one line that is safe to print.
-
-    Control characters, line ends, marks of the writing direction and bytes that are not text
-    become escapes; beyond `most` characters the middle is left out.
-    """
+    """Return a text as one safe line: other characters escaped, the middle left out."""
     found = str(text)
     if not found.isprintable():
         found = ''.join(

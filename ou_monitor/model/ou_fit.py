@@ -422,11 +422,7 @@ def fit_ou(part: Regression, span: float, *, precise: bool = False) -> OuFacts:
 
 
 def fit_pieces(parts: Sequence[tuple[FloatArray, FloatArray]], dt: float, walk: float) -> OuFacts:
-    """
-    Fit the noise to parts of what a regression left: V, and the size of the noise beside its rms.
-
-    dt in s, usual walk of the level in V per sqrt(s); each piece has a mean of its own.
-    """
+    """Fit the noise to pieces (V, relative size of the noise), each with its own mean."""
     parts = [part for part in parts if part[0].size >= _STRETCH]
     total = sum(part[0].size for part in parts)
     # Pieces of one length: the longest, at most that of a hat, in which most readings are.
@@ -447,11 +443,7 @@ def fit_pieces(parts: Sequence[tuple[FloatArray, FloatArray]], dt: float, walk: 
 
 
 def white_variance(ou: OuFacts, steps: float, dt: float) -> float:
-    """
-    Return the variance of the white noise beside an OU, V^2.
-
-    steps: mean square of the steps between readings of spacing dt, s: they hold nothing slow.
-    """
+    """Return the white variance beside an OU, V^2, by the mean square of steps over dt, s."""
     relaxed = ou.var_inf * math.expm1(-ou.alpha * dt) if ou.status == 'ok' else 0.0
     return max(0.0, 0.5 * steps + relaxed)
 

@@ -206,12 +206,7 @@ def _cut(recording: Recording, start: float | None, end: float | None) -> Record
 
 def read_beside(path: str | Path, signal: str, **options: Unpack[ReadOptions],
                 ) -> tuple[Recording, Series]:
-    """
-    Read a recording, and one whole scalar beside it; options as for `read_recording`.
-
-    Repeats of the logger are kept, because throttle changes between readings of the voltage (see
-    `readings_of`).  A log is read once.
-    """
+    """Read a recording with the repeats of its logger, and one whole scalar beside it."""
     path = Path(path)
     recording, log = _read(path, options, signal)
     if log is None:

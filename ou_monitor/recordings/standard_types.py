@@ -204,12 +204,7 @@ def encode_battery(stamps_ns: npt.NDArray[np.int64], voltage: npt.ArrayLike) -> 
 
 def encode_imu(stamps_ns: npt.NDArray[np.int64], vectors: Mapping[str, npt.NDArray[np.float64]],
                ) -> list[bytes]:
-    """
-    Return one sensor_msgs/Imu in `base_link` for each stamp.
-
-    stamps_ns in ns; vectors: angular_velocity, rad/s, and linear_acceleration, m/s^2, as far as
-    measured, each of shape (n, 3).
-    """
+    """Return one Imu in `base_link` for each stamp, ns, of rad/s and m/s^2, (n, 3)."""
     # By the message definition -1 means not measured, and 0 an unknown covariance.
     unmeasured = {f'{name}_covariance': [-1.0, *[0.0] * 8] for name in (
         'orientation', 'angular_velocity', 'linear_acceleration') if name not in vectors}

@@ -49,12 +49,7 @@ _LEARN = 0.05
 
 
 class SourceClock:
-    """
-    Age of the newest sample, from its stamp if it was taken from the node's clock.
-
-    `name` is 'ros' for stamps of the node's clock, 'foreign' if only the arrival counts, and
-    'unknown' before the first message.
-    """
+    """Age of the newest sample; `name`: 'ros' if its stamp counts, 'foreign', 'unknown'."""
 
     def __init__(self) -> None:
         self.name = 'unknown'
@@ -153,11 +148,7 @@ class Publishers:
         return kept
 
     def _give_up(self, publishers: int) -> None:
-        """
-        Forget publishers that are gone; follow another if the followed one is silent.
-
-        Only after the whole batch: after a stall the first message may be from any of them.
-        """
+        """Forget publishers that are gone, follow another one; only after a whole batch."""
         while len(self._tracks) > max(publishers, 2):
             # A publisher has restarted: the one that has been silent longest is gone.
             gone = min(range(len(self._tracks)), key=lambda k: self._tracks[k].arrived)

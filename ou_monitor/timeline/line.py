@@ -560,11 +560,7 @@ def _select(which: Any, t: FloatArray, y: FloatArray, u: FloatArray | None, i: F
 
 def in_order(t: FloatArray, rows: FloatArray, most: float, unit: str = '',
              ) -> tuple[Picked, list[str]]:
-    """
-    Return the samples that the time line keeps, in its order, and notes on the others.
-
-    t in s; rows of shape (n, m) are kept or dropped as a whole, with values up to `most`.
-    """
+    """Return which samples a time line keeps, rows (n, m) up to `most`, and notes."""
     # The comparisons are also false for NaN.
     good = np.isfinite(t) & ((rows <= most) & (rows >= -most)).all(axis=1)
     if good.all() and (t[1:] > t[:-1]).all():

@@ -84,12 +84,7 @@ def log_normal_below(x: npt.ArrayLike) -> FloatArray:
 
 
 def mean_first_passage(start: float, barrier: float) -> float:
-    """
-    Return the mean time of a unit OU from `start` up to `barrier`.
-
-    sqrt(pi/2) * integral from start to barrier of erfcx(-z / sqrt 2) dz (Siegert,
-    Phys. Rev. 81 (1951) 617).
-    """
+    """Return the mean time of a unit OU to a barrier (Siegert, Phys. Rev. 81 (1951) 617)."""
     if start >= barrier:
         return 0.0
     if barrier > _NEVER:

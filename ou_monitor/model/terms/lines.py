@@ -78,12 +78,7 @@ def keeps_its_height(view: View, frequency: float, linewidth: float) -> bool:
 
 
 def prominence(z: FloatArray, rate: float, frequency: float, width: float) -> float:
-    """
-    Return by how many standard errors the power of a peak exceeds that on both of its sides.
-
-    z: scores; rate, frequency, width (at half its height) in Hz.  The powers are compared by
-    their logarithms, the less of both sides counts; -inf where the spectrum ends on one side.
-    """
+    """Return by how many standard errors a peak, Hz, exceeds both sides; -inf: no side."""
     power = np.abs(np.fft.rfft(z - z.mean()))[1:] ** 2
     away = (np.fft.rfftfreq(z.size, 1.0 / rate)[1:] - frequency) / width
     inside = power[np.abs(away) <= 0.5]
@@ -113,13 +108,7 @@ def broad_peaks(z: FloatArray, rate: float) -> list[tuple[float, float]]:
 
 
 def order_lines(view: View) -> list[tuple[float, float]]:
-    """
-    Return the lines whose frequency follows throttle.
-
-    The power of short segments is added up along frequency = idle + slope *
-    throttle for many idles and slopes (a Hough transform); the best are
-    refined by adding up amplitudes over longer segments.
-    """
+    """Return the lines that follow throttle, by a Hough transform, then refined."""
     if view.throttle is None:
         return []
     z, u = view.z[view.train], view.throttle[view.train]

@@ -16,12 +16,7 @@ from ou_monitor.records import FloatArray
 
 @dataclass(frozen=True)
 class NonlinearRestoring(Term):
-    """
-    Add square * x^2 + cube * x^3 to the force alpha x that pulls back.
-
-    Integrated by the `ou` (weak order 2).  A square alone has no stationary law: it
-    needs a cube that holds it.
-    """
+    """Add square * x^2 + cube * x^3 to the force alpha x; a square needs a cube."""
 
     NAME: ClassVar[str] = 'nonlinear_restoring'
     FAMILY: ClassVar[str] = 'restoring'

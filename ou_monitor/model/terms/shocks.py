@@ -168,12 +168,7 @@ class Glitches(Term):
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
-        """
-        Find samples that their neighbours on both sides contradict.
-
-        A bad sample makes two large innovations, z and -phi z; leaving it out
-        removes both.  Runs of up to three samples are looked at.
-        """
+        """Find runs of up to three samples that their neighbours on both sides contradict."""
         # The bad ones widen what the fit so far takes for noise: a scale that
         # does not see them.
         # Judged by what a filter sees that knows of no error: a sample once left
@@ -300,12 +295,7 @@ def _best_runs(begin: npt.NDArray[np.int64], end: npt.NDArray[np.int64], gain: F
 
 @dataclass(frozen=True)
 class HeavyTails(Term):
-    """
-    Make what the noise adds in each step Student-t, of unchanged variance.
-
-    Defined for the spacing at which it is fitted: Student-t steps do not add up to
-    Student-t steps.
-    """
+    """Make what the noise adds in a step Student-t, variance kept, at the fitted spacing."""
 
     NAME: ClassVar[str] = 'heavy_tails'
     FAMILY: ClassVar[str] = 'events'

@@ -265,12 +265,7 @@ def noise_scale(share: float) -> float:
 
 def solve_tridiagonal(diag: FloatArray, off: FloatArray, right: FloatArray
                       ) -> tuple[float, FloatArray, FloatArray, FloatArray]:
-    """
-    Solve a symmetric positive system for rows of right sides, shape (k, n).
-
-    Cyclic reduction: every second unknown is eliminated, again and again.  Returns the
-    log-determinant, the solutions, and of the inverse the diagonal and the one beside it.
-    """
+    """Return log-determinant, solutions, and two diagonals of the inverse (cyclic reduction)."""
     halves, pivots = [], []
     while diag.size > _DENSE:
         # Each odd one has a neighbour before it and, but for the last of an even number, after it.
@@ -353,12 +348,7 @@ def maximise(likelihood: _Likelihood, used: int, before: Maximum | None = None) 
 
 def _least(f: Callable[[FloatArray], _Point], here: FloatArray, curved: FloatArray | None,
            low: FloatArray, high: FloatArray) -> tuple[FloatArray, _Point, FloatArray | None]:
-    """
-    Return where f is least within a box, its point, and the curvature.
-
-    Newton's method: where the curvature is not given, and after a step that had to be shortened,
-    it is by differences of the slopes, else by their change over the last step (BFGS).
-    """
+    """Return where f is least within a box, its point, and the curvature (Newton, BFGS)."""
     at = f(here)
     left = _MOST_POINTS
     while left > 0:

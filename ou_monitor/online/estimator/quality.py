@@ -57,12 +57,7 @@ def examine(y: FloatArray, held: float = 1.0) -> Quality:
 
 
 def lattice(sizes: FloatArray, fewest: int = _FEWEST_STEPS) -> float:
-    """
-    Return the common step of increments, V; 0 when there is none.
-
-    Float32 values of a lattice miss it by their rounding, which is allowed
-    for; a lattice finer than a thousandth of the largest step is not told.
-    """
+    """Return the common step of increments, V, from 1e-3 of the largest on; 0: none."""
     ordered = np.unique(sizes)
     least = float(ordered[0])
     # Rounding splits one step into several: join what is within 1e-3 of the least.

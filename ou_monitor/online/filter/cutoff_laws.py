@@ -354,12 +354,7 @@ def wiener_law(settings: FilterSettings, sigma: float, alpha: float, interval: f
 
 
 def throttle_law(settings: FilterSettings, throttle: float) -> float:
-    """
-    Return Betaflight's curve: fmin + (fmax - fmin) (t + e t (1 - t)), e = expo / 10.
-
-    It rises with throttle, for less delay where control is fast, and knows
-    nothing of sigma: the peer that the other laws are held against.
-    """
+    """Return Betaflight's curve: fmin + (fmax - fmin) (t + e t (1 - t)), e = expo / 10."""
     if not math.isfinite(throttle):
         return NAN
     t = min(max(throttle, 0.0), 1.0)

@@ -310,12 +310,7 @@ class LoadNoise:
         self._n += 1
 
     def learn(self, e: float, s: float, u: float, du: float, n: int, within: float) -> None:
-        """
-        Score ln variance (Fisher) by one innovation.
-
-        e in V; s, the variance of what is predicted, and `within`, that of one of the n samples
-        about their mean (NaN: unknown), in V^2.
-        """
+        """Score ln variance (Fisher) by an innovation, V, of variance s beside the noise, V^2."""
         f = 1.0, ripple(u), math.sqrt(du)
         R = self.variance(u, du, n)
         square = min(e * e / (s + R), _OUTLIER)

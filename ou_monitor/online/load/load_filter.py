@@ -698,12 +698,7 @@ class LoadFilter:
 
     def path(self, t: FloatArray, throttle: FloatArray | None,
              current: FloatArray | None = None) -> FloatArray:
-        """
-        Return the predicted mean voltage, V, after the last sample, from throttle.
-
-        With current, A, from that.  NaN while throttle is unknown, as the level is then one under
-        load, or while no current has been measured.
-        """
+        """Return the mean voltage ahead, V, from throttle or current, A; NaN: unknown."""
         if not math.isfinite(self._t):
             raise ValueError('no voltage has arrived: there is nothing to start from')
         load, delay = (throttle, self._delay.delay) if current is None else (

@@ -219,13 +219,7 @@ def _version(headers: Headers) -> tuple[str, tuple[int, int, int]]:
 
 
 def _battery_scales(headers: Headers) -> tuple[float | None, float | None]:
-    """
-    Return V and A per unit; None if unknown.
-
-    As in Betaflight's blackbox-log-viewer (flightlog_fields_presenter.js);
-    for other firmware the cell limits in the header decide the unit.
-
-    """
+    """Return V and A per unit, as blackbox-log-viewer has them; None: unknown."""
     name, version = _version(headers)
     if name == 'inav' and version >= (2, 0, 0):
         return 0.01, 0.01
