@@ -7,8 +7,8 @@ never 0.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
 import enum
 import math
 from typing import Any
@@ -36,6 +36,21 @@ MOST_STAMP = 1.0e11
 # Median steps below and above which the unit of the time is wrong, s: no oscilloscope is faster,
 # no logger of a supply is slower.
 LEAST_STEP, LONGEST_STEP = 1e-12, 100.0
+
+
+def plain_data(value: Any) -> Any:
+    """Return a value as strict JSON allows it: plain types, None for NaN and infinity."""
+    if is_dataclass(value):
+        return {one.name: plain_data(getattr(value, one.name)) for one in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): plain_data(item) for key, item in value.items()}
+    if isinstance(value, (np.ndarray, np.generic)):
+        return plain_data(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [plain_data(item) for item in value]
+    if isinstance(value, enum.Enum):
+        return value.name
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def as_numbers(values: npt.ArrayLike) -> FloatArray:

@@ -20,7 +20,7 @@ sys.path.insert(0, str(ROOT))
 
 from ou_monitor.analysis.analyze import Analysis, analyze, as_data  # noqa: E402
 from ou_monitor.recordings.read import read_recording  # noqa: E402
-from ou_monitor.report.result import plain  # noqa: E402
+from ou_monitor.records import plain_data  # noqa: E402
 
 BAGS = ROOT / 'bags'
 GOLDEN = ROOT / 'test' / 'analysis' / 'golden'
@@ -48,7 +48,7 @@ def table(analysis: Analysis) -> Any:
     del data['source']
     # Told by the load filter, which has tests of its own.
     del data['overview']
-    return thinned(plain(data))
+    return thinned(plain_data(data))
 
 
 def thinned(value: Any) -> Any:

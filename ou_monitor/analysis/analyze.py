@@ -1,11 +1,11 @@
 """
-A recording -> the paper's Tables 1 and 2 for it, with intervals, and what they rest on.
+A recording -> Tables 1 and 2 of the paper, with intervals, tests and curves over throttle.
 
-The recording also goes through `SupplyMonitor`, as in flight, so that both say the same of the
-same data, also where throttle never stands still.  Limits: those of the monitor; the risk is that
-of the supply as it was at the end of the recording.  What has not been flown is NaN.
+The recording also goes through `SupplyMonitor`, as in flight, so that node and command agree on
+the same data, even if throttle never stands still.  Limits: those of the monitor; the risk is for
+the state at the end of the recording.  Throttles not flown are NaN.
 
-`as_data` writes the JSON of `analyze`, see doc/analysis.md.
+`as_data` returns the JSON of `analyze`; see doc/analysis.md.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from ou_monitor.timeline.line import readings_of
 
 Progress = Callable[[float], None]
 
-# Voltages, V, between which the median of a 5 V rail lies.
+# Range of the median of a 5 V rail, V.
 RAIL = (4.0, 6.0)
 
 
@@ -46,21 +46,18 @@ RAIL = (4.0, 6.0)
 class Analysis:
     """Result of `analyze`."""
 
-    recording: Recording  # What was analysed
+    recording: Recording
     levels: tuple[LevelResult, ...]  # In order of throttle
-    # After falls of throttle (``release``) and rises (``load``).
-    relaxations: tuple[Relaxation, ...]
-    # Of each relaxation: the noise's own time constant, or the instrument.
-    causes: tuple[ReleaseCause, ...]
+    relaxations: tuple[Relaxation, ...]  # After falls of throttle (``release``) and rises
+    causes: tuple[ReleaseCause, ...]  # Of each relaxation: rail or instrument
     alpha_test: AlphaTest  # Whether alpha is the same at all levels
     by_throttle: ByThrottle  # Sag, noise and risk over throttle
-    sliding: Sliding  # What the node would have published
-    quality: tuple[QualityItem, ...]  # What to know before using the numbers, worst first
-    # Whether the voltage of the risk is the node's default, not one that was asked for.
-    brownout_default: bool
+    sliding: Sliding  # Reports of the node
+    quality: tuple[QualityItem, ...]  # Cautions about the numbers, worst first
+    brownout_default: bool  # Whether the voltage of the risk is the default of the node
     notes: tuple[str, ...]  # What was dropped or left out, one sentence each
-    overview: Overview  # Lowest voltage, dips, sag and noise: what is known of every recording
-    craft: Craft  # Cells, and sag, noise and resistance beside those of known crafts
+    overview: Overview  # Lowest voltage, dips, sag and noise
+    craft: Craft  # Cells, and a comparison with known crafts
 
 
 def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
@@ -70,8 +67,8 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
     """
     Analyse a recording load level by load level.
 
-    window in s, brownout_voltage in V (of so many cells, to tell it by the cell),
-    brownout_horizon in s, progress 0..1.
+    window in s, brownout_voltage in V, brownout_horizon in s, cells in series, to which the
+    voltage refers (0: none), progress 0..1.
     """
     report: Progress = progress or (lambda share: None)
     recording = readings_of(recording)
@@ -92,7 +89,7 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
     relaxations = _relaxations(recording, judged)
     lines = [line_item(level.throttle, level.estimate, level.with_lines) for level in judged
              if level.lines.lines]
-    # A second relaxation is the supply's: where it is too faint to detect it still biases alpha.
+    # A second relaxation biases alpha even at levels where it is too weak to be detected.
     wanders = any(level.wanders for level in judged)
     alpha = alpha_constancy(throttles, estimates,
                             [wanders or level.doubted for level in judged])
@@ -107,7 +104,7 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
 
 
 def _default_voltage(recording: Recording) -> float:
-    """Return the node's default, V, for a 5 V rail; NaN for any other supply."""
+    """Return the default of the node, V, for a 5 V rail; NaN for other supplies."""
     low, high = RAIL
     middle = float(np.median(recording.voltage)) if recording.n else NAN
     return MonitorSettings().brownout_voltage if low <= middle <= high else NAN
@@ -125,7 +122,7 @@ def _relaxations(recording: Recording, levels: Sequence[LevelResult]) -> tuple[R
 
 
 def _left_out(recording: Recording, found: tuple[LoadLevel, ...]) -> tuple[str, ...]:
-    """Say which part of the recording no level holds."""
+    """Return notes of the parts that belong to no level."""
     if not recording.n:
         return ('The recording holds no samples.',)
     if not recording.has_throttle:
@@ -156,13 +153,12 @@ class Sliding:
 
     window: float  # Length of the window, s
     t: FloatArray  # Stamps of the newest sample of each window, s; shape (k,)
-    # One a stamp; the numbers of those that are not usable are NaN.
-    estimates: tuple[Estimate, ...]
-    risk: FloatArray  # Probability of a brown-out within the horizon; NaN when unknown; shape (k,)
-    # What the risk is of, V and s.
+    estimates: tuple[Estimate, ...]  # One for each stamp; unusable ones have NaN
+    risk: FloatArray  # Probability of a brown-out within the horizon; NaN if unknown; shape (k,)
+    # Voltage, V, and horizon, s, of the risk.
     brownout_voltage: float
     brownout_horizon: float
-    monitor: SupplyMonitor  # As it is at the end of the recording
+    monitor: SupplyMonitor  # State at the end of the recording
 
     def series(self, name: str) -> FloatArray:
         """Return one field of the estimates as an array."""
@@ -194,9 +190,9 @@ def slide(recording: Recording, window: float, brownout_voltage: float = NAN,
     duration = recording.duration
     monitor, parts = node_for(recording, settings)
     for now, shown in parts:
-        # In between, reports are for what the monitor learns from its own estimates.
+        # The monitor also learns from reports in between.
         last = monitor.report(0.0)
-        # Until the first window is full its estimates would only look poor.
+        # Estimates before the first window is full are too poor to show.
         if shown and now >= min(window, 0.5 * duration):
             reports.append(last)
             if progress is not None:
@@ -211,25 +207,22 @@ def slide(recording: Recording, window: float, brownout_voltage: float = NAN,
 class ByThrottle:
     """Curves over throttle."""
 
-    # 0, 0.1, .. 1; shape (k,).
-    throttle: FloatArray
+    throttle: FloatArray  # 0, 0.1, .. 1; shape (k,)
     # Whether that throttle was flown; beyond, sag and noise are extrapolated; shape (k,).
     known: npt.NDArray[np.bool_]
-    # Sag of the facts and its 95 % interval, V; NaN where it is not known; shape (k,).
+    # Sag and its 95 % interval, V; NaN if unknown; shape (k,).
     sag: FloatArray
     sag_low: FloatArray
     sag_high: FloatArray
-    noise: FloatArray  # Rms of what the load does not explain, of the facts, V; shape (k,)
-    # Probability of a brown-out within the horizon; NaN well beyond the highest throttle; shape
-    # (k,).
-    risk: FloatArray
-    budget: float  # Highest throttle that keeps the risk within `limit`; NaN when unknown
-    budget_reason: str  # What ends it, or why it is not known
-    limit: float  # That risk
-    # What the risk is of, V and s.
+    noise: FloatArray  # Rms not explained by the load, V; shape (k,)
+    risk: FloatArray  # Probability of a brown-out within the horizon; NaN if unknown; shape (k,)
+    budget: float  # Highest throttle that keeps the risk within `limit`; NaN if unknown
+    budget_reason: str  # What limits the budget, or why it is unknown
+    limit: float  # Risk of the budget
+    # Voltage, V, and horizon, s, of the risk.
     voltage: float
     horizon: float
-    time: float  # Stamp at which the risk is told, s; NaN of a recording too short for a window
+    time: float  # Stamp of the risk, s; NaN if the recording is shorter than a window
 
     def at(self, throttle: float, name: str) -> float:
         """Return one curve at a throttle, between its points; NaN when unknown."""
@@ -239,7 +232,7 @@ class ByThrottle:
 
 
 def by_throttle(found: Overview, voltage: float, horizon: float) -> ByThrottle:
-    """Return what the facts, and the node at the end, say over throttle (V, s)."""
+    """Return sag and noise of the facts, and risk of the node, over throttle (V, s)."""
     grid, sag, last = np.array(THROTTLES), found.facts.sag, found.end
     low, high = sag.flown
     middle, reach = np.array(sag.sag_v), Z95 * np.array(sag.se_v)
@@ -247,7 +240,7 @@ def by_throttle(found: Overview, voltage: float, horizon: float) -> ByThrottle:
         middle = np.full(grid.size, NAN)
     risk = np.full(grid.size, NAN)
     if last is not None and last.risk_curve:
-        # RISK_CURVE has the same throttles; one beyond the highest, to interpolate.
+        # RISK_CURVE has the same throttles; keep one beyond the highest flown, to interpolate.
         risk = np.where(grid < found.highest + 0.1, last.risk_curve, NAN)
     return ByThrottle(
         grid, (grid >= low) & (grid <= high), middle, middle - reach, middle + reach,

@@ -1,36 +1,35 @@
 """
 How much of a signal, such as a gyro axis, is noise of the supply.
 
-Limits: white noise of the voltage sensor makes the gain too small, by its share of the voltage in
-the band.  Effects of throttle are regressed out if they are linear in throttle and its square,
-with a lag shorter than a segment.  Motor rotation shakes the gyro and ripples the supply; only its
-narrow line reveals that common cause.  A signal that *leads* the voltage is its cause, by way of
-the motors.  Both are reported, neither is corrected.
+Limits: white noise of the voltage sensor lowers the gain by its share of the voltage in the band.
+Effects of throttle are regressed out if they are linear in throttle and its square, with a lag
+shorter than a segment.  Motor rotation disturbs both gyro and supply; only its narrow line reveals
+this common cause.  A signal that *leads* the voltage is its cause, through the motors.  Both are
+reported, but not corrected.
 
 Method: Fourier coefficients of half-overlapping Hann segments.  `measure_coherence` tests for
-coupling.  If there is any, the signal is regressed on voltage, throttle and its square.  Each
-segment is weighted by the signal's noise in it, which grows with throttle as the supply's does:
-otherwise a few loud segments would decide.  Repeated readings of the ADC are dropped, because the
-steps between them come from the logger.
+coupling.  If there is any, the signal is regressed on voltage, throttle and its square.  Segments
+are weighted by the noise of the signal, which grows with throttle, so that a few loud ones do not
+dominate.  Repeated readings of the ADC are dropped, because the steps between them come from the
+logger.
 
-The fastest series sets an even grid; slower ones are interpolated by cubic splines, so nothing is
-aliased here.  Above a quarter of the slowest rate the spline attenuates by more than 3 %: there
-the usable band ends.  Limits: aliases of the original sampling stay, and jittering stamps leave a
-phase error of the order of their jitter.
+All series are brought to the even grid of the fastest one by cubic splines, which do not alias.
+The usable band ends at a quarter of the slowest rate; above, the spline attenuates by more than
+3 %.  Limits: aliases of the original sampling stay, and jitter of the stamps gives a phase error
+of that size.
 
-`measure_coherence` tests whether two series share anything, at a stated level whatever their
-spectra.  Limits: given their sizes, the series must be zero-mean in the band and as likely as
-their negatives.  A line of the same frequency and phase in both is found although it is not
-coupling (`narrow`).  Effects of throttle on both must be regressed out, or count as shared.
+`measure_coherence` tests whether two series are coherent, at a stated level for any spectra.
+Limits: both signs of the series must be equally likely.  A line with the same frequency and phase
+in both is detected although it is not coupling (`narrow`).  Effects of throttle on both must be
+regressed out.
 
-A manoeuvre changes the shape of a gyro's spectrum, not only its size.  With one weight for each
-segment the quiet segments would decide the high bins.  So each bin of each segment is divided by
-the root mean square of the signal over the bins around it.  If the signal is then white Gaussian,
-the squared partial coherence of a bin exceeds c by chance with probability (1 - c)^(K - 1 - p),
-for any voltage, with K segments and p causes regressed out (Halliday et al., 1995).  Moving lines
-and bursts are not whitened by that.  So the same statistics are computed with random signs of the
-signal for blocks of neighbouring segments, which keep every size (Freedman and Lane, 1983); a
-coherence must be too large for both laws.
+A manoeuvre changes the shape of the gyro spectrum, so one weight for each segment is not enough:
+each bin of each segment is divided by the rms of the signal over the bins around it.  If the
+signal is then white Gaussian, the squared partial coherence of a bin exceeds c by chance with
+probability (1 - c)^(K - 1 - p), for any voltage, with K segments and p causes regressed out
+(Halliday et al., 1995).  Moving lines and bursts are not whitened by that, so the same statistics
+are also computed with random signs of the signal for blocks of neighbouring segments, which keep
+all sizes (Freedman and Lane, 1983).  A coherence is significant only if both tests reject.
 """
 
 from __future__ import annotations
@@ -50,13 +49,13 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal.windows import hann
 from scipy.special import chndtrinc
 
-# Lower end of the band, Hz: pilot and discharge are below.
+# Lower end of the band, Hz; stick inputs and discharge are slower.
 LOWEST = 5.0
-# Longest and shortest segment, s; number of segments aimed at.
+# Longest and shortest segment, s; target number of segments.
 _LONGEST, _SHORTEST, _PIECES = 1.0, 0.1, 40
 FEWEST = 16
 LONGEST_LAG = 0.05
-# Share of the common time below which a note reports what gaps cost.
+# Minimum share of the common time that is used without a note.
 _MOST = 0.9
 _BLOCKS = 12
 # Probability of detection at the limiting gain.
@@ -69,17 +68,17 @@ class Coupling:
 
     seen: bool  # Whether there is coupling, at the family-wise `level`
     p_value: float  # Family-wise
-    # Signal units per volt, signed, lag removed; NaN when no coupling was seen.
+    # Signal units per volt, signed, lag removed; NaN without coupling.
     gain: float
     gain_ci95: tuple[float, float]
-    # Delay of the signal behind the voltage, s; NaN when no coupling was seen.
+    # Delay of the signal behind the voltage, s; NaN without coupling.
     lag: float
     lag_se: float
     limit: float  # Gain that would be detected with probability `POWER`, signal units per volt
-    narrow: bool  # Only a few bins are coherent: a line that both share
-    signal_leads: bool  # The signal is ahead of the voltage by three standard errors
+    narrow: bool  # Whether only a few bins are coherent, as with a common line
+    signal_leads: bool  # Whether the signal leads the voltage, by three standard errors
     noise_share: float  # Share of the signal's power in the band that the voltage explains
-    # Bins of the band, Hz; squared partial coherence; signal units per volt; shape (m,).
+    # Bins of the band, Hz; squared partial coherence; gain, signal units per volt; shape (m,).
     frequency: FloatArray
     coherence: FloatArray
     response: ComplexArray
@@ -170,11 +169,11 @@ def estimate_coupling(
         lag_se = 1.0 / math.sqrt(known_by) if known_by > 0.0 else NAN
     leads = bool(seen and lag < -3.0 * lag_se and lag < -0.25 / grid.rate)
     if found.narrow:
-        notes.append('Only a few frequencies are coherent: a line that both share, such as motor '
+        notes.append('Only a few frequencies are coherent: this is a common line, such as motor '
                      'rotation, rather than coupling.')
     if leads:
-        notes.append('The signal is ahead of the voltage: the signal drives the motors and so the '
-                     'load, rather than the other way round.')
+        notes.append('The signal leads the voltage: it drives the motors and so the load, rather '
+                     'than the other way round.')
     return Coupling(
         seen, found.p_value, gain, interval, lag, lag_se, found.limit(level, POWER),
         found.narrow, leads, share, frequency, found.squared, response, found.threshold, level,
@@ -200,7 +199,7 @@ _QUIET = 1e-9
 def _weighted(pieces: list[ComplexArray]) -> tuple[ComplexArray, ComplexArray, FloatArray]:
     """Return weighted voltage and signal without the causes, and the signal's residual power."""
     weight = np.sqrt(np.mean(np.abs(pieces[1])**2, axis=1))
-    # Anything quieter is rounding, or a signal that decays after standing still.
+    # A quieter segment is rounding, or the decay of a filter.
     weight = np.maximum(weight, _QUIET * weight.max())
     scaled = [one / weight[:, None] for one in pieces]
     basis = basis_of(scaled[2:])
@@ -223,7 +222,7 @@ def _band(band: tuple[float, float] | None, grid: Grid) -> tuple[float, float]:
 
 
 def _segment_length(grid: Grid, low: float) -> int:
-    """Return the samples of a segment: many segments, but no bin below the third."""
+    """Return the samples of a segment: short, but with the band from the third bin on."""
     seconds = min(max(grid.duration / _PIECES, _SHORTEST), _LONGEST)
     return max(32, round(max(seconds, 3.0 / low) * grid.rate))
 
@@ -233,7 +232,7 @@ def _segments(grid: Grid, length: int, low: float, high: float,
     """Return bins, Hz, and coefficients of each series, shape (segments, bins)."""
     window = hann(length, sym=False)
     frequency = np.fft.rfftfreq(length, 1.0 / grid.rate)
-    # Rates come from stamps and are not round to the last bit.
+    # The tolerance allows for rates from stamps, which are not exact.
     bins = (frequency >= low * (1.0 - 1e-6)) & (frequency <= high * (1.0 + 1e-6))
     if bins.sum() < 2:
         raise InputError(f'the band {low:g}..{high:g} Hz holds {int(bins.sum())} frequencies of '
@@ -290,10 +289,10 @@ def _jackknife(frequency: FloatArray, v: ComplexArray, x: ComplexArray, density:
     return gain - half, gain + half
 
 
-# Pause, in typical steps, from which it is a gap; gaps are not interpolated.
+# Minimum pause, in typical steps, that is a gap; gaps are not interpolated.
 GAP = 3.0
-# Ratio of rates above which the fastest series is averaged onto a slower grid; rate of that grid
-# over the slowest rate.
+# Maximum ratio of rates; above it the fastest series is averaged onto a slower grid, whose rate is
+# this multiple of the slowest rate.
 _FASTEST = 8.0
 _STEPS = 4.0
 # Cubic splines need four points.
@@ -306,22 +305,22 @@ class Grid:
 
     rate: float  # Of the grid, Hz
     usable: float  # Highest frequency at which all series are unattenuated, Hz
-    # Stretches without a gap in any series; each a tuple of the series, shape (n,).
+    # Parts without a gap in any series; each a tuple of the series, shape (n,).
     runs: list[tuple[FloatArray, ...]]
-    rates: tuple[float, ...]  # Usual rate of each series, Hz
+    rates: tuple[float, ...]  # Median rate of each series, Hz
     # Dropped samples of each series: not finite, or with a repeated stamp.
     lost: tuple[int, ...]
-    gaps: int  # Gaps between the stretches
+    gaps: int  # Gaps between the parts
     shared: float  # Time between the latest start and the earliest end of the series, s
 
     @property
     def duration(self) -> float:
-        """Time in the stretches, s."""
+        """Total duration of the parts, s."""
         return sum(run[0].size for run in self.runs) / self.rate
 
 
 def on_grid(series: dict[str, tuple[FloatArray, FloatArray]]) -> Grid:
-    """Bring series onto one grid (series in s)."""
+    """Bring series, each of stamps, s, and values, onto one grid."""
     clean: list[tuple[FloatArray, FloatArray]] = []
     lost, rates = [], []
     for name, (t, values) in series.items():
@@ -346,7 +345,7 @@ def on_grid(series: dict[str, tuple[FloatArray, FloatArray]]) -> Grid:
         shared = _shared(shared, other)
     runs, begin = [], min(t[0] for t, _ in clean)
     for start, stop in shared:
-        # One grid for all stretches, so that a lag means the same in each.
+        # One grid for all parts, so that a lag means the same in each.
         first = int(np.ceil((start - begin) * rate - 1e-9))
         last = int(np.floor((stop - begin) * rate + 1e-9))
         if last - first >= _LEAST_SAMPLES:
@@ -355,13 +354,13 @@ def on_grid(series: dict[str, tuple[FloatArray, FloatArray]]) -> Grid:
     if not runs:
         ranges = ', '.join(f'{name} {t[0]:.6g}..{t[-1]:.6g} s'
                            for name, (t, _) in zip(series, clean))
-        raise InputError(f'the series have no stretch of time in common: {ranges}')
+        raise InputError(f'the series have no time in common: {ranges}')
     span = min(float(t[-1]) for t, _ in clean) - max(float(t[0]) for t, _ in clean)
     return Grid(rate, 0.25 * slowest, runs, tuple(rates), tuple(lost), len(runs) - 1, span)
 
 
 def _spans(t: FloatArray, step: float) -> list[tuple[float, float]]:
-    """Return the stretches without a gap: first and last stamp of each, s."""
+    """Return the parts without a gap: first and last stamp of each, s."""
     breaks = np.flatnonzero(np.diff(t) > GAP * step)
     starts = np.concatenate(([0], breaks + 1))
     stops = np.concatenate((breaks, [t.size - 1]))
@@ -370,7 +369,7 @@ def _spans(t: FloatArray, step: float) -> list[tuple[float, float]]:
 
 def _shared(one: list[tuple[float, float]], other: list[tuple[float, float]],
             ) -> list[tuple[float, float]]:
-    """Return the intersection of two ordered lists of stretches."""
+    """Return the intersection of two ordered lists of time ranges."""
     found, i, j = [], 0, 0
     while i < len(one) and j < len(other):
         low, high = max(one[i][0], other[j][0]), min(one[i][1], other[j][1])
@@ -384,13 +383,12 @@ def _shared(one: list[tuple[float, float]], other: list[tuple[float, float]],
 
 
 def _at(at: FloatArray, t: FloatArray, x: FloatArray, own: float, rate: float) -> FloatArray:
-    """Return a series at the stamps of a stretch."""
+    """Return a series at the stamps of a part."""
     inside = slice(max(int(np.searchsorted(t, at[0] - 2.0 / own)) - 1, 0),
                    int(np.searchsorted(t, at[-1] + 2.0 / own)) + 1)
     t, x = t[inside], x[inside]
     if own > 1.5 * rate:
-        # Averages over the steps of the grid; a step that jitter left empty
-        # takes its neighbours' line.
+        # Average over the steps of the grid; empty steps are interpolated.
         place = np.rint((t - at[0]) * rate).astype(np.intp)
         good = (place >= 0) & (place < at.size)
         count = np.bincount(place[good], minlength=at.size)
@@ -407,19 +405,19 @@ def _at(at: FloatArray, t: FloatArray, x: FloatArray, own: float, rate: float) -
 
 ComplexArray = npt.NDArray[np.complex128]
 
-# Bins that the signal's power is averaged over.
+# Bins over which the power of the signal is averaged.
 _AROUND = 11
 # Neighbouring bins of the Hann window are correlated by 2/3, every second by 1/6.
 STRIDE = 2
 # Power correlation of half-overlapping Hann segments: (1/6)^2.
 OVERLAP = 1.0 / 36.0
-# Random draws of signs; number that must reach a statistic for its p-value to be their share
-# rather than extrapolated.
+# Random draws of signs; minimum draws that exceed a statistic for a p-value by counting (otherwise
+# it is extrapolated).
 _DRAWS, _COUNTED = 499, 10
-# Segments that share a sign: overlap correlates neighbours, lines and slow manoeuvres more
-# distant ones.  With few segments blocks are shorter, so that 2^16 draws exist.
+# Segments with a common sign, because overlap, lines and slow manoeuvres correlate them; minimum
+# number of blocks, so that 2^16 draws exist.
 _BLOCK, _SIGNED = 16, 16
-# Family-wise level of bins that may be a line: far beyond chance.
+# Family-wise level of bins that may be a line.
 _LINE = 1e-4
 
 
@@ -457,7 +455,7 @@ def measure_coherence(voltage: ComplexArray, signal: ComplexArray, causes: list[
                       level: float, rng: np.random.Generator) -> Coherence:
     """Test Fourier coefficients of shape (segments, bins), with the causes regressed out."""
     weight = 1.0 / local_size(signal)
-    # The weights contain the signal: equivalent to losing one of so many independent powers.
+    # The weights contain the signal itself, which costs one of the independent powers.
     share = 1.0 - 1.0 / _independent(signal.shape[1])
     whole = weight * signal
     basis = basis_of([weight * cause for cause in causes])
@@ -504,7 +502,7 @@ def basis_of(causes: list[ComplexArray]) -> list[ComplexArray]:
         size = (np.abs(cause)**2).sum(0)
         part = without(cause, basis)
         norm = np.sqrt((np.abs(part)**2).sum(0))
-        # A cause that repeats another leaves rounding only (float32: 1e-7).
+        # Of a cause that repeats another, only rounding is left (float32: 1e-7).
         basis.append(np.where(norm**2 > 1e-10 * size, part / np.where(norm > 0.0, norm, 1.0),
                               0.0))
     return basis
@@ -556,7 +554,7 @@ def _power(signs: FloatArray, parts: ComplexArray) -> FloatArray:
 
 
 def _tail(drawn: FloatArray, law: str) -> float:
-    """Return the share of draws that reach the first; with few, the tail of a fitted law."""
+    """Return the share of draws that reach the first; if few do, by a fitted distribution."""
     reached = int((drawn >= drawn[0] * (1.0 - 1e-12)).sum())
     if reached > _COUNTED:
         return reached / drawn.size

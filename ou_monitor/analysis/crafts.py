@@ -1,9 +1,9 @@
 """
-Sag, noise and resistance of a supply beside those of crafts that are known.
+Compare sag, noise and resistance of a supply with known crafts.
 
-Limits: a few crafts a class, each of one flight; noise depends on where and how fast the voltage
-was read, so that a slow or filtered sensor seems quiet.  "Usual" is within a factor of two of the
-median of its class, and says nothing of whether it is safe.
+Limits: a few crafts in each class, with one flight each; noise depends on where and how fast the
+voltage was measured, so a slow or filtered sensor seems quiet.  "Usual" means within a factor of
+two of the median of the class, not that it is safe.
 """
 
 from __future__ import annotations
@@ -17,27 +17,27 @@ from typing import Any
 import numpy as np
 from ou_monitor.analysis.supply import SupplyFacts
 from ou_monitor.errors import InputError
-from ou_monitor.records import NAN, Recording
+from ou_monitor.records import NAN, plain_data, Recording
 from ou_monitor.text import counted, number
 
-# Throttle at which crafts are compared; it must be within what was flown by this much.
+# Throttle at which crafts are compared, and tolerance if the flown range ends before it.
 _AT, _NEAR = 0.5, 0.15
-# Factor about the median that is usual.
+# Maximum factor from the median that is usual.
 _USUAL = 2.0
-# A lithium cell at rest, V: the highest that a charger leaves (LiHV 4.35 V, 0.1 V for the sensor),
-# the lowest of one that is not destroyed, and the lowest with which a flight begins.
+# A lithium cell at rest, V: highest after charging (LiHV 4.35 V, and 0.1 V for the sensor), lowest
+# without damage, and lowest at the begin of a flight.
 HIGHEST_CELL, LOWEST_CELL, _BEGINS = 4.45, 2.0, 3.0
-# A lithium cell under load is empty at that, V (Betaflight's vbat_min_cell_voltage, and design's
-# default).
+# Voltage of an empty lithium cell under load, V (vbat_min_cell_voltage of Betaflight, and the
+# default of design).
 CELL_LIMIT = 3.3
-# The highest median of this time is the pack before the flight, glitches and noise left out, s.
+# Length of the medians whose highest is the voltage of the full pack, s.
 _FULL = 0.5
 
-# Cells beyond which a craft is of no known class: the largest known quads have 6.
+# Maximum cells of the known classes; the largest known quads have 6.
 _MOST_CELLS = 8
 MICRO, QUAD = '1S micro', 'quad, 2S and more'
-# Class -> craft -> cells, sag and noise at half throttle, V, and resistance at once, Ohm, of the
-# pack; by `supply_facts` in November 2026.
+# Class -> craft -> cells, sag and noise at half throttle, V, and instantaneous resistance, Ohm, of
+# the pack; by `supply_facts` in November 2026.
 KNOWN: dict[str, dict[str, tuple[float, float, float, float]]] = {
     # Crazyflie in close flight and taking off (aerorobotics/neural-swarm).
     MICRO: {'cf_solo': (1, 0.095, 0.0034, NAN), 'cf_takeoff': (1, 0.128, 0.0038, NAN)},
@@ -56,11 +56,11 @@ _REASONS = {
                     'feel whether a connector is warm after a flight, then try a fresh or larger '
                     'pack'),
     ('sag', False): ('a large pack, or a voltage that the flight controller has corrected for sag',
-                     'nothing; see that sag compensation is off in what is logged'),
+                     'none needed; check that the logged voltage has no sag compensation'),
     ('noise', True): ('no capacitor, or one of high ESR, at the ESCs, or an ESC that loses step',
                       'a low-ESR capacitor of 470 to 1000 uF at the battery pads of the ESCs'),
     ('noise', False): ('a sensor that is slow or filtered before it is logged',
-                       'raise its rate or its filter before noise is judged by it'),
+                       'raise its rate or filter cutoff before judging the noise'),
     ('resistance', True): ('an aged or cold pack, or a poor connector',
                            'warm the pack, then try a fresh one and other leads'),
     ('resistance', False): ('a large pack, or a current that is scaled too high',
@@ -69,34 +69,31 @@ _REASONS = {
 
 @dataclass(frozen=True)
 class Measure:
-    """One number of a supply beside that of known crafts."""
+    """One number of a supply, compared with known crafts."""
 
     name: str  # sag, noise or resistance
-    value: float  # A cell: V, V, Ohm
-    usual: tuple[float, float]  # Likewise
+    value: float  # V, V or Ohm per cell
+    usual: tuple[float, float]  # Usual range, likewise
     verdict: str  # usual, high, low or unknown
-    reason: str  # Likely; '' where usual
+    reason: str  # Likely reason; empty if usual
     remedy: str
 
 
 @dataclass(frozen=True)
 class Craft:
-    """Cells of a supply, the class that it is compared with, and how it stands there."""
+    """Cells of a supply, its class, and a comparison with known crafts."""
 
     cells: int  # 0: unknown
     cells_from: str  # given, log, guessed or unknown
     full_v: float  # Highest median of half a second, V
-    kind: str  # '' without a class
+    kind: str  # Class; empty if there is none
     measures: tuple[Measure, ...]
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as strict JSON holds it."""
-        def plain(value: float) -> float | None:
-            return value if math.isfinite(value) else None
-
         return {'cells': self.cells or None, 'cells_from': self.cells_from,
-                'full_v': plain(self.full_v), 'class': self.kind or None, 'measures': [
-                    {'name': one.name, 'value': plain(one.value), 'usual': list(one.usual),
+                'full_v': plain_data(self.full_v), 'class': self.kind or None, 'measures': [
+                    {'name': one.name, 'value': plain_data(one.value), 'usual': list(one.usual),
                      'verdict': one.verdict, 'reason': one.reason, 'remedy': one.remedy}
                     for one in self.measures]}
 
@@ -111,7 +108,7 @@ def full_voltage(recording: Recording) -> float:
 
 
 def cell_count(full: float) -> int:
-    """Return the fewest cells that have this voltage at rest, V; 0: it is no pack of cells."""
+    """Return the minimum number of cells with this voltage at rest, V; 0 if implausible."""
     if not (math.isfinite(full) and full > 0.0):
         return 0
     cells = math.ceil(full / HIGHEST_CELL)
@@ -119,7 +116,7 @@ def cell_count(full: float) -> int:
 
 
 def check_cells(full: float, cells: int) -> None:
-    """Refuse a number of cells that a pack of this voltage at rest, V, cannot have."""
+    """Raise InputError if a pack with this voltage at rest, V, cannot have so many cells."""
     if math.isfinite(full) and not LOWEST_CELL <= full / cells <= HIGHEST_CELL:
         raise InputError(
             f'--cells {cells}: {full:.4g} V at rest would be {full / cells:.3g} V a cell: it is '
@@ -127,7 +124,7 @@ def check_cells(full: float, cells: int) -> None:
 
 
 def cells_of(recording: Recording, given: int = 0) -> tuple[int, str]:
-    """Return the cells in series and who says so: what was given, the log, or the voltage."""
+    """Return the cells in series and their source: given, log, guessed or unknown."""
     if given:
         return given, 'given'
     guess = cell_count(full_voltage(recording))
@@ -137,7 +134,7 @@ def cells_of(recording: Recording, given: int = 0) -> tuple[int, str]:
 def stated_cells(source: Mapping[str, str]) -> tuple[int, str] | None:
     """Return the cells that the header of a log states."""
     text = source.get('cells', source.get('log_cells', ''))
-    # A bag may hold any text there.
+    # The metadata of a bag may contain any text.
     return (int(text), 'log') if re.fullmatch('[1-9][0-9]?', text) else None
 
 
@@ -150,14 +147,14 @@ def stated_limit(source: Mapping[str, str]) -> tuple[int, float] | None:
 
 
 def craft_of(recording: Recording, facts: SupplyFacts, given: int = 0) -> Craft:
-    """Return how a supply stands among known crafts of its class."""
+    """Compare a supply with known crafts of its class."""
     cells, source = cells_of(recording, given)
     kind = '' if not 0 < cells <= _MOST_CELLS else MICRO if cells == 1 else QUAD
     if not kind or not recording.has_throttle:
         return Craft(cells, source, full_voltage(recording), '', ())
     low, high = facts.sag.flown
     seen = low - _NEAR <= _AT <= high + _NEAR
-    # Each with its standard error; that of the noise is small beside the factor that is usual.
+    # Values and standard errors; the error of the noise is negligible.
     values = {
         'sag': [float(np.interp(_AT, facts.sag.throttle, one)) if seen and facts.sag.known else NAN
                 for one in (facts.sag.sag_v, facts.sag.se_v)],
@@ -185,7 +182,7 @@ def _measure(name: str, value: float, reach: float, middle: float) -> Measure:
 
 
 def craft_line(craft: Craft) -> str:
-    """Return in words how each measure stands; empty where none can be judged."""
+    """Return the comparison in words; empty if there is none."""
     found = []
     for one in craft.measures:
         if one.verdict != 'unknown':
@@ -201,9 +198,9 @@ def craft_line(craft: Craft) -> str:
 
 def craft_advice(craft: Craft) -> list[str]:
     """
-    Return a sentence for each measure that is high: the likely reason, and what to do.
+    Return a sentence for each measure that is high: the likely reason and a remedy.
 
-    None where the cells are a guess, for it may be no pack at all.
+    There are none if the number of cells is a guess, because it may not be a pack at all.
     """
     if craft.cells_from == 'guessed':
         return []

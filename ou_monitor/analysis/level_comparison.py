@@ -1,19 +1,16 @@
 """
-What differs from load level to load level: sigma, and whether alpha is the same.
+Compare load levels: the change of sigma, and whether alpha is constant.
 
-The test of alpha, which the paper takes as the same at every load, is chi^2 of ln(alpha) of the
-levels about their weighted mean, each with its standard error; that error is carried over to the
-common alpha, for it grows with 1/sqrt(alpha T) and a level whose alpha came out high by chance
-would weigh too much.  The test withholds a level that one OU in white noise does not describe
-(more than one relaxation, or lines beside impulses): its alpha is that of a mixture, and the error
-of its fit does not cover that.  Limits: only levels with a usable fit count; a spectral line too
-faint for the finder stays in the fit; a test that does not reject proves nothing, so the ratio
-that it would have detected stands beside it.
+The paper assumes the same alpha at every load.  The test is chi^2 of ln(alpha) about the weighted
+mean, with standard errors at the common alpha: they grow with 1/sqrt(alpha T), so a level whose
+alpha is high by chance would otherwise weigh too much.  Levels that one OU in white noise does not
+describe (more than one relaxation, or lines with impulses) are withheld, because their standard
+errors do not include this.  Limits: only levels with a usable fit count; weak spectral lines stay
+in the fit; a test that does not reject proves nothing, so the detectable ratio is reported too.
 
-Alpha and sigma have one threshold, `LEVEL`, that of the intervals printed beside them.  The
-question is how much they change from level to level, each level fitted by itself.  `discover`
-fits one model to a whole recording, throttle held or not, and asks `alpha_score` and
-`sigma_score` (`ou_monitor.criticism.battery`) whether to let them go with throttle.
+The significance level of both is `LEVEL`, as of the printed intervals.  Each level is fitted by
+itself here; `discover` fits one model to a whole recording, and uses `alpha_score` and
+`sigma_score` (`ou_monitor.criticism.battery`) to decide whether they depend on throttle.
 """
 
 from __future__ import annotations
@@ -28,11 +25,9 @@ from ou_monitor.text import p_words
 from scipy import stats
 from scipy.special import chndtrinc
 
-# Probability of "differs" where alpha or sigma is the same (what intervals of 95 % leave), and of
-# seeing `detectable_ratio`.
+# Significance level of a difference, and power of the test at `detectable_ratio`.
 LEVEL, POWER = 0.05, 0.9
-# A change by less than this factor changes no decision here: tau is known no better in most
-# recordings of a flight.
+# Minimum factor of a change that matters: in most flights tau is not known better than that.
 NARROW = 1.5
 
 
@@ -50,11 +45,10 @@ class AlphaTest:
     # chi^2 with levels - 1 degrees of freedom.
     statistic: float = NAN
     p_value: float = NAN
-    # Ratio of alpha between the lowest and the highest level that the test detects with 90 %
-    # probability, where ln(alpha) is a straight line over throttle.
+    # Ratio of alpha from the lowest to the highest level, with ln(alpha) linear in throttle, that
+    # the test detects with 90 % probability.
     detectable_ratio: float = NAN
-    # That ratio as fitted, highest over lowest throttle (NaN where it is not determined), and its
-    # 95 % interval.
+    # Fitted ratio, highest over lowest throttle (NaN if not determined), and its 95 % interval.
     ratio: float = NAN
     ratio_low: float = NAN
     ratio_high: float = NAN
@@ -75,8 +69,8 @@ class AlphaTest:
         if not self.withheld:
             return ''
         names = ', '.join('all' if math.isnan(x) else f'{100.0 * x:.3g} %' for x in self.withheld)
-        return (f' Withheld: {names}; the level or another one shows more than one relaxation, '
-                'or lines stand beside impulses.')
+        return (f' Withheld: {names}, because this or another level shows more than one '
+                'relaxation, or both lines and impulses.')
 
     def _verdict(self) -> str:
         if self.levels < 2:
@@ -99,7 +93,7 @@ class AlphaTest:
 
 
 def _factor(ratio: float) -> str:
-    """Return a ratio to three digits; beyond a factor of 100 either way only that."""
+    """Return a ratio with three digits, or that it is beyond a factor of 100."""
     if ratio > 100.0:
         return 'more than 100'
     return 'less than 0.01' if ratio < 0.01 else f'{ratio:#.3g}'.rstrip('.')
@@ -139,10 +133,10 @@ def alpha_constancy(throttles: Sequence[float], estimates: Sequence[Estimate],
 
 def at_common_alpha(logs: FloatArray, errors: FloatArray) -> FloatArray:
     """
-    Return relative errors of alpha or Var_inf as they would be at the common alpha.
+    Return relative errors of alpha or Var_inf at the common alpha (logs: ln of alpha, 1/s).
 
-    logs are those of the alphas found (1/s).  The error is sqrt(2 / (alpha T)) times what the
-    noise adds: what came out high by chance shows too small a one.
+    The error is proportional to sqrt(2 / (alpha T)), so it is too small for an alpha that is high
+    by chance.
     """
     found = errors
     for _ in range(20):

@@ -1,16 +1,15 @@
 """
 One load level of a recording -> its fit, tests, spectrum and lines.
 
-Level and load are taken out of the whole recording first (`ou_monitor.analysis.supply.remainder`);
-what they leave in the segments of the level, without its spectral lines, is fitted by the model
-that all commands share (`ou_monitor.model.ou_fit`).
+Level and load are subtracted from the whole recording first
+(`ou_monitor.analysis.supply.remainder`); the residual in the segments of the level, without
+spectral lines, is fitted by the model that all commands share (`ou_monitor.model.ou_fit`).
 
-Limits: a relaxation slower than half of a segment, or than 2.5 s, is the level's.
+Limits: a relaxation slower than half of a segment, or than 2.5 s, counts as drift of the level.
 
-Kind of process: the words are those of the paper's Table 1; the paper names the kinds by eye,
-here each has tests (`ou_monitor.analysis.level_tests`), adjusted so
-that a recording of stationary OU levels has any of them reject once in a
-hundred times.  The first that applies names the level:
+The types of process are those of Table 1 of the paper, which names them by eye; here each has
+tests (`ou_monitor.analysis.level_tests`), adjusted so that one recording in a hundred of
+stationary OU levels has any rejection.  The first rule that applies names the level:
 
 1. mean or intensity changes from block to block: 'quasi-stationary' (the
    verdict also names what the level is apart from that);
@@ -24,9 +23,8 @@ hundred times.  The first that applies names the level:
    'diffusion';
    without a usable fit 'undetermined'.
 
-Limits of the words: one stands for what was found, and the tests that did not reject
-have a power that depends on the length; impulses and an intensity that
-wanders within a block look alike.
+Limits: the power of the tests depends on the length of the level; impulses, and an intensity that
+changes within a block, look alike.
 """
 
 from __future__ import annotations
@@ -56,10 +54,10 @@ from scipy import stats
 from scipy.signal import welch
 
 
-# A level is called Gaussian only when the tests would have detected this excess kurtosis.
+# Excess kurtosis that the tests must be able to detect, with this power, to name a level Gaussian.
 VISIBLE_KURTOSIS = 1.0
 _POWER = 0.9
-# More of the variance than this in spectral lines is most of it.
+# Maximum share of the variance in spectral lines of a diffusion.
 _LINE_SHARE = 0.5
 
 
@@ -80,7 +78,7 @@ def detectable_kurtosis(n: int) -> float:
     """Return the excess kurtosis that n innovations reveal with 90 % probability."""
     if n < 1:
         return math.inf
-    # Half of the level goes to the largest innovation.
+    # The other half of the significance level is for the largest innovation.
     reach = float(stats.norm.isf(0.5 * FAMILY_WISE) + stats.norm.ppf(_POWER))
     return reach * math.sqrt(24.0 / n)
 
@@ -89,10 +87,10 @@ def detectable_kurtosis(n: int) -> float:
 class KindVerdict:
     """What a level is called, and why."""
 
-    kind: ProcessType  # Kind
-    why: str  # The reason without numbers, so that levels of one reason can stand together
-    figures: str = ''  # The numbers behind it; may be empty
-    # For 'quasi-stationary' what the level is called apart from its changes; else `kind`.
+    kind: ProcessType
+    why: str  # Reason without numbers, by which levels are grouped
+    figures: str = ''  # Numbers of the reason; may be empty
+    # For 'quasi-stationary', the type apart from the changes; otherwise `kind`.
     within: ProcessType = ProcessType.UNDETERMINED
 
     @property
@@ -127,7 +125,7 @@ def classify(estimate: Estimate, shape: Shape, line_share: float = 0.0) -> KindV
 
 
 def _apart_from_changes(estimate: Estimate, shape: Shape, line_share: float) -> KindVerdict:
-    """Return the kind of a level as if nothing moved from block to block."""
+    """Return the type of a level, ignoring changes from block to block."""
     tails, normal = shape['impulses'], shape['gaussian']
     if tails.rejects:
         return _plain(ProcessType.IMPULSES, 'single innovations lie beyond the range of '
@@ -149,7 +147,7 @@ def _apart_from_changes(estimate: Estimate, shape: Shape, line_share: float) -> 
 
 
 def _gaussian(estimate: Estimate, shape: Shape, line_share: float, normal: str) -> KindVerdict:
-    """Return the kind of a level whose shape no test rejects as Gaussian."""
+    """Return the type of a level whose shape no test rejects as Gaussian."""
     correlated = shape['correlated']
     if not correlated.rejects:
         return _plain(ProcessType.GAUSSIAN, 'neighbouring samples are uncorrelated', normal)
@@ -176,7 +174,7 @@ def _gaussian(estimate: Estimate, shape: Shape, line_share: float, normal: str) 
     second = shape['second_relaxation']
     if second.rejects:
         return _plain(ProcessType.STATIONARY, 'the innovations show a second relaxation, '
-                      'slower or faster than the fitted one: alpha is that of neither',
+                      'slower or faster than the fitted one, so alpha is a mixture',
                       f'{_share(second.effect)}, {_p(second)}; {normal}')
     beside = f'; beside lines of {100.0 * line_share:.2g} % of the variance' if line_share else ''
     return _plain(ProcessType.DIFFUSION, 'one relaxation, slower than the sampling, leaves '
@@ -184,8 +182,8 @@ def _gaussian(estimate: Estimate, shape: Shape, line_share: float, normal: str) 
 
 
 def _share(share: float) -> str:
-    """Return a share of Var_inf to first order, which beyond the whole says no more than that."""
-    return 'as large as Var_inf' if share > 1.0 else f'some {100.0 * share:.0f} % of Var_inf'
+    """Return a share of Var_inf, which is a first-order estimate and not accurate above 1."""
+    return 'as large as Var_inf' if share > 1.0 else f'about {100.0 * share:.0f} % of Var_inf'
 
 
 def _plain(kind: ProcessType, why: str, figures: str = '') -> KindVerdict:
@@ -196,11 +194,12 @@ def _p(test: TestResult) -> str:
     return p_words(test.p_adjusted)
 
 
+# Minimum length of a Welch segment, samples.
 _MIN_LENGTH = 32
-# About this many averages: the estimate scatters by 1/sqrt(8), and there is
-# still a decade below the corner in a segment of 25 relaxation times.
+# Minimum number of averages: the relative error is 1/sqrt(8), and a segment of 25 relaxation times
+# still shows a decade below the corner.
 _AVERAGES = 8
-# Enough to show a tone as a line of its own.
+# Points of the spectrum per decade; enough to resolve a tone.
 _PER_DECADE = 40
 
 
@@ -212,11 +211,9 @@ def _empty() -> FloatArray:
 class LevelSpectrum:
     """One-sided power spectral density of a level."""
 
-    # Hz, > 0, even on a log axis; shape (k,).
-    frequency: FloatArray = field(default_factory=_empty)
+    frequency: FloatArray = field(default_factory=_empty)  # Even on a log axis, Hz; shape (k,)
     density: FloatArray = field(default_factory=_empty)  # Measured, V^2/Hz; shape (k,)
-    # Of the fitted OU in white noise, sampled as the data are, V^2/Hz; NaN without a fit; shape
-    # (k,).
+    # The fitted OU in white noise at the same rate, V^2/Hz; NaN without a fit; shape (k,).
     fitted: FloatArray = field(default_factory=_empty)
 
 
@@ -225,8 +222,8 @@ def level_spectrum(recording: Recording, segments: Sequence[Stay],
     """
     Return the PSD of a level (Welch, Hann), averaged over its segments.
 
-    Limits: the samples are taken as evenly spaced at their mean rate; where
-    they are not, frequencies near the Nyquist frequency are smeared.
+    Limits: samples are taken as evenly spaced; if they are not, frequencies near the Nyquist
+    frequency are smeared.
     """
     longest = max((s.stop - s.start for s in segments), default=0)
     rate = segment_rate(recording, segments)
@@ -242,8 +239,8 @@ def level_spectrum(recording: Recording, segments: Sequence[Stay],
             frequency, density = welch(recording.voltage[s.start:s.stop], fs=rate,
                                        nperseg=length, detrend='constant')
             summed, weight = summed + n * density, weight + n
-    # The first bin above zero is what removing the mean has left; the last,
-    # at the Nyquist frequency, is not doubled as the others are.
+    # Without the first bin, which the removal of the mean distorts, and the last, at the Nyquist
+    # frequency, which is not doubled like the others.
     frequency, density = even_on_log(frequency[2:-1], summed[2:-1] / weight, _PER_DECADE)
     fitted = np.full(frequency.size, math.nan)
     if estimate.usable:
@@ -252,14 +249,14 @@ def level_spectrum(recording: Recording, segments: Sequence[Stay],
 
 
 def segment_rate(recording: Recording, segments: Sequence[Stay]) -> float:
-    """Return the mean rate of the samples within segments, Hz; 0 when there is no time."""
+    """Return the mean rate of the samples within segments, Hz; 0 if they have no duration."""
     steps = sum(s.stop - s.start - 1 for s in segments)
     time = float(sum(recording.t[s.stop - 1] - recording.t[s.start] for s in segments))
     return steps / time if time > 0.0 else 0.0
 
 
 def _pieces(segments: Sequence[Stay], length: int) -> int:
-    """Return how many half-overlapping pieces of that length the segments hold."""
+    """Return the number of half-overlapping pieces of a length in the segments."""
     return sum(max(0, 2 * (s.stop - s.start) // length - 1) for s in segments)
 
 
@@ -268,8 +265,8 @@ def ou_spectrum(frequency: FloatArray, alpha: float, sigma: float, rate: float,
     """
     Return the one-sided PSD of a *sampled* OU in white noise.
 
-    The Lorentzian 2 sigma^2 / (alpha^2 + (2 pi f)^2) with its aliases folded
-    in, which is the spectrum of an AR(1) of coefficient exp(-alpha/rate).
+    The Lorentzian 2 sigma^2 / (alpha^2 + (2 pi f)^2) with its aliases is the spectrum of an AR(1)
+    with the coefficient exp(-alpha/rate).
 
     frequency in Hz, rate in Hz, noise_std in V.
     """
@@ -282,12 +279,11 @@ def ou_spectrum(frequency: FloatArray, alpha: float, sigma: float, rate: float,
     return density
 
 
-# Fewer samples than this have no spectrum, tests or lines.
+# Minimum samples of a segment for spectrum, tests and lines.
 _MIN_SEGMENT = 16
-# Fewer samples have no histogram.
+# Minimum samples of a histogram.
 _LEAST_BINNED = 50
-# What is correlated without a relaxation wanders: the mean square of its steps is less than this
-# share of what that of white noise would be.
+# Maximum mean square of the steps, relative to white noise, of a voltage that wanders.
 _WANDERS = 0.5
 
 
@@ -352,30 +348,27 @@ def fit_parts(recording: Recording, left: Remainder, segments: Sequence[Stay],
 
 @dataclass(frozen=True, eq=False)
 class LevelResult:
-    """What one load level shows."""
+    """Results of one load level."""
 
-    throttle: float  # Throttle, 0..1; NaN for a level that holds the whole recording
-    segments: tuple[Stay, ...]  # Segments of samples that were used
+    throttle: float  # 0..1; NaN if the level is the whole recording
+    segments: tuple[Stay, ...]  # Segments used
     time: float  # Time in them, s
     n: int  # Samples in them
     mean: float  # Mean voltage, V
-    # Peak to peak, largest absolute value and rms of the deviation from the mean of its segment, V
-    # (as an AC-coupled oscilloscope would show it).
+    # Peak to peak, largest absolute value and rms of the deviation from the mean of each segment,
+    # V, as on an AC-coupled oscilloscope.
     vpp: float
     peak: float
     vrms: float
     deviation: FloatArray  # That deviation, V; shape (n,)
-    ou: OuFacts  # Relaxation in what level and load leave, without its lines, or its bounds
-    estimate: Estimate  # The same, as the node gives it
-    shape: Shape  # Tests of the kind of process, adjusted over all levels
-    # Kind of process, and why.
+    ou: OuFacts  # Relaxation without level, load and lines, or its bounds
+    estimate: Estimate  # The same as the node reports it
+    shape: Shape  # Tests of the type of process, adjusted over all levels
     verdict: KindVerdict = KindVerdict(ProcessType.UNDETERMINED, 'not judged')
-    sag: LevelSag = LevelSag()  # How far the mean lies below that of the lowest throttle
-    spectrum: LevelSpectrum = field(default_factory=LevelSpectrum)  # PSD, measured and fitted
-    # Spectral lines, and what would have been found.
-    lines: LineSearch = field(default_factory=LineSearch)
-    # With its lines, when these were taken out; None when they were not.
-    with_lines: Estimate | None = None
+    sag: LevelSag = LevelSag()
+    spectrum: LevelSpectrum = field(default_factory=LevelSpectrum)
+    lines: LineSearch = field(default_factory=LineSearch)  # Spectral lines
+    with_lines: Estimate | None = None  # Fit with the lines, if these were subtracted
 
     @property
     def kind(self) -> ProcessType:
@@ -395,7 +388,7 @@ class LevelResult:
 
     @property
     def coupled(self) -> bool:
-        """Whether the noise lacks what an AC-coupled instrument takes out."""
+        """Whether slow noise is missing, as behind an AC-coupled instrument."""
         return self.shape.coupling_p < FAMILY_WISE
 
     @property
@@ -421,7 +414,7 @@ class LevelResult:
 
 def fit_level(recording: Recording, left: Remainder, level: LoadLevel, levels: int
               ) -> LevelResult:
-    """Return the result of one level, its kind not judged yet."""
+    """Return the result of one level, without the verdict."""
     segments = [s for s in level.segments if s.stop - s.start >= _MIN_SEGMENT]
     if not segments:
         segments = [s for s in level.segments if s.stop - s.start >= 2]
@@ -439,7 +432,7 @@ def fit_level(recording: Recording, left: Remainder, level: LoadLevel, levels: i
         for s in within] if estimate.usable else ())
     shape = examine_level(_parts(still, within), estimate, left.above)
     with_lines = None
-    # Impulses at even distances have lines, too: those are not taken out.
+    # Periodic impulses have spectral lines too, which are not subtracted.
     if lines.lines and not holm([shape])[0]['impulses'].rejects:
         with_lines = estimate
         clean = _without_lines(still, within, even, lines)
@@ -478,7 +471,7 @@ def _white(t: FloatArray, voltage: FloatArray, estimate: Estimate) -> FloatArray
 
 
 def _grid_rate(grids: Sequence[EvenGrid]) -> float:
-    """Return the rate of the clock of segments, Hz; 0 when there is no time."""
+    """Return the rate of the clock of segments, Hz; 0 if they have no duration."""
     steps = sum(grid.values.size - 1 for grid in grids)
     time = sum((grid.values.size - 1) / grid.rate for grid in grids)
     return steps / time if time > 0.0 else 0.0
@@ -495,7 +488,7 @@ def _without_lines(recording: Recording, segments: Sequence[Stay], rate: float,
 
 
 def judge_levels(results: Sequence[LevelResult], load: SupplyLoad) -> tuple[LevelResult, ...]:
-    """Name the kind of each level, the tests of all adjusted together; load: of the facts."""
+    """Return the levels with their verdicts, all tests adjusted together."""
     shapes = holm([level.shape for level in results])
     return tuple(
         replace(level, shape=shape, sag=LevelSag(

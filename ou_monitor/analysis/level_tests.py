@@ -1,8 +1,8 @@
 """
-Tests of the kind of process at a load level, with calibrated p-values.
+Tests of the type of process at a load level, with calibrated p-values.
 
-Each test works on the one-step innovations of the level's fitted model, which are independent
-and standard normal when the level is a stationary OU in white noise:
+Each test works on the one-step innovations of the fitted model, which are independent and standard
+normal if the level is a stationary OU in white noise:
 
 =============  ========================================================================
 mean_drift     means of blocks of innovations, F with the error of alpha in it
@@ -18,11 +18,11 @@ second_relaxation
                `ou_monitor.criticism.innovations`, in their periodogram
 =============  ========================================================================
 
-A test that rejects counts only when its effect is of consequence, too: with 10^5 samples a
-change of sigma of 1 % is found and means nothing.  Limits: the OU's parameters are fitted to the
-same samples, so what a fit can absorb (slow drift, a second time constant) is found late; coarse
-ADC steps make the shape unknowable; changes faster than a sixteenth of the level average out;
-correlation that no relaxation describes (a tone) makes the tests of the shape a little sharp.
+A rejection counts only if the effect is large enough to matter: with 10^5 samples, even a change
+of sigma by 1 % is significant.  Limits: the OU is fitted to the same samples and absorbs part of a
+slow drift or a second time constant, which lowers the power; coarse ADC steps hide the shape;
+changes within a sixteenth of the level average out; with correlation other than a relaxation (a
+tone), the tests of the shape reject a little too often.
 """
 
 from __future__ import annotations
@@ -37,16 +37,17 @@ from ou_monitor.criticism.innovations import (
 from ou_monitor.records import Estimate, Flag, FloatArray, NAN, Status
 from scipy import stats
 
-# Fewer samples than this are not tested; a block has at least as many innovations.
+# Minimum samples of a test, and innovations of a block; maximum number of blocks.
 FEWEST = 50
 _BLOCKS = 16
-# Relaxation times of a block of the test of the mean.
+# Minimum relaxation times of a block in the test of the mean.
 _MEAN_BLOCK = 5.0
-# Standard deviations beyond which nothing counts for a change of intensity: a few impulses decide
-# the variance of a block, while of heavy tails (Student's t of 5 degrees) 1 in 10^4 goes.
+# Limit of innovations in the test of intensity, standard deviations: beyond it a few impulses
+# would determine the variance of a block; of heavy tails (Student's t with 5 degrees), 1 in 10^4
+# is lost.
 _FAR = 10.0
 _LAGS_RAW, _LAGS_FITTED = 5, 10
-# Least effects of consequence, in the unit of each test.
+# Minimum effects that matter, in the unit of each test.
 LEAST = {'mean_drift': 0.25, 'variance_drift': 0.1, 'gaussian': 0.3, 'impulses': 0.5,
          'correlated': 0.0, 'one_relaxation': 0.1, 'second_relaxation': LEAST_SHARE}
 EFFECT = {
@@ -64,34 +65,32 @@ class TestResult:
     """One test of one level."""
 
     name: str  # Key of `EFFECT`
-    p_value: float = NAN  # Probability of as much under the model; NaN when it could not be done
-    effect: float = NAN  # How large what was found is, see `EFFECT`
-    p_adjusted: float = NAN  # After Holm, over all tests of all levels of the recording
-    why_not: str = ''  # Why it could not be done; empty when it was
+    p_value: float = NAN  # NaN if the test was not possible
+    effect: float = NAN  # Effect size, see `EFFECT`
+    p_adjusted: float = NAN  # Holm-adjusted over all tests of all levels of the recording
+    why_not: str = ''  # Why the test was not possible; otherwise empty
 
-    # Not a class of pytest's.
+    # Not a test class of pytest.
     __test__ = False
 
     @property
     def rejects(self) -> bool:
-        """Whether it rejects at `FAMILY_WISE`, with an effect of consequence."""
+        """Whether it rejects at `FAMILY_WISE`, with an effect that matters."""
         return self.p_adjusted < FAMILY_WISE and self.effect >= LEAST[self.name]
 
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """What the innovations of a level look like."""
+    """Tests and moments of the innovations of a level."""
 
     tests: tuple[TestResult, ...]  # In the order of `EFFECT`
     n: int  # Innovations
     # Of the innovations over the standard deviation of their block; kurtosis is in excess.
     skewness: float
     kurtosis: float
-    # Innovations beyond what the largest of as many normal ones stays under with 99 %.
-    impulses: int
+    impulses: int  # Innovations above the 99 % quantile of the largest of n normal ones
     impulse_rate: tuple[float, float, float]  # Their rate, 1/s, and its 95 % interval (Poisson)
-    # Probability that noise looks as much like an AC-coupled instrument, after Holm over all
-    # levels; NaN when it could not be tested.
+    # p-value of an AC-coupled instrument, Holm-adjusted over all levels; NaN if not tested.
     coupling_p: float = NAN
 
     def __getitem__(self, name: str) -> TestResult:
@@ -101,7 +100,7 @@ class Shape:
 
 def examine_level(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Estimate,
                   above: float = 0.0) -> Shape:
-    """Test one level (parts in s); what is slower than `above`, Hz, was taken out."""
+    """Test one level (parts: stamps, s, and V); noise slower than `above`, Hz, was removed."""
     parts = [(t, v) for t, v in parts if t.size >= 2]
     n = sum(t.size for t, _ in parts)
     time = sum(float(t[-1] - t[0]) for t, _ in parts)
@@ -157,7 +156,7 @@ def holm(shapes: Sequence[Shape]) -> tuple[Shape, ...]:
     """Adjust the p-values of all levels together (Holm 1979)."""
     flat = [test.p_value for shape in shapes for test in shape.tests]
     found = iter(adjusted(flat))
-    # What the instrument does is a family of its own: it is no kind of process.
+    # The instrument is a family of its own, because it is not a type of process.
     coupling = adjusted([shape.coupling_p for shape in shapes])
     return tuple(replace(shape, coupling_p=p, tests=tuple(
         replace(test, p_adjusted=next(found)) for test in shape.tests))
@@ -181,7 +180,7 @@ def _untested(n: int, why: str) -> Shape:
 
 def _mean_drift(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Estimate, alpha: float,
                 var_inf: float, noise_var: float, spread: float) -> TestResult:
-    """Compare means of blocks: of innovations about one mean of the whole level."""
+    """Compare means of blocks of innovations, about one mean of the whole level."""
     total = join([v for _, v in parts])
     time = sum(float(t[-1] - t[0]) for t, _ in parts)
     blocks = _BLOCKS if math.isinf(alpha) else min(_BLOCKS, int(alpha * time / _MEAN_BLOCK))
@@ -191,8 +190,8 @@ def _mean_drift(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Estima
             f'fewer than three blocks of {_MEAN_BLOCK:g} relaxation times'))
     centre = float(total.mean())
     z = join([innovations(t, v - centre, alpha, var_inf, noise_var) for t, v in parts])
-    # A constant c of the voltage is a constant of the innovations; not so of a first one, which
-    # has no past.  It is one of hundreds, and left out.
+    # A constant voltage gives constant innovations, except for the first of each part, which has
+    # no past and is left out.
     ends = np.cumsum([t.size for t, _ in parts])[:-1]
     z = np.delete(z, np.concatenate(([0], ends)).astype(np.intp))
     pieces = np.array_split(z, blocks)
@@ -201,13 +200,13 @@ def _mean_drift(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Estima
     q = float(counts @ (means - float(z.mean())) ** 2)
     scale = 1.0
     if math.isinf(alpha):
-        # What correlation of neighbours there is moves the means of blocks.
+        # Correlation of neighbours increases the scatter of the means of blocks.
         centred = [piece - piece.mean() for piece in pieces]
         square = sum(float(c @ c) for c in centred)
         near = sum(float(c[lag:] @ c[:-lag]) for c in centred
                    for lag in range(1, _LAGS_RAW + 1)) / square
         scale = square / (z.size - blocks) * max(1.0, 1.0 + 2.0 * near)
-    # The gain from a constant to its innovations is known as well as alpha.
+    # The gain from a constant to its innovations has the relative error of alpha.
     freedom = math.inf
     if math.isfinite(alpha):
         error = 2.0 * math.hypot(estimate.alpha_se, estimate.sigma_se)
@@ -223,7 +222,7 @@ def _mean_drift(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Estima
 
 def _constant_gain(parts: Sequence[tuple[FloatArray, FloatArray]], alpha: float, var_inf: float,
                    noise_var: float) -> float:
-    """Return the innovation that a constant of 1 V leaves in the long run, 1/V."""
+    """Return the stationary innovation of a constant of 1 V, 1/V."""
     t = max((t for t, _ in parts), key=len)
     step = float(np.median(np.diff(t)))
     steady: FloatArray = step * np.arange(float(max(64, t.size)))
@@ -248,7 +247,7 @@ def _variance_drift(z: FloatArray) -> TestResult:
     free = np.array([piece.size - 1.0 for piece in pieces])
     logs = np.log([max(float(piece.var(ddof=1)), 1e-300) for piece in pieces])
     centred = [piece - piece.mean() for piece in pieces]
-    # Kurtosis within the blocks: what makes their variances scatter more than chi^2.
+    # Kurtosis within the blocks increases the scatter of their variances beyond chi^2.
     fourth = float(np.mean(join([c ** 4 / max(float(np.mean(c ** 2)), 1e-300) ** 2
                                  for c in centred])))
     scatter = 2.0 + (1.0 - 1.0 / blocks) * max(fourth - 3.0, -1.0)
@@ -260,7 +259,7 @@ def _variance_drift(z: FloatArray) -> TestResult:
 
 
 def _without_impulses(piece: FloatArray) -> FloatArray:
-    """Return a block without what lies further out than any of its noise; impulses have a test."""
+    """Return a block without impulses, which have their own test."""
     away = np.abs(piece - np.median(piece))
     middle = float(np.median(away)) / 0.6745
     return piece[away <= _FAR * middle] if middle > 0.0 else piece
@@ -287,12 +286,12 @@ def _correlated(name: str, parts: Sequence[FloatArray], lags: int) -> TestResult
         top = sum(float(p.sum()) for p in products)
         variance = sum(float(p @ p) for p in products)
         r = top / total
-        # Removing the mean of each part has moved every correlation down a little.
+        # Correct the bias from removing the mean of each part.
         r += len(parts) / n if name == 'correlated' else 0.0
         se = math.sqrt(max(variance, 1e-300)) / total
         q += (r / se) ** 2
         squares += max(0.0, r * r - se * se)
-    # Of what is fitted, the noise alone acts on so few lags.
+    # Of the fitted parameters, only the noise affects so few lags.
     freedom = lags - 1.0 if name == 'one_relaxation' else freedom
     return TestResult(name, float(stats.chi2.sf(q, freedom)), math.sqrt(squares))
 

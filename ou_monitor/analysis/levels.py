@@ -1,12 +1,11 @@
 """
-Load levels: which segments of a recording were flown at which throttle.
+Load levels: segments of a recording at constant throttle.
 
-A level is a throttle that was held: its segments begin within the half width of it, and end where
-throttle leaves twice that, so that the jitter of a stick breaks none of them.  The half width is
-`HALF_WIDTH`, or as much more as the stick moves while it is held.  A steady ramp through a
-throttle is no stay at it.  Limits: throttle is a command, not a current, so two segments at one
-throttle can carry different loads; a segment is only as stationary as its throttle says; levels
-closer than the jitter of the stick are one.
+Segments of a level begin within its half width and end outside twice that, so that jitter of the
+stick does not split them.  The half width is `HALF_WIDTH`, or more if the stick jitters more.  A
+ramp through a throttle is not a segment.  Limits: throttle is a command, not a current, so two
+segments at one throttle can have different loads, and a segment need not be stationary; levels
+closer than the jitter of the stick are merged.
 """
 
 from __future__ import annotations
@@ -21,35 +20,35 @@ from ou_monitor.records import FloatArray, NAN
 
 BoolArray = npt.NDArray[np.bool_]
 
-# The paper's levels lie 5 % apart; +-2 % keeps neighbours apart and still
-# holds the jitter of a careful stick or of a hover controller.
+# Minimum half width of a level: the levels of the paper are 5 % apart, and a careful stick or a
+# hover controller jitters within 2 %.
 HALF_WIDTH = 0.02
-# Of a stick that moves more it is this many of its standard deviations, and this at most.
+# With more jitter: half width in standard deviations of the jitter, and its maximum.
 _SPREADS, _WIDEST = 2.5, 0.03
-# Blocks over which the jitter is measured, s, and the share of them that it holds for:
-# many a stick is still at idle and jitters only in flight.
+# Length of blocks in which the jitter is measured, s, and the quantile of blocks that is used:
+# sticks often stand still at idle and jitter only in flight.
 _LOOK, _QUIETER = 1.0, 0.75
-# Left out after throttle came from more than two half widths away: six
-# relaxation times of the paper's rail (tau = 15.9 ms), when 0.2 % of the step
-# is left.
+# Time left out after a change of throttle by more than two half widths, s: six relaxation times of
+# the rail of the paper (15.9 ms), after which 0.2 % of a step is left.
 SETTLE = 0.1
-# A level needs this share of the recording, or one stay as long as this, s, to be
-# found without being asked for: a few seconds at full throttle matter in any flight.
+# Minimum share of the recording, or minimum length of one segment, s, of a level that is found: a
+# few seconds at full throttle matter.
 MIN_SHARE, LONG_STAY = 0.02, 2.0
-# Time at a throttle, s, from which it is looked at.
+# Minimum time at a throttle to consider it, s.
 MIN_TIME = 0.25
-# And one segment that can be fitted by itself, s: thirty relaxation times of the
-# paper's rail.  A ramp that lingers here and there is no level where others are.
+# Minimum length of the longest segment of a level, s: thirty relaxation times of the rail of the
+# paper.
 MIN_STAY = 0.5
 MAX_LEVELS = 20
-# A segment shorter than this, s, through which throttle goes steadily is a passage: quarters at
-# its ends differ by more than this share of its range (of a ramp 0.75), and of the half width.
+# Passages: maximum length, s, and minimum difference between the first and the last quarter, as a
+# share of the range (a ramp has 0.75) and of the half width.
 _PASSAGE, _STEADY, _CROSSED = 3.0, 0.65, 0.75
-# A pause of more than this many median steps breaks a segment.
+# Minimum pause that splits a segment, in median steps.
 GAP_STEPS = 20.0
 
+# Bin width of the histogram of throttle.
 _GRID = 0.0025
-# Between two levels time falls to less than this share of that at the lesser of them.
+# Maximum density of time between two levels, relative to the smaller of them.
 _VALLEY = 0.7
 
 
@@ -65,8 +64,8 @@ class Stay:
 class LoadLevel:
     """One throttle and where in the recording it was held."""
 
-    throttle: float  # Throttle of the level, 0..1; NaN for a level that holds everything
-    segments: tuple[Stay, ...]  # Segments at this throttle, settling left out
+    throttle: float  # Throttle of the level, 0..1; NaN if it is the whole recording
+    segments: tuple[Stay, ...]  # Segments at this throttle, without settling
     settling: float = 0.0  # Time left out after changes of throttle, s
 
 
@@ -86,16 +85,16 @@ def find_levels(t: FloatArray, throttle: FloatArray,
         if all(held):
             return _most(t, found)
         if not any(held):
-            # Where every stay is short, only short stays can decide.
+            # All segments are short: accept the levels if they cover half of the recording.
             enough = 0.5 * float(t[-1] - t[0]) <= sum(_time(t, level) for level in found)
             return _most(t, found) if enough else whole
-        # What was taken for a level may be its neighbours'.
+        # Segments of a rejected level may belong to its neighbours.
         centres = [centre for centre, kept in zip(centres, held) if kept]
     return whole
 
 
 def half_width(t: FloatArray, throttle: FloatArray) -> float:
-    """Return how far from its middle a level reaches."""
+    """Return the half width of levels."""
     known = throttle[np.isfinite(throttle)]
     step = float(np.median(np.diff(t))) if t.size > 1 else 0.0
     size = max(8, round(_LOOK / step)) if step > 0.0 else known.size + 1
@@ -113,10 +112,10 @@ def _time(t: FloatArray, level: LoadLevel) -> float:
 
 
 def _held(t: FloatArray, level: LoadLevel) -> bool:
-    """Return whether a level was held: a long segment, or one of some length and a share."""
+    """Return whether a level has a long segment, or a shorter one and enough time in all."""
     whole = float(t[-1] - t[0])
     longest = max((float(t[s.stop - 1] - t[s.start]) for s in level.segments), default=0.0)
-    # A short recording may be all one level.
+    # The limit is lower in short recordings.
     return longest >= min(MIN_STAY, 0.25 * whole) and (
         longest >= LONG_STAY or _time(t, level) >= MIN_SHARE * whole)
 
@@ -129,7 +128,7 @@ def _most(t: FloatArray, found: tuple[LoadLevel, ...]) -> tuple[LoadLevel, ...]:
 
 def _split(t: FloatArray, throttle: FloatArray, centres: list[float], width: float,
            named: bool) -> tuple[LoadLevel, ...]:
-    """Give each level its segments, without passages through a level that nobody named."""
+    """Return levels with their segments; `named` ones keep passages."""
     broken = _gaps(t)
     runs: list[list[Stay]] = [[] for _ in centres]
     for run, k in stays(throttle, centres, width):
@@ -180,7 +179,7 @@ def _modes(t: FloatArray, throttle: FloatArray, width: float) -> list[float]:
     time_at = np.bincount(where, weights=spent, minlength=bins)
     reach = int(round(width / _GRID))
     fine = np.convolve(time_at, _triangle(reach // 2), mode='same')
-    # A recording of less than a second may be all one level.
+    # The limit is lower in recordings of less than a second.
     least = min(MIN_TIME, 0.25 * float(spent.sum()))
     found: list[int] = []
     while True:
@@ -195,12 +194,12 @@ def _modes(t: FloatArray, throttle: FloatArray, width: float) -> list[float]:
 
 
 def _triangle(reach: int) -> FloatArray:
-    """Return weights that fall on both sides: a box midway between two levels would hold both."""
+    """Return triangular weights; with a box, the middle of two levels would be a mode."""
     return 1.0 - np.abs(np.arange(-reach, reach + 1)) / (reach + 1.0)
 
 
 def _apart(density: FloatArray, peak: int, other: int, reach: int) -> bool:
-    """Tell whether a second peak is a level of its own, not a shoulder of the other."""
+    """Return whether a second peak is a separate level, not a shoulder of the other."""
     if abs(peak - other) > 2 * reach:
         return True
     between = density[min(peak, other):max(peak, other) + 1]
@@ -216,7 +215,7 @@ def stays(throttle: FloatArray, centres: Sequence[float], width: float
     level = np.asarray(centres)
     nearest = _nearest(centres)
     inner = _inner(centres, width)
-    # Of two levels that lie close, the other one is arrived at somewhat short of it.
+    # The outer limit ends before a close neighbour.
     outer = np.maximum(inner, np.minimum(2.0 * width, 0.8 * nearest))
     edges = np.unique(np.concatenate((level - outer, level - inner, level + inner,
                                       level + outer)))
@@ -243,13 +242,13 @@ def stays(throttle: FloatArray, centres: Sequence[float], width: float
 
 
 def _nearest(centres: Sequence[float]) -> FloatArray:
-    """Return how far the nearest other level is."""
+    """Return the distance to the nearest other level, for each level."""
     apart = np.diff(np.asarray(centres), prepend=-math.inf, append=math.inf)
     return np.minimum(apart[:-1], apart[1:])
 
 
 def _inner(centres: Sequence[float], width: float) -> FloatArray:
-    """Return the half width of each level, less where another is near."""
+    """Return the half width of each level, reduced if another is near."""
     return np.minimum(width, 0.5 * _nearest(centres)) + 1e-9
 
 
@@ -261,7 +260,7 @@ def _cut(run: Stay, broken: BoolArray) -> list[Stay]:
 
 
 def _passage(t: FloatArray, throttle: FloatArray, run: Stay, width: float) -> bool:
-    """Tell whether throttle only passes through, from one side to the other."""
+    """Return whether throttle only passes through."""
     if t[run.stop - 1] - t[run.start] >= _PASSAGE:
         return False
     inside = throttle[run.start:run.stop]
@@ -272,7 +271,7 @@ def _passage(t: FloatArray, throttle: FloatArray, run: Stay, width: float) -> bo
 
 def _settle(t: FloatArray, runs: Sequence[Stay], away: BoolArray,
             broken: BoolArray) -> tuple[tuple[Stay, ...], float]:
-    """Leave out the time after throttle came from far away; jitter is not a step."""
+    """Leave out the settling time after changes of throttle larger than jitter."""
     kept, lost = [], 0.0
     for run in runs:
         start = run.start

@@ -1,7 +1,7 @@
 """
-The facts of a supply in words, with the strongest spectral line: what every command says first.
+The facts of a supply in words, which every command reports first.
 
-Every number is one of `supply_facts`, with its limits; only the line comes from the load levels.
+Every number comes from `supply_facts`; only the strongest spectral line is from the load levels.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.records import NAN, OuFacts, Recording
 from ou_monitor.text import counted, number, volts, Z95
 
-# The noise follows throttle when it differs by more than that factor between its ends.
+# Minimum ratio of the noise at both ends of throttle that is reported as a change.
 _GROWS = 1.25
-# Less noise, V, is rounding.
+# Minimum noise, V; less is rounding.
 _NOTHING = 1e-9
-# Lines are part of the answer when they make more than that share of the noise at their level.
+# Minimum share of lines in the noise of their level to mention them in the answer.
 _LOUD = 0.25
 
 
@@ -30,50 +30,49 @@ _LOUD = 0.25
 class LoudestLine:
     """The strongest spectral line of all load levels."""
 
-    # Hz and V.
-    frequency: float
-    rms: float
-    share: float  # Of the variance of its level, 0..1
+    frequency: float  # Hz
+    rms: float  # V
+    share: float  # Share of the variance of its level, 0..1
     level: str  # Throttle of that level, in words
-    # How many lines that level has, and their share together.
+    # Number of lines of that level, and their total share.
     lines: int
     all_share: float
 
 
 @dataclass(frozen=True)
 class Overview:
-    """What every command says first of a recording."""
+    """The facts that every command reports first."""
 
-    facts: SupplyFacts  # What is known of the supply
-    duration: float  # Of the recording, s
-    load: SupplyLoad  # The load at the end, of which the facts hold eleven points
+    facts: SupplyFacts
+    duration: float  # Duration of the recording, s
+    load: SupplyLoad  # Load model at the end, which the facts give at eleven throttles
     highest: float  # Highest throttle; NaN without throttle
-    line: LoudestLine | None = None  # Strongest spectral line; None when there is none
-    cells: int = 0  # Cells in series that the limit is of; 0 when it is of the whole
-    end: MonitorReport | None = None  # What the node says at the end; None without a limit
+    line: LoudestLine | None = None  # Strongest spectral line
+    cells: int = 0  # Cells in series to which the limit refers; 0: none
+    end: MonitorReport | None = None  # Report of the node at the end; None without a limit
 
     @property
     def limit(self) -> float:
-        """Return the voltage that dips are counted below, V; NaN without one."""
+        """Return the voltage limit of dips, V; NaN without one."""
         return NAN if self.facts.dips is None else self.facts.dips.limit_v
 
     @property
     def sag(self) -> tuple[float, float, float]:
-        """Return throttle, sag there and its error, V, at the point next to the highest flown."""
+        """Return throttle, sag and its error, V, near the highest throttle flown."""
         sag = self.facts.sag
         k = _next_to(sag.flown[1])
         return THROTTLES[k], sag.sag_v[k], sag.se_v[k]
 
     @property
     def noise(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Return throttle and noise, V, at the points next to the ends of what was flown."""
+        """Return throttle and noise, V, near the lowest and the highest throttle flown."""
         low, high = (_next_to(u) for u in self.facts.noise.flown)
         rms = self.facts.noise.rms_v
         return (THROTTLES[low], rms[low]), (THROTTLES[high], rms[high])
 
 
 def _next_to(throttle: float) -> int:
-    """Return the place of the nearest of THROTTLES; 0 when it is not known."""
+    """Return the index of the nearest of THROTTLES; 0 for NaN."""
     return round(10.0 * min(max(throttle, 0.0), 1.0)) if math.isfinite(throttle) else 0
 
 
@@ -81,9 +80,9 @@ def overview(recording: Recording, limit: float | None = None,
              levels: Sequence[LevelResult] = (), cells: int = 0,
              left: Remainder | None = None, monitor: SupplyMonitor | None = None) -> Overview:
     """
-    Return what is known.
+    Return the facts.
 
-    limit in V, of so many cells; levels: where lines were found; left and monitor as of
+    limit in V, for `cells` in series; levels: the source of lines; left and monitor as in
     `facts_and_end`.
     """
     facts, load, end = facts_and_end(recording, limit, left, monitor)
@@ -116,8 +115,8 @@ def answers(found: Overview) -> list[str]:
         at, sag, se = found.sag
         parts.append(f'The rail sags by {volts(sag)} at {100.0 * at:.0f} % throttle.'
                      if sag > 2.0 * se else
-                     'No sag over throttle can be told from none: at '
-                     f'{100.0 * at:.0f} % throttle it is below {volts(sag + 2.0 * se)}.')
+                     f'No sag is measurable: at {100.0 * at:.0f} % throttle it is below '
+                     f'{volts(sag + 2.0 * se)}.')
     if found.line is not None and found.line.all_share > _LOUD:
         line = found.line
         what = (f'A line at {number(line.frequency, 4)} Hz makes' if line.lines == 1 else
@@ -128,7 +127,7 @@ def answers(found: Overview) -> list[str]:
 
 
 def known_lines(found: Overview) -> list[tuple[str, str]]:
-    """Return what is known: pairs of name and words."""
+    """Return the facts as pairs of name and words."""
     least, resistance = found.facts.lowest, found.facts.resistance
     if not math.isfinite(least.voltage_v):
         return []
@@ -155,7 +154,7 @@ def known_lines(found: Overview) -> list[tuple[str, str]]:
 
 
 def _dips(found: Overview, below: float = NAN) -> str:
-    """Return the dips in words, with the limit where it is given; empty when there is none."""
+    """Return the dips in words, with a limit if given; empty without dips."""
     dips = found.facts.dips
     if dips is None or not dips.count:
         return ''
@@ -198,7 +197,7 @@ def _noise_words(found: Overview) -> str:
 
 def other_scale(ou: OuFacts, alpha: float, ln_alpha_se: float, sigma: float, ln_sigma_se: float,
                 ) -> bool:
-    """Whether alpha and sigma of another fit are not those of the facts, by both intervals."""
+    """Return whether alpha or sigma of another fit contradicts the facts, by both intervals."""
     return ou.status == 'ok' and any(
         x * math.exp(Z95 * se) < low or x * math.exp(-Z95 * se) > high
         for x, se, (low, high) in ((alpha, ln_alpha_se, ou.alpha_95),

@@ -1,10 +1,10 @@
 """
-The list of what is doubtful about a recording, worst first.
+Cautions about the quality of a recording, worst first.
 
-The list gathers what is flagged at each level, what the reader dropped or mended, what the samples
-and stamps show by themselves, and what lines and a second relaxation do to the fit of a level.
+They come from the flags of each level, samples that the reader dropped or repaired, samples and
+stamps themselves, and the effects of lines and of a second relaxation on the fit of a level.
 
-Limits: a list without warnings says that nothing was found, not that there is nothing.
+Limits: a list without warnings does not prove that a recording is free of defects.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from ou_monitor.records import defect_of, Estimate, Flag, Recording, Severity, S
 from ou_monitor.text import counted, Z95
 from ou_monitor.timeline.line import TAIL
 
-# Flags that inform; the others make numbers doubtful.
+# Flags for information; the others are warnings.
 _INFORMS = frozenset({Flag.HELD_SAMPLES, Flag.IRREGULAR, Flag.NO_EXCITATION})
-# Root mean square of the steps about their median, in medians, from which a clock is uneven.
+# Maximum scatter of the steps of an even clock: rms about the median, in medians.
 _UNEVEN = 0.05
-# No supply of a UAV has more, V; the millivolts of any do.
+# Maximum voltage of a UAV supply, V; any supply in millivolts exceeds it.
 _MOST_VOLTS = 1000.0
-# No autopilot tells its battery less often, s; nor, once a second, for as long in one flight, s.
+# Maximum step between battery messages of an autopilot, s; and for steps of about 1 s, the maximum
+# duration of a flight, s.
 _LONG_STEP, _SLOW, _LONG_FLIGHT = 5.0, 0.9, 10_800.0
-# Throttle may go beyond 0..1 by so much, as sticks out of trim do, and by more for so small a
-# share of the samples.
+# Tolerance of throttle beyond 0..1 (trim), and maximum share of samples beyond that.
 _TRIM, _RARE = 0.05, 0.01
 # Segments of samples examined for ADC steps.
 _LOOKS = 8
@@ -40,16 +40,14 @@ class QualityItem:
     """One thing to know before using the numbers."""
 
     name: str  # Stable key in capitals
-    # ERROR: there are no numbers; WARNING: they are doubtful; INFO: good to know.
-    severity: Severity
+    severity: Severity  # ERROR: there are no numbers; WARNING: they are doubtful
     text: str  # One sentence
-    # Levels it is true of; empty when it is of the whole recording.
-    throttles: tuple[float, ...] = ()
+    throttles: tuple[float, ...] = ()  # Levels it applies to; empty: the whole recording
 
 
 def quality_list(recording: Recording, throttles: Sequence[float], estimates: Sequence[Estimate],
                  more: Sequence[QualityItem] = ()) -> tuple[QualityItem, ...]:
-    """Gather what is doubtful."""
+    """Return all cautions, worst first."""
     found: dict[tuple[str, Severity, str], list[float]] = {}
     for throttle, estimate in zip(throttles, estimates):
         for item in _of_estimate(estimate):
@@ -77,38 +75,38 @@ def _of_reader(note: str) -> QualityItem:
 
 
 def _of_units(recording: Recording) -> list[QualityItem]:
-    """Return what the sizes of the numbers say of their units."""
+    """Return suspicions of wrong units."""
     items = []
     middle = float(np.median(np.abs(recording.voltage))) if recording.n else 0.0
     if middle > _MOST_VOLTS:
         items.append(QualityItem('VOLTAGE_UNIT', Severity.WARNING, (
-            f'The median of the voltages is {middle:.4g}, more than any supply of a UAV has in '
-            'volts: is this mV, or counts of an ADC? Alpha and tau hold; figures in V are in '
-            'that unit instead, and no risk is computed. --unit mV reads a CSV in mV; for a bag '
-            'there is unit_factor in a msg config.')))
+            f'The median voltage is {middle:.4g}, too large for a UAV in volts: is it in mV, or '
+            'in counts of an ADC? Alpha and tau are right, but all figures in V are in that unit, '
+            'and no risk is computed. Use --unit mV for a CSV, unit_factor in a msg config for a '
+            'bag.')))
     if recording.n and float(recording.voltage.max()) < 0.0:
         items.append(QualityItem('VOLTAGE_SIGN', Severity.WARNING, (
-            'The voltage is negative throughout: swap the leads of the sensor, or the sign; '
-            'lowest voltage, sag and risk have no meaning otherwise.')))
+            'The voltage is negative throughout, so lowest voltage, sag and risk have no meaning: '
+            'swap the leads of the sensor, or change the sign.')))
     step = float(np.median(np.diff(recording.t))) if recording.n > 1 else 0.0
     if step > _LONG_STEP or (step > _SLOW and recording.duration > _LONG_FLIGHT):
         items.append(QualityItem('TIME_UNIT', Severity.WARNING, (
             f'The samples are {step:.3g} s apart, over {recording.duration / 3600.0:.3g} hours: '
-            'is the time in ms or us? --time-unit ms reads a CSV in ms. All rates and times are '
-            'wrong by that factor otherwise.')))
+            'is the time in ms or us? If so, all rates and times are wrong by that factor; '
+            '--time-unit ms reads a CSV in ms.')))
     known = recording.throttle[np.isfinite(recording.throttle)]
     low, high = np.quantile(known, (_RARE, 1.0 - _RARE)) if known.size else (0.0, 1.0)
     if low < -_TRIM or high > 1.0 + _TRIM:
         items.append(QualityItem('THROTTLE_RANGE', Severity.WARNING, (
             f'Throttle runs from {low:.3g} to {high:.3g} instead of 0 to 1: curves, risk and '
-            'throttle budget end at 0 and 1, and sag counts from the lowest throttle. Check the '
-            'sign; use (x + 1) / 2 for a stick from -1 to 1, the absolute value for reverse '
-            'thrust.')))
+            'throttle budget only cover 0 to 1, and sag counts from the lowest throttle. Check '
+            'the sign; use (x + 1) / 2 for a stick from -1 to 1, and the absolute value for '
+            'reverse thrust.')))
     return items
 
 
 def _of_stamps(recording: Recording) -> list[QualityItem]:
-    """Return what the stamps show: pauses, and an uneven clock."""
+    """Return defects of the stamps: pauses, and an uneven clock."""
     steps = np.diff(recording.t)
     if steps.size < 2:
         return []
@@ -133,7 +131,7 @@ def _of_stamps(recording: Recording) -> list[QualityItem]:
 
 
 def _of_samples(recording: Recording) -> list[QualityItem]:
-    """Return what the samples show: the ADC's step, repeats, a rail of the ADC."""
+    """Return properties of the samples: the step of the ADC, and clipping."""
     n = recording.n
     starts = np.unique(np.linspace(0, max(0, n - TAIL), _LOOKS).astype(int))
     looks = [examine(recording.voltage[k:k + TAIL]) for k in starts.tolist()]
@@ -143,24 +141,24 @@ def _of_samples(recording: Recording) -> list[QualityItem]:
         step = float(np.median(steps))
         rms = float(np.median([look.rms_increment for look in looks if look.step > 0.0]))
         items.append(QualityItem('ADC_STEP', Severity.INFO, (
-            f'Voltages lie on a lattice of {1e3 * step:.3g} mV, {step / rms:.2g} times the '
-            'scatter from sample to sample.')))
+            f'The voltage resolution is {1e3 * step:.3g} mV ({step / rms:.2g} times the scatter '
+            'from sample to sample).')))
     clipped = sum(look.saturated for look in looks)
     if clipped:
         items.append(QualityItem('CLIPPED', Severity.WARNING, (
-            f'In {clipped} of {len(looks)} segments examined the voltage piles up at one end of '
-            'its range: the ADC may be saturated.')))
+            f'In {clipped} of {len(looks)} segments examined, readings accumulate at one end of '
+            'the range: the ADC may be saturated.')))
     return items
 
 
 def line_item(throttle: float, without: Estimate, with_lines: Estimate | None) -> QualityItem:
-    """Say what the lines of a level do to its fit, or would have done (throttle 0..1)."""
+    """Return the effect of spectral lines on the fit of a level (throttle 0..1)."""
     if with_lines is None:
         worry = Severity.WARNING if without.usable else Severity.INFO
         return QualityItem('LINES_LEFT_IN', worry, (
-            'The level shows impulses beside spectral lines; the lines may come from the impulses '
-            'and were left in: alpha and sigma include both.'), (throttle,))
-    taken = 'Spectral lines were taken out before the fit'
+            'The level shows impulses and spectral lines. The lines may come from the impulses, '
+            'so they were not subtracted: alpha and sigma include both.'), (throttle,))
+    taken = 'Spectral lines were subtracted before the fit'
     if without.usable and with_lines.usable:
         moved = any(abs(math.log(getattr(with_lines, name) / getattr(without, name)))
                     > Z95 * getattr(without, name + '_se') for name in ('alpha', 'sigma'))
@@ -169,23 +167,23 @@ def line_item(throttle: float, without: Estimate, with_lines: Estimate | None) -
     else:
         moved = without.usable or with_lines.usable
         left = ', and the remainder cannot be fitted' if not without.usable else (
-            ', and only then does the fit succeed: the node, which keeps them, gives no numbers')
+            ', and the fit succeeds only then: the node, which keeps them, gives no numbers')
         text = f'{taken}{left}.'
     return QualityItem('LINES_TAKEN_OUT', Severity.WARNING if moved else Severity.INFO, text,
                        (throttle,))
 
 
 def second_items(throttles: Sequence[float]) -> list[QualityItem]:
-    """Say where a second relaxation was found (throttles 0..1)."""
+    """Return the caution for levels with a second relaxation (throttles 0..1)."""
     return [QualityItem('SECOND_RELAXATION', Severity.WARNING, (
         'The noise shows a second relaxation, slower or faster than the fitted one: alpha, tau '
-        'and Var_inf are those of a mixture, and their intervals hold for neither; the other '
-        'levels may hide the same. `ou-monitor discover` fits both.'), tuple(throttles))
+        'and Var_inf describe a mixture, and their intervals are valid for neither; other levels '
+        'may have it too. `ou-monitor discover` fits both.'), tuple(throttles))
         ] if throttles else []
 
 
 def coupling_items(throttles: Sequence[float]) -> list[QualityItem]:
-    """Say where the noise shows an AC-coupled instrument (throttles 0..1)."""
+    """Return the caution for levels behind an AC-coupled instrument (throttles 0..1)."""
     return [QualityItem('AC_COUPLING', Severity.WARNING, (
         'Slow noise is missing, as behind an AC-coupled instrument: alpha, tau and Var_inf '
         'describe rail and instrument together; repeat with a DC-coupled instrument. '

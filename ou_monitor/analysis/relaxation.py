@@ -1,29 +1,27 @@
 """
-How the voltage relaxes after a change of load, as in the paper's Fig. 5, with honest intervals.
+Relaxation of the voltage after a change of load, as in Fig. 5 of the paper, with intervals.
 
-From the moment throttle stands still, U(t) = U0 + A exp(-t/tau) in the noise of that level: OU
-and white noise, whose exact covariance weighs the samples (generalised least squares, through the
-one-step innovations).  tau is common to all changes of one kind, U0 and A are each one's own; the
-interval of tau is where the profile likelihood drops by less than chi^2 allows.
+Once throttle stands still, U(t) = U0 + A exp(-t/tau) in the noise of that level: OU and white
+noise, whose exact covariance weights the samples (generalised least squares, through the one-step
+innovations).  tau is common to all changes of one kind; U0 and A differ for each.  The interval of
+tau comes from the profile likelihood.
 
-The noise itself is where the level before left it: the louder of the two levels gives the variance
-of its first deviation, which then decays.  Only what goes beyond that is a relaxation.
+At the change, the noise still has the variance of the level before; if that is the larger one, the
+excess decays.  Only a deviation beyond this is a relaxation.
 
-Whether one exponential is enough is tested with two more, four times as fast and as slow, each
-change with amplitudes of its own.  Where it is not, the first third of tau is left out, if that
-makes it fit: late motors, or a rail much faster than the instrument, are over by then.
+An F test with two further exponentials, four times as fast and as slow, tests whether one is
+enough.  If it is not, the first third of tau is left out, provided that the rest then fits:
+delayed motors, or a rail much faster than the instrument, have settled by then.
 
-What relaxes is the rail as its noise shows it, or the instrument.  An AC-coupled input is a
-high-pass: whatever the rail does, a step comes out of it as a decay to the level before, at its
-own corner, and the noise shows the same corner.  So a supply that comes back to the level that it
-had under the other load says nothing about the rail.  One that settles at another level excludes
-the high-pass, for a high-pass keeps no level.
+The relaxation may be that of the rail or of the instrument.  An AC-coupled input is a high-pass:
+it shows any step as a decay to the level before, at its own corner, which the noise shows too.  So
+a voltage that returns to the level before tells nothing about the rail, but one that settles at
+another level excludes the high-pass.
 
-Limits: throttle is a command; motors follow it some 5 to 20 ms later, which a relaxation watched
-from the end of the step does not know, and which bends the first milliseconds.  One exponential;
-alpha, sigma and noise of the level count as known; after slow ramps little is left to relax, which
-widens the interval and does no harm.  A regulator that compensates a change of load looks like a
-high-pass; the stay before has to last some time constants, or its level is not known.
+Limits: throttle is a command that motors follow after 5 to 20 ms, which distorts the first
+milliseconds.  One exponential; alpha, sigma and noise of the level are taken as known.  Slow ramps
+leave little relaxation and so a wide interval.  A regulator that compensates a change of load
+looks like a high-pass.  The level before is known only if it was held for several time constants.
 """
 
 from __future__ import annotations
@@ -42,16 +40,16 @@ from ou_monitor.text import number, p_words, volts, Z95
 from scipy import stats
 
 
-# Longest way from one level to the other, s: after a slower one nothing is left to relax.
+# Maximum duration of a change of level, s; a slower one leaves nothing to relax.
 LONGEST_RAMP = 1.0
-# Shorter stays at a level are passages through it, s.
+# Minimum time at a level, s; shorter stays are passages.
 SHORTEST_STAY = 0.1
-# Throttle has arrived, and stays, within this share of the change.
+# Tolerance of throttle after a change, as a share of the change.
 _STILL = 0.1
-# What is watched after a change: so many relaxation times of the noise, and seconds, at least.
+# Minimum time fitted after a change, in relaxation times of the noise and in s; maximum samples.
 _WATCHED, _WATCHED_S = 20.0, 0.5
 _MOST = 2000
-# Time constants of the exponentials that are tried beside the one that is fitted, in tau.
+# Time constants of further exponentials in the test of one, in tau.
 _BESIDE = (0.25, 4.0)
 
 
@@ -64,7 +62,7 @@ class LevelChange:
     after: int
     leave: int  # Index of the first sample that is no longer at the level before
     enter: int  # Index of the sample from which throttle stands still at the level after
-    # First sample of the stay before; one past the last that throttle stands still after.
+    # First sample of the stay before; end of the samples with constant throttle after.
     begin: int
     stop: int
 
@@ -85,7 +83,7 @@ def find_steps(recording: Recording, throttles: Sequence[float]) -> tuple[LevelC
         if t[start] - t[leave - 1] > LONGEST_RAMP:
             continue
         stay = throttle[start:stop]
-        # Where the stick jitters as wide as that, what is still is as wide as the jitter.
+        # A jittering stick has a wider tolerance.
         wide = width if width > HALF_WIDTH else 0.0
         still = np.abs(stay - np.median(stay)) <= max(_STILL * change, wide)
         enter = start + int(still.argmax())
@@ -143,7 +141,7 @@ class Window:
         return found
 
     def more(self, tau: float) -> tuple[float, int]:
-        """Return by how much exponentials beside tau lower the sum of squares, and how many."""
+        """Return the reduction of the sum of squares by further exponentials, and their number."""
         times = tau * np.array((1.0, *_BESIDE))
         basis = self.whitened(np.exp(-self.since[:, None] / times[None, :]))
         basis -= np.outer(self._one, self._one @ basis) / float(self._one @ self._one)
@@ -172,19 +170,21 @@ def _project(direction: FloatArray, y: FloatArray) -> FloatArray:
     return np.asarray(direction * float(direction @ y) / float(direction @ direction))
 
 
+# Minimum samples of a change, and points of the grids of tau.
 _FEWEST = 12
 _COARSE, _FINE = 41, 61
-# Of the voltage before a change the last so many seconds give its level.
+# Maximum time before a change that gives the level before, and settling time left out there, s.
 _BEFORE_S, _SETTLED_S = 0.5, 0.1
+# Half the 95 % quantile of chi^2 with one degree of freedom.
 _HALF_95 = 1.920729410347062
-# Probability that a relaxation is detected in noise alone; an amplitude a change, and tau.
+# Probability of detecting a relaxation in noise alone.
 _CHANCE = 1e-4
-# Probability that one exponential is said not to be enough where it is.
+# Level of the test of one exponential.
 BADLY_FITTED = 1e-3
-# Probability that noise alone goes as far as one change of load.
+# Level at which a single change stands out of the noise.
 _ALONE = 0.05
-# Where it is not, so much of tau is left out at first, and what is left has to fit this well: of
-# a rail 16 times faster than the instrument, or motors that follow late, nothing is left by then.
+# If one exponential is not enough: start of the fit, in tau, and minimum p-value of the rest.  A
+# rail 16 times faster than the instrument, or delayed motors, have settled by then.
 _LATER, _WELL = 1.0 / 3.0, 0.05
 
 
@@ -192,25 +192,23 @@ _LATER, _WELL = 1.0 / 3.0, 0.05
 class Release:
     """One change of load."""
 
-    t: float  # When throttle had arrived, s, by the recording's clock
+    t: float  # Time when throttle stood still, s, clock of the recording
     # Levels, 0..1.
     throttle_before: float
     throttle_after: float
-    # Mean voltage at the end of the stay before and its standard error, V; NaN when the stay was
-    # too short.
+    # Mean voltage at the end of the stay before and its standard error, V; NaN if it was too
+    # short.
     level_before: float
     level_before_se: float
-    # Voltage U0 that it settles at, V.
+    # U0, the voltage after settling, V.
     level: float
     level_se: float
-    # A: how far from U0 it is when throttle has arrived, V; negative after a release.
+    # A, the deviation from U0 when throttle stands still, V; negative after a release.
     amplitude: float
     amplitude_se: float
-    # How far it goes beyond U0 to the other side, V: overshoot after a release, undershoot after a
-    # load.
-    beyond: float
-    beyond_p: float  # Probability that noise goes as far (a bound, over all changes of the kind)
-    duration: float  # Time watched, s
+    beyond: float  # Overshoot beyond U0 after a release, undershoot after a load, V
+    beyond_p: float  # Upper bound of its p-value, over all changes of the kind
+    duration: float  # Time fitted, s
     n: int  # Samples used
 
 
@@ -220,23 +218,17 @@ class Relaxation:
 
     kind: str  # ``release`` (throttle falls) or ``load`` (it rises)
     releases: tuple[Release, ...]  # Those fitted
-    # s, and 95 % interval; tau is NaN where the interval spans more than a factor of 10 either
-    # way, an open end is 0 or inf; all NaN when no relaxation is detected.
+    # s, with its 95 % interval.  tau is NaN if an end is more than a factor of 10 away; an open
+    # end is 0 or inf; all are NaN if no relaxation is detected.
     tau: float = NAN
     tau_low: float = NAN
     tau_high: float = NAN
-    # Mean square of the standardised innovations: 1 when one exponential in the level's noise
-    # describes it.
-    misfit: float = NAN
-    # Twice the gain of log likelihood over no relaxation at all; large without a tau when the
-    # voltage moves on over the whole time watched.
+    misfit: float = NAN  # Mean square of the standardised innovations; 1 if the model is right
+    # Twice the gain of log likelihood over no relaxation; large without a tau if the voltage keeps
+    # moving over the whole time.
     likelihood_gain: float = NAN
-    # Probability that further exponentials take as much out of the residuals where one is all
-    # there is; NaN when no relaxation is detected.
-    misfit_p: float = NAN
-    # Time after throttle arrived that the fit leaves out, s: one exponential describes only what
-    # follows.
-    left_out: float = 0.0
+    misfit_p: float = NAN  # p-value of further exponentials; NaN if no relaxation is detected
+    left_out: float = 0.0  # Time after the change that the fit leaves out, s
 
     @property
     def clear(self) -> tuple[Release, ...]:
@@ -246,19 +238,19 @@ class Relaxation:
 
     @property
     def badly_fitted(self) -> bool:
-        """Whether one exponential does not describe what relaxes."""
+        """Whether one exponential does not describe the relaxation."""
         return self.misfit_p < BADLY_FITTED
 
     @property
     def caveat(self) -> str:
-        """Return what to say next to tau when one exponential is not enough; else empty."""
+        """Return a caution about tau if one exponential is not enough; otherwise empty."""
         if not self.badly_fitted:
             return (f'The fit leaves out the first {1e3 * self.left_out:.2g} ms after the change '
                     'of throttle, which one exponential does not describe; a second exponential '
                     'nearly as slow would still bias tau.' if self.left_out > 0.0 else '')
         return (f'One exponential does not describe it ({p_words(self.misfit_p)}; mean square of '
-                f'the residuals {self.misfit:.2f} of what the noise has): do not rely on tau, on '
-                'its interval, or on what follows from them.')
+                f'the residuals {self.misfit:.2f} times that of the noise): do not rely on tau or '
+                'its interval.')
 
     @property
     def log_se(self) -> float:
@@ -281,7 +273,7 @@ class Relaxation:
 
     @property
     def moves_on(self) -> bool:
-        """Whether the voltage moves, and does not level off while watched."""
+        """Whether the voltage moves and does not settle in the time fitted."""
         return not (self.detected or self.bounded) and (
             self.likelihood_gain > _limit(len(self.releases)))
 
@@ -298,7 +290,7 @@ def fit_relaxation(recording: Recording, kind: str, steps: Sequence[LevelChange]
     if misfit_p < BADLY_FITTED:
         rest, once, p = _later(recording, steps, estimates, rms, _LATER * fit[0])
         _, twice, _ = _later(recording, steps, estimates, rms, 2.0 * _LATER * fit[0])
-        # Where more of it moves tau again, it is not the beginning alone that does not fit.
+        # If leaving out more changes tau again, the misfit is not limited to the beginning.
         if p > _WELL and len(rest) == len(used) and once[1] < twice[0] < once[2]:
             left_out, windows, fit, misfit_p = _LATER * fit[0], rest, once, p
     tau, low, high, scale, drop = fit
@@ -322,7 +314,7 @@ def fit_relaxation(recording: Recording, kind: str, steps: Sequence[LevelChange]
 
 def _watched(recording: Recording, steps: Sequence[LevelChange], estimates: Sequence[Estimate],
              rms: Sequence[float], later: float) -> tuple[list[LevelChange], list[Window]]:
-    """Return the changes with enough to watch from `later` s after throttle arrived."""
+    """Return the changes with enough samples from `later` s after throttle stands still."""
     used, windows = [], []
     for step in steps:
         begin = int(np.searchsorted(recording.t, recording.t[step.enter] + later))
@@ -338,7 +330,7 @@ def _watched(recording: Recording, steps: Sequence[LevelChange], estimates: Sequ
 def _later(recording: Recording, steps: Sequence[LevelChange], estimates: Sequence[Estimate],
            rms: Sequence[float], later: float
            ) -> tuple[list[Window], tuple[float, float, float, float, float], float]:
-    """Return windows that begin later, what `_profile` finds in them, and how well it fits."""
+    """Return windows that begin later, the result of `_profile`, and the p-value of a misfit."""
     _, windows = _watched(recording, steps, estimates, rms, later)
     if not windows:
         return [], (NAN, NAN, NAN, NAN, NAN), NAN
@@ -347,12 +339,12 @@ def _later(recording: Recording, steps: Sequence[LevelChange], estimates: Sequen
 
 
 def _limit(changes: int) -> float:
-    """Return the gain of likelihood that says something moves: chi^2 at `_CHANCE`."""
+    """Return the gain of likelihood needed to detect a relaxation: chi^2 at `_CHANCE`."""
     return float(stats.chi2.isf(_CHANCE, changes + 1))
 
 
 def _variance(estimate: Estimate, rms: float) -> float:
-    """Return the variance of the OU at a level, V^2; all of its variance where none is fitted."""
+    """Return the variance of the OU at a level, V^2; the whole variance without a fit."""
     return estimate.var_inf if estimate.usable else rms * rms if rms > 0.0 else 0.0
 
 
@@ -368,7 +360,7 @@ def _profile(windows: Sequence[Window]) -> tuple[float, float, float, float, flo
     drop = float((flat - np.min(total)) / scale) if scale > 0.0 else NAN
     if not drop > _limit(len(windows)):
         return NAN, NAN, NAN, scale, drop
-    # Where the drop is small, so that the fine grid holds minimum and interval.
+    # The fine grid covers the minimum and the interval.
     near = np.flatnonzero((total - np.min(total)) / scale < 16.0)
     a, b = max(0, near[0] - 1), min(grid.size - 1, near[-1] + 1)
     fine = np.geomspace(grid[a], grid[b], _FINE)
@@ -392,7 +384,7 @@ def _profile(windows: Sequence[Window]) -> tuple[float, float, float, float, flo
 
 
 def _misfit_p(windows: Sequence[Window], tau: float, scale: float) -> float:
-    """Return the probability that exponentials beside tau gain as much by chance; F test."""
+    """Return the p-value of further exponentials; F test."""
     if not math.isfinite(tau):
         return NAN
     gains = [window.more(tau) for window in windows]
@@ -414,7 +406,7 @@ def _vertex(x: FloatArray, y: FloatArray, k: int) -> float:
 
 
 def _crossing(x: FloatArray, fall: FloatArray) -> float:
-    """Return where the fall first reaches that of 95 %; NaN when it does not."""
+    """Return where the drop of the likelihood first reaches the 95 % limit; NaN if nowhere."""
     beyond = np.flatnonzero(fall > _HALF_95)
     if not beyond.size:
         return NAN
@@ -437,31 +429,31 @@ def _level_before(recording: Recording, step: LevelChange, estimate: Estimate, r
     return mean, math.sqrt(mean_variance(last - first, n, estimate, rms))
 
 
-# A level that is off by more than this share of the transient has settled elsewhere; by less
-# than the other, it has come back.
+# Minimum change of level, as a share of the transient, that excludes a high-pass, and maximum one
+# that is a return to the level before; minimum significance of both, standard errors.
 _ELSEWHERE, _BACK = 0.5, 0.25
 _SURE = 4.0
-# tau and 1/alpha nearer than this factor, with 95 %, are called the same.
+# Maximum factor, at 95 %, between tau and 1/alpha that agree.
 _CLOSE = 1.5
 
 
 @dataclass(frozen=True)
 class ReleaseCause:
-    """How tau compares with the noise, and whether the instrument explains it."""
+    """Comparison of tau with the noise, and with an AC-coupled instrument."""
 
     # ``agrees`` (tau alpha within a factor of 1.5 of 1 with 95 %), ``differs`` or
     # ``undetermined``.
     noise: str
-    # tau alpha, with alpha that of the noise, common to all levels, and its 95 % interval; that is
-    # NaN where one exponential does not describe the transient.
+    # tau times the common alpha of the noise, and its 95 % interval, which is NaN if one
+    # exponential does not describe the transient.
     ratio: float
     ratio_low: float
     ratio_high: float
-    p_value: float  # Of a ratio so far from 1
+    p_value: float  # p-value of a ratio of 1
     instrument: str  # ``excluded``, ``possible`` or ``undetermined``
     corner: float  # Of the high-pass that would explain it, 1/(2 pi tau), Hz
-    # Level after less level before in the direction of the transient, mean of the changes that
-    # have an amplitude, V; NaN when none has.
+    # Level after less level before, in the direction of the transient, V: mean of the changes with
+    # a significant amplitude; NaN without any.
     step: float
     step_se: float
     sentence: str  # Both verdicts in words
@@ -477,9 +469,9 @@ def judge_cause(relaxation: Relaxation, alpha: AlphaTest) -> ReleaseCause:
     corner = 1.0 / (2.0 * math.pi * relaxation.tau)
     of_noise = {
         'agrees': 'tau agrees with 1/alpha of the noise',
-        'differs': f'tau is not 1/alpha of the noise ({p_words(p)})',
-        'undetermined': 'the data neither separate tau from 1/alpha of the noise nor show '
-                        'them equal'}[noise]
+        'differs': f'tau differs from 1/alpha of the noise ({p_words(p)})',
+        'undetermined': 'the data show neither that tau differs from 1/alpha of the noise nor '
+                        'that they agree'}[noise]
     if math.isfinite(low):
         of_noise += f' (tau alpha = {ratio:.2f}, 95 % {low:.2f} to {high:.2f})'
     of_instrument = {
@@ -517,7 +509,7 @@ def _against_noise(relaxation: Relaxation, alpha: AlphaTest
     p = 2.0 * float(stats.norm.sf(abs(log) / se))
     reach = abs(log) + Z95 * se
     if relaxation.badly_fitted:
-        # The p-value and the interval rest on an error of tau that does not hold.
+        # The error of tau, and so p-value and interval, are not valid.
         return 'undetermined', math.exp(log), NAN, NAN, NAN
     word = 'differs' if p < LEVEL else 'agrees' if reach < math.log(_CLOSE) else 'undetermined'
     ratio = math.exp(log)
@@ -528,10 +520,11 @@ def _against_noise(relaxation: Relaxation, alpha: AlphaTest
 
 
 def _against_instrument(relaxation: Relaxation) -> tuple[str, float, float]:
-    """Return the verdict and the mean step of the level that stays, with its error."""
+    """Return the verdict and the mean lasting change of the level, with its error."""
     steps, errors, sizes = [], [], []
     for change in relaxation.releases:
-        if math.isfinite(change.level_before_se) and _tells(change):
+        if math.isfinite(change.level_before_se) and (
+                abs(change.amplitude) > _SURE * change.amplitude_se):
             # The transient starts on the side of the level before.
             steps.append(-math.copysign(1.0, change.amplitude)
                          * (change.level - change.level_before))
@@ -547,8 +540,3 @@ def _against_instrument(relaxation: Relaxation) -> tuple[str, float, float]:
     if abs(step) + Z95 * se < _BACK * size:
         return 'possible', step, se
     return 'undetermined', step, se
-
-
-def _tells(change: Release) -> bool:
-    """Whether a change has an amplitude to compare its level with."""
-    return abs(change.amplitude) > _SURE * change.amplitude_se

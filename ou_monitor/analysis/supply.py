@@ -1,8 +1,8 @@
 """
-What is known of a supply, once for all commands: `supply_facts`.
+The facts of a supply, the same for all commands: `supply_facts`.
 
-Sag, resistance and budget are those that the node has at the end of the recording.  Noise, alpha,
-sigma and Var_inf come from one regression of the voltage on level, throttle and current
+Sag, resistance and budget are those of the node at the end of the recording.  Noise, alpha, sigma
+and Var_inf come from one regression of the voltage on level, throttle and current
 (`ou_monitor.model.ou_fit`): noise is its residual; alpha, sigma and Var_inf are those of the
 shortest window at the end of the recording in which alpha is known within a factor of 1.5, else of
 the longest.
@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 import math
 from typing import Any
 
@@ -29,24 +29,24 @@ from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.online.risk.forecast import LOOK
 from ou_monitor.online.settings import MonitorSettings
-from ou_monitor.records import FloatArray, NAN, OuFacts, Recording
+from ou_monitor.records import FloatArray, NAN, OuFacts, plain_data, Recording
 from ou_monitor.timeline.line import ordered, readings_of
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 # Throttles at which sag and noise are given.
 THROTTLES = tuple(k / 10.0 for k in range(11))
-# Part, s, of a recording of which the noise is the residual of one regression.
+# Length of a part with its own regression, s.
 _PART = 60.0
-# Looks of the risk at a recording at most: 15 minutes of the node's.
+# Maximum evaluations of the risk: as many as the node makes in 15 minutes.
 _LOOKS = 900.0 / LOOK
-# Points along a recording at which the node is shown; at least every so many s, and at most so
-# often in all, it reports in between.
+# Number of reports of the node that are shown; maximum time between two reports, s, and maximum
+# number of reports in all.
 _POINTS, _STEP, _MOST = 300, 0.5, 1200
-# A current comes at most so much late or early, s.
+# Maximum delay of a current, either way, s.
 _LATE = 0.06
-# Throttle is steady while it spans at most this for so long, s.
+# Maximum range of a steady throttle, and the time over which it is taken, s.
 _STEADY, _STEADY_TIME = 0.02, 0.2
-# Half width of the band of throttle about each of THROTTLES; fewest readings in it.
+# Half width of the band of throttle about each of THROTTLES; minimum readings in it.
 _BAND, _IN_BAND = 0.05, 20
 
 
@@ -92,7 +92,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class Resistance:
-    """Resistance at once."""
+    """Instantaneous resistance."""
 
     ohm: float  # Ohm; NaN without a current that moves the voltage
     se_ohm: float  # Ohm
@@ -111,7 +111,7 @@ class Budget:
 @dataclass(frozen=True)
 class SupplyFacts:
     """
-    What is known of a supply; see `supply_facts`.
+    The facts of a supply; see `supply_facts`.
 
     Attributes
     ----------
@@ -124,7 +124,7 @@ class SupplyFacts:
     noise : Noise
         Noise over throttle.
     resistance : Resistance
-        Resistance at once, from the measured current.
+        Instantaneous resistance, from the measured current.
     ou : OuFacts
         Relaxation, or bounds of it.
     budget : Budget or None
@@ -149,21 +149,13 @@ class SupplyFacts:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the facts as strict JSON holds them: unknown numbers are None."""
-        found: dict[str, Any] = _plain(self)
+        found: dict[str, Any] = plain_data(self)
         return found
-
-
-def _plain(value: Any) -> Any:
-    if is_dataclass(value):
-        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
-    if isinstance(value, tuple):
-        return [_plain(one) for one in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def supply_facts(recording: Recording, limit: float | None = None) -> SupplyFacts:
     """
-    Return what is known of the supply of a recording.
+    Return the facts of the supply of a recording.
 
     Parameters
     ----------
@@ -197,10 +189,10 @@ def facts_and_end(recording: Recording, limit: float | None = None, left: Remain
                   monitor: SupplyMonitor | None = None,
                   ) -> tuple[SupplyFacts, SupplyLoad, MonitorReport | None]:
     """
-    Return the facts, and load and report of the node at the end; without a limit no report.
+    Return the facts, and load and report of the node at the end (no report without a limit).
 
-    limit in V; left: the recording's `remainder`, and monitor: `node_for` it that has taken the
-    recording; both found when left out.
+    limit in V; left: `remainder` of the recording; monitor: of `node_for`, fed with the recording;
+    both are computed if left out.
     """
     if limit is not None and not math.isfinite(limit):
         raise ValueError(f'the limit must be finite, got {limit} V')
@@ -236,7 +228,7 @@ def node_for(recording: Recording, settings: MonitorSettings,
     """
     Return a monitor, and an iterator that feeds it with a recording part by part.
 
-    After each part it says how far it is, s, and whether this is one of `_POINTS`.
+    After each part it yields the time, s, and whether this is one of `_POINTS`.
     """
     t, drawn, duration = recording.t, recording.current, recording.duration
     throttle = recording.throttle if recording.has_throttle else None
@@ -268,7 +260,7 @@ def _at_the_end(recording: Recording, limit: float | None, monitor: SupplyMonito
             load.push(recording.t, recording.voltage,
                       recording.throttle if recording.has_throttle else None, recording.current)
             return load.load(), None, None
-        # The fit of `window: auto` is none of the budget's.
+        # The budget does not depend on the fit of `window: auto`.
         monitor, parts = node_for(
             recording, MonitorSettings(window=SLIDING, brownout_voltage=limit))
         deque(parts, 0)
@@ -283,7 +275,7 @@ def _dips(t: FloatArray, v: FloatArray, u: FloatArray, limit: float, noise: Nois
     begins = dip_begins(v, limit, rise_that_ends(v, u, noise))
     if not begins.size:
         return Dips(limit, 0, 0.0, 0.0)
-    # Each reading stands for the time to the next, but not for a gap.
+    # Each reading counts for the time to the next, gaps excluded.
     spacing = np.diff(t)
     usual = float(np.median(spacing)) if spacing.size else 0.0
     held = np.where(v < limit, np.append(np.minimum(spacing, 10.0 * usual), usual), 0.0)
@@ -292,32 +284,32 @@ def _dips(t: FloatArray, v: FloatArray, u: FloatArray, limit: float, noise: Nois
 
 
 def rise_that_ends(v: FloatArray, u: FloatArray, noise: Noise) -> FloatArray:
-    """Return how far above a limit a dip ends, V, at each reading: ADC step or steady noise."""
+    """Return the hysteresis of a dip, V, at each reading: ADC step or steady noise."""
     steady = np.nan_to_num(np.interp(np.nan_to_num(u), THROTTLES, noise.steady_rms_v))
     return np.asarray(np.maximum(find_step(v), steady))
 
 
 def dip_begins(v: FloatArray, limit: float, rise: FloatArray) -> npt.NDArray[np.intp]:
-    """Return where dips begin: readings below a limit that come first, or after one above."""
+    """Return the indices at which dips below a limit begin."""
     below = v < limit
-    # Of the readings that decide, each one below after one above begins a dip.
+    # Of readings outside the hysteresis, each one below after one above begins a dip.
     decides = np.flatnonzero(below | (v > limit + rise))
     return np.asarray(decides[below[decides] & np.append(True, ~below[decides[:-1]])])
 
 
 @dataclass(frozen=True, eq=False)
 class Remainder:
-    """What level and load leave of the voltage of a recording, `_PART` by `_PART`."""
+    """The voltage of a recording without level and load, by regressions of parts."""
 
-    voltage: FloatArray  # V, by the regressions' degrees of freedom larger; NaN beside a gap
-    size: FloatArray  # of the noise beside its rms in the part
-    dt: float  # usual step, s
-    walk: float  # usual walk of the level, V per sqrt(s)
-    above: float = 0.0  # slower noise than this is the level's, Hz
+    voltage: FloatArray  # V, corrected for degrees of freedom; NaN near gaps
+    size: FloatArray  # size of the noise relative to its rms in the part
+    dt: float  # median step, s
+    walk: float  # median random walk of the level, V/sqrt(s)
+    above: float = 0.0  # lowest frequency that the level has not absorbed, Hz
 
 
 def remainder(recording: Recording) -> Remainder:
-    """Take level and load out of the voltage of a recording."""
+    """Subtract level and load from the voltage of a recording."""
     t, n = recording.t, recording.n
     left, size, steps, walks, above = np.full(n, NAN), np.ones(n), [], [], 0.0
     edges: list[int] = [] if not n else np.searchsorted(t, np.linspace(
@@ -362,7 +354,7 @@ def _still(t: FloatArray, u: FloatArray) -> npt.NDArray[np.bool_]:
     count = max(1, math.ceil(_STEADY_TIME / max(float(np.median(np.diff(t))), 1e-9)))
     if count + 1 >= t.size:
         return np.full(t.size, bool(np.ptp(held) <= _STEADY))
-    # Of the readings up to each.
+    # The window ends at each reading.
     behind = {'size': count + 1, 'origin': count // 2}
     span = maximum_filter1d(held, **behind) - minimum_filter1d(held, **behind)
     return np.asarray(span <= _STEADY)
@@ -370,7 +362,7 @@ def _still(t: FloatArray, u: FloatArray) -> npt.NDArray[np.bool_]:
 
 def _over_throttle(u: FloatArray, square: FloatArray, flown: tuple[float, float],
                    ) -> tuple[float, ...]:
-    """Return rms, V, at THROTTLES: between those flown by interpolation, beyond as at the edge."""
+    """Return rms, V, at THROTTLES: interpolated, and constant beyond the flown range."""
     at, rms = [], []
     for throttle in np.unique(np.clip(THROTTLES, *flown)):
         near = np.abs(u - throttle) <= _BAND

@@ -34,14 +34,13 @@ class WithoutOut(argparse.Action):
                 action.required = False
 
 
-# Maximum digits of a whole number: those of the largest of 64 bits.
+# Maximum digits of a whole number, within 64 bits.
 _DIGITS = 18
 
 
 def whole(what: str, low: int, high: float = math.inf, step: int = 1) -> Callable[[str], int]:
-    """Return a parser of whole numbers within a range and a multiple of a step; what: in words."""
+    """Return a parser of whole numbers in a range, multiples of a step; what: its wording."""
     def read(text: str) -> int:
-        # More digits than any number of these has.
         value = int(text) if text.isascii() and text.isdigit() and len(text) <= _DIGITS else -1
         if not low <= value <= high or value % step:
             raise argparse.ArgumentTypeError(f"'{printable(text, 60)}' is not {what}")
@@ -50,7 +49,7 @@ def whole(what: str, low: int, high: float = math.inf, step: int = 1) -> Callabl
 
 
 def number(what: str, fits: Callable[[float], bool]) -> Callable[[str], float]:
-    """Return a parser of numbers that fit; what: in words."""
+    """Return a parser of numbers for which `fits` is true; what: its wording."""
     def read(text: str) -> float:
         try:
             value = plain_number(text)
@@ -62,9 +61,9 @@ def number(what: str, fits: Callable[[float], bool]) -> Callable[[str], float]:
     return read
 
 
-# Divisors, because they are exact: 10u is 1e-5 to the last digit.
+# Divisors, because they are exact: 10u is exactly 1e-5.
 _PREFIX = {'': 1.0, 'p': 1e12, 'n': 1e9, 'u': 1e6, 'µ': 1e6, 'm': 1e3, 'k': 1e-3, 'M': 1e-6}
-# No component, time or level is as large; products of such numbers stay finite.
+# Upper limit of a quantity, with which products stay finite.
 _QUANTITY_MOST = 1e15
 _QUANTITY = re.compile(r'([+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?)\s*([pnuµmkM]?)'
                        r'(F|H|[Oo]hm|Ω|V|A|Hz|W|s|1/s)?', re.ASCII)
@@ -261,7 +260,7 @@ _ANALYZE = Command(
      'log.csv --voltage-column CH2 --throttle-unit us'))
 
 _COMPARE = Command(
-    'compare', 'a recording beside simulations of it: what the simulation gets wrong most',
+    'compare', 'a recording and simulations of it: the largest difference',
     'ou_monitor.cli.recorded:compare',
     'Simulate a recording many times under its own throttle, and compare: mean path, lowest '
     'voltage, falls through low levels, spectrum, response to throttle, distribution. '
@@ -283,7 +282,7 @@ _COMPARE = Command(
      'flight.mcap --model other_day.yaml'))
 
 _CONVERT = Command(
-    'convert', 'a log becomes an MCAP bag', 'ou_monitor.cli.convert',
+    'convert', 'convert a log to an MCAP bag', 'ou_monitor.cli.convert',
     'Convert a log to a bag with the topics /voltage, /throttle and /current (A, positive when '
     'the battery is drained), and of an autopilot /imu and, from eRPM or ESCs, /motor_speed. '
     'Stamps count from the start of the log, in seconds; a CSV '
@@ -410,7 +409,7 @@ _FLEET = Command(
             help="finds the vehicle in a recording's path (its first group) if the metadata "
             'name none (default: its folder)'),
      Option('--discover', action='store_true',
-            help='also look for causes; takes some seconds per recording (default: off)'),
+            help='also search for causes; takes a few seconds per recording (default: off)'),
      seed(0, 'of discover'), levels('found in each recording'),
      *estimate('count dips below this voltage, V, and give their risk'), *TOPICS, JSON,
      FORCE),
@@ -442,8 +441,8 @@ _REPRODUCE = Command(
 
 _SIMULATE = Command(
     'simulate', 'a recording from a model', 'ou_monitor.cli.simulate',
-    'Draw a recording from a model of a supply, exact in law at any rate. --list shows the '
-    'presets and the throttle profiles.',
+    'Simulate a recording from a model of a supply, exactly distributed at any rate. --list shows '
+    'the presets and the throttle profiles.',
     ((Option('--preset', metavar='NAME',
              help="preset to simulate (default 'flight'; --list shows all)"),
       Option('--model', metavar='FILE.yaml', type=path_argument,

@@ -1,7 +1,7 @@
 """
-What commands write: tables and progress for people, JSON and files for programs.
+Output of commands: text and progress on the terminal, JSON and other files.
 
-Progress is a bar on a terminal, and an occasional line elsewhere.
+Progress is a bar on a terminal, and a line every minute elsewhere.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Progress:
         self._live = sys.stderr.isatty()
         self._drawn = 0.0
         self._told = time.monotonic()
-        # Time and value of the first share: results of an earlier run took no time.
+        # Time and value of the first share, which may include results of an earlier run.
         self._first: tuple[float, float] | None = None
 
     def __call__(self, share: float) -> None:
@@ -113,12 +113,12 @@ _NO_BAG = ('.bag', '.bbl', '.bfl', '.bin', '.csv', '.db3', '.json', '.log', '.tx
 
 
 def write_json(data: Mapping[str, Any], target: str, force: bool = False) -> None:
-    """Write strict JSON; with `force` over a file that is there."""
+    """Write strict JSON; `force` overwrites."""
     # Imported here, so that `--help` needs no NumPy.
-    from ou_monitor.report.result import plain
+    from ou_monitor.records import plain_data
 
     # ASCII suits every encoding of standard output, and file names that are not valid text.
-    text = json.dumps(plain(data), indent=2, allow_nan=False)
+    text = json.dumps(plain_data(data), indent=2, allow_nan=False)
     if target == STDOUT:
         say(text)
     else:
@@ -146,7 +146,7 @@ def abandon_stdout() -> None:
 
 
 def write_text(text: str, target: str | Path, force: bool = False) -> None:
-    """Write a text file in UTF-8; with `force` over a file that is there."""
+    """Write a text file in UTF-8; `force` overwrites."""
     from ou_monitor.stream.files import write_whole
 
     # A file name may hold bytes that are not valid text.
@@ -218,7 +218,7 @@ def check_bag(name: str, bag: Path, force: bool) -> None:
 
 @contextmanager
 def replacing(bag: Path | None, force: bool) -> Iterator[None]:
-    """Move an existing bag aside while a new one is written; restore it if that fails."""
+    """Move an existing bag aside while a new one is written; restore it after an error."""
     if bag is None or not (bag.exists() or bag.is_symlink()):
         yield
         return

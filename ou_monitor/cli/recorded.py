@@ -68,7 +68,7 @@ def discover(args: argparse.Namespace) -> int:
         # Last, so that a refused model does not stop the other files from being written.
         if finding.refused and not args.force:
             raise InputError(f'no model saved: {finding.refused[0].lower()}{finding.refused[1:]}; '
-                             '--force saves it all the same')
+                             '--force saves it anyway')
         output.write_text(model_text(finding.record, recording), args.save_model, args.force)
     return 0
 

@@ -1,8 +1,8 @@
 """
-A recording beside simulations of it over its own throttle.
+Compare a recording with simulations over its own throttle.
 
-Limits first: the model fitted here is told throttle, or current, alone; the bands hold the errors
-of its parameters as parts left out of the fit showed them, no change of the craft after that.
+Limits: the input of the fitted model is throttle or current only; the bands include errors of its
+parameters, estimated from held-out parts, but no later change of the craft.
 """
 
 from __future__ import annotations
@@ -23,11 +23,12 @@ from ou_monitor.model.supply import SupplyModel
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.text import counted, number
 
-# Readings that a part needs, and seconds; simulations for a verdict at 5 %.
+# Minimum readings of a part, and its minimum duration, s; minimum simulations for a verdict at 5
+# %, and maximum.
 _LEAST, _SHORTEST, _FEWEST_SEEDS, _MOST_SEEDS = 50, 0.2, 20, 10_000
-# Points of the band that a page draws, at most.
+# Maximum points of the band on a page.
 _POINTS = 2000
-# Seconds whose level a model from a file takes from the recording.
+# Time at the begin by which a model from a file is aligned with the recording, s.
 _ALIGNED = 2.0
 
 
@@ -38,7 +39,7 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
     """
     Compare a recording with simulations of it: see `ou_monitor.compare`.
 
-    levels: voltages, V, whose crossings are counted beside two that are found.
+    levels: voltages, V, at which falls are counted, in addition to two low ones.
     """
     report = progress or (lambda share: None)
     if not _FEWEST_SEEDS <= seeds <= _MOST_SEEDS:
@@ -55,7 +56,7 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
         _check_throttle(model, samples)
         drawn = FiledModel(model)
         notes.append('The errors of the parameters in the model file are not simulated: the '
-                     'bands hold the noise alone.')
+                     'bands include only the noise.')
     part = slice(begin, samples.t.size)
     own = samples.part(part)
     lsb = samples.lsb
@@ -71,9 +72,9 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
     for k in range(seeds):
         v = drawn.draw(samples, rng)[part]
         if not np.isfinite(v).all():
-            raise InputError('the model runs away over this throttle: its voltage is not finite')
+            raise InputError('the model diverges over this throttle: its voltage is not finite')
         if aligned is not None:
-            # Each by itself: the bands then hold what the first seconds do not tell of the level.
+            # Aligned one by one, so that the bands include the error of the level.
             shifts[k] = (own.voltage[aligned] - v[aligned]).mean()
             v = v + shifts[k]
         total += v
@@ -84,9 +85,9 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
         traces[k] = v[::stride]
         report(0.6 + 0.4 * (k + 1.0) / seeds if model is None else (k + 1.0) / seeds)
     if aligned is not None:
-        notes.append(f'The level of the model is moved by {number(float(shifts.mean()), 3)} V (+- '
-                     f'{number(float(shifts.std()), 2)} V), each simulation so that its first '
-                     f'{_ALIGNED:g} s are those of the recording.')
+        notes.append(f'The level of the model was moved by {number(float(shifts.mean()), 3)} V '
+                     f'(+- {number(float(shifts.std()), 2)} V), so that the mean of the first '
+                     f'{_ALIGNED:g} s of each simulation equals the recording.')
     if strays:
         notes.append(f'{strays} of {seeds} simulations leave the range of the recording by more '
                      'than half of it.')
@@ -97,7 +98,7 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
 
 
 def _samples(recording: Recording, notes: list[str]) -> tuple[Readings, float]:
-    """Return each reading once, from 0 s on, and the stamp of the first, s."""
+    """Return the readings without repeats, from 0 s on, and the stamp of the first, s."""
     t, v, u = usable(recording, notes)
     if v.size < 2 * _LEAST:
         raise InputError(f"'{recording.name}' holds {counted(v.size, 'usable sample')}; a "
@@ -126,8 +127,8 @@ def _begin(samples: Readings, fit_until: float | None, fitted: bool) -> int:
             ('fitted', begin, until), ('simulated', samples.t.size - begin, duration - until)):
         if (what == 'simulated' or fitted) and (n < _LEAST or not seconds > _SHORTEST):
             raise InputError(
-                f'the part that is {what} holds {counted(n, "reading")} in {number(seconds, 3)} '
-                f's; it needs {_LEAST} in more than {_SHORTEST:g} s')
+                f'the part to be {what} has {counted(n, "reading")} in {number(seconds, 3)} s; it '
+                f'needs {_LEAST} in more than {_SHORTEST:g} s')
     return begin
 
 
@@ -139,7 +140,7 @@ def _fit_notes(model: FlightModel, samples: Readings) -> list[str]:
                          'is simulated.' if samples.throttle is not None else
                          'Current is the load that is simulated.')
         if math.isfinite(model.load.model.stands):
-            found.append('No discharge is seen: the level stands.')
+            found.append('No discharge is visible, so the level is constant.')
         return found
     if samples.current is None and samples.throttle is None:
         return ['Throttle is not recorded: only level and noise are simulated.']
@@ -158,7 +159,7 @@ def _check_throttle(model: SupplyModel, samples: Readings) -> None:
 
 
 def _first(own: Readings) -> slice:
-    """Return the samples that tell the level: the first seconds, and at least ten."""
+    """Return the samples used for alignment: the first seconds, and at least ten."""
     return slice(0, max(10, int(np.searchsorted(own.t, own.t[0] + _ALIGNED, side='right'))))
 
 

@@ -1,9 +1,9 @@
 """
-A model in the terms of another simulator, and what that simulator cannot express.
+Export a model to another simulator, and report what that simulator cannot express.
 
-What each of them can express is read from its sources (`SOURCES`): PX4 a straight fall from full
-to empty, Gazebo the same less the sag of a constant load, ArduPilot a charge curve less a current
-times a resistance.  None has noise, lags, an inrush or an ADC.
+According to their sources (`SOURCES`), PX4 has a linear discharge from full to empty, Gazebo also
+the sag of a constant load, and ArduPilot a charge curve less current times resistance.  None has
+noise, lags, an inrush or an ADC.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ou_monitor.model.terms.slow import Drift
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.simulation import RunningSupply
 
-# Where the names and the equations are from: repository, file, commit.
+# Sources of names and equations: repository, file, commit.
 SOURCES = {
     'px4': ('PX4/PX4-Autopilot src/modules/simulation/battery_simulator/BatterySimulator.cpp '
             '1295561, battery_simulator_params.yaml 3debe5b, src/lib/battery/module.yaml 042778a'),
@@ -32,7 +32,7 @@ SOURCES = {
                   'SIM_Frame.h 07b1fa1, libraries/AP_BattMonitor/AP_BattMonitor_Params.cpp '
                   '000ecd1'),
 }
-# Terms of which a target keeps something.
+# Terms that a target can express, at least in part.
 _KEPT = {'px4': ('drift',), 'gazebo': ('drift', 'load_sag'), 'ardupilot': ('drift', 'load_sag')}
 # Voltages of a cell that counts as empty, and as critical, V.
 _EMPTY, _CRITICAL = 3.5, 3.3
@@ -177,7 +177,7 @@ _WRITERS: dict[str, Callable[[_Numbers, float], str]] = {
 
 
 def _lost(model: SupplyModel, target: str, throttle: FloatArray, rate: float) -> list[str]:
-    """Return a line for each term that is left out: how much it moves the simulated voltage."""
+    """Return a line for each term that is left out, with its effect on the simulated voltage."""
     whole = _drawn(model, throttle, rate)
     notes = []
     for k, term in enumerate(model.terms):
@@ -185,7 +185,7 @@ def _lost(model: SupplyModel, target: str, throttle: FloatArray, rate: float) ->
             continue
         rest = (replace(model.ou, sigma=0.0), *model.terms[1:]) if k == 0 else (
             *model.terms[:k], *model.terms[k + 1:])
-        # A term's draws do not depend on the others: the difference is what it does.
+        # The draws of a term do not depend on the others, so the difference is its effect.
         moved = whole - _drawn(SupplyModel(rest, model.load), throttle, rate)
         notes.append(f'{term.NAME} is left out: {1e3 * float(np.std(moved)):.3g} mV rms, up to '
                      f'{1e3 * float(np.abs(moved).max()):.3g} mV')
@@ -197,7 +197,7 @@ def _drawn(model: SupplyModel, throttle: FloatArray, rate: float) -> FloatArray:
 
 
 def _cost(model: SupplyModel, left: SupplyModel, recording: Recording) -> list[str]:
-    """Return what the model and what is left of it say of a recording."""
+    """Compare the model, and its exported part, with a recording."""
     notes = []
     for words, one in (('the model', model), ('what is exported', left)):
         found = compare(recording, one, seeds=_SEEDS).as_data()

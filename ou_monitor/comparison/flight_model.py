@@ -1,12 +1,12 @@
 """
-A model of one flight, fitted to a part of it, that can be drawn over any throttle.
+A model of one flight, fitted to a part of it, that can be simulated over any throttle.
 
-Fitted first is the load where it predicts, then what it leaves: an OU beside white noise, whose
-size follows the load and its changes (`model.ou_fit`).
+First the load is fitted, if it improves predictions, then the residual: an OU in white noise,
+whose size follows the load and its changes (`model.ou_fit`).
 
-Limits: four parts are left out one after the other, so a flight that changes for good after
-the part fitted is not foreseen; what has memory is one OU, whatever made it, which changes its
-size with the white noise; readings of the part fitted count as evenly spaced.
+Limits: errors come from four held-out parts, so a lasting change after the fitted part is not
+covered; all correlated noise is one OU, whose size follows the load like the white noise; readings
+are taken as evenly spaced.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from scipy.signal import lfilter
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """What a comparison is about: each reading of the ADC once."""
+    """The readings of a recording, without repeats."""
 
     # Stamps, s, and readings, V; shape (n,).
     t: FloatArray
     voltage: FloatArray
-    # 0..1, and A; None where not recorded; shape (n,).
+    # 0..1, and A; None if not recorded; shape (n,).
     throttle: FloatArray | None
     current: FloatArray | None = None
 
@@ -51,17 +51,17 @@ class Readings:
 
     @property
     def spacing(self) -> float:
-        """Return the usual time from one sample to the next, s."""
+        """Return the median step, s."""
         return float(np.median(np.diff(self.t)))
 
     @property
     def lsb(self) -> float:
-        """Return the step of the ADC, V; 0 where none is seen."""
+        """Return the step of the ADC, V; 0 if none is found."""
         return find_step(self.voltage)
 
 
 class Drawn(Protocol):
-    """What can be simulated over the stamps, throttle and current of a recording."""
+    """A model that can be simulated over the stamps, throttle and current of a recording."""
 
     @property
     def names(self) -> list[str]:
@@ -69,7 +69,7 @@ class Drawn(Protocol):
 
     @property
     def alone(self) -> bool:
-        """Return whether it tells its own level, so that none is taken from the recording."""
+        """Return whether its level is valid, so that it needs no alignment with the recording."""
 
     def draw(self, samples: Readings, rng: np.random.Generator) -> FloatArray:
         """Return one simulated voltage, V, before the ADC."""
@@ -78,14 +78,15 @@ class Drawn(Protocol):
 @dataclass(frozen=True)
 class Damping:
     """
-    How much of the fast changes of a path the voltage does not follow.
+    The share of fast changes of a path that the voltage does not follow.
 
-    Throttle jitters, arrives at other moments than the voltage, and is no current: what is fast in
-    the path is partly not in the voltage, and would be counted twice, in the path and as noise.
+    Throttle jitters, is not synchronous with the voltage, and is not a current.  So the voltage
+    follows fast changes only in part, and without damping they would count twice, as path and as
+    noise.
     """
 
     share: float = 0.0  # Share of the fast part that is missing, 0..1
-    time: float = 0.02  # What is faster than this time constant, s
+    time: float = 0.02  # Time constant below which changes are fast, s
 
     def of(self, path: FloatArray, t: FloatArray) -> FloatArray:
         """Return a path, V, at stamps, s, damped."""
@@ -94,42 +95,40 @@ class Damping:
         return np.asarray(path - self.share * (path - lowpass(path, t, self.time)))
 
 
-# Errors are drawn from those whose size is alike: this share of all to either side, and at least
-# so many; sizes that differ by rounding are the same.
+# Errors are drawn from errors of similar size: this share of all on either side, and a minimum
+# number; tolerance for sizes that are equal.
 _ALIKE, _FEWEST, _ROUNDING = 0.02, 50, 1e-9
-# White noise has at least this share of the variance: the filter needs some.
+# Minimum share of white noise in the variance, which the filter needs.
 _LEAST_WHITE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class FlightNoise:
-    """An OU beside white noise: independent errors of one size law, coloured by a filter."""
+    """An OU in white noise, as independent errors coloured by a filter."""
 
     sizes: NoiseSize  # Size of the errors over the load and its changes
-    logs: FloatArray  # ln of the size, V, at the readings of the fit, rising; shape (n,)
-    # Errors there, V: the shape of their law, tails included; shape (n,).
-    errors: FloatArray
-    # Autoregressive and moving-average coefficient of the filter; 0 where no OU is visible.
+    logs: FloatArray  # ln of the size, V, at the readings of the fit, increasing; shape (n,)
+    errors: FloatArray  # Errors there, V, from which errors are drawn; shape (n,)
+    # Autoregressive and moving-average coefficient of the filter; 0 if no OU is visible.
     phi: float
     theta: float
-    spacing: float  # From one reading to the next, s
+    spacing: float  # Step between readings, s
 
     def draw(self, n: int, load: FloatArray | None, rng: np.random.Generator) -> FloatArray:
         """Return n samples of noise, V, under that throttle or current."""
         wanted = np.log(self.sizes.of(load_signs(n, self.spacing, load)))
-        # Any of those that are as large, and its neighbours: as many at the ends as between.
-        # By rounding the same size comes out in two ways.
+        # Any error of the same size (within rounding) and its neighbours; near the ends, as many.
         first = np.searchsorted(self.logs, wanted - _ROUNDING, side='left')
         last = np.searchsorted(self.logs, wanted + _ROUNDING, side='right')
         at = first + (rng.random(wanted.size) * (last - first)).astype(np.int64)
         most = self.errors.size - 1
         reach = min(max(_FEWEST, int(_ALIKE * self.errors.size)), most // 2)
         near = np.clip(at, reach, most - reach) + rng.integers(-reach, reach + 1, at.size)
-        # As they were, not scaled: an outlier in a calm does not become a larger one in a storm.
+        # Not scaled, so that an outlier at low noise does not become a larger one at high noise.
         return np.asarray(lfilter([1.0, -self.theta], [1.0, -self.phi], self.errors[near]))
 
     def mean_error(self, duration: float) -> float:
-        """Return the standard error of a mean over that time, s, in V."""
+        """Return the standard error of a mean over a duration, s, in V."""
         variance = float(np.mean(self.errors ** 2)) * self.spacing / duration
         return (1.0 - self.theta) / (1.0 - self.phi) * math.sqrt(variance)
 
@@ -137,9 +136,9 @@ class FlightNoise:
 def fit_noise(samples: Readings, left: FloatArray, load: FloatArray | None, slow: float
               ) -> FlightNoise:
     """
-    Fit the noise to what is left of readings, V, under that throttle or current.
+    Fit the noise to residuals, V, under a throttle or current.
 
-    slow: variance, V^2, of the process of `SLOW_TIME` that is in it as well, and not in the noise.
+    slow: variance, V^2, of the process of `SLOW_TIME` that they also contain.
     """
     dt, lsb = samples.spacing, samples.lsb
     left = left - left.mean()
@@ -150,7 +149,7 @@ def fit_noise(samples: Readings, left: FloatArray, load: FloatArray | None, slow
                 _LEAST_WHITE * float(left @ left) / left.size, 1e-18)
     errors, predicted = _predicted(
         left, dt, white, {alpha: variance, 1.0 / SLOW_TIME: slow})
-    # What the readings add by rounding is simulated by itself.
+    # Rounding by the ADC is simulated separately.
     own, phi, theta = max(white - lsb * lsb / 12.0, _LEAST_WHITE * white), 0.0, 0.0
     if variance > 0.0:
         phi = math.exp(-alpha * dt)
@@ -170,7 +169,7 @@ def fit_noise(samples: Readings, left: FloatArray, load: FloatArray | None, slow
 def _predicted(x: FloatArray, dt: float, white: float, parts: dict[float, float]
                ) -> tuple[FloatArray, float]:
     """
-    Return the errors of predicting each reading from those before, V, and their variance, V^2.
+    Return the one-step prediction errors of readings, V, and their variance, V^2.
 
     x in V, spacing dt in s, white in V^2; parts: variances of OUs, V^2, by rates, 1/s.
     """
@@ -178,7 +177,7 @@ def _predicted(x: FloatArray, dt: float, white: float, parts: dict[float, float]
     if not rates.size:
         return x, white
     variances = np.array([parts[rate] for rate in rates])
-    # Until then the gain has settled.
+    # The gain is constant after that.
     n = min(x.size, max(3, math.ceil(SLOW_TIME / dt)))
     keep = np.exp(-rates * dt)
     f, q = (np.tile(np.diag(row), (n, 1, 1)) for row in (keep, variances * (1.0 - keep ** 2)))
@@ -191,17 +190,15 @@ def _predicted(x: FloatArray, dt: float, white: float, parts: dict[float, float]
 class FlightModel:
     """Load model, slow process, OU and white noise, as fitted to a part of a recording."""
 
-    load: LoadFit | None  # The answer to the load; None where the level is all there is
+    load: LoadFit | None  # The response to the load; None if there is only a level
     # Level, V, without a load model, and its standard error.
     level: float
     level_se: float
-    damping: Damping  # Of its path
-    # Factor on the variance of the slow process: how much farther parts that were left out lay
-    # from their prediction than the fit says.
-    spread: float
-    sag_error: float  # Relative error of the sag, as parts that were left out show it
-    noise: FlightNoise  # What else the load leaves
-    until: float  # End of the part fitted, s
+    damping: Damping  # Damping of its path
+    spread: float  # Factor on the variance of the slow process, from held-out parts
+    sag_error: float  # Relative error of the sag, from held-out parts
+    noise: FlightNoise  # The residual
+    until: float  # End of the fitted part, s
 
     @property
     def names(self) -> list[str]:
@@ -215,7 +212,7 @@ class FlightModel:
 
     @property
     def alone(self) -> bool:
-        """Return that it tells its own level."""
+        """Return that its level is valid."""
         return True
 
     def path(self, samples: Readings) -> FloatArray:
@@ -237,7 +234,7 @@ class FlightModel:
             size = load.size * math.exp(self.sag_error * float(rng.standard_normal()))
             other = replace(load, size=size).path(
                 samples.t, samples.throttle, samples.current)
-            # Over the part fitted the mean is known: a larger sag goes with a higher level.
+            # The mean over the fitted part is known, so a larger sag goes with a higher level.
             path = other - float((other - path)[samples.t <= self.until].mean())
             voltage = self.damping.of(path, samples.t)
             slow = self.spread * self.load.slow_std ** 2
@@ -255,7 +252,7 @@ def _simulated_load(fit: LoadFit | None, samples: Readings) -> FloatArray | None
 
 @dataclass(frozen=True, eq=False)
 class FiledModel:
-    """A model from a file, drawn at each reading of the ADC, so that none is held twice."""
+    """A model from a file; it is simulated at the readings only, without held samples."""
 
     model: SupplyModel  # As in the file
 
@@ -266,7 +263,7 @@ class FiledModel:
 
     @property
     def alone(self) -> bool:
-        """Return that its level is that of another day."""
+        """Return that its level is of another flight."""
         return False
 
     def draw(self, samples: Readings, rng: np.random.Generator) -> FloatArray:
@@ -277,22 +274,22 @@ class FiledModel:
         return analogue.simulate(samples.t, rng, samples.throttle)
 
 
-# Parts of what is fitted that are left out in turn.
+# Number of parts that are held out in turn.
 _PARTS = 4
-# Throttle that moves less than this says nothing.
+# Minimum range of a throttle that is used.
 MOVES = 0.01
-# Log evidence, nat, below which the simpler of two loads is taken: odds of less than e to 1.
+# Minimum log evidence, nats, for the more complex of two loads: odds of e to 1.
 _CLEAR = 1.0
-# Readings that a fit of the load looks at: means of neighbours beyond it.
+# Maximum readings in a fit of the load; more are averaged.
 _MOST = 40_000
-# Time constants below which changes of the path may be damped, s.
+# Time constants tried for the damping, s.
 _FAST = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64)
-# Models drawn for the error of a mean.
+# Number of models drawn for the error of a mean.
 _DRAWN = 16
 
 
 def fit_flight(samples: Readings, progress: Callable[[float], None] | None = None) -> FlightModel:
-    """Fit a model to samples: at least 100, over more than some seconds."""
+    """Fit a model to samples: at least 100, over several seconds."""
     report = progress or (lambda share: None)
     mean = float(samples.voltage.mean())
     best = _best(samples, lambda share: report(0.4 * share))
@@ -321,7 +318,7 @@ def fit_flight(samples: Readings, progress: Callable[[float], None] | None = Non
 
 @dataclass(frozen=True, eq=False)
 class _Load:
-    """A load, its fit, and the fits without each part with their errors there, V."""
+    """A load, its fit, and for each part the fit without it and its errors there, V."""
 
     fit: LoadFit
     current: FloatArray | None
@@ -330,10 +327,10 @@ class _Load:
 
 
 def _best(samples: Readings, report: Callable[[float], None]) -> _Load | None:
-    """Return the load, and the law of its level, with most evidence; None: no load has any."""
+    """Return the load and kind of level with most evidence; None if no load has any."""
     found: _Load | None = None
     most = level_evidence(samples.t, samples.voltage)
-    # The simpler ones first: throttle before current, a level that stands before a pack's.
+    # The simpler ones first: throttle before current, a constant level before a discharge.
     tried = [(current, stands) for current in _loads(samples) for stands in (True, False)]
     for k, (current, stands) in enumerate(tried):
         fit = _fit(samples, current, stands)
@@ -360,7 +357,7 @@ def _parts(samples: Readings) -> list[slice]:
 
 def _fit(samples: Readings, current: FloatArray | None, stands: bool,
          without: slice | None = None, near: LoadFit | None = None) -> LoadFit:
-    """Fit the load, to means of neighbours where there are very many."""
+    """Fit the load, to means of neighbours if there are very many samples."""
     width = -(-samples.t.size // _MOST)
     n = samples.t.size // width * width
 
@@ -380,7 +377,7 @@ def _path(samples: Readings, fit: LoadFit, current: FloatArray | None) -> FloatA
 
 
 def damping(samples: Readings, path: FloatArray) -> Damping:
-    """Return what is missing of the fast changes of the path, V, by least squares."""
+    """Return the damping of a path, V, by least squares."""
     left = samples.voltage - path
     best, most = Damping(), 0.0
     for time in _FAST:
@@ -395,10 +392,10 @@ def damping(samples: Readings, path: FloatArray) -> Damping:
 
 def _sag_error(samples: Readings, load: _Load) -> float:
     """
-    Return the relative error of the sag over a stretch as long as two of the parts.
+    Return the relative error of the sag over a time as long as two parts.
 
-    In each part left out, the voltage is so many times the predicted path; parts that move more
-    count more.  Warmth, wind and what a motor law leaves out change it from part to part.
+    In each held-out part, the voltage is regressed on the predicted path; parts that move more
+    have more weight.  Temperature, wind and simplifications of the load model change the ratio.
     """
     squares, weights = [], []
     for (fit, errors), part in zip(load.parts, _parts(samples)):
@@ -410,13 +407,13 @@ def _sag_error(samples: Readings, load: _Load) -> float:
 
 
 def _spread(samples: Readings, load: _Load) -> float:
-    """Return how much larger the variance of slow errors is than the fit says."""
+    """Return the factor by which the variance of slow errors exceeds the fit."""
     rng = np.random.default_rng(0)
     ratios = []
     for (fit, errors), part in zip(load.parts, _parts(samples)):
         means = [fit.draw(rng).path(samples.t, samples.throttle, load.current)[part].mean()
                  for _ in range(_DRAWN)]
-        # The mean of an OU over so many relaxation times.
+        # Variance of the mean of an OU over this number of relaxation times.
         times = float(samples.t[part.stop - 1] - samples.t[part.start]) / SLOW_TIME
         slow = fit.slow_std ** 2 * 2.0 / times * (1.0 + math.expm1(-times) / times)
         ratios.append((float(errors.mean()) ** 2 - float(np.var(means, ddof=1))) / slow)

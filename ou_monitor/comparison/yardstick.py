@@ -1,13 +1,13 @@
 """
-What a simulation gets right and wrong of a recording: measures, records, verdict.
+Compare a recording with simulations of it: measures, records, verdict.
 
-Levels lie half-way between two codes of the ADC, so that no reading is on them.  A fall is a dip
-as `supply_facts` counts them: a run, however its noise crosses the level.
+Levels lie halfway between two codes of the ADC, so that no reading is on them.  Falls through a
+level are dips as in `supply_facts`, with hysteresis.
 
-Each number of the recording is scored by its distance from the median of the simulations, in
-half-widths of their 95 % band; a band is never narrower than what a pilot would not notice.  The
-largest score, weighted, is compared with those of the simulations among themselves: so one in
-twenty recordings that are just as simulated is said to differ.
+The score of a number is its distance from the median of the simulations, in half-widths of their
+95 % band; the half-width is at least a difference that a pilot would not notice.  The largest
+weighted score is compared with the scores of the simulations, so of recordings that follow the
+model, one in twenty is reported to differ.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from scipy.signal import welch
 
 
 class Likeness(enum.Enum):
-    """Whether the recording could be one of its simulations; the value is said to people."""
+    """Whether the recording could be one of its simulations; the value is its wording."""
 
     LOOKS_LIKE_IT = 'The simulation looks like the recording'
     DIFFERS = 'The simulation differs from the recording'
@@ -36,10 +36,10 @@ class Likeness(enum.Enum):
 
 @dataclass(frozen=True)
 class Band:
-    """A number of the recording beside those of the simulations."""
+    """A number of the recording, and its distribution over the simulations."""
 
-    measured: float  # Of the recording
-    # 2.5 %, 50 % and 97.5 % of the simulations.
+    measured: float  # In the recording
+    # 2.5 %, 50 % and 97.5 % quantiles of the simulations.
     low: float
     median: float
     high: float
@@ -67,23 +67,23 @@ class SpectrumBand:
 
 @dataclass(frozen=True, eq=False)
 class Traces:
-    """What a page draws: the part compared, and simulations of it."""
+    """Curves for a page: the part compared, and simulations of it."""
 
-    # The recording, s, V, 0..1 (NaN: not recorded).
+    # The recording: stamps, s, voltage, V, and throttle, 0..1 (NaN: not recorded).
     t: FloatArray
     voltage: FloatArray
     throttle: FloatArray
     simulated: FloatArray  # One simulation, V
-    # Stamps, s, and 95 % of the simulations there, V.
+    # Stamps, s, and the 95 % band of the simulations, V.
     at: FloatArray
     low: FloatArray
     high: FloatArray
-    # Seconds about a rise of throttle, and the mean answer to it, V.
+    # Time after a rise of throttle, s, and the mean response to it, V.
     after: FloatArray
     answer: FloatArray
     answer_low: FloatArray
     answer_high: FloatArray
-    # Voltages, V, and the share of the samples below.
+    # Voltages, V, and the share of the samples below each.
     edges: FloatArray
     distribution: FloatArray
     simulated_distribution: FloatArray
@@ -93,43 +93,43 @@ class Traces:
 class Agreement:
     """A recording beside its simulations."""
 
-    recording: str  # Its name
-    # Parts, s after the first sample; (0, 0) where nothing was fitted.
+    recording: str  # Name
+    # Time ranges, s after the first sample; (0, 0) if nothing was fitted.
     fitted: tuple[float, float]
     simulated: tuple[float, float]
     model: tuple[str, ...]  # Names of the terms
-    # Of the mean path: share of the variance explained, V, V.
+    # Mean path: share of the variance explained, rms error and bias, V.
     explained: float
     rmse: float
     bias: float
     bias_by_third: tuple[float, float, float]  # V
-    # Least and mean voltage, V.
+    # Lowest and mean voltage, V.
     lowest: Band
     mean: Band
     levels: tuple[float, ...]  # Levels, V
-    falls: tuple[Band, ...]  # Dips below each per minute, as runs
+    falls: tuple[Band, ...]  # Dips below each per minute
     spectrum: tuple[SpectrumBand, ...]  # By band of frequency
-    # Deepest point of the mean answer to rises of throttle, and its value 1 s after, V.
+    # Deepest point of the mean response to rises of throttle, and its value 1 s after, V.
     dip: Band | None
     recovery: Band | None
     rises: int  # Rises of throttle
     ks_distance: float  # Largest difference of the two distributions
     seeds: int  # Simulations
-    p_value: float  # Share of the simulations that are as odd among the others
-    verdict: Likeness  # The verdict
-    words: str  # What the simulation gets wrong most, as a part of a sentence
+    p_value: float  # Share of simulations, recording included, with a score as large
+    verdict: Likeness
+    words: str  # The largest difference, as a part of a sentence
     farthest: str  # Kind of that difference: lowest, falls, level, answer, spectrum, ks or path
     notes: tuple[str, ...]  # What was left out or assumed
     traces: Traces  # For a page
 
     @property
     def worst(self) -> str:
-        """Return the sentence that says what the simulation gets wrong most."""
+        """Return the largest difference in a sentence."""
         begin = 'Most wrong' if self.verdict is Likeness.DIFFERS else 'Farthest, but within chance'
         return f'{begin}: in the simulation, {self.words}.'
 
     def measures(self) -> list[dict[str, Any]]:
-        """Return every number of the recording beside those of the simulations."""
+        """Return all numbers of the recording and of the simulations."""
         answer = [('dip after rises, V', self.dip), ('1 s after rises, V', self.recovery)]
         bands = [('lowest voltage, V', self.lowest), ('mean voltage, V', self.mean),
                  *((f'falls through {level:.4g} V, 1/min', falls)
@@ -140,7 +140,7 @@ class Agreement:
         return [{'measure': name, **one.as_data(), 'inside': one.inside} for name, one in bands]
 
     def as_data(self) -> dict[str, Any]:
-        """Return what `--json` writes."""
+        """Return the data of `--json`."""
         return {
             'recording': self.recording, 'fitted_s': list(self.fitted),
             'simulated_s': list(self.simulated), 'model': list(self.model),
@@ -160,13 +160,14 @@ def _ratio(power: Band) -> float:
     return power.median / power.measured if power.measured > 0.0 else float('nan')
 
 
-# Shares of the measured samples below the two low levels.
+# Quantiles of the measured voltage that are the two low levels.
 LOW_SHARES = (0.01, 0.05)
-# Bands of the spectrum, and the longest segment of Welch's mean, s.
+# Bands of the spectrum, and maximum length of a Welch segment, s.
 _BANDS, _SEGMENT = 5, 20.0
-# A rise of throttle: so much within that time, s, and none in the time before.
+# A rise of throttle: minimum rise, the time in which it happens, s, and the time without another
+# one before, s.
 _RISE, _WITHIN, _QUIET = 0.1, 0.2, 1.0
-# Seconds before and after the begin of a rise, points between, and rises at least.
+# Response: time before and after the begin of a rise, s, points, and minimum number of rises.
 _BEFORE, _AFTER, _POINTS, _FEWEST = 0.2, 1.5, 86, 3
 # Bins of the distribution.
 _BINS = 2000
@@ -174,24 +175,22 @@ _BINS = 2000
 
 @dataclass(frozen=True, eq=False)
 class Measures:
-    """What was measured of one voltage."""
+    """Measures of one voltage."""
 
-    mean: float  # Mean, V
+    mean: float  # V
     thirds: FloatArray  # Means of the thirds, V; shape (3,)
-    lowest: float  # Least voltage, V
-    # Dips below each level per minute, as `supply_facts` counts them; shape (levels,).
-    falls: FloatArray
+    lowest: float  # V
+    falls: FloatArray  # Dips below each level per minute; shape (levels,)
     power: FloatArray  # Power in each band, V^2; shape (bands,)
-    # Mean answer to rises of throttle, V; empty where there are too few; shape (points,).
-    answer: FloatArray
+    answer: FloatArray  # Mean response to rises, V; empty with too few; shape (points,)
     distribution: FloatArray  # Share of the samples below each edge; shape (bins,)
 
 
 class Yardstick:
     """
-    What to measure, chosen from the recorded part alone.
+    Levels, bands and rises at which voltages are measured, from the recorded part.
 
-    lsb: step of the ADC, V, 0 where none is seen; limits: levels, V, beside the two low ones.
+    lsb: step of the ADC, V, or 0; limits: levels, V, in addition to the two low ones.
     """
 
     def __init__(self, samples: Readings, lsb: float, limits: tuple[float, ...] = ()) -> None:
@@ -253,39 +252,39 @@ def _rises(t: FloatArray, throttle: FloatArray | None) -> npt.NDArray[np.float64
         since = t[k]
         room = t[0] + _BEFORE < since - _WITHIN and since + _AFTER < t[-1]
         if room and (not found or since - found[-1] > _QUIET):
-            # The rise was seen when it was done in full: it began where most of it happened.
+            # The rise is detected at its end; its begin is the steepest point.
             window = throttle[before[k]:k + 1]
             steepest = int(np.argmax(np.diff(window))) if window.size > 1 else 0
             found.append(float(t[before[k] + steepest]))
     return np.array(found)
 
 
-# Probability that a recording which is as simulated is said to differ.
+# Probability of a false `DIFFERS`.
 LEVEL = 0.05
-# What a pilot cares for, relative to the lowest voltage and the dips.
+# Importance for a pilot, relative to the lowest voltage and the dips.
 _WEIGHTS = {'lowest': 1.0, 'falls': 1.0, 'level': 0.8, 'answer': 0.8, 'spectrum': 0.5, 'ks': 0.5}
-# What a pilot would not notice: a share of the range of the voltage; factors on a rate and on a
-# power; a difference of distributions.
+# Differences that a pilot would not notice: a share of the range of the voltage, factors of a rate
+# and of a power, and a KS distance.
 _RANGE, _RATE, _POWER, _KS = 0.03, 1.25, 1.5, 0.05
-# Half of a 95 % band.
+# Ends of a 95 % band, %.
 _LOW, _HIGH = 2.5, 97.5
-# Where the mean answer to a rise is read, s after it begins.
+# Time of the recovery after the begin of a rise, s.
 RECOVERED = 1.0
 
 
 @dataclass(frozen=True)
 class Difference:
-    """One number, and what would be said of it."""
+    """One number that is judged, and its wording."""
 
     kind: str  # Key of its weight
-    measured: float  # Of the recording
-    simulated: FloatArray  # Of each simulation; shape (seeds,)
-    least: float  # Half of the narrowest band
-    words: Callable[[Band], str]  # Band -> sentence without its end
+    measured: float  # In the recording
+    simulated: FloatArray  # In each simulation; shape (seeds,)
+    least: float  # Minimum half-width of the band
+    words: Callable[[Band], str]  # Band -> part of a sentence
 
     @property
     def band(self) -> Band:
-        """Return the band."""
+        """Return measured value and band."""
         return band(self.measured, self.simulated)
 
     def scores(self) -> FloatArray:
@@ -297,13 +296,13 @@ class Difference:
 
 
 def band(measured: float, simulated: FloatArray) -> Band:
-    """Return a number of the recording beside those of the simulations, shape (seeds,)."""
+    """Return a number of the recording with the band of the simulations, shape (seeds,)."""
     low, median, high = np.percentile(simulated, [_LOW, 50.0, _HIGH]).tolist()
     return Band(measured, low, median, high)
 
 
 def answer_times(yardstick: Yardstick) -> tuple[int, int]:
-    """Return the points of the answer at the begin of a rise and at `RECOVERED` after it."""
+    """Return the indices of the response at the begin of a rise and at `RECOVERED` after it."""
     at = np.searchsorted(yardstick.after, [0.0, RECOVERED])
     return int(at[0]), int(at[1])
 
@@ -325,7 +324,7 @@ def differences(yardstick: Yardstick, own: Measures, others: Sequence[Measures],
             f'{_too(b, "high", "low")}'))]
     for k, level in enumerate(yardstick.levels):
         rate = own.falls[k]
-        # A count is never known better than to its own chance.
+        # Poisson error of the count.
         chance = math.sqrt(max(rate * yardstick.minutes, 1.0)) / yardstick.minutes
         found.append(Difference(
             'falls', float(rate), of(lambda m, k=k: float(m.falls[k])),  # type: ignore[misc]
@@ -361,7 +360,7 @@ def differences(yardstick: Yardstick, own: Measures, others: Sequence[Measures],
 
 
 def distance(one: Measures, pooled: FloatArray) -> float:
-    """Return the Kolmogorov-Smirnov distance of a distribution from that of all simulations."""
+    """Return the Kolmogorov-Smirnov distance between a voltage and all simulations."""
     return float(np.max(np.abs(one.distribution - pooled)))
 
 
@@ -380,13 +379,12 @@ def _fall(v: float) -> str:
 def judge(found: Sequence[Difference], explained: float, moved: bool
           ) -> tuple[float, Likeness, str, str]:
     """
-    Return the share of simulations as odd as the recording, verdict, what is most wrong, its kind.
+    Return p-value, verdict, the largest difference in words, and its kind.
 
-    explained: share of the variance by the mean path; moved: whether throttle did.
+    explained: share of the variance explained by the mean path; moved: whether throttle moved.
     """
     scores = np.array([one.scores() for one in found])
-    # A simulation that is at once the recording and its own judge would be flattered by its own
-    # place in the band; with the recording it is one of seeds + 1.
+    # The recording counts as one of seeds + 1, because each simulation is part of its own band.
     largest = scores.max(axis=0)
     p = float(np.mean(largest >= largest[0]))
     worst = int(np.argmax(scores[:, 0]))

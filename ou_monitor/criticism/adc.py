@@ -1,14 +1,13 @@
 """
-What the ADC and its input did to the readings: steps between codes, rails, squeezed ends.
+Effects of the ADC and its input on the readings: steps, clipping, compression, repeats.
 
-Ties have no chance in a diffusion, so steps and rails are findings without a model.  A protection
-diode before the ADC squeezes readings beyond a knee: they rise as a logarithm.  Undone, they are
-an OU again: the knee and the scale are those under which an AR(1) finds the readings likeliest,
-the density of the transformed samples counted.
+Ties have probability zero in a diffusion, so steps and clipping need no model.  A protection diode
+before the ADC compresses readings beyond a knee to a logarithm; knee and scale are found by the
+maximum likelihood of an AR(1) of the expanded readings, Jacobian included.
 
-Leaving clipped samples out would cut the law where they were, and every statistic of the rest
-would see the cut.  So they are drawn from the law of an AR(1), given their neighbours and that
-they lie beyond the limit (Gibbs sampling; Tanner & Wong, J. Am. Stat. Assoc. 82 (1987) 528).
+Omitting clipped samples would truncate the distribution and bias every statistic of the rest.  So
+they are drawn from an AR(1), given their neighbours and the limit (Gibbs sampling; Tanner & Wong,
+J. Am. Stat. Assoc. 82 (1987) 528).
 """
 
 from __future__ import annotations
@@ -21,44 +20,44 @@ from ou_monitor.records import FloatArray
 from ou_monitor.timeline.line import reading_places, reading_times
 from scipy.special import ndtr, ndtri
 
-# Values looked at for the step: more would not change it.
+# Maximum values used to find the step.
 _MOST = 200_000
-# Rounding of float32, as a share of the value, with room for two of them.
+# Relative rounding error of the difference of two float32.
 _FLOAT32 = 2.5e-7
-# Share of the samples that must lie on the lattice, and how near, in steps.
+# Minimum share of the samples on the lattice, and their maximum distance from it, steps.
 _SHARE, _NEAR = 0.99, 0.1
-# Printed steps to one of the ADC from which it is looked for: below two, any value is within half
-# a printed step of one code or the next.  Gaps between codes that show it, at least; decimals.
+# Minimum step of the ADC in printed steps: below two, every value is near some code.  Minimum gaps
+# between codes that show it; numbers of decimals tried.
 _SPARSE, _FEWEST_CODES = 2.0, 4
 _DECIMALS = range(7)
-# Equal changes from which they come again and again: of a voltage without codes no two are equal.
+# Minimum number of equal changes: without codes no two are equal.
 _AGAIN = 20
-# Samples at a rail, visits to it, and standard errors above its neighbours, at least.
+# Clipping: minimum samples at the limit, visits to it, and excess over neighbouring codes in
+# standard errors.
 _LEAST, _VISITS, _CLEAR = 8, 3, 5.0
-# Codes that noise lifts clipped readings by, at most.
+# Maximum codes by which later noise moves clipped readings.
 _LIFTED = 2
-# With steps above this many standard deviations of the noise the codes next to
-# each other say nothing of a density.
+# Maximum step, in standard deviations of the noise, at which counts of neighbouring codes follow a
+# density.
 _COARSE = 2.0
-# Parts of equal size by throttle, each with a noise of its own, and how near to its lowest it is
-# idle.
+# Number of parts by throttle, each with its own noise; maximum throttle of idle above the lowest.
 _LOADS, _STILL = 8, 0.01
-# Sweeps over all samples drawn: excursions last some relaxation times at most.
+# Sweeps of Gibbs sampling; excursions last a few relaxation times.
 _SWEEPS = 60
-# Shares of the samples beyond the knee, and scales in standard deviations of the
-# innovations.  A larger scale is no limit but a bent characteristic.
+# Compression: shares of the samples beyond the knee, and scales in standard deviations of the
+# innovations.  A larger scale is a bent characteristic, not a limit.
 _SHARES = (0.01, 0.02, 0.03, 0.045, 0.06, 0.08, 0.1)
 _SCALES = (0.05, 0.1, 0.15, 0.2, 0.3)
-# Evidence from which it is found, nats.
+# Minimum log likelihood ratio, nats.
 _FOUND = 50.0
-# Falls from just below the knee, at least, and how noisy beside all; and parts of the
-# recording of which half must have been beyond it.
+# Minimum falls from just below the knee, their minimum rms relative to all falls, and parts of the
+# recording, half of which must have samples beyond the knee.
 _FEWEST, _AS_NOISY, _PARTS = 30, 0.6, 10
-# Samples before from which lines are predicted: two for each, and as many for the noise about it.
+# Order of the AR that also predicts lines: two for each line, and as many for the noise.
 _LINES = 16
-# Beyond so many scales a reading says nothing of what was there.
+# Maximum excess over the knee, in scales, that is expanded exponentially.
 _FAR = 8.0
-# Sums of squares that are none; far from it, their inverse is still a number.
+# Lower limit of a sum of squares; its inverse is finite.
 _TINY = 1e-280
 
 
@@ -66,7 +65,7 @@ def find_step(voltage: FloatArray) -> float:
     """Return the step of the lattice on which the values lie (voltage in V)."""
     v = voltage[:_MOST]
     if v.size > 16:
-        # A rail need not be a code.
+        # The extremes may be clipped off the lattice.
         inner = v[(v > v.min()) & (v < v.max())]
         v = inner if np.unique(inner).size > 2 else v
     values, counts = np.unique(v, return_counts=True)
@@ -85,8 +84,8 @@ def find_step(voltage: FloatArray) -> float:
 
 
 def usual_change(voltage: FloatArray) -> float:
-    """Return the change that comes most often, V; 0 where none comes again and again."""
-    # Codes to which something was added now and then lie on no lattice, but most changes do.
+    """Return the most frequent change, V; 0 if no change is frequent."""
+    # If an offset was added at times, the codes lie on no lattice, but most changes do.
     rounding = 2.0 * _FLOAT32 * float(np.abs(voltage).max())
     size = np.sort(np.abs(np.diff(voltage[:_MOST])))
     size = size[size > rounding]
@@ -99,7 +98,7 @@ def _unprinted(codes: FloatArray, gaps: FloatArray, weight: FloatArray) -> float
     """Return the step of an ADC whose codes were printed with few decimals, V; 0 for none."""
     printed = next((10.0 ** -k for k in _DECIMALS if float(np.abs(
         codes * 10.0 ** k - np.rint(codes * 10.0 ** k)).max()) < 1e-3), 0.0)
-    # Where most values are, every code is taken.
+    # In the middle of the distribution every code occurs.
     middle = np.cumsum(weight) / weight.sum()
     dense = (middle[:-1] > 0.1) & (middle[1:] < 0.9)
     if not printed or int(dense.sum()) < _FEWEST_CODES:
@@ -113,7 +112,7 @@ def _unprinted(codes: FloatArray, gaps: FloatArray, weight: FloatArray) -> float
 
 def _fitted(codes: FloatArray, gaps: FloatArray, weight: FloatArray, first: float,
             near: float = 0.0) -> float:
-    """Return the step near `first` that the codes fit (to `near`, V); 0 when they do not."""
+    """Return the step near `first` that fits the codes to `near`, V; 0 if none does."""
     step = float(gaps[gaps < 1.5 * first].mean())
     number = np.concatenate(([0.0], np.cumsum(np.rint(gaps / step))))
     middle = float(weight @ number) / float(weight.sum())
@@ -128,18 +127,19 @@ def _fitted(codes: FloatArray, gaps: FloatArray, weight: FloatArray, first: floa
 
 def find_rails(voltage: FloatArray, step: float, noise: float,
                throttle: FloatArray | None = None) -> tuple[float, float]:
-    """Return the readings at which the ADC clips (voltage in V, step in V, noise in V)."""
+    """Return the readings at which the ADC clips, V; infinite if it does not (inputs in V)."""
     if step > _COARSE * noise:
         return -math.inf, math.inf
-    told = _told(voltage, step, throttle)
-    return -_limit(-voltage, step, told), _limit(voltage, step, told)
+    noisy = _noisy(voltage, step, throttle)
+    return -_limit(-voltage, step, noisy), _limit(voltage, step, noisy)
 
 
-def _told(voltage: FloatArray, step: float, throttle: FloatArray | None) -> npt.NDArray[np.bool_]:
+def _noisy(voltage: FloatArray, step: float, throttle: FloatArray | None
+           ) -> npt.NDArray[np.bool_]:
     """
-    Return the samples at throttles at which the noise fills the codes.
+    Return the samples at throttles whose noise spans several codes.
 
-    A rail at idle may be so quiet that it stays within one code, the top one: that is no end.
+    A quiet rail at idle may stay within the top code without clipping.
     """
     if throttle is None or not step > 0.0:
         return np.ones(voltage.size, dtype=bool)
@@ -153,15 +153,14 @@ def _told(voltage: FloatArray, step: float, throttle: FloatArray | None) -> npt.
 
 
 def _idle(throttle: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return where throttle is at its lowest."""
     return np.asarray(throttle <= throttle.min() + _STILL)
 
 
-def _limit(x: FloatArray, step: float, told: npt.NDArray[np.bool_]) -> float:
+def _limit(x: FloatArray, step: float, noisy: npt.NDArray[np.bool_]) -> float:
     """
-    Return the reading at the top that holds more than its neighbours below say; inf for none.
+    Return the top reading if it is more frequent than its neighbours predict; otherwise inf.
 
-    A stage before the ADC may clip, and noise after it lift some readings by a code or two.
+    If a stage before the ADC clips, later noise may raise some readings by a code or two.
     """
     top = float(x.max())
     tie = _FLOAT32 * abs(top)
@@ -169,31 +168,30 @@ def _limit(x: FloatArray, step: float, told: npt.NDArray[np.bool_]) -> float:
     below = top - x
     for codes in range(1, (_LIFTED if step > 0.0 else 0) + 2):
         inside = below < (codes - 0.5) * width + tie
-        at = inside & told
+        at = inside & noisy
         count = int(at.sum())
-        # The extremes of a bell need not be tested where nothing is heaped.
         if count < _LEAST or int((at[1:] & ~at[:-1]).sum()) < _VISITS:
             continue
         others = below[~inside]
         if not others.size or float(others.min()) > (codes - 1) * step + max(
                 3.5 * step, 0.2 * float(others.std())):
-            # Far from all others: a code of its own, no end of a range.
+            # Far from all others: a separate code, not clipping.
             continue
         if step > 0.0:
-            # A tail that falls has no more in any code than in those below.
-            next_ones = [float((np.abs(below[told] - (codes - 1 + k) * step)
+            # In a falling tail no code is more frequent than the codes below.
+            next_ones = [float((np.abs(below[noisy] - (codes - 1 + k) * step)
                                 < 0.5 * step).sum()) for k in (1, 2, 3)]
             expected = codes * max(next_ones)
             if codes > 1 and next_ones[0] > max(next_ones[1:]) + _CLEAR * math.sqrt(next_ones[0]):
-                # The flank of a bell: a rail at rest.
+                # The flank of a peak: a rail at rest.
                 continue
         else:
-            # As dense as the nearest interval that holds some samples.
+            # Expect the density of the nearest samples below.
             reach = float(np.partition(others, min(_LEAST, others.size - 1))[:_LEAST].max())
             expected = _LEAST * 2.0 * tie / max(reach, tie)
         if count - expected > _CLEAR * math.sqrt(count + codes * expected):
             full = max(range(codes), key=lambda k: int(
-                (np.abs(below[told] - k * width) < 0.5 * width + tie).sum()))
+                (np.abs(below[noisy] - k * width) < 0.5 * width + tie).sum()))
             return float(x[np.abs(below - full * width) < 0.5 * width + tie].max())
     return math.inf
 
@@ -219,7 +217,7 @@ def redraw(voltage: FloatArray, low: float, high: float, step: float,
             centre = mean + phi / (1.0 + phi * phi) * (c[k - 1] + c[k + 1])
             side = np.where(top[k], 1.0, -1.0)
             limit = np.where(top[k], high, low)
-            # On the side of the limit: -z is below where the limit lies.
+            # Probability of the side beyond the limit, then a draw there.
             room = ndtr(side * (centre - limit) / spread)
             draw = -ndtri(np.maximum(room * (1.0 - rng.random(k.size)), 1e-300))
             c[k] = np.where(room > 1e-12, centre + side * spread * draw, limit) - mean
@@ -232,7 +230,7 @@ def redraw(voltage: FloatArray, low: float, high: float, step: float,
 
 def find_knee(voltage: FloatArray, noise: float, side: float,
               throttle: FloatArray | None = None) -> float | None:
-    """Return where readings begin to be squeezed (voltage in V, noise in V)."""
+    """Return the voltage beyond which readings are compressed; None if there is none (V)."""
     x = side * voltage
     plain = _likelihood(x)
     best, found, undone, squeezed = plain + _FOUND, None, x, 0.0
@@ -244,7 +242,7 @@ def find_knee(voltage: FloatArray, noise: float, side: float,
             if float(far.max()) > 1e3:
                 continue
             part = np.minimum(far, _FAR)
-            # Beyond, on along the tangent.
+            # Beyond `_FAR`, continue along the tangent.
             stretched = np.expm1(part) + (far - part) * math.exp(_FAR)
             whole = np.minimum(x, knee) + scale * noise * stretched
             value = float(part.sum()) + _likelihood(whole)
@@ -252,26 +250,26 @@ def find_knee(voltage: FloatArray, noise: float, side: float,
                 best, found, undone, squeezed = value, knee, whole, float(part.sum())
     if found is None or not _is_limit(x, found):
         return None
-    # Where idle is beyond it, and what is beyond it idle, it may be how quiet the rail is then.
+    # If mostly idle is beyond the knee, the rail may be just quiet at idle.
     idle = None if throttle is None else _idle(throttle)
     if idle is not None and not idle.all() and min(
             float(idle[x > found].mean()), float((x > found)[idle].mean())) > 0.5:
         return None
-    # A line is slow at its turning points: of what is predicted with it they are no likelier.
+    # A line is slow at its turning points, which an AR of higher order predicts.
     gain = squeezed + _likelihood(undone, _LINES) - _likelihood(x, _LINES)
     return side * found if gain > _FOUND else None
 
 
 def _is_limit(x: FloatArray, knee: float) -> bool:
     """
-    Return whether noise is squeezed above a knee only, and now and then.
+    Return whether noise is compressed above a knee only, and repeatedly.
 
-    A rail that is quiet while nothing draws current is near its top then, too: but
-    just below as well, and for one long while.
+    A rail that is quiet without load is also near its top, but it is quiet just below the knee
+    too, and for one long time.
     """
     step = np.diff(x)
     near = (x[:-1] < knee) & (x[:-1] > knee - 3.0 * float(np.std(step)))
-    # What falls from just below the knee is not squeezed.
+    # Falls from just below the knee are not compressed.
     below, all_ = step[near & (step < 0.0)], step[step < 0.0]
     if below.size < _FEWEST or float(np.sqrt(np.mean(below**2))) < _AS_NOISY * float(
             np.sqrt(np.mean(all_**2))):
@@ -281,7 +279,7 @@ def _is_limit(x: FloatArray, knee: float) -> bool:
 
 
 def _likelihood(x: FloatArray, order: int = 1) -> float:
-    """Return the log-likelihood of an AR of some order, but for a constant, nats."""
+    """Return the log-likelihood of an AR of an order, less a constant, nats."""
     count = int(x.size - order)
     c = x - x.mean()
     past = np.lib.stride_tricks.sliding_window_view(c, order + 1)
@@ -291,25 +289,25 @@ def _likelihood(x: FloatArray, order: int = 1) -> float:
     return -0.5 * count * math.log(max(float(e @ e), _TINY) / count)
 
 
-# Repeats, or runs of them, that are called so, at least; and the share of ties by chance up to
-# which the size of the changes says how many there are.
+# Minimum repeats, or runs of them; maximum chance of a tie at which the size of the changes
+# predicts the number of ties.
 _FEWEST_TIES, _FINE = 20, 0.15
-# Samples apart at which values alike are counted: at 8 seven held of ten show.  A line brings its
-# values back after periods of its own, where holds are no longer seen.
+# Lags at which equal values are counted (at 8, seven held samples of ten are still seen), and
+# lags at which the period of a line is sought, beyond those of holds.
 _APART, _PERIODS = (2, 4, 8), range(9, 101)
-# The noise of a rail falls to one part in so many at rest: ties are so much likelier there.
+# Maximum ratio of the noise of a rail to its noise at rest, and of the probabilities of a tie.
 _CALMEST = 100.0
-# Standard errors by which ties must exceed what is expected, and ends of runs may fall short.
+# Minimum excess of ties, and maximum deficit of the changes at the ends of runs, standard errors.
 _CLEARLY, _SHORT = 6.0, 3.0
-# Share at either end of the range where readings may be squeezed together.
+# Share at either end of the range where readings may be compressed.
 _END = 0.1
-# Samples looked at for repeats.
+# Maximum samples used to find repeats.
 _LOOK = 200_000
 
 
 def without_repeats(t: FloatArray, v: FloatArray, u: FloatArray | None
                     ) -> tuple[FloatArray, FloatArray, FloatArray | None, float]:
-    """Return readings, and samples a reading: 1 where none repeats."""
+    """Return readings, and the number of samples a reading: 1 without repeats."""
     places, period = reading_places(v)
     t, v, u = reading_times(t[places], period), v[places], None if u is None else u[places]
     if period > 1.0:
@@ -321,9 +319,9 @@ def without_repeats(t: FloatArray, v: FloatArray, u: FloatArray | None
 
 
 def _ties(v: FloatArray) -> bool:
-    """Return whether more samples repeat the one before than the codes of the ADC explain."""
+    """Return whether there are more repeats than the codes of the ADC explain."""
     step = np.diff(v)
-    # At the ends of the range there are other reasons to repeat.
+    # Repeats at the ends of the range may be clipping.
     inner = (v[1:] > v.min()) & (v[1:] < v.max())
     equal, count = int(((step == 0.0) & inner).sum()), int(inner.sum())
     if equal < _FEWEST_TIES:
@@ -332,14 +330,14 @@ def _ties(v: FloatArray) -> bool:
     if moved.size < 2:
         return False
     code = _code(v)
-    # Chance of two normal values one code apart or less, on average over their codes.
+    # Probability that two normal values have the same code.
     chance = min(1.0, code / (math.sqrt(2.0 * math.pi) * float(np.sqrt(np.mean(moved**2)))))
     if chance >= _FINE and float(np.mean(moved[1:] * moved[:-1] > 0.0)) > 0.5:
-        # A voltage that goes on where it goes stays in each code for a while.
+        # A smooth voltage stays in each code for some samples.
         return False
     share = _ties_without_holds(v, inner)
     if int(((step[1:] == 0.0) & (step[:-1] != 0.0)).sum()) < _FEWEST_TIES:
-        # Where a rail is calm, ties are likelier; but that calm none is, and a sensor was stuck.
+        # Ties are likelier at rest, up to a limit; beyond it the sensor was stuck.
         share = min(share, _CALMEST * chance)
     expected = count * max(chance if chance < _FINE else 0.0, share)
     smooth, error = _ties_of_codes(moved, code)
@@ -357,8 +355,8 @@ def _ties_of_codes(moved: FloatArray, code: float) -> tuple[float, float]:
     """
     Return the ties expected from changes by one and by two codes (V), and their standard error.
 
-    The logarithm of a density that is smooth about zero is a parabola there: that of a normal law
-    behind any ramp, line or load, as most of what adds to a change is as likely at either sign.
+    The log density of a change is nearly a parabola about zero, whatever ramp, line or load is
+    added, because both signs are about equally likely.
     """
     size = np.abs(moved)
     one, two = (max(0.5 * float((np.abs(size - k * code) < 0.5 * code).sum()), 0.5)
@@ -369,10 +367,10 @@ def _ties_of_codes(moved: FloatArray, code: float) -> tuple[float, float]:
 
 def _stuck(v: FloatArray) -> npt.NDArray[np.bool_]:
     """
-    Return which samples but the first repeat the one before in runs that no chance makes.
+    Return which samples (from the second on) belong to runs of repeats too long for chance.
 
-    A rail that is calm comes to rest, and moves on, by a code or so; a link that is lost holds
-    what it had in the midst of ordinary changes, and has moved on by the more when it is back.
+    A calm rail enters and leaves a run by a change of about one code.  A lost link stops between
+    ordinary changes, and the voltage has moved further when it is back.
     """
     step = np.diff(v)
     none = np.zeros(step.size, dtype=np.bool_)
@@ -385,7 +383,7 @@ def _stuck(v: FloatArray) -> npt.NDArray[np.bool_]:
         return none
     chance = _ties_of_codes(size, code)[0] / step.size
     if float(size[size.size // 2]) < 1.5 * code:
-        # Where most changes are by one code, what is alike stays so more often than codes say.
+        # If most changes are by one code, runs are longer than independent ties suggest.
         chance = max(chance, float(np.mean(ends - begins > 1)))
     chance = min(chance, 0.9)
     least = max(2, math.ceil(math.log(step.size) / -math.log(chance)))
@@ -398,7 +396,7 @@ def _stuck(v: FloatArray) -> npt.NDArray[np.bool_]:
         return none
     usual = 0.5 - _SHORT / math.sqrt(12.0 * begins.size)
     if 0.5 * float(np.mean(size < 1.25 * code)) > usual:
-        # Coming to rest by a code is no small change.
+        # A change by one code is not small here.
         return none
     for ending in (np.abs(step[begins - 1]), np.abs(step[ends])):
         rank = (np.searchsorted(size, ending - 0.25 * code)
@@ -413,12 +411,11 @@ def _stuck(v: FloatArray) -> npt.NDArray[np.bool_]:
 
 def _ties_without_holds(v: FloatArray, inner: npt.NDArray[np.bool_]) -> float:
     """
-    Return the share of ties to neighbours that values alike without any hold explain.
+    Return the share of ties between neighbours that is expected without holds.
 
-    Values some samples apart are alike by chance of their codes, whatever the intensity does over
-    the recording; neighbours are the more so as they lie nearer to each other, by sqrt(k) over k
-    samples in a diffusion and less in white noise, or as the recording itself says.  Of a share h
-    held, h^k are alike k apart, too.
+    Values k samples apart are equal only by chance of their codes, or with probability h^k if a
+    share h is held.  Neighbours are equal more often, by the ratio of the rms differences at lags
+    k and 1: sqrt(k) in a diffusion, less in white noise.
     """
     near = float(np.mean((v[1:] - v[:-1]) ** 2))
     shares = []
@@ -430,6 +427,6 @@ def _ties_without_holds(v: FloatArray, inner: npt.NDArray[np.bool_]) -> float:
 
 
 def _alike_again(v: FloatArray, inner: npt.NDArray[np.bool_]) -> float:
-    """Return the share of values that come back after the period at which most do."""
+    """Return the largest share of values that return after one period."""
     return max((float(np.mean(v[k:][inner[k - 1:]] == v[:-k][inner[k - 1:]]))
                 for k in _PERIODS if k < v.size // 2), default=0.0)

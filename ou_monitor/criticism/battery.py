@@ -1,15 +1,14 @@
 """
-Signed statistics of normal scores: standard normal under a right model.
+Signed statistics of normal scores: standard normal if the model is right.
 
-Each is scaled to be about N(0, 1) for independent normal scores.  Their true spread is found by
-simulation (`NullBank`): recordings of the fitted baseline, with the stamps and the throttle of
-the data, go through the same fit and the same statistics; theory suffices for lines that follow
-throttle, which take longest, and for what comes after large errors.  A name begins with its kind,
-to which the `SIGNS` of terms refer.
+Each is scaled to be about N(0, 1) for independent normal scores.  Mean and spread come from
+simulations (`NullBank`) of the fitted baseline with the stamps and throttle of the data, and with
+the same fit and statistics; only lines that follow throttle (too slow to simulate) and errors
+after large ones use theory.  A name begins with its kind, to which the `SIGNS` of terms refer.
 
-No term of the catalogue answers to loops of throttle, to an effect of throttle that grows, or to
-the errors after large ones: those statistics expose effects that imitate a term, by their course
-over minutes, on the way up and down, or after their onset.
+No term predicts loops of throttle, a growing effect of throttle, or errors after large ones.
+These statistics expose effects that imitate a term, by their course over minutes, by hysteresis,
+or after their onset.
 """
 
 from __future__ import annotations
@@ -29,25 +28,25 @@ from ou_monitor.records import FloatArray
 from scipy.signal import lfilter
 from scipy.special import ndtri, stdtr, stdtrit
 
-# Lags grouped.
+# Groups of lags.
 _LAGS = ((1, 1), (2, 2), (3, 5), (6, 15), (16, 50))
-# Spectral bands: edges in shares of the Nyquist frequency, from the slowest on.
+# Number of spectral bands.
 _BANDS = 8
-# Scores up to this are small.
+# Maximum of small scores.
 _SMALL = 2.5
 # Spans over which power is averaged, s.
 _CLUSTERS = (0.02, 0.1, 0.5, 2.5, 8.0)
-# Samples in a segment whose spectrum is taken, and lags of products of three.
+# Lengths of segments for bursts, samples, and maximum lag of products of three.
 _SEGMENTS, _TRIPLES = (32, 128, 512), 10
-# Shares of the time that throttle is below and above where a relay switches.
+# Quantiles of throttle at which a relay (hysteresis) switches down and up.
 _RELAYS = ((0.15, 0.85), (0.28, 0.72), (0.4, 0.6))
-# Share of a regressor's power that the mean response to throttle must leave.
+# Minimum share of the power of a regressor that the static response to throttle leaves.
 _LEAST = 0.02
-# Errors this large begin something, in standard deviations; one in so many samples.
+# Minimum large error, standard deviations, and minimum distance of two of them, samples.
 _LARGE, _APART = 4.0, 20
-# Fewer of them are not tested.
+# Minimum number of large errors.
 _FEW = 5
-# Samples after them, in groups.
+# Edges of groups of samples after a large error.
 _AFTER = (1, 4, 16, 64, 256, 1024)
 
 
@@ -78,7 +77,7 @@ def is_sign(sign: str, name: str, value: float) -> bool:
 
 
 def _all(z: FloatArray, given: Covariates, lines: bool) -> Iterator[tuple[str, float]]:
-    # One far outlier must not dominate the statistics that are not about outliers.
+    # An outlier must not dominate statistics of other kinds.
     w = np.clip(z, -5.0, 5.0)
     square = np.minimum(z * z, 25.0) - 1.0
     square -= square.mean()
@@ -125,14 +124,13 @@ def _spectrum(w: FloatArray, given: Covariates) -> Iterator[tuple[str, float]]:
     edges[0] = 0
     for k, (a, b) in enumerate(zip(edges[:-1], edges[1:])):
         if b - a >= 2:
-            # A mean of exponentials, made more normal by the cube root (Wilson & Hilferty).
+            # The cube root makes a mean of exponentials nearly normal (Wilson & Hilferty).
             m = b - a
             mean = float(power[a:b].mean())
             value = (mean ** (1.0 / 3.0) - 1.0 + 1.0 / (9.0 * m)) * 3.0 * math.sqrt(m)
             yield f'band {k}, {_hertz(a, n, given)} to {_hertz(b, n, given)} Hz', value
-    # The highest of many exponentials: its chance, as a normal score.  Not by `find_lines`: its
-    # level, the median of neighbours, is for spectra that are not flat, and scores are flat under
-    # the null of the bank; where they are not, `find_lines` decides which lines are tried.
+    # The largest of many exponentials.  `find_lines`, which decides which lines are tried, allows
+    # for spectra that are not flat; under the null of the bank they are flat.
     yield 'line', _gumbel(float(power[3:].max()), power.size - 3)
 
 
@@ -165,7 +163,7 @@ def _moments(z: FloatArray) -> Iterator[tuple[str, float]]:
     yield 'kurtosis', math.sqrt(n / 24.0) * (float(np.mean(c**4)) - 3.0)
     for limit, chance in ((4.0, 6.334e-5), (5.5, 3.798e-8)):
         found, expected = float((np.abs(z) > limit).sum()), n * chance
-        # Poisson counts, made normal by the square root (Anscombe).
+        # The square root makes Poisson counts nearly normal (Anscombe).
         value = 2.0 * (math.sqrt(found + 0.375) - math.sqrt(expected + 0.375))
         yield f'tails beyond {limit:g}', value
 
@@ -242,7 +240,7 @@ def _beyond_second_order(w: FloatArray, given: Covariates) -> Iterator[tuple[str
         rows = w[:count * length].reshape(count, length) * np.hanning(length)
         power = np.abs(np.fft.rfft(rows, axis=1)[:, 1:-1]) ** 2
         power /= power.mean(axis=0)
-        # Exponentials: mean square 2, of variance 20.
+        # Squares of exponentials have mean 2 and variance 20.
         value = (float((power * power).mean()) - 2.0) * math.sqrt(power.size / 20.0)
         yield f'bursts within {length / given.rate:.2g} s', value
     if n > 4 * _TRIPLES:
@@ -275,25 +273,25 @@ def sigma_score(square: FloatArray, throttle: FloatArray) -> float:
     """
     Return the score of a slope of ln sigma over throttle (0..1).
 
-    square are squared innovations.  `analyze` asks a narrower question, how much sigma differs
-    between levels at which throttle was held (`ou_monitor.analysis.level_comparison`).
+    square: squared innovations.  `analyze` instead compares sigma between levels of constant
+    throttle (`ou_monitor.analysis.level_comparison`).
     """
     return score(square, throttle)
 
 
 def alpha_score(w: FloatArray, state: FloatArray, throttle: FloatArray) -> float:
     """
-    Return the score of a slope of ln alpha over throttle (0..1), that of alpha projected out.
+    Return the score of a slope of ln alpha over throttle (0..1), orthogonal to the score of alpha.
 
-    w are innovations, state the standardised deviation before each.  `analyze` asks whether
-    levels at which throttle was held share one alpha (`ou_monitor.analysis.level_comparison`).
+    w: innovations; state: the standardised deviation before each.  `analyze` instead tests whether
+    levels of constant throttle share one alpha (`ou_monitor.analysis.level_comparison`).
     """
     u = throttle - throttle.mean()
     return score(w, state * u - float((state * state * u).mean()) * state)
 
 
 def throttle_paths(throttle: FloatArray, keep: float) -> Iterator[tuple[str, FloatArray]]:
-    """Yield regressors that are no function of throttle now: its growing effect, and loops."""
+    """Yield regressors that depend on the history of throttle: growing effect, hysteresis."""
     time = np.linspace(-1.0, 1.0, throttle.size)
     spread = float(throttle.std())
     if not spread > 0.0:
@@ -311,14 +309,14 @@ def throttle_paths(throttle: FloatArray, keep: float) -> Iterator[tuple[str, Flo
 
 def _left(name: str, wanted: FloatArray, known: FloatArray, keep: float
           ) -> Iterator[tuple[str, FloatArray]]:
-    """Yield a regressor less its fit by others, whitened, if a share of its power is left."""
+    """Yield a regressor less its fit by others, whitened, if enough of its power is left."""
     less = wanted - known @ np.linalg.lstsq(known, wanted, rcond=None)[0]
     if float(less @ less) > _LEAST * float(wanted @ wanted):
         yield name, less - keep * np.concatenate((less[:1], less[:-1]))
 
 
 def large_ones(errors: FloatArray, found: npt.NDArray[np.bool_] | None = None) -> FloatArray:
-    """Return the signs of large errors that do not follow another one shortly before."""
+    """Return the signs of large errors, and 0 elsewhere and shortly after another one."""
     large = np.abs(errors) > _LARGE
     if found is not None:
         large |= found
@@ -331,7 +329,7 @@ def large_ones(errors: FloatArray, found: npt.NDArray[np.bool_] | None = None) -
 
 def after_large(w: FloatArray, square: FloatArray, large: FloatArray
                 ) -> Iterator[tuple[str, float]]:
-    """Yield whether errors that follow large ones have their sign, and whether they are larger."""
+    """Yield scores of the sign and of the size of errors that follow large ones."""
     enough = int((large != 0.0).sum()) >= _FEW
     signs, counts = np.cumsum(large), np.cumsum(np.abs(large))
     for low, high in zip(_AFTER[:-1], _AFTER[1:]):
@@ -363,34 +361,32 @@ def covariates_of(samples: Samples, composite: Composite) -> Covariates:
         large=large_ones(gaussian.z, found), paths=paths)
 
 
-# Recordings simulated.
+# Number of simulated recordings.
 SIZE = 24
-# The spread found by so few is drawn towards 1, which theory gives, as by this
-# many more.
+# Weight, in recordings, of the theoretical spread of 1 in the estimated spread.
 _PRIOR = 24.0
-# Degrees of freedom of a score divided by such a spread: its square has variance w^2 2/(m - 1) for
-# a weight w of m draws, as a chi square of (m - 1)/w^2 degrees over them.  Of 8700 recordings of a
-# plain OU (2000 to 6000 samples, five throttles and rates) 0.89 % have a family chance below 1 %,
-# and 0.14 % below 0.1 %; by the normal law it would be 1.52 and 0.31 %.
+# Degrees of freedom of a score over that spread: with a weight w of m draws its square has
+# variance w^2 2/(m - 1), as a chi square of (m - 1)/w^2 degrees.  Of 8700 recordings of a plain OU
+# (2000 to 6000 samples, five throttles and rates), 0.89 % have a family-wise p below 1 %, and 0.14
+# % below 0.1 %; by the normal distribution 1.52 and 0.31 %.
 _FREEDOM = (SIZE - 1) * ((SIZE + _PRIOR) / SIZE) ** 2
 
 
 @dataclass(frozen=True)
 class NullBank:
-    """Means and spreads of the statistics under the baseline."""
+    """Means and standard deviations under the baseline, by statistic."""
 
-    # By statistic.
     mean: dict[str, float]
     std: dict[str, float]
 
     def standardised(self, values: dict[str, float]) -> dict[str, float]:
-        """Return statistics as they would be N(0, 1) under the baseline."""
+        """Return statistics scaled to be N(0, 1) under the baseline."""
         return {name: (value - self.mean.get(name, 0.0)) / self.std.get(name, 1.0)
                 for name, value in values.items()}
 
 
 def criticise(samples: Samples, composite: Composite, bank: NullBank) -> dict[str, float]:
-    """Return the statistics of a model, as they would be N(0, 1) if it were right."""
+    """Return the statistics of a model, scaled to be N(0, 1) if it is right."""
     return bank.standardised(statistics(composite.z, covariates_of(samples, composite)))
 
 
@@ -409,10 +405,10 @@ def simulate_bank(given: Covariates, phi: float, rng: np.random.Generator, size:
 def simulate_bank_of(samples: Samples, composite: Composite, rng: np.random.Generator,
                      size: int = SIZE) -> NullBank:
     """
-    Simulate the bank of a model that is more than the `ou`.
+    Simulate the bank of a model with more terms than the `ou`.
 
-    A step of the ADC that is as large as the noise leaves errors that are
-    neither normal nor independent, however right the model is.
+    If the step of the ADC is as large as the noise, errors of the right model are neither normal
+    nor independent.
     """
     model, rows, given = SupplyModel(composite.terms), [], covariates_of(samples, composite)
     for _ in range(size):
@@ -425,12 +421,12 @@ def simulate_bank_of(samples: Samples, composite: Composite, rng: np.random.Gene
 
 
 def _summary(rows: list[dict[str, float]]) -> NullBank:
-    """Return means and spreads, the spreads drawn towards 1."""
+    """Return means, shrunk towards 0, and standard deviations, shrunk towards 1."""
     weight = len(rows) / (len(rows) + _PRIOR)
     mean, std = {}, {}
     for name in rows[0]:
         v = np.array([row[name] for row in rows if name in row])
-        # What is far from normal has a mean of its own, known as well as may be.
+        # A mean far from 0 is not shrunk.
         strange = abs(float(v.mean())) > 4.0 * float(v.std()) / math.sqrt(v.size) + 1.0
         mean[name] = (1.0 if strange else weight) * float(v.mean())
         std[name] = math.sqrt(weight * float(v.var(ddof=1)) + 1.0 - weight)
@@ -447,12 +443,12 @@ def refit(y: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def family_chance(largest: float, count: int) -> float:
-    """Return the chance that the largest of `count` scores of a bank is at least so large."""
+    """Return the probability that the largest of `count` scores of a bank reaches `largest`."""
     one = 2.0 * float(stdtr(_FREEDOM, -abs(largest)))
     return -math.expm1(count * math.log1p(-min(one, 1.0 - 1e-16)))
 
 
 def family_edge(chance: float, count: int) -> float:
-    """Return the score that the largest of `count` exceeds by so small a chance."""
+    """Return the score that the largest of `count` exceeds with probability `chance`."""
     one = -math.expm1(math.log1p(-chance) / count)
     return -float(stdtrit(_FREEDOM, 0.5 * one))

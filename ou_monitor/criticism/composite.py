@@ -1,9 +1,9 @@
 """
-A whole model, fitted: the Gaussian part, then laws of its innovations in turn.
+Fit a whole model: its Gaussian part, then the laws of its innovations in turn.
 
-Each law maps normal scores to new ones and returns the ratio of densities, so that laws
-compose; events that a law finds go back into the Gaussian part as extra variance, and both are
-fitted again.
+A law is a term of the distribution of the innovations.  It maps normal scores to new ones and
+returns the ratio of densities, so that laws compose.  Events that it finds go back into the
+Gaussian part as extra variance, and both are fitted again.
 """
 
 from __future__ import annotations
@@ -19,13 +19,12 @@ from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.term import LawFit, Role, Term
 from ou_monitor.records import FloatArray
 
-# Rounds between events and the Gaussian part.
+# Maximum rounds between laws and the Gaussian part.
 _ROUNDS = 3
-# Factors on the noise at most and at least, and how alike they are when they count
-# as found again: the mean of their logarithms.
+# Limits of a factor on the noise; convergence tolerance of its mean logarithm.
 _POWERS = 1e-3, 1e3
 _ALIKE = 0.03
-# Processor time of the fit of a dear law, s a sample: of the fastest of them.
+# Processor time of the fit of a `DEAR` law, s a sample (of the fastest one).
 LAW_COST = 1e-5
 # Fits a law for the first time.
 Look = Callable[[type[Term], View], LawFit | None]
@@ -40,20 +39,20 @@ class Composite:
     gaussian: GaussianFit  # Its Gaussian part
     z: FloatArray  # Normal scores of the one-step predictions; shape (n,)
     density: FloatArray  # Log predictive density of each sample, nats; shape (n,)
-    free: int  # Free parameters
-    search: float  # Penalty for what was searched beside them, nats
-    events: Events | None = None  # What the laws found, as the Gaussian part was fitted with it
-    offset: FloatArray | None = None  # Likewise, V; shape (n,)
+    free: int  # Number of free parameters
+    search: float  # Penalty for searched alternatives, nats
+    events: Events | None = None  # Events from the laws, used in the Gaussian part
+    offset: FloatArray | None = None  # Offset from the laws, likewise, V; shape (n,)
     cost: float = 0.0  # Processor time of the fits, s, estimated from filters and laws
 
     def score(self, samples: Samples) -> float:
-        """Return evidence, nats: of the part fitted, less its price, and of the part kept."""
+        """Return the penalised log density of the fitted part and the held-out part, nats."""
         n = samples.train.stop
         return float(self.density[samples.train].sum() + self.density[samples.test].sum()
                      - 0.5 * self.free * math.log(n) - self.search)
 
     def has(self, name: str) -> bool:
-        """Whether a term of that name is in."""
+        """Return whether the model has a term of that name."""
         return any(term.NAME == name for term in self.terms)
 
 
@@ -62,10 +61,10 @@ def fit_composite(samples: Samples, terms: Sequence[Term | type[Term]], part: sl
                   rough: bool = False, begun: bool = False, first: Look | None = None
                   ) -> Composite | None:
     """
-    Fit a model on a part; None where a law cannot be fitted.
+    Fit a model on a part; None if a law cannot be fitted.
 
-    A law that was never fitted is given as its class, and fitted by `first`; events and offset of
-    `known`, a model with the same laws, are taken over.
+    A law without parameters yet is given as its class, and fitted by `first`.  `known` is a model
+    with the same laws, whose events and offset are the start.
     """
     structural = [term for term in terms
                   if isinstance(term, Term) and term.ROLE is not Role.LAW]
@@ -112,13 +111,12 @@ def fit_composite(samples: Samples, terms: Sequence[Term | type[Term]], part: sl
 
 
 def _kinds(terms: Sequence[Term | type[Term]]) -> list[str]:
-    """Return the names of the laws."""
     return [term.NAME for term in terms if term.ROLE is Role.LAW]
 
 
 def _same(events: Events | None, offset: FloatArray | None, found: Events, moved: FloatArray,
           gaussian: GaussianFit) -> bool:
-    """Return whether the laws have found again what the Gaussian part was fitted with."""
+    """Return whether the events and the offset of the laws have converged."""
     before = events or Events(np.zeros(1), np.zeros(1), np.ones(1))
     if ((found.push > 0.0) != (before.push > 0.0)).any() or (
             (found.error > 0.0) != (before.error > 0.0)).any():
@@ -130,7 +128,7 @@ def _same(events: Events | None, offset: FloatArray | None, found: Events, moved
 
 
 def view_of(samples: Samples, gaussian: GaussianFit, z: FloatArray, part: slice) -> View:
-    """Return what a law or a candidate may look at."""
+    """Return the series from which a law or a candidate is fitted."""
     residual = samples.voltage - gaussian.mean
     s = driven(samples, gaussian.terms)
     white = white_noise(samples, gaussian.terms, s)

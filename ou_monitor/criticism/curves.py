@@ -18,34 +18,31 @@ from ou_monitor.model.supply import SupplyModel
 from ou_monitor.records import FloatArray
 from scipy.signal import welch
 
-# Simulations of each model: their range leaves out about one point in twenty.
+# Simulations of each model; about one point in twenty lies outside their range.
 DRAWS = 40
 _BINS, _LEVELS, _LAGS, _BANDS = 60, 10, 40, 60
-# Up to so many distinct throttles each is a bin of its own.
+# Maximum number of distinct throttles that are bins of their own.
 _DISTINCT = 12
 
 Curve = Callable[[FloatArray], FloatArray]
-# Title and labels, x, the curve, which axes are logarithmic, and whether it is separate points.
+# Title and labels, x, the curve, log x, log y, and separate points.
 _Curve = tuple[tuple[str, str, str], FloatArray, Curve, tuple[bool, bool, bool]]
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """A curve of the data, and what simulations make of it."""
+    """A curve of the data, and its range in simulations."""
 
-    # For people.
     title: str
     x_label: str
     y_label: str
-    # The curve; NaN where nothing is known; shape (p,).
-    x: FloatArray
-    data: FloatArray
+    x: FloatArray  # shape (p,)
+    data: FloatArray  # NaN where unknown; shape (p,)
     # Lowest and highest of the simulations, for each model; shape (p,).
     bands: tuple[tuple[FloatArray, FloatArray], ...]
-    # Axes.
     log_x: bool = False
     log_y: bool = False
-    points: bool = False  # Separate values, between which there is nothing to draw a line through
+    points: bool = False  # Separate values, drawn without a line
 
 
 def compare_curves(samples: Samples, models: Sequence[SupplyModel], rng: np.random.Generator,
@@ -60,7 +57,7 @@ def compare_curves(samples: Samples, models: Sequence[SupplyModel], rng: np.rand
             try:
                 v = model.simulate(samples.t, rng, samples.throttle)
             except ValueError:
-                # A force that runs away has no simulation.
+                # A diverging force has no simulation.
                 break
             for k, (_, _, curve, _) in enumerate(curves):
                 drawn = curve(v)
@@ -73,14 +70,13 @@ def compare_curves(samples: Samples, models: Sequence[SupplyModel], rng: np.rand
 
 
 def _curves(samples: Samples) -> list[_Curve]:
-    """Return title and labels, x, the curve as a function of the voltage, and how to draw it."""
     v, n = samples.logged, samples.n
     step = float(np.median(samples.step[1:]))
     even = samples.even
     grid = np.arange(samples.t[0], samples.t[-1] + 0.5 * step, step)
 
     def evened(y: FloatArray) -> FloatArray:
-        # The same for data and simulations, so what it does cancels.
+        # Data and simulations are resampled alike, so the effect cancels.
         return y if even else np.interp(grid, samples.t, y)
 
     size = n if even else grid.size
@@ -104,7 +100,7 @@ def _curves(samples: Samples) -> list[_Curve]:
         r: FloatArray = np.fft.irfft(spectrum_)[lags] / max(float(c @ c), 1e-300)
         return r
 
-    # Bins that hold different numbers of codes would show a comb.
+    # Every bin has the same number of codes; otherwise the histogram would be a comb.
     code = find_step(v)
     values = _bins(v, code)
     changes = _bins(np.diff(v), code)
@@ -124,7 +120,7 @@ def _curves(samples: Samples) -> list[_Curve]:
         which, bins = _by_throttle(u)
         count = np.bincount(which, minlength=bins).astype(np.float64)
         at = np.bincount(which, u, minlength=bins) / np.maximum(count, 1.0)
-        # Few levels are separate: a line would say something of what lies between.
+        # A few levels are drawn as points, without a line between them.
         few = bins <= _DISTINCT and np.unique(u).size == bins or bins < 3
 
         def mean(y: FloatArray) -> FloatArray:
@@ -143,7 +139,7 @@ def _curves(samples: Samples) -> list[_Curve]:
 
 
 def _by_throttle(u: FloatArray) -> tuple[np.ndarray, int]:
-    """Return the bin of each sample, and how many: one a distinct value when these are few."""
+    """Return the bin of each sample, and the number of bins: distinct values if they are few."""
     values, which = np.unique(u, return_inverse=True)
     if values.size <= _DISTINCT:
         return which, values.size
@@ -157,7 +153,7 @@ def _averages(y: FloatArray, which: np.ndarray, count: FloatArray) -> FloatArray
 
 
 def _bins(y: FloatArray, code: float = 0.0) -> FloatArray:
-    """Return edges with room for the tails; half-way between codes, each bin of as many."""
+    """Return edges with room for the tails; with codes, halfway between them, evenly spaced."""
     low, high = float(y.min()), float(y.max())
     room = 0.15 * (high - low) or 1e-6
     if not code > 0.0:
@@ -189,20 +185,20 @@ def outline(edges: FloatArray, heights: npt.ArrayLike) -> tuple[FloatArray, Floa
     return np.repeat(edges, 2)[1:-1], np.repeat(np.asarray(heights, dtype=np.float64), 2)
 
 
-# Room on either side of what was seen, as a share of its range.  The extremes of two halves of a
-# stationary flight differ by less, and a wrong sag or a drift that runs on by more; a choice.
+# Margin on either side of the recorded range, as a share of it.  Chosen: the extremes of two
+# halves of a stationary flight differ by less, those of a wrong sag or a growing drift by more.
 MARGIN = 0.5
 
 
 def seen_range(voltage: FloatArray) -> tuple[float, float]:
-    """Return the range that a simulation may have: that of the recording, V, and a margin."""
+    """Return the range allowed for a simulation: the recorded range, V, and a margin."""
     low, high = float(np.min(voltage)), float(np.max(voltage))
     room = MARGIN * (high - low)
     return low - room, high + room
 
 
 def stray(simulated: FloatArray, voltage: FloatArray) -> float:
-    """Return how far simulations, V, shape (..., n), leave `seen_range`, V; inf: not finite."""
+    """Return by how much simulations, V, shape (..., n), leave `seen_range`, V; inf: diverged."""
     low, high = seen_range(voltage)
     if not np.isfinite(simulated).all():
         return float('inf')
@@ -210,7 +206,7 @@ def stray(simulated: FloatArray, voltage: FloatArray) -> float:
 
 
 def even_on_log(x: FloatArray, y: FloatArray, per_decade: int) -> tuple[FloatArray, FloatArray]:
-    """Average neighbours of a curve over rising x > 0, so that its points lie evenly on a log."""
+    """Average a curve over increasing x > 0 in even bins of log x."""
     if x.size < 3:
         return x, y
     bins = np.floor(per_decade * np.log10(x / x[0])).astype(np.intp)

@@ -1,24 +1,22 @@
 """
-One-step innovations of an OU in white noise, and what their spectrum shows of another pole.
+One-step innovations of an OU in white noise, and a test of their spectrum for another pole.
 
-Both verbs whiten by `ou_monitor.model.innovations.Filter`: `analyze` what level and load leave of
-a load level by the OU and the white noise found there, `discover` a whole recording by all terms
-of its model.
+`analyze` uses it for the residual of a load level, `discover` for a whole recording.
 
 Under the right model the innovations are independent and standard normal, and the ordinates of
 their periodogram independent and exponential.  A second OU, slower or faster by a known factor,
-lifts them in a known pattern; what the fit can absorb of it (alpha, sigma, white noise) is
-projected out of the pattern, and what is left is compared with the ordinates.  Near the model
-this score test is the most powerful one, where lags of innovations see nothing: a wander ten
-times slower is correlated over hundreds of them.  An AC-coupled instrument takes out what a
-second OU of the rate of its corner would add,
+raises them in a known pattern.  The part of the pattern that the fit absorbs (alpha, sigma, white
+noise) is projected out, and the rest is compared with the ordinates.  Near the model this score
+test is the most powerful one; correlations at single lags miss a wander ten times slower, which is
+correlated over hundreds of samples.  An AC-coupled instrument subtracts what a second OU with the
+rate of its corner would add,
 
     S r^2 / (w^2 + r^2) = (S - S_r) a^2 r^2 / (a^2 - r^2) up to factors,  S = 1 / (a^2 + w^2),
 
-so the same score with the other sign is the test of it.
+so the same score with the opposite sign tests for it.
 
-Limits: `FACTORS` only, each alone; a corner at the rate of the OU itself bends nothing that the
-fit does not absorb; straight drifts are taken out; samples of the spectrum count as even.
+Limits: only the rates in `FACTORS`, one at a time; a corner at the rate of the OU itself is
+absorbed by the fit; linear drifts are removed; samples are taken as evenly spaced.
 """
 
 from __future__ import annotations
@@ -33,37 +31,36 @@ from ou_monitor.records import FloatArray, NAN
 from scipy import stats
 from scipy.signal import periodogram
 
-# Probability that tests of what is as modelled reject: those of all levels of a recording
-# together in `analyze`, those of a whole recording in `discover`.  One in a hundred, as for lines.
+# Probability that any test of a right model rejects, over all levels of a recording in `analyze`,
+# and over a whole recording in `discover`.  One in a hundred, as for lines.
 FAMILY_WISE = 0.01
-# Least variance of a second relaxation that is of consequence, over Var_inf.
+# Minimum variance of a second relaxation, over Var_inf, that matters.
 LEAST_SHARE = 0.1
-# Rates of the other pole that are looked for, in those of the first.
+# Rates of the other pole that are tested, over the rate of the first.
 FACTORS = (1.0 / 30.0, 1.0 / 10.0, 1.0 / 3.0, 3.0, 10.0)
-# Fewer ordinates than this are not tested; shorter segments give none.
+# Minimum ordinates of a test, and minimum samples of a segment.
 _FEWEST, _SHORTEST = 64, 64
-# Steps that differ by less than this share count as alike.
+# Maximum relative difference of steps that count as equal.
 ALIKE = 0.3
-# White noise that stands for none, as a share of what a step adds.
+# Minimum measurement noise, for a regular filter, as a share of the variance of a step.
 _NO_NOISE = 1e-6
 
 
 @dataclass(frozen=True)
 class OtherPole:
-    """What the spectrum of innovations shows of a pole beside the fitted one."""
+    """Tests of the spectrum of innovations for another pole; NaN with too few samples."""
 
-    # Probability that noise looks as much like a second relaxation; NaN without enough samples.
-    second_p: float = NAN
+    second_p: float = NAN  # p-value of a second relaxation
     second_share: float = NAN  # Its variance, over Var_inf
-    coupling_p: float = NAN  # Probability that noise looks as much like an AC-coupled instrument
+    coupling_p: float = NAN  # p-value of an AC-coupled instrument
 
 
 def steps_before(t: FloatArray) -> FloatArray:
     """Return the time before each sample, s; infinite before the first."""
     step = np.diff(t, prepend=-np.inf)
     usual = float(np.median(step[1:]))
-    # A step a little off moves a prediction by much less than its error, and an even
-    # spacing saves most of the time.
+    # Small deviations change a prediction by much less than its error, and even steps save most
+    # of the time.
     step[np.abs(step - usual) < ALIKE * usual] = usual
     return step
 
@@ -73,7 +70,7 @@ def ou_filter(t: FloatArray, alpha: float, var_inf: float, noise_var: float,
     """
     Return the filter of a sampled OU in white noise.
 
-    t in s; first is the variance of the OU at the first sample, V^2, of itself Var_inf.
+    t in s; first: variance of the OU at the first sample, V^2 (default Var_inf).
     """
     dt = steps_before(t)[1:]
     q = np.append(var_inf if math.isnan(first) else first,
@@ -97,16 +94,15 @@ def innovations(t: FloatArray, deviation: FloatArray, alpha: float, var_inf: flo
 
 
 def join(parts: Sequence[FloatArray]) -> FloatArray:
-    """Return the parts one after the other; empty for none."""
+    """Concatenate parts, of which there may be none."""
     return np.concatenate(parts) if parts else np.zeros(0)
 
 
 def other_pole(parts: Sequence[FloatArray], rate: float, alpha: float, var_inf: float,
                noise_var: float, above: float = 0.0) -> OtherPole:
     """Test innovations for a second relaxation and for an AC coupling (rate, above in Hz)."""
-    # The first innovation of a part has no past, and the trend is that of the rest.
     both = [periodogram(part, rate, detrend='linear') for part in parts if part.size >= _SHORTEST]
-    # The ordinates at 0 and at half the rate are of another law.
+    # The ordinates at 0 and at half the rate have another distribution.
     frequency = join([f[1:-1] if f[-1] == 0.5 * rate else f[1:] for f, _ in both])
     power = join([p[1:-1] if f[-1] == 0.5 * rate else p[1:] for f, p in both])
     frequency, power = frequency[frequency > above], power[frequency > above]
@@ -116,7 +112,7 @@ def other_pole(parts: Sequence[FloatArray], rate: float, alpha: float, var_inf: 
     omega = 2.0 * np.pi * frequency / rate
     step = alpha / rate
     fitted = var_inf * _shape(omega, step) + noise_var
-    # What the fit absorbs: a factor of all, a change of alpha, a change of the white noise.
+    # The fit absorbs a common factor, a change of alpha and a change of the white noise.
     nudge = 1e-3
     slope = (_shape(omega, step * (1.0 + nudge)) - _shape(omega, step * (1.0 - nudge))) / nudge
     absorbed = np.linalg.qr(np.column_stack((
@@ -130,7 +126,7 @@ def other_pole(parts: Sequence[FloatArray], rate: float, alpha: float, var_inf: 
         if not left > 1e-6 * full:
             continue
         score = float(pattern @ power)
-        # A weighted sum of exponentials is skewed as few of them carry it.
+        # A weighted sum of exponentials is skewed if few of them dominate.
         law = stats.pearson3(2.0 * float(np.sum(pattern ** 3)) / left ** 1.5)
         p = float(law.sf(score / math.sqrt(left)))
         if p < more:

@@ -1,9 +1,9 @@
 """
-What a recording shows without any model, and the samples left for one.
+Findings that need no model (stamps, repeats, ADC codes, clipping), and the samples to fit.
 
-Not-a-number, stamps, repeated values, codes and rails: exact findings, for in a diffusion ties
-have probability zero.  Stamps that scatter about an even grid are either true, and then the
-increments follow the steps, or wrong, and then they do not.
+These findings are exact, because ties have probability zero in a diffusion.  If stamps scatter
+about an even grid, the voltage increments tell whether the scatter is real: only then do they
+follow the steps.
 """
 
 from __future__ import annotations
@@ -26,34 +26,34 @@ from ou_monitor.records import FloatArray, Recording
 from ou_monitor.text import counted
 from ou_monitor.timeline.line import on_grid, reading_places, reading_times
 
-# Fewer samples than this are not fitted.
+# Minimum samples of a fit.
 LEAST = 100
-# Steps of the ADC from this share of the innovations' standard deviation are named.
+# Minimum step of the ADC that is named a cause, in standard deviations of the innovations.
 NAMED_STEP = 0.3
-# Throttle that moves less than this says nothing.
+# Minimum range of a throttle that is used.
 MOVES = 0.01
-# Samples as logged that are kept for the score of the plain model.
+# Maximum samples as logged that are kept for the score of the plain model.
 _LOOK = 200_000
 
 
 @dataclass(frozen=True, eq=False)
 class Integrity:
-    """What a recording is, before any model."""
+    """Exact findings in a recording, and the samples to fit."""
 
-    samples: Samples | None  # For the fit; None when there is nothing to fit
-    exact: tuple[Term, ...]  # What was found, with parameters
+    samples: Samples | None  # For the fit; None if there is nothing to fit
+    exact: tuple[Term, ...]  # Findings, with parameters
     notes: tuple[str, ...]  # What was dropped or left out, one sentence each
-    reason: str = ''  # Why there is nothing to fit; empty when there is
-    # The samples as logged, repeats included, where those differ from `samples` by an exact
-    # finding: for the score of the plain model.
+    reason: str = ''  # Why there is nothing to fit; otherwise empty
+    # Samples as logged, repeats included, for the score of the plain model; None if they equal
+    # `samples`.
     raw: Samples | None = None
-    current: bool = False  # Whether the load is the measured current, and not throttle
-    # Samples that were drawn and not measured: they take no part in scores; shape (samples.n,).
+    current: bool = False  # Whether the load is the measured current instead of throttle
+    # Samples that were drawn, not measured, and so are not scored; shape (samples.n,).
     drawn: npt.NDArray[np.bool_] | None = None
 
 
 def examine(recording: Recording, progress: Callable[[float], None] | None = None) -> Integrity:
-    """Examine a recording."""
+    """Examine a recording (progress 0..1)."""
     report = progress or (lambda share: None)
     notes = list(recording.notes)
     t, v, u = usable(recording, notes)
@@ -65,7 +65,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
         return Integrity(None, (), tuple(notes), reason)
     report(0.2)
     exact: list[Term] = []
-    # A recording from Python may still hold the steady repeats of a logger: no score counts them.
+    # A recording made in Python may still contain the steady repeats of a logger.
     places, period = reading_places(v)
     t, v, u = reading_times(t[places], period), v[places], None if u is None else u[places]
     logged = (t, v, u)
@@ -75,8 +75,9 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     if period > 1.0 or recording.held or held > 1.0:
         fresh = (v.size - 1) / float(t[-1] - t[0])
         exact.append(HeldSamples(fresh))
-        notes.append(f'The logger repeats its last value: the voltage was read at {fresh:.4g} Hz; '
-                     f'{recording.held + recording.n - v.size} repeats were left out.')
+        notes.append(f'The logger repeats its last value: the voltage was measured at '
+                     f'{fresh:.4g} Hz; {recording.held + recording.n - v.size} repeats were left '
+                     'out.')
     report(0.4)
     rate = (v.size - 1) / float(t[-1] - t[0])
     which, note = choose_samples(v, rate)
@@ -84,8 +85,8 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
         notes.append(note)
     lines = lines_between(t, v, which)
     for line in lines:
-        notes.append(f'The line at {line.frequency:.6g} Hz was found in all samples and taken '
-                     'out of those used, which are too few to show it.')
+        notes.append(f'The line at {line.frequency:.6g} Hz was found in all samples and '
+                     'subtracted from the samples used, whose rate is too low to show it.')
     between = events_between(v, u, rate, which)
     origin = float(t[which.start])
     events = (t[between], without_tones(t[between], v[between], origin, lines),
@@ -98,7 +99,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     noise = _innovation_std(v)
     step = find_step(v)
     low, high = find_rails(v, step or usual_change(v), noise, u)
-    soft = 'readings squeezed near the end of the range'
+    soft = 'readings compressed near the end of the range'
     if not math.isfinite(low) and not math.isfinite(high):
         low, high = _knees(v, noise, u)
     else:
@@ -106,20 +107,18 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     if math.isfinite(low) or math.isfinite(high):
         drawn = (v <= low) | (v >= high)
         exact.append(_saturation(v, low, high))
-        notes.append(f'{int(drawn.sum())} {soft} were redrawn from the '
-                     'law of an OU beyond it, given their neighbours.')
+        notes.append(f'{int(drawn.sum())} {soft} were replaced by random draws of an OU beyond '
+                     'it, given their neighbours.')
         v = redraw(v, low, high, step, np.random.default_rng(0))
     cell = _judge_step(step, _innovation_std(v), exact, notes)
     stamps = judge_stamps(t, v)
     notes += stamps.notes
     if stamps.error > 0.0:
         exact.append(ClockJitter(stamps.error))
-    useful = _useful(u, recording.has_throttle or current_is_load, notes)
-    samples = Samples(stamps.t, v, useful)
+    samples = Samples(stamps.t, v, _useful(u, recording.has_throttle or current_is_load, notes))
     if between.size and drawn is None and stamps.error == 0.0:
         samples = _joined(samples, *events)
-        notes.append(f'{between.size} samples around changes that stand out between neighbours '
-                     'were kept as well.')
+        notes.append(f'{between.size} samples around sudden changes were kept as well.')
     samples = samples.spread(samples.voltage, cell, np.random.default_rng(0))
     report(1.0)
     raw = _as_logged(*logged) if held > 1.0 or any(
@@ -129,37 +128,37 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
 
 
 def _joined(samples: Samples, t: FloatArray, v: FloatArray, u: FloatArray | None) -> Samples:
-    """Return samples with more between them."""
+    """Insert further samples."""
     at = np.searchsorted(samples.t, t)
     more = None if samples.throttle is None or u is None else np.insert(samples.throttle, at, u)
     return Samples(np.insert(samples.t, at, t), np.insert(samples.voltage, at, v), more)
 
 
 def _innovation_std(v: FloatArray) -> float:
-    """Return the standard deviation of the error of predicting from the sample before, V."""
+    """Return the standard deviation of the error of an AR(1) prediction, V, without outliers."""
     a, b = v[:-1] - v[:-1].mean(), v[1:] - v[1:].mean()
     e = b - float(a @ b) / max(float(a @ a), 1e-300) * a
-    # Events and load steps are no noise.
+    # Limit the errors of events and load steps.
     middle = float(np.quantile(np.abs(e), 0.95))
     return float(np.minimum(np.abs(e), middle).std()) if middle == 0.0 else float(
         np.sqrt(np.mean(np.square(np.clip(e, -middle, middle)))) / 0.8729)
 
 
 def _judge_step(step: float, noise: float, exact: list[Term], notes: list[str]) -> float:
-    """Name the step of the ADC where it matters, and return it, V; else 0."""
+    """Return the step of the ADC, V, if it is large enough to be named a cause; else 0."""
     if step <= 0.0:
         return 0.0
-    # Rounding adds step^2/12 to each sample, and so up to twice that to an innovation.
+    # Rounding adds step^2/12 to the variance of a sample, up to twice that to an innovation.
     own = math.sqrt(max(noise * noise - step * step / 6.0, 0.01 * noise * noise))
     named = step >= NAMED_STEP * own
     exact += [Quantization(step)] if named else []
-    size = f'{step / own:.2g} times the' if named else 'small beside the'
-    notes.append(f'The ADC counts in steps of {1e3 * step:.3g} mV, {size} noise between samples.')
+    size = f'{step / own:.2g} times the' if named else 'small relative to the'
+    notes.append(f'The ADC has steps of {1e3 * step:.3g} mV, {size} noise between samples.')
     return step if named else 0.0
 
 
 def _knees(v: FloatArray, noise: float, u: FloatArray | None) -> tuple[float, float]:
-    """Return the limits beyond which readings are squeezed; infinite where there is none."""
+    """Return the limits beyond which readings are compressed; infinite if there is none."""
     if not noise > 0.0:
         return -math.inf, math.inf
     bottom, top = find_knee(v, noise, -1.0, u), find_knee(v, noise, 1.0, u)
@@ -167,14 +166,14 @@ def _knees(v: FloatArray, noise: float, u: FloatArray | None) -> tuple[float, fl
 
 
 def _saturation(v: FloatArray, low: float, high: float) -> Term:
-    """Return the term; a rail that was not met is put where no reading comes."""
+    """Return the term; a limit that was not found is put far from all readings."""
     far = 1e3 * (float(v.max()) - float(v.min()))
     return Saturation(low if math.isfinite(low) else float(v.min()) - far,
                       high if math.isfinite(high) else float(v.max()) + far)
 
 
 def _useful(u: FloatArray | None, recorded: bool, notes: list[str]) -> FloatArray | None:
-    """Return throttle where it moves; say what cannot be tested where it does not."""
+    """Return throttle if it moves; otherwise None, and a note of the causes not tested."""
     if u is not None and float(u.max() - u.min()) >= MOVES:
         return u
     names = [name for name, kind in catalogue().items() if kind.NEEDS_THROTTLE]
@@ -184,38 +183,36 @@ def _useful(u: FloatArray | None, recorded: bool, notes: list[str]) -> FloatArra
 
 
 def _as_logged(t: FloatArray, v: FloatArray, u: FloatArray | None) -> Samples:
-    """Return the first samples as logged, where the fit works on others."""
     part = slice(0, min(v.size, _LOOK))
     return Samples(t[part], v[part], None)
 
 
-# Scatter below this share of a step is put onto the grid: it changes nothing else.
-_SMALL = 0.02
-# Scatter above this share of a step is no scatter about a grid.
-_LARGE = 0.45
-# Correlation of neighbouring errors up to which they count as independent.
+# Scatter of stamps about a grid, as a share of a step: below the first it is ignored, above the
+# second there is no grid.
+_SMALL, _LARGE = 0.02, 0.45
+# Maximum correlation of neighbouring errors that count as independent.
 _WHITE = 0.3
 _TINY = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Stamps:
-    """What became of the stamps."""
+    """Corrected stamps."""
 
     t: FloatArray  # Stamps to use, s; shape (n,)
-    error: float  # Standard deviation of stamps that are wrong, s; 0: none are
-    notes: tuple[str, ...]  # Sentences
+    error: float  # Standard deviation of wrong stamps, s; 0 if they are right
+    notes: tuple[str, ...]  # What was changed, one sentence each
 
 
 def judge_stamps(t: FloatArray, voltage: FloatArray) -> Stamps:
     """
-    Judge stamps, and put them onto the grid where that is where they belong.
+    Replace stamps by an even grid if their scatter is negligible or wrong.
 
     t in s, voltage in V.
     """
     step = np.diff(t)
     usual = float(np.median(step))
-    # Without gaps first: steps that scatter by half of their length look like gaps.
+    # First without gaps, because steps that scatter by half of their length look like gaps.
     number = np.ones(step.size)
     grid = on_grid(t, number)
     if float((t - grid).std()) > _LARGE * usual:
@@ -232,27 +229,26 @@ def judge_stamps(t: FloatArray, voltage: FloatArray) -> Stamps:
         return Stamps(t if gaps else grid, 0.0, tuple(notes))
     white = abs(_correlation(off[1:], off[:-1])) < _WHITE
     if scatter < _SMALL:
-        notes.append(f'Stamps scatter by {100.0 * scatter:.2g} % of a step about an even grid: '
-                     'taken as even.')
+        notes.append(f'Stamps scatter by {100.0 * scatter:.2g} % of a step about an even grid, '
+                     'which was used instead.')
         return Stamps(grid, 0.0, tuple(notes))
     if white and scatter < _LARGE and _wrong(step / usual, number, voltage):
         error = float(off.std())
-        notes.append(f'Stamps scatter by {1e3 * error:.3g} ms about an even grid while the '
-                     'voltage does not follow: the stamps are wrong, the grid was used.')
+        notes.append(f'Stamps scatter by {1e3 * error:.3g} ms about an even grid, but the voltage '
+                     'does not follow: the stamps are wrong, and the grid was used.')
         return Stamps(grid, error, tuple(notes))
     uneven = float(step[number == 1.0].std()) / usual
     if uneven > _SMALL:
-        notes.append(f'Steps between stamps scatter by {100.0 * uneven:.2g} %: taken as they '
-                     'are.')
+        notes.append(f'Steps between stamps scatter by {100.0 * uneven:.2g} %: kept.')
     return Stamps(t, 0.0, tuple(notes))
 
 
 def _wrong(step: FloatArray, number: FloatArray, voltage: FloatArray) -> bool:
     """
-    Return whether increments are likelier not to follow the steps than to follow them.
+    Return whether increments do not follow the steps, so that the stamps are wrong.
 
-    By a likelihood ratio above the price of a parameter, as causes are; white noise of the sensor
-    follows no step.
+    By a likelihood ratio above the penalty of a parameter, as for causes.  White noise of the
+    sensor, which follows no step, is allowed for.
     """
     change = np.diff(voltage)
     change = change - np.median(change)
@@ -261,14 +257,14 @@ def _wrong(step: FloatArray, number: FloatArray, voltage: FloatArray) -> bool:
     both = use[1:] & use[:-1]
     if not both.any():
         return False
-    # It makes neighbouring increments undo each other.
+    # White noise gives neighbouring increments a negative correlation.
     power = float(np.mean(change[use] ** 2))
     noise = -2.0 * float(np.mean((change[1:] * change[:-1])[both])) / power
     rail = min(max(1.0 - noise, 0.0), 1.0)
     square = change[use] ** 2 / power - 1.0
     x = step[use] - step[use].mean()
     follow, weight = float(x @ square), float(x @ x)
-    # Of normal errors, with the spread of the squares.
+    # For normal errors with the variance of the squares.
     ratio = 0.5 * ((follow - rail * weight) ** 2 - follow**2) / (
         weight * float(square @ square) / square.size)
     return bool(ratio > 0.5 * math.log(square.size))

@@ -1,7 +1,7 @@
 """
-The readings of a recording: codes and bad samples left out, throttle as 0..1.
+The readings of a recording, without error codes and bad samples, and throttle as 0..1.
 
-Each correction leaves a note.
+Each correction adds a note.
 """
 
 from __future__ import annotations
@@ -16,29 +16,30 @@ from ou_monitor.records import FloatArray, Recording
 from ou_monitor.text import counted, number
 from ou_monitor.timeline.line import in_order
 
-# Far from the others: so many times their spread, and so many times as far as they go.
+# Minimum distance of an outlier from the median, in spreads of the samples, and in distances of
+# the farthest other sample.
 _FAR, _GAP = 50.0, 5.0
-# Samples from which one value far from all others is a code, and the share it has at most;
-# single bad samples that are left out at most, and one more for each so many samples.
+# Minimum repeats of an outlying value that is an error code, and maximum share of such samples.
 _CODE, _MOST_CODES = 3, 0.2
+# Maximum single bad samples that are left out; for long recordings, one for each _EACH samples.
 _SINGLES, _EACH = 3, 100_000
-# Others from which a value of a larger share can be far.
+# Minimum other samples if a value has a larger share.
 _OTHERS = 100
-# Values looked at for the spread.
+# Maximum values used for the spread.
 _LOOK = 200_000
-# Constant but for so many samples, or this share of them, says nothing.
+# Maximum number, or share, of samples that differ in a voltage that counts as constant.
 _ODD, _ODD_SHARE = 3, 1e-3
-# Volts beyond which nothing is measured, and which squares and fourth powers still hold.
+# Limits of a voltage and of its range, V; their fourth powers are finite numbers.
 _LARGEST, _SMALLEST = 1e30, 1e-30
-# Volts above which they may be millivolts.
+# Median above which volts may be millivolts.
 _MILLIVOLTS = 1000.0
-# Throttle: as 0..1 with what calibration adds; a percentage; microseconds of a servo pulse.
+# Ranges of throttle as 0..1 with trim, as a percentage, and in microseconds of a servo pulse.
 _UNIT, _PERCENT, _PULSE = (-1.5, 1.5), (-1.0, 150.0), (700.0, 2400.0)
 _EDGE = 0.05
-# Longest hole in a current, s; share of its sizes below its scale; lags in which the mean answers
-# to a load, s.
+# Maximum gap in a current, s; quantile of its size that is its scale; lags of the mean response to
+# a load, s.
 _HOLE, _FULL, _LAGS = 1.0, 0.99, np.array([0.02, 0.2, 2.0])
-# Second differences up to so many roundings are none.
+# Maximum second difference of a straight line, in rounding errors.
 _ROUNDINGS = 16.0
 
 
@@ -56,16 +57,16 @@ def usable(recording: Recording, notes: list[str]
         t, v, u = t[~bad], v[~bad], None if u is None else u[~bad]
     usual = _quantiles(v[:_LOOK], 0.5)[0] if v.size else 0.0
     if _MILLIVOLTS < abs(usual) <= _LARGEST:
-        notes.append(f'The voltage is near {number(usual)}: taken as volts. Where it is in '
-                     'millivolts or counts of the ADC, so is every number in V here; give it in '
-                     'volts.')
+        notes.append(f'The voltage is near {number(usual)}: taken as volts. If it is in '
+                     'millivolts or counts of the ADC, every result in V is wrong by that factor; '
+                     'give it in volts.')
     if u is not None:
         u = _held(t, _as_share(u, notes), notes) if np.isfinite(u).any() else None
     return t, v, u
 
 
 def current_at(recording: Recording, t: FloatArray) -> FloatArray | None:
-    """Return the current at some stamps, A; None where it is not known throughout."""
+    """Return the current at some stamps, s, in A; None if it has large gaps."""
     if recording.current is None:
         return None
     known = np.isfinite(recording.current) & np.isfinite(recording.t)
@@ -84,10 +85,10 @@ def current_at(recording: Recording, t: FloatArray) -> FloatArray | None:
 def load_of(recording: Recording, t: FloatArray, v: FloatArray, u: FloatArray | None,
             notes: list[str]) -> FloatArray | None:
     """
-    Return what moves the mean: throttle, or the measured current where it says more of it.
+    Return the load: throttle, or the measured current if it predicts the voltage better.
 
-    As a share of the current that is seldom exceeded, read when the voltage answers to it; t in s,
-    v in V.
+    The current is scaled by its 99 % quantile, and shifted by the delay of the voltage; t in s, v
+    in V.
     """
     current = current_at(recording, t)
     if current is None or not float(np.ptp(current)) > 0.0:
@@ -98,18 +99,18 @@ def load_of(recording: Recording, t: FloatArray, v: FloatArray, u: FloatArray | 
     if not full:
         return u
     load = np.interp(t + late, t, current) / full
-    gain = _said(t[some], v[some], load[some]) - (
-        0.0 if u is None else _said(t[some], v[some], u[some]))
+    gain = _explained(t[some], v[some], load[some]) - (
+        0.0 if u is None else _explained(t[some], v[some], u[some]))
     if not gain > 0.5 * _LAGS.size * math.log(v.size):
         return u
-    notes.append(f'The measured current says more of the voltage than throttle (by {gain:.3g} '
-                 f'nats): it is the load, as a share of {full:.3g} A. What is said of throttle is '
-                 'said of it, and the model is for it.')
+    notes.append(f'The measured current predicts the voltage better than throttle (by {gain:.3g} '
+                 f'nats), so it is used as the load, as a share of {full:.3g} A. Read "throttle" '
+                 'in the results and in the model as this share.')
     return np.asarray(load)
 
 
-def _said(t: FloatArray, v: FloatArray, load: FloatArray) -> float:
-    """Return what a load says of changes of the voltage, nats: by itself, its square, lags."""
+def _explained(t: FloatArray, v: FloatArray, load: FloatArray) -> float:
+    """Return the log likelihood gain from a load, its square and its lags, nats."""
     lags = [lowpass(load, t, tau) for tau in _LAGS[_LAGS > float(np.median(np.diff(t)))].tolist()]
     columns = np.diff(np.stack([load, load * load, *lags]))
     change = np.diff(v)
@@ -124,7 +125,7 @@ def _said(t: FloatArray, v: FloatArray, load: FloatArray) -> float:
 
 
 def find_bad(v: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return which samples are no readings of a supply (v in V)."""
+    """Return which samples are error codes or glitches (v in V)."""
     bad = np.zeros(v.size, dtype=np.bool_)
     some = v[::max(1, v.size // _LOOK)]
     if some.size < 2:
@@ -137,7 +138,7 @@ def find_bad(v: FloatArray) -> npt.NDArray[np.bool_]:
     low, middle, high = _quantiles(some, 0.2, 0.5, 0.8)
     if low == high:
         low, high = _quantiles(some, 0.05, 0.95)
-    # The half-width of the inner 60 %, as of a normal law.
+    # Standard deviation of a normal distribution with this inner 60 %.
     spread = (high - low) / 1.683
     with np.errstate(over='ignore'):
         away = np.abs(v - middle)
@@ -162,7 +163,7 @@ def find_bad(v: FloatArray) -> npt.NDArray[np.bool_]:
 
 
 def _resting(v: FloatArray) -> float | None:
-    """Return the value of a large share of the samples that is far from all others, if any."""
+    """Return a value that many samples have and that is far from all others, if any."""
     values, count = np.unique(v, return_counts=True)
     value = float(values[count.argmax()])
     others = v[v != value]
@@ -176,18 +177,18 @@ def _resting(v: FloatArray) -> float | None:
 
 
 def _quantiles(v: FloatArray, *shares: float) -> list[float]:
-    """Return values of the sample itself: a mean of two of them might overflow."""
+    """Return quantiles without interpolation, which might overflow."""
     at = [round(share * (v.size - 1)) for share in shares]
     found: list[float] = np.partition(v, at)[at].tolist()
     return found
 
 
 def _bad_notes(t: FloatArray, v: FloatArray, bad: npt.NDArray[np.bool_]) -> list[str]:
-    """Return what was left out, codes first."""
+    """Return notes of the samples left out."""
     rest = f'while all others lie within {_range(v[~bad])} V'
     values, count = np.unique(v[bad], return_counts=True)
-    notes = [f'{many} samples read exactly {_short(value)} V, {rest}: taken as a code for no '
-             'reading, or as the supply being off, and left out.'
+    notes = [f'{many} samples read exactly {_short(value)} V, {rest}: taken as an error code, or '
+             'as the supply being off, and left out.'
              for value, many in zip(values.tolist(), count.tolist()) if many >= _CODE]
     single = np.flatnonzero(bad & np.isin(v, values[count < _CODE]))
     if single.size:
@@ -208,7 +209,7 @@ def _short(value: float) -> str:
 
 
 def why_nothing(v: FloatArray) -> str:
-    """Return why nothing can be fitted to voltages, as a sentence; empty where it can (v in V)."""
+    """Return why no model can be fitted to voltages, V; empty if one can."""
     if float(v.min()) == float(v.max()):
         return ('The voltage does not change at all: the sensor is stuck, or its step is larger '
                 'than the noise.')
@@ -229,9 +230,9 @@ def why_nothing(v: FloatArray) -> str:
 
 
 def _as_share(u: FloatArray, notes: list[str]) -> FloatArray:
-    """Return throttle as 0..1, NaN where it cannot be; say which unit it was taken for."""
+    """Return throttle as 0..1, NaN where implausible; note the unit."""
     known = u[np.isfinite(u)]
-    # A few wild values are no unit.
+    # A few wild values do not decide the unit.
     low, high = _quantiles(known[::max(1, known.size // _LOOK)], 0.005, 0.995)
     within = _UNIT
     if _UNIT[0] <= low and high <= _UNIT[1]:
@@ -250,8 +251,8 @@ def _as_share(u: FloatArray, notes: list[str]) -> FloatArray:
                      'throttle = value / 100. All results, and the model file, are for throttle '
                      '0 to 1.')
     else:
-        notes.append(f'Throttle lies within {number(low)} to {number(high)}, in no unit known '
-                     'here: not used. Give it as 0 to 1.')
+        notes.append(f'Throttle lies within {number(low)} to {number(high)}, an unknown unit: '
+                     'not used. Give it as 0 to 1.')
         return np.full(u.size, np.nan)
     with np.errstate(invalid='ignore'):
         wild = np.isfinite(u) & ((u < within[0]) | (u > within[1]))
@@ -263,7 +264,7 @@ def _as_share(u: FloatArray, notes: list[str]) -> FloatArray:
 
 
 def _held(t: FloatArray, u: FloatArray, notes: list[str]) -> FloatArray | None:
-    """Return throttle with its holes filled, and say how much of it that is."""
+    """Return throttle with the last value held over gaps; note their size."""
     there = np.isfinite(u)
     known = np.flatnonzero(there)
     if not known.size:
@@ -272,7 +273,7 @@ def _held(t: FloatArray, u: FloatArray, notes: list[str]) -> FloatArray | None:
         return u
     step = np.diff(t, append=t[-1])
     total = float(step[~there].sum())
-    # Lengths of the holes: sums between the samples where it is known.
+    # Lengths of the gaps: unknown time between known samples.
     lost = np.concatenate(([0.0], np.cumsum(np.where(there, 0.0, step))))
     ends = lost[np.concatenate((known, [u.size]))]
     longest = float(np.diff(ends, prepend=0.0).max())
@@ -280,6 +281,6 @@ def _held(t: FloatArray, u: FloatArray, notes: list[str]) -> FloatArray | None:
         f'Throttle is unknown at {counted(u.size - known.size, "sample")} ({number(total)} of '
         f'{number(float(t[-1] - t[0]))} s, the longest gap {number(longest)} s): the last '
         'known value is held there' + ('' if there[0] else ', and the first one before it')
-        + '. Where throttle moved meanwhile, findings about throttle are wrong.')
+        + '. If throttle moved meanwhile, findings about throttle are wrong.')
     at = np.searchsorted(known, np.arange(u.size), side='right') - 1
     return u[known[np.maximum(at, 0)]]

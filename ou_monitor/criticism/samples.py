@@ -1,9 +1,9 @@
 """
-The samples that `discover` works on, and which of a long recording they are.
+The samples that `discover` fits, and their choice in a long recording.
 
-Every k-th sample of an OU is an OU, and all terms keep their meaning, which averages would not
-do: so samples of a recording too long to be fitted whole are left out, not averaged.  Where that
-would lose the relaxation, a segment from the middle is used instead.
+Of a recording with too many samples, every k-th is used: every k-th sample of an OU is an OU, and
+all terms keep their meaning, unlike with averages.  If this would lose the relaxation, a segment
+from the middle is used instead.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ from ou_monitor.model.terms.tones import Tone
 from ou_monitor.records import FloatArray
 from scipy.special import ndtri
 
-# Share of the samples that models are fitted on; the rest is kept to score them.
+# Share of the samples for fitting; the rest is held out to score models.
 TRAIN = 0.6
-# Samples that are fitted at most.
+# Maximum samples of a fit.
 MOST = 80_000
-# Steps of up to this many relaxation times keep alpha identifiable.
+# Maximum step, in relaxation times, at which alpha stays identifiable.
 _STEP = 0.3
-# What (gamma(2L) - gamma(L)) / (gamma(4L) - gamma(2L)) is at that step, gamma
-# being the variogram of an OU: exp(x) / (1 + exp(-x)).  White noise cancels.
+# (gamma(2L) - gamma(L)) / (gamma(4L) - gamma(2L)) at that step L, with the variogram gamma of an
+# OU: exp(x) / (1 + exp(-x)).  White noise cancels.
 _RATIO = math.exp(_STEP) / (1.0 + math.exp(-_STEP))
-# Values looked at for it.
+# Maximum values used for that ratio.
 _LOOK = 1_000_000
-# Samples whose changes share a scale; chance that noise makes any change pass for an
-# event, and by what more they must be larger, for the scale is an estimate.
+# Samples with a common noise scale; probability that noise makes any change an event; margin for
+# the error of the scale.
 _SHARE, _CHANCE, _MORE = 1024, 0.02, 1.05
-# Throttle that moves more than this in a sample steps, and for how long after it a change
-# is the load's, s.
+# Minimum change of throttle of a load step, and the time after it in which a change of voltage is
+# attributed to the load, s.
 _STEPS, _SOON = 0.01, 0.02
-# Events that are few; of more the samples used have enough.
+# Maximum events that are kept; if there are more, the samples used contain enough of them.
 _FEW = 300
-# Changes larger than this many deviations are events, no part of a line; share of its power that
-# a line must have in common with one sinusoid.
+# Limit of changes when lines are sought, in standard deviations (larger ones are events); minimum
+# share of the power of a line that one sinusoid explains.
 _EVENT, _COMMON = 5.0, 0.5
-# Stamps off an even grid by more than this share of a step give no phase; stamps at once.
+# Maximum distance of stamps from an even grid, in steps; stamps checked at a time.
 _EVEN, _CHUNK = 0.1, 500_000
 
 
@@ -53,15 +53,13 @@ _EVEN, _CHUNK = 0.1, 500_000
 class Samples:
     """Clean samples in order."""
 
-    # Stamps, s, rising, and V; shape (n,).
-    t: FloatArray
-    voltage: FloatArray
-    # 0..1; None when it says nothing (unknown, or constant); shape (n,).
-    throttle: FloatArray | None
+    t: FloatArray  # Increasing, s; shape (n,)
+    voltage: FloatArray  # V; shape (n,)
+    throttle: FloatArray | None  # 0..1; None if unknown or constant; shape (n,)
     longer: Samples | None = None  # Samples that begin with these
-    # V, as logged, where `voltage` is those codes spread over their cells; shape (n,).
+    # ADC codes as logged, V, if `voltage` is spread evenly within their cells; shape (n,).
     codes: FloatArray | None = None
-    cell: float = 0.0  # Width of a cell, V; 0 where nothing was spread
+    cell: float = 0.0  # Width of a cell, V; 0 without spreading
 
     @property
     def n(self) -> int:
@@ -87,9 +85,9 @@ class Samples:
                        None if self.codes is None else self.codes[part], self.cell)
 
     def columns(self, term: Term) -> FloatArray:
-        """Return the columns of a term of the mean, computed once, as none looks ahead."""
+        """Return the columns of a term of the mean, computed once; they are causal."""
         source = self.longer or self
-        # Its coefficients apart, a term has the same columns again and again.
+        # The columns do not depend on the coefficients of the term.
         unit = term.with_linear([1.0] * len(term.LINEAR))
         if unit not in source._known:
             source._known[unit] = unit.columns(source.segment(1.0, 0.0))
@@ -102,16 +100,16 @@ class Samples:
 
     @property
     def blur(self) -> float:
-        """Return the variance that spreading has added to each sample, V^2."""
+        """Return the variance that spreading adds to a sample, V^2."""
         return self.cell * self.cell / 12.0
 
     def spread(self, codes: FloatArray, cell: float, rng: np.random.Generator) -> Samples:
         """
-        Return the samples with codes, V, each drawn anew within its cell (width in V; 0: as is).
+        Return the samples with codes, V, spread evenly within their cells (cell in V; 0: as is).
 
-        The log density of a value drawn evenly within a cell is, in the mean, at most the log
-        probability of the code over the width (Jensen; Theis et al., ICLR 2016): no law gains by
-        being ever narrower where codes repeat, as it does from the density at a code itself.
+        The mean log density of a value spread within a cell is at most the log probability of the
+        code over the width (Jensen; Theis et al., ICLR 2016).  So a narrow distribution cannot
+        gain without limit where codes repeat, as it does with the density at the code itself.
         """
         if not cell > 0.0:
             return replace(self, voltage=codes)
@@ -119,7 +117,7 @@ class Samples:
         return replace(self, voltage=drawn, longer=self.longer or self, codes=codes, cell=cell)
 
     def redrawn(self, at: npt.NDArray[np.int64], voltage: FloatArray) -> Samples:
-        """Return the samples with others at some places (voltage in V, one for each place)."""
+        """Return the samples with other voltages, V, at some indices."""
         v, codes = self.voltage.copy(), self.codes
         v[at] = voltage
         if codes is not None:
@@ -129,17 +127,17 @@ class Samples:
 
     @cached_property
     def _known(self) -> dict[Term, FloatArray]:
-        """Return columns that were computed before."""
+        """Return a cache of columns by term."""
         return {}
 
     @cached_property
     def means(self) -> dict[tuple[object, ...], FloatArray]:
-        """Return the mean that was computed last, V, by the terms with their coefficients."""
+        """Return a cache of the last mean, V, by terms with their coefficients."""
         return {}
 
     @cached_property
     def designs(self) -> dict[tuple[Term, ...], FloatArray]:
-        """Return voltage, level and columns that were put side by side last, by terms."""
+        """Return a cache of the last design (voltage, level, columns) by terms."""
         return {}
 
     @cached_property
@@ -149,12 +147,12 @@ class Samples:
 
     @cached_property
     def even(self) -> bool:
-        """Return whether all steps are alike."""
+        """Return whether all steps are equal."""
         step = self.step[1:]
         return bool((step == step[0]).all()) if step.size else True
 
     def segment(self, alpha: float, sigma: float) -> Segment:
-        """Return the samples as terms take them, with nothing on them yet."""
+        """Return an initial segment for terms to change."""
         n = self.n
         return Segment(
             t=self.t, at=self.t, step=self.step,
@@ -174,23 +172,22 @@ def choose_samples(voltage: FloatArray, rate: float) -> tuple[slice, str]:
     if widest >= factor:
         return slice(0, n, factor), (
             f'{n} samples: every {_nth(factor)} was used ({rate / factor:.4g} Hz); lines above '
-            f'{0.5 * rate / factor:.4g} Hz show up at other frequencies.')
+            f'{0.5 * rate / factor:.4g} Hz are aliased.')
     size = MOST * widest
     first = (n - size) // 2
     what = f'every {_nth(widest)} was used' if widest > 1 else 'all were used'
     return slice(first, first + size, widest), (
         f'{n} samples: {what} of the {size / rate:.4g} s in the middle ({rate / widest:.4g} Hz), '
-        'because the rail relaxes too fast for sparser samples; effects slower than that segment '
-        'go undetected.')
+        'because the rail relaxes too fast for a lower rate; effects slower than that segment '
+        'are not detected.')
 
 
 def events_between(voltage: FloatArray, throttle: FloatArray | None, rate: float, which: slice
                    ) -> npt.NDArray[np.int64]:
     """
-    Return samples to keep beside those used: about changes that only neighbours show.
+    Return further samples to keep: around sudden changes.
 
-    A jump that stands out between two samples drowns in what the noise adds on the way
-    to the k-th one.
+    A jump that is clear between neighbours may be hidden by the noise of k steps.
 
     voltage in V, rate in Hz.
     """
@@ -203,7 +200,7 @@ def events_between(voltage: FloatArray, throttle: FloatArray | None, rate: float
     size = np.abs(change[:blocks * _SHARE]).reshape(blocks, _SHARE)
     scale = np.median(size, axis=1) / 0.6745
     if not (scale > 0.0).all():
-        # Codes so coarse that most do not change.
+        # Coarse codes: most changes are 0.
         return none
     limit = -_MORE * float(ndtri(0.5 * _CHANCE / change.size))
     row, column = np.nonzero(size > limit * scale[:, None])
@@ -215,7 +212,7 @@ def events_between(voltage: FloatArray, throttle: FloatArray | None, rate: float
         at = at[since > _SOON * rate]
     if not 0 < at.size <= _FEW:
         return none
-    # Before it and after it, and the next, which separates a bad sample from a jump.
+    # The samples before and after it, and the next, which tells a bad sample from a jump.
     near: npt.NDArray[np.int64] = np.unique(np.concatenate((at, at + 1, at + 2)))
     kept: npt.NDArray[np.int64] = near[(near < stop) & ((near - first) % k != 0)]
     return kept
@@ -223,10 +220,9 @@ def events_between(voltage: FloatArray, throttle: FloatArray | None, rate: float
 
 def lines_between(t: FloatArray, voltage: FloatArray, which: slice) -> list[Tone]:
     """
-    Find steady lines in all samples that are above half of the rate of the samples used.
+    Find steady lines in all samples above the Nyquist frequency of the samples used.
 
-    At the samples used they would show up at other frequencies, and mostly drown in what the
-    noise adds between them.
+    In the samples used they would be aliased, and mostly hidden by noise.
     """
     k = which.step or 1
     part = slice(which.start, min(which.stop, voltage.size))
@@ -242,7 +238,7 @@ def lines_between(t: FloatArray, voltage: FloatArray, which: slice) -> list[Tone
         wave = fit_sinusoid(e, 1.0 / dt, line.frequency, line.resolution)
         if 0.5 * wave.amplitude ** 2 > _COMMON * line.rms ** 2:
             turn = 2.0 * math.pi * wave.frequency * dt
-            # The first of the differences belongs to the second sample.
+            # The first difference belongs to the second sample.
             gain = 1.0 - keep * np.exp(-1j * turn)
             found.append(Tone(wave.amplitude / abs(gain), wave.frequency,
                               wave.phase - turn - float(np.angle(gain)), 0.0))
@@ -259,12 +255,12 @@ def without_tones(t: FloatArray, voltage: FloatArray, origin: float, lines: Sequ
 
 
 def _even(t: FloatArray, first: float, dt: float) -> bool:
-    """Return whether stamps are where an even grid has them."""
+    """Return whether stamps lie on an even grid."""
     return float(np.abs(t - first - dt * np.arange(t.size)).max()) < _EVEN * dt
 
 
 def _whitened(v: FloatArray) -> tuple[FloatArray, float]:
-    """Return the error of predicting from the sample before, events cut, and the coefficient."""
+    """Return the errors of an AR(1) prediction, limited at events, and its coefficient."""
     c = v - v.mean()
     keep = float(c[1:] @ c[:-1]) / max(float(c @ c), 1e-300)
     e: FloatArray = c[1:] - keep * c[:-1]
@@ -279,21 +275,21 @@ def _nth(k: int) -> str:
 
 
 def _widest(voltage: FloatArray, factor: int) -> int:
-    """Return the largest whole step, up to `factor`, that keeps the relaxation."""
+    """Return the largest step in samples, up to `factor`, that resolves the relaxation."""
     first = max(0, (voltage.size - _LOOK) // 2)
     v = voltage[first:first + _LOOK]
     lag, risen = 1, False
     coarse = bool(np.mean(v[4:] == v[:-4]) > 0.1)
     while lag < factor and 16 * lag < v.size:
         near, mid, far = (_variogram(v, k * lag, coarse) for k in (1, 2, 4))
-        # Squares of neighbours within 4 lags go together.
+        # Squares within 4 lags are correlated.
         error = 3.0 * far * math.sqrt(8.0 * lag / v.size)
         if far - mid > error:
             risen = True
             if (mid - near) / (far - mid) > _RATIO:
                 return lag
         elif risen:
-            # Risen and level: the relaxation lies before.
+            # The variogram is level after its rise: the relaxation is faster.
             return max(1, lag // 2)
         lag *= 2
     return factor
@@ -301,11 +297,10 @@ def _widest(voltage: FloatArray, factor: int) -> int:
 
 def _variogram(v: FloatArray, lag: int, coarse: bool) -> float:
     """
-    Return half the variance of what a lag adds, up to a factor, V^2.
+    Return the variogram at a lag, V^2, up to a factor.
 
-    Of the smaller half of the differences: the steps of a load, which are fewer,
-    take as long to level off as they are apart, and would hide how fast the
-    rail itself relaxes.  Not so for codes so coarse that half do not differ.
+    Computed from the smaller half of the differences, because load steps, which are in the other
+    half, would hide how fast the rail itself relaxes.  Coarse codes need all differences.
     """
     d = np.square(v[lag:] - v[:-lag])
     if coarse:

@@ -1,10 +1,10 @@
 """
-The Gaussian part of a model: mean, poles, intensities, noise; fitted together.
+The Gaussian part of a model: mean, poles, intensities and noise, fitted together.
 
-A model is a list of terms.  Those of `Role.MEAN` are columns of a regression,
-`DRIVE` changes alpha and sigma along the recording, `BLOCK` adds states and
-`NOISE` white errors; `LAW` terms are left to `laws`.  Events found by a law
-enter as extra variance at their samples.
+A model is a list of terms: `Role.MEAN` terms are columns of a regression, `DRIVE` terms change
+alpha and sigma along the recording, `BLOCK` terms add states, and `NOISE` terms white errors.
+`LAW` terms, of the distribution of the innovations, are fitted in `composite`; events that they
+find enter here as extra variance at their samples.
 """
 
 from __future__ import annotations
@@ -23,34 +23,34 @@ from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.model.terms.tones import Tone
 from ou_monitor.records import FloatArray
 
-# Measurement noise that stands for none, as a share of what a step adds.
+# Minimum measurement noise, for a regular filter, as a share of the variance of a step.
 NO_NOISE = 1e-6
-# Steps of the numerical scores, in the logarithm of a parameter.
+# Step of the numerical scores, in the logarithm of a parameter.
 _STEP = 1e-4
+# Maximum rounds of a fit, of a rough one, and of a last one that begins near the maximum.
 _ROUNDS, _FEW_ROUNDS, _LAST_ROUNDS = 12, 6, 2
-# Samples times further states that are too dear to begin with.
+# Samples times additional states above which a fit begins with a part of the samples.
 _DEAR = 30000
-# With more states than this the part has to do; with more lines they are fitted apart.
+# With more states than this only the part is fitted; more lines than this are fitted separately.
 _MANY = 4
-# Samples in which the gain of a constant model has settled: the predictive
-# variance is then within some 1e-5 of its limit.
+# Samples after which the gain of a time-invariant filter is constant (predictive variance within
+# 1e-5 of its limit).
 _SETTLES = 1024
-# Settled: a step gains less than this, nats.
+# Converged: a step gains less than this, nats; for a full and a rough fit.
 _SETTLED, _NEARLY = 0.02, 0.5
 _RNG = np.random.default_rng(0)
 
 
 @dataclass(frozen=True, eq=False)
 class Events:
-    """Variance that events add, V^2, and by what the noise is more or less."""
+    """Variance added by events, and a factor on the noise."""
 
-    # To the state, and to the measurement; shape (n,).
-    push: FloatArray
-    error: FloatArray
-    power: FloatArray  # Factor on what the noise of the `ou` adds to the state; shape (n,)
+    push: FloatArray  # Added to the state, V^2; shape (n,)
+    error: FloatArray  # Added to the measurement, V^2; shape (n,)
+    power: FloatArray  # Factor on the state noise of the `ou`; shape (n,)
 
     def part(self, part: slice) -> Events:
-        """Return a part."""
+        """Return the events of some samples."""
         return Events(self.push[part], self.error[part], self.power[part])
 
 
@@ -61,7 +61,7 @@ class GaussianFit:
     terms: tuple[Term, ...]  # With their parameters; the first is the `ou`
     se: tuple[dict[str, float], ...]  # Standard errors by parameter, a dict a term
     mean: FloatArray  # Of the voltage, V; shape (n,)
-    # One-step errors, V, and their predictive variances, V^2, events not counted at their own
+    # One-step errors, V, and their predictive variances, V^2, each without the event at its own
     # sample; shape (n,).
     innovation: FloatArray
     variance: FloatArray
@@ -82,7 +82,7 @@ def fit_gaussian(samples: Samples, terms: Sequence[Term], part: slice,
     """
     Fit the Gaussian part by maximum likelihood on a part of the recording (offset in V).
 
-    begun: whether the parameters were fitted to all of the part already, in some way.
+    begun: whether the parameters were already fitted to the whole part.
     """
     voltage = samples.voltage if offset is None else samples.voltage - offset
     chosen = samples.part(part, voltage)
@@ -92,18 +92,18 @@ def fit_gaussian(samples: Samples, terms: Sequence[Term], part: slice,
     if whole_mean and chosen.n < samples.n:
         mean = _with_mean(samples.part(slice(None), voltage), fit.terms, events)
         fit, cost = replace(fit, terms=mean.terms), cost + mean.cost
-    # A rough fit of many states has found no errors.
+    # A rough fit of many states has no standard errors.
     whole = evaluate(samples, fit.terms, events, fit.se or tuple({} for _ in fit.terms))
     return replace(whole, cost=cost + whole.cost)
 
 
 def evaluate(samples: Samples, terms: Sequence[Term], events: Events | None = None,
              se: Sequence[dict[str, float]] = (), inside: bool = False) -> GaussianFit:
-    """Return what a model with given parameters says of a recording."""
+    """Filter a recording with given parameters; inside: variances include the events."""
     run = _filter(samples, terms, events)
     mean = mean_of(samples, terms, run.segment)
     e = run.kalman.innovations(samples.voltage - mean)
-    # An event is the law's to expect, at its own sample: not so while it is fitted around.
+    # The law predicts an event at its own sample, except during the fit of the Gaussian part.
     variance = run.full if inside else run.plain
     return GaussianFit(tuple(terms), tuple(se), mean, e, variance, _log_density(e, variance),
                        run.phi, run.cost)
@@ -113,10 +113,10 @@ def whitened(samples: Samples, terms: Sequence[Term], more: Sequence[Term],
              events: Events | None = None, offset: FloatArray | None = None, *,
              own: bool = False) -> FloatArray:
     """
-    Return voltage, level and columns of the mean as the noise of a model leaves them white.
+    Return voltage, level and columns of the mean, whitened by the noise of a model.
 
-    Columns are those of more terms, and with `own` those of the model itself; else its measured
-    ones are left out, and what the others add is taken off the voltage.  offset in V.
+    The columns are those of `more`, and with `own` also those of the model.  Without `own`, terms
+    of the model that are not `MEASURED` are subtracted from the voltage.  offset in V.
     """
     run = _filter(samples, terms, events)
     kept = terms if own else [term for term in terms if term.ROLE is not Role.MEAN]
@@ -138,26 +138,24 @@ def _log_density(e: FloatArray, variance: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """A filter over the samples, variances without and with events at their own, cost in s."""
+    """A filter over the samples."""
 
     segment: Segment
     kalman: Filter
-    plain: FloatArray
-    full: FloatArray
-    cost: float
+    plain: FloatArray  # Predictive variances without the event at each sample, V^2; shape (n,)
+    full: FloatArray  # The same with it; shape (n,)
+    cost: float  # Processor time, s
 
     @property
     def phi(self) -> FloatArray:
-        """Return the coefficient of the OU in each step."""
         phi: FloatArray = np.exp(-self.segment.alpha * self.segment.step)
         return phi
 
 
 def _filter(samples: Samples, terms: Sequence[Term], events: Events | None) -> _Run:
-    """Return the filter of a model over the samples."""
     if events is not None and _states(terms) >= _MANY and not events.error.any():
-        # Where noise or pushes enter the state and nothing hides them, the gains of
-        # several states hardly change: a filter that is settled saves most of the time.
+        # Extra variance of the state hardly changes the gains of several states, so a filter with
+        # constant gains is used, which saves most of the time.
         s, space, _ = state_space(samples, terms, None)
         run = Filter(space, samples.n)
         q = s.sigma * s.sigma * -np.expm1(-2.0 * s.alpha * s.step) / (2.0 * s.alpha)
@@ -169,19 +167,18 @@ def _filter(samples: Samples, terms: Sequence[Term], events: Events | None) -> _
 
 
 def _cost(space: StateSpace, n: int) -> float:
-    """Return what a filter over n samples costs, s: measured, and as the square of the states."""
+    """Return the processor time of a filter over n samples, s (measured on a desktop)."""
     length, states = map(int, space.f.shape[:2])
     return 1e-7 * length * states * states + 2e-8 * n * states
 
 
 def _states(terms: Sequence[Term]) -> int:
-    """Return about how many states a model has."""
     return 1 + sum(term.STATES for term in terms if term.ROLE is Role.BLOCK)
 
 
 def state_space(samples: Samples, terms: Sequence[Term], events: Events | None
                 ) -> tuple[Segment, StateSpace, FloatArray | float]:
-    """Return the segment, the state space, and what events add to each variance predicted."""
+    """Return segment, state space, and the variance that events add to each prediction, V^2."""
     s = driven(samples, terms)
     whole = s
     if events is None and samples.n > _SETTLES and samples.even and not any(
@@ -206,7 +203,7 @@ def state_space(samples: Samples, terms: Sequence[Term], events: Events | None
     blocks += [term.block(s) for term in terms
                if term.ROLE is Role.BLOCK and not isinstance(term, ACCoupling)]
     d = sum(h.size for _, _, h in blocks)
-    # Element by element along the samples, as the filter takes them.
+    # Each element is contiguous along the samples, as the filter needs it.
     f_all, q_all = (np.zeros((d, d, n)).transpose(2, 0, 1) for _ in range(2))
     h_all = np.zeros(d)
     at = 0
@@ -221,7 +218,7 @@ def state_space(samples: Samples, terms: Sequence[Term], events: Events | None
 
 
 def driven(samples: Samples, terms: Sequence[Term]) -> Segment:
-    """Return the samples as a segment, with what throttle does to alpha, sigma and noise."""
+    """Return the samples as a segment, with the effects of throttle on alpha, sigma and noise."""
     ou = terms[0]
     assert isinstance(ou, OU)
     s = samples.segment(ou.alpha, ou.sigma)
@@ -232,12 +229,11 @@ def driven(samples: Samples, terms: Sequence[Term]) -> Segment:
 
 
 def white_noise(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray:
-    """Return the variance of white noise in each sample of a segment of them, V^2."""
+    """Return the variance of white noise in each sample of a segment, V^2; shape (n,)."""
     return np.full(s.t.size, samples.blur) + sum(term.variances(s) for term in terms)
 
 
 def _first(s: Segment, n: int) -> Segment:
-    """Return the first samples of a segment."""
     return replace(s, **{name: getattr(s, name)[:n] for name in (
         't', 'at', 'step', 'throttle', 'alpha', 'sigma', 'power', 'push', 'x', 'level',
         'noise', 'voltage')})
@@ -245,7 +241,7 @@ def _first(s: Segment, n: int) -> Segment:
 
 def _coupled(term: ACCoupling, s: Segment, phi: FloatArray, q: FloatArray
              ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the OU and its low-pass, which the instrument subtracts."""
+    """Return the block of the OU and of its low-pass, which an AC coupling subtracts."""
     rate = 2.0 * math.pi * term.corner
     step = s.step.copy()
     step[0] = 1.0
@@ -264,11 +260,11 @@ def _coupled(term: ACCoupling, s: Segment, phi: FloatArray, q: FloatArray
 def _beside_lines(samples: Samples, terms: tuple[Term, ...], events: Events | None, rough: bool,
                   begun: bool) -> GaussianFit:
     """
-    Fit by scoring, many lines as they are beside the noise to begin with.
+    Fit by scoring; more than `_MANY` lines are first subtracted with the initial noise.
 
-    In what the noise tells of itself, coefficients of the mean do not occur, and a line is found
-    at its frequency whatever the noise is elsewhere: so the other terms are fitted to what lines
-    leave, and then all coefficients again.
+    The information about the noise does not involve coefficients of the mean, and a line depends
+    only on the noise at its own frequency.  So the other terms are fitted to the rest, then all
+    coefficients together.
     """
     lines = [k for k, term in enumerate(terms) if isinstance(term, Tone)
              and term.ROLE is Role.MEAN]
@@ -290,7 +286,7 @@ def _beside_lines(samples: Samples, terms: tuple[Term, ...], events: Events | No
 def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
               rough: bool = False, only: Sequence[int] | None = None, begun: bool = False
               ) -> GaussianFit:
-    """Fit by scoring: the outer product of numerical scores stands for the information."""
+    """Fit by scoring, with numerical derivatives."""
     rounds = _FEW_ROUNDS if rough else _ROUNDS
     run = _filter(samples, terms, events)
     states, cost = run.kalman.shape, run.cost
@@ -299,9 +295,8 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
         if states[1] > _MANY:
             return _with_mean(samples, terms, events)
     elif states[0] * (states[1] - 1) > _DEAR and few < samples.n:
-        # Far from the top a part of the samples shows the way.
+        # Begin with a part of the samples; keep the start, which all samples may fit better.
         part = _liveliest(samples, few)
-        # A part determines parameters that were fitted to all samples less well than those did.
         begin = terms
         first = _maximise(
             samples.part(part), terms, None if events is None else events.part(part),
@@ -310,7 +305,7 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
         if rough or states[1] > _MANY:
             shrink = math.sqrt((part.stop - part.start) / samples.n)
             fit = _with_mean(samples, terms, events)
-            # Nor may what suits the part be worse for all.
+            # Reject parameters that fit the part but are worse for all samples.
             before = fit if rough else _with_mean(samples, begin, events)
             cost += 0.0 if rough else before.cost
             if float(before.density.sum()) > float(fit.density.sum()):
@@ -354,7 +349,7 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
         damping *= 0.3
         if gain < (_NEARLY if rough else _SETTLED):
             break
-    # Errors hold whatever the tails (sandwich of White 1982).
+    # Standard errors are robust to heavy tails (sandwich of White 1982).
     covariance = inverse @ outer @ inverse
     se: list[dict[str, float]] = [{} for _ in terms]
     for j, (k, name) in enumerate(free):
@@ -365,10 +360,10 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
 def _scored(samples: Samples, terms: tuple[Term, ...], events: Events | None, base: GaussianFit,
             free: Sequence[tuple[int, str]]) -> tuple[FloatArray, FloatArray, float]:
     """
-    Return scores, shape (n, free), expected information, and what they cost, s.
+    Return scores, shape (n, free), expected information, and processor time, s.
 
-    The information is that of a normal law with the predicted variances: unlike the outer product
-    of the scores it holds for heavy tails too, which would shorten each step by their kurtosis.
+    The information assumes normal errors with the predicted variances.  The outer product of the
+    scores would shorten each step by the kurtosis of heavy tails.
     """
     v, cost = base.variance, 0.0
     z = base.innovation / np.sqrt(v)
@@ -383,7 +378,7 @@ def _scored(samples: Samples, terms: tuple[Term, ...], events: Events | None, ba
 
 
 def _liveliest(samples: Samples, size: int) -> slice:
-    """Return the part of a size in which throttle moves most; the first without throttle."""
+    """Return the part of `size` samples in which throttle moves most; the first without it."""
     if samples.throttle is None:
         return slice(0, size)
     first = np.arange(0, samples.n - size + 1, max(size // 4, 1))
@@ -398,11 +393,11 @@ def _moved(terms: tuple[Term, ...], k: int, name: str, by: float) -> tuple[Term,
 
 
 def _with_mean(samples: Samples, terms: tuple[Term, ...], events: Events | None) -> GaussianFit:
-    """Fit the coefficients of the mean by generalised least squares; events count as known."""
+    """Fit the coefficients of the mean by generalised least squares, with known events."""
     run = _filter(samples, terms, events)
     variance, design = run.full, design_of(samples, terms, run.segment)
     if not (variance > 0.0).all():
-        raise ArithmeticError('variances that are not above 0')
+        raise ArithmeticError('variances are not positive')
     weight = 1.0 / np.sqrt(variance)
     through = run.kalman.innovations(design) * weight[:, None]
     beta = solved(through[:, 1:], through[:, 0])
@@ -420,12 +415,12 @@ def coefficients(term: Term) -> list[float]:
 
 
 def columns_of(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray:
-    """Return all columns of the mean, through the instrument."""
+    """Return all columns of the mean, as the instrument shows them."""
     return design_of(samples, terms, s)[:, 1:]
 
 
 def design_of(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray:
-    """Return the voltage and all columns of the mean; as they were where they are the same."""
+    """Return the voltage and all columns of the mean, cached by terms."""
     means = _means(terms)
     key = tuple(term.with_linear([1.0] * len(term.LINEAR)) for term in means)
     if key not in samples.designs:
@@ -437,7 +432,7 @@ def design_of(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray
     for term in terms:
         if isinstance(term, ACCoupling):
             design = design.copy()
-            # What the instrument shows has a level of its own.
+            # The level behind an AC coupling is a parameter of its own: column 1 is unchanged.
             design[:, 2:] = term.pass_through(design[:, 2:], s)
     return design
 
@@ -447,7 +442,7 @@ def _means(terms: Sequence[Term]) -> tuple[Term, ...]:
 
 
 def mean_of(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray:
-    """Return the mean of the voltage, V; as it was where only the noise has changed."""
+    """Return the mean of the voltage, V, cached by terms and coefficients."""
     beta = np.array([value for term in terms for value in coefficients(term)])
     if any(isinstance(term, ACCoupling) for term in terms):
         return np.asarray(columns_of(samples, terms, s) @ beta)
@@ -465,16 +460,14 @@ def owners(terms: Sequence[Term]) -> list[Term | None]:
 
 
 def solved(columns: FloatArray, y: FloatArray) -> FloatArray:
-    """Return least squares; coefficients that nothing determines come out as small as may be."""
-    # By the normal equations: scaled, columns here are never so alike that it matters, and
-    # least squares by orthogonal factors take ten times as long.
+    """Return the least-squares coefficients; undetermined ones are as small as possible."""
+    # Normal equations take a tenth of the time of a QR, and scaled columns are accurate enough.
     scale = np.sqrt(np.einsum('ij,ij->j', columns, columns))
     scale[scale == 0.0] = 1.0
     gram = columns.T @ columns / np.outer(scale, scale)
     inverse = np.asarray(np.linalg.pinv(gram, rcond=1e-12, hermitian=True), dtype=np.float64)
-    many: FloatArray = inverse @ (
-        columns.T @ y / scale) / scale
-    return many
+    beta: FloatArray = inverse @ (columns.T @ y / scale) / scale
+    return beta
 
 
 def with_mean(terms: tuple[Term, ...], beta: FloatArray) -> tuple[Term, ...]:

@@ -1,8 +1,8 @@
 """
 Draw clipped readings from a model of the other samples.
 
-Adjacent samples, throttle and noise together determine the law of a clipped value.  A path of the
-rail is drawn given all readings, and then each clipped reading given the path.
+Neighbouring samples, throttle and noise together determine the distribution of a clipped value.  A
+path of the rail is drawn given all readings, then each clipped reading given the path.
 """
 
 from __future__ import annotations
@@ -18,35 +18,18 @@ from ou_monitor.model.terms.reading import Saturation
 from ou_monitor.records import FloatArray
 from scipy.special import log_ndtr, ndtr, ndtri
 
-# Minimum white noise, as a share of the noise of a step: without it a reading would be the path.
+# Minimum white noise, as a share of the noise of a step, so that reading and path differ.
 _LEAST = 0.1
-# Sweeps of the approximation; factor on the white noise at which a reading carries no information.
+# Sweeps of expectation propagation; factor on the white noise of a reading without information.
 _SWEEPS, _NOTHING = 8, 1e6
 
 
 def redrawn(samples: Samples, model: Composite, ends: Saturation,
             clipped: npt.NDArray[np.bool_], rng: np.random.Generator) -> Samples:
     """
-    Draw the clipped readings anew.
+    Return samples with clipped readings, shape (n,), drawn again beyond their limits.
 
-    Parameters
-    ----------
-    samples : Samples
-        With clipped readings as they were drawn before.
-    model : Composite
-        Its mean, its `ou` and its white noise are used.
-    ends : Saturation
-        Where readings end.
-    clipped : ndarray of bool, shape (n,)
-        Which readings are at an end of it.
-    rng : numpy.random.Generator
-        Source of the draws.
-
-    Returns
-    -------
-    Samples
-        The others unchanged.
-
+    Mean, `ou` and white noise are those of the model.
     """
     s = driven(samples, model.gaussian.terms)
     phi = np.exp(-s.alpha * s.step)
@@ -60,7 +43,7 @@ def redrawn(samples: Samples, model: Composite, ends: Saturation,
     end = np.where(top, ends.high - 0.5 * samples.cell, ends.low + 0.5 * samples.cell) - mean[at]
     y = samples.voltage - mean
     x = _path_at(y, at, side, end, phi, added, white, rng)
-    # On the side of the end: -z is below where the end lies.
+    # Probability of the side beyond the limit, then a draw there.
     room = ndtr(side * (x - end) / spread)
     draw = -ndtri(np.maximum(room * (1.0 - rng.random(at.size)), 1e-300))
     beyond = np.where(room > 1e-12, x + side * spread * draw, end)
@@ -71,10 +54,10 @@ def _path_at(y: FloatArray, at: npt.NDArray[np.int64], side: FloatArray, end: Fl
              phi: FloatArray, added: FloatArray, white: FloatArray, rng: np.random.Generator
              ) -> FloatArray:
     """
-    Draw a path where readings are beyond an end, given that and the other readings, V.
+    Draw the path at clipped readings, given their limits and the other readings, V.
 
-    Each that is beyond stands for a reading with a mean and a white noise of its own, so that the
-    path has the moments that it has given the end (expectation propagation, Minka 2001).
+    Each clipped reading is replaced by a pseudo-reading with its own mean and white noise, which
+    gives the path the same moments as the limit (expectation propagation, Minka 2001).
     """
     white = white.copy()
     own = white[at]
@@ -82,7 +65,7 @@ def _path_at(y: FloatArray, at: npt.NDArray[np.int64], side: FloatArray, end: Fl
     for _ in range(_SWEEPS):
         path = _Path(phi, added, white)
         mean, variance = path.drawn(y)[at], path.variance()[at]
-        # What the others say.
+        # Without its own pseudo-reading (cavity distribution).
         less = np.maximum(1.0 / variance - 1.0 / white[at], 1.0 / (_NOTHING * own))
         mean = (mean / variance - y[at] / white[at]) / less
         variance = 1.0 / less
@@ -108,7 +91,7 @@ class _Path:
             before[k], known[k] = ahead, last
         self._phi = phi.tolist()
         self._gain = (before / (before + white)).tolist()
-        # What the next one says of each.
+        # Backward gain.
         back = known[:-1] * phi[1:] / before[1:]
         self._back = back.tolist()
         rest = np.append(known[:-1] - back * back * before[1:], known[-1])

@@ -26,14 +26,14 @@ ACCEPT = 6.0
 # Difference in evidence below which two causes tie, nats: odds of 20.  A cause must gain it to
 # stay.
 TIE = 3.0
-# Share of a larger effect's evidence below which a term of its kind may only mend its form:
-# another answer of the mean, or a second curve of intensity over throttle.  A form that is right
-# to 7 % of the effect leaves the square of it; in simulated loads of ten shapes (test/hidden)
-# further terms brought 0.8 % at most where the form was right.
+# Minimum share of the evidence of a larger effect for a further term of its kind (a response of
+# the mean, or a second curve of intensity over throttle); a smaller one only corrects the form.
+# With a form right to 7 %, its square remains; in simulated loads of ten shapes (test/hidden),
+# further terms gained 0.8 % at most if the form was right.
 FORM = 0.005
 CURVE = 0.1
-# Minimum number of relaxation times in a recording; with fewer the rate is a trend.  It is then
-# known to sqrt(2/20) = 30 %.
+# Minimum number of relaxation times in a recording; with fewer the rate is a trend.  At the limit
+# its relative error is sqrt(2/20) = 30 %.
 RELAXES = 20.0
 # Largest p-value of a named cause.
 CHANCE = 0.05
@@ -43,12 +43,12 @@ MOST = 8
 MOST_COST = 10.0
 # A statistic beyond this fails: of 70, one by chance in 2300 recordings (3 of 8700 simulated).
 FAILS = 4.8
-# Share of its own value before any cause was accepted that a statistic may keep: the form of a
-# cause leaves as much of a large effect.
+# Maximum share of its initial value that a statistic may keep, because the form of a cause is not
+# exact.
 OWN_SHARE = 0.07
-# Share of its largest sign that a latent cause may leave beside measured ones.  In 70 recordings
-# by another hand (b052f3b) right ones that left more than FAILS left 13 % at most, one of them
-# 35 %; wrong ones 30 to 97 %.
+# Maximum share of its largest sign that a latent cause may leave beside measured ones.  In 70
+# independently simulated recordings (b052f3b), right causes that left more than FAILS left 13 % at
+# most, one of them 35 %; wrong causes left 30 to 97 %.
 BESIDE_SHARE = 0.3
 
 
@@ -59,9 +59,9 @@ def kinds_to_try(kinds: Iterable[Kind], model: Sequence[Kind], given: Collection
     """
     Return the kinds to try beside those of a model: those that come first, or the others.
 
-    Measured inputs come first, for latent causes imitate them, and so does white noise, which
-    every sensor has.  On answers of the mean the regression decides; but a trend is tried beside
-    latent causes, which imitate it.
+    Measured inputs come first, because latent causes imitate them, and white noise, because every
+    sensor has it.  The regression chooses responses of the mean, except that a trend is also tried
+    together with latent causes, which imitate it.
     """
     return [kind for kind in kinds
             if kind.NAME not in ('ou', *given) and kind.ROLE is not Role.EXACT
@@ -84,10 +84,9 @@ def imitate(one: Kind, other: Kind) -> bool:
 
 def scored(kind: Kind, values: Statistics) -> float:
     """
-    Return what the score tests of a kind gain, nats: half the square of the largest of its signs.
+    Return the gain of a kind by score tests, nats: half the square of its largest sign.
 
-    Statistics are normal scores, each for a size and span of its own; the kind itself gains
-    several times as much where none of them is quite right.
+    Each statistic tests one size and span; the fitted kind may gain several times as much.
     """
     return 0.5 * max((value ** 2 for name, value in values.items() for sign in kind.SIGNS
                       if is_sign(sign, name, value)), default=0.0)
@@ -102,34 +101,34 @@ def affordable(kind: Kind, cost: float) -> bool:
 
 def least_evidence(kind: Kind, largest: float, again: bool = False) -> float:
     """
-    Return the evidence above which an answer of the mean is accepted (largest: of any; nats).
+    Return the minimum evidence of a response of the mean, nats (largest: evidence of all).
 
-    again: whether there is one of this kind already, whose form it may only mend.
+    again: whether there is one of this kind already, whose form it may only correct.
     """
     share = max(kind.LEAST_SHARE, FORM if again else 0.0)
     return max(ACCEPT, share * largest)
 
 
 def is_answer(kind: Kind) -> bool:
-    """Return whether a cause is an answer of the mean to what is measured."""
+    """Return whether a cause is a response of the mean to a measured input."""
     return kind.MEASURED and kind.ROLE is Role.MEAN
 
 
 def is_latent(kind: Kind) -> bool:
-    """Return whether a cause is only inferred, not from a measured input or time."""
+    """Return whether a cause is inferred without a measured input or time."""
     return not (kind.NEEDS_THROTTLE or kind.MEASURED)
 
 
 def is_shared(gains: npt.ArrayLike, errors: float = 1.0) -> bool:
     """
-    Return whether the gain of all parts of a recording exceeds some errors of it (nats).
+    Return whether the total gain of parts of a recording exceeds its standard error, nats.
 
-    Of k parts of which one alone gains, the standard error of the sum is that gain itself; of an
-    effect that gains g nats throughout, it is sqrt(2 g).
+    If only one part gains, the standard error of the sum equals that gain; for an effect that
+    gains g nats evenly, it is sqrt(2 g).
     """
     parts = np.asarray(gains, dtype=np.float64)
     error = math.sqrt(parts.size) * float(parts.std(ddof=1))
-    # A margin for rounding: one part alone is on the limit.
+    # The margin for rounding excludes a single part, which is exactly at the limit.
     return bool(float(parts.sum()) > errors * error * (1.0 + 1e-9))
 
 
@@ -140,7 +139,7 @@ def rivals_of(best: str, evidence: Sequence[tuple[str, float]]) -> list[str]:
 
 
 def is_plainer(one: Kind, other: Kind) -> bool:
-    """Return whether a cause is preferred to another in a tie, because less was searched."""
+    """Return whether a cause is preferred in a tie, because fewer alternatives were searched."""
     return one.SEARCH < other.SEARCH and one.FAMILY == other.FAMILY
 
 
@@ -181,10 +180,11 @@ def withdrawn(before: Statistics, after: Statistics, accepted: Sequence[Kind],
     """
     Return which accepted causes do not explain their statistics.
 
-    Beside measured causes, whose form is never complete on a real flight, something always fails:
-    there a latent cause answers for its own signs, as the measured ones left them (`before`), or
-    as they were when it was accepted (`asked`, by name), for a larger effect may have hidden
-    them.  Alone, latent causes answer for everything: the effect may not be in the catalogue.
+    With measured causes, some statistic always fails on a real flight, because their form is not
+    exact.  Then a latent cause is tested by its own signs only, as they were with the measured
+    causes alone (`before`), or when it was accepted (`asked`, by name), because a larger effect
+    may have hidden them.  Without measured causes, latent ones are tested by all statistics: the
+    effect may not be in the catalogue.
     """
     beside = not all(map(is_latent, accepted))
     left = failing(before, after)

@@ -16,13 +16,13 @@ from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate, fit_gaussian
 from ou_monitor.discovery.clipped import redrawn
 from ou_monitor.discovery.decision import relaxes
-from ou_monitor.discovery.earning import Earned, earned, refusal
 from ou_monitor.discovery.finding import Cause, Criticism, CrossingRate, Finding, Verdict
 from ou_monitor.discovery.fitting import Fitter, standard_errors, with_reach
 from ou_monitor.discovery.gain import (
-    covered, crossing_rates, gain_of, grown, guess, held_out, HeldOut, mean_score, shrink_of,
+    covered, crossing_rates, errors_grew, gain_of, guess, held_out, HeldOut, mean_score, shrink_of,
     why_unknown, without)
 from ou_monitor.discovery.named import INTERRUPTED, Named, named_causes
+from ou_monitor.discovery.pruning import prune_by_gain, Pruned, refusal
 from ou_monitor.discovery.regression import load_terms
 from ou_monitor.discovery.search import position, Progress, whole_load
 from ou_monitor.discovery.words import (
@@ -37,11 +37,11 @@ from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.records import Recording
 from ou_monitor.text import listed, number, Z95
 
-# Reason why the gain of a line is unknown that was found in samples which the fit does not use.
-FAST = 'the samples that are used are too few to show a line so fast.'
+# Reason why the gain of a line above the Nyquist frequency of the samples used is unknown.
+FAST = 'the rate of the samples used is too low to show this line.'
 # Alternations between drawing clipped samples and fitting the load to them.
 _REDRAWN = 2
-# Steps of more relaxation times than this hide the relaxation.
+# Maximum sampling step, in relaxation times, that still shows the relaxation.
 _BLIND = 1.0
 
 
@@ -53,7 +53,7 @@ def discover(recording: Recording, *, seed: int = 0,
             found = _discover(recording, seed, progress)
             return replace(found, notes=(*found.notes, *left_out()))
         except Exception as error:
-            # A cause of another package may fail anywhere: again without it, and that is said.
+            # A cause from another package may fail anywhere: repeat without it, and note that.
             if not withdraw(error):
                 raise
 
@@ -84,8 +84,8 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
     uncovered = samples.n - int(scored.sum())
     if state.drawn is not None:
         scored &= ~state.drawn
-    left = earned(samples, named.whole, named.names, plain, scored,
-                  lambda share: done(0.6 + 0.3 * share))
+    left = prune_by_gain(samples, named.whole, named.names, plain, scored,
+                         lambda share: done(0.6 + 0.3 * share))
     whole = left.full.model
     after = named.after if not left.out else criticise(samples, whole, named.bank)
     dropped = (*named.dropped, *left.out)
@@ -98,10 +98,10 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
     why = unknown or ('' if math.isfinite(gain) else VAGUE)
     criticism = _criticism(named.before, after)
     remaining = sorted((c for c in criticism if c.is_off), key=lambda c: -abs(c.after))
-    larger = grown(left.full, plain, scored, 1.0)
-    refused = refusal(samples, whole.terms, gain, gain_se, larger and grown(
+    larger = errors_grew(left.full, plain, scored, 1.0)
+    refused = refusal(samples, whole.terms, gain, gain_se, larger and errors_grew(
         left.full, plain, scored, Z95)) if causes else ''
-    # The other exact terms were undone in the samples; the model needs them again.
+    # The effects of other exact terms were removed from the samples; the model includes them.
     undone = tuple(t for t in state.exact if t.NAME != 'quantization')
     baseline = plain.model.terms[0]
     assert isinstance(baseline, OU)
@@ -132,7 +132,7 @@ def _insufficient(recording: Recording, state: Integrity, reason: str, seed: int
 
 
 def _start(samples: Samples, state: Integrity) -> Composite:
-    """Return where the search starts: an OU, and what is known without a model."""
+    """Return the initial model of the search: an OU, and exact noise terms."""
     clean = fit_composite(samples, [guess(samples)], samples.train)
     assert clean is not None
     steps = [term for term in state.exact if term.ROLE is Role.NOISE]
@@ -164,31 +164,29 @@ def _plain(samples: Samples, state: Integrity) -> HeldOut:
         return found
     logged = fit_gaussian(state.raw, [guess(state.raw)], slice(0, state.raw.n)).terms
     gaussian = evaluate(samples, logged)
-    # What keeping a block back costs it is what it costs the same process without repeats.
+    # The cost of holding out a block is taken from the same fit without repeats.
     density = gaussian.density + found.density - plain.density
     return HeldOut(replace(plain, terms=logged, gaussian=gaussian, density=density), density,
                    found.known & np.isfinite(density), gaussian.innovation)
 
 
-def _causes(samples: Samples, state: Integrity, left: Earned, se: tuple[dict[str, Any], ...],
+def _causes(samples: Samples, state: Integrity, left: Pruned, se: tuple[dict[str, Any], ...],
             plain: HeldOut, scored: npt.NDArray[np.bool_], rivals: Mapping[str, list[str]]
             ) -> tuple[Cause, ...]:
     """
     Return all causes: exact findings first, then those of the search.
 
-    The gain of a cause is what the model loses without it, fitted again; causes
-    of one kind, where there are many (the harmonics of a line), are left out
-    together, and each has the gain of all.  That of repeats, rails and wrong
-    stamps, which are undone in the samples, is what the OU fitted to the
-    samples as logged loses on those left, all together.
-
+    The gain of a cause is the loss of the model without it, fitted again.  If there are many
+    causes of one kind (harmonics of a line), they are left out together and share one gain.
+    Repeats, clipping and wrong stamps, which are corrected in the samples, also share one gain:
+    the loss of the plain OU fitted to the samples as logged.
     """
     found: list[Cause] = []
     model = left.full.model
     for term in state.exact:
         why = ''
         if term.ROLE is Role.NOISE:
-            # The plain OU, to which a model may come down, has none.
+            # A model reduced to the plain OU does not have this term.
             index = next((i for i, t in enumerate(model.terms) if t.NAME == term.NAME), None)
             less = None if index is None else without(samples, model, index)
             gain, error = (math.nan, math.nan) if less is None else gain_of(
@@ -218,7 +216,7 @@ def _causes(samples: Samples, state: Integrity, left: Earned, se: tuple[dict[str
 
 
 def _criticism(before: Mapping[str, float], after: Mapping[str, float]) -> tuple[Criticism, ...]:
-    """Return all statistics with the band that a right model leaves with chance `NOTHING`."""
+    """Return all statistics with their band at the family-wise level `NOTHING`."""
     count = len(before)
     edge = family_edge(NOTHING, count)
     return tuple(Criticism(
@@ -229,13 +227,13 @@ def _criticism(before: Mapping[str, float], after: Mapping[str, float]) -> tuple
 
 def _notes(state: Integrity, named: Named, model: Composite, dropped: Sequence[str],
            samples: Samples, uncovered: int) -> tuple[str, ...]:
-    """Return what to know: the way in, what was withdrawn, what cannot be decided."""
+    """Return notes: corrections of the samples, withdrawn causes, and undecided questions."""
     notes = [*state.notes, *([named.failure] if named.failure else [])]
     for name in dict.fromkeys(dropped):
-        notes.append(f"'{name}' fitted, but left what it should explain: withdrawn."
+        notes.append(f"'{name}' fitted, but did not explain its statistics: withdrawn."
                      if name in named.dropped else
-                     f"'{name}' fitted, but does not help to predict what was kept back: left "
-                     'out.')
+                     f"'{name}' fitted, but did not improve predictions of held-out samples: "
+                     'left out.')
     if uncovered:
         notes.append(left_out_note(uncovered, samples.n - uncovered))
     duration = float(samples.t[-1] - samples.t[0])
@@ -253,7 +251,7 @@ def _notes(state: Integrity, named: Named, model: Composite, dropped: Sequence[s
 
 # Probability that any statistic of a correct model lies outside its band.
 NOTHING = 0.01
-# Step, in a coordinate, that a parameter at the end of its range cannot take.
+# Step of a parameter that tests whether it is at the end of its range.
 _STEP = 1e-4
 
 
@@ -274,12 +272,12 @@ def doubts(terms: Sequence[Term], crossing: CrossingRate, duration: float, step:
     found = ['its one-step errors are larger than those of the plain OU'] if larger else []
     if crossing.worse:
         found.append(f'it falls through {number(crossing.level, 4)} V '
-                     f'{number(crossing.extended)} times a minute, where '
-                     f'{number(crossing.observed)} were measured and the plain OU says '
+                     f'{number(crossing.extended)} times a minute; measured were '
+                     f'{number(crossing.observed)}, and the plain OU predicts '
                      f'{number(crossing.baseline)}')
     ends = [f'{name} of {term.NAME}' for term in terms for name in _at_ends(term, duration, step)]
     if ends:
-        found.append(f'{listed(ends)} {"stand" if ends[1:] else "stands"} at the end of the range')
+        found.append(f'{listed(ends)} {"are" if ends[1:] else "is"} at the end of the range')
     return tuple(found)
 
 

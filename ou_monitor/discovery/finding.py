@@ -15,7 +15,7 @@ from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_answer import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Role, Term
-from ou_monitor.records import FloatArray, NAN
+from ou_monitor.records import FloatArray, NAN, plain_data
 from ou_monitor.text import number, Z95
 
 
@@ -37,7 +37,7 @@ class Criticism:
     # Normal score of the data under the plain and under the extended model.
     before: float
     after: float
-    # Band that a correct model leaves in one of a hundred recordings, over all statistics.
+    # Band of all statistics together, which one of a hundred recordings of a correct model leaves.
     low: float
     high: float
     # Probability that any statistic of a correct model is as far off.
@@ -89,7 +89,7 @@ class CrossingRate:
     observed: float = NAN
     baseline: float = NAN
     extended: float = NAN
-    # Standard errors: of the count, as if crossings were independent, and of the averages.
+    # Standard errors: of the count, for independent crossings, and of the averages.
     observed_se: float = NAN
     baseline_se: float = NAN
     extended_se: float = NAN
@@ -118,27 +118,25 @@ class Finding:
     causes: tuple[Cause, ...] = ()  # As accepted
     model: SupplyModel | None = None  # The extended model, fitted on everything
     se: tuple[Mapping[str, Any], ...] = ()  # Its standard errors, a dict a term
-    # The same of the extended model, nats per sample.
+    # The same of the extended model, its gain and standard error, nats per sample.
     score: float = NAN
     gain: float = NAN
     gain_se: float = NAN
     # Relative reduction of the rms of one-step errors on those blocks against the plain OU.
     shrink: float = NAN
-    larger: bool = False  # Whether these errors are larger than the plain OU's, by their error
+    larger: bool = False  # Whether these errors are significantly larger than the plain OU's
     crossing: CrossingRate = field(default_factory=CrossingRate)  # Falls through a low level
     notes: tuple[str, ...] = ()  # What was dropped, left out or cannot be decided
     samples: Samples | None = None  # Samples that were fitted
-    # The extended model of `samples`, without effects that were undone in them, such as repeats.
+    # The extended model of `samples`, without effects removed from them, such as repeats.
     simulated: SupplyModel | None = None
-    # Why the extended model is refused, in words; empty: it is not.
-    refused: str = ''
-    # Name of the load: 'throttle', or 'current' if the measured current is the load.
-    load: str = 'throttle'
+    refused: str = ''  # Why the extended model is refused, in words; otherwise empty
+    load: str = 'throttle'  # The load: 'throttle', or 'current' if that predicts better
     seed: int = 0  # Random seed
 
     @property
     def size_gain(self) -> float:
-        """Return the gain from knowing the size of the errors better, nats."""
+        """Return the gain from a better predicted size of the errors, nats."""
         return self.gain + math.log1p(-self.shrink) if self.shrink < 1.0 else NAN
 
     @property
@@ -158,11 +156,11 @@ class Finding:
         return tuple(sorted((c for c in self.criticism if c.is_off), key=lambda c: -abs(c.after)))
 
     @cached_property
-    def felt(self) -> Felt:
+    def throttle_effects(self) -> ThrottleEffects:
         """Return what the extended model predicts for punch-outs and dips."""
         if self.samples is None or self.simulated is None:
-            return Felt()
-        return felt(self.samples, self.simulated.terms, self.crossing.level)
+            return ThrottleEffects()
+        return throttle_effects(self.samples, self.simulated.terms, self.crossing.level)
 
     def as_data(self) -> dict[str, Any]:
         """
@@ -175,7 +173,7 @@ class Finding:
 
         """
         baseline = self.baseline
-        found: dict[str, Any] = _plain({
+        found: dict[str, Any] = plain_data({
             'recording': self.recording, 'load': self.load, 'n': self.n,
             'duration_s': self.duration,
             'verdict': self.verdict.value, 'sentence': self.sentence,
@@ -201,12 +199,12 @@ class Finding:
                     'baseline_se': self.crossing.baseline_se,
                     'extended_se': self.crossing.extended_se, 'unit': '1/min'}},
             'remaining': [_discrepancy(c, c.after, c.p_after) for c in self.remaining],
-            'felt': self.felt.as_data(), 'refused': self.refused or None,
+            'felt': self.throttle_effects.as_data(), 'refused': self.refused or None,
             'notes': list(self.notes)})
         return found
 
     def _extended(self) -> dict[str, Any]:
-        """Return parameters, errors and units by term; a second one of a kind gets a number."""
+        """Return parameters, errors and units by term; the second of a kind is ``tone 2``."""
         found: dict[str, dict[str, Any]] = {'params': {}, 'se': {}, 'units': {}}
         terms = () if self.model is None else self.model.terms
         for k, term in enumerate(terms):
@@ -227,35 +225,25 @@ def _discrepancy(c: Criticism, observed: float, chance: float) -> dict[str, Any]
             'simulated_high': c.high, 'p_value': chance}
 
 
-def _plain(value: Any) -> Any:
-    """Return numbers that are not finite as None, and sequences as lists, all the way down."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-# Throttle flown: shares of the samples below; seconds before and after a punch-out, and samples
-# of it at most.
+# Punch-out: quantiles of throttle before and after it, its duration before and after, s, and its
+# maximum number of samples.
 _FLOWN, _BEFORE, _AFTER, _MOST = (0.01, 0.99), 1.0, 5.0, 6000
 # Share of the recovery that counts as complete, and minimum recovery as a share of the dip.
 _BACK, _COUNTS = 0.9, 0.1
-# Time between falls below which they are one dip, s; also the range in which its minimum is
-# searched.
+# Minimum time between two dips, s, and range in which the predicted minimum of a dip is sought, s.
 _APART, _NEAR = 0.2, 0.05
 # Share of a dip's depth above which throttle has caused it.
 _MADE = 0.5
 
 
 @dataclass(frozen=True)
-class Felt:
-    """A model in units that a pilot feels; the punch-out is at half time."""
+class ThrottleEffects:
+    """Predicted effects of throttle: a punch-out (at half time), and the dips of the recording."""
 
-    # Throttle before and after a punch-out.
+    # Throttle before and after the punch-out.
     low: float = NAN
     high: float = NAN
-    # Deepest point of the mean after it, V below the voltage before, and when, s.
+    # Depth of the mean below the voltage before, V, and its time after the punch-out, s.
     dip: float = NAN
     after: float = NAN
     # Recovery while throttle is held, V, and time to 90 % of it, s; 0 and NaN without any.
@@ -276,7 +264,7 @@ class Felt:
 
     @property
     def words(self) -> str:
-        """Return it in a sentence or two; empty if throttle has no effect."""
+        """Return the effects in words; empty if throttle has none."""
         if not self.dip > 0.0:
             return ''
         found = (f'A punch-out from throttle {number(self.low, 2)} to {number(self.high, 2)} '
@@ -292,12 +280,12 @@ class Felt:
         return found
 
 
-def felt(samples: Samples, terms: Sequence[Term], level: float) -> Felt:
+def throttle_effects(samples: Samples, terms: Sequence[Term], level: float) -> ThrottleEffects:
     """Return what a model predicts for punch-outs and for dips below a level, V."""
     answers = [term for term in terms if term.ROLE is Role.MEAN and term.MEASURED]
     u = samples.throttle
     if u is None or not any(term.NEEDS_THROTTLE for term in answers):
-        return Felt()
+        return ThrottleEffects()
     low, high = np.quantile(u, _FLOWN).tolist()
     step = max(float(np.median(samples.step[1:])), (_BEFORE + _AFTER) / _MOST)
     t = step * np.arange(math.ceil((_BEFORE + _AFTER) / step), dtype=np.float64)
@@ -315,7 +303,8 @@ def felt(samples: Samples, terms: Sequence[Term], level: float) -> Felt:
         recovered = 0.0
     within = step * int(np.argmax(back >= _BACK * recovered)) if recovered else NAN
     dips, made = _dips(samples, _path(samples, answers), level)
-    return Felt(low, high, dip, step * (deepest + 1), recovered, within, level, dips, made)
+    return ThrottleEffects(low, high, dip, step * (deepest + 1), recovered, within, level, dips,
+                           made)
 
 
 def _path(samples: Samples, answers: Sequence[Term]) -> FloatArray:

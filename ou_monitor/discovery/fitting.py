@@ -1,8 +1,8 @@
 """
-Candidates for the next cause: their starting points, tried and fitted beside the accepted causes.
+Candidates for the next cause: their starting points, and fits together with the accepted causes.
 
-Most starts are compared on some thousand samples.  Evidence is the gain in log-likelihood on the
-fitted part, minus its price, plus the gain on the held-out part.
+Most starts are compared on a few thousand samples.  Evidence is the gain in log-likelihood on the
+fitted part, minus the penalty of the parameters, plus the gain on the held-out part.
 """
 
 from __future__ import annotations
@@ -25,40 +25,40 @@ from ou_monitor.model.terms.term import LawFit, Role, Term
 from ou_monitor.model.whittle import Ordinates
 from ou_monitor.records import FloatArray, NAN
 
-# Number of starting points that are fitted, of samples that select them, and of kinds fitted in
-# full.
+# Number of starting points that are fitted, of samples that select them, and of kinds that get a
+# full fit.
 _FULL, _GLANCE, _FEW = 2, 8000, 4
-# Minimum share of the best first estimate: a full fit gains at most twice the estimate.
+# Minimum share of the best first estimate, because a full fit gains at most twice its estimate.
 _WITHIN = 0.5
-# Times that a term finds its parameters beside those of the fit.
+# Maximum alternations between the fit and terms with parameters of their own (`APART`).
 _AGAIN = 3
 # Minimum difference of two fits to one spectrum, nats, and of two scores.
 _ALIKE, _SAME = 0.1, 1e-6
 
 
-# Nats that a kind gains at first sight, the kind, and a start; None for a law, which has none.
+# First estimate of the gain of a kind, nats, the kind, and a start (None for a law).
 _Glance = tuple[float, type[Term], Composite | None]
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """A candidate, fitted beside the accepted causes."""
+    """A candidate, fitted together with the accepted causes."""
 
-    name: str  # Of the cause
+    name: str  # Name of the cause
     composite: Composite  # The model with it
     evidence: float  # nats
-    beside: str = ''  # Name of a cause that comes with it; empty where none does
+    beside: str = ''  # Name of a cause that it needs and brings along; otherwise empty
 
 
 @dataclass(eq=False)
 class Fitter:
-    """Fits of models to one recording, and an account of what they cost."""
+    """Fits of models to one recording, and their processor time."""
 
     samples: Samples  # The recording
     cost: float = 0.0  # Processor time of the fits, s, estimated from their filters
-    # For each law, the scores at which it was last looked for, and what was found.
+    # For each law, the scores of its last fit, and the result.
     looks: dict[type[Term], tuple[FloatArray, LawFit | None]] = field(default_factory=dict)
-    # Kinds tried in vain, and their gain by score tests, nats.
+    # Kinds tried without success, and their gain by score tests then, nats.
     failed: dict[str, float] = field(default_factory=dict)
 
     def evidence(self, composite: Composite) -> float:
@@ -70,7 +70,7 @@ class Fitter:
         return view_of(self.samples, composite.gaussian, composite.z, self.samples.train)
 
     def holds(self, composite: Composite) -> bool:
-        """Return whether all terms of a model still mean what their names say."""
+        """Return whether all terms of a model still match their names."""
         view = self.view(composite)
         return all(term.holds(view) for term in composite.terms)
 
@@ -81,13 +81,13 @@ class Fitter:
             found = fit_composite(self.samples, terms, self.samples.train, known,
                                   whole_mean=True, rough=rough, begun=begun, first=self.look)
         except (ValueError, ArithmeticError, np.linalg.LinAlgError):
-            # Parameters have left what a term allows, or numbers can hold.
+            # Parameters out of range, or an overflow.
             return None
         self.cost += 0.0 if found is None else found.cost
         return found if found is None or rough else self._apart(found, self.samples.train)
 
     def _apart(self, found: Composite, part: slice) -> Composite:
-        """Return a model whose terms have found again what the fit does not."""
+        """Return a model with the `APART` parameters of its terms estimated again."""
         for _ in range(_AGAIN):
             if not any(term.APART for term in found.terms):
                 break
@@ -107,7 +107,7 @@ class Fitter:
     def whole(self, model: Composite) -> Composite:
         """Return a model fitted to everything, or unchanged if that fails."""
         try:
-            # What its laws have found is that of all samples already.
+            # Its laws were already fitted to all samples.
             again = fit_composite(self.samples, model.terms, slice(0, self.samples.n), model)
         except (ValueError, ArithmeticError, np.linalg.LinAlgError):
             return model
@@ -117,7 +117,7 @@ class Fitter:
         return self._apart(again, slice(0, self.samples.n))
 
     def join(self, composite: Composite, starts: Sequence[Term], rough: bool) -> Composite | None:
-        """Return the fit with more terms, the last before the laws."""
+        """Return the fit with more terms, inserted before the laws."""
         structural = [term for term in composite.terms if term.ROLE is not Role.LAW]
         laws = [term for term in composite.terms if term.ROLE is Role.LAW]
         structural[0] = starts[-1].beside(structural[0])
@@ -126,11 +126,11 @@ class Fitter:
     def trials(self, composite: Composite, kinds: Sequence[type[Term]],
                statistics: Callable[[Composite], Mapping[str, float]]) -> list[Trial]:
         """
-        Return kinds that gain beside a model: a glance at all, the best few fitted in full.
+        Return kinds that improve a model: a first estimate of all, a full fit of the best few.
 
-        What was tried in vain comes again where score tests show more than then.  Kinds whose
-        fit takes seconds come last, and only where score tests show them beside the best of the
-        others, unless they imitate it.  statistics are those of a model.
+        Kinds that failed before are tried again if score tests show more than then.  Kinds whose
+        fit takes seconds come last, and only if score tests still show them with the best of the
+        others in the model, or if they imitate it.  statistics: function of a model.
         """
         values = statistics(composite)
         shown = {kind: decision.scored(kind, values) for kind in kinds}
@@ -150,7 +150,7 @@ class Fitter:
         if dear:
             glances += self._glances(composite, dear, _WITHIN * top)
             found = self._in_full(composite, glances, found)
-            # Of what the spectrum shows to gain less than another kind more is not known.
+            # A BROAD kind below `least` was not estimated in full, so it has not failed.
             tried += [kind for kind in dear if not top or not kind.BROAD]
         gained = {glance[1] for glance in glances}
         self.failed |= {kind.NAME: shown[kind] for kind in tried if kind not in gained}
@@ -167,7 +167,7 @@ class Fitter:
             else:
                 start = self.best_start(composite, kind, view, least)
                 gain = -math.inf if start is None else self.evidence(start) - before
-            # Less than another kind now is not in vain: beside that one it may be the best.
+            # Keep kinds that gain less than others: later they may be the best.
             if gain > (least if kind.BROAD else 0.0):
                 found.append((gain, kind, start))
         return found
@@ -178,7 +178,7 @@ class Fitter:
         found, names = list(known), {trial.name for trial in known}
         best = sorted(glances, key=lambda glance: -glance[0])[:_FEW]
         for gain, kind, start in best:
-            # Of what was fitted, not of what a glance saw: a law may lose all in a fit.
+            # Compare with full fits, because a law may lose its whole first estimate in one.
             top = max((trial.evidence for trial in found), default=0.0)
             if gain < _WITHIN * top or kind.NAME in names:
                 continue
@@ -195,7 +195,7 @@ class Fitter:
         return found
 
     def look(self, kind: type[Term], view: View) -> LawFit | None:
-        """Return a law fitted to a view: where the scores are as they were, as it was found."""
+        """Return a law fitted to a view, cached by the scores."""
         last = self.looks.get(kind)
         if last is None or not np.allclose(last[0], view.z, rtol=0.0, atol=_SAME):
             last = self.looks[kind] = view.z, kind.fit_law(view)
@@ -246,10 +246,10 @@ class Fitter:
         laws = [term for term in composite.terms if term.ROLE is Role.LAW]
         moved = [from_spectrum(self.samples, composite, [start.beside(ou), *others, start])
                  for start in starts]
-        # What gains less than its price in the spectrum gains no more in the samples.
+        # A start whose spectrum gains less than its penalty does not gain more in the samples.
         moved = sorted((way for way in moved if way[0][-1].holds(view)
                         and way[1] > max(decision.ACCEPT, least)), key=lambda way: -way[1])
-        # Those that went the same way are one.
+        # Starts with the same gain have converged to one fit.
         ways = [way for k, way in enumerate(moved)
                 if not any(way[1] > other[1] - _ALIKE for other in moved[:k])]
         fits = [self.fit([*terms, *laws], composite, rough=True, begun=True)
@@ -258,7 +258,7 @@ class Fitter:
                    default=None, key=self.evidence)
 
     def _by_likelihood(self, composite: Composite, starts: list[Term]) -> list[Term]:
-        """Return starts in the order of their likelihood as they are, on a part."""
+        """Return starts by their likelihood without a fit, on a part of the samples."""
         few = self.samples.part(slice(0, min(self.samples.train.stop, _GLANCE)))
         structural = [term for term in composite.terms if term.ROLE is not Role.LAW]
 
@@ -275,7 +275,7 @@ class Fitter:
 
 
 def is_trend(samples: Samples, model: Composite) -> bool:
-    """Return whether the `ou` of a model is too slow for a recording to be a relaxation."""
+    """Return whether the `ou` of a model is too slow to be a relaxation in a recording."""
     ou = model.terms[0]
     assert isinstance(ou, OU)
     return not decision.relaxes(ou.alpha, float(samples.t[-1] - samples.t[0]))
@@ -288,9 +288,9 @@ def _joined(composite: Composite) -> Term:
 
 def _by_scores(samples: Samples, starts: list[Term], view: View) -> list[Term]:
     """
-    Return starts in the order of what they gain in scores, lines only where that may pay.
+    Return starts by their gain in the scores; lines only if they may be worth their penalty.
 
-    What is slow, the rail has absorbed: its scores say little of it.
+    Slow terms are partly absorbed by the `ou`, so their scores are small.
     """
     s = samples.segment(1.0, 0.0)
     scale = np.sqrt(view.variance)
@@ -317,8 +317,8 @@ def from_spectrum(samples: Samples, composite: Composite, starts: Sequence[Term]
     """
     Return the terms of a model and more of them, fitted to the spectrum of its scores.
 
-    starts are the terms of `composite` without its laws, the `ou` as it should begin, and more
-    of them at the end.  The second result is the gain of the fit, nats.
+    starts: the terms of `composite` without its laws, with the initial `ou`, and further terms at
+    the end.  The second result is the gain of the fit, nats.
     """
     ordinates = Ordinates.of(composite.z[samples.train])
     spectrum = _Spectrum(samples, composite.gaussian.terms, ordinates.omega)
@@ -332,7 +332,7 @@ def from_spectrum(samples: Samples, composite: Composite, starts: Sequence[Term]
             try:
                 found[k] = found[k].moved(name, by)
             except ValueError:
-                # As far as its range goes.
+                # Out of range.
                 continue
         return tuple(found)
 
@@ -384,7 +384,7 @@ def standard_errors(samples: Samples, model: Composite, part: slice) -> tuple[di
 
 
 def with_reach(term: Term, se: dict[str, Any], samples: Samples) -> dict[str, Any]:
-    """Return errors, infinite for each parameter that this recording cannot determine."""
+    """Return errors, infinite for parameters that the recording cannot determine."""
     duration = float(samples.t[-1] - samples.t[0])
     values = term.values()
     far = [name for name, value in values.items() if isinstance(value, float) and (
@@ -411,7 +411,7 @@ def _gathered(term: Term, se: dict[str, float]) -> dict[str, Any]:
 
 
 def _of_mean(samples: Samples, model: Composite, part: slice) -> dict[int, dict[str, Any]]:
-    """Return errors of the level and of the coefficients of known columns."""
+    """Return errors of the level and of the coefficients of the mean, by term index."""
     terms = model.gaussian.terms
     where = [(k, j) for k, term in enumerate(terms) for j in range(len(coefficients(term)))]
     base = evaluate(samples, terms)
@@ -419,7 +419,7 @@ def _of_mean(samples: Samples, model: Composite, part: slice) -> dict[int, dict[
     through = np.empty((weight.size, len(where)))
     for column, (k, j) in enumerate(where):
         beta = coefficients(terms[k])
-        # Innovations are linear in these, so the step may have any size.
+        # Innovations are linear in the coefficients, so any step will do.
         beta[j] += 1.0
         moved = evaluate(samples, (*terms[:k], _with(terms[k], beta), *terms[k + 1:]))
         through[:, column] = weight * (base.innovation - moved.innovation)[part]

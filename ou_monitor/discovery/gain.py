@@ -2,15 +2,15 @@
 Gain of a model on samples that were not used for its fit.
 
 Blocked cross-validation (Bergmeir & Benitez, Inf. Sci. 191 (2012) 192): each block in turn is
-predicted, one step ahead, by parameters found on the others.  These are one step of scoring from
-the fit to everything, which moves them by what the block itself contributed; the mean is solved
-again.  So a recording that is fitted once can be scored several times.  Scores are log densities;
-neighbours share a part of theirs, so errors come from means of blocks.  Only samples at throttle
-that the other blocks cover are scored: elsewhere a model extrapolates.
+predicted, one step ahead, by parameters from the other blocks.  These are found by one step of
+scoring from the fit to everything, which removes the contribution of the block; the mean is solved
+again.  So one fit is enough.  Scores are log densities; neighbouring scores are correlated, so
+errors come from means of blocks.  Only samples at throttle that the other blocks cover are scored,
+because elsewhere a model extrapolates.
 
-Limits: what a law of the innovations found (jumps, tails, switching) and what was searched for
-(frequencies, time constants) is that of the whole recording; their number is subtracted, as the
-likelihood of a fit exceeds that of the next recording by one nat a parameter (Akaike 1973).
+Limits: laws of the innovations (jumps, tails, switching) and searched values (frequencies, time
+constants) are those of the whole recording.  Instead, one nat for each of their parameters is
+subtracted, by which the likelihood of a fit exceeds that of the next recording (Akaike 1973).
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from scipy.stats import chi2
 
 # Number of blocks of the held-out samples: the minimum for a good estimate of their spread.
 BLOCKS = 24
-# Error of an unknown gain: at least this many times the gain, and this many nats per sample.
+# Minimum error of an unknown gain: relative to the gain, and in nats per sample.
 _VAGUE, _WIDE = 10.0, 0.1
-# Level of the crossings: standard deviations below the mean, lowered in steps
-# until the fitted and the held-out part both cross it at least this often.
+# Level of the crossings, in standard deviations below the mean: start, step and end of the search,
+# and the minimum number of crossings in the fitted and in the held-out part.
 _DEEP, _LOWER, _SHALLOW, _OFTEN = 2.5, 0.25, 0.5, 5
 # Simulations of each model.
 _DRAWS = 8
@@ -60,7 +60,7 @@ def mean_difference(new: FloatArray, old: FloatArray) -> tuple[float, float]:
     blocks = difference[:size * BLOCKS].reshape(BLOCKS, size).mean(axis=1)
     c = blocks - blocks.mean()
     own = float(c @ c) / (BLOCKS - 1)
-    # Half the weight of a full lag; negative correlation is not trusted.
+    # Half the weight of a full lag; a negative correlation is ignored.
     shared = max(float(c[1:] @ c[:-1]) / (BLOCKS - 1), 0.0)
     return mean, math.sqrt((own + shared) / BLOCKS)
 
@@ -75,7 +75,7 @@ def without(samples: Samples, model: Composite, *indices: int, plain: Composite 
     """
     Return the model fitted again to everything without some of its terms; None if that fails.
 
-    A fit that is worse than the plain one has gone astray, and is tried from elsewhere.
+    A fit that is worse than the plain one has not converged, and is repeated from another start.
     """
     kept = [term for k, term in enumerate(model.terms) if k not in indices]
     # Terms that modify a removed term are removed too.
@@ -99,7 +99,7 @@ def _fitted(samples: Samples, terms: Sequence[Term], known: Composite | None
     try:
         found = fit_composite(samples, terms, slice(0, samples.n), known, rough=True)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):
-        # Parameters have left what a term allows, or numbers can hold.
+        # Parameters out of range, or an overflow.
         return None
     return found if found is not None and math.isfinite(float(found.density.sum())) else None
 
@@ -130,7 +130,7 @@ def shrink_of(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_]) -> floa
     return 1.0 - math.sqrt(float(np.mean(new.error[both] ** 2) / np.mean(old.error[both] ** 2)))
 
 
-def grown(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_], errors: float) -> bool:
+def errors_grew(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_], errors: float) -> bool:
     """Return whether one-step errors are significantly larger than before."""
     both = scored & new.known & old.known
     return errors_grow(new.error[both], old.error[both], new.model.gaussian.variance[both], errors)
@@ -146,10 +146,10 @@ def why_unknown(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_],
 def cause_gain(full: HeldOut, less: HeldOut, scored: npt.NDArray[np.bool_]
                ) -> tuple[float, float, float]:
     """
-    Return the gain of the larger of two models, its error, nats per sample, and its chance.
+    Return the gain of the larger of two models, its error, nats per sample, and a p-value.
 
-    The chance is twice the smaller of two: that of the likelihood ratio on everything, with the
-    price of what was searched, and that of the gain on what was kept back.
+    It is twice the smaller of two p-values: of the likelihood ratio on everything, corrected for
+    the search, and of the gain on held-out samples.
     """
     gain, error = gain_of(full, less, scored)
     ratio = 2.0 * float((full.model.density - less.model.density).sum())
@@ -168,7 +168,7 @@ def crossings(t: FloatArray, voltage: FloatArray, level: float,
 
 
 def crossing_level(samples: Samples, scored: npt.NDArray[np.bool_] | None = None) -> float:
-    """Return a level that both parts cross sometimes, V."""
+    """Return a low level that both parts cross, V."""
     v = samples.logged
     fitted, kept = np.zeros((2, samples.n), dtype=np.bool_)
     fitted[samples.train] = True
@@ -181,7 +181,7 @@ def crossing_level(samples: Samples, scored: npt.NDArray[np.bool_] | None = None
         depth -= _LOWER
     level = mean - depth * spread
     below, above = v[v < level], v[v >= level]
-    # Half-way between ADC codes, so that rounding changes no crossing.
+    # Halfway between ADC codes, so that rounding changes no crossing.
     return 0.5 * float(below.max() + above.min()) if below.size and above.size else level
 
 
@@ -201,31 +201,31 @@ def crossing_rates(samples: Samples, baseline: Sequence[Term], extended: Sequenc
     for terms in (baseline, extended):
         try:
             model = SupplyModel(tuple(terms))
-            # Drift and tones count from the very first sample.
+            # All samples are simulated, because drift and tones depend on the time since the
+            # first.
             found = [crossings(t, model.simulate(t, rng, samples.throttle), level, scored)
                      for _ in range(_DRAWS)]
         except ValueError:
             found = [NAN, NAN]
         rates.append((float(np.mean(found)), float(np.std(found, ddof=1)) / math.sqrt(len(found))))
     observed = crossings(t, samples.logged, level, scored)
-    # As if crossings came independently of each other; none at all is as uncertain as one.
+    # Poisson error; no crossing is as uncertain as one.
     minutes = float(np.diff(t)[scored[1:] & scored[:-1]].sum()) / 60.0
     error = math.sqrt(max(observed * minutes, 1.0)) / minutes if minutes > 0.0 else NAN
     return CrossingRate(level, observed, rates[0][0], rates[1][0], error, rates[0][1],
                         rates[1][1])
 
 
-# Number of blocks: more blocks are predicted from more of the recording, at a higher cost.
+# Number of blocks of the cross-validation.
 FOLDS = 6
 # Step of the numerical derivatives, in the logarithm of a parameter.
 _STEP = 1e-4
 # Maximum change of a parameter, in its logarithm, as in a fit.
 _FAR = 1.5
-# Mean loss by errors of parameters, nats per sample, from which the other blocks do not
-# determine them: predictions are then as far off by them as by the noise.
+# Maximum mean loss by errors of the parameters, nats per sample; at the limit these errors are as
+# large as the noise.
 _UNKNOWN = 0.5
-# Samples count up to this far outside of the throttle that the other blocks have been through: a
-# share of its range, and what is no change of throttle at all.
+# Tolerance outside the throttle of the other blocks: as a share of its range, and at least.
 _BEYOND, _STILL = 0.05, 0.01
 # Duration of the response to throttle that no other block contains, s: most lags of recorded
 # flights are shorter.
@@ -239,7 +239,7 @@ class HeldOut:
     model: Composite  # Fitted on everything
     # Log predictive density of each sample with its block held out, nats; shape (n,).
     density: FloatArray
-    known: npt.NDArray[np.bool_]  # Where the other blocks determine the parameters; shape (n,)
+    known: npt.NDArray[np.bool_]  # Whether other blocks determine the parameters; shape (n,)
     error: FloatArray  # Error of each prediction with its block held out, V; shape (n,)
 
 
@@ -271,7 +271,7 @@ def held_out(samples: Samples, model: Composite) -> HeldOut:
                      for b in blocks])
     gram = np.array([columns[b].T @ columns[b] for b in blocks])
     density, known = model.density.copy(), np.ones(samples.n, dtype=np.bool_)
-    # The law's estimate of the level uses later samples too.
+    # With an offset, which a law estimates from later samples too, use errors without it.
     error = e.copy() if model.offset is None else evaluate(samples, terms, events).innovation
     for b, own, mean in zip(blocks, info, gram, strict=True):
         others, rest = info.sum(axis=0) - own, gram.sum(axis=0) - mean
@@ -285,7 +285,7 @@ def held_out(samples: Samples, model: Composite) -> HeldOut:
         try:
             there = evaluate(data, with_mean(_moved(terms, free, step), beta), events, inside=True)
         except ValueError:
-            # The rest leads to a model whose covariance cannot be computed.
+            # No valid model without the block.
             known[b] = False
             continue
         density[b] += there.density[b] - base.density[b]
@@ -299,12 +299,11 @@ def held_out(samples: Samples, model: Composite) -> HeldOut:
 def errors_grow(new: FloatArray, old: FloatArray, variance: FloatArray, errors: float = Z95
                 ) -> bool:
     """
-    Return whether one-step errors of a model are larger (rms) than those of another one.
+    Return whether one-step errors (rms) grew by more than `errors` standard errors.
 
-    Under a right model its errors, of these variances (V^2), are independent of the difference,
-    which is known beforehand; a sum of their products has a standard error, and the squares have
-    to grow by so many of these.  A likelihood does not see it: calling a few bursts noise costs
-    less there than it gains elsewhere.
+    Under the right new model, its errors, with these variances, V^2, are independent of the
+    difference from the old ones, which gives the standard error of the increase.  A likelihood may
+    miss larger errors: to explain a few bursts as noise may cost less than it gains elsewhere.
     """
     difference = old - new
     error = 2.0 * math.sqrt(float(np.sum(variance * difference**2)))
@@ -312,7 +311,7 @@ def errors_grow(new: FloatArray, old: FloatArray, variance: FloatArray, errors: 
 
 
 def _stepped(term: Term, name: str) -> tuple[Term, float]:
-    """Return a term with a parameter moved a little, inwards at the end of its range."""
+    """Return a term with a parameter moved by a small step within its range, and the step."""
     for step in (_STEP, -_STEP):
         try:
             moved = term.moved(name, step)

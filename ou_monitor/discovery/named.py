@@ -1,8 +1,8 @@
 """
 Named causes: the causes of a search, without those that a second criticism refutes.
 
-The result of the search is criticised on everything; a cause that does not explain its statistics
-is withdrawn, and the search continues without it.
+The model is criticised on the whole recording; causes that do not explain their statistics are
+withdrawn, and the search continues without them.
 """
 
 from __future__ import annotations
@@ -29,35 +29,31 @@ from ou_monitor.model.terms.tones import Resonance, Tone
 
 # Maximum number of searches, each without the causes withdrawn before.
 _TURNS = 3
-# Standard errors from which a line always stays.
+# Minimum amplitude, in standard errors, of a line that is never withdrawn.
 _SURE = 25.0
 
 # Note if the search was cut short.
-STOPPED = ('The search for causes was cut short where the next ones would have taken long; there '
-           'may be more than are named.')
+STOPPED = ('The search for causes was cut short because the next ones would have taken long; '
+           'there may be more causes.')
 
 # Note if the user stopped the search.
-INTERRUPTED = ('The search for causes was stopped by hand: these are the causes found until then, '
-               'and there may be more.')
+INTERRUPTED = ('The search for causes was stopped by the user: these are the causes found so far; '
+               'there may be more.')
 
 
 @dataclass(frozen=True, eq=False)
 class Named:
-    """
-    Result of the search: a model fitted to everything, its causes, statistics before and after.
+    """Result of the search."""
 
-    `bank` calibrates the statistics.
-
-    """
-
-    whole: Composite
-    bank: NullBank
-    names: tuple[str, ...]
-    rivals: Mapping[str, list[str]]
-    dropped: tuple[str, ...]
+    whole: Composite  # Model fitted to everything
+    bank: NullBank  # Calibration of the statistics
+    names: tuple[str, ...]  # Causes in the order of acceptance
+    rivals: Mapping[str, list[str]]  # For each, the causes that tie with it
+    dropped: tuple[str, ...]  # Causes that were withdrawn
+    # Statistics of the plain and of the extended model.
     before: Mapping[str, float]
     after: Mapping[str, float]
-    failure: str
+    failure: str  # Why the search ended early; otherwise empty
 
 
 def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
@@ -72,7 +68,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
     fitter = Fitter(samples, start.cost)
     search = Search(fitter.fit(start.terms, start) or start)
     found = _Result(search.copy(), start, before)
-    # Beside lines that were taken out there may be slower ones.
+    # Lines already subtracted do not exclude further, slower ones.
     given = [term.NAME for term in exact if term.FAMILY != 'line']
     failure, begun = '', None
     dropped: list[str] = []
@@ -80,7 +76,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
         under_load(fitter, search)
         begun = found = _finished(fitter, search, bank)
         for turn in range(_TURNS):
-            # At last without latent causes, which were withdrawn again and again.
+            # The last turn is without latent causes, which were withdrawn repeatedly.
             name_causes(fitter, search, bank, given=[*given, *dropped],
                         latent=turn < _TURNS - 1,
                         progress=None if turn else lambda share: progress(0.1 + 0.9 * share))
@@ -100,10 +96,10 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
         if blamed(error):
             raise
-        # A fit outside of what numbers can hold; the criticism still stands.
-        failure = f'The search for causes broke off: {error}.'
+        # A numerical failure; the criticism is still valid.
+        failure = f'The search for causes failed: {error}.'
     if failure and begun is not None:
-        # Causes found until then; in the middle of the load no model belongs to the names.
+        # After the load model, search and names are consistent.
         found = _finished(fitter, search, bank)
     names = found.search.accepted
     return Named(found.whole, bank, tuple(names),
@@ -122,7 +118,7 @@ class _Result:
 
 
 def _finished(fitter: Fitter, search: Search, bank: NullBank) -> _Result:
-    """Return a search with its model fitted to everything: an event in the part kept counts."""
+    """Return a search with its model fitted to everything, held-out events included."""
     whole = fitter.whole(search.composite)
     return _Result(search.copy(), whole, criticise(fitter.samples, whole, bank))
 
@@ -131,7 +127,7 @@ def _withdrawn(fitter: Fitter, found: _Result, begun: _Result) -> list[int]:
     """Return the causes that do not explain their statistics, or no longer fit their name."""
     names = found.search.accepted
     out = decision.withdrawn(begun.after, found.after, kinds_of(names), found.search.asked)
-    # Noise that the load needs is part of it.
+    # Noise terms of the load model stay.
     out = [k for k in out if names[k] not in begun.search.accepted]
     return sorted({*_in_doubt(fitter.samples, found.whole, names, out),
                    *_other(fitter, found.whole, names)})

@@ -1,13 +1,13 @@
 """
 Response of the mean to throttle, its lags, and time, by regression on whitened samples.
 
-The recording and the columns of all candidates go through the filter of the noise found so far;
-then any set of terms is a small linear system.  Its evidence is the less of two: the likelihood
-less its price (BIC), and what the set gains on blocks that were kept back one after the other.
-The first guards against noise, the second against a form that only mends one part of the
-recording.  Terms come and go one at a time, from the load model on.
+The recording and the columns of all candidates are whitened by the noise found so far; then any
+set of terms is a small linear system.  Its evidence is the smaller of two: the likelihood less its
+penalty (BIC), and the gain in cross-validation over blocks.  The first guards against noise, the
+second against a form that only improves one part of the recording.  Starting from the load model,
+terms are added and removed one at a time.
 
-Limits: time constants and delays are those of the list; what noise the rest has is taken as found.
+Limits: time constants and delays come from a list; the noise is not fitted again.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def mean_answer(samples: Samples, composite: Composite, view: View,
     """Return the terms of the mean in a recording, beside the other terms of a model."""
     own = [term for term in composite.terms if _measured(term)]
     pool = [*(term for term in start if not _there(term, own)), *own]
-    # Beside the noise of a first look, a sag that grows stands for other terms.
+    # With only a rough noise model, a growing sag would take the place of other terms.
     pool += [term for term in _candidates(view) if not _there(term, pool)
              and not (start and isinstance(term, LoadSag) and term.growth)]
     if not pool:
@@ -106,7 +106,7 @@ def _there(term: Term, others: Sequence[Term]) -> bool:
 
 
 def _nearby(one: Term, other: Term) -> bool:
-    """Return whether two terms differ by a time constant of the list, or the next but one."""
+    """Return whether two terms differ only by a small step of the time constant."""
     return (isinstance(one, LoadTransient) and isinstance(other, LoadTransient)
             and one.delay == other.delay and 0.5 < one.tau / other.tau < 2.0)
 
@@ -118,7 +118,7 @@ def _candidates(view: View) -> Iterator[Term]:
         if kind.ROLE is Role.MEAN and kind.MEASURED and (
                 view.throttle is not None or not kind.NEEDS_THROTTLE):
             for term in kind.candidates(view):
-                # An answer that is late for good does not die out: it has no rate.
+                # A delayed response has no rate.
                 if (not isinstance(term, LoadTransient) or term.delay > 0.0
                         or decision.relaxes(1.0 / term.tau, duration)):
                     yield term
@@ -163,7 +163,7 @@ class _Regression:
         best, most = None, 0.0
         for k in chosen:
             less = self._less(chosen, k)
-            # Removing a term saves its price, so the term has to be worth it.
+            # Removing a term saves its penalty.
             gain = self._least(less, k, largest) - (value - self._value(less))
             if not self._steady(less, chosen):
                 gain = max(gain, 1e-6)
@@ -200,7 +200,7 @@ class _Regression:
         return tuple(j for j in chosen if j != k)
 
     def _with(self, chosen: tuple[int, ...], k: int) -> tuple[int, ...]:
-        """Return a set with one more term, in the place of another one of its kind if need be."""
+        """Return a set with one more term; it replaces another of a kind that occurs once."""
         kind = type(self._pool[k])
         kept = chosen if kind.SEVERAL else tuple(
             j for j in chosen if type(self._pool[j]) is not kind)
@@ -256,9 +256,9 @@ class _Regression:
 
 
 def _lost(fitted: FloatArray, scored: FloatArray, at: npt.NDArray[np.int64]) -> float:
-    """Return half the squares that a fit to some blocks leaves on others."""
+    """Return half the sum of squared residuals on some blocks of a fit to others."""
     gram = fitted[np.ix_(at, at)]
-    # The columns have one scale: a millionth of a millionth keeps what is the same from division.
+    # The columns are scaled; the ridge keeps equal columns from a division by zero.
     beta = np.linalg.solve(gram + 1e-10 * np.trace(gram) * np.eye(at.size), fitted[at, 0])
     inside = scored[np.ix_(at, at)]
     return 0.5 * float(scored[0, 0] - 2.0 * beta @ scored[at, 0] + beta @ inside @ beta)

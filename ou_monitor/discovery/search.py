@@ -1,12 +1,12 @@
 """
-The search for causes: which ones a recording shows.
+The search for the causes that a recording shows.
 
-It begins with the response of the mean to throttle and time, and the noise of a load: on real
-flights that is nearly all of the variance, so that nothing else can be seen before.
-Every candidate of the catalogue is fitted beside the model so far, and the one of most evidence is
-accepted; then what is no longer worth its price goes, and a law of throttle in the place of
-another stays where it does better.  Measured inputs come before anything latent, which can
-imitate them; causes that do as well are named as alternatives.
+It begins with the response of the mean to throttle and time, and the noise under load, which are
+nearly all of the variance on real flights and hide everything else.  Then, in each round, every
+candidate of the catalogue is fitted together with the model so far, and the one with most evidence
+is accepted; causes that are no longer worth their penalty are removed, and a law of throttle
+replaces another if it fits better.  Measured inputs come before latent causes, which can imitate
+them; causes that tie are named as alternatives.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ _CURVES = {LoadDependentSigma.NAME: LoadDependentNoise.NAME,
 _ROUGH = 20.0
 # Maximum time of one fit, s, for which the mean is chosen again after each cause.
 _SOON = 1.0
-# Maximum number of rounds in which lines are added to a tone: three motors or converters, each
-# with its harmonics; and of lines added at once.
+# Maximum rounds that add lines to a tone (three motors or converters, each with harmonics), and
+# maximum lines added in one.
 _LINE_TURNS, _MOST_LINES = 3, 12
 
 
@@ -85,7 +85,7 @@ def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
         if best.composite.gaussian.cost < _SOON:
             choose_answer(fitter, search, ())
         if best.name == Tone.NAME:
-            # Beside the strongest the next ones show.
+            # Weaker lines become visible once the strongest is in the model.
             for _ in range(_LINE_TURNS):
                 if not _more_lines(fitter, search):
                     break
@@ -137,7 +137,7 @@ def choose_answer(fitter: Fitter, search: Search, start: Sequence[Term]) -> None
 
 
 def position(model: Composite, names: Sequence[str], k: int) -> int:
-    """Return where in the model the k-th cause is: the n-th of its kind is the n-th."""
+    """Return the index in the model of the k-th cause; causes of a kind keep their order."""
     nth = list(names[:k]).count(names[k])
     return [i for i, term in enumerate(model.terms) if term.NAME == names[k]][nth]
 
@@ -150,10 +150,10 @@ def kinds_of(names: Sequence[str]) -> list[type[Term]]:
 def _round(fitter: Fitter, search: Search, bank: NullBank, given: Sequence[str], latent: bool
            ) -> list[Trial]:
     """
-    Return the trials of a round that may be accepted, the one to accept first.
+    Return the trials of a round that may be accepted, best first.
 
-    A measured input comes before latent causes where its gain holds throughout: a few outliers
-    that coincide with one throttle by chance imitate an answer to it.
+    A measured input comes before latent causes if it gains throughout the recording: a few
+    outliers that coincide with one throttle by chance imitate a response.
     """
     trials: list[Trial] = []
     for first in (True, False)[:1 + latent]:
@@ -188,7 +188,7 @@ def _price(fitter: Fitter, beside: Composite, name: str, least: float = decision
 
 
 def _accept(search: Search, best: Trial, trials: Sequence[Trial]) -> None:
-    """Accept a trial; the ones that tie are its rivals."""
+    """Accept a trial; trials that tie are its rivals."""
     search.rivals[best.name] = decision.rivals_of(
         best.name, [(trial.name, trial.evidence) for trial in trials])
     search.log.append(f'{best.name}: {best.evidence:.1f} nats; '
@@ -202,9 +202,9 @@ def _more_lines(fitter: Fitter, search: Search) -> bool:
     """Add lines beside the one accepted last, such as its harmonics."""
     composite, samples = search.composite, fitter.samples
     view = fitter.view(composite)
-    # An amplitude, a phase, and what was searched for the frequency.
+    # Penalty of amplitude, phase, and searched frequency.
     price = math.log(samples.train.stop) + Tone.SEARCH
-    # A line of the scores, which have variance 1, gains n rms^2 / 2 nats.
+    # A line of the scores, with variance 1, gains n rms^2 / 2 nats.
     lines = [Tone.at(line, view) for line in lines_of(view)[:_MOST_LINES]
              if 0.5 * samples.n * line.rms ** 2 > price + decision.ACCEPT]
     fit = fitter.join(composite, lines, rough=True) if lines else None
@@ -221,7 +221,7 @@ def _more_lines(fitter: Fitter, search: Search) -> bool:
 class _Move:
     """A model without a cause, or with another one in its place."""
 
-    name: str  # Of the cause
+    name: str  # Name of the cause
     instead: str  # Name of its replacement; empty: none
     model: Composite
     gain: float  # Evidence above the required minimum, nats
@@ -287,17 +287,17 @@ def _in_full(fitter: Fitter, found: Composite) -> Composite:
     return full if full is not None and fitter.evidence(full) > fitter.evidence(found) else found
 
 
-# Initial rate of the residual after load, 1/s: a fit reaches minutes and tenths of a second from
-# it.
+# Initial rate of the residual after load, 1/s; from it a fit reaches minutes and tenths of a
+# second.
 _SLOW = 1.0
 
 
 def under_load(fitter: Fitter, search: Search) -> None:
     """
-    Start from the load model: response to throttle, and noise that follows it, at once.
+    Start from the load model: response to throttle, and noise that follows it, together.
 
-    In a flight they are nearly all of the variance: one by one, each would be fitted to what the
-    others leave.  Nothing is accepted that the mean without them does not need.
+    They are nearly all of the variance of a flight; one by one, each would be fitted to the
+    residuals of the others.  Afterwards each must be worth its own penalty.
     """
     load, plain = load_terms(fitter.samples), search.composite
     noisy = whole_load(fitter, plain, load)
@@ -307,7 +307,7 @@ def under_load(fitter: Fitter, search: Search) -> None:
     search.composite = noisy
     choose_answer(fitter, search, load)
     if not any(catalogue()[name].FAMILY == LoadSag.FAMILY for name in search.accepted):
-        # Throttle does not move the mean: what the noise is, the search asks one by one.
+        # Throttle does not move the mean: the search tests the noise terms one by one.
         search.composite, search.accepted = plain, []
         choose_answer(fitter, search, ())
         return
@@ -315,7 +315,7 @@ def under_load(fitter: Fitter, search: Search) -> None:
     bare = fitter.fit([*plain.terms, *means], plain)
     if bare is None:
         return
-    # Again beside the mean as it is now, each for its own evidence.
+    # Choose the noise terms again for the new mean, each by its own evidence.
     known = [term.NAME for term in plain.terms]
     best = _noise_beside(fitter, bare)
     if fitter.evidence(search.composite) > fitter.evidence(best):
@@ -340,7 +340,7 @@ def _coupled(fitter: Fitter, search: Search) -> None:
     changes = [term for term in means if isinstance(term, LoadTransient)]
     if any(term.delay > 0.0 for term in changes):
         return
-    # What a step of throttle leaves dies out with the corner.
+    # The response to a step of throttle decays at the corner.
     tau = max(term.tau for term in changes)
     coupling = ACCoupling(0.5 / (math.pi * tau), 0.0)
     ou, *others = [term for term in composite.terms if term not in means]
@@ -348,7 +348,7 @@ def _coupled(fitter: Fitter, search: Search) -> None:
     laws = [term for term in others if term.ROLE is Role.LAW]
     fit = fitter.fit([coupling.beside(ou), *structural, LoadSag(0.0, 0.0), coupling, *laws],
                      composite)
-    # Behind a coupling, a rail that does not relax within the recording appears to relax.
+    # Behind a coupling, even a trend appears to relax.
     if fit is None or is_trend(fitter.samples, fit):
         return
     gain = fitter.evidence(fit) - fitter.evidence(composite)
@@ -379,7 +379,7 @@ def _noise_beside(fitter: Fitter, composite: Composite) -> Composite:
     ou = composite.terms[0]
     assert isinstance(ou, OU)
     error = math.sqrt(float(np.median(composite.gaussian.variance)))
-    # What the load leaves is slow, and small beside the white noise; or it is the noise itself.
+    # The residual of the load is slow and smaller than the white noise, or it is the noise itself.
     slow = replace(ou, alpha=_SLOW, sigma=0.3 * error * math.sqrt(2.0 * _SLOW))
     while True:
         view = fitter.view(best)

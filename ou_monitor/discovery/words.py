@@ -1,7 +1,7 @@
 """
-A finding in words: verdict, causes, gains, what remains, what would decide.
+A finding in words: verdict, causes, gains, remaining discrepancies, and what would decide.
 
-`cause_rows` are the rows of the table of causes, for the terminal and the page.
+`cause_rows` are the rows of the table of causes.
 """
 
 from __future__ import annotations
@@ -19,13 +19,12 @@ from ou_monitor.model.terms.term import Term
 from ou_monitor.records import LARGEST_LOG_SE
 from ou_monitor.text import chance as shown_chance, listed, number, p_words, Z95
 
-# What a gain is counted in.
+# The unit of a gain.
 MNAT = ('mnat: a thousandth of a nat of log predictive density. A gain of 1 mnat per sample makes '
         '1000 samples e = 2.7 times as likely as before.')
-# What to say where the error of a gain leaves nothing known of it.
+# Reasons why a gain is unknown.
 VAGUE = ('its error is more than ten times the gain, because the rest of the recording hardly '
          'determines its parameters.')
-# What to say where there is no model to compare with.
 NO_OTHER = 'the model cannot be fitted without it.'
 NOT_KNOWN = 'not known'
 
@@ -46,9 +45,9 @@ _PLAIN = ((
     ('throttle', 'the mean depends on throttle or its changes'),
     ('state throttle', 'the relaxation depends on throttle'),
     ('state', 'the relaxation is not proportional to the deviation'),
-    ('growing effect', 'what throttle does to the mean changes with time'),
-    ('loop of throttle', 'the mean depends on whether throttle has come from above or below'),
-    ('after large', 'what follows a large error is not what the relaxation predicts'),
+    ('growing effect', 'the effect of throttle on the mean changes with time'),
+    ('loop of throttle', 'the mean depends on whether throttle came from above or below'),
+    ('after large', 'the voltage after a large error does not follow the relaxation'),
     ('power after large', 'a large error is followed by more noise, or by less'),
     ('irreversibility', 'it looks different backwards in time'),
     ('small errors', 'neighbouring small errors are correlated'),
@@ -58,13 +57,13 @@ _PLAIN = ((
 
 
 def plain_words(statistic: str) -> str:
-    """Return what it means when a statistic is off."""
+    """Return the meaning of a statistic outside its band."""
     fits = [(len(sign), text) for sign, text in _PLAIN if statistic.startswith(sign)]
     return max(fits)[1] if fits else statistic
 
 
 def parameters(term: Term, se: Mapping[str, Any]) -> str:
-    """Return the estimates of a term with units and errors, as far as the recording shows them."""
+    """Return the estimates of a term with units and errors, without undetermined ones."""
     return '; '.join(
         f'{name} = {with_error(value, se.get(name), positive=term.positive(name))}'
         f'{_unit(term, name)}' for name, value in term.values().items()
@@ -73,7 +72,7 @@ def parameters(term: Term, se: Mapping[str, Any]) -> str:
 
 def with_error(value: Any, error: Any, *, positive: bool = False) -> str:
     """
-    Return a number, or a list of them, with its standard error where known.
+    Return a number, or a list of them, with its standard error if known.
 
     A positive number is not determined beyond `LARGEST_LOG_SE`, as in an `Estimate`.
     """
@@ -100,7 +99,7 @@ def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
             alternatives: Sequence[str], exact: bool, why: str = '', together: int = 1,
             chance: float = math.nan) -> str:
     """
-    Return what a cause is, its estimate, its gain and what to do, for people.
+    Return an explanation of a cause: meaning, estimate, gain and remedy.
 
     gain, gain_se in nats.
     """
@@ -116,26 +115,23 @@ def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
     if alternatives:
         separate = [f'{catalogue()[name].SEPARATED_BY} (for {name})'
                     for name in (term.NAME, *alternatives)]
-        parts.append(f'This recording cannot separate it from {listed(list(alternatives))}; what '
+        parts.append(f'This recording cannot separate it from {listed(list(alternatives))}; this '
                      f'would: {"; ".join(dict.fromkeys(separate))}.')
     parts.append(term.REMEDY)
     return ' '.join(part for part in parts if part)
 
 
 def left_out_note(count: int, scored: int) -> str:
-    """Return that samples at throttle which other blocks do not cover are not scored."""
+    """Return the note for samples at throttle that other blocks do not cover."""
     return (f'{count} samples are at throttle that the rest of the recording does not cover: a '
             f'model fitted there does not apply to them. Only the other {scored} are scored.')
 
 
 def coupling_note(alpha: float, duration: float) -> str:
     """
-    Return what can be said of an AC coupling that was not found.
+    Return how far an AC coupling is excluded (alpha in 1/s, duration in s).
 
-    Evidence for one grows as 0.24 alpha T nats, alpha being the rate of the
-    rail behind it.
-
-    alpha in 1/s, duration in s.
+    Evidence for one grows as 0.24 alpha T nats with the rate alpha of the rail behind it.
     """
     slowest = 6.0 / (0.24 * duration)
     corner = alpha / (2.0 * math.pi)
@@ -146,7 +142,7 @@ def coupling_note(alpha: float, duration: float) -> str:
 
 
 def no_relaxation_note(alpha: float, step: float) -> str:
-    """Return the note for samples that are farther apart than the rail remembers."""
+    """Return the note for samples farther apart than the relaxation time."""
     return (f'Samples {number(1e3 * step)} ms apart are nearly uncorrelated: the rail is faster '
             f'than the sampling, or the noise is that of the sensor, and alpha = {number(alpha)} '
             '1/s is only a lower bound.')
@@ -159,7 +155,7 @@ def coupling_found(duration: float) -> str:
 
 
 def remaining_words(left: Sequence[Criticism]) -> str:
-    """Return the worst of what remains, in words."""
+    """Return the largest remaining discrepancies, in words."""
     texts = list(dict.fromkeys(plain_words(c.statistic) for c in left))
     return listed(texts[:4]) + ('' if len(texts) <= 4 else f' ({len(texts) - 4} more)')
 
@@ -180,13 +176,13 @@ def verdict_sentence(verdict: Verdict, causes: Sequence[Cause], left: Sequence[C
 def _verdict(verdict: Verdict, causes: Sequence[Cause], left: Sequence[Criticism], gain: float,
              gain_se: float, dropped: Sequence[str], why: str, uncovered: int,
              doubts: Sequence[str]) -> str:
-    """Return the verdict without what speaks against the model."""
+    """Return the verdict without a refusal."""
     names = _counted([cause.name for cause in causes])
-    tried = (f' The nearest entries of the catalogue ({listed(list(dropped))}) fit in part only.'
+    tried = (f' The nearest entries of the catalogue ({listed(list(dropped))}) fit only in part.'
              if dropped else '')
     if left and uncovered:
         tried += (f' {uncovered} samples are at throttle that the rest of the recording does not '
-                  'cover: that alone may be what is left'
+                  'cover, which alone may explain the rest'
                   + ('.' if why else '; a recording that covers its whole range of throttle more '
                      'than once would decide.'))
     if verdict is Verdict.NO_EFFECT:
@@ -196,8 +192,8 @@ def _verdict(verdict: Verdict, causes: Sequence[Cause], left: Sequence[Criticism
         return ('The simulation deviates from the recording, and no known cause explains it: '
                 f'{remaining_words(left)}.{tried}')
     if verdict is Verdict.EXPLAINED:
-        return (f'What the plain OU gets wrong is explained by {listed(names)}. '
-                + gain_words(gain, gain_se, why))
+        return (f'{listed(names)} explain{"s" if len(names) == 1 else ""} what the plain OU gets '
+                'wrong. ' + gain_words(gain, gain_se, why))
     rest = '; '.join([*([remaining_words(left)] if left else []), *doubts])
     return (f'{listed(names)} explain{"s" if len(names) == 1 else ""} a part of what the plain OU '
             f'gets wrong; another part remains{": " if rest else ""}{rest}.{tried} '
@@ -205,7 +201,7 @@ def _verdict(verdict: Verdict, causes: Sequence[Cause], left: Sequence[Criticism
 
 
 def _counted(names: Sequence[str]) -> list[str]:
-    """Return each name once, with how often it is there."""
+    """Return each name once, with its number of terms."""
     return [name if names.count(name) == 1 else f'{name} ({names.count(name)} terms)'
             for name in dict.fromkeys(names)]
 
@@ -217,7 +213,7 @@ def plain_model_words(baseline: OU) -> str:
 
 
 def gain_words(gain: float, gain_se: float, why: str = '') -> str:
-    """Return the gain in a sentence; one that is not distinguishable from zero is none."""
+    """Return the gain in a sentence."""
     if not math.isfinite(gain):
         return 'Its gain cannot be measured on this recording' + (f': {why}' if why else '.')
     size = f'{number(1e3 * gain)} +- {number(1e3 * gain_se, 2)} mnat per sample'
@@ -229,15 +225,15 @@ def gain_words(gain: float, gain_se: float, why: str = '') -> str:
 
 
 def why_named(gain: float, gain_se: float, chance: float) -> str:
-    """Return why a cause is named whose gain does not say so; empty where it does."""
+    """Return why a cause without a significant gain is named; otherwise empty."""
     if gain > Z95 * gain_se or not math.isfinite(chance):
         return ''
-    return f'Named for what it explains in the recording as a whole ({p_words(chance)}).'
+    return f'Named because it explains the whole recording better ({p_words(chance)}).'
 
 
 def overlap_words(causes: Sequence[Cause], gain: float) -> str:
     """
-    Return why single gains are larger than that of the whole; empty where none is.
+    Return why single gains exceed the gain of the whole model; empty if none does.
 
     gain in nats.
     """
@@ -246,17 +242,17 @@ def overlap_words(causes: Sequence[Cause], gain: float) -> str:
     if not larger:
         return ''
     return (f'Without {" or without ".join(larger)} the rest of the model predicts worse than the '
-            'plain OU, so that this gain is larger than that of the whole model: single gains '
-            'overlap and do not add up.')
+            'plain OU, so this gain exceeds the gain of the whole model: single gains overlap and '
+            'do not add up.')
 
 
 def unmeasured_words(fewest: int, scored: int, throttle: bool) -> str:
-    """Return why a gain cannot be measured, and what recording would measure it."""
-    few = (f'{scored} samples are left to score it on, fewer than {fewest}' if scored
-           else 'no part of the recording determines it for the others')
+    """Return why a gain cannot be measured, and which recording would measure it."""
+    few = (f'only {scored} samples can be scored, fewer than {fewest}' if scored
+           else 'no part of the recording determines its parameters for the others')
     if throttle:
-        return (f'{few}: throttle of one part does not cover that of the others. A recording that '
-                'covers its whole range of throttle more than once would measure it.')
+        return (f'{few}: the parts cover different ranges of throttle. A recording that covers '
+                'its whole range of throttle more than once would measure it.')
     return f'{few}. A longer recording would measure it.'
 
 
@@ -264,20 +260,20 @@ def unmeasured_words(fewest: int, scored: int, throttle: bool) -> str:
 class CauseRow:
     """One row: a cause, or several terms of one kind that share a gain."""
 
-    name: str  # Of the cause
-    label: str  # The same, and how many terms there are when more than one
-    family: str  # Of the catalogue
-    gain: str  # mnat per sample with its standard error, or that it is not known
-    remark: str  # What to make of the gain, and why the cause is named; empty when it is one
-    chance: str  # p, ``exact``, or that it is not known
+    name: str  # Name of the cause
+    label: str  # Name, with the number of terms if there are several
+    family: str  # Family in the catalogue
+    gain: str  # mnat per sample with its standard error, or `NOT_KNOWN`
+    remark: str  # Why the cause is named if its gain is not significant; otherwise empty
+    chance: str  # p, ``exact``, or `NOT_KNOWN`
     alternatives: tuple[str, ...]  # Causes that the recording cannot separate from it
     estimates: tuple[str, ...]  # Parameters of each term, with units and standard errors
-    explanation: str  # For people; lists the parameters of each term
+    explanation: str  # With the parameters of each term
 
 
 def cause_rows(causes: Sequence[Cause]) -> list[CauseRow]:
     """Return the rows of the table of causes."""
-    # By the text of the numbers: NaN is not equal to itself.
+    # Compared as text, because NaN is not equal to itself.
     groups: dict[tuple[str, ...], list[Cause]] = {}
     for cause in causes:
         key = (cause.name, repr(cause.gain), repr(cause.gain_se), _chance(cause))
@@ -292,7 +288,7 @@ def cause_rows(causes: Sequence[Cause]) -> list[CauseRow]:
 
 
 def gain_text(gain: float, gain_se: float) -> str:
-    """Return a gain given in nats, in mnat, with its standard error as far as it is known."""
+    """Return a gain, nats, in mnat with its standard error."""
     if not math.isfinite(gain):
         return NOT_KNOWN
     if not math.isfinite(gain_se):
@@ -301,21 +297,21 @@ def gain_text(gain: float, gain_se: float) -> str:
 
 
 def gain_remark(gain: float, gain_se: float) -> str:
-    """Return what to make of a gain; nothing when it is one, or is not known."""
+    """Return a remark on a gain that is not significant; otherwise empty."""
     if not (math.isfinite(gain) and math.isfinite(gain_se)) or gain > Z95 * gain_se:
         return ''
     if gain < -Z95 * gain_se:
-        return 'worse on what was kept back'
-    return 'not distinguishable from none'
+        return 'worse on held-out samples'
+    return 'not distinguishable from 0'
 
 
 def _remark(cause: Cause) -> str:
-    """Return what to make of the gain of a cause, and why it is named all the same."""
+    """Return a remark on the gain, and why the cause is named nevertheless."""
     remark = gain_remark(cause.gain, cause.gain_se) if math.isfinite(cause.gain) else (
         'not measurable here')
     if cause.exact or not remark:
         return remark
-    return remark + '; named for what it explains in the recording as a whole'
+    return remark + '; named because it explains the whole recording better'
 
 
 def _chance(cause: Cause) -> str:
@@ -363,13 +359,13 @@ PLAIN_NAMES = {
     'tone': 'a line at a fixed frequency',
     'volatility': 'noise that comes and goes',
 }
-# Names that are no words of English; the others stand for themselves where they are no cause.
+# Names with an underscore; the others are English words, and are replaced only as causes.
 _CODE = re.compile(r'(?<![\w(])(' + '|'.join(
     name for name in sorted(PLAIN_NAMES, key=len, reverse=True) if '_' in name) + r')(?![\w)])')
 
 
 def plain(text: str, causes: Sequence[str] = ()) -> str:
-    """Return a text with what a pilot calls each cause before its name in code."""
+    """Return a text with the plain name of each cause before its name in code."""
     said: set[str] = set()
 
     def both(found: re.Match[str]) -> str:
@@ -387,5 +383,5 @@ def plain(text: str, causes: Sequence[str] = ()) -> str:
 
 
 def both_names(name: str) -> str:
-    """Return what a pilot calls a cause, with its name in code behind it."""
+    """Return the plain name of a cause, followed by its name in code."""
     return f'{PLAIN_NAMES[name]} ({name})' if name in PLAIN_NAMES else name

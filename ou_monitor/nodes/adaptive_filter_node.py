@@ -135,7 +135,7 @@ class SupplyInput:
             self._sigma, error, alpha, throttle, level, level_se, source='relaxation')
 
     def why_no_throttle(self, stale_after: float) -> str:
-        """Say why the throttle is unknown."""
+        """Return why the throttle is unknown."""
         age = self._state_silence.age
         if age is None:
             return f'no message on {self._state_topic}'
@@ -153,11 +153,11 @@ class SupplyInput:
             return f'sigma on {self._topic} is not a number, or negative'
         status = self._state.get('status', Status.OK.name)
         if fresh and status not in _USABLE:
-            return f'the estimator says {status}'
+            return f'the estimator reports {status}'
         window = _number(self._state, 'window_s')
         if fresh and window > _LONGER * _number(self._state, 'duration'):
-            # It does not follow the throttle.
-            return f'sigma is of the last {window:g} s, too long for the filter'
+            # Such a sigma does not follow the throttle.
+            return f'sigma is an average over the last {window:g} s, too long for the filter'
         return ''
 
 
@@ -270,8 +270,8 @@ class AdaptiveFilterNode(MonitorNode):
         NotchSettings.from_options(notch_options(values))
         if self._channels is not None and _not_a_voltage(self._type, settings):
             raise ValueError(
-                f'law {settings.law} without {_of_signal(settings)} is for a voltage, and '
-                f'{self._topic} is {self._type}: set it first')
+                f'law {settings.law} without {_of_signal(settings)} is for a voltage, but '
+                f'{self._topic} is {self._type}: set {_of_signal(settings)} first')
 
     def apply(self, values: Mapping[str, Any]) -> None:
         """Bring checked parameters into force; the output does not move."""
@@ -408,7 +408,7 @@ class AdaptiveFilterNode(MonitorNode):
         self.diagnose('adaptive low-pass', level, summary, fields, self._topic)
 
     def _decided_by(self, supply: KnownSupply) -> str:
-        """Say in words what determines the cutoff now."""
+        """Return in words what determines the cutoff now."""
         low_pass = self.low_pass
         s, bound = low_pass.settings, low_pass.bound
         if not self._passed:
@@ -425,7 +425,7 @@ class AdaptiveFilterNode(MonitorNode):
         return bound.value
 
     def _unknown(self, supply: KnownSupply) -> str:
-        """Say why the inputs of the law are unknown."""
+        """Return why the inputs of the law are unknown."""
         s = self.low_pass.settings
         if s.law == 'throttle':
             return self._supply.why_no_throttle(s.stale_after)
@@ -444,13 +444,13 @@ class AdaptiveFilterNode(MonitorNode):
             return Level.STALE, f'No message on {self._topic}' + (
                 ' yet.' if age is None else f' for {age:.1f} s.')
         if self._stamper.waiting and self._unplaced:
-            return Level.WARN, 'use_sim_time is set, but nothing comes on /clock (any more).'
+            return Level.WARN, 'use_sim_time is set, but no message arrives on /clock.'
         if self._input_clock.stamps is not StampOrder.GOOD:
             return Level.WARN, f'{self._topic}: {self._input_clock.stamps.by_arrival}'
         if _not_a_voltage(self._type, s):
             return Level.WARN, (
-                f'Law {s.law} without {_of_signal(s)} takes {self._topic} of type {self._type} '
-                'for the voltage: set it.')
+                f'Law {s.law} without {_of_signal(s)} assumes that {self._topic} is the voltage, '
+                f'but it is {self._type}: set {_of_signal(s)}.')
         missing = math.isnan(supply.throttle if s.law == 'throttle' else supply.sigma)
         if missing:
             return Level.WARN, (
@@ -458,8 +458,8 @@ class AdaptiveFilterNode(MonitorNode):
                 f'{self._unknown(supply)}.')
         if self.low_pass.highest < s.lowest:
             return Level.WARN, (
-                f'The messages on {self._topic} come too slowly: 0.45 of their rate is '
-                f'{self.low_pass.highest:.4g} Hz, below fmin ({s.lowest:.4g} Hz), which stays.')
+                f'The messages on {self._topic} are too slow: 0.45 of their rate is '
+                f'{self.low_pass.highest:.4g} Hz, below fmin ({s.lowest:.4g} Hz), which is used.')
         shadow = 'Shadow, the signal passes unfiltered: ' if s.shadow else ''
         of = f'throttle {supply.throttle:.2f}' if s.law == 'throttle' else (
             f'sigma {supply.sigma:.4g} V/sqrt(s)')
@@ -469,7 +469,7 @@ class AdaptiveFilterNode(MonitorNode):
             f'({1e3 * self._delay:.3g} ms) at {s.lag_frequency:g} Hz{self._of_notches()}.')
 
     def _of_notches(self) -> str:
-        """Say what the notches do."""
+        """Return the state of the notches in words."""
         notch = self._notch
         if not notch.settings.count:
             return ''
@@ -491,5 +491,5 @@ def _not_a_voltage(kind: str, settings: FilterSettings) -> bool:
 
 
 def _of_signal(settings: FilterSettings) -> str:
-    """Return the parameter that tells a law that its signal is not the voltage."""
+    """Return the parameter that is set if the signal is not the voltage."""
     return 'coupling' if settings.law == 'kalman' else 'signal_bandwidth'

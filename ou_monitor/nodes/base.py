@@ -47,7 +47,7 @@ LOCK = Parameter(
 SPIN = 0.0001
 # Maximum single sleep, s: limits the delay in noticing a signal.
 NAP = 0.05
-# How long the diagnostics report an exception of a callback, s.
+# Time for which the diagnostics report an exception of a callback, s.
 TELL = 10.0
 PUBLISH_RATE = Parameter('publish_rate', 10.0, 'How often the outputs are published, Hz.',
                          0.01, 1000.0)
@@ -297,7 +297,7 @@ class MonitorNode(Node):
         for name in self._parameter_overrides:
             if name.startswith(QOS) and not any(
                     name.startswith(f'{QOS}{topic}.') for topic in known):
-                raise InputError(f"parameter '{name}' is of no topic of this node: "
+                raise InputError(f"parameter '{name}' names no topic of this node, which are: "
                                  f"{', '.join(known)}")
 
     def create_polled(self, kind: Any, topic: str, qos: QoSProfile) -> Subscription:
@@ -355,8 +355,8 @@ class MonitorNode(Node):
         if self.locked and (set(changed) - {PUBLISH_RATE.name}
                             or any(p.name == 'use_sim_time' for p in parameters)):
             return SetParametersResult(
-                successful=False, reason='lock_parameters is set: of the parameters only '
-                'publish_rate can be changed until the node is started anew without it')
+                successful=False, reason='lock_parameters is set: only publish_rate can be '
+                'changed, until the node is restarted without it')
         if self.running and any(p.name in self._fixed for p in parameters):
             return SetParametersResult(
                 successful=False, reason='it is read when the node is activated: deactivate it '

@@ -1,28 +1,24 @@
 """
-Times of messages that carry no stamp: when sent, when sampled, and in simulated time.
+Times of messages without a stamp: sampling time from sending time, and simulated time.
 
-`SendClock`: estimates sampling times from sending times.
+`SendClock`: a message without a stamp has only its source timestamp.  A driver samples by a timer,
+but its sending is scheduled: after a pause of 10 ms, ten messages leave within 0.2 ms, and an
+increment over 1 ms seems to take 20 us. If 0.5 % of the intervals are like this, sigma doubles.
+So the samples of a steady source are put on an even time line that slowly follows the source
+timestamps.
 
-A message without a stamp has only its source timestamp.  A driver samples by a timer,
-but its sending is scheduled: after a pause of 10 ms ten messages leave within 0.2 ms,
-and an increment that took 1 ms seems to have taken 20 us.  Half a per cent of such
-intervals doubles sigma.  So, while the source is steady, its samples are put on an even
-time line that drifts slowly towards the source timestamps.
+A steady source can be late, but not early: the lower convex hull of source timestamp against
+message number is a straight line with the period as its slope, and many messages lie near it (this
+separates clock skew from delays: Zhang, Liu & Xia 2002, "Clock synchronization algorithms for
+network measurements").  The hull must span many pauses at any rate, because a burst of 400
+messages sent 10 us apart is a straight line too.
 
-A steady source can be late, never early: the lower convex hull of source
-timestamp against message number is a straight line, its slope the period, and
-many messages lie near it (clock skew is separated from delays in this way: Zhang, Liu &
-Xia 2002, "Clock synchronization algorithms for network measurements").  The
-hull must span many pauses, whatever the rate: a burst of 400 messages sent
-10 us apart is a straight line, too.
+Limits: a constant delay stays; the times of an unsteady source are not changed, and `in_bursts`
+reports it if its intervals cannot be sampling intervals, as when a driver empties a buffer.
 
-Limits: a constant delay stays; an unsteady source is left unchanged, and `in_bursts` reports it
-when its intervals cannot be sampling intervals, as when a driver empties a buffer.
-
-`SimClockMap`: the middleware stamps every message with the wall clock of its sender.  When a
-bag is replayed at four times its speed, those stamps lie four times too close
-and alpha would come out four times too large.  The messages on `/clock` carry
-both times, so they give the map from one to the other.
+`SimClockMap`: the middleware stamps every message with the wall clock of its sender.  If a bag is
+replayed at four times its speed, these stamps are four times too close, and alpha would be four
+times too large.  Messages on `/clock` have both times and so give the map between them.
 """
 
 from __future__ import annotations
@@ -35,12 +31,12 @@ import math
 import numpy as np
 from ou_monitor.records import FloatArray
 
-# Messages examined: the larger of this number and the messages of these seconds.
+# Minimum number of messages examined, and minimum time that they span, s.
 KEEP, SPAN = 400, 1.0
 # Maximum number of messages examined: one second at 30 kHz.
 MOST = 30_000
-# Messages, and seconds, needed for the first judgement: pauses of 50 ms, each caught up in a
-# burst, tilt a line over 0.2 s by a quarter at most.
+# Minimum messages and time, s, of the first judgement: pauses of 50 ms followed by bursts tilt a
+# line over 0.2 s by at most a quarter.
 LEAST, FIRST_SPAN = 200, 0.2
 # Messages and seconds between judgements (a judgement takes 0.2 ms for 400 messages, 0.6 ms for
 # 10 000).
@@ -63,7 +59,7 @@ IN_BURSTS = (
 # The line follows the source with this time constant, s: 50 ms of delay, made up within 50 ms,
 # move it by 1.2 ms.
 FOLLOW = 1.0
-# Later than this, s, counts as a gap, not a delay; earlier than this, the clock went back.
+# Minimum gap, as opposed to a delay, s; minimum step back of a clock, s.
 GAP, BACK = 0.25, 0.5
 # Maximum points of the hull; with more messages, the lowest of each group is used.
 _POINTS = 400

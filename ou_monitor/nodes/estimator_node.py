@@ -52,8 +52,8 @@ POLL = 0.02
 # Maximum period of handing fetched messages to the monitor, s; also done before each report. Each
 # time costs 2 to 3 ms of CPU, however few samples there are.
 HAND_OVER = 0.25
-# Maximum load of estimating, a share of the time: above it estimates become rarer, and where
-# pushing samples alone exceeds it, they are thinned.
+# Maximum share of the time for estimates: above it they become less frequent, and if taking the
+# samples alone exceeds it, samples are thinned.
 SHARE = 0.25
 # An estimate that takes longer than this, s of CPU, is not made for every report.
 HEAVY = 0.02
@@ -139,7 +139,7 @@ class EstimatorNode(MonitorNode):
         return latch
 
     def recover(self, error: Exception) -> None:
-        """Begin anew after a callback has raised, without data of the supply."""
+        """Restart without data of the supply after a callback has raised."""
         if self.running:
             self._monitor.restart(error)
 
@@ -256,7 +256,7 @@ class EstimatorNode(MonitorNode):
             for end, own in zip(column.stamp.tolist(), column.stamped.tolist())])
 
     def _balance(self, pushed: float) -> None:
-        """Thin the samples where estimating from them takes too long (s of CPU)."""
+        """Thin the samples if taking them costs too much (pushed: s of CPU)."""
         self._load += pushed
         now = self.steady_now()
         if now - self._loaded < 1.0:
@@ -287,8 +287,8 @@ class EstimatorNode(MonitorNode):
     def _clear(self) -> str:
         if self.locked:
             raise InputError(
-                f'{LOCK.name} is set: the flag is cleared only by starting the node anew without '
-                'it' + (', and without the file of state_file.' if self._latch else '.'))
+                f'{LOCK.name} is set: the flag is cleared only by restarting the node without it'
+                + (', and without the file of state_file.' if self._latch else '.'))
         done = self._monitor.clear_brownout()
         if not done:
             raise InputError('Nothing to clear: the brown-out flag is not CRITICAL.')
@@ -309,7 +309,7 @@ class EstimatorNode(MonitorNode):
         path = self._models.save(
             learned, _entry(learned, loads.against(model.load)), self._meanwhile)
         self._monitor.set_model(self._models.use(path))
-        return f'{path} holds what this flight has learned, and {self._models.terms} of before.'
+        return f'{path}: saved the load of this flight; {self._models.terms} are unchanged.'
 
     # -- reports out
 
@@ -367,10 +367,10 @@ class EstimatorNode(MonitorNode):
         return notes
 
     def _why_unusable(self) -> str:
-        """Say why arriving messages hold no usable voltage."""
+        """Return why arriving messages contain no usable voltage."""
         if self._stamper.waiting and self._stream.unplaced:
             return ('Messages without a stamp cannot be placed in time: use_sim_time is set, but '
-                    'nothing comes on /clock (any more).')
+                    'no message arrives on /clock.')
         spec = self._voltage.spec
         return (f'Messages arrive on {self._topic}, but their field '
                 f"'{spec.field if spec else ''}' holds no finite voltage.")
@@ -424,7 +424,7 @@ class EstimatorNode(MonitorNode):
 
 
 def _entry(learned: LoadStart, found: ModelComparison) -> dict[str, object]:
-    """Return the line of a flight in the history of its model."""
+    """Return the entry of a flight in the history of its model."""
     values = {'level_v': learned.volts, 'sag_ratio': found.sag_ratio,
               'sag_ratio_se': found.sag_ratio_se, 'resistance_ohm': learned.resistance,
               'noise_v': learned.noise}

@@ -27,14 +27,14 @@ _NONE = (math.nan, math.nan, math.nan)
 
 @dataclass(frozen=True)
 class Group:
-    """Numbers that a message holds all together or not at all."""
+    """Numbers that a message has all together or not at all."""
 
     fields: tuple[FieldPath, ...]  # One for each signal
-    # A matrix that shrinks with their noise; -1 as its first element: the message does not hold
-    # them; all 0: unknown.
+    # Their covariance, which is scaled with the noise; -1 as its first element means that the
+    # message does not have them, all 0 that it is unknown.
     covariance: FieldPath | None = None
-    # Whether a message without them is left out; otherwise the filter takes them as 0, and they
-    # stay unchanged in the message.
+    # Whether a message without them is dropped; otherwise the filter takes 0, and they stay
+    # unchanged in the message.
     needed: bool = True
 
 
@@ -62,7 +62,7 @@ class Channels:
         return tuple(values)
 
     def put(self, message: Any, values: Sequence[float], left: float) -> Any:
-        """Return the output message; `left` of white noise's variance remains."""
+        """Return the output message; left: the remaining share of the variance of white noise."""
         if self.make is not None:
             return self.make(message, values)
         at = 0

@@ -324,7 +324,7 @@ class Console:
 
     def waiting(self, topic: str) -> None:
         """
-        Say why a topic has brought no message yet.
+        Log why no message has arrived on a topic yet.
 
         Without a publisher: at once, then once a minute; with a silent publisher: after a while.
         """
@@ -348,8 +348,8 @@ class Console:
             return
         self._muted = now + AGAIN
         self._node.get_logger().info(
-            f'{topic} has a publisher, but no message has come: it sends none, or runs as another '
-            'user, whose messages Fast DDS does not deliver (doc/deploy.md).')
+            f'{topic} has a publisher, but no message has arrived: it sends none, or runs as '
+            'another user, whose messages Fast DDS does not deliver (doc/deploy.md).')
 
     def flag(self, state: FlagState) -> None:
         """Log when the flag becomes CRITICAL, and when it ends."""

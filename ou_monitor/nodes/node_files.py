@@ -1,10 +1,10 @@
 """
-The files of a node: the model in force, and the latch that outlasts a restart.
+The files of a node: its model, and the latch of the flag, which survives a restart.
 
-A model file is replaced only if it is a regular file and still has the bytes that were read.
-The latch is one JSON object in one small file.  It exists while the node runs: it holds OK or
-CRITICAL and the name of the node; the lock of its inode shows that the node runs.  Only
-regular files with that name in them are written or replaced.  No ROS here.
+A model file is replaced only if it is a regular file and still has the bytes that were read. The
+latch is a small file with one JSON object: OK or CRITICAL, and the name of the node.  A lock on
+its inode shows that the node runs.  Only regular files that contain this name are written or
+replaced.  No ROS here.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ class ModelChoice:
         try:
             written = self._wait(self._reader.submit(_save, path, file, known), meanwhile)
         except (OSError, ValueError) as error:
-            raise InputError(f'model_file {path_words(path)} is left as it is: '
+            raise InputError(f'model_file {path_words(path)} was not changed: '
                              f'{_words(error)}.') from error
         except NotReadyError as error:
             raise InputError(f'model_file {path_words(path)} was not written within '
@@ -144,7 +144,7 @@ def _read(path: str) -> tuple[ModelFile, bytes]:
 def _save(path: str, file: ModelFile, known: bytes) -> bytes:
     """Replace a model file that still holds `known`; return its new bytes."""
     from ou_monitor.recordings.model_file import as_yaml
-    # Keep what a reader has written above the entries.
+    # Keep comments at the top of the file.
     lines = known.decode('utf-8-sig').splitlines(keepends=True)
     head = ''.join(takewhile(lambda line: line.startswith('#'), lines))
     text = (head + as_yaml(file)).encode()
@@ -241,8 +241,8 @@ class LatchFile:
             found = self._claim()
         except (OSError, ValueError) as error:
             self.refused = True
-            self.problem = (f'state_file {self.path} is refused and left as it is: '
-                            f'{_words(error)}; no latch is kept over a restart')
+            self.problem = (f'state_file {self.path} is refused and was not changed: '
+                            f'{_words(error)}; a latched flag will not survive a restart')
             return ''
         if found is None:
             self._write(self._wanted)
@@ -252,7 +252,7 @@ class LatchFile:
             return ''
         when = time.strftime('%Y-%m-%d %H:%M:%S UTC', time.gmtime(found['time']))
         reason = ' '.join(c for c in found['reason'].split() if c.isprintable())[:300]
-        return f'latched before the node was started anew, at {when}: {reason}'
+        return f'latched before a restart of the node, at {when}: {reason}'
 
     def keep(self, latched: bool, reason: str) -> None:
         """Write whether the flag is latched; called often, it retries a write."""
@@ -280,8 +280,8 @@ class LatchFile:
         try:
             self._replace(json.dumps(record).encode())
         except (OSError, ValueError) as error:
-            self.problem = (f'state_file {self.path} cannot be written: {_words(error)}; no latch '
-                            'is kept over a restart until it can')
+            self.problem = (f'state_file {self.path} cannot be written: {_words(error)}; until '
+                            'then, a latched flag will not survive a restart')
             return
         self._written, self.problem = record, ''
 

@@ -1,9 +1,8 @@
 """
-Which topic, type and field the voltage and the throttle are read from.
+Topics, types and fields of voltage and throttle.
 
-A msg_config gives them, or (`auto`) the type that a publisher offers on
-the topic chooses among the generic msg_configs.  Parameters override single
-entries.
+They come from a msg_config; with `auto`, the type that a publisher offers on the topic selects a
+generic msg_config.  Parameters override single entries.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """
-Vpp over Vrms of one Ornstein-Uhlenbeck process on a screen, and jumps that could explain it.
+Crest factors Vpp/Vrms of an Ornstein-Uhlenbeck process on a screen, without and with jumps.
 
-Paths are drawn with the exact transition over a hundred of the paper's samples; the extremes in
-between follow the law of the Brownian bridge, which differs from the process by a share
-alpha dt = 0.006 over such a step.  The crest factor does not depend on sigma.
-Section 5, "diffusion and jump components", is recomputed from jumps that relax at alpha.
+Paths are drawn with the exact transition over a hundred samples of the paper; the extremes in
+between are those of a Brownian bridge, with a relative error of alpha dt = 0.006 a step.  The
+crest factor does not depend on sigma.  Section 5, "diffusion and jump components", is recomputed
+from jumps that relax at alpha.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ou_monitor.paper.published import over, Printed, Range, Row
 from ou_monitor.records import FloatArray
 from scipy.signal import lfilter
 
-# Screen lengths tried, ms: the paper does not give its own.
+# Screen lengths tried, ms; the paper does not give any.
 SCREENS_MS = (10, 100, 500)
 TYPICAL_MS = 100
 # Share of screens left out at either end.
@@ -81,14 +81,14 @@ def simulate_crests(rng: np.random.Generator, paths: int,
 def _draw(rng: np.random.Generator, paths: int) -> dict[int, FloatArray]:
     """Return the crest factors of all screens of `paths` simulated segments."""
     dt = _SAMPLES / published.SAMPLING_HZ
-    # Of stationary variance 1.
+    # For a stationary variance of 1.
     sigma = math.sqrt(2.0 * published.ALPHA.value)
     phi, q = (float(v) for v in transition(published.ALPHA.value, sigma, dt))
     noise = rng.standard_normal((paths, 1 + round(1e-3 * max(SCREENS_MS) / dt)))
     noise[:, 1:] *= math.sqrt(q)
     path = lfilter([1.0], [1.0, -phi], noise, axis=1)
     left, right = path[:, :-1], path[:, 1:]
-    # Largest and smallest value of a bridge from a to b of variance s^2 dt:
+    # Extremes of a bridge from a to b with variance s^2 dt:
     # (a + b +- sqrt((b - a)^2 - 2 s^2 dt ln U)) / 2, U uniform.
     middle, square = left + right, (right - left) ** 2
     top, bottom = (middle + sign * np.sqrt(
@@ -108,11 +108,8 @@ def screen_for(crest_factor: float) -> float:
     """
     Return the screen length at which an OU shows a crest factor, s.
 
-    Half of the screens of this length go beyond crest/2 standard deviations on
-    one side: passages above a high level d come nearly as a Poisson process of
-    rate alpha d exp(-d^2/2) / sqrt(2 pi).
-
-    result in s.
+    Half of the screens of this length go beyond crest/2 standard deviations on one side: passages
+    above a high level d are nearly a Poisson process of rate alpha d exp(-d^2/2) / sqrt(2 pi).
     """
     d = 0.5 * crest_factor
     rate = published.ALPHA.value * d * math.exp(-0.5 * d * d) / math.sqrt(2.0 * math.pi)
@@ -127,7 +124,7 @@ def rows(crests: Crests) -> list[Row]:
     for state in published.LOADED:
         value, inputs = state.crest, state.crest_range
         beyond = ('' if inputs[0] <= crests.band[1] else
-                  f'; the least would take a screen of {screen_for(inputs[0]):.2g} s')
+                  f'; the lowest would need a screen of {screen_for(inputs[0]):.2g} s')
         found.append(Row(
             'Table 1', f'Vpp/Vrms, {state.label}', '', Printed(f'{value:.1f}'), mean,
             f'OU with tau {published.TAU_MS.text} ms sampled at 1 MHz, {count} segments of '
@@ -141,11 +138,11 @@ def rows(crests: Crests) -> list[Row]:
 
 
 WHERE = 'Section 5'
-# Jumps per second, and their shares of the variance, that are tried.
+# Jumps per second, and shares of the variance, that are tried.
 RATES = (2.0, 5.0, 10.0, 20.0, 50.0)
 SHARES = (0.25, 0.5, 0.75, 0.95)
 JUMP_SCREENS_MS = (100, 500)
-# Sampling coarser than 1 MHz: takes less than 0.1 off a crest factor.
+# Sampling rate with jumps, Hz; compared with 1 MHz it lowers a crest factor by less than 0.1.
 _SAMPLING = 20e3
 
 
@@ -160,7 +157,7 @@ class JumpCrest:
     mean: float
     error: float
     band: Range  # 5 % and 95 % of the screens
-    kurtosis: float  # Excess kurtosis of the stationary law
+    kurtosis: float  # Excess kurtosis of the stationary distribution
 
     def size(self, vrms: float) -> float:
         """Return the standard deviation of the jumps, in the unit of `vrms`."""
@@ -182,7 +179,7 @@ def simulate_jumps(rng: np.random.Generator, seconds: float,
     """Draw screens of OUs with jumps (seconds in s, progress 0..1)."""
     alpha = published.ALPHA.value
     longest = max(JUMP_SCREENS_MS)
-    # One extra screen, dropped later, in which the jumps reach their stationary law.
+    # One more screen, dropped later, in which the jumps become stationary.
     t = np.arange(round((seconds + 1e-3 * longest) * _SAMPLING)) / _SAMPLING
     begin = round(1e-3 * longest * _SAMPLING)
     found = []
@@ -196,7 +193,7 @@ def simulate_jumps(rng: np.random.Generator, seconds: float,
             for ms in JUMP_SCREENS_MS:
                 values = crest_of(path.reshape(-1, round(1e-3 * ms * _SAMPLING)))
                 low, high = np.quantile(values, [TAIL, 1.0 - TAIL])
-                # Neighbouring screens are almost independent: a screen is many tau long.
+                # Screens are many tau long, so neighbours are almost independent.
                 found.append(JumpCrest(
                     ms, rate, share, *mean_and_error(values), (float(low), float(high)),
                     excess_kurtosis(rate, share)))
@@ -210,7 +207,7 @@ def largest(found: list[JumpCrest], screen: int) -> JumpCrest:
 
 
 def impulse_height(state: published.PrintedLoad, crests: Crests) -> float:
-    """Return the height of short impulses that widens an OU to its printed Vpp, mV."""
+    """Return the height of short impulses that would raise an OU to the printed Vpp, mV."""
     return state.vpp.value - crests.mean(TYPICAL_MS)[0] * state.vrms.value
 
 
@@ -221,7 +218,7 @@ def jump_rows(found: list[JumpCrest], crests: Crests) -> list[Row]:
     result = [Row(
         WHERE, 'Vpp/Vrms, 40 % over 5 %', '', Printed('> 1'), high / low, 'quotient from Table 1',
         f'"From Gaussian noise to impulse disturbances with load" would raise it; it falls from '
-        f'{low:.1f} to {high:.1f}, a quotient that half a step of each reading lets lie within '
+        f'{low:.1f} to {high:.1f}; half a step of each reading allows a quotient of '
         f'{inputs[0]:.2f} to {inputs[1]:.2f}.', inputs=inputs, point=8)]
     for state in (published.LOW, published.MEDIUM):
         value, inputs = state.crest, state.crest_range

@@ -2,22 +2,22 @@
 Find the bulk capacitance that brings the brown-out risk of a rail under a target.
 
 Limits: a linear network with Gaussian noise (see `ou_monitor.paper.network`), constant throttle,
-ideal capacitors of one series, no ageing, no cold.  The larger of two risks decides: the exact
-mean first passage of the OU with the rail's slowest excited pole and its variance, and the
-high-level crossing rate of the whole Gaussian process.  Against simulated paths at 2.5 and 3.2
-standard deviations (step extrapolated to 0) the first was from 60 times too low (noise through a
-large ESR) to 4 times too high (no ESR), the second 1.1 to 3 times too high.
+ideal capacitors of one series, no ageing, no cold.  The larger of two risks decides: from the
+exact mean first passage of an OU with the slowest excited pole and the variance of the rail, and
+from the high-level crossing rate of the whole Gaussian process.  Compared with simulations at 2.5
+and 3.2 standard deviations (step extrapolated to 0), the first was 60 times too low (noise through
+a large ESR) to 4 times too high (no ESR), the second 1.1 to 3 times too high.
 
-Without LC filter, and once the network is slower than the noise, both fall as
-C rises; with less C the second rose by up to 1.44 times in 39 of 6000 drawn
-networks.  With an LC filter the risk may rise, up to an oscillation.
+Without an LC filter, both risks fall as C rises once the network is slower than the noise; below
+that C, the second rose by up to 1.44 times in 39 of 6000 random networks.  With an LC filter the
+risk may rise, up to an oscillation.
 
-`network_of` sets the components so that they reproduce a flight.  Limits: sag and noise are the
-sensor's, with its white noise and without what its filter removes.  Noise added while throttle
-moves, and an OU that was found, count as slow fluctuations of the current, which no capacitor of a
-board changes; the rest is attributed to the switching of the ESCs.  Without a measured current the
-resistance is the one given, and the current is scaled to the sag: the effect of packs in parallel
-then holds, an ESR beside it is a guess.
+`network_of` chooses components that reproduce a flight.  Limits: sag and noise are as measured,
+with the white noise of the sensor and its filter.  Noise added by changes of throttle, and an OU
+if one was found, count as slow fluctuations of the current, which no capacitor of a board changes;
+the rest is attributed to the switching of the ESCs.  Without a measured current, the resistance is
+the given or default one and the current is scaled to the sag: the effect of packs in parallel is
+then still right, the effect of an ESR is uncertain.
 """
 
 from __future__ import annotations
@@ -41,17 +41,17 @@ REGULATED_BROWNOUT = {
     5.0: (4.5, 'lower limit of the 5 V rail in PX4'),
     3.3: (2.88, 'STM32F405 brown-out reset level 3, falling, highest (ST DS8626)')}
 LEAST, MOST = 10e-6, 22e-3
-# Capacitances tried before the root is narrowed; the risk may not be monotone.
+# Capacitances tried before the root is refined, because the risk may not be monotonic.
 _GRID = 81
-# Rates below this count as never, 1/s.
+# Lower limit of a rate of brown-outs, 1/s.
 _NEVER = 1e-300
-# Range of the alternatives to capacitors: packs in parallel, share of the resistance that new
-# leads and a fresh pack leave, share of the throttle that a limit leaves.
+# Limits of the alternatives to capacitors: maximum packs in parallel, minimum shares of the
+# resistance (new leads and a fresh pack) and of the throttle.
 _PACKS, _RESISTANCE, _THROTTLE = 3, 0.5, 0.5
 
 
 class DesignVerdict(enum.Enum):
-    """The verdict of the calculation."""
+    """The verdict of a design."""
 
     ENOUGH = 'the present capacitor is enough'
     FOUND = 'a capacitance in the range brings the risk under the target'
@@ -63,29 +63,28 @@ class DesignVerdict(enum.Enum):
 class DesignRow:
     """The rail with one capacitor."""
 
-    # Of the bulk capacitor, F and Ohm.
+    # Bulk capacitor, F and Ohm.
     capacitance: float
     esr: float
     # Relaxation rate, 1/s, and time, s; NaN without noise.
     alpha: float
     tau: float
-    # Intensity, V/sqrt(s), and stationary variance, V^2; NaN and inf when this capacitor
-    # makes the network unstable (the risk is then 1).
+    # Intensity, V/sqrt(s), and stationary variance, V^2; NaN and inf if the network is unstable
+    # (the risk is then 1).
     sigma: float
     var_inf: float
-    # Sag of the bus and mean of the rail, V; the same with every capacitor.
+    # Sag of the bus and mean of the rail, V; independent of the capacitor.
     sag: float
     mean: float
     mean_time: float  # Mean time to brown-out of the OU from its mean level, s; may be inf.
     crossing_rate: float  # High-level crossing rate of the whole process, 1/s.
-    # Probability within the horizon, by the OU's mean first passage and by the crossing
-    # rate.
+    # Probability within the horizon, by mean first passage of the OU and by the crossing rate.
     risk_ou: float
     risk_crossing: float
 
     @property
     def stable(self) -> bool:
-        """Return whether the network has no oscillation that grows."""
+        """Return whether the network is stable."""
         return math.isfinite(self.var_inf)
 
     @property
@@ -106,11 +105,10 @@ class Lever:
 
     name: str  # What is changed.
     unit: str  # Unit of the values as shown.
-    # Present value, and one that is easy to get.
     present: float
-    tried: float
-    risk: float  # Risk with the second value.
-    least: float  # Smallest change that meets the target; NaN: out of reach.
+    tried: float  # A value that is easy to get.
+    risk: float  # Risk with the value tried.
+    least: float  # Value of the smallest change that meets the target; NaN: out of reach.
 
 
 @dataclass(frozen=True)
@@ -127,16 +125,14 @@ class Design:
     esr_follows: bool  # Whether ESR is 1/C of the present one (capacitors in parallel).
     verdict: DesignVerdict  # Verdict.
     present: DesignRow  # With the present capacitor.
-    # With the smallest capacitance that meets the target, as all larger ones tried do; None if
-    # there is none.
+    # With the smallest capacitance from which on all meet the target; None if there is none.
     least: DesignRow | None
     rows: tuple[DesignRow, ...]  # A table over capacitances, rising.
     falls: bool  # Whether the risk never rises with capacitance in the table.
     # Battery resistance at which the mean of the bus is at the level, Ohm; NaN if there is none or
     # the rail is regulated.
     resistance: float
-    # Alternatives to capacitors: packs in parallel, leads and throttle limits.
-    levers: tuple[Lever, ...]
+    levers: tuple[Lever, ...]  # More capacitance and its alternatives.
 
 
 def default_voltage(network: PowerNetwork, rail: str) -> tuple[float, str]:
@@ -183,16 +179,17 @@ def design(
     network: PowerNetwork, throttle: float, *, voltage: float, horizon: float, risk: float,
     rail: str = 'bus', esr_follows: bool = True, capacitances: tuple[float, float] = (LEAST, MOST),
 ) -> Design:
-    """Return the least bulk capacitance that meets a brown-out risk (capacitances in F)."""
+    """Return the minimum bulk capacitance that meets a brown-out risk (capacitances in F)."""
     low, high = capacitances
     for name, value, unit in (('voltage', voltage, 'V'), ('horizon', horizon, 's'),
-                              ('least capacitance', low, 'F'), ('most capacitance', high, 'F')):
+                              ('minimum capacitance', low, 'F'),
+                              ('maximum capacitance', high, 'F')):
         if not (math.isfinite(value) and value > 0.0):
             raise ValueError(f'{name} must be positive and finite, got {value} {unit}')
     if not 0.0 < risk < 1.0:
         raise ValueError(f'risk must be between 0 and 1, both excluded, got {risk}')
     if low >= high:
-        raise ValueError(f'the least capacitance must be below the most, got {low:g} F and '
+        raise ValueError(f'the minimum capacitance must be below the maximum, got {low:g} F and '
                          f'{high:g} F')
 
     present = row_of(rail_at(network, throttle, rail), voltage, horizon)
@@ -230,7 +227,7 @@ def _levers(network: PowerNetwork, throttle: float, voltage: float, horizon: flo
         try:
             return row_of(rail_at(changed, u, rail), voltage, horizon).risk
         except ValueError:
-            # Unstable, or more load than the battery gives.
+            # Unstable, or a load beyond the battery.
             return 1.0
 
     def resistance(share: float) -> float:
@@ -278,8 +275,7 @@ def _least(at: Callable[[float], DesignRow], rows: list[DesignRow],
         return None
     low, high = (math.log(rows[k].capacitance) for k in (above[-1], above[-1] + 1))
     root = float(brentq(excess, low, high, xtol=1e-12))
-    # The root may lie on the wrong side by its tolerance, or where alpha
-    # changes to another pole.
+    # The root may lie on the wrong side by its tolerance, or at a jump of alpha between poles.
     step = 1e-12
     while excess(root) > 0.0 and root < high:
         root, step = min(root + step, high), 2.0 * step
@@ -295,7 +291,7 @@ def _resistance(network: PowerNetwork, throttle: float, voltage: float) -> float
 
 
 def as_data(result: Design, source: str, taken: str) -> dict[str, Any]:
-    """Return the result for JSON; taken: the values from a flight, if any."""
+    """Return the result for JSON; `taken` describes the values from a flight, if any."""
     def row(r: DesignRow | None) -> dict[str, float] | None:
         return None if r is None else {**asdict(r), 'risk': r.risk}
 
@@ -315,12 +311,12 @@ def answer(result: Design) -> str:
     """Return the answer in words."""
     present, least = result.present, result.least
     if result.verdict is DesignVerdict.ENOUGH:
-        also = '' if least is None else f' From {_uf(least)} on the target is met.'
+        also = '' if least is None else f' The target is met from {_uf(least)} on.'
         return (f'No more capacitance is needed: with the present {_uf(present)} the risk is '
                 f'{probability(present.risk)}.{also}')
     if result.verdict is DesignVerdict.FOUND:
         assert least is not None
-        return (f'{_uf(least)} is the least capacitance that brings the risk under '
+        return (f'{_uf(least)} is the minimum capacitance that brings the risk under '
                 f'{result.target:g}.')
     if result.verdict is DesignVerdict.OUT_OF_RANGE:
         return (f'No capacitance between {_uf(result.rows[0])} and {_uf(result.rows[-1])} brings '
@@ -332,7 +328,7 @@ def answer(result: Design) -> str:
         return (f'{text} The mean is above the level with less than '
                 f'{1e3 * result.resistance:.3g} mOhm.')
     if result.rail == 'bus':
-        text += (' That level is not below the open-circuit voltage: check cells and '
+        text += (' The level is at or above the open-circuit voltage: check cells and '
                  'battery_voltage, or lower the level.')
     else:
         text += ' Raise regulator_voltage or lower the level.'
@@ -344,9 +340,9 @@ def _others(result: Design) -> str:
              for lever in result.levers[1:] if math.isfinite(lever.least)]
     if found:
         return 'What would help: ' + ', or '.join(found) + '.'
-    return (f'Nothing within reach would help: not {_PACKS} packs in parallel, '
-            f'{_RESISTANCE:.0%} of the resistance, or {_THROTTLE:.0%} of the throttle; land '
-            'before the battery is at this level, use more cells, or allow a lower voltage.')
+    return (f'Neither {_PACKS} packs in parallel, nor {_RESISTANCE:.0%} of the resistance, nor '
+            f'{_THROTTLE:.0%} of the throttle would be enough: land with more charge left, use '
+            'more cells, or allow a lower voltage.')
 
 
 def effect(result: Design) -> str:
@@ -393,17 +389,17 @@ def remarks(result: Design) -> list[str]:
     notes = []
     rail = rail_at(result.network, result.throttle, result.rail)
     if any(math.isclose(rail.alpha, rate, rel_tol=1e-6) for rate in rail.source_rates):
-        notes.append('With the present capacitor alpha is the rate of the noise, not of the '
-                     'network: capacitance changes it only once the network is slower.')
+        notes.append('With the present capacitor, alpha is the rate of the noise; capacitance '
+                     'changes alpha only when it makes the network slower than the noise.')
     if result.least is not None and result.least.risk_crossing > result.least.risk_ou:
         notes.append('The crossing rate of the whole process decides: part of the noise is '
                      'faster than the OU of the slowest pole.')
     if not result.falls:
         if not all(row.stable for row in result.rows):
-            notes.append('Some capacitances make the network unstable: the regulator as a '
-                         'constant-power load undoes the damping of the filter.')
-        notes.append('The risk does not fall at each step of the capacitance here (resonance or '
-                     'ESR): more is not simply better; choose a value from the table.')
+            notes.append('Some capacitances make the network unstable: the regulator, a '
+                         'constant-power load, cancels the damping of the filter.')
+        notes.append('More capacitance does not always lower the risk here (resonance or ESR): '
+                     'choose a value from the table.')
     if result.network.filter_inductance > 0.0:
         text = f'LC filter: corner {result.network.lc_corner:.4g} Hz'
         if rail.resonance is None:
@@ -416,11 +412,11 @@ def remarks(result: Design) -> list[str]:
 
 
 def probability(value: float) -> str:
-    """Return a probability to two digits; below 1e-12 only that."""
+    """Return a probability with two digits, or '<1e-12'."""
     return '<1e-12' if 0.0 < value < 1e-12 else number(value, 2)
 
 
-# Throttle from which the exponent of a sag can be estimated.
+# Minimum throttle for estimating the exponent of the sag.
 _FROM = 0.1
 # Bounds of the exponent of the current over throttle.
 _EXPONENTS = 1.0, 4.0
@@ -431,17 +427,17 @@ class Flight:
     """Facts of a supply from a recording, as numbers; NaN: unknown."""
 
     level: float  # Open-circuit voltage at its end, V
-    full: float  # Its highest voltage except for a few readings, V
+    full: float  # Highest voltage, without a few outliers, V
     cells: int  # In series; 0: unknown
-    throttle: Sequence[float]  # 0..1, of the next three
+    throttle: Sequence[float]  # 0..1, at which the next three are given
     sag: Sequence[float]  # V
     noise: Sequence[float]  # Rms as flown, V
     steady: Sequence[float]  # Rms while throttle stands still, V
     flown: tuple[float, float]  # Throttles, 1 % and 99 % quantile
-    highest: float  # Throttle, 0..1
-    resistance: float  # Instantaneous, from a current, Ohm
-    alpha: float  # Of an OU that was found, 1/s
-    var_inf: float  # Its variance, V^2
+    highest: float  # Highest throttle, 0..1
+    resistance: float  # Instantaneous, from a measured current, Ohm
+    alpha: float  # Relaxation rate of the OU, 1/s
+    var_inf: float  # Variance of the OU, V^2
 
 
 def network_of(flight: Flight, throttle: float, given: dict[str, Any]) -> PowerNetwork:

@@ -11,27 +11,24 @@ capacitor's ESR turns current directly into voltage.
 
 Limits: leads have no inductance, so edges faster than R/L (0.1 to 1 us) are not modelled.  The
 battery is one resistance without polarisation, so recovery over 0.3 s and more is missing.  The
-random part of the ESC current is the paper's Markov switching, which spreads over all frequencies
-the power that a regular PWM keeps at its multiples: it is an upper bound until `switching_scale`
-is set from a measured rail.
+random part of the ESC current is the Markov switching of the paper, which spreads the power of a
+regular PWM over all frequencies: an upper bound, unless `switching_scale` is set from a measured
+rail.
 
-Effect of more bulk capacitance.  Without LC filter the bus carries the ESC
-current through |Z(f)|^2 = R^2 (1 + (w r C)^2) / (1 + (w (R + r) C)^2), which
-falls with C at every frequency: Var_inf falls for noise of any colour, on both
-rails, and so does the pole 1/((R + r) C), although the paper's section 4.5 says that alpha
-rises.  These poles are fast: with 40 mOhm the paper's 63 1/s would take 0.4 F.
-Exceptions:
+Effect of more bulk capacitance.  Without an LC filter, the impedance from ESC current to bus is
+|Z(f)|^2 = R^2 (1 + (w r C)^2) / (1 + (w (R + r) C)^2), which falls with C at every frequency:
+Var_inf falls on both rails for noise of any colour, and so does the pole 1/((R + r) C), although
+section 4.5 of the paper says that alpha rises.  These poles are fast: with 40 mOhm, the 63 1/s of
+the paper would need 0.4 F.  Exceptions:
 
-- Slow noise.  When the noise relaxes more slowly than the pole (a small C, or
-  flutter), alpha is the rate of the noise and does not move with C.
-- ESR.  With r fixed, fast noise leaves (R r / (R + r))^2 times its variance
-  however large C is, and the pole carries less and less of it; below
-  1 %, alpha jumps up to the next pole, the rate of the noise.  With r C
-  fixed (capacitors of one series in parallel), neither happens on the
-  bus.
-- LC filter.  C shorts the battery resistance that damps L; the resonance rises,
-  and where it is excited Var_inf of either rail may rise with C.  A constant-power
-  regulator can then turn it into an oscillation.
+- Slow noise.  If the noise relaxes more slowly than the pole (a small C, or flutter), alpha is the
+  rate of the noise and does not depend on C.
+- ESR.  With r fixed, fast noise keeps a variance of (R r / (R + r))^2 times its own however large
+  C is, and the share of the pole falls; below 1 %, alpha jumps up to the next pole, the rate of
+  the noise.  With r C fixed (capacitors of one series in parallel), neither happens on the bus.
+- LC filter.  C shorts the battery resistance that damps L, so the resonance rises; if it is
+  excited, Var_inf of either rail may rise with C.  With a constant-power regulator it may become
+  an oscillation.
 """
 
 from __future__ import annotations
@@ -52,7 +49,7 @@ RAILS = ('bus', 'regulated')
 LEAST_DUTY = 0.01
 # A lithium cell at rest, V.
 NOMINAL_CELL = 3.7
-# A pole counts as excited when its share of Var_inf is at least this.
+# Minimum share of Var_inf of an excited pole.
 EXCITED = 0.01
 # Noise currents are the last states, in this order.
 SOURCES = ('switching', 'flutter', 'mcu')
@@ -60,18 +57,17 @@ ComplexArray = npt.NDArray[np.complex128]
 
 
 def completed(values: dict[str, Any]) -> dict[str, Any]:
-    """Return components with derived values: voltage from cells, a rail below a cell."""
+    """Return components with derived values: battery voltage from cells, rail of a 1S craft."""
     found = dict(values)
     if 'cells' in found:
         found.setdefault('battery_voltage', NOMINAL_CELL * found['cells'])
     if found.get('battery_voltage', math.inf) <= PowerNetwork.regulator_voltage:
-        # The rail of a Crazyflie.
+        # As on a Crazyflie.
         found.setdefault('regulator_voltage', 3.0)
     return found
 
 
 def _part(default: Any, unit: str = '', *, zero: bool = False) -> Any:
-    """Return a number of the network: its unit, and whether it may be zero."""
     return field(default=default, metadata={'unit': unit, 'zero': zero})
 
 
@@ -84,7 +80,7 @@ class PowerNetwork:
     # Battery, connector and leads, Ohm (a 6S pack of 1.3..2.2 Ah has 20..60 mOhm; PX4
     # assumes 5 mOhm a cell).
     battery_resistance: float = _part(0.04, 'Ohm')
-    # Capacitor at the ESC's battery pads, F and Ohm (470 uF..1000 uF of a low-ESR 35 V
+    # Capacitor at the battery pads of the ESC, F and Ohm (470 uF..1000 uF of a low-ESR 35 V
     # series have 20..40 mOhm).
     bulk_capacitance: float = _part(470e-6, 'F')
     bulk_esr: float = _part(0.03, 'Ohm', zero=True)
@@ -96,14 +92,13 @@ class PowerNetwork:
     escs: int = _part(4)  # ESCs that switch independently.
     # PWM frequency, Hz (24..48 kHz, the paper's section 4.5).
     esc_frequency: float = _part(48e3, 'Hz')
-    # Measured rms of the random ESC current over the telegraph's; 1 is the telegraph.
+    # Measured rms of the random ESC current, relative to the telegraph process.
     switching_scale: float = _part(1.0, zero=True)
     # Slow fluctuation of the motor current (control loop, gusts): rms as a share of the
-    # mean, and its rate, 1/s (motor and propeller, 30 ms). Left out by default.
+    # mean, and its rate, 1/s (motor and propeller, 30 ms); off by default.
     flutter: float = _part(0.0, zero=True)
     flutter_rate: float = _part(33.3, '1/s')
-    # Optional LC filter between bus and regulator, H, Ohm, F, Ohm; without it the inductance is 0;
-    # the two resistances damp it.
+    # LC filter between bus and regulator, H, Ohm, F, Ohm; an inductance of 0 means none.
     filter_inductance: float = _part(0.0, 'H', zero=True)
     filter_resistance: float = _part(0.05, 'Ohm', zero=True)
     filter_capacitance: float = _part(100e-6, 'F')
@@ -131,7 +126,7 @@ class PowerNetwork:
     mcu_noise_rate: float = _part(1e6, '1/s')
 
     def __post_init__(self) -> None:
-        """Refuse values that no component can have."""
+        """Raise ValueError for values that no component can have."""
         for part in fields(self):
             self._check(part.name, getattr(self, part.name), part.metadata)
         if self.regulator_efficiency > 1.0:
@@ -215,9 +210,7 @@ class Load:
     bus: float
     regulated: float
     sag: float  # Battery voltage less the mean of the bus, V.
-    # Incremental conductance P/V^2 of the constant-power load, 1/Ohm, counted positive; otherwise
-    # 0.
-    input_conductance: float
+    input_conductance: float  # Incremental P/V^2 of the constant-power load, 1/Ohm, or 0.
 
     def mean(self, rail: str) -> float:
         """Return the mean of a rail, V."""
@@ -228,10 +221,9 @@ def load_at(network: PowerNetwork, throttle: float) -> Load:
     """
     Return the load at a throttle.
 
-    An ESC draws the phase current I_m during the on-time of its PWM and
-    nothing else, so that the mean is I = D I_m with the duty D = throttle.  As
-    a telegraph with f cycles per second it has the variance I_m^2 D (1 - D) and
-    a covariance that decays at f / (D (1 - D)).
+    An ESC draws the phase current I_m during the on-time of its PWM only, so its mean is
+    I = D I_m with the duty D = throttle.  As a telegraph process with f cycles per second it has
+    the variance I_m^2 D (1 - D) and a covariance that decays at f / (D (1 - D)).
     """
     if not 0.0 <= throttle <= 1.0:
         raise ValueError(f'throttle must be within 0..1, got {throttle}')
@@ -249,9 +241,9 @@ def load_at(network: PowerNetwork, throttle: float) -> Load:
     source = (free + math.sqrt(root)) / 2.0 if free > 0.0 and root >= 0.0 else 0.0
     if source <= network.regulator_voltage:
         raise ValueError(
-            f'the battery cannot give the load at throttle {throttle:g}: {current:.4g} A through '
-            f'battery_resistance {resistance:g} Ohm takes {resistance * current:.4g} V of '
-            f'{network.battery_voltage:g} V and leaves the regulator less than '
+            f'the battery cannot supply the load at throttle {throttle:g}: {current:.4g} A '
+            f'through battery_resistance {resistance:g} Ohm drops {resistance * current:.4g} V of '
+            f'{network.battery_voltage:g} V, which leaves the regulator less than '
             f'{network.regulator_voltage:g} V')
     drawn = power / source
     bus = free - resistance * drawn
@@ -283,9 +275,11 @@ class Rail:
     network: PowerNetwork  # Components.
     load: Load  # Load and mean voltages.
     name: str  # ``bus`` or ``regulated``.
-    a: FloatArray  # Rates between the states (voltages, V, and currents, A), 1/s and mixed.
-    b: FloatArray  # Intensities of the independent white noises that drive the sources.
-    c: FloatArray  # The rail's deviation from its mean, V, is c x.
+    # dx = a x dt + b dW for the states x (voltages, V, and currents, A); the deviation of the rail
+    # from its mean, V, is c x.
+    a: FloatArray
+    b: FloatArray
+    c: FloatArray
 
     @property
     def mean(self) -> float:
@@ -319,7 +313,7 @@ class Rail:
 
     @property
     def poles(self) -> ComplexArray:
-        """Poles, 1/s, shape (n,), slowest first, including the noise sources' poles."""
+        """Poles, 1/s, shape (n,), slowest first, noise sources included."""
         return self._modes[0]
 
     @property
@@ -365,15 +359,12 @@ class Rail:
         """
         Return the rate of passages below a voltage at high levels, 1/s.
 
-        For the whole Gaussian process, not its OU: with d the distance in
-        standard deviations, q the quadratic variation of the rail per second
-        and v the variance of the smooth part of its slope, the larger of
-        q/(2 Var) d/sqrt(2 pi) exp(-d^2/2) (rough paths: Pickands, Trans. AMS
-        145 (1969) 51) and sqrt(v/Var)/(2 pi) exp(-d^2/2) (smooth paths: Rice,
-        Bell Syst. Tech. J. 24 (1945) 46).  For an OU the first equals the
-        rate of its mean first passage.
-
-        voltage in V.
+        For the whole Gaussian process, not its OU: with the distance d to the voltage, V, in
+        standard deviations, the quadratic variation q of the rail per second and the variance v
+        of the smooth part of its slope, the larger of q/(2 Var) d/sqrt(2 pi) exp(-d^2/2) (rough
+        paths: Pickands, Trans. AMS 145 (1969) 51) and sqrt(v/Var)/(2 pi) exp(-d^2/2) (smooth
+        paths: Rice, Bell Syst. Tech. J. 24 (1945) 46).  For an OU, the first is the rate of its
+        mean first passage.
         """
         if self.mean <= voltage:
             return math.inf
@@ -405,14 +396,14 @@ def rail_at(network: PowerNetwork, throttle: float, rail: str = 'bus') -> Rail:
     if worst.real >= 0.0:
         raise UnstableNetworkError(
             f'the network is unstable at throttle {throttle:g}: pole at {worst.real:.4g} '
-            f'+- {abs(worst.imag):.4g}i 1/s; the regulator as a constant-power load is a negative '
+            f'+- {abs(worst.imag):.4g}i 1/s; the regulator, a constant-power load, has a negative '
             f'resistance of {-1.0 / load.input_conductance:.4g} Ohm at its input: damp the filter '
             '(raise filter_resistance or filter_esr) or raise filter_capacitance')
     return Rail(network, load, rail, a, b, outputs[rail])
 
 
 def _circuit(net: PowerNetwork, g: float) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Return the rates of the states, without the noise sources', and the rails as rows."""
+    """Return the matrix `a`, with zeros for the noise sources, and the row `c` of each rail."""
     filtered = net.filter_inductance > 0.0
     names = ['bulk', *(['inductor', 'filter'] if filtered else []), 'line', 'output', *SOURCES]
     unit = dict(zip(names, np.eye(len(names))))
@@ -422,7 +413,7 @@ def _circuit(net: PowerNetwork, g: float) -> tuple[FloatArray, dict[str, FloatAr
     if filtered:
         current = unit['inductor']
         bus = (r * unit['bulk'] - r * esr * (drawn + current)) / (r + esr)
-        # The capacitor's current is the inductor's less -g v of the regulator.
+        # The capacitor carries the inductor current plus g v of the regulator.
         source = (unit['filter'] + net.filter_esr * current) / (1.0 - net.filter_esr * g)
         rate['inductor'] = (bus - net.filter_resistance * current - source) / net.filter_inductance
         rate['filter'] = (current + g * source) / net.filter_capacitance
@@ -430,7 +421,7 @@ def _circuit(net: PowerNetwork, g: float) -> tuple[FloatArray, dict[str, FloatAr
         bus = source = (r * unit['bulk'] - r * esr * drawn) / (r + esr - r * esr * g)
         current = -g * source
     rate['bulk'] = (-bus / r - drawn - current) / net.bulk_capacitance
-    # `line` is the part of its input that the regulator rejects; the rest passes.
+    # `line` is the slow part of its input, which the regulator rejects.
     rate['line'] = 2.0 * math.pi * net.regulator_bandwidth * (source - unit['line'])
     passed = net.line_feedthrough * (source - unit['line'])
     ro, eso = net.regulator_resistance, net.output_esr

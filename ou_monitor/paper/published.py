@@ -1,7 +1,7 @@
 """
-Printed numbers of the paper, and the verdict of each beside its recomputation.
+Printed numbers of the paper, and how each is compared with its recomputation.
 
-Units are the paper's own: mV, ms, 1/s, V/sqrt(s), V^2.
+Units are those of the paper: mV, ms, 1/s, V/sqrt(s), V^2.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import math
 
 Range = tuple[float, float]
 
-# Standard errors allowed to a recomputed number: by chance one row in 370 is called wrong.
+# Tolerance of a recomputed number, standard errors: by chance, one row in 370 exceeds it.
 STANDARD_ERRORS = 3.0
-# A number half a unit from the true one is correctly rounded either way.
+# Relative tolerance: a number halfway between two roundings agrees with both.
 _TIE = 1e-9
-# Finest step of an instrument that is tried: the smallest reading over this.
+# Maximum steps of an instrument in its smallest reading.
 _FINEST = 64
 
 
@@ -32,13 +32,10 @@ class RowVerdict(enum.Enum):
 
 @dataclass(frozen=True)
 class Printed:
-    """A number or a bound, as the paper has it."""
+    """A number of the paper, or a claim as a bound."""
 
-    # As printed, with all digits (``63.0``, ``315.6e-3``), or a claim as a bound (``> 0``, ``<
-    # 0``).
-    text: str
-    # Half a unit of the last printed digit, the most that rounding can have moved it; derived from
-    # the text unless given (``~0`` has no digits).
+    text: str  # As printed, with all digits (``63.0``), or a bound (``> 0``)
+    # Maximum error of rounding, half a unit of the last digit; from the text if left out.
     half_unit: float = math.nan
 
     def __post_init__(self) -> None:
@@ -82,25 +79,24 @@ class Row:
     """One printed number, recomputed."""
 
     where: str  # Table, figure or section of the paper.
-    # Quantity, and its unit in the paper.
     quantity: str
-    unit: str
-    printed: Printed  # As printed.
-    recomputed: float  # The same recomputed from its inputs, finite.
+    unit: str  # As in the paper.
+    printed: Printed
+    recomputed: float  # Recomputed from its inputs, finite.
     how: str  # How it was recomputed.
     sentence: str  # Conclusion.
     error: float | None = None  # Standard error of `recomputed`; None for arithmetic.
-    # Range of the recomputed number if it is one draw of something random, or if its error is not
-    # normal; replaces 3 standard errors.
+    # Range of the recomputed number if it is a random draw, or if its error is not normal;
+    # replaces 3 standard errors.
     band: Range | None = None
-    # Range of the printed number when the inputs of *that* number are changed within their
-    # rounding.
+    # Ranges of the printed and of the recomputed number, each with its own inputs varied within
+    # their rounding.
     printed_inputs: Range | None = None
-    inputs: Range | None = None  # Likewise for the recomputed one.
+    inputs: Range | None = None
     point: int = 0  # Which of the eight points it belongs to, or 0.
 
     def __post_init__(self) -> None:
-        """Refuse values that would make the verdict meaningless."""
+        """Raise ValueError for values without a meaningful verdict."""
         if not math.isfinite(self.recomputed):
             raise ValueError(f'{self.quantity}: recomputed is {self.recomputed}')
         if self.error is not None and not 0.0 <= self.error < math.inf:
@@ -123,9 +119,9 @@ class Row:
         """
         Return the verdict from the ranges.
 
-        `AGREES`: the recomputed number rounds to the printed one, or its
-        interval reaches it. `ROUNDING`: it does once the inputs of either move
-        within their own rounding. `DOES_NOT_HOLD`: not even then.
+        `AGREES`: the recomputed number rounds to the printed one, or its interval includes it.
+        `ROUNDING`: this holds with the inputs of either varied within their rounding.
+        `DOES_NOT_HOLD`: not even then.
         """
         if _overlap(self.printed.ends, self.interval):
             return RowVerdict.AGREES
@@ -156,7 +152,7 @@ class ReadingStep:
     low: float
     high: float
     multiples: tuple[int, ...]  # Steps in each reading
-    chance: float  # Approximate probability that readings without steps show one this large
+    chance: float  # Approximate probability of a step as large in readings without steps
 
     @property
     def size(self) -> float:
@@ -233,11 +229,11 @@ TABLE_1 = (
 IDLE, LOW, MEDIUM, HIGH = TABLE_1
 # Load states with a Vrms.
 LOADED = (LOW, MEDIUM, HIGH)
-# Of the oscilloscope, mV.
+# Steps of the oscilloscope, mV.
 VPP_STEP = common_step([state.vpp for state in TABLE_1])
 VRMS_STEP = common_step([state.vrms for state in LOADED])
 
-# Fig. 5: ms and |U| in mV; the paper does not use the last point.
+# Fig. 5: ms and |U| in mV; the paper leaves out the last point.
 FIG_5_MS = (0.0, 10.0, 25.0, 35.0, 50.0)
 FIG_5_MV = (Printed('368'), Printed('200'), Printed('80'), Printed('40'), Printed('6'))
 FIG_5_USED = 4

@@ -1,7 +1,7 @@
 """
 The paper, recomputed: all rows, the eight points to read it with, figures, headline, JSON.
 
-Everything comes from one seed.
+One seed determines all random numbers.
 """
 
 from __future__ import annotations
@@ -31,20 +31,19 @@ from ou_monitor.text import number
 from scipy.signal import welch
 
 Progress = Callable[[float], None]
-# Independent segments of half a second, which give the 95 % quantile to 0.03; and seconds with
-# jumps.
+# Independent segments of 0.5 s (95 % quantile within 0.03), and seconds with jumps.
 CREST_PATHS, JUMP_SECONDS = 4000, 100.0
-# In the order of the paper.
+# Sections in the order of the paper.
 _ORDER = ('Section 3.1', 'Section 3.3', 'Section 4.1', 'Section 4.2', 'Section 4.4',
           'Section 4.5', 'Table 1', 'Fig. 5', 'Section 5', 'Table 2', 'Section 6', 'Section 8')
 
 
 @dataclass(frozen=True)
 class Point:
-    """One point."""
+    """One of the eight points to read the paper with."""
 
     number: int  # 1 to 8
-    title: str  # Subject
+    title: str
     text: str  # Finding, with numbers
     rows: tuple[Row, ...]  # Rows it is based on
 
@@ -102,7 +101,7 @@ def _factor(rows: Sequence[Row]) -> str:
             f'reversible. So B = 2 sum pi C R0 C. A second way: under multiplicative noise ln U '
             f'must not grow; (4) to (6) as printed say {log.printed.value:g} 1/s, the simulation '
             f'{log.recomputed:.2f} +- {log.error or 0.0:.2f} 1/s. A sigma computed from a chain '
-            'by (6) is too small by sqrt(2); a sigma measured from Vrms is not touched.')
+            'by (6) is too small by sqrt(2); a sigma measured from Vrms is not affected.')
 
 
 def _coupling(rows: Sequence[Row]) -> str:
@@ -115,14 +114,14 @@ def _coupling(rows: Sequence[Row]) -> str:
     return (f'{alpha} 1/s is 2 pi x {published.ALPHA.value / (2.0 * math.pi):.2f} Hz, and '
             f'AC coupling is a first-order high-pass, on many oscilloscopes at 10 Hz. Behind '
             f'it a rail of {transient.TYPICAL_RAIL:g} 1/s is read as {fitted.recomputed:.1f} 1/s, '
-            f"and the reading follows the rail's own rate by {100 * slope.recomputed:.1f} +- "
-            f'{100 * (slope.error or 0.0):.1f} % only. It never exceeds the corner, and a rail '
-            f'slower than the corner is read slower: with that coupling, Fig. 5 '
-            f'({line.alpha:.1f} +- {line.half_width:.1f} 1/s) says that the rail is faster than '
-            f'about {transient.slowest_rail():.0f} 1/s, not that it is {alpha}. An OU '
-            f'of {alpha} 1/s would show {100 * kept:.0f} % of its standard deviation '
-            'through it, so Vrms would be too low as well. DC coupling, or a measured corner of '
-            'the instrument, would decide.')
+            f'and a change of its rate changes the reading by only {100 * slope.recomputed:.1f} '
+            f'+- {100 * (slope.error or 0.0):.1f} % of that. The reading never exceeds the '
+            f'corner, and a rail slower than the corner is read slower: with that coupling, Fig. '
+            f'5 ({line.alpha:.1f} +- {line.half_width:.1f} 1/s) shows that the rail is faster '
+            f'than about {transient.slowest_rail():.0f} 1/s, not that it is {alpha}. An OU of '
+            f'{alpha} 1/s would keep {100 * kept:.0f} % of its standard deviation behind it, so '
+            'Vrms would be too low as well. DC coupling, or a measured corner of the instrument, '
+            'would decide.')
 
 
 def _exponential(rows: Sequence[Row]) -> str:
@@ -141,7 +140,8 @@ def _exponential(rows: Sequence[Row]) -> str:
             f'{low:.0f} to {high:.0f}), offset {shifted.parameters[2]:.1f} mV: the shape of a '
             'baseline shifted by AC coupling, or of a second pole. The F test of the offset gives '
             f'p = {p:.2f}, {said}. If the points scatter in proportion to their size, as a fit of '
-            f'ln|U| assumes, the rates that do: {", ".join(outside) or "none"}.')
+            'ln|U| assumes, one exponential is excluded by the rates at: '
+            f'{", ".join(outside) or "none"}.')
 
 
 def _steps() -> str:
@@ -153,9 +153,9 @@ def _steps() -> str:
         for s in published.LOADED)
     return (f'Every Vpp is a multiple ({", ".join(map(str, vpp.multiples))}) of {vpp.low:.4g} to '
             f'{vpp.high:.4g} mV, and every Vrms ({", ".join(map(str, vrms.multiples))}) of '
-            f'{vrms.low:.4g} to {vrms.high:.4g} mV; by chance that would be so once in '
+            f'{vrms.low:.4g} to {vrms.high:.4g} mV; by chance that would happen once in '
             f'{1 / vpp.chance:.0f} and {1 / vrms.chance:.0f} cases. Half a step of Vrms is '
-            f'{halves}. With that and the interval of alpha, sigma is {sigmas} V/sqrt(s). '
+            f'{halves}. With this and the interval of alpha, sigma is {sigmas} V/sqrt(s). '
             f'Motors off, "{published.IDLE.vrms.text}" beside Vpp = {published.IDLE.vpp.text} mV '
             'is a reading below one step.')
 
@@ -169,17 +169,17 @@ def _crests(crests: Crests) -> str:
     for state in published.LOADED:
         value, (low, high) = state.crest, state.crest_range
         if low > limit:
-            said = f'not even half a step of each reading, which leaves {low:.2f}, brings it there'
+            said = f'above that, and within half a step of each reading still {low:.2f} or more'
         elif value > limit:
-            said = f'only at the edge of its rounding ({low:.1f} to {high:.1f})'
+            said = f'below that only at the edge of its rounding ({low:.1f} to {high:.1f})'
         else:
-            said = 'within'
+            said = 'below that'
         parts.append(f'{state.label} has {value:.1f}: {said}')
     return (f'One OU with tau = {published.TAU_MS.text} ms, sampled at 1 MHz, shows a Vpp/Vrms of '
             f'{means} screens; 95 % of the {longest} ms screens lie below {limit:.2f}. '
-            f'{"; ".join(parts)}. Something faster rides on the OU where the crest factor is '
-            'larger: impulses, ripple, or white noise. The paper does not say how long its '
-            'screens are; longer ones show more.')
+            f'{"; ".join(parts)}. A larger crest factor shows something faster beside the OU: '
+            'impulses, ripple, or white noise. The paper does not give the length of its '
+            'screens; on longer ones the crest factor is larger.')
 
 
 def _growth() -> str:
@@ -198,10 +198,11 @@ def _capacitance() -> str:
     return (f'For an RC rail alpha = 1/(R C) and Var_inf = S R/(2 C) under white current noise: '
             f'both are halved by a second capacitor, sigma = sqrt(S)/C too. In a 6S network of '
             f'typical parts at 40 %, a second {1e6 * before.network.bulk_capacitance:.0f} uF in '
-            f'parallel takes alpha from {before.alpha:.3g} to {after.alpha:.3g} 1/s and the '
+            f'parallel lowers alpha from {before.alpha:.3g} to {after.alpha:.3g} 1/s and the '
             f'standard deviation from {1e3 * math.sqrt(before.var_inf):.0f} to '
             f'{1e3 * math.sqrt(after.var_inf):.0f} mV. The advice to add low-ESR '
-            'capacitance is right, because Var_inf falls; that alpha rises is not.')
+            'capacitance is right, because Var_inf falls; the reason given, that alpha rises, is '
+            'not.')
 
 
 def _jumps(crests: Crests, found: list[JumpCrest]) -> str:
@@ -218,24 +219,24 @@ def _jumps(crests: Crests, found: list[JumpCrest]) -> str:
                         for s in published.LOADED)
     low, medium, high = (state.crest for state in published.LOADED)
     quotient = over(published.HIGH.crest_range, published.LOW.crest_range)
-    return ('The paper says that its data justify diffusion and jump components, and fits no '
-            'jump. Of the compound Poisson jumps tried, relaxing at alpha, the best show '
-            f'a mean crest factor of {" and ".join(parts)}; {low:.1f} (5 %) and '
-            f'{medium:.1f} (10 %) are what the readings require. Impulses '
+    return ('The paper says that its data justify diffusion and jump components, but fits no '
+            'jumps. Of the compound Poisson jumps tried, relaxing at alpha, the best show '
+            f'a mean crest factor of {" and ".join(parts)}; the readings require {low:.1f} (5 %) '
+            f'and {medium:.1f} (10 %). Impulses '
             f'too short to count in Vrms would need a height, peak to peak over the OU, of '
             f'{heights}. '
             f'From 5 to 40 % the crest factor goes from {low:.1f} to {high:.1f} (quotient '
             f'{quotient[0]:.2f} to {quotient[1]:.2f} within half a step): '
             'the readings do not show impulses that come with load. '
-            'Two readings a load cannot decide between these; a recording can: see '
-            'ou-monitor discover.')
+            'Two readings at each load cannot decide between these; a recording can (ou-monitor '
+            'discover).')
 
 
 @dataclass(frozen=True, eq=False)
 class Reproduction:
     """Result of `reproduce`."""
 
-    seed: int  # Of all random numbers
+    seed: int  # Seed of all random numbers
     rows: tuple[Row, ...]  # In the order of the paper
     points: tuple[Point, ...]  # The eight points
     crests: Crests  # Simulated crest factors
@@ -244,7 +245,7 @@ class Reproduction:
     spectra: tuple[DrawnSpectrum, ...]  # Of 10 and 40 %
 
     def parts(self) -> list[tuple[str, list[Row]]]:
-        """Return the rows by table, figure and whole section of the paper; no empty ones."""
+        """Return the rows by table, figure and main section of the paper."""
         found: dict[str, list[Row]] = {}
         for row in self.rows:
             # 'Section 4.5' belongs to 'Section 4'; 'Fig. 5' stays.
@@ -260,7 +261,7 @@ def reproduce(seed: int = 1, progress: Progress | None = None) -> Reproduction:
     def within(start: float, stop: float) -> Progress:
         return lambda share: report(start + share * (stop - start))
 
-    # Each part has its own generator, so that none depends on the others' draws.
+    # Each part has its own generator, so that none depends on the draws of another.
     rngs = np.random.default_rng(seed).spawn(8)
     crests = simulate_crests(rngs[0], CREST_PATHS, within(0.0, 0.35))
     found = simulate_jumps(rngs[1], JUMP_SECONDS, within(0.35, 0.6))
@@ -293,11 +294,11 @@ def headline(result: Reproduction) -> str:
 
 
 def recomputed(row: Row) -> str:
-    """Return the recomputed number with its standard error, to its digits."""
+    """Return the recomputed number with its standard error."""
     digits = max(4, 1 + sum(c.isdigit() for c in row.printed.text.split('e')[0].lstrip('0.')))
     if not row.error:
         return number(row.recomputed, digits)
-    # Decimals: as many as give the error two digits.
+    # Decimals for two digits of the error.
     decimals = max(0, 1 - math.floor(math.log10(row.error)))
     return f'{row.recomputed:.{decimals}f} +- {row.error:.{decimals}f}'
 
@@ -337,7 +338,7 @@ class Screen:
     """One simulated oscilloscope screen."""
 
     state: published.PrintedLoad  # Its row of Table 1
-    # s and V, in steps of the oscilloscope; shape (n,).
+    # Time, s, and voltage, V, in steps of the oscilloscope; shape (n,).
     t: FloatArray
     u: FloatArray
 
@@ -347,7 +348,7 @@ class DrawnSpectrum:
     """One-sided density of a load state."""
 
     state: published.PrintedLoad  # Its row of Table 1
-    # Hz and V^2/Hz, of a simulated recording at 1 MHz; shape (k,).
+    # Frequency, Hz, and density, V^2/Hz, of a simulated recording at 1 MHz; shape (k,).
     frequency: FloatArray
     density: FloatArray
     coupled: FloatArray  # Of the same OU through an AC coupling of 10 Hz, V^2/Hz; shape (k,)
@@ -359,7 +360,7 @@ def lorentzian(frequency: FloatArray, alpha: float, sigma: float) -> FloatArray:
 
 
 def _screen(state: published.PrintedLoad, rng: np.random.Generator) -> Screen:
-    """Return a screen of a load state; motors off, Vrms is half a step."""
+    """Return a screen of a load state; Vrms with motors off is half a step."""
     t = np.arange(round(SCREEN * published.SAMPLING_HZ)) / published.SAMPLING_HZ
     step = 1e-3 * published.VPP_STEP.size
     sigma = state.sigma or 0.5e-3 * published.VRMS_STEP.size * math.sqrt(

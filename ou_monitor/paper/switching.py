@@ -1,8 +1,8 @@
 """
 Sections 3 and 8: the matrix as printed, averaging, and formulas (4) to (6) of switching.
 
-The chain is drawn jump by jump and the system moved exactly between jumps; the
-recomputed side uses no limit theorem.
+The chain is simulated jump by jump, with exact motion between jumps: the recomputed numbers use no
+limit theorem.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from ou_monitor.records import FloatArray
 from scipy.integrate import quad
 
 WHERE = 'Section 3.3'
-# Telegraph noise of +-1 V/s that switches a thousand times a second each way.
+# Telegraph noise of +-SPEED, V/s, with RATE switches a second each way.
 RATE, SPEED = 1000.0, 1.0
-# Multiplicative: dU = +-c U dt; c small beside the rate, so that the limit holds to c^2/(4 q^2).
+# Multiplicative noise dU = +-c U dt; small relative to RATE: the limit holds to c^2/(4 q^2).
 GROWTH = 100.0
-# An example, since the paper gives only alpha: rates 1/s, rad/s; two
-# states that switch as an ESC of 24 kHz does, each coefficient +-30 % about its mean.
+# An example, since the paper gives only alpha: rates, 1/s and rad/s; two states that switch like
+# an ESC of 24 kHz, with each coefficient +-30 % about its mean.
 DAMPING, COUPLING, CARRIER = 100.0, 40.0, 2.0 * math.pi * 10.0
 _SWING = np.array([1.3, 0.7])
 
@@ -36,7 +36,7 @@ class Spreading:
     """Variance of the integral of telegraph noise, from Monte Carlo."""
 
     t: FloatArray  # Times, s; shape (k,)
-    # V^2, with standard errors; shape (k,).
+    # Variance and its standard error, V^2; shape (k,).
     variance: FloatArray
     error: FloatArray
     # Rates of formula (6) with the 2 and without, V^2/s.
@@ -51,7 +51,7 @@ def telegraph() -> SwitchedSystem:
 
 
 def three_states() -> SwitchedSystem:
-    """Return an additive system on three states that is not reversible, balanced."""
+    """Return a balanced additive system on a chain of three states that is not reversible."""
     chain = Generator(RATE * np.array([[-3.0, 2.5, 0.5], [0.2, -1.2, 1.0], [2.0, 0.3, -2.3]]))
     speeds = SPEED * np.array([2.0, -1.0, 0.5])
     return SwitchedSystem(chain, np.zeros((3, 1, 1)),
@@ -69,8 +69,7 @@ def variance_rate(system: SwitchedSystem, rng: np.random.Generator,
     """
     Return the long-run growth rate of the variance of a balanced additive system.
 
-    (Var U(T) - Var U(S)) / (T - S), unbiased once S is longer than the
-    memory of the chain.
+    (Var U(T) - Var U(S)) / (T - S), unbiased if S is longer than the memory of the chain.
     """
     memory = 1.0 / float(system.generator.leaving.min())
     t = memory * np.array([0.0, 10.0, 110.0])
@@ -102,7 +101,7 @@ def _potential() -> Row:
     return Row(WHERE, 'R0(0, 0) of a telegraph', 'ms', Printed(f'{1e3 * found:.6g}'),
                1e3 * float(chain.potential[0, 0]),
                'printed integral by quadrature, against (Pi - Q)^-1 - Pi',
-               'The potential is defined rightly.')
+               'The definition of the potential is right.')
 
 
 def _intensity(rng: np.random.Generator, paths: int) -> list[Row]:
@@ -125,11 +124,10 @@ def _drift(rng: np.random.Generator, paths: int) -> list[Row]:
     drift = float(switching_drift(system).matrix[0, 0])
     span = 2.0 * RATE / GROWTH ** 2
     u = system.simulate(np.array([0.0, 0.5 * span, span]), [1.0], rng, paths=paths)[:, 1:, 0]
-    # Time over which the mean growth is large beside its scatter.
+    # At this time the mean growth is large relative to its scatter.
     mean, error = mean_and_error(u[:, 0])
     rate, rate_se = 2.0 * math.log(mean) / span, 2.0 * error / mean / span
-    # In contiguous memory: NumPy 1.26's logarithm of a column differs in the last digit by its
-    # place.
+    # Contiguous: in NumPy 1.26 the last digit of a logarithm depends on the memory layout.
     log, log_se = mean_and_error(np.log(np.ascontiguousarray(u[:, 1])) / span)
     intensity = float(diffusion_limit(system, PRINTED_FACTOR).intensity([1.0])[0, 0])
     ito = drift - 0.5 * intensity
@@ -140,7 +138,7 @@ def _drift(rng: np.random.Generator, paths: int) -> list[Row]:
         Row(WHERE, 'b/U of (5), multiplicative noise', '1/s', Printed(f'{drift:.6g}', 0.0), rate,
             f'{how} of the mean',
             f'The mean grows {rate / drift:.3f} +- {rate_se / drift:.3f} times as fast as (5) '
-            'says, which lacks no factor.', error=rate_se,
+            'says: no factor is missing.', error=rate_se,
             inputs=(rate - left, rate + left), point=1),
         Row(WHERE, 'growth of ln U by (4) to (6)', '1/s', Printed(f'{ito:.6g}', 0.0),
             log, f'{how} of ln U',
@@ -178,18 +176,18 @@ def averaging_rows(rng: np.random.Generator, paths: int = 400) -> list[Row]:
     return [
         Row('Section 3.1', 'P(tau)/P(0), +gamma on the diagonal', '', Printed('< 1'), grown,
             'printed matrix, gamma = alpha as its note says',
-            'The power grows by e in one tau; one that relaxes needs -alpha there.'),
+            'The power grows by e in one tau; to relax, the entry must be -alpha.'),
         Row('Section 8', 'phase: late over early advance', '', Printed('1', 0.0), turned,
             'printed matrix over two spans of 1/omega',
             'The printed row is dphi/dt = omega phi, an exponential; with dphi/dt = omega the '
-            f'switched model gives {ratio:.4f}, linear as said.'),
+            f'switched model gives {ratio:.4f}: linear, as the paper says.'),
         Row('Section 8', 'amplitude: late over early decay', '', Printed('1', 0.0),
-            amplitude, how, 'The mean amplitude decays as one exponential, as said.',
+            amplitude, how, 'The mean amplitude decays as one exponential, as the paper says.',
             error=amplitude_se),
         Row('Section 8', 'power: late over early decay', '', Printed('1', 0.0), power,
             f'{how}, beta = {COUPLING:g} 1/s',
             f'Fed by the amplitude, the power is a sum of two exponentials (averaged model: '
-            f'{limit[1]:.3f}); it is pure only when beta = 0.', error=power_se)]
+            f'{limit[1]:.3f}); it is one exponential only if beta = 0.', error=power_se)]
 
 
 def _of_mean(paths: FloatArray) -> tuple[float, float]:

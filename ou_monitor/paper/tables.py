@@ -1,4 +1,4 @@
-"""Tables 1 and 2, and the sections that follow from them by arithmetic: 4, 5, 6 and 8."""
+"""Tables 1 and 2, and the sections computed from them: 4, 5, 6 and 8."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from scipy.special import erfc
 
 # Threshold of section 4.4, V: the paper gives none.
 DELTA = 0.1
-# Distance of independent samples, in tau: their correlation is exp(-SPACING).
+# Spacing of nearly independent samples, in tau: their correlation is exp(-_SPACING).
 _SPACING = 8.0
-# An RC rail of any values: Ohm, F, A^2/Hz (two-sided); elasticities do not depend on them.
+# An example of an RC rail, Ohm, F, A^2/Hz (two-sided); its elasticities do not depend on them.
 _R, _C, _S = 0.07, 470e-6, 1e-6
 
 
@@ -38,7 +38,7 @@ def table_1(white_crest: float, white_crest_se: float) -> list[Row]:
 
 def _multiples(name: str, known: str, step: ReadingStep, readings: Sequence[Printed],
                states: Sequence[PrintedLoad]) -> list[Row]:
-    """Return readings as multiples of the step of the oscilloscope."""
+    """Return the rows of readings as multiples of the step of the oscilloscope."""
     return [Row(
         'Table 1', f'{name}, {state.label}', 'mV', reading, k * step.size,
         f'multiple of a common step of {step.low:.4g} to {step.high:.4g} mV',
@@ -53,8 +53,8 @@ def _idle(crest: float, crest_se: float) -> Row:
     return Row(
         'Table 1', 'Vrms, motors off', 'mV', Printed(IDLE.vrms.text, 0.5 * step), lowest,
         'Vpp over the crest factor of white Gaussian noise, 100 ms at 1 MHz, Monte Carlo',
-        f'Gaussian noise with this Vpp on 100 ms has about {lowest:.1f} mV or more, whatever '
-        f'its colour; one step is {step:.2f} mV, so "~0" is a reading, not the absence of noise.',
+        f'Gaussian noise of any colour with this Vpp on 100 ms has {lowest:.1f} mV rms or more; '
+        f'one step is {step:.2f} mV, so "~0" is a reading, not the absence of noise.',
         error=lowest * crest_se / crest, printed_inputs=(0.0, step), point=4)
 
 
@@ -81,8 +81,8 @@ def _grades() -> list[Row]:
     low, high = over(HIGH.vrms_range, MEDIUM.vrms_range)
     found = [Row(
         'Table 1', f'{name}: {state.label} over motors off', '', Printed('> 1'),
-        state.vrms.value / below, 'Vrms over half a step, the most that reads as zero',
-        'The order holds; the factor is a lower bound, because V0 is only known to read as zero.',
+        state.vrms.value / below, 'Vrms over half a step, the largest that reads as zero',
+        'The order holds; the factor is a lower bound, because V0 reads as zero.',
         inputs=over(state.vrms_range, (below, step)))
         for name, state in (('V1 > V0', LOW), ('V2 >> V0', MEDIUM))]
     found.append(Row(
@@ -119,7 +119,7 @@ def table_2() -> list[Row]:
         Row('Section 5', 'sqrt(2 alpha)', '1/sqrt(s)', ROOT_2_ALPHA, root,
             f'sqrt(2 x {ALPHA.text})', 'The arithmetic is right.'),
         Row('Table 2', 'tau', 'ms', TAU_MS, 1e3 / alpha, f'1 / {ALPHA.text}',
-            'The arithmetic is right; its five digits come from the division; alpha has fewer.')]
+            'The arithmetic is right; the five digits come from the division, alpha has three.')]
     for state in (MEDIUM, HIGH):
         found += _of_load(state)
     return found + _repetitions()
@@ -142,8 +142,8 @@ def _of_load(state: PrintedLoad) -> list[Row]:
         Row('Table 2', f'implied error, {state.label}', 'V/sqrt(s)',
             Printed(f'{printed.half_unit:.2g}', 0.0), width,
             'half a step of Vrms and the 95 % interval of alpha, in quadrature',
-            f'sigma is {sigma:.2f} +- {width:.2f} V/sqrt(s), {100.0 * width / sigma:.0f} %, where '
-            'four digits are printed.', point=4),
+            f'sigma is {sigma:.2f} +- {width:.2f} V/sqrt(s), {100.0 * width / sigma:.0f} %, but '
+            'is printed with four digits.', point=4),
         Row('Table 2', f'Var_inf, {state.label}', 'V^2', VAR_INF[state.label], var,
             'sigma^2 / (2 alpha) with the printed numbers',
             f'The arithmetic is right; half a step of Vrms allows {1e-6 * low ** 2:.2g} to '
@@ -152,9 +152,9 @@ def _of_load(state: PrintedLoad) -> list[Row]:
 
 def _repetitions() -> list[Row]:
     said = {
-        'Section 4.5': 'The number, from Fig. 5, shows a limit of the filtration only if the '
-                       'network, and not the oscilloscope, set it.',
-        'Section 8': 'The number is from Fig. 5, and a rate alone does not confirm an OU: every '
+        'Section 4.5': 'The number, from Fig. 5, is a limit of the filtering only if it comes '
+                       'from the network and not from the oscilloscope.',
+        'Section 8': 'The number is from Fig. 5. A rate alone does not confirm an OU: every '
                      'first-order system has one, AC coupling included.'}
     return [Row(
         where, quantity, unit, printed,
@@ -209,14 +209,14 @@ def _of_thresholds() -> list[Row]:
     return [
         Row('Section 4.4', f'P(|U| > {1e3 * DELTA:g} mV), 40 % over 10 %', '',
             Printed(f'> {load:g}'), ratio, 'quotient of the formula',
-            f'"Nonlinear" holds: four times the load, {ratio:.0f} times the probability; half a '
-            f'step of each Vrms allows {spread[2] / spread[1]:.0f} to '
+            f'"Nonlinear" holds: {load:.0f} times the load gives {ratio:.0f} times the '
+            f'probability; half a step of each Vrms allows {spread[2] / spread[1]:.0f} to '
             f'{spread[3] / spread[0]:.0f}.',
             inputs=(spread[2] / spread[1], spread[3] / spread[0])),
         Row('Section 4.4', f'falls by {1e3 * DELTA:g} mV a second, 40 over 10 %', '',
             Printed('> 1'), times[0] / times[1], 'quotient of mean first-passage times',
-            'P(|U| > delta) is a share of time, not a frequency; by first passage the mean time '
-            f'to such a fall is {times[0]:.3g} s at 10 % and {times[1]:.3g} s at 40 %.'),
+            'P(|U| > delta) is a share of time, not a frequency; the mean first-passage time to '
+            f'such a fall is {times[0]:.3g} s at 10 % and {times[1]:.3g} s at 40 %.'),
         Row('Section 4.4', 'Var_inf, 40 % over 5 %', '', Printed('> 1'), high / low,
             'squared quotient of the Vrms',
             f'Larger, as printed: {high / low:.0f} times, {wide[0] ** 2:.0f} to '
@@ -262,8 +262,8 @@ def _hardware() -> list[Row]:
         Row('Section 4.2', 'Nyquist frequency at 1 MHz', 'kHz', Printed(f'> {1e-3 * high:g}'),
             1e-3 * nyquist, 'half of the sampling frequency',
             f'ESC lines at {1e-3 * low:g} to {1e-3 * high:g} kHz are resolved with '
-            f'{int(nyquist / high)} harmonics; of the OU itself {100 * share_above(low):.2g} % of '
-            'the variance lies up there.')]
+            f'{int(nyquist / high)} harmonics; the OU itself has {100 * share_above(low):.2g} % '
+            'of its variance there.')]
 
 
 def _capacitance() -> list[Row]:
@@ -278,8 +278,8 @@ def _capacitance() -> list[Row]:
         Row('Section 4.5', 'd ln alpha / d ln C', '', Printed('> 0'), alpha,
             'eigenvalue of an RC rail, C doubled',
             f'alpha = 1/(R C) falls with C ({net_alpha:+.2f} for a 6S network of typical parts '
-            f'with capacitors in parallel, whose alpha is {before.alpha:.2g} 1/s; '
-            f'{ALPHA.text} 1/s would take {farad:.2g} F there).', point=7),
+            f'with capacitors in parallel, whose alpha is {before.alpha:.2g} 1/s; {ALPHA.text} '
+            f'1/s would need {farad:.2g} F).', point=7),
         Row('Section 4.5', 'd ln Var_inf / d ln C', '', Printed('< 0'), var,
             "Lyapunov's equation of an RC rail under white current noise, C doubled",
             f'The advice is right for another reason: Var_inf = S R/(2 C) falls ({net_var:+.2f} '
@@ -302,7 +302,7 @@ def _growth() -> list[Row]:
             f'{second_in[0]:.2f} to {second_in[1]:.2f} within half a step of Vrms.',
             inputs=second_in, point=6),
         Row('Section 6', 'load states measured above 40 %', '', Printed('> 0'), float(above),
-            'rows of Table 1', '"40 % and above" is said of nothing that was measured above.',
+            'rows of Table 1', '"40 % and above" is claimed, but nothing above was measured.',
             point=6),
         Row('Section 8', 'sigma, 40 % over 5 %', '', Printed('> 1'), ratio,
             'quotient of the Vrms', f'Noise grows with load, {ratio:.1f} times in all.',

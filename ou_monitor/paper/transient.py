@@ -1,5 +1,5 @@
 """
-Fig. 5: the relaxation rate from its points, and whether it is the rail's or the instrument's.
+Fig. 5: the relaxation rate from its points, and whether rail or oscilloscope determines it.
 
 An AC-coupled oscilloscope is a first-order high-pass: it shows a step of the rail as a decay at
 2 pi times its corner, unless the rail is slower.
@@ -27,11 +27,11 @@ WHERE = 'Fig. 5'
 # Corner of the AC coupling of many hand-held oscilloscopes, Hz.
 CORNER_HZ = 10.0
 CORNER = 2.0 * math.pi * CORNER_HZ
-# Rates of rails fitted through it, 1/s.  A bulk capacitor of 470 uF behind 40 mOhm of battery and
-# 30 mOhm of its own relaxes at 3e4 1/s.
+# Rates of rails fitted through it, 1/s.  For comparison: 470 uF with 30 mOhm ESR behind a battery
+# of 40 mOhm relaxes at 3e4 1/s.
 RAILS = (500.0, 1000.0, 2000.0, 5000.0)
 TYPICAL_RAIL = 1000.0
-# Of a simulated release: rate, Hz, time under load and time recorded after it, s.
+# A simulated release: sampling rate, Hz, time under load and time recorded after it, s.
 _RATE, _HOLD, _WATCH = 10e3, 0.3, 0.06
 
 TIME = 1e-3 * np.array(published.FIG_5_MS)
@@ -137,7 +137,7 @@ def through_coupling(time: FloatArray, rail: float) -> FloatArray:
 
 
 def peak_of(rail: float) -> float:
-    """Return when a step of a rail, 1/s, shows its peak behind the high-pass, s."""
+    """Return the time of the peak of a step of a rail, 1/s, behind the high-pass, s."""
     return math.log(rail / CORNER) / (rail - CORNER)
 
 
@@ -155,7 +155,7 @@ def fitted_through_coupling(time: FloatArray) -> tuple[FloatArray, float]:
 
 
 def fitted_rate(rail: float) -> float:
-    """Return the rate that the paper's fit gives for a step behind the high-pass, 1/s."""
+    """Return the rate, 1/s, that the fit of the paper gives for a step behind the high-pass."""
     used = TIME[USED]
     return fit_log_line(used, through_coupling(peak_of(rail) + used, rail)).alpha
 
@@ -170,11 +170,9 @@ def simulate_fitted(rng: np.random.Generator, draws: int) -> FloatArray:
     """
     Release a load behind an AC-coupled oscilloscope and fit it as the paper does.
 
-    The rail is an OU with noise of half a step of the oscilloscope, the largest
-    that reads as "~0"; the points are taken 0, 10, 25 and 35 ms after the peak
-    of the noiseless trace.
-
-    result in 1/s.
+    The rail is an OU with half a step of the oscilloscope as noise, the largest that reads as
+    "~0"; the points are taken 0, 10, 25 and 35 ms after the peak of the noiseless trace.  Result
+    in 1/s.
     """
     t = np.arange(round((_HOLD + _WATCH) * _RATE)) / _RATE
     throttle = np.where(t <= _HOLD, published.TRANSIENT_LOAD, 0.0)
@@ -209,7 +207,7 @@ def _fit() -> list[Row]:
             point=3),
         Row(WHERE, 'error implied by its digits', '1/s', Printed('0.05', 0.0),
             line.half_width, 'half of the 95 % interval of that fit',
-            f'{published.ALPHA.text} claims a digit that four points do not give: the interval is '
+            f'{published.ALPHA.text} has more digits than four points support: the interval is '
             f'{line.alpha - line.half_width:.0f} to {line.alpha + line.half_width:.0f} 1/s.',
             point=3),
         Row(WHERE, '|U(0)|', 'mV', published.FIG_5_MV[0], line.start, 'intercept of that fit',

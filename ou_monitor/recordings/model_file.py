@@ -8,7 +8,6 @@ Written by `discover`, read by `simulate` and by the estimator node.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 import math
 from pathlib import Path
@@ -20,6 +19,7 @@ from ou_monitor.model.load import LoadStart
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue, left_out
 from ou_monitor.model.terms.term import Term
+from ou_monitor.records import plain_data
 from ou_monitor.stream.files import one_line, path_words, read_yaml
 import yaml
 
@@ -141,10 +141,10 @@ def as_yaml(file: ModelFile) -> str:
     """Return the text of a model file; `parse_model` gives the same model back."""
     entries = []
     for k, term in enumerate(file.model.terms):
-        entry: dict[str, Any] = {'term': term.NAME, 'params': _plain(term.values())}
+        entry: dict[str, Any] = {'term': term.NAME, 'params': plain_data(term.values())}
         se = file.se[k] if k < len(file.se) else {}
         if se:
-            entry['se'] = _plain(se)
+            entry['se'] = plain_data(se)
         entries.append(entry)
     data: dict[str, Any] = {'model': entries}
     if file.model.load is not None:
@@ -153,12 +153,3 @@ def as_yaml(file: ModelFile) -> str:
         data['provenance'] = dict(file.provenance)
     text: str = yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
     return text
-
-
-def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
-    def one(value: Any) -> Any:
-        if isinstance(value, (list, tuple)):
-            return [one(v) for v in value]
-        return float(value) if math.isfinite(value) else None
-
-    return {name: one(value) for name, value in values.items()}

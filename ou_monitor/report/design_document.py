@@ -25,7 +25,7 @@ def design_document(result: Design, source: str, taken: str = '', command: str =
     present = result.present
     chosen = [(present, 'present')]
     if result.least is not None:
-        chosen.append((result.least, 'minimum that meets it'))
+        chosen.append((result.least, 'just meets it'))
     for row in result.rows[::_EVERY]:
         if not any(math.isclose(row.capacitance, r.capacitance, rel_tol=0.01) for r, _ in chosen):
             chosen.append((row, '' if row.stable else 'unstable'))

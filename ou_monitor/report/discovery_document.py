@@ -153,7 +153,7 @@ def _gain(finding: Finding) -> list[Part]:
     # If nothing was added to the plain OU, there is nothing to compare.
     kept = 5 if finding.causes else 3
     return [Table(['', 'observed', 'plain OU', 'extended', 'gain'][:kept],
-                  [row[:kept] for row in rows], left=[0]), Text(finding.felt.words),
+                  [row[:kept] for row in rows], left=[0]), Text(finding.throttle_effects.words),
             Text(f'Plain OU, with nothing else in the model: {plain_model_words(baseline)}.')]
 
 

@@ -7,13 +7,12 @@ Limits: the table and the plots are the main ones of the command; `to_dict` has 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-import enum
 from functools import cached_property
-import math
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from ou_monitor.errors import how_to_install, InputError, nearest
+from ou_monitor.records import plain_data
 from ou_monitor.report.document import Document, Figure, Pair, Part, Section
 from ou_monitor.report.svg import Plot
 
@@ -91,7 +90,7 @@ class Result:
         data = dict(self._data())
         if self._supply is not None and not callable(self._supply):
             data['supply'] = self._supply.to_dict()
-        found: dict[str, Any] = plain(data)
+        found: dict[str, Any] = plain_data(data)
         return found
 
     def to_dataframe(self) -> DataFrame:
@@ -194,23 +193,6 @@ def _plots(parts: Sequence[Part]) -> Iterator[Plot]:
             yield from _plots(part.parts if isinstance(part, Section) else part.figures)
         elif callable(part):
             yield from _plots(part())
-
-
-def plain(value: Any) -> Any:
-    """Return a value as strict JSON allows it: plain types, None for NaN and infinity."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    if isinstance(value, enum.Enum):
-        return value.name
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
 
 
 def draw(plot: Plot, ax: Axes | None = None) -> Axes:

@@ -5,7 +5,7 @@ import re
 
 from ou_monitor.analysis.analyze import analyze, as_data
 from ou_monitor.recordings.read import read_recording
-from ou_monitor.report.result import plain
+from ou_monitor.records import plain_data
 from project import ROOT
 import pytest
 from simulated_recordings import recording
@@ -63,6 +63,6 @@ def test_every_key_is_documented(analysis):
     """doc/analysis.md names each in backticks; those of `source` are the reader's."""
     text = (ROOT / 'doc' / 'analysis.md').read_text(encoding='utf-8')
     documented = set(re.findall(r'`([a-z0-9_]+)`', text))
-    data = plain(as_data(analyze(read_recording(ROOT / 'bags' / 'transient'))))
+    data = plain_data(as_data(analyze(read_recording(ROOT / 'bags' / 'transient'))))
     data['source'] = {}
     assert sorted(set(names(data)) - documented) == []

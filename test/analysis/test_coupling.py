@@ -163,14 +163,14 @@ def test_leading_signal_is_noted():
     found = estimate_coupling(t, voltage + 0.05 * np.roll(signal, 5), t, signal,
                               throttle=throttle)
     assert found.seen and found.signal_leads and found.lag < -0.005
-    assert any('ahead of the voltage' in note for note in found.notes)
+    assert any('leads the voltage' in note for note in found.notes)
 
 
 T = np.arange(5000) / RATE
 
 
 @pytest.mark.parametrize('signal_t, signal, options, words', [
-    (T + 100.0, T, {}, 'no stretch of time in common'),
+    (T + 100.0, T, {}, 'no time in common'),
     (T, np.full(T.size, np.nan), {}, 'finite samples'),
     (T, np.ones(T.size), {}, 'does not change'),
     (T[:600], np.sin(99 * T[:600]), {}, 'at least 16 segments'),

@@ -101,7 +101,7 @@ def test_the_samples_show_the_step_of_the_adc():
     """A lattice of 5 mV, repeats of four, a rail at 5.03 V, and throttle that comes late."""
     simulated = recording(3, ((0.1, 0.3),))
     step = listed(replace(simulated, voltage=0.005 * np.round(simulated.voltage / 0.005)))
-    assert names(step) == {'ADC_STEP': Severity.INFO} and 'of 5 mV' in step[0].text
+    assert names(step) == {'ADC_STEP': Severity.INFO} and 'is 5 mV' in step[0].text
     held = listed(readings_of(replace(
         simulated, voltage=np.repeat(simulated.voltage[::4], 4))))
     assert names(held) == {'READER': Severity.INFO} and 'repeats were left' in held[0].text

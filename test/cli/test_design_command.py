@@ -32,7 +32,7 @@ def told(capsys, *more):
 def test_answer_table_and_effect(capsys):
     """The table has both ends, the present capacitor and the answer, in order of capacitance."""
     out = said(capsys)
-    assert '2305 uF is the least capacitance that brings the risk under 0.001.' in out
+    assert '2305 uF is the minimum capacitance that brings the risk under 0.001.' in out
     words = ' '.join(out.split())
     assert ('From 470 uF to 2305 uF: alpha falls from 30391 to 9406 1/s, Var_inf falls from 0.161 '
             'to 0.0341 V^2') in words
@@ -106,13 +106,13 @@ def test_what_is_missing_is_named(capsys, given, missing):
     (['--risk', '1e999'], 'not a number'), (['--voltage', '1e300'], 'not a number'),
     (['--set', 'cells=1e300'], 'not a number'), (['--horizon', '0'], 'horizon must be positive'),
     (['--horizon', '5V'], 'must be in s'), (['--voltage', 'low'], 'not a number'),
-    (['--capacitance-min', '1F'], 'must be below the most'),
+    (['--capacitance-min', '1F'], 'must be below the maximum'),
     (['--set', 'bulk_esr'], 'NAME=VALUE'), (['--set', 'bulk_capacitence=1'], 'bulk_capacitance'),
     (['--set', 'bulk_capacitance=0'], 'bulk_capacitance must be positive and finite, got 0.0 F'),
     (['--set', 'bulk_esr=-1mOhm'], 'bulk_esr must be zero or positive'),
     (['--set', 'bulk_esr=20mV'], 'must be in Ohm'), (['--set', 'cells=6V'], 'no unit'),
     (['--set', 'cells=5.5'], 'whole number'), (['--set', 'constant_power=2'], 'true nor false'),
-    (['--set', 'current_max=5000'], 'battery cannot give the load'),
+    (['--set', 'current_max=5000'], 'battery cannot supply the load'),
     (['--set', 'regulator_voltage=9', '--rail', 'regulated'], 'no default brown-out voltage'),
     (['--set', 'filter_inductance=100uH', '--set', 'filter_resistance=1m', '--set',
       'filter_capacitance=1uF', '--set', 'filter_esr=0'], 'unstable'),
@@ -226,5 +226,5 @@ def test_what_each_change_buys(flight, capsys):
         less = asked(capsys, '--from', flight, '--voltage', '14.9', option, f'{limit:.3f}')
         assert less['present']['mean'] > 14.9
     none = asked(capsys, '--from', flight, '--voltage', '16.15')
-    assert 'Nothing within reach' in none['answer']
+    assert 'would be enough' in none['answer']
     assert all(one['least'] is None for one in none['levers'])

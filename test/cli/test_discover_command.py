@@ -145,10 +145,10 @@ def test_what_is_not_known_is_said_and_what_is_worse_too():
     for shown in (text, html):
         assert not re.search(r'\bnan\b|- \+- -|\u2013 \u00b1 \u2013', shown)
         words = ' '.join(re.sub('<[^>]*>', ' ', shown).split())
-        assert words.count('worse on what was kept back') == 1
+        assert words.count('worse on held-out samples') == 1
         assert 'Worse on samples not used' in words
-        assert 'Gain not measurable here; named for what it explains' in words
-        assert 'Gain not distinguishable from none' in words
+        assert 'Gain not measurable here; named because it explains' in words
+        assert 'Gain not distinguishable from 0' in words
     # Its name, and what a pilot calls it.
     rows = {row[0]: row for row in tables(html)}
     assert rows['load_sag'][:4] == ['load_sag', 'sag', 'load', 'not known']

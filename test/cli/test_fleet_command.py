@@ -198,7 +198,7 @@ def test_copies_are_analysed_once_and_named(rows, whole):
 def test_what_was_passed_over_is_told(whole):
     """A CSV of something else and what only ends like a log are named."""
     said = ' '.join(whole[1].stdout.split())
-    assert 'tuning.csv' in said and 'raw.ulg' in said and 'not one that can be read' in said
+    assert 'tuning.csv' in said and 'raw.ulg' in said and 'in no known format' in said
 
 
 def test_vehicles_flights_and_dates(rows, whole):
@@ -209,7 +209,7 @@ def test_vehicles_flights_and_dates(rows, whole):
     dated = {row['recording']: row['start'] for row in rows if row['start']}
     assert set(dated) == {'bag_9'} and dated['bag_9'].timestamp() == 1_700_000_000
     said = ' '.join(whole[1].stdout.split())
-    assert 'vehicles by the folder they lie in' in said and 'in the order of their names' in said
+    assert 'vehicles by their folder' in said and 'in the order of their names' in said
 
 
 def test_the_table_says_what_it_holds(whole):
@@ -346,7 +346,7 @@ def test_two_packs_in_one_folder_are_said(tmp_path, one_process, capsys):
     assert main(['fleet', str(tmp_path), '--output', str(tmp_path / 'out'), '--json',
                  str(tmp_path / 'x.json')]) == 0
     said = [note for note in json.loads((tmp_path / 'x.json').read_text())['notes']
-            if 'several supplies' in note]
+            if 'different supplies' in note]
     assert [note.split(':')[0] for note in said] == ['mixed'] and '--vehicle-from' in said[0]
 
 

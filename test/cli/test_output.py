@@ -13,7 +13,7 @@ import numpy as np
 from ou_monitor.cli import output
 from ou_monitor.errors import InputError
 from ou_monitor.report import terminal
-from ou_monitor.report.result import plain
+from ou_monitor.records import plain_data
 import pytest
 
 
@@ -27,7 +27,7 @@ def test_plain_is_strict_json_at_any_depth():
     """All of NaN and infinities are null; arrays, tuples, NumPy numbers and enums are plain."""
     data = {'a': math.nan, 'b': [math.inf, (1, -math.inf)], 'c': np.array([[1.0, math.nan]]),
             'd': {1: np.float64('nan'), 'e': np.int64(3)}, 'f': Colour.RED, 'g': np.bool_(True)}
-    found = plain(data)
+    found = plain_data(data)
     assert found == {'a': None, 'b': [None, [1, None]], 'c': [[1.0, None]],
                      'd': {'1': None, 'e': 3}, 'f': 'RED', 'g': True}
     assert json.loads(json.dumps(found, allow_nan=False)) == found

@@ -194,7 +194,7 @@ def test_a_bench_supply_does_not_discharge():
     v = 16.6 - 1.2 * u ** 1.7 + 0.01 * rng.standard_normal(t.size)
     found = compare(Recording(t, v, u, 'bench'), fit_until=30.0, seeds=20)
     assert found.explained > 0.95
-    assert any('the level stands' in note for note in found.notes)
+    assert any('the level is constant' in note for note in found.notes)
 
 
 def test_held_samples_count_once():
@@ -212,8 +212,8 @@ def test_held_samples_count_once():
 @pytest.mark.parametrize('change, words', [
     ({'fit_until': 60.0}, 'must end within the recording'),
     ({'fit_until': 0.0}, 'must end within the recording'),
-    ({'fit_until': 0.2}, 'the part that is fitted holds'),
-    ({'fit_until': 39.9}, 'the part that is simulated holds')])
+    ({'fit_until': 0.2}, 'the part to be fitted has'),
+    ({'fit_until': 39.9}, 'the part to be simulated has')])
 def test_parts_that_are_too_short(change, words):
     """One line that says which part."""
     with pytest.raises(InputError, match=words):

@@ -77,7 +77,7 @@ def test_steps_are_found_and_named_where_they_matter(share, offset):
     found = examined(t, coded)
     assert names(found) == (['quantization'] if share > 0.3 else [])
     assert found.samples.n == t.size
-    assert any('ADC counts' in note for note in found.notes)
+    assert any('ADC has steps' in note for note in found.notes)
 
 
 def test_no_lattice_in_what_is_rounded_to_text():

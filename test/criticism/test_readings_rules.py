@@ -86,27 +86,27 @@ def throttle(u, t=None):
 @pytest.mark.parametrize('low, high, word', [
     (0.0, 1.0, ''), (-0.05, 1.05, ''), (-0.06, 1.0, 'not 0 to 1'), (0.0, 1.06, 'not 0 to 1'),
     (-1.5, 1.5, 'not 0 to 1'), (0.0, 1.6, 'percent'), (-1.0, 150.0, 'percent'),
-    (0.0, 151.0, 'no unit'), (-1.6, 1.0, 'no unit'), (700.0, 2400.0, 'microseconds'),
-    (699.0, 2000.0, 'no unit'), (1000.0, 2401.0, 'no unit')])
+    (0.0, 151.0, 'unknown unit'), (-1.6, 1.0, 'unknown unit'), (700.0, 2400.0, 'microseconds'),
+    (699.0, 2000.0, 'unknown unit'), (1000.0, 2401.0, 'unknown unit')])
 def test_units_of_throttle_by_their_range(low, high, word):
     raw = np.linspace(low, high, 101)
     raw[:3], raw[-3:] = low, high
     u, notes = throttle(raw)
     assert (word in notes) if word else notes == ''
     expected = {'percent': raw / 100.0, 'microseconds': (raw - 1000.0) / 1000.0}.get(word, raw)
-    if word == 'no unit':
+    if word == 'unknown unit':
         assert u is None
     else:
         np.testing.assert_allclose(u, expected)
 
 
-@pytest.mark.parametrize('wild, word', [(4, '4 samples'), (6, 'no unit')])
+@pytest.mark.parametrize('wild, word', [(4, '4 samples'), (6, 'unknown unit')])
 def test_half_a_percent_of_wild_values_is_no_unit(wild, word):
     raw = np.linspace(0.0, 1.0, 1001)
     raw[500:500 + wild] = 1e4
     u, notes = throttle(raw)
     assert word in notes
-    if word != 'no unit':
+    if word != 'unknown unit':
         assert (u[500:500 + wild] == raw[499]).all()
 
 

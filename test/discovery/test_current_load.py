@@ -36,7 +36,7 @@ def test_the_measured_current_is_the_load_where_it_says_more():
     found = discover(recording)
     assert found.as_data()['load'] == 'current'
     assert [cause.name for cause in found.causes] == ['load_sag']
-    assert any('current says more' in note for note in found.notes)
+    assert any('current predicts the voltage better' in note for note in found.notes)
     with pytest.raises(InputError, match='current'):
         model_text(found, recording)
     alone = discover(Recording(T, v, u, 'made'))

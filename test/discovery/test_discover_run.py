@@ -195,7 +195,7 @@ def test_the_page_of_a_plain_rail_keeps_the_plain_model():
     assert found.verdict is Verdict.NO_EFFECT
     root = parsed(page_of(discovery_document(found)))
     text = ' '.join(''.join(root.itertext()).split())
-    assert 'The plain OU is kept' in text and 'xtended' not in text
+    assert 'No cause was named: this is the plain OU' in text and 'xtended' not in text
     assert 'simulations of the plain OU at each moment' in text
     assert len(root.findall('.//figure/svg')) == 2 + 6
     assert 'xtended' not in terminal(discovery_document(found))
@@ -228,5 +228,5 @@ def test_stopped_by_hand_it_says_what_it_found(limit):
 
     found = discover(drawn_from(LoadSag(0.5, 0.0), n=6000), progress=progress)
     assert names(found) == ['load_sag'] and max(shares) == 1.0
-    stopped = any('stopped by hand' in note for note in found.notes)
+    stopped = any('stopped by the user' in note for note in found.notes)
     assert stopped == (limit < 0.6)

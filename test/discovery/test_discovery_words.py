@@ -32,7 +32,7 @@ def test_a_gain_is_one_beyond_its_error(gain, error, words, remark):
     assert found.startswith(remark) and bool(found) == bool(remark)
     row, = cause_rows([replace(SAG, gain=gain, gain_se=error)])
     if math.isfinite(gain):
-        assert row.remark.endswith('; named for what it explains in the recording as a whole'
+        assert row.remark.endswith('; named because it explains the whole recording better'
                                    ) == bool(remark)
         assert f'{1e3 * gain:.3g}'[:4] in row.gain
     else:
@@ -117,7 +117,7 @@ def test_terms_that_share_a_gain_are_one_row_with_the_estimates_of_all():
 @pytest.mark.parametrize('verdict, left, begin, gain', (
     (Verdict.NO_EFFECT, False, 'The plain OU simulates this recording', False),
     (Verdict.UNEXPLAINED, True, 'The simulation deviates from the recording', False),
-    (Verdict.EXPLAINED, False, 'What the plain OU gets wrong is explained by tone', True),
+    (Verdict.EXPLAINED, False, 'tone explains what the plain OU gets wrong', True),
     (Verdict.PARTLY_EXPLAINED, False, 'tone explains a part of what the plain OU', True),
     (Verdict.PARTLY_EXPLAINED, True, 'tone explains a part of what the plain OU', True)))
 def test_each_verdict_has_its_sentence(verdict, left, begin, gain):
@@ -137,7 +137,7 @@ def test_every_cause_has_its_words(name):
     values.update({'number': [0.0]} if 'number' in values else {})
     values.update({p: v for p, v in (('dof', 5.0), ('states', 2.0)) if p in values})
     text = explain(kind.read(values), {}, 0.01, 0.001, ['drift'], False)
-    assert len(text) > 120 and 'what would' in text and '(for drift)' in text
+    assert len(text) > 120 and 'this would' in text and '(for drift)' in text
     assert all(f'{p} = ' in text for p in kind.parameters())
 
 

@@ -187,7 +187,7 @@ def test_qos_overrides_are_taken_or_refused(world):
     assert end.qos_profile.reliability == ReliabilityPolicy.RELIABLE
     wait_until(lambda: 'Waiting for a publisher on /voltage' in process.err)
     assert process.stop() == 0
-    for name, words in (('/rail.subscription.depth:=5', 'is of no topic of this node'),
+    for name, words in (('/rail.subscription.depth:=5', 'names no topic of this node'),
                         ('/voltage.subscription.reliability:=somehow', 'qos_overrides of')):
         assert words in refusal(lambda: EstimatorNode('ou_estimator'), '-p',
                                 'msg_config:=std_float64', '-p', f'qos_overrides.{name}')

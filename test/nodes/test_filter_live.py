@@ -231,7 +231,7 @@ def test_a_slow_input_warns(rig):
             rig.send((0.0, 0.0, 0.0), dt=0.1)
             time.sleep(0.001)
         rig.sigma.publish(Float64(data=0.6))
-        return 'come too slowly: 0.45 of their rate is 4.5 Hz' in rig.status.message
+        return 'are too slow: 0.45 of their rate is 4.5 Hz' in rig.status.message
     wait_until(told, what='WARN')
     assert rig.status.level == b'\x01'
     # The sample rate is averaged over 100 samples: back to what the other tests use.

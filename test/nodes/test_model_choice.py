@@ -106,7 +106,7 @@ def test_a_flight_is_saved_into_its_own_file_alone(tmp_path):
             (lambda: (path.unlink(), os.mkfifo(path)), 'not a regular file'),
             (path.unlink, 'No such file')):
         change()
-        with pytest.raises(InputError, match=f'left as it is: .*{words}'):
+        with pytest.raises(InputError, match=f'was not changed: .*{words}'):
             choice.save(load, {'date': '2026-08-03'})
         assert choice.use(str(path)).date == '2026-08-02'
     assert other.read_text() == changed and os.listdir(tmp_path) == ['other.yaml']

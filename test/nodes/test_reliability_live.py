@@ -198,7 +198,7 @@ def test_the_latch_survives_a_restart(world, tmp_path):
     again = Rig(world, 'keep', *arguments)
     wait_until(lambda: again.field('brownout_level') == 'CRITICAL', what='the latch')
     assert 'latched' in again.field('brownout_reason')
-    assert 'before the node was started anew' in again.process.err
+    assert 'before a restart of the node' in again.process.err
     wait_until(lambda: again.flags and again.flags[-1].data, what='the flag itself')
     answer = again.probe.call(Trigger, f'{again.node}/clear_brownout', Trigger.Request())
     assert answer.success

@@ -269,7 +269,7 @@ def test_bad_throttles_are_refused(throttle, words):
 
 
 def test_a_load_beyond_the_battery_is_refused():
-    with pytest.raises(ValueError, match='battery cannot give the load at throttle 0.9'):
+    with pytest.raises(ValueError, match='battery cannot supply the load at throttle 0.9'):
         rail_at(PowerNetwork(current_max=600.0), 0.9)
     with pytest.raises(ValueError, match='cannot give the regulator'):
         FILTERED.regulator_current(0.1)

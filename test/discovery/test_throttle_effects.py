@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.discovery.earning import refusal
-from ou_monitor.discovery.finding import felt
+from ou_monitor.discovery.pruning import refusal
+from ou_monitor.discovery.finding import throttle_effects
 from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.shocks import Glitches
@@ -30,7 +30,7 @@ def flown(*terms):
 
 def test_a_punch_out_dips_and_comes_back():
     """1 V of sag and 0.5 V of inrush, of which 90 % are gone after 0.1 s ln 10."""
-    found = felt(flown(*INRUSH), (OU(1.0, 0.01, 15.0), *INRUSH), 14.5)
+    found = throttle_effects(flown(*INRUSH), (OU(1.0, 0.01, 15.0), *INRUSH), 14.5)
 
     assert found.dip == pytest.approx(1.0 + 0.5 * math.exp(-0.1), rel=1e-6)
     assert found.after == pytest.approx(0.01)
@@ -44,23 +44,25 @@ def test_a_punch_out_dips_and_comes_back():
 
 def test_a_sag_stays():
     """Nothing comes back, and nothing is said of it."""
-    found = felt(flown(INRUSH[0]), (OU(1.0, 0.01, 15.0), INRUSH[0]), 14.5)
+    found = throttle_effects(flown(INRUSH[0]), (OU(1.0, 0.01, 15.0), INRUSH[0]), 14.5)
     assert found.recovered == 0.0 and math.isnan(found.within)
     assert 'come back' not in found.words and 'costs 1.0 V' in found.words
     # One that grows is that of half time, 30 s.
-    grown = felt(flown(INRUSH[0]), (OU(1.0, 0.01, 15.0), LoadSag(1.0, 0.0, 0.02)), 14.5)
+    grown = throttle_effects(flown(INRUSH[0]), (OU(1.0, 0.01, 15.0), LoadSag(1.0, 0.0, 0.02)),
+                             14.5)
     assert grown.dip == pytest.approx(1.6, rel=1e-3) and grown.recovered == 0.0
 
 
 def test_without_an_answer_to_throttle_nothing_is_said():
     """Neither of a model without one, nor of a recording without throttle."""
-    assert felt(flown(), (OU(1.0, 0.01, 15.0),), 14.5).words == ''
-    assert felt(Samples(T, T, None), INRUSH, 14.5).words == ''
+    assert throttle_effects(flown(), (OU(1.0, 0.01, 15.0),), 14.5).words == ''
+    assert throttle_effects(Samples(T, T, None), INRUSH, 14.5).words == ''
 
 
 def test_what_leaves_the_range_is_refused():
     """Bad samples of 100 V were never seen; the same model without them passes."""
     samples, ou = flown(*INRUSH), OU(1.0, 0.01, 15.0)
     assert refusal(samples, (ou, *INRUSH), 0.1, 0.01) == ''
-    assert 'leave the range' in refusal(samples, (ou, *INRUSH, Glitches(0.1, 100.0)), 0.1, 0.01)
+    assert 'exceed the recorded range' in refusal(
+        samples, (ou, *INRUSH, Glitches(0.1, 100.0)), 0.1, 0.01)
     assert 'predicts worse' in refusal(samples, (ou, *INRUSH), -0.1, 0.01)

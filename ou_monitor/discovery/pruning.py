@@ -1,5 +1,5 @@
 """
-Remove causes that do not improve predictions of held-out blocks, and judge the model.
+Remove causes that do not improve predictions of held-out blocks, and check the model.
 
 A cause is removed if the rest, fitted again, predicts held-out blocks as well without it.  Then
 the others are tested again, because another cause may take over its effect.
@@ -25,9 +25,9 @@ from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.term import Term
 from ou_monitor.records import FloatArray, NAN
 
-# Causes of one kind from which their gain is measured together.
+# Minimum number of causes of one kind whose gain is measured together.
 MANY = 4
-# Rounds of leaving out.
+# Maximum number of rounds.
 _ROUNDS = 4
 # Number of simulations whose range is compared.
 _DRAWS = 16
@@ -37,16 +37,16 @@ _DRAWS = 16
 class Worth:
     """Loss of the model without a group of terms."""
 
-    # nats per sample.
+    # Gain and standard error, nats per sample.
     gain: float = NAN
     error: float = NAN
-    chance: float = NAN  # As `gain.cause_gain` has it
+    chance: float = NAN  # p-value; see `gain.cause_gain`
     size: int = 1  # Terms of the group
-    less: HeldOut | None = None  # The model without it
+    less: HeldOut | None = None  # The model without the group
 
 
 @dataclass(eq=False)
-class Earned:
+class Pruned:
     """The remaining model, and the gain of each of its causes."""
 
     full: HeldOut  # The model
@@ -55,14 +55,14 @@ class Earned:
     out: list[str] = field(default_factory=list)  # Causes that were left out
 
 
-def earned(samples: Samples, model: Composite, names: Sequence[str], plain: HeldOut,
-           scored: npt.NDArray[np.bool_], progress: Callable[[float], None]) -> Earned:
+def prune_by_gain(samples: Samples, model: Composite, names: Sequence[str], plain: HeldOut,
+                  scored: npt.NDArray[np.bool_], progress: Callable[[float], None]) -> Pruned:
     """
     Remove the causes that do not improve held-out predictions, the worst first.
 
-    Interrupted (Ctrl-C), it returns what there is, gains that were not measured yet as unknown.
+    Interrupted (Ctrl-C), it returns the current model; gains not yet measured are unknown.
     """
-    state = Earned(held_out(samples, model), list(names))
+    state = Pruned(held_out(samples, model), list(names))
     for turn in range(_ROUNDS):
         state.worth = []
         try:
@@ -85,8 +85,8 @@ def earned(samples: Samples, model: Composite, names: Sequence[str], plain: Held
     return state
 
 
-def _leave_out(state: Earned, worst: int) -> None:
-    """Remove a cause, and the terms that depend on it."""
+def _leave_out(state: Pruned, worst: int) -> None:
+    """Remove a cause and the terms that depend on it."""
     less = state.worth[worst].less
     assert less is not None
     kept = {term.NAME for term in less.model.terms}
@@ -100,13 +100,13 @@ def _leave_out(state: Earned, worst: int) -> None:
     state.names, state.full = left, less
 
 
-def _straying(samples: Samples, state: Earned) -> int | None:
+def _straying(samples: Samples, state: Pruned) -> int | None:
     """
-    Return the cause without which simulations stay within the recorded range; None: there is none.
+    Return the cause whose removal keeps simulations within the recorded range, if there is one.
 
-    One-step predictions say little of how far a process goes: an intensity or an event that fits
-    them may still be none that the recording shows.  Answers of the mean are not asked.  Half of
-    the simulations have to leave it: heavy tails may do so once.
+    One-step predictions hardly constrain the range of a process: an intensity or an event that
+    fits them may still exceed the recorded range.  Responses of the mean are not tested.  The
+    median simulation decides, because heavy tails may leave the range once.
     """
     def far_of(model: Composite) -> float:
         try:
@@ -119,7 +119,7 @@ def _straying(samples: Samples, state: Earned) -> int | None:
         return None
     other = {k: far_of(worth.less.model) for k, worth in enumerate(state.worth)
              if worth.less is not None and not decision.is_answer(catalogue()[state.names[k]])}
-    # One that costs least: several that would have to go together are no such cause.
+    # The cheapest single cause; combinations are not tried.
     return min((k for k, stays in other.items() if not stays > 0.0), default=None,
                key=lambda k: state.worth[k].gain)
 
@@ -128,7 +128,7 @@ def _far(samples: Samples, terms: Sequence[Term]) -> FloatArray:
     """
     Return how far the level of each simulation leaves the recorded range, V (fixed seeds).
 
-    The level is a median of five: single wrong or wild samples do not move it.
+    The level is a running median of five samples, which single bad samples do not change.
     """
     rng, model = np.random.default_rng(0), SupplyModel(tuple(terms))
 
@@ -140,19 +140,19 @@ def _far(samples: Samples, terms: Sequence[Term]) -> FloatArray:
                            samples.logged) for _ in range(_DRAWS)])
 
 
-def _as_trend(samples: Samples, state: Earned, k: int) -> bool:
-    """Return whether the `ou` is only a trend in place of a term of the mean."""
+def _as_trend(samples: Samples, state: Pruned, k: int) -> bool:
+    """Return whether the `ou` would become a trend if this response of the mean were removed."""
     less = state.worth[k].less
     return (decision.is_answer(catalogue()[state.names[k]]) and less is not None
             and is_trend(samples, less.model) and not is_trend(samples, state.full.model))
 
 
-def _measure(samples: Samples, state: Earned, plain: HeldOut, scored: npt.NDArray[np.bool_],
+def _measure(samples: Samples, state: Pruned, plain: HeldOut, scored: npt.NDArray[np.bool_],
              progress: Callable[[float], None]) -> None:
     """
-    Measure what each cause of a model is worth; of many of a kind, all together.
+    Measure the gain of each cause, or of all of one kind if there are many.
 
-    The plain OU is always left: a rest that predicts worse than that is none.
+    If the rest predicts worse than the plain OU, the gain is relative to the plain OU.
     """
     found: dict[tuple[int, ...], Worth] = {}
     for k in range(len(state.names)):
@@ -172,7 +172,7 @@ def _measure(samples: Samples, state: Earned, plain: HeldOut, scored: npt.NDArra
 
 
 def group_of(model: Composite, names: Sequence[str], k: int) -> tuple[int, ...]:
-    """Return where in a model the k-th cause is, with the others of its kind if there are many."""
+    """Return the index of the k-th cause in a model, or of all of its kind if there are many."""
     if list(names).count(names[k]) < MANY:
         return (position(model, names, k),)
     return tuple(position(model, names, j) for j, name in enumerate(names) if name == names[k])
@@ -181,9 +181,9 @@ def group_of(model: Composite, names: Sequence[str], k: int) -> tuple[int, ...]:
 def refusal(samples: Samples, terms: Sequence[Term], gain: float, gain_se: float,
             larger: bool = False) -> str:
     """
-    Return why a model is refused, in words; empty: it is not.
+    Return why a model is refused, in words; otherwise empty.
 
-    gain, gain_se in nats per sample; larger: whether its one-step errors are.
+    gain, gain_se in nats per sample; larger: whether its one-step errors are significantly larger.
     """
     if math.isfinite(gain) and not decision.earns(gain, gain_se, 0.0):
         return 'The extended model predicts worse than the plain OU'
@@ -195,6 +195,6 @@ def refusal(samples: Samples, terms: Sequence[Term], gain: float, gain_se: float
         return f'The extended model cannot be simulated ({error})'
     if far > 0.0:
         by = 'without bound' if math.isinf(far) else f'by {far:.2g} V'
-        return ('Simulations of the extended model leave the range that was seen, and a margin of '
-                f'half of it, {by}')
+        return ('Simulations of the extended model exceed the recorded range and a margin of '
+                f'half of it {by}')
     return ''

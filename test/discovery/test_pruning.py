@@ -4,8 +4,8 @@ from types import SimpleNamespace
 
 import numpy as np
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.discovery import earning
-from ou_monitor.discovery.earning import Earned, earned, group_of, MANY, refusal, Worth
+from ou_monitor.discovery import pruning
+from ou_monitor.discovery.pruning import Pruned, prune_by_gain, group_of, MANY, refusal, Worth
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.slow import Drift, SecondRelaxation
@@ -27,7 +27,7 @@ def state_of(*names, sizes=()):
     """Return a state in which each cause may be left out alone."""
     worth = [Worth(0.1, 0.01, 0.0, 1, scored_model(*names[:k], *names[k + 1:]))
              for k in range(len(names))]
-    return Earned(scored_model(*names), list(names), worth)
+    return Pruned(scored_model(*names), list(names), worth)
 
 
 @pytest.mark.parametrize('names, worst, less, size, left, out', [
@@ -43,7 +43,7 @@ def test_what_goes_with_a_cause(names, worst, less, size, left, out):
     state = state_of(*names)
     rest = scored_model(*less)
     state.worth[worst] = Worth(0.0, 1.0, 1.0, size, rest)
-    earning._leave_out(state, worst)
+    pruning._leave_out(state, worst)
     assert state.names == left and sorted(state.out) == out and state.full is rest
 
 
@@ -60,9 +60,9 @@ def test_many_of_a_kind_are_one_group():
 def run(monkeypatch, values, names):
     """Return what is left, with (gain, chance) of each cause in each round; error 0.01."""
     rounds = iter(values)
-    monkeypatch.setattr(earning, 'held_out', lambda samples, model: scored_model(*names))
-    monkeypatch.setattr(earning, '_straying', lambda samples, state: None)
-    monkeypatch.setattr(earning, '_as_trend', lambda *given: False)
+    monkeypatch.setattr(pruning, 'held_out', lambda samples, model: scored_model(*names))
+    monkeypatch.setattr(pruning, '_straying', lambda samples, state: None)
+    monkeypatch.setattr(pruning, '_as_trend', lambda *given: False)
 
     def measure(samples, state, plain, scored, progress):
         table = next(rounds)
@@ -71,8 +71,8 @@ def run(monkeypatch, values, names):
             rest = [one for j, one in enumerate(state.names) if j != k]
             state.worth.append(Worth(gain, 0.01, chance, 1, scored_model(*rest)))
 
-    monkeypatch.setattr(earning, '_measure', measure)
-    return earned(None, None, names, None, None, lambda share: None)
+    monkeypatch.setattr(pruning, '_measure', measure)
+    return prune_by_gain(None, None, names, None, None, lambda share: None)
 
 
 def test_the_worst_goes_first_and_the_others_are_measured_again(monkeypatch):
@@ -104,8 +104,8 @@ def test_the_cause_by_which_simulations_stray(full, less, gains, out, monkeypatc
                    for gain, worth in zip(gains, state.worth)]
     far = {state.full.model.terms: full,
            **{worth.less.model.terms: by for worth, by in zip(state.worth, less)}}
-    monkeypatch.setattr(earning, '_far', lambda samples, terms: np.full(3, far[terms]))
-    assert earning._straying(None, state) == out
+    monkeypatch.setattr(pruning, '_far', lambda samples, terms: np.full(3, far[terms]))
+    assert pruning._straying(None, state) == out
 
 
 def test_a_model_that_cannot_be_simulated_strays_without_bound(monkeypatch):
@@ -115,9 +115,9 @@ def test_a_model_that_cannot_be_simulated_strays_without_bound(monkeypatch):
             raise ValueError('runs away')
         return np.zeros(3)
 
-    monkeypatch.setattr(earning, '_far', far)
-    assert earning._straying(None, state_of('drift', 'tone')) == 1
-    assert earning._straying(None, state_of('drift')) is None
+    monkeypatch.setattr(pruning, '_far', far)
+    assert pruning._straying(None, state_of('drift', 'tone')) == 1
+    assert pruning._straying(None, state_of('drift')) is None
 
 
 def test_how_far_simulations_leave_what_was_seen():
@@ -126,12 +126,12 @@ def test_how_far_simulations_leave_what_was_seen():
     t = 1e-3 * np.arange(3000)
     v = 5.0 + 0.05 * rng.standard_normal(t.size)
     samples = Samples(t, v, None)
-    still = earning._far(samples, [OU(60.0, 0.5, 5.0)])
+    still = pruning._far(samples, [OU(60.0, 0.5, 5.0)])
     assert still.shape == (16,) and (still == 0.0).all()
-    away = earning._far(samples, [OU(60.0, 0.5, 7.0)])
+    away = pruning._far(samples, [OU(60.0, 0.5, 7.0)])
     seen = v.max() - v.min()
     assert away == pytest.approx(np.full(16, 7.0 - v.max() - 0.5 * seen), abs=0.25)
-    assert (earning._far(samples, [OU(60.0, 0.5, 7.0)]) == away).all()
+    assert (pruning._far(samples, [OU(60.0, 0.5, 7.0)]) == away).all()
 
 
 @pytest.mark.parametrize('gain, far, said', [
@@ -145,7 +145,7 @@ def test_why_a_model_has_not_earned_its_place(gain, far, said, monkeypatch):
             raise ValueError('runs away')
         return np.array([0.0, far])
 
-    monkeypatch.setattr(earning, '_far', given)
+    monkeypatch.setattr(pruning, '_far', given)
     text = refusal(None, (BASE,), gain, 0.01)
     assert said in text and bool(text) is bool(said)
     if gain > 0.0:
