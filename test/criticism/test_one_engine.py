@@ -26,9 +26,8 @@ from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.slow import SecondRelaxation
 from ou_monitor.recordings.importers.csv_table import CsvColumns
-from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import Recording
-from project import REAL, ROOT
+from project import REAL, recorded, ROOT
 import pytest
 from simulated_recordings import as_one_level, bare
 
@@ -44,7 +43,7 @@ def both(request):
     """Return samples, what `analyze` says of them, and what `discover` may look at."""
     # Of the two batteries of a log the first.
     columns = CsvColumns(voltage=BATTERY) if request.param.suffix == '.ulg' else None
-    whole = read_recording(request.param, columns=columns)
+    whole = recorded(request.param, **({} if columns is None else {'columns': columns}))
     kept = examine(whole)
     if kept.samples is None:
         # Neither verb says anything.

@@ -8,7 +8,7 @@ from injected import EFFECTS, noise_of
 import numpy as np
 from ou_monitor import discover, read_recording, Recording
 from ou_monitor.criticism.integrity import examine
-from project import ROOT
+from project import recorded, ROOT
 import pytest
 
 # Seconds of the flight: throttle moves all the time; 200 Hz, codes of 10 mV.
@@ -76,7 +76,7 @@ FLIGHTS = {'gecko': (ROOT / 'bags' / 'recorded' / 'gecko.csv', 30.0, 40.0),
 def piece(name):
     """Return a piece of a recorded run, and the causes that it has by itself."""
     path, first, last = FLIGHTS[name]
-    whole = read_recording(path)
+    whole = recorded(path)
     part = (whole.t >= first) & (whole.t < last)
     found = Recording(whole.t[part], whole.voltage[part], whole.throttle[part])
     return found, [cause.name for cause in discover(found).causes]

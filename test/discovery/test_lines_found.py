@@ -17,8 +17,8 @@ from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.tones import Resonance, Tone
-from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import NAN, Recording
+from project import recorded
 import pytest
 from simulated_recordings import bare
 
@@ -95,7 +95,7 @@ def test_the_flown_path_is_no_line_of_the_supply(frequency, terms, line):
 @pytest.mark.skipif(not (REAL / 'xt_pico_a.csv').exists(), reason='recorded runs are elsewhere')
 def test_analyze_and_discover_name_the_same_lines_of_a_comb():
     """A second of xt_pico_a, a comb of 106.5 Hz: each clear line of one is one of the other."""
-    whole = read_recording(REAL / 'xt_pico_a.csv')
+    whole = recorded(REAL / 'xt_pico_a.csv')
     n = 5_000
     part = replace(whole, t=whole.t[:n], voltage=whole.voltage[:n], throttle=np.full(n, NAN))
     level = fit_level(part, bare(part), LoadLevel(NAN, (Stay(0, n),)), 1)

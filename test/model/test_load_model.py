@@ -6,8 +6,7 @@ import numpy as np
 from ou_monitor.model.load import (
     CELL, cells_in_series, charge_at, LoadModel, lowpass, open_circuit)
 from ou_monitor.model.load_fit import fit_load
-from ou_monitor.recordings.read import read_recording
-from project import needs_recordings, REAL, ROOT
+from project import needs_recordings, REAL, recorded, ROOT
 import pytest
 
 
@@ -102,7 +101,7 @@ def test_a_simulated_pack_is_recovered():
 
 def test_no_degenerate_fit_of_the_recorded_flight():
     """Physical sizes, distinct time constants, and 0.9 of the second half's variance."""
-    flight = read_recording(GECKO)
+    flight = recorded(GECKO)
     t, v, u = flight.t - flight.t[0], flight.voltage, np.clip(flight.throttle, 0.0, 1.0)
     half = t <= 0.5 * t[-1]
     # A third of the samples: the answer is slower than that.
@@ -131,7 +130,7 @@ def test_a_fit_stays_physical(name):
 
     An extended model of sums of poles held +25.8 V beside -19 V on one of these.
     """
-    flight = read_recording(REAL / f'{name}.csv')
+    flight = recorded(REAL / f'{name}.csv')
     t, v, u = flight.t - flight.t[0], flight.voltage, np.clip(flight.throttle, 0.0, 1.0)
     t, v, u = t[::3], v[::3], u[::3]
     half = t <= 0.5 * t[-1]

@@ -3,14 +3,14 @@
 import math
 
 import numpy as np
-from ou_monitor import AdaptiveLowPass, read_recording
+from ou_monitor import AdaptiveLowPass
 from ou_monitor.model.ou import simulate
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.risk.flag import FlagLevel
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.online.trust import Doubt, InputClock, SourceInterval, StampOrder, StillReading
 from ou_monitor.records import Level
-from project import needs_recordings, REAL
+from project import needs_recordings, REAL, recorded
 import pytest
 
 
@@ -102,7 +102,7 @@ def test_no_recorded_source_is_called_stuck():
     for path in sorted([*REAL.glob('*.csv'), *REAL.glob('raw/*')]):
         if path.suffix == '.ulg':
             continue
-        recording = read_recording(path)
+        recording = recorded(path)
         watch = StillReading()
         for k in range(0, min(recording.n, 20_000), 7):
             part = slice(k, k + 7)

@@ -1,5 +1,6 @@
 """Files of the project for the tests that look at or copy all of them; recordings of others."""
 
+from functools import cache
 import os
 from pathlib import Path
 import subprocess
@@ -16,6 +17,13 @@ needs_recordings = pytest.mark.skipif(
 # What running the project makes; in an unpacked archive there is no git to say so.
 GENERATED = {'.venv', '.venv-noble', 'build', 'install', 'log', 'out', '__pycache__', '.git',
              '.hypothesis', '.pytest_cache', '.mypy_cache', 'ou_monitor.egg-info'}
+
+
+@cache
+def recorded(path: Path, **options: Any) -> Any:
+    """Return a recording that many tests look at, read once by all tests of a process."""
+    from ou_monitor.recordings.read import read_recording
+    return read_recording(path, **options)
 
 
 def metadata() -> dict[str, Any]:
