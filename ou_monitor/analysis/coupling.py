@@ -383,7 +383,6 @@ def _shared(one: list[tuple[float, float]], other: list[tuple[float, float]],
 
 
 def _at(at: FloatArray, t: FloatArray, x: FloatArray, own: float, rate: float) -> FloatArray:
-    """Return a series at the stamps of a part."""
     inside = slice(max(int(np.searchsorted(t, at[0] - 2.0 / own)) - 1, 0),
                    int(np.searchsorted(t, at[-1] + 2.0 / own)) + 1)
     t, x = t[inside], x[inside]

@@ -75,7 +75,6 @@ def _of_reader(note: str) -> QualityItem:
 
 
 def _of_units(recording: Recording) -> list[QualityItem]:
-    """Return suspicions of wrong units."""
     items = []
     middle = float(np.median(np.abs(recording.voltage))) if recording.n else 0.0
     if middle > _MOST_VOLTS:
@@ -106,7 +105,6 @@ def _of_units(recording: Recording) -> list[QualityItem]:
 
 
 def _of_stamps(recording: Recording) -> list[QualityItem]:
-    """Return defects of the stamps: pauses, and an uneven clock."""
     steps = np.diff(recording.t)
     if steps.size < 2:
         return []

@@ -67,7 +67,6 @@ def _convert(args: argparse.Namespace, log: Any) -> int:
 
 
 def _topic_contents(chosen: Any, extras: Any) -> dict[str, dict[str, Any]]:
-    """Return what each topic holds."""
     found = {'/voltage': chosen.voltage, '/throttle': chosen.throttle,
              '/current': chosen.current, **{f'/{k}': one for k, one in extras.signals.items()}}
     rows = {topic: {'field': one.name, 'scale': one.scale, 'what': one.words, 'unit': one.unit,

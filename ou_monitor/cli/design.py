@@ -18,7 +18,6 @@ from ou_monitor.stream.files import read_yaml
 
 
 def _list(args: argparse.Namespace) -> None:
-    """Show the components with defaults and units."""
     network = PowerNetwork()
     values = asdict(network)
     output.tell(args, Document('Components', '', (), [Table(['component', 'default', 'unit'], [

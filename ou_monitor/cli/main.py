@@ -79,7 +79,6 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
 
 
 def _options(parser: argparse.ArgumentParser, command: str) -> list[str]:
-    """Return the long options of a command."""
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             chosen = action.choices[command]

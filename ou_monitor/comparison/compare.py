@@ -116,7 +116,6 @@ def _samples(recording: Recording, notes: list[str]) -> tuple[Readings, float]:
 
 
 def _begin(samples: Readings, fit_until: float | None, fitted: bool) -> int:
-    """Return the first sample that is simulated."""
     duration = float(samples.t[-1])
     until = (0.5 * duration if fitted else 0.0) if fit_until is None else fit_until
     if not 0.0 <= until < duration or (fitted and not until > 0.0):

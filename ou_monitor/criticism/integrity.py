@@ -128,7 +128,6 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
 
 
 def _joined(samples: Samples, t: FloatArray, v: FloatArray, u: FloatArray | None) -> Samples:
-    """Insert further samples."""
     at = np.searchsorted(samples.t, t)
     more = None if samples.throttle is None or u is None else np.insert(samples.throttle, at, u)
     return Samples(np.insert(samples.t, at, t), np.insert(samples.voltage, at, v), more)

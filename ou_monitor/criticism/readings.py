@@ -184,7 +184,6 @@ def _quantiles(v: FloatArray, *shares: float) -> list[float]:
 
 
 def _bad_notes(t: FloatArray, v: FloatArray, bad: npt.NDArray[np.bool_]) -> list[str]:
-    """Return notes of the samples left out."""
     rest = f'while all others lie within {_range(v[~bad])} V'
     values, count = np.unique(v[bad], return_counts=True)
     notes = [f'{many} samples read exactly {_short(value)} V, {rest}: taken as an error code, or '

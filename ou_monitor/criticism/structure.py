@@ -286,7 +286,6 @@ def _beside_lines(samples: Samples, terms: tuple[Term, ...], events: Events | No
 def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
               rough: bool = False, only: Sequence[int] | None = None, begun: bool = False
               ) -> GaussianFit:
-    """Fit by scoring, with numerical derivatives."""
     rounds = _FEW_ROUNDS if rough else _ROUNDS
     run = _filter(samples, terms, events)
     states, cost = run.kalman.shape, run.cost

@@ -95,7 +95,6 @@ def without(samples: Samples, model: Composite, *indices: int, plain: Composite 
 
 def _fitted(samples: Samples, terms: Sequence[Term], known: Composite | None
             ) -> Composite | None:
-    """Return a fit to everything; None if it fails."""
     try:
         found = fit_composite(samples, terms, slice(0, samples.n), known, rough=True)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):

@@ -188,7 +188,6 @@ def _price(fitter: Fitter, beside: Composite, name: str, least: float = decision
 
 
 def _accept(search: Search, best: Trial, trials: Sequence[Trial]) -> None:
-    """Accept a trial; trials that tie are its rivals."""
     search.rivals[best.name] = decision.rivals_of(
         best.name, [(trial.name, trial.evidence) for trial in trials])
     search.log.append(f'{best.name}: {best.evidence:.1f} nats; '
@@ -282,7 +281,6 @@ def _without(fitter: Fitter, composite: Composite, name: str) -> Composite | Non
 
 
 def _in_full(fitter: Fitter, found: Composite) -> Composite:
-    """Return the better of a rough and a full fit."""
     full = fitter.fit(found.terms, found)
     return full if full is not None and fitter.evidence(full) > fitter.evidence(found) else found
 

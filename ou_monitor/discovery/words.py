@@ -359,12 +359,12 @@ PLAIN_NAMES = {
     'tone': 'a line at a fixed frequency',
     'volatility': 'noise that comes and goes',
 }
-# Names with an underscore; the others are English words, and are replaced only as causes.
+# Names with an underscore; the others are English words.
 _CODE = re.compile(r'(?<![\w(])(' + '|'.join(
     name for name in sorted(PLAIN_NAMES, key=len, reverse=True) if '_' in name) + r')(?![\w)])')
 
 
-def plain(text: str, causes: Sequence[str] = ()) -> str:
+def plain(text: str) -> str:
     """Return a text with the plain name of each cause before its name in code."""
     said: set[str] = set()
 
@@ -376,9 +376,6 @@ def plain(text: str, causes: Sequence[str] = ()) -> str:
         return both_names(name)
 
     text = _CODE.sub(both, text)
-    for name in dict.fromkeys(causes):
-        if '_' not in name and name in PLAIN_NAMES:
-            text = re.sub(rf'(?<![\w(]){name}(?![\w)])', both_names(name), text, count=1)
     return text[:1].upper() + text[1:]
 
 

@@ -102,7 +102,6 @@ def _level(level: LevelResult, options: Options) -> dict[str, Any]:
 
 
 def _facts(found: Overview) -> dict[str, float]:
-    """Return the columns of lowest voltage, dips and sag."""
     lowest, dips, sag = found.facts.lowest, found.facts.dips, found.facts.sag
     there = found.sag if sag.known else (NAN, NAN, NAN)
     return {

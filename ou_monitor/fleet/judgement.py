@@ -495,7 +495,6 @@ def _is_of_vehicle(values: Values, vehicle: str) -> npt.NDArray[np.bool_]:
 
 
 def _vehicles(values: Values, within: Outliers, rate: float, seed: int) -> VehicleValues:
-    """Compare the vehicles with each other."""
     names = tuple(sorted(set(values.vehicles) - {''}))
     scatter = float(np.nan_to_num(within.scatter))
     value, error = np.zeros(len(names)), np.zeros(len(names))

@@ -408,7 +408,6 @@ class AdaptiveFilterNode(MonitorNode):
         self.diagnose('adaptive low-pass', level, summary, fields, self._topic)
 
     def _decided_by(self, supply: KnownSupply) -> str:
-        """Return in words what determines the cutoff now."""
         low_pass = self.low_pass
         s, bound = low_pass.settings, low_pass.bound
         if not self._passed:
@@ -469,7 +468,6 @@ class AdaptiveFilterNode(MonitorNode):
             f'({1e3 * self._delay:.3g} ms) at {s.lag_frequency:g} Hz{self._of_notches()}.')
 
     def _of_notches(self) -> str:
-        """Return the state of the notches in words."""
         notch = self._notch
         if not notch.settings.count:
             return ''
@@ -480,7 +478,6 @@ class AdaptiveFilterNode(MonitorNode):
 
 
 def _of_filter(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the parameters that belong to the filter itself."""
     return {p.name: values[p.name] for p in FILTER_PARAMETERS}
 
 

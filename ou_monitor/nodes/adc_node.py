@@ -143,7 +143,6 @@ class AdcNode(MonitorNode):
         self.diagnose('adc', level, summary, fields, self._device)
 
     def _close(self) -> None:
-        """Stop the buffer."""
         assert self._buffer is not None
         try:
             self._buffer.close()

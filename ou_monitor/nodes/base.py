@@ -200,7 +200,6 @@ class MonitorNode(Node):
         return call
 
     def _take_fault(self, error: Exception) -> None:
-        """Count and log an exception of a callback, and recover."""
         words = ' '.join(str(error).split())[:200]
         self.fault = f'{type(error).__name__}: {words}' if words else type(error).__name__
         self.faults += 1

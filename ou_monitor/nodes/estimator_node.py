@@ -121,7 +121,6 @@ class EstimatorNode(MonitorNode):
                                      *self._sources.topics])
 
     def _open_latch(self, name: str) -> LatchFile | None:
-        """Open the file of the latch; restore a latched flag."""
         if not name:
             return None
         latch = LatchFile(Path(get_logging_directory()) / Path(name).expanduser(),
@@ -270,7 +269,6 @@ class EstimatorNode(MonitorNode):
             stream.thin //= 2
 
     def _watch_throttle(self) -> None:
-        """Invalidate a throttle that has fallen silent."""
         age = self._throttle_silence.age
         limit = self._throttle_limit()
         if age is not None and age > limit and not math.isnan(self._stream.throttle):
@@ -424,7 +422,6 @@ class EstimatorNode(MonitorNode):
 
 
 def _entry(learned: LoadStart, found: ModelComparison) -> dict[str, object]:
-    """Return the entry of a flight in the history of its model."""
     values = {'level_v': learned.volts, 'sag_ratio': found.sag_ratio,
               'sag_ratio_se': found.sag_ratio_se, 'resistance_ohm': learned.resistance,
               'noise_v': learned.noise}

@@ -149,7 +149,6 @@ class PolledInput:
         self._bytes = 0
 
     def _broken(self, index: int, why: str) -> None:
-        """Leave out a message that cannot be read."""
         self.unreadable += 1
 
     @property
@@ -294,7 +293,6 @@ class SourceFinder:
             self._note(quantity, problem)
 
     def _take(self, source: Source, topic: str) -> None:
-        """Record an opened source."""
         assert source.spec is not None
         self.opened[source.quantity] = source
         self._node.get_logger().info(
@@ -302,7 +300,6 @@ class SourceFinder:
             f"(msg_config '{source.config}')")
 
     def _note(self, quantity: str, problem: str) -> None:
-        """Log a problem once until it changes."""
         if problem and self.problems.get(quantity) != problem:
             self._node.get_logger().warning(problem, throttle_duration_sec=10.0)
         self.problems[quantity] = problem

@@ -79,7 +79,6 @@ def _serve(host: str, port: int, estimator: str, low_pass: str) -> int:
 
 
 def _local(host: str) -> bool:
-    """Return whether an address is local to this machine."""
     try:
         return host == 'localhost' or ipaddress.ip_address(host.strip('[]')).is_loopback
     except ValueError:

@@ -29,7 +29,6 @@ _CONFIG = Parameter('msg_config', AUTO,
 
 
 def _where(quantity: str, words: str) -> tuple[Parameter, ...]:
-    """Return the parameters that locate a quantity."""
     return (
         Parameter(f'{quantity}.topic', '',
                   f'Topic of the {words}; empty: as the msg_config says.'),

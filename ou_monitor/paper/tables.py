@@ -239,7 +239,6 @@ def doubled(network: PowerNetwork) -> tuple[Rail, Rail]:
 
 
 def _elasticity(before: float, after: float) -> float:
-    """Return d ln y / d ln C from a doubling of C."""
     return math.log(after / before) / math.log(2.0)
 
 

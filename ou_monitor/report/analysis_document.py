@@ -250,7 +250,6 @@ def _column(values: Sequence[float] | Sequence[tuple[float, float]]) -> FloatArr
 
 
 def _with_levels(plot: Plot, x: FloatArray, y: FloatArray, ends: FloatArray) -> None:
-    """Add the load levels with their intervals, shape (n, 2)."""
     low, high = ends.reshape(-1, 2).T
     plot.bars(x, low, high, '', 7).markers(x, y, 'load levels', 7)
 
@@ -388,7 +387,6 @@ def _changes(analysis: Analysis, fit: Relaxation) -> Table:
 
 
 def _voltage(analysis: Analysis) -> Plot:
-    """Return the voltage, with its limit and the load levels."""
     plot = voltage_plot(analysis.recording, analysis.overview.limit)
     return _with_segments(plot, analysis) if analysis.recording.has_throttle else plot
 
@@ -403,7 +401,6 @@ def voltage_plot(recording: Recording, limit: float) -> Plot:
 
 
 def _over(recording: Recording, title: str, unit: str, height: int, log: bool = False) -> Plot:
-    """Return an empty plot over the time of a recording."""
     return Plot(title, 'time, s', unit, height=height, log_y=log).limits(
         x=(0.0, max(recording.duration, 1e-9)))
 
@@ -413,7 +410,6 @@ def _since_start(recording: Recording, t: FloatArray) -> FloatArray:
 
 
 def _with_segments(plot: Plot, analysis: Analysis) -> Plot:
-    """Shade the segments used for the load levels."""
     t = _since_start(analysis.recording, analysis.recording.t)
     for k, level in enumerate(_drawn(analysis)):
         for s in level.segments:

@@ -50,7 +50,6 @@ def design_document(result: Design, source: str, taken: str = '', command: str =
 
 
 def _risk(result: Design) -> Plot:
-    """Return the risk over capacitance, with the target."""
     farads = np.array([row.capacitance for row in result.rows])
     plot = Plot('Risk by capacitance', 'bulk capacitance, uF', 'probability', log_x=True,
                 log_y=True, legend_row=True).limits(y=(_LEAST_RISK, 2.0))

@@ -485,7 +485,6 @@ def _strips(fleet: Fleet) -> list[Part]:
 
 
 def _by_vehicle(fleet: Fleet, values: Values) -> Plot:
-    """Return a strip of dots for each vehicle."""
     plot = Plot(f'{_TITLES[values.name]} of every recording', 'vehicle', _UNITS[values.name],
                 height=260, log_y=values.name in LOGARITHMIC)
     for k in range(0, len(fleet.vehicles), 2):

@@ -277,12 +277,20 @@ def _head(text: str) -> str:
 
 
 def html(document: Document) -> str:
-    """Return a document as a page."""
+    """Return a document as a whole page, which loads nothing else."""
     again = [Section('To repeat this', [Code(document.command)], folded=True)
              ] if document.command else []
-    return _page(document.title, document.subject, (
-        f'<p class="headline">{_set(document.headline)}</p>\n'
-        + _joined([*document.parts, *again])))
+    body = _joined([*document.parts, *again])
+    text, source = _script() if 'class="plot-data"' in body else ('', "'none'")
+    policy = (f"default-src 'none'; script-src {source}; style-src 'unsafe-inline'; "
+              "base-uri 'none'; form-action 'none'")
+    style = _stylesheet() + (_file('plots.css') if text else '')
+    script = f'<script>{text}</script>\n' if text else ''
+    return (f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"/>\n'
+            f'<meta http-equiv="Content-Security-Policy" content="{policy}"/>\n'
+            '<meta name="viewport" content="width=device-width, initial-scale=1"/>\n'
+            f'<title>{escape(document.title)}</title>\n<style>{style}</style></head>\n'
+            f'<body>\n{_top(document)}{body}\n{script}</body></html>\n')
 
 
 def section(document: Document) -> str:
@@ -290,9 +298,12 @@ def section(document: Document) -> str:
     # Nesting limits the rules to this section.
     style = _stylesheet().replace(':root', 'article').replace('body {', 'article {')
     return (f'<div class="ou-monitor"><style>.ou-monitor {{{style}}}</style><article>\n'
-            f'<h1>{escape(document.title)}</h1>\n<p{_SOFT}>{escape(document.subject)}</p>\n'
-            f'<p class="headline">{_set(document.headline)}</p>\n'
-            f'{_joined(document.parts, live=False)}\n</article></div>\n')
+            f'{_top(document)}{_joined(document.parts, live=False)}\n</article></div>\n')
+
+
+def _top(document: Document) -> str:
+    return (f'<h1>{escape(document.title)}</h1>\n<p{_SOFT}>{escape(document.subject)}</p>\n'
+            f'<p class="headline">{_set(document.headline)}</p>\n')
 
 
 def _joined(parts: Sequence[Part], live: bool = True) -> str:
@@ -347,18 +358,3 @@ def _table(part: Table) -> str:
         '<div class="scroll"><table><thead>' + line('th', [_head(head) for head in part.heads])
         + '</thead><tbody>' + ''.join(line('td', row) for row in part.rows)
         + '</tbody></table></div>')
-
-
-def _page(title: str, subtitle: str, body: str) -> str:
-    """Return a whole page that loads nothing else."""
-    text, source = _script() if 'class="plot-data"' in body else ('', "'none'")
-    policy = (f"default-src 'none'; script-src {source}; style-src 'unsafe-inline'; "
-              "base-uri 'none'; form-action 'none'")
-    style = _stylesheet() + (_file('plots.css') if text else '')
-    script = f'<script>{text}</script>\n' if text else ''
-    return (f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"/>\n'
-            f'<meta http-equiv="Content-Security-Policy" content="{policy}"/>\n'
-            '<meta name="viewport" content="width=device-width, initial-scale=1"/>\n'
-            f'<title>{escape(title)}</title>\n<style>{style}</style></head>\n'
-            f'<body>\n<h1>{escape(title)}</h1>\n<p class="soft">{escape(subtitle)}</p>\n'
-            f'{body}\n{script}</body></html>\n')
