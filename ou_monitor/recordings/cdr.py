@@ -403,29 +403,23 @@ class FieldReader:
         # A damaged message may hold a signalling NaN, of which NumPy would warn.
         with np.errstate(invalid='ignore'):
             for picked, rows, layout in self._groups(table, refused):
-                # Writing to a slice is far faster than writing to indices.
-                at = slice(None) if picked.size == n else picked
-                stamp[at] = self._stamps(layout, rows)
+                stamp[picked] = self._stamps(layout, rows)
                 block, *other = (self._values(layout, rows, spec, path)
                                  for spec, path, _ in self._fields)
                 blocks.append((picked, block))
-                count[at] = block.shape[1]
+                count[picked] = block.shape[1]
                 if other and other[0].shape[1] == 1:
-                    beside[at] = other[0][:, 0]
+                    beside[picked] = other[0][:, 0]
         for k, why in sorted(refused.items()):
             self._broken(int(table.log_time[k]), why)
             kept[k] = False
         stamped = ~np.isnan(stamp)
         if not stamped.all():
             stamp[~stamped] = seconds(table.log_time[~stamped])
-        if len(blocks) == 1 and not refused:
-            # All alike and in order.
-            values = blocks[0][1].reshape(-1)
-        else:
-            begin = np.cumsum(count) - count
-            values = np.empty(int(count.sum()))
-            for picked, block in blocks:
-                values[begin[picked][:, None] + np.arange(block.shape[1])] = block
+        begin = np.cumsum(count) - count
+        values = np.empty(int(count.sum()))
+        for picked, block in blocks:
+            values[begin[picked][:, None] + np.arange(block.shape[1])] = block
         column = FieldColumn(table.log_time, stamp, stamped, count, values, beside)
         if refused:
             column = column.take(np.flatnonzero(kept))
@@ -437,9 +431,7 @@ class FieldReader:
                 ) -> Iterator[tuple[IntArray, Rows, Layout]]:
         """Yield indices, rows and layout of messages alike; note why others are refused."""
         lengths = table.end - table.begin
-        # A comparison costs a tenth of a sort, and most messages of a topic are of one length.
-        alike = lengths.size > 0 and bool((lengths == lengths[0]).all())
-        for length in (lengths[:1] if alike else np.unique(lengths)).tolist():
+        for length in np.unique(lengths).tolist():
             left = np.nonzero(lengths == length)[0]
             rows = table.rows(left, length)
             known = self._layouts.setdefault(length, [])

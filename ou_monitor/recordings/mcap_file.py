@@ -74,8 +74,6 @@ _MOST_DEFINITION, _MOST_OF_NAME = 256 * 1024, 256
 _MOST_BREAKS, _MOST_NOTES, _MOST_OTHERS = 10_000, 20, 2 * 65536
 # Block size for messages outside of chunks, bytes.
 _BLOCK = 64 * 1024
-# With more channels, only those in a chunk are searched.
-_FEW_CHANNELS = 8
 
 # Maximum ratio of unpacked chunks to the file: 20 to 30 for logs of a constant voltage, 30 000 for
 # zeros.
@@ -560,14 +558,12 @@ class McapFile:
                 '--partial to read the intact part') from error
         topics: dict[str, npt.NDArray[np.bool_]] = {}
         channels = self.channels_of(wanted)
-        if len(channels) > _FEW_CHANNELS:
-            channels = {key: channels[key] for key in np.unique(table.channel).tolist()
-                        if key in channels}
-        for key, name in channels.items():
-            # Two publishers of one topic are two channels.
-            topics[name] = topics.get(name, False) | (table.channel == key)
-        parts = {name: table.where(mine) for name, mine in topics.items()}
-        return {name: part for name, part in parts.items() if part.n}
+        for key in np.unique(table.channel).tolist():
+            if key in channels:
+                # Two publishers of one topic are two channels.
+                name = channels[key]
+                topics[name] = topics.get(name, False) | (table.channel == key)
+        return {name: table.where(mine) for name, mine in topics.items()}
 
     def _table_of(self, spans: Sequence[Span]) -> MessageTable:
         """Return the messages of some spans; register their schemas and channels."""

@@ -327,12 +327,7 @@ class ThrottleHold:
     def at(self, t: FloatArray) -> FloatArray:
         """Return the throttle at each stamp, s; NaN before the first one."""
         places, values = self.held()
-        asked, values = t + self._slack if self._slack else t, np.append(np.nan, values)
-        if places.size < asked.size and (asked[1:] >= asked[:-1]).all():
-            # Both in order, few throttles: find the first sample of each.
-            first = np.searchsorted(asked, places, 'left')
-            return np.repeat(values, np.diff(np.concatenate([[0], first, [asked.size]])))
-        return values[np.searchsorted(places, asked, 'right')]
+        return np.append(np.nan, values)[np.searchsorted(places, t + self._slack, 'right')]
 
     def forget_before(self, t: float) -> None:
         """Drop the values that no sample from `t` (s) on can need."""
