@@ -1,6 +1,5 @@
 """What the regression of the mean counts as alike, as next to each other, as a candidate."""
 
-import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,7 +7,7 @@ from ou_monitor.criticism.composite import fit_composite, view_of
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import decision, regression
 from ou_monitor.discovery.regression import (
-    _candidates, _lost, _nearby, _Regression, _there, FOLDS, mean_answer)
+    _candidates, _nearby, _Regression, _there, mean_answer)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
@@ -69,13 +68,6 @@ def made(pool, columns, voltage, monkeypatch):
     return _Regression(SimpleNamespace(n=N), model, pool), through
 
 
-def squares(through, at, fitted, scored):
-    """Return half the squares that least squares on some rows leaves on others."""
-    beta = np.linalg.lstsq(through[np.ix_(fitted, at)], through[fitted, 0], rcond=None)[0]
-    rest = through[scored, 0] - through[np.ix_(scored, at)] @ beta
-    return 0.5 * float(rest @ rest)
-
-
 @pytest.fixture
 def driven():
     """Return a pool of terms, their columns, and a voltage that two of them make."""
@@ -89,25 +81,6 @@ def driven():
     columns = [column.reshape(N, -1) for column in columns]
     voltage = 3.0 - 4.0 * u - 6.0 * slow[0] + rng.standard_normal(N)
     return pool, columns, voltage
-
-
-def test_evidence_is_the_less_of_price_and_blocks_kept_back(driven, monkeypatch):
-    """By least squares on the rows themselves; what was searched for is taken off."""
-    pool, columns, voltage = driven
-    found, through = made(pool, columns, voltage, monkeypatch)
-    ends = np.cumsum([2, *(len(term.LINEAR) for term in pool)])
-    everything = np.arange(N)
-    blocks = np.array_split(everything, FOLDS)
-    for chosen in ((), (0,), (0, 1), (1, 3, 4)):
-        at = np.concatenate([[1], *(np.arange(ends[k], ends[k + 1]) for k in chosen)]).astype(int)
-        whole = squares(through, at, everything, everything) + 0.5 * math.log(N) * at.size
-        kept = sum(squares(through, at, np.setdiff1d(everything, block), block)
-                   for block in blocks)
-        search = sum(pool[k].SEARCH for k in chosen)
-        assert found._value(chosen) == pytest.approx(-max(whole, kept) - search, rel=1e-6)
-    gram = through.T @ through
-    assert _lost(gram, gram, np.array([1, 2])) == pytest.approx(
-        squares(through, np.array([1, 2]), everything, everything), rel=1e-6)
 
 
 @pytest.mark.parametrize('start', [(), (4,), (0, 3), (0, 1, 3, 4)])
@@ -128,18 +101,6 @@ def test_the_search_ends_at_what_made_the_voltage(driven, start, monkeypatch):
     worse = tuple(sorted((0, other)))
     if found._value(chosen) > found._value(worse) + 0.1:
         assert found._best_exchange(worse, found._value(worse)) == chosen
-
-
-def test_one_of_a_kind_unless_there_may_be_several(driven, monkeypatch):
-    """Lags add up, a second sag takes the place of the first."""
-    pool, columns, voltage = driven
-    found, _ = made([*pool, LoadSag(0.2, 0.0)], [*columns, columns[0]], voltage, monkeypatch)
-    assert LoadTransient.SEVERAL and not LoadSag.SEVERAL
-    assert found._with((0, 1), 3) == (0, 1, 3) and found._with((0, 1), 5) == (1, 5)
-    assert found._one_of_a_kind([0, 1, 5, 4]) == (1, 4, 5)
-    assert found._less((0, 1, 4), 1) == (0, 4)
-    # Two that are the same are rivals only of another kind.
-    assert found._rivals((1, 5), 5) == ()
 
 
 def test_another_cause_that_does_as_well_is_a_rival(driven, monkeypatch):
