@@ -1,5 +1,6 @@
 """What the regression of the mean counts as alike, as next to each other, as a candidate."""
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,7 +8,7 @@ from ou_monitor.criticism.composite import fit_composite, view_of
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import decision, regression
 from ou_monitor.discovery.regression import (
-    _candidates, _nearby, _Regression, _there, mean_answer)
+    _candidates, _nearby, _Regression, _there, FOLDS, mean_answer)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
@@ -81,6 +82,25 @@ def driven():
     columns = [column.reshape(N, -1) for column in columns]
     voltage = 3.0 - 4.0 * u - 6.0 * slow[0] + rng.standard_normal(N)
     return pool, columns, voltage
+
+
+def test_evidence_is_the_less_of_price_and_blocks_kept_back(driven, monkeypatch):
+    """By least squares on the rows themselves; what was searched for is taken off."""
+    pool, columns, voltage = driven
+    found, through = made(pool, columns, voltage, monkeypatch)
+    ends = np.cumsum([2, *(len(term.LINEAR) for term in pool)])
+    rows = np.arange(N)
+
+    def squares(at, fitted, scored):
+        beta = np.linalg.lstsq(through[np.ix_(fitted, at)], through[fitted, 0], rcond=None)[0]
+        return 0.5 * float(np.sum((through[scored, 0] - through[np.ix_(scored, at)] @ beta)**2))
+    for chosen in ((), (0, 1), (1, 3, 4)):
+        at = np.concatenate([[1], *(np.arange(ends[k], ends[k + 1]) for k in chosen)]).astype(int)
+        kept = sum(squares(at, np.setdiff1d(rows, block), block)
+                   for block in np.array_split(rows, FOLDS))
+        whole = squares(at, rows, rows) + 0.5 * math.log(N) * at.size
+        assert found._value(chosen) == pytest.approx(
+            -max(whole, kept) - sum(pool[k].SEARCH for k in chosen), rel=1e-6)
 
 
 @pytest.mark.parametrize('start', [(), (4,), (0, 3), (0, 1, 3, 4)])
