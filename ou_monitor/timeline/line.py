@@ -451,29 +451,11 @@ class TimeLine:
               pause: float) -> list[Batch]:
         """Process samples as `take` does, but keep repeats."""
         self.count(pushed=t.size)
-        # The sum is finite only if all values are: one pass.
-        if not math.isfinite(np.add.reduce(t) + np.add.reduce(y)):
-            good = np.isfinite(t) & np.isfinite(y)
+        good = np.isfinite(t) & np.isfinite(y)
+        if not good.all():
             self.count(non_finite=t.size - int(good.sum()))
             t, y, u, i = _select(good, t, y, u, i)
-        if not t.size:
-            return []
-        first = float(t[0]) - self.newest
-        shortest = longest = first
-        if t.size > 1:
-            steps = t[1:] - t[:-1]
-            shortest = min(first, float(np.minimum.reduce(steps)))
-            # There is no pause before the very first sample.
-            longest = float(np.maximum.reduce(steps))
-            longest = longest if first == math.inf else max(longest, first)
-        if shortest > 0.0 and (longest <= pause or first == longest == math.inf):
-            self._accept(t)
-            return [Batch(t, y, u, i, shortest, longest, restart=False)]
-        return self._untangle(t, y, u, i, pause)
-
-    def _accept(self, t: FloatArray) -> None:
-        self.count(used=t.size)
-        self.newest = float(t[-1])
+        return self._untangle(t, y, u, i, pause) if t.size else []
 
     def _untangle(self, t: FloatArray, y: FloatArray, u: FloatArray | None, i: FloatArray | None,
                   pause: float) -> list[Batch]:
@@ -516,8 +498,11 @@ class TimeLine:
         if not t.size:
             return None
         steps = np.diff(t, prepend=self.newest)
-        self._accept(t)
-        return Batch(t, y, u, i, float(steps.min()), float(steps.max()), restart)
+        # There is no pause before the very first sample.
+        rest = steps if steps[0] < math.inf or t.size == 1 else steps[1:]
+        self.count(used=t.size)
+        self.newest = float(t[-1])
+        return Batch(t, y, u, i, float(steps.min()), float(rest.max()), restart)
 
     def _readings(self, batch: Batch) -> list[Batch]:
         """Drop repeats; when they are first recognised, restart the tail without them."""
