@@ -397,11 +397,6 @@ class TimeLine:
         return Counters(**self._counts)
 
     @property
-    def used(self) -> int:
-        """Return the number of samples that were passed on."""
-        return self._counts.get('used', 0)
-
-    @property
     def waiting(self) -> int:
         """Return the number of samples in the buffer."""
         return self._fill

@@ -30,8 +30,7 @@ import numpy.typing as npt
 from ou_monitor.model import arma
 from ou_monitor.model.ou_fit import known_ou
 from ou_monitor.online.estimator.fit import fit_window, FitEnd, Fitted, Maximum, MOST, TREND_SCORE
-from ou_monitor.online.estimator.quality import (
-    examine, input_flags, judge, Quality, recount)
+from ou_monitor.online.estimator.quality import examine, input_flags, judge, Quality
 from ou_monitor.online.estimator.window import (
     Kept, lagged, LOAD_LAGS, LOOK_BACK, Thinner, UNEVEN)
 from ou_monitor.records import (
@@ -114,7 +113,6 @@ class SlidingEstimator:
         self._before: Maximum | None = None
         self._before_end = -math.inf
         self._cached: Estimate | None = None
-        self._last: Estimate | None = None
 
     @property
     def window(self) -> float:
@@ -127,7 +125,7 @@ class SlidingEstimator:
         self._work_off()
         self._window = _positive('window', value, 's')
         self._slide()
-        self._cached = self._last = None
+        self._cached = None
 
     def reset(self) -> None:
         """Clear the window; keep the counters."""
@@ -135,7 +133,7 @@ class SlidingEstimator:
         self._line.forget()
         self._line.count(resets=1)
         self._forget()
-        self._cached = self._last = None
+        self._cached = None
 
     def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike,
              throttle: npt.ArrayLike | None = None) -> None:
@@ -178,14 +176,8 @@ class SlidingEstimator:
     def estimate(self) -> Estimate:
         """Return the estimate for the window that ends at the newest sample."""
         if self._cached is None or self._cached.counters != self._line.counters:
-            used = self._line.used
             self._work_off()
-            if self._last is not None and self._line.used == used == self._last.counters.used:
-                # Nothing new in the window: return exactly the same numbers.
-                self._last = recount(self._last, self._line.counters)
-            else:
-                self._last = self._estimate()
-            self._cached = self._last
+            self._cached = self._estimate()
         return self._cached
 
     @property

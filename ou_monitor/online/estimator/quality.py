@@ -8,7 +8,7 @@ the extremes are exact findings, made without a model.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import math
 from typing import Any
 
@@ -181,14 +181,6 @@ def input_flags(counters: Counters, quality: Quality, throttle_std: float) -> li
     if counters.late or counters.non_finite:
         flags.append(Flag.IRREGULAR)
     return flags
-
-
-def recount(estimate: Estimate, counters: Counters) -> Estimate:
-    """Return the same estimate with newer counters, and the flag that goes with them."""
-    flags = estimate.flags
-    if (counters.late or counters.non_finite) and Flag.IRREGULAR not in flags:
-        flags = (*flags, Flag.IRREGULAR)
-    return replace(estimate, counters=counters, flags=flags)
 
 
 def _level(fit: Fitted, throttle: float, moves: bool) -> tuple[float, float]:
