@@ -1,18 +1,15 @@
 """Every cheap command on a recorded run, and on real ones where they are: no traceback."""
 
-import os
-from pathlib import Path
 
 from every_command import run, runs_of, wide
-from project import ROOT
+from project import REAL, ROOT
 import pytest
 
-REAL = os.environ.get('OU_MONITOR_REALDATA', '')
 
 
 @pytest.mark.parametrize('path', [
     # The second is almost white: relative errors of 4e4.
-    ROOT / 'bags/recorded/micromouse_3.csv', Path(REAL or '.') / 'px_tg1.csv'],
+    ROOT / 'bags/recorded/micromouse_3.csv', REAL / 'px_tg1.csv'],
     ids=lambda path: path.stem)
 def test_no_command_breaks_off(path, tmp_path):
     """Status 0, or 2 with one line; in the JSON nothing that is not known."""

@@ -2,17 +2,14 @@
 
 import json
 import math
-import os
-from pathlib import Path
 
 import numpy as np
 from ou_monitor import MonitorSettings, read_recording, SupplyMonitor
 from ou_monitor.cli.main import main
 from ou_monitor.fleet.analysis import work
-from project import ROOT
+from project import REAL, ROOT
 import pytest
 
-REAL = Path(os.environ.get('OU_MONITOR_REALDATA', 'nowhere'))
 # Recording, limit in V, and the part of it that is taken, s.
 RECORDINGS = [
     (ROOT / 'bags/recorded/gecko_gyro.csv', 15.5, (0, 6)),

@@ -1,14 +1,12 @@
 """Effects hidden in a recorded flight are found; what it shows by itself is not taken for them."""
 
 from functools import cache
-import os
-from pathlib import Path
 
 from injected import EFFECTS, noise_of
 import numpy as np
 from ou_monitor import discover, read_recording, Recording
 from ou_monitor.criticism.integrity import examine
-from project import recorded, ROOT
+from project import REAL, recorded, ROOT
 import pytest
 
 # Seconds of the flight: throttle moves all the time; 200 Hz, codes of 10 mV.
@@ -66,7 +64,6 @@ def test_codes_moved_by_what_is_no_code_are_no_holds(height):
     assert examine(Recording(t, moved, throttle)).exact == ()
 
 
-REAL = Path(os.environ.get('OU_MONITOR_REALDATA', 'nowhere'))
 # Recorded runs, and the seconds of each in which effects are hidden: short, so that it is cheap.
 FLIGHTS = {'gecko': (ROOT / 'bags' / 'recorded' / 'gecko.csv', 30.0, 40.0),
            'cf_solo': (REAL / 'cf_solo_large.csv', 10.0, 30.0)}

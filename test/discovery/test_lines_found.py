@@ -1,8 +1,6 @@
 """Which lines `discover` names: those of the supply, however much else is left, and no others."""
 
 from dataclasses import replace
-import os
-from pathlib import Path
 
 import numpy as np
 from ou_monitor import discover
@@ -18,11 +16,10 @@ from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.tones import Resonance, Tone
 from ou_monitor.records import NAN, Recording
-from project import recorded
+from project import needs_recordings, REAL, recorded
 import pytest
 from simulated_recordings import bare
 
-REAL = Path(os.environ.get('OU_MONITOR_REALDATA', 'nowhere'))
 RATE = 50.0
 T = np.arange(2000) / RATE
 RAIL = OU(20.0, 0.1, 15.0)
@@ -92,7 +89,7 @@ def test_the_flown_path_is_no_line_of_the_supply(frequency, terms, line):
     assert {'load_sag', 'load_transient'} & {cause.name for cause in found.causes}
 
 
-@pytest.mark.skipif(not (REAL / 'xt_pico_a.csv').exists(), reason='recorded runs are elsewhere')
+@needs_recordings
 def test_analyze_and_discover_name_the_same_lines_of_a_comb():
     """A second of xt_pico_a, a comb of 106.5 Hz: each clear line of one is one of the other."""
     whole = recorded(REAL / 'xt_pico_a.csv')
