@@ -88,15 +88,17 @@ def test_explained_needs_statistics_errors_falls_and_parameters():
     """A statistic outside, larger errors, more wrong falls, a parameter at an end forbid it."""
     falls = CrossingRate(14.0, 46.0, 15.5, 2.9, 2.0, 1.0, 0.5)
     assert falls.worse and not replace(falls, extended=20.0).worse
-    assert not replace(falls, extended=44.0, baseline=45.0).worse
+    # 1.96 of the error of both, 2.06, is 4.04.
+    for extended, worse in ((42.1, False), (41.8, True)):
+        assert replace(falls, extended=extended, baseline=45.0).worse is worse
     (said,) = doubts((OU(60.0, 0.3, 5.0),), falls, 60.0, 0.001)
     assert judge([], 1, (said,)) is Verdict.PARTLY_EXPLAINED
     assert all(words in said for words in ('2.9', '46', '15.5'))
     good = CrossingRate(14.0, 46.0, 15.5, 44.0, 2.0, 1.0, 0.5)
     assert len(doubts((OU(60.0, 0.3, 5.0),), good, 60.0, 0.001, larger=True)) == 1
     lag = LoadTransient(0.2, 0.0005, 0.0)
-    assert doubts((lag,), good, 60.0, 0.001) == ('tau of load_transient stands at the end of the '
-                                                 'range',)
+    (said,) = doubts((lag,), good, 60.0, 0.001)
+    assert 'tau of load_transient' in said
     assert not doubts((replace(lag, tau=0.1), replace(lag, tau=6000.0, delay=0.02)), good, 60.0,
                       0.001)
     steep = LoadDependentSigma((0.0, 1.0), (0.0, 4.0))
