@@ -33,6 +33,8 @@ PLAIN = (
     ('BAT2', 'Curr', CURRENT, 0, 'second battery'),
     ('CURR', 'Volt', VOLTAGE, 0, 'battery'),
     ('CURR', 'Curr', CURRENT, 0, 'battery'),
+    # Until 2015, in mV.
+    ('CURR', 'Vcc', VOLTAGE, None, '5 V rail'),
     ('CUR2', 'Volt', VOLTAGE, 0, 'second battery'),
     ('CUR2', 'Curr', CURRENT, 0, 'second battery'),
     ('POWR', 'Vcc', VOLTAGE, None, '5 V rail'),
@@ -273,8 +275,8 @@ def _plain(name: str, kind: str, columns: dict[str, list[float]],
         if quantity == THROTTLE:
             scale = _throttle_scale(values)
         elif field in whole:
-            # Logs of before 2014 hold hundredths in whole numbers.
-            scale = 0.01
+            # Logs of before 2014 hold hundredths in whole numbers, and mV of the rail.
+            scale = 0.001 if field == 'Vcc' else 0.01
         one = Series(f'{name}.{field}', quantity, t, values * scale, f'{scale:g}', words, rank,
                      name)
         if quantity != THROTTLE and one.silent:

@@ -80,6 +80,8 @@ def test_units_of_old_logs_are_converted(tmp_path):
     np.testing.assert_allclose(chosen.voltage.values, 11.0 + 0.01 * np.arange(50), rtol=1e-12)
     np.testing.assert_allclose(chosen.current.values, 2.5)
     np.testing.assert_allclose(chosen.voltage.t, 0.1 * np.arange(50), atol=1e-9)
+    rail = choose(path, found, voltage='CURR.Vcc').voltage
+    np.testing.assert_allclose(rail.values, 4.9, rtol=1e-6)
 
 
 def test_a_log_without_a_battery_names_the_missing_messages(tmp_path):
