@@ -473,7 +473,8 @@ class Recording:
     voltage : ndarray, shape (n,)
         Voltage, V, finite.
     throttle : ndarray, shape (n,)
-        Throttle 0..1, the last value known at each stamp; NaN where unknown.
+        Throttle 0..1, the last value known at each stamp; NaN where unknown, as without it.  A
+        number holds for all samples.
     name : str
         Name for messages and pages.
     source : dict
@@ -498,7 +499,7 @@ class Recording:
 
     t: FloatArray
     voltage: FloatArray
-    throttle: FloatArray
+    throttle: FloatArray = field(default_factory=lambda: np.array(NAN))
     name: str = ''
     source: dict[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
@@ -507,12 +508,22 @@ class Recording:
 
     def __post_init__(self) -> None:
         """Convert dates and masked values; refuse arrays that cannot be one recording."""
+        # Series of pandas are paired by place, so that two orders would be mixed in silence.
+        found: list[Any] = [getattr(given, 'index', None) for given in (
+            self.t, self.voltage, self.throttle, self.current)]
+        # `index` of a list is a method.
+        order = [index for index in found if index is not None and not callable(index)]
+        if not all(order[0].equals(other) for other in order[1:]):
+            raise ValueError('the series have different indices: align them first')
         object.__setattr__(self, 't', as_seconds(self.t))
         # `abs` would copy the stamps.
         far = (self.t > MOST_STAMP) | (self.t < -MOST_STAMP)
         if (beyond := self.t[np.isfinite(self.t) & far]).size:
             raise ValueError(f'a stamp of {beyond[0]:.4g} s is implausible: give all stamps in s, '
                              'or all as dates')
+        if self.throttle is None or np.ndim(self.throttle) == 0:
+            object.__setattr__(self, 'throttle', np.full(
+                self.t.shape, NAN if self.throttle is None else self.throttle))
         for name in ('voltage', 'throttle', 'current'):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, as_numbers(getattr(self, name)))

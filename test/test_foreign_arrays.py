@@ -139,6 +139,39 @@ def test_masked_values_are_unknown():
         k == 0 for k in range(N)]
 
 
+class Indexed(Axis):
+    """A `pandas.Series`: an array with an index, which has `equals`."""
+
+    def __init__(self, values, order):
+        """Keep values and index."""
+        super().__init__(values)
+        self.index = self
+        self._order = order
+
+    def equals(self, other):
+        """Return whether two indices are the same."""
+        return self._order == other._order
+
+
+def test_series_of_two_orders_are_refused():
+    """They would be paired by place; the same order, an array or a list beside them will do."""
+    volts, throttle = Indexed(VOLTS, 'by time'), np.full(N, 0.3)
+    for beside in (Indexed(throttle, 'by time'), throttle, throttle.tolist()):
+        np.testing.assert_array_equal(Recording(SECONDS, volts, beside).throttle, throttle)
+    with pytest.raises(ValueError, match='different indices: align them'):
+        Recording(SECONDS, volts, Indexed(throttle, 'by size'))
+    with pytest.raises(ValueError, match='different indices'):
+        Recording(Indexed(SECONDS, 'by size'), volts)
+
+
+def test_a_recording_without_throttle():
+    """Left out or None it is unknown; a number holds for all samples."""
+    for recording in (Recording(SECONDS, VOLTS), Recording(DATES, VOLTS, None)):
+        assert recording.throttle.shape == (N,) and not recording.has_throttle
+    assert analyze(Recording(SECONDS, VOLTS)).supply.lowest.voltage_v == VOLTS.min()
+    np.testing.assert_array_equal(Recording(SECONDS, VOLTS, 0.3).throttle, np.full(N, 0.3))
+
+
 @pytest.mark.parametrize('t, volts', [
     (SECONDS, DATES), (SECONDS, VOLTS.astype(str)), (SECONDS.astype(str), VOLTS),
     (SECONDS, VOLTS.astype(complex)),
