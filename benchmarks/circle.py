@@ -1,0 +1,99 @@
+"""
+Models that `discover` finds, simulated and criticised again: alike, with nothing new, or named.
+
+    OU_MONITOR_REALDATA=FOLDER python benchmarks/circle.py --page doc/results/circle.md
+
+Each model is drawn under the throttle of its own recording, with fresh seeds.  `compare` with the
+model must call the drawing alike; `discover` must find no cause that the model lacks; a tone that
+is added to the model must be found, with its frequency.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+import sys
+import tempfile
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+import numpy as np  # noqa: E402
+from ou_monitor import compare, discover, read_recording, Recording, simulate  # noqa: E402
+from ou_monitor.cli.recorded import model_text  # noqa: E402
+from ou_monitor.comparison.yardstick import Likeness  # noqa: E402
+from ou_monitor.model.supply import SupplyModel  # noqa: E402
+from ou_monitor.model.terms.tones import Tone  # noqa: E402
+from ou_monitor.recordings.model_file import read_model  # noqa: E402
+from tables import deliver, recorded, table  # noqa: E402
+
+# Five flights and a robot: file below OU_MONITOR_REALDATA, and flight of a log.
+MODELS = {
+    'gecko': ('bf_gecko_a.csv', None), 'nazgul': ('raw/bf_nazgul_4s.bbl', 1),
+    'hiro': ('raw/bf_hiro_4s.BFL', None), 'bf3s': ('raw/bf_3s_erpm2.bbl', 2),
+    'cf_solo': ('cf_solo_large.csv', None), 'mm_bench_3': ('mm_bench_3.csv', None)}
+# Part of each recording that is drawn again, s.
+SECONDS = 60.0
+# The tone that is added: its peak over the rms of the readings' differences, and its share of the
+# sampling rate, where neither load nor OU have much.
+AMPLITUDE, SHARE = 1.0, 0.23
+# Relative error of a frequency that is called the same.
+NEAR = 1e-3
+
+
+def saved(name: str, path: Path) -> Recording:
+    """Save the model of a recording, and return its first minute."""
+    file, flight = MODELS[name]
+    recording = read_recording(recorded() / file, flight=flight, end=SECONDS)
+    path.write_text(model_text(discover(recording).record, recording))
+    return recording
+
+
+def named(recording: Recording, model: SupplyModel) -> list[str]:
+    """Return the causes that `discover` finds and the model lacks."""
+    own = {term.NAME for term in model.terms}
+    return [cause.name for cause in discover(recording).causes if cause.name not in own]
+
+
+def row(name: str, seeds: int) -> list[str]:
+    """Draw a model of a recording, and judge what is drawn."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / 'model.yaml'
+        recording = saved(name, file)
+        filed = read_model(file)
+    model, foreign = filed.model, Counter[str]()
+    alike = clean = found = 0
+    rate = 1.0 / float(np.median(np.diff(recording.t)))
+    draw = partial(simulate, throttle=recording, rate=rate)
+    size = AMPLITUDE * float(np.diff(recording.voltage).std())
+    hum = SHARE * rate
+    hummed = replace(filed, model=SupplyModel((*model.terms, Tone(size, hum, 0.0, 0.0))))
+    for seed in range(seeds):
+        drawn = draw(filed, seed=seed).recording
+        alike += compare(drawn, model).verdict is Likeness.LOOKS_LIKE_IT
+        new = named(drawn, model)
+        clean += not new
+        foreign.update(new)
+        found += any(isinstance(cause.term, Tone) and abs(cause.term.frequency / hum - 1.0) < NEAR
+                     for cause in discover(draw(hummed, seed=seed).recording).causes)
+        print(name, seed, alike, clean, dict(foreign), found, file=sys.stderr, flush=True)
+    return [name, ', '.join(term.NAME for term in model.terms), f'{alike} of {seeds}',
+            f'{clean} of {seeds}', ', '.join(f'{k} {n}' for k, n in foreign.most_common()) or '-',
+            f'{found} of {seeds}']
+
+
+def main() -> None:
+    """Measure, and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('names', nargs='*', default=list(MODELS))
+    parser.add_argument('--seeds', type=int, default=10)
+    parser.add_argument('--page', type=Path)
+    args = parser.parse_args()
+    head = ('model of', 'terms', 'looks like it', 'nothing new', 'new', 'tone found')
+    deliver(table(head, [row(name, args.seeds) for name in args.names]), args.page, 'circle')
+
+
+if __name__ == '__main__':
+    main()
