@@ -30,7 +30,7 @@ HIGHEST_CELL, LOWEST_CELL, _BEGINS = 4.45, 2.0, 3.0
 # Voltage of an empty lithium cell under load, V (vbat_min_cell_voltage of Betaflight, and the
 # default of design).
 CELL_LIMIT = 3.3
-# Length of the medians whose highest is the voltage of the full pack, s.
+# The highest median of the voltage over this time is the voltage of the full pack, s.
 _FULL = 0.5
 
 # Maximum cells of the known classes; the largest known quads have 6.

@@ -19,9 +19,8 @@ stationary OU levels has any rejection.  The first rule that applies names the l
 5. neighbours uncorrelated, or more white noise than relaxation, or relaxation
    faster than the sampling: 'Gaussian';
 6. lines carry most of the variance, or one relaxation does not leave
-   independent innovations, or a second one is detected: 'stationary stochastic'; if it does:
-   'diffusion';
-   without a usable fit 'undetermined'.
+   independent innovations, or a second one is detected: 'stationary stochastic';
+7. otherwise 'diffusion', or 'undetermined' without a usable fit.
 
 Limits: the power of the tests depends on the length of the level; impulses, and an intensity that
 changes within a block, look alike.
@@ -289,7 +288,7 @@ _WANDERS = 0.5
 
 @dataclass(frozen=True)
 class LevelSag:
-    """Sag of one level, of the facts."""
+    """Sag of one level, from the supply facts."""
 
     sag: float = NAN  # V, positive
     sag_se: float = NAN  # V

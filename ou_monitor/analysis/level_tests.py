@@ -10,7 +10,8 @@ variance_drift Layard's test of equal variances of blocks (J. Am. Stat. Assoc. 6
                which heavy tails do not upset
 gaussian       D'Agostino & Pearson's K^2 of skewness and kurtosis, of innovations over
                the standard deviation of their block
-impulses       the largest innovation (Sidak) or a positive excess kurtosis, each at half
+impulses       the largest innovation (Sidak) or a positive excess kurtosis, each at
+               half the level of the test
 correlated     lags 1..5 of the deviation, with variances robust against changing
                intensity (Lo & MacKinlay, Rev. Financ. Stud. 1, 1988)
 one_relaxation lags 1..10 of the innovations, likewise

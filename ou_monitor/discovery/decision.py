@@ -20,11 +20,11 @@ from ou_monitor.model.terms.term import Role, Term
 Statistics = Mapping[str, float]
 Kind = type[Term]
 
-# Minimum evidence of a cause, nats, after the prices of its parameters (BIC) and of its search:
+# Minimum evidence of a cause, nats, after the penalties of its parameters (BIC) and of its search:
 # odds of e^6 = 403 give 5 % false names over 22 kinds.
 ACCEPT = 6.0
-# Difference in evidence below which two causes tie, nats: odds of 20.  A cause must gain it to
-# stay.
+# Difference in evidence below which two causes tie, nats: odds of 20.  A cause that gains less is
+# removed.
 TIE = 3.0
 # Minimum share of the evidence of a larger effect for a further term of its kind (a response of
 # the mean, or a second curve of intensity over throttle); a smaller one only corrects the form.
@@ -47,8 +47,8 @@ FAILS = 4.8
 # exact.
 OWN_SHARE = 0.07
 # Maximum share of its largest sign that a latent cause may leave beside measured ones.  In 70
-# independently simulated recordings (b052f3b), right causes that left more than FAILS left 13 % at
-# most, one of them 35 %; wrong causes left 30 to 97 %.
+# independently simulated recordings (b052f3b), of the right causes that left more than FAILS, one
+# left 35 % and the others at most 13 %; wrong causes left 30 to 97 %.
 BESIDE_SHARE = 0.3
 
 
@@ -128,7 +128,7 @@ def is_shared(gains: npt.ArrayLike, errors: float = 1.0) -> bool:
     """
     parts = np.asarray(gains, dtype=np.float64)
     error = math.sqrt(parts.size) * float(parts.std(ddof=1))
-    # The margin for rounding excludes a single part, which is exactly at the limit.
+    # Margin for rounding: a single part is exactly at the limit and must not pass.
     return bool(float(parts.sum()) > errors * error * (1.0 + 1e-9))
 
 

@@ -37,7 +37,7 @@ class Criticism:
     # Normal score of the data under the plain and under the extended model.
     before: float
     after: float
-    # Band of all statistics together, which one of a hundred recordings of a correct model leaves.
+    # Band over all statistics: one recording of a correct model in a hundred leaves it.
     low: float
     high: float
     # Probability that any statistic of a correct model is as far off.

@@ -224,10 +224,10 @@ _FAR = 1.5
 # Maximum mean loss by errors of the parameters, nats per sample; at the limit these errors are as
 # large as the noise.
 _UNKNOWN = 0.5
-# Tolerance outside the throttle of the other blocks: as a share of its range, and at least.
+# Tolerance outside the throttle of the other blocks: share of its range, and minimum.
 _BEYOND, _STILL = 0.05, 0.01
-# Duration of the response to throttle that no other block contains, s: most lags of recorded
-# flights are shorter.
+# After throttle that no other block contains, samples are not scored for this time, s: most lags
+# of recorded flights are shorter.
 _AFTER = 0.2
 
 

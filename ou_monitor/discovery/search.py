@@ -285,8 +285,8 @@ def _in_full(fitter: Fitter, found: Composite) -> Composite:
     return full if full is not None and fitter.evidence(full) > fitter.evidence(found) else found
 
 
-# Initial rate of the residual after load, 1/s; from it a fit reaches minutes and tenths of a
-# second.
+# Initial rate of the residual after load, 1/s; from it a fit converges to relaxation times from
+# tenths of a second to minutes.
 _SLOW = 1.0
 
 

@@ -96,7 +96,7 @@ class AdcNode(MonitorNode):
     def _publish(self, message: Any, block: Block) -> None:
         message.header.stamp = to_time(block.stamp)
         volts = block.volts * self._gain + self._shift
-        # It is taken over as an array; a list would be checked number by number.
+        # The message takes over an array as it is, but checks each number of a list.
         message.position = array('d', volts.tobytes())
         self._output.publish(message)
         self._samples += volts.size
@@ -129,9 +129,8 @@ class AdcNode(MonitorNode):
             level, summary = Level.ERROR, f'{self._device} is no longer read: {self.problem}'
         elif age is None or age > max(SILENT, 3.0 / self.rate if self.rate > 0.0 else 0.0):
             level, summary = Level.STALE, (
-                f'No samples of {self._channel} from {self._device}'
-                + self._silence.words
-                + ': does its trigger run?')
+                f'No samples of {self._channel} from {self._device}{self._silence.words}: '
+                'does its trigger run?')
         elif holes:
             level, summary = Level.WARN, (
                 f'{summary} Samples were lost {holes} times: enlarge the block or lower the rate.')

@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
         import tornado.web  # noqa: F401
     except ImportError as error:
         raise InputError(f"live needs tornado: {how_to_install('live')}") from error
-    # A name of a node, as ROS writes it.
+    # Names of nodes with the leading slash that ROS writes.
     names = [f"/{name.strip('/')}" for name in (args.estimator, args.filter)]
     return run_ros(NAME, lambda: _serve(args.host, port, *names), [])
 
@@ -132,7 +132,7 @@ def application(node: Any, token: str) -> Any:
     html, policy = _html()
 
     class Guarded(RequestHandler):
-        """Refuses requests without the token, and pages of other names that resolve to here."""
+        """Refuses requests without the token, or by another host name that resolves to here."""
 
         def prepare(self) -> None:
             """Check the request."""

@@ -21,6 +21,7 @@ from typing import Any, Generic, TypeVar
 
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.nodes.base import wait_until
+from ou_monitor.nodes.run import one_line
 from ou_monitor.nodes.sources import message_class
 from ou_monitor.recordings.bag import BagReader
 from ou_monitor.recordings.write import LAST_HEADER_NS
@@ -194,8 +195,7 @@ class Player(Node):
         try:
             self._outputs[topic] = self.create_publisher(message_class(kind), topic, DEPTH)
         except (InputError, InvalidTopicNameException) as error:
-            self._skipped[topic] = ' '.join(
-                f"topic '{topic}' is left out: {error}".split())
+            self._skipped[topic] = one_line(f"topic '{topic}' is left out: {error}")
             self.get_logger().warning(self._skipped[topic])
 
     def going(self) -> bool:

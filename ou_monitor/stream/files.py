@@ -45,7 +45,7 @@ def plain_texts(found: Any) -> dict[str, str]:
 
 
 def open_regular(path: str | Path) -> BinaryIO:
-    """Open a regular file to read, never waiting for a FIFO; OSError: it is none."""
+    """Open a file to read, never waiting for a FIFO; OSError if it is not a regular file."""
     file = open(path, 'rb', opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         file.close()
@@ -161,7 +161,7 @@ class _BoundedLoader(yaml.SafeLoader):
         return node
 
     def compose_mapping_node(self, anchor: Any) -> Any:
-        """Compose a mapping; refuse a key that is there twice, of which YAML takes the last."""
+        """Compose a mapping; refuse a repeated key, of which YAML would take the last."""
         node = super().compose_mapping_node(anchor)
         known = set()
         for key, _ in node.value:
