@@ -225,14 +225,16 @@ def comparison_words(fleet: Fleet) -> list[str]:
                      + (f'; {counted(len(few), "tested vehicle")} '
                         f'{"has" if len(few) == 1 else "have"} fewer.' if few else '.'))
     else:
-        notes.append('No vehicle has the 5 flights that a test for drift needs.')
+        notes.append('No vehicle has the 5 flights in a known order, with known values, that a '
+                     'test for drift needs.')
     if any(np.isfinite(o.bound) for o in judged.recordings.values()):
         notes.append(
             f'Outliers: a fleet without faults shows one with {100 * OUTLIER_RATE:g} % '
             'probability (over all quantities, recordings and vehicles, if the scatter between '
             'good recordings is normal).')
     else:
-        notes.append(f'No vehicle has the {LEAST} flights that outliers among them need.')
+        notes.append(f'No vehicle has the {LEAST} flights with known values that outliers among '
+                     'them need.')
     if len(fleet.vehicles) < LEAST_VEHICLES:
         notes.append(f'Vehicles are not compared with each other: that needs {LEAST_VEHICLES}.')
     return notes
