@@ -90,9 +90,9 @@ def _gain_words(finding: Finding) -> str:
         return gain_words(gain, finding.gain_se)
     errors = ('shrink by ' if shrink > 0.0 else 'grow by ') + f'{number(100.0 * abs(shrink), 2)} %'
     return (f'One-step errors on samples not used for the fit {errors} (rms), and their size is '
-            f'{"better" if size >= 0.0 else "worse"} predicted, by '
-            f'{number(1e3 * abs(size), 2)} of the {number(1e3 * gain)} +- '
-            f'{number(1e3 * finding.gain_se, 2)} mnat gained per sample.')
+            f'{"better" if size >= 0.0 else "worse"} predicted: {1e3 * (gain - size):+.3g} and '
+            f'{1e3 * size:+.3g} mnat per sample, {number(1e3 * gain)} +- '
+            f'{number(1e3 * finding.gain_se, 2)} in all.')
 
 
 def _model_name(finding: Finding) -> str:
@@ -153,7 +153,8 @@ def _gain(finding: Finding) -> list[Part]:
     # If nothing was added to the plain OU, there is nothing to compare.
     kept = 5 if finding.causes else 3
     return [Table(['', 'observed', 'plain OU', 'extended', 'gain'][:kept],
-                  [row[:kept] for row in rows], left=[0]), Text(finding.throttle_effects.words),
+                  [row[:kept] for row in rows], left=[0]), Text(
+                      '' if finding.refused else finding.throttle_effects.words),
             Text(f'Plain OU, with nothing else in the model: {plain_model_words(baseline)}.')]
 
 

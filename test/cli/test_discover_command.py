@@ -198,7 +198,10 @@ def test_the_headline_names_the_strongest_and_what_all_are_worth():
         gain=math.log(2.0), gain_se=0.1, shrink=0.2)
     strongest, worth, passes = answer(finding)
     assert re.findall(r'\((\w+)\)', strongest) == ['tone', 'load_sag', 'drift']
-    assert re.findall(r'\d+', worth) == ['20', '470', '693', '100'] and 'every test' in passes
+    assert re.findall(r'\d+', worth) == ['20', '223', '470', '693', '100']
+    assert 'every test' in passes
+    grown = answer(replace(finding, shrink=-0.2))[1]
+    assert re.findall(r'[-+]?\b\d+', grown) == ['20', '-182', '+875', '693', '100']
     more = replace(finding, verdict=Verdict.PARTLY_EXPLAINED, refused='It strays', causes=(
         *finding.causes, *made((MeasurementNoise(0.01), 0.1, 0.01, 0.0)).causes))
     strongest, _, closer, refused = answer(more)
