@@ -25,7 +25,7 @@ def test_why_no_message_comes():
         console.waiting('rail')
         clock += 1.0
     assert [time for time, _ in said] == [100.0 + MUTE, 100.0 + MUTE + AGAIN]
-    assert said[0][1].startswith('/rail has a publisher, but no message has come')
+    assert said[0][1].startswith('/rail has a publisher, but no message has arrived')
     # One that goes and comes again has its time again.
     publishers = 0
     console.waiting('rail')

@@ -90,7 +90,7 @@ def test_time_line_of_the_supply():
     assert math.isnan(supply.now(1.0).alpha) and supply.now(1.0).sigma == 0.5
     supply.take_state(state_of(sigma='nan', sigma_se='x', status='NO_DATA', throttle=0.2))
     known = supply.now(1.0)
-    assert math.isnan(known.sigma) and known.why == 'the estimator says NO_DATA'
+    assert math.isnan(known.sigma) and known.why == 'the estimator reports NO_DATA'
     assert known.throttle == 0.2 and known.source == 'none'
     # The noise beside the load, 20 mV, is that of an OU of 63 1/s and 0.2245 V/sqrt(s).
     supply.take_state(state_of(sigma='nan', sigma_se='x', status='NO_RELAXATION', throttle=0.2,

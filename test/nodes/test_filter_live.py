@@ -187,12 +187,13 @@ def test_the_state_of_the_estimator_is_used_while_it_is_published(rig):
         def there():
             rig.state.publish(state_of(**{**good, **change}))
             drive(rig, 0.6, 0.1)
-            return value in (values_of(rig.status)[key] if key else rig.status.message)
+            return rig.status and value in (
+                values_of(rig.status)[key] if key else rig.status.message)
         wait_until(there, what=value)
     with_state(HELD)
     told('sigma_se', '0.03')
     with_state(75.0, status='QUANTIZED_HEAVILY')
-    told('', 'because the estimator says QUANTIZED_HEAVILY', status='QUANTIZED_HEAVILY')
+    told('', 'because the estimator reports QUANTIZED_HEAVILY', status='QUANTIZED_HEAVILY')
     assert rig.probe.set_parameter(NODE, 'law', 'throttle').successful
     with_state(20.0 + 130.0 * 0.625)
     told('', 'by law throttle at throttle 0.50')
