@@ -64,7 +64,7 @@ def test_the_bar_fits_and_tells_the_time_left(monkeypatch, clock, width):
 
     terminal = Terminal()
     monkeypatch.setattr('sys.stderr', terminal)
-    monkeypatch.setattr('shutil.get_terminal_size', lambda *_: os.terminal_size((width, 24)))
+    monkeypatch.setattr('shutil.get_terminal_size', lambda *_, **__: os.terminal_size((width, 24)))
     with Progress('work') as progress:
         progress(0.5)
         clock[0] += 30.0
