@@ -59,7 +59,7 @@ def test_without_a_clock_it_says_so(world):
 
     def said():
         output.publish(Float32(data=5.0))
-        return states and 'nothing comes on /clock' in states[-1].status[0].message
+        return states and 'no message arrives on /clock' in states[-1].status[0].message
     wait_until(said, what='complaint')
     assert states[-1].status[0].level == b'\x03'
     # A clock that runs, and then stops.
