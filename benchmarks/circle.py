@@ -88,7 +88,7 @@ def main() -> None:
     """Measure, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('names', nargs='*', default=list(MODELS))
-    parser.add_argument('--seeds', type=int, default=10)
+    parser.add_argument('--seeds', type=int, default=20)
     parser.add_argument('--page', type=Path)
     args = parser.parse_args()
     head = ('model of', 'terms', 'looks like it', 'nothing new', 'new', 'tone found')
