@@ -98,6 +98,24 @@ def test_slow_relaxations_lie_within_the_bounds():
     assert inside >= 13
 
 
+def test_throttle_does_not_excuse_a_slow_relaxation():
+    """
+    Of 16 rails with readings much faster than the OU, intervals of sigma hold 13.
+
+    95 %; fewer than 13 of 16 has a chance of 0.7 %.  A law of the noise's size fitted to the OU
+    itself, whose few independent values follow throttle by chance, held 9.
+    """
+    inside = 0
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        alpha = rng.uniform(4.0, 8.0)
+        t, v, u = rail(rng, 500.0, alpha, 0.02, 0.003, 8.0, sag=0.0)
+        found = fit_ou(regress(t, v, u, None), 8.0)
+        inside += found.status != 'ok' or found.sigma_95[0] < 0.02 * np.sqrt(2.0 * alpha) < \
+            found.sigma_95[1]
+    assert inside >= 13
+
+
 def test_noise_that_grows_with_changes_of_throttle():
     """
     Of 16 rails whose white noise is as large again while throttle moves, intervals hold 13.
