@@ -112,7 +112,12 @@ def cell_count(full: float) -> int:
     if not (math.isfinite(full) and full > 0.0):
         return 0
     cells = math.ceil(full / HIGHEST_CELL)
-    return cells if full / cells >= _BEGINS else 0
+    return cells if fits(full, cells) else 0
+
+
+def fits(full: float, cells: int) -> bool:
+    """Return whether a pack with this voltage, V, begins a flight with so many cells."""
+    return _BEGINS <= full / cells <= HIGHEST_CELL
 
 
 def check_cells(full: float, cells: int) -> None:

@@ -128,7 +128,8 @@ TOPICS = (
            help='msg_config with topic and field of the voltage'),
     Option('--voltage-topic', metavar='TOPIC', help='topic of the voltage'),
     Option('--throttle-topic', metavar='TOPIC', help='topic of the throttle'),
-    Option('--partial', action='store_true', help='use the intact part of a damaged file'))
+    Option('--partial', action='store_true',
+           help='use the intact part of a damaged file, and a CSV without its bad lines'))
 
 
 # Format of a CSV, if it is not detected correctly.

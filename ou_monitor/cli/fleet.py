@@ -136,6 +136,6 @@ def _options(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
     return Options(
         levels=args.levels, window=args.window,
         brownout_voltage=math.nan if limit is None else limit,
-        brownout_horizon=args.brownout_horizon,
+        brownout_horizon=args.brownout_horizon, cells=args.cells or 0,
         msg_config=config, voltage_topic=args.voltage_topic, throttle_topic=args.throttle_topic,
         partial=args.partial, discover=args.discover, seed=args.seed), more

@@ -5,21 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from ou_monitor.analysis.analyze import analyze
+from ou_monitor.analysis.crafts import check_cells, full_voltage
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.overview import Overview
 from ou_monitor.errors import InputError
+from ou_monitor.fleet.vehicles import start_of
 from ou_monitor.online.risk.first_passage import brownout_probability
+from ou_monitor.recordings.importers.formats import is_csv
 from ou_monitor.recordings.read import read_recording
-from ou_monitor.records import NAN, Recording
+from ou_monitor.records import Defect, defect_of, NAN, Recording
 from ou_monitor.text import counted, printable
-
-# Valid dates: a time before 2000 is of a clock that counts from start-up; a time after 2100 is not
-# in seconds.
-_EPOCH, _LATEST = 946684800.0, 4102444800.0
 
 
 @dataclass(frozen=True)
@@ -31,11 +31,13 @@ class Options:
     # Voltage, V, and horizon, s, of the risk; a voltage of NaN leaves the risk unknown.
     brownout_voltage: float = NAN
     brownout_horizon: float = 5.0
+    cells: int = 0  # Cells in series; 0: those of the log, else a guess
     # Arguments of `read_recording`.
     msg_config: str | None = None
     voltage_topic: str | None = None
     throttle_topic: str | None = None
-    partial: bool = False  # Whether to read the intact part of damaged bags
+    # Whether to read the intact part of damaged bags; CSVs are always read without bad lines.
+    partial: bool = False
     discover: bool = False  # Whether to search for causes, which takes some seconds a recording
     seed: int = 0  # Seed of `discover`
 
@@ -58,30 +60,35 @@ def work(path: str, options: Mapping[str, Any]) -> dict[str, Any]:
 def _analysed(path: str, options: Options) -> dict[str, Any]:
     recording = read_recording(
         path, msg_config=options.msg_config, voltage_topic=options.voltage_topic,
-        throttle_topic=options.throttle_topic, partial=options.partial)
+        throttle_topic=options.throttle_topic, partial=options.partial or is_csv(Path(path)))
     if recording.n < 2:
         raise InputError(f'{recording.name} has {counted(recording.n, "usable sample")}: nothing '
                          'can be estimated from it')
+    if options.cells:
+        check_cells(full_voltage(recording), options.cells)
     # Overflows give non-finite values, which the analysis reports in its status.
     with np.errstate(all='ignore'):
         analysis = analyze(
             recording, levels=options.levels if recording.has_throttle else None,
             window=options.window, brownout_voltage=options.brownout_voltage,
-            brownout_horizon=options.brownout_horizon)
-        start = float(recording.t[0])
-        facts = analysis.overview.facts
+            brownout_horizon=options.brownout_horizon, cells=options.cells)
+        start, start_from = start_of(recording)
+        facts, craft = analysis.overview.facts, analysis.craft
         known = analysis.sliding.risk[np.isfinite(analysis.sliding.risk)]
         return {
             'error': '', 'recording': recording.name,
             'vehicle': recording.source.get('vehicle', ''),
-            'start': start if _EPOCH <= start < _LATEST else NAN, 'duration_s': recording.duration,
+            'start': start, 'start_from': start_from, 'duration_s': recording.duration,
             'samples': recording.n, 'rate_hz': (recording.n - 1) / recording.duration,
             **_facts(analysis.overview), 'supply': facts.to_dict(),
+            'cells': craft.cells or None, 'cells_from': craft.cells_from, 'full_v': craft.full_v,
             'risk_max': float(known.max()) if known.size else NAN,
             'alpha_p': analysis.alpha_test.p_value,
             'quality': [f'{item.severity.value}: {item.text}' for item in analysis.quality],
             'levels': [_level(level, options) for level in analysis.levels],
-            'notes': list(analysis.notes), **_discovery(recording, options)}
+            'notes': list(analysis.notes), 'damage': [
+                note for note in recording.notes if defect_of(note) is Defect.DAMAGED_FILE],
+            **_discovery(recording, options)}
 
 
 def _level(level: LevelResult, options: Options) -> dict[str, Any]:
@@ -109,7 +116,8 @@ def _facts(found: Overview) -> dict[str, float]:
         'dips': dips.count if dips else NAN, 'below_s': dips.seconds if dips else NAN,
         'sag_throttle': there[0], 'sag': there[1], 'sag_se': there[2],
         'sag_full': sag.sag_v[-1] if sag.known else NAN,
-        'sag_full_se': sag.se_v[-1] if sag.known else NAN}
+        'sag_full_se': sag.se_v[-1] if sag.known else NAN,
+        'resistance': found.facts.resistance.ohm, 'resistance_se': found.facts.resistance.se_ohm}
 
 
 def _discovery(recording: Recording, options: Options) -> dict[str, Any]:

@@ -17,6 +17,7 @@ import re
 from tempfile import TemporaryFile
 from typing import Any
 
+from ou_monitor.analysis.crafts import fits
 from ou_monitor.errors import InputError
 from ou_monitor.fleet.analysis import Options, work
 from ou_monitor.fleet.find import duplicates, Found, FoundRecording
@@ -177,9 +178,21 @@ def _table(sources: Sequence[FoundRecording], results: dict[Path, dict[str, Any]
             notes.append(f"'{path}' has the same content as '{first}', but its path names "
                          f"another vehicle ('{vehicles[path].name}' instead of "
                          f"'{vehicles[first].name}'): one of the two is in the wrong place.")
+    more += [f'{vehicles[path].name or "unknown vehicle"}: {path.name}: {note}' for path in starts
+             for note in results[path]['damage']]
+    for group in {v.name for v in vehicles.values()} - {''}:
+        _raise_guesses([results[path] for path in starts if vehicles[path].name == group])
     rows = [row for source in sources for row in rows_of(
         source, whole[source.path], vehicles[source.path], flights.get(source.path),
         twice.get(source.path))]
     rows.sort(key=lambda row: (row['vehicle'] is None, row['vehicle'] or '',
                                row['flight'] is None, row['flight'] or 0, row['path']))
     return rows, [*notes, *more]
+
+
+def _raise_guesses(flights: Sequence[dict[str, Any]]) -> None:
+    """Set guesses of cells to the largest number of the vehicle that a flight can have."""
+    known = sorted({one['cells'] for one in flights if one['cells']}, reverse=True)
+    for one in flights:
+        if one['cells_from'] == 'guessed':
+            one['cells'] = next(cells for cells in known if fits(one['full_v'], cells))

@@ -3,14 +3,21 @@ The fleet table -> drifting vehicles, and outliers among recordings and vehicles
 
 Common throttle: the logarithms of sigma and alpha follow one curve over throttle for all vehicles
 (straight between knots, by Huber's estimate, with a level for each vehicle).  Recordings are moved
-along it to the median throttle; the error of the move is included.  Sag is compared at full
-throttle, extrapolated by the load model (doc/load.md).  Limits: the curve assumes the same shape,
-and the same load at a throttle, on all vehicles; recordings without throttle are not moved.
+along it to the median throttle; the error of the move is included.  Resistance and sag are those
+of `supply`, per cell where the cells are known, the sag at full throttle, extrapolated by the load
+model (doc/load.md).  Limits: the curve assumes the same shape, and the same load at a throttle, on
+all vehicles; recordings without throttle are not moved.
 
-Drift: the Mann-Kendall test, exact for few flights; it assumes only that without drift every order
-of the flights is equally likely.  Slope and interval: Theil and Sen.  Holm's procedure limits the
-probability of any false alarm in the fleet.  Limits: consecutive flights with a common cause (a
-season, a battery) look like a drift; `fewest` returns the minimum number of flights.
+Drift: a line through the logarithms over the number of the flight, weighted by their errors and a
+scatter between flights (Paule and Mandel); t test, with the scatter about the line as the scale,
+so that an error common to all flights does not count.  Holm's procedure limits the probability of
+any false alarm in the fleet.  Limits: the scatter between flights is assumed normal; consecutive
+flights with a common cause (a season, a battery) look like a drift.
+
+Few vehicles (fewer than `LEAST_VEHICLES`): the mean resistance and sag of each are compared with
+the mean of the others by a t test, with the scatter between flights, pooled, for a difference of
+more than a tenth, as the usual spread between good vehicles is unknown.  Packs are compared among
+those with as many cells.
 
 Outliers: the score of a value is its distance from the median of its group (or from the drift line
 of the group) divided by sqrt(s^2 + se^2), with its standard error se and the scatter s between
@@ -32,15 +39,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.curves import bin_width
+from ou_monitor.online.load.load_filter import LEAST_ERROR
 from ou_monitor.records import FloatArray, NAN
 from ou_monitor.text import Z95
 
 Row = Mapping[str, Any]
 IntArray = npt.NDArray[np.intp]
 USABLE = ('OK', 'SHORT_WINDOW')
-# Quantities compared -> unit; the first two on the log scale.
-QUANTITIES = {'sigma': 'V/sqrt(s)', 'alpha': '1/s', 'sag': 'V'}
-LOGARITHMIC = ('sigma', 'alpha')
+# Quantities compared, on the log scale -> unit; the first two are per cell where cells are known,
+# the others are measured at several levels of throttle.
+QUANTITIES = {'resistance': 'Ohm', 'sag': 'V', 'sigma': 'V/sqrt(s)', 'alpha': '1/s'}
+OF_PACK = {'resistance': ('resistance', 'resistance_se', 'resistance', ''),
+           'sag': ('sag_full', 'sag_full_se', 'sag', 'sag_throttle')}
+# Maximum relative error of a pack's value that is compared; with a larger one it is unknown.
+_VAGUE = 0.5
 # Bend of Huber's function, in standard deviations (95 % efficiency); maximum rounds of the fit.
 _HUBER = 1.345
 _ROUNDS = 30
@@ -83,8 +95,8 @@ class Values:
     paths: tuple[str, ...]  # Recordings
     vehicles: tuple[str, ...]  # Vehicle of each; empty where unknown
     flights: IntArray  # Number of the flight; 0 where unknown; shape (n,)
-    # Logarithm at the reference throttle (sag: V at full throttle), and its standard error with
-    # the error of the move; shape (n,).
+    # Logarithm at the reference throttle (sag: at full throttle), and its standard error with the
+    # error of the move; shape (n,).
     value: FloatArray
     error: FloatArray
     curve: CommonCurve  # Curve that was subtracted
@@ -92,11 +104,11 @@ class Values:
     # and their mean throttle, NaN where unknown; shape (n,).
     measured: FloatArray
     throttle: FloatArray
+    cells: IntArray  # Cells by which values are divided; 0: they are not; shape (n,)
 
     def shown(self, value: FloatArray | float) -> FloatArray:
         """Return numbers on the scale of `value` in the unit of the quantity."""
-        data = np.asarray(value, dtype=np.float64)
-        return np.exp(data) if self.name in LOGARITHMIC else data
+        return np.asarray(np.exp(np.asarray(value, dtype=np.float64)))
 
     def interval(self) -> tuple[FloatArray, FloatArray]:
         """Return the ends of the 95 % intervals in the unit of the quantity."""
@@ -119,11 +131,15 @@ class Values:
 
 def values_of(rows: Sequence[Row], name: str) -> Values:
     """Return one quantity of every recording."""
-    if name == 'sag':
-        once = list({row['path']: row for row in rows if row['sag_full'] is not None}.values())
-        return _values(name, once, CommonCurve(NAN), *(
-            np.array([_number(row[column]) for row in once])
-            for column in ('sag_full', 'sag_full_se', 'sag', 'sag_throttle')))
+    if name in OF_PACK:
+        whole_of, se_of, shown, at = OF_PACK[name]
+        once = list({row['path']: row for row in rows if row[whole_of] is not None
+                     and row[whole_of] > 0.0 and row[se_of] < _VAGUE * row[whole_of]}.values())
+        cells = np.array([row['cells'] or 0 for row in once], dtype=np.intp)
+        whole, se, seen = (np.array([_number(row[column]) for row in once]) / np.maximum(cells, 1)
+                           for column in (whole_of, se_of, shown))
+        return _values(name, once, CommonCurve(NAN), np.log(whole), se / whole, seen, np.array([
+            _number(row[at]) if at else NAN for row in once]), cells)
     good = [row for row in rows if row['status'] in USABLE and row[name] is not None]
     y = np.log(np.array([row[name] for row in good], dtype=np.float64))
     u = np.array([_number(row['throttle']) for row in good])
@@ -164,12 +180,14 @@ def _number(value: Any) -> float:
 
 
 def _values(name: str, rows: Sequence[Row], curve: CommonCurve, value: FloatArray,
-            error: FloatArray, measured: FloatArray, throttle: FloatArray) -> Values:
+            error: FloatArray, measured: FloatArray, throttle: FloatArray,
+            cells: IntArray | None = None) -> Values:
     return Values(name, tuple(row['path'] for row in rows),
                   tuple(row['vehicle'] or '' for row in rows),
                   np.array([row['flight'] or 0 for row in rows], dtype=np.intp),
                   np.asarray(value, dtype=np.float64),
-                  np.nan_to_num(np.asarray(error, dtype=np.float64)), curve, measured, throttle)
+                  np.nan_to_num(np.asarray(error, dtype=np.float64)), curve, measured, throttle,
+                  np.zeros(len(rows), dtype=np.intp) if cells is None else cells)
 
 
 def _pieces(u: FloatArray, knots: Sequence[float]) -> FloatArray:
@@ -257,8 +275,8 @@ def _knots(u: FloatArray) -> list[float]:
     return [float(knot) for knot in knots]
 
 
-# Minimum flights of a test for drift: with 4, the lowest possible p is 2/4! = 0.08.
-LEAST_FLIGHTS = 5
+# Minimum flights of a test for drift: two leave no scatter about their line.
+LEAST_FLIGHTS = 3
 
 
 @dataclass(frozen=True)
@@ -268,7 +286,7 @@ class Trend:
     quantity: str
     vehicle: str
     flights: int  # Number of flights used
-    # Change per flight (of the logarithm, or V for sag) and its 95 % interval.
+    # Change of the logarithm per flight, and its 95 % interval.
     slope: float
     low: float
     high: float
@@ -305,22 +323,39 @@ def _of_values(values: Values) -> list[Trend]:
             continue
         mine = mine[np.argsort(values.flights[mine])]
         x, y = values.flights[mine].astype(np.float64), values.value[mine]
-        p_value = float(stats.kendalltau(x, y).pvalue)
-        slope, start, low, high = (float(v) for v in stats.theilslopes(
-            y, x, 0.95, method='joint'))
-        found.append(Trend(values.name, name, int(mine.size), slope, low, high, start,
-                           int(x[0]), int(x[-1]),
-                           # NaN if all values are equal.
-                           p_value if math.isfinite(p_value) else 1.0))
+        slope, start, se = weighted_line(x, y, values.error[mine])
+        reach = float(stats.t.ppf(0.975, mine.size - 2)) * se
+        # Equal values: 0 / 0.
+        p_value = 2.0 * float(stats.t.sf(abs(slope) / se, mine.size - 2)) if se > 0.0 else 1.0
+        found.append(Trend(values.name, name, int(mine.size), slope, slope - reach, slope + reach,
+                           start, int(x[0]), int(x[-1]), p_value))
     return found
 
 
-def fewest(tests: int, rate: float) -> int:
-    """Return the minimum number of flights for a significant drift among some tests."""
-    n = LEAST_FLIGHTS
-    while 2.0 / math.factorial(n) > rate / max(tests, 1):
-        n += 1
-    return n
+def weighted_line(x: FloatArray, y: FloatArray, error: FloatArray) -> tuple[float, float, float]:
+    """
+    Return slope and start of a weighted line, and the standard error of the slope.
+
+    The weights are 1 / (error^2 + s^2), with the scatter s that explains the residuals (0 if the
+    errors do); the residuals give the scale of the error, with n - 2 degrees of freedom.
+    """
+    columns = np.column_stack((np.ones(x.size), x))
+    variance = error ** 2
+
+    def fit(scatter: float) -> tuple[FloatArray, FloatArray, float]:
+        root = 1.0 / np.sqrt(np.maximum(variance + scatter, 1e-24))
+        found = np.linalg.lstsq(root[:, None] * columns, root * y, rcond=None)[0]
+        rest = root * (y - columns @ found)
+        return found, root, float(rest @ rest) / (x.size - 2)
+
+    low, high = 0.0, max(float(np.ptp(y)) ** 2, 1e-24)
+    # The scale falls as the scatter grows; 60 halvings are more than a double resolves.
+    for _ in range(60 if fit(0.0)[2] > 1.0 else 0):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if fit(middle)[2] > 1.0 else (low, middle)
+    found, root, scale = fit(low)
+    inverse = np.linalg.inv((root[:, None] * columns).T @ (root[:, None] * columns))
+    return float(found[1]), float(found[0]), math.sqrt(scale * float(inverse[1, 1]))
 
 
 # The median of |z| of a normal distribution.
@@ -345,14 +380,18 @@ class Outliers:
     centre: FloatArray  # Value that each was compared with; shape (n,)
     # Standard deviation between recordings of one group, without their errors; NaN if unknown.
     scatter: float
-    bound: float  # Score exceeded with probability `rate` in a fleet without faults
     rate: float  # Probability of any false alarm
+    reach: FloatArray | None = None  # Half the 95 % interval of the distance, if known; shape (n,)
 
     @property
     def found(self) -> npt.NDArray[np.bool_]:
         """Return which values are outliers, shape (n,)."""
-        beyond: npt.NDArray[np.bool_] = np.abs(np.nan_to_num(self.score)) > self.bound
-        return beyond
+        return np.nan_to_num(self.chance, nan=1.0) <= self.rate
+
+    @property
+    def compared(self) -> bool:
+        """Return whether any value was compared."""
+        return bool(np.isfinite(self.chance).any())
 
 
 def outliers(value: FloatArray, error: FloatArray, groups: Sequence[str], rate: float,
@@ -366,7 +405,7 @@ def outliers(value: FloatArray, error: FloatArray, groups: Sequence[str], rate: 
     flat = value if trend is None else value - trend
     score, chance, centre = (np.full(n, np.nan) for _ in range(3))
     if not good.any():
-        return Outliers(score, chance, centre, float('nan'), float('inf'), rate)
+        return Outliers(score, chance, centre, NAN, rate)
     members = [np.flatnonzero(of[good] == g) for g in np.unique(of[good])]
     se = error[good]
     rest, middle = _centred(flat[good][None, :], members)
@@ -387,8 +426,7 @@ def outliers(value: FloatArray, error: FloatArray, groups: Sequence[str], rate: 
     worst = np.sort(np.concatenate(largest)[:simulations])
     over = simulations - np.searchsorted(worst, np.abs(score[good]), side='left')
     chance[good] = (1.0 + over) / (1.0 + simulations)
-    bound = float(np.quantile(worst, 1.0 - rate))
-    return Outliers(score, chance, centre, float(scatter[0, 0]), bound, rate)
+    return Outliers(score, chance, centre, float(scatter[0, 0]), rate)
 
 
 def _centred(value: FloatArray, members: Sequence[npt.NDArray[np.intp]]
@@ -423,8 +461,11 @@ def _scatter(rest: FloatArray, error: FloatArray, share: float = 0.5) -> FloatAr
 # Probability of any false drift in a fleet without faults, and of any false outlier.
 DRIFT_RATE = 0.05
 OUTLIER_RATE = 0.05
-# Minimum number of vehicles to compare them with each other.
+# Minimum number of vehicles to judge one by the spread of the others.
 LEAST_VEHICLES = 6
+# Difference of ln resistance and ln sag that two good vehicles may have: the least error of these
+# facts (`LEAST_ERROR`), which the flights of one vehicle share.
+_APART = math.log(1.0 + LEAST_ERROR)
 # Standard error of a median relative to the mean, for many normal values.
 _MEDIAN_ERROR = 1.2533141373155
 
@@ -438,6 +479,7 @@ class VehicleValues:
     value: FloatArray
     error: FloatArray
     outliers: Outliers  # How far each is from the fleet
+    cells: tuple[int, ...]  # Cells by which the values of each are divided; 0: they are not
 
 
 @dataclass(frozen=True, eq=False)
@@ -485,7 +527,7 @@ def judge(rows: Sequence[Row], seed: int = 0) -> Judgement:
                 trend[mine] = t.line(one.flights[mine].astype(np.float64)) - t.line(np.array(
                     0.5 * (t.first + t.last)))
         recordings[name] = outliers(one.value, one.error, one.vehicles, rate, trend, seed=seed)
-        vehicles[name] = _vehicles(one, recordings[name], rate, seed)
+        vehicles[name] = _vehicles(one, recordings[name], one.value - trend, rate, seed)
     return Judgement(values, tested, recordings, vehicles, rate)
 
 
@@ -494,15 +536,54 @@ def _is_of_vehicle(values: Values, vehicle: str) -> npt.NDArray[np.bool_]:
     return mine
 
 
-def _vehicles(values: Values, within: Outliers, rate: float, seed: int) -> VehicleValues:
+def _vehicles(values: Values, within: Outliers, flat: FloatArray, rate: float, seed: int,
+              ) -> VehicleValues:
+    """Compare the vehicles (flat: values without drift); pack values only among their like."""
     names = tuple(sorted(set(values.vehicles) - {''}))
     scatter = float(np.nan_to_num(within.scatter))
     value, error = np.zeros(len(names)), np.zeros(len(names))
-    for k, name in enumerate(names):
-        mine = _is_of_vehicle(values, name)
+    of = [np.flatnonzero(_is_of_vehicle(values, name)) for name in names]
+    for k, mine in enumerate(of):
         value[k] = np.median(values.value[mine])
-        one = np.sqrt(np.mean(scatter ** 2 + values.error[mine] ** 2) / mine.sum())
+        one = np.sqrt(np.mean(scatter ** 2 + values.error[mine] ** 2) / mine.size)
         # The median of two is their mean.
-        error[k] = one * (_MEDIAN_ERROR if mine.sum() > 2 else 1.0)
-    return VehicleValues(names, value, error, outliers(
-        value, error, ['fleet'] * len(names), rate, least=LEAST_VEHICLES, seed=seed))
+        error[k] = one * (_MEDIAN_ERROR if mine.size > 2 else 1.0)
+    # Packs of other numbers of cells are of other crafts.
+    cells = tuple(int(values.cells[mine].max()) for mine in of)
+    found = outliers(value, error, [f'{one} cells' for one in cells], rate, least=LEAST_VEHICLES,
+                     seed=seed)
+    for kind in set(cells) if values.name in OF_PACK else ():
+        # The scatter of a vehicle with one flight is unknown.
+        places = [k for k, one in enumerate(cells) if one == kind and of[k].size > 1]
+        if 1 < len(places) and cells.count(kind) < LEAST_VEHICLES:
+            found = _few(found, places, [flat[of[k]] for k in places])
+    return VehicleValues(names, value, error, found, cells)
+
+
+def _few(found: Outliers, places: Sequence[int], flights: Sequence[FloatArray]) -> Outliers:
+    """
+    Compare the mean of each of a few vehicles, 2 flights or more each, with the others'.
+
+    The p-value is that of a difference of at most `_APART`, either way.
+    """
+    from ou_monitor.analysis.level_tests import adjusted
+    from scipy import stats
+
+    freedom = sum(one.size - 1 for one in flights)
+    squares = sum(float(((one - one.mean()) ** 2).sum()) for one in flights)
+    if not squares > 0.0:
+        return found
+    means = np.array([one.mean() for one in flights])
+    variance = squares / freedom / np.array([one.size for one in flights])
+    others = (means.sum() - means) / (len(means) - 1)
+    se = np.sqrt(variance + (variance.sum() - variance) / (len(means) - 1) ** 2)
+    score, least = (means - others) / se, _APART / se
+    p = stats.t.sf(np.abs(score) - least, freedom) + stats.t.sf(np.abs(score) + least, freedom)
+    # Of two vehicles there is one difference: it is told of the higher one.
+    told = np.arange(len(means)) if len(means) > 2 else np.array([int(means.argmax())])
+    reach = np.full(found.score.size, NAN) if found.reach is None else found.reach
+    for column, values in ((found.score, score[told]), (found.chance, adjusted(p[told].tolist())),
+                           (found.centre, others[told]),
+                           (reach, float(stats.t.ppf(0.975, freedom)) * se[told])):
+        column[np.array(places)[told]] = values
+    return replace(found, reach=reach)

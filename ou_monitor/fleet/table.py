@@ -37,7 +37,9 @@ COLUMNS = (
     Column('vehicle', 'text', '', 'vehicle; null if unknown'),
     Column('vehicle_from', 'text', '', 'origin of that name: metadata, pattern, folder'),
     Column('flight', 'count', '', 'number of the flight of this vehicle, from 1'),
-    Column('start', 'time', '', 'time of the first sample; null if its clock has no date'),
+    Column('start', 'time', '', 'time of the first sample; null if unknown'),
+    Column('start_from', 'text', '', 'origin of that time: stamps, log (its header or GPS), name '
+           '(of the file)'),
     Column('recording', 'text', '', 'name of the recording'),
     Column('path', 'text', '', 'file or folder'),
     Column('level', 'text', '', "load level, such as '40 %', or 'all' for the whole recording"),
@@ -84,6 +86,13 @@ COLUMNS = (
     Column('sag_full', 'number', 'V', 'sag extrapolated to full throttle; recordings are compared '
            'by it'),
     Column('sag_full_se', 'number', 'V', 'standard error of sag_full'),
+    Column('cells', 'count', '', 'cells in series; a guess is the largest one of the vehicle that '
+           'fits'),
+    Column('cells_from', 'text', '', 'origin of the cells: given, log, guessed (by the voltage), '
+           'unknown'),
+    Column('resistance', 'number', 'Ohm', 'instantaneous resistance of the whole pack, as in '
+           'analyze; null without a current that moves the voltage'),
+    Column('resistance_se', 'number', 'Ohm', 'standard error of resistance'),
     Column('supply', 'json', '', 'the supply facts that all commands share, as JSON'),
     Column('alpha_p', 'number', '1', 'p-value of the test that alpha is the same at all levels'),
     Column('quality', 'texts', '', 'defects of the recording, worst first'),
@@ -117,6 +126,7 @@ def rows_of(source: FoundRecording, result: Mapping[str, Any], vehicle: Vehicle,
         return [base]
     base.update({name: _null_if_unknown(value) for name, value in result.items()
                  if name in base and name not in _OTHERWISE})
+    base['start_from'] = result['start_from'] or None
     start = result['start']
     base['start'] = (datetime.fromtimestamp(start, timezone.utc)
                      if math.isfinite(start) else None)

@@ -3,20 +3,27 @@ Vehicle and flight number of a recording.
 
 The vehicle is named by the metadata of the recording, else by a pattern in its path, else by its
 folder.  Recordings are compared within a vehicle only; those of unknown vehicles are not compared.
+Flights are in the order of their dates: of the stamps, of the log, or in the name of the file.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from datetime import datetime, timezone
 import math
 from pathlib import Path
 import re
 
 from ou_monitor.errors import InputError
+from ou_monitor.records import clock_unit, NAN, Recording
 from ou_monitor.text import counted, printable, some
 
 METADATA, PATTERN, FOLDER = 'metadata', 'pattern', 'folder'
+# A date in a name, with the time if it follows: 2024-05-03_14-07-12, 20240503T140712.
+_DATE = re.compile(r'(?<!\d)(20\d\d)(?:([-_.])(\d\d?)\2(\d\d?)|(\d\d)(\d\d))(?:[T _-]+(\d\d)'
+                   r'[-_:.h]?(\d\d)(?:[-_:.m]?(\d\d))?)?(?!\d)')
 # Maximum paths or vehicles named in a note.
 _SHOWN = 3
 
@@ -120,6 +127,25 @@ def _these(paths: Sequence[Path]) -> str:
     return some((f"'{path}'" for path in paths), _SHOWN)
 
 
+def start_of(recording: Recording) -> tuple[float, str]:
+    """Return the time of the first sample, s since 1970 or NaN, and where it is from."""
+    if clock_unit(float(recording.t[0])) == 's':
+        return float(recording.t[0]), 'stamps'
+    stated = recording.source.get('started', recording.source.get('log_started', ''))
+    with suppress(ValueError):
+        found = datetime.fromisoformat(stated)
+        return found.replace(tzinfo=found.tzinfo or timezone.utc).timestamp(), 'log'
+    named = _DATE.search(recording.name)
+    with suppress(ValueError):
+        if named:
+            year, _, *parts = named.groups()
+            month, day = [int(part) for part in parts[:4] if part]
+            hour, minute, second = (int(part or 0) for part in parts[4:])
+            return datetime(int(year), month, day, hour, minute, second,
+                            tzinfo=timezone.utc).timestamp(), 'name'
+    return NAN, ''
+
+
 def number_flights(vehicles: Mapping[Path, Vehicle], starts: Mapping[Path, float]
                    ) -> tuple[dict[Path, int], list[str]]:
     """Return the flight number of each recording within its vehicle, from 1 (starts in s)."""
@@ -131,16 +157,17 @@ def number_flights(vehicles: Mapping[Path, Vehicle], starts: Mapping[Path, float
             groups.setdefault(vehicles[path].name, []).append(path)
     for name, paths in groups.items():
         dates = [starts[path] for path in paths]
-        dated = all(map(math.isfinite, dates)) and len(set(dates)) == len(dates)
-        if len(paths) > 1 and not dated:
+        dated = all(map(math.isfinite, dates))
+        if len(paths) > 1 and not (dated and len(set(dates)) == len(dates)):
             by_name.append(name)
-        order = sorted(paths, key=lambda path: (starts[path],) if dated else natural(str(path)))
+        order = sorted(paths, key=lambda path: (
+            starts[path] if dated else 0.0, natural(str(path))))
         for k, path in enumerate(order):
             flights[path] = k + 1
     notes = []
     if by_name:
-        notes.append(f'{some(sorted(by_name), _SHOWN)}: the flights are in the order of their '
-                     'names, because their dates are unknown or not distinct.')
+        notes.append(f'{some(sorted(by_name), _SHOWN)}: flights are in the order of their names '
+                     'where their dates are unknown or not distinct.')
     return flights, notes
 
 

@@ -57,7 +57,8 @@ def read_recording(
     voltage_topic, throttle_topic : str, optional
         Topics other than the config's.
     partial : bool
-        Whether to read the intact part of a damaged bag, with a note.
+        Whether to read the intact part of a damaged bag, or a CSV without its bad lines, with a
+        note.
     start, end : float, optional
         Part to read, s after the first message of the bag (by log time) or the first sample of
         the CSV or log: start <= t < end.  The throttle before it is held.
@@ -122,7 +123,8 @@ def _read(path: Path, options: ReadOptions, signal: str | None = None,
     if csv:
         if flight is not None:
             raise InputError(f'{path} is a CSV: --flight is for logs')
-        return _cut(tidy(read_csv(path, columns)), start, end), None
+        return _cut(tidy(read_csv(
+            path, columns, partial=options.get('partial', False))), start, end), None
     if log:
         recording, whole = _of_log(path, signal, columns, flight, options.get('progress'))
         return _cut(recording, start, end), whole

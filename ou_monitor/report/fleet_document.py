@@ -14,7 +14,7 @@ import numpy.typing as npt
 from ou_monitor.criticism.curves import outline
 from ou_monitor.fleet.fleet import Fleet
 from ou_monitor.fleet.judgement import (
-    DRIFT_RATE, fewest, Judgement, LEAST, LEAST_VEHICLES, LOGARITHMIC, OUTLIER_RATE, QUANTITIES,
+    DRIFT_RATE, Judgement, LEAST, LEAST_FLIGHTS, LEAST_VEHICLES, OF_PACK, OUTLIER_RATE, QUANTITIES,
     Trend, USABLE, Values)
 from ou_monitor.fleet.table import Row
 from ou_monitor.records import FloatArray, NAN, Severity
@@ -23,9 +23,9 @@ from ou_monitor.report.document import (
 from ou_monitor.report.svg import Plot
 from ou_monitor.text import chance, counted, number, p_words, some, volts
 
-_TITLES = {'sigma': 'Noise intensity \u03c3', 'alpha': 'Relaxation rate \u03b1',
-           'sag': 'Sag at full throttle'}
-_UNITS = {'sigma': 'V/\u221as', 'alpha': '1/s', 'sag': 'V'}
+_TITLES = {'resistance': 'Resistance', 'sag': 'Sag at full throttle',
+           'sigma': 'Noise intensity \u03c3', 'alpha': 'Relaxation rate \u03b1'}
+_UNITS = {'resistance': 'mOhm', 'sag': 'mV', 'sigma': 'V/\u221as', 'alpha': '1/s'}
 # Maximum significant drifts drawn; if there are none, this number of the most likely ones.
 _DRAWN, _LIKELY = 8, 2
 # Minimum trends in the table (further ones need p below `DRIFT_RATE`), and maximum.
@@ -36,14 +36,18 @@ _WORST, _SHOWN = 12, 10
 _SENTENCES, _RECORDINGS = 40, 500
 # Maximum ratio of mean voltages of one pack: 4.35 V a cell full to 2.8 V empty under load.
 _ONE_PACK = 1.6
-# Heads of the table of vehicles.
-VEHICLE_HEADS = ('vehicle', 'flights', 'lowest, V', 'dips', 'sag, V', '/flight',
-                 'sigma, V/sqrt(s)', '/flight', 'alpha, 1/s', '/flight')
+# Maximum ageing packs in the answer.
+_OLD = 3
+# Heads of the tables of packs and of vehicles.
+PACK_HEADS = ('vehicle', 'flights', 'dates', 'cells', 'resistance\na cell, mOhm',
+              'a flight\n[95 %]', 'sag\na cell, mV', 'a flight\n[95 %]')
+VEHICLE_HEADS = ('vehicle', 'flights', 'lowest, V', 'dips', 'sigma, V/sqrt(s)', '/flight',
+                 'alpha, 1/s', '/flight')
 # Maximum characters of a vehicle's name in a table.
 _NAME = 30
 # Heads of the table of recordings.
-LOWEST_HEADS = ('vehicle', 'recording', 'lowest, V', 'at, s', 'dips', 'below, s', 'sag, V',
-                'at throttle')
+LOWEST_HEADS = ('vehicle', 'recording', 'lowest, V', 'at, s', 'dips', 'below, s',
+                'resistance, mOhm', 'sag, V', 'at throttle')
 
 
 def fleet_document(fleet: Fleet, command: str = '') -> Document:
@@ -51,7 +55,7 @@ def fleet_document(fleet: Fleet, command: str = '') -> Document:
     rows = worst(fleet)
     odd = finding_words(fleet)
     vehicles = vehicle_table(fleet)
-    copies = [f"{row['path']} is {row['duplicate_of']}" for row in fleet.duplicates]
+    copies = [f"{_of(row)}{row['path']} is {row['duplicate_of']}" for row in fleet.duplicates]
     subject = (f'{counted(fleet.recordings, "recording")}, '
                f'{counted(len(fleet.vehicles), "vehicle")}, '
                f'{counted(len(fleet.rows), "row")} in the table')
@@ -63,13 +67,14 @@ def fleet_document(fleet: Fleet, command: str = '') -> Document:
             *([Text(f'and {len(odd) - _SENTENCES} more: see the table.')]
               if len(odd) > _SENTENCES else [])] if odd else [
                   Text('Nothing, at the false-alarm rates stated below.')]),
+        Section('Packs: resistance and sag', _packs(fleet)),
         Section('Lowest voltages', [lowest_table(fleet)]),
         Section('Not analysed: the next run tries them again', [
             Notes.of(failure_words(fleet), Severity.ERROR, _SHOWN)] if fleet.failed else []),
         Section('Duplicates, analysed once', [Notes.of(copies, most=_SHOWN)] if copies else []),
         Section('Vehicles', [
             vehicles,
-            Text('Lowest voltage and total dips of all flights. sag, sigma and alpha: medians as '
+            Text('Lowest voltage and total dips of all flights. sigma and alpha: medians as '
                  'measured; "/flight": drift of the values moved to the common throttle. A star '
                  'marks what stands out.', legend=True), lambda: _strips(fleet)]
                 if vehicles.rows else [Text('No vehicle was identified.', legend=True)]),
@@ -84,8 +89,44 @@ def fleet_document(fleet: Fleet, command: str = '') -> Document:
 
 def answer(fleet: Fleet) -> list[str]:
     """Return the answer: the lowest voltage, what stands out, and what was analysed."""
-    return [part for part in (*sentences(fleet), _anomalies(fleet), _analysed(fleet))
-            if part]
+    return [part for part in (_ageing(fleet), *sentences(fleet), _anomalies(fleet),
+                              _analysed(fleet)) if part]
+
+
+def _ageing(fleet: Fleet) -> str:
+    """Return which packs age; else how fast one still could; empty without packs."""
+    judged = fleet.judgement
+    if not any(judged.values[name].value.size for name in OF_PACK):
+        return ''
+    tested = [t for t in judged.trends if t.quantity in OF_PACK]
+    old = [t for t in tested if t.p_family <= DRIFT_RATE and t.slope > 0.0]
+    if old:
+        words = [f'{vehicle}: ' + ' and '.join(_growth(fleet, t) for t in old
+                                               if t.vehicle == vehicle)
+                 for vehicle in dict.fromkeys(t.vehicle for t in old)]
+        more = f'; and {len(words) - _OLD} more' if len(words) > _OLD else ''
+        return f'Ageing pack{"s" * (len(words) > 1)}: {"; ".join(words[:_OLD])}{more}.'
+    if not tested:
+        return (f'Whether a pack ages is unknown: no vehicle has {LEAST_FLIGHTS} flights with a '
+                'known resistance or sag.')
+    least = {vehicle: min((t for t in tested if t.vehicle == vehicle), key=lambda t: t.high)
+             for vehicle in {t.vehicle for t in tested}}
+    most = max(least.values(), key=lambda t: t.high)
+    return (f'No pack is seen to age; not excluded (95 %): {most.quantity} '
+            f'{change(most.high)} a flight on {most.vehicle}, which has {most.flights} flights.')
+
+
+def _growth(fleet: Fleet, trend: Trend) -> str:
+    """Return by how much a quantity of a pack grows, from where to where."""
+    values = fleet.judgement.values[trend.quantity]
+    cell = _a_cell(fleet.judgement, trend.quantity, trend.vehicle)
+    first, last = (_plain(values, trend.line(np.array(float(flight))))
+                   for flight in (trend.first, trend.last))
+    dates = _dates(fleet, trend.vehicle)
+    return (f'{trend.quantity} {change(trend.slope)} a flight (95 % {change(trend.low)} to '
+            f'{change(trend.high)}), {first} to {last} {_UNITS[trend.quantity]}{cell}'
+            f'{_guessed(fleet, trend.vehicle) if cell else ""} in {trend.flights} flights'
+            + ('' if dates == UNKNOWN else f', {dates}'))
 
 
 def _analysed(fleet: Fleet) -> str:
@@ -116,32 +157,30 @@ def _anomalies(fleet: Fleet) -> str:
         parts.append(
             f'Unlike the other flights of their vehicle: {counted(len(odd), "recording")}.')
     if not parts:
-        tested = judged.trends or any(np.isfinite(o.bound) for o in (
+        tested = judged.trends or any(o.compared for o in (
             *judged.recordings.values(), *[v.outliers for v in judged.vehicles.values()]))
         parts.append('Nothing stands out.' if tested else
                      'There are too few recordings per vehicle to tell what stands out.')
     return ' '.join(parts)
 
 
-def change(name: str, value: float) -> str:
-    """Return a change of a quantity with its sign: in % of sigma and alpha, in V of a sag."""
+def change(value: float) -> str:
+    """Return a change of a logarithm with its sign, in %, or as a factor."""
     if not math.isfinite(value):
         return UNKNOWN
-    if name not in LOGARITHMIC:
-        return f'{1e3 * value:+.3g} mV' if abs(value) < 1.0 else f'{value:+.3g} V'
+    if value >= math.log(2.0):
+        # Few flights may leave nearly anything open.
+        return f'x {number(math.exp(value))}' if value < 7.0 else 'x 1000 or more'
     percent = 100.0 * math.expm1(value)
-    if percent >= 100.0:
-        return f'x {number(math.exp(value))}'
     return f'{percent:+.0f} %' if abs(percent) >= 10.0 else f'{percent:+.2g} %'
 
 
 def trend_words(trend: Trend) -> str:
     """Return a drift in a sentence."""
     flights = trend.last - trend.first
-    return (f'{trend.vehicle}: {trend.quantity} drifts by '
-            f'{change(trend.quantity, trend.slope)} a flight (95 % '
-            f'{change(trend.quantity, trend.low)} to {change(trend.quantity, trend.high)}), '
-            f'{change(trend.quantity, flights * trend.slope)} over {trend.flights} flights; '
+    return (f'{trend.vehicle}: {trend.quantity} drifts by {change(trend.slope)} a flight (95 % '
+            f'{change(trend.low)} to {change(trend.high)}), '
+            f'{change(flights * trend.slope)} over {trend.flights} flights; '
             f'{p_words(trend.p_value)}, over the fleet {chance(trend.p_family)}.')
 
 
@@ -151,19 +190,24 @@ def finding_words(fleet: Fleet) -> list[str]:
     found = [trend_words(trend) for trend in judged.drifting]
     for name, k in judged.odd_vehicles():
         one = judged.vehicles[name]
-        centre = float(one.outliers.centre[k])
-        values = judged.values[name]
+        off = float(one.value[k] - one.outliers.centre[k])
+        values, reach = judged.values[name], one.outliers.reach
+        few = reach is not None and math.isfinite(reach[k])
+        beside = 'the mean of the others' if few else 'the median of the vehicles'
+        interval = '' if not few or reach is None else (
+            f' (95 % {change(off - float(reach[k]))} to {change(off + float(reach[k]))})')
         found.append(f'{one.names[k]}: {name} is {shown(values, one.value[k])}'
-                     f'{_at(values, " at ")}, '
-                     f'{change(name, float(one.value[k]) - centre)} from the median of the '
-                     f'vehicles; p over the fleet {chance(float(one.outliers.chance[k]))}.')
+                     f'{_a_cell(judged, name, one.names[k])}{_at(values, " at ")}, '
+                     f'{change(off)}{interval} from {beside}; p over the fleet '
+                     f'{chance(float(one.outliers.chance[k]))}.')
     for name, k in judged.odd_recordings():
         values, out = judged.values[name], judged.recordings[name]
-        off = change(name, float(values.value[k] - out.centre[k]))
+        away = change(float(values.value[k] - out.centre[k]))
         found.append(f'{values.vehicles[k]}, {values.paths[k]}: {name} is '
-                     f'{shown(values, values.value[k])}{_at(values, " at ")} '
+                     f'{shown(values, values.value[k])}{_a_cell(judged, name, values.vehicles[k])}'
+                     f'{_at(values, " at ")} '
                      f'({_raw_value(values, k)}), '
-                     f'{off} from the other flights; p over the fleet '
+                     f'{away} from the other flights; p over the fleet '
                      f'{chance(float(out.chance[k]))}.')
     return found
 
@@ -174,27 +218,68 @@ def failure_words(fleet: Fleet) -> list[str]:
     for row in fleet.failed:
         error = str(row['error']).removeprefix(row['path'])
         # The rest may name a line of the file, or a file within it.
-        found.append(row['path'] + (error if re.match(r':\d+:|/', error) else
+        found.append(_of(row) + row['path'] + (error if re.match(r':\d+:|/', error) else
                                     f": {error.lstrip(': ')}"))
     return found
 
 
+def _of(row: Row) -> str:
+    """Return the vehicle of a row before its path."""
+    return '' if row['vehicle'] is None else f"{row['vehicle']}: "
+
+
 def shown(values: Values, value: float | FloatArray) -> str:
     """Return one value in its unit, at the reference throttle."""
-    return f'{number(float(values.shown(value)))} {QUANTITIES[values.name]}'
+    unit = QUANTITIES[values.name] if values.name not in OF_PACK else _UNITS[values.name]
+    return f'{_plain(values, value)} {unit}'
+
+
+def _plain(values: Values, value: float | FloatArray) -> str:
+    """Return one value without its unit, of a pack in thousandths."""
+    return number(_thousandths(values.name) * float(values.shown(value)))
+
+
+def _thousandths(name: str) -> float:
+    return 1e3 if name in OF_PACK else 1.0
+
+
+def _a_cell(judged: Judgement, name: str, vehicle: str) -> str:
+    """Return whether the values of a vehicle are per cell."""
+    one = judged.vehicles[name]
+    return ' a cell' if vehicle in one.names and one.cells[one.names.index(vehicle)] else ''
+
+
+def _guessed(fleet: Fleet, vehicle: str) -> str:
+    """Return how a guessed number of cells is marked."""
+    cells = _cells_of(fleet, vehicle)
+    return f' ({cells[:-1]} cells, a guess)' if cells.endswith('?') else ''
+
+
+def _cells_of(fleet: Fleet, vehicle: str) -> str:
+    """Return the cells of a vehicle, with a question mark if they are a guess."""
+    found = sorted({(row['cells'], '?' * (row['cells_from'] == 'guessed')) for row in fleet.rows
+                    if row['vehicle'] == vehicle and row['cells']})
+    return ', '.join(f'{cells}{mark}' for cells, mark in found) or UNKNOWN
+
+
+def _dates(fleet: Fleet, vehicle: str) -> str:
+    """Return the dates of the first and the last flight of a vehicle."""
+    found = [row['start'] for row in fleet.rows if row['vehicle'] == vehicle and row['start']]
+    days = sorted({f'{date:%Y-%m-%d}' for date in (min(found), max(found))}) if found else []
+    return ' to '.join(days) or UNKNOWN
 
 
 def _at(values: Values, before: str) -> str:
     """Return the throttle at which recordings are compared, after `before`; empty without one."""
-    if values.name == 'sag':
-        return f'{before}full throttle'
+    if values.name in OF_PACK:
+        return f'{before}full throttle' if values.name == 'sag' else ''
     at = values.curve.reference
     return f'{before}{100.0 * at:.0f} % throttle' if math.isfinite(at) else ''
 
 
 def _raw_value(values: Values, k: int) -> str:
     at = values.throttle[k]
-    return (f'{number(float(values.measured[k]))} as measured'
+    return (f'{number(_thousandths(values.name) * float(values.measured[k]))} as measured'
             + (f' at {100.0 * at:.0f} %' if math.isfinite(at) else ''))
 
 
@@ -209,25 +294,25 @@ def comparison_words(fleet: Fleet) -> list[str]:
             notes.append(f'{vehicle}: voltages of {number(min(means))} to {number(max(means))} V '
                          'come from different supplies but are compared as one vehicle; separate '
                          'them by --vehicle-from REGEX or by a folder for each.')
-    references = [judged.values[name].curve.reference for name in LOGARITHMIC]
+    references = [judged.values[name].curve.reference for name in ('sigma', 'alpha')]
     if all(map(math.isfinite, references)):
         notes.append('sigma and alpha are shown as measured. For comparison they are moved to '
                      + ' and '.join(dict.fromkeys(f'{100.0 * u:.0f} %' for u in references))
                      + ' throttle along a curve common to all recordings; its error is '
-                     'included. sag is compared at full throttle.')
+                     'included.')
+    if any(judged.values[name].value.size for name in OF_PACK):
+        notes.append('Resistance and sag are those of analyze, a cell where the cells are known; '
+                     'a question mark marks a guess by the voltage. The sag is compared at full '
+                     'throttle. A current sensor of another scale looks like another resistance.')
     tests = len(judged.trends)
     if tests:
-        need = fewest(tests, DRIFT_RATE)
-        few = sorted({t.vehicle for t in judged.trends if t.flights < need})
         notes.append(f'Drift: {counted(tests, "test")}, with {100 * DRIFT_RATE:g} % probability '
-                     f'of any false alarm (Holm). With this number of tests a vehicle needs at '
-                     f'least {need} flights to show a drift'
-                     + (f'; {counted(len(few), "tested vehicle")} '
-                        f'{"has" if len(few) == 1 else "have"} fewer.' if few else '.'))
-    else:
-        notes.append('No vehicle has the 5 flights in a known order, with known values, that a '
-                     'test for drift needs.')
-    if any(np.isfinite(o.bound) for o in judged.recordings.values()):
+                     'of any false alarm (Holm).')
+    few = sorted({*fleet.vehicles} - {t.vehicle for t in judged.trends})
+    if few:
+        notes.append(f'Drift unknown: {some(few, 5)}: it needs {LEAST_FLIGHTS} flights with known '
+                     'values.')
+    if any(o.compared for o in judged.recordings.values()):
         notes.append(
             f'Outliers: a fleet without faults shows one with {100 * OUTLIER_RATE:g} % '
             'probability (over all quantities, recordings and vehicles, if the scatter between '
@@ -235,9 +320,42 @@ def comparison_words(fleet: Fleet) -> list[str]:
     else:
         notes.append(f'No vehicle has the {LEAST} flights with known values that outliers among '
                      'them need.')
+    compared = any(v.outliers.compared for v in judged.vehicles.values())
     if len(fleet.vehicles) < LEAST_VEHICLES:
-        notes.append(f'Vehicles are not compared with each other: that needs {LEAST_VEHICLES}.')
+        notes.append(
+            'Vehicles: mean resistance and sag of each are compared with the mean of the others '
+            f'with as many cells, by the scatter between flights; below {LEAST_VEHICLES} vehicles '
+            'the spread between good ones is unknown, and only more than a tenth counts.'
+            if compared else 'Vehicles are not compared with each other: that needs two with as '
+            'many cells and two flights each with known resistance or sag.')
     return notes
+
+
+def pack_table(fleet: Fleet) -> Table:
+    """Return the table of packs: resistance and sag of each vehicle, with their drift."""
+    judged = fleet.judgement
+    short = short_names(fleet.vehicles)
+    rows = [[short[vehicle], str(_flights(fleet, vehicle)), _dates(fleet, vehicle),
+             _cells_of(fleet, vehicle), *(cell for name in OF_PACK for cell in (
+                 _median(judged, name, vehicle), _slope(judged, name, vehicle, interval=True)))]
+            for vehicle in fleet.vehicles
+            if any(vehicle in judged.values[name].vehicles for name in OF_PACK)]
+    return Table.of_known(PACK_HEADS, rows, left=[0, 2], most=2 * _SHOWN)
+
+
+def _packs(fleet: Fleet) -> list[Part]:
+    made = pack_table(fleet)
+    if not made.rows:
+        return []
+    return [made, Text(
+        'Medians as measured, the sag at the highest throttle flown; without known cells, of the '
+        'whole supply. "a flight": drift, the sag at full throttle. A star marks what stands out.',
+        legend=True)]
+
+
+def _flights(fleet: Fleet, vehicle: str) -> int:
+    return len({row['path'] for row in fleet.rows if row['vehicle'] == vehicle
+                and row['flight'] is not None})
 
 
 def vehicle_table(fleet: Fleet) -> Table:
@@ -246,14 +364,12 @@ def vehicle_table(fleet: Fleet) -> Table:
     found, seen = [], once(fleet)
     shown_as = short_names(fleet.vehicles)
     for vehicle in fleet.vehicles:
-        flights = {row['path'] for row in fleet.rows if row['vehicle'] == vehicle
-                   and row['flight'] is not None}
         mine = [row for row in seen if row['vehicle'] == vehicle]
         dips = dips_of(mine)
-        cells = [shown_as[vehicle], str(len(flights)),
+        cells = [shown_as[vehicle], str(_flights(fleet, vehicle)),
                  number(min((row['lowest'] for row in mine), default=NAN), 4),
                  UNKNOWN if dips is None else str(dips.count)]
-        for name in ('sag', 'sigma', 'alpha'):
+        for name in ('sigma', 'alpha'):
             cells += [_median(judged, name, vehicle), _slope(judged, name, vehicle)]
         found.append(cells)
     return Table.of_known(VEHICLE_HEADS, found, left=[0], most=2 * _SHOWN)
@@ -267,13 +383,14 @@ def _median(judged: Judgement, name: str, vehicle: str) -> str:
     star = '*' if one.outliers.found[k] else ''
     values = judged.values[name]
     mine = [k for k, of in enumerate(values.vehicles) if of == vehicle]
-    return number(float(np.median(values.measured[mine]))) + star
+    return number(_thousandths(name) * float(np.median(values.measured[mine]))) + star
 
 
-def _slope(judged: Judgement, name: str, vehicle: str) -> str:
+def _slope(judged: Judgement, name: str, vehicle: str, *, interval: bool = False) -> str:
     for trend in judged.trends:
         if (trend.quantity, trend.vehicle) == (name, vehicle):
-            return change(name, trend.slope) + ('*' if trend.p_family <= DRIFT_RATE else '')
+            return change(trend.slope) + '*' * (trend.p_family <= DRIFT_RATE) + (
+                f'\n[{change(trend.low)}, {change(trend.high)}]' if interval else '')
     return UNKNOWN
 
 
@@ -312,7 +429,9 @@ def as_data(fleet: Fleet) -> dict[str, Any]:
         'brownout_voltage': fleet.limit,
         'vehicles': [{
             'vehicle': vehicle,
-            **{name: _vehicle_value(judged, name, vehicle) for name in QUANTITIES}}
+            'cells': _cells_of(fleet, vehicle),
+            **{name + ('_a_cell' if _a_cell(judged, name, vehicle) else ''): _vehicle_value(
+                judged, name, vehicle) for name in QUANTITIES}}
             for vehicle in fleet.vehicles],
         'drift': [{
             'vehicle': t.vehicle, 'quantity': t.quantity, 'flights': t.flights,
@@ -382,7 +501,7 @@ def sentences(fleet: Fleet) -> list[str]:
         return [f'{text}.']
     row = max(sags, key=lambda row: row['sag'])
     return [f'{text}.', f'The rail sags by up to {volts(row["sag"])}, at '
-            f'{100.0 * row["sag_throttle"]:.0f} % throttle.']
+            f'{100.0 * row["sag_throttle"]:.0f} % throttle in {_name(row)}.']
 
 
 def _lowest_of(rows: Sequence[Row]) -> tuple[Row, str]:
@@ -410,12 +529,21 @@ def facts(fleet: Fleet) -> list[tuple[str, str]]:
     sags = [row for row in rows if row['sag'] is not None]
     if sags:
         least, most = (choose(sags, key=lambda row: row['sag']) for choose in (min, max))
-        lines.append(('Sag', (f'{volts(least["sag"])} to ' if len(sags) > 1 else '')
-                      + f'{volts(most["sag"])} (+- {volts(2.0 * most["sag_se"])}) at the highest '
-                      f'throttle flown; known in {len(sags)} of '
+        lines.append(('Sag', (f'{volts(least["sag"])}, {_name(least)}, to '
+                              if len(sags) > 1 else '')
+                      + f'{volts(most["sag"])} (+- {volts(2.0 * most["sag_se"])}), '
+                      f'{_name(most)}, at the highest throttle flown; known in {len(sags)} of '
                       f'{counted(len(rows), "recording")}'))
     else:
         lines.append(('Sag', 'unknown in all: throttle is unknown, or did not move enough'))
+    known = [row for row in rows if row['resistance'] is not None]
+    if known:
+        least, most = (choose(known, key=lambda row: row['resistance']) for choose in (min, max))
+        lines.append(('Resistance', (f'{number(1e3 * least["resistance"])} mOhm, '
+                                     f'{_name(least)}, to ' if len(known) > 1 else '')
+                      + f'{number(1e3 * most["resistance"])} mOhm (+- '
+                      f'{number(2e3 * most["resistance_se"], 2)}), {_name(most)}; known in '
+                      f'{len(known)} of {counted(len(rows), "recording")}'))
     return lines
 
 
@@ -445,7 +573,9 @@ def _cells(row: Row, names: dict[str, str]) -> list[str]:
 
     return [names.get(row['vehicle'], UNKNOWN), row['recording'], shown(row['lowest'], 4),
             shown(row['lowest_at']), UNKNOWN if row['dips'] is None else f'{row["dips"]:g}',
-            shown(row['below_s'], 2), shown(row['sag']),
+            shown(row['below_s'], 2),
+            UNKNOWN if row['resistance'] is None else number(1e3 * row['resistance']),
+            shown(row['sag']),
             UNKNOWN if row['sag_throttle'] is None else f'{100.0 * row["sag_throttle"]:.0f} %']
 
 
@@ -483,12 +613,12 @@ def _dots(plot: Plot, names: Sequence[str], vehicles: Sequence[str], flights: Fl
 def _strips(fleet: Fleet) -> list[Part]:
     return [Figure(_by_vehicle(fleet, values), (
         'As measured: the mean over the levels of each recording.' if name == 'sigma' else ''))
-        for name in LOGARITHMIC if (values := fleet.judgement.values[name]).value.size]
+        for name in ('sigma', 'alpha') if (values := fleet.judgement.values[name]).value.size]
 
 
 def _by_vehicle(fleet: Fleet, values: Values) -> Plot:
     plot = Plot(f'{_TITLES[values.name]} of every recording', 'vehicle', _UNITS[values.name],
-                height=260, log_y=values.name in LOGARITHMIC)
+                height=260, log_y=True)
     for k in range(0, len(fleet.vehicles), 2):
         plot.shade(k + 0.5, k + 1.5, 7)
     _dots(plot, fleet.vehicles, values.vehicles, values.flights.astype(np.float64),
@@ -507,20 +637,21 @@ def _drift(fleet: Fleet) -> list[Part]:
     parts += Pair.two_by_two([
         Figure(_trend_plot(judged.values[t.quantity], t), _caption(t, fleet)) for t in drawn])
     listed = [t for k, t in enumerate(judged.trends) if k < _LEAST or t.p_value < DRIFT_RATE]
-    rows = [[t.vehicle, t.quantity, str(t.flights), change(t.quantity, t.slope) + '\n'
-             + f'[{change(t.quantity, t.low)}, {change(t.quantity, t.high)}]',
+    rows = [[t.vehicle, t.quantity, str(t.flights), change(t.slope) + '\n'
+             + f'[{change(t.low)}, {change(t.high)}]',
              chance(t.p_value), chance(t.p_family),
              'yes' if t.p_family <= DRIFT_RATE else 'no'] for t in listed[:_MOST]]
     more = len(judged.trends) - len(rows)
     return [*parts, Table(['vehicle', 'quantity', 'flights', 'change a flight\n[95 %]', 'p',
                            'p over the fleet', 'stands'], rows, left=[0, 1]), Text(
-        'Theil-Sen slopes and intervals. p: Mann-Kendall test; over the fleet: Holm-adjusted.'
+        'Lines through the logarithms, weighted by the errors; p: t test by the scatter about the '
+        'line; over the fleet: Holm-adjusted.'
         + (f' {more} less likely trends are not shown.' if more > 0 else ''), legend=True)]
 
 
 def _caption(trend: Trend, fleet: Fleet) -> str:
     at = _at(fleet.judgement.values[trend.quantity], ' at ') or ' as measured'
-    return (f'{change(trend.quantity, trend.slope)} a flight; p over the fleet '
+    return (f'{change(trend.slope)} a flight; p over the fleet '
             f'{chance(trend.p_family)}. Values{at}, with 95 % intervals.')
 
 
@@ -528,13 +659,15 @@ def _trend_plot(values: Values, trend: Trend) -> Plot:
     mine = np.array([v == trend.vehicle for v in values.vehicles]) & (values.flights > 0)
     x, y = values.flights[mine].astype(float), values.value[mine]
     low, high = values.interval()
-    plot = Plot(f'{trend.vehicle}: {_TITLES[values.name]}', 'flight', _UNITS[values.name],
-                width=450, height=260, log_y=values.name in LOGARITHMIC)
+    scale = _thousandths(values.name)
+    cell = ' a cell' * bool(values.cells[mine].all())
+    plot = Plot(f'{trend.vehicle}: {_TITLES[values.name]}{cell}', 'flight', _UNITS[values.name],
+                width=450, height=260, log_y=True)
     plot.limits(x=(trend.first - 0.5, trend.last + 0.5))
-    plot.bars(x, low[mine], high[mine], '', 7)
-    plot.markers(x, values.shown(y), '', 0)
+    plot.bars(x, scale * low[mine], scale * high[mine], '', 7)
+    plot.markers(x, scale * values.shown(y), '', 0)
     at = np.linspace(trend.first, trend.last, 50)
-    return plot.line(at, values.shown(trend.line(at)), '', 1, 'thick')
+    return plot.line(at, scale * values.shown(trend.line(at)), '', 1, 'thick')
 
 
 def _distributions(fleet: Fleet) -> list[Part]:
@@ -546,10 +679,10 @@ def _distributions(fleet: Fleet) -> list[Part]:
             x, height = outline(edges, count)
             # On a log axis the bins are even in the logarithm.
             plot = Plot(f'{_TITLES[name]}, all recordings', _UNITS[name], 'recordings', width=450,
-                        height=240, log_x=name in LOGARITHMIC)
+                        height=240, log_x=True)
             plot.limits(y=(0.0, 1.08 * float(count.max())))
             figures.append(Figure(plot.line(
-                values.shown(np.concatenate((x[:1], x, x[-1:]))),
+                _thousandths(name) * values.shown(np.concatenate((x[:1], x, x[-1:]))),
                 np.concatenate(([0.0], height, [0.0])), '', 0, 'thick')))
     over = _over_throttle(fleet)
     if over:
@@ -604,16 +737,20 @@ def _recordings(fleet: Fleet) -> list[Part]:
                     for name, values in judged.values.items()]
         rows.append([
             names.get(first['vehicle'], UNKNOWN), str(first['flight'] or UNKNOWN),
-            f"{first['recording']}\n{_date(first)}", number(first['duration_s'] or NAN),
+            f"{first['recording']}\n{_date(first)}", UNKNOWN if not first['cells'] else
+            f"{first['cells']}{'?' * (first['cells_from'] == 'guessed')}",
+            number(first['duration_s'] or NAN),
             UNKNOWN if first['lowest'] is None else number(first['lowest'], 4),
             UNKNOWN if first['dips'] is None else f"{first['dips']:g}", *measured,
             ', '.join(sorted(flags[path])) or UNKNOWN])
-    heads = ['vehicle', 'flight', 'recording', 's', 'lowest, V', 'dips', *[
-        f'{name}, {_UNITS[name]}' for name in QUANTITIES], 'flags']
+    heads = ['vehicle', 'flight', 'recording', 'cells', 's', 'lowest, V', 'dips', *[
+        f'{name}, {_UNITS[name]}' + '\na cell' * (name in OF_PACK) for name in QUANTITIES],
+        'flags']
     more = len(firsts) - _RECORDINGS
-    return [Table(heads, rows, left=[0, 2, 9]), Text(
-        'As measured. Small print: the throttle and, if the vehicle has enough flights, the '
-        'distance from its other flights in standard deviations.' + (
+    return [Table.of_known(heads, rows, left=[0, 2, len(heads) - 1]), Text(
+        'As measured, a cell where the cells are known; "?" is a guess. Small print: the throttle '
+        'and, if the vehicle has enough flights, the distance from its other flights in standard '
+        'deviations.' + (
             f' {more} more recordings are in the Parquet table.' if more > 0 else ''),
         legend=True)]
 
@@ -628,4 +765,5 @@ def _cell(values: Values, score: FloatArray, k: int | None) -> str:
     at = values.throttle[k]
     small = [f'at {100.0 * at:.0f} %'] if math.isfinite(at) else []
     small += [f'{score[k]:+.1f} sd'] if math.isfinite(score[k]) else []
-    return number(float(values.measured[k])) + '\n' + ', '.join(small)
+    return (number(_thousandths(values.name) * float(values.measured[k])) + '\n'
+            + ', '.join(small)).rstrip()

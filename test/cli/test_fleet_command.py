@@ -178,6 +178,46 @@ def test_the_numbers_are_those_of_analyze(rows, logs):
         assert 0.0 <= row['risk'] <= 1.0
 
 
+def test_resistance_and_sag_are_those_of_analyze(tmp_path, one_process, capsys):
+    """The row is `supply` of analyze; a bad line costs a line; a guess of cells is the fullest."""
+    rng = np.random.default_rng(2)
+    t = np.arange(1500) * 0.02
+    logs = tmp_path / 'logs' / 'uav7'
+    logs.mkdir(parents=True)
+    for k, rest in enumerate((16.4, 13.2)):
+        throttle = np.repeat(rng.uniform(0.1, 0.9, 60), 25)
+        current = 40.0 * throttle ** 1.8
+        volts = rest - 0.03 * current + 0.02 * rng.standard_normal(t.size)
+        lines = [f'{a:.2f},{b:.3f},{c:.3f},{d:.2f}' for a, b, c, d in zip(
+            t, volts, throttle, current)]
+        if k:
+            lines[700] = '14.00,1x.3,0.2,3'
+        (logs / f'f_2024-05-0{k + 1}.csv').write_text('\n'.join(
+            ['time_s,voltage_v,throttle,current_a', *lines]))
+    assert main(['fleet', str(logs.parent), '--output', str(tmp_path / 'out')]) == 0
+    said = capsys.readouterr().out
+    rows = {row['recording']: row for row in parquet.read_table(
+        tmp_path / 'out' / 'fleet.parquet').to_pylist()}
+    assert main(['analyze', str(logs / 'f_2024-05-01.csv'), '--json', str(tmp_path / 'a')]) == 0
+    row, last = rows['f_2024-05-01.csv'], rows['f_2024-05-02.csv']
+    supply = json.loads((tmp_path / 'a').read_text())['supply']
+    assert json.loads(row['supply']) == supply
+    assert (row['resistance'], row['resistance_se']) == (
+        supply['resistance']['ohm'], supply['resistance']['se_ohm'])
+    assert (row['sag_full'], row['lowest']) == (
+        supply['sag']['sag_v'][-1], supply['lowest']['voltage_v'])
+    assert abs(row['resistance'] - 0.03) < 2.0 * row['resistance_se']
+    # 13.2 V alone would be three cells.
+    assert [(one['cells'], one['cells_from'], one['start_from'], one['samples'])
+            for one in (row, last)] == [(4, 'guessed', 'name', 1500), (4, 'guessed', 'name', 1499)]
+    (note,) = (note for note in last['notes'] if 'bad line' in note)
+    assert "1 bad line left out, such as line 702: column 'voltage_v' holds '1x.3'" in note
+    # It is told with vehicle and file, and so is the resistance.
+    told = ' '.join(said.split())
+    assert 'uav7: f_2024-05-02.csv: 1 bad line left out' in told
+    assert 'mOhm, f_2024-05-0' in told and '4?' in told
+
+
 def test_bad_files_are_rows(rows, whole):
     """The reason is in the row and on the terminal; the others are not harmed."""
     (bad,) = (row for row in rows if row['error'])

@@ -1,6 +1,7 @@
 """The fleet's disk and processes: workers that die, saved results, search."""
 
 from dataclasses import asdict
+from datetime import datetime, timezone
 import errno
 import json
 import os
@@ -11,13 +12,15 @@ import signal
 from types import SimpleNamespace
 
 from made_logs import crazyflie, hover
+import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.fleet.analysis import Options, work
 from ou_monitor.fleet.find import duplicates, find_recordings
 from ou_monitor.fleet.fleet import Parts
-from ou_monitor.fleet.vehicles import assign, natural, number_flights, read_pattern
+from ou_monitor.fleet.vehicles import assign, natural, number_flights, read_pattern, start_of
 from ou_monitor.fleet.workers import check_address, LocalWorkers, LOST, usable_memory
 from ou_monitor.recordings.read import read_recording
+from ou_monitor.records import Recording
 from ou_monitor.report.fleet_document import failure_words
 from ou_monitor.stream.files import write_whole
 import pytest
@@ -122,9 +125,11 @@ def test_a_scheduler_of_another_machine_wants_tls(address, fine):
 def test_a_failure_names_its_path_once():
     errors = {'/f/a.csv': '/f/a.csv:1: no column', '/f/bag': '/f/bag/bag_0.mcap is damaged',
               '/f/b.mcap': '/f/b.mcap is empty', '/f/c': 'something else'}
-    fleet = SimpleNamespace(failed=[{'path': p, 'error': e} for p, e in errors.items()])
+    fleet = SimpleNamespace(failed=[
+        {'path': p, 'error': e, 'vehicle': 'v' if p == '/f/c' else None}
+        for p, e in errors.items()])
     assert failure_words(fleet) == ['/f/a.csv:1: no column', '/f/bag/bag_0.mcap is damaged',
-                                    '/f/b.mcap: is empty', '/f/c: something else']
+                                    '/f/b.mcap: is empty', 'v: /f/c: something else']
 
 
 def test_work_never_raises(tmp_path, monkeypatch):
@@ -279,14 +284,35 @@ def test_ambiguous_vehicles_are_not_pooled():
 
 
 def test_flights_are_in_order_of_date_or_else_of_name():
-    """If a date is missing or occurs twice, the order is by name, with a note."""
+    """If a date is missing, the order is by name, if one occurs twice, within it; with a note."""
     nan = float('nan')
     names = [Path(f'/u/flight_{k}.csv') for k in (10, 9, 1)]
     vehicles, _ = assign(dict.fromkeys(names, ''))
     flights, notes = number_flights(vehicles, dict(zip(names, (1.0, 2.0, 3.0))))
     assert [flights[path] for path in names] == [1, 2, 3] and not notes
-    for dates in ((1.0, 1.0, 2.0), (1.0, nan, 2.0)):
+    for dates, order in (((1.0, 1.0, 2.0), [2, 1, 3]), ((1.0, nan, 2.0), [3, 2, 1])):
         flights, notes = number_flights(vehicles, dict(zip(names, dates)))
-        assert [flights[path] for path in names] == [3, 2, 1]
+        assert [flights[path] for path in names] == order
         assert 'order of their names' in notes[0]
     assert sorted(['f10', 'f9', 'g1', 'f'], key=natural) == ['f', 'f9', 'f10', 'g1']
+
+
+@pytest.mark.parametrize('name, source, t, date, origin', [
+    ('f.csv', {}, 1.7e9, '2023-11-14T22:13:20', 'stamps'),
+    ('2024-05-03.bbl', {'started': '2022-02-02T15:04:53.000+00:00'}, 0.0, '2022-02-02T15:04:53',
+     'log'),
+    ('bag', {'log_started': '2022-02-02T15:04:53'}, 5.0, '2022-02-02T15:04:53', 'log'),
+    ('LOG_2024-05-03_14-07-12.bbl', {}, 0.0, '2024-05-03T14:07:12', 'name'),
+    ('2022_02_25 21_25_39 Fri.csv', {}, 0.0, '2022-02-25T21:25:39', 'name'),
+    ('flight_20240503T1407.csv', {'started': 'no date'}, 0.0, '2024-05-03T14:07:00', 'name'),
+    ('log_7_2024-5-3-14-07-12.bin', {}, 0.0, '2024-05-03T14:07:12', 'name'),
+    ('uav3_2024-05-03_2.csv', {}, 0.0, '2024-05-03T00:00:00', 'name'),
+    ('flight_20241399.csv', {}, 0.0, None, ''), ('120240503.csv', {}, 0.0, None, ''),
+    ('flight_12.csv', {}, 0.0, None, '')])
+def test_the_date_of_a_flight(name, source, t, date, origin):
+    """From the stamps, else the header of the log, else the name of the file."""
+    at = np.array([t, t + 1.0])
+    start, found = start_of(Recording(at, at, None, name, source))
+    assert found == origin
+    assert (None if np.isnan(start) else datetime.fromtimestamp(start, timezone.utc).isoformat(
+        ).removesuffix('+00:00')) == date

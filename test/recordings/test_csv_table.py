@@ -177,3 +177,37 @@ def test_a_time_without_a_unit(begin, unit, tmp_path):
     path = written(tmp_path, 't,U\n' + ''.join(f'{t},{12 + t % 7}\n' for t in ticks))
     found = read_recording(path).t
     assert (found[0] > 1e9) == (begin > 1.6e9) and found[-1] - found[0] == pytest.approx(1.99)
+
+
+@pytest.mark.parametrize('line, words', [
+    ('3.0,1x.2,0.3', "line 302: column 'voltage_v' holds '1x.2', not a number"),
+    ('3.0', "line 302: the line ends before column 'throttle'"),
+    ('3.0,5.0,0.3,7,8', 'line 302: 5 cells'), ('?,5.0,0.3', "line 302: column 'time_s'"),
+    ('?,y,z', "1 bad line left out, such as line 302: column 'time_s'")])
+def test_one_bad_line_costs_one_line(line, words, tmp_path):
+    """With --partial; without it the file is refused, and so is one with many of them."""
+    rows = [f'{0.01 * k:.2f},{5.0 + 0.01 * (k % 7):.2f},0.3' for k in range(400)]
+    good = read_recording(written(tmp_path, '\n'.join(['time_s,voltage_v,throttle', *rows])))
+    rows[300] = line
+    path = written(tmp_path, '\n'.join(['time_s,voltage_v,throttle', *rows]))
+    with pytest.raises(InputError, match='302'):
+        read_recording(path)
+    found = read_recording(path, partial=True)
+    np.testing.assert_array_equal(found.t, np.delete(good.t, 300))
+    np.testing.assert_array_equal(found.voltage, np.delete(good.voltage, 300))
+    (note,) = found.notes
+    assert words in note and '1 bad line left out' in note
+    rows[::10] = ['9,bad,0'] * 40
+    with pytest.raises(InputError, match='too many to leave out'):
+        read_recording(written(tmp_path, '\n'.join(['time_s,voltage_v,throttle', *rows])),
+                       partial=True)
+
+
+def test_a_bad_date_costs_one_line(tmp_path):
+    """A clock that no number was read from is told as such."""
+    rows = [f'2024-05-03 14:07:{k:02d},{5.0 + 0.01 * k:.2f}' for k in range(50)]
+    rows[20] = '2024-05-03 14:oo:20,5.2'
+    path = written(tmp_path, '\n'.join(['time,voltage_v', *rows]))
+    found = read_recording(path, partial=True)
+    assert found.n == 49 and any("holds '2024-05-03 14:oo:20', not a date" in note
+                                 for note in found.notes)

@@ -1,6 +1,8 @@
 """The report and the words of a fleet: complete, escaped, and there also when little is known."""
 
 from dataclasses import replace
+from datetime import datetime, timezone
+import re
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
@@ -8,7 +10,7 @@ from ou_monitor.fleet.fleet import Fleet
 from ou_monitor.fleet.judgement import judge
 from ou_monitor.fleet.table import NAMES
 from ou_monitor.report.fleet_document import (
-    as_data, facts, finding_words, fleet_document, lowest_table, short_names,
+    as_data, facts, finding_words, fleet_document, lowest_table, pack_table, short_names,
     vehicle_table, worst)
 from ou_monitor.report.page import html
 from ou_monitor.text import number
@@ -104,12 +106,12 @@ def test_the_lowest_voltage_comes_first():
     known = replace(fleet(rows), limit=13.5)
     assert fleet_document(known).headline.startswith(
         '4 dips below 13.5 V in 2 of 3 recordings, most in b (quad), 3: the lowest was 13.10 V '
-        'at 12.0 s of b (quad). The rail sags by up to 1.90 V, at 95 % throttle.')
+        'at 12.0 s of b (quad). The rail sags by up to 1.90 V, at 95 % throttle in b (quad).')
     assert facts(known) == [
         ('Lowest voltage', '13.10 V at 12.0 s of b (quad), at 80 % throttle'),
         ('Below 13.5 V', '4 dips, 0.40 s in all, in 2 of 3 recordings'),
-        ('Sag', '1.20 V to 1.90 V (+- 400 mV) at the highest throttle flown; known in 2 of 3 '
-         'recordings')]
+        ('Sag', '1.20 V, a (quad), to 1.90 V (+- 400 mV), b (quad), at the highest throttle '
+         'flown; known in 2 of 3 recordings')]
     assert [row['path'] for row in worst(known)] == ['b', 'c', 'a']
     text = page_text(known)
     assert text.index('4 dips below') < text.index('Lowest voltages') < text.index('Vehicles')
@@ -119,6 +121,35 @@ def test_the_lowest_voltage_comes_first():
     made = lowest_table(known, 2)
     assert [row[made.heads.index('vehicle')] for row in made.rows] == ['quad', 'hexa']
     assert as_data(known)['brownout_voltage'] == 13.5
+
+
+def test_an_ageing_pack_is_the_headline():
+    """Its vehicle, growth, values a cell and dates; else what is not excluded, or why unknown."""
+    rows = table(np.random.default_rng(8), 2, 8, ageing={1: 0.1})
+    for row in rows:
+        row['start'] = datetime(2024, 5, row['flight'], tzinfo=timezone.utc)
+        row['cells_from'] = 'guessed'
+    made = fleet(rows)
+    first = made.judgement.trends[0]
+    assert (first.vehicle, first.low < 0.1 < first.high) == ('uav1', True)
+    said = fleet_document(made).headline
+    assert said.startswith('Ageing pack: uav1: resistance +') and 'uav0' not in said
+    # 5 mOhm a cell at first, twice as much after seven more flights; three errors of a line.
+    start, end = (float(word) for word in re.search(
+        r', ([\d.]+) to ([\d.]+) mOhm a cell \(4 cells, a guess\) in 8 flights, 2024-05-01 to '
+        '2024-05-08', said).groups())
+    assert start == pytest.approx(5.0 * np.exp(0.1), rel=3 * 0.05) and end / start == (
+        pytest.approx(np.exp(0.7), rel=3 * 0.05))
+    packs = pack_table(made)
+    assert packs.heads[:4] == ['vehicle', 'flights', 'dates', 'cells']
+    assert [row[:4] for row in packs.rows] == [
+        [name, '8', '2024-05-01 to 2024-05-08', '4?'] for name in ('uav0', 'uav1')]
+    assert '*' in packs.rows[1][5] and '*' not in packs.rows[0][5]
+    assert 'Resistance a cell' in page_text(made)
+    healthy = fleet_document(fleet(table(np.random.default_rng(9), 2, 5))).headline
+    assert healthy.startswith('No pack is seen to age; not excluded (95 %): ')
+    assert fleet_document(fleet(table(np.random.default_rng(9), 2, 2))).headline.startswith(
+        'Whether a pack ages is unknown: no vehicle has 3 flights')
 
 
 def test_without_a_limit_no_dip_is_counted():

@@ -32,6 +32,7 @@ import re
 from typing import NamedTuple, TextIO
 
 import numpy as np
+import numpy.typing as npt
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.importers import log as logs
 from ou_monitor.recordings.importers.formats import kind_of_foreign
@@ -350,8 +351,13 @@ def _stated_step(lines: list[str], above: list[list[str]]) -> tuple[float, float
 
 
 def numbers(path: Path, form: Form, places: Sequence[int],
-            texts: dict[int, list[str]] | None = None) -> list[FloatArray]:
-    """Return columns of numbers, NaN where blank; `texts` gets cells as written."""
+            texts: dict[int, list[str]] | None = None,
+            left_out: list[str] | None = None) -> list[FloatArray]:
+    """
+    Return columns of numbers, NaN where blank; `texts` gets cells as written.
+
+    A bad line is an InputError, unless `left_out` is there to get the errors of those left out.
+    """
     parts: list[list[FloatArray]] = [[] for _ in places]
     last = max([*places, *(texts or {})])
     width = len(form.names)
@@ -360,15 +366,20 @@ def numbers(path: Path, form: Form, places: Sequence[int],
             for begin, block in _blocks(path, file, form, width):
                 rows = block
                 if len(rows[0]) <= last or len(rows[0]) > width or len(set(map(len, rows))) > 1:
-                    rows = _fitting(path, rows, width, last, form, begin)
+                    rows = _fitting(path, rows, width, last, form, begin, left_out)
                 columns: list[tuple[str, ...]] = list(zip(*rows))
                 if not columns:
                     continue
+                good = np.ones(len(rows), dtype=bool)
                 for place, part in zip(places, parts):
                     where = partial(_place, path, form, place, begin, block)
-                    part.append(_floats(columns[place], where, form.comma, form.units[place]))
+                    part.append(_floats(columns[place], where, form.comma, form.units[place],
+                                        good if left_out is not None else None, left_out))
+                if not good.all():
+                    for part in parts:
+                        part[-1] = part[-1][good]
                 for place, cells in (texts or {}).items():
-                    cells += columns[place]
+                    cells += (cell for cell, fine in zip(columns[place], good) if fine)
     except OSError as error:
         raise InputError(f'cannot read {path}: {error.strerror}') from error
     except UnicodeError as error:
@@ -430,25 +441,34 @@ def _line(before: int, rows: list[list[str]], k: int) -> int:
 
 
 def _fitting(path: Path, rows: list[list[str]], width: int, last: int, form: Form, begin: int,
-             ) -> list[list[str]]:
+             left_out: list[str] | None) -> list[list[str]]:
     """Return the rows that are not blank, all of one width."""
     for k, row in enumerate(rows):
+        wrong, blank = '', not any(cell.strip() for cell in row)
         if len(row) > width and any(cell.strip() for cell in row[width:]):
-            raise InputError(
-                f'{path}:{_line(begin, rows, k)}: {len(row)} cells, and the header names '
-                f'{width} columns: mend the line; the decimal mark is a point')
-        if not any(cell.strip() for cell in row):
+            wrong = (f'{path}:{_line(begin, rows, k)}: {len(row)} cells, and the header names '
+                     f'{width} columns: mend the line; the decimal mark is a point')
+        elif not blank and len(row) <= last:
+            wrong = (f'{path}:{_line(begin, rows, k)}: the line ends before column '
+                     f"'{form.names[last]}'")
+        if wrong and left_out is None:
+            raise InputError(wrong)
+        if wrong or blank:
             # It stays in the block, so that line numbers can be counted.
             row.clear()
-        elif len(row) <= last:
-            raise InputError(f'{path}:{_line(begin, rows, k)}: the line ends before column '
-                             f"'{form.names[last]}'")
+        if wrong and left_out is not None:
+            left_out.append(wrong)
     return [row[:last + 1] for row in rows if row]
 
 
 def _floats(cells: Sequence[str], where: Callable[[int], str], comma: bool, stated: str,
-            ) -> FloatArray:
-    """Return cells as numbers (where: words for the place of one; stated: their unit)."""
+            good: npt.NDArray[np.bool_] | None, left_out: list[str] | None) -> FloatArray:
+    """
+    Return cells as numbers (where: words for the place of one; stated: their unit).
+
+    A bad one is an InputError; if `good` is there, its line is marked, and `left_out` gets the
+    error, once a line.
+    """
     try:
         values = np.fromiter(map(float, cells), np.float64, len(cells))
         # As in `plain_number`.
@@ -471,7 +491,13 @@ def _floats(cells: Sequence[str], where: Callable[[int], str], comma: bool, stat
                 cell = cell.replace('.', '\0').replace(',', '.').replace('\0', ',')
             mark = _MARK if cell.count(',') == 1 and not comma else (
                 ': the decimal mark is a comma' * comma)
-            raise InputError(f"{where(k)} holds '{shown(cell)}', not a number{mark}")
+            wrong = f"{where(k)} holds '{shown(cell)}', not a number{mark}"
+            if good is None or left_out is None:
+                raise InputError(wrong)
+            if good[k]:
+                left_out.append(wrong)
+            good[k] = False
+            found.append(math.nan)
     return np.array(found, dtype=np.float64)
 
 
@@ -554,9 +580,19 @@ class _Table(NamedTuple):
     note: str  # How the file was read; '' if nothing was detected
 
 
-def read_csv(path: Path, columns: CsvColumns | None = None) -> RawColumns:
-    """Read the samples of a supply, unsorted and with NaN kept."""
-    table = _table(path, columns or CsvColumns(), needed=True)
+def read_csv(path: Path, columns: CsvColumns | None = None, *, partial: bool = False,
+             ) -> RawColumns:
+    """Read the samples of a supply, unsorted and with NaN kept; partial: without bad lines."""
+    left_out: list[str] | None = [] if partial else None
+    table = _table(path, columns or CsvColumns(), needed=True, left_out=left_out)
+    said = [table.note] if table.note else []
+    if left_out:
+        if len(left_out) > WILD * table.t.size:
+            raise InputError(f'{left_out[0]} ({len(left_out)} such lines, too many to leave out)')
+        first = left_out[0].removeprefix(str(path)).lstrip(': ')
+        said.append(Note(
+            f'{counted(len(left_out), "bad line")} left out, such as '
+            f'{"line " * first[0].isdigit()}{first}.', Defect.DAMAGED_FILE))
     (column, volts), nothing = table.found[logs.VOLTAGE], np.full(table.t.shape, np.nan)
     name = printable(path.name)
     held = {quantity: values for quantity, (_, values) in table.found.items()}
@@ -566,8 +602,7 @@ def read_csv(path: Path, columns: CsvColumns | None = None) -> RawColumns:
                    if quantity != logs.CURRENT}
     # A blank cell is not a message: the last command holds.
     return RawColumns(table.t, volts, hold(held.get(logs.THROTTLE, nothing)),
-                      held.get(logs.CURRENT, nothing), name, source,
-                      (table.note,) if table.note else ())
+                      held.get(logs.CURRENT, nothing), name, source, tuple(said))
 
 
 def read(path: Path, request: Request) -> Log:
@@ -625,8 +660,12 @@ def holds_supply(path: Path) -> bool:
 
 
 def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: bool = False,
-           ) -> _Table:
-    """Read time, the columns of a supply, and others by name (needed: a voltage must be there)."""
+           left_out: list[str] | None = None) -> _Table:
+    """
+    Read time, the columns of a supply, and others by name (needed: a voltage must be there).
+
+    left_out as in `numbers`.
+    """
     form = form_of(path, wanted)
     time = _time_of(path, form, wanted)
     found = _supply_of(path, form, wanted, time, needed)
@@ -638,7 +677,7 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
     for place in (*time.place, *places):
         if form.names.count(form.names[place]) > 1:
             raise InputError(f"{path}:{form.line}: column '{form.names[place]}' is there twice")
-    t, values = _read(path, form, time, places)
+    t, values = _read(path, form, time, places, left_out)
     volts = next(zip(found, values), (None, t))[1] if logs.VOLTAGE in found else t
     if time.place:
         _check_backwards(path, t, volts, time.name, found)
@@ -803,7 +842,7 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: _Column, needed
 
 
 def _read(path: Path, form: Form, time: _Column, places: list[int],
-          ) -> tuple[FloatArray, list[FloatArray]]:
+          left_out: list[str] | None = None) -> tuple[FloatArray, list[FloatArray]]:
     """Return the time as written, days and clocks in s, and columns of numbers."""
     sample = [row[time.place[-1]] for row in form.rows
               if time.place and time.place[-1] < len(row) and row[time.place[-1]]]
@@ -811,15 +850,15 @@ def _read(path: Path, form: Form, time: _Column, places: list[int],
         if not LEAST_STEP <= time.scale <= LONGEST_STEP:
             raise InputError(f"{path}: '{time.name}' says rows {time.scale:g} s apart, outside "
                              f'{LEAST_STEP:g} to {LONGEST_STEP:g} s')
-        values = numbers(path, form, places or [0])
+        values = numbers(path, form, places or [0], left_out=left_out)
         return time.scale * np.arange(float(values[0].size)) + form.start * (
             time.name == form.stated), values
     if sample and not is_number(sample[0]) and is_clock(sample[0]):
         clocks: list[list[str]] = [[] for _ in time.place]
-        values = numbers(path, form, places, dict(zip(time.place, clocks)))
+        values = numbers(path, form, places, dict(zip(time.place, clocks)), left_out)
         cells = [' '.join(pair) for pair in zip(*clocks)] if len(clocks) > 1 else clocks[0]
-        return _clock(path, [swapped(cell) for cell in cells], time.name), values
-    t, *values = numbers(path, form, [time.place[0], *places])
+        return _clock(path, [swapped(cell) for cell in cells], time.name, left_out), values
+    t, *values = numbers(path, form, [time.place[0], *places], left_out=left_out)
     return t, values
 
 
@@ -828,13 +867,15 @@ def _days(year: int, month: int, day: int) -> int:
     return date(year + (2000 if year < 100 else 0), month, day).toordinal() - 719163
 
 
-def _clock(path: Path, cells: list[str], name: str) -> FloatArray:
+def _clock(path: Path, cells: list[str], name: str, left_out: list[str] | None) -> FloatArray:
     """Return dates and times in s since 1970; without a date since the first midnight."""
     found = [None if not cell.strip() else CLOCK.fullmatch(cell) for cell in cells]
-    bad = next((k for k, one in enumerate(found) if one is None and cells[k].strip()), None)
-    if bad is not None:
-        raise InputError(f"{path}: column '{name}' holds '{shown(cells[bad])}', not a date or "
-                         'a time')
+    bad = [f"{path}: column '{name}' holds '{shown(cells[k])}', not a date or a time"
+           for k, one in enumerate(found) if one is None and cells[k].strip()]
+    if bad and left_out is None:
+        raise InputError(bad[0])
+    if left_out is not None:
+        left_out += bad
     try:
         either = [_clock_seconds(found, first) for first in (True, False)]
     except ValueError as error:

@@ -19,7 +19,7 @@ import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import (
     CURRENT, FRD_TO_FLU, gyro_of, Log, log_of, Motion, one_flight, quiet, quiet_process, Request,
-    RPM, Series, SIGNAL, three_axes, THROTTLE, UNKNOWN, VELOCITY, VOLTAGE)
+    RPM, Series, SIGNAL, started, three_axes, THROTTLE, UNKNOWN, VELOCITY, VOLTAGE)
 from ou_monitor.records import FloatArray
 from ou_monitor.stream.files import open_regular
 from pymavlink import DFReader
@@ -83,6 +83,8 @@ def read(path: Path, request: Request) -> Log:
             table, banner, bad = _collect(log, request)
             notes = mended + (_lost_text(log) if text else _lost_binary(log))
             parameters: dict[str, float] = dict(log.params)
+            # Unix time of boot by GPS; 0: unknown.
+            boot = float(getattr(log.clock, 'timebase', 0.0) or 0.0)
             whole = {kind: _whole_numbers(log, kind) for kind, _ in table}
             units = {kind: _units(log, kind) for kind, _ in table}
             names = tuple(f'{one.name}.{field}' for one in log.formats.values()
@@ -105,7 +107,8 @@ def read(path: Path, request: Request) -> Log:
                          f'({", ".join(dict.fromkeys(row[0] for row in PLAIN))})'
                          + ''.join(f': {note}' for note in notes))
     return log_of('dataflash_text' if text else 'dataflash', series,
-                  _facts(banner) | _cells(parameters), notes,
+                  _facts(banner) | _cells(parameters) | started(boot + min(
+                      columns['t'][0] for columns in table.values()) if boot else 0.0), notes,
                   (*(one.name for one in series), *names), _gyros(table), _speeds(table))
 
 

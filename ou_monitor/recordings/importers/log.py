@@ -2,8 +2,8 @@
 Result of an importer: a `Log` with candidate `Series` and motion, each with its origin.
 
 Limits: the wanted fields of a log are read into memory at once.  Stamps are seconds from the
-start of the log, or of the flight in it; absolute time is not kept.  Importers do not
-depend on the bag format.
+start of the log, or of the flight in it; only the date of the start is kept, as the fact
+``started``.  Importers do not depend on the bag format.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field, replace
+from datetime import datetime, timezone
 import io
 import logging
 import math
@@ -23,7 +24,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
-from ou_monitor.records import Defect, FloatArray, Note
+from ou_monitor.records import clock_unit, Defect, FloatArray, Note
 from ou_monitor.text import counted, printable
 from ou_monitor.timeline.line import in_order, Picked
 
@@ -311,6 +312,12 @@ def log_of(form: str, series: Sequence[Series], facts: dict[str, str], notes: It
     return Log(form, shifted(series), facts, tuple(notes), shifted(inertial),
                next(iter(shifted([speeds] if speeds else [])), None),
                tuple(dict.fromkeys(names)))
+
+
+def started(unix: float) -> dict[str, str]:
+    """Return the fact that a log began at a Unix time, s, if its clock has a date."""
+    return {'started': datetime.fromtimestamp(unix, timezone.utc).isoformat(
+        timespec='seconds')} if clock_unit(unix) == 's' else {}
 
 
 def three_axes(columns: Mapping[str, Any], names: Sequence[str]) -> FloatArray | None:

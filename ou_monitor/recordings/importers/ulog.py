@@ -18,12 +18,13 @@ from typing import Any
 import numpy as np
 from ou_monitor.recordings.importers.log import (
     CURRENT, FRD_TO_FLU, gyro_of, Log, log_of, Motion, one_flight, Progress, quiet, Request, RPM,
-    Series, SIGNAL, three_axes, THROTTLE, UNKNOWN, VELOCITY, VOLTAGE)
+    Series, SIGNAL, started, three_axes, THROTTLE, UNKNOWN, VELOCITY, VOLTAGE)
 from ou_monitor.records import Defect, FloatArray, Note
 from pyulog import ULog
 
-TOPICS = ('battery_status', 'system_power', 'power_monitor', 'esc_status', 'actuator_motors',
-          'vehicle_thrust_setpoint', 'actuator_controls_0', 'actuator_outputs',
+CLOCK, UTC = 'vehicle_gps_position', 'time_utc_usec'
+TOPICS = ('battery_status', CLOCK, 'system_power', 'power_monitor', 'esc_status',
+          'actuator_motors', 'vehicle_thrust_setpoint', 'actuator_controls_0', 'actuator_outputs',
           'manual_control_setpoint', 'sensor_combined', 'vehicle_angular_velocity', 'sensor_gyro')
 
 # Topic, field of the gyro, field of the accelerometer, rank, words.  Axes are front, right,
@@ -143,7 +144,7 @@ def read(path: Path, request: Request) -> Log:
             series += [*found, *_others(name, data.name, columns, {one.name for one in found})]
             inertial += _gyros(name, data.name, columns)
             speeds = speeds or _speeds(data.name, columns)
-    return log_of('ulog', series, _facts(ulog), notes,
+    return log_of('ulog', series, _facts(ulog) | _started(ulog), notes,
                   (*(one.name for one in series), *_declared(ulog)), inertial, speeds,
                   ulog.start_timestamp * 1e-6)
 
@@ -231,6 +232,18 @@ def _facts(ulog: Any) -> dict[str, str]:
         if 2.0 < empty < 4.0:
             facts['cell_minimum'] = f'{empty:g}'
     return facts
+
+
+def _started(ulog: Any) -> dict[str, str]:
+    """Return the date of the start by the first GPS time."""
+    for data in ulog.data_list:
+        if data.name == CLOCK and UTC in data.data:
+            known = np.flatnonzero(data.data[UTC])
+            if known.size:
+                k = known[0]
+                return started(1e-6 * (float(data.data[UTC][k]) - float(
+                    data.data['timestamp'][k]) + ulog.start_timestamp))
+    return {}
 
 
 def _series(name: str, topic: str, columns: dict[str, Any]) -> Iterator[Series]:

@@ -111,3 +111,13 @@ def test_broken_at_random(tmp_path):
                 assert '\n' not in str(error) and len(str(error)) < 1000
                 refused += 1
     assert read and refused
+
+
+@pytest.mark.parametrize('name, started', [
+    # GPS: second 3880.6 of week 1815 less 18 leap seconds; header; GPS; a board without a clock.
+    ('ac_jd_2004.bin', '2014-10-19T01:04:22'), ('bf_ar8_6s.BFL', '2022-02-02T15:04:53'),
+    ('px_sample_log_small.ulg', '2021-04-21T06:30:58'), ('ie_btfl_002.bbl', '')])
+def test_the_date_of_a_log_is_kept(name, started):
+    """From the header or the GPS; without either there is none."""
+    assert import_log(RAW / name, Request()).facts.get('started', '').startswith(started)
+    assert bool(started) == ('started' in import_log(RAW / name, Request()).facts)
