@@ -12,34 +12,30 @@ sample, and whether WEAKER at any second.  Needs `OU_MONITOR_REALDATA`.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from itertools import permutations
 import math
 from pathlib import Path
 
+from common import arguments, deliver, FLIGHTS, flights, HIRO, table
 import numpy as np
 from ou_monitor.model.load import LoadStart
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.model_watch import ModelComparison, ModelVerdict
 from ou_monitor.recordings.model_file import read_model
-from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import Recording
 from ou_monitor.simulation import read_throttle, RecordedThrottle, simulated
-from tables import deliver, recorded, table
 
 # Hz; length of the flight that teaches and of those compared, s.
 RATE, TAUGHT, LENGTH = 100.0, 120.0, 60.0
 AGES, PLACES = (1.0, 1.1, 1.2, 1.4), (0.0, 1.0 / 3.0, 2.0 / 3.0)
-# Name, file below OU_MONITOR_REALDATA, flight of a log, and the craft: pairs are of one craft.
-FLIGHTS: tuple[tuple[str, str, int | None, str], ...] = (
-    ('gecko', 'bf_gecko_a.csv', None, ''), ('nazgul', 'raw/bf_nazgul_4s.bbl', None, ''),
-    ('hiro', 'raw/bf_hiro_4s.BFL', None, ''), ('erle', 'raw/ac_erle_althold2.BIN', None, ''),
-    ('roma 1', 'raw/bf_roma_6s.bbl', 1, 'roma'), ('roma 2', 'raw/bf_roma_6s.bbl', 2, 'roma'),
-    ('roma 3', 'raw/bf_roma_6s.bbl', 3, 'roma'),
-    ('Crazyflie alone', 'cf_solo_large.csv', None, 'cf'),
-    ('Crazyflie in a pair', 'cf_pair_large.csv', None, 'cf'))
+# Recorded flights by craft; a craft with one flight is compared by its halves.
+CRAFTS: dict[str, dict[str, tuple[str, int | None]]] = {
+    'gecko': {'gecko': FLIGHTS['gecko']}, 'nazgul': {'nazgul': FLIGHTS['nazgul']},
+    'hiro': {'hiro': HIRO}, 'erle': {'erle': FLIGHTS['erle']},
+    'roma': {f'roma {k}': (FLIGHTS['roma'][0], k) for k in (1, 2, 3)},
+    'cf': {'Crazyflie alone': FLIGHTS['cf_solo'], 'Crazyflie in a pair': FLIGHTS['cf_pair']}}
 
 
 def seconds(made: Recording, start: LoadStart, factor: float = 1.0) -> Iterator[ModelComparison]:
@@ -104,15 +100,14 @@ def half(made: Recording, second: bool) -> Recording:
 
 def pairs() -> list[list[str]]:
     """Return a row for each recorded pair, either way."""
-    folder, flights, rows = recorded(), {}, []
-    for name, file, number, craft in FLIGHTS:
-        made = read_recording(folder / file, flight=number)
-        flights.setdefault(craft or name, []).append((name, made))
-        if not craft:
-            flights[name] = [(f'{name}, first half', half(made, False)),
-                             (f'{name}, second half', half(made, True))]
-    for craft in flights.values():
-        for (then, first), (now, second) in permutations(craft, 2):
+    rows = []
+    for craft in CRAFTS.values():
+        parts = list(flights(of=craft))
+        if len(parts) == 1:
+            (name, made), = parts
+            parts = [(f'{name}, first half', half(made, False)),
+                     (f'{name}, second half', half(made, True))]
+        for (then, first), (now, second) in permutations(parts, 2):
             start = learned(first)
             if start is None:
                 rows.append([now, then, '-', '-', 'the model has no load', ''])
@@ -127,11 +122,10 @@ def pairs() -> list[list[str]]:
 
 def main() -> int:
     """Measure, and print the tables, or put them into the page."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
+    parser = arguments(__doc__)
     parser.add_argument('what', choices=('aged', 'pairs'))
     parser.add_argument('runs', nargs='*', metavar='MODEL.yaml:RECORDING')
     parser.add_argument('--seeds', type=int, default=10)
-    parser.add_argument('--page', type=Path)
     options = parser.parse_args()
     if options.what == 'aged':
         rows = []

@@ -37,19 +37,17 @@ from dataclasses import dataclass
 from pathlib import Path
 import sys
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from common import deliver, drawing, FLIGHTS, flights, HIRO, median3, say, table
+import numpy as np
+from ou_monitor import MonitorSettings, SupplyMonitor
+from ou_monitor.online.risk.flag import FlagLevel
+from ou_monitor.records import Recording
+from ou_monitor.report.svg import Plot
 
-import numpy as np  # noqa: E402
-from ou_monitor import MonitorSettings, read_recording, SupplyMonitor  # noqa: E402
-from ou_monitor.online.risk.flag import FlagLevel  # noqa: E402
-from ou_monitor.records import Recording  # noqa: E402
-from ou_monitor.report.svg import Plot  # noqa: E402
-from tables import deliver, drawing, median3, recorded, table  # noqa: E402
-
-# Name, file, flight of the log, cells.
-FLIGHTS = (('gecko', 'bf_gecko_a.csv', None, 4), ('nazgul', 'raw/bf_nazgul_4s.bbl', 1, 4),
-           ('roma', 'raw/bf_roma_6s.bbl', 3, 6), ('bf3s', 'raw/bf_3s_erpm2.bbl', 2, 3),
-           ('hiro', 'raw/bf_hiro_4s.BFL', None, 4), ('erle', 'raw/ac_erle_althold2.BIN', None, 3))
+# The flights, and the cells of their packs.
+FLOWN = {**{name: FLIGHTS[name] for name in ('gecko', 'nazgul', 'roma', 'bf3s')}, 'hiro': HIRO,
+         'erle': FLIGHTS['erle']}
+CELLS = {'gecko': 4, 'nazgul': 4, 'roma': 6, 'bf3s': 3, 'hiro': 4, 'erle': 3}
 # Time between two reports, and before the first that counts, s.
 LOOK, SETTLED = 0.1, 20.0
 # An alarm catches a dip from so long before it to so long after, s; a lone dip has none before.
@@ -288,20 +286,13 @@ def strip(watch: Watch) -> str:
     return drawing(parts, 900, 320 + 14 * len(SHORT), f'{watch.flight}, alarms')
 
 
-def flights(options: argparse.Namespace) -> str:
+def recorded_flights(options: argparse.Namespace) -> str:
     """Return the tables of recorded flights; draw their strips."""
-    folder = recorded()
     watches = []
-    for name, file, flight, cells in FLIGHTS:
-        path = folder / file
-        if options.flight and name not in options.flight:
-            continue
-        if not path.exists():
-            print(f'{name}: {path} is not there, left out', file=sys.stderr)
-            continue
-        for limit, watch in fly(name, read_recording(path, flight=flight), cells):
+    for name, recording in flights(options.flight, FLOWN):
+        for limit, watch in fly(name, recording, CELLS[name]):
             watches.append((limit, watch))
-            print(name, limit, numbers(watch.counts(OURS), watch.leads(OURS)), file=sys.stderr)
+            say(name, limit, numbers(watch.counts(OURS), watch.leads(OURS)))
             if options.strips and limit == DRAWN:
                 (options.strips / f'alarms_{name}.svg').write_text(
                     strip(watch), encoding='utf-8')
@@ -381,8 +372,8 @@ def main() -> int:
     """Print the tables, or put them into the page."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parts = parser.add_subparsers(dest='part', required=True)
-    part = parts.add_parser('flights', help=flights.__doc__)
-    part.set_defaults(action=flights)
+    part = parts.add_parser('flights', help=recorded_flights.__doc__)
+    part.set_defaults(action=recorded_flights)
     part.add_argument('flight', nargs='*', help='names (default all)')
     part.add_argument('--strips', type=Path, help='folder for a drawing of each flight')
     part = parts.add_parser('loop', help=loop.__doc__)

@@ -26,20 +26,18 @@ from typing import Any
 import warnings
 import zlib
 
+import common  # noqa: F401
 import lz4.frame
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, IndexType, Writer
 import numpy as np
-import zstandard
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from ou_monitor.errors import InputError  # noqa: E402, I100
-from ou_monitor.recordings.mcap_file import MAGIC  # noqa: E402
-from ou_monitor.recordings.read import read_recording  # noqa: E402
-from ou_monitor.recordings.standard_types import (  # noqa: E402
+from ou_monitor.errors import InputError
+from ou_monitor.recordings.mcap_file import MAGIC
+from ou_monitor.recordings.read import read_recording
+from ou_monitor.recordings.standard_types import (
     BATTERY_STATE, encode_battery, encode_scalars, FLOAT32, FLOAT64, SCHEMAS)
-from ou_monitor.records import Recording  # noqa: E402
+from ou_monitor.records import Recording
+import zstandard
 
 START = 1_704_067_200_000_000_000
 MS = 1_000_000
@@ -97,6 +95,23 @@ def records(data: bytes) -> list[tuple[int, int]]:
     return found
 
 
+# Damage that needs no knowledge of the format.
+BYTES = ('bits', 'bytes', 'zeros', 'cut', 'hole')
+
+
+def damage(data: bytearray, kind: str, at: int, most: int, rng: np.random.Generator) -> None:
+    """Damage bytes from a place on, at most so many."""
+    size = int(rng.integers(1, most))
+    if kind == 'bits':
+        for place in rng.integers(len(data), size=int(rng.integers(1, 9))).tolist():
+            data[place] ^= 1 << int(rng.integers(8))
+    elif kind == 'cut':
+        del data[at:]
+    else:
+        there = len(data[at:at + size])
+        data[at:at + size] = {'bytes': rng.bytes(there), 'zeros': bytes(there), 'hole': b''}[kind]
+
+
 def mutated(sound: bytes, rng: np.random.Generator) -> tuple[str, bytes]:
     """Return the kind of an attack, and a file after it."""
     data = bytearray(sound)
@@ -104,23 +119,12 @@ def mutated(sound: bytes, rng: np.random.Generator) -> tuple[str, bytes]:
     # A record that is gone without a trace from a file that counts nothing cannot be missed.
     if not any(sound[begin] == Opcode.STATISTICS for begin, _ in parts):
         parts = [part for part in parts if sound[part[0]] != Opcode.CHUNK]
-    kind = str(rng.choice(['bits', 'bytes', 'zeros', 'cut', 'hole', 'more', 'swap', 'twice',
-                           'lost', 'length', 'word', 'kind', 'tail']))
+    kind = str(rng.choice([*BYTES, 'more', 'swap', 'twice', 'lost', 'length', 'word', 'kind',
+                           'tail']))
     at = int(rng.integers(len(MAGIC), len(data)))
     one, other = (parts[int(k)] for k in rng.integers(len(parts), size=2))
-    if kind == 'bits':
-        for place in rng.integers(len(data), size=int(rng.integers(1, 9))).tolist():
-            data[place] ^= 1 << int(rng.integers(8))
-    elif kind == 'bytes':
-        size = int(rng.integers(1, 300))
-        data[at:at + size] = rng.bytes(len(data[at:at + size]))
-    elif kind == 'zeros':
-        size = int(rng.integers(1, 5000))
-        data[at:at + size] = bytes(len(data[at:at + size]))
-    elif kind == 'cut':
-        del data[at:]
-    elif kind == 'hole':
-        del data[at:at + int(rng.integers(1, 3000))]
+    if kind in BYTES:
+        damage(data, kind, at, 3000, rng)
     elif kind == 'more':
         data[at:at] = rng.bytes(int(rng.integers(1, 300)))
     elif kind == 'swap':
@@ -162,15 +166,11 @@ class Crafted:
 
     def __init__(self, rng: np.random.Generator) -> None:
         """Choose what lies."""
-        self.rng, self.kinds = rng, []
-        self.count = 0
+        self.rng, self.count = rng, 0
 
-    def lies(self, kind: str, chance: float = 0.12) -> bool:
-        """Return whether a part of that kind lies."""
-        if self.rng.random() < chance:
-            self.kinds.append(kind)
-            return True
-        return False
+    def lies(self, chance: float = 0.12) -> bool:
+        """Return whether the next part lies."""
+        return bool(self.rng.random() < chance)
 
     def lie(self) -> int:
         """Return a number that is wrong nearly everywhere."""
@@ -183,15 +183,15 @@ class Crafted:
                      text(definition))
         out += record(Opcode.CHANNEL, struct.pack('<HH', 1, 1), text('/voltage'), text('cdr'),
                       text(b''))
-        if self.lies('endless text'):
+        if self.lies():  # endless text
             out += record(Opcode.SCHEMA, struct.pack('<HI', 2, 2**32 - 1), b'x' * 50)
-        if self.lies('second definition'):
+        if self.lies():  # second definition
             out += record(Opcode.SCHEMA, struct.pack('<H', 1), text(name), text('ros2msg'),
                           text('float32 data\nfloat32 more\n'))
-        if self.lies('long names'):
+        if self.lies():  # long names
             out += b''.join(record(Opcode.CHANNEL, struct.pack('<HH', k + 2, 1), text(
                 f'/x{k}' * 200), text('cdr'), text(b'')) for k in range(300))
-        if self.lies('json'):
+        if self.lies():  # json
             out += record(Opcode.CHANNEL, struct.pack('<HH', 999, 0), text('/j'), text('json'),
                           text(b''))
         return out
@@ -203,11 +203,11 @@ class Crafted:
             at = START + self.count * MS
             out += record(Opcode.MESSAGE, struct.pack('<HIQQ', 1, self.count, at, at), data)
             self.count += 1
-        if self.lies('short message', 0.03):
+        if self.lies(0.03):
             out += record(Opcode.MESSAGE, bytes(int(self.rng.integers(22))))
-        if self.lies('unknown channel', 0.05):
+        if self.lies(0.05):
             out += record(Opcode.MESSAGE, struct.pack('<HIQQ', 77, 0, START, START), bytes(12))
-        if self.lies('cut within', 0.03):
+        if self.lies(0.03):
             out += record(Opcode.MESSAGE, bytes(30), length=self.lie())
         return out
 
@@ -215,7 +215,7 @@ class Crafted:
         """Return a chunk; what it states of itself may be a lie."""
         way = str(self.rng.choice(['', 'zstd', 'lz4']))
         packed, size, crc = content, len(content), zlib.crc32(content)
-        if self.lies('bomb', 0.05):
+        if self.lies(0.05):
             content = bytes(int(self.rng.choice([10**6, 2 * 10**8])))
         if way == 'zstd':
             one = zstandard.ZstdCompressor(
@@ -225,13 +225,13 @@ class Crafted:
             packed = lz4.frame.compress(content)
         else:
             packed = content[:10**6]
-        if self.lies('chunk size', 0.05):
+        if self.lies(0.05):
             size = self.lie()
-        if self.lies('chunk checksum', 0.05):
+        if self.lies(0.05):
             crc = 12345
-        if self.lies('compression', 0.03):
+        if self.lies(0.03):
             way = str(self.rng.choice(['lz4', 'zstd', '', 'gzip', 'x' * 5000]))
-        length = self.lie() if self.lies('length of data', 0.03) else len(packed)
+        length = self.lie() if self.lies(0.03) else len(packed)
         return record(Opcode.CHUNK, struct.pack(
             '<QQQI', START + first * MS, START + max(first, self.count - 1) * MS, size, crc),
             text(way), struct.pack('<Q', length), packed)
@@ -252,28 +252,28 @@ class Crafted:
             one = self.chunk(content, first)
             numbers = [START + first * MS, START + (self.count - 1) * MS, len(data), len(one)]
             size = len(content)
-            if self.lies('index', 0.1):
+            if self.lies(0.1):
                 numbers[int(self.rng.integers(4))] = self.lie()
-            if self.lies('size of index', 0.05):
+            if self.lies(0.05):
                 size = self.lie()
             entry = record(
                 Opcode.CHUNK_INDEX, struct.pack('<QQQQ', *numbers),
                 text(struct.pack('<HQ', 1, len(data) + len(one))), struct.pack('<Q', 0),
                 text(''), struct.pack('<QQ', size, size))
             data += one
-            indexes += entry * (0 if self.lies('chunk unlisted', 0.05) else
-                                int(self.rng.integers(2, 40)) if self.lies('listed twice', 0.05)
+            indexes += entry * (0 if self.lies(0.05) else
+                                int(self.rng.integers(2, 40)) if self.lies(0.05)
                                 else 1)
-            if self.lies('private record', 0.05):
+            if self.lies(0.05):
                 data += record(0x90, bytes(30))
-            if self.lies('junk', 0.03):
+            if self.lies(0.03):
                 data += self.rng.bytes(40)
         data += record(Opcode.DATA_END, bytes(4))
         start = len(data)
         if self.rng.random() < 0.3:
             start = 0
         else:
-            counted = self.count + (self.lies('count') and int(self.rng.integers(-5, 6)))
+            counted = self.count + (self.lies() and int(self.rng.integers(-5, 6)))
             data += self.definitions() + indexes + record(
                 Opcode.STATISTICS, struct.pack(
                     '<QHIIIIQQ', max(counted, 0), 1, 1, 0, 0, chunks, START,
@@ -299,26 +299,16 @@ def sheet() -> bytes:
 
 def mutated_sheet(sound: bytes, rng: np.random.Generator) -> tuple[str, bytes]:
     """Return the kind of an attack, and a CSV after it."""
-    kind = str(rng.choice(['bits', 'bytes', 'zeros', 'cut', 'hole', 'swap', 'twice', 'less',
-                           'more', 'cell', 'quote', 'endless', 'ends', 'marks', 'text', 'header',
-                           'short']))
+    kind = str(rng.choice([*BYTES, 'swap', 'twice', 'less', 'more', 'cell', 'quote', 'endless',
+                           'ends', 'marks', 'text', 'header', 'short']))
     data = bytearray(sound)
     lines = sound.decode().splitlines()
     at = int(rng.integers(len(data)))
     one, other = (int(k) for k in rng.integers(1, len(lines), size=2))
     cells = lines[one].split(',')
     which = int(rng.integers(len(cells)))
-    if kind == 'bits':
-        for place in rng.integers(len(data), size=int(rng.integers(1, 9))).tolist():
-            data[place] ^= 1 << int(rng.integers(8))
-    elif kind in ('bytes', 'zeros'):
-        size = int(rng.integers(1, 60))
-        data[at:at + size] = rng.bytes(size) if kind == 'bytes' else bytes(size)
-    elif kind == 'cut':
-        del data[at:]
-    elif kind == 'hole':
-        del data[at:at + int(rng.integers(1, 300))]
-    if kind in ('bits', 'bytes', 'zeros', 'cut', 'hole'):
+    if kind in BYTES:
+        damage(data, kind, at, 300, rng)
         return kind, bytes(data)
     end = '\n'
     if kind == 'swap':
@@ -479,9 +469,9 @@ def main() -> int:
                     print(f'{said}: {kind}, seed {seed}, partial {partial}', file=sys.stderr)
     for (kind, said), n in sorted(tally.items()):
         print(f'{kind:12} {said:32} {n}')
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
     print(f'{faults} faults in {sum(tally.values())} readings; slowest {slowest:.2f} s of CPU; '
-          f'peak '
-          f'{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB resident')
+          f'peak {peak:.0f} MB resident')
     return 1 if faults else 0
 
 

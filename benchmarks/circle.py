@@ -1,5 +1,5 @@
 """
-Models that `discover` finds, simulated and criticised again: alike, with nothing new, or named.
+Models saved by `discover`, drawn again: do `compare` and `discover` recognise them? (25 min).
 
     OU_MONITOR_REALDATA=FOLDER python benchmarks/circle.py --page doc/results/circle.md
 
@@ -10,30 +10,24 @@ is added to the model must be found, with its frequency.
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-import sys
 import tempfile
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from common import arguments, BENCHES, deliver, FLIGHTS, HIRO, recorded, say, table
+import numpy as np
+from ou_monitor import compare, discover, read_recording, Recording, simulate
+from ou_monitor.cli.recorded import model_text
+from ou_monitor.comparison.yardstick import Likeness
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.tones import Tone
+from ou_monitor.recordings.model_file import read_model
 
-import numpy as np  # noqa: E402
-from ou_monitor import compare, discover, read_recording, Recording, simulate  # noqa: E402
-from ou_monitor.cli.recorded import model_text  # noqa: E402
-from ou_monitor.comparison.yardstick import Likeness  # noqa: E402
-from ou_monitor.model.supply import SupplyModel  # noqa: E402
-from ou_monitor.model.terms.tones import Tone  # noqa: E402
-from ou_monitor.recordings.model_file import read_model  # noqa: E402
-from tables import deliver, recorded, table  # noqa: E402
-
-# Five flights and a robot: file below OU_MONITOR_REALDATA, and flight of a log.
-MODELS = {
-    'gecko': ('bf_gecko_a.csv', None), 'nazgul': ('raw/bf_nazgul_4s.bbl', 1),
-    'hiro': ('raw/bf_hiro_4s.BFL', None), 'bf3s': ('raw/bf_3s_erpm2.bbl', 2),
-    'cf_solo': ('cf_solo_large.csv', None), 'mm_bench_3': ('mm_bench_3.csv', None)}
+# Five flights and a robot.
+MODELS = {**{name: FLIGHTS[name] for name in ('gecko', 'nazgul', 'bf3s', 'cf_solo')},
+          'hiro': HIRO, 'mm_bench_3': BENCHES['mm_bench_3']}
 # Part of each recording that is drawn again, s.
 SECONDS = 60.0
 # The tone that is added: its peak over the rms of the readings' differences, and its share of the
@@ -78,7 +72,7 @@ def row(name: str, seeds: int) -> list[str]:
         foreign.update(new)
         found += any(isinstance(cause.term, Tone) and abs(cause.term.frequency / hum - 1.0) < NEAR
                      for cause in discover(draw(hummed, seed=seed).recording).causes)
-        print(name, seed, alike, clean, dict(foreign), found, file=sys.stderr, flush=True)
+        say(name, seed, alike, clean, dict(foreign), found)
     return [name, ', '.join(term.NAME for term in model.terms), f'{alike} of {seeds}',
             f'{clean} of {seeds}', ', '.join(f'{k} {n}' for k, n in foreign.most_common()) or '-',
             f'{found} of {seeds}']
@@ -86,13 +80,12 @@ def row(name: str, seeds: int) -> list[str]:
 
 def main() -> None:
     """Measure, and write the page."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('names', nargs='*', default=list(MODELS))
+    parser = arguments(__doc__, names=True)
     parser.add_argument('--seeds', type=int, default=20)
-    parser.add_argument('--page', type=Path)
     args = parser.parse_args()
     head = ('model of', 'terms', 'looks like it', 'nothing new', 'new', 'tone found')
-    deliver(table(head, [row(name, args.seeds) for name in args.names]), args.page, 'circle')
+    rows = [row(name, args.seeds) for name in args.names or MODELS]
+    deliver(table(head, rows), args.page, 'circle')
 
 
 if __name__ == '__main__':

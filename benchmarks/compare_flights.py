@@ -6,25 +6,15 @@ Nothing is set for any one flight.  Flights that are not there are left out, wit
 
 from __future__ import annotations
 
-import argparse
-import os
-from pathlib import Path
 import sys
 import time
 
+from common import arguments, deliver, flights, say, table
 from ou_monitor.comparison.compare import compare
 from ou_monitor.comparison.yardstick import Agreement, Band
-from ou_monitor.recordings.read import read_recording
-from real_flights import FLIGHTS
-from tables import put, table
 
 HEAD = ['flight', 's', 'explained', 'bias mV', 'lowest V', 'simulated', 'falls 1 %', 'simulated',
         'falls 5 %', 'simulated', 'KS', 'verdict', 'CPU s']
-
-
-def flight_number(options: tuple[str, ...]) -> int | None:
-    """Return the number that `convert` is given."""
-    return int(options[options.index('--flight') + 1]) if '--flight' in options else None
 
 
 def beside(of: Band, digits: int) -> str:
@@ -50,28 +40,16 @@ def row(name: str, found: Agreement, spent: float) -> list[str]:
 
 def main() -> int:
     """Compare the flights and print the table, or put it into the page."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
-    parser.add_argument('flight', nargs='*', help='names (default all)')
+    parser = arguments(__doc__, names=True)
     parser.add_argument('--seeds', type=int, default=200, help='simulations of each')
-    parser.add_argument('--page', type=Path, help='page whose table is replaced')
     options = parser.parse_args()
-    folder = os.environ.get('OU_MONITOR_REALDATA')
-    if folder is None:
-        parser.error('OU_MONITOR_REALDATA is not set: it names the folder of the flights')
     rows: list[list[str]] = []
     lowest = rates = one = 0
-    for name, file, given in FLIGHTS:
-        path = Path(folder) / file
-        if options.flight and name not in options.flight:
-            continue
-        if not path.exists():
-            print(f'{name}: {path} is not there, left out', file=sys.stderr)
-            continue
-        recording = read_recording(path, flight=flight_number(given))
+    for name, recording in flights(options.names):
         started = time.process_time()
         found = compare(recording, seeds=options.seeds)
         rows.append(row(name, found, time.process_time() - started))
-        print(rows[-1], found.worst, file=sys.stderr)
+        say(rows[-1], found.worst)
         lowest += found.lowest.inside
         rates += all(within(falls) for falls in found.falls)
         one += any(within(falls) for falls in found.falls)
@@ -79,10 +57,7 @@ def main() -> int:
         f'\nLowest voltage within its band: {lowest} of {len(rows)}. Falls within a factor of 2 '
         f'of the measured: through both levels {rates} of {len(rows)}, through one at least '
         f'{one} of {len(rows)}.\n')
-    if options.page:
-        put(options.page, text, 'beside')
-    else:
-        print(text)
+    deliver(text, options.page, 'beside')
     return 0
 
 

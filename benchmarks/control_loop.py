@@ -28,13 +28,13 @@ from dataclasses import dataclass, field, replace
 import math
 from typing import Any
 
+from common import number, table
 import numpy as np
 from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.online.filter.lowpass import AdaptiveLowPass
 from ou_monitor.records import FloatArray, NAN
 from ou_monitor.report.svg import Plot
 from scipy.optimize import brentq
-from tables import number, table
 
 # Of the cutoff, octaves: below, whatever it does is of no consequence to a loop.
 SWING = 0.5

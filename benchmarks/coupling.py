@@ -9,13 +9,13 @@ Every gyro axis of the recordings is used, unfiltered where the log has it so.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass
 import math
 from pathlib import Path
 import sys
 
+from common import arguments, deliver, recorded, say, table
 import numpy as np
 from ou_monitor.analysis.coupling import estimate_coupling
 from ou_monitor.recordings.importers.choose import choose
@@ -24,7 +24,6 @@ from ou_monitor.recordings.importers.formats import import_log
 from ou_monitor.recordings.importers.log import Request
 from scipy import stats
 from scipy.signal import lfilter
-from tables import deliver, recorded, table
 
 # Name, file below OU_MONITOR_REALDATA, number of the flight.
 LOGS = (('nazgul', 'raw/bf_nazgul_4s.bbl', 1), ('roma', 'raw/bf_roma_6s.bbl', 3),
@@ -55,7 +54,7 @@ def flights(folder: Path) -> Iterator[Flight]:
     for name, file, number in LOGS:
         path = folder / file
         if not path.exists():
-            print(f'{name}: {path} is not there, left out', file=sys.stderr)
+            say(f'{name}: {path} is not there, left out')
             continue
         log = import_log(path, Request(number))
         volts = 'battery_status[1].voltage_v' if name == 'px4' else None
@@ -126,9 +125,8 @@ def share(values: list[bool], whole: bool = False) -> str:
 
 def main() -> int:
     """Draw and print the table, or put it into the page."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
+    parser = arguments(__doc__)
     parser.add_argument('--each', type=int, default=2, help='draws of each axis and kind')
-    parser.add_argument('--page', type=Path, help='page whose table is replaced')
     options = parser.parse_args()
     rng = np.random.default_rng(20)
     known = list(flights(recorded()))
@@ -148,16 +146,16 @@ def main() -> int:
                     other = others[int(rng.integers(len(others)))]
                     for what, seen in draw(rng, kind, flight, axis, other).items():
                         mine[kind][what] += seen
-        print(flight.name, {kind: share(one['alarm']) for kind, one in mine.items()},
-              file=sys.stderr)
-    rows = [[name, str(len(next(one for one in known if one.name == name).axes)),
-             *(share(mine[kind]['alarm']) for kind in KINDS),
+        say(flight.name, {kind: share(one['alarm']) for kind, one in mine.items()})
+    axes = {one.name: len(one.axes) for one in known}
+    rows = [[name, str(axes[name]), *(share(mine[kind]['alarm']) for kind in KINDS),
              share([seen for kind in KINDS for seen in mine[kind]['power']])]
             for name, mine in counts.items() if mine[KINDS[0]]['alarm']]
-    rows.append(['**all**', str(sum(int(row[1]) for row in rows)), *(share([
-        seen for mine in counts.values() for seen in mine[kind]['alarm']], True)
-        for kind in KINDS), share([seen for mine in counts.values() for kind in KINDS
-                                   for seen in mine[kind]['power']], True)])
+    alarms = [[seen for mine in counts.values() for seen in mine[kind]['alarm']]
+              for kind in KINDS]
+    power = [seen for mine in counts.values() for kind in KINDS for seen in mine[kind]['power']]
+    rows.append(['**all**', str(sum(int(row[1]) for row in rows)),
+                 *(share(one, True) for one in (*alarms, power))])
     text = table(['recording', 'axes', *(f'{kind}: seen' for kind in KINDS),
                   'gain 5 deg/s per V: seen'], rows)
     deliver(text, options.page, 'coupling')

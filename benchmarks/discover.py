@@ -32,12 +32,12 @@ _ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(_ROOT), *(str(_ROOT / 'test' / name) for name in ('support', 'hidden'))]
 
 from blind_scores import from_data, Outcome  # noqa: E402
+from common import deliver, number, recorded, table  # noqa: E402
 import discover_runs as runs  # noqa: E402
 from hidden_effects import causes, KINDS, pairs, unknowns, variants  # noqa: E402
 from injected import EFFECTS  # noqa: E402
 import numpy as np  # noqa: E402
 from scipy.stats import binomtest  # noqa: E402
-from tables import deliver, number, recorded, table  # noqa: E402
 
 SEED = 20260131
 

@@ -25,15 +25,16 @@ from typing import Any
 import zlib
 
 from blind_scores import hide, outcome
+from common import BENCHES, FLIGHTS, flights
 from hidden_circuit import FINE_RATE, make_bench, UPDATE_RATE
 from hidden_effects import Hidden
 from hidden_registry import EFFECTS as BASES
 from injected import EFFECTS, noise_of
 import numpy as np
 from ou_monitor import discover
-from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import Recording
-from real_flights import BENCHES, FLIGHTS, flights
+
+KNOWN = {**FLIGHTS, **BENCHES}
 
 _ROOT = Path(__file__).resolve().parent.parent
 TIME_LIMIT = 'time limit'
@@ -178,11 +179,7 @@ def _collect(pipe: Connection, task: Task, process: Any) -> dict[str, Any]:
 def examine_recorded(folder: Path, names: Iterable[str], halves: bool
                      ) -> Iterator[tuple[str, list[dict[str, Any]]]]:
     """Yield names of real runs, and JSON of what is found in the whole and in its halves."""
-    for name, file, options in (*FLIGHTS, *BENCHES):
-        if (names and name not in names) or not (folder / file).exists():
-            continue
-        flight = int(options[options.index('--flight') + 1]) if '--flight' in options else None
-        whole = read_recording(folder / file, flight=flight)
+    for name, whole in flights(names, KNOWN):
         middle = whole.t.size // 2
         found = []
         for part in (slice(None), slice(0, middle), slice(middle, None))[:3 if halves else 1]:
@@ -314,7 +311,7 @@ def _recorded(known: list[np.ndarray] = []) -> list[np.ndarray]:
     """Return throttle of recorded flights at the rate of commands, read once."""
     folder = os.environ.get('OU_MONITOR_REALDATA')
     if folder is not None and not known:
-        for _, recording in flights(Path(folder), []):
+        for _, recording in flights():
             if recording.throttle is not None and recording.n > 1000:
                 t = recording.t - recording.t[0]
                 at = np.arange(0.0, float(t[-1]), 1.0 / UPDATE_RATE)
@@ -396,11 +393,7 @@ STRENGTHS = (1.0, 3.0)
 
 def pieces(folder: Path, names: Sequence[str]) -> Iterator[tuple[str, Recording]]:
     """Yield the pieces of the recordings that are there."""
-    for name, file, options in (*FLIGHTS, *BENCHES):
-        if name not in PIECES or (names and name not in names) or not (folder / file).exists():
-            continue
-        flight = int(options[options.index('--flight') + 1]) if '--flight' in options else None
-        whole = read_recording(folder / file, flight=flight)
+    for name, whole in flights(names, {k: v for k, v in KNOWN.items() if k in PIECES}):
         first, last = PIECES[name]
         at = whole.t - whole.t[0]
         part = (at >= first) & (at < last)

@@ -26,7 +26,8 @@ for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
 _HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(_HERE.parent))
 
-import methods  # noqa: E402, I202
+import common  # noqa: E402
+import methods  # noqa: E402
 import numpy as np  # noqa: E402
 from ou_monitor.online.estimator.estimator import SlidingEstimator  # noqa: E402
 import tables  # noqa: E402
@@ -274,7 +275,7 @@ def main() -> int:
     for name, text in (('accuracy', accuracy_report(results)), ('speed', speed_report(results))):
         path = getattr(given, name)
         if text and path:
-            tables.put(path, text, name)
+            common.deliver(text, path, name)
         elif text:
             print(text)
     return 0

@@ -22,10 +22,8 @@ import sys
 import tempfile
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT)]
-
-from ou_monitor.records import determined  # noqa: E402
+from common import ROOT
+from ou_monitor.records import determined
 
 ENDINGS = ('.csv', '.bbl', '.bfl', '.txt', '.bin', '.ulg', '.mcap')
 # Longest that one command may take, s: discover of a long flight, on a busy machine.

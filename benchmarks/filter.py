@@ -21,12 +21,12 @@ import time
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from common import deliver, drawing  # noqa: E402
 import control_loop  # noqa: E402
 import filter_error  # noqa: E402
 from filter_error import CASES, fly, RATE  # noqa: E402
 import numpy as np  # noqa: E402
 from ou_monitor.report.svg import Plot  # noqa: E402
-from tables import drawing, put  # noqa: E402
 
 SEED = 20261121
 
@@ -118,7 +118,7 @@ def flight(given: argparse.Namespace) -> tuple[str, str]:
 def _write(given: argparse.Namespace, text: str, figure: str) -> None:
     if given.table and text:
         stamp = f'{date.today().isoformat()}, seed {given.seed}, {given.seconds:g} s each.'
-        put(given.table, f'{stamp}\n\n{text}', given.part)
+        deliver(f'{stamp}\n\n{text}', given.table, given.part)
     elif text:
         print(text)
     if given.figure and figure:

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 import math
 from typing import Any
 
+from common import number, table
 import numpy as np
 from ou_monitor import AdaptiveLowPass, SlidingEstimator
 from ou_monitor.online.filter.cutoff_laws import wanted_cutoff
 from ou_monitor.online.settings import FilterSettings
 from ou_monitor.report.svg import Plot
 from scipy.linalg import expm
-from tables import number, table
 
 RATE = 1000.0
 # Stationary deviation of the supply at half throttle, V, and that of the body rate, rad/s.

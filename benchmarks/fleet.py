@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import asdict
 import logging
 import os
 from pathlib import Path
@@ -21,18 +22,13 @@ import sys
 import tempfile
 import time
 
+from common import deliver, table
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from ou_monitor.fleet.analysis import Options, work  # noqa: E402, I202
-from ou_monitor.fleet.workers import LocalWorkers, usable_cores  # noqa: E402
-from ou_monitor.recordings.write import write_recording  # noqa: E402
-from ou_monitor.records import Recording  # noqa: E402
-from ou_monitor.simulation import PRESETS, read_profile, simulated  # noqa: E402
-from tables import table  # noqa: E402
-
-BEGIN, END = '<!-- benchmark begins -->', '<!-- benchmark ends -->'
+from ou_monitor.fleet.analysis import Options, work
+from ou_monitor.fleet.workers import LocalWorkers, usable_cores
+from ou_monitor.recordings.write import write_recording
+from ou_monitor.records import Recording
+from ou_monitor.simulation import PRESETS, read_profile, simulated
 
 
 def make(folder: Path, count: int, seconds: float) -> list[str]:
@@ -92,7 +88,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         paths = make(Path(folder), args.recordings, args.seconds)
         size = sum(os.path.getsize(path) for path in paths)
-        tasks = [(path, Options().as_data()) for path in paths]
+        tasks = [(path, asdict(Options())) for path in paths]
         # Imports and compiled code are loaded before the clock starts.
         work(*tasks[0])
         one: list[tuple[float, float, float]] = []
@@ -114,13 +110,7 @@ def main() -> int:
             'within a round, with their range.\n\n' + table(
                 ['workers', 'start s', 'work s', 'recordings a second', 'times as fast as none',
                  'CPU s, all processes'], rows))
-    if args.markdown is None:
-        print(text)
-        return 0
-    old = args.markdown.read_text(encoding='utf-8')
-    head, rest = old.split(BEGIN)
-    args.markdown.write_text(f'{head}{BEGIN}\n\n{text}\n{END}{rest.split(END)[1]}',
-                             encoding='utf-8')
+    deliver(text, args.markdown, 'benchmark')
     return 0
 
 

@@ -8,13 +8,12 @@ debug_mode is GYRO_SCALED (6); else `gyroADC`, behind them.
 from __future__ import annotations
 
 from dataclasses import dataclass
-import sys
 
+from common import recorded, say
 import numpy as np
 from ou_monitor.recordings.importers.choose import choose
 from ou_monitor.recordings.importers.formats import import_log
 from ou_monitor.recordings.importers.log import Request
-from tables import recorded
 
 # Name, file below OU_MONITOR_REALDATA, number of the flight, which gyro.
 FLIGHTS = (
@@ -49,7 +48,7 @@ def read(name: str, seconds: float = np.inf) -> Gyro | None:
     file, number, kind = next(one[1:] for one in (*FLIGHTS, *SLOW) if one[0] == name)
     where = recorded()
     if not (where / file).exists():
-        print(f'{name}: {file} is not there, left out', file=sys.stderr)
+        say(f'{name}: {file} is not there, left out')
         return None
     log = import_log(where / file, Request(number, poles=14 if name == 'bf3s' else None))
     (gyro,) = (one for one in log.inertial if one.name == kind)

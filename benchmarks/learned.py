@@ -15,19 +15,15 @@ what happens in the first second, on gecko.  nazgul and erle chose nothing.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 import math
-from pathlib import Path
 import sys
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
-import gyros  # noqa: E402
-import numpy as np  # noqa: E402
-from ou_monitor import AdaptiveLowPass  # noqa: E402
-from scipy import signal  # noqa: E402
-from tables import deliver, table  # noqa: E402
+from common import arguments, deliver, say, table
+import gyros
+import numpy as np
+from ou_monitor import AdaptiveLowPass
+from scipy import signal
 
 SEED, ALPHA, SPREAD, WHITE = 20261122, 63.0, 0.05, 0.01
 SIGMA = SPREAD * math.sqrt(2.0 * ALPHA)
@@ -88,19 +84,17 @@ def measure(gyro: gyros.Gyro, most: int, told: list[float]) -> list[list[str]]:
 
 def main() -> int:
     """Measure and print the table, or put it into the page."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
-    parser.add_argument('flight', nargs='*', help='names (default all)')
+    parser = arguments(__doc__, names=True)
     parser.add_argument('--stretches', type=int, default=4, help='most of an axis')
     parser.add_argument('--told', type=float, nargs='+', default=list(TOLD),
                         help='by how much the deviation of the noise is told wrong')
-    parser.add_argument('--page', type=Path, help='page whose table is replaced')
     options = parser.parse_args()
     rows = []
     for name, *_ in (*gyros.FLIGHTS, *gyros.SLOW):
-        gyro = gyros.read(name) if name in (options.flight or [name]) else None
+        gyro = gyros.read(name) if name in (options.names or [name]) else None
         if gyro is not None:
             rows += measure(gyro, options.stretches, options.told)
-            print(*rows[-2:], sep='\n', file=sys.stderr)
+            say(*rows[-2:])
     text = table(['gyro', '', 'stretches', *(word for told in options.told for word in (
         'mean' if told == 1.0 else f'noise told {told:g} times: mean', 'worst'))], rows)
     deliver(text, options.page, 'learned')

@@ -11,7 +11,6 @@ an OU rail that sags under a throttle of 50 Hz, so the estimator finds alpha, lo
 
 from __future__ import annotations
 
-import argparse
 import os
 from pathlib import Path
 import signal
@@ -20,13 +19,9 @@ import sys
 import time
 from typing import Any
 
+from common import arguments, deliver, ROOT, table
 import numpy as np
-
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-
-from ou_monitor.model.ou import simulate  # noqa: E402
-from tables import deliver, table  # noqa: E402
+from ou_monitor.model.ou import simulate
 
 DOMAIN = '63'
 # What listens on a topic and publishes how many it has had, 10 times a second as the nodes do.
@@ -174,9 +169,8 @@ def trial(kind: str, nodes: list[tuple[str, list[str]]], rate: float, seconds: f
 
 def main() -> int:
     """Measure, and write the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
+    parser = arguments(__doc__)
     parser.add_argument('--seconds', type=float, default=10.0)
-    parser.add_argument('--page', type=Path, default=None)
     args = parser.parse_args()
     os.environ['ROS_DOMAIN_ID'] = DOMAIN
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'

@@ -14,10 +14,9 @@ the scored part counts.
 The first half of a flight is for learning; the second is scored.  `from nothing`: the whole
 flight, nothing known before.
 
-Betaflight: dynamic low-pass of one pole, f..2 f by throttle with expo 5, and a fixed pole at
-2 f, which is the form of its D term's defaults (75..150 and 150 Hz); RPM filter: three
-harmonics of each motor up to 0.48 of the rate, Q 5, faded in over 100..150 Hz, motor speeds
-through a low-pass of 150 Hz (src/main/flight/rpm_filter.c and pg/rpm_filter.c, 4.5).
+Betaflight's RPM filter: three harmonics of each motor up to 0.48 of the rate, Q 5, faded in over
+100..150 Hz, motor speeds through a low-pass of 150 Hz (src/main/flight/rpm_filter.c and
+pg/rpm_filter.c, 4.5).
 ArduPilot: harmonic notch, throttle-based, 1st and 2nd harmonic, 40 dB, bandwidth half of the
 frequency at hover, f = FREQ max(FM_RAT, sqrt(throttle / REF)) with FM_RAT 0.7, FREQ the highest
 peak above 60 Hz of the first half within 0.05 of its median throttle, REF that throttle
@@ -26,20 +25,16 @@ peak above 60 Hz of the first half within 0.05 of its median throttle, REF that 
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 import math
-from pathlib import Path
 import sys
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
-import gyros  # noqa: E402
-import numpy as np  # noqa: E402
-from ou_monitor import AdaptiveNotch  # noqa: E402
-from ou_monitor.online.notch.notch import Notch, phase_lag  # noqa: E402
-from scipy import optimize, signal  # noqa: E402
-from tables import deliver, table  # noqa: E402
+from common import arguments, deliver, say, table
+import gyros
+import numpy as np
+from ou_monitor import AdaptiveNotch
+from ou_monitor.online.notch.notch import Notch, phase_lag
+from scipy import optimize, signal
 
 LAG_AT, NOISE_FROM = 10.0, 60.0
 CUTOFFS = (40.0, 60.0, 80.0, 120.0)
@@ -159,43 +154,6 @@ def harmonic_notch(gyro: gyros.Gyro) -> tuple[np.ndarray, np.ndarray]:
     return notches(gyro, both, 0.5, 1.0 * (both < 0.48 * gyro.rate), 10.0**(-40.0 / 20.0))
 
 
-def dynamic(gyro: gyros.Gyro, delay: float, part: np.ndarray) -> np.ndarray:
-    """Return the noise of Betaflight's dynamic low-pass whose mean lag is the wanted one."""
-    u = np.round(gyro.throttle, 2)
-    curve = 1.0 + u + 0.5 * u * (1.0 - u)
-
-    def gains(f: float) -> np.ndarray:
-        w = np.tan(np.pi * np.clip(f * curve / gyro.rate, 1e-6, 0.475))
-        return w / (1.0 + w)
-
-    def second(f: float) -> tuple[np.ndarray, np.ndarray]:
-        return low_pass('1', min(2.0 * f, 0.475 * gyro.rate), gyro.rate)
-
-    def off(f: float) -> float:
-        # One pole by the trapezoidal rule: its response, sample by sample.
-        p = 1j * math.tan(math.pi * LAG_AT / gyro.rate) / np.tan(
-            np.pi * np.clip(f * curve[part][::20] / gyro.rate, 1e-6, 0.475))
-        return (float(np.mean(np.angle(1.0 + p))) / (2.0 * math.pi * LAG_AT)
-                + response(*second(f), gyro.rate) - delay)
-    if off(0.475 * gyro.rate) > 0.0:
-        return np.full(3, np.nan)
-    f = optimize.brentq(off, 0.5, 0.475 * gyro.rate)
-    big = gains(f).tolist()
-    out = np.empty_like(gyro.signal)
-    for axis in range(3):
-        s = float(gyro.signal[0, axis])
-        values = gyro.signal[:, axis].tolist()
-        for k, (x, g) in enumerate(zip(values, big)):
-            v = g * (x - s)
-            values[k] = v + s
-            s += 2.0 * v
-        out[:, axis] = values
-    return noise(out, [second(f)], gyro.rate, part)
-
-
-Method = Callable[[gyros.Gyro], tuple[np.ndarray, np.ndarray]]
-
-
 def measure(gyro: gyros.Gyro, cutoffs: tuple[float, ...]) -> Iterator[list[str]]:
     """Yield a row a cutoff: noise over that of the best fixed low-pass of the lag."""
     second = gyro.t > 0.5 * gyro.t[-1]
@@ -219,7 +177,7 @@ def measure(gyro: gyros.Gyro, cutoffs: tuple[float, ...]) -> Iterator[list[str]]
                      for kind in KINDS
                      if (one := of_lag(kind, delay, gyro.rate)) is not None]
             best[name] = min(fixed, key=np.sum)
-        cells = [_cell(dynamic(gyro, delay, second), best['second'])]
+        cells = []
         for method in methods:
             if method is None:
                 cells.append('-')
@@ -250,28 +208,26 @@ def _cell(left: np.ndarray, fixed: np.ndarray) -> str:
     return f'{ratio:.2f} ({math.sqrt(float(np.max(left / fixed))):.2f})'
 
 
-HEAD = ['gyro', 'Hz', 'low-pass, Hz', 'lag, ms', "Betaflight's dynamic low-pass",
-        "ArduPilot's notch by throttle", '`AdaptiveNotch` by throttle', 'from nothing',
-        "Betaflight's RPM filter", '`AdaptiveNotch` by rpm', 'from nothing']
+HEAD = ['gyro', 'Hz', 'low-pass, Hz', 'lag, ms', "ArduPilot's notch by throttle",
+        '`AdaptiveNotch` by throttle', 'from nothing', "Betaflight's RPM filter",
+        '`AdaptiveNotch` by rpm', 'from nothing']
 
 
 def main() -> int:
     """Measure and print the table, or put it into the page."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
-    parser.add_argument('flight', nargs='*', help='names (default all)')
+    parser = arguments(__doc__, names=True)
     parser.add_argument('--seconds', type=float, default=math.inf, help='read so much of each')
     parser.add_argument('--cutoffs', type=float, nargs='+', default=list(CUTOFFS))
-    parser.add_argument('--page', type=Path, help='page whose table is replaced')
     options = parser.parse_args()
     rows = []
     for name, *_ in gyros.FLIGHTS:
-        if options.flight and name not in options.flight:
+        if options.names and name not in options.names:
             continue
         gyro = gyros.read(name, options.seconds)
         if gyro is not None:
             for row in measure(gyro, tuple(options.cutoffs)):
                 rows.append(row)
-                print(row, file=sys.stderr)
+                say(row)
     text = table(HEAD, rows)
     deliver(text, options.page, 'notch')
     return 0

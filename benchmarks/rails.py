@@ -8,27 +8,22 @@ Both are given the current of that second.  The first quarter of a recording is 
 
 from __future__ import annotations
 
-import argparse
 import math
-import os
-from pathlib import Path
 import sys
 
+from common import arguments, deliver, FLIGHTS, flights, table
 import numpy as np
 from ou_monitor.online.load.load_filter import LoadFilter
-from ou_monitor.recordings.read import read_recording
+from ou_monitor.records import Recording
 from ou_monitor.timeline.line import readings_of
-from tables import put, table
 
-# Name, file below OU_MONITOR_REALDATA, flight of a log.
-RAILS: tuple[tuple[str, str, int | None], ...] = (
-    ('frc_ol_1', 'frc_ol_1.csv', None), ('euc_1', 'euc_1.csv', None),
-    ('hebi_x', 'hebi_x.csv', None), ('js_11t', 'js_11t_6s.csv', None),
-    ('as_f60', 'as_f60.csv', None), ('jd', 'raw/ac_jd_2004.bin', None),
-    ('bf3s', 'raw/bf_3s_erpm2.bbl', 2), ('ar8', 'raw/bf_ar8_6s.BFL', None),
-    ('nazgul', 'raw/bf_nazgul_4s.bbl', 1), ('roma', 'raw/bf_roma_6s.bbl', 3),
-    ('in_xr', 'raw/in_xr_141340.TXT', None),
-)
+# File below OU_MONITOR_REALDATA, flight of a log.
+RAILS: dict[str, tuple[str, int | None]] = {
+    'frc_ol_1': ('frc_ol_1.csv', None), 'euc_1': ('euc_1.csv', None),
+    'hebi_x': ('hebi_x.csv', None), 'js_11t': ('js_11t_6s.csv', None),
+    'as_f60': ('as_f60.csv', None), 'jd': FLIGHTS['jd'], 'bf3s': FLIGHTS['bf3s'],
+    'ar8': ('raw/bf_ar8_6s.BFL', None), 'nazgul': FLIGHTS['nazgul'], 'roma': FLIGHTS['roma'],
+    'in_xr': ('raw/in_xr_141340.TXT', None)}
 AHEAD, LOOK = 1.0, 0.1  # s
 FORGETTING, LEVEL, OHM, LEVEL_VAR, OHM_VAR = 0.95, 4.2, 0.005, 1.5, 0.1  # a cell
 
@@ -50,9 +45,9 @@ def peer(voltage: np.ndarray, current: np.ndarray) -> np.ndarray:
     return found
 
 
-def measure(name: str, path: Path, flight: int | None) -> list[str]:
+def measure(name: str, recording: Recording) -> list[str]:
     """Return the row of a recording."""
-    recording = readings_of(read_recording(path, flight=flight))
+    recording = readings_of(recording)
     t, v, u, i = recording.t - recording.t[0], recording.voltage, recording.throttle, \
         recording.current
     known = np.isfinite(i)
@@ -77,21 +72,11 @@ def measure(name: str, path: Path, flight: int | None) -> list[str]:
 
 def main() -> int:
     """Measure the recordings and print the table, or put it into the page."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
-    parser.add_argument('rail', nargs='*', help='names (default all)')
-    parser.add_argument('--page', type=Path, help='page whose table is replaced')
-    options = parser.parse_args()
-    folder = os.environ.get('OU_MONITOR_REALDATA')
-    if folder is None:
-        parser.error('OU_MONITOR_REALDATA is not set: it names the folder of the recordings')
-    rows = [measure(name, Path(folder) / file, flight) for name, file, flight in RAILS
-            if (not options.rail or name in options.rail) and (Path(folder) / file).exists()]
+    options = arguments(__doc__, names=True).parse_args()
+    rows = [measure(*one) for one in flights(options.names, RAILS)]
     text = table(['recording', 'deviation mV', '1 s ahead, mV', 'peer', 'ratio', 'mOhm',
                   'peer', 'basis'], rows)
-    if options.page:
-        put(options.page, text, 'rails')
-    else:
-        print(text)
+    deliver(text, options.page, 'rails')
     return 0
 
 

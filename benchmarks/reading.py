@@ -24,6 +24,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
+from common import deliver, table  # noqa: E402
 from mcap.reader import make_reader  # noqa: E402
 from mcap.writer import CompressionType, IndexType, Writer  # noqa: E402
 from mcap_ros2.decoder import DecoderFactory  # noqa: E402
@@ -37,7 +38,6 @@ from ou_monitor.recordings.standard_types import (  # noqa: E402
 from ou_monitor.records import Recording  # noqa: E402
 from rosbags.highlevel import AnyReader  # noqa: E402
 from rosbags.typesys import get_typestore, Stores  # noqa: E402
-from tables import deliver, table  # noqa: E402
 
 COMPRESSIONS = {'none': CompressionType.NONE, 'lz4': CompressionType.LZ4,
                 'zstd': CompressionType.ZSTD}

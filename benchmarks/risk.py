@@ -21,17 +21,15 @@ from pathlib import Path
 import sys
 import time
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
-import numpy as np  # noqa: E402
-from ou_monitor import brownout_probability  # noqa: E402
-from ou_monitor.online.monitor import SupplyMonitor  # noqa: E402
-from ou_monitor.online.settings import MonitorSettings  # noqa: E402
-from ou_monitor.records import Estimate  # noqa: E402
-from ou_monitor.report.svg import Plot  # noqa: E402
-from scipy.special import ndtr  # noqa: E402
-from scipy.stats import beta  # noqa: E402
-from tables import drawing, number, put, table  # noqa: E402
+from common import deliver, drawing, number, say, table
+import numpy as np
+from ou_monitor import brownout_probability
+from ou_monitor.online.monitor import SupplyMonitor
+from ou_monitor.online.settings import MonitorSettings
+from ou_monitor.records import Estimate
+from ou_monitor.report.svg import Plot
+from scipy.special import ndtr
+from scipy.stats import beta
 
 SEED = 20261121
 # Flights simulated at once: bounds memory.
@@ -236,7 +234,7 @@ def _told(what: str, of: int) -> Callable[[], None]:
         done[0] += 1
         if done[0] % 20 == 0 or done[0] == of:
             rest = (time.monotonic() - begin) / done[0] * (of - done[0])
-            print(f'{what}: {done[0]}/{of}, about {rest:.0f} s left', file=sys.stderr)
+            say(f'{what}: {done[0]}/{of}, about {rest:.0f} s left')
     return tell
 
 
@@ -330,11 +328,8 @@ def main() -> int:
                         help='results as JSON lines: written, or read where it exists')
     given = parser.parse_args()
     text, figure = calibration(given)
-    if given.table:
-        put(given.table, f'{date.today().isoformat()}, seed {given.seed}.\n\n{text}',
-            'calibration')
-    else:
-        print(text)
+    text = f'{date.today().isoformat()}, seed {given.seed}.\n\n{text}'
+    deliver(text, given.table, 'calibration')
     if given.figure:
         given.figure.write_text(figure, encoding='utf-8')
     return 0

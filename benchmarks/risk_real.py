@@ -12,7 +12,6 @@ with a word on stderr.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
 import json
@@ -20,15 +19,12 @@ from pathlib import Path
 import sys
 import time
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
-import numpy as np  # noqa: E402
-from ou_monitor import MonitorSettings, SupplyMonitor  # noqa: E402
-from ou_monitor.online.risk.courses import AT_PEAK, excursion_risk, excursions, Past  # noqa: E402
-from ou_monitor.records import Recording  # noqa: E402
-from real_flights import flights  # noqa: E402
-from scipy.special import expit  # noqa: E402
-from tables import deliver, median3, recorded, table  # noqa: E402
+from common import arguments, deliver, flights, median3, say, table
+import numpy as np
+from ou_monitor import MonitorSettings, SupplyMonitor
+from ou_monitor.online.risk.courses import AT_PEAK, excursion_risk, excursions, Past
+from ou_monitor.records import Recording
+from scipy.special import expit
 
 QUADS = ('gecko', 'nazgul', 'roma', 'bf3s', 'erle')
 OTHERS = ('cf_solo', 'cf_pair')
@@ -273,21 +269,19 @@ def tables(cases: dict[str, list[Case]], facts: dict[str, dict[str, float]]) -> 
 
 def main() -> int:
     """Measure the flights and print the tables, or put them into the page."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
-    parser.add_argument('flight', nargs='*', help='names (default all)')
-    parser.add_argument('--page', type=Path, help='page whose tables are replaced')
+    parser = arguments(__doc__, names=True)
     parser.add_argument('--json', type=Path, help='file for what is known of each flight')
     options = parser.parse_args()
     cases: dict[str, list[Case]] = {'middle': [], 'single': []}
     facts = {}
-    for name, recording in flights(recorded(), options.flight or [*QUADS, *OTHERS]):
+    for name, recording in flights(options.names or [*QUADS, *OTHERS]):
         if not np.isfinite(recording.throttle).any():
-            print(f'{name}: no throttle was found in the log, left out', file=sys.stderr)
+            say(f'{name}: the log has no throttle, left out')
             continue
         middle, single, facts[name] = fly(name, recording)
         cases['middle'] += middle
         cases['single'] += single
-        print(name, facts[name], file=sys.stderr)
+        say(name, facts[name])
     for event in cases.values():
         with_logistics([c for c in event if c.flight in QUADS])
     if options.json:

@@ -1,16 +1,18 @@
 """
-The source of a soak, in a process of its own: voltages at 1 kHz, with dips, as scheduled.
+The source of a soak: its schedule, drawn from a seed, and voltages at 1 kHz as scheduled.
 
     python soak_source.py SEED SECONDS LOG [dense]
 
-Each phase and each dip is one line of JSON in the log: when its first and last sample were sent
-(monotonic clock, s), and how many; ten times a second the messages sent so far are one.  Samples
-that are due while the process has no CPU are sent as soon as it has, with the stamps of when they
-were due.
+Two schedules run side by side: what is sent (phases, with dips at random times), and what is done
+to the node (parameters, services, CPU).  Each phase and each dip is one line of JSON in the log:
+when its first and last sample were sent (monotonic clock, s), and how many; the number of messages
+sent so far is one line ten times a second.  Samples that are due while the process has no CPU are
+sent as soon as it has, with the stamps of when they were due.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 import json
 import math
 from pathlib import Path
@@ -24,12 +26,163 @@ from typing import Any, TextIO
 import rclpy
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import BatteryState
-from soak_schedule import Dip, dips, Phase, phases, RATE
 from std_msgs.msg import Float64
+
+# -- the schedule
+
+RATE = 1000.0  # Hz.
+# What comes: a weight each.  Stamps: `good` (the time of the sample), `none` (0), `frozen` at
+# that of the phase's begin, `backwards`, `jumps` (steps of 10 ms to 12 days, either way),
+# `future` (nine years ahead), `wild` (each within 100 s of the truth), `fast` (milliseconds taken
+# for seconds).  Values: `nan`, `huge` (a fifth of the samples).  Also: `burst` (sent 100 at once),
+# `lumps` (no stamps, and three of six seconds sent 100 at once), `second` (another publisher of
+# the topic comes, and ends or is killed).
+SEEN = {'good': 6.0, 'none': 2.0, 'frozen': 1.0, 'backwards': 1.0, 'jumps': 1.0, 'future': 1.0,
+        'wild': 1.0, 'fast': 1.0, 'nan': 1.0, 'huge': 1.0, 'burst': 1.0, 'lumps': 1.0,
+        'second': 1.0}
+# What holds no voltage that the node can take for one: all samples NaN, millivolts, another
+# message type, a publisher that pauses, or that ends and begins anew.
+UNSEEN = {'only_nan': 0.7, 'millivolts': 0.7, 'type': 0.7, 'silent': 0.7, 'restart': 1.0}
+# During these no estimate can be made, so the flag must never be false.
+NEVER_FALSE = ('frozen', 'backwards', 'wild', 'only_nan', 'type', 'silent')
+LONG, SHORT = (4.0, 12.0), (2.0, 4.0)
+# Nothing is asked of a dip so shortly after the start, or after a new publisher, s: discovery;
+# nor so shortly before a publisher ends: what has been sent may go with it.
+SETTLE, FIRST, LEAVE = 1.0, 3.0, 0.3
+# Of dips: s between them (dense ones: never less than two can be told apart), s, and V; all at or
+# below the lowest floor that is ever set.
+BETWEEN, DENSE, DIP, DEPTH = (1.5, 5.0), (1.3, 2.0), (0.04, 0.08), (3.0, 4.1)
+# Events at the node: s between them.
+PAUSE = (1.0, 5.0)
+SLICES = ((0.02, 0.01), (0.05, 0.05), (0.2, 0.1), (0.4, 0.2))
+
+
+@dataclass(frozen=True)
+class Phase:
+    """What the source sends from `begin` to `end`, s."""
+
+    kind: str
+    begin: float
+    end: float
+
+
+@dataclass(frozen=True)
+class Dip:
+    """One dip."""
+
+    begin: float  # s.
+    length: float  # s.
+    voltage: float  # V.
+    unseen: str  # Why the node cannot see it; empty if it must.
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something done to the node at `begin`, s."""
+
+    kind: str
+    begin: float
+    about: Any = None
+
+
+def phases(seed: int, seconds: float) -> list[Phase]:
+    """Return what is sent, phase by phase."""
+    rng = random.Random(f'phases {seed}')
+    weights = {**SEEN, **UNSEEN}
+    made, now = [Phase('good', 0.0, FIRST + 2.0)], FIRST + 2.0
+    while now < seconds:
+        # A publisher that pauses or changes while another is there would lose its place to it.
+        kind = rng.choices(list(weights), list(weights.values()))[0]
+        length = rng.uniform(*(LONG if kind in SEEN else SHORT))
+        if kind == 'second':
+            length = max(length, 8.0)
+        made.append(Phase(kind, now, min(now + length, seconds)))
+        now += length
+    return made
+
+
+def dips(seed: int, sent: list[Phase], dense: bool = False) -> list[Dip]:
+    """Return the dips, whole milliseconds each."""
+    rng = random.Random(f'dips {seed}')
+    made: list[Dip] = []
+    now = 0.0
+    while True:
+        now = round(now + rng.uniform(*(DENSE if dense else BETWEEN)), 3)
+        length = round(rng.uniform(*DIP), 3)
+        if now + length >= sent[-1].end:
+            return made
+        made.append(Dip(now, length, rng.uniform(*DEPTH), _unseen(now, now + length, sent)))
+
+
+def _unseen(begin: float, end: float, sent: list[Phase]) -> str:
+    if begin < FIRST:
+        return 'start'
+    for phase in sent:
+        if phase.kind in UNSEEN:
+            ends = phase.kind in ('type', 'restart')
+            before, after = (LEAVE, SETTLE) if ends else (0.1, 0.1)
+            if end > phase.begin - before and begin < phase.end + after:
+                return phase.kind
+    return ''
+
+
+def events(seed: int, seconds: float, fifo: str, model: str) -> list[Event]:
+    """Return what is done to the node (fifo, model: paths of files)."""
+    rng = random.Random(f'events {seed}')
+    made, now = [], FIRST
+    while True:
+        now += rng.uniform(*PAUSE)
+        if now > seconds - 10.0:
+            return made
+        kind = rng.choices(['set', 'refused', 'clear', 'slices', 'busy'], [6, 4, 1, 1.5, 1])[0]
+        about: Any = None
+        if kind == 'set':
+            about = [good_parameter(rng, model) for _ in range(rng.choice([1, 1, 1, 3]))]
+        elif kind == 'refused':
+            about = [rng.choice(bad_parameters(fifo))]
+        elif kind in ('slices', 'busy'):
+            about = (rng.uniform(3.0, 12.0), rng.choice(SLICES))
+        made.append(Event(kind, now, about))
+        if kind in ('slices', 'busy'):
+            now += about[0]
+
+
+def good_parameter(rng: random.Random, model: str) -> tuple[str, Any]:
+    """Return a parameter and a value that are taken, whatever the others are."""
+    return rng.choice([
+        lambda: ('window', rng.uniform(0.5, 4.0)),
+        lambda: ('stale_after', rng.uniform(0.5, 2.0)),
+        lambda: ('publish_rate', rng.uniform(5.0, 20.0)),
+        lambda: ('brownout.horizon', rng.uniform(0.5, 5.0)),
+        lambda: ('brownout.warn', rng.uniform(0.005, 0.05)),
+        lambda: ('brownout.critical', rng.uniform(0.1, 0.5)),
+        lambda: ('brownout.leave', rng.uniform(0.1, 0.9)),
+        lambda: ('brownout.hold', rng.choice([0.0, 0.0, 0.2, 1.0])),
+        lambda: ('brownout.delay', rng.choice([0.0, 0.2])),
+        lambda: ('brownout.latch', rng.random() < 0.3),
+        lambda: ('brownout.floor', rng.uniform(4.15, 4.35)),
+        lambda: ('brownout.floor_time', rng.uniform(0.005, 0.03)),
+        lambda: ('brownout.budget_limit', rng.choice([0.0, 0.02])),
+        lambda: ('model_file', rng.choice(['', model])),
+    ])()
+
+
+def bad_parameters(fifo: str) -> list[tuple[str, Any]]:
+    """Return parameters that must be refused."""
+    return [
+        ('window', -1.0), ('window', math.nan), ('window', 'long'), ('window', 1e9),
+        ('publish_rate', 0.0), ('publish_rate', 1e9), ('publish_rate', math.inf),
+        ('brownout.warn', 0.6), ('brownout.warn', -0.1), ('brownout.critical', 0.001),
+        ('brownout.leave', 1.0), ('brownout.floor', 100.0), ('brownout.floor', math.nan),
+        ('brownout.latch', 1), ('brownout.hold', -1.0),
+        ('model_file', fifo), ('model_file', '/dev/zero'), ('model_file', '/no/such.yaml'),
+        ('voltage.topic', 'elsewhere'), ('lock_parameters', True), ('no_such_parameter', 1.0)]
+
+
+# -- what is sent
 
 FLOOD = Path(__file__).resolve().parents[1] / 'test/support/flood.py'
 TOPIC = '/soak/voltage'
-QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 # Of the supply: relaxation, 1/s, noise, V/sqrt(s), level, V.
 ALPHA, SIGMA, LEVEL = 63.0, 0.2, 5.0
 # Share of bad values where there are some, and what they are, V.
@@ -48,13 +201,17 @@ class Source:
         self._phases = phases(seed, seconds)
         self._dips = dips(seed, self._phases, dense)
         self._node = rclpy.create_node('soak_source')
-        self._output: Any = self._node.create_publisher(BatteryState, TOPIC, QOS)
+        self._output = self._publisher(BatteryState)
         self._second: subprocess.Popen[bytes] | None = None
         self._phase = self._phases[0]
         self._away, self._offset, self._jump_at = 0.0, 0.0, 0.0
         self._low: list[float] = []
         self._count, self._counted = 0, -math.inf
         self._start = self._wall = 0.0
+
+    def _publisher(self, kind: Any) -> Any:
+        return self._node.create_publisher(kind, TOPIC, QoSProfile(
+            depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT))
 
     def run(self) -> None:
         """Send until the schedule ends."""
@@ -68,7 +225,7 @@ class Source:
             due = int((time.monotonic() - self._start) * RATE)
             lump = self._phase.kind == 'lumps' and sent / RATE % 6.0 < 3.0
             burst = BURST if lump or self._phase.kind == 'burst' else 1
-            self._tell_count()
+            self._note_count()
             sent = max(sent, due - MOST)
             while due - sent >= burst or sent / RATE >= self._phase.end:
                 now = sent / RATE
@@ -80,9 +237,9 @@ class Source:
                     self._phase = self._phases[at]
                     self._enter(self._phase)
                     break
-                # A step behind the end of a dip tells of it.
+                # One step after the end of a dip.
                 while dip_at < len(self._dips) and now > _end(self._dips[dip_at]):
-                    self._tell(dip_at)
+                    self._note_dip(dip_at)
                     dip_at += 1
                 for _ in range(burst):
                     self._send(sent / RATE, self._dips[dip_at:dip_at + 1])
@@ -93,13 +250,13 @@ class Source:
         self._log.write(json.dumps(about) + '\n')
         self._log.flush()
 
-    def _tell_count(self) -> None:
+    def _note_count(self) -> None:
         now = time.monotonic()
         if now - self._counted >= 0.1:
             self._counted = now
             self._note(kind='sent', at=now, count=self._count)
 
-    def _tell(self, number: int) -> None:
+    def _note_dip(self, number: int) -> None:
         dip = self._dips[number]
         if self._low:
             self._note(kind='dip', begin=self._low[0], end=self._low[-1], samples=len(self._low),
@@ -115,14 +272,13 @@ class Source:
                 stderr=subprocess.DEVNULL)
         elif phase.kind in ('restart', 'type'):
             self._node.destroy_publisher(self._output)
-            self._output = self._node.create_publisher(
-                Float64, TOPIC, QOS) if phase.kind == 'type' else None
+            self._output = self._publisher(Float64) if phase.kind == 'type' else None
 
     def _leave(self, phase: Phase) -> None:
         if phase.kind in ('restart', 'type'):
             if self._output is not None:
                 self._node.destroy_publisher(self._output)
-            self._output = self._node.create_publisher(BatteryState, TOPIC, QOS)
+            self._output = self._publisher(BatteryState)
         self._end_second()
 
     def _end_second(self) -> None:
@@ -172,26 +328,14 @@ class Source:
 
     def _stamp(self, kind: str, now: float) -> float:
         """Return the stamp of the sample of a time, s."""
-        begin = self._wall + self._phase.begin
-        t = self._wall + now
-        if kind in ('none', 'lumps'):
-            return 0.0
-        if kind == 'frozen':
-            return begin
-        if kind == 'backwards':
-            return 2.0 * begin - t
-        if kind == 'future':
-            return t + 3e8
-        if kind == 'wild':
-            return t + self._rng.uniform(-100.0, 100.0)
-        if kind == 'fast':
-            return begin + 1000.0 * (t - begin)
-        if kind == 'jumps':
-            if now > self._jump_at:
-                self._jump_at = now + self._rng.uniform(0.2, 1.0)
-                self._offset += self._rng.choice([-1.0, 1.0]) * 10.0 ** self._rng.uniform(-2, 6)
-            return min(max(t + self._offset, 1.0), 2.0 ** 31 - 1.0)
-        return t
+        begin, t = self._wall + self._phase.begin, self._wall + now
+        if kind == 'jumps' and now > self._jump_at:
+            self._jump_at = now + self._rng.uniform(0.2, 1.0)
+            self._offset += self._rng.choice([-1.0, 1.0]) * 10.0 ** self._rng.uniform(-2, 6)
+        return {'none': 0.0, 'lumps': 0.0, 'frozen': begin, 'backwards': 2.0 * begin - t,
+                'future': t + 3e8, 'wild': t + self._rng.uniform(-100.0, 100.0),
+                'fast': begin + 1000.0 * (t - begin),
+                'jumps': min(max(t + self._offset, 1.0), 2.0 ** 31 - 1.0)}.get(kind, t)
 
 
 def _end(dip: Dip) -> float:

@@ -1,90 +1,15 @@
-"""Markdown tables, drawings that stand alone, and what is written between marks of a file."""
+"""The tables of estimator.py."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from html import escape
+from collections.abc import Sequence
 import math
-import os
-from pathlib import Path
 from typing import Any
 
-import numpy as np
+from common import number, table
 from windows import NAMES
 
 _TITLES = {'alpha': 'alpha', 'sigma': 'sigma', 'var_inf': 'Var_inf'}
-
-
-STYLE = """<style>
-text { fill: #5d686c; font: 12px system-ui, -apple-system, "Segoe UI", sans-serif; }
-text.title { fill: #1c2326; font-weight: 600; font-size: 13px; } text.legend { fill: #1c2326; }
-text.light { fill: #ffffff; } .grid { stroke: #dde3e5; stroke-width: 1; }
-.line { fill: none; stroke-width: 1.6; stroke-linejoin: round; }
-.thick { stroke-width: 2.2; } .dash { stroke-dasharray: 6 4; }
-.s0 { stroke: #0072b2; } .s1 { stroke: #d55e00; } .s2 { stroke: #009e73; }
-.s3 { stroke: #cc79a7; } .s4 { stroke: #8a6d00; } .s5 { stroke: #56b4e9; }
-.s6 { stroke: #444444; } .s7 { stroke: #9aa5a9; }
-.band { stroke: none; opacity: .18; } .faint { opacity: .5; }
-.band.s0, .dot.s0 { fill: #0072b2; } .band.s1, .dot.s1 { fill: #d55e00; }
-.dot.s2 { fill: #009e73; } .dot.s3 { fill: #cc79a7; } .dot.s4 { fill: #8a6d00; }
-.band.s7, .dot.s7 { fill: #9aa5a9; }
-.shade { fill: #d55e00; opacity: .35; }
-.panel { fill: #ffffff; opacity: .8; } .right { fill: none; stroke: #1c2326; stroke-width: 1.2; }
-</style>"""
-
-
-def drawing(parts: Sequence[str], width: int, height: int, title: str) -> str:
-    """Return an SVG document that stands alone, on white."""
-    return '\n'.join([
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
-        f'width="{width}" height="{height}" role="img" '
-        f'aria-label="{escape(title, quote=True)}">', STYLE,
-        f'<rect width="{width}" height="{height}" fill="#ffffff"/>', *parts, '</svg>', ''])
-
-
-def put(path: Path, text: str, name: str) -> None:
-    """Write text: between the marks of that name where the file has them, else as the file."""
-    begin, end = f'<!-- {name} begins -->', f'<!-- {name} ends -->'
-    if path.exists():
-        head, mark, rest = path.read_text().partition(begin)
-        _, last, tail = rest.partition(end)
-        if mark and last:
-            text = f'{head}{mark}\n{text}\n{last}{tail}'
-    path.write_text(text)
-
-
-def deliver(text: str, page: Path | None, name: str) -> None:
-    """Put a text between the marks of a page, or print it where there is none."""
-    if page is None:
-        print(text)
-    else:
-        put(page, text, name)
-
-
-def recorded() -> Path:
-    """Return the folder of the recorded flights; it ends a program where there is none."""
-    folder = os.environ.get('OU_MONITOR_REALDATA')
-    if folder is None:
-        raise SystemExit('OU_MONITOR_REALDATA is not set: it names the folder of the flights')
-    return Path(folder)
-
-
-def median3(v: np.ndarray) -> np.ndarray:
-    """Return the middle one of each sample and the two before."""
-    padded = np.concatenate((v[:1], v[:1], v))
-    return np.median(np.stack((padded[:-2], padded[1:-1], padded[2:])), axis=0)
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a Markdown table; all columns but the first are aligned right."""
-    lines = ['| ' + ' | '.join(head) + ' |', '|---|' + '---:|' * (len(head) - 1)]
-    lines += ['| ' + ' | '.join(row) + ' |' for row in rows]
-    return '\n'.join(lines) + '\n'
-
-
-def number(value: float, form: str = '.1f') -> str:
-    """Return a number, or a dash for none."""
-    return format(value, form) if math.isfinite(value) else '-'
 
 
 def _bias(one: dict[str, float]) -> str:

@@ -11,12 +11,12 @@ from pathlib import Path
 import sys
 import time
 
+from common import table
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from ou_monitor.online.monitor import SupplyMonitor  # noqa: E402
 from ou_monitor.online.settings import MonitorSettings  # noqa: E402
-import tables  # noqa: E402
 import windows as simulated  # noqa: E402
 
 SECONDS, COUNTED, REPORT = 40.0, 6.0, 0.1
@@ -44,7 +44,7 @@ def main() -> None:
             shown = np.percentile(cost, [50, 99])
             usual = shown if usual is None else usual
             rows.append([str(window), name, *(f'{x:.2f}' for x in (*shown, *shown / usual))])
-    print(tables.table(['window', 'samples', 'p50, ms', 'p99, ms', 'over even: p50', 'p99'], rows))
+    print(table(['window', 'samples', 'p50, ms', 'p99, ms', 'over even: p50', 'p99'], rows))
 
 
 def reports(window: float | str, t: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:

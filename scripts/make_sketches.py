@@ -20,7 +20,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / 'benchmarks')]
 from ou_monitor.model.supply import SupplyModel  # noqa: E402
 from ou_monitor.model.terms.catalogue import catalogue  # noqa: E402
 from ou_monitor.paper import published  # noqa: E402
-from tables import drawing  # noqa: E402
+from common import drawing  # noqa: E402
 
 # Cause: its parameters, and the seconds shown.
 CAUSES: dict[str, tuple[dict[str, object], float]] = {

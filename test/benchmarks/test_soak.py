@@ -4,9 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from soak_figures import (
-    dips_of, false_of, growth, Heard, overlap, Said, silence, State, unheard, unmatched)
-from soak_schedule import (
+from soak import dips_of, false_of, growth, Heard, overlap, Said, silence, State, unheard
+from soak_source import (
     bad_parameters, DEPTH, Dip, dips, events, LEAVE, Phase, phases, SEEN, SETTLE, UNSEEN)
 
 FLOOR = 'the voltage is at or below brownout.floor (4.3 V)'
@@ -24,7 +23,7 @@ def heard(critical=(), lost=0, flags=None, stops=(), reason=FLOOR, counted=0, dr
     times = np.arange(0.0, 20.0, 0.1).round(3).tolist()
     states = [State(t, 'CRITICAL' if t in critical else 'OK', reason if t in critical else '',
                     'true' if t in critical else 'false',
-                    round(1000.0 * t) + (backlog - lost) * (t > 10.0), lost * (t > 10.0), 0,
+                    round(1000.0 * t) + (backlog - lost) * (t > 10.0), lost * (t > 10.0),
                     counted * (t > 10.0), k)
               for k, t in enumerate(times) if t not in dropped]
     said = [Said(t, t in (critical if flags is None else flags), k)
@@ -67,23 +66,8 @@ def test_a_dip_counts_as_reported_within_a_second(made, fate):
     assert found['asked'] == 1 and counts == {kind: kind == fate for kind in counts}
 
 
-def test_a_dip_that_was_not_told_explains_itself():
-    """The node's counts, what the listener lost, what was in force and what was done."""
-    made = heard(lost=3, counted=1, dropped=[10.1, 10.2], unsaid=[10.3], stops=[(10.2, 10.25)])
-    made.done = [(2.0, 'brownout.floor', '4.3'), (9.5, 'clear', ''), (10.5, 'window', '1.0'),
-                 (15.0, 'busy', '')]
-    why, = (dip['why'] for dip in dips_of(made)['unheard'])
-    assert why['counted'] == 1 and why['lost'] == 3
-    assert (why['came'], why['due']) == (1197, 1180)
-    assert (why['states_unheard'], why['flags_unheard']) == (2, 1)
-    assert why['gap'] == pytest.approx(0.3) and why['stopped'] == pytest.approx(0.05)
-    assert why['in_force'] == {'brownout.floor': '4.3'}
-    assert why['done'] == 'clear at -0.50 s, window 1.0 at +0.50 s'
-    assert unheard(made.states) == 2
-
-
 @pytest.mark.parametrize('change', [{'unseen': 'silent'}, {'samples': 39}])
-def test_dips_that_nobody_could_see_do_not_count(change):
+def test_dips_that_the_node_cannot_see_do_not_count(change):
     """Nor those of which too few samples were sent."""
     made = heard()
     made.source[-1].update(change)
@@ -95,10 +79,11 @@ def test_silence_without_the_time_of_stops():
     assert overlap(0.5, 1.97, stops) == pytest.approx(0.92)
     assert overlap(2.0, 3.0, stops) == 0.0
     said = [Said(at, None, k) for k, at in enumerate([0.0, 0.5, 2.0, 3.2])]
-    gap, net, at = silence(said, stops)
-    assert (gap, net, at) == (pytest.approx(1.5), pytest.approx(1.2), 2.0)
-    # One that was not heard is no silence.
-    assert silence([*said, Said(9.0, None, 5)], stops) == (gap, net, at)
+    gap, net = silence(said, stops)
+    assert (gap, net) == (pytest.approx(1.5), pytest.approx(1.2))
+    # A gap with a message that the listener lost does not count.
+    assert unheard([*said, Said(9.0, None, 5)]) == 1
+    assert silence([*said, Said(9.0, None, 5)], stops) == (gap, net)
 
 
 def test_pauses_are_one_account():
@@ -111,17 +96,15 @@ def test_pauses_are_one_account():
     assert dips_of(made)['in_time'] == 0
 
 
-def test_false_flags_and_flags_that_are_not_sent():
-    """False where nothing can be known counts once it has lingered; each state has its flag."""
+def test_false_flags_while_the_input_is_unusable():
+    """They count from when the node may no longer report what came before the phase."""
     made = heard([10.1])
-    assert unmatched(made) == 0.0
     made.source = [{'kind': 'phase', 'name': 'silent', 'at': 5.0},
                    {'kind': 'phase', 'name': 'good', 'at': 8.05}]
     spent, found = false_of(made)
     assert spent == 1 and len(found) == 7 and found[0] == (pytest.approx(7.4), 'silent')
-    made.flags = [flag for flag in made.flags if not 5.05 < flag.at < 7.05]
-    assert unmatched(made) == pytest.approx(1.0)
-    assert len(false_of(made)[1]) == 7
+    made.flags = [flag for flag in made.flags if not 7.45 < flag.at < 7.65]
+    assert len(false_of(made)[1]) == 5
 
 
 def test_growth_is_within_its_error():

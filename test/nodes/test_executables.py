@@ -72,7 +72,7 @@ def test_a_signal_at_any_moment_of_the_start(world, number):
 
 @pytest.mark.parametrize('name', NODES)
 def test_ctrl_c_of_a_launch_is_two_signals(world, name):
-    """The second comes while the first is being answered; benchmarks/soak_exits.py has 200."""
+    """The second comes while the first is being answered."""
     for spacing in (0.001, 0.005, 0.02, 0.04):
         process = world.start(name)
         wait_until(lambda process=process: 'Waiting for' in process.err, what='the node at work')
