@@ -61,7 +61,8 @@ text.light { fill: #ffffff; } .grid { stroke: #dde3e5; stroke-width: 1; }
 
 def arguments(doc: str | None, names: bool = False) -> argparse.ArgumentParser:
     """Return a parser with `--page`, and with names of recordings if a program takes some."""
-    parser = argparse.ArgumentParser(description=(doc or '').strip().splitlines()[0])
+    words = (doc or '').strip().partition('\n')[0]
+    parser = argparse.ArgumentParser(description=words)
     if names:
         parser.add_argument('names', nargs='*', metavar='NAME', help='recordings (default: all)')
     parser.add_argument('--page', type=Path, help='page whose table is replaced')
