@@ -1,40 +1,30 @@
 """
-The loop that an adaptive D term closes: does the cutoff hunt.
+Used by filter.py: does the loop that an adaptive D term closes through the supply hunt.
 
     throttle -> load -> sigma and sag -> SlidingEstimator -> cutoff -> D term -> throttle
 
-Limits first: one rate axis of a multirotor in hover, four motors in two pairs,
-first-order motors, no air.  What counts is the order of magnitude of the
-margins, not the third digit of a boundary.
+One rate axis of a multirotor in hover: four motors in two pairs, first-order motors, no air.  The
+order of magnitude of the margins counts, not the third digit of a boundary.
 
-The load is the root mean square of the motors' commands, sqrt(u^2 + d^2) for
-the collective u and the differential d: noise in d costs current.  sigma is
-`intensity` (load / hover)^steepness; the paper's 10 % and 40 % loads have a
-steepness of ln(0.632 / 0.3156) / ln(4) = 0.5.  The collective holds the thrust
-as the voltage sags.  Around a mean, with s the share of the load that the
-noise makes (d ln load / d ln d) and p = s steepness, noise in d raises sigma
-at once by a gain p, and the law `constant_noise` takes it back behind the
-estimator's window and the smoothing, by a gain p / (1 - p).  A moving average
-of the window's length and a smoothing of a quarter of it, the worst case,
-oscillate from a gain of about 4.5: p = 0.82.  See `critical_gain`.  A
-`threshold` has no finite gain: it hunts wherever sigma lies below the
-threshold at fmin and above it at fmax.
+The load is the rms of the motors' commands, sqrt(u^2 + d^2) for the collective u and the
+differential d: noise in d costs current.  sigma is `intensity` (load / hover)^steepness; the
+paper's loads of 10 and 40 % have a steepness of ln(0.632 / 0.3156) / ln(4) = 0.5.  The collective
+holds the thrust as the voltage sags.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 import math
 from typing import Any
 
-from common import number, table
+from common import number, say, table
 import numpy as np
 from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.online.filter.lowpass import AdaptiveLowPass
 from ou_monitor.records import FloatArray, NAN
 from ou_monitor.report.svg import Plot
-from scipy.optimize import brentq
 
 # Of the cutoff, octaves: below, whatever it does is of no consequence to a loop.
 SWING = 0.5
@@ -64,7 +54,7 @@ CASES: dict[str, dict[str, object]] = {
 }
 
 
-def scan(seconds: float, seed: int, tell: Callable[[str], None]) -> dict[str, list[Verdict]]:
+def scan(seconds: float, seed: int) -> dict[str, list[Verdict]]:
     """Return verdicts of each case at each coupling."""
     found: dict[str, list[Verdict]] = {}
     for name, options in CASES.items():
@@ -76,7 +66,7 @@ def scan(seconds: float, seed: int, tell: Callable[[str], None]) -> dict[str, li
                 given['filter'] = {**of_filter, 'coupling': coupling}  # type: ignore[dict-item]
             found[name].append(judge(Loop(coupling=coupling, **given),  # type: ignore[arg-type]
                                      seconds, seed))
-        tell(name)
+        say(name)
     return found
 
 
@@ -101,19 +91,8 @@ def render(found: dict[str, list[Verdict]]) -> tuple[str, Plot]:
             'rad/s per V**\n\n'
             + table(['law', *(f'{c:g}' for c in COUPLINGS), 'hunts from', 'period, s'], rows)
             + '\nRms of the differential command in the first row: '
-            + ', '.join(f'{v.command:.2f}' for v in share) + '.\n\n'
-            '**Loop gain from which the linear theory hunts, window 2 s**\n\n' + table(
-                ['smoothing, s', *(f'{s:g}' for s in _SMOOTHINGS)],
-                [['gain', *(_gain(s) for s in _SMOOTHINGS)]]))
+            + ', '.join(f'{v.command:.2f}' for v in share) + '.\n')
     return text, plot
-
-
-_SMOOTHINGS = (0.0, 0.05, 0.2, 0.5, 1.0, 4.0)
-
-
-def _gain(smoothing: float) -> str:
-    value = critical_gain(2.0, smoothing)
-    return 'never' if math.isinf(value) else f'{value:.1f}'
 
 
 @dataclass(frozen=True)
@@ -252,22 +231,3 @@ def _period(octaves: FloatArray) -> float:
     if not below.size or below[0] >= x.size // 2:
         return NAN
     return float(below[0] + np.argmax(correlation[below[0]:x.size * 3 // 4]))
-
-
-def critical_gain(window: float, smoothing: float) -> float:
-    """
-    Return the loop gain from which the cutoff hunts, in the linear theory.
-
-    The estimate is a moving average over the window, sinc(w W / 2)
-    exp(-i w W / 2), the cutoff follows with one pole, 1 / (1 + i w smoothing).
-    Negative feedback oscillates where both together lag by half a turn.
-    """
-    if smoothing <= 0.0:
-        return math.inf
-    ratio = 2.0 * smoothing / window
-
-    def off(x: float) -> float:
-        return x + math.atan(ratio * x) - math.pi
-
-    x = float(brentq(off, 0.1, math.pi))
-    return x / math.sin(x) * math.hypot(1.0, ratio * x)

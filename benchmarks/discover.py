@@ -356,9 +356,10 @@ def injected(given: argparse.Namespace) -> str:
     kept, had = np.sum([one.kept for one in every], axis=0)
     rows.append(['named', *(f'{named[effect]} of {of[effect]}' for effect in given.effects),
                  f'{kept} of {had}', str(sum(len(one.false) for one in every))])
+    found, had = named.total() / max(len(tried), 1), max(had, 1)
     return table(['recording', *given.effects, 'own causes kept', 'named beside, times'], rows) + (
-        f'\nNamed: {named.total()} of {len(tried)}, {100.0 * named.total() / max(len(tried), 1):.0f} %; '
-        f'own causes kept: {100.0 * kept / max(had, 1):.0f} %.\n')
+        f'\nNamed: {named.total()} of {len(tried)}, {100.0 * found:.0f} %; '
+        f'own causes kept: {100.0 * kept / had:.0f} %.\n')
 
 
 def main() -> int:

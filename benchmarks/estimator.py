@@ -1,283 +1,325 @@
 """
-The sliding-window estimator against what users would pick: one command (10 min).
+The sliding-window estimator beside the exact likelihood and AR(1), and its speed (10 min).
 
-    python benchmarks/estimator.py [--windows 500] [--quick] [--json FILE]
-        [--accuracy doc/results/estimator.md] [--speed doc/results/estimator.md]
+    python benchmarks/estimator.py [--windows 500] [--parts awts] [--quick]
+        [--page doc/results/estimator.md]
 
-See README.md beside this file.
+The likelihood shares nothing with the package.  README.md beside this file defines the columns.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
-import json
-import os
-from pathlib import Path
-import platform
-import subprocess
+from dataclasses import replace
+import importlib.util
+import math
 import sys
 import time
 from typing import Any
 
-# Before NumPy is loaded: one thread for all, so that CPU times compare.
-for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
-    os.environ[_name] = '1'
-_HERE = Path(__file__).resolve().parent
-sys.path.insert(0, str(_HERE.parent))
-
-import common  # noqa: E402
-import methods  # noqa: E402
-import numpy as np  # noqa: E402
-from ou_monitor.online.estimator.estimator import SlidingEstimator  # noqa: E402
-import tables  # noqa: E402
-import windows as simulated  # noqa: E402
-from windows import Array, Fit, Fits, NAMES, rmse_ratio, SENSORS, TRUTH  # noqa: E402
+from common import arguments, deliver, environment, number, say, table
+import numpy as np
+from ou_monitor.online.estimator.estimator import SlidingEstimator
+from scipy.optimize import minimize, minimize_scalar
+import windows as simulated
+from windows import Array, cells, errors, Fit, ratios, SENSORS, statuses
 
 SEED = 20260131
-_PACKAGES = ('numpy', 'scipy', 'numba', 'statsmodels', 'celerite2', 'pandas')
-OURS = 'ou_monitor SlidingEstimator'
-KALMAN = 'Kalman, restricted likelihood'
-CORRECTED = 'the same, corrected by 2/T'
-# alpha T of the small windows; they are seen with this sensor.
-RELAXATIONS = (5, 8, 12, 25, 40, 126, 630)
-SMALL_SENSOR = '5 mV noise'
+HEAD = [f'{name} {what}' for name in ('alpha', 'sigma', 'Var_inf')
+        for what in ('bias %', 'RMSE %', 'cover %')]
+# alpha T of the short and long windows, which are measured with this sensor.
+RELAXATIONS, SENSOR = (5, 8, 12, 25, 40, 126, 630), '5 mV noise'
 # Name, time constant, dead time (s), and whether steps fall on the sampling grid.
 RESPONSES: tuple[tuple[str, float, float, bool], ...] = (
-    ('(a) at once', 0.0, 0.0, True),
-    ('(b) through a 10 ms lag', 0.010, 0.0, True),
+    ('(a) at once', 0.0, 0.0, True), ('(b) through a 10 ms lag', 0.010, 0.0, True),
     ('(c) 10 ms lag, steps between samples', 0.010, 0.0, False),
     ('(d) through a 20 ms lag', 0.020, 0.0, True),
-    ('(e) 10 ms lag after 5 ms dead time', 0.010, 0.005, True),
-)
+    ('(e) 10 ms lag after 5 ms dead time', 0.010, 0.005, True))
 
 
-def environment() -> dict[str, str]:
-    """Return what the numbers depend on."""
-    from importlib import metadata
-    out = {'python': platform.python_version(), 'machine': _processor()}
-    for name in _PACKAGES:
-        try:
-            out[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            out[name] = 'not installed'
-    try:
-        out['commit'] = subprocess.run(
-            ['git', 'describe', '--always', '--dirty'], cwd=_HERE, check=True,
-            capture_output=True, text=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        out['commit'] = 'unknown'
-    return out
-
-
-def _processor() -> str:
-    info = Path('/proc/cpuinfo')
-    if info.exists():
-        for line in info.read_text().splitlines():
-            if line.startswith('model name'):
-                return line.split(':', 1)[1].strip()
-    return platform.processor() or platform.machine()
-
-
-def say(text: str) -> None:
-    """Tell progress."""
-    print(text, file=sys.stderr, flush=True)
+# -- methods: one window and its spacing, s -> a fit
 
 
 def ours(y: Array, dt: float, throttle: Array | None = None) -> Fit:
-    """Return our estimate of one window, from nothing."""
-    n = y.size
-    window = n * dt
-    estimator = SlidingEstimator(window)
-    estimator.push(1000.0 * window + np.arange(n) * dt, y, throttle)
+    """Return the estimate of one window, from nothing."""
+    estimator = SlidingEstimator(y.size * dt)
+    estimator.push(1000.0 * y.size * dt + np.arange(y.size) * dt, y, throttle)
     e = estimator.estimate()
-    return Fit(e.alpha, e.sigma, e.var_inf, (e.alpha_se, e.sigma_se, e.var_inf_se),
+    return Fit((e.alpha, e.sigma, e.var_inf), (e.alpha_se, e.sigma_se, e.var_inf_se),
                e.status.name)
 
 
-def run(method: Callable[..., Any], windows: Array, *columns: Array) -> Fits:
-    """Fit each window; CPU time of this process, errors of a fit left out where they are extra."""
-    out = Fits()
+_LOW, _HIGH = math.log(1e-5), math.log(8.0)
+# Noise variances, in units of sigma^2 dt, from which the search starts.
+_STARTS = (0.02, 0.2, 2.0)
+_LEAST_NOISE, _MOST_NOISE = math.log(1e-6), math.log(1e4)
+
+
+def _compiled(function: Callable[..., Any]) -> Any:
+    if importlib.util.find_spec('numba') is None:
+        return function
+    import numba
+    return numba.njit(function)
+
+
+@_compiled
+def _filtered(y: Array, a: float, noise: float) -> tuple[float, float, float]:
+    """Return quadratic form, log-determinant, and information on the level."""
+    phi = math.exp(-a)
+    stationary = 0.5 / a
+    drive = -stationary * math.expm1(-2.0 * a)
+    variance = stationary
+    state = 0.0
+    unit = 0.0
+    by_data = 0.0
+    crossed = 0.0
+    by_level = 0.0
+    log_det = 0.0
+    for value in y:
+        total = variance + noise
+        gain = variance / total
+        error = value - state
+        left = 1.0 - unit
+        by_data += error * error / total
+        crossed += error * left / total
+        by_level += left * left / total
+        log_det += math.log(total)
+        state = phi * (state + gain * error)
+        unit = phi * (unit + gain * left)
+        variance = phi * phi * variance * (1.0 - gain) + drive
+    return by_data - crossed * crossed / by_level, log_det, by_level
+
+
+def _deviance(y: Array, log_a: float, noise: float) -> float:
+    """Return minus twice the restricted log-likelihood with the scale profiled out."""
+    form, log_det, by_level = _filtered(y, math.exp(log_a), noise)
+    return float((y.size - 1) * math.log(form) + log_det + math.log(by_level))
+
+
+def _log_errors(y: Array, log_a: float, log_scale: float, noise: float) -> Array:
+    """
+    Return standard errors of ln(alpha), ln(sigma), ln(Var_inf).
+
+    Observed information by central differences.  The noise variance counts as
+    unknown on its bound too, where that is on the careful side.
+    """
+    def value(p: Array) -> float:
+        form, log_det, by_level = _filtered(y, math.exp(p[0]), p[2])
+        return float(0.5 * ((y.size - 1) * p[1] + form * math.exp(-p[1]) + log_det
+                            + math.log(by_level)))
+
+    at = np.array([log_a, log_scale, noise])
+    steps = np.array([1e-2, 1e-3, 3e-3 * max(noise, 0.1)])
+    hessian = np.empty((3, 3))
+    for i in range(3):
+        for j in range(i + 1):
+            one, other = np.eye(3)[i] * steps, np.eye(3)[j] * steps
+            hessian[i, j] = hessian[j, i] = (
+                value(at + one + other) - value(at + one - other) - value(at - one + other)
+                + value(at - one - other)) / (4.0 * steps[i] * steps[j])
+    try:
+        covariance = np.linalg.inv(hessian)
+    except np.linalg.LinAlgError:
+        return np.full(3, np.nan)
+    turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.5, 0.0], [-1.0, 1.0, 0.0]])
+    variances = (turn @ covariance @ turn.T).diagonal()
+    return np.sqrt(np.where(variances > 0.0, variances, np.nan))
+
+
+def kalman(y: Array, dt: float) -> Fit:
+    """
+    Return the restricted maximum-likelihood fit by the Kalman filter.
+
+    The level is integrated out (its flat prior gives the term in `by_level`), the scale is
+    profiled out, and the noise variance is bounded at 0: the bound is searched by itself, the
+    interior from several starts, so the global maximum is found.
+    """
+    centred = y - y.mean()
+    edge = minimize_scalar(lambda x: _deviance(centred, x, 0.0), bounds=(_LOW, _HIGH),
+                           method='bounded', options={'xatol': 1e-7})
+    best, log_a, noise = float(edge.fun), float(edge.x), 0.0
+    for start in _STARTS:
+        # With noise the slope of the variogram at the edge is too steep.
+        begin = np.array([max(log_a - 0.5 * math.log1p(start), _LOW + 1.0), math.log(start)])
+        found = minimize(
+            lambda p: _deviance(centred, p[0], math.exp(p[1])), begin, method='Nelder-Mead',
+            bounds=((_LOW, _HIGH), (_LEAST_NOISE, _MOST_NOISE)),
+            options={'xatol': 1e-5, 'fatol': 1e-8})
+        if found.fun < best - 1e-9:
+            best, log_a, noise = float(found.fun), float(found.x[0]), math.exp(found.x[1])
+    form = _filtered(centred, math.exp(log_a), noise)[0]
+    scale = form / (y.size - 1)
+    alpha = math.exp(log_a) / dt
+    sigma2 = scale / dt
+    return Fit((alpha, math.sqrt(sigma2), sigma2 / (2.0 * alpha)),
+               tuple(_log_errors(centred, log_a, math.log(scale), noise).tolist()))
+
+
+def corrected(plain: Fit, duration: float) -> Fit:
+    """
+    Return a restricted fit less its small-sample bias.
+
+    2/T of alpha remain (Tang & Chen 2009, less the half that comes from the level); Var_inf,
+    convex in alpha, is taken at alpha - 1/T.
+    """
+    alpha, sigma, _ = plain.values
+    if alpha * duration <= 2.0:
+        return Fit()
+    return replace(plain, values=(alpha - 2.0 / duration, sigma,
+                                  sigma ** 2 / (2.0 * (alpha - 1.0 / duration))))
+
+
+def autoregression(y: Array, dt: float) -> Fit:
+    """Return the least-squares AR(1), carried to continuous time exactly; delta-method errors."""
+    x, later = y[:-1] - y[:-1].mean(), y[1:] - y[1:].mean()
+    phi = float(x @ later / (x @ x))
+    if not 0.0 < phi < 1.0:
+        return Fit()
+    shock = float(np.mean((later - phi * x) ** 2))
+    rate, var_inf = -math.log(phi), shock / (1.0 - phi * phi)
+    # Derivatives of ln(alpha), ln(sigma), ln(Var_inf) by phi; by ln(shock): 0, 1/2, 1.
+    by_alpha, by_var = -1.0 / (phi * rate), 2.0 * phi / (1.0 - phi * phi)
+    by_phi = np.array([by_alpha, 0.5 * (by_alpha + by_var), by_var])
+    variance = by_phi ** 2 * shock / (x @ x) + np.array([0.0, 0.25, 1.0]) * 2.0 / y.size
+    return Fit((rate / dt, math.sqrt(2.0 * rate / dt * var_inf), var_inf),
+               tuple(np.sqrt(variance).tolist()))
+
+
+def run(method: Callable[..., Fit], windows: Array, *columns: Array) -> list[Fit]:
+    """Fit each window; with the CPU time of this process."""
+    out = []
     for row, y in enumerate(windows):
         begin = time.process_time()
         fit = method(y, simulated.DT, *(c[row] for c in columns))
-        out.seconds.append(time.process_time() - begin)
-        if isinstance(fit, tuple):
-            fit = fit[1]()
-        out.fits.append(fit)
+        out.append(replace(fit, seconds=time.process_time() - begin))
     return out
 
 
-def correct(plain: Fits, duration: float) -> Fits:
-    """Return fits less their small-sample bias."""
-    return Fits([methods.kalman_corrected(f, duration) for f in plain.fits], plain.seconds)
+# -- parts
 
 
-def compare(seed: int, windows: int, slow: int) -> dict[str, Any]:
-    """Compare all methods on 2 s windows at 1 kHz."""
-    rng = np.random.default_rng(seed)
+def accuracy(windows: int) -> str:
+    """Compare the methods on 2 s windows at 1 kHz."""
+    rng = np.random.default_rng(SEED)
     paths = simulated.simulate(rng, windows, round(simulated.WINDOW / simulated.DT))
-    tables: dict[str, Any] = {}
-    ratios: dict[str, Any] = {}
+    parts, beside = [], []
     for sensor, see in SENSORS.items():
         seen = see(paths, rng)
-        results = {OURS: run(ours, seen)}
-        for name, package, method, is_slow in methods.PEERS:
-            if not methods.installed(package):
-                say(f'  {name}: {package} is not installed, left out')
-                continue
-            begin = time.monotonic()
-            results[name] = run(method, seen[:slow] if is_slow else seen)
-            say(f'  {sensor}: {name}: {time.monotonic() - begin:.1f} s')
-            if name == KALMAN:
-                results[CORRECTED] = correct(results[name], simulated.WINDOW)
-        tables[sensor] = {name: fits.summary(TRUTH) for name, fits in results.items()}
-        ratios[sensor] = _ratios(results)
-    return {'tables': tables, 'ratios': ratios}
+        exact = run(kalman, seen)
+        less = [corrected(fit, simulated.WINDOW) for fit in exact]
+        own = run(ours, seen)
+        rows = [[name, *cells(fits), number(1e3 * float(np.median([f.seconds for f in fits])),
+                                            '.3g')]
+                for name, fits in (
+                    ('ou_monitor SlidingEstimator', own),
+                    ('Kalman, restricted likelihood', exact),
+                    ('the same, corrected by 2/T', less), ('AR(1)', run(autoregression, seen)))]
+        parts.append(f'**{sensor}**\n\n' + table(['method', *HEAD, 'CPU ms'], rows))
+        beside += [[sensor, name, *ratios(own, fits)] for name, fits in (
+            ('Kalman, restricted likelihood', exact), ('the same, corrected by 2/T', less))]
+        say(f'  {sensor} done')
+    return ('### Accuracy: 2 s windows at 1 kHz\n\n' + '\n'.join(parts)
+            + '\n### RMSE beside the full likelihood\n\n' + table(
+                ['sensor', 'our RMSE over that of', 'alpha', 'sigma', 'Var_inf'], beside))
 
 
-def _ratios(results: dict[str, Fits]) -> dict[str, Any]:
-    own = results[OURS].relative(TRUTH)
-    out: dict[str, Any] = {}
-    for reference in (KALMAN, CORRECTED):
-        other = results[reference].relative(TRUTH)
-        out[reference] = {name: rmse_ratio(own[:, i], other[:, i], paired=True)
-                          for i, name in enumerate(NAMES)}
-    return out
-
-
-def small(seed: int, windows: int) -> dict[str, Any]:
-    """Shorten the window."""
-    rng = np.random.default_rng(seed)
-    out: dict[str, Any] = {}
+def lengths(windows: int) -> str:
+    """Shorten and lengthen the window."""
+    rng = np.random.default_rng(SEED + 1)
+    rows, shares = [], []
     for relaxations in RELAXATIONS:
         n = round(relaxations / simulated.ALPHA / simulated.DT)
-        seen = SENSORS[SMALL_SENSOR](simulated.simulate(rng, windows, n), rng)
+        seen = SENSORS[SENSOR](simulated.simulate(rng, windows, n), rng)
         own = run(ours, seen)
-        reference = correct(run(methods.kalman_fit, seen), n * simulated.DT)
-        told = np.isfinite(own.relative(TRUTH)[:, 0])
-        out[str(relaxations)] = {
-            'samples': n, 'ours': own.summary(TRUTH, told),
-            'kalman': reference.summary(TRUTH, told), 'kalman_all': reference.summary(TRUTH)}
+        exact = [corrected(fit, n * simulated.DT) for fit in run(kalman, seen)]
+        given = np.isfinite(errors(own)).all(axis=1)
+        rows += [[str(relaxations), name, *cells(fits, only)] for name, fits, only in (
+            ('ours', own, None), ('Kalman, same windows', exact, given),
+            ('Kalman, all windows', exact, None))]
+        shares.append([str(relaxations), str(n), str(windows), statuses(own)])
         say(f'  alpha T = {relaxations} done')
-    return out
+    return (f'### Short and long windows ({SENSOR})\n\n'
+            + table(['alpha T', 'method', *HEAD], rows) + '\n'
+            + table(['alpha T', 'samples', 'windows', 'status of our estimate'], shares))
 
 
-def load(seed: int, windows: int) -> dict[str, Any]:
+def steps(windows: int) -> str:
     """Step the throttle within the window."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(SEED + 2)
     n = round(simulated.WINDOW / simulated.DT)
-    still = SENSORS[SMALL_SENSOR](simulated.simulate(rng, windows, n), rng)
+    still = SENSORS[SENSOR](simulated.simulate(rng, windows, n), rng)
     throttle, times = simulated.throttle_steps(rng, windows, n)
     rest = run(ours, still, np.full_like(still, simulated.LOW))
-    base = rest.relative(TRUTH)
-    out: dict[str, Any] = {'no steps': {'summary': rest.summary(TRUTH), 'ratio': None}}
-
-    def add(name: str, fits: Fits) -> None:
-        errors = fits.relative(TRUTH)
-        out[name] = {'summary': fits.summary(TRUTH),
-                     'ratio': {p: rmse_ratio(errors[:, i], base[:, i], paired=True)
-                               for i, p in enumerate(NAMES)}}
-
-    add('throttle moves, supply does not sag', run(ours, still, throttle))
-    for name, lag, delay, on_grid in RESPONSES:
-        sag = simulated.sagging(throttle, times, lag, delay, on_grid)
-        add(name, run(ours, still + sag, throttle))
+    found = {'no steps': rest, 'throttle moves, supply does not sag': run(ours, still, throttle)}
+    for name, lag, dead, on_grid in RESPONSES:
+        found[name] = run(ours, still + simulated.sagging(throttle, times, lag, dead, on_grid),
+                          throttle)
         say(f'  {name} done')
-    sag = simulated.sagging(throttle, times, RESPONSES[1][1])
-    add('(b), throttle not given', run(ours, still + sag))
-    return out
+    found['(b), throttle not given'] = run(
+        ours, still + simulated.sagging(throttle, times, RESPONSES[1][1]))
+    return f'### Throttle steps, sag 0.3 V ({SENSOR})\n\n' + table(
+        ['response of the supply', *HEAD, 'alpha ratio', 'sigma ratio', 'Var_inf ratio'],
+        [[name, *cells(fits), *ratios(fits, rest)] for name, fits in found.items()])
 
 
-def speed(quick: bool) -> dict[str, Any]:
-    """Measure speed in a fresh process."""
-    command = [sys.executable, str(_HERE / 'speed.py'), *(['--quick'] if quick else [])]
-    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return found
+def speed(scale: int) -> str:
+    """Time `push` by block, and `estimate` by window: CPU time of this thread."""
+    rng = np.random.default_rng(5)
 
-
-def measure(windows: int, slow: int, quick: bool, parts: str) -> dict[str, Any]:
-    """Run the parts asked for; a letter each."""
-    out: dict[str, Any] = {'environment': environment(), 'windows': windows, 'slow': slow}
-    if 'a' in parts:
-        say(f'accuracy, {windows} windows ({slow} for the slow methods)')
-        out['accuracy'] = compare(SEED, windows, slow)
-    if 'w' in parts:
-        say('short windows')
-        out['small'] = small(SEED + 1, windows)
-    if 't' in parts:
-        say('throttle steps')
-        out['load'] = load(SEED + 2, windows)
-    if 's' in parts:
-        say('speed')
-        out['speed'] = speed(quick)
-    return out
-
-
-def accuracy_report(results: dict[str, Any]) -> str:
-    """Return the tables of accuracy as Markdown; empty when no such part was run."""
-    parts = []
-    if 'accuracy' in results:
-        parts += [f'### Accuracy: {simulated.WINDOW:g} s windows at 1 kHz\n',
-                  tables.accuracy(results['accuracy']['tables']),
-                  '### RMSE beside the full likelihood\n',
-                  tables.ratios(results['accuracy']['ratios'])]
-    if 'small' in results:
-        parts += [f'### Short and long windows ({SMALL_SENSOR})\n',
-                  tables.small(results['small'])]
-    if 'load' in results:
-        parts += [f'### Throttle steps, sag 0.3 V ({SMALL_SENSOR})\n',
-                  tables.load(results['load'])]
-    note = f'; {results["windows"]} windows, {results["slow"]} for the slow methods'
-    return _with_setting(results, note, parts)
-
-
-def speed_report(results: dict[str, Any]) -> str:
-    """Return the tables of speed as Markdown; empty when that part was not run."""
-    parts = []
-    if 'speed' in results:
-        found = results['speed']
-        parts += ['### Throughput\n', tables.throughput(found['throughput']),
-                  '### Latency of `estimate()` after pushes of 100 at 1 kHz\n',
-                  tables.latency(found['latency'])]
-    return _with_setting(results, '', parts)
-
-
-def _with_setting(results: dict[str, Any], note: str, parts: list[str]) -> str:
-    setting = ', '.join(f'{k} {v}' for k, v in results['environment'].items())
-    return '\n'.join([f'<!-- {setting}{note} -->\n', *parts]) if parts else ''
+    def supply(n: int) -> tuple[Array, Array, Array]:
+        y = SENSORS[SENSOR](simulated.simulate(rng, 1, n)[0], rng)
+        return (1000.0 + np.arange(n) * simulated.DT, y,
+                np.repeat(0.3 + 0.4 * rng.random(n // 100 + 1), 100)[:n])
+    pushes = []
+    for block in (1, 10, 100, 1000):
+        n = 200_000 // scale // block * block
+        t, y, u = supply(n)
+        blocks = [(t[i:i + block], y[i:i + block], u[i:i + block]) for i in range(0, n, block)]
+        least = math.inf
+        for _ in range(5):
+            push, begin = SlidingEstimator(simulated.WINDOW).push, time.thread_time()
+            for one in blocks:
+                push(*one)
+            least = min(least, time.thread_time() - begin)
+        pushes.append([str(block), f'{1e6 * least * block / n:.1f}', f'{1e-6 * n / least:.3g}'])
+    fits = []
+    for window in (2.0, 20.0, 200.0):
+        filled, rounds = round(1.1 * window / simulated.DT), 400 // scale
+        t, y, u = supply(filled + 100 * rounds)
+        for throttle, how in ((np.full_like(u, simulated.LOW), 'steady'), (u, 'moving')):
+            estimator, spent = SlidingEstimator(window), []
+            estimator.push(t[:filled], y[:filled], throttle[:filled])
+            for i in range(filled, t.size, 100):
+                part = slice(i, i + 100)
+                begin = time.thread_time()
+                estimator.estimate()
+                spent.append(1e6 * (time.thread_time() - begin))
+                estimator.push(t[part], y[part], throttle[part])
+            middle, high = np.percentile(spent[2:], [50, 99])
+            fits.append([f'{window:g} s', how, f'{middle:.0f}', f'{high:.0f}', f'{spent[0]:.0f}'])
+    return ('### `push(t, voltage, throttle)`\n\n'
+            + table(['samples in a block', 'CPU us a block', 'million samples/s'], pushes)
+            + '\n### `estimate()` after pushes of 100 samples at 1 kHz\n\n'
+            + table(['window', 'throttle', 'CPU p50 us', 'CPU p99 us', 'first fit, CPU us'], fits))
 
 
 def main() -> int:
     """Parse arguments, measure, write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
-    parser.add_argument('--windows', type=int, default=500, help='windows per case')
-    parser.add_argument('--slow-windows', type=int,
-                        help='windows for methods of 0.2 s a fit and more (default: a fifth)')
-    parser.add_argument('--quick', action='store_true',
-                        help='20 windows and a tenth of the samples: does it run')
+    parser = arguments(__doc__)
+    parser.add_argument('--windows', type=int, default=500, help='windows of each case')
+    parser.add_argument('--quick', action='store_true', help='20 windows, a tenth of the samples')
     parser.add_argument('--parts', default='awts',
-                        help='a: accuracy, w: short windows, t: throttle steps, s: speed')
-    parser.add_argument('--json', type=Path, help='write all numbers here')
-    for name in ('accuracy', 'speed'):
-        parser.add_argument(f'--{name}', type=Path,
-                            help=f'write the tables of {name} here, between its marks '
-                            f'"<!-- {name} begins -->" and "<!-- {name} ends -->" if it has them')
+                        help='a: accuracy, w: lengths of the window, t: throttle steps, s: speed')
     given = parser.parse_args()
-    windows = min(given.windows, 20) if given.quick else given.windows
-    slow = given.slow_windows or max(windows // 5, min(windows, 5))
-    if windows < 2 or slow < 2 or not set(given.parts) <= set('awts'):
-        parser.error('--windows and --slow-windows need 2 or more; --parts is of a, w, t, s')
-    results = measure(windows, min(slow, windows), given.quick, given.parts)
-    if given.json:
-        given.json.write_text(json.dumps(results, indent=1) + '\n')
-    for name, text in (('accuracy', accuracy_report(results)), ('speed', speed_report(results))):
-        path = getattr(given, name)
-        if text and path:
-            common.deliver(text, path, name)
-        elif text:
-            print(text)
+    count = min(given.windows, 20) if given.quick else given.windows
+    made: dict[str, Any] = {'a': accuracy, 'w': lengths, 't': steps}
+    setting = f'<!-- {environment("numba")}'
+    parts = [made[part](count) for part in given.parts if part in made]
+    if parts:
+        text = '\n'.join([f'{setting}; {count} windows -->\n', *parts])
+        deliver(text, given.page, 'accuracy')
+    if 's' in given.parts:
+        deliver(f'{setting} -->\n\n{speed(10 if given.quick else 1)}', given.page, 'speed')
     return 0
 
 

@@ -1,9 +1,10 @@
 """
-Reading bags: against the libraries that decode message by message; and memory (minutes).
+Reading bags beside rosbags, which decodes message by message; and memory (2 min).
 
-    python benchmarks/reading.py peers --table doc/results/reading.md
-    python benchmarks/reading.py files --table doc/results/reading.md
-    python benchmarks/reading.py memory --table doc/results/reading.md
+    python benchmarks/reading.py peers --page doc/results/reading.md
+    python benchmarks/reading.py memory --page doc/results/reading.md
+
+CPU time of both readers on the same file, in turn; their arrays must be equal.
 """
 
 from __future__ import annotations
@@ -11,40 +12,28 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from datetime import date
-from importlib.metadata import version
 from pathlib import Path
-import platform
 import subprocess
 import sys
 import tempfile
 import time
 from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))
-
-from common import deliver, table  # noqa: E402
-from mcap.reader import make_reader  # noqa: E402
-from mcap.writer import CompressionType, IndexType, Writer  # noqa: E402
-from mcap_ros2.decoder import DecoderFactory  # noqa: E402
-import numpy as np  # noqa: E402
-from ou_monitor.recordings.bag import BagReader, BagWriter, batches  # noqa: E402
-from ou_monitor.recordings.bag_samples import choose  # noqa: E402
-from ou_monitor.recordings.cdr import join  # noqa: E402
-from ou_monitor.recordings.read import read_recording  # noqa: E402
-from ou_monitor.recordings.standard_types import (  # noqa: E402
+from common import arguments, deliver, environment, ROOT, say, table
+from mcap.writer import CompressionType, Writer
+import numpy as np
+from ou_monitor.recordings.bag import BagReader, BagWriter, batches
+from ou_monitor.recordings.bag_samples import choose
+from ou_monitor.recordings.cdr import join
+from ou_monitor.recordings.standard_types import (
     BATTERY_STATE, encode_battery, encode_blocks, encode_scalars, FLOAT32, FLOAT32_ARRAY, SCHEMAS)
-from ou_monitor.records import Recording  # noqa: E402
-from rosbags.highlevel import AnyReader  # noqa: E402
-from rosbags.typesys import get_typestore, Stores  # noqa: E402
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import get_typestore, Stores
 
 COMPRESSIONS = {'none': CompressionType.NONE, 'lz4': CompressionType.LZ4,
                 'zstd': CompressionType.ZSTD}
-# Repeats of the reader that takes milliseconds; the others take seconds.
+# Repeats of our reader, which takes milliseconds; rosbags takes seconds.
 REPEATS = 5
-
-
 THROTTLE = '/throttle'
 IMU = 'sensor_msgs/msg/Imu'
 START = 1_704_067_200_000_000_000
@@ -133,14 +122,15 @@ def messages(case: Case, count: int) -> list[tuple[str, int, bytes]]:
     return rows
 
 
-def write(path: Path, case: Case, rows: list[tuple[str, int, bytes]], **options: Any) -> Path:
+def write(path: Path, case: Case, rows: list[tuple[str, int, bytes]],
+          compression: CompressionType) -> Path:
     """Write a bag with the Python library of MCAP."""
     schemas = dict(SCHEMAS)
     if case.type not in schemas:
         store = get_typestore(Stores.ROS2_JAZZY)
         schemas[case.type], _ = store.generate_msgdef(case.type, ros_version=2)
     with path.open('wb') as file:
-        writer = Writer(file, **{'chunk_size': CHUNK, **options})
+        writer = Writer(file, chunk_size=CHUNK, compression=compression)
         writer.start(profile='ros2', library='benchmark')
         channels = {}
         for topic, kind in ((case.topic, case.type), (THROTTLE, FLOAT32)):
@@ -185,22 +175,6 @@ def rosbags(path: Path, case: Case) -> Columns:
                               for c, t, data in reader.messages(connections=wanted)))
 
 
-def mcap_ros2(path: Path, case: Case) -> Columns:
-    """Read with mcap and mcap-ros2-support, a message an object."""
-    with path.open('rb') as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        found = reader.iter_decoded_messages(topics=[case.topic, THROTTLE])
-        return collect(case, ((channel.topic, message.log_time, decoded)
-                              for _, channel, message, decoded in found))
-
-
-def unpacked(path: Path) -> int:
-    """Read and unpack the chunks, their checksums verified: what every reader has to do."""
-    file = BagReader(path)._files[0]
-    with path.open('rb') as stream:
-        return sum(len(file._data(stream, span)) for span in file.spans)
-
-
 def ours(path: Path, case: Case) -> Columns:
     """Read with this package, to the same arrays as the others."""
     bag = BagReader(path)
@@ -210,19 +184,6 @@ def ours(path: Path, case: Case) -> Columns:
     columns = {topic: join([batch[topic] for batch in found if topic in batch])
                for topic in (case.topic, THROTTLE)}
     return {topic: (column.stamp, column.values) for topic, column in columns.items()}
-
-
-def recording(path: Path, case: Case) -> Recording:
-    """Read with `read_recording`: in order, each stamp once, the throttle held at each sample."""
-    return read_recording(path, msg_config=case.config)
-
-
-def check(case: Case, mine: Columns, other: Columns) -> None:
-    """Refuse to compare the time of ways that do not agree on what is in the bag."""
-    for topic in (case.topic, THROTTLE):
-        np.testing.assert_array_equal(mine[topic][1], other[topic][1])
-        # Float64 seconds since 1970 resolve 0.24 us.
-        np.testing.assert_allclose(mine[topic][0], other[topic][0], rtol=0, atol=1e-6)
 
 
 def timed(call: Callable[[], Any], repeats: int) -> tuple[float, Any]:
@@ -236,57 +197,22 @@ def timed(call: Callable[[], Any], repeats: int) -> tuple[float, Any]:
 
 
 def peers(given: argparse.Namespace, folder: Path) -> str:
-    """Compare with rosbags and mcap-ros2-support: types and compressions."""
+    """Compare with rosbags: types of messages and compressions."""
     rows = []
     for case in cases(folder):
-        count = given.messages
-        content = messages(case, count)
+        content = messages(case, given.messages)
         for name, compression in COMPRESSIONS.items():
-            print(f'{case.name}, {name}', file=sys.stderr)
-            path = write(folder / 'bag.mcap', case, content, compression=compression)
-            least, _ = timed(lambda: unpacked(path), REPEATS)
+            say(f'{case.name}, {name}')
+            path = write(folder / 'bag.mcap', case, content, compression)
             mine, found = timed(lambda: ours(path, case), REPEATS)
-            whole, _ = timed(lambda: recording(path, case), REPEATS)
-            cells = [case.name, name, *(f'{seconds / count * 1e6:.2f}'
-                                        for seconds in (least, mine, whole))]
-            for other in (rosbags, mcap_ros2):
-                seconds, theirs = timed(lambda other=other: other(path, case), given.repeats)
-                check(case, found, theirs)
-                cells += [f'{seconds / count * 1e6:.1f}', f'**{seconds / mine:.0f}**']
-            rows.append(cells)
-    return table(['type of the voltage', 'compression', 'unpacking alone', 'this package',
-                  '`read_recording`', 'rosbags', 'times', 'mcap-ros2-support', 'times'], rows)
-
-
-def files(given: argparse.Namespace, folder: Path) -> str:
-    """Compare files with and without indexes, chunks, summaries."""
-    ways: list[tuple[str, dict[str, Any], dict[str, Any]]] = [
-        ('chunks, indexed', {}, {}),
-        ('chunks, indexed; `partial`: the whole file is checked', {}, {'partial': True}),
-        ('chunks of 128 KiB, indexed', {'chunk_size': 128 * 1024}, {}),
-        ('chunks without message indexes', {'index_types': IndexType.CHUNK}, {}),
-        ('chunks, no summary', {
-            'index_types': IndexType.NONE, 'use_statistics': False,
-            'use_summary_offsets': False, 'repeat_channels': False, 'repeat_schemas': False}, {}),
-        ('no chunks', {'use_chunking': False}, {}),
-        ('a tenth of the time (`start`, `end`)', {}, {
-            'start': 0.45e-3 * given.messages, 'end': 0.55e-3 * given.messages})]
-    rows = []
-    first: dict[str, float] = {}
-    chosen = [case for case in cases(folder) if case.name in ('Float32', 'BatteryState')]
-    contents = {case.name: messages(case, given.messages) for case in chosen}
-    for words, options, reading in ways:
-        cells = [words]
-        for case in chosen:
-            path = write(folder / 'bag.mcap', case, contents[case.name], **options)
-            seconds, found = timed(
-                lambda: read_recording(path, msg_config=case.config, **reading), REPEATS)
-            assert found.n == given.messages * (0.1 if 'start' in reading else 1.0)
-            first.setdefault(case.name, seconds)
-            cells += [f'{seconds * 1e3:.0f}', f'{seconds / first[case.name]:.2f}']
-        rows.append(cells)
-    return table(['file (zstd)', 'Float32, ms', 'times the first', 'BatteryState, ms',
-                  'times the first'], rows)
+            other, theirs = timed(lambda: rosbags(path, case), given.repeats)
+            for topic in (case.topic, THROTTLE):
+                np.testing.assert_array_equal(found[topic][1], theirs[topic][1])
+                # Float64 seconds since 1970 resolve 0.24 us.
+                np.testing.assert_allclose(found[topic][0], theirs[topic][0], rtol=0, atol=1e-6)
+            rows.append([case.name, name, f'{1e6 * mine / given.messages:.2f}',
+                         f'{1e6 * other / given.messages:.1f}', f'**{other / mine:.0f}**'])
+    return table(['type of the voltage', 'compression', 'this package', 'rosbags', 'times'], rows)
 
 
 # Program that reads a bag, or only loads what that needs, and prints samples, peak resident memory
@@ -324,7 +250,7 @@ def memory(given: argparse.Namespace, folder: Path) -> str:
     write_long(path, given.seconds)
     rows = []
     for words, how in (('nothing read (Python, NumPy, mcap)', 'none'), ('whole', 'whole')):
-        print(words, file=sys.stderr)
+        say(words)
         found = []
         for _ in range(REPEATS):
             done = subprocess.run([sys.executable, '-c', CHILD, str(path), how], check=True,
@@ -339,27 +265,17 @@ def memory(given: argparse.Namespace, folder: Path) -> str:
             + table(['reading', 'peak resident memory, MB', 'CPU, s'], rows))
 
 
-def stamp() -> str:
-    """Return what the numbers depend on."""
-    names = ' '.join(f'{name} {version(name)}' for name in (
-        'numpy', 'mcap', 'mcap-ros2-support', 'rosbags'))
-    return (f'{date.today().isoformat()}; Python {platform.python_version()}, {names}, '
-            f'{platform.machine()}.')
-
-
 def main() -> int:
     """Parse arguments, measure, write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
-    parser.add_argument('part', choices=('peers', 'files', 'memory'))
+    parser = arguments(__doc__)
+    parser.add_argument('part', choices=('peers', 'memory'))
     parser.add_argument('--messages', type=int, default=100_000, help='of the voltage')
     parser.add_argument('--seconds', type=int, default=3600, help='of the long bag')
-    parser.add_argument('--repeats', type=int, default=2, help='of the other libraries')
-    parser.add_argument('--table', type=Path)
+    parser.add_argument('--repeats', type=int, default=2, help='of rosbags')
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
-        text = {'peers': peers, 'files': files, 'memory': memory}[given.part](given, Path(name))
-    text = f'{stamp()}\n\n{text}'
-    deliver(text, given.table, given.part)
+        text = {'peers': peers, 'memory': memory}[given.part](given, Path(name))
+    deliver(f'{environment("mcap", "rosbags")}.\n\n{text}', given.page, given.part)
     return 0
 
 

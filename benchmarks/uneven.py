@@ -7,17 +7,13 @@ first 6 s not counted; this thread's CPU time, so that fits in the background ar
 
 from __future__ import annotations
 
-from pathlib import Path
-import sys
 import time
 
 from common import table
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from ou_monitor.online.monitor import SupplyMonitor  # noqa: E402
-from ou_monitor.online.settings import MonitorSettings  # noqa: E402
-import windows as simulated  # noqa: E402
+from ou_monitor.online.monitor import SupplyMonitor
+from ou_monitor.online.settings import MonitorSettings
+import windows as simulated
 
 SECONDS, COUNTED, REPORT = 40.0, 6.0, 0.1
 

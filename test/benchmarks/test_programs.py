@@ -4,7 +4,9 @@ import sys
 
 from alarms import ardupilot_low, dips_of, fly_loop, px4_charge
 import attack_files
+from filter import RATE, sweep
 import numpy as np
+from ou_monitor import AdaptiveLowPass
 from project import needs_recordings, REAL
 import pytest
 from scipy import stats
@@ -53,6 +55,17 @@ def test_a_dip_ends_above_the_limit_and_near_ones_are_one():
         v[(t >= begin - 1e-9) & (t < end - 1e-9)] = 10.0
     found = dips_of(t, v, 11.0, 0.01)
     assert np.allclose(found, [[25.0, 25.5], [30.0, 30.1]])
+
+
+@pytest.mark.parametrize('order', [1, 2])
+@pytest.mark.parametrize('mode', ['lowpass', 'derivative'])
+def test_the_sweep_of_cutoffs_is_the_filter_of_the_package(order, mode):
+    """At one cutoff, sample by sample; both are exact, so rounding alone remains."""
+    x = np.cumsum(np.random.default_rng(4).standard_normal((1, 2000)), axis=1)
+    ours = AdaptiveLowPass(order=order, fmin=1.0, fmax=30.0, fallback=20.0, mode=mode).filter(
+        np.arange(2000) / RATE, x[0], np.nan)
+    found = sweep(x, np.full((1, 1, 1), 20.0), order, mode == 'derivative')[0, 0]
+    assert np.abs(found - ours).max() < 1e-9 * np.abs(ours).max()
 
 
 @pytest.mark.parametrize('seed', [11, 900_000])
