@@ -1,5 +1,5 @@
 """
-A flight beside the model of its supply: aged packs, and recorded pairs (5 min a model).
+Verdicts on a flight beside a saved model: aged packs, and recorded pairs (5 min a model).
 
 `aged`: a model learned from one simulated flight, and 60 s of other ones under the recorded
 throttle, begun at three places of it, with 1, 1.1, 1.2 and 1.4 times the answer, and 5 s with

@@ -4,10 +4,9 @@ The brown-out flag on recorded flights, beside the battery alarms of PX4 and Ard
 Reports at 10 Hz of one monitor a limit; limits passed by 1 and 5 % of the seconds, and 3.3 and
 3.5 V a cell.  A dip: the middle one of three readings at or below the limit; dips less than 0.3 s
 apart are one.  Caught: the alarm is on at some time from 2 s before the dip begins to 0.25 s
-after; its lead counts from the first report of that time at which it is on.  Lone: no dip within
-4 s before.  Quiet: 2 s away from any dip.  A false rise: one that no dip follows within 2 s.
-Limits that are undershot for more than 30 % of the flight are no limits.  Flights that are not
-there are left out, with a word on stderr.
+after; its lead counts from the first such report.  Lone: no dip within 4 s before.  Quiet: 2 s
+away from any dip.  A false rise: no dip follows within 2 s.  Limits that the voltage undershoots
+for more than 30 % of the flight are left out.
 
 The autopilots' alarms, with their defaults and the cells of the pack, are taken to be on while
 their condition holds; both keep them until the landing.  Without a current neither compensates
@@ -37,7 +36,7 @@ from dataclasses import dataclass
 from pathlib import Path
 import sys
 
-from common import deliver, drawing, FLIGHTS, flights, HIRO, median3, say, table
+from common import arguments, deliver, drawing, FLIGHTS, flights, HIRO, median3, say, table
 import numpy as np
 from ou_monitor import MonitorSettings, SupplyMonitor
 from ou_monitor.online.risk.flag import FlagLevel
@@ -372,20 +371,18 @@ def main() -> int:
     """Print the tables, or put them into the page."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parts = parser.add_subparsers(dest='part', required=True)
-    part = parts.add_parser('flights', help=recorded_flights.__doc__)
+    page = [arguments('', help_option=False)]
+    part = parts.add_parser('flights', help=recorded_flights.__doc__, parents=page)
     part.set_defaults(action=recorded_flights)
     part.add_argument('flight', nargs='*', help='names (default all)')
     part.add_argument('--strips', type=Path, help='folder for a drawing of each flight')
-    part = parts.add_parser('loop', help=loop.__doc__)
+    part = parts.add_parser('loop', help=loop.__doc__, parents=page)
     part.set_defaults(action=loop)
     part.add_argument('--dips', type=int, default=200)
     part.add_argument('--minutes', type=float, default=60.0, help='of healthy flight')
     part.add_argument('--seed', type=int, default=1)
-    for part in parts.choices.values():
-        part.add_argument('--page', type=Path, help='page whose table is replaced')
     options = parser.parse_args()
-    text = options.action(options)
-    deliver(text, options.page, options.part)
+    deliver(options.action(options), options.page, options.part)
     return 0
 
 

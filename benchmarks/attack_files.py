@@ -1,5 +1,5 @@
 """
-Damage bags and CSVs at random: the reader returns what is true, or reports it (3 min).
+Damage bags and CSVs at random: does the reader return true values or report the damage (3 min).
 
 In a bag each voltage belongs to its stamp by a formula, so a wrong value shows itself; of a CSV
 each value must stand in the line of its stamp.  A mutated file may be refused in one line, or read

@@ -1,5 +1,5 @@
 """
-Models saved by `discover`, drawn again: do `compare` and `discover` recognise them? (25 min).
+Do `compare` and `discover` recognise simulations of the models that `discover` saved (25 min).
 
     OU_MONITOR_REALDATA=FOLDER python benchmarks/circle.py --page doc/results/circle.md
 

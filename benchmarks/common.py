@@ -59,10 +59,11 @@ text.light { fill: #ffffff; } .grid { stroke: #dde3e5; stroke-width: 1; }
 </style>"""
 
 
-def arguments(doc: str | None, names: bool = False) -> argparse.ArgumentParser:
-    """Return a parser with `--page`, and with names of recordings if a program takes some."""
-    words = (doc or '').strip().partition('\n')[0]
-    parser = argparse.ArgumentParser(description=words)
+def arguments(doc: str | None, names: bool = False, help_option: bool = True
+              ) -> argparse.ArgumentParser:
+    """Return a parser with `--page`; `names`: and with names of recordings."""
+    parser = argparse.ArgumentParser(description=(doc or '').strip().partition('\n')[0],
+                                     add_help=help_option)
     if names:
         parser.add_argument('names', nargs='*', metavar='NAME', help='recordings (default: all)')
     parser.add_argument('--page', type=Path, help='page whose table is replaced')

@@ -1,7 +1,7 @@
 """
 Recorded flights beside their simulations: fitted on the first half, the second simulated (1 min).
 
-Nothing is set for any one flight.  Flights that are not there are left out, with a word on stderr.
+All flights use the same settings.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 """
-Used by filter.py: does the loop that an adaptive D term closes through the supply hunt.
+Used by filter.py: the loop that an adaptive D term closes through the supply.
 
     throttle -> load -> sigma and sag -> SlidingEstimator -> cutoff -> D term -> throttle
 
@@ -24,14 +24,11 @@ import numpy as np
 from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.online.filter.lowpass import AdaptiveLowPass
 from ou_monitor.records import FloatArray, NAN
-from ou_monitor.report.svg import Plot
 
 # Of the cutoff, octaves: below, whatever it does is of no consequence to a loop.
 SWING = 0.5
 # How much more the cutoff must swing than with the loop cut.
 FACTOR = 3.0
-
-
 COUPLINGS = (0.1, 0.3, 1.0, 1.5, 2.0, 3.0, 4.0)
 # The threshold just above what a quiet hover has: where a law is most tempted.
 _ABOVE = 0.72
@@ -70,29 +67,21 @@ def scan(seconds: float, seed: int) -> dict[str, list[Verdict]]:
     return found
 
 
-def render(found: dict[str, list[Verdict]]) -> tuple[str, Plot]:
-    """Return a table and a figure."""
+def render(found: dict[str, list[Verdict]]) -> str:
+    """Return a table."""
     rows = []
-    plot = Plot('Swing of the cutoff against coupling of the supply into the gyro',
-                'coupling, rad/s per V', 'swing, octaves', width=760, height=380, log_x=True)
-    # Room for the legend above the curves.
-    plot.limits((COUPLINGS[0], COUPLINGS[-1]), (-0.1, 5.0))
-    for colour, (name, verdicts) in enumerate(found.items()):
-        swings = [v.swing for v in verdicts]
+    for name, verdicts in found.items():
         first = next((k for k, v in enumerate(verdicts) if v.cycle), None)
         rows.append([
             name, *(f'{v.swing:.2f}{" *" if v.cycle else ""}' for v in verdicts),
             'none' if first is None else f'{COUPLINGS[first]:g}',
             '-' if first is None else number(verdicts[first].period, '.1f')])
-        plot.line(np.array(COUPLINGS), np.array(swings), name, colour, 'thick')
-    plot.line(np.array([COUPLINGS[0], COUPLINGS[-1]]), np.array([SWING] * 2), '', 7, 'dash')
     share = found['constant_noise, defaults']
-    text = ('**Swing of the cutoff, octaves (95 % less 5 % quantile; * it hunts), by coupling, '
+    return ('**Swing of the cutoff, octaves (95 % less 5 % quantile; * it hunts), by coupling, '
             'rad/s per V**\n\n'
             + table(['law', *(f'{c:g}' for c in COUPLINGS), 'hunts from', 'period, s'], rows)
             + '\nRms of the differential command in the first row: '
             + ', '.join(f'{v.command:.2f}' for v in share) + '.\n')
-    return text, plot
 
 
 @dataclass(frozen=True)

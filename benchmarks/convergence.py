@@ -1,5 +1,5 @@
 """
-How fast a switched supply tends to its limits as eps shrinks, and a rail under an ESC (10 s).
+Orders of convergence of a switched supply to its limits, and a rail under an ESC (10 s).
 
 Averaging (paper, 3.2): u^eps - u^0 is sqrt(eps) times a Gaussian process, so its root mean square
 has order 1/2 in eps.  Diffusion (3.3): a rail driven by a fast chain x(t), dU = -alpha U dt +

@@ -1,5 +1,5 @@
 """
-False alarms and power of `coupling` on recorded gyros, whose spectra change their shape (3 min).
+False alarms and power of `coupling` on recorded gyros (3 min).
 
 Nothing couples: a simulated supply of constant sigma, one whose sigma follows the throttle of
 another flight, or the flight's own voltage against its gyro turned in time.  Power: the same
@@ -15,7 +15,7 @@ import math
 from pathlib import Path
 import sys
 
-from common import arguments, deliver, recorded, say, table
+from common import arguments, deliver, FLIGHTS, recorded, say, table
 import numpy as np
 from ou_monitor.analysis.coupling import estimate_coupling
 from ou_monitor.recordings.importers.choose import choose
@@ -25,12 +25,9 @@ from ou_monitor.recordings.importers.log import Request
 from scipy import stats
 from scipy.signal import lfilter
 
-# Name, file below OU_MONITOR_REALDATA, number of the flight.
-LOGS = (('nazgul', 'raw/bf_nazgul_4s.bbl', 1), ('roma', 'raw/bf_roma_6s.bbl', 3),
-        ('3s_erpm2', 'raw/bf_3s_erpm2.bbl', 2), ('gecko', 'raw/ie_btfl_002.bbl', 1),
-        ('erle', 'raw/ac_erle_althold2.BIN', 1), ('jd', 'raw/ac_jd_2004.bin', 1),
-        ('px4', 'raw/px_sample_log_small.ulg', 1))
-TABLES = (('crazyflie solo', 'cf_solo_large.csv'), ('crazyflie pair', 'cf_pair_large.csv'))
+LOGS = {**{name: FLIGHTS[name] for name in ('nazgul', 'roma', 'bf3s', 'erle', 'jd')},
+        'gecko': ('raw/ie_btfl_002.bbl', 1), 'px4': ('raw/px_sample_log_small.ulg', None)}
+TABLES = {'crazyflie solo': 'cf_solo_large.csv', 'crazyflie pair': 'cf_pair_large.csv'}
 KINDS = ('constant sigma', "sigma of another flight's throttle", 'gyro shifted')
 ALPHAS, DEVIATION, GAIN = (20.0, 63.0, 200.0), 0.05, math.radians(5.0)
 # Highest rate of a simulated supply, Hz: that of an ADC.
@@ -51,12 +48,12 @@ class Flight:
 
 def flights(folder: Path) -> Iterator[Flight]:
     """Yield the recordings that are there."""
-    for name, file, number in LOGS:
+    for name, (file, number) in LOGS.items():
         path = folder / file
         if not path.exists():
             say(f'{name}: {path} is not there, left out')
             continue
-        log = import_log(path, Request(number))
+        log = import_log(path, Request(number or 1))
         volts = 'battery_status[1].voltage_v' if name == 'px4' else None
         chosen = choose(path, log, voltage=volts)
         axes = {f'{one.name} {axis}': one.vectors['angular_velocity'][:, k]
@@ -67,17 +64,13 @@ def flights(folder: Path) -> Iterator[Flight]:
                     np.interp(chosen.voltage.t, series.t, series.values))
         yield Flight(name, chosen.voltage.t, chosen.voltage.values, throttle,
                      log.inertial[0].t, axes)
-    for name, file in TABLES:
+    for name, file in TABLES.items():
         path = folder / file
         if path.exists():
             raw = read_csv(path)
             t, voltage, throttle = raw.t, raw.voltage, raw.throttle
-            yield Flight(name, t, voltage, throttle, *_rate(path))
-
-
-def _rate(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    t, values = read_column(path, 'roll_rate')
-    return t, {'roll_rate': np.radians(values)}
+            at, rate = read_column(path, 'roll_rate')
+            yield Flight(name, t, voltage, throttle, at, {'roll_rate': np.radians(rate)})
 
 
 def supply(rng: np.random.Generator, t: np.ndarray, rise: np.ndarray) -> np.ndarray:

@@ -19,6 +19,7 @@ import argparse
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from hashlib import sha256
 import json
 import multiprocessing
@@ -118,10 +119,6 @@ def examine(task: tuple[Any, ...], limit: float) -> dict[str, Any]:
             'seconds': time.perf_counter() - began}
 
 
-def _examine(both: tuple[tuple[Any, ...], float]) -> dict[str, Any]:
-    return examine(*both)
-
-
 # Kind, what is counted, and which recordings count.
 SHARES: tuple[tuple[str, str, Callable[[Outcome], bool]], ...] = (
     ('single', 'named right, alone', lambda o: o.alone),
@@ -142,7 +139,7 @@ def blind(given: argparse.Namespace) -> str:
     def run(tasks: list[tuple[Any, ...]]) -> Iterator[dict[str, Any]]:
         # A process for each recording: its memory ends with it.
         with multiprocessing.get_context('fork').Pool(given.jobs, maxtasksperchild=1) as pool:
-            yield from pool.imap_unordered(_examine, [(task, given.limit) for task in tasks])
+            yield from pool.imap_unordered(partial(examine, limit=given.limit), tasks)
     lines = resumed(plan(given), given.lines, run)
     outcomes = [from_data(line) for line in lines]
     rows = []
@@ -151,20 +148,12 @@ def blind(given: argparse.Namespace) -> str:
         if hits:
             rows.append([f'{kind}: {what}', f'{sum(hits)} of {len(hits)}',
                          f'{100.0 * mean(hits):.1f} %', interval(sum(hits), len(hits))])
-    groups: dict[str, list[Outcome]] = {}
-    for one in outcomes:
-        groups.setdefault(one.kind if one.kind in ('none', 'pair') else one.effect,
-                          []).append(one)
-    wrong = [[effect, str(len(part)), str(sum(o.in_set for o in part)), counted(
-        ' + '.join(sorted(o.named)) or o.verdict or 'failed' for o in part if not o.in_set)]
-        for effect, part in sorted(groups.items())]
     spent = [line['seconds'] for line in lines]
     return (f'Seed {given.seed}, {len(lines)} recordings of {given.duration:g} s at '
             f'{given.rate:g} Hz, strength {given.strength:g}, which the generator varies by 30 % '
             f'either way; {environment()}. Time of a recording: {median(spent):.1f} s at the '
             f'median, {max(spent):.1f} s at most.\n\n'
-            + table(['', 'recordings', 'share', '95 % interval'], rows) + '\n' + table(
-                ['effect', 'recordings', 'in the set', 'reported for the others'], wrong))
+            + table(['', 'recordings', 'share', '95 % interval'], rows))
 
 
 # -- nothing hidden
@@ -369,8 +358,7 @@ def main() -> int:
 
     def add(name: str, action: Callable[[argparse.Namespace], str], names: bool
             ) -> argparse.ArgumentParser:
-        part = parts.add_parser(name, help=action.__doc__, parents=[arguments('', names)],
-                                conflict_handler='resolve')
+        part = parts.add_parser(name, help=action.__doc__, parents=[arguments('', names, False)])
         part.set_defaults(action=action)
         return part
     part = add('blind', blind, False)

@@ -34,15 +34,11 @@ MOST = 3600.0
 class Run:
     """One command that was run."""
 
-    # Words after 'ou-monitor', without paths of this machine.
-    command: str
+    command: str  # Words after 'ou-monitor', without paths of this machine.
     status: int
-    # CPU time of it and its workers, s.
-    seconds: float
-    # What is wrong with it; empty when nothing is.
-    fault: str
-    # Its standard output.
-    out: str = ''
+    seconds: float  # CPU time of it and its workers, s.
+    fault: str  # What is wrong with it; empty if nothing is.
+    out: str = ''  # Its standard output.
 
 
 def run(*words: object, cwd: Path) -> Run:

@@ -4,8 +4,7 @@ The adaptive low-pass beside the best fixed cutoff and the truth, and in a contr
     python benchmarks/filter.py error --page doc/results/filter.md
     python benchmarks/filter.py dterm --page doc/results/filter.md \
         --figure doc/results/filter_dterm.svg
-    python benchmarks/filter.py loop --page doc/results/filter.md \
-        --figure doc/results/filter_loop.svg
+    python benchmarks/filter.py loop --page doc/results/filter.md
 
 sigma follows throttle, which moves in steps and ramps.  A signal is a stochastic process with a
 state, so its best linear estimate is that of a Kalman filter that knows sigma at every sample; it
@@ -314,21 +313,10 @@ def laws(case: Case) -> dict[str, dict[str, Any]]:
 def mistaken(case: Case) -> dict[str, dict[str, Any]]:
     """Return the options of `kalman` with one parameter wrong by a factor of 2."""
     right = laws(case)['kalman']
-    found = {}
-    for name in ('n0', 'coupling'):
-        for factor, word in ((0.5, 'half'), (2.0, 'twice')):
-            # The gyro's own noise is next to nothing beside the supply's.
-            if right.get(name) and not (name == 'n0' and case.kind != 'voltage'):
-                found[f'kalman, {name} {word} the true one'] = {
-                    **right, name: factor * right[name]}
-    return found
-
-
-def threshold(case: Case, best: float) -> dict[str, Any]:
-    """Return the paper's switch at the sigma of half throttle, an octave to both sides."""
-    return {'order': case.order, 'law': 'threshold',
-            'fmin': max(0.5 * best, case.limits[0]), 'fmax': min(2.0 * best, 450.0),
-            'sigma_ref': SPREAD * math.sqrt(2.0 * case.alpha)}
+    # The gyro's own noise is next to nothing beside the supply's.
+    name = 'n0' if case.kind == 'voltage' else 'coupling'
+    return {f'kalman, {name} {word} the true one': {**right, name: factor * right[name]}
+            for factor, word in ((0.5, 'half'), (2.0, 'twice'))}
 
 
 def curve(throttle: np.ndarray, low: np.ndarray) -> np.ndarray:
@@ -341,10 +329,6 @@ def curve(throttle: np.ndarray, low: np.ndarray) -> np.ndarray:
 TRUTH = 'Kalman filter that knows sigma'
 FIXED = 'best fixed cutoff in hindsight'
 CURVE = "Betaflight's curve, f..2 f, best f in hindsight"
-# Candidates of what is chosen in hindsight.
-_FIXED, _CURVES = 41, 21
-
-
 CASE = Case('D term of a body rate of two poles at 5 Hz, alpha 600', 'smooth', 600.0, 5.0, 2,
             (20.0, 150.0), coupling=2.0)
 FIXED_CUTOFF, CURVE_CUTOFF, SWITCH = 'fixed', "Betaflight's curve, f..2 f", 'threshold, f/2..f'
@@ -359,18 +343,13 @@ _TOPS, _WANTED = (40.0, 70.0, 110.0, 150.0), (4.0, 7.0, 12.0, 20.0, 30.0)
 class Point:
     """One setting of one method."""
 
-    # What and how.
     method: str
     setting: str
-    # Rms of the noise that comes out and that of the loudest second in twenty, rad/s^2;
-    # delay of the signal, ms; rms of output less the true derivative, rad/s^2.
-    noise: float
-    loud: float
-    lag: float
-    rms_error: float
-    # 5 % and 95 % quantile of the cutoff, Hz.
-    low: float = math.nan
-    high: float = math.nan
+    noise: float  # Rms of the output noise, rad/s^2.
+    loud: float  # Rms of its loudest second in twenty, rad/s^2.
+    lag: float  # Delay of the signal, ms.
+    rms_error: float  # Of the output against the true derivative, rad/s^2.
+    cutoff: str = '-'  # 5 % and 95 % quantile, Hz.
 
 
 def run_dterm(flights: int, seconds: float, seed: int, window: float) -> list[Point]:
@@ -378,11 +357,6 @@ def run_dterm(flights: int, seconds: float, seed: int, window: float) -> list[Po
     flown = fly(CASE, np.random.default_rng([seed, 100]), flights, seconds)
     seen = estimates(flown, window)
     points = []
-
-    def keep(method: str, setting: str, noise: np.ndarray, signal: np.ndarray,
-             cutoff: np.ndarray) -> None:
-        points.append(_point(method, setting, flown, noise, signal, cutoff))
-
     say(FIXED_CUTOFF)
     for name, cutoffs, settings in (
             (FIXED_CUTOFF, _CUTOFFS[:, None, None], [f'{f:.0f} Hz' for f in _CUTOFFS]),
@@ -391,7 +365,7 @@ def run_dterm(flights: int, seconds: float, seed: int, window: float) -> list[Po
         noises = sweep(flown.noise, cutoffs, 2, True)
         signals = sweep(flown.truth, cutoffs, 2, True)
         for k, setting in enumerate(settings):
-            keep(name, setting, noises[k], signals[k], cutoffs[k])
+            points.append(point(name, setting, flown, noises[k], signals[k], cutoffs[k]))
         del noises, signals
     middle = SPREAD * math.sqrt(2.0 * CASE.alpha)
     base = {'mode': 'derivative', 'order': 2, 'alpha': CASE.alpha}
@@ -404,8 +378,8 @@ def run_dterm(flights: int, seconds: float, seed: int, window: float) -> list[Po
     for name, setting, options in runs:
         say(f'{name}, {setting}')
         noise, cutoff = adaptive(options, flown, seen, flown.noise)
-        keep(name, setting, noise,
-             sweep(flown.truth, cutoff[None], 2, True)[0], cutoff)
+        points.append(point(name, setting, flown, noise,
+                            sweep(flown.truth, cutoff[None], 2, True)[0], cutoff))
     for limit in _LAGS:
         options = {**base, 'law': 'kalman', 'coupling': CASE.coupling, 'fmin': 5.0,
                    'fmax': 300.0, 'max_lag': limit, 'n0': CASE.white**2 / RATE}
@@ -415,7 +389,8 @@ def run_dterm(flights: int, seconds: float, seed: int, window: float) -> list[Po
         # half the difference of both is the noise, half the sum the signal.
         both, cutoff = adaptive(options, flown, seen, flown.truth + flown.noise)
         other, _ = adaptive(options, flown, seen, flown.truth - flown.noise)
-        keep(KALMAN, setting, 0.5 * (both - other), 0.5 * (both + other), cutoff)
+        points.append(point(KALMAN, setting, flown, 0.5 * (both - other), 0.5 * (both + other),
+                            cutoff))
     slope = kalman(CASE, flown)[1]
     points.append(Point('Kalman filter that knows sigma', '-', math.nan, math.nan,
                         lag_ms(slope, flown.slope),
@@ -423,18 +398,17 @@ def run_dterm(flights: int, seconds: float, seed: int, window: float) -> list[Po
     return points
 
 
-def _point(method: str, setting: str, flown: Flights, noise: np.ndarray, signal: np.ndarray,
-           cutoff: np.ndarray) -> Point:
-    first, second = int(SETTLE * RATE), int(RATE)
-    rest = noise[:, first:]
+def point(method: str, setting: str, flown: Flights, noise: np.ndarray, signal: np.ndarray,
+          cutoff: np.ndarray) -> Point:
+    """Return what one setting does to noise and signal."""
+    second = int(RATE)
+    rest = noise[:, int(SETTLE * RATE):]
     pieces = rest[:, :rest.shape[1] // second * second].reshape(-1, second)
-    settled = cutoff[..., first:] if cutoff.shape[-1] > 1 else cutoff
     return Point(
         method, setting, float(np.sqrt(np.mean(rest**2))),
         float(np.quantile(np.sqrt(np.mean(pieces**2, axis=1)), 0.95)),
         lag_ms(signal, flown.slope),
-        float(np.sqrt(square_error(noise + signal, flown.slope).mean())),
-        float(np.quantile(settled, 0.05)), float(np.quantile(settled, 0.95)))
+        float(np.sqrt(square_error(noise + signal, flown.slope).mean())), span(cutoff, '.0f'))
 
 
 def render_dterm(points: list[Point]) -> tuple[str, Plot]:
@@ -455,7 +429,7 @@ def render_dterm(points: list[Point]) -> tuple[str, Plot]:
         rows.append([p.method, p.setting, number(p.lag, '.1f'), number(p.noise, '.3g'),
                      number(p.noise / at(p.lag, 'noise'), '.2f'), number(p.loud, '.3g'),
                      number(p.loud / at(p.lag, 'loud'), '.2f'), number(p.rms_error, '.3g'),
-                     f'{p.low:.0f}..{p.high:.0f}' if math.isfinite(p.low) else '-'])
+                     p.cutoff])
     plot = Plot('D term: noise of the loudest second in twenty against lag', 'lag, ms',
                 'rms of the noise, rad/s^2', width=760, height=360, log_y=True)
     for colour, name in enumerate((FIXED_CUTOFF, CONSTANT, SWITCH, CURVE_CUTOFF, KALMAN)):
@@ -469,100 +443,65 @@ def render_dterm(points: list[Point]) -> tuple[str, Plot]:
                  rows), plot
 
 
-@dataclass(frozen=True, eq=False)
-class Result:
-    """Of one case."""
-
-    name: str  # Case.
-    errors: dict[str, np.ndarray]  # Mean square error.
-    lags: dict[str, float]  # ms.
-    cutoffs: dict[str, tuple[float, float]]  # 5 % and 95 % quantile, Hz.
-
-
-def score(case: Case, flights: Flights, seen: np.ndarray, best: np.ndarray) -> Result:
-    """Run every method on flights; `best` is the estimate that knows the truth."""
-    errors = {TRUTH: square_error(best, flights.truth)}
-    lags = {TRUTH: lag_ms(best, flights.truth)}
-    cutoffs: dict[str, tuple[float, float]] = {}
-
-    def keep(name: str, output: np.ndarray, cutoff: np.ndarray) -> None:
-        errors[name] = square_error(output, flights.truth)
-        lags[name] = lag_ms(output, flights.truth)
-        settled = cutoff[..., int(SETTLE * RATE):] if cutoff.ndim > 1 else cutoff
-        cutoffs[name] = (float(np.quantile(settled, 0.05)), float(np.quantile(settled, 0.95)))
-
-    x, order, (fmin, fmax) = flights.measured, case.order, case.limits
-    fixed = np.geomspace(fmin, fmax, _FIXED)
-    outputs = sweep(x, fixed[:, None, None], order)
-    chosen = _least(square_error(outputs, flights.truth))
-    keep(FIXED, _taken(outputs, chosen), fixed[chosen])
-    middle = float(np.median(fixed[chosen]))
-    # One octave is in the curve itself, so both may use the whole range.
-    curves = np.minimum(curve(flights.throttle, np.geomspace(fmin, fmax / 2.0, _CURVES)),
-                        fmax)
-    outputs = sweep(x, curves, order)
-    chosen = _least(square_error(outputs, flights.truth))
-    keep(CURVE, _taken(outputs, chosen), _taken(curves, chosen))
-    del outputs, curves
-    keep('threshold, an octave either side of it',
-         *adaptive(threshold(case, middle), flights, seen, x))
-    for name, options in {**laws(case), **mistaken(case)}.items():
-        keep(name, *adaptive(options, flights, seen, x))
-    return Result(case.name, errors, lags, cutoffs)
+def hindsight(flights: Flights, cutoffs: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return output and cutoff of the candidate with the least error in each flight."""
+    outputs = sweep(flights.measured, cutoffs, order)
+    chosen = np.argmin(square_error(outputs, flights.truth), axis=0)
+    each = np.arange(chosen.size)
+    return outputs[chosen, each], np.broadcast_to(
+        cutoffs, (len(cutoffs), chosen.size, cutoffs.shape[2]))[chosen, each]
 
 
-def _least(found: np.ndarray) -> np.ndarray:
-    """Return the candidate of the least error of each flight, from (candidates, flights)."""
-    chosen: np.ndarray = np.argmin(found, axis=0)
-    return chosen
+def score(case: Case, flights: Flights, window: float) -> list[list[str]]:
+    """Return a row for each filter."""
+    fmin, fmax = case.limits
+    seen, x = estimates(flights, window), flights.measured
+    found = {TRUTH: (kalman(case, flights)[0], np.full((1, 1), np.nan)),
+             FIXED: hindsight(flights, np.geomspace(fmin, fmax, 41)[:, None, None], case.order),
+             # The curve spans an octave, so both may use the whole range.
+             CURVE: hindsight(flights, np.minimum(curve(
+                 flights.throttle, np.geomspace(fmin, fmax / 2.0, 21)), fmax), case.order)}
+    middle = float(np.median(found[FIXED][1]))
+    for name, options in {
+            'threshold, an octave either side of it': {
+                'order': case.order, 'law': 'threshold', 'fmin': max(0.5 * middle, fmin),
+                'fmax': min(2.0 * middle, 450.0),
+                'sigma_ref': SPREAD * math.sqrt(2.0 * case.alpha)},
+            **laws(case), **mistaken(case)}.items():
+        found[name] = adaptive(options, flights, seen, x)
+    errors = {name: square_error(output, flights.truth) for name, (output, _) in found.items()}
+    return [[name, f'{math.sqrt(errors[name].mean()):.4g}',
+             ratio(errors[name], errors[TRUTH]), ratio(errors[name], errors[FIXED]),
+             number(lag_ms(output, flights.truth)), span(cutoff, '.3g')]
+            for name, (output, cutoff) in found.items()]
 
 
-def _taken(outputs: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    taken: np.ndarray = outputs[chosen, np.arange(chosen.size)]
-    return taken
-
-
-def errors(flights: int, seconds: float, seed: int, window: float) -> list[Result]:
-    """Run all cases."""
-    results = []
-    for number_, case in enumerate(CASES):
-        say(case.name)
-        flown = fly(case, np.random.default_rng([seed, number_]), flights, seconds)
-        results.append(score(case, flown, estimates(flown, window),
-                             kalman(case, flown)[0]))
-    return results
-
-
-def render(results: list[Result]) -> str:
-    """Return a table for each case."""
-    parts = []
-    for one in results:
-        best, fixed = one.errors[TRUTH], one.errors[FIXED]
-        rows = []
-        for name, found in one.errors.items():
-            low, high = one.cutoffs.get(name, (math.nan, math.nan))
-            rows.append([
-                name, f'{math.sqrt(found.mean()):.4g}', _ratio(found, best),
-                _ratio(found, fixed), number(one.lags[name], '.1f'),
-                f'{low:.3g}..{high:.3g}' if math.isfinite(low) else '-'])
-        parts.append(f'**{one.name}** ({best.size} flight{"s" * (best.size > 1)})\n\n' + table(
-            ['filter', 'rms error', 'MSE over truth-knowing', 'MSE over best fixed', 'lag, ms',
-             'cutoff 5..95 %, Hz'], rows))
-    return '\n'.join(parts)
-
-
-def _ratio(found: np.ndarray, to: np.ndarray) -> str:
+def ratio(found: np.ndarray, to: np.ndarray) -> str:
     """Return the geometric mean of the ratios with its standard error."""
     log = np.log(found / to)
+    mean = math.exp(log.mean())
     if log.size < 2 or not log.any():
-        return f'{math.exp(log.mean()):.3f}'
-    se = math.exp(log.mean()) * log.std(ddof=1) / math.sqrt(log.size)
-    return f'{math.exp(log.mean()):.3f} ± {se:.3f}'
+        return f'{mean:.3f}'
+    return f'{mean:.3f} ± {mean * log.std(ddof=1) / math.sqrt(log.size):.3f}'
+
+
+def span(cutoff: np.ndarray, form: str) -> str:
+    """Return the 5 % and 95 % quantile of a cutoff, Hz."""
+    settled = cutoff[:, int(SETTLE * RATE):] if cutoff.shape[1] > 1 else cutoff
+    low, high = np.quantile(settled, [0.05, 0.95])
+    return f'{low:{form}}..{high:{form}}' if math.isfinite(low) else '-'
 
 
 def error(given: argparse.Namespace) -> tuple[str, Plot | None]:
     """Score the mean square error and lag of every law over simulated flights."""
-    return render(errors(given.flights, given.seconds, given.seed, given.window)), None
+    parts = []
+    for k, case in enumerate(CASES):
+        say(case.name)
+        flown = fly(case, np.random.default_rng([given.seed, k]), given.flights, given.seconds)
+        parts.append(f'**{case.name}** ({given.flights} flights)\n\n' + table(
+            ['filter', 'rms error', 'MSE over truth-knowing', 'MSE over best fixed', 'lag, ms',
+             'cutoff 5..95 %, Hz'], score(case, flown, given.window)))
+    return '\n'.join(parts), None
 
 
 def dterm(given: argparse.Namespace) -> tuple[str, Plot | None]:
@@ -572,7 +511,7 @@ def dterm(given: argparse.Namespace) -> tuple[str, Plot | None]:
 
 def loop(given: argparse.Namespace) -> tuple[str, Plot | None]:
     """Find the coupling at which the loop through the supply begins to hunt."""
-    return control_loop.render(control_loop.scan(given.seconds, given.seed))
+    return control_loop.render(control_loop.scan(given.seconds, given.seed)), None
 
 
 def main() -> int:
@@ -581,7 +520,7 @@ def main() -> int:
     parts = parser.add_subparsers(dest='part', required=True)
     for action, flights, seconds in ((error, 10, 40.0), (dterm, 10, 40.0), (loop, 1, 30.0)):
         part = parts.add_parser(action.__name__, help=action.__doc__,
-                                parents=[arguments('')], conflict_handler='resolve')
+                                parents=[arguments('', help_option=False)])
         part.set_defaults(action=action)
         part.add_argument('--flights', type=int, default=flights)
         part.add_argument('--seconds', type=float, default=seconds, help='of each flight')

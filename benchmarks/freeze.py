@@ -1,6 +1,5 @@
-#!/usr/bin/env python3
 """
-Keep what every command says of recorded runs, and print what moved between two states.
+Keep the JSON of every command on recorded runs, and print what moved between states (10 min).
 
     python benchmarks/freeze.py keep BEFORE --root OTHER_CHECKOUT
     python benchmarks/freeze.py keep AFTER

@@ -1,15 +1,15 @@
 """
-Gyros of recorded flights, unfiltered where the log has them so, with throttle and motor speeds.
+Used by notch.py and learned.py: gyros of recorded flights, with throttle and motor speeds.
 
-Betaflight logs the gyro before its filters as `gyroUnfilt` (from 4.5), or in `debug` when
-debug_mode is GYRO_SCALED (6); else `gyroADC`, behind them.
+Betaflight logs the gyro before its filters as `gyroUnfilt` (from 4.5), or in `debug` if
+debug_mode is GYRO_SCALED (6); otherwise only `gyroADC`, after the filters.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from common import recorded, say
+from common import FLIGHTS as known, recorded, say
 import numpy as np
 from ou_monitor.recordings.importers.choose import choose
 from ou_monitor.recordings.importers.formats import import_log
@@ -17,24 +17,18 @@ from ou_monitor.recordings.importers.log import Request
 
 # Name, file below OU_MONITOR_REALDATA, number of the flight, which gyro.
 FLIGHTS = (
-    ('bf3s', 'raw/bf_3s_erpm2.bbl', 2, 'gyroUnfilt'),
-    ('nazgul', 'raw/bf_nazgul_4s.bbl', 1, 'debug'),
-    ('roma 1', 'raw/bf_roma_6s.bbl', 1, 'debug'),
-    ('roma 2', 'raw/bf_roma_6s.bbl', 2, 'debug'),
-    ('roma 3', 'raw/bf_roma_6s.bbl', 3, 'debug'),
-    ('gecko', 'raw/ie_btfl_002.bbl', 1, 'gyroADC'),
-)
+    ('bf3s', *known['bf3s'], 'gyroUnfilt'), ('nazgul', *known['nazgul'], 'debug'),
+    *((f'roma {k}', known['roma'][0], k, 'debug') for k in (1, 2, 3)),
+    ('gecko', 'raw/ie_btfl_002.bbl', 1, 'gyroADC'))
 # Gyros logged at 50 Hz, below what a notch follows.
-SLOW = (('erle', 'raw/ac_erle_althold2.BIN', 1, 'IMU'), ('jd', 'raw/ac_jd_2004.bin', 1, 'IMU'))
+SLOW = (('erle', known['erle'][0], 1, 'IMU'), ('jd', known['jd'][0], 1, 'IMU'))
 
 
 @dataclass(frozen=True, eq=False)
 class Gyro:
     """One flight."""
 
-    # Name; the gyro of the log.
     name: str
-    kind: str
     t: np.ndarray  # s.
     rate: float  # Mean sample rate, Hz.
     signal: np.ndarray  # Angular velocity, degree/s.
@@ -61,5 +55,5 @@ def read(name: str, seconds: float = np.inf) -> Gyro | None:
     if log.speeds is not None:
         place = np.clip(np.searchsorted(log.speeds.t, t, 'right') - 1, 0, None)
         rpm = 60.0 / (2.0 * np.pi) * log.speeds.vectors['velocity'][place]
-    return Gyro(name, kind, t - t[0], (t.size - 1) / float(t[-1] - t[0]),
+    return Gyro(name, t - t[0], (t.size - 1) / float(t[-1] - t[0]),
                 np.degrees(gyro.vectors['angular_velocity'][part]), held, rpm)

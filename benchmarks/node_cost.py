@@ -1,5 +1,5 @@
 """
-What a message costs the nodes, beside nodes that only count or read it (1 min).
+CPU of the nodes for each message, beside nodes that only count or read it (1 min).
 
     .venv/bin/python benchmarks/node_cost.py [--seconds 10] [--page doc/results/node_cost.md]
 

@@ -1,5 +1,5 @@
 """
-With current: voltage a second ahead and resistance, beside least squares (1 min).
+Measured current as the load: voltage a second ahead and resistance, beside PX4's fit (1 min).
 
 The peer fits voltage = level - R current to each reading with a forgetting factor of 0.95, as PX4
 does onboard (its pull request 23205); it leaves out the updates that do not shrink its covariance.

@@ -10,7 +10,7 @@ CPU time of both readers on the same file, in turn; their arrays must be equal.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 import subprocess
@@ -34,27 +34,11 @@ COMPRESSIONS = {'none': CompressionType.NONE, 'lz4': CompressionType.LZ4,
                 'zstd': CompressionType.ZSTD}
 # Repeats of our reader, which takes milliseconds; rosbags takes seconds.
 REPEATS = 5
-THROTTLE = '/throttle'
-IMU = 'sensor_msgs/msg/Imu'
+VOLTAGE, THROTTLE = '/voltage', '/throttle'
 START = 1_704_067_200_000_000_000
 BLOCK = 100
 # Size of a chunk that rosbag2 writes.
 CHUNK = 786_432
-
-_IMU_CONFIG = f"""description: A body rate read as if it were the voltage.
-package: sensor_msgs
-install: ros-jazzy-sensor-msgs
-generic: false
-voltage:
-  topic: /imu
-  type: {IMU}
-  field: angular_velocity.x
-  stamp_field: header.stamp
-throttle:
-  topic: /throttle
-  type: std_msgs/msg/Float32
-  field: data
-"""
 
 
 @dataclass(frozen=True)
@@ -63,37 +47,17 @@ class Case:
 
     name: str
     type: str  # noqa: A003
-    topic: str
     config: str
     value: Callable[[Any], Any]
     stamped: bool = False
     block: bool = False
 
 
-def cases(folder: Path) -> list[Case]:
-    """Return the types; the msg config of one of them is written to a folder."""
-    config = folder / 'imu.yaml'
-    config.write_text(_IMU_CONFIG, encoding='utf-8')
-    return [
-        Case('Float32', FLOAT32, '/voltage', 'std_float32', lambda m: m.data),
-        Case('BatteryState', BATTERY_STATE, '/voltage', 'battery_state', lambda m: m.voltage,
-             stamped=True),
-        Case('Imu', IMU, '/imu', str(config), lambda m: m.angular_velocity.x, stamped=True),
-        Case(f'Float32MultiArray, {BLOCK} samples', FLOAT32_ARRAY, '/voltage', 'adc_block',
-             lambda m: m.data, block=True)]
-
-
-def _imu(stamps: np.ndarray, values: np.ndarray) -> Iterator[bytes]:
-    store = get_typestore(Stores.ROS2_JAZZY)
-    types = store.types
-    vector, quaternion = types['geometry_msgs/msg/Vector3'], types['geometry_msgs/msg/Quaternion']
-    header, time = types['std_msgs/msg/Header'], types['builtin_interfaces/msg/Time']
-    for stamp, value in zip(stamps.tolist(), values.tolist()):
-        message = types[IMU](
-            header(time(stamp // 10**9, stamp % 10**9), 'imu_link'),
-            quaternion(0.0, 0.0, 0.0, 1.0), np.zeros(9), vector(value, 0.1, -0.2), np.zeros(9),
-            vector(0.0, 0.0, 9.81), np.zeros(9))
-        yield bytes(store.serialize_cdr(message, IMU))
+CASES = (
+    Case('Float32', FLOAT32, 'std_float32', lambda m: m.data),
+    Case('BatteryState', BATTERY_STATE, 'battery_state', lambda m: m.voltage, stamped=True),
+    Case(f'Float32MultiArray, {BLOCK} samples', FLOAT32_ARRAY, 'adc_block', lambda m: m.data,
+         block=True))
 
 
 def messages(case: Case, count: int) -> list[tuple[str, int, bytes]]:
@@ -107,8 +71,6 @@ def messages(case: Case, count: int) -> list[tuple[str, int, bytes]]:
     values = rng.normal(5.0, 0.1, count)
     if case.block:
         voltage = encode_blocks(rng.normal(5.0, 0.1, (count, BLOCK)))
-    elif case.type == IMU:
-        voltage = list(_imu(times, values))
     elif case.type == BATTERY_STATE:
         voltage = encode_battery(times, values)
     else:
@@ -118,23 +80,19 @@ def messages(case: Case, count: int) -> list[tuple[str, int, bytes]]:
     for k, (at, data) in enumerate(zip(times.tolist(), voltage)):
         if k % 20 == 0:
             rows.append((THROTTLE, at, throttle[k // 20]))
-        rows.append((case.topic, at, data))
+        rows.append((VOLTAGE, at, data))
     return rows
 
 
 def write(path: Path, case: Case, rows: list[tuple[str, int, bytes]],
           compression: CompressionType) -> Path:
     """Write a bag with the Python library of MCAP."""
-    schemas = dict(SCHEMAS)
-    if case.type not in schemas:
-        store = get_typestore(Stores.ROS2_JAZZY)
-        schemas[case.type], _ = store.generate_msgdef(case.type, ros_version=2)
     with path.open('wb') as file:
         writer = Writer(file, chunk_size=CHUNK, compression=compression)
         writer.start(profile='ros2', library='benchmark')
         channels = {}
-        for topic, kind in ((case.topic, case.type), (THROTTLE, FLOAT32)):
-            schema = writer.register_schema(kind, 'ros2msg', schemas[kind].encode())
+        for topic, kind in ((VOLTAGE, case.type), (THROTTLE, FLOAT32)):
+            schema = writer.register_schema(kind, 'ros2msg', SCHEMAS[kind].encode())
             channels[topic] = writer.register_channel(topic, 'cdr', schema)
         for topic, at, data in rows:
             writer.add_message(channels[topic], at, data, at)
@@ -163,14 +121,14 @@ def collect(case: Case, messages: Any) -> Columns:
             voltage[0].append(at * 1e-9)
             voltage[1].append(value(message))
     join: Callable[[list[Any]], np.ndarray] = np.concatenate if case.block else np.array
-    return {case.topic: (np.array(voltage[0]), join(voltage[1]).astype(float)),
+    return {VOLTAGE: (np.array(voltage[0]), join(voltage[1]).astype(float)),
             THROTTLE: (np.array(throttle[0]), np.array(throttle[1], dtype=float))}
 
 
 def rosbags(path: Path, case: Case) -> Columns:
     """Read with rosbags: `AnyReader`, a message an object."""
     with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
-        wanted = [c for c in reader.connections if c.topic in (case.topic, THROTTLE)]
+        wanted = [c for c in reader.connections if c.topic in (VOLTAGE, THROTTLE)]
         return collect(case, ((c.topic, t, reader.deserialize(data, c.msgtype))
                               for c, t, data in reader.messages(connections=wanted)))
 
@@ -180,9 +138,9 @@ def ours(path: Path, case: Case) -> Columns:
     bag = BagReader(path)
     choice = choose(path, bag.topics, msg_config=case.config)
     assert choice.throttle is not None
-    found = list(batches(bag, {case.topic: choice.voltage, THROTTLE: choice.throttle}))
+    found = list(batches(bag, {VOLTAGE: choice.voltage, THROTTLE: choice.throttle}))
     columns = {topic: join([batch[topic] for batch in found if topic in batch])
-               for topic in (case.topic, THROTTLE)}
+               for topic in (VOLTAGE, THROTTLE)}
     return {topic: (column.stamp, column.values) for topic, column in columns.items()}
 
 
@@ -199,14 +157,14 @@ def timed(call: Callable[[], Any], repeats: int) -> tuple[float, Any]:
 def peers(given: argparse.Namespace, folder: Path) -> str:
     """Compare with rosbags: types of messages and compressions."""
     rows = []
-    for case in cases(folder):
+    for case in CASES:
         content = messages(case, given.messages)
         for name, compression in COMPRESSIONS.items():
             say(f'{case.name}, {name}')
             path = write(folder / 'bag.mcap', case, content, compression)
             mine, found = timed(lambda: ours(path, case), REPEATS)
             other, theirs = timed(lambda: rosbags(path, case), given.repeats)
-            for topic in (case.topic, THROTTLE):
+            for topic in (VOLTAGE, THROTTLE):
                 np.testing.assert_array_equal(found[topic][1], theirs[topic][1])
                 # Float64 seconds since 1970 resolve 0.24 us.
                 np.testing.assert_allclose(found[topic][0], theirs[topic][0], rtol=0, atol=1e-6)

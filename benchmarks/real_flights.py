@@ -1,9 +1,8 @@
 """
-The load model on recorded flights: what of the voltage follows from throttle alone (2 min).
+The load model on recorded flights: how much of the voltage follows from throttle (2 min).
 
 Simulated ahead: fitted on the first half, the second predicted from its throttle; offset included.
 One second ahead: the filter, on the second half, the throttle of that second given.
-Flights that are not there are left out, with a word on stderr.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 """
-How the brown-out risk of simulated rails compares with what happens (1 h).
+Predicted and observed frequency of brown-outs of simulated rails (1 h).
 
     python benchmarks/risk.py --table doc/results/risk.md --figure doc/results/risk_reliability.svg
 
@@ -12,24 +12,22 @@ sigma depends on throttle and wanders; throttle changes in steps; the ADC adds w
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
 from datetime import date
 import json
 import math
 from pathlib import Path
 import sys
-import time
 
 from common import deliver, drawing, number, say, table
 import numpy as np
 from ou_monitor import brownout_probability
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.settings import MonitorSettings
-from ou_monitor.records import Estimate
 from ou_monitor.report.svg import Plot
 from scipy.special import ndtr
-from scipy.stats import beta
+from scipy.stats import binomtest
 
 SEED = 20261121
 # Flights simulated at once: bounds memory.
@@ -38,14 +36,11 @@ _BATCH = 100
 _FACTOR = 1.5
 # Names that fit into a legend.
 _SHORT = {'published risk': 'published', 'window alone, errors averaged': 'window alone',
-          'window alone, errors ignored': 'and without errors',
           'stationary, as the paper': 'paper'}
 
 RATE, FINE = 1000.0, 20
 # Throttle as a flight has it: what it is set to, and for how long, s.
 _THROTTLE, _DWELL = (0.15, 0.9), (2.0, 9.0)
-
-
 # Seconds before the first prediction, and between looks.
 WARM, WINDOW = 3.0, 2.0
 # Samples from one report of the monitor to the next: a slow companion computer.
@@ -66,25 +61,8 @@ class Horizon:
     steady: bool  # Whether throttle did not change within the horizon.
 
 
-def monitor_settings(level: float, horizon: float) -> MonitorSettings:
-    """Return the defaults but for the level, the horizon and a floor that would answer for it."""
-    return MonitorSettings(window=WINDOW, brownout_voltage=level, brownout_horizon=horizon,
-                           brownout_floor=0.0)
-
-
-def stationary(e: Estimate, level: float) -> float:
-    """Return the paper's P(|U - U0| > delta): the share of time, both sides."""
-    return 2.0 * float(ndtr(-(e.u0 - level) / math.sqrt(e.var_inf)))
-
-
-def certain(e: Estimate, level: float, horizon: float) -> float:
-    """Return the first-passage risk as if the estimate had no errors."""
-    known = replace(e, alpha_se=0.0, sigma_se=0.0, var_inf_se=0.0, u0_se=0.0)
-    return brownout_probability(known, level, horizon, e.voltage)
-
-
-def predict(flights: Flights, levels: np.ndarray, horizon: float, every: float,
-            progress: Callable[[], None]) -> Iterator[Horizon]:
+def predict(flights: Flights, levels: np.ndarray, horizon: float, every: float
+            ) -> Iterator[Horizon]:
     """
     Predict each `every` s, over horizons (s) that do not overlap, with a level (V) a flight.
 
@@ -92,7 +70,9 @@ def predict(flights: Flights, levels: np.ndarray, horizon: float, every: float,
     """
     count, ahead = flights.t.size, round(horizon * RATE)
     for f, level in enumerate(levels.tolist()):
-        monitor = SupplyMonitor(monitor_settings(level, horizon))
+        # Without a floor, which would answer for the risk.
+        monitor = SupplyMonitor(MonitorSettings(
+            window=WINDOW, brownout_voltage=level, brownout_horizon=horizon, brownout_floor=0.0))
         v, u = flights.voltage[f].astype(np.float64), flights.throttle[f]
         for at in range(STEP, count - ahead, STEP):
             part = slice(at - STEP, at)
@@ -106,11 +86,11 @@ def predict(flights: Flights, levels: np.ndarray, horizon: float, every: float,
                 PUBLISHED: report.risk,
                 'window alone, errors averaged': brownout_probability(
                     e, level, horizon, e.voltage),
-                'window alone, errors ignored': certain(e, level, horizon),
-                'stationary, as the paper': stationary(e, level),
+                # P(|U - U0| > delta): the share of time, both sides.
+                'stationary, as the paper': 2.0 * float(
+                    ndtr(-(e.u0 - level) / math.sqrt(e.var_inf))),
             }, bool(flights.low[f, at:at + ahead].min() < level),
                 bool((u[at:at + ahead] == u[at - 1]).all()))
-        progress()
 
 
 @dataclass(frozen=True)
@@ -131,9 +111,8 @@ class Bin:
     @property
     def interval(self) -> tuple[float, float]:
         """Return the 95 % interval of the share (Clopper & Pearson 1934)."""
-        k, n = self.hits, self.count
-        return (float(beta.ppf(0.025, k, n - k + 1)) if k else 0.0,
-                float(beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0)
+        found = binomtest(self.hits, self.count).proportion_ci(0.95)
+        return float(found.low), float(found.high)
 
 
 def reliability(predicted: np.ndarray, happened: np.ndarray) -> list[Bin]:
@@ -145,11 +124,6 @@ def reliability(predicted: np.ndarray, happened: np.ndarray) -> list[Bin]:
             bins.append(Bin(low, high, int(inside.sum()), float(predicted[inside].mean()),
                             int(happened[inside].sum())))
     return bins
-
-
-def brier(predicted: np.ndarray, happened: np.ndarray) -> float:
-    """Return the Brier score: mean square of probability less outcome."""
-    return float(np.mean((predicted - happened) ** 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,17 +153,11 @@ def throttle_steps(rng: np.random.Generator, flights: int, n: int) -> np.ndarray
     return out
 
 
-def fly(rng: np.random.Generator, flights: int, seconds: float, *, wander: float = 0.08,
-        noise: float = 0.2, throttle: np.ndarray | None = None) -> Flights:
-    """
-    Simulate; throttle in steps is drawn where it is not given.
-
-    wander: deviation of ln sigma after one second, 1/sqrt(s), which comes back within a minute;
-    noise: largest white noise of the ADC, in stationary deviations.
-    """
+def fly(rng: np.random.Generator, flights: int, seconds: float) -> Flights:
+    """Simulate."""
     n = int(seconds * RATE)
     h = 1.0 / RATE / FINE
-    throttle = throttle_steps(rng, flights, n) if throttle is None else throttle
+    throttle = throttle_steps(rng, flights, n)
     # Components: 20..120 1/s, 20..150 mV.
     resistance = rng.uniform(0.05, 0.4, flights)
     alpha = np.exp(rng.uniform(math.log(20.0), math.log(120.0), flights))
@@ -199,14 +167,15 @@ def fly(rng: np.random.Generator, flights: int, seconds: float, *, wander: float
     growth = rng.uniform(0.3, 2.0, flights)
     sag = rng.uniform(0.5, 4.0, flights) * spread
     source = 5.0 + sag * 0.5
-    adc = rng.uniform(0.0, noise, flights) * spread
+    adc = rng.uniform(0.0, 0.2, flights) * spread
     log = np.zeros(flights)
     keep = np.exp(-h / (resistance * capacitance))
     v = source - sag * throttle[:, 0] + spread * rng.standard_normal(flights)
     voltage, low, path = (np.empty((flights, n), np.float32) for _ in range(3))
     for k in range(n):
         u = throttle[:, k]
-        log += wander / math.sqrt(RATE) * rng.standard_normal(flights) - log / (60.0 * RATE)
+        # ln sigma wanders by 0.08 in a second and comes back within a minute.
+        log += 0.08 / math.sqrt(RATE) * rng.standard_normal(flights) - log / (60.0 * RATE)
         current = sag * u / resistance
         rest = source - resistance * current
         # White current through the capacitor, its intensity as throttle and time have it.
@@ -226,37 +195,25 @@ def fly(rng: np.random.Generator, flights: int, seconds: float, *, wander: float
                    source - 0.5 * sag, spread)
 
 
-def _told(what: str, of: int) -> Callable[[], None]:
-    """Return what to call after each of so many steps: tells how far it is."""
-    done, begin = [0], time.monotonic()
-
-    def tell() -> None:
-        done[0] += 1
-        if done[0] % 20 == 0 or done[0] == of:
-            rest = (time.monotonic() - begin) / done[0] * (of - done[0])
-            say(f'{what}: {done[0]}/{of}, about {rest:.0f} s left')
-    return tell
-
-
-def calibration(given: argparse.Namespace) -> tuple[str, str]:
-    """Return a table and a reliability diagram."""
-    found: list[Horizon] = []
+def predictions(given: argparse.Namespace) -> list[Horizon]:
+    """Return all predictions, from the file of lines if it exists."""
     if given.lines and given.lines.exists():
-        found = [Horizon(**json.loads(line)) for line in given.lines.read_text().splitlines()]
-        return _calibration(found, given.horizon)
-    tell = _told('flights', given.flights)
+        return [Horizon(**json.loads(line)) for line in given.lines.read_text().splitlines()]
+    found: list[Horizon] = []
     for begin in range(0, given.flights, _BATCH):
         rng = np.random.default_rng([given.seed, begin])
         count = min(_BATCH, given.flights - begin)
         flights = fly(rng, count, given.seconds)
         levels = flights.level - flights.spread * rng.uniform(2.5, 7.0, count)
-        found += predict(flights, levels, given.horizon, given.horizon, tell)
+        found += predict(flights, levels, given.horizon, given.horizon)
+        say(f'{begin + count} of {given.flights} flights')
     if given.lines:
         given.lines.write_text(''.join(json.dumps(asdict(h)) + '\n' for h in found))
-    return _calibration(found, given.horizon)
+    return found
 
 
-def _calibration(found: Sequence[Horizon], horizon: float) -> tuple[str, str]:
+def calibration(found: Sequence[Horizon], horizon: float) -> tuple[str, str]:
+    """Return the tables and a reliability diagram."""
     steady = [h for h in found if h.steady]
     parts = [_reliability_table(
         f'Throttle stays as it is within the horizon: {len(steady)} horizons of '
@@ -278,23 +235,21 @@ def _reliability_table(title: str, found: Sequence[Horizon]) -> str:
     rows = []
     for method in methods:
         predicted, happened = _columns(found, method)
-        score_ = brier(predicted, happened)
-        rows.append([method, f'{score_:.4f}', f'{1.0 - score_ / (base * (1.0 - base)):.3f}'])
+        score = float(np.mean((predicted - happened) ** 2))
+        rows.append([method, f'{score:.4f}', f'{1.0 - score / (base * (1.0 - base)):.3f}'])
     text = [f'**{title}**', '', table(['method', 'Brier score', 'skill'], rows), '']
-    for method in methods[:1]:
-        rows = []
-        for b in reliability(*_columns(found, method)):
-            low, high = b.interval
-            ratio = b.observed / b.predicted
-            inside = low <= b.predicted * _FACTOR and high >= b.predicted / _FACTOR
-            rows.append([f'{b.low:g}..{b.high:g}', str(b.count), number(b.predicted, '.3g'),
-                         number(b.observed, '.3g'), f'{low:.2g}..{high:.2g}',
-                         f'{ratio:.2f}', 'yes' if 1 / _FACTOR <= ratio <= _FACTOR
-                         else 'not refuted' if inside else 'no'])
-        text += [f'{method[0].upper()}{method[1:]}:', '', table(
-            ['predicted', 'horizons', 'mean', 'observed', '95 % interval', 'observed / predicted',
-             f'within {_FACTOR:g}'], rows)]
-    return '\n'.join(text)
+    rows = []
+    for b in reliability(*_columns(found, PUBLISHED)):
+        low, high = b.interval
+        ratio = b.observed / b.predicted
+        inside = low <= b.predicted * _FACTOR and high >= b.predicted / _FACTOR
+        rows.append([f'{b.low:g}..{b.high:g}', str(b.count), number(b.predicted, '.3g'),
+                     number(b.observed, '.3g'), f'{low:.2g}..{high:.2g}', f'{ratio:.2f}',
+                     'yes' if 1 / _FACTOR <= ratio <= _FACTOR
+                     else 'not refuted' if inside else 'no'])
+    return '\n'.join([*text, 'Published risk:', '', table(
+        ['predicted', 'horizons', 'mean', 'observed', '95 % interval', 'observed / predicted',
+         f'within {_FACTOR:g}'], rows)])
 
 
 def _reliability_figure(found: Sequence[Horizon]) -> str:
@@ -327,7 +282,7 @@ def main() -> int:
     parser.add_argument('--lines', type=Path,
                         help='results as JSON lines: written, or read where it exists')
     given = parser.parse_args()
-    text, figure = calibration(given)
+    text, figure = calibration(predictions(given), given.horizon)
     text = f'{date.today().isoformat()}, seed {given.seed}.\n\n{text}'
     deliver(text, given.table, 'calibration')
     if given.figure:

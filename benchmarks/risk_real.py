@@ -1,11 +1,10 @@
 """
 The brown-out risk on recorded flights, causally, beside simpler forecasts (10 min).
 
-Asked at 5 Hz of one monitor with default window, whose fits count in the CPU of reports here:
-levels that 1, 5 and 20 % of the horizons of the flight undershoot; the middle one of three
-samples, or single samples.  Horizons overlap: n of them count as n / (5 Hz x horizon).  Skill: 1
-less the Brier score over that of the climatology so far.  Flights that are not there are left out,
-with a word on stderr.
+One monitor with the default window is asked at 5 Hz; its fits count in the CPU of reports.  The
+levels are undershot in 1, 5 and 20 % of the flight's horizons, by the median of three samples or
+by single samples.  Horizons overlap: n of them count as n / (5 Hz x horizon).  Skill: 1 minus the
+Brier score divided by that of the climatology so far.
 
     OU_MONITOR_REALDATA=... python benchmarks/risk_real.py --page doc/results/risk_real.md
 """

@@ -1,5 +1,5 @@
 """
-Simulated samples a second beside other ways to draw an OU process, and memory (1 min).
+Simulated samples a second beside other ways to draw an OU process (1 min).
 
 All ways run in turn, `--repeats` times; the least CPU time of each counts.  Ours make stamps and
 throttle anew for each piece, as `ou-monitor simulate` does.  The variance over that of the OU
@@ -9,11 +9,8 @@ process shows whether a way keeps the law.
 from __future__ import annotations
 
 from collections.abc import Callable
-import json
 import math
-from pathlib import Path
 import random
-import subprocess
 import sys
 import time
 from typing import Any
@@ -21,11 +18,8 @@ from typing import Any
 from common import arguments, deliver, environment, table
 import numpy as np
 from ou_monitor.model.supply import SEGMENT, Simulation, SupplyModel
-from ou_monitor.model.terms.ac_coupling import ACCoupling
 from ou_monitor.model.terms.nonlinear_restoring import NonlinearRestoring
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.shocks import Jumps
-from ou_monitor.model.terms.slow import FlickerNoise
 from ou_monitor.model.terms.term import Term
 from ou_monitor.simulation import PRESETS, PROFILES
 from scipy.signal import lfilter
@@ -94,10 +88,6 @@ def ways() -> dict[str, tuple[Draw, float, bool]]:
             (ours(PRESETS['flight'].model), 1.0, False),
         '**ou_monitor: flight_full, 7 terms**':
             (ours(PRESETS['flight_full'].model), 1.0, False),
-        '**ou_monitor: ou, jumps**': (with_ou(Jumps(5.0, 0.0, 0.05)), 1.0, False),
-        '**ou_monitor: ou, ac_coupling**': (with_ou(ACCoupling(10.0, 0.0)), 1.0, False),
-        '**ou_monitor: ou, flicker_noise**':
-            (with_ou(FlickerNoise(5e-3, 0.1, 100.0)), 1.0, False),
         '**ou_monitor: ou, nonlinear_restoring**':
             (with_ou(NonlinearRestoring(0.0, 2e3)), 0.05, False),
         'scipy lfilter by hand, plain OU': (filtered, 1.0, True),
@@ -130,39 +120,14 @@ def speeds(samples: int, repeats: int) -> str:
                   for name, ns in least.items()])
 
 
-def one_run(samples: int) -> list[str]:
-    """Return the row of a simulation at 1 MHz in this process (peak memory: Linux)."""
-    def peak() -> str:
-        status = Path('/proc/self/status').read_text().splitlines()
-        (line,) = (line for line in status if line.startswith('VmHWM'))
-        return f'{int(line.split()[1]) / 1024.0:.0f}'
-    before, profile = peak(), PROFILES['flight'][0]
-    run = Simulation(PRESETS['flight'].model, np.random.default_rng(SEED))
-    begin = time.thread_time()
-    for first in range(0, samples, SEGMENT):
-        t = np.arange(first, min(first + SEGMENT, samples)) / 1e6
-        run.advance(t, profile(t))
-    return [f'{samples:.0e}', f'{time.thread_time() - begin:.3g}', before, peak()]
-
-
 def main() -> int:
     """Measure and print the tables, or put them into the page."""
     parser = arguments(__doc__)
     parser.add_argument('--quick', action='store_true', help='a tenth of the samples, once')
     parser.add_argument('--repeats', type=int, default=5)
-    parser.add_argument('--memory', type=int, help='only the row of so many samples, as JSON')
     given = parser.parse_args()
-    if given.memory:
-        print(json.dumps(one_run(given.memory)))
-        return 0
-    runs = [json.loads(subprocess.run(
-        [sys.executable, __file__, '--memory', str(n)], check=True, text=True,
-        stdout=subprocess.PIPE).stdout) for n in ((10**6, 10**7) if given.quick
-                                                  else (10**7, 10**8))]
     text = (f'<!-- {environment("numba")} -->\n\n### Samples per second, one thread, CPU time\n\n'
-            + speeds(*((200_000, 1) if given.quick else (2_000_000, given.repeats)))
-            + '\n### Memory: the preset `flight` at 1 MHz, in pieces, throttle included\n\n'
-            + table(['samples', 'CPU s', 'RSS before, MB', 'peak RSS, MB'], runs))
+            + speeds(*((200_000, 1) if given.quick else (2_000_000, given.repeats))))
     deliver(text, given.page, 'benchmark')
     return 0
 

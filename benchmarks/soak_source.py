@@ -1,5 +1,5 @@
 """
-The source of a soak: its schedule, drawn from a seed, and voltages at 1 kHz as scheduled.
+Used by soak.py: its schedule, drawn from a seed, and the source of voltages at 1 kHz.
 
     python soak_source.py SEED SECONDS LOG [dense]
 
@@ -320,7 +320,9 @@ class Source:
             value *= 1000.0
         elif low:
             self._low.append(time.monotonic())
-        message = BatteryState(voltage=_single(value))
+        # A value that a float32 takes.
+        message = BatteryState(
+            voltage=math.copysign(math.inf, value) if abs(value) > 3e38 else value)
         stamp = self._stamp(kind, now)
         message.header.stamp.sec = int(stamp)
         message.header.stamp.nanosec = int((stamp - int(stamp)) * 1e9)
@@ -340,11 +342,6 @@ class Source:
 
 def _end(dip: Dip) -> float:
     return dip.begin + dip.length - 0.5 / RATE
-
-
-def _single(value: float) -> float:
-    """Return a value that a float32 of a message takes."""
-    return math.copysign(math.inf, value) if abs(value) > 3e38 else value
 
 
 def main() -> None:

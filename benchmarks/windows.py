@@ -24,7 +24,6 @@ DT, WINDOW = 1e-3, 2.0  # s.
 ADC_STEP = 12.5e-3  # One code of a 10-bit ADC over 12.8 V.
 SAG, LOW, HIGH = -0.6, 0.2, 0.7  # V at full throttle; the two throttles.
 Z95 = 1.96  # 97.5 % quantile of the normal distribution.
-_RESAMPLES = 400
 
 
 @dataclass(frozen=True)
@@ -60,17 +59,6 @@ def statuses(fits: list[Fit]) -> str:
     """Return the share of each status."""
     return ', '.join(f'{name} {100.0 * many / len(fits):.0f} %'
                      for name, many in Counter(fit.status for fit in fits).most_common())
-
-
-def ratios(one: list[Fit], other: list[Fit]) -> list[str]:
-    """Return the ratio of the RMSE of two methods on the same windows, with bootstrap errors."""
-    squares = np.stack((errors(one), errors(other))) ** 2
-    squares = squares[:, np.isfinite(squares).all(axis=(0, 2))]
-    rng = np.random.default_rng(1)
-    again = squares[:, rng.integers(0, squares.shape[1], (_RESAMPLES, squares.shape[1]))]
-    spread = np.sqrt(again[0].mean(axis=1) / again[1].mean(axis=1)).std(axis=0)
-    found = np.sqrt(squares[0].mean(axis=0) / squares[1].mean(axis=0))
-    return [f'{a:.3f} ± {b:.3f}' for a, b in zip(found, spread)]
 
 
 def simulate(rng: np.random.Generator, count: int, n: int, dt: float = DT) -> Array:
