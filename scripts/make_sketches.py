@@ -17,10 +17,10 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'benchmarks')]
 
+from common import drawing  # noqa: E402, I100, I202
 from ou_monitor.model.supply import SupplyModel  # noqa: E402
 from ou_monitor.model.terms.catalogue import catalogue  # noqa: E402
 from ou_monitor.paper import published  # noqa: E402
-from common import drawing  # noqa: E402
 
 # Cause: its parameters, and the seconds shown.
 CAUSES: dict[str, tuple[dict[str, object], float]] = {

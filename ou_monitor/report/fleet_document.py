@@ -218,8 +218,9 @@ def failure_words(fleet: Fleet) -> list[str]:
     for row in fleet.failed:
         error = str(row['error']).removeprefix(row['path'])
         # The rest may name a line of the file, or a file within it.
-        found.append(_of(row) + row['path'] + (error if re.match(r':\d+:|/', error) else
-                                    f": {error.lstrip(': ')}"))
+        if not re.match(r':\d+:|/', error):
+            error = f": {error.lstrip(': ')}"
+        found.append(_of(row) + row['path'] + error)
     return found
 
 
