@@ -7,8 +7,10 @@ that a function loads only what it uses.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING, Union
 
@@ -341,7 +343,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
         Flight that gives level, sag, resistance and noise.
     network : mapping or PowerNetwork, optional
         Components in SI units, such as ``{'cells': 4, 'bulk_capacitance': 470e-6}``; they override
-        measured values.
+        measured values.  A PowerNetwork is for a design without a recording.
     rail : {'bus', 'regulated'}
         The battery bus at the ESCs, or the regulated rail.
     voltage : float, optional
@@ -375,53 +377,76 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     ('FOUND', True)
 
     """
-    from ou_monitor.analysis.crafts import check_cells
+    from ou_monitor.analysis.crafts import cells_of, check_cells, full_voltage, stated_limit
     from ou_monitor.paper.network import completed, PowerNetwork
     from ou_monitor.paper.design import (
-        as_data, default_voltage, design as designed, LEAST, MOST, network_of)
+        as_data, CELL_BROWNOUT, default_voltage, design as designed, LEAST, MOST, network_of,
+        SHOWN)
     from ou_monitor.report.design_document import design_document, taken_words
 
-    flown = None if recording is None else _flight(_read(recording))
-    if throttle is None:
-        if flown is None:
+    taken, facts, error, known = '', None, 0.0, None
+    if recording is None:
+        if throttle is None:
             raise ValueError('the throttle is missing: 0.4 asks for 40 %, and a recording gives '
                              'that of a flight')
-        throttle = flown[0].highest
-    taken = ''
-    if isinstance(network, PowerNetwork):
-        circuit = network
-    elif flown is None:
-        circuit = PowerNetwork(**completed(dict(network or {})))
+        circuit = network if isinstance(network, PowerNetwork) else PowerNetwork(
+            **completed(dict(network or {})))
+        level, source = default_voltage(circuit, rail) if voltage is None else (voltage, 'given')
+    elif isinstance(network, PowerNetwork):
+        raise ValueError('a PowerNetwork leaves nothing for the recording to give: pass a mapping '
+                         'of the components that the recording does not show')
     else:
-        flight, values = flown[0], dict(network or {})
-        cells = values.setdefault('cells', flight.cells)
+        flown, values = readings_of(_read(recording)), dict(network or {})
+        full, stated = full_voltage(flown), stated_limit(flown.source)
+        cells = values.setdefault('cells', cells_of(flown)[0])
         if not cells:
-            raise InputError(f'{flight.full:.4g} V fits no number of cells: give --set cells=N')
-        check_cells(flight.full, cells)
+            raise InputError(f'{full:.4g} V fits no number of cells: give --set cells=N')
+        check_cells(full, cells)
+        level, source = cells * CELL_BROWNOUT, f'{CELL_BROWNOUT} V a LiPo cell'
+        if stated is not None and stated[0] == cells:
+            level, source = stated[1], 'by the log'
+        level, source = (level, source) if voltage is None else (voltage, 'given')
+        flight, facts, risks = _flight(flown, full, cells, level if rail == 'bus' else None,
+                                       horizon, risk)
+        throttle = flight.highest if throttle is None else throttle
         circuit = network_of(flight, throttle, values)
+        if rail != 'bus' and voltage is None:
+            level, source = default_voltage(circuit, rail)
         taken = taken_words(flight, circuit, throttle, values)
-    level, source = default_voltage(circuit, rail) if voltage is None else (voltage, 'given')
+        error = float(np.interp(throttle, flight.throttle, flight.sag_se) / np.interp(
+            throttle, flight.throttle, flight.sag))
+        if facts.budget is not None and risks and not values.keys() & SHOWN and math.isfinite(
+                facts.budget.throttle):
+            known = (facts.budget.throttle, float(np.interp(throttle, facts.sag.throttle, risks)),
+                     float(np.interp(0.8 * throttle, facts.sag.throttle, risks)))
     found = designed(circuit, throttle, voltage=level, horizon=horizon, risk=risk, rail=rail,
-                     esr_follows=not esr_fixed, capacitances=capacitances or (LEAST, MOST))
-    facts = None if flown is None else flown[1]
+                     esr_follows=not esr_fixed, capacitances=capacitances or (LEAST, MOST),
+                     sag_error=error, flown=known)
     return Result(found, partial(design_document, found, source, taken),
                   partial(as_data, found, source, taken), 'rows', facts)
 
 
-def _flight(recording: Recording) -> tuple[Flight, Any]:
-    """Return the measured properties of a supply, and its facts."""
-    from ou_monitor.analysis.crafts import cells_of, full_voltage
-    from ou_monitor.analysis.supply import facts_and_end
+def _flight(recording: Recording, full: float, cells: int, level: float | None, horizon: float,
+            risk: float) -> tuple[Flight, SupplyFacts, tuple[float, ...]]:
+    """Return a flight in numbers, its facts, and its risks over throttle (full, level in V)."""
+    from ou_monitor.analysis.supply import facts_and_end, node_for
+    from ou_monitor.online.estimator.estimator import SLIDING
+    from ou_monitor.online.settings import MonitorSettings
     from ou_monitor.paper.design import Flight
 
     if not recording.has_throttle:
         raise InputError(f'--from {recording.name}: the recording has no throttle')
-    facts, load, _ = facts_and_end(recording)
-    return Flight(load.level, full_voltage(recording), cells_of(recording)[0],
-                  facts.sag.throttle, facts.sag.sag_v, facts.noise.rms_v,
-                  facts.noise.steady_rms_v, facts.noise.flown,
+    monitor = None
+    if level is not None:
+        monitor, parts = node_for(recording, MonitorSettings(
+            window=SLIDING, brownout_voltage=level, brownout_horizon=horizon,
+            brownout_budget_limit=risk, brownout_critical=max(risk, 0.5)))
+        deque(parts, 0)
+    facts, load, end = facts_and_end(recording, level, monitor=monitor)
+    return Flight(load.level, full, cells, facts.sag.throttle, facts.sag.sag_v, facts.sag.se_v,
+                  facts.noise.rms_v, facts.noise.steady_rms_v, facts.noise.flown,
                   min(1.0, float(np.nanmax(recording.throttle))), facts.resistance.ohm,
-                  facts.ou.alpha, facts.ou.var_inf), facts
+                  facts.ou.alpha, facts.ou.var_inf), facts, () if end is None else end.risk_curve
 
 
 def reproduce(*, seed: int = 1, progress: Progress | None = None) -> Result:

@@ -1,6 +1,7 @@
 """The commands as functions: their JSON, tables, plots and HTML, and what is missing without."""
 
 import copy
+from dataclasses import replace
 import json
 import pickle
 import re
@@ -62,7 +63,10 @@ def test_a_design_of_a_flight_has_its_facts(tmp_path):
                  str(tmp_path / 'x.json')]) == 0
     result = design(0.5, recording=GECKO, network={'cells': 4})
     assert result.to_dict() == json.loads((tmp_path / 'x.json').read_text())
-    assert result.supply == supply_facts(read_recording(GECKO))
+    # The budget is that of the risk allowed, 1e-3.
+    assert replace(result.supply, budget=None) == replace(
+        supply_facts(read_recording(GECKO), limit=4 * 3.3), budget=None)
+    assert result.supply.budget.risk == 1e-3
 
 
 def test_simulate_equals_the_command(tmp_path):

@@ -12,12 +12,13 @@ Without an LC filter, both risks fall as C rises once the network is slower than
 that C, the second rose by up to 1.44 times in 39 of 6000 random networks.  With an LC filter the
 risk may rise, up to an oscillation.
 
-`network_of` chooses components that reproduce a flight.  Limits: sag and noise are as measured,
-with the white noise of the sensor and its filter.  Noise added by changes of throttle, and an OU
-if one was found, count as slow fluctuations of the current, which no capacitor of a board changes;
-the rest is attributed to the switching of the ESCs.  Without a measured current, the resistance is
-the given or default one and the current is scaled to the sag: the effect of packs in parallel is
-then still right, the effect of an ESR is uncertain.
+`network_of` chooses components that reproduce a flight; the error of its sag counts in all risks
+of the bus, and the throttle limit is the budget of the flight.  Limits: sag and noise are as
+measured, with the white noise of the sensor and its filter.  Noise added by changes of throttle,
+and an OU if one was found, count as slow fluctuations of the current, which no capacitor of a
+board changes; the rest is attributed to the switching of the ESCs.  Without a measured current,
+the resistance is the given or default one and the current is scaled to the sag: the effect of
+packs in parallel is then still right, the effect of an ESR is uncertain.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from ou_monitor.paper.network import (
     completed, PowerNetwork, Rail, rail_at, UnstableNetworkError)
 from ou_monitor.text import number
 from scipy.optimize import brentq
+from scipy.special import ndtr
 
 CELL_BROWNOUT = 3.3
 # Regulated voltage, V -> (brown-out level, V, source).
@@ -48,6 +50,9 @@ _NEVER = 1e-300
 # Limits of the alternatives to capacitors: maximum packs in parallel, minimum shares of the
 # resistance (new leads and a fresh pack) and of the throttle.
 _PACKS, _RESISTANCE, _THROTTLE = 3, 0.5, 0.5
+# Errors of a mean beyond this, in standard errors, are left out; nodes and weights of Gauss.
+_FAR = 8.0
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(40)
 
 
 class DesignVerdict(enum.Enum):
@@ -76,7 +81,9 @@ class DesignRow:
     # Sag of the bus and mean of the rail, V; independent of the capacitor.
     sag: float
     mean: float
-    mean_time: float  # Mean time to brown-out of the OU from its mean level, s; may be inf.
+    # Mean time to brown-out of the OU from its mean level, s, or the one that gives the risk if
+    # the mean has an error; may be inf.
+    mean_time: float
     crossing_rate: float  # High-level crossing rate of the whole process, 1/s.
     # Probability within the horizon, by mean first passage of the OU and by the crossing rate.
     risk_ou: float
@@ -133,6 +140,8 @@ class Design:
     # the rail is regulated.
     resistance: float
     levers: tuple[Lever, ...]  # More capacitance and its alternatives.
+    sag_error: float = 0.0  # Standard error of the sag of the bus, relative.
+    flown_risk: float = math.nan  # At this throttle by the facts of a flight; NaN: unknown.
 
 
 def default_voltage(network: PowerNetwork, rail: str) -> tuple[float, str]:
@@ -155,31 +164,57 @@ def with_capacitance(network: PowerNetwork, capacitance: float,
     return replace(network, bulk_capacitance=capacitance, bulk_esr=esr)
 
 
-def row_of(rail: Rail, voltage: float, horizon: float) -> DesignRow:
-    """Return the numbers of a rail."""
+def row_of(rail: Rail, voltage: float, horizon: float, sag_error: float = 0.0) -> DesignRow:
+    """Return the numbers of a rail (sag_error: standard error of the sag of the bus, relative)."""
     quiet = rail.var_inf == 0.0
-    if rail.mean <= voltage:
-        mean_time, crossing = 0.0, math.inf
-    elif quiet:
-        mean_time, crossing = math.inf, 0.0
-    else:
-        barrier = (rail.mean - voltage) / math.sqrt(rail.var_inf)
-        mean_time = mean_first_passage(0.0, barrier) * rail.tau
-        crossing = rail.crossing_rate(voltage)
+    mean_time, crossing = _times(rail, voltage)
+    se = sag_error * rail.load.sag if rail.name == 'bus' else 0.0
+    if se > 0.0:
+        # Means below the voltage count with the risk 1, the others by quadrature.
+        lowest = max((voltage - rail.mean) / se, -_FAR)
+        risks = np.full(2, float(ndtr((voltage - rail.mean) / se)))
+        z = lowest + 0.5 * (_FAR - lowest) * (_NODES + 1.0)
+        weight = 0.5 * (_FAR - lowest) * _WEIGHTS * np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
+        for share, off in zip(weight.tolist() if lowest < _FAR else (), (se * z).tolist()):
+            risks += share * np.array(_risks(horizon, *_times(rail, voltage - off)))
+        rate = -np.log1p(-np.minimum(risks, 1.0 - 1e-16)) / horizon
+        mean_time, crossing = math.inf if rate[0] == 0.0 else 1.0 / float(rate[0]), float(rate[1])
     net = rail.network
+    risk_ou, risk_crossing = _risks(horizon, mean_time, crossing)
     return DesignRow(
         capacitance=net.bulk_capacitance, esr=net.bulk_esr, alpha=rail.alpha, tau=rail.tau,
         sigma=0.0 if quiet else rail.sigma, var_inf=rail.var_inf, sag=rail.load.sag,
-        mean=rail.mean, mean_time=mean_time, crossing_rate=crossing,
-        risk_ou=1.0 if mean_time == 0.0 else -math.expm1(-horizon / mean_time),
-        risk_crossing=-math.expm1(-horizon * crossing))
+        mean=rail.mean, mean_time=mean_time, crossing_rate=crossing, risk_ou=risk_ou,
+        risk_crossing=risk_crossing)
+
+
+def _times(rail: Rail, voltage: float) -> tuple[float, float]:
+    """Return the mean time to a voltage, s, and the crossing rate, 1/s."""
+    if rail.mean <= voltage:
+        return 0.0, math.inf
+    if rail.var_inf == 0.0:
+        return math.inf, 0.0
+    barrier = (rail.mean - voltage) / math.sqrt(rail.var_inf)
+    return mean_first_passage(0.0, barrier) * rail.tau, rail.crossing_rate(voltage)
+
+
+def _risks(horizon: float, mean_time: float, crossing: float) -> tuple[float, float]:
+    """Return the probabilities within a horizon, s, of the OU and of the crossing rate."""
+    return (1.0 if mean_time == 0.0 else -math.expm1(-horizon / mean_time),
+            -math.expm1(-horizon * crossing))
 
 
 def design(
     network: PowerNetwork, throttle: float, *, voltage: float, horizon: float, risk: float,
     rail: str = 'bus', esr_follows: bool = True, capacitances: tuple[float, float] = (LEAST, MOST),
+    sag_error: float = 0.0, flown: tuple[float, float, float] | None = None,
 ) -> Design:
-    """Return the minimum bulk capacitance that meets a brown-out risk (capacitances in F)."""
+    """
+    Return the minimum bulk capacitance that meets a brown-out risk (capacitances in F).
+
+    sag_error as in `row_of`; flown: throttle budget of a flight at this voltage, horizon and
+    risk, and its risks at this throttle and at 0.8 of it, by `supply_facts`.
+    """
     low, high = capacitances
     for name, value, unit in (('voltage', voltage, 'V'), ('horizon', horizon, 's'),
                               ('minimum capacitance', low, 'F'),
@@ -192,12 +227,12 @@ def design(
         raise ValueError(f'the minimum capacitance must be below the maximum, got {low:g} F and '
                          f'{high:g} F')
 
-    present = row_of(rail_at(network, throttle, rail), voltage, horizon)
+    present = row_of(rail_at(network, throttle, rail), voltage, horizon, sag_error)
 
     def at(capacitance: float) -> DesignRow:
         changed = with_capacitance(network, capacitance, esr_follows)
         try:
-            return row_of(rail_at(changed, throttle, rail), voltage, horizon)
+            return row_of(rail_at(changed, throttle, rail), voltage, horizon, sag_error)
         except UnstableNetworkError:
             return replace(present, capacitance=capacitance, esr=changed.bulk_esr,
                            alpha=math.nan, tau=math.nan, sigma=math.nan, var_inf=math.inf,
@@ -217,15 +252,17 @@ def design(
         target=risk, esr_follows=esr_follows, verdict=verdict, present=present, least=least,
         rows=tuple(rows), falls=all(b <= a * (1.0 + 1e-9) for a, b in zip(risks, risks[1:])),
         resistance=_resistance(network, throttle, voltage) if rail == 'bus' else math.nan,
-        levers=_levers(network, throttle, voltage, horizon, risk, rail, at, least))
+        levers=_levers(network, throttle, voltage, horizon, risk, rail, at, least, sag_error,
+                       flown),
+        sag_error=sag_error, flown_risk=math.nan if flown is None else flown[1])
 
 
 def _levers(network: PowerNetwork, throttle: float, voltage: float, horizon: float, target: float,
             rail: str, at: Callable[[float], DesignRow], least: DesignRow | None,
-            ) -> tuple[Lever, ...]:
+            sag_error: float, flown: tuple[float, float, float] | None) -> tuple[Lever, ...]:
     def risk(changed: PowerNetwork, u: float = throttle) -> float:
         try:
-            return row_of(rail_at(changed, u, rail), voltage, horizon).risk
+            return row_of(rail_at(changed, u, rail), voltage, horizon, sag_error).risk
         except ValueError:
             # Unstable, or a load beyond the battery.
             return 1.0
@@ -237,6 +274,10 @@ def _levers(network: PowerNetwork, throttle: float, voltage: float, horizon: flo
         return risk(network, share * throttle)
 
     bulk, ohm = network.bulk_capacitance, network.battery_resistance
+    # The budget of the flight is the answer of all commands; 0: no throttle.
+    most, then = (100.0 * throttle * _share(limit, _THROTTLE, target), limit(0.8)) if (
+        flown is None) else (100.0 * min(flown[0], throttle) if flown[0] > 0.0 else math.nan,
+                             flown[2])
     packs = next((n for n in range(1, _PACKS + 1) if resistance(1.0 / n) <= target), math.nan)
     return (
         Lever('bulk capacitance', 'uF', 1e6 * bulk, 2e6 * bulk, at(2.0 * bulk).risk,
@@ -244,8 +285,7 @@ def _levers(network: PowerNetwork, throttle: float, voltage: float, horizon: flo
         Lever('packs in parallel', '', 1.0, 2.0, resistance(0.5), packs),
         Lever('battery and lead resistance', 'mOhm', 1e3 * ohm, 0.75e3 * ohm, resistance(0.75),
               1e3 * ohm * _share(resistance, _RESISTANCE, target)),
-        Lever('throttle limit', '%', 100.0 * throttle, 80.0 * throttle, limit(0.8),
-              100.0 * throttle * _share(limit, _THROTTLE, target)))
+        Lever('throttle limit', '%', 100.0 * throttle, 80.0 * throttle, then, most))
 
 
 def _share(risk: Callable[[float], float], least: float, target: float) -> float:
@@ -309,6 +349,15 @@ def as_data(result: Design, source: str, taken: str) -> dict[str, Any]:
 
 def answer(result: Design) -> str:
     """Return the answer in words."""
+    fits = result.present.risk <= result.target
+    more = '' if not (fits and result.flown_risk > result.target) else (
+        f' But right after the flight the risk at this throttle is '
+        f'{probability(result.flown_risk)}, as analyze gives it, by level and excursions that no '
+        f'capacitor changes. {_others(result)}')
+    return _network_answer(result) + more
+
+
+def _network_answer(result: Design) -> str:
     present, least = result.present, result.least
     if result.verdict is DesignVerdict.ENOUGH:
         also = '' if least is None else f' The target is met from {_uf(least)} on.'
@@ -359,7 +408,7 @@ def effect(result: Design) -> str:
         twice = with_capacitance(result.network, 2.0 * a.capacitance, result.esr_follows)
         try:
             b = row_of(rail_at(twice, result.throttle, result.rail), result.voltage,
-                       result.horizon)
+                       result.horizon, result.sag_error)
         except UnstableNetworkError as error:
             return f'With {number(2e6 * a.capacitance)} uF {error}.'
     if not b.stable:
@@ -429,8 +478,9 @@ class Flight:
     level: float  # Open-circuit voltage at its end, V
     full: float  # Highest voltage, without a few outliers, V
     cells: int  # In series; 0: unknown
-    throttle: Sequence[float]  # 0..1, at which the next three are given
+    throttle: Sequence[float]  # 0..1, at which the next four are given
     sag: Sequence[float]  # V
+    sag_se: Sequence[float]  # V
     noise: Sequence[float]  # Rms as flown, V
     steady: Sequence[float]  # Rms while throttle stands still, V
     flown: tuple[float, float]  # Throttles, 1 % and 99 % quantile
@@ -438,6 +488,11 @@ class Flight:
     resistance: float  # Instantaneous, from a measured current, Ohm
     alpha: float  # Relaxation rate of the OU, 1/s
     var_inf: float  # Variance of the OU, V^2
+
+
+# Components that a flight shows; if one of them is given, the flight is not the answer.
+SHOWN = frozenset(('battery_voltage', 'battery_resistance', 'current_max', 'current_exponent',
+                   'switching_scale', 'flutter'))
 
 
 def network_of(flight: Flight, throttle: float, given: dict[str, Any]) -> PowerNetwork:

@@ -67,9 +67,12 @@ def taken_words(flight: Flight, network: PowerNetwork, throttle: float, values: 
                 ) -> str:
     """Return the values taken from a flight, and the missing ones."""
     known = flight.resistance > 0.0 and values.get('battery_resistance') is None
+    sag, se = (float(np.interp(throttle, flight.throttle, one))
+               for one in (flight.sag, flight.sag_se))
     return (f'From the flight: {flight.level:.4g} V open at its end, {network.cells} cells '
-            f'({flight.full:.4g} V at most; --set cells=N), sag '
-            f'{float(np.interp(throttle, flight.throttle, flight.sag)):.3g} V and noise '
+            f'({flight.full:.4g} V at most; --set cells=N), sag {sag:.3g} V (+- {2.0 * se:.2g} V, '
+            'which counts in the risks; the throttle limit is the budget of analyze at this risk) '
+            'and noise '
             f'{1e3 * float(np.interp(throttle, flight.throttle, flight.noise)):.3g} mV rms at '
             f'{throttle:.0%} throttle, resistance '
             + (f'{1e3 * flight.resistance:.3g} mOhm.' if known else
