@@ -15,6 +15,7 @@ from ou_monitor.criticism.integrity import examine, Integrity
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate, fit_gaussian
 from ou_monitor.discovery.clipped import redrawn
+from ou_monitor.discovery.coded import within_codes
 from ou_monitor.discovery.decision import relaxes
 from ou_monitor.discovery.finding import Cause, Criticism, CrossingRate, Finding, Verdict
 from ou_monitor.discovery.fitting import Fitter, standard_errors, with_reach
@@ -69,9 +70,13 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
         start = _start(samples, state)
         if state.drawn is not None:
             samples, start = _unclipped(samples, state, start)
+        # Causes are named from readings within codes, and scored where no model has drawn.
+        inside, start = _uncoded(samples, state, start) if samples.cell else (samples, start)
         done(0.1)
-        named = named_causes(samples, start, rng, state.exact,
+        named = named_causes(inside, start, rng, state.exact,
                              lambda share: done(0.1 + 0.5 * share))
+        model, names = (named.whole, named.names) if inside is samples else _coded(
+            samples, state, named)
         plain = _plain(samples, state)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
         if blamed(error):
@@ -84,11 +89,15 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
     uncovered = samples.n - int(scored.sum())
     if state.drawn is not None:
         scored &= ~state.drawn
-    left = prune_by_gain(samples, named.whole, named.names, plain, scored,
+    left = prune_by_gain(samples, model, names, plain, scored,
                          lambda share: done(0.6 + 0.3 * share))
     whole = left.full.model
-    after = named.after if not left.out else criticise(samples, whole, named.bank)
-    dropped = (*named.dropped, *left.out)
+    after = named.after
+    if len(left.names) < len(named.names):
+        less = whole if inside is samples else _refitted(
+            inside, [term for term in whole.terms if term.NAME != 'quantization'])
+        after = after if less is None else criticise(inside, less, named.bank)
+    dropped = (*named.dropped, *left.out, *(name for name in named.names if name not in names))
     se = tuple(with_reach(term, found, samples) for term, found in zip(
         whole.terms, standard_errors(samples, whole, slice(0, samples.n)), strict=True))
     done(0.95)
@@ -135,7 +144,7 @@ def _start(samples: Samples, state: Integrity) -> Composite:
     """Return the initial model of the search: an OU, and exact noise terms."""
     clean = fit_composite(samples, [guess(samples)], samples.train)
     assert clean is not None
-    steps = [term for term in state.exact if term.ROLE is Role.NOISE]
+    steps = [term for term in state.exact if term.ROLE is Role.NOISE and samples.cell]
     start = fit_composite(samples, [clean.terms[0], *steps], samples.train) if steps else clean
     assert start is not None
     return start
@@ -152,6 +161,36 @@ def _unclipped(samples: Samples, state: Integrity, start: Composite
         samples = redrawn(samples, model, ends, state.drawn, rng)
         start = _start(samples, state)
     return samples, start
+
+
+def _uncoded(samples: Samples, state: Integrity, start: Composite) -> tuple[Samples, Composite]:
+    """Return the samples drawn within coarse codes, and the start of the search."""
+    rng, inside = np.random.default_rng(0), samples
+    for _ in range(_REDRAWN):
+        model = whole_load(Fitter(inside), start, load_terms(inside)) or start
+        drawn = within_codes(samples, model, rng)
+        if drawn is samples:
+            break
+        inside, start = drawn, _start(drawn, state)
+    return inside, start
+
+
+def _coded(samples: Samples, state: Integrity, named: Named) -> tuple[Composite, tuple[str, ...]]:
+    """Return the named model fitted to the codes, and its causes, without laws that do not fit."""
+    steps = [term for term in state.exact if term.ROLE is Role.NOISE]
+    terms, names = list(named.whole.terms), list(named.names)
+    while True:
+        found = _refitted(samples, [terms[0], *steps, *terms[1:]])
+        if found is not None:
+            return found, tuple(names)
+        if terms[-1].ROLE is not Role.LAW:
+            raise ArithmeticError('the model within codes does not fit the codes')
+        names.remove(terms.pop().NAME)
+
+
+def _refitted(samples: Samples, terms: Sequence[Term]) -> Composite | None:
+    """Return terms fitted to everything; None if a law has no fit."""
+    return fit_composite(samples, terms, slice(0, samples.n))
 
 
 def _plain(samples: Samples, state: Integrity) -> HeldOut:
