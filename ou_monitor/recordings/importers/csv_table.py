@@ -90,7 +90,7 @@ _WITH_UNIT = re.compile(
     rf'(.+?)[ _]{_WORD}')
 # A number with groups of thousands and decimals, or with a unit.
 _GROUPED = re.compile(r'[-+]?\d{1,3}(?:,\d{3})+\.\d+')
-_AND_UNIT = re.compile(r'(\S*[\d.])\s*+([^\d\s.]{1,12})')
+_AND_UNIT = re.compile(r'(\S*[\d.])\s*+([^\d\s.]{1,12}+(?: [AaDd][Cc])?)')
 # Lines above the data that state the time between rows, or its inverse.
 _NUMBER = r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?'
 # Possessive, so that lines of blanks cost no more than their length.
@@ -247,8 +247,11 @@ def number_of(cell: str) -> tuple[float, str]:
         return plain_number(cell), ''
     except ValueError:
         pass
-    found = _AND_UNIT.fullmatch(cell.strip())
-    text, unit = (found[1], found[2].lower()) if found else (cell.strip(), '')
+    # Graphtec aligns numbers behind their sign.
+    cell = re.sub(r'^([-+]) +', r'\1', cell.strip())
+    found = _AND_UNIT.fullmatch(cell)
+    text, unit = (found[1], found[2].lower()) if found else (cell, '')
+    unit = unit.removesuffix(' dc').removesuffix(' ac')
     if unit and unit not in WORDS:
         raise ValueError(cell)
     return plain_number(text.replace(',', '') if _GROUPED.fullmatch(text) else text), unit
@@ -297,8 +300,8 @@ def _header(rows: list[list[str]], lines: list[str], first: int, width: int, del
     names: list[str] = []
     units: list[str] = []
     line = 0
-    if above and _are_units(rows[above[-1]]) and len(above) > 1 \
-            and len(rows[above[-2]]) >= min(width, len(rows[above[-1]])):
+    if len(above) > 1 and (_are_units_of_channels(rows[above[-2]], rows[above[-1]]) or _are_units(
+            rows[above[-1]]) and len(rows[above[-2]]) >= min(width, len(rows[above[-1]]))):
         units = [cell.strip('[](){} ').lower() for cell in rows[above.pop()]]
     if above:
         names, line = rows[above[-1]], above[-1] + 1
@@ -315,8 +318,23 @@ def _header(rows: list[list[str]], lines: list[str], first: int, width: int, del
     # Else the unit behind the first number of the column.
     for k, unit in enumerate(stated):
         cell = next((row[k] for row in rows[first:] if k < len(row) and is_number(row[k])), '0')
-        stated[k] = unit or number_of(cell)[1]
+        stated[k] = unit or number_of(cell)[1] or _unit_beside(names, rows[first:], k)
     return tuple(names), tuple(stated), line
+
+
+def _unit_beside(names: Sequence[str], rows: list[list[str]], place: int) -> str:
+    """Return the unit in the next column, such as Volt DC, if that is named so."""
+    beside = names[place + 1].lower() if place + 1 < len(names) else ''
+    words = rows[0][place + 1].lower().split() if beside in ('unit', 'units') and rows and len(
+        rows[0]) > place + 1 else []
+    return words[0] if words and words[0] in WORDS else ''
+
+
+def _are_units_of_channels(names: list[str], row: list[str]) -> bool:
+    """Return whether a row holds units below the names of channels, whatever else it holds."""
+    below = [name for name, cell in zip(names, row)
+             if cell.lower() in VOLT_WORDS or cell.lower() in AMPERE_WORDS]
+    return len(names) == len(row) and bool(below) and all(map(CHANNEL.fullmatch, below))
 
 
 def _are_units(row: list[str]) -> bool:
@@ -520,6 +538,8 @@ MOST_COLUMNS = 300
 _BACK = 0.25
 # A time without a unit has the coarsest unit with steps, and span, of at most these, s.
 _USUAL_STEP, _USUAL_SPAN = 2.0, 43200.0
+# Rows from which repeated stamps are the resolution of a clock.
+_FEW_ROWS = 8
 # A voltage without a unit above this is in mV: no craft's pack has that many volts.
 _MOST_VOLTS = 1000.0
 
@@ -530,7 +550,7 @@ _TIME_NAME, _INDEX_NAME = 'time', r'sequence|index|sample|no|n|x|point|'
 _PATTERNS = {
     _TIME_NAME: (
         r'time_s',
-        r'(?:__|_)?time|t|zeit|ms_today|millis|micros|elapsed(?:_time)?|x_axis|seconds?',
+        r'(?:__|_)?time|t|zeit|ms_today|millis|micros|elapsed(?:_time)?|x_axis|x_value|seconds?',
         r'timestamp|date_?time|datum_?(?:und_)?(?:uhr)?zeit|temps|tiempo|tempo|uhrzeit',
         r'.*(?:time|zeit|stamp).*', r'date|datum'),
     logs.VOLTAGE: (
@@ -550,7 +570,7 @@ _PATTERNS = {
     logs.CURRENT: (
         r'current_a', r'amperage(?:_?latest)?|current_in|i_?bat(?:t|tery)?|'
         r'batt?(?:ery)?_?(?:i|curr(?:ent)?|amps?)|current_?batt?(?:ery)?|'
-        r'(?:bus|input|supply|main)_?current|curr',
+        r'(?:bus|input|supply|main|pack)_?current|curr',
         r'i|amps?|current|strom|courant|corriente'),
 }
 # Column that identifies a program -> units of its columns, not stated there.  Betaflight's
@@ -558,6 +578,12 @@ _PATTERNS = {
 _MAKERS: dict[str, dict[str, tuple[float, str]]] = {
     'loopIteration': {'time': (1e-6, 'us'), 'vbatLatest': (0.01, '0.01 V'),
                       'amperageLatest': (0.01, '0.01 A'), 'rcCommand[3]': (0.0, 'us')}}
+# Fields of MAVLink's SYS_STATUS, BATTERY_STATUS and POWER_STATUS (common.xml): factor to V or A,
+# unit, and the number that stands for unknown.  All are whole numbers.
+_MAVLINK = {'voltage_battery': (1e-3, 'mV', 65535.0), 'voltages[0]': (1e-3, 'mV', 65535.0),
+            'vcc': (1e-3, 'mV', 0.0), 'vservo': (1e-3, 'mV', 0.0),
+            'current_battery': (1e-2, '10 mA', -1.0)}
+_CELLS = re.compile(r'(.*voltages\[)0\]', re.IGNORECASE)
 _DAY = 86400.0  # s
 
 
@@ -673,7 +699,10 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
     for name, place in others.items():
         if place in time.place:
             raise InputError(f"{path}: '{name}' is the time, not a signal")
-    places = [*(one.place[0] for one in found.values()), *others.values()]
+    cells = _CELLS.fullmatch(found[logs.VOLTAGE].name) if logs.VOLTAGE in found else None
+    places = [*(one.place[0] for one in found.values()), *others.values(), *(
+        k for k, name in enumerate(form.names) if cells and re.fullmatch(
+            re.escape(cells[1]) + r'[1-9]\]', name))]
     for place in (*time.place, *places):
         if form.names.count(form.names[place]) > 1:
             raise InputError(f"{path}:{form.line}: column '{form.names[place]}' is there twice")
@@ -685,7 +714,13 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
     units = {'voltage': wanted.unit, 'throttle': wanted.throttle_unit}
     scaled, guesses = {}, {_TIME_NAME: words}
     for (quantity, column), column_values in zip(found.items(), values):
-        si, guesses[quantity] = _in_si(quantity, column, column_values, units.get(quantity), volts)
+        if quantity == logs.VOLTAGE:
+            # Cells of a pack; those that are not there are unknown.
+            column_values = column_values + sum(np.where(np.isfinite(cell) & (
+                cell != 65535.0), cell, 0.0) for cell in values[len(found) + len(others):])
+        si, guesses[quantity] = _of_mavlink(
+            column, column_values, wanted.unit, guesses.get(logs.VOLTAGE, '')) or _in_si(
+                quantity, column, column_values, units.get(quantity), volts)
         scaled[quantity] = column, si
     note = _read_note(form, time, found, guesses, wanted.throttle is None)
     return _Table(form, t, scaled, dict(zip(others, values[len(found):])), note)
@@ -753,10 +788,12 @@ def _time_of(path: Path, form: Form, wanted: CsvColumns) -> _Column:
     found = [] if numbered and math.isfinite(form.step) else (
         _choose(form, _TIME_NAME) or _clock_columns(form))
     if found:
-        first = found[0]
+        first = _finest(form, found[0])
         beside = [k for k in range(min(form.width, len(form.names))) if k != first and any(
-            k < len(row) and _has_day(row[k]) for row in form.rows[:3])]
+            k < len(row) and _has_day(row[k]) and ':' not in row[k] for row in form.rows[:3])]
         cells = [row[first] for row in form.rows if first < len(row)]
+        if (parts := _parts_of_second(form, first)) is not None:
+            return _Column((first, parts), f'{form.names[first]}, {form.names[parts]}', 's', 0.0)
         if beside and cells and ':' in cells[0] and not _has_day(cells[0]):
             return _Column((beside[0], first),
                            f'{form.names[beside[0]]}, {form.names[first]}', 's', 0.0)
@@ -768,6 +805,32 @@ def _time_of(path: Path, form: Form, wanted: CsvColumns) -> _Column:
         raise InputError(_absent(
             path, form, TIME, ' (--time-column or --sample-interval)'))
     return _Column((), form.stated, 's', form.step)
+
+
+def _finest(form: Form, first: int) -> int:
+    """Return a time that tells the rows apart if the chosen one, in whole seconds, does not."""
+    named = [k for k in range(min(form.width, len(form.names)))
+             if re.search('time|zeit', form.names[k].lower()) and not re.search(
+                 'step|lap|interval', form.names[k].lower()) and _of_kind(form, k, True)]
+    return first if _tells_apart(form, first) else next(
+        (k for k in named if _tells_apart(form, k) and _rises(form, k)), first)
+
+
+def _tells_apart(form: Form, place: int) -> bool:
+    """Return whether most of the first rows differ in a column."""
+    cells = [row[place] for row in form.rows if place < len(row)]
+    return 2 * len(set(cells)) > len(cells) or len(cells) < _FEW_ROWS
+
+
+def _parts_of_second(form: Form, clock: int) -> int | None:
+    """Return the column of milliseconds beside a clock in whole seconds, if there is one."""
+    cells = [row[clock] for row in form.rows if clock < len(row)]
+    if _tells_apart(form, clock) or not all(re.search(r':\d\d:\d\d$', cell) for cell in cells):
+        return None
+    return next((k for k, name in enumerate(form.names[:form.width])
+                 if name.strip().lower() in ('ms', 'millis', 'milliseconds') and all(
+                     k < len(row) and re.fullmatch(r'\d{1,3}', row[k]) for row in form.rows)),
+                None)
 
 
 def _nameless_columns(form: Form) -> list[int]:
@@ -844,8 +907,8 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: _Column, needed
 def _read(path: Path, form: Form, time: _Column, places: list[int],
           left_out: list[str] | None = None) -> tuple[FloatArray, list[FloatArray]]:
     """Return the time as written, days and clocks in s, and columns of numbers."""
-    sample = [row[time.place[-1]] for row in form.rows
-              if time.place and time.place[-1] < len(row) and row[time.place[-1]]]
+    sample = [row[time.place[0]] for row in form.rows
+              if time.place and time.place[0] < len(row) and row[time.place[0]]]
     if not time.place:
         if not LEAST_STEP <= time.scale <= LONGEST_STEP:
             raise InputError(f"{path}: '{time.name}' says rows {time.scale:g} s apart, outside "
@@ -856,7 +919,11 @@ def _read(path: Path, form: Form, time: _Column, places: list[int],
     if sample and not is_number(sample[0]) and is_clock(sample[0]):
         clocks: list[list[str]] = [[] for _ in time.place]
         values = numbers(path, form, places, dict(zip(time.place, clocks)), left_out)
-        cells = [' '.join(pair) for pair in zip(*clocks)] if len(clocks) > 1 else clocks[0]
+        cells = clocks[0]
+        if len(clocks) > 1 and all(map(str.isdigit, clocks[1])):
+            cells = [f'{clock}.{part:0>3}' for clock, part in zip(*clocks)]
+        elif len(clocks) > 1:
+            cells = [' '.join(pair) for pair in zip(*clocks)]
         return _clock(path, [swapped(cell) for cell in cells], time.name, left_out), values
     t, *values = numbers(path, form, [time.place[0], *places], left_out=left_out)
     return t, values
@@ -957,6 +1024,26 @@ def _stamps(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: _Co
         raise InputError(f'{path}: the samples are {usual * TIME_UNITS[unit]:g} s apart by '
                          f"'{time.name}': is it in ms, us or ns? --time-unit says so")
     return t, unit + words
+
+
+def _of_mavlink(column: _Column, values: FloatArray, given: str | None, beside: str,
+                ) -> tuple[FloatArray, str] | None:
+    """
+    Return values of a field of MAVLink in V or A, and their unit; None if it is another.
+
+    given: the unit of the voltage; beside: the words of the voltage's unit, for a current.
+    """
+    name = re.split(r'[./:]', column.name.strip().lower())[-1]
+    if name not in _MAVLINK or given == 'V' or column.unit and given is None or beside == 'V':
+        return None
+    scale, unit, unknown = _MAVLINK[name]
+    known = values[np.isfinite(values) & (values != unknown)]
+    # A tool that has converted them writes fractions; a supply has volts.
+    if (known != np.rint(known)).any() or unit == 'mV' and not (
+            known.size and float(np.median(known)) >= _MOST_VOLTS):
+        return None
+    return np.where(values == unknown, np.nan, values * scale), (
+        f'{unit} by MAVLink, {unknown:g} is unknown: --unit V for V and A')
 
 
 def _in_si(quantity: str, column: _Column, values: FloatArray, given: str | None,

@@ -158,6 +158,39 @@ FORMS = {
     'hioki': (table(['"File name","WAVE0001.CSV","V 1.00"', '"Title comment",""', '"Trigger Time",'
                      '"\'12-07-01 09:14:03"', '"Time","CH1[V]","Event"'],
                     lambda k: f'{0.01 * k:.9E},{V[k]:.5E},0'), 0.01, False, False),
+    # Clocks in whole seconds beside a finer time, a unit in the next column, a line of units below
+    # channels.
+    'graphtec': (table(['Vendor ,"GRAPHTEC Corporation"', 'Sampling interval,10ms',
+                        'Number,Date&Time,ms,CH1,CH2,Alarm1', 'NO.,Time,ms,V,A,A1234567890'],
+                       lambda k: f"{k},{clock(k, '%Y/%m/%d %H:%M:%S')},{10 * k % 1000},"
+                                 f'+{V[k]},+{AMPS[k]:7.2f},LLLLLLLLLL'), 0.01, False, True),
+    'keithley': (table(['Model,DMM6500', '', 'Index,Reading,Unit,Range Digits,Date,Time,'
+                        'Fractional Seconds,Relative Time,Channel'],
+                       lambda k: f"{k + 1},{V[k]:.6E},Volt DC,5.5,{clock(k, '%m/%d/%Y')},"
+                                 f"{clock(k, '%H:%M:%S')},0.01,{0.01 * k:.9f},"), 0.01, False,
+                 False),
+    'arbin': (table(['Data_Point,Date_Time,Test_Time(s),Step_Time(s),Current(A),Voltage(V)'],
+                    lambda k: f"{k},{clock(k, '%m/%d/%Y %H:%M:%S')},{9 + 0.01 * k:.4f},"
+                              f'{0.01 * k:.4f},{AMPS[k]},{V[k]}'), 0.01, False, True),
+    'neware': (table(['Record ID,Realtime,Time(h:min:s.ms),Status,Current(mA),Voltage(mV)'],
+                     lambda k: f"{k},{clock(k, '%Y-%m-%d %H:%M:%S')},00:00:{0.01 * k:06.3f},"
+                               f'CC_DChg,{1e3 * AMPS[k]:.1f},{1e3 * V[k]:.0f}'), 0.01, False,
+               True),
+    'labview': (table(['LabVIEW Measurement', 'Separator\tTab', '***End_of_Header***',
+                       'Delta_X\t0.01\t0.01', '***End_of_Header***\t\t\t',
+                       'X_Value\tPack Voltage\tPack Current\tComment'],
+                      lambda k: f'{0.01 * k:.6f}\t{V[k]}\t{AMPS[k]}\t'), 0.01, False, True),
+    'flukeview': (table(['"Meter","289"', '', 'Reading,Sample,Start Time,Max'],
+                        lambda k: f"{k},{V[k]} V DC,{clock(k, '%m/%d/%Y %H:%M:%S.%f')},"
+                                  f'{V[k] + 1:.3f} V DC'), 0.01, False, False),
+    'mavlogdump': (table(
+        ['timestamp,SYS_STATUS.load,SYS_STATUS.voltage_battery,SYS_STATUS.current_battery'],
+        lambda k: f'{1.7e9 + 0.01 * k:.8f},325,{1e3 * V[k]:.0f},{100 * AMPS[k]:.0f}'), 0.01,
+        False, True),
+    'battery_status': (table(
+        ['time_s,voltages[0],voltages[1],voltages[2],current_battery'],
+        lambda k: f'{0.01 * k:.2f},{1e3 * V[k] - 8000:.0f},8000,65535,{100 * AMPS[k]:.0f}'), 0.01,
+        False, True),
 }
 
 
@@ -208,6 +241,28 @@ def test_a_guess_is_overruled(content, columns, step, volts, tmp_path):
     found = read_recording(written(tmp_path, content), columns=columns)
     np.testing.assert_allclose(found.voltage, volts)
     np.testing.assert_allclose(np.diff(found.t), step)
+
+
+@pytest.mark.parametrize('cells, given, volts, amps', [
+    ('16108,986', None, 16.108, 9.86), ('16108,986', 'V', 16108.0, 986.0),
+    # Unknown is no current of -10 mA, and no voltage of 65.5 V.
+    ('16108,-1', None, 16.108, None), ('16108,0', 'mV', 16.108, 0.0),
+    # A tool that has converted them keeps the names.
+    ('16.108,9.86', None, 16.108, 9.86), ('16.108,9', None, 16.108, 9.0)])
+def test_fields_of_mavlink_have_its_units(cells, given, volts, amps, tmp_path):
+    """Millivolts and 10 mA, where the numbers are whole; a line says so, --unit V overrules it."""
+    unknown = '' if '.' in cells else f'0.5,65535,{cells.split(",")[1]}\n'
+    rows = ''.join(f'{k},{cells}\n' for k in range(1, 9))
+    path = written(tmp_path, f'time_s,m.voltage_battery,m.current_battery\n{unknown}{rows}')
+    found = read_recording(path, columns=CsvColumns(unit=given))
+    voltage = found.voltage[found.t > 0.7]
+    np.testing.assert_allclose(voltage, volts)
+    assert found.n == 8 + (given == 'V' and bool(unknown))
+    assert (found.current is None) == (amps is None)
+    if amps is not None:
+        np.testing.assert_allclose(found.current, amps)
+    said = ' '.join(found.notes)
+    assert ('mV by MAVLink' in said) == (given != 'V' and '.' not in cells)
 
 
 def test_the_unit_of_a_throttle(tmp_path):
