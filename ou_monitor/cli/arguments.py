@@ -92,8 +92,8 @@ def brownout_limit(args: argparse.Namespace) -> float | None:
         return voltage
     if voltage > _CELL_MOST:
         raise InputError(
-            f'--brownout-voltage: with --cells {args.cells} it is volts a cell, and no cell has '
-            f'{voltage:g} V: write {voltage / args.cells:.3g}, or leave --cells out')
+            f'--brownout-voltage: with --cells {args.cells} it is in volts per cell, and no cell '
+            f'has {voltage:g} V: write {voltage / args.cells:.3g}, or leave --cells out')
     return float(args.cells * voltage)
 
 

@@ -135,20 +135,20 @@ TOPICS = (
 # Format of a CSV, if it is not detected correctly.
 CSV = (
     Option('--time-column', metavar='NAME', help='column of a CSV (default: found by its name)'),
-    Option('--unit', choices=('V', 'mV'), help='unit of the voltage in a CSV (default: found)'),
+    Option('--unit', choices=('V', 'mV'), help='unit of the voltage in a CSV (default: detected)'),
     Option('--time-unit', choices=('s', 'ms', 'us', 'ns'),
-           help='unit of the time in a CSV (default: found)'),
+           help='unit of the time in a CSV (default: detected)'),
     Option('--throttle-unit', choices=('1', '%', 'us', '1024', '65535'),
            help='unit of the throttle in a CSV: 0..1, percent, a pulse of 1000 to 2000 us, -1024 '
-           'to 1024, or 0 to 65535 (default: found)'),
+           'to 1024, or 0 to 65535 (default: detected)'),
     Option('--sample-interval', metavar='S', type=POSITIVE,
            help='time from row to row of a CSV, s, in place of a column'),
     Option('--delimiter', metavar='C',
            help="separator of the cells of a CSV: a character, 'tab' or 'space' (default: "
-           'found)'),
-    Option('--decimal', choices=('.', ','), help='decimal mark of a CSV (default: found)'),
+           'detected)'),
+    Option('--decimal', choices=('.', ','), help='decimal mark of a CSV (default: detected)'),
     Option('--skip-rows', metavar='N', type=whole('a number of lines, 0 or more', 0),
-           help='lines above the header of a CSV (default: found)'))
+           help='lines above the header of a CSV (default: detected)'))
 # How a log or a CSV is read.
 FILES = (
     Option('--flight', metavar='N', type=FLIGHT,
@@ -187,8 +187,8 @@ def limit(meaning: str) -> tuple[Option, ...]:
     """Return the options of the limit; meaning: what --brownout-voltage does, and its default."""
     return (Option('--brownout-voltage', metavar='V', type=POSITIVE, help=meaning),
             Option('--cells', metavar='N', type=_CELLS,
-                   help='cells in series: --brownout-voltage is then volts a cell (default with '
-                   '--cells: 3.3)'))
+                   help='cells in series: --brownout-voltage is then in volts per cell (default '
+                   'with --cells: 3.3)'))
 
 
 def estimate(voltage: str) -> tuple[Option, ...]:
@@ -254,7 +254,7 @@ _ANALYZE = Command(
     'Analyze the noise of a supply: per load level Vpp, Vrms, alpha, tau, sigma and Var_inf with '
     '95 % intervals, and the type of process.',
     (RECORDING, levels('found'), *PART,
-     *estimate('voltage that must not be undershot, V (default: as the node, 4.5)'),
+     *estimate("voltage that must not be undershot, V (default: the node's 4.5)"),
      *TOPICS, *FILES, JSON, REPORT, FORCE),
     ('flight.bbl --cells 4 --report flight.html',
      'flight.mcap --brownout-voltage 14 --from 10 --to 70',
@@ -284,10 +284,10 @@ _COMPARE = Command(
 
 _CONVERT = Command(
     'convert', 'convert a log to an MCAP bag', 'ou_monitor.cli.convert',
-    'Convert a log to a bag with the topics /voltage, /throttle and /current (A, positive when '
-    'the battery is drained), and of an autopilot /imu and, from eRPM or ESCs, /motor_speed. '
-    'Stamps count from the start of the log, in seconds; a CSV '
-    'keeps its own.',
+    'Convert a log to a bag with the topics /voltage, /throttle and /current (A, positive while '
+    'the battery discharges), and from autopilot logs /imu and, with eRPM or ESC telemetry, '
+    '/motor_speed. Stamps count from the start of the log, in seconds; the times of a CSV are '
+    'kept.',
     (Option('log', metavar='LOG', type=path_argument, help='log to read'),
      Option('out', metavar='OUT', type=path_argument,
             help='bag to write: NAME.mcap for one file, NAME for a rosbag2 folder'),
@@ -375,7 +375,7 @@ _DESIGN = Command(
     'Values are in SI units, or with prefix and unit: 470uF, 40mOhm, 24kHz.')
 
 _DISCOVER = Command(
-    'discover', 'criticise the simulation, name the cause, extend, measure the gain',
+    'discover', 'what a simulation gets wrong, its cause, a better model, and its gain',
     'ou_monitor.cli.recorded:discover',
     'Fit and simulate the plain OU, find what it gets wrong, name the cause, extend the model, '
     'and measure the gain on samples not used for the fit.',
@@ -456,8 +456,8 @@ _SIMULATE = Command(
             'and throttle, or a recording, whose length is then the default'),
      *PART,
      Option('--capacity-left', metavar='X', type=NUMBER,
-            help='charge at the start, 0..1, drawn by throttle, in place of drift; -1: '
-            "as at the start of the model's recording"),
+            help='initial charge, 0..1, which throttle discharges, in place of drift; -1: '
+            "the charge at the start of the model's recording"),
      Option('--scale-resistance', metavar='X', type=NUMBER, default=1.0,
             help='factor on the response to throttle: 1.4 is a pack aged by 40 %% (default '
             '%(default)s)'),

@@ -68,8 +68,8 @@ def run(args: argparse.Namespace) -> int:
         raise
     _write(fleet, folder, args)
     if not fleet.analysed:
-        raise InputError(f"none of the recordings could be analysed; why is in '{folder}', and in "
-                         'the column error of the table')
+        raise InputError('none of the recordings could be analysed; the reasons are in '
+                         f"'{folder}' and in the column error of the table")
     return 0
 
 

@@ -32,7 +32,7 @@ def _complain(text: str) -> None:
 
 
 def _end(number: int, frame: object) -> NoReturn:
-    """End as by an error, so that what was moved aside comes back."""
+    """Exit as after an error, so that files moved aside are restored."""
     sys.exit(128 + number)
 
 
@@ -120,7 +120,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         from ou_monitor.cli.output import abandon_stdout
 
-        # The reader (head, less) has closed the pipe: write nothing more, also not in the flush at
+        # The reader (head, less) has closed the pipe: write nothing more, not even in the flush at
         # exit.
         abandon_stdout()
         return 0

@@ -28,8 +28,8 @@ ACCEPT = 6.0
 TIE = 3.0
 # Minimum share of the evidence of a larger effect for a further term of its kind (a response of
 # the mean, or a second curve of intensity over throttle); a smaller one only corrects the form.
-# With a form right to 7 %, its square remains; in simulated loads of ten shapes (test/hidden),
-# further terms gained 0.8 % at most if the form was right.
+# A form that is wrong by 7 % leaves (7 %)^2 of the evidence; in simulated loads of ten shapes
+# (test/hidden), further terms gained at most 0.8 % if the form was right.
 FORM = 0.005
 CURVE = 0.1
 # Minimum number of relaxation times in a recording; with fewer the rate is a trend.  At the limit
@@ -181,10 +181,10 @@ def withdrawn(before: Statistics, after: Statistics, accepted: Sequence[Kind],
     Return which accepted causes do not explain their statistics.
 
     With measured causes, some statistic always fails on a real flight, because their form is not
-    exact.  Then a latent cause is tested by its own signs only, as they were with the measured
-    causes alone (`before`), or when it was accepted (`asked`, by name), because a larger effect
-    may have hidden them.  Without measured causes, latent ones are tested by all statistics: the
-    effect may not be in the catalogue.
+    exact.  Then a latent cause is tested only by its own signs, relative to their values with the
+    measured causes alone (`before`), or at its acceptance (`asked`, by name), because a larger
+    effect may have hidden them.  Without measured causes, latent ones are tested by all
+    statistics: the effect may not be in the catalogue.
     """
     beside = not all(map(is_latent, accepted))
     left = failing(before, after)

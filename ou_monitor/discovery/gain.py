@@ -2,15 +2,14 @@
 Gain of a model on samples that were not used for its fit.
 
 Blocked cross-validation (Bergmeir & Benitez, Inf. Sci. 191 (2012) 192): each block in turn is
-predicted, one step ahead, by parameters from the other blocks.  These are found by one step of
-scoring from the fit to everything, which removes the contribution of the block; the mean is solved
-again.  So one fit is enough.  Scores are log densities; neighbouring scores are correlated, so
-errors come from means of blocks.  Only samples at throttle that the other blocks cover are scored,
-because elsewhere a model extrapolates.
+predicted, one step ahead, with parameters from the other blocks.  One fit to everything is enough:
+one scoring step removes the contribution of the block, and the mean is solved again.  Scores are
+log densities; neighbouring scores are correlated, so errors come from means of blocks.  Only
+samples at throttle that the other blocks cover are scored, because elsewhere a model extrapolates.
 
 Limits: laws of the innovations (jumps, tails, switching) and searched values (frequencies, time
-constants) are those of the whole recording.  Instead, one nat for each of their parameters is
-subtracted, by which the likelihood of a fit exceeds that of the next recording (Akaike 1973).
+constants) are not fitted again without the block.  Instead one nat is subtracted for each of their
+parameters, which is the expected optimism of a fit (Akaike 1973).
 """
 
 from __future__ import annotations
@@ -147,7 +146,7 @@ def cause_gain(full: HeldOut, less: HeldOut, scored: npt.NDArray[np.bool_]
     """
     Return the gain of the larger of two models, its error, nats per sample, and a p-value.
 
-    It is twice the smaller of two p-values: of the likelihood ratio on everything, corrected for
+    The p-value is twice the smaller of two: of the likelihood ratio on everything, corrected for
     the search, and of the gain on held-out samples.
     """
     gain, error = gain_of(full, less, scored)

@@ -64,7 +64,7 @@ Executable `adc`: the voltage of a Linux IIO or hwmon device -> ROS messages.
 
 ros2 run ou_monitor adc --ros-args -p device:=iio:device0 -p channel:=in_voltage0 -p gain:=11.0
 
-{_DESCRIBED}; doc/deploy.md where such a device comes from.
+{_DESCRIBED}; doc/deploy.md says which devices there are.
 """)
 
 supply_simulator = Executable('supply_simulator', 'supply_simulator_node', 'SupplySimulatorNode',
@@ -73,8 +73,8 @@ Executable `supply_simulator`: throttle -> the voltage of a saved model of a sup
 
 ros2 run ou_monitor supply_simulator --ros-args -p model_file:=m.yaml -p rate:=100.0
 
-'ou-monitor discover RECORDING --save-model m.yaml' makes such a model; doc/simulation.md has the
-rest. {_DESCRIBED}.
+'ou-monitor discover RECORDING --save-model m.yaml' makes such a model; see
+doc/simulation.md. {_DESCRIBED}.
 """)
 
 

@@ -13,11 +13,11 @@ geometry_msgs/AccelStamped or Vector3Stamped), `~/cutoff` (Hz) and `~/lag`
 (ms, phase delay at `lag_frequency`, notches included) as std_msgs/Float64 at `publish_rate`,
 `/diagnostics` at 1 Hz.
 
-Limits: an IMU's angular velocity is filtered, with `input.acceleration` its linear
-acceleration too, and its covariances shrink as for white noise; a BatteryState's
-voltage, unless `input.field` names another field.  Everything else passes through.
-Messages with a non-finite signal are counted and dropped.  Messages whose stamps repeat
-or go back are placed by their arrival, and the diagnostics report it.
+Limits: of an Imu only the angular velocity is filtered, and with `input.acceleration` the
+linear acceleration; their covariances shrink as for white noise.  Of a BatteryState only
+the voltage is filtered, unless `input.field` names another field.  All other fields stay
+unchanged.  Messages with a non-finite signal are counted and dropped.  If stamps repeat or
+go back, the arrival times are used, and the diagnostics report it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import MonitorNode, PUBLISH_RATE
 from ou_monitor.nodes.filter_channels import CHANNELS, Channels, channels_of, IMU
 from ou_monitor.nodes.inputs import (
-    Console, decode, INPUT_QOS, Silence, SourceFinder, Stamper, types_on, within)
+    Console, decode, INPUT_QOS, NO_CLOCK, Silence, SourceFinder, Stamper, types_on, within)
 from ou_monitor.nodes.sources import message_class, MOTOR_PARAMETERS, Source
 from ou_monitor.online.filter.cutoff_control import Bound
 from ou_monitor.online.filter.lowpass import AdaptiveLowPass, FilterCounters
@@ -119,9 +119,9 @@ class SupplyInput:
         """
         Return the latest values that are not older than `stale_after`, s.
 
-        Without a sigma, use that of an OU process with the deviation left after the load
-        at the present throttle and relaxation `rate`, 1/s: it includes the ADC's white noise,
-        so it is never below the supply's own sigma.
+        Without a sigma, derive it from the noise that the load does not explain at the present
+        throttle, as of an OU process with relaxation `rate`, 1/s.  This sigma includes the
+        ADC's white noise, so it is never below the supply's own.
         """
         fresh = within(self._state_silence.age, stale_after)
         error, (alpha, throttle, level, level_se, noise) = (
@@ -231,7 +231,7 @@ class AdaptiveFilterNode(MonitorNode):
         self._channels = None
         self._filters: list[AdaptiveLowPass] = []
         values = self.values()
-        # Replaces the filters until they exist.
+        # Used until the filters exist.
         self._idle = AdaptiveLowPass(**_of_filter(values))
         self._notch = AdaptiveNotch(**notch_options(values))
         self._motors = MotorInputs(self, values, self.steady_now)
@@ -370,7 +370,7 @@ class AdaptiveFilterNode(MonitorNode):
 
     def _jumped(self, reason: str) -> None:
         """Do nothing: a step back in time has length 0, so the output stays."""
-        self.get_logger().info(f'{reason}: the filter goes on from its output')
+        self.get_logger().info(f'{reason}: the filter continues from its output')
 
     # -- reporting
 
@@ -411,7 +411,7 @@ class AdaptiveFilterNode(MonitorNode):
         low_pass = self.low_pass
         s, bound = low_pass.settings, low_pass.bound
         if not self._passed:
-            return f'nothing yet: no message was filtered, it starts at {s.fallback:g} Hz'
+            return f'nothing yet: no message was filtered; it starts at {s.fallback:g} Hz'
         if bound is Bound.FALLBACK:
             return f'the fallback, because {self._unknown(supply)}'
         if bound is Bound.LAG:
@@ -443,7 +443,7 @@ class AdaptiveFilterNode(MonitorNode):
             return Level.STALE, f'No message on {self._topic}' + (
                 ' yet.' if age is None else f' for {age:.1f} s.')
         if self._stamper.waiting and self._unplaced:
-            return Level.WARN, 'use_sim_time is set, but no message arrives on /clock.'
+            return Level.WARN, NO_CLOCK
         if self._input_clock.stamps is not StampOrder.GOOD:
             return Level.WARN, f'{self._topic}: {self._input_clock.stamps.by_arrival}'
         if _not_a_voltage(self._type, s):

@@ -1,11 +1,11 @@
 """
 The node of `adc`.
 
-An IIO device with a buffer is read in blocks by a thread and published on `voltage` as
-sensor_msgs/JointState (a header and an array; `position` holds the samples, V, the stamp is the
-kernel's for the last one): msg_config `adc` reads it.  hwmon, and IIO without a buffer, are
-polled and published as sensor_msgs/BatteryState, one sample each, stamped when polled.
-`/diagnostics` at 1 Hz.
+A thread reads an IIO device with a buffer in blocks and publishes them on `voltage` as
+sensor_msgs/JointState, which has a header and an array: `position` holds the samples, V, and the
+stamp is the kernel's time of the last one.  msg_config `adc` reads these messages.  hwmon devices,
+and IIO devices without a buffer, are polled; each sample is a sensor_msgs/BatteryState, stamped
+when polled.  `/diagnostics` at 1 Hz.
 
 Limits: one channel.  Blocks carry kernel stamps only with a timestamp channel; a gap in them
 splits a block, so that the estimator detects the gap.
@@ -130,7 +130,7 @@ class AdcNode(MonitorNode):
         elif age is None or age > max(SILENT, 3.0 / self.rate if self.rate > 0.0 else 0.0):
             level, summary = Level.STALE, (
                 f'No samples of {self._channel} from {self._device}{self._silence.words}: '
-                'does its trigger run?')
+                'is its trigger running?')
         elif holes:
             level, summary = Level.WARN, (
                 f'{summary} Samples were lost {holes} times: enlarge the block or lower the rate.')

@@ -1,8 +1,7 @@
 """
-What the nodes share: parameters from a table, start and end, a thread, and diagnostics.
+Base of the nodes: parameters from tables, start and end, a thread, and diagnostics.
 
-Parameters are declared from tables, so each name and default exists once. An exception in a
-callback does not end a node.
+Each name and default exists once, in a table. An exception in a callback does not end a node.
 """
 
 from __future__ import annotations
@@ -40,10 +39,10 @@ _BUILT_IN = ('use_sim_time', 'start_type_description_service', QOS)
 
 LOCK = Parameter(
     'lock_parameters', False,
-    'Whether to refuse at run time all that can disarm the node: every parameter but '
-    'publish_rate, ~/clear_brownout and ~/save_model.')
-# Length of the spin before an instant, s: about the usual lateness of sleep, so that a 1 kHz bag
-# costs a tenth of a core.
+    'Whether to refuse what can disarm the node at run time: changes of any parameter except '
+    'publish_rate, and the services ~/clear_brownout and ~/save_model.')
+# Busy wait before an instant, s: about the usual lateness of sleep; a 1 kHz bag then costs a tenth
+# of a core.
 SPIN = 0.0001
 # Maximum single sleep, s: limits the delay in noticing a signal.
 NAP = 0.05
@@ -208,7 +207,7 @@ class MonitorNode(Node):
         self.recover(error)
 
     def recover(self, error: Exception) -> None:
-        """Restart work that an exception of a callback may have left unfinished."""
+        """Restart work that a failed callback may have left unfinished."""
 
     @property
     def fault_notes(self) -> list[str]:
@@ -278,7 +277,7 @@ class MonitorNode(Node):
         return made
 
     def _keep(self, made: Any) -> None:
-        """Record what `stop` closes; rclpy opens its own before the list exists."""
+        """Record an object for `stop` to close; rclpy makes its own before the list exists."""
         if hasattr(self, '_made'):
             self._made.append(made)
 
@@ -296,8 +295,8 @@ class MonitorNode(Node):
         for name in self._parameter_overrides:
             if name.startswith(QOS) and not any(
                     name.startswith(f'{QOS}{topic}.') for topic in known):
-                raise InputError(f"parameter '{name}' names no topic of this node, which are: "
-                                 f"{', '.join(known)}")
+                raise InputError(f"parameter '{name}' names no topic of this node; its topics "
+                                 f"are {', '.join(known)}")
 
     def create_polled(self, kind: Any, topic: str, qos: QoSProfile) -> Subscription:
         """

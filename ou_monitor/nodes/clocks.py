@@ -2,10 +2,10 @@
 Times of messages without a stamp: sampling time from sending time, and simulated time.
 
 `SendClock`: a message without a stamp has only its source timestamp.  A driver samples by a timer,
-but its sending is scheduled: after a pause of 10 ms, ten messages leave within 0.2 ms, and an
-increment over 1 ms seems to take 20 us. If 0.5 % of the intervals are like this, sigma doubles.
-So the samples of a steady source are put on an even time line that slowly follows the source
-timestamps.
+but the scheduler delays its sending: after a pause of 10 ms, ten messages leave within 0.2 ms, and
+a change over 1 ms seems to take 20 us.  If 0.5 % of the intervals are like this, sigma doubles.
+The samples of a steady source are therefore put on an even time line that slowly follows the
+source timestamps.
 
 A steady source can be late, but not early: the lower convex hull of source timestamp against
 message number is a straight line with the period as its slope, and many messages lie near it (this
@@ -13,8 +13,8 @@ separates clock skew from delays: Zhang, Liu & Xia 2002, "Clock synchronization 
 network measurements").  The hull must span many pauses at any rate, because a burst of 400
 messages sent 10 us apart is a straight line too.
 
-Limits: a constant delay stays; the times of an unsteady source are not changed, and `in_bursts`
-reports it if its intervals cannot be sampling intervals, as when a driver empties a buffer.
+Limits: a constant delay stays.  The times of an unsteady source are not changed; if its intervals
+cannot be sampling intervals, as when a driver empties a buffer, `in_bursts` is true.
 
 `SimClockMap`: the middleware stamps every message with the wall clock of its sender.  If a bag is
 replayed at four times its speed, these stamps are four times too close, and alpha would be four
@@ -113,7 +113,7 @@ class SendClock:
     Turn source timestamps of single samples into stamps.
 
     `in_bursts`: no steady source is detectable, and the times are unusable; `settled`:
-    how often a line was found after such times had been given.
+    how often a steady source was found after that.
     """
 
     def __init__(self) -> None:

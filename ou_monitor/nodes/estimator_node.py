@@ -12,7 +12,7 @@ fits of up to a minute run in a thread.  Messages wait in the middleware, which 
 newest 2000, and are fetched 50 times a second and read before each report, so that a flood of
 messages does not delay an output.  Services: `~/clear_brownout` (std_srvs/Trigger) drops a flag
 that is latched or held, unless `lock_parameters` is set; `~/save_model` writes what the flight has
-learned into `model_file`.  Hold, delay and latch count real time, under `use_sim_time` too.
+learned into `model_file`.  Hold, delay and latch run in real time, even under `use_sim_time`.
 
 Limits: one voltage; an estimate older than `stale_after` is not published as
 a number, though `~/state` still shows its fields.
@@ -34,7 +34,8 @@ from ou_monitor.model.load import LoadStart
 from ou_monitor.nodes.base import LOCK, MonitorNode, PUBLISH_RATE
 from ou_monitor.nodes.clocks import IN_BURSTS, SendClock
 from ou_monitor.nodes.inputs import (
-    Arrivals, Console, PolledInput, PublisherWatch, Silence, SourceFinder, Stamper, within)
+    Arrivals, Console, NO_CLOCK, PolledInput, PublisherWatch, Silence, SourceFinder, Stamper,
+    within)
 from ou_monitor.nodes.node_files import LatchFile, ModelChoice
 from ou_monitor.nodes.sources import Source, SOURCE_PARAMETERS
 from ou_monitor.online.load.model_watch import ModelComparison
@@ -49,16 +50,16 @@ from std_msgs.msg import Bool, Float64
 
 # Period of fetching the waiting messages, s, whatever `publish_rate` is.
 POLL = 0.02
-# Maximum period of handing fetched messages to the monitor, s; also done before each report. Each
-# time costs 2 to 3 ms of CPU, however few samples there are.
+# Maximum time between two transfers of fetched messages to the monitor, s; each report makes one
+# too. A transfer takes 2 to 3 ms of CPU, however few samples there are.
 HAND_OVER = 0.25
-# Maximum share of the time for estimates: above it they become less frequent, and if taking the
+# Maximum share of the time for estimates: above it they become less frequent; if pushing the
 # samples alone exceeds it, samples are thinned.
 SHARE = 0.25
 # An estimate that takes longer than this, s of CPU, is not made for every report.
 HEAVY = 0.02
-# Maximum time the thread of the fits keeps the interpreter from the executor, s: at Python's 5 ms
-# each of the executor's calls would wait that long.
+# Maximum time for which the fitting thread may hold the interpreter, s: with Python's default of
+# 5 ms each call of the executor would wait that long.
 SWITCH = 2e-4
 # Maximum thinning: one sample in this many is kept.
 MOST_THIN = 1024
@@ -191,7 +192,7 @@ class EstimatorNode(MonitorNode):
     # -- messages in
 
     def _poll(self, most: float = 0.0) -> None:
-        """Fetch what has arrived; hand it to the monitor if the last time is `most` s ago."""
+        """Fetch messages; pass them to the monitor if the last transfer was `most` s ago."""
         for each in self._inputs.values():
             each.fetch()
         now = self.steady_now()
@@ -231,7 +232,7 @@ class EstimatorNode(MonitorNode):
         self._arrived.record(messages.arrived.item(-1))
         ends = self._times(messages, self._send_clock)
         if self._send_clock is not None and self._send_clock.settled > self._settled:
-            # Earlier messages lie on another time line, and this poll may hold some of them.
+            # Earlier messages are on another time line, and this poll may include some of them.
             self._settled = self._send_clock.settled
             self._stream.reset('a steady source was found behind messages in bursts')
             ends = np.full(ends.size, math.nan)
@@ -303,7 +304,7 @@ class EstimatorNode(MonitorNode):
         if model is None:
             raise InputError('There is no model_file.')
         if learned is None or not learned.noise > 0.0:
-            raise InputError('Nothing to save: throttle moved too little to know the sag well.')
+            raise InputError('Nothing to save: throttle moved too little to determine the sag.')
         path = self._models.save(
             learned, _entry(learned, loads.against(model.load)), self._meanwhile)
         self._monitor.set_model(self._models.use(path))
@@ -349,7 +350,7 @@ class EstimatorNode(MonitorNode):
             summary = ' '.join((summary, *notes))
             level = max(level, Level.WARN) if level is not Level.STALE else level
         if self._latch is not None and self._latch.problem:
-            # The owner relies on it, whatever the input does.
+            # The owner relies on the latch, whatever the input does.
             level, summary = Level.ERROR, f'{summary} {self._latch.problem}.'
         return report, level, summary
 
@@ -367,8 +368,7 @@ class EstimatorNode(MonitorNode):
     def _why_unusable(self) -> str:
         """Return why arriving messages contain no usable voltage."""
         if self._stamper.waiting and self._stream.unplaced:
-            return ('Messages without a stamp cannot be placed in time: use_sim_time is set, but '
-                    'no message arrives on /clock.')
+            return f'Messages without a stamp cannot be placed in time: {NO_CLOCK}'
         spec = self._voltage.spec
         return (f'Messages arrive on {self._topic}, but their field '
                 f"'{spec.field if spec else ''}' holds no finite voltage.")

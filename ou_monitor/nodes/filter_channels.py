@@ -27,7 +27,7 @@ _NONE = (math.nan, math.nan, math.nan)
 
 @dataclass(frozen=True)
 class Group:
-    """Numbers that a message has all together or not at all."""
+    """Numbers of which a message contains either all or none."""
 
     fields: tuple[FieldPath, ...]  # One for each signal
     # Their covariance, which is scaled with the noise; -1 as its first element means that the

@@ -38,14 +38,16 @@ INPUT_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000,
 # Fewer blocks: 2000 of 10 000 samples would take 80 MB.
 BLOCK_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=200,
                        reliability=ReliabilityPolicy.BEST_EFFORT)
-# Maximum messages and bytes taken at a time: all that can wait, up to the bytes, which need about
-# 50 ms and 50 MB to process.
+# Maximum messages and bytes taken at a time: all that can wait, limited in bytes so that they need
+# at most about 50 ms and 50 MB to process.
 MOST_TAKEN, MOST_BYTES = 2000, 2_000_000
 # Maximum wait of a message in the middleware, s: it keeps 2000.
 MOST_WAIT = 60.0
 # Period of reminders, and silence of a publisher before it is reported, s.
 AGAIN = 60.0
 MUTE = 10.0
+# The one sentence for it in the diagnostics of every node.
+NO_CLOCK = 'use_sim_time is set, but no message arrives on /clock.'
 CLOCK_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
@@ -129,7 +131,7 @@ class PolledInput:
     """
     One field of the messages of a topic, fetched in batches on request.
 
-    `spec` names the field and the stamp, `beside` a second field with one number a message.
+    `spec` names the field and the stamp, `beside` a second field with one number per message.
     `publishers` follows the senders; `unreadable` counts messages that could not be decoded.
     """
 
@@ -181,7 +183,7 @@ class PolledInput:
         sent = np.array([info['source_timestamp'] for info in infos], dtype=np.uint64)
         received = np.array([info['received_timestamp'] for info in infos]) * 1e-9
         received = np.where(received > 0.0, np.minimum(received, wall), wall)
-        # What waited in the middleware arrived before now; the wall clock may have been set.
+        # Messages that waited in the middleware arrived earlier; the wall clock may have been set.
         arrived: FloatArray = np.maximum.accumulate(now - np.clip(
             wall - received, 0.0, MOST_WAIT))
         times: FloatArray = sent.astype(np.float64) * 1e-9
@@ -391,7 +393,7 @@ class PublisherWatch:
         if self._lost_of_late:
             notes.append(f'{self._lost_of_late} messages were lost within the last second.')
         if len(self._names) > 1:
-            followed = ('the first is followed, the others are left out'
+            followed = ('the first is used, the others are ignored'
                         if self._publishers.numbered else
                         'the middleware does not number messages, so they are mixed')
             notes.append(f"{len(self._names)} publishers on {topic} ({', '.join(self._names)}): "

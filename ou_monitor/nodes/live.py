@@ -1,9 +1,9 @@
 """
 `ou-monitor live`: a page to watch while flying, served from the topics of the nodes.
 
-Limits first: read-only, and on 127.0.0.1 unless another address is given, which then requires the
-token that is printed; HTTP without encryption.  Connections above `CONNECTIONS` at once
-are closed, and a connection without a whole request after `PATIENCE`.
+Limits first: read-only; HTTP without encryption; on 127.0.0.1, or on another address with the
+token that is printed.  Connections beyond `CONNECTIONS` are closed, and so is a connection without
+a complete request after `PATIENCE`.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ _STEP = 0.1
 CONNECTIONS = 64
 # Timeout of a request on an open connection, s.
 PATIENCE = 10.0
-# Maximum header and body of a request, bytes; browsers send some 1000, without a body.
+# Maximum header and body of a request, bytes; browsers send about 1000, without a body.
 _HEADER, _BODY = 16384, 0
-# Maximum digits of a number that is parsed; Python raises an error for some thousand.
+# Maximum digits of a number that is parsed; Python raises an error for a few thousand.
 _DIGITS = 18
 # Period of a line that keeps an idle connection open, s.
 _ALIVE = 5.0
@@ -132,7 +132,7 @@ def application(node: Any, token: str) -> Any:
     html, policy = _html()
 
     class Guarded(RequestHandler):
-        """Refuses requests without the token, or by another host name that resolves to here."""
+        """Refuses requests without the token, or under a foreign name of this machine."""
 
         def prepare(self) -> None:
             """Check the request."""

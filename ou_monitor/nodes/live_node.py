@@ -1,8 +1,8 @@
 """
 The node behind the live page: listens to estimator and filter, and keeps the last minute.
 
-Limits first: a row five times a second, so a dip between two rows shows in the flag but not
-in the line; for the filter's signals each row keeps the lowest and highest value.
+Limits first: five rows a second, so a dip between two rows shows in the flag but not in the line;
+for the filter's signals each row has the lowest and highest value.
 """
 
 from __future__ import annotations

@@ -182,7 +182,7 @@ def _write_beside(path: Path, text: bytes, mode: int) -> tuple[int, str]:
         os.write(handle, text)
         os.fsync(handle)
         if os.pread(handle, len(text) + 1, 0) != text:
-            raise ValueError('it does not read as it was written')
+            raise ValueError('the bytes read back differ from those written')
     except BaseException:
         os.close(handle)
         os.unlink(beside)

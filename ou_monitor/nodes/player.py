@@ -1,9 +1,9 @@
 """
 The node of `replay`: messages as recorded, and /clock.
 
-The schedule is absolute, so a late message does not delay those after it.  Unpacking one chunk of
-a bag takes longer than the spacing of its messages, so a thread of its own does it, up to a
-bounded number of messages ahead.
+The schedule is absolute, so a late message does not delay the next ones.  Unpacking a chunk of a
+bag takes longer than the spacing of its messages, so a separate thread reads a bounded number of
+messages ahead.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ Message = tuple[str, str, int, bytes]
 Item = TypeVar('Item')
 # Maximum messages held: about 20 s at 10 kHz, some 50 MB.
 AHEAD = 200_000
-# Maximum time the reading thread may keep the interpreter from the sending one, s; Python's 5 ms
+# Maximum time for which the reading thread may hold the interpreter, s; Python's default of 5 ms
 # would show in the spacing.
 SWITCH = 0.0002
 
@@ -227,7 +227,7 @@ class Player(Node):
             time.sleep(0.01)
         if self._options.wait > 0.0 and self.going():
             self.get_logger().warning(
-                f'nobody has subscribed within {self._options.wait:g} s: playing anyway')
+                f'no subscriber within {self._options.wait:g} s: playing anyway')
 
     def _messages(self) -> Iterator[Message]:
         return iter(self._bag.raw_messages(self._outputs))

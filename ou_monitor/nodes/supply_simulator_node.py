@@ -1,13 +1,13 @@
 """
 The node of `supply_simulator`.
 
-A thread draws samples under the newest throttle and publishes them by the node's clock (simulated
-time too) as `msg_config` says: sensor_msgs/BatteryState on `voltage` by default.  Throttle comes
-from its topic, or is played and published (`throttle.play`).  `~/reset` (std_srvs/Trigger)
-restarts; `/diagnostics` at 1 Hz.
+A thread simulates samples under the newest throttle and publishes each when the node's clock
+(also simulated time) reaches its time, in the format of `msg_config`: by default
+sensor_msgs/BatteryState on `voltage`.  Throttle comes from its topic, or is played and published
+(`throttle.play`).  `~/reset` (std_srvs/Trigger) restarts the simulation; `/diagnostics` at 1 Hz.
 
-Limits: one voltage, no current.  Above 200 Hz samples are drawn 20 ms at a time: throttle acts
-that much later, and messages that carry a stamp leave together.
+Limits: one voltage, no current.  Above 200 Hz samples are drawn in pieces of 20 ms, so throttle
+acts up to 20 ms later, and the stamped messages of a piece are sent together.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from typing import Any
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import MonitorNode
-from ou_monitor.nodes.inputs import PolledInput, PublisherWatch, Silence, SourceFinder, within
+from ou_monitor.nodes.inputs import (
+    NO_CLOCK, PolledInput, PublisherWatch, Silence, SourceFinder, within)
 from ou_monitor.nodes.sources import find_source, Source, SOURCE_PARAMETERS
 from ou_monitor.online.settings import Parameter
 from ou_monitor.recordings.model_file import read_model
@@ -34,32 +35,32 @@ from ou_monitor.stream.config import parse_field_path, put, walk
 LIVE_PARAMETERS: tuple[Parameter, ...] = (
     Parameter('seed', 0, 'Seed of the random numbers, from the next ~/reset on.', 0, 2**31 - 1),
     Parameter('capacity_left', -1.0,
-              'Charge of the pack at the start, 0..1, from the next ~/reset on; -1: as where the '
-              "model's recording began.", -1.0, 1.0),
+              'Initial charge of the pack, 0..1, from the next ~/reset on; -1: the charge at the '
+              "start of the model's recording.", -1.0, 1.0),
     Parameter('scale_resistance', 1.0,
-              'Factor on the response to throttle: 1.4 is a pack aged by 40 %; in force at once.',
+              'Factor on the response to throttle: 1.4 is a pack aged by 40 %; effective at once.',
               0.0, 100.0),
 )
 FIXED_PARAMETERS: tuple[Parameter, ...] = (
     Parameter('model_file', '', 'Model of the supply, from discover --save-model.'),
     Parameter('rate', 100.0, 'Samples per second, Hz.', 0.1, 1000.0),
     Parameter('throttle.play', '',
-              'Throttle that is played, repeated and published: a profile (flight, hover), 0..1, '
-              'points T:U, or a recording; empty: the topic of the throttle.'),
+              'Throttle to play, repeat and publish: a profile (flight, hover), 0..1, points T:U, '
+              'or a recording; empty: use the throttle topic.'),
 )
 _SOURCES = tuple(p for p in SOURCE_PARAMETERS if p.name not in (
     'adc.sample_rate', 'smooth_stamps'))
-# Type published or played if the parameters leave it open.
+# Types if the parameters do not specify them.
 _USUAL = {'voltage': 'sensor_msgs/msg/BatteryState', 'throttle': 'std_msgs/msg/Float32'}
-# Up to this rate, Hz, each sample is drawn on its own; above, as many as this time, s, holds: a
-# call of the model costs 0.2 ms of CPU, and waking the thread as much as a message.
+# Up to this rate, Hz, samples are drawn one by one; above it, in pieces of this length, s: a call
+# of the model takes 0.2 ms of CPU, and waking the thread costs as much as a message.
 _EACH, _AHEAD = 200.0, 0.02
-# A throttle that falls silent is held for this time, s; then the craft idles.
+# Time for which the last throttle is held, s; then the craft idles.
 _HOLD = 1.0
 # Throttle beyond this is invalid (as in the estimator); below, it is clipped to 0..1.
 _MOST_THROTTLE = 2.0
-# A clock that is this far from the next sample, s, was set: samples continue from its time.  A
-# machine under load pauses for a second.
+# Difference between the clock and the next sample, s, above which the clock was set, and samples
+# continue from its time.  A machine under load pauses for up to a second.
 _JUMP = 5.0
 # Maximum sleep, s, and period of checking simulated time, s.
 _NAP, _LOOK = 0.05, 0.002
@@ -172,13 +173,13 @@ class SupplySimulatorNode(MonitorNode):
             raise ValueError('capacity_left must lie within 0..1, or be -1')
 
     def _reset(self) -> str:
-        """Begin with the first sample; return what was done."""
+        """Start again from the first sample; return what was done."""
         values = self.values()
         left = values['capacity_left']
         charge = math.nan if left < 0.0 else left
         if self._model.load is None and left >= 0.0:
-            raise InputError("capacity_left: the model has no entry 'load', so nothing is known "
-                             'of its charge')
+            raise InputError("capacity_left: the model has no entry 'load', so its charge is "
+                             'unknown')
         with self._lock:
             self._run_now = RunningSupply(
                 self._model, rate=self._rate, seed=values['seed'],
@@ -187,7 +188,7 @@ class SupplySimulatorNode(MonitorNode):
             # Stamp of the first sample, s; NaN: the clock's time then.
             self._begin = math.nan
             self.problem = ''
-        return f"Begun anew with seed {values['seed']}."
+        return f"Restarted with seed {values['seed']}."
 
     def _play(self, text: str) -> tuple[Profile, float, Sender] | None:
         """Return the throttle that is played, its length, s, and its publisher."""
@@ -204,7 +205,7 @@ class SupplySimulatorNode(MonitorNode):
     # -- throttle
 
     def _watch(self) -> None:
-        """Check who publishes throttle, 5 times a second."""
+        """Check the publishers of throttle, 5 times a second."""
         if self._played is None:
             self._sources.watch('throttle')
         self._watched.look(self._input)
@@ -248,7 +249,7 @@ class SupplySimulatorNode(MonitorNode):
                 if not math.isnan(self._begin):
                     self._lost += max(0, int((now - due) * self._rate))
                     self.get_logger().warning(f'the clock jumped by {now - due:+.3g} s: the '
-                                              'supply goes on from its last state')
+                                              'supply continues from its last state')
                 self._begin = now - run.samples / self._rate
             begin = self._begin
             times = run.times(1 if self._rate <= _EACH else int(_AHEAD * self._rate))
@@ -299,17 +300,17 @@ class SupplySimulatorNode(MonitorNode):
         voltage = self.resolve_topic_name(self._voltage.source.topic)
         if self._played is None and self._needs_throttle and self._is_idle:
             notes.append(f'No throttle {f"on {topic}" if topic else "in this msg_config"}'
-                         f'{self._throttle_silence.words}: it idles.')
+                         f'{self._throttle_silence.words}: the craft idles.')
         notes += [*filter(None, self._sources.problems.values()), *self._watched.notes(topic)]
         if self.count_publishers(voltage) > 1:
             notes.append(f'{voltage} has another publisher.')
         notes += self.fault_notes
         if self.stamp_now() <= 0.0:
-            notes.append('use_sim_time is set, but nothing comes on /clock.')
+            notes.append(NO_CLOCK)
         if notes:
             level = Level.WARN
         if self.problem:
-            level, notes = Level.ERROR, [f'{self.problem} (~/reset begins anew).']
+            level, notes = Level.ERROR, [f'{self.problem} (~/reset restarts it).']
         run = self._run_now
         discharge = run.simulation.discharge
         fields = {

@@ -40,7 +40,7 @@ _ORDER = ('Section 3.1', 'Section 3.3', 'Section 4.1', 'Section 4.2', 'Section 4
 
 @dataclass(frozen=True)
 class Point:
-    """One of the eight points to read the paper with."""
+    """One of the eight points to consider when reading the paper."""
 
     number: int  # 1 to 8
     title: str
@@ -169,7 +169,7 @@ def _crests(crests: Crests) -> str:
     for state in published.LOADED:
         value, (low, high) = state.crest, state.crest_range
         if low > limit:
-            said = f'above that, and within half a step of each reading still {low:.2f} or more'
+            said = f'above that, and at least {low:.2f} within half a step of each reading'
         elif value > limit:
             said = f'below that only at the edge of its rounding ({low:.1f} to {high:.1f})'
         else:
@@ -223,7 +223,7 @@ def _jumps(crests: Crests, found: list[JumpCrest]) -> str:
             'jumps. Of the compound Poisson jumps tried, relaxing at alpha, the best show '
             f'a mean crest factor of {" and ".join(parts)}; the readings require {low:.1f} (5 %) '
             f'and {medium:.1f} (10 %). Impulses '
-            f'too short to count in Vrms would need a height, peak to peak over the OU, of '
+            f'too short to change Vrms would need a height, peak to peak above the OU, of '
             f'{heights}. '
             f'From 5 to 40 % the crest factor goes from {low:.1f} to {high:.1f} (quotient '
             f'{quotient[0]:.2f} to {quotient[1]:.2f} within half a step): '

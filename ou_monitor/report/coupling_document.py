@@ -44,7 +44,7 @@ def _answer(found: Coupling, name: str, per: str) -> str:
         return (f'{number(100.0 * found.noise_share, 2)} % of {name} from {band} is noise of the '
                 f'supply: {number(found.gain)} {per}.')
     return (f'No noise of the supply is detected in {name} from {band}; a gain of '
-            f'{number(found.limit)} {per} would have been.')
+            f'{number(found.limit)} {per} would have been detected.')
 
 
 def _facts(found: Coupling, per: str) -> list[tuple[str, str]]:

@@ -94,7 +94,7 @@ def test_throttle_that_fails(world):
 
     def words(part):
         return wait_until(lambda: [m for m in said if part in m.status[0].message], what=part)
-    words('No throttle on /throttle: it idles.')
+    words('No throttle on /throttle: the craft idles.')
     assert 'no charge (load) and no drift' in node.err
     assert got[-1].voltage == pytest.approx(5.0) and math.isnan(got[-1].percentage)
     send(0.5, lambda v: v == pytest.approx(4.5))

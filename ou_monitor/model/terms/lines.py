@@ -16,7 +16,7 @@ _MOST = 3
 
 
 def wandering(linewidth: float, rng: np.random.Generator) -> Callable[[FloatArray], FloatArray]:
-    """Return what draws, for steps in s, the phase that widens a line to `linewidth`, Hz."""
+    """Return a function that draws the phase noise of a line of a width, Hz, for steps, s."""
     last = 0.0
 
     def walk(step: FloatArray) -> FloatArray:
@@ -34,10 +34,10 @@ def wandering(linewidth: float, rng: np.random.Generator) -> Callable[[FloatArra
 def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float,
              lag: float = 0.0) -> tuple[FloatArray, FloatArray, FloatArray]:
     """
-    Return two states that turn, die out and are driven, as `Term.block`.
+    Return two states that rotate, decay and are driven by noise, as `Term.block`.
 
-    The first has the autocovariance std^2 exp(-damping t) (cos + lag sin) of the
-    angle turned in t.
+    The first has the autocovariance std^2 exp(-damping t) (cos + lag sin), with the angle
+    turned in t.
 
     damping in 1/s, step in s, std in V, result in V^2.
     """
@@ -50,7 +50,7 @@ def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float,
     if lag == 0.0:
         q[:, 0, 0] = q[:, 1, 1] = left
     else:
-        # What is left of a covariance of 1, -lag and 1 + 2 lag^2 when it has turned.
+        # The stationary covariance (1, -lag, 1 + 2 lag^2) less the rotated one.
         more, mixed = 2.0 * lag * lag * std * std, 2.0 * lag * std * std * along * across
         q[:, 0, 0] = left - more * across * across - mixed
         q[:, 1, 1] = left + more * (1.0 - along * along) + mixed
@@ -59,14 +59,15 @@ def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float,
     return f, q, np.array([1.0, 0.0])
 
 
-# Segments in a coherence time of a line (over pi), how many it takes, and the mean of
-# the squares of their powers over the square of the mean: 2 for ringing driven by
-# noise, whose powers are exponential, and of 12 so low in 1 % only; 1 for a line.
+# Segments in a coherence time of a line (over pi); minimum number of segments; and maximum mean
+# square of their powers over the squared mean.  This ratio is 1 for a line and 2 for ringing
+# driven by noise, whose powers are exponential; 12 such powers are below the maximum in 1 % of
+# cases.
 _FINE, _ENOUGH, _LEVEL = 4.0, 12, 1.25
 
 
 def keeps_its_height(view: View, frequency: float, linewidth: float) -> bool:
-    """Return whether a line, Hz, keeps its amplitude, as ringing does not."""
+    """Return whether a line, Hz, keeps its amplitude; ringing does not."""
     length = int(view.rate / (_FINE * max(linewidth, 1.0 / float(view.at[-1]))))
     v, at = view.residual[view.train], view.at[view.train]
     count = v.size // max(length, 1)
@@ -100,7 +101,7 @@ def broad_peaks(z: FloatArray, rate: float) -> list[tuple[float, float]]:
         # The lowest bins are those of slow noise, not of ringing.
         density[:3] = 0.0
         at = int(np.argmax(density))
-        # A mean of exponentials, by its tail (Cramer), beside the bins that were looked at.
+        # Tail of a mean of exponentials (Cramer bound), over the number of bins searched.
         mean, segments = float(density[at] / np.median(density[3:])), z.size / length
         if segments * (mean - 1.0 - math.log(max(mean, 1e-9))) > math.log(density.size):
             found.append((float(frequency[at]), 4.0 * math.pi * rate / length))
@@ -130,13 +131,13 @@ def order_power(z: FloatArray, u: FloatArray, rate: float) -> tuple[float, float
     return top, trials
 
 
-# Share of the lines looked at that are as good as independent: neighbours share
-# most of their bins.  Found by simulation: of 120 flights of white noise 5 % were
-# to exceed the 95 % point, and 1 did.
+# Effective share of independent lines among those examined, because neighbours share most of their
+# bins.  From simulation: of 120 flights of white noise, 1 exceeded the 95 % point.
 _INDEPENDENT = 0.02
-# Slopes looked at, in sampling rates: idle to full throttle may fold once and come back.
+# Maximum slope examined, in sampling rates: from idle to full throttle a line may fold once and
+# return.
 _REACH = 1.0
-# By how much a segment is shorter that shows lines which throttle moves fast.
+# Ratio of the long segments to the short ones, which show lines while throttle moves fast.
 _SHORTER = 8
 
 
@@ -170,7 +171,7 @@ def _hough(z: FloatArray, u: FloatArray, rate: float, length: int) -> list[_Line
     width = rate / (2.0 * length)
     bins = power.shape[1] - 1
     best: list[_Line] = []
-    # Beyond the Nyquist frequency a line comes back.
+    # Beyond the Nyquist frequency a line is folded back.
     fold = np.abs((np.arange(3 * bins) + bins) % (2 * bins) - bins)
     folded = np.ascontiguousarray(power[:, fold])
     total = np.empty(bins, dtype=np.float32)
@@ -181,7 +182,7 @@ def _hough(z: FloatArray, u: FloatArray, rate: float, length: int) -> list[_Line
         for row, first in zip(folded, (shift % (2 * bins)).tolist(), strict=True):
             total += row[first:first + bins]
         k = int(np.argmax(total))
-        # A mean of `count` exponentials, about; its tail by the Cramer bound.
+        # About a mean of `count` exponentials, whose tail has the Cramer bound.
         mean = float(total[k]) / count
         rise = count * (mean - 1.0 - math.log(max(mean, 1e-9)))
         best.append(_Line(rise if mean > 1.0 else 0.0, k * width, float(slope), length))
@@ -191,7 +192,7 @@ def _hough(z: FloatArray, u: FloatArray, rate: float, length: int) -> list[_Line
 
 def _refined(z: FloatArray, u: FloatArray, rate: float, idle: float, slope: float, width: float
              ) -> tuple[float, float]:
-    """Climb to the top of the coherent power, segments growing to the whole."""
+    """Maximise the coherent power over segments that grow to the whole recording."""
     turns = np.cumsum(u - u.mean()) / rate
     idle += slope * float(u.mean())
     at = np.arange(z.size) / rate

@@ -12,9 +12,9 @@ from ou_monitor.model.terms.segment import Effect, first_order, Segment, Stage, 
 from ou_monitor.model.terms.term import parameter, Term
 from ou_monitor.records import FloatArray
 
-# With a force that is not linear, a step is cut into parts of at most this
-# many relaxation times, of the whole force at a usual deviation; the error of the
-# law is of second order in it.  More parts than that are refused.
+# With a nonlinear force, a step is split into parts of at most this many relaxation times (of the
+# whole force at one standard deviation); the error of the law is of second order in it.  Maximum
+# number of parts of a step.
 _PART = 0.05
 _PARTS_MOST = 1_000_000
 # Maximum number of parts whose random numbers are stored at once.
@@ -26,8 +26,8 @@ class OU(Term):
     """
     dU = -alpha (U - u0) dt + sigma dW, exact in law at any spacing.
 
-    Uhlenbeck & Ornstein, Phys. Rev. 36 (1930) 823.  A force that is not linear
-    (`Segment.bend`) is integrated by Strang splitting, weak order 2.
+    Uhlenbeck & Ornstein, Phys. Rev. 36 (1930) 823.  A nonlinear force (`Segment.bend`) is
+    integrated by Strang splitting, weak order 2.
     """
 
     NAME: ClassVar[str] = 'ou'
@@ -63,8 +63,8 @@ class OU(Term):
 def _law(s: Segment) -> tuple[FloatArray, FloatArray]:
     """Return the decay of the state in each step, and the deviation of the added noise, V."""
     n = s.step.size
-    # Of equal steps at one alpha two will do: the first, which may come after
-    # a gap or be the first of all, and any other.
+    # If all steps and alphas are equal, two values suffice: of the first sample, which may follow
+    # a gap, and of any other.
     some = slice(2) if steady(s.step[1:]) and steady(s.alpha[1:]) else slice(n)
     alpha, step = s.alpha[some], s.step[some]
     phi = _over(n, np.exp(-alpha * step))
@@ -76,7 +76,7 @@ def _law(s: Segment) -> tuple[FloatArray, FloatArray]:
 
 
 def _over(n: int, values: FloatArray) -> FloatArray:
-    """Return n values, the last one repeated as often as it takes."""
+    """Return n values: the given ones, and then the last one repeated."""
     if values.size == n:
         return values
     filled = np.full(n, values[-1])
@@ -85,9 +85,9 @@ def _over(n: int, values: FloatArray) -> FloatArray:
 
 
 def _bent(s: Segment, kicks: FloatArray, before: float, rng: np.random.Generator) -> FloatArray:
-    """Return the state under a force that is not linear; steps that are cut draw from rng."""
+    """Return the state under a nonlinear force; rng gives the draws of split steps."""
     square, cube = s.bend
-    # Stationary from some relaxations before the first sample on.
+    # A long first step starts from the stationary law.
     span = np.minimum(s.step, 20.0 / s.alpha)
     wanted = (s.alpha + _stiffness(s)) * span / _PART
     if not (wanted < _PARTS_MOST).all():
@@ -98,7 +98,7 @@ def _bent(s: Segment, kicks: FloatArray, before: float, rng: np.random.Generator
     phi = np.exp(-s.alpha * h)
     spread = s.sigma * np.sqrt(-np.expm1(-2.0 * s.alpha * h) / (2.0 * s.alpha) * s.power)
     x = np.empty(s.t.size)
-    # Some samples at a time: what they draw is bounded, and is in order.
+    # In bundles of samples, which bounds the memory and keeps the order of the draws.
     for some in _bundles(parts):
         cut = parts[some]
         draws = np.empty(int(cut.sum()))
@@ -132,18 +132,18 @@ def _bent(s: Segment, kicks: FloatArray, before: float, rng: np.random.Generator
 
 
 def _bundles(parts: npt.NDArray[np.int64]) -> list[slice]:
-    """Return slices of samples that have about `_DRAWS` parts together, or one sample of more."""
+    """Return slices with about `_DRAWS` parts in all, or one sample that has more."""
     bundle = np.cumsum(parts) // _DRAWS
     edges = [0, *(np.flatnonzero(np.diff(bundle)) + 1).tolist(), parts.size]
     return [slice(first, last) for first, last in zip(edges, edges[1:])]
 
 
 def _stiffness(s: Segment) -> FloatArray:
-    """Return the rate that the bend adds at one standard deviation, 1/s, shape (n,)."""
+    """Return the rate that the nonlinear force adds at one deviation, 1/s, shape (n,)."""
     square, cube = s.bend
     var = s.sigma * s.sigma / (2.0 * s.alpha)
     if cube > 0.0:
-        # Of a cube alone it is 0.48 sigma / sqrt(cube).
+        # With only a cubic force the variance is 0.48 sigma / sqrt(cube).
         var = np.minimum(var, 0.48 * s.sigma / math.sqrt(cube))
     stiffness: FloatArray = abs(square) * np.sqrt(var) + cube * var
     return stiffness

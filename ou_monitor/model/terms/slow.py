@@ -29,10 +29,10 @@ class Drift(Term):
         lambda term: ('rate', 'curvature') if term.curvature else ('rate',))
     SIGNS: ClassVar[tuple[str, ...]] = ('time', 'band 0')
     MEASURED: ClassVar[bool] = True
-    # Time mends a little of whatever the form of a larger effect leaves.
+    # A trend always explains a little of the error in the form of a larger effect.
     LEAST_SHARE: ClassVar[float] = 0.02
     MEANING: ClassVar[str] = 'The mean moves slowly with time: discharge or warming.'
-    REMEDY: ClassVar[str] = 'Use a window short beside the drift, or take the trend out first.'
+    REMEDY: ClassVar[str] = 'Use a window in which the drift is small, or remove the trend first.'
     SEPARATED_BY: ClassVar[str] = 'a recording several times as long'
 
     rate: float = parameter('V/s', 'slope at the first sample')
@@ -96,7 +96,7 @@ class SecondRelaxation(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return poles slower and faster than that of the ou, of less variance."""
+        """Return candidates slower and faster than the ou, with less variance."""
         rate = -math.log(max(float(np.median(view.phi[1:])), 1e-300)) * view.rate
         spread = float(np.std(view.residual))
         slowest = _LEAST / float(view.at[-1])
@@ -115,14 +115,15 @@ class SecondRelaxation(Term):
         return phi[:, None, None], q[:, None, None], np.ones(1)
 
 
-# Octaves from pole to pole: 1/f within 0.2 %, and within 6 %.
+# Octaves between poles: with the first the spectrum is 1/f within 0.2 %, with the second within
+# 6 %.
 _FINE, _COARSE = 0.5, 3.0
-# Relaxation times in a step after which 1e-9 of a state is left.
+# Relaxation times in a step above which the old state is negligible (exp(-20) = 2e-9).
 _FORGOTTEN = 20.0
-# The upper end, the last poles and the corner of the low-pass: at the end the
-# low-pass has taken 1.5 %, and where the poles end most of the rest.
+# Last pole, and corner of the low-pass, relative to the upper frequency: there the low-pass
+# removes 1.5 %, and above the last pole most of the rest.
 _LADDER, _CORNER = 4.5, 8.0
-# Corner over lower end below which it is one relaxation, or two.
+# Minimum ratio of the corner to the lower frequency; below it one or two relaxations suffice.
 _LEAST_SPAN = 30.0
 
 
@@ -131,10 +132,9 @@ class FlickerNoise(Term):
     """
     Add noise of PSD amplitude^2 / f between two frequencies.
 
-    A sum of OUs, two to the octave, behind a first-order low-pass at 8 * high.  It
-    follows 1/f within 2 % between the frequencies, the ends included (one-sided
-    PSD), is flat below, and falls as 1/f^3, then 1/f^4, from the corner on, as noise
-    behind a circuit of that bandwidth does.  Exact in law at any spacing.
+    A sum of OUs, two per octave, behind a first-order low-pass at 8 * high.  Its one-sided PSD
+    follows 1/f within 2 % from `low` to `high`, is flat below, and falls as 1/f^3, then 1/f^4
+    above the corner, like noise behind a circuit of that bandwidth.  Exact in law at any spacing.
     """
 
     NAME: ClassVar[str] = 'flicker_noise'
@@ -150,7 +150,7 @@ class FlickerNoise(Term):
     IMITATES: ClassVar[tuple[str, ...]] = ('regime_switching', 'second_relaxation')
     MEANING: ClassVar[str] = '1/f noise: there is no single relaxation time.'
     REMEDY: ClassVar[str] = (
-        'Treat alpha as a number of this window only; use windows of one length to compare.')
+        'Use alpha only for windows of this length, and compare only windows of equal length.')
     SEPARATED_BY: ClassVar[str] = 'a recording over two more decades of frequency'
 
     amplitude: float = parameter('V', 'square root of f times the PSD', 0.0)
@@ -188,7 +188,7 @@ class FlickerNoise(Term):
             first = math.isnan(low)
             step = s.step.copy()
             if first:
-                # What was long ago is forgotten; the low-pass is drawn apart.
+                # The past is negligible; the state of the low-pass is drawn separately.
                 step[0] = 0.0
             driven, spread = np.zeros(s.t.size), np.zeros(s.t.size)
             of_first = 0.0
@@ -215,7 +215,7 @@ class FlickerNoise(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return noise over all frequencies of the recording, of a third of its variance."""
+        """Return noise over all frequencies of the recording, with a third of its variance."""
         low, high = 1.0 / float(view.at[-1]), 0.2 * view.rate / _CORNER
         if _CORNER * high < _LEAST_SPAN * low:
             return ()
@@ -227,15 +227,15 @@ class FlickerNoise(Term):
         return bool(_CORNER * self.high > _LEAST_SPAN * self.low)
 
     def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return one state a pole, and the low-pass; for a fit few poles are enough."""
+        """Return one state for each pole, and the low-pass; a fit needs only few poles."""
         poles, variances = _sum(self.low, _LADDER * self.high, _COARSE)
         variances = self.amplitude ** 2 * variances
-        # Most recordings have but a few different steps.
+        # Most recordings have only a few different steps.
         step, which = np.unique(s.step, return_inverse=True)
         rate, finite = self.corner, np.isfinite(step)
         fast = poles * float(step[finite].min(initial=math.inf)) > _FORGOTTEN
         if fast[1:].any():
-            # Without memory from sample to sample, behind the low-pass too: one state for all.
+            # One state stands for all poles that have no memory from sample to sample.
             seen = variances * rate / (rate + poles)
             first = int(np.argmax(fast))
             variances[first] *= float(seen[fast].sum() / seen[first])
@@ -260,7 +260,7 @@ class FlickerNoise(Term):
 
 def _bridge(pole: float, rate: float, step: FloatArray
             ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return `bridge` for one pole; most steps are alike."""
+    """Return `bridge` for one pole, computed once for equal steps."""
     some, which = np.unique(step, return_inverse=True)
     old, new, left = bridge(np.full(some.size, pole), rate, some)
     return old[which], new[which], left[which]
@@ -270,9 +270,9 @@ def _sum(low: float, high: float, octaves: float) -> tuple[FloatArray, FloatArra
     """
     Return relaxation rates, 1/s, and variances whose one-sided PSD is nearly 1/f, V^2/Hz.
 
-    The integral of 4 a / (a^2 + w^2) d(ln a) over all rates a is 1/f.  Between
-    the ends it becomes a sum by the midpoint rule; what is left on either side
-    (in a below, in 1/a above) by Gauss-Legendre of two points.
+    The integral of 4 a / (a^2 + w^2) d(ln a) over all rates a is 1/f.  It is computed between the
+    ends by the midpoint rule, and below and above them (in a and in 1/a) by two-point
+    Gauss-Legendre quadrature.
     """
     count = max(1, math.ceil(math.log2(high / low) / octaves))
     width = math.log(high / low) / count

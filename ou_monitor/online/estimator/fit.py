@@ -4,14 +4,14 @@ From the samples of a window to OU parameters.
 While throttle moves, or when the voltage drifts, sag, its curvature and its lag are regressed out
 of the mean, within the restricted likelihood (REML: Harville, J. Am. Stat. Assoc. 72 (1977) 320).
 
-Evenly spaced samples, or block means: `SpectralLikelihood`, Whittle's of the window's ordinates
+Evenly spaced samples, or block means: `SpectralLikelihood`, the Whittle likelihood
 (model/whittle.py), which `window: auto` and `supply_facts` maximise too.
 
-Windows whose stamps are not evenly spaced: `StampLikelihood`, the exact Gaussian one.  The inverse
-covariance Q of a sampled OU is tridiagonal, so the likelihood costs O(n): K = Q^-1 + nu I with A =
-I + nu Q tridiagonal, K^-1 = Q A^-1 and log|K| = log|A| - log|Q|. It is the likelihood of the
-Kalman filter.  Its gradient needs no more than the elimination and the three diagonals of A^-1,
-so a search that starts from the fit of evenly spaced samples takes a handful of evaluations.
+Unevenly spaced samples: `StampLikelihood`, the exact Gaussian likelihood, equal to the Kalman
+filter's.  The inverse covariance Q of a sampled OU is tridiagonal, so it costs O(n): K = Q^-1 + nu
+I, with A = I + nu Q tridiagonal, K^-1 = Q A^-1 and log|K| = log|A| - log|Q|.  The gradient needs
+only the elimination and the three diagonals of A^-1, so a search that starts from the fit of
+evenly spaced samples takes a few evaluations.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from ou_monitor.model.ou_fit import stretches
 from ou_monitor.model.whittle import CrossSpectrum
 from ou_monitor.records import FloatArray
 
-# Directions of the load that vary less than this share of the largest are
-# left out: the window does not show them.
+# Minimum variance of a combination of load variables, relative to the largest; the window does not
+# determine the coefficients of others.
 _UNSEEN = 1e-5
-# A load variable of less variance than this (full scale squared) is constant.
+# Minimum variance of a load variable, full scale squared; below it the variable is constant.
 _STILL = 1e-12
-# Neighbouring samples correlated by less than this many standard errors are not correlated.
+# Minimum correlation of adjacent samples, standard errors, for a fit.
 _CORRELATED = 4.0
 # alpha D above which adjacent samples carry no information on the relaxation; number of
 # relaxations in the window below which a drift may be chance.
@@ -103,22 +103,22 @@ class Fitted:
 
 # Relaxations between two samples beyond which they are independent: exp(2 * 300) is a double.
 _FAR = 300.0
-# Unknowns of a tridiagonal system that are eliminated at once: fewer steps of NumPy calls.
+# Size at which a tridiagonal system is solved as a dense one, which needs fewer NumPy calls.
 _DENSE = 24
 # Minimum gain of a step, nats: the optimum is then within 1e-4 standard errors, for any start.
 _SETTLED = 1e-9
-# Evaluations that a fit may take after the first; 4 to 8 are usual, more where nothing tells
-# alpha from noise.
+# Maximum evaluations of a fit after the first; 4 to 8 are usual, more if alpha and noise cannot be
+# distinguished.
 _MOST_POINTS = 24
-# Step of the finite differences of slopes, in ln a and z: for unit curvature the error is 1e-4,
-# the rounding 1e-7; and of those of values.
+# Steps in ln a and z of finite differences of slopes (error 1e-4 for unit curvature, rounding
+# 1e-7), and of finite differences of values.
 _STEP, _HAIR = 1e-4, 1e-3
 # Points of the first grid of a search, in ln a and z.
 _GRID = (16, 8)
 # Lower limit of the curvature of a direction, nats; longest step.
 _FLAT, _LONGEST = 1e-3, 1.5
-# Share of noise up to which the search is linear in it; noise of more than ten thousand times the
-# diffusion of one step hides any OU.
+# White noise, relative to the diffusion of one step: up to the first value the search is linear in
+# it, above it logarithmic; the second is the upper limit (1e4), which hides any OU.
 _SMALL = 0.05
 _LOUDEST = math.log1p(1e4 / _SMALL)
 
@@ -127,7 +127,7 @@ _LOUDEST = math.log1p(1e4 / _SMALL)
 class _Point:
     """The likelihood at one choice of ln a and z, see `Likelihood.at`."""
 
-    # Minus the restricted log-likelihood, nats, and its slopes by the two.
+    # Minus the restricted log-likelihood, nats, and its derivatives by ln a and z.
     value: float
     slopes: FloatArray
     # Scale sigma^2, V^2/s; coefficients, V per unit of each regressor, and their covariance, V^2.
@@ -160,7 +160,7 @@ def _ends(n: int) -> tuple[FloatArray, FloatArray]:
 
 
 class SpectralLikelihood:
-    """Of samples, or means of m, in evenly spaced stretches of `lengths`; the voltage is last."""
+    """Whittle likelihood of samples, or means of m, in even stretches; the last row is voltage."""
 
     def __init__(self, rows: FloatArray, lengths: list[int], step: float, m: int = 1) -> None:
         self.n, self.m, self.step = rows.shape[1], m, step
@@ -171,7 +171,7 @@ class SpectralLikelihood:
         """Return the spectra of OU and noise in units of sigma^2, shape (k, bins)."""
         gamma = np.array([arma.block_autocovariance(math.exp(x), self.m) for x in log_a.tolist()])
         a = np.exp(log_a)
-        # Block means of an OU are correlated as an OU of this variance, and vary by less.
+        # Block means of an OU have the correlations of an OU of this variance, but vary less.
         size = gamma[:, 1] * np.exp(a)
         white = gamma[:, 0] - size + _SMALL * np.expm1(z)
         return np.asarray(self.step * (
@@ -196,7 +196,7 @@ class SpectralLikelihood:
 
 
 class StampLikelihood:
-    """Exact, of samples at any stamps, s; rows: regressors, the voltage, V, last."""
+    """Exact likelihood of samples at stamps, s; rows: regressors, and voltage, V, as the last."""
 
     def __init__(self, t: FloatArray, rows: FloatArray) -> None:
         self.steps = np.diff(t)
@@ -208,7 +208,7 @@ class StampLikelihood:
     def at(self, log_a: float, z: float, used: int) -> _Point:
         """Return the likelihood with the first `used` regressors; z is `noise_scale`."""
         a, share = math.exp(log_a), _SMALL * math.expm1(z)
-        # Q over 2 alpha: its diagonal and the one beside it.
+        # Q / (2 alpha): its diagonal and first off-diagonal.
         x = np.minimum(a / self.step * self.steps, _FAR)
         h = 1.0 / np.expm1(2.0 * x)
         off = -np.sqrt(h * (1.0 + h))
@@ -223,7 +223,7 @@ class StampLikelihood:
         q[:, 1:] += off * w[:, :-1]
         q[:, :-1] += off * w[:, 1:]
         gram = double * (self._table @ q.T)
-        # The same by ln alpha at constant noise, and by the noise: of the products and of log|K|.
+        # Derivatives of the products and of log|K| by ln alpha (constant noise), and by the noise.
         d_h = -2.0 * x * off * off
         d_diag = diag.copy()
         d_diag[1:] += d_h
@@ -259,7 +259,7 @@ class StampLikelihood:
 
 
 def noise_scale(share: float) -> float:
-    """Return z of the white noise over sigma^2 times the mean step: linear, then logarithmic."""
+    """Return z of white noise / (sigma^2 mean step): linear for small values, then logarithmic."""
     return math.log1p(share / _SMALL)
 
 
@@ -268,7 +268,7 @@ def solve_tridiagonal(diag: FloatArray, off: FloatArray, right: FloatArray
     """Return log-determinant, solutions, and two diagonals of the inverse (cyclic reduction)."""
     halves, pivots = [], []
     while diag.size > _DENSE:
-        # Each odd one has a neighbour before it and, but for the last of an even number, after it.
+        # Each odd row has a row before it and, except for the last row of all, one after it.
         pivot, before, after, w = diag[1::2], off[0::2], off[1::2], right[:, 1::2]
         m, k = pivot.size, after.size
         inverse = 1.0 / pivot
@@ -298,7 +298,7 @@ def solve_tridiagonal(diag: FloatArray, off: FloatArray, right: FloatArray
 
 
 def _woven(even: FloatArray, odd: FloatArray) -> FloatArray:
-    """Return an array whose last axis takes turns from two."""
+    """Return an array whose last axis alternates between two arrays."""
     both = np.empty((*even.shape[:-1], even.shape[-1] + odd.shape[-1]))
     both[..., 0::2], both[..., 1::2] = even, odd
     return both
@@ -326,7 +326,7 @@ class Maximum:
     share: float
     # Products of all rows at the maximum, see `_Point`.
     gram: FloatArray
-    # ln a and z at the maximum, and the curvature there, nats: where the next window begins.
+    # ln a and z at the maximum, and the curvature, nats, from which the next search starts.
     place: FloatArray
     curved: FloatArray | None
 
@@ -373,7 +373,7 @@ def _least(f: Callable[[FloatArray], _Point], here: FloatArray, curved: FloatArr
             new = f(there)
             if new.value <= at.value:
                 break
-            # To the minimum of the parabola through both values and the slope here.
+            # Step to the minimum of the parabola through both values with the slope here.
             whole = False
             step *= min(max(0.5 * gain / (new.value - at.value + gain), 0.1), 0.5)
             gain = -float(slopes @ step)
@@ -392,21 +392,21 @@ def _least(f: Callable[[FloatArray], _Point], here: FloatArray, curved: FloatArr
 
 # Samples up to which the exact likelihood is used.
 MOST = 4096
-# Share of its variance that time must keep, given the load, to be separable from it.
+# Minimum share of the variance of time that the load does not explain, for a trend.
 _APART = 1e-5
-# Samples that make one of a coarser grid, and samples below which there is none.
+# Samples averaged into one of a coarser grid, and minimum number of samples on that grid.
 _FACTOR, _FEWEST = 4, 100
-# An ADC step is white noise only where the OU crosses several codes within a
-# step: D >= (0.7 step / sigma)^2 (doc/estimation.md).
+# An ADC step acts as white noise only if the OU crosses several codes within a sampling step:
+# D >= (0.7 step / sigma)^2 (doc/estimation.md).
 _DITHER = 0.7
-# What alpha is high by, in 1/T: spectral likelihood, and that of the stamps.  The restricted
-# likelihood of the stamps leaves 2/T of the bias of alpha (Tang & Chen, J. Econometrics 149 (2009)
-# 65: 4/T with unknown mean, half of it from the mean), the spectral one 0.1 to 1.2/T, and 1.6 to
-# 2.5/T beside 5 mV of noise (600 simulated windows each of 12 to 126 relaxations).  Var_inf =
-# sigma^2 / (2 alpha) is convex in alpha, and users divide one by the other, so that one correction
-# serves both: it leaves Var_inf high by 0.5/(alpha T) and 1.3/(alpha T).
+# Correction of the bias of alpha, in 1/T, for the spectral likelihood and for the exact one.  The
+# exact restricted likelihood makes alpha too high by 2/T (Tang & Chen, J. Econometrics 149 (2009)
+# 65: 4/T with unknown mean, half of it from the mean), the spectral one by 0.1 to 1.2/T, or 1.6 to
+# 2.5/T with 5 mV of noise (600 simulated windows each of 12 to 126 relaxations).  Var_inf =
+# sigma^2 / (2 alpha) is convex in alpha, so this one correction is a compromise: it leaves Var_inf
+# too high by 0.5/(alpha T) and 1.3/(alpha T).
 _HIGH_BY = (0.5, 1.5)
-# Share of the mean square below which a residual, or the diffusion of one step, is rounding.
+# Share of the mean square below which a residual, or the diffusion of one step, is rounding error.
 _EXACT = 1e-14
 
 
@@ -416,22 +416,22 @@ def fit_window(t: FloatArray, y: FloatArray, load: FloatArray, m: int, adc: floa
     """
     Fit the OU, the noise and the mean.
 
-    t in s, y in V; load: variables of shape (c, n), none while throttle stands still; m: raw
-    samples in each; adc: ADC step, V; stamps: whether stamps count as they are at an alpha times
-    the mean step (inf: whatever it is); before: the second value returned for a nearly identical
-    window.
+    t in s, y in V; load: variables of shape (c, n), none while throttle is constant; m: raw
+    samples averaged in each; adc: ADC step, V; stamps: whether the exact likelihood is needed at
+    an alpha times the mean step (inf: at any); before: the second value returned for a nearly
+    identical window.
     """
     level = np.append(y.mean(), load.mean(axis=1))
     centred = load - level[1:, None]
     basis = independent(centred @ centred.T / t.size)
     known = basis.T @ centred
     time = (t - t[0]) / (t[-1] - t[0]) - 0.5
-    # Time beside the load: what of it the load does not explain.
+    # The part of time that the load does not explain.
     within = known @ time / t.size
     time = time - time.mean() - within @ known
     used, apart = 1 + len(known), float(time @ time) > _APART * t.size / 12.0
     rows = np.stack([np.ones(t.size), *known, *([time] if apart else []), y - level[0]])
-    # Fit the residuals of least squares, against rounding, and add the change afterwards.
+    # Fit the least-squares residuals, which avoids rounding errors; add their fit afterwards.
     plain = np.linalg.lstsq(rows[:used].T, rows[-1], rcond=None)[0]
     rows[-1] -= plain @ rows[:used]
     left = rows[-1]
@@ -490,7 +490,7 @@ def fit_window(t: FloatArray, y: FloatArray, load: FloatArray, m: int, adc: floa
 
 
 def _spectral(t: FloatArray, rows: FloatArray, m: int, factor: int = 1) -> SpectralLikelihood:
-    """Return the likelihood of the stretches without a gap, or of means of so many samples."""
+    """Return the likelihood of the stretches without a gap, or of means of `factor` samples."""
     parts = stretches(t) or [slice(0, t.size)]
     sizes = [(part.stop - part.start) // factor for part in parts]
     step = sum(t[part.stop - 1] - t[part.start] for part in parts) / sum(

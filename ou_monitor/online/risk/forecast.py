@@ -5,14 +5,14 @@ Methods: `first_passage` (the OU in the window, at the present throttle), `load`
 to the pilot's future throttle, half the excursions), and `excursions` (the drops of this flight,
 used alone if the load is unknown).  First passage and the other method are averaged with weights
 from their predictions of completed horizons' lowest voltages (Bayes, with forgetting).  First
-passage gives a share to the excursions, equal to the share of horizons in which it was wrong; the
-conditional risk gives such a share to a law as wide as the excursions.
+passage is mixed with the excursions, and the conditional risk with a law as wide as the
+excursions, each in the share of horizons in which it was wrong.
 
 The law learned in flight, from completed horizons: (lowest - start) / s = b0 + b1 (mu - start) / s
 + k e, with mean mu and deviation s of `lowest`, by least squares with forgetting; e has Student's
-t distribution with five degrees of freedom.  In a share of horizons the law is wrong, and the
-excursions apply.  This share is counted by the rule of succession, each horizon weighted by the
-probability that it belongs to it.  Overlapping horizons count as step / horizon each.
+t distribution with five degrees of freedom.  The share of horizons in which a law was wrong is
+counted by the rule of succession, with the probability of each horizon as its weight.  Overlapping
+horizons count as step / horizon each.
 
 Limits: "below" refers to the median of three samples, except in first passage; nothing is known in
 the first second; all throttles share one bias and one gain; values between two horizons are
@@ -47,7 +47,7 @@ from ou_monitor.timeline.line import Batch
 FREEDOM = 5.0
 _NORM = math.exp(math.lgamma(0.5 * FREEDOM + 0.5) - math.lgamma(0.5 * FREEDOM)) / math.sqrt(
     math.pi * (FREEDOM - 2.0))
-# Coefficients of its tail in the squares of sqrt(FREEDOM / (FREEDOM + t^2)), last first.
+# Coefficients of the power series of its tail in FREEDOM / (FREEDOM + t^2), highest power first.
 _TAIL = [8.0 / (3.0 * math.pi) * math.comb(2 * k, k) / 4.0**k / (2 * k + 5)
          for k in range(9, -1, -1)]
 # Horizons' worth of the prior, its variance, and the prior of bias and gain.
@@ -98,7 +98,7 @@ class Calibrator:
     """Learns a `LowestLaw` from completed horizons."""
 
     def __init__(self) -> None:
-        # Of 1 and x: squares and product, and products with y.
+        # Sums for the regression of y on 1 and x: of 1, x and x^2, and of y and x y.
         self._information: tuple[float, ...] = _PRECISION
         self._weighted: tuple[float, ...] = _PRECISION[1:]
         self._count = self._squares = 0.0
@@ -251,7 +251,7 @@ class Forecast:
     """Risk with the pilot's future throttle, and with a given one (look: s between updates)."""
 
     def __init__(self, loads: LoadFilter, look: float = LOOK) -> None:
-        # Takes a third of a second once; not while samples arrive.
+        # Takes a third of a second, once; done here so that no sample has to wait.
         prepare()
         self._loads, self._look_time = loads, look
         self.follow(Estimate(), 0.0)
@@ -277,15 +277,15 @@ class Forecast:
             rung.next = rung.learned = -math.inf
 
     def take(self, batch: Batch, came: float = math.inf) -> None:
-        """Take readings; the last came at a time, s, on a monotonic clock; inf: not known."""
+        """Take readings; came: arrival of the last, s, on a monotonic clock; inf: unknown."""
         t, v, u, drawn = batch.columns()
         if t[0] < self._newest:
-            # Readings rise within one time line: another one has begun.
+            # Stamps increase within one time line, so another one has begun.
             self.new_time_line()
             self._loads.new_time_line()
         begin, n = 0, t.size
         while begin < n:
-            # As far as the next look.
+            # Up to the next update.
             ahead = np.flatnonzero(t[begin:] >= self._next)
             end = begin + int(ahead[0]) + 1 if ahead.size and came >= self._rested else n
             part = slice(begin, end)
@@ -320,7 +320,7 @@ class Forecast:
         return median(self._last.tolist()) if self._last.size > 1 else NAN
 
     def follow(self, e: Estimate, window: float, ago: float = 0.0) -> None:
-        """Take the newest estimate; alpha and sigma are of a window, s, that ended earlier, s."""
+        """Take the newest estimate, of a window, s, that ended some time ago, s."""
         self.estimate, self._window = e, (window, ago)
 
     def supply(self) -> Supply | None:
@@ -486,7 +486,7 @@ def look_ahead(forecast: Forecast, load: SupplyLoad, settings: MonitorSettings) 
             not load.known) else 'Less than a second has been flown.'
         return Ahead(outcome, NAN, why, soon=soon)
     budget, reason = throttle_budget(risks, forecast.flown[1], s.budget_limit)
-    # NaN is not below.
+    # The comparison is false for NaN.
     return Ahead(outcome, budget, reason, tuple(risks[::5].tolist()), soon, budget < forecast.used)
 
 

@@ -49,9 +49,9 @@ class Format(NamedTuple):
 
 def _is_text(head: bytes) -> bool:
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        # Spreadsheets write "Unicode text" in it; their cells use its first 256.
+        # "Unicode text" of spreadsheets, whose cells use only the first 256 characters.
         head = head[2:].replace(b'\0', b'')
-    # Text of other encodings than UTF-8 passes, so that its reader can name the byte.
+    # Text that is not UTF-8 passes, so that its reader can name the invalid byte.
     return bool(head) and (head[0] < 0x80 or head.startswith(codecs.BOM_UTF8)) and all(
         byte >= 0x20 or byte in b'\t\n\r\f' for byte in head)
 
@@ -135,8 +135,8 @@ def detect(path: Path) -> Format:
     found = format_of(head)
     if found is not None:
         return found
-    raise InputError(f"'{path}' cannot be converted: it begins like none of the formats read "
-                     'today: ' + '; '.join(one.words for one in FORMATS if one.module))
+    raise InputError(f"'{path}' cannot be converted: it has none of the formats that can be "
+                     'read: ' + '; '.join(one.words for one in FORMATS if one.module))
 
 
 # Endings of text tables; their first bytes must not fit another format.
