@@ -126,7 +126,7 @@ BROKEN = {
     'ends': ('raise SystemExit(3)', 'SystemExit: 3'),
     'number': ('Cause = 3', 'not a class derived from Term'),
     'silent': ("class Cause(Heartbeat):\n    NAME = 'silent'\n    MEANING = ''", 'no MEANING'),
-    'tone': ("class Cause(Heartbeat):\n    NAME = 'tone'", 'not that of another cause'),
+    'tone': ("class Cause(Heartbeat):\n    NAME = 'tone'", 'not the name of another cause'),
     'other': ("class Cause(Heartbeat):\n    NAME = 'another'", 'that of the entry point'),
     'linear': ("class Cause(Heartbeat):\n    NAME = 'linear'\n    LINEAR = ('width',)",
                'width is in LINEAR'),

@@ -35,7 +35,7 @@ def test_the_first_bytes_decide(tmp_path, name, ending):
 
 @pytest.mark.parametrize('content, words', [
     (b'', 'is empty'), (b'\x89MCAP0\r\n' + bytes(20), 'an MCAP bag already'),
-    (b'\x7fELF' + bytes(100), 'none of the formats read today'),
+    (b'\x7fELF' + bytes(100), 'none of the formats that can be read'),
     (b'ULog\x01\x12', 'none of the formats'), (b'\xa3\x95', 'none of the formats'),
     (b'nothing here', "no column 'time_s'"),
 ])
