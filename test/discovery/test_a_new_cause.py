@@ -127,7 +127,7 @@ BROKEN = {
     'number': ('Cause = 3', 'not a class derived from Term'),
     'silent': ("class Cause(Heartbeat):\n    NAME = 'silent'\n    MEANING = ''", 'no MEANING'),
     'tone': ("class Cause(Heartbeat):\n    NAME = 'tone'", 'not the name of another cause'),
-    'other': ("class Cause(Heartbeat):\n    NAME = 'another'", 'that of the entry point'),
+    'other': ("class Cause(Heartbeat):\n    NAME = 'another'", 'the name of the entry point'),
     'linear': ("class Cause(Heartbeat):\n    NAME = 'linear'\n    LINEAR = ('width',)",
                'width is in LINEAR'),
 }
