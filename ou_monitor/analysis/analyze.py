@@ -98,7 +98,8 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
         by_throttle(seen, voltage, brownout_horizon), sliding,
         quality_list(recording, throttles, estimates,
                      lines + second_items([level.throttle for level in judged if level.wanders])
-                     + coupling_items([level.throttle for level in judged if level.coupled])),
+                     + coupling_items([level.throttle for level in judged if level.coupled]),
+                     seen.facts.ou.status == 'ok'),
         brownout_voltage is None, recording.notes + _left_out(recording, found), seen,
         craft_of(recording, seen.facts, cells))
 

@@ -13,7 +13,7 @@ import math
 import numpy as np
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.supply import facts_and_end, Remainder, SupplyFacts, THROTTLES
-from ou_monitor.online.load.supply_load import SupplyLoad
+from ou_monitor.online.load.supply_load import LoadStatus, SupplyLoad
 from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.records import NAN, OuFacts, Recording
 from ou_monitor.text import counted, number, volts, Z95
@@ -111,7 +111,7 @@ def answers(found: Overview) -> list[str]:
     elif math.isfinite(least.voltage_v):
         parts.append(f'The voltage fell to {number(least.voltage_v, 4)} V at '
                      f'{number(least.time_s)} s.')
-    if found.facts.sag.known:
+    if found.facts.sag.known or _bounded(found):
         at, sag, se = found.sag
         parts.append(f'The rail sags by {volts(sag)} at {100.0 * at:.0f} % throttle.'
                      if sag > 2.0 * se else
@@ -164,13 +164,22 @@ def _dips(found: Overview, below: float = NAN) -> str:
             f'{number(dips.seconds, 2)} s in all ({share:.2g} % of the time)')
 
 
+def _bounded(found: Overview) -> bool:
+    """Return whether the voltage does not fall with throttle, and a sag would have shown."""
+    _, sag, se = found.sag
+    return found.load.status is LoadStatus.NO_RELATION and sag < 2.0 * se
+
+
 def _sag_words(found: Overview) -> str:
     sag = found.facts.sag
     if math.isnan(sag.flown[0]):
         return 'unknown: the recording has no throttle'
+    at, there, se = found.sag
+    if _bounded(found):
+        return (f'not measurable: at {100.0 * at:.0f} % throttle it is below '
+                f'{volts(there + 2.0 * se)} (95 %). {found.load.status.value}')
     if not sag.known:
         return f'unknown. {found.load.status.value}'
-    at, there, se = found.sag
     words = f'{volts(there)} (+- {volts(2.0 * se)}) at {100.0 * at:.0f} % throttle'
     if at < 1.0:
         words += (f'; about {volts(sag.sag_v[-1])} (+- {volts(2.0 * sag.se_v[-1])}) extrapolated '

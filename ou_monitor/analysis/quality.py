@@ -22,6 +22,9 @@ from ou_monitor.timeline.line import TAIL
 
 # Flags for information; the others are warnings.
 _INFORMS = frozenset({Flag.HELD_SAMPLES, Flag.IRREGULAR, Flag.NO_EXCITATION})
+# Statuses that a good recording may have: its rate or length shows no more.
+_LIMITS = frozenset({Status.TOO_FEW_SAMPLES, Status.TOO_SHORT, Status.UNBOUND, Status.BURIED,
+                     Status.NO_RELAXATION})
 # Maximum scatter of the steps of an even clock: rms about the median, in medians.
 _UNEVEN = 0.05
 # Maximum voltage of a UAV supply, V; any supply in millivolts exceeds it.
@@ -46,11 +49,11 @@ class QualityItem:
 
 
 def quality_list(recording: Recording, throttles: Sequence[float], estimates: Sequence[Estimate],
-                 more: Sequence[QualityItem] = ()) -> tuple[QualityItem, ...]:
-    """Return all cautions, worst first."""
+                 more: Sequence[QualityItem] = (), known: bool = False) -> tuple[QualityItem, ...]:
+    """Return all cautions, worst first (known: the facts have alpha)."""
     found: dict[tuple[str, Severity, str], list[float]] = {}
     for throttle, estimate in zip(throttles, estimates):
-        for item in _of_estimate(estimate):
+        for item in _of_estimate(estimate, known):
             found.setdefault(item, []).append(throttle)
     items = [QualityItem(*key, tuple(where)) for key, where in found.items()]
     items += more
@@ -59,9 +62,13 @@ def quality_list(recording: Recording, throttles: Sequence[float], estimates: Se
     return tuple(sorted(items, key=lambda item: -item.severity))
 
 
-def _of_estimate(e: Estimate) -> list[tuple[str, Severity, str]]:
+def _of_estimate(e: Estimate, known: bool) -> list[tuple[str, Severity, str]]:
     items = []
-    if e.status is not Status.OK:
+    if e.status in _LIMITS:
+        items.append((e.status.name, Severity.INFO, (
+            'The level alone does not show the relaxation that the whole recording shows beside '
+            'level and load.') if known else e.status.value))
+    elif e.status is not Status.OK:
         severity = Severity.WARNING if e.usable else Severity.ERROR
         items.append((e.status.name, severity, e.status.value))
     items += [(flag.name, Severity.INFO if flag in _INFORMS else Severity.WARNING, flag.value)

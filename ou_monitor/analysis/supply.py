@@ -35,8 +35,9 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 # Throttles at which sag and noise are given.
 THROTTLES = tuple(k / 10.0 for k in range(11))
-# Length of a part with its own regression, s.
-_PART = 60.0
+# Length of a part with its own regression, s, and the minimum number of readings in it, five times
+# as many as a regression takes at most of a part of 60 s.
+_PART, _IN_PART = 60.0, 200
 # Maximum evaluations of the risk: as many as the node makes in 15 minutes.
 _LOOKS = 900.0 / LOOK
 # Number of reports of the node that are shown; maximum time between two reports, s, and maximum
@@ -313,7 +314,8 @@ def remainder(recording: Recording) -> Remainder:
     t, n = recording.t, recording.n
     left, size, steps, walks, above = np.full(n, NAN), np.ones(n), [], [], 0.0
     edges: list[int] = [] if not n else np.searchsorted(t, np.linspace(
-        t[0], t[-1], 1 + max(1, round(float(t[-1] - t[0]) / _PART)))[1:-1]).tolist()
+        t[0], t[-1], 1 + max(1, min(round(float(t[-1] - t[0]) / _PART), n // _IN_PART)))[1:-1]
+                                                ).tolist()
     for begin, end in zip([0, *edges], [*edges, n]):
         if end - begin < FEWEST:
             continue

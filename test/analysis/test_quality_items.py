@@ -34,12 +34,23 @@ def test_a_clean_recording_has_an_empty_list():
 
 def test_worst_comes_first_and_levels_share_an_entry():
     """An unusable level, a doubtful flag of two, one that only informs."""
-    bad = Estimate(status=Status.BURIED)
+    bad = Estimate(status=Status.CONSTANT)
     flagged = replace(GOOD, flags=(Flag.QUANTIZED, Flag.HELD_SAMPLES))
     items = quality_list(recording(1, ((0.1, 0.3),)), [0.1, 0.2, 0.3], [flagged, bad, flagged])
     assert [(item.name, item.severity, item.throttles) for item in items] == [
-        ('BURIED', Severity.ERROR, (0.2,)), ('QUANTIZED', Severity.WARNING, (0.1, 0.3)),
+        ('CONSTANT', Severity.ERROR, (0.2,)), ('QUANTIZED', Severity.WARNING, (0.1, 0.3)),
         ('HELD_SAMPLES', Severity.INFO, (0.1, 0.3))]
+
+
+@pytest.mark.parametrize('status', [
+    Status.NO_RELAXATION, Status.BURIED, Status.TOO_SHORT, Status.UNBOUND, Status.TOO_FEW_SAMPLES])
+def test_the_rate_or_length_of_a_recording_is_no_fault(status):
+    """A limit is information; where the whole shows alpha, the level does not deny it."""
+    bad = [Estimate(status=status)]
+    (item,) = listed(recording(1, ((0.1, 0.3),)), bad)
+    assert (item.name, item.severity, item.text) == (status.name, Severity.INFO, status.value)
+    (item,) = quality_list(recording(1, ((0.1, 0.3),)), [0.1], bad, known=True)
+    assert item.severity is Severity.INFO and 'whole recording shows' in item.text
 
 
 @pytest.mark.parametrize('defect', Defect)

@@ -49,6 +49,17 @@ def test_noise_is_of_its_throttle():
         assert (rms, steady) == pytest.approx((truth, truth), rel=0.15)
 
 
+def test_a_log_of_1_hz_has_noise():
+    """Five minutes of readings a second apart: the white noise beside level and load."""
+    rng = np.random.default_rng(3)
+    t = np.arange(300.0)
+    u = np.clip(0.45 + 0.1 * rng.standard_normal(t.size), 0.0, 1.0)
+    v = 16.0 - 0.002 * t - 1.2 * u ** 1.8 + 0.02 * rng.standard_normal(t.size)
+    found = supply_facts(Recording(t, v, u)).noise
+    # Of 300 readings some 80 go into level and load.
+    assert found.rms_v[4] == pytest.approx(0.02, rel=3.0 / np.sqrt(2.0 * 220.0) + 0.05)
+
+
 def test_sag_and_resistance_are_those_of_the_filter():
     """Positive, at eleven throttles; without a limit as with one."""
     recording = flight(np.random.default_rng(5))

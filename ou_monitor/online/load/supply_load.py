@@ -44,8 +44,8 @@ class LoadStatus(enum.Enum):
     NO_THROTTLE = 'Throttle is not known: the level is that under load, the sag is not known.'
     STILL = 'Throttle has not moved: the sag is unknown.'
     UNCERTAIN = 'The sag is too uncertain: it needs more changes of throttle.'
-    NO_RELATION = ('The voltage does not fall with throttle: check the topic, the unit and the '
-                   'sign of throttle.')
+    NO_RELATION = ('The voltage does not fall with throttle, as on a regulated rail; on a '
+                   'battery, check topic, unit and sign of throttle.')
 
 
 class Basis(enum.Enum):
