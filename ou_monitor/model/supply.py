@@ -1,8 +1,8 @@
 """
 A supply as a sum of terms, and its simulation.
 
-Limits: between samples the parameters of a step hold still (throttle, a
-wandering sigma); what is exact in law and what is not is said by each term.
+Limits: parameters that change (throttle, sigma) are constant between two samples;
+each term says which of its effects are exact in law.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from ou_monitor.model.terms.segment import Effect, Segment, Stage
 from ou_monitor.model.terms.term import Term
 from ou_monitor.records import FloatArray
 
-# Samples drawn at once by `SupplyModel.simulate`: bounds memory beside the result,
-# and what the terms touch stays in the processor's caches.
+# Samples that `SupplyModel.simulate` draws at a time: bounds memory, and keeps the data of all
+# terms in the processor's caches.
 SEGMENT = 15_000
 
-# After an array of this size was allocated and freed, the GNU allocator keeps the memory of
-# segments for the next ones.  Otherwise it returns and requests it page by page, which can cost
-# more than the arithmetic.
+# Allocating and freeing an array of this size once makes the GNU allocator keep the memory of
+# segments.  Otherwise it returns and requests it page by page, which can take longer than the
+# arithmetic.
 _KEPT = 2**18
 
 # Relative difference below which steps are equal: rounding of stamps.
@@ -36,7 +36,7 @@ class SupplyModel:
     """
     Terms that add up to a supply.
 
-    ValueError: the first term is not the `ou`, or one that can be there once is there twice.
+    ValueError: the first term is not the `ou`, or a term that a model can have once occurs twice.
 
     Examples
     --------
@@ -54,9 +54,9 @@ class SupplyModel:
 
     # The first is the `ou`, the only one of its kind.
     terms: tuple[Term, ...]
-    # What the load filter knows of this craft at take-off; None: nothing.
+    # Where the load filter starts at take-off, learned from this craft; None: unknown.
     load: LoadStart | None = None
-    # When it was learned, as the model file says; empty: unknown.
+    # Date of learning in the model file; empty: unknown.
     date: str = field(default='', compare=False)
 
     def __post_init__(self) -> None:
@@ -80,7 +80,7 @@ class SupplyModel:
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """Return names of terms that affect the supply and that the risk onboard ignores."""
+        """Return the names of the terms that change the rail but that the live risk ignores."""
         return tuple(term.NAME for term in self.terms
                      if term.STAGE in (Stage.DRIVE, Stage.STATE, Stage.LEVEL) and not term.LIVE)
 
@@ -94,7 +94,7 @@ class SupplyModel:
         """
         Draw a recording, V (t in s, rising).
 
-        throttle: 0..1, held from the stamp before to its own; one number stands for all.
+        throttle: 0..1, each held from the previous stamp to its own; one number for all samples.
         """
         stamps = np.asarray(t, dtype=np.float64)
         load = None if throttle is None else np.broadcast_to(
@@ -107,16 +107,16 @@ class SupplyModel:
         return voltage
 
 
-# The exponent of current over throttle that `LoadStart.discharge` counts by.
+# Exponent of the current over throttle, for which `LoadStart.discharge` holds.
 _POWER = 1.8
 
 
 class Discharge:
-    """Fall of the level as throttle draws charge; `charge` is the remaining charge, 0..1."""
+    """Drop of the level as the pack discharges; `charge` is the remaining charge, 0..1."""
 
     def __init__(self, load: LoadStart, level: float, charge: float = math.nan) -> None:
         self._load = load
-        # The level of the model is the level at this charge.
+        # The charge at which the level is that of the model.
         self._origin = charge_at(level / load.cells)
         self.charge = self._origin if math.isnan(charge) else charge
 
@@ -130,12 +130,12 @@ class Discharge:
 
 class Simulation:
     """
-    A simulation that goes on from segment to segment; each term gets a child of `rng`.
+    A simulation that continues from segment to segment; each term has its own generator.
 
     The same seed gives the same samples, to rounding, whatever the segments.  `resistance`
-    multiplies the response to throttle, and may change meanwhile: an old pack.  `charge`, 0..1,
-    at the first sample has the level follow the charge that throttle draws (`model.load`), in
-    place of the recording's drift; NaN: the charge at which the recording began.
+    multiplies the response to throttle, for an old pack, and may change between segments.  With
+    `charge`, 0..1 at the first sample, the level falls as throttle discharges the pack
+    (`model.load`) and not by the recording's drift; NaN: the charge at which the recording began.
     """
 
     def __init__(self, model: SupplyModel, rng: np.random.Generator, *,
@@ -145,12 +145,11 @@ class Simulation:
         self.discharge: Discharge | None = None
         if charge is not None:
             if model.load is None:
-                raise ValueError("the model has no entry 'load': nothing is known of its charge")
+                raise ValueError("the model has no entry 'load', which the charge needs")
             self.discharge = Discharge(model.load, model.ou.u0, charge)
         np.empty(_KEPT)
         self._effects = self._in_order(rng)
-        # Only then does a term change alpha, sigma, power or push: else they are
-        # one number each, broadcast n times.
+        # Without such a term, alpha, sigma, power and push are constants, broadcast to n samples.
         self._driven = any(term.STAGE is Stage.DRIVE for term in model.terms)
         self._origin = math.nan
         self._last = -math.inf
@@ -178,8 +177,8 @@ class Simulation:
 
     def _in_order(self, rng: np.random.Generator) -> list[Effect]:
         """Return the effects of all terms in the order of their stages."""
-        # A term's draws depend on its name and on how many of that name came before
-        # it, so that adding another term leaves them as they were.
+        # A term's draws depend on its name and its count among terms of that name, so adding
+        # another term does not change them.
         seeds = rng.integers(0, 2**63, size=2).tolist()
         counts: dict[str, int] = {}
         pairs: list[tuple[Stage, Effect]] = []
@@ -212,21 +211,21 @@ class Simulation:
         return scaled
 
     def _load(self, throttle: npt.ArrayLike | None, stamps: FloatArray) -> FloatArray:
-        """Return throttle for all samples; NaN where no term asks for it."""
+        """Return throttle for all samples; NaN if no term needs it."""
         needs = self._model.needs_throttle
         if self.discharge is not None:
             needs = (*needs, 'load')
         if throttle is None:
             if needs:
-                raise ValueError(f"the term '{needs[0]}' needs throttle, and none is given")
+                raise ValueError(f"the term '{needs[0]}' needs throttle, but none was given")
             return np.broadcast_to(math.nan, stamps.size)
         load = np.asarray(throttle, dtype=np.float64)
         if load.shape != stamps.shape:
             raise ValueError(f'throttle must have the shape of t, {stamps.shape}, got '
                              f'{load.shape}')
         if needs and not np.isfinite(load).all():
-            raise ValueError(f"the term '{needs[0]}' needs throttle at every sample: some is not "
-                             'finite')
+            raise ValueError(f"the term '{needs[0]}' needs throttle at every sample, but not all "
+                             'of it is finite')
         return load
 
     def _segment(self, stamps: FloatArray, step: FloatArray, throttle: FloatArray) -> Segment:
@@ -243,5 +242,5 @@ class Simulation:
 
 
 def _join(s: Segment) -> None:
-    """Put the rail together, before any instrument sees it."""
+    """Compute the voltage of the rail from its parts, before any instrument."""
     s.voltage = s.x + s.level

@@ -1,4 +1,4 @@
-"""The instrument's AC coupling: then the fitted alpha may be the instrument's corner."""
+"""AC coupling of the instrument, whose corner may be taken for alpha."""
 
 from __future__ import annotations
 
@@ -13,19 +13,18 @@ from ou_monitor.model.terms.segment import Effect, first_order, Segment, Stage
 from ou_monitor.model.terms.term import parameter, Role, Term
 from ou_monitor.records import FloatArray
 
-# Minimum relative difference of two rates, which is enforced because the closed forms below divide
-# by their difference.
+# Minimum relative difference of two rates, because the formulas below divide by it.
 _APART = 1e-4
 
 
 @dataclass(frozen=True)
 class ACCoupling(Term):
     """
-    High-pass the rail with a first-order corner.
+    A first-order high-pass between rail and reading.
 
-    What is logged is U - l with dl = rate (U - l) dt, rate = 2 pi corner.  For
-    the OU the law of l between samples is exact, given the samples; all other
-    terms count as straight lines between samples.
+    The reading is U - l with dl = rate (U - l) dt, rate = 2 pi corner.  The
+    effect on the OU is exact in law; all other terms are taken as straight
+    lines between samples.
     """
 
     NAME: ClassVar[str] = 'ac_coupling'
@@ -41,14 +40,14 @@ class ACCoupling(Term):
     # An instrument may have two corners.
     MAY_LEAVE: ClassVar[float] = 0.75
     MEANING: ClassVar[str] = (
-        'The instrument is AC-coupled: the observed relaxation is that of its high-pass.')
+        'The instrument is AC-coupled: the relaxation comes from its high-pass.')
     REMEDY: ClassVar[str] = (
-        'Repeat with the instrument DC-coupled; alpha of the rail is the one given here, not the '
-        'one of the plain fit.')
+        'Repeat with DC coupling; use the alpha of this model for the rail, not that of the plain '
+        'fit.')
     SEPARATED_BY: ClassVar[str] = 'the same rail DC-coupled'
 
-    corner: float = parameter('Hz', 'where the high-pass is down by 3 dB', 0.0, above=True)
-    offset: float = parameter('V', 'level about which the instrument shows its input')
+    corner: float = parameter('Hz', 'corner (-3 dB) of the high-pass', 0.0, above=True)
+    offset: float = parameter('V', 'mean level of the readings')
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
@@ -62,7 +61,7 @@ class ACCoupling(Term):
             alpha, step = s.alpha.copy(), s.step.copy()
             first = math.isnan(low)
             if first:
-                # In the stationary law, given x; the level has long been there.
+                # From the stationary law given x, as if the level had always been constant.
                 of_x = rate / (rate + alpha[0])
                 spread = s.sigma[0] ** 2 / (2.0 * alpha[0]) * s.power[0] * of_x * (1.0 - of_x)
                 low = float(level[0] + of_x * s.x[0] + math.sqrt(spread) * draws[0])
@@ -86,16 +85,16 @@ class ACCoupling(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return corners around that of the fitted relaxation."""
+        """Return the corner of the fitted relaxation, and a quarter of it."""
         rate = -math.log(max(float(np.median(view.phi[1:])), 1e-300)) * view.rate / (2.0 * math.pi)
         return [cls(rate, 0.0), cls(0.25 * rate, 0.0)]
 
     def beside(self, ou: Term) -> Term:
-        """Return a slow `ou`: the fitted relaxation may be all the instrument's."""
+        """Return a slow `ou`, since the fitted relaxation may be that of the instrument."""
         return ou.read({**ou.values(), 'alpha': 0.3 * math.pi * self.corner})
 
     def pass_through(self, columns: FloatArray, s: Segment) -> FloatArray:
-        """Return columns of the mean after the instrument."""
+        """Return columns of the mean after the high-pass."""
         shown = np.empty_like(columns)
         for k in range(columns.shape[1]):
             alone = replace(s, x=np.zeros(s.t.size), sigma=np.zeros(s.t.size),
@@ -108,7 +107,7 @@ class ACCoupling(Term):
 def bridge(alpha: FloatArray, rate: float, step: FloatArray
            ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """
-    Return the law of what an OU adds to its low-pass in a step, given both ends.
+    Return the law of the step of an OU's low-pass, given the OU at both ends.
 
     l_k = exp(-rate step) l_{k-1} + start x_{k-1} + end x_k + sigma sqrt(spread) z.
 

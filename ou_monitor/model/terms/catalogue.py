@@ -1,9 +1,9 @@
 """
 All terms: the classes with a NAME in a module of this folder, and causes of other packages.
 
-The names are those of model files and of findings.  Another package declares its causes as entry
-points of the group `ou_monitor.causes`.  One that cannot be used is left out with a reason, and
-`discover` goes on without it.
+The names are those in model files and findings.  Another package declares its causes as entry
+points of the group `ou_monitor.causes`.  A cause that cannot be used is left out with a reason,
+and `discover` continues without it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Laws of the innovations: input of their fits, results, and common functions."""
+"""Laws of the innovations: the input of their fits, and common functions."""
 
 from __future__ import annotations
 
@@ -12,33 +12,33 @@ from scipy.optimize import minimize
 from scipy.special import ndtr, ndtri
 
 LOG_2PI = math.log(2.0 * math.pi)
-# Probabilities nearer to 0 and 1 than this are cut: scores of 8 and more are one thing.
+# Minimum probability, which limits scores to about 8.
 _EDGE = 1e-15
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Input of a candidate before it is fitted."""
+    """What a candidate is fitted to: the residual of the model so far."""
 
     z: FloatArray  # Normal scores of the one-step innovations under the model so far; shape (n,)
     variance: FloatArray  # Predictive variance of each sample, V^2; shape (n,)
-    phi: FloatArray  # Coefficient of the OU in the step before each sample; shape (n,)
-    # Deviation of the sample before from its mean, V; 0 at the first; shape (n,).
+    phi: FloatArray  # exp(-alpha step) of the OU in the step before each sample; shape (n,)
+    # Deviation of the previous sample from its mean, V; 0 at the first; shape (n,).
     state: FloatArray
     residual: FloatArray  # Voltage less its mean, V; shape (n,)
     at: FloatArray  # Time since the first sample, s; shape (n,)
-    step: FloatArray  # Time since the sample before, s; shape (n,)
+    step: FloatArray  # Time since the previous sample, s; shape (n,)
     throttle: FloatArray | None  # 0..1; shape (n,)
-    train: slice  # The part that parameters are fitted on
-    # Share of each error that the filter takes for the rail's: 1 without white noise; shape (n,).
+    train: slice  # Samples to which parameters are fitted
+    # Gain of the filter, 0..1: 1 without white noise; shape (n,).
     trust: FloatArray | float = 1.0
-    # Share of each variance that the noise of the `ou` adds in the step before: 1 without white
-    # noise and other states; shape (n,).
+    # Share of each variance that comes from the noise of the `ou` in the step before: 1 without
+    # white noise and other states; shape (n,).
     driven: FloatArray | float = 1.0
 
     @property
     def rate(self) -> float:
-        """Return the usual rate, Hz."""
+        """Return the median sampling rate, Hz."""
         return 1.0 / float(np.median(self.step[1:]))
 
 
@@ -68,7 +68,7 @@ def climb(value: Callable[[FloatArray], float], start: Sequence[float] | FloatAr
 
 def curvature_se(value: Callable[[FloatArray], float], at: FloatArray, step: float = 0.05
                  ) -> FloatArray:
-    """Return standard errors by the curvature of a log-likelihood along each axis."""
+    """Return standard errors from the curvature of a log-likelihood along each axis."""
     top = value(at)
     errors = np.full(at.size, math.nan)
     for k in range(at.size):
@@ -82,7 +82,7 @@ def curvature_se(value: Callable[[FloatArray], float], at: FloatArray, step: flo
 
 def refine(values: Callable[[FloatArray], FloatArray], start: Sequence[float] | FloatArray,
            step: float = 0.1) -> tuple[FloatArray, float, FloatArray] | None:
-    """Climb from near a top by Newton's steps; return place, height, errors, or None."""
+    """Maximise by Newton steps from nearby; return position, value and errors, or None."""
     x = np.asarray(start, dtype=np.float64)
     size = x.size
     moves, pairs = step * np.eye(size), np.triu_indices(size, 1)
@@ -95,7 +95,7 @@ def refine(values: Callable[[FloatArray], FloatArray], start: Sequence[float] | 
             return None
         top, up, down = found[0], found[1:size + 1], found[size + 1:2 * size + 1]
         gradient, bend = (up - down) / (2.0 * step), np.diag((up - 2.0 * top + down) / step**2)
-        # Two-sided, because a third derivative would bias one-sided differences.
+        # Central differences, because a third derivative would bias one-sided ones.
         sides = found[2 * size + 1:].reshape(2, -1).sum(axis=0)
         alone = up + down - top
         bend[pairs] = (sides - alone[pairs[0]] - alone[pairs[1]]) / (2.0 * step**2)
@@ -103,7 +103,7 @@ def refine(values: Callable[[FloatArray], FloatArray], start: Sequence[float] | 
         curve, axes = np.linalg.eigh(bend)
         if curve[0] >= 0.0:
             return None
-        # Uphill along each axis, also where it bends the other way.
+        # Uphill along each axis, even where the curvature is positive.
         by = axes @ (axes.T @ gradient / np.maximum(np.abs(curve), _STRAIGHT * -curve[0]))
         gain = 0.5 * float(by @ gradient)
         ends = x + np.clip(by, -0.5, 0.5) * _SHARES[:, None]
@@ -113,8 +113,8 @@ def refine(values: Callable[[FloatArray], FloatArray], start: Sequence[float] | 
         x, turn = ends[int(np.argmax(further))], turn + 1
 
 
-# Newton's steps at most, nats below which one is none, shares of one that are tried, and the least
-# curvature, as a share of the largest.
+# Maximum Newton steps, gain below which they end, nats, step lengths tried, and minimum curvature
+# as a share of the largest.
 _NEWTON, _FLAT = 5, 0.05
 _SHARES = np.array([1.0, 0.4, 0.1])
 _STRAIGHT = 1e-3

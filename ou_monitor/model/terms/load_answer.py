@@ -1,4 +1,4 @@
-"""Response of the mean to throttle: immediate sag, lag, inrush, slow polarisation."""
+"""How the mean voltage responds to throttle: sag, lag, inrush, slow polarisation."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from ou_monitor.model.terms.segment import Effect, first_order, Segment, Stage
 from ou_monitor.model.terms.term import by_parameters, NEXT_TO_ZERO, parameter, Role, Term
 
 
-# Evidence that a growth must gain beyond the price of its parameter, nats: that of a cause.
-# Without it, 5 of 72 simulated flights with a steady sag were said to grow; with it, none.
+# Evidence needed for a growth beyond the price of its parameter, nats: as much as for a cause.
+# Without it, a growth was found in 5 of 72 simulated flights with a steady sag; with it, in none.
 _GROWS = 6.0
 
 
@@ -23,8 +23,8 @@ class LoadSag(Term):
     """
     Subtract (linear + growth * t) * throttle + square * throttle^2 from the level.
 
-    t counts from the first sample: the resistance of a pack grows as it empties, and falls as it
-    warms.  A square or growth of exactly 0 is left out, of a fit too.
+    t is the time since the first sample: the resistance of a pack rises as it empties, and falls
+    as it warms.  A square or growth of exactly 0 stays 0 in a fit.
     """
 
     NAME: ClassVar[str] = 'load_sag'
@@ -42,12 +42,12 @@ class LoadSag(Term):
     MEANING: ClassVar[str] = (
         'The mean falls with throttle: IR drop of battery, leads and regulator.')
     REMEDY: ClassVar[str] = (
-        'Give the estimator throttle, so that it takes the sag out; thicker or shorter leads '
+        'Give the estimator the throttle, so that it removes the sag; thicker or shorter leads '
         'reduce it.')
     SEPARATED_BY: ClassVar[str] = 'throttle held for some seconds at several levels'
 
-    linear: float = parameter('V', 'fall at full throttle, linear part')
-    square: float = parameter('V', 'fall at full throttle, square part')
+    linear: float = parameter('V', 'drop at full throttle, linear part')
+    square: float = parameter('V', 'drop at full throttle, quadratic part')
     growth: float = parameter('V/s', 'growth of the linear part', default=0.0)
 
     def start(self, rng: np.random.Generator) -> Effect:
@@ -59,29 +59,29 @@ class LoadSag(Term):
         return effect
 
     def at(self, t: float) -> LoadSag:
-        """Return the sag as it is t seconds after the first sample, growing no more."""
+        """Return the sag t seconds after the first sample, without growth."""
         return LoadSag(self.linear + self.growth * t, self.square)
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return a straight line and a parabola, each as it stays and as it grows."""
+        """Return a straight line and a parabola, each with and without growth."""
         return tuple(cls(0.0, square, growth) for growth in (0.0, NEXT_TO_ZERO)
                      for square in (0.0, NEXT_TO_ZERO))
 
 
-# Difference below which stamps are equal, s: bags count in ns.
+# Difference below which stamps are equal, s: the resolution of a bag.
 _HAIR = 1e-9
 
 
 @dataclass(frozen=True)
 class LoadTransient(Term):
     """
-    Add gain * (throttle - its low-pass of time constant tau), after a delay, and rise * its rises.
+    Add gain * d + rise * max(d, 0), where d is the delayed throttle less its low-pass (tau).
 
-    A step of throttle shows as gain * exp(-t/tau), one upwards as (gain + rise) * exp(-t/tau):
-    motors draw more as they run up, and give nothing back as they run down.  gain of the sign of
-    the sag (> 0 when the voltage falls) delays the sag: with gain equal to the sag it is
-    low-passed.  gain < 0 deepens the fall at first (inrush).
+    A unit step up adds (gain + rise) * exp(-t/tau), one down -gain * exp(-t/tau): motors draw
+    more current while they speed up, and return none while they slow down.  gain > 0 delays a
+    sag that lowers the voltage: with gain equal to the sag, the sag is low-passed.  gain < 0
+    deepens it at first (inrush).
     """
 
     NAME: ClassVar[str] = 'load_transient'
@@ -89,7 +89,7 @@ class LoadTransient(Term):
     STAGE: ClassVar[Stage] = Stage.LEVEL
     NEEDS_THROTTLE: ClassVar[bool] = True
     ROLE: ClassVar[Role] = Role.MEAN
-    # The rise is left out of a fit where it is 0.
+    # A rise of 0 stays 0 in a fit.
     LINEAR: ClassVar[tuple[str, ...]] = by_parameters(
         ('gain', 'rise'), lambda term: ('gain', 'rise') if term.rise else ('gain',))
     SIGNS: ClassVar[tuple[str, ...]] = ('throttle',)
@@ -98,17 +98,17 @@ class LoadTransient(Term):
     SEVERAL: ClassVar[bool] = True
     RECURS: ClassVar[bool] = True
     MEANING: ClassVar[str] = (
-        'The mean answers to changes of throttle: lag, inrush or slow polarisation recovery.')
+        'The mean responds to changes of throttle: lag, inrush or slow recovery of polarisation.')
     REMEDY: ClassVar[str] = (
-        'Count the dip after a throttle step into the brown-out margin; capacitance at the ESC '
+        'Include the dip after a throttle step in the brown-out margin; capacitance at the ESC '
         'shortens it.')
     SEPARATED_BY: ClassVar[str] = (
-        'single steps of throttle, each held for ten times the time in which the answer dies out')
+        'single steps of throttle, each held for ten times the time constant of the response')
 
-    gain: float = parameter('V', 'answer to a step of full throttle, at once')
-    tau: float = parameter('s', 'time in which it dies out', 0.0, above=True)
-    delay: float = parameter('s', 'time until the answer begins', 0.0)
-    rise: float = parameter('V', 'more of it where throttle rises', default=0.0)
+    gain: float = parameter('V', 'immediate response to a step to full throttle')
+    tau: float = parameter('s', 'time constant of its decay', 0.0, above=True)
+    delay: float = parameter('s', 'delay before the response begins', 0.0)
+    rise: float = parameter('V', 'added to the gain while throttle rises', default=0.0)
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
@@ -120,10 +120,10 @@ class LoadTransient(Term):
             nonlocal slow, times, values
             throttle = s.throttle
             if self.delay > 0.0:
-                # What was set `delay` ago; before the first sample, what it had.
+                # Throttle `delay` ago; before the first sample, that of the first sample.
                 times = np.concatenate((times, s.at))
                 values = np.concatenate((values, throttle))
-                # A margin for rounding, for delays of whole steps.
+                # Tolerance for rounding where the delay is a whole number of steps.
                 hair = _HAIR + 2.0 * np.spacing(np.abs(s.at))
                 then = np.searchsorted(times, s.at - self.delay + hair, side='right') - 1
                 throttle = values[np.maximum(then, 0)]
@@ -149,7 +149,7 @@ class LoadTransient(Term):
         count = max(2, math.ceil(2.0 * math.log2(longest / (SHORTEST * step))))
         lags = [cls(0.0, float(tau), 0.0) for tau in np.geomspace(
             SHORTEST * step, longest, count)]
-        # Late by whole steps, and for good: a delay.
+        # A pure delay of whole steps: a response that never decays.
         latest = max(_LATEST, 4.0 * step)
         late = np.unique(np.rint(np.geomspace(step, latest, _DELAYS) / step)) * step
         inrush = [cls(0.0, lag.tau, 0.0, NEXT_TO_ZERO) for lag in lags if lag.tau < _INRUSH]
@@ -157,12 +157,12 @@ class LoadTransient(Term):
             cls(0.0, _FOR_GOOD * 4.0 * longest, float(delay)) for delay in late)]
 
 
-# Steps of the recording in the shortest time constant that it shows: a seventh of the answer is
-# left at the next reading.
+# Shortest visible time constant, in steps of the recording: one seventh of the response is left at
+# the next sample.
 SHORTEST = 0.5
-# Longest time in which motors run up, s.
+# Longest time that motors take to speed up, s.
 _INRUSH = 0.2
-# Delays tried, and the longest of them, s.
+# Number of delays to try, and the longest, s.
 _DELAYS, _LATEST = 12, 0.1
-# Share of a recording's duration in which a response loses a hundredth: it cannot follow a trend.
+# Time constant of a response that never decays, in durations of the recording.
 _FOR_GOOD = 100.0

@@ -1,4 +1,4 @@
-"""Parameters that depend on throttle: sigma, the main finding of the paper; alpha; white noise."""
+"""Parameters that depend on throttle: sigma (the paper's main finding), alpha, white noise."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class LoadDependentSigma(Term):
     LIVE: ClassVar[bool] = True
     MEANING: ClassVar[str] = 'The noise grows or shrinks with throttle.'
     REMEDY: ClassVar[str] = (
-        'Let the estimator run while flying, so that filters and risk follow the load.')
+        'Run the estimator in flight, so that filter and risk use the noise at the present load.')
     SEPARATED_BY: ClassVar[str] = 'throttle held for some seconds at several levels'
 
     throttle: tuple[float, ...] = parameters('', 'knots, rising')
@@ -48,7 +48,7 @@ class LoadDependentSigma(Term):
             raise ValueError(f'{self.NAME}.throttle must rise, got {list(self.throttle)}')
 
     def steps(self) -> bool:
-        """Return whether it is one step."""
+        """Return whether the curve is a single step."""
         return len(self.throttle) == 2 and self.throttle[1] - self.throttle[0] < 3.0 * _EDGE
 
     def start(self, rng: np.random.Generator) -> Effect:
@@ -59,7 +59,7 @@ class LoadDependentSigma(Term):
         return effect
 
     def free(self) -> tuple[str, ...]:
-        """Return all knots but the first, at which sigma is that of the OU."""
+        """Return all knots but the first, where sigma equals that of the OU."""
         return tuple(f'log_factor {k}' for k in range(1, len(self.log_factor)))
 
     def moved(self, name: str, by: float) -> LoadDependentSigma:
@@ -70,12 +70,12 @@ class LoadDependentSigma(Term):
         return replace(self, log_factor=factors)
 
     def per_coordinate(self, name: str) -> float:
-        """Return 1: a knot is a logarithm already."""
+        """Return 1: the value at a knot is already a logarithm."""
         return 1.0
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return the two most likely of a straight line, single steps, and several knots."""
+        """Return the two most likely curves: a straight line, a single step, or several knots."""
         if view.throttle is None:
             return ()
         u = view.throttle[view.train]
@@ -102,7 +102,7 @@ class LoadDependentSigma(Term):
 
 # Price of the search for the edge of a step, nats: ln of the edges tried.
 _STEP_PRICE = 4.5
-# The same for a knot; bins of throttle, minimum scores in a bin, maximum knots.
+# Price of the search for a knot; number of bins, minimum scores in a bin, maximum knots.
 _KNOT_PRICE = 3.5
 _BINS, _IN_BIN, _MOST_KNOTS = 40, 20, 9
 # Largest logarithm of a factor: where white noise hides the rail, nothing else limits it.
@@ -112,7 +112,7 @@ _APART, _EDGE = 0.02, 0.002
 
 
 def _ends(throttle: FloatArray) -> FloatArray:
-    """Return the ends of all throttle, the held-out part included: knots of a straight line."""
+    """Return lowest and highest throttle, with the held-out part: knots of a straight line."""
     return np.array([throttle.min(), throttle.max()])
 
 
@@ -120,7 +120,7 @@ Bins = tuple[FloatArray, FloatArray, FloatArray]
 
 
 def _binned(square: FloatArray, x: FloatArray, edges: FloatArray) -> Bins:
-    """Return mean input, ln of the scores' deviation, and count of each bin with enough scores."""
+    """Return mean input, ln of the scores' std, and count of each bin with enough scores."""
     last = edges.size - 2
     where = np.clip(np.searchsorted(edges, x, side='right') - 1, 0, last)
     count = np.bincount(where, minlength=last + 1).astype(np.float64)
@@ -131,7 +131,7 @@ def _binned(square: FloatArray, x: FloatArray, edges: FloatArray) -> Bins:
 
 
 def _hats(x: FloatArray, knots: FloatArray) -> FloatArray:
-    """Return the shares of knots, shape (sets, knots), in inputs: (sets, inputs, knots)."""
+    """Return the weight of each knot, shape (sets, knots), at x: (sets, inputs, knots)."""
     sets, count = knots.shape
     at = np.clip((x[None, :, None] >= knots[:, None, :]).sum(axis=2) - 1, 0, count - 2)
     rows = np.arange(sets)[:, None]
@@ -145,9 +145,9 @@ def _hats(x: FloatArray, knots: FloatArray) -> FloatArray:
 
 
 def _to_bins(bins: Bins, knots: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return factors that fit the bins, and the misfit, nats, for each set of knots."""
+    """Return for each set of knots the factors fitted to the bins, and the misfit, nats."""
     centre, log, count = bins
-    # The logarithm of a deviation found from n scores has a variance of 1/(2 n).
+    # The logarithm of a standard deviation estimated from n scores has a variance of 1/(2 n).
     weight = 2.0 * count
     hats = _hats(centre, knots)
     gram = np.einsum('sik,i,sil->skl', hats, weight, hats)
@@ -159,7 +159,7 @@ def _to_bins(bins: Bins, knots: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _greedy(bins: Bins, knots: FloatArray, price: float, apart: float
             ) -> tuple[FloatArray, FloatArray, float]:
-    """Return knots, factors and misfit, nats; adds the best knot while it gains `price`."""
+    """Add the best knot while it gains `price`; return knots, factors and misfit, nats."""
     factors, misfit = _to_bins(bins, knots[None])
     found = knots, factors[0], float(misfit[0])
     while found[0].size < _MOST_KNOTS:
@@ -190,7 +190,7 @@ class LoadDependentAlpha(Term):
     LIVE: ClassVar[bool] = True
     MEANING: ClassVar[str] = 'The relaxation rate depends on throttle.'
     REMEDY: ClassVar[str] = (
-        'Fit each load level on its own (analyze); a single alpha is wrong at all levels but one.')
+        'Fit each throttle level separately (analyze): a single alpha is right at one level only.')
     SEPARATED_BY: ClassVar[str] = 'throttle held for 50 relaxation times at each of several levels'
 
     slope: float = parameter('', 'ln of the factor at full throttle')
@@ -207,44 +207,43 @@ class LoadDependentAlpha(Term):
         return replace(self, slope=self.slope + by)
 
     def per_coordinate(self, name: str) -> float:
-        """Return 1: the slope is that of a logarithm already."""
+        """Return 1: the slope is already that of a logarithm."""
         return 1.0
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return the constant rate."""
+        """Return a rate that does not depend on throttle."""
         return () if view.throttle is None else (cls(0.0),)
 
 
 # Spans of the moving means of throttle from which changes are measured, s.
 _FAST, _SLOW = 0.03, 0.2
-# What the noise may follow, by number, and the span, s: throttle; its distance from its mean of
-# the last 30 ms; its change from sample to sample; the distance between its means of the last 30
-# and 200 ms; and its rises and falls as they are remembered.
+# Inputs that the noise may depend on, and their time constants, s: throttle; its distance from
+# its mean of the last 30 ms; its change between samples; the distance between its means of the
+# last 30 and 200 ms; and sums of its rises and of its falls that decay.
 INPUTS = (('throttle', 0.0), ('fast', _FAST), ('step', 0.0), ('slow', _SLOW), *(
     (what, span) for span in (0.1, 0.5, 2.5) for what in ('rises', 'falls')))
 # Price of choosing an input, nats: ln of their number.
 _INPUT_PRICE = math.log(len(INPUTS))
-# Share of white noise in the one-step errors below which it is not separated.
+# Minimum share of white noise in the one-step errors; below it, it cannot be separated.
 _LEAST_WHITE = 0.05
-# Quantiles that bound the bins of an input: most changes are zero.
+# Quantiles between the bins of an input, dense at the top because most changes are zero.
 _SHARES = np.array([*np.linspace(0.0, 0.95, 39), 0.97, 0.98, 0.985, 0.99, 0.995, 0.998, 1.0])
-# Maximum squared score once the curves are roughly known, which limits the effect of wrong
-# samples.
+# Maximum squared score once the curves are roughly known: limits the effect of wrong samples.
 _LARGEST = 25.0
 # Rounds of fitting each curve given the others; minimum distance of knots over the range.
 _ROUNDS, _SPACING = 2, 0.02
-# Input number of the curve over the sum of the other curves.
+# Index for the curve that bends the sum of the others.
 SUM = len(INPUTS)
 
 
 def _curve(square: FloatArray, x: FloatArray, shares: FloatArray, log: FloatArray | None
            ) -> tuple[FloatArray, FloatArray] | None:
     """
-    Return knots over x and ln of the scores' deviation there, the first 0; None: constant.
+    Return knots in x and ln of the scores' std there, relative to the first; None: constant.
 
-    square: of the scores, shape (n,); shares: quantiles that bound the bins of x; log: ln of the
-    scores' deviation once roughly known, shape (n,).
+    square: squared scores, shape (n,); shares: quantiles between the bins of x; log: ln of the
+    scores' std once roughly known, shape (n,).
     """
     edges = np.unique(np.quantile(x, shares))
     if edges.size < 3:
@@ -254,7 +253,7 @@ def _curve(square: FloatArray, x: FloatArray, shares: FloatArray, log: FloatArra
         square = np.minimum(square, _LARGEST * usual * np.exp(2.0 * log))
     centre, values, count = _binned(square, x, edges)
     if log is not None:
-        # The mean of heavy-tailed squares is less certain than that of normal scores.
+        # The mean of heavy-tailed squares is less certain than that of normal ones.
         alike = square * np.exp(-2.0 * log)
         count = count / max(0.5 * float(np.mean(alike**2) / np.mean(alike)**2) - 0.5, 1.0)
     flat = 0.0 if centre.size < 2 else float(np.sum(
@@ -272,10 +271,11 @@ def _curve(square: FloatArray, x: FloatArray, shares: FloatArray, log: FloatArra
 @dataclass(frozen=True)
 class LoadDependentNoise(Term):
     """
-    Multiply the white noise by a factor whose ln is a sum of curves over throttle and its changes.
+    Multiply the white noise by a factor that depends on throttle and its changes.
 
-    Each curve is straight between knots and level beyond the outer ones, over one of `INPUTS`; one
-    over their sum bends it.  It scales `measurement_noise`; without one it does nothing.
+    The logarithm of the factor is a sum of curves, each of one of `INPUTS`, linear between knots
+    and constant beyond them; a last curve may bend the sum.  Without a `measurement_noise` to
+    scale, it does nothing.
     """
 
     NAME: ClassVar[str] = 'load_dependent_noise'
@@ -291,18 +291,18 @@ class LoadDependentNoise(Term):
     APART: ClassVar[int] = by_parameters(0, lambda term: len(term.at) - len(set(term.number)))
     CHANGES: ClassVar[type[Term] | None] = MeasurementNoise
     MEANING: ClassVar[str] = (
-        'The white noise of the reading grows with throttle or with its changes: ripple of the '
-        'ESCs, which the ADC samples.')
+        'The white noise of the readings grows with throttle or its changes: the ADC samples the '
+        'ripple of the ESCs.')
     REMEDY: ClassVar[str] = (
-        'Put capacitance at the ESCs or a filter before the ADC; weigh readings at high throttle '
-        'less.')
+        'Add capacitance at the ESCs or a filter before the ADC; give readings at high throttle '
+        'less weight.')
     SEPARATED_BY: ClassVar[str] = (
-        'the same flight at several times the sampling rate: white noise has no memory there '
-        'either')
+        'the same flight at several times the sampling rate, where white noise is still '
+        'uncorrelated')
 
-    number: tuple[float, ...] = parameters('', 'which input each knot is of: see INPUTS, SUM')
-    at: tuple[float, ...] = parameters('', 'where it is, rising for one input')
-    log_factor: tuple[float, ...] = parameters('', 'ln of the factor on the deviation there')
+    number: tuple[float, ...] = parameters('', 'index of the input of each knot: see INPUTS, SUM')
+    at: tuple[float, ...] = parameters('', 'value of the input at the knot, rising for each input')
+    log_factor: tuple[float, ...] = parameters('', 'ln of the factor there')
 
     def check(self) -> None:
         """Check that the knots rise and match."""
@@ -316,7 +316,7 @@ class LoadDependentNoise(Term):
                 raise ValueError(f'{self.NAME}.at must rise for one input, got {list(knots)}')
 
     def curves(self) -> dict[int, tuple[FloatArray, FloatArray]]:
-        """Return knots and factors by the number of the input."""
+        """Return knots and factors by the index of the input."""
         numbers = np.asarray(self.number, dtype=int)
         return {k: (np.asarray(self.at)[numbers == k], np.asarray(self.log_factor)[numbers == k])
                 for k in np.unique(numbers).tolist()}
@@ -331,7 +331,7 @@ class LoadDependentNoise(Term):
         return effect
 
     def log_of(self, inputs: Mapping[int, FloatArray]) -> FloatArray:
-        """Return ln of the factor for inputs, as `Inputs` returns them."""
+        """Return ln of the factor for the inputs that `Inputs` returns."""
         size = next((x.size for x in inputs.values()), 1)
         curves = self.curves()
         bent = curves.pop(SUM, None)
@@ -352,7 +352,7 @@ class LoadDependentNoise(Term):
         square = view.z[view.train] ** 2
         white = 1.0 - np.broadcast_to(view.trust, view.z.shape)[view.train]
         if float(white.mean()) > _LEAST_WHITE:
-            # The term does not scale the noise of the rail.
+            # Without the part of the rail, which the term does not scale.
             square = np.maximum(square - (1.0 - white), 0.0) / np.maximum(white, _LEAST_WHITE)
         square = square * np.exp(2.0 * self.log_of(inputs))
         few = max(1, math.ceil(2.0 * _IN_BIN * _SHARES.size / square.size))
@@ -380,7 +380,7 @@ class LoadDependentNoise(Term):
 
 
 class Inputs:
-    """Some of INPUTS, from segment to segment."""
+    """Computes some of INPUTS; keeps its state from segment to segment."""
 
     def __init__(self, wanted: Iterable[int]) -> None:
         self._wanted = [k for k in wanted if k != SUM]
@@ -388,7 +388,7 @@ class Inputs:
         self._before: dict[tuple[str, float], float] = {}
 
     def __call__(self, step: FloatArray, throttle: FloatArray) -> dict[int, FloatArray]:
-        """Return the inputs of the next samples by number (step in s)."""
+        """Return the inputs of the next samples by index (step in s)."""
         if math.isnan(self._last):
             self._last = float(throttle[0])
             self._before = {('mean', span): self._last for span in (_FAST, _SLOW)}
@@ -397,7 +397,7 @@ class Inputs:
         known: dict[tuple[str, float], FloatArray] = {}
 
         def through(what: str, span: float) -> FloatArray:
-            """Return the mean of throttle, or its decaying rises or falls, over a span (s)."""
+            """Return the mean of throttle, or a decaying sum of its rises or falls (span, s)."""
             if (what, span) not in known:
                 keep = np.exp(-step / span)
                 added = ((1.0 - keep) * throttle if what == 'mean' else

@@ -25,11 +25,11 @@ class NonlinearRestoring(Term):
     SIGNS: ClassVar[tuple[str, ...]] = ('state squared', 'state cubed')
     IMITATES: ClassVar[tuple[str, ...]] = ('regime_switching',)
     MEANING: ClassVar[str] = (
-        'What pulls the voltage back is not proportional to the deviation: a load of constant '
-        'power, or softening near brown-out.')
+        'The restoring force is not proportional to the deviation: a constant-power load, or '
+        'softening near brown-out.')
     REMEDY: ClassVar[str] = (
-        'Take deep excursions as longer and more frequent than the linear model says.')
-    SEPARATED_BY: ClassVar[str] = 'stronger excursions: steps of load in both directions'
+        'Expect deep excursions to be longer and more frequent than the linear model says.')
+    SEPARATED_BY: ClassVar[str] = 'larger excursions: load steps in both directions'
 
     square: float = parameter('1/(V s)', 'coefficient of x^2')
     cube: float = parameter('1/(V^2 s)', 'coefficient of x^3', 0.0)
@@ -49,7 +49,7 @@ class NonlinearRestoring(Term):
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
-        """Regress the innovations on square, cube, or both, of the deviation before them."""
+        """Regress the innovations on the square, the cube, or both, of the previous deviation."""
         found = [fit for powers in ((2,), (3,), (2, 3))
                  if (fit := cls._regressed(view, powers)) is not None]
         price = 0.5 * math.log(view.train.stop)
@@ -58,7 +58,7 @@ class NonlinearRestoring(Term):
 
     @classmethod
     def _regressed(cls, view: View, powers: tuple[int, ...]) -> LawFit | None:
-        """Return the fit with some powers; the linear force is fitted again with them."""
+        """Return the fit with some powers and the linear force."""
         train = view.train
         span = np.where(np.isfinite(view.step), view.step, 0.0)
         s, x = np.sqrt(view.variance), view.state
@@ -76,7 +76,7 @@ class NonlinearRestoring(Term):
         widest = float(np.median(view.variance[train]))
 
         def scored(b: FloatArray, part: slice) -> tuple[FloatArray, FloatArray]:
-            """Return scores and log densities of a part with these coefficients."""
+            """Return scores and log densities of a part for the coefficients b."""
             by = dict(zip(powers, b[1:].tolist(), strict=True))
             move, spread = _linearised(x[part], span[part], alpha - b[0], by.get(2, 0.0),
                                        by.get(3, 0.0), widest)
@@ -89,8 +89,8 @@ class NonlinearRestoring(Term):
             return scores, log_normal(scores) - 0.5 * np.log(spread)
 
         level = [0.0, 1.0]
-        # The regression takes the force at the begin of a step for that throughout.
-        # Far from what the data are, or as they are in a sensor that was stuck, a force runs away.
+        # The regression takes the force as constant within a step.  With coefficients far from the
+        # data, or the data of a stuck sensor, the voltage runs away.
         with np.errstate(over='ignore', invalid='ignore'):
             b = _climbed(lambda b: scored(b, train)[1], inverse @ (inside.T @ view.z[train]),
                          error)
@@ -104,9 +104,9 @@ class NonlinearRestoring(Term):
         errors = dict(zip(powers, error[1:].tolist(), strict=True))
         square, cube = by.get(2, 0.0), by.get(3, 0.0)
         if cube < 0.0:
-            # It would push away, which no term can represent, so its scores are not used.
+            # It would push the voltage away, which no term can represent.
             return None
-        # A square that would push away at large deviations is limited to just below that.
+        # The cube is at least what keeps the square from pushing the voltage away.
         cube = max(cube, _HOLDS * square * square / alpha)
         return LawFit(cls(square, cube), {'square': errors.get(2, math.nan),
                                           'cube': errors.get(3, math.nan)}, scores,
@@ -116,14 +116,12 @@ class NonlinearRestoring(Term):
 def _linearised(x: FloatArray, span: FloatArray, linear: float, square: float, cube: float,
                 variance: float) -> tuple[FloatArray, FloatArray]:
     """
-    Return what the force moves a deviation by in a step, and how noise spreads in it.
+    Return the movement of each deviation in a step, V, and its variance over `variance`.
 
-    The force is taken as linear about the deviation at the begin of a part of the step, and
-    the bend of it by its mean effect (Shoji & Ozaki, Stoch. Anal. Appl. 16 (1998) 733).
-
-    result in V.
+    Within a part of the step, the force is linearised about the deviation at its beginning,
+    with the mean effect of its curvature (Shoji & Ozaki, Stoch. Anal. Appl. 16 (1998) 733).
     """
-    # A force that softens stays as large as it has become: it does not push away.
+    # Beyond the extremum of a softening force, the force stays constant.
     tops = np.roots([3.0 * cube, 2.0 * square, linear])
     tops = tops[np.isreal(tops)].real
     low = np.max(tops, initial=-np.inf, where=tops < 0.0)
@@ -150,7 +148,7 @@ def _linearised(x: FloatArray, span: FloatArray, linear: float, square: float, c
 
 def _climbed(density: Callable[[FloatArray], FloatArray], b: FloatArray, error: FloatArray
              ) -> FloatArray:
-    """Return the coefficients of the largest likelihood near `b`, by numerical scores."""
+    """Maximise the likelihood from b by Fisher scoring with numerical derivatives."""
     now = density(b)
     for _ in range(_ROUNDS):
         scores = np.stack([density(b + _NEAR * step) - now for step in np.diag(error)],
@@ -169,12 +167,12 @@ def _climbed(density: Callable[[FloatArray], FloatArray], b: FloatArray, error: 
     return b
 
 
-# Cube at least, in square^2/alpha: from 1/4 on the force has one zero only.
+# Minimum cube in square^2/alpha: from 1/4 on, the force has only one zero.
 _HOLDS = 0.26
-# Slopes of the force times the step: the steepest, what counts as none, and up to which a
-# part of the step may be; parts at most.
+# Slope of the force times the step: the steepest, the smallest, and the largest in a part of the
+# step; maximum number of parts.
 _STIFF, _FLAT, _TURN, _PARTS = 20.0, 1e-9, 0.4, 6
-# Rounds of scoring, and the gain of one that is too little for another, nats.
+# Maximum rounds of scoring, and minimum gain of a round to start another, nats.
 _ROUNDS, _SETTLED = 5, 0.05
-# Steps of numerical scores, in standard errors.
+# Step of the numerical derivatives, in standard errors.
 _NEAR = 0.1

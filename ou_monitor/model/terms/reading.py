@@ -1,4 +1,4 @@
-"""Effects of the measurement: white noise, ADC steps and limits, repeats, wrong stamps."""
+"""Effects of the measurement: noise, ADC resolution and range, repeats, wrong stamps."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class MeasurementNoise(Term):
     FREE: ClassVar[tuple[str, ...]] = ('std',)
     SIGNS: ClassVar[tuple[str, ...]] = ('-autocorrelation', '+band')
     MAY_LEAVE: ClassVar[float] = 0.3
-    MEANING: ClassVar[str] = 'White noise of the sensor adds to the voltage of the rail.'
+    MEANING: ClassVar[str] = 'The sensor adds white noise to the voltage of the rail.'
     REMEDY: ClassVar[str] = (
         'Average in the ADC or use a finer range; alpha and sigma fitted without it are too high.')
     SEPARATED_BY: ClassVar[str] = (
@@ -47,7 +47,7 @@ class MeasurementNoise(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return a share of the one-step error."""
+        """Return two shares of the one-step error."""
         error = math.sqrt(float(np.median(view.variance)))
         return [cls(0.1 * error), cls(0.4 * error)]
 
@@ -60,23 +60,23 @@ class MeasurementNoise(Term):
         return self.std * self.std
 
     def variances(self, s: Segment) -> FloatArray | float:
-        """Return the same at each sample."""
+        """Return the variance at each sample, V^2."""
         return self.variance() * np.square(s.noise)
 
 
-# Share of the one-step variance below which white noise counts as 0: it moves the likelihood of n
-# samples by n/4 of its square, so that 10^7 samples would not show it.
+# Share of the one-step variance below which white noise counts as 0: a share s changes the log
+# likelihood of n samples by n s^2/4, too little to show even with 10^7 samples.
 _LEAST = 1e-3
 
 
 @dataclass(frozen=True)
 class LopsidedNoise(Term):
     """
-    Make the draws of the white noise lopsided, of unchanged mean and variance.
+    Make the white noise asymmetric or heavy-tailed, with the same mean and variance.
 
-    A draw is sinh((asinh(normal) + skew) / tail), less its mean and over its deviation (Jones &
-    Pewsey, Biometrika 96 (2009) 761): skew < 0 has falls that are rarer and deeper than the
-    rises, tail < 1 more of both.  It shapes `measurement_noise`; without one it does nothing.
+    A draw is sinh((asinh(normal) + skew) / tail), standardised (Jones & Pewsey, Biometrika 96
+    (2009) 761).  With skew < 0, dips are rarer and deeper than rises; with tail < 1, both tails
+    are heavier.  Without a `measurement_noise` to shape, it does nothing.
     """
 
     NAME: ClassVar[str] = 'lopsided_noise'
@@ -87,15 +87,15 @@ class LopsidedNoise(Term):
     IMITATES: ClassVar[tuple[str, ...]] = ('clock_jitter', 'glitches', 'heavy_tails', 'jumps')
     CHANGES: ClassVar[type[Term] | None] = MeasurementNoise
     MEANING: ClassVar[str] = (
-        'The white noise is lopsided: bursts of load, shorter than the time between readings and '
-        'not seen in throttle, make falls rarer and deeper than rises, or the other way round.')
+        'The white noise is asymmetric, with dips rarer and deeper than rises or the reverse: '
+        'load pulses that are shorter than the time between readings and not visible in throttle.')
     REMEDY: ClassVar[str] = (
-        'Take the margin from the lower side of the noise, not from its deviation; capacitance at '
-        'the ESCs makes short falls shallower.')
+        'Take the margin from the quantile of the dips, not from the rms; capacitance at the ESCs '
+        'makes short dips shallower.')
     SEPARATED_BY: ClassVar[str] = 'the same flight at several times the sampling rate'
 
-    skew: float = parameter('', 'asymmetry: below 0 falls are deeper than rises')
-    tail: float = parameter('', 'weight of the tails: 1 as a normal law, below 1 more', 0.0,
+    skew: float = parameter('', 'asymmetry: below 0, dips are deeper than rises')
+    tail: float = parameter('', '1: normal tails, below 1: heavier tails', 0.0,
                             above=True)
 
     def start(self, rng: np.random.Generator) -> Effect:
@@ -109,14 +109,14 @@ class LopsidedNoise(Term):
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
-        """Fit it to scores that are white noise for the most part, their scale free."""
+        """Fit the scores if they are mostly white noise, with a free scale."""
         white = 1.0 - np.broadcast_to(view.trust, view.z.shape)[view.train]
         found, paid = cls._climbed(view)
-        # Tails alone are told apart by where they come from: other causes are.
+        # Heavy tails without asymmetry are left to other causes.
         return found if float(white.mean()) > _MOSTLY and paid else None
 
     def refit_law(self, view: View) -> LawFit:
-        """Fit again, whatever other laws have taken over: the evidence says what is left."""
+        """Fit again unconditionally: the evidence decides whether the cause stays."""
         return self._climbed(view)[0]
 
     @classmethod
@@ -144,20 +144,20 @@ class LopsidedNoise(Term):
         return fit, most - even > 0.5 * math.log(z[view.train].size)
 
 
-# Share of white noise in the errors from which its law is theirs; cells of scores that a fit
-# tells apart; the largest score that a law gives.
+# Minimum share of white noise in the errors; number of bins of scores in a fit; limit of the
+# scores.
 _MOSTLY, _CELLS, _FARTHEST = 0.5, 400, 8.0
-# Points and weights of the normal law.
+# Points and weights for expectations over a normal distribution.
 _NORMAL = np.polynomial.hermite_e.hermegauss(80)
 
 
 def _lopsided(draws: FloatArray, skew: float, tail: float) -> FloatArray:
-    """Return normal draws as the law has them, mean and deviation not set."""
+    """Transform normal draws, without standardising them."""
     return np.asarray(np.sinh((np.arcsinh(draws) + skew) / tail))
 
 
 def _moments(skew: float, tail: float) -> tuple[float, float]:
-    """Return the mean and the deviation of the law."""
+    """Return mean and standard deviation of the transformed draws."""
     points, weights = _NORMAL[0], _NORMAL[1] / _NORMAL[1].sum()
     values = _lopsided(points, skew, tail)
     mean = float(weights @ values)
@@ -180,18 +180,18 @@ def _lopsided_scores(z: FloatArray, skew: float, log_tail: float, log_scale: flo
 
 @dataclass(frozen=True)
 class Quantization(Term):
-    """Round to whole steps, counted from 0 V."""
+    """Round to a multiple of `step`."""
 
     NAME: ClassVar[str] = 'quantization'
     FAMILY: ClassVar[str] = 'sensor'
     STAGE: ClassVar[Stage] = Stage.CODE
     ROLE: ClassVar[Role] = Role.NOISE
-    MEANING: ClassVar[str] = 'The steps of the ADC are comparable to the noise.'
+    MEANING: ClassVar[str] = 'The resolution of the ADC is comparable to the noise.'
     REMEDY: ClassVar[str] = (
-        'Use a finer range of the ADC or more gain ahead of it; sigma is partly rounding.')
-    SEPARATED_BY: ClassVar[str] = 'the same rail with a finer range of the ADC'
+        'Use a smaller range of the ADC or more gain ahead of it; sigma is partly rounding.')
+    SEPARATED_BY: ClassVar[str] = 'the same rail with a smaller range of the ADC'
 
-    step: float = parameter('V', 'one code', 0.0, above=True)
+    step: float = parameter('V', 'resolution, one code', 0.0, above=True)
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
@@ -201,7 +201,7 @@ class Quantization(Term):
         return effect
 
     def variance(self) -> float:
-        """Return the variance of rounding to whole steps, V^2."""
+        """Return the variance of the rounding, V^2."""
         return self.step * self.step / 12.0
 
 
@@ -215,14 +215,14 @@ class Saturation(Term):
     ROLE: ClassVar[Role] = Role.EXACT
     MEANING: ClassVar[str] = 'The voltage is clipped at the end of the range of the ADC.'
     REMEDY: ClassVar[str] = (
-        'Rescale the input: the true excursions are larger, and those are the ones that matter.')
+        'Rescale the input: the true excursions are larger than recorded.')
     SEPARATED_BY: ClassVar[str] = 'the same rail with a larger range'
 
     low: float = parameter('V', 'lowest reading')
     high: float = parameter('V', 'highest reading')
 
     def check(self) -> None:
-        """Check that the limits leave room."""
+        """Check that low is below high."""
         if not self.low < self.high:
             raise ValueError(f'{self.NAME}: low must be below high, got {self.low:g} V and '
                              f'{self.high:g} V')
@@ -237,18 +237,18 @@ class Saturation(Term):
 
 @dataclass(frozen=True)
 class HeldSamples(Term):
-    """Keep each value until 1/rate later."""
+    """Repeat each value for 1/rate."""
 
     NAME: ClassVar[str] = 'held_samples'
     FAMILY: ClassVar[str] = 'sensor'
     STAGE: ClassVar[Stage] = Stage.LOGGER
     ROLE: ClassVar[Role] = Role.EXACT
-    MEANING: ClassVar[str] = 'The logger repeats its last value until the source has a new one.'
+    MEANING: ClassVar[str] = 'The logger repeats the last value until the source has a new one.'
     REMEDY: ClassVar[str] = (
-        'Log at the rate of the source, or drop repeats before any fit (done here).')
+        'Log at the rate of the source, or remove repeats before a fit, as this program does.')
     SEPARATED_BY: ClassVar[str] = 'the raw samples of the ADC'
 
-    rate: float = parameter('Hz', 'rate at which the source has new values', 0.0, above=True)
+    rate: float = parameter('Hz', 'update rate of the source', 0.0, above=True)
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
@@ -257,7 +257,7 @@ class HeldSamples(Term):
 
         def effect(s: Segment) -> None:
             nonlocal last, turn
-            # A margin for rounding: a stamp at a refresh has the new value.
+            # Tolerance for rounding: a stamp at an update has the new value.
             hair = 1e-6 + 2.0 * self.rate * np.spacing(np.abs(s.t))
             turns = np.floor((s.t - s.origin) * self.rate + hair)
             fresh = np.diff(turns, prepend=turn) > 0.0
@@ -270,7 +270,7 @@ class HeldSamples(Term):
 
 @dataclass(frozen=True)
 class ClockJitter(Term):
-    """Take each sample a normal time off its stamp, cut at 0.45 of the step."""
+    """Take each sample a normally distributed time off its stamp, at most 0.45 of the step."""
 
     NAME: ClassVar[str] = 'clock_jitter'
     FAMILY: ClassVar[str] = 'sensor'
@@ -279,9 +279,9 @@ class ClockJitter(Term):
     DEAR: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('kurtosis', 'clustering')
     IMITATES: ClassVar[tuple[str, ...]] = ('glitches', 'heavy_tails', 'jumps')
-    MEANING: ClassVar[str] = 'Time stamps are off by a random amount.'
-    REMEDY: ClassVar[str] = 'Stamp in the interrupt of the ADC, not where the message is sent.'
-    SEPARATED_BY: ClassVar[str] = 'stamps by the clock of the ADC recorded beside the others'
+    MEANING: ClassVar[str] = 'Time stamps have random errors.'
+    REMEDY: ClassVar[str] = 'Take the stamp in the interrupt of the ADC, not when sending.'
+    SEPARATED_BY: ClassVar[str] = 'a recording that also has the stamps of the ADC'
 
     std: float = parameter('s', 'standard deviation of the error of a stamp', 0.0)
 
@@ -293,10 +293,10 @@ class ClockJitter(Term):
         def effect(s: Segment) -> None:
             nonlocal last, stamp
             gap = np.diff(s.t, prepend=stamp)
-            # The step to come is not known at the end of a segment: that behind bounds both.
+            # The next step is unknown at the end of a segment, so the previous one is the bound.
             bound = np.where(np.isfinite(gap), 0.45 * gap, 0.0)
             error = self.std * rng.standard_normal(s.t.size)
-            # Uneven stamps: the sample before may have gone past this one.
+            # With uneven stamps, the previous sample may be later than this one.
             s.at = np.maximum(np.maximum.accumulate(s.t + np.clip(error, -bound, bound)), last)
             s.step = np.diff(s.at, prepend=last)
             last, stamp = float(s.at[-1]), float(s.t[-1])
@@ -305,11 +305,11 @@ class ClockJitter(Term):
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
-        """Fit hidden errors of the stamps: a step that is longer has more noise in it."""
+        """Fit hidden errors of the stamps: a longer step contains more noise."""
         return cls._climbed(view, [math.log(0.2), 0.0], 40)
 
     def refit_law(self, view: View) -> LawFit | None:
-        """Fit again, from where it was."""
+        """Fit again, starting from these parameters."""
         return self._climbed(view, [math.log(min(max(self.std * view.rate, 0.02), 0.44)), 0.0], 20)
 
     @classmethod
@@ -319,8 +319,8 @@ class ClockJitter(Term):
         z = view.z[view.train]
         square = z * z
         if float(np.mean(square**2)) > _MOST_KURTOSIS or _together(square) > _MOST_TOGETHER:
-            # Errors of half a step at the most leave less; and a step that was too
-            # long makes the next too short.
+            # Errors of at most half a step have a smaller kurtosis, and a step that is too long
+            # makes the next one too short.
             return None
         state = view.state / np.sqrt(view.variance)
         z, inside = z[:_SHORT], state[view.train][:_SHORT]
@@ -343,29 +343,29 @@ class ClockJitter(Term):
 
 
 def _together(square: FloatArray) -> float:
-    """Return the correlation of neighbouring squares, as a normal score."""
+    """Return the correlation of neighbouring squares over its standard error."""
     c = square - square.mean()
     return math.sqrt(c.size) * float(c[1:] @ c[:-1]) / float(c @ c)
 
 
-# Samples that the error is fitted on, the largest fourth moment it can leave, and
-# the largest correlation of neighbouring squares: it makes that negative.
+# Samples in a fit, the largest fourth moment that jitter causes, and the largest correlation of
+# neighbouring squares, which jitter makes negative.
 _SHORT, _MOST_KURTOSIS, _MOST_TOGETHER = 15000, 6.0, 4.0
 # Levels of the error of a stamp.
 _LEVELS = 7
 
 
-# As near as coefficients come to 0 and 1.
+# Minimum distance of phi from 0 and 1.
 _LEAST_JITTER = 1e-12
 
 
 def _errors(z: FloatArray, state: FloatArray, phi: float, x: FloatArray
             ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """
-    Return the law of the error before, densities, scales, shifts of pairs, and the prior.
+    Return predicted law of the previous error, densities, stds and shifts of pairs, and prior.
 
-    A shift is what a step that is longer moves the score by, per score that the rail is
-    away from its mean.
+    A shift is the change of the score caused by the error of the step, per standard deviation
+    of the rail from its mean.
     """
     nodes = np.linspace(-2.4, 2.4, _LEVELS)
     law = np.exp(-0.5 * nodes * nodes)

@@ -1,9 +1,9 @@
 """
 Markov switching of the mean or of sigma, unrelated to throttle.
 
-A filter that knows of no levels takes a change of one for noise at first, and follows it the more
-slowly the more white noise there is; what it has followed depends on all states before.  Their
-mean, as known at each sample, stands for them (generalised pseudo-Bayesian filter of first order;
+A filter without levels at first takes a change of level for noise, and follows it more slowly the
+more white noise there is.  How far it has followed depends on all earlier states, which are
+replaced by their mean given the samples so far (generalised pseudo-Bayesian filter of first order;
 Blom & Bar-Shalom, IEEE Trans. Autom. Control 33 (1988) 780).
 """
 
@@ -26,23 +26,23 @@ from scipy.special import ndtr
 
 # Median of the size of a normal score.
 _MEDIAN = 0.6745
-# Share of an error that a filter takes for the rail's from which it takes all; a level of fewer
-# innovations than this is none.
+# Filter gain above which it counts as 1; level below which there is none, in standard deviations
+# of an innovation.
 _ALL, NO_LEVEL = 0.98, 0.2
-# Correlation of what levels leave from which there is a rail at all.
+# Minimum correlation of the residual for an OU beside the levels.
 _LEAST = 1e-3
-# Shares of its noise that an `ou` without levels may have, and heights of levels over the spread.
+# Tried: shares of the fitted noise for an OU with levels; heights of levels over the spread.
 _CALMER, _HEIGHTS = (0.1, 0.01), (0.7, 1.2, 2.0)
 
 
 def rates_between(up: float, down: float, states: int) -> FloatArray:
-    """Return the rates from each state to each other, 1/s; 0 on the diagonal."""
+    """Return the transition rates between states, 1/s; 0 on the diagonal."""
     ones = np.ones((states, states))
     return up * np.triu(ones, 1) + down * np.tril(ones, -1)
 
 
 def stationary_law(rates: FloatArray) -> FloatArray:
-    """Return the stationary law of a chain."""
+    """Return the stationary probabilities of a chain."""
     flow = np.vstack(((rates - np.diag(rates.sum(axis=1))).T / rates.max(),
                       np.ones(rates.shape[0])))
     law: FloatArray = np.linalg.lstsq(flow, np.eye(rates.shape[0] + 1)[-1], rcond=None)[0]
@@ -50,7 +50,7 @@ def stationary_law(rates: FloatArray) -> FloatArray:
 
 
 def step_chances(x: FloatArray, step: float, states: int) -> FloatArray:
-    """Return the chances to go from state to state within a step."""
+    """Return the transition probabilities of one step."""
     rates = rates_between(math.exp(x[0]), math.exp(x[1]), states)
     moved: FloatArray = expm((rates - np.diag(rates.sum(axis=1))) * step)
     return moved
@@ -58,21 +58,21 @@ def step_chances(x: FloatArray, step: float, states: int) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """Scores that a chain is fitted to."""
+    """Scores to which a chain is fitted."""
 
     # As in `View`; shape (n,).
     z: FloatArray
     phi: FloatArray
-    unit: FloatArray  # How much of a score the median standard deviation is; shape (n,)
-    # Share of the error before each that the filter has taken for the rail's; shape (n,).
+    unit: FloatArray  # Median standard deviation of an innovation over its own; shape (n,)
+    # Gain of the filter at the previous sample; shape (n,).
     trust: FloatArray
     step: float  # From sample to sample, s
-    # What the filter has followed of the states up to two samples ago, in states; shape (n,).
+    # How far the filter has followed the states up to two samples ago, in states; shape (n,).
     followed: FloatArray
 
     @classmethod
     def of(cls, view: View) -> Scores:
-        """Return those of a view, as if nothing had been followed."""
+        """Return the scores of a view, with nothing followed."""
         unit: FloatArray = np.sqrt(float(np.median(view.variance)) / view.variance)
         trust = np.concatenate(([1.0], np.broadcast_to(view.trust, view.z.shape)[:-1]))
         if float(np.median(trust)) > _ALL:
@@ -80,24 +80,24 @@ class Scores:
         return cls(view.z, view.phi, unit, trust, 1.0 / view.rate, np.zeros(view.z.size))
 
     def part(self, part: slice) -> Scores:
-        """Return a part."""
+        """Return the scores of a part of the samples."""
         return Scores(self.z[part], self.phi[part], self.unit[part], self.trust[part], self.step,
                       self.followed[part])
 
     @property
     def at_once(self) -> Scores:
-        """Return them as if the filter had followed each error at once."""
+        """Return the scores for a filter gain of 1."""
         return replace(self, trust=np.ones(self.z.size), followed=np.zeros(self.z.size))
 
     def following(self, x: FloatArray, at_once: float, states: int = 2) -> Scores:
-        """Return them with what the filter has followed of a chain with coordinates x."""
+        """Return the scores with `followed` computed for a chain with coordinates x."""
         if abs(x[2]) < NO_LEVEL or bool((self.trust == 1.0).all()):
             return self.at_once
         chances = step_chances(x, self.step, states)
         law = stationary_law(rates_between(math.exp(x[0]), math.exp(x[1]), states))
         middle = float(law @ np.arange(states))
         std = np.exp(x[4] + x[3] * np.arange(states))
-        # What each pair of states leaves of a score, but for what was followed, and the exponent.
+        # The residual of a score for each pair of states, before `followed` is subtracted.
         direct = _direct(self, at_once, middle, states)
         height = x[2] * self.unit
         pairs = list(np.ndindex(states, states))
@@ -109,12 +109,12 @@ class Scores:
         exp, found, before = math.exp, [], law.tolist()
         followed = moved = 0.0
         for off, high, keep, draw, slow in columns:
-            # The state before the sample: the level itself, or the rail that goes there.
+            # The level itself has been followed, or the rail that moves towards it.
             behind = keep * (followed if at_once else followed - moved)
             found.append(behind)
             more = high * behind
             if states == 2:
-                # Written out: half of the time of a search for causes went here.
+                # Written out because half the time of a search was spent here.
                 known = before[1] - middle
                 low, top = before
                 (a, b, c, d), (e, f) = off, scales
@@ -127,7 +127,7 @@ class Scores:
                 for m, (i, j) in enumerate(pairs):
                     tops[j] += before[i] * weights[m] * exp(scales[j] * (off[m] + more) ** 2)
             total = sum(tops)
-            # Where no state explains the sample, as at the begin.
+            # If no state explains the sample, start again from the stationary law.
             before = [p / total for p in tops] if total > 0.0 else law.tolist()
             if at_once:
                 followed = keep * followed + draw * known
@@ -138,10 +138,10 @@ class Scores:
 
 
 def _direct(s: Scores, at_once: float, middle: float, states: int) -> FloatArray:
-    """Return what each pair of states expects of each error at once, in states."""
+    """Return the error that each pair of states predicts with nothing followed, in states."""
     direct = np.empty((states, states, s.z.size))
     for i, j in np.ndindex(states, states):
-        # The level itself, less what the filter makes of the one before; or the pull to it.
+        # The new level less what the filter predicts from the old one; or the pull towards it.
         direct[i, j] = ((j - middle) - s.phi * s.trust * (i - middle) if at_once
                         else (1.0 - s.phi) * (i - middle))
     return direct
@@ -149,7 +149,7 @@ def _direct(s: Scores, at_once: float, middle: float, states: int) -> FloatArray
 
 def chain_of(s: Scores, x: FloatArray, at_once: float, states: int = 2
              ) -> tuple[tuple[FloatArray, FloatArray, FloatArray], FloatArray, FloatArray]:
-    """Return what `forward` takes, the mean of each pair, (states, states, n), and the stds."""
+    """Return the arguments of `forward`, the pairs' means, (states, states, n), and the stds."""
     state = np.arange(states, dtype=np.float64)
     chances = step_chances(x, s.step, states)
     law = stationary_law(rates_between(math.exp(x[0]), math.exp(x[1]), states))
@@ -162,7 +162,7 @@ def chain_of(s: Scores, x: FloatArray, at_once: float, states: int = 2
 
 
 def moving(view: View, size: int) -> slice:
-    """Return the segment of a size in which the voltage moves most beside its noise."""
+    """Return the part of a given size in which the voltage moves most, relative to its noise."""
     moves = (view.residual / np.sqrt(view.variance))[view.train]
     starts = range(0, moves.size - size + 1, max(size // 2, 1))
     begin = max(starts, key=lambda k: float(moves[k:k + size].var()))
@@ -170,13 +170,13 @@ def moving(view: View, size: int) -> slice:
 
 
 def relaxing(view: View, faster: float) -> View:
-    """Return what a rail leaves over that relaxes faster than was fitted without levels."""
+    """Return the view for a rail that relaxes faster than the fit without levels says."""
     if faster == 1.0:
         return view
     phi = view.phi**faster
     e = view.z * np.sqrt(view.variance) + (view.phi - phi) * view.state
     inside = e[view.train]
-    # Most of what it leaves is noise, however large the levels are.
+    # Most innovations are noise, even with large levels, so the median gives its size.
     middle = float(np.median(inside))
     std = float(np.median(np.abs(inside - middle))) / _MEDIAN
     if not std > 0.0:
@@ -190,10 +190,10 @@ def relaxing(view: View, faster: float) -> View:
 def calm_levels(view: View, part: slice, spread: float, rates: FloatArray
                 ) -> tuple[FloatArray, float, View] | None:
     """
-    Return coordinates of levels under white noise, and the view that shows them; None for none.
+    Return a start for levels in white noise, and a view in which they show; None without noise.
 
-    An `ou` that was fitted with the levels follows them; one with less noise of its own does not.
-    Heights are tried up to that of two levels that make all of the spread, V.
+    An `ou` fitted to the levels follows them, so ones with less noise are tried; and heights up
+    to that of two levels that explain the whole spread, V.
     """
     if bool((Scores.of(view).trust == 1.0).all()):
         return None
@@ -213,7 +213,7 @@ def calm_levels(view: View, part: slice, spread: float, rates: FloatArray
 
 
 def _calmer(view: View, share: float) -> View:
-    """Return what a rail with a share of its noise leaves over, the white noise being the same."""
+    """Return the view for a rail with a share of its noise and the same white noise."""
     keep = min(float(np.median(view.phi[view.train])), 1.0 - 1e-9)
     trust = float(np.median(np.broadcast_to(view.trust, view.z.shape)[view.train]))
     variance = float(np.median(view.variance))
@@ -224,7 +224,7 @@ def _calmer(view: View, share: float) -> View:
 
 
 def _filtered(view: View, keep: float, trust: float, variance: float) -> View:
-    """Return what a settled filter leaves over (keep in a usual step, variance in V^2)."""
+    """Return the view of a settled filter (keep: phi of a usual step; variance in V^2)."""
     phi = view.phi**(math.log(keep) / math.log(float(np.median(view.phi[view.train]))))
     before = np.concatenate(([0.0], view.residual[:-1]))
     e = view.residual - first_order(phi * (1.0 - trust), phi * trust * before, 0.0)
@@ -235,10 +235,10 @@ def _filtered(view: View, keep: float, trust: float, variance: float) -> View:
 
 def without_levels(view: View, levels: FloatArray) -> View:
     """
-    Return what a rail leaves over on which levels lie, V: with the levels, as it relaxes without.
+    Return the view of the whole voltage for an OU fitted to the voltage without levels, V.
 
-    An OU, or an OU in white noise, by the covariances of what the levels leave at lags up to 2:
-    whichever predicts that better.
+    That is an OU, or an OU in white noise, whichever predicts the voltage without levels better;
+    both follow from its covariances at lags up to 2.
     """
     r = (view.residual - levels)[view.train]
     r = r - r.mean()
@@ -262,7 +262,7 @@ def without_levels(view: View, levels: FloatArray) -> View:
 
 
 def _settled(keep: float, power: float, white: float) -> tuple[float, float]:
-    """Return the variance of an OU before each sample once a filter has settled, and the noise."""
+    """Return a settled filter's variance of the OU before a sample, and the white noise's."""
     drive = power * (1.0 - keep * keep)
     b = white * (1.0 - keep * keep) - drive
     return 0.5 * (-b + math.sqrt(b * b + 4.0 * drive * white)), white
@@ -275,11 +275,11 @@ _MOST = 5_000_000
 @dataclass(frozen=True)
 class RegimeSwitching(Term):
     """
-    Switch between two or three states; each adds a level and multiplies sigma once more.
+    Switch between two or three states; each step up adds `level` and multiplies sigma.
 
-    From any state to any higher one at `rate_up`, to any lower one at `rate_down`.
-    Exact in law: the instants of switching are drawn, and sigma is integrated over
-    the part of a step that it holds for.
+    The rate from a state to each higher one is `rate_up`, to each lower one `rate_down`.
+    Exact in law: switching times are drawn, and sigma is integrated over the parts of a
+    step in which it is constant.
     """
 
     NAME: ClassVar[str] = 'regime_switching'
@@ -294,20 +294,20 @@ class RegimeSwitching(Term):
         'flicker_noise', 'heavy_tails', 'jumps', 'nonlinear_restoring', 'second_relaxation',
         'volatility')
     SEVERAL: ClassVar[bool] = True
-    MEANING: ClassVar[str] = 'The supply switches between two states, unrelated to throttle.'
-    REMEDY: ClassVar[str] = 'Look for a consumer that goes on and off, or a loose contact.'
-    SEPARATED_BY: ClassVar[str] = 'the state of other consumers recorded beside it'
+    MEANING: ClassVar[str] = 'The supply switches between states, independent of throttle.'
+    REMEDY: ClassVar[str] = 'Look for a load that switches on and off, or a loose contact.'
+    SEPARATED_BY: ClassVar[str] = 'a recording with the state of the other loads'
 
-    rate_up: float = parameter('1/s', 'rate of going to each higher state', 0.0, above=True)
-    rate_down: float = parameter('1/s', 'rate of going to each lower state', 0.0, above=True)
-    level: float = parameter('V', 'what each further state adds to the level')
-    sigma_ratio: float = parameter('', 'sigma in a state / in the one below', 0.0)
+    rate_up: float = parameter('1/s', 'rate of switching to each higher state', 0.0, above=True)
+    rate_down: float = parameter('1/s', 'rate of switching to each lower state', 0.0, above=True)
+    level: float = parameter('V', 'voltage that each further state adds')
+    sigma_ratio: float = parameter('', 'sigma in a state over that in the state below', 0.0)
     at_once: float = parameter(
-        '', 'share of the level that comes at once; the rest at the rate alpha', 0.0, 1.0)
+        '', 'share of the level that acts at once; the rest relaxes at alpha', 0.0, 1.0)
     states: float = parameter('', 'number of states, 2 or 3', 2.0, 3.0)
 
     def check(self) -> None:
-        """Check that states can be counted."""
+        """Check the number of states."""
         if self.states not in (2.0, 3.0):
             raise ValueError(f'{self.NAME}.states must be 2 or 3, got {self.states:g}')
 
@@ -326,8 +326,8 @@ class RegimeSwitching(Term):
                 next_at = float(s.at[0]) + rng.standard_exponential() / leave[now_in]
             changes = float(stationary_law(rates) @ leave)
             if changes * (s.at[-1] - next_at) > _MOST:
-                raise ValueError(f'{self.NAME}: {changes:g} changes a second are more than '
-                                 f'{_MOST} in one segment of samples; so many are noise')
+                raise ValueError(f'{self.NAME}: {changes:g} changes a second exceed the limit of '
+                                 f'{_MOST} per segment of samples; model them as noise')
             times = []
             states = [now_in]
             while next_at <= s.at[-1]:
@@ -337,12 +337,12 @@ class RegimeSwitching(Term):
                 next_at += rng.standard_exponential() / leave[now_in]
             when = np.array(times)
             entered = np.array(states, dtype=np.float64)
-            # The state at each sample, and at the begin of each step.
+            # The state at each sample, and at the beginning of each step.
             now = entered[np.searchsorted(when, s.at, side='right')]
             before = np.concatenate(([entered[0]], now[:-1]))
             s.level += self.at_once * self.level * now
-            # What is left of a change within a step: the share of the step's
-            # pull, and of its noise, that comes after it.
+            # A change within a step affects only the share of the pull and of the noise that
+            # comes after it.
             k = np.searchsorted(s.at, when)
             slow = (1.0 - self.at_once) * self.level
             if slow != 0.0:
@@ -360,28 +360,28 @@ class RegimeSwitching(Term):
         return effect
 
     def holds(self, view: View) -> bool:
-        """Return whether so many changes are expected that they are a law, not a few steps."""
+        """Return whether enough changes are expected for a random process, not a few steps."""
         rates = rates_between(self.rate_up, self.rate_down, int(self.states))
         span = float(view.at[view.train.stop - 1] - view.at[0])
         return float(stationary_law(rates) @ rates.sum(axis=1)) * span >= _CHANGES
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
-        """Fit a hidden chain of two states that share a level and a scale."""
-        # The best with a level of its own, and without.
+        """Fit a hidden chain of two or three states."""
+        # The best start with a level, and without.
         best: dict[bool, tuple[float, FloatArray, float, View]] = {}
         spread = math.sqrt(float(np.mean(view.residual[view.train] ** 2)))
         first = slice(0, min(_SHORT, view.train.stop))
         busy = moving(view, first.stop)
-        # Coordinates: ln rates, level in innovations, ln sigma ratio, ln scale.
+        # Coordinates: two ln rates, level in std of an innovation, ln sigma ratio, ln scale.
         shortest = math.exp(-_fastest(view))
         for faster in _FASTER:
             relaxed = relaxing(view, faster)
             unit = math.sqrt(float(np.median(relaxed.variance)))
             scores = Scores.of(relaxed).at_once
-            # Two levels that hide how fast the rail relaxes make most of the spread.
+            # Levels that hide a faster relaxation explain most of the spread.
             height = (1.0 if faster == 1.0 else 2.0) * spread / unit
-            # Densities of volts, over those without states.
+            # Log densities in V without states, to subtract.
             plain = log_normal(view.z) - 0.5 * np.log(view.variance / relaxed.variance)
 
             def value(x: FloatArray) -> float:
@@ -412,7 +412,7 @@ class RegimeSwitching(Term):
             if fit is None:
                 continue
             if any(x is start for start in levels) and fit.offset is not None:
-                # The residual without the levels shows how fast the rail relaxes, and its noise.
+                # The voltage without levels shows the relaxation and the noise of the rail.
                 again = without_levels(view, fit.offset)
                 unit = math.sqrt(float(np.median(again.variance)))
                 term = fit.term
@@ -430,9 +430,9 @@ class RegimeSwitching(Term):
         if two.power is None:
             slow, ahead, states = _slow_levels(view)
             if slow is not None and ahead > max(float(two.gain[view.train].sum()), _SLOW_AHEAD):
-                # Fitted is the relaxation of both; that of the noise alone comes with the fit.
+                # The view relaxes as levels and noise together do; the next fit separates them.
                 return cls._finished(view, [slow], 0.0, 1, states) or two
-        # Three states: of sigma, or of the level, whichever the two differ in.
+        # Three states that differ in what the two states differ in: sigma or the level.
         starts = [np.array([0.0, 0.0, 0.0, ratio, -ratio]) for ratio in (0.45, 0.9)]
         if two.power is None:
             starts = [np.array(begin) * [1.0, 1.0, 0.6, 0.0, 1.0]]
@@ -445,14 +445,14 @@ class RegimeSwitching(Term):
         return found
 
     def refit_law(self, view: View) -> LawFit | None:
-        """Fit again, from where it was."""
+        """Fit again, starting from these parameters."""
         unit = math.sqrt(float(np.median(view.variance)))
         ratio = math.log(max(self.sigma_ratio, 1e-2))
         states = int(self.states)
         law = stationary_law(rates_between(self.rate_up, self.rate_down, states))
         square = float(law @ np.exp(2.0 * ratio * np.arange(states)))
-        # Such that the mean square is that of the scores, or 1, as in clear levels; 0 where the
-        # `ou` has the sigma of the lowest state.
+        # The first scale yields the mean square of the scores, or 1 if levels are clear; the other
+        # is for an `ou` that already has the sigma of the lowest state.
         mean = float(np.mean(view.z[view.train] ** 2)) if abs(self.level) < unit else 1.0
         starts = [np.array([math.log(self.rate_up), math.log(self.rate_down), self.level / unit,
                             ratio, scale])
@@ -462,7 +462,7 @@ class RegimeSwitching(Term):
     @classmethod
     def _finished(cls, view: View, starts: Sequence[FloatArray], at_once: float, most: int,
                   states: int = 2) -> LawFit | None:
-        """Return the fit near the best of some starts, which differ in scale alone."""
+        """Return the fit from the best of some starts that differ only in scale."""
         scores = Scores.of(view)
         part = slice(view.train.start, min(view.train.stop, view.train.start + _LONG))
         within = scores.part(part).following(starts[0], at_once, states)
@@ -474,7 +474,7 @@ class RegimeSwitching(Term):
 
         start = max(starts, key=value)
         if states == 2:
-            # Few changes in few samples say little of rates; what is counted in all says more.
+            # Few changes determine the rates badly; counting them in all samples is better.
             counted = _counted(forward(*chain_of(within, start, at_once)[0])[0], scores.step)
             start = max(np.array(start), np.append(counted, start[2:]), key=value)
         x, top = climb(value, start, size=0.2, most=most)
@@ -497,16 +497,16 @@ class RegimeSwitching(Term):
         if at_once == 0.0:
             moved = first_order(view.phi, (1.0 - view.phi) * moved, 0.0)
         offset = None if abs(x[2]) < NO_LEVEL else moved
-        # As known at each sample.
+        # Given the samples up to each one.
         known = np.concatenate((before[1:], before[-1:]))
-        # Over the sigma of the lowest state, which so becomes that of the `ou`.
+        # Relative to the sigma of the lowest state, which thus becomes that of the `ou`.
         power = 1.0 / (known @ np.exp(-2.0 * x[3] * np.arange(states)))
         return LawFit(term, se, normal, density - log_normal(view.z), 5,
                       power=None if abs(x[3]) < _NO_RATIO else power, offset=offset)
 
 
 def _counted(before: FloatArray, step: float) -> FloatArray:
-    """Return the logarithms of the rates that the likelier of two states is left at."""
+    """Return ln of the rates of leaving each of two states, counted in the likelier state."""
     high = before[:, 1] > 0.5
     ups, downs = (int((high[1:] & ~high[:-1]).sum()), int((~high[1:] & high[:-1]).sum()))
     spent = step * np.array([(~high).sum(), high.sum()])
@@ -516,10 +516,10 @@ def _counted(before: FloatArray, step: float) -> FloatArray:
 
 def _slow_levels(view: View) -> tuple[FloatArray | None, float, int]:
     """
-    Return a start for levels that last much longer than the noise, and its evidence.
+    Return a start for levels much slower than the noise, its evidence, and the number of states.
 
-    Means over half a relaxation time are levels and a first-order noise, of which
-    the correlation is fitted with them: that of the samples is of both together.
+    Means over half a relaxation time are modelled as levels plus first-order noise, whose
+    correlation is fitted too, because that of the samples includes the levels.
     """
     r = view.residual[view.train]
     a = -math.log(min(max(float(np.median(view.phi[view.train])), 1e-6), 1.0 - 1e-6))
@@ -533,7 +533,7 @@ def _slow_levels(view: View) -> tuple[FloatArray | None, float, int]:
         return None, 0.0, 2
     mean = (mean - mean.mean()) / spread
     step = size / view.rate
-    # What throttle does to the noise is none of the levels'.
+    # Keeps noise that depends on throttle from being taken for levels.
     noisy = view.variance[view.train][:count * size].reshape(count, size).mean(axis=1)[1:]
     noisy /= math.exp(float(np.mean(np.log(noisy))))
 
@@ -549,7 +549,7 @@ def _slow_levels(view: View) -> tuple[FloatArray | None, float, int]:
             log[i, j] = log_normal(e, 0.0, math.exp(2.0 * x[4]) * noisy)
         return log_likelihood(log.transpose(2, 0, 1), step_chances(x, step, states), law)
 
-    # Without a level the rates say nothing: correlation and scale alone.
+    # Without levels only the correlation and the scale are fitted.
     keep = float(mean[1:] @ (mean[:-1] / noisy)) / float(mean[:-1] @ (mean[:-1] / noisy))
     rest = mean[1:] - keep * mean[:-1]
     least = float(log_normal(rest, 0.0, float(np.mean(rest**2 / noisy)) * noisy).sum())
@@ -569,11 +569,11 @@ def _slow_levels(view: View) -> tuple[FloatArray | None, float, int]:
     return np.array([x[0], x[1], x[2] * spread / unit, 0.0, 0.0]), best[0] - least, best[2]
 
 
-# How much faster the rail may relax than it seems to with levels on it.
+# Factors by which the rail may relax faster than it seems to because of levels.
 _FASTER = 1.0, 3.0, 9.0
 # Minimum evidence to try slow levels, nats.
 _SLOW_AHEAD = 8.0
-# Number of samples for trying starts, and for fitting the best.
+# Number of samples for comparing starts, and for the fit from the best.
 _SHORT, _LONG = 8000, 30000
 # Largest rate of switching, 1/s.
 _FASTEST = 30.0
@@ -581,12 +581,12 @@ _FASTEST = 30.0
 _CHANGES = 8.0
 # Minimum evidence for three states, nats.
 _THIRD = 10.0
-# Logarithm of a ratio below which the ratio is 1.
+# |ln ratio| below which the ratio counts as 1.
 _NO_RATIO = 0.05
 
 
 def _fastest(view: View) -> float:
-    """Return the logarithm of the largest rate: states of a few samples are another law."""
+    """Return ln of the largest rate: states that last a few samples are another cause."""
     return math.log(min(_FASTEST, view.rate / 20.0))
 
 

@@ -35,24 +35,24 @@ class Segment:
     """Consecutive samples during a simulation; terms change it in place."""
 
     t: FloatArray  # Stamps, s; shape (n,)
-    at: FloatArray  # Instants at which the samples are really taken, s; shape (n,)
-    # Time since the sample before, s; infinite before the first one, which is drawn from the
-    # stationary law; shape (n,).
+    at: FloatArray  # Times at which the samples are really taken, s; shape (n,)
+    # Time since the previous sample, s; infinite before the first, which has the stationary law;
+    # shape (n,).
     step: FloatArray
-    throttle: FloatArray  # 0..1, held from the stamp before to its own stamp; shape (n,)
-    origin: float  # Stamp of the first sample of all, s
+    throttle: FloatArray  # 0..1, each held from the previous stamp to its own; shape (n,)
+    origin: float  # Stamp of the first sample of the recording, s
     # Rate, 1/s, and intensity, V/sqrt(s), over the step before each sample; shape (n,).
     alpha: FloatArray
     sigma: FloatArray
-    power: FloatArray  # Factor on the variance of what the noise adds in that step; shape (n,)
+    power: FloatArray  # Factor on the variance of the noise in that step; shape (n,)
     push: FloatArray  # Added to the state at the end of the step, V; shape (n,)
-    # Coefficients of x^2, 1/(V s), and x^3, 1/(V^2 s), in the restoring force, beside alpha x.
+    # Coefficients of x^2, 1/(V s), and x^3, 1/(V^2 s), of the restoring force beside alpha x.
     bend: tuple[float, float]
     x: FloatArray  # OU deviation, V; shape (n,)
-    level: FloatArray  # Everything else in the voltage of the rail, V; shape (n,)
-    noise: FloatArray  # Factor on the deviation of the white noise of the measurement; shape (n,)
-    voltage: FloatArray  # What is logged, V; shape (n,)
-    # Transformations of the normal draws of the white noise; empty: they stay normal.
+    level: FloatArray  # The rest of the voltage of the rail, V; shape (n,)
+    noise: FloatArray  # Factor on the std of the white measurement noise; shape (n,)
+    voltage: FloatArray  # Reading, V; shape (n,)
+    # Transformations of the normal draws of the white noise, in order.
     shape: list[Callable[[FloatArray], FloatArray]] = field(default_factory=list)
 
 
@@ -60,15 +60,15 @@ Effect = Callable[[Segment], None]
 
 
 def first_order(phi: FloatArray, e: FloatArray, before: float) -> FloatArray:
-    """Run the recursion."""
+    """Return x with x_k = phi_k x_{k-1} + e_k; before: the value before the first."""
     n = e.size
     if not n:
         return np.empty(0)
     if steady(phi[1:]):
         x: FloatArray = lfilter([1.0], [1.0, -phi[-1]], e, zi=[phi[0] * before])[0]
         return x
-    # A lower bidiagonal system with a unit diagonal, laid out as LAPACK has it:
-    # otherwise it is copied line by line.
+    # A lower bidiagonal system with a unit diagonal, in the memory order of LAPACK, which avoids
+    # a slow copy.
     band = np.empty((2, n), order='F')
     band[0] = 1.0
     np.negative(phi[1:], out=band[1, :-1])
@@ -81,6 +81,6 @@ def first_order(phi: FloatArray, e: FloatArray, before: float) -> FloatArray:
 
 def steady(values: FloatArray) -> bool:
     """Return whether all values are equal."""
-    # Compare the last one first: varying values mostly differ there.
+    # Compare the last value first: if values vary, it mostly differs.
     return not values.size or values.strides == (0,) or bool(
         values[0] == values[-1] and (values == values[0]).all())

@@ -1,4 +1,4 @@
-"""Single events: steps that relax, bad samples, heavy tails."""
+"""Rare events: steps that relax, bad samples, heavy tails."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from scipy.special import gammainccinv, gammaincinv, ndtr
 
 # Maximum number of events in one segment; limits time and memory.
 _MOST = 5_000_000
-# Share of samples with a jump above which jumps overlap.
+# Share of samples with a jump above which jumps are not rare events.
 _OFTEN = 0.05
 
 
@@ -35,9 +35,9 @@ class Jumps(Term):
         'clock_jitter', 'glitches', 'heavy_tails', 'regime_switching', 'volatility')
     SEVERAL: ClassVar[bool] = True
     MEANING: ClassVar[str] = (
-        'The supply is kicked now and then and relaxes at the rate alpha: load impulses.')
+        'Random jumps of the rail that decay at the rate alpha: load pulses.')
     REMEDY: ClassVar[str] = 'Look for what switches at that rate: servos, payload, radio.'
-    SEPARATED_BY: ClassVar[str] = 'a recording with each consumer off in turn'
+    SEPARATED_BY: ClassVar[str] = 'recordings with one load after another switched off'
 
     rate: float = parameter('1/s', 'jumps per second', 0.0)
     mean: float = parameter('V', 'mean size')
@@ -55,8 +55,8 @@ class Jumps(Term):
             if math.isnan(next_at):
                 next_at = float(s.at[0]) + waits.standard_exponential() / self.rate
             if self.rate * (s.at[-1] - next_at) > _MOST:
-                raise ValueError(f'{self.NAME}.rate of {self.rate:g} 1/s: more than {_MOST} jumps '
-                                 'in one segment of samples; so many are noise')
+                raise ValueError(f'{self.NAME}.rate of {self.rate:g} 1/s exceeds the limit of '
+                                 f'{_MOST} jumps per segment of samples; model them as noise')
             times = []
             while next_at <= s.at[-1]:
                 times.append(next_at)
@@ -64,7 +64,7 @@ class Jumps(Term):
             if not times:
                 return
             when = np.array(times)
-            # Within its step a jump has relaxed since it came.
+            # A jump within a step decays until the end of the step.
             k = np.searchsorted(s.at, when)
             size = self.mean + self.std * sizes.standard_normal(when.size)
             np.add.at(s.push, k, size * np.exp(-s.alpha[k] * (s.at[k] - when)))
@@ -73,14 +73,14 @@ class Jumps(Term):
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
-        """Fit a mixture to the scores: most are N(0, 1), some have a jump in them."""
+        """Fit a mixture to the scores: most are N(0, 1), some contain a jump."""
         z, var = view.z, view.variance
         found = _mixture(z[view.train], var[view.train])
         if found is None:
             return None
         share, mean, spread, unit = found
         if share > _OFTEN:
-            # This many are not events: the noise itself has another law.
+            # So many jumps are not events: the noise itself has another distribution.
             return None
         log_calm, log_jump = _parts(z, var, share, mean, spread, unit)
         both = np.logaddexp(log_calm, log_jump)
@@ -108,7 +108,7 @@ def _parts(z: FloatArray, var: FloatArray, share: float, mean: float, spread: fl
 
 
 def _mixture(z: FloatArray, var: FloatArray) -> tuple[float, float, float, float] | None:
-    """Return share, mean and spread (V) of the jumps and the scale of the rest, by EM."""
+    """Return share, mean and std (V) of the jumps, and the scale of the noise, by EM."""
     s = np.sqrt(var)
     big = np.abs(z) > 4.0
     if big.sum() < 3:
@@ -123,7 +123,7 @@ def _mixture(z: FloatArray, var: FloatArray) -> tuple[float, float, float, float
             return None
         before = share
         share = min(total / z.size, 0.5)
-        # What of a score is jump, by its prior and that of the noise in it.
+        # Share of an innovation that the jump explains, given both variances.
         part = spread * spread / (spread * spread + unit * unit * var)
         size = mean + part * (z * s - mean)
         mean = float((weight * size).sum()) / total
@@ -138,7 +138,7 @@ def _mixture(z: FloatArray, var: FloatArray) -> tuple[float, float, float, float
 
 @dataclass(frozen=True)
 class Glitches(Term):
-    """Add a normal error to a sample now and then."""
+    """Add a normal error to some samples."""
 
     NAME: ClassVar[str] = 'glitches'
     FAMILY: ClassVar[str] = 'events'
@@ -148,10 +148,10 @@ class Glitches(Term):
     IMITATES: ClassVar[tuple[str, ...]] = ('clock_jitter', 'heavy_tails', 'jumps')
     SEVERAL: ClassVar[bool] = True
     MEANING: ClassVar[str] = (
-        'Single bad samples that do not enter the dynamics: bus errors or pick-up of the ADC.')
+        'Single bad readings that the rail does not follow: bus errors or pick-up at the ADC.')
     REMEDY: ClassVar[str] = (
-        'Reject single outliers before the estimator; check cables and ground of the ADC.')
-    SEPARATED_BY: ClassVar[str] = 'two ADCs on one rail: a glitch is in one only'
+        'Reject outliers ahead of the estimator; check the cables and the ground of the ADC.')
+    SEPARATED_BY: ClassVar[str] = 'two ADCs on one rail: a glitch shows in only one'
 
     probability: float = parameter('', 'share of samples that are bad', 0.0, 1.0)
     std: float = parameter('V', 'standard deviation of the error', 0.0)
@@ -168,11 +168,9 @@ class Glitches(Term):
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
-        """Find runs of up to three samples that their neighbours on both sides contradict."""
-        # The bad ones widen what the fit so far takes for noise: a scale that
-        # does not see them.
-        # Judged by what a filter sees that knows of no error: a sample once left
-        # out no longer disturbs the next.
+        """Find runs of up to three samples that contradict their neighbours on both sides."""
+        # Bad samples have widened the fitted noise, so the scale is a median.  It is that of a
+        # filter without measurement errors, in which a sample affects only the next one.
         plain = (view.residual - view.phi * view.state) / np.sqrt(view.variance)
         unit = float(np.median(np.abs(plain))) / 0.6745
         scaled = replace(view, z=plain / unit, variance=view.variance * unit * unit)
@@ -194,15 +192,15 @@ class Glitches(Term):
         scores, gain, free = _scored(view, bad, share, spread, lengths)
         se = {'probability': term.probability / math.sqrt(count),
               'std': spread / math.sqrt(2.0 * count)}
-        # Once an error is taken out, the samples after it are scored anew.
+        # The variance of the error makes the next fit ignore the bad samples.
         return LawFit(term, se, scores, gain, free,
                       error=np.where(bad, spread * spread, 0.0))
 
 
 def _scored(view: View, bad: npt.NDArray[np.bool_], share: float, spread: float,
             lengths: FloatArray) -> tuple[FloatArray, FloatArray, int]:
-    """Return normal scores, gains in log density, and how many parameters they took."""
-    # Good, and the first, second and third sample of a run, whose errors are alike.
+    """Return normal scores, gains in log density, and the number of parameters."""
+    # States: good, and the first, second and third sample of a run with similar errors.
     e = view.z * np.sqrt(view.variance)
     keep, rest = _alike(e, bad, view.train, spread)
     wide = np.sqrt(1.0 + spread * spread / view.variance)
@@ -210,7 +208,7 @@ def _scored(view: View, bad: npt.NDArray[np.bool_], share: float, spread: float,
     mean = keep * np.concatenate(([0.0], e[:-1])) / np.sqrt(view.variance)
     calm, hit = log_normal(view.z), log_normal(view.z, 0.0, wide * wide)
     more = log_normal(view.z, mean, again * again)
-    # What each step of the chain expects: nothing, an error, the same error again.
+    # What each transition predicts: no error, a new error, or a similar error again.
     which = np.array([[0, 1, 0, 0], [0, 0, 2, 0], [0, 0, 0, 2], [0, 0, 0, 0]])
     go = 1.0 - lengths[0], lengths[2] / (lengths[1] + lengths[2])
     transition = np.array([[1.0 - share, share, 0.0, 0.0], [1.0 - go[0], 0.0, go[0], 0.0],
@@ -225,7 +223,7 @@ def _scored(view: View, bad: npt.NDArray[np.bool_], share: float, spread: float,
 
 def _alike(e: FloatArray, bad: npt.NDArray[np.bool_], train: slice, spread: float
            ) -> tuple[float, float]:
-    """Return how much of an error the next one of its run keeps, and what it adds, V."""
+    """Return the regression of an error on the previous one of its run, and the rest, V."""
     e, bad = e[train], bad[train]
     second = np.flatnonzero(bad[1:] & bad[:-1]) + 1
     if second.size < _PAIRS:
@@ -234,12 +232,12 @@ def _alike(e: FloatArray, bad: npt.NDArray[np.bool_], train: slice, spread: floa
     return keep, float(np.std(e[second] - keep * e[second - 1]))
 
 
-# Pairs of bad samples from which it can be said whether errors repeat.
+# Minimum pairs of adjacent bad samples to tell whether their errors are similar.
 _PAIRS = 8
 
 
 def _lengths(bad: npt.NDArray[np.bool_]) -> FloatArray:
-    """Return how many runs there are of one, of two, and of three or more."""
+    """Return the number of runs of one sample, of two, and of three or more."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], bad, [False]))))
     widths = np.minimum(edges[1::2] - edges[::2], 3)
     return np.bincount(widths, minlength=4)[1:].astype(np.float64)
@@ -247,14 +245,14 @@ def _lengths(bad: npt.NDArray[np.bool_]) -> FloatArray:
 
 def bad_samples(view: View, share: float, spread: float, lengths: FloatArray
                 ) -> npt.NDArray[np.bool_]:
-    """Return the set of runs of up to three wrong samples that explains most."""
+    """Return the most likely set of bad samples, in runs of up to three."""
     z, phi, n = view.z, view.phi, view.z.size
     size = 0.5 * math.log1p(spread * spread / float(np.median(view.variance)))
     begins, ends, gains = [], [], []
     for width in (1, 2, 3):
         first = np.arange(1, n - width)
-        # Innovations k..k+width with the samples k..k+width-1 out: one remains,
-        # the way from k-1 to k+width in width + 1 steps.
+        # Leaving out samples k..k+width-1 replaces the innovations k..k+width by one, from
+        # sample k-1 to k+width.
         run, weight, power = z[first + width].copy(), np.ones(first.size), np.ones(first.size)
         before = run**2
         for j in range(width - 1, -1, -1):
@@ -273,10 +271,10 @@ def bad_samples(view: View, share: float, spread: float, lengths: FloatArray
 
 def _best_runs(begin: npt.NDArray[np.int64], end: npt.NDArray[np.int64], gain: FloatArray, n: int
                ) -> npt.NDArray[np.bool_]:
-    """Return the samples of the runs that gain most together (weighted interval scheduling)."""
+    """Return the samples of the best set of runs (weighted interval scheduling)."""
     order = np.argsort(end, kind='stable')
     begin, end = begin[order], end[order]
-    # A run needs the innovations up to its end; how many runs end before each begins.
+    # A run uses the innovations up to its end: the number of runs that end before each begins.
     clear = np.searchsorted(end, begin, side='left').tolist()
     best, taken = [0.0], []
     for value, k in zip(gain[order].tolist(), clear, strict=True):
@@ -295,7 +293,7 @@ def _best_runs(begin: npt.NDArray[np.int64], end: npt.NDArray[np.int64], gain: F
 
 @dataclass(frozen=True)
 class HeavyTails(Term):
-    """Make what the noise adds in a step Student-t, variance kept, at the fitted spacing."""
+    """Make the noise of a step Student-t with the same variance, at the fitted sample spacing."""
 
     NAME: ClassVar[str] = 'heavy_tails'
     FAMILY: ClassVar[str] = 'events'
@@ -305,7 +303,7 @@ class HeavyTails(Term):
     IMITATES: ClassVar[tuple[str, ...]] = (
         'clock_jitter', 'glitches', 'jumps', 'regime_switching', 'volatility')
     MEANING: ClassVar[str] = 'The driving noise itself has heavy tails, without distinct events.'
-    REMEDY: ClassVar[str] = 'Expect large excursions more often than a normal law predicts.'
+    REMEDY: ClassVar[str] = 'Expect more large excursions than a normal distribution predicts.'
     SEPARATED_BY: ClassVar[str] = 'a recording several times as long, at a higher rate'
 
     dof: float = parameter('', 'degrees of freedom', 2.0, above=True)
@@ -319,7 +317,7 @@ class HeavyTails(Term):
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
-        """Fit a scaled Student-t, in what else the scores have that is normal, the scale free."""
+        """Fit a Student-t for the share of the scores that the OU drives, with a free scale."""
         share = np.broadcast_to(view.driven, view.z.shape)
         square, shares, count = _cells(view.z[view.train], share[view.train])
 
@@ -339,10 +337,10 @@ class HeavyTails(Term):
 
 class _Mixture:
     """
-    Scores of which a share of the variance is Student-t and the rest normal.
+    Scores whose variance is in part that of a Student-t, otherwise of a normal distribution.
 
-    A Student-t is normal with a variance that is the inverse of a gamma: a sum over its logarithm,
-    at points so near that the sum is the integral.
+    A Student-t is a normal distribution whose variance is inverse-gamma distributed; the integral
+    over the variance is a sum over close points of its logarithm.
 
     """
 
@@ -354,7 +352,7 @@ class _Mixture:
         ends = np.log(gammaincinv(half, _OUTSIDE)), np.log(gammainccinv(half, _OUTSIDE))
         gamma = np.exp(np.linspace(*ends, _POINTS))
         log = half * np.log(gamma) - gamma
-        # In logarithms, for among many degrees of freedom most weights vanish.
+        # In logarithms, because most weights underflow with many degrees of freedom.
         log -= log.max()
         log -= math.log(float(np.exp(log).sum()))
         self._weight = np.exp(log)
@@ -372,7 +370,7 @@ class _Mixture:
         return self._log
 
     def beyond(self) -> FloatArray:
-        """Return the chance of a score on the same side that is farther out."""
+        """Return the probability of a more extreme score on the same side."""
         return np.asarray(ndtr(-np.sqrt(self._square[:, None] / self._variance)) @ self._weight)
 
     def power(self) -> FloatArray:
@@ -382,7 +380,7 @@ class _Mixture:
 
 
 def _cells(z: FloatArray, share: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return squares and shares of cells of scores, and how many each has."""
+    """Return mean square, mean share and number of scores in cells of similar scores."""
     edges = np.unique(np.quantile(share, np.linspace(0.0, 1.0, _SHARES + 1)[1:-1]))
     row = np.searchsorted(edges, share)
     column = np.minimum(np.arcsinh(np.abs(z)) / _WIDTH, _CELLS - 1).astype(np.int64)
@@ -391,11 +389,11 @@ def _cells(z: FloatArray, share: FloatArray) -> tuple[FloatArray, FloatArray, Fl
     return (np.bincount(cell, z * z) / count, np.bincount(cell, share) / count, count)
 
 
-# Share of the Student-t from which it is the only noise.  Beside another, each sample's own power
-# would explain all of it, and a fit around that power finds no white noise: the variance is the
-# same without.
+# Share of the Student-t from which it is the only noise.  With white noise beside it, a power for
+# each sample would explain that noise too, and the next fit would find none; the variance is right
+# without.
 _ALONE = 0.99
-# Points of the variance, and the chance outside of them; shares, and cells of scores, that a fit
-# tells apart.
+# Points of the variance, and the probability outside them; bins of share, and number and width of
+# the bins of scores, in a fit.
 _POINTS, _OUTSIDE = 40, 1e-10
 _SHARES, _CELLS, _WIDTH = 8, 300, 0.03

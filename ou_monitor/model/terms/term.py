@@ -1,13 +1,12 @@
 """
-Base of all terms: named parameters with units, a simulator, a likelihood, words.
+Base of all terms: named parameters with units, a simulator, a likelihood, explanations.
 
-A term defines its effect on a `Segment` of samples.  A simulator draws from its own
-generator and keeps its state from segment to segment, so a recording does not
-depend on the segments it is simulated in, nor one term's draws on another's.
+A term defines its effect on a `Segment` of samples.  Each simulator has its own
+generator and keeps its state from segment to segment, so a recording depends neither
+on the division into segments nor on the draws of other terms.
 
-A module in this folder that defines a `Term` is a cause: the search, its words, the
-report and the model file find it through `catalogue`, and read all that they need to
-know of it from the class.
+Each class in this folder that is derived from `Term` is a cause: search, report and
+model file find it through `catalogue`, and read everything about it from the class.
 """
 
 from __future__ import annotations
@@ -25,42 +24,42 @@ from ou_monitor.records import FloatArray
 
 Value = TypeVar('Value')
 
-# A coefficient to start from that is not left out as 0 is.
+# Initial value of a coefficient that is to be fitted: one of exactly 0 stays 0.
 NEXT_TO_ZERO = 1e-12
 
 
 class Role(enum.Enum):
     """How a term enters a likelihood."""
 
-    # Known without a model: a property of the codes and stamps themselves.
+    # Found without a model, from the codes and stamps themselves.
     EXACT = enum.auto()
-    # A sum of known columns, each times a coefficient.
+    # A sum of known columns with coefficients.
     MEAN = enum.auto()
-    # Changes alpha or sigma by what is measured.
+    # Changes alpha or sigma with a measured input.
     DRIVE = enum.auto()
-    # Further states of the linear system.
+    # Adds states to the linear system.
     BLOCK = enum.auto()
     # White noise of the measurement.
     NOISE = enum.auto()
-    # Another law of the one-step innovations.
+    # Another distribution of the one-step innovations.
     LAW = enum.auto()
 
 
 def parameter(unit: str, text: str, low: float = -math.inf, high: float = math.inf, *,
               above: bool = False, default: float | None = None) -> Any:
-    """Declare a parameter of a term; one with a default may be left out, in a file too."""
+    """Declare a parameter; one with a default may be omitted, also in a model file."""
     about = {'unit': unit, 'text': text, 'low': low, 'high': high, 'above': above}
     return field(metadata=about) if default is None else field(default=default, metadata=about)
 
 
 def parameters(unit: str, text: str) -> Any:
-    """Declare a parameter that is a list of numbers; as `parameter`, any finite value."""
+    """Declare a parameter that is a list of finite numbers."""
     return field(metadata={'unit': unit, 'text': text, 'low': -math.inf, 'high': math.inf,
                            'above': False, 'several': True})
 
 
 class _ByParameters(Generic[Value]):
-    """An attribute with a value for a class, and another for each term by its parameters."""
+    """An attribute with one value for the class, and one for each term, from its parameters."""
 
     def __init__(self, usual: Value, own: Callable[[Any], Value]) -> None:
         self._usual, self._own = usual, own
@@ -70,7 +69,7 @@ class _ByParameters(Generic[Value]):
 
 
 def by_parameters(usual: Value, own: Callable[[Any], Value]) -> Value:
-    """Declare an attribute of a class that a term computes from its parameters."""
+    """Declare an attribute of the class that each term computes from its parameters."""
     return cast('Value', _ByParameters(usual, own))
 
 
@@ -93,7 +92,7 @@ class Term:
     # As in a model file and in a finding.
     NAME: ClassVar[str] = ''
     FAMILY: ClassVar[str] = ''
-    # When it acts.
+    # When it acts in a simulation.
     STAGE: ClassVar[Stage] = Stage.LEVEL
     NEEDS_THROTTLE: ClassVar[bool] = False
     # How it enters a likelihood.
@@ -102,38 +101,38 @@ class Term:
     LINEAR: ClassVar[tuple[str, ...]] = ()
     # Positive parameters found by maximum likelihood, on a log scale (`DRIVE`, `BLOCK`, `NOISE`).
     FREE: ClassVar[tuple[str, ...]] = ()
-    # Statistics that show this term, by the beginning of their names, after + or - where only
-    # one direction does.
+    # Beginnings of the names of the statistics that show this term; + or - in front: only in that
+    # direction.
     SIGNS: ClassVar[tuple[str, ...]] = ()
-    # Answers to throttle or time alone: the search tries it before latent causes.
+    # Depends only on throttle or time: the search tries it before latent causes.
     MEASURED: ClassVar[bool] = False
-    # Causes that it imitates or that imitate it: one beside the other would only refine its form.
-    # It suffices that one of the two names the other.
+    # Causes that are hard to tell from it, so that the search does not add one to the other; it is
+    # enough to name one of a pair in the class of the other.
     IMITATES: ClassVar[tuple[str, ...]] = ()
     # Whether a model can have several, and whether the search looks for another one.
     SEVERAL: ClassVar[bool] = False
     RECURS: ClassVar[bool] = False
-    # Evidence that it needs, as a share of the largest of any cause.
+    # Minimum evidence, as a share of that of the strongest cause.
     LEAST_SHARE: ClassVar[float] = 0.0
-    # Share of its signs that it may leave; 0: it is withdrawn where any statistic fails.
+    # Share of its signs that may remain after the fit; 0: no statistic may fail.
     MAY_LEAVE: ClassVar[float] = 0.0
-    # Statistics that it cannot leave.
+    # Statistics that must not fail after the fit.
     REFUTED_BY: ClassVar[tuple[str, ...]] = ()
-    # Penalty for what is searched beside the free parameters, nats.
+    # Penalty for a search beyond the free parameters, nats.
     SEARCH: ClassVar[float] = 0.0
-    # Number of parameters that the term finds from the scores, and not the fit (`apart`).
+    # Number of parameters found by `apart` and not by the fit.
     APART: ClassVar[int] = 0
-    # A fit takes seconds: none is begun late in a search.
+    # Whether a fit takes seconds, so that none starts late in a search.
     DEAR: ClassVar[bool] = False
-    # Its spectrum is broad and the same throughout, so that a fit starts from that of the scores,
-    # and the number of states that it adds to the linear system (`Role.BLOCK`).
+    # Whether its spectrum is broad and stationary, so that a fit starts from the spectrum of the
+    # scores; the number of states that it adds to the linear system (`Role.BLOCK`).
     BROAD: ClassVar[bool] = False
     STATES: ClassVar[int] = 0
-    # The term that it changes and that a model needs beside it; None for the `ou`.
+    # The term that it modifies, which the model must have; None: the `ou`.
     CHANGES: ClassVar[type[Term] | None] = None
-    # The live estimate has alpha, sigma or u0 as this term makes them at the present throttle.
+    # Whether the live estimate, at the present throttle, includes its effect.
     LIVE: ClassVar[bool] = False
-    # For people: what it is, what to do about it, which recording separates it from other causes.
+    # For the report: what it is, what to do about it, which recording separates it from others.
     MEANING: ClassVar[str] = ''
     REMEDY: ClassVar[str] = ''
     SEPARATED_BY: ClassVar[str] = ''
@@ -157,24 +156,24 @@ class Term:
         """Check relations between parameters; the base has none."""
 
     def start(self, rng: np.random.Generator) -> Effect:
-        """Return a function that changes one `Segment` after the other, in order."""
+        """Return a function that applies the term to one `Segment` after another, in order."""
         raise NotImplementedError
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return starting points for a fit to what the model leaves over, best first."""
+        """Return starting points for a fit to the residual of the model, best first."""
         return ()
 
     def holds(self, view: View) -> bool:
-        """Return whether fitted parameters still fit the name; by default they do."""
+        """Return whether the fitted parameters still mean this cause; by default, yes."""
         return True
 
     def beside(self, ou: Term) -> Term:
-        """Return the `ou` that a fit with this term starts from; the default leaves it."""
+        """Return the `ou` from which a fit with this term starts; by default, the given one."""
         return ou
 
     def columns(self, s: Segment) -> FloatArray:
-        """Return one column for each of `LINEAR`, V per unit, shape (n, p)."""
+        """Return a column for each parameter in `LINEAR`, V per unit, shape (n, p)."""
         columns = []
         rng = np.random.default_rng(0)
         for name in self.LINEAR:
@@ -189,19 +188,19 @@ class Term:
         return [float(getattr(self, name)) for name in self.LINEAR]
 
     def with_linear(self, beta: Sequence[float]) -> Self:
-        """Return the term with the coefficients of its columns."""
+        """Return the term with new coefficients of its columns."""
         return replace(self, **dict(zip(self.LINEAR, map(float, beta), strict=True)))
 
     def free(self) -> tuple[str, ...]:
-        """Return the names of the coordinates found by maximum likelihood."""
+        """Return the names of the coordinates for maximum likelihood."""
         return self.FREE
 
     def moved(self, name: str, by: float) -> Self:
-        """Return the term with one coordinate moved; the default moves the logarithm."""
+        """Return the term with one coordinate moved; by default, that is the logarithm."""
         return replace(self, **{name: getattr(self, name) * math.exp(by)})
 
     def apart(self, view: View) -> Self:
-        """Return the term with the parameters that it finds itself, from the scores with it."""
+        """Return the term with its `APART` parameters, found from the scores of a fit with it."""
         return self
 
     def per_coordinate(self, name: str) -> float:
@@ -212,8 +211,8 @@ class Term:
         """
         Return the states that this term adds (`Role.BLOCK`): f, q, h.
 
-        f, q, shape (n, d, d): transition into each sample and covariance of what is added, V^2,
-        at the first sample the stationary one; h, shape (d,): shares of the states in the voltage.
+        f, q, shape (n, d, d): transition into each sample, and covariance of the noise, V^2,
+        at the first sample the stationary one; h, shape (d,): weights of the states in the sum.
         """
         raise NotImplementedError
 
@@ -222,16 +221,16 @@ class Term:
         return 0.0
 
     def variances(self, s: Segment) -> FloatArray | float:
-        """Return the same at each sample of a segment, where what is measured changes it."""
+        """Return that variance at each sample of a segment, if a measured input changes it."""
         return self.variance()
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
-        """Fit another law to the normal scores (`Role.LAW`); None where it cannot be."""
+        """Fit another law to the normal scores (`Role.LAW`); None if it is not possible."""
         return None
 
     def refit_law(self, view: View) -> LawFit | None:
-        """Fit the law again to nearly the same scores; the default starts anew."""
+        """Fit the law again to nearly the same scores; by default, from the beginning."""
         return type(self).fit_law(view)
 
     @classmethod
@@ -241,12 +240,12 @@ class Term:
 
     @classmethod
     def usual(cls) -> dict[str, Any]:
-        """Return the values of parameters that may be left out."""
+        """Return the defaults of the parameters that may be omitted."""
         return {spec.name: spec.default for spec in fields(cls) if spec.default is not MISSING}
 
     @classmethod
     def unit(cls, name: str) -> str:
-        """Return the unit of a parameter; empty for a pure number."""
+        """Return the unit of a parameter; empty for a number."""
         return next(str(spec.metadata['unit']) for spec in fields(cls) if spec.name == name)
 
     @classmethod
@@ -257,7 +256,7 @@ class Term:
 
     @classmethod
     def read(cls, params: Mapping[str, Any]) -> Self:
-        """Return a term from a value for every parameter; ValueError names what is wrong."""
+        """Return a term from its parameters; a ValueError names what is wrong."""
         names = cls.parameters()
         missing = [name for name in names if name not in {**cls.usual(), **params}]
         unknown = [name for name in params if name not in names]
@@ -280,17 +279,16 @@ class LawFit:
 
     term: Term  # With its parameters
     se: dict[str, float]  # Their standard errors, where known
-    z: FloatArray  # Normal scores under the law: independent N(0, 1) when it is right; shape (n,)
-    # Log predictive density of each sample over that of N(0, 1) for `View.z`, nats; shape (n,).
+    z: FloatArray  # Normal scores: independent N(0, 1) if the law is right; shape (n,)
+    # Log predictive density of each sample less that of `View.z` under N(0, 1), nats; shape (n,).
     gain: FloatArray
-    free: int  # Parameters fitted
+    free: int  # Number of fitted parameters
     push: FloatArray | None = None  # Variance that events add to the state, V^2; shape (n,)
     error: FloatArray | None = None  # Variance that events add to the measurement, V^2; shape (n,)
-    # Factor on the variance of what the noise adds in the step before each sample, as the law
-    # believes it was: the inverse of the mean precision; shape (n,).
+    # Estimated factor on the variance of the noise in the step before each sample, as the inverse
+    # of the mean precision; shape (n,).
     power: FloatArray | None = None
-    # Voltage that the law adds to the level, V; the Gaussian part is fitted to the rest; shape
-    # (n,).
+    # Voltage that the law adds to the level, subtracted before the Gaussian fit, V; shape (n,).
     offset: FloatArray | None = None
 
 

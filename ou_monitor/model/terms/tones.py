@@ -1,4 +1,4 @@
-"""Lines in the spectrum: at a fixed frequency, of a resonance, along with throttle."""
+"""Spectral lines: at a fixed frequency, from a resonance, or following throttle."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from ou_monitor.records import FloatArray
 
 @dataclass(frozen=True)
 class Tone(Term):
-    """Add a sine whose phase wanders, so that its line is `linewidth` wide at half height."""
+    """Add a sine whose random-walk phase makes its line `linewidth` wide at half height."""
 
     NAME: ClassVar[str] = 'tone'
     FAMILY: ClassVar[str] = 'line'
     STAGE: ClassVar[Stage] = Stage.LEVEL
-    # A line that wanders is two states, not known columns.
+    # With a wandering phase, it is two states instead of known columns.
     ROLE: ClassVar[Role] = by_parameters(
         Role.MEAN, lambda term: Role.BLOCK if term.linewidth else Role.MEAN)
     LINEAR: ClassVar[tuple[str, ...]] = by_parameters(
@@ -40,9 +40,9 @@ class Tone(Term):
     MEANING: ClassVar[str] = (
         'A line at a fixed frequency: PWM of an ESC or its alias, or a DC-DC converter.')
     REMEDY: ClassVar[str] = (
-        'Find the source by its frequency; sample at another rate to identify an alias.')
+        'Find the source from its frequency; sample at another rate to identify an alias.')
     SEPARATED_BY: ClassVar[str] = (
-        'the same at two sampling rates: an alias moves, a true line does not')
+        'the same rail at two sampling rates: an alias moves, a true line does not')
 
     amplitude: float = parameter('V', 'peak', 0.0)
     frequency: float = parameter('Hz', 'frequency', 0.0, above=True)
@@ -61,14 +61,14 @@ class Tone(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return the strongest lines of what is left over, and the first of them wandering."""
+        """Return the strongest lines of the residual, and the first with a wandering phase too."""
         found = [cls.at(line, view) for line in lines_of(view)[:_MOST]]
         spread = math.sqrt(float(np.median(view.variance)))
         return [*found, *(cls(0.3 * spread, line.frequency, 0.0, _WANDERS) for line in found[:1])]
 
     @classmethod
     def at(cls, line: Line, view: View) -> Tone:
-        """Return a start for a line of what is left over: where it is over the whole recording."""
+        """Return a start at a line of the residual, at its frequency in the whole recording."""
         grid = on_grid(view.at, view.z)
         wave = fit_sinusoid(grid.values, grid.rate, line.frequency, line.resolution)
         return cls(0.0, wave.frequency, 0.0, 0.0)
@@ -80,7 +80,7 @@ class Tone(Term):
             or keeps_its_height(view, self.frequency, self.linewidth))
 
     def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the two states of a line that wanders, which turn."""
+        """Return the two rotating states of a line whose phase wanders."""
         turn = 2.0 * math.pi * self.frequency * np.where(np.isfinite(s.step), s.step, 0.0)
         return rotation(turn, math.pi * self.linewidth, s.step, self.amplitude / math.sqrt(2.0))
 
@@ -104,39 +104,38 @@ class Tone(Term):
 
 
 def lines_of(view: View) -> tuple[Line, ...]:
-    """Return the lines of what is left over, strongest first."""
-    # In all of it: a line may have begun late, and its frequency is no parameter of a
-    # likelihood, but pays for its search.
+    """Return the lines of the residual, strongest first."""
+    # With the held-out part, because a line may begin late; the frequency is not fitted there but
+    # pays the price of a search.
     grid = on_grid(view.at, view.z)
     return find_lines([grid.values], grid.rate, false_alarm=_PROPOSED).lines
 
 
-# Lines that are tried, one after the other; probability that noise proposes one, where the
-# evidence of a fit decides.
+# Number of lines to try; false-alarm probability of proposing one, large because the evidence of a
+# fit decides.
 _MOST, _PROPOSED = 3, 0.5
-# Linewidth to start from, Hz, and that from which a line is ringing that dies out, if it
-# does not keep its height.
+# Initial linewidth, Hz; linewidth from which a line whose amplitude varies is ringing, Hz.
 _WANDERS, WIDEST = 0.3, 2.0
-# Width of the widest line, in frequencies.
+# Largest width of a line over its frequency.
 SHARP = 0.05
 
 
 @dataclass(frozen=True)
 class Resonance(Term):
     """
-    Add noise with a rounded spectral line.
+    Add noise with a broad spectral line.
 
     Autocovariance std^2 exp(-damping |tau|) (cos(w |tau|) + tilt damping/w sin(w |tau|)),
     w = 2 pi frequency; exact in law at any spacing.  tilt = 0 is the real part of a
-    complex OU, 1 the voltage of the capacitor of an LC filter (all of it below the
-    line), -1 that across its choke (none at 0 Hz).
+    complex OU, 1 the voltage of the capacitor of an LC filter (passes low
+    frequencies), -1 that of its choke (nothing at 0 Hz).
     """
 
     NAME: ClassVar[str] = 'resonance'
     FAMILY: ClassVar[str] = 'line'
     STAGE: ClassVar[Stage] = Stage.LEVEL
     ROLE: ClassVar[Role] = Role.BLOCK
-    # The tilt is fitted where it is not 0.
+    # The tilt is fitted unless it is 0.
     FREE: ClassVar[tuple[str, ...]] = by_parameters(
         ('frequency', 'damping', 'std'),
         lambda term: ('frequency', 'damping', 'std', *(('tilt',) if term.tilt else ())))
@@ -148,20 +147,19 @@ class Resonance(Term):
     RECURS: ClassVar[bool] = True
     # A broad line fits almost any spectrum.
     MAY_LEAVE: ClassVar[float] = 0.1
-    # What rings under noise does not come and go, nor makes three neighbours depend on
-    # each other.
+    # Ringing driven by noise is Gaussian: without bursts and third moments.
     REFUTED_BY: ClassVar[tuple[str, ...]] = ('bursts', 'products of three')
     MEANING: ClassVar[str] = 'The rail rings: inductance of the leads against the capacitors.'
     REMEDY: ClassVar[str] = 'Damp it with a resistive (electrolytic) capacitor or shorter leads.'
-    SEPARATED_BY: ClassVar[str] = 'a sampling rate of ten times the ringing, throttle held still'
+    SEPARATED_BY: ClassVar[str] = 'constant throttle, sampled at ten times that frequency'
 
-    frequency: float = parameter('Hz', 'of the ringing', 0.0, above=True)
-    damping: float = parameter('1/s', 'rate at which ringing dies out', 0.0, above=True)
+    frequency: float = parameter('Hz', 'frequency of the ringing', 0.0, above=True)
+    damping: float = parameter('1/s', 'decay rate of the ringing', 0.0, above=True)
     std: float = parameter('V', 'standard deviation', 0.0)
     tilt: float = parameter('', 'slope of the spectrum: 1 low-pass, -1 band-pass', -1.0, 1.0)
 
     def moved(self, name: str, by: float) -> Resonance:
-        """Return the term with one coordinate moved: the tilt itself, logarithms else."""
+        """Return the term with one coordinate moved: the tilt, or the logarithm of another."""
         if name != 'tilt':
             return super().moved(name, by)
         return replace(self, tilt=min(max(self.tilt + by, -_STEEPEST), _STEEPEST))
@@ -183,7 +181,7 @@ class Resonance(Term):
             across = np.divide(q[:, 0, 1], low, out=np.zeros(n), where=low > 0.0)
             rest = np.sqrt(np.maximum(q[:, 1, 1] - across * across, 0.0))
             kicks = low * pairs[:, 0] + 1j * (across * pairs[:, 0] + rest * pairs[:, 1])
-            # In a frame that turns along, it is an OU with a real rate.
+            # In a rotating frame, it is an OU with a real rate.
             turn = np.exp(2j * math.pi * self.frequency * ((s.at - s.origin) % (
                 1.0 / self.frequency)))
             phi = np.exp(-self.damping * s.step)
@@ -197,33 +195,33 @@ class Resonance(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return the broad peaks of what is left over."""
+        """Return the broad peaks of the residual."""
         spread = float(np.sqrt(np.median(view.variance)))
         return [cls(frequency, width, 0.5 * spread, tilt)
                 for frequency, width in broad_peaks(view.z[view.train], view.rate)
                 for tilt in (0.0, -_STEEP, _STEEP)]
 
     def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return its two states, which turn."""
+        """Return its two rotating states."""
         turn = 2.0 * math.pi * self.frequency * np.where(np.isfinite(s.step), s.step, 0.0)
         return rotation(turn, self.damping, s.step, self.std,
                         self.tilt * self.damping / (2.0 * math.pi * self.frequency))
 
     def holds(self, view: View) -> bool:
-        """Return whether it turns before it dies out, and dies out sooner than a line does."""
+        """Return whether it oscillates, and decays faster than a line."""
         width = self.damping / math.pi
-        # What is too wide for a tone; or would be one but for its height.
+        # Too wide for a tone, or a tone whose amplitude varies.
         return width < 2.0 * self.frequency and (width >= SHARP * self.frequency or (
             width > WIDEST and not keeps_its_height(view, self.frequency, width)))
 
 
-# Tilt to begin with, and at most: at 1 a step would add no noise in one direction.
+# Initial tilt, and the largest: at 1, a step would add no noise to one of the states.
 _STEEP, _STEEPEST = 0.9, 0.99
 
 
 @dataclass(frozen=True)
 class ThrottleTone(Term):
-    """Add a sine at idle + slope * throttle, whose phase wanders as in `Tone`."""
+    """Add a sine at idle + slope * throttle with the random phase of `Tone`."""
 
     NAME: ClassVar[str] = 'throttle_tone'
     FAMILY: ClassVar[str] = 'line'
@@ -243,10 +241,10 @@ class ThrottleTone(Term):
     SEPARATED_BY: ClassVar[str] = 'a slow sweep of throttle'
 
     amplitude: float = parameter('V', 'peak', 0.0)
-    idle: float = parameter('Hz', 'frequency at zero throttle, below 0 where it folds back')
-    slope: float = parameter('Hz', 'what full throttle adds to it')
+    idle: float = parameter('Hz', 'frequency at zero throttle; below 0 for an alias')
+    slope: float = parameter('Hz', 'frequency at full throttle less idle')
     phase: float = parameter('rad', 'phase at the first sample')
-    linewidth: float = parameter('Hz', 'width of the line; 0: it follows throttle alone', 0.0)
+    linewidth: float = parameter('Hz', 'width of the line; 0: it follows throttle exactly', 0.0)
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
@@ -265,7 +263,7 @@ class ThrottleTone(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return the strongest lines of what is left over that throttle moves at all."""
+        """Return the strongest lines of the residual that move with throttle."""
         if view.throttle is None:
             return ()
         spread = math.sqrt(float(np.median(view.variance)))
@@ -274,21 +272,21 @@ class ThrottleTone(Term):
                 for idle, slope in order_lines(view) if abs(slope) > moving]
 
     def holds(self, view: View) -> bool:
-        """Return whether throttle moves the line by more than it is wide."""
+        """Return whether throttle moves the line by more than its width."""
         return view.throttle is not None and (
             abs(self.slope) * float(view.throttle[view.train].std()) > _MORE * self.linewidth)
 
     def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return its two states, which turn as throttle says."""
+        """Return its two states, which rotate at the frequency for the throttle."""
         step = np.where(np.isfinite(s.step), s.step, 0.0)
         turn = 2.0 * math.pi * (self.idle + self.slope * s.throttle) * step
         damping = math.pi * max(self.linewidth, _NARROWEST)
         return rotation(turn, damping, s.step, self.amplitude / math.sqrt(2.0))
 
 
-# Lines that throttle moves by fewer than this many widths of a bin are tones.
+# Minimum movement over the range of throttle, in bins: other lines are tones.
 _MOVES = 30.0
 # Minimum movement of the line by one standard deviation of throttle, in widths of the line.
 _MORE = 1.0
-# Minimum width of a line as noise, Hz.
+# Minimum linewidth of the two states, Hz.
 _NARROWEST = 1e-4

@@ -1,4 +1,4 @@
-"""sigma wanders slowly, unrelated to throttle: temperature, ageing of the supply."""
+"""Slow, random changes of sigma that throttle does not cause: temperature, ageing."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from scipy.special import comb, digamma, ndtr
 
 @dataclass(frozen=True)
 class Volatility(Term):
-    """Multiply sigma by exp of an OU, taken as constant within a step."""
+    """Multiply sigma by the exponential of an OU, constant within a step."""
 
     NAME: ClassVar[str] = 'volatility'
     FAMILY: ClassVar[str] = 'intensity'
@@ -26,10 +26,10 @@ class Volatility(Term):
     DEAR: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('clustering', 'kurtosis')
     IMITATES: ClassVar[tuple[str, ...]] = ('heavy_tails', 'jumps', 'regime_switching')
-    MEANING: ClassVar[str] = 'The intensity of the noise wanders slowly, unrelated to throttle.'
-    REMEDY: ClassVar[str] = 'Keep the window of the estimator short beside that time.'
+    MEANING: ClassVar[str] = 'sigma changes slowly at random, independent of throttle.'
+    REMEDY: ClassVar[str] = 'Use an estimator window much shorter than 1/rate.'
     SEPARATED_BY: ClassVar[str] = (
-        'a recording several times as long, temperature recorded beside it')
+        'a recording several times as long, with the temperature')
 
     std: float = parameter('', 'standard deviation of ln sigma', 0.0)
     rate: float = parameter('1/s', 'relaxation rate of ln sigma', 0.0, above=True)
@@ -50,16 +50,16 @@ class Volatility(Term):
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
-        """Fit a log-variance that wanders, taken as constant over short segments."""
+        """Fit an OU of ln sigma, constant within short segments."""
         return cls._climbed(view, _start(view), known=False)
 
     def refit_law(self, view: View) -> LawFit | None:
-        """Fit again, from where it was."""
+        """Fit again, starting from these parameters."""
         return self._climbed(view, np.array([
             math.log(max(self.std, 1e-3)), math.log(self.rate), _start(view)[2]]), known=True)
 
     def holds(self, view: View) -> bool:
-        """Return whether it wanders: a recording of fewer relaxations shows a trend of sigma."""
+        """Return whether the recording has enough relaxations; with fewer, sigma has a trend."""
         return self.rate * float(view.at[-1]) > _WANDERS
 
     @classmethod
@@ -73,7 +73,7 @@ class Volatility(Term):
             found = np.full(points.shape[0], -math.inf)
             inside = np.flatnonzero((np.abs(points[:, 0] + 1.5) < 2.5)
                                     & (np.abs(points[:, 1] + 1.0) < 6.0))
-            # Those of one rate share the chances from level to level.
+            # Points with the same rate share their transition probabilities.
             for rate in np.unique(points[inside, 1]).tolist():
                 at = inside[points[inside, 1] == rate]
                 found[at] = _grid(squares[:trained], sizes[:trained], span, points[at])[1].sum(
@@ -95,18 +95,18 @@ class Volatility(Term):
         scores = _scores(view.z, before, levels, size)[:view.z.size]
         gain = np.repeat((density + 0.5 * squares) / sizes, size)[:view.z.size]
         term = cls(math.exp(x[0]), math.exp(x[1]))
-        # As known at the end of each segment.
+        # Given all samples up to the end of each segment.
         log = np.log(np.maximum(before, 1e-300)) - sizes[:, None] * levels - 0.5 * squares[
             :, None] * np.exp(-2.0 * levels)
         weight = np.exp(log - log.max(axis=1)[:, None])
-        # Over the median, which so becomes the sigma of the `ou`.
+        # Relative to the median, which thus becomes the sigma of the `ou`.
         power = weight.sum(axis=1) / (weight @ np.exp(2.0 * (x[2] - levels)))
         return LawFit(term, {'std': term.std * float(e[0]), 'rate': term.rate * float(e[1])},
                       scores, gain, 3, power=np.repeat(power, size)[:view.z.size])
 
 
 def _segments(view: View) -> tuple[int, FloatArray, FloatArray]:
-    """Return samples in a segment, the sums of squares, and what each segment really has."""
+    """Return the samples per segment, each segment's sum of squares, and its actual size."""
     n = view.z.size
     size = max(1, n // _SEGMENTS)
     begin = np.arange(0, n, size)
@@ -116,11 +116,11 @@ def _segments(view: View) -> tuple[int, FloatArray, FloatArray]:
 
 def _start(view: View) -> FloatArray:
     """
-    Return std, rate and mean of ln sigma, as `_grid` has them, by moments.
+    Return std, rate and mean of ln sigma, found by moments, in the coordinates of `_grid`.
 
-    The logarithm of the mean of m squares is 2 ln sigma and an error that does
-    not depend on its neighbours; so the covariances at two lags give variance
-    and rate.
+    The logarithm of the mean of m squares is 2 ln sigma plus an error that is
+    independent from segment to segment, so the covariances at two lags give the
+    variance and the rate.
     """
     size, squares, sizes = _segments(view)
     log = 0.5 * np.log(np.maximum(squares / sizes, 1e-12))[:max(view.train.stop // size, 2)]
@@ -130,23 +130,23 @@ def _start(view: View) -> FloatArray:
         return float(np.mean(c[lag:] * c[:-lag]))
 
     near = max(covariance(1), 1e-3)
-    # Where a good part of it is gone: there it says most of the rate.
+    # The lag at which the covariance has dropped clearly, which determines the rate best.
     lags = [1 << k for k in range(1, 11) if 1 << k < c.size // 4]
     far = next((lag for lag in lags if covariance(lag) < 0.6 * near), lags[-1] if lags else 0)
     fall = math.log(near / max(covariance(far), 0.05 * near)) if far else 1.0
     rate = max(fall, 0.02) / (max(far - 1, 1) * size / view.rate)
-    # The mean of the logarithm of a chi square is below the logarithm of its mean.
+    # For a chi-squared variable, the mean of the logarithm is below the logarithm of the mean.
     below = 0.5 * (float(digamma(0.5 * size)) - math.log(0.5 * size))
     return np.array([0.5 * math.log(near), min(math.log(rate), 4.0), float(log.mean()) - below])
 
 
 def _scores(z: FloatArray, before: FloatArray, levels: FloatArray, size: int) -> FloatArray:
-    """Return normal scores, each given all samples before it in its segment, too."""
+    """Return normal scores, each also conditioned on the earlier samples of its segment."""
     count = before.shape[0]
     padded = np.zeros(count * size)
     padded[:z.size] = z
     z = padded.reshape(count, size, 1)
-    # Levels without weight in any segment.
+    # Levels with a noticeable probability in some segment.
     some = before.max(axis=0) > _BELIEVED
     before, levels = before[:, some], levels[some]
     std = np.exp(levels)
@@ -157,18 +157,18 @@ def _scores(z: FloatArray, before: FloatArray, levels: FloatArray, size: int) ->
     return normal_scores(chance.ravel())
 
 
-# Segments that a recording is cut into, levels of ln sigma (they reach 8 standard
-# deviations: it may go beyond the range of the fit), products between two
-# scalings: few, for a segment can be unlikely at all levels but one.
+# Segments per recording; levels of ln sigma, which span 8 standard deviations because it may
+# leave the range of the fit; and steps between two normalisations: few, because a segment can be
+# unlikely at all levels but one.
 _SEGMENTS = 1500
 _LEVELS = 65
 _EVERY = 4
-# Relaxations of ln sigma in a recording, from which its variance is known to a factor of e:
-# sqrt(2/2) = 1.
+# Minimum relaxations of ln sigma in a recording: with 2, the logarithm of its variance has a
+# standard error of sqrt(2/2) = 1.
 _WANDERS = 2.0
-# Chances of the levels.
+# Stationary probabilities of the levels.
 _STATIONARY: FloatArray = comb(_LEVELS - 1, np.arange(_LEVELS)) / 2.0 ** (_LEVELS - 1)
-# Evaluations of a fit from afar and from nearby; chance below which a level counts as none.
+# Evaluations of a first fit and of a refit; probability below which a level is ignored.
 _EVALUATIONS = 60, 30
 _BELIEVED = 1e-9
 
@@ -176,11 +176,11 @@ _BELIEVED = 1e-9
 @lru_cache(maxsize=8)
 def _rouwenhorst(keep: float) -> FloatArray:
     """
-    Return the chances to go from level to level, shape (levels, levels).
+    Return the transition probabilities between levels, shape (levels, levels).
 
-    Conditional mean and variance are those of the OU however slow it is, where
-    steps are much smaller than from one level to the next (Rouwenhorst 1995;
-    Kopecky & Suen, Rev. Econ. Dyn. 13 (2010) 701).
+    The conditional mean and variance are those of the OU even if it is so slow
+    that its steps are much smaller than the spacing of the levels (Rouwenhorst
+    1995; Kopecky & Suen, Rev. Econ. Dyn. 13 (2010) 701).
 
     """
     stay, go = 0.5 * (1.0 + keep), 0.5 * (1.0 - keep)
@@ -198,7 +198,7 @@ def _rouwenhorst(keep: float) -> FloatArray:
 
 def _grid(squares: FloatArray, sizes: FloatArray, span: float, points: FloatArray
           ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return law before each segment, log density, levels; points of one rate side by side."""
+    """Return each segment's prior, its log density, and the levels, for points of one rate."""
     reach = math.sqrt(_LEVELS - 1.0)
     std = np.exp(points[:, :1])
     levels = points[:, 2:] + std * np.linspace(-reach, reach, _LEVELS)
