@@ -503,7 +503,8 @@ def simulate(model: SupplyModel | ModelFile | str | Path | None = None, *,
     duration : float, optional
         Length, s; by default that of the preset or of the recorded throttle.
     rate : float, optional
-        Samples per second, Hz.
+        Samples per second, Hz; by default that of the model's recording, if its file has it, or
+        of the preset.
     seed : int
         Equal seeds give equal recordings.
     capacity_left : float, optional

@@ -385,7 +385,7 @@ def plan(model: SupplyModel | ModelFile | str | Path | None = None, *, preset: s
     profile, words, flown = _throttle_of(usual.throttle if throttle is None else throttle,
                                          start, end)
     length = usual.duration if flown is None else float(flown.t[-1] - flown.t[0])
-    rate = _positive('--rate', usual.rate if rate is None else rate, 'Hz')
+    rate = _positive('--rate', _rate_of(file, usual.rate) if rate is None else rate, 'Hz')
     duration = _positive('--duration', length if duration is None else duration, 's')
     if not 1.0 <= duration * rate <= 1e12:
         raise InputError(f'{duration:g} s at {rate:g} Hz are {duration * rate:.3g} samples, '
@@ -400,6 +400,13 @@ def plan(model: SupplyModel | ModelFile | str | Path | None = None, *, preset: s
     resistance = _positive('--scale-resistance', resistance, '')
     charge = math.nan if capacity_left == -1.0 else capacity_left
     return Run(file, name, profile, words, flown, duration, rate, seed, charge, resistance)
+
+
+def _rate_of(file: ModelFile, usual: float) -> float:
+    """Return the rate of the recording that a model was learned from, if its file has it, Hz."""
+    rate = file.provenance.get('rate_hz')
+    known = isinstance(rate, (int, float)) and math.isfinite(rate) and 0.0 < rate <= _RATE_MOST
+    return float(rate) if known else usual
 
 
 def _throttle_of(throttle: Any, start: float | None, end: float | None,

@@ -449,7 +449,8 @@ _SIMULATE = Command(
       Option('--model', metavar='FILE.yaml', type=path_argument,
              help='model file, as discover writes it')),
      Option('--duration', metavar='S', type=POSITIVE, help='length, s'),
-     Option('--rate', metavar='HZ', type=POSITIVE, help='samples per second'),
+     Option('--rate', metavar='HZ', type=POSITIVE,
+            help="samples per second (default: the preset's, or of the model's recording)"),
      seed(1, 'same seed, same recording'),
      Option('--throttle', metavar='PROFILE',
             help='name of a profile, a number 0..1, points T:U,T:U,..., a CSV file with time_s '

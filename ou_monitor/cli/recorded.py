@@ -125,7 +125,9 @@ def model_text(finding: Finding, recording: Recording | None = None) -> str:
         'recording': finding.recording, 'date': datetime.now(timezone.utc).date().isoformat(),
         'ou_monitor': __version__, 'verdict': finding.verdict.value,
         'heldout_score': known(finding.score), 'gain': known(finding.gain),
-        'gain_se': known(finding.gain_se), 'seed': finding.seed}
+        'gain_se': known(finding.gain_se), 'seed': finding.seed,
+        # At which `simulate` draws the model.
+        'rate_hz': float(f'{(finding.n - 1) / finding.duration:.6g}')}
     loads = LoadFilter()
     if recording is not None:
         loads.push(recording.t, recording.voltage, recording.throttle, recording.current)

@@ -323,3 +323,28 @@ def test_export_and_an_old_pack(tmp_path, capsys):
     assert main(['simulate', '--model', model, '--capacity-left', '2', '--output',
                  str(tmp_path / 'no.mcap')]) == 2
     assert '--capacity-left' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('learned, options, rate', [
+    ('rate_hz: 250', [], 250.0), ('rate_hz: 250', ['--rate', '50'], 50.0), ('', [], 1000.0),
+    ('rate_hz: fast', [], 1000.0), ('rate_hz: -1', [], 1000.0)])
+def test_a_model_is_drawn_at_the_rate_of_its_recording(learned, options, rate, tmp_path):
+    """Unless an option says another, or its file, whose provenance is free text, has none."""
+    model = tmp_path / 'm.yaml'
+    model.write_text('model: [{term: ou, params: {alpha: 9.0, sigma: 0.1, u0: 12.0}}]\n'
+                     f'provenance: {{{learned}}}\n')
+    path = tmp_path / 'run.mcap'
+    assert main(['simulate', '--model', str(model), '--duration', '2', *options, '--output',
+                 str(path)]) == 0
+    assert read_recording(path).n == 2 * rate
+
+
+def test_a_saved_model_has_the_rate_of_its_recording(tmp_path):
+    """So that it is drawn as often as the recording was read."""
+    flight, model, again = (tmp_path / name for name in ('f.mcap', 'm.yaml', 'again.mcap'))
+    assert main(['simulate', '--preset', 'idle', '--rate', '125', '--duration', '8', '--output',
+                 str(flight)]) == 0
+    assert main(['discover', str(flight), '--save-model', str(model)]) == 0
+    assert main(['simulate', '--model', str(model), '--duration', '4', '--output',
+                 str(again)]) == 0
+    assert read_recording(again).n == 500
