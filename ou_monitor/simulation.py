@@ -405,8 +405,7 @@ def plan(model: SupplyModel | ModelFile | str | Path | None = None, *, preset: s
 def _rate_of(file: ModelFile, usual: float) -> float:
     """Return the rate of the recording that a model was learned from, if its file has it, Hz."""
     rate = file.provenance.get('rate_hz')
-    known = isinstance(rate, (int, float)) and math.isfinite(rate) and 0.0 < rate <= _RATE_MOST
-    return float(rate) if known else usual
+    return float(rate) if isinstance(rate, (int, float)) and 0.0 < rate <= _RATE_MOST else usual
 
 
 def _throttle_of(throttle: Any, start: float | None, end: float | None,

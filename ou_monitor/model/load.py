@@ -36,6 +36,11 @@ _CUBIC = (3.66631, 0.35371, -0.22145, 0.41052)
 # Charge below which the curve is a straight line, and its slope, V: a prediction with a charge
 # wrong by a few per cent must not fall down the knee.  Slopes of 0.6 to 2.0 V work.
 _KNEE, _KNEE_SLOPE = 0.079, 1.2
+# Relative change of the response with the open-circuit voltage of a cell, 1/V, beyond that of the
+# propeller (a pack warms as it empties), and its scatter between packs.  Halves or successive
+# flights of four packs have 0.6 (gecko), 1.3 (nazgul), -0.1 +- 0.7 (hiro), 0.5 (roma): mean and
+# prediction error by DerSimonian & Laird, Control. Clin. Trials 7 (1986) 177.
+WARMING, WARMING_SE = 0.7, 0.33
 # Time constant of the inrush, s: a motor's current settles in about 20 ms.
 INRUSH_TIME = 0.02
 # Fall of ln resistance per unit of charge and relative sag.  An adiabatic pack (150 Wh/kg,
@@ -158,7 +163,7 @@ class LoadModel:
 # Coefficients of x, u, u^3, x after three lags, and inrush, with x = u^1.8 (load/load_filter.py).
 SIZE = 7
 # A model file may omit the last entries.
-_OPTIONAL = 6
+_OPTIONAL = 9
 _COLUMNS = ('coefficients', 'covariance', 'log_variance', 'flown')
 
 
@@ -182,6 +187,11 @@ class LoadStart:
     noise: float = 0.0
     noise_se: float = 0.0
     size_se: float = 0.0  # Relative standard error of the size of the response; 0: unknown.
+    # Mean open-circuit voltage of a cell where the size was measured, V; 0: unknown.
+    level: float = 0.0
+    # Relative change of the size with it, 1/V, and its standard error.
+    warming: float = WARMING
+    warming_se: float = WARMING_SE
 
     def __post_init__(self) -> None:
         """Check shapes and signs."""
@@ -192,9 +202,9 @@ class LoadStart:
         if len(self.log_variance) != 3 or len(self.flown) != 2:
             raise ValueError('the load needs 3 numbers of log_variance and 2 of flown')
         positive = (self.discharge, self.resistance, self.resistance_se, self.noise,
-                    self.noise_se, self.size_se)
+                    self.noise_se, self.size_se, self.level, self.warming_se)
         numbers = (*self.coefficients, *P.ravel().tolist(), *self.log_variance, *self.flown,
-                   self.cells, self.volts, self.delay, *positive)
+                   self.cells, self.volts, self.delay, self.warming, *positive)
         if not all(map(math.isfinite, numbers)):
             raise ValueError('the numbers of the load must be finite')
         if not np.allclose(P, P.T, rtol=1e-6, atol=1e-9 * float(np.abs(P.diagonal()).max())):

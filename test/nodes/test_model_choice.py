@@ -94,7 +94,7 @@ def test_a_flight_is_saved_into_its_own_file_alone(tmp_path):
     assert written.model == replace(model, load=load) and written.model.date == '2026-08-02'
     assert [entry['date'] for entry in written.provenance['history']] == [
         '2026-08-01', '2026-08-02']
-    assert written.provenance['recording'] == 'bags/recorded/gecko.csv'
+    assert written.provenance['recording'] == 'gecko.csv'
     assert path.read_text().startswith('# Learned by') and stat.S_IMODE(
         path.stat().st_mode) == 0o640
     other = tmp_path / 'other.yaml'

@@ -417,7 +417,7 @@ class LoadFilter:
             self._start = None
         # Whether the coefficients have met a throttle.
         self._loaded = math.isfinite(u)
-        self._heard, self._first = -math.inf, NAN
+        self._heard, self._highest = -math.inf, NAN
         # Of each bin of throttle: seconds, samples, and their squares about the prediction, V^2.
         self._flown = np.zeros((3, _BINS + 1))
         self._m = np.zeros(_STATES)
@@ -453,7 +453,7 @@ class LoadFilter:
             return
         if self._opening:
             # The battery may be another one.
-            self._contrasts, self._first = LoadContrasts(), NAN
+            self._contrasts, self._highest = LoadContrasts(), NAN
         if math.isfinite(u) is not math.isfinite(self._throttle):
             self._noise, self._other = self._other, self._noise
         self._settle(v, u)
@@ -470,8 +470,8 @@ class LoadFilter:
         m, P = self._m, self._P
         h = self._regressors()
         m[0] = self._rest = v - float(h[2:] @ m[2:])
-        if math.isnan(self._first) and math.isfinite(u):
-            self._first = float(m[0])
+        if math.isnan(self._highest) and math.isfinite(u):
+            self._highest = float(m[0])
         # The level follows from the voltage: it shares the errors of the coefficients.
         P[0, 1:] = P[1:, 0] = -P[1:, 1:] @ h[1:]
         P[0, 0] = (0.02 * self._volts) ** 2 + h[1:] @ P[1:, 1:] @ h[1:]
@@ -551,7 +551,9 @@ class LoadFilter:
         total *= max(1.0, abs(e) / math.sqrt(total) / CLIP)
         noise.learn(e, s, u, du, block.n, block.within)
         if math.isfinite(self._throttle):
-            self._contrasts.take(block.t, block.voltage, h[2:], total)
+            self._contrasts.take(block.t, block.voltage, h[2:], total,
+                                 float(m[0]) / self._cells)
+            self._highest = max(self._highest, float(m[0]))
             # The uncertainty of the state is not noise.
             share = R / (s + R)
             square = share * block.n * min(abs(e), self._volts) ** 2
@@ -678,23 +680,24 @@ class LoadFilter:
             size += (found.ratio - 1.0) / (1.0 + (found.se / SIZE_ERROR) ** 2)
             share = found.se / found.ratio
             size_se = share * SIZE_ERROR / math.hypot(share, SIZE_ERROR)
-        ohm, ohm_se, noise, noise_se = np.nan_to_num((
-            load.resistance, load.resistance_se, found.noise, found.noise_se)).tolist()
+        ohm, ohm_se, noise, noise_se, level = np.nan_to_num((
+            load.resistance, load.resistance_se, found.noise, found.noise_se, found.level)
+        ).tolist()
         scale = size ** 2 * max(1.0, self._noise.scale)
         P = 0.5 * (self._P[2:, 2:] + self._P[2:, 2:].T) * scale
         return LoadStart(
             self._cells, float(self._m[0]), tuple((size * self._m[2:]).tolist()),
             tuple(tuple(row) for row in P.tolist()), max(0.0, float(self._m[1])),
             self._noise.of_blocks, load.flown, self._delay.delay, ohm, ohm_se,
-            noise, noise_se, size_se)
+            noise, noise_se, size_se, level, found.warming, found.warming_se)
 
     def against(self, start: LoadStart | None, date: str = '') -> ModelComparison:
         """Return the comparison of this flight with the model of another, of that date."""
-        if start is None or not math.isfinite(self._t) or math.isnan(self._first):
+        if start is None or not math.isfinite(self._t) or math.isnan(self._highest):
             return ModelComparison()
         ohm = (NAN, NAN) if self._current is None else self._current.resistance
         return compare(self._contrasts.against(start.coefficients), start, *ohm,
-                       other_pack(start, self._first, self._level), date)
+                       other_pack(start, self._highest, self._level), date)
 
     def path(self, t: FloatArray, throttle: FloatArray | None,
              current: FloatArray | None = None) -> FloatArray:

@@ -1,9 +1,8 @@
 """
 Compare this flight with the saved model of its supply: ratios of sag, resistance and noise.
 
-Limits first: a cold pack looks like an old one; a pack warms, and its sag falls by up to a quarter
-within a flight; a full 5S pack for a 6S one is not detected at once; steady throttle allows no
-comparison.
+Limits first: a cold pack looks like an old one; a full 5S pack for a 6S one is not detected at
+once; steady throttle allows no comparison.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.model.load import LoadStart, SIZE
+from ou_monitor.model.load import LoadStart, SIZE, WARMING, WARMING_SE
 from ou_monitor.records import FloatArray, NAN
 
 # Length, s, of the stretches within which voltages and the model's answer are compared, so that
@@ -31,7 +30,8 @@ SIZE_ERROR = 0.1
 _NOISE_FORM = 0.15
 # Lower limit of the noise, V.
 _LEAST_NOISE = 1e-6
-# Weaker: above both limits, relative and in standard errors (1 % of a normal law lies above).
+# Weaker: above both limits, relative and in standard errors of the logarithm (1 % of a normal law
+# lies above).
 _LEAST, _ERRORS = 0.10, 2.33
 # Relative error above which the ratio is not determined.
 _VAGUE = 0.15
@@ -87,23 +87,29 @@ class Contrast:
     se: float = NAN
     noise: float = NAN  # Residual rms while throttle moves, outliers downweighted, V
     noise_se: float = NAN
+    level: float = NAN  # Mean open-circuit voltage of a cell, V, weighted as the slope
+    # Relative change of the slope with that voltage, 1/V, and its standard error.
+    warming: float = WARMING
+    warming_se: float = WARMING_SE
 
 
 class LoadContrasts:
     """Weighted products of voltage and regressors within stretches of 2 s, means removed."""
 
     def __init__(self) -> None:
-        # Of each: sum of the weights, 1/V^2, and products of voltage and regressors.
-        self._stretches: deque[tuple[float, FloatArray]] = deque(maxlen=_MOST)
+        # Of each: weights, 1/V^2, level of a cell, V, and products of voltage and regressors.
+        self._stretches: deque[tuple[float, float, FloatArray]] = deque(maxlen=_MOST)
         self._begin, self._sums = NAN, np.zeros((2 + SIZE, 2 + SIZE))
         self._origin = 0.0
 
-    def take(self, t: float, voltage: float, regressors: FloatArray, variance: float) -> None:
-        """Take a voltage, V, the regressors of its throttle, and its variance, V^2 (t in s)."""
+    def take(self, t: float, voltage: float, regressors: FloatArray, variance: float,
+             level: float) -> None:
+        """Take a voltage, V, regressors, variance, V^2, and the level of a cell, V (t in s)."""
         if not t - self._begin < _STRETCH:
             total, sums = float(self._sums[0, 0]), self._sums[0, 1:]
             if total > 0.0:
-                self._stretches.append((total, self._sums[1:, 1:] - np.outer(sums, sums) / total))
+                self._stretches.append((
+                    total, level, self._sums[1:, 1:] - np.outer(sums, sums) / total))
             self._begin, self._origin = t, voltage
             self._sums = np.zeros_like(self._sums)
         row = np.array([1.0, voltage - self._origin, *regressors])
@@ -114,8 +120,7 @@ class LoadContrasts:
         if len(self._stretches) < _FEWEST:
             return Contrast()
         a = np.asarray(coefficients, dtype=np.float64)
-        weights = np.array([weight for weight, _ in self._stretches])
-        products = np.array([one for _, one in self._stretches])
+        weights, levels, products = map(np.array, zip(*self._stretches))
         along, squares = products[:, 0, 1:] @ a, products[:, 1:, 1:] @ a @ a
         total = float(squares.sum())
         if not total > 0.0:
@@ -130,23 +135,39 @@ class LoadContrasts:
         noise = 0.5 * np.log(np.maximum(squared, _LEAST_NOISE ** 2))
         mean = float(share @ noise)
         spread = share * (noise - mean) / (1.0 - share)
+        level = float(share @ levels)
         return Contrast(ratio, math.sqrt(float(left @ left)) / total, math.exp(mean),
-                        math.exp(mean) * math.sqrt(float(spread @ spread)))
+                        math.exp(mean) * math.sqrt(float(spread @ spread)), level,
+                        *_warming(levels - level, along / ratio - squares, squares))
 
 
-def other_pack(start: LoadStart, first: float, level: float) -> str:
-    """Return why the first or present level, V, indicates another pack; '': it does not."""
+def _warming(levels: FloatArray, left: FloatArray, squares: FloatArray) -> tuple[float, float]:
+    """Return the slope of relative residuals over levels, V, and its error, beside usual ones."""
+    weight = float(squares @ levels ** 2)
+    if not weight > 0.0:
+        return WARMING, WARMING_SE
+    slope = float(levels @ left) / weight
+    each = levels * (left - slope * levels * squares)
+    # An error of the form at each end of the levels, sqrt(12) deviations apart, turns the slope.
+    variance = (float(each @ each) / weight + _FORM ** 2 * float(squares.sum()) / 6.0) / weight
+    own, usual = 1.0 / variance, WARMING_SE ** -2
+    return (slope * own + WARMING * usual) / (own + usual), (own + usual) ** -0.5
+
+
+def other_pack(start: LoadStart, highest: float, level: float) -> str:
+    """Return why the highest or present level, V, indicates another pack; '': it does not."""
     cells = start.cells
     # The number of cells means nothing for a rail.
-    lithium = _EMPTY <= start.volts / cells <= _FULL
-    each = level / cells
-    if lithium and not _EMPTY <= each <= _FULL or not (
-            1.0 / OTHER_LEVEL < level / start.volts < OTHER_LEVEL):
-        return f'{level:.2f} V at rest, where the model has {start.volts:.2f} V: another pack.'
-    if lithium and first / cells < _TAKE_OFF:
-        return (f'{first:.2f} V at rest at first is {first / cells:.2f} V for each of the '
+    if not _EMPTY <= start.volts / cells <= _FULL:
+        other = not 1.0 / OTHER_LEVEL < level / start.volts < OTHER_LEVEL
+    elif highest / cells < _TAKE_OFF:
+        # A pack that was fuller before has emptied.
+        return (f'{highest:.2f} V at rest at most is {highest / cells:.2f} V for each of the '
                 f"model's {cells:.0f} cells: another pack, or an empty one.")
-    return ''
+    else:
+        other = level / cells > _FULL
+    return (f'{level:.2f} V at rest, where the model has {start.volts:.2f} V: another pack.'
+            if other else '')
 
 
 def judge(ratio: float, se: float, date: str) -> tuple[ModelVerdict, str]:
@@ -156,7 +177,8 @@ def judge(ratio: float, se: float, date: str) -> tuple[ModelVerdict, str]:
     more, model = ratio - 1.0, 'the model' + (f' of {date}' if date else '')
     sizes = sorted((100.0 * (abs(more) - 1.96 * se), 100.0 * (abs(more) + 1.96 * se)))
     found = f'Sag {100.0 * abs(more):.0f} % ({sizes[0]:.0f} to {sizes[1]:.0f})'
-    if more > max(_LEAST, _ERRORS * se):
+    # Most errors are factors: they grow with the ratio, its logarithm has them as without ageing.
+    if more > _LEAST and math.log(ratio) > _ERRORS * se / ratio:
         return ModelVerdict.WEAKER, f'{found} above {model}: weak pack or cold.'
     if ratio + _ERRORS * se < _OTHER:
         return ModelVerdict.OTHER_PACK, f'{found} below {model}: another pack, or another load.'
@@ -166,8 +188,12 @@ def judge(ratio: float, se: float, date: str) -> tuple[ModelVerdict, str]:
 def compare(found: Contrast, start: LoadStart, ohm: float, ohm_se: float, other: str, date: str
             ) -> ModelComparison:
     """Compare this flight with an earlier model (ohm: now; other: why another pack, or empty)."""
-    ratio = found.ratio
-    se = math.hypot(found.se, ratio * (start.size_se or SIZE_ERROR), ratio * _FORM)
+    # Levels at which the two were measured: the sag of a pack falls as it empties and warms.
+    apart = found.level - (start.level or start.volts / start.cells)
+    as_found = math.exp(-start.warming * apart)
+    ratio = found.ratio * as_found
+    se = math.hypot(found.se * as_found, ratio * (start.size_se or SIZE_ERROR), ratio * _FORM,
+                    ratio * start.warming_se * apart)
     verdict, words = (ModelVerdict.OTHER_PACK, other) if other else judge(ratio, se, date)
     return ModelComparison(
         verdict, ratio, se, *_over(ohm, ohm_se, start.resistance, start.resistance_se),

@@ -6,6 +6,7 @@ import math
 from live import ROOT
 import numpy as np
 from ou_monitor import MonitorSettings, SupplyMonitor
+from ou_monitor.model.load import WARMING, WARMING_SE
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.model_watch import ModelVerdict
@@ -118,3 +119,68 @@ def test_resistance_is_compared_where_a_current_is_measured():
         assert abs(found.resistance_ratio - ratio) < 1.96 * found.resistance_ratio_se < 0.5
         assert abs(found.sag_ratio - ratio) < 1.96 * found.sag_ratio_se
         assert found.verdict is ModelVerdict.WEAKER
+
+
+def against(start, made):
+    """Return what each second of a flight says beside what another one taught."""
+    loads = LoadFilter()
+    loads.begin_with(start)
+    found = []
+    for second in range(int(made.duration)):
+        part = (made.t >= second) & (made.t < second + 1)
+        loads.push(made.t[part], made.voltage[part], made.throttle[part])
+        found.append(loads.against(start))
+    return found
+
+
+def taught(made):
+    """Return what a flight teaches."""
+    loads = LoadFilter()
+    loads.push(made.t, made.voltage, made.throttle)
+    return loads.learned()
+
+
+@pytest.mark.parametrize('age, verdict', [
+    (1.0, ModelVerdict.AS_MODEL), (1.4, ModelVerdict.WEAKER)])
+def test_a_pack_that_warmed_in_the_other_flight_is_no_weaker_now(age, verdict):
+    """The sag falls in flight: what its later part taught is scaled to a full pack."""
+    made, now = flight(130.0, 1), flight(60.0, 2, age=age)
+    late = made.t >= 70.0
+    start = taught(Recording(made.t[late], made.voltage[late], made.throttle[late], 'late'))
+    found = against(start, now)
+    assert start.level < taught(now).level - 0.05
+    assert found[-1].verdict is verdict
+    assert abs(found[-1].sag_ratio - age) < 1.96 * found[-1].sag_ratio_se
+    if age == 1.0:
+        assert not [one for one in found if one.verdict is ModelVerdict.WEAKER]
+
+
+@pytest.mark.parametrize('change', [0.0, 2.0])
+def test_how_the_sag_falls_is_learned(change):
+    """By the share of its weight beside usual packs, within two errors of its own."""
+    t = np.arange(0.0, 120.0, 0.01)
+    u = FLOWN(t)
+    level = 4.1 - 0.3 * t / 120.0
+    sag = 2.0 * u ** 1.8 * (1.0 + change * (level - 3.95))
+    v = 4.0 * level - sag + 0.02 * np.random.default_rng(1).standard_normal(t.size)
+    start = taught(Recording(t, v, u, 'made'))
+    own = 1.0 / (start.warming_se ** -2 - WARMING_SE ** -2)
+    share = start.warming_se ** 2 / own
+    # The filter itself scales the sag with the level to the power 0.8, as a propeller does.
+    usual = WARMING + share * (change - 0.8 / 3.95 - WARMING)
+    assert abs(start.warming - usual) < 2.0 * share * math.sqrt(own)
+    assert share > 0.5
+
+
+def test_an_emptied_pack_is_no_other_pack():
+    """It began full; one that is as low at the start is another, or an empty one."""
+    t = np.arange(0.0, 60.0, 0.01)
+    u = FLOWN(t)
+    level = 3.9 - 0.85 * np.clip((t - 20.0) / 40.0, 0.0, 1.0)
+    v = 4.0 * level - 2.0 * u ** 1.8 + 0.02 * np.random.default_rng(1).standard_normal(t.size)
+    start = taught(flight(120.0, 1))
+    found = against(start, Recording(t, v, u, 'emptied'))
+    assert not [one for one in found if one.verdict is ModelVerdict.OTHER_PACK]
+    last = t >= 55.0
+    found = against(start, Recording(t[last] - 55.0, v[last], u[last], 'empty'))
+    assert found[-1].verdict is ModelVerdict.OTHER_PACK and 'an empty one' in found[-1].words
