@@ -64,10 +64,12 @@ def quality_list(recording: Recording, throttles: Sequence[float], estimates: Se
 
 def _of_estimate(e: Estimate, known: bool) -> list[tuple[str, Severity, str]]:
     items = []
-    if e.status in _LIMITS:
-        items.append((e.status.name, Severity.INFO, (
+    if e.status in _LIMITS and known:
+        items.append(('LEVEL_ALONE', Severity.INFO, (
             'The level alone does not show the relaxation that the whole recording shows beside '
-            'level and load.') if known else e.status.value))
+            'level and load.')))
+    elif e.status in _LIMITS:
+        items.append((e.status.name, Severity.INFO, e.status.value))
     elif e.status is not Status.OK:
         severity = Severity.WARNING if e.usable else Severity.ERROR
         items.append((e.status.name, severity, e.status.value))

@@ -101,8 +101,8 @@ def _ageing(fleet: Fleet) -> str:
     tested = [t for t in judged.trends if t.quantity in OF_PACK]
     old = [t for t in tested if t.p_family <= DRIFT_RATE and t.slope > 0.0]
     if old:
-        words = [f'{vehicle}: ' + ' and '.join(_growth(fleet, t) for t in old
-                                               if t.vehicle == vehicle)
+        words = [f'{vehicle}{_flown(fleet, [t for t in old if t.vehicle == vehicle])}: '
+                 + ', '.join(_growth(judged, t) for t in old if t.vehicle == vehicle)
                  for vehicle in dict.fromkeys(t.vehicle for t in old)]
         more = f'; and {len(words) - _OLD} more' if len(words) > _OLD else ''
         return f'Ageing pack{"s" * (len(words) > 1)}: {"; ".join(words[:_OLD])}{more}.'
@@ -116,17 +116,22 @@ def _ageing(fleet: Fleet) -> str:
             f'{change(most.high)} a flight on {most.vehicle}, which has {most.flights} flights.')
 
 
-def _growth(fleet: Fleet, trend: Trend) -> str:
+def _flown(fleet: Fleet, trends: Sequence[Trend]) -> str:
+    """Return flights, dates and cells of an ageing pack."""
+    dates, cells = (of(fleet, trends[0].vehicle) for of in (_dates, _cells_of))
+    words = [counted(max(t.flights for t in trends), 'flight'), '' if dates == UNKNOWN else dates,
+             f'{cells[:-1]} cells, a guess' if cells.endswith('?') else '']
+    return f' ({"; ".join(word for word in words if word)})'
+
+
+def _growth(judged: Judgement, trend: Trend) -> str:
     """Return by how much a quantity of a pack grows, from where to where."""
-    values = fleet.judgement.values[trend.quantity]
-    cell = _a_cell(fleet.judgement, trend.quantity, trend.vehicle)
+    values = judged.values[trend.quantity]
     first, last = (_plain(values, trend.line(np.array(float(flight))))
                    for flight in (trend.first, trend.last))
-    dates = _dates(fleet, trend.vehicle)
     return (f'{trend.quantity} {change(trend.slope)} a flight (95 % {change(trend.low)} to '
-            f'{change(trend.high)}), {first} to {last} {_UNITS[trend.quantity]}{cell}'
-            f'{_guessed(fleet, trend.vehicle) if cell else ""} in {trend.flights} flights'
-            + ('' if dates == UNKNOWN else f', {dates}'))
+            f'{change(trend.high)}), {first} to {last} {_UNITS[trend.quantity]}'
+            f'{_a_cell(judged, trend.quantity, trend.vehicle)}')
 
 
 def _analysed(fleet: Fleet) -> str:
@@ -250,12 +255,6 @@ def _a_cell(judged: Judgement, name: str, vehicle: str) -> str:
     return ' a cell' if vehicle in one.names and one.cells[one.names.index(vehicle)] else ''
 
 
-def _guessed(fleet: Fleet, vehicle: str) -> str:
-    """Return how a guessed number of cells is marked."""
-    cells = _cells_of(fleet, vehicle)
-    return f' ({cells[:-1]} cells, a guess)' if cells.endswith('?') else ''
-
-
 def _cells_of(fleet: Fleet, vehicle: str) -> str:
     """Return the cells of a vehicle, with a question mark if they are a guess."""
     found = sorted({(row['cells'], '?' * (row['cells_from'] == 'guessed')) for row in fleet.rows
@@ -338,10 +337,34 @@ def pack_table(fleet: Fleet) -> Table:
     short = short_names(fleet.vehicles)
     rows = [[short[vehicle], str(_flights(fleet, vehicle)), _dates(fleet, vehicle),
              _cells_of(fleet, vehicle), *(cell for name in OF_PACK for cell in (
-                 _median(judged, name, vehicle), _slope(judged, name, vehicle, interval=True)))]
+                 _of_pack(fleet, name, vehicle), _slope(judged, name, vehicle, interval=True)))]
             for vehicle in fleet.vehicles
-            if any(vehicle in judged.values[name].vehicles for name in OF_PACK)]
+            if any(_known(fleet, name, vehicle) for name in OF_PACK)]
     return Table.of_known(PACK_HEADS, rows, left=[0, 2], most=2 * _SHOWN)
+
+
+def _known(fleet: Fleet, name: str, vehicle: str) -> list[Row]:
+    """Return one row for each recording of a vehicle in which a quantity is known."""
+    return list({row['path']: row for row in fleet.rows
+                 if row['vehicle'] == vehicle and row[name] is not None}.values())
+
+
+def _of_pack(fleet: Fleet, name: str, vehicle: str) -> str:
+    """Return the median of a quantity of a pack as measured, with its throttle."""
+    mine = _known(fleet, name, vehicle)
+    if not mine:
+        return UNKNOWN
+    value = float(np.median([row[name] / (row['cells'] or 1) for row in mine]))
+    at = {row['sag_throttle'] for row in mine} if name == 'sag' else set()
+    ends = [f'{100.0 * u:.0f}' for u in sorted({min(at), max(at)})] if at else []
+    where = f'\nat {" to ".join(ends)} %' if ends else ''
+    return f'{number(1e3 * value)}{_star(fleet.judgement, name, vehicle)}{where}'
+
+
+def _star(judged: Judgement, name: str, vehicle: str) -> str:
+    """Return a star if a vehicle is unlike the others."""
+    one = judged.vehicles[name]
+    return '*' * bool(vehicle in one.names and one.outliers.found[one.names.index(vehicle)])
 
 
 def _packs(fleet: Fleet) -> list[Part]:
@@ -380,11 +403,9 @@ def _median(judged: Judgement, name: str, vehicle: str) -> str:
     one = judged.vehicles[name]
     if vehicle not in one.names:
         return UNKNOWN
-    k = one.names.index(vehicle)
-    star = '*' if one.outliers.found[k] else ''
     values = judged.values[name]
     mine = [k for k, of in enumerate(values.vehicles) if of == vehicle]
-    return number(_thousandths(name) * float(np.median(values.measured[mine]))) + star
+    return number(float(np.median(values.measured[mine]))) + _star(judged, name, vehicle)
 
 
 def _slope(judged: Judgement, name: str, vehicle: str, *, interval: bool = False) -> str:

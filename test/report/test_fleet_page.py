@@ -133,11 +133,11 @@ def test_an_ageing_pack_is_the_headline():
     first = made.judgement.trends[0]
     assert (first.vehicle, first.low < 0.1 < first.high) == ('uav1', True)
     said = fleet_document(made).headline
-    assert said.startswith('Ageing pack: uav1: resistance +') and 'uav0' not in said
+    assert said.startswith('Ageing pack: uav1 (8 flights; 2024-05-01 to 2024-05-08; 4 cells, a '
+                           'guess): ') and 'uav0' not in said
     # 5 mOhm a cell at first, twice as much after seven more flights; three errors of a line.
     start, end = (float(word) for word in re.search(
-        r', ([\d.]+) to ([\d.]+) mOhm a cell \(4 cells, a guess\) in 8 flights, 2024-05-01 to '
-        '2024-05-08', said).groups())
+        r'resistance [^:]*, ([\d.]+) to ([\d.]+) mOhm a cell', said).groups())
     assert start == pytest.approx(5.0 * np.exp(0.1), rel=3 * 0.05) and end / start == (
         pytest.approx(np.exp(0.7), rel=3 * 0.05))
     packs = pack_table(made)

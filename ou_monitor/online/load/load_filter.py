@@ -6,7 +6,10 @@ throttles flown the sag is extrapolated; changes of the true sag are followed wi
 doc/load.md has the equations and the figures.
 
 With a measured current: its scale and sign are not corrected, so a wrong scale makes the
-resistance wrong; a constant current gives no information.
+resistance wrong, and a load that follows throttle but is not in the current counts in it (0.1 V at
+full throttle makes 0.2 Ohm 0.4 on a robot that draws 1 A); a constant current gives no
+information.  Throttle as a regressor beside the current would take that load, but also, on quads
+with slow current sensors, half of the resistance and more.
 """
 
 from __future__ import annotations
