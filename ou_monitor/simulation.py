@@ -37,7 +37,7 @@ Profile = Callable[[FloatArray], FloatArray]
 # A receiver updates the throttle at this rate, Hz.
 STICK_RATE = 50.0
 
-# (time s, throttle) joined by straight lines: arm, take-off, hover, two climbs
+# (time s, throttle), linear between: arm, take-off, hover, two climbs
 # and descents, landing.
 FLIGHT = (
     (0.0, 0.0), (2.0, 0.0), (2.2, 0.05), (4.0, 0.05), (4.6, 0.55), (6.0, 0.55), (6.4, 0.40),
@@ -65,7 +65,7 @@ def _through(points: FloatArray, period: float | None, stick_rate: float | None,
     # Several times as fast as t % period; its only error is one rounding.
     at = t if period is None else t - np.floor(t / period) * period
     if stick_rate is not None:
-        # A margin for rounding: a stamp at an update has the new value.
+        # Tolerance for rounding: a stamp at an update has the new value.
         at = np.floor(at * stick_rate + 1e-6) / stick_rate
     found: FloatArray = np.interp(at, *points)
     return found
@@ -168,7 +168,7 @@ def is_recording(text: str) -> bool:
     if path.suffix.lower() != '.csv':
         return True
     try:
-        # Without voltage it is a profile: times from 0 s on, joined by straight lines.
+        # A file without voltage is a profile: times from 0 s, linear between.
         return VOLTAGE in form_of(path, CsvColumns()).names
     except InputError:
         return False
@@ -181,7 +181,7 @@ def read_throttle(text: str, start: float | None = None, end: float | None = Non
 
 
 def recorded_throttle(recording: Recording, name: str) -> RecordedThrottle:
-    """Return the throttle of a recording (name: for the error)."""
+    """Return the throttle of a recording (name: for error messages)."""
     known = np.isfinite(recording.throttle)
     if not known.any():
         raise InputError(f"--throttle '{name}': the recording has no throttle")
@@ -192,7 +192,7 @@ def recorded_throttle(recording: Recording, name: str) -> RecordedThrottle:
 
 
 def _held(t: FloatArray, u: FloatArray, at: FloatArray) -> FloatArray:
-    # A margin for rounding: a value holds from its own stamp on.
+    # Tolerance for rounding: a value holds from its own stamp.
     return np.asarray(u[np.maximum(np.searchsorted(t, at + 1e-9, side='right') - 1, 0)])
 
 

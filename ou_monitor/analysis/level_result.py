@@ -13,8 +13,8 @@ stationary OU levels has any rejection.  The first rule that applies names the l
 
 1. mean or intensity changes from block to block: 'quasi-stationary' (the
    verdict also names what the level is apart from that);
-2. single innovations far out, or heavy tails: 'with impulses';
-3. another shape than the normal law: 'not Gaussian';
+2. isolated extreme innovations, or heavy tails: 'with impulses';
+3. not a normal distribution: 'not Gaussian';
 4. too few samples to detect heavy tails: 'undetermined';
 5. neighbours uncorrelated, or more white noise than relaxation, or relaxation
    faster than the sampling: 'Gaussian';
@@ -22,8 +22,8 @@ stationary OU levels has any rejection.  The first rule that applies names the l
    independent innovations, or a second one is detected: 'stationary stochastic';
 7. otherwise 'diffusion', or 'undetermined' without a usable fit.
 
-Limits: the power of the tests depends on the length of the level; impulses, and an intensity that
-changes within a block, look alike.
+Limits: the power of the tests depends on the length of the level; impulses cannot be told from an
+intensity that changes within a block.
 """
 
 from __future__ import annotations
@@ -282,7 +282,7 @@ def ou_spectrum(frequency: FloatArray, alpha: float, sigma: float, rate: float,
 _MIN_SEGMENT = 16
 # Minimum samples of a histogram.
 _LEAST_BINNED = 50
-# Maximum mean square of the steps, relative to white noise, of a voltage that wanders.
+# Maximum mean square of the steps, relative to white noise, of a random walk.
 _WANDERS = 0.5
 
 
@@ -400,7 +400,7 @@ class LevelResult:
         if self.n < _LEAST_BINNED or not self.vrms > 0.0:
             return np.zeros(0), np.zeros(0)
         z = self.deviation / self.vrms
-        # Within what a plot can show.
+        # Limit of a plot.
         width = min(max(bin_width(z), 0.05), 0.5)
         edges = np.arange(-6.0, 6.0 + width, width)
         return edges, np.histogram(z, edges)[0] / (self.n * np.diff(edges))

@@ -7,7 +7,7 @@ normal if the level is a stationary OU in white noise:
 =============  ========================================================================
 mean_drift     means of blocks of innovations, F with the error of alpha in it
 variance_drift Layard's test of equal variances of blocks (J. Am. Stat. Assoc. 68, 1973),
-               which heavy tails do not upset
+               which is robust against heavy tails
 gaussian       D'Agostino & Pearson's K^2 of skewness and kurtosis, of innovations over
                the standard deviation of their block
 impulses       the largest innovation (Sidak) or a positive excess kurtosis, each at
@@ -43,9 +43,9 @@ FEWEST = 50
 _BLOCKS = 16
 # Minimum relaxation times of a block in the test of the mean.
 _MEAN_BLOCK = 5.0
-# Limit of innovations in the test of intensity, standard deviations: beyond it a few impulses
-# would determine the variance of a block; of heavy tails (Student's t with 5 degrees), 1 in 10^4
-# is lost.
+# Limit of innovations in the test of intensity, standard deviations, without which a few impulses
+# would determine the variance of a block.  With heavy tails (Student's t with 5 degrees), it
+# removes 1 in 10^4.
 _FAR = 10.0
 _LAGS_RAW, _LAGS_FITTED = 5, 10
 # Minimum effects that matter, in the unit of each test.
@@ -77,7 +77,7 @@ class TestResult:
 
     @property
     def rejects(self) -> bool:
-        """Whether it rejects at `FAMILY_WISE`, with an effect that matters."""
+        """Whether it rejects at the level `FAMILY_WISE`, with an effect that matters."""
         return self.p_adjusted < FAMILY_WISE and self.effect >= LEAST[self.name]
 
 

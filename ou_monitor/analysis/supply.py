@@ -35,8 +35,8 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 # Throttles at which sag and noise are given.
 THROTTLES = tuple(k / 10.0 for k in range(11))
-# Length of a part with its own regression, s, and the minimum number of readings in it, five times
-# as many as a regression takes at most of a part of 60 s.
+# Length of a part with its own regression, s, and the minimum number of readings in it: five times
+# the most that a regression uses from 60 s.
 _PART, _IN_PART = 60.0, 200
 # Maximum evaluations of the risk: as many as the node makes in 15 minutes.
 _LOOKS = 900.0 / LOOK
@@ -56,7 +56,7 @@ class Lowest:
     """Lowest reading."""
 
     voltage_v: float  # V
-    time_s: float  # since the first reading, s
+    time_s: float  # time since the first reading, s
     throttle: float  # 0..1
 
 
@@ -86,9 +86,9 @@ class Noise:
     """Rms of what the load does not explain, over throttle."""
 
     throttle: tuple[float, ...]  # 0..1
-    rms_v: tuple[float, ...]  # as flown, changes of throttle included, V
-    steady_rms_v: tuple[float, ...]  # while throttle stands still, V
-    flown: tuple[float, float]  # 1 % and 99 % quantile of throttle; beyond, the edge's holds
+    rms_v: tuple[float, ...]  # in flight, including changes of throttle, V
+    steady_rms_v: tuple[float, ...]  # at steady throttle, V
+    flown: tuple[float, float]  # 1 % and 99 % quantile of throttle; constant beyond
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ class SupplyFacts:
     budget: Budget | None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the facts as strict JSON holds them: unknown numbers are None."""
+        """Return the facts for strict JSON: unknown numbers are None."""
         found: dict[str, Any] = plain_data(self)
         return found
 
@@ -163,7 +163,7 @@ def supply_facts(recording: Recording, limit: float | None = None) -> SupplyFact
     recording : Recording
         The recording.
     limit : float, optional
-        Voltage that must not be undershot, V, for dips and budget.
+        Lowest permitted voltage, V, for dips and budget.
 
     Returns
     -------
@@ -193,7 +193,7 @@ def facts_and_end(recording: Recording, limit: float | None = None, left: Remain
     Return the facts, and load and report of the node at the end (no report without a limit).
 
     limit in V; left: `remainder` of the recording; monitor: of `node_for`, fed with the recording;
-    both are computed if left out.
+    both are computed if omitted.
     """
     if limit is not None and not math.isfinite(limit):
         raise ValueError(f'the limit must be finite, got {limit} V')
@@ -276,7 +276,7 @@ def _dips(t: FloatArray, v: FloatArray, u: FloatArray, limit: float, noise: Nois
     begins = dip_begins(v, limit, rise_that_ends(v, u, noise))
     if not begins.size:
         return Dips(limit, 0, 0.0, 0.0)
-    # Each reading counts for the time to the next, gaps excluded.
+    # Each reading stands for the time to the next one, without gaps.
     spacing = np.diff(t)
     usual = float(np.median(spacing)) if spacing.size else 0.0
     held = np.where(v < limit, np.append(np.minimum(spacing, 10.0 * usual), usual), 0.0)
@@ -351,7 +351,7 @@ def noise_of(recording: Recording, left: Remainder | None = None) -> Noise:
 
 
 def _still(t: FloatArray, u: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return where throttle has stood still for `_STEADY_TIME`."""
+    """Return where throttle has been steady for `_STEADY_TIME`."""
     held = np.nan_to_num(u, nan=-1.0)
     count = max(1, math.ceil(_STEADY_TIME / max(float(np.median(np.diff(t))), 1e-9)))
     if count + 1 >= t.size:

@@ -1,5 +1,5 @@
 """
-Every parameter of the two nodes: name, default, range and sentence, once.
+The parameters of the two nodes: name, default, range and description.
 
 A parameter is a field of a class of settings.  The nodes declare their ROS parameters from these
 fields, and the YAML in `config/` is tested against them.
@@ -25,10 +25,10 @@ class Parameter:
     name: str  # Dotted name as in YAML
     default: bool | int | float | str  # Default; its type is the parameter's type
     description: str  # One sentence with the unit
-    # Range, inclusive; None where the type has none.
+    # Range, inclusive; None: no limit.
     low: float | None = None
     high: float | None = None
-    # Accepted words; empty when free.  With a range, numbers within it are accepted too.
+    # Accepted words; empty: any.  With a range, numbers within it are accepted too.
     choices: tuple[str, ...] = ()
 
     @property
@@ -46,14 +46,14 @@ def _parameter(default: bool | int | float | str, description: str, low: float |
 
 
 def parameters_of(settings: type[Any], prefix: str = '') -> tuple[Parameter, ...]:
-    """Return the parameters that settings stand for; a group of them has a prefix or a dot."""
+    """Return the parameters of a class of settings; names of groups have a prefix or a dot."""
     return tuple(Parameter(prefix + one.name.replace('brownout_', 'brownout.'), **one.metadata)
                  for one in fields(settings))
 
 
 _Settings = TypeVar('_Settings')
 
-# Window as long as it takes.
+# The window is chosen by the data.
 AUTO = 'auto'
 
 
@@ -88,46 +88,46 @@ class MonitorSettings:
         AUTO, 'Length of the sliding window, s; auto: the shortest of 2, 8, 30 and 60 s in which '
         'alpha is known within a factor of 1.5, else the longest.', 0.05, 3600.0, (AUTO,))
     stale_after: float = _parameter(
-        1.0, 'Age of the newest sample from which the input counts as stale, s; of a fast source '
-        'less: 300 of its intervals, but not below 0.3 s; of a slow one 2.5 intervals.',
+        1.0, 'Silence after which the input counts as stale, s; less for a fast source: 300 '
+        'samples, but at least 0.3 s; more for a slow source: 2.5 of its intervals.',
         0.01, 3600.0)
     brownout_voltage: float = _parameter(
-        4.5, 'Supply voltage that must not be undershot, V (default: the lower limit of PX4 for '
-        'a 5 V rail).', 0.0, 1000.0)
+        4.5, 'Lowest permitted supply voltage, V (default: the lower limit of PX4 for a 5 V '
+        'rail).', 0.0, 1000.0)
     brownout_horizon: float = _parameter(
-        5.0, 'Time ahead for which the risk is told, s.', 0.001, 3600.0)
-    brownout_warn: float = _parameter(0.1, 'Risk from which the diagnostics warn, 0..1.', 0.0, 1.0)
+        5.0, 'Time ahead for which the risk is computed, s.', 0.001, 3600.0)
+    brownout_warn: float = _parameter(0.1, 'Risk at which the diagnostics warn, 0..1.', 0.0, 1.0)
     brownout_critical: float = _parameter(
-        0.5, 'Risk within 1 s, throttle held as it is, from which the brown-out flag is set, '
-        '0..1.', 0.0, 1.0)
+        0.5, 'Risk within 1 s at the present throttle at which the brown-out flag is set, 0..1.',
+        0.0, 1.0)
     brownout_leave: float = _parameter(
-        0.5, 'A level is left when the risk falls below this share of what it is entered at, '
-        '0.001..1, less than 1 (default: half, our choice).', 0.001, 1.0)
+        0.5, 'WARN or CRITICAL ends when the risk falls below this share of the value at which it '
+        'begins, 0.001..1, less than 1 (default: half, our choice).', 0.001, 1.0)
     brownout_hold: float = _parameter(
-        1.0, 'Time for which WARN and CRITICAL stay at least, and outlast an unknown risk, s '
-        '(default: on five recorded quads 2 s set the flag twice as long where nothing dipped).',
+        1.0, 'Minimum duration of WARN and CRITICAL, also while the risk is unknown, s (default: '
+        'with 2 s, the flag of five recorded quads was set twice as long without a dip).',
         0.0, 3600.0)
     brownout_delay: float = _parameter(
-        0.15, 'Time for which a risk must last before its level is entered, s (default: three '
-        'reports, which on recorded quads halves the false rises of two; ArduPilot waits 10 s '
+        0.15, 'Time that a risk must last before WARN or CRITICAL begins, s (default: three '
+        'reports, with half as many false alarms on recorded quads as two; ArduPilot waits 10 s '
         'before a voltage failsafe).', 0.0, 3600.0)
     brownout_latch: bool = _parameter(
-        False, 'Whether CRITICAL stays until ~/clear_brownout is called or this is switched off '
-        '(default: no; PX4 latches its battery warning while armed).')
+        False, 'Whether CRITICAL stays until ~/clear_brownout is called or this parameter is set '
+        'to false (default: no; PX4 latches its battery warning while armed).')
     brownout_floor: float = _parameter(
-        -1.0, 'Voltage at or below which the flag is CRITICAL whatever the model says, V; 0: '
-        'off; negative: brownout.voltage itself (default).', -1.0, 1000.0)
+        -1.0, 'Voltage at or below which the flag is CRITICAL whatever the model predicts, V; 0: '
+        'off; negative: brownout.voltage (default).', -1.0, 1000.0)
     brownout_floor_time: float = _parameter(
-        0.01, 'Time over which the median of the voltage is held against the floor, s, three '
-        'samples at least (default: shorter than the dips of recorded quads, from 10 ms on, '
-        'longer than a bad sample).', 0.0, 10.0)
+        0.01, 'Time over which the median of the voltage is compared with the floor, s, at least '
+        'three samples (default: longer than a bad sample, but no longer than the dips of '
+        'recorded quads, 10 ms and more).', 0.0, 10.0)
     brownout_budget_limit: float = _parameter(
-        0.01, 'Risk that the throttle budget keeps under, 0..1; 0: brownout.warn.', 0.0, 1.0)
+        0.01, 'Highest risk that the throttle budget allows, 0..1; 0: brownout.warn.', 0.0, 1.0)
     model_file: str = _parameter(
         '', 'Model file of the supply (discover --save-model); empty: none.')
 
     def __post_init__(self) -> None:
-        """Refuse values out of range and contradictions."""
+        """Refuse values that are out of range or contradict each other."""
         check_values(self)
         if not self.brownout_warn < self.brownout_critical:
             raise ValueError(
@@ -135,8 +135,8 @@ class MonitorSettings:
                 f'({self.brownout_critical})')
         if not self.brownout_leave < 1.0:
             raise ValueError(
-                f'brownout.leave ({self.brownout_leave}) must be less than 1: a level is left at '
-                'brownout.leave times the risk at which it is entered')
+                f'brownout.leave ({self.brownout_leave}) must be less than 1: a level ends at '
+                'brownout.leave times the risk at which it begins')
         if self.brownout_floor > self.brownout_voltage:
             raise ValueError(
                 f'brownout.floor ({self.brownout_floor} V) must not exceed brownout.voltage '
@@ -150,8 +150,8 @@ class MonitorSettings:
         if not 0.0 < self.budget_limit < 1.0:
             raise ValueError(
                 f'brownout.budget_limit ({self.brownout_budget_limit:g}; 0: brownout.warn, '
-                f'{self.brownout_warn:g}) must leave a limit above 0 and below 1: a risk of 0 '
-                'cannot be kept under, one of 1 is always')
+                f'{self.brownout_warn:g}) must give a limit above 0 and below 1: no throttle '
+                'has a risk below 0, and any has one of at most 1')
 
     @cached_property
     def floor(self) -> float:
@@ -162,7 +162,7 @@ class MonitorSettings:
 
     @cached_property
     def budget_limit(self) -> float:
-        """Return the risk that the throttle budget keeps under, 0..1."""
+        """Return the highest risk that the throttle budget allows, 0..1."""
         return self.brownout_budget_limit or self.brownout_warn
 
 
@@ -174,32 +174,32 @@ class FilterSettings:
     """Settings of `AdaptiveLowPass`."""
 
     mode: str = _parameter(
-        'lowpass', 'What comes out: the signal, or its derivative in unit/s (for a D term).',
+        'lowpass', 'Output: the signal, or its derivative in unit/s (for a D term).',
         choices=('lowpass', 'derivative'))
     order: int = _parameter(2, 'Order of the low-pass: 1, or 2 (Butterworth).', 1, 2)
     law: str = _parameter('constant_noise', 'Law from sigma to cutoff.', choices=LAWS)
     fmin: float = _parameter(
-        20.0, 'Lowest cutoff, Hz: the limit of the lag, so a safety limit.', 0.001, 1.0e6)
+        20.0, 'Lowest cutoff, Hz; it limits the lag, so it is a safety limit.', 0.001, 1.0e6)
     fmax: float = _parameter(150.0, 'Highest cutoff, Hz.', 0.001, 1.0e6)
     max_lag: float = _parameter(
-        0.0, 'Most lag at lag_frequency, degrees: takes the place of fmin; 0: fmin as given.',
+        0.0, 'Maximum lag at lag_frequency, degrees, which replaces fmin; 0: fmin is used.',
         0.0, 179.0)
     lag_frequency: float = _parameter(
-        10.0, 'Where the lag is computed and limited, Hz.', 0.001, 1.0e6)
+        10.0, 'Frequency at which the lag is computed and limited, Hz.', 0.001, 1.0e6)
     sigma_ref: float = _parameter(
         0.3, 'Sigma up to which the cutoff stays at fmax, V/sqrt(s) (threshold, and '
         'constant_noise without noise_wanted).', 1.0e-9, 1.0e6)
     coupling: float = _parameter(
-        0.0, 'Supply noise in the signal, unit of the signal per V; 0: not known, constant_noise '
-        'is relative to sigma_ref.', 0.0, 1.0e9)
+        0.0, 'Supply noise in the signal, unit of the signal per V; 0: unknown, constant_noise is '
+        'then relative to sigma_ref.', 0.0, 1.0e9)
     noise_wanted: float = _parameter(
-        0.0, 'Rms of the output noise that constant_noise holds, unit of the output, with '
-        'coupling; 0: what sigma_ref makes at fmax.', 0.0, 1.0e12)
+        0.0, 'Rms of the output noise that constant_noise keeps constant, unit of the output, '
+        'with coupling; 0: that at sigma_ref and fmax.', 0.0, 1.0e12)
     n0: float = _parameter(
-        0.0, 'White noise of the measurement for wiener and kalman, unit^2/Hz, two-sided: '
-        'variance of a sample over sample rate.', 0.0, 1.0e12)
+        0.0, 'White measurement noise for wiener and kalman, unit^2/Hz, two-sided: variance of a '
+        'sample over the sample rate.', 0.0, 1.0e12)
     alpha: float = _parameter(
-        63.0, "Relaxation rate of the supply while the estimator's is not known, 1/s.",
+        63.0, 'Relaxation rate of the supply while the estimator does not know it, 1/s.',
         1.0e-6, 1.0e9)
     signal_bandwidth: float = _parameter(
         0.0, 'Bandwidth of the true signal for wiener, Hz; 0: the signal is the voltage itself '
@@ -211,21 +211,22 @@ class FilterSettings:
         'bandwidth), or 2 (Butterworth, f^4).', 1, 2)
     expo: float = _parameter(5.0, 'Curvature of the throttle law, 0..10.', 0.0, 10.0)
     smoothing: float = _parameter(
-        0.2, 'Time constant of the cutoff (in its logarithm), s, at a relative error of sigma of '
-        'smoothing_error.', 0.0, 3600.0)
+        0.2, 'Time constant of ln(cutoff) if the relative error of sigma is smoothing_error, s.',
+        0.0, 3600.0)
     smoothing_error: float = _parameter(
-        0.1, 'Relative error of sigma for which smoothing is meant; a better sigma moves the '
-        'cutoff faster in proportion.', 0.001, 10.0)
+        0.1, 'Relative error of sigma at which smoothing holds; the time constant is proportional '
+        'to the error.', 0.001, 10.0)
     smoothing_range: float = _parameter(
-        4.0, 'Most that the time constant is divided or multiplied by for the error of sigma; 1: '
-        'never.', 1.0, 100.0)
+        4.0, 'Maximum factor on the time constant, up or down, for the error of sigma; 1: '
+        'constant.', 1.0, 100.0)
     slew: float = _parameter(
-        4.0, 'Most that the cutoff moves, octaves/s; 0: no limit.', 0.0, 1.0e6)
+        4.0, 'Maximum rate of change of the cutoff, octaves/s; 0: no limit.', 0.0, 1.0e6)
     dead_band: float = _parameter(
-        0.1, 'Change of the wanted cutoff that is not followed, octaves.', 0.0, 10.0)
+        0.1, 'Changes of the wanted cutoff below this are ignored, octaves.', 0.0, 10.0)
     fallback: float = _parameter(75.0, 'Cutoff when sigma is stale or unknown, Hz.', 0.001, 1.0e6)
     shadow: bool = _parameter(
-        False, 'Whether the cutoff is only computed and published, the signal passing unfiltered.')
+        False, 'Whether the cutoff is only computed and published, and the signal passes '
+        'unfiltered.')
     stale_after: float = _parameter(
         1.0, 'Age of sigma after which the fallback is used, s.', 0.01, 3600.0)
 
@@ -244,7 +245,7 @@ class FilterSettings:
             if not self.lowest < self.fmax:
                 raise ValueError(
                     f'max_lag ({self.max_lag:g} degrees at {self.lag_frequency:g} Hz) needs a '
-                    f'cutoff of {self.lowest:.4g} Hz at least, which is not less than fmax '
+                    f'cutoff of at least {self.lowest:.4g} Hz, which is not below fmax '
                     f'({self.fmax} Hz): allow more lag or raise fmax')
         elif not self.fmin < self.fmax:
             raise ValueError(f'fmin ({self.fmin} Hz) must be less than fmax ({self.fmax} Hz)')
@@ -286,12 +287,12 @@ class FilterSettings:
 
     @property
     def of_voltage(self) -> bool:
-        """Tell whether law kalman takes the signal for the voltage itself."""
+        """Whether the signal is the voltage itself, for the law kalman."""
         return not (self.coupling or self.signal_bandwidth)
 
     @property
     def lowest(self) -> float:
-        """Return the lowest cutoff, Hz: fmin, or what max_lag makes of it."""
+        """Return the lowest cutoff, Hz: fmin, or that for max_lag."""
         if self.max_lag:
             return cutoff_for_lag(self.order, self.max_lag, self.lag_frequency)
         return self.fmin
@@ -299,7 +300,7 @@ class FilterSettings:
     @classmethod
     def from_options(cls, options: Mapping[str, object],
                      base: FilterSettings | None = None) -> FilterSettings:
-        """Return settings with options changed; a fallback not given moves into fmin..fmax."""
+        """Return settings with options changed; a default fallback is moved into fmin..fmax."""
         values = _known(options, cls, 'filter option')
         old = base or cls()
         if 'fallback' not in values:
@@ -307,7 +308,7 @@ class FilterSettings:
                 lowest = replace(old, **{**values, 'fallback': values.get('fmax', old.fmax)}
                                  ).lowest
             except (TypeError, ValueError):
-                # Told below, with the fallback as it was.
+                # Reported below, with the old fallback.
                 lowest = math.nan
             if math.isfinite(lowest):
                 values['fallback'] = min(max(old.fallback, lowest),
@@ -329,7 +330,7 @@ def monitor_settings(values: Mapping[str, object]) -> MonitorSettings:
 
 
 def _known(options: Mapping[str, object], settings: type[Any], what: str) -> dict[str, Any]:
-    """Return options; `ValueError` where one is no field of the settings."""
+    """Return options; `ValueError` if one is not a field of the settings."""
     known = [one.name for one in fields(settings)]
     for name in options:
         if name not in known:
@@ -347,7 +348,7 @@ def _is_number(value: object) -> bool:
 
 
 def check_values(settings: object, prefix: str = '') -> None:
-    """Raise `ValueError` for a field that its parameter does not allow."""
+    """Raise `ValueError` for a value that its parameter does not allow."""
     for parameter in parameters_of(type(settings), prefix):
         value = getattr(settings, parameter.name.removeprefix(prefix).replace('.', '_'))
         if parameter.choices and not (parameter.mixed and not isinstance(value, str)):
@@ -371,7 +372,7 @@ def check_values(settings: object, prefix: str = '') -> None:
                 raise ValueError(f'{parameter.name} must lie within {low}..{high}, got {value}')
 
 
-# Revolutions per second for one of the unit, and whether the poles of the motors divide it.
+# Revolutions per second of one unit, and whether to divide by the pole pairs of the motors.
 RPM_UNITS: dict[str, tuple[float, bool]] = {
     'rpm': (1.0 / 60.0, False), 'erpm': (1.0 / 60.0, True), 'hz': (1.0, False),
     'rad_s': (0.5 / math.pi, False)}
@@ -381,21 +382,22 @@ RPM_UNITS: dict[str, tuple[float, bool]] = {
 class NotchSettings:
     """Settings of `AdaptiveNotch`."""
 
-    count: int = _parameter(4, 'Most notches that follow the motors; 0: none.', 0, 4)
+    count: int = _parameter(4, 'Maximum number of notches that follow the motors; 0: none.', 0, 4)
     fmin: float = _parameter(
-        60.0, 'Lowest frequency of a notch, and lower end of what counts as noise, Hz: above the '
-        'band in which the vehicle is flown.', 1.0, 1.0e5)
+        60.0, 'Lowest frequency of a notch and of what counts as noise, Hz: above the bandwidth '
+        'of the flight controller.', 1.0, 1.0e5)
     cutoff: float = _parameter(
-        80.0, 'Cutoff of the low-pass of order 2 behind the notches for whose derivative and lag '
-        'they must pay, Hz.', 1.0, 1.0e5)
+        80.0, 'Cutoff of the second-order low-pass after the notches, Hz: notches are used if '
+        'they reduce the noise of its derivative at equal lag.', 1.0, 1.0e5)
     rpm_unit: str = _parameter(
-        'rpm', 'Unit of the motor speeds: rpm, hz or rad_s of the shaft, erpm of the field '
+        'rpm', 'Unit of the motor speeds: rpm, hz or rad_s of the shaft, or erpm, electrical '
         '(needs notch.poles).', choices=tuple(RPM_UNITS))
     poles: int = _parameter(
-        0, 'Magnets of a motor, for erpm: 14 on most motors for 5 inch propellers; 0: not known.',
+        0, 'Number of magnets of a motor, for erpm: 14 on most motors for 5 inch propellers; 0: '
+        'unknown.',
         0, 200)
     stale_after: float = _parameter(
-        0.25, 'Age of the motor speeds after which throttle takes their place, s.', 0.001, 3600.0)
+        0.25, 'Age of the motor speeds after which throttle is used instead, s.', 0.001, 3600.0)
 
     def __post_init__(self) -> None:
         """Refuse values out of range and contradictions."""
@@ -407,7 +409,7 @@ class NotchSettings:
 
     @property
     def per_unit(self) -> float:
-        """Return the revolutions per second of the shaft for one of the unit."""
+        """Return the revolutions per second of the shaft for one unit."""
         scale, electrical = RPM_UNITS[self.rpm_unit]
         return scale / (0.5 * self.poles) if electrical else scale
 
@@ -418,12 +420,12 @@ class NotchSettings:
         return replace(base or cls(), **_known(options, cls, 'notch option'))
 
 
-# The node has none unless it is told to.
+# In the node, notches are off by default.
 NOTCH_PARAMETERS = tuple(replace(one, default=0) if one.name == 'notch.count' else one
                          for one in parameters_of(NotchSettings, 'notch.'))
 
 
 def notch_options(values: Mapping[str, object]) -> dict[str, object]:
-    """Return the options that parameters of the node stand for."""
+    """Return the notch options from the parameters of the node."""
     return {parameter.name.removeprefix('notch.'): values[parameter.name]
             for parameter in NOTCH_PARAMETERS}

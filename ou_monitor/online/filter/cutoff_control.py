@@ -1,9 +1,9 @@
 """
 From the wanted cutoff of a law to the cutoff in force.
 
-limits -> dead band -> smoothing in ln(fc), fast for a certain sigma -> slew limit -> 0.45 of the
-sample rate, but not below fmin.  An unknown cutoff gives the fallback.  The cutoff in force never
-leaves fmin..fmax, whatever the rate is.
+limits -> dead band -> smoothing of ln(fc), faster if sigma is certain -> slew limit -> 0.45 of
+the sample rate, but not below fmin.  An unknown cutoff is replaced by the fallback.  The cutoff in
+force is always within fmin..fmax, whatever the rate.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ LN2 = math.log(2.0)
 # Highest cutoff as a share of the sample rate (Betaflight allows 0.475).
 OF_RATE = 0.45
 # Number of samples over which the sample rate is averaged; factor from the mean above which an
-# interval is odd; number of odd intervals in a row that mean a new rate.
+# interval is an outlier; number of outliers in a row that mean a new rate.
 INTERVALS = 100
 ODD = 5.0
 _NEW = 5
@@ -41,7 +41,7 @@ class Bound(enum.Enum):
 
 class SampleInterval:
     """
-    Mean time between samples, s, over some 100 of them; 0 before the second sample.
+    Mean time between samples, s, over about 100 of them; 0 before the second sample.
 
     Intervals over five times the mean are gaps and left out, unless a third of all are gaps. Five
     intervals in a row that are off by a factor of five are a new rate and restart the mean.
@@ -84,9 +84,9 @@ def time_constant(settings: FilterSettings, error: float) -> float:
 
     A random walk of intensity q, measured with an error e
     over a correlation time T, is tracked best (steady Kalman filter) with the
-    time constant e sqrt(T) / q: proportional to the error.  So it is
-    `smoothing` at `smoothing_error`, in proportion elsewhere, within a factor
-    of `smoothing_range` (Betaflight moves its notches 1 to 10 times as fast).
+    time constant e sqrt(T) / q.  So the time constant is proportional to the
+    error, and `smoothing` at `smoothing_error`, within a factor of
+    `smoothing_range` (Betaflight moves its notches 1 to 10 times as fast).
 
     result in s.
     """
@@ -156,7 +156,7 @@ class CutoffControl:
         return self._cutoff
 
     def _choose(self, wanted: float) -> None:
-        """Set the aim: the wanted cutoff once it is outside the dead band around the old aim."""
+        """Set the target to the wanted cutoff if that is outside the dead band of the old one."""
         if wanted != wanted:
             self._wanted, self._aim = wanted, self._settings.fallback
             self._follow_exactly = True
@@ -171,17 +171,17 @@ class CutoffControl:
         self._follow_exactly = False
 
     def _approach(self, constant: float, dt: float) -> None:
-        """Move towards the aim over a step, s."""
+        """Move towards the target over a step, s."""
         slew = self._settings.slew * LN2 or math.inf
         off, most = math.log(self._moving / self._aim), slew * dt
         step = off * math.expm1(-dt / constant) if constant else -off
         self._slewing = not -most <= step <= most
         off += math.copysign(most, step) if self._slewing else step
-        # Stop at the tolerance instead of creeping on.
+        # Stop within the tolerance instead of approaching the target for ever.
         self._moving = self._aim * math.exp(off) if abs(off) >= ARRIVED else self._aim
 
     def _limit(self, interval: float) -> None:
-        """Put the moving cutoff into force (interval in s; 0: unknown)."""
+        """Apply the moving cutoff (interval in s; 0: unknown)."""
         most = OF_RATE / interval if interval > 0.0 else math.inf
         self._cutoff = self._clip(min(self._moving, most))
 

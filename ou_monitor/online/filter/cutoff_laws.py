@@ -11,15 +11,15 @@ output variance is (coupling sigma)^2 V(w), by the integral of
     derivative, order 1   V = w^2 / (2 (w + alpha))
     derivative, order 2   V = w^3 / (2 sqrt2 (w^2 + sqrt2 w alpha + alpha^2))
 
-All grow with w, so that a wanted variance has one cutoff.
+All grow with w, so each variance has one cutoff.
 
 The law `wiener` looks for the least mean square error of a low-pass of gain 1: for a signal of one
 or two poles in the noise of the supply and white noise, of the continuous filter; for the voltage
 itself in white noise, of the sampled one.
 
 White noise: with the input linear between samples a step of the filter is z' = F z + a x_(k-1)
-+ b x_k (its columns are asked of `LowPassState`), so that independent samples of
-variance 1 give the stationary covariance
++ b x_k (its columns come from `LowPassState`), so independent samples of variance 1
+give the stationary covariance
 
     C = F C F^T + a a^T + b b^T + F b a^T + a b^T F^T,
 
@@ -28,8 +28,8 @@ with g = a + b
 
     C dt^2 = F C F^T dt^2 + 2 g g^T - F g g^T - g g^T F^T.
 
-Limits: stationary laws of a cutoff that stays; noise above half the sample
-rate, which folds down, is not in them.
+Limits: the laws are stationary, for a constant cutoff, and ignore noise above half
+the sample rate, which is aliased.
 """
 
 from __future__ import annotations
@@ -45,15 +45,15 @@ from ou_monitor.online.settings import FilterSettings
 from ou_monitor.records import FloatArray, NAN
 
 
-# Angles (2 pi cutoff interval) of the table, and the step of their logarithms: straight lines
-# between them, and the power below the first, are right to 1e-4.
+# Range of angles (2 pi cutoff interval) in the table, and step of their logarithms: interpolation,
+# and the power law below the first, are accurate to 1e-4.
 _LEAST_ANGLE, _MOST_ANGLE, _STEP = 1e-4, 300.0, 0.02
-# Rise of the logarithm of the noise below which all of it passes.
+# Minimum rise of ln noise between angles: from a smaller one on, all noise passes.
 _STILL = 1e-6
 
 
 def white_noise(mode: str, order: int, angle: float) -> float:
-    """Return the variance that comes out for independent samples of variance 1."""
+    """Return the output variance for independent samples of variance 1."""
     (f11, f21), (f12, f22) = (_step(order, angle, y, s, 0.0, 0.0)
                               for y, s in ((1.0, 0.0), (0.0, 1.0)))
     (a1, a2), (b1, b2) = (_step(order, angle, 0.0, 0.0, *ends)
@@ -66,7 +66,7 @@ def white_noise(mode: str, order: int, angle: float) -> float:
         g1, g2 = a1 + b1, a2 + b2
         m1, m2 = f11 * g1 + f12 * g2, f21 * g1 + f22 * g2
         drive = (2.0 * g1 * (g1 - m1), 2.0 * g1 * g2 - m1 * g2 - m2 * g1, 2.0 * g2 * (g2 - m2))
-    # Of the symmetric C: its first, mixed and last element.
+    # The three elements of the symmetric C.
     turned = [[1.0 - f11 * f11, -2.0 * f11 * f12, -f12 * f12],
               [-f11 * f21, 1.0 - f11 * f22 - f12 * f21, -f12 * f22],
               [-f21 * f21, -2.0 * f21 * f22, 1.0 - f22 * f22]]
@@ -89,7 +89,7 @@ def _step(order: int, angle: float, y: float, slope: float, start: float, end: f
 
 @cache
 def _table(mode: str, order: int) -> tuple[FloatArray, FloatArray, float]:
-    """Return rising ln of angles and of noise there, and the power of the noise below."""
+    """Return ln of angles and of their noise, both rising, and the exponent below."""
     count = math.ceil(math.log(_MOST_ANGLE / _LEAST_ANGLE) / _STEP) + 1
     angle = math.log(_LEAST_ANGLE) + _STEP * np.arange(count)
     noise = np.log([white_noise(mode, order, one) for one in np.exp(angle).tolist()])
@@ -101,7 +101,7 @@ def _table(mode: str, order: int) -> tuple[FloatArray, FloatArray, float]:
 
 
 def held_cutoff(mode: str, order: int, fmax: float, times: float, interval: float) -> float:
-    """Return the cutoff, Hz, for `times` the white noise at fmax, Hz (interval in s)."""
+    """Return the cutoff of the sampled filter, as `relative_cutoff` (Hz, interval in s)."""
     angle, noise, power = _table(mode, order)
     log = math.log(TWO_PI * fmax * interval)
     before = math.log(white_noise(mode, order, math.exp(log))) if log > angle[-1] else (
@@ -123,11 +123,11 @@ def squared_error(order: int, w: float, signal: tuple[float, float],
     """
     Return the mean square error of a low-pass with a cutoff of `w`.
 
-    What of the signal is lost, with 1 - H: of an OU of intensity a and rate b,
+    Lost signal, by 1 - H: for an OU of intensity a and rate b,
     a^2 / (2 (w + b)) for order 1 and a^2 (3 w + sqrt2 b)
-    / (2 sqrt2 (w^2 + sqrt2 w b + b^2)) for order 2; of two poles see
-    `_lost_of_two_poles`.  What comes through of the supply's noise: V of
-    `cutoff_laws`; of white noise: n0 w / 2 or n0 w / (2 sqrt2).
+    / (2 sqrt2 (w^2 + sqrt2 w b + b^2)) for order 2; for two poles see
+    `_lost_of_two_poles`.  Noise that passes: V of `cutoff_laws` from the
+    supply; n0 w / 2 or n0 w / (2 sqrt2) from white noise.
 
     w in 1/s, signal in 1/s.
     """
@@ -147,7 +147,7 @@ def squared_error(order: int, w: float, signal: tuple[float, float],
 
 def _lost_of_two_poles(order: int, w: float, b: float) -> float:
     r"""
-    Return what a low-pass loses of a Butterworth signal of two poles and variance 1.
+    Return the variance that a low-pass removes from a two-pole signal of variance 1.
 
     The signal has the spectrum 2 sqrt2 b^3 / |s^2 + sqrt2 b s + b^2|^2 at s = i w'.
     The integral of |c / d|^2 is in the table of Newton, Gould & Kaiser
@@ -173,9 +173,9 @@ def sampled_error(w: float, dt: float, alpha: float, var: float, white: float) -
     Return the mean square error of the sampled low-pass of order 1 for an OU in white noise.
 
     With q = exp(-w dt), b = 1 - (1 - q) / (w dt) and a = 1 - q - b the filter is
-    y_k = q y_(k-1) + b x_k + a x_(k-1).  The white noise comes through with
-    (a^2 + b^2 + 2 a b q) / (1 - q^2); what is lost of the signal is what
-    (b - 1, a + q) over the same pole makes of an AR(1) process.
+    y_k = q y_(k-1) + b x_k + a x_(k-1).  White noise passes with the variance
+    (a^2 + b^2 + 2 a b q) / (1 - q^2); the lost signal is the response to an
+    AR(1) process of (b - 1, a + q) over the same pole.
 
     w in 1/s, dt in s.
     """
@@ -214,7 +214,7 @@ def least_sampled_error(settings: FilterSettings, sigma: float, alpha: float,
 
 
 def _least(error: Callable[[float], float], lowest: float, highest: float) -> float:
-    """Return where an error is least, Hz, to 1e-4: a grid finds which of two valleys."""
+    """Return where an error is least, Hz, to 1e-4: a grid chooses one of two minima."""
     def at(level: float) -> float:
         return error(math.exp(level))
 
@@ -229,13 +229,13 @@ def _least(error: Callable[[float], float], lowest: float, highest: float) -> fl
             right = outer
         else:
             left = inner
-    # The ends of the range count too: the search only comes near them.
+    # Include the ends of the range, which the search only approaches.
     return math.exp(min((0.5 * (left + right), low, high), key=at))
 
 
 def wanted_cutoff(settings: FilterSettings, sigma: float, alpha: float, throttle: float,
                   interval: float) -> float:
-    """Return the cutoff that the law wants, Hz (V/sqrt(s), 1/s, 0..1, interval in s)."""
+    """Return the cutoff of the law, Hz (V/sqrt(s), 1/s, 0..1, interval in s)."""
     if settings.law == 'throttle':
         return throttle_law(settings, throttle)
     if not (math.isfinite(sigma) and sigma >= 0.0):
@@ -256,12 +256,12 @@ def constant_noise_law(settings: FilterSettings, sigma: float, alpha: float,
     """
     Return the cutoff at which the rms of the output noise is the wanted one.
 
-    With `coupling`: the noise is the supply's own, and `cutoff_for_noise`
-    solves coupling sigma sqrt(V) = noise_wanted (when that is not given: what
-    comes out at `sigma_ref` and fmax).
+    With `coupling`, the noise is that of the supply, and `cutoff_for_noise`
+    solves coupling sigma sqrt(V) = noise_wanted (by default the output noise
+    at `sigma_ref` and fmax).
 
-    Without: white noise of a variance proportional to sigma^2, held at its
-    value for `sigma_ref` and fmax; see `relative_cutoff`.
+    Otherwise the noise is white with a variance proportional to sigma^2, and
+    the output noise is kept at that for `sigma_ref` and fmax: `relative_cutoff`.
     """
     if settings.coupling:
         wanted = settings.noise_wanted or settings.coupling * settings.sigma_ref * math.sqrt(
@@ -276,17 +276,16 @@ def constant_noise_law(settings: FilterSettings, sigma: float, alpha: float,
 
 def relative_cutoff(mode: str, order: int, fmax: float, times: float, interval: float) -> float:
     """
-    Return the cutoff, Hz, that makes `times` as much white noise come out as at fmax once did.
+    Return the cutoff, Hz, at which white noise `times` as large has the same rms as at fmax.
 
-    Of the sampled filter, see `held_cutoff`; interval in s, 0: as if sampled without
-    end.  Far below the sample rate: white noise of two-sided density N through a low-pass has the
-    variance N w / 2 (order 1) or N w / (2 sqrt 2) (order 2): rms ~ sqrt(fc), so fc = fmax /
-    times^2 for both.  Derivative, order 2: N int w'^2 |H|^2 dw' / 2 pi = N w^3 / (2 sqrt 2), so
-    rms ~ fc^(3/2) and fc = fmax / times^(2/3).  Derivative, order 1: the integral is infinite and
-    the sample rate makes it finite; independent samples of variance v give v w^2, so fc = fmax /
-    times.
+    For the sampled filter see `held_cutoff`; interval in s, 0: continuous.  Far below the sample
+    rate, white noise of two-sided density N has the variance N w / 2 (order 1) or
+    N w / (2 sqrt 2) (order 2) after a low-pass: rms ~ sqrt(fc), so fc = fmax / times^2 for both.
+    Derivative, order 2: N int w'^2 |H|^2 dw' / 2 pi = N w^3 / (2 sqrt 2), so rms ~ fc^(3/2) and
+    fc = fmax / times^(2/3).  Derivative, order 1: the integral is finite only because of the
+    sample rate; independent samples of variance v give v w^2, so fc = fmax / times.
     """
-    # Within the table of white noise.
+    # Range of the table of white noise.
     if interval > 0.0 and 1e-6 < TWO_PI * fmax * interval < 1e2 and times < 1e3:
         return held_cutoff(mode, order, fmax, times, interval)
     if mode == 'lowpass':
@@ -295,7 +294,7 @@ def relative_cutoff(mode: str, order: int, fmax: float, times: float, interval: 
 
 
 def supply_noise(mode: str, order: int, cutoff: float, alpha: float) -> float:
-    """Return V of the head of this module (cutoff in Hz, alpha in 1/s)."""
+    """Return V as defined at the top of this module (cutoff in Hz, alpha in 1/s)."""
     w = TWO_PI * cutoff
     if order == 1:
         return (0.5 * w / (alpha * (w + alpha)) if mode == 'lowpass' else
@@ -306,13 +305,13 @@ def supply_noise(mode: str, order: int, cutoff: float, alpha: float) -> float:
     return w ** 3 / spread
 
 
-# ln of the cutoffs, Hz, between which one is looked for.
+# Range of ln of the cutoff, Hz, in the search.
 _LOGS = -14.0, 21.0
 
 
 def cutoff_for_noise(mode: str, order: int, rms: float, intensity: float,
                      alpha: float) -> float:
-    """Return the cutoff, Hz, at which the supply's noise has a wanted rms; inf: there is none."""
+    """Return the cutoff, Hz, at which the supply's noise has a given rms; inf: there is none."""
     if intensity <= 1e-12 * rms:
         return math.inf
     wanted = (rms / intensity) ** 2
@@ -335,14 +334,14 @@ def wiener_law(settings: FilterSettings, sigma: float, alpha: float, interval: f
     Without `signal_bandwidth` the signal is the voltage itself, in white noise
     of density n0.  The Kalman-Bucy filter of an OU process has one pole: from
     its Riccati equation 0 = sigma^2 - 2 alpha P - P^2 / n0 it lies at
-    alpha + P / n0 = sqrt(alpha^2 + sigma^2 / n0).  A low-pass of gain 1 has the
-    least error a little off it, and a sampled one further; where the interval
-    is known, order 1 has the least `sampled_error`.  A second-order Butterworth
+    alpha + P / n0 = sqrt(alpha^2 + sigma^2 / n0).  The best low-pass of gain 1 is
+    slightly off it, and a sampled one more so: if the interval is known, order 1
+    minimises `sampled_error`.  A second-order Butterworth
     has the error 3 sigma^2 / (2 sqrt2 w) + n0 w / (2 sqrt2) for w >> alpha, least
     at w = sqrt(3) sigma / sqrt(n0): the law for order 2 is
     sqrt(alpha^2 + 3 sigma^2 / n0).
 
-    With `signal_bandwidth`: the least `squared_error`.
+    With `signal_bandwidth`, `squared_error` is minimised.
     """
     s = settings
     if s.signal_bandwidth:

@@ -1,19 +1,19 @@
 """
-The low-pass itself: two numbers of state, over a step of any length.
+The low-pass itself: two states, advanced by steps of any length.
 
 With w = 2 pi fc, input x, output y:
 
     order 1:  y' = w (x - y)
     order 2:  y' = w s,  s' = w (x - y - sqrt(2) s)     (Butterworth)
 
-A cutoff that moves only stretches time (dtau = w dt), so with *any* sequence
-of cutoffs y is what the one fixed filter makes of the input in another time:
-it is continuous, and bounded by the bound of the input times the integral of
-the absolute impulse response: 1 for order 1, coth(pi / 2) = 1.0903 for order 2.
+A changing cutoff only stretches time (dtau = w dt), so with *any* sequence of
+cutoffs y is the response of one fixed filter to the input in stretched time.  It
+is continuous, and at most the largest input times the integral of the absolute
+impulse response: 1 for order 1, coth(pi / 2) = 1.0903 for order 2.
 
-Between samples the input is linear.  Held at the newest value instead, it
-would lead by half a sample (18 degrees at a tenth of the sample rate); linear
-it has no phase error and an amplitude that falls short by (pi f dt)^2 / 3.
+Between samples the input is linear.  Held at the newest value, it would lead by
+half a sample (18 degrees at a tenth of the sample rate); linear, it has no phase
+error, and its amplitude is too small by (pi f dt)^2 / 3.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _ROOT2 = math.sqrt(2.0)
 
 
 class LowPassState:
-    """A low-pass: output `y` and, of order 2, `slope` = y' / w, in the unit of the input."""
+    """A low-pass: output `y` and, for order 2, `slope` = y' / w, in the unit of the input."""
 
     __slots__ = ('slope', 'y')
 
@@ -42,7 +42,7 @@ class LowPassState:
             self.y += lost * off + rise * (1.0 + lost / angle)
             return self.y
         # Poles at w exp(+-3i pi/4): closed form of the 2 x 2 exponential, and of its integral
-        # over the ramp; written in what is small for a short step, so that nothing cancels.
+        # over the ramp, in terms that are small for a short step, to avoid cancellation.
         p = angle / _ROOT2
         decay, sin = math.exp(-p), math.sin(p)
         c = math.expm1(-p) * math.cos(p) - 2.0 * math.sin(0.5 * p) ** 2

@@ -1,10 +1,10 @@
 """
-Phase lag of the low-passes, and the cutoff that keeps a lag.
+Phase lag of the low-passes, and the cutoff for a given lag.
 
-Of the continuous filters, with r = f / fc: order 1 lags by atan r, the
-second-order Butterworth by atan2(sqrt(2) r, 1 - r^2).  The filter of this
-package takes its input as linear between samples, which has no phase of its
-own, so that these are its lags too (of a derivative: behind the true one).
+With r = f / fc, the continuous filter of order 1 lags by atan r, the second-order
+Butterworth by atan2(sqrt(2) r, 1 - r^2).  The filter of this package takes its
+input as linear between samples, which adds no phase, so its lags are the same (for
+a derivative, relative to the true one).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def delay(lag: float, frequency: float) -> float:
 
 
 def most_lag(order: int) -> float:
-    """Return the upper limit of the lag of a low-pass, degrees, which it never reaches."""
+    """Return the limit that the lag of a low-pass approaches, degrees."""
     return 90.0 * order
 
 
@@ -57,9 +57,8 @@ def share_for_lag(response: complex, raw: complex, most: float) -> float:
     """
     Return the share of the unfiltered signal that reduces a lag to a limit.
 
-    With the angle of the mixture (1 - m) H + m R turned by the limit p, its
-    imaginary part is that of H e^(ip) and R e^(ip) in the same shares, and 0
-    where the lag is p.
+    A mixture (1 - m) H + m R has the lag p where (1 - m) H e^(ip) + m R e^(ip)
+    has the imaginary part 0.
     """
     if -cmath.phase(response) <= most:
         return 0.0

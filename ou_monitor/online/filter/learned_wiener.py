@@ -1,8 +1,8 @@
 """
 The law `kalman` for a signal in supply noise: the best filter, learned in flight.
 
-The signal is unknown.  The outputs z of four low-passes and the input (`step_of`) are signal
-and noise, z = z_s + z_n, and the noise is known: `coupling` times the supply's noise, an OU with
+The signal is unknown.  The outputs z of four low-passes, and the input (`step_of`), are signal
+plus noise, z = z_s + z_n.  The noise is known: `coupling` times the supply's noise, an OU with
 sigma and alpha, and white noise n0.  Of all linear combinations of z
 
     w = (C_s + C_n)^-1 c_s,    C_s = C_z - C_n,
@@ -47,8 +47,8 @@ from ou_monitor.online.settings import FilterSettings
 from ou_monitor.records import FloatArray, NAN
 
 Complexes = npt.NDArray[np.complex128]
-# Cutoffs, Hz: they span the motions of vehicles; two octaves apart (benchmarks/learned.py names
-# the recordings on which they were chosen).
+# Cutoffs, Hz, two octaves apart, in the range of vehicle motions (benchmarks/learned.py names
+# the recordings used to choose them).
 CUTOFFS = (2.0, 8.0, 32.0, 128.0)
 COUNT = len(CUTOFFS) + 1
 _TWO_PI = 2.0 * math.pi
@@ -60,7 +60,7 @@ _GONE = 1e-18
 
 
 def _key(x: float) -> int:
-    """Return a number that values within 1 % of each other share."""
+    """Return the same number for values within 1 % of each other."""
     return round(math.log(x) / _SAME)
 
 
@@ -104,7 +104,7 @@ def noise_of(key: int, decay: float, slope: bool) -> FloatArray:
     size = step.shape[0]
     phi = math.exp(-decay * interval)
     first, second = step[:, -2], step[:, -1]
-    # State: noise, low-passes, input; what they make of the noise before, and of its news.
+    # State: noise, low-passes, input; their transition, and their response to new noise.
     a, g = np.zeros((size + 2, size + 2)), np.ones(size + 2)
     a[0, 0] = a[-1, 0] = phi
     a[1:-1, 1:-1] = step[:, :-2]
@@ -122,10 +122,10 @@ def noise_of(key: int, decay: float, slope: bool) -> FloatArray:
     return np.asarray(p[np.ix_(outputs, outputs)])
 
 
-# s between new weights, over which the output moves to them, and of what is remembered; chosen
+# Time between new weights, of the transition to them, and of the memory, s; chosen
 # on bf3s, roma, jd and gecko (benchmarks/learned.py).
 _HOP, _MEMORY = 0.01, 5.0
-# Prior weight of no signal before the first sample, s.
+# Weight of the prior, which is no signal, s.
 _BEFORE = 1.0
 # 99.9 % quantile of chi squared with 5 degrees of freedom.
 _MISFIT = 20.515
@@ -142,10 +142,10 @@ _RAW = np.eye(COUNT)[-1]
 
 class LearnedWiener:
     """
-    The filter of least error in the span of a few low-passes, from a first sample x on.
+    The best linear combination of a few low-passes, starting at a first sample x.
 
     `y` is the signal, or its slope in mode derivative (unit/s); `lag` that of the output at
-    `lag_frequency`, degrees, NaN while not known; `mixed` the share of what is unfiltered in it.
+    `lag_frequency`, degrees, NaN if unknown; `mixed` the share of unfiltered input in it.
     """
 
     def __init__(self, settings: FilterSettings, x: float) -> None:
@@ -182,7 +182,7 @@ class LearnedWiener:
 
     def advance(self, dt: float, interval: float, x: float, slope: float, sigma: float,
                 error: float, alpha: float, level: float, level_se: float) -> float:
-        """Take a sample (dt in s, alpha in 1/s); the level of a voltage plays no part."""
+        """Take a sample (dt in s, alpha in 1/s); the level is not used."""
         state, raw = self._state, slope if self._slope else x
         state[-2], state[-1] = slope if self._slope else self._x, raw
         self._x = x
@@ -219,13 +219,13 @@ class LearnedWiener:
 
     def _best(self, noise: FloatArray, misfit: float) -> FloatArray:
         """Return the weights of least error with the present noise."""
-        # A floor, in the signal as measured and in the noise.
+        # Regularisation of the power and of the noise.
         floor = np.diag(_FLOOR * np.diag(self._noise + noise)
                         + _FLOOR_OF_ALL * np.diag(self._power) + _TINY)
         root = np.linalg.cholesky(self._noise + floor)
         inverse = np.linalg.inv(root)
         shares, turn = np.linalg.eigh(inverse @ (self._power + floor) @ inverse.T)
-        # The sampling error of a share is about this times itself.
+        # Factor on a share: 1 plus its relative sampling error.
         unsure = 1.0 + math.sqrt(2.0 * self._squares) / self._sum
         believed = min(max(float(shares[0]) * unsure, _LEAST), self._most)
         grown = (root @ turn) * np.sqrt(np.maximum(shares - believed * unsure, 0.0))
@@ -255,7 +255,7 @@ class LearnedWiener:
         return found
 
     def _misfit(self, rows: FloatArray) -> float:
-        """Return the factor by which the signal exceeds its model; 1: it fits."""
+        """Return the factor by which the signal exceeds its model; 1: none."""
         if self._whiten is None:
             return 1.0
         squares = np.sum((rows @ self._whiten)**2, axis=1)
@@ -282,7 +282,7 @@ class LearnedWiener:
         s = self._settings
         response = response_of(interval, s.lag_frequency, self._slope)
         if self._slope:
-            # Both behind the true derivative.
+            # Both lags relative to the true derivative.
             response = response / (1j * _TWO_PI * s.lag_frequency)
         h, raw = complex(weights @ response), complex(response[-1])
         if not abs(h) > 1e-9 * abs(raw):

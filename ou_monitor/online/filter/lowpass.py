@@ -4,8 +4,8 @@ A low-pass, or filtered derivative, whose cutoff follows the noise of the supply
 sigma -> law (`cutoff_laws`) -> wanted cutoff -> limits, smoothing, slew
 (`cutoff_control`) -> cutoff in force -> filter (`filter_state`) -> output.
 
-The derivative is the same low-pass, applied to the slope of the input.  No term of it jumps when
-the cutoff moves, and it is the exact response to an input that is linear between samples.
+The derivative is the same low-pass, applied to the slope of the input.  It does not jump when the
+cutoff changes, and is exact for an input that is linear between samples.
 
 With the law `kalman` the output comes from `VoltageKalman` or `learned_wiener`.  The low-pass runs
 in parallel at the cutoff of equal lag, and takes over while sigma is unknown.
@@ -44,7 +44,7 @@ from ou_monitor.online.filter.learned_wiener import LearnedWiener
 from ou_monitor.online.settings import FilterSettings
 from ou_monitor.records import FloatArray, NAN
 
-# Time over which what is not told of the level moves, s: ten of the default windows.
+# Time constant of the error of the level, s: ten default windows.
 LEVEL_TIME = 20.0
 # Relative change of sigma, alpha or the step, and factor in the error of the level, above which
 # the model is computed again.
@@ -77,7 +77,7 @@ class KalmanStep(NamedTuple):
 
 
 class VoltageKalman:
-    """Kalman filter of the voltage, V; `y`, `lag` and `mixed` as of `LearnedWiener`."""
+    """Kalman filter of the voltage, V; for `y`, `lag` and `mixed` see `LearnedWiener`."""
 
     def __init__(self, settings: FilterSettings, x: float, level: float) -> None:
         self._settings = settings
@@ -98,7 +98,7 @@ class VoltageKalman:
         self._gain, self._told = [0.0, 0.0], [NAN, NAN]
 
     def configure(self, settings: FilterSettings) -> None:
-        """Change settings; the estimate goes on."""
+        """Change settings; keep the estimate."""
         self._settings = settings
         self._forget()
 
@@ -125,7 +125,7 @@ class VoltageKalman:
 
     def _learn(self, sigma: float, error: float, alpha: float, level: float, level_se: float,
                dt: float) -> None:
-        """Follow sigma in its logarithm; compute new models after sufficient changes."""
+        """Smooth ln sigma; compute new models after sufficient changes."""
         wanted = math.log(min(max(sigma, 1.0 / _HIGHEST), _HIGHEST))
         if self._log_sigma != self._log_sigma:
             self._log_sigma = wanted
@@ -208,7 +208,7 @@ def step_model(known: Known, dt: float) -> KalmanStep:
 def _ou(rate: float, intensity: float, dt: float) -> tuple[float, float, float]:
     """Return transition, driving and stationary variance of an OU; of a random walk at rate 0."""
     if rate == 0.0:
-        # Its start is unknown: the first sample determines it.
+        # The initial value is unknown: the first sample determines it.
         drive = intensity * intensity * dt
         return 1.0, drive, 1e6 * drive
     still = intensity * intensity / (2.0 * rate)
@@ -227,10 +227,10 @@ _TWO_PI = 2.0 * math.pi
 _LARGEST, _LATEST, _SHORTEST = 1e150, 1e18, 1e-12
 # Minimum gap in mean intervals, and minimum number of samples in the mean to count one.
 _GAP, _KNOWN = 5.0, 10
-# Number of samples of an array that become Python's numbers at once; limits memory.
+# Number of samples that are converted to Python floats at a time; limits memory.
 _PIECE = 16384
-# Change of the mean interval, as a share, at which the law is asked anew: five standard
-# deviations of the mean over 100 intervals that are uniform within half of themselves.
+# Relative change of the mean interval at which the law is evaluated again: five standard
+# deviations of the mean of 100 intervals that jitter uniformly by up to a third.
 _MOVED = 0.1
 
 _Maybe = npt.ArrayLike | None
@@ -241,10 +241,10 @@ class FilterCounters:
     """Numbers of samples by outcome."""
 
     samples: int = 0  # Samples used
-    # Samples that were NaN, infinite or beyond 1e150, or whose stamp was or lay beyond 1e18 s.
+    # Samples that were NaN, infinite or beyond 1e150, or whose stamp was so or beyond 1e18 s.
     non_finite: int = 0
-    repeated: int = 0  # Samples with the stamp of the one before, or less than 1 ps later
-    back: int = 0  # Samples with an earlier stamp; time goes on from there
+    repeated: int = 0  # Samples less than 1 ps after the previous one
+    back: int = 0  # Samples with an earlier stamp, from which time continues
     gaps: int = 0  # Steps of more than five mean intervals
 
 
@@ -279,7 +279,7 @@ class AdaptiveLowPass:
         self._settings = FilterSettings.from_options(options)
         self._control = CutoffControl(self._settings)
         self._state = LowPassState()
-        # Of the law kalman; None until its first known sigma.
+        # For the law kalman; None until sigma is known for the first time.
         self._kalman: VoltageKalman | LearnedWiener | None = None
         self._known = False
         self._sigma = NAN
@@ -306,14 +306,15 @@ class AdaptiveLowPass:
         """
         Cutoff in force, within fmin..fmax, Hz.
 
-        Of a shadow the one that would be; of `kalman` the one of its lag, as far as it is within.
+        With `shadow`, the one that would be in force; with `kalman`, that of a low-pass of equal
+        lag.
         """
         told = self._of_its_lag()
         return self._within(told) if told == told else self._control.cutoff
 
     @property
     def wanted(self) -> float:
-        """Cutoff that the law wants, within fmin..fmax, Hz; NaN when it does not know."""
+        """Cutoff that the law requests, within fmin..fmax, Hz; NaN if unknown."""
         told = self._of_its_lag()
         return self._within(told) if told == told else self._control.wanted
 
@@ -354,10 +355,10 @@ class AdaptiveLowPass:
     @property
     def noise_left(self) -> float:
         """
-        Share of the variance of white noise that the low-pass leaves, to 1 %.
+        Share of the variance of white noise that passes the low-pass, to 1 %.
 
-        Of the law `kalman` that of the low-pass of its lag; 1 for a shadow and until the
-        sample rate is known.
+        With the law `kalman`, that of the low-pass of equal lag; 1 with `shadow`, and until
+        the sample rate is known.
         """
         told = self._of_its_lag()
         cutoff = told if told == told else self._control.cutoff
@@ -368,16 +369,16 @@ class AdaptiveLowPass:
 
     def configure(self, **options: object) -> None:
         """
-        Change options; the output does not move, the cutoff follows.
+        Change options; the output does not jump, and the cutoff follows.
 
-        Where `shadow` is switched, the output goes from the one to the other
-        within the time constant of the filter.
+        If `shadow` changes, the output moves from one signal to the other with
+        the time constant of the filter.
 
         Raises
         ------
         ValueError
-            For an option that cannot be used (the old ones stay), or another
-            mode: its output has another unit, which takes a new filter.
+            For an option that cannot be used (no option changes then), or
+            another mode, whose output has another unit: make a new filter.
 
         """
         settings = FilterSettings.from_options(options, base=self._settings)
@@ -407,25 +408,25 @@ class AdaptiveLowPass:
         Parameters
         ----------
         t : float or array_like, shape (n,)
-            Stamps, s.  At a repeat or a step back the output stays; both are
-            counted, and time goes on from an earlier stamp.
+            Stamps, s.  A repeated or earlier stamp does not change the output
+            and is counted; time continues from an earlier stamp.
         x : float or array_like, shape (n,)
             Signal, any unit.  NaN and infinite samples are counted and do not
             move the output.
         sigma : float or array_like, shape (n,)
             Noise intensity, V/sqrt(s); NaN means unknown (fallback cutoff).
         sigma_se : float or array_like, shape (n,), optional
-            Standard error of ln sigma, as in `Estimate` (0.1: 10 %): a certain
-            sigma moves the cutoff faster.
+            Standard error of ln sigma, as in `Estimate` (0.1: 10 %): the smaller
+            it is, the faster the cutoff follows.
         alpha : float or array_like, shape (n,), optional
-            Relaxation rate of the supply, 1/s; NaN or left out: the parameter.
+            Relaxation rate of the supply, 1/s; NaN or omitted: the parameter.
         throttle : float or array_like, shape (n,), optional
-            Throttle, 0..1, for the law of that name.
+            Throttle, 0..1, for the law `throttle`.
         level : float or array_like, shape (n,), optional
             Level of the supply at the present throttle, V (`Estimate.u0`), for
             the law `kalman` of the voltage itself.
         level_se : float or array_like, shape (n,), optional
-            Its standard error, V; NaN or left out: it is exact.
+            Standard error of the level, V; NaN or omitted: it is exact.
 
         Returns
         -------
@@ -464,7 +465,7 @@ class AdaptiveLowPass:
     def step(self, t: float, x: float, sigma: float, sigma_se: float = NAN,
              alpha: float = NAN, throttle: float = NAN, level: float = NAN,
              level_se: float = NAN) -> float:
-        """Filter one sample as `filter` does, NaN for unknown inputs (faster, for the node)."""
+        """Filter one sample like `filter`, but faster; NaN for unknown inputs."""
         if not (abs(x) < _LARGEST and abs(t) < _LATEST):
             self.counters.non_finite += 1
             return self._out
@@ -473,7 +474,7 @@ class AdaptiveLowPass:
         if self._t is None:
             self.counters.samples += 1
             if self._settings.law == 'kalman':
-                # Its lag is unknown before it has run.
+                # The lag is unknown before the first step.
                 self._start_kalman(x, sigma, level)
             self._control.update(self._ask(sigma, alpha, throttle, 0.0), error, 0.0, 0.0)
             self._state.y = self._raw = self._out = 0.0 if derivative else x
@@ -507,7 +508,7 @@ class AdaptiveLowPass:
     def _stay(self, t: float, x: float, dt: float) -> None:
         """Process a sample with a repeated or backward stamp."""
         if dt < 0.0:
-            # The slope from here to the next sample is of the new time line.
+            # The next slope begins at the earlier stamp.
             self._t, self._x = t, x
             self.counters.back += 1
         else:
@@ -530,7 +531,7 @@ class AdaptiveLowPass:
 
     def _run_kalman(self, dt: float, interval: float, x: float, sigma: float, error: float,
                     alpha: float, level: tuple[float, float]) -> None:
-        """Run the Kalman filter; while sigma is unknown, with the last one."""
+        """Run the Kalman filter, with the last known sigma."""
         begun = self._kalman is None
         if self._kalman is None:
             self._start_kalman(x, sigma, level[0])
@@ -545,7 +546,7 @@ class AdaptiveLowPass:
         if begun:
             self._offset = self._out - self._kalman.y
         elif self._before is not None:
-            # What the old parameters would have made of this sample is where the new begin.
+            # The output continues from what the old parameters would have given.
             self._offset += self._before.advance(*sample) - self._kalman.y
         self._before = None
         if known != self._known:
@@ -558,10 +559,10 @@ class AdaptiveLowPass:
         s = self._settings
         if s.law == 'kalman':
             return self._of_its_lag()
-        # The jitter of the stamps is not worth a new search.
+        # Jitter of the stamps needs no new search.
         if abs(interval - self._interval_asked) > _MOVED * self._interval_asked:
             self._interval_asked = interval
-        # NaN never equals itself.
+        # Replace NaN, which never equals itself.
         asked = (*(one if one == one else math.inf for one in (sigma, alpha, throttle)),
                  self._interval_asked)
         if asked != self._asked:
