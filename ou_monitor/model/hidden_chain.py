@@ -1,10 +1,9 @@
 """
 Hidden Markov chains over many samples, in library code.
 
-Forward probabilities are products of small matrices; the products of equal
-blocks are formed side by side, so that the Python loop has a few hundred turns
-whatever the number of samples (Rabiner, Proc. IEEE 77 (1989) 257, for the
-recursion itself).
+Forward probabilities are products of small matrices.  Those of equal blocks are
+computed side by side, so the Python loop has a few hundred iterations for any
+number of samples (for the recursion: Rabiner, Proc. IEEE 77 (1989) 257).
 """
 
 from __future__ import annotations
@@ -15,8 +14,8 @@ from operator import mul
 import numpy as np
 from ou_monitor.records import FloatArray
 
-# Products, and levels of pairwise products, between two scalings: no underflow, because the
-# largest density of each sample is scaled to 1.
+# Products, and levels of pairwise products, between two normalisations: without underflow, because
+# the largest density of each sample is scaled to 1.
 _EVERY, _LEVELS = 8, 3
 # Samples per block, in square roots of their number: an iteration over blocks costs more.
 _SHORT = 0.4
@@ -44,7 +43,7 @@ def forward(log_density: FloatArray, transition: FloatArray, start: FloatArray
 
 
 def smoothed(log_density: FloatArray, transition: FloatArray, start: FloatArray) -> FloatArray:
-    """Return the law of the state at each sample given all of them, shape (n, k)."""
+    """Return the probabilities of the states at each sample, given all samples, shape (n, k)."""
     ahead = forward(log_density, transition, start)[0][1:]
     behind = forward(log_density[::-1].transpose(0, 2, 1), transition.T,
                      np.ones(start.size))[0][::-1]
@@ -54,7 +53,7 @@ def smoothed(log_density: FloatArray, transition: FloatArray, start: FloatArray)
 
 
 def log_likelihood(log_density: FloatArray, transition: FloatArray, start: FloatArray) -> float:
-    """Return the summed evidence of `forward`, at a small part of its cost."""
+    """Return the sum of the log densities of `forward`, much faster."""
     k = transition.shape[0]
     log: FloatArray = log_density.transpose(1, 2, 0)
     top = _largest(log)
@@ -63,7 +62,7 @@ def log_likelihood(log_density: FloatArray, transition: FloatArray, start: Float
     for i, j in np.ndindex(k, k):
         np.exp(log[i, j] - top, out=m[i, j])
         m[i, j] *= transition[i, j]
-    # Neighbours in pairs, and these in pairs again.
+    # Multiply neighbours in pairs, then pairs of pairs, and so on.
     level = 0
     while m.shape[2] > 1:
         if m.shape[2] % 2:
@@ -92,7 +91,7 @@ def _largest(log: FloatArray) -> FloatArray:
 
 
 def _in_blocks(log_density: FloatArray, transition: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the scale of each sample, and scaled products, shape (size, k, k, blocks)."""
+    """Return each sample's scale, and the scaled products, shape (size, k, k, blocks)."""
     n, k, _ = log_density.shape
     log: FloatArray = log_density.transpose(1, 2, 0)
     size = max(1, round(_SHORT * math.sqrt(n)))
@@ -109,7 +108,7 @@ def _in_blocks(log_density: FloatArray, transition: FloatArray) -> tuple[FloatAr
 
 
 def _through(padded: FloatArray, start: FloatArray) -> FloatArray:
-    """Return the law before each block."""
+    """Return the probabilities of the states before each block."""
     size = padded.shape[0]
     whole = padded[0]
     for j in range(1, size):
@@ -117,7 +116,7 @@ def _through(padded: FloatArray, start: FloatArray) -> FloatArray:
         if j % _EVERY == 0:
             total = whole.sum(axis=(0, 1))
             whole = whole / np.where(total > 0.0, total, 1.0)
-    # Sums of a few numbers: not worth arrays.
+    # For a few numbers, plain Python is faster than arrays.
     fresh = law = (start / start.sum()).tolist()
     first = []
     for product in whole.transpose(2, 0, 1).tolist():
@@ -129,7 +128,7 @@ def _through(padded: FloatArray, start: FloatArray) -> FloatArray:
 
 
 def _law(weight: FloatArray, start: FloatArray) -> FloatArray:
-    """Return weights, shape (k, blocks), as laws; the first law where all are too small."""
+    """Return weights, shape (k, blocks), normalised; the first law where all are too small."""
     total = weight.sum(axis=0)
     fresh = (start / start.sum())[:, None]
     law: FloatArray = np.where(total >= _NONE, weight / np.maximum(total, _NONE), fresh)

@@ -7,11 +7,11 @@ tridiagonal; its banded Cholesky factor, in the order of time, is the
 information form of the Kalman filter (Rue & Held, Gaussian Markov Random
 Fields, 2005), so no Python loop runs over the samples.
 
-Where the model stays constant the gain settles: it is solved on the first samples, and a constant
-filter does the rest.
+If the model is constant, the gain converges: it is computed from the first samples, and a filter
+with constant gain does the rest.
 
-Limits: Q_k must be regular and R_k above 0 (a millionth of Q_k stands for "no
-measurement noise"); the states are few, for the cost grows with their square.
+Limits: Q_k must be regular and R_k above 0 (a millionth of Q_k for "no measurement
+noise"); the cost grows with the square of the number of states.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Filter:
             self.variance = np.concatenate((self.variance[:-1], more))
 
     def _solve(self, model: StateSpace) -> FloatArray:
-        """Find the gains, stretch by stretch; return the variances."""
+        """Compute the gains, segment by segment; return the variances."""
         h = model.h
         n, d = model.f.shape[0], model.f.shape[1]
         self._gain, self._look = np.empty((n, d)), np.empty((n, d))
@@ -69,8 +69,8 @@ class Filter:
         count = max(1, round(n * d * d / _ELEMENTS))
         edges = [n * k // count for k in range(count + 1)]
         for begin, end in zip(edges[:-1], edges[1:]):
-            # One array for each element of the matrices, along the samples: no small
-            # matrices are touched one by one.  Blocks leave most of them zero.
+            # One array along the samples for each element of the matrices, most of which are
+            # zero because of the blocks.
             f, q = _elements(model.f[begin:end]), _elements(model.q[begin:end])
             r = model.r[begin:end]
             variance[begin:end] += h @ _seen(h, q)
@@ -133,7 +133,7 @@ _CHUNK = 4096
 
 
 class _Steady:
-    """A filter whose gain has settled, run mode by mode where the modes are distinct."""
+    """A filter with constant gain, run mode by mode if the modes are distinct."""
 
     def __init__(self, loop: FloatArray, gain: FloatArray, look: FloatArray) -> None:
         self._loop, self._gain, self._look = loop, gain, look
@@ -155,7 +155,7 @@ class _Steady:
                 continue
             if root.imag == 0.0:
                 root, drive, before = root.real, drive.real, before.real
-            # The conjugate of a complex mode adds the same again.
+            # The conjugate of a complex mode contributes the same.
             seen = 2.0 * seen if root.imag > 0.0 else seen.real
             kept, _ = lfilter([drive], [1.0, -root], columns, axis=0, zi=root * before[None, :])
             e[0] -= (seen * before).real
@@ -199,7 +199,7 @@ def _pattern(a: FloatArray) -> Pattern:
 
 
 def _seen(h: FloatArray, a: FloatArray) -> FloatArray:
-    """Return the rows of matrices, shape (d, d, n), added up with weights."""
+    """Return the weighted sum of the rows of matrices, shape (d, d, n)."""
     total = np.zeros(a.shape[1:])
     for k in np.flatnonzero(h).tolist():
         total += a[k] if h[k] == 1.0 else h[k] * a[k]
@@ -217,7 +217,7 @@ def _times(a: FloatArray, b: FloatArray, left: Pattern, right: Pattern) -> Float
 
 def _symmetric(a: FloatArray, b: FloatArray, left: Pattern, right: Pattern, out: FloatArray
                ) -> None:
-    """Put the product of the transpose of a with b, which is symmetric, into zeros."""
+    """Write the symmetric product of the transpose of a with b into zeros."""
     for k, i in np.argwhere(left).tolist():
         for j in np.flatnonzero(right[k, :i + 1]).tolist():
             out[i, j] += a[k, i] * b[k, j]
@@ -294,15 +294,15 @@ def _filtered(f: FloatArray, q: FloatArray, h: FloatArray, r: FloatArray) -> Flo
     return _inverse(p)
 
 
-# Samples whose matrices stay in the fast memory.
+# Number of samples whose matrices fit into the caches.
 _AT_ONCE = 1024
 
 
 def _band(diagonal: FloatArray, below: FloatArray) -> FloatArray:
     """Return a block bidiagonal or symmetric block tridiagonal matrix, lower band storage."""
     d, n = diagonal.shape[0], diagonal.shape[2]
-    # As LAPACK wants it: all rows of one column beside each other; written stretch by
-    # stretch, or each element would go through all the memory.
+    # In the order of LAPACK, column by column; written in segments, because writing one element
+    # for all samples at a time would miss the caches.
     band = np.zeros((n, d, 2 * d))
     inside = [(i, j) for j in range(d) for i in range(j, d)]
     across = np.argwhere(_pattern(below)).tolist()

@@ -2,26 +2,26 @@
 Fit an Ornstein-Uhlenbeck process and white noise to a voltage, together with level and load.
 
 `known_ou` fits the shortest window in which alpha is known well.  `regress` takes a flexible
-level (linear hats every 5 s), throttle and measured current, each at once and after a bank of
-lags whose state at the beginning is free, out of the voltage; `fit_ou` fits the noise jointly
-with them.
+level (linear hats every 5 s), throttle and measured current out of the voltage, both without lag
+and after several lags with free initial states; `fit_ou` fits the noise jointly with them.
 
-The size of the noise follows a law of the load and of its changes, and each reading counts by it:
-what a load model misses while the load moves would otherwise pass for a fast OU. The noise is
-white noise, the OU, and a random walk of the level, which may be nil and has a usual size that it
-hardly exceeds: without it, what the hats leave of the level would pass for a slow OU. The fit is a
-restricted likelihood in the frequency domain (`whittle.CrossSpectrum`). Intervals are quantiles by
-importance sampling about all its maxima over the rate; prior: flat in ln(alpha), arcsine in the
-share of the OU.
+The size of the noise depends on the load and its changes, and readings are weighted by it:
+otherwise the errors of the load model while the load moves would be taken for a fast OU. The noise
+is white noise, the OU, and a random walk of the level, whose size has a prior and may be zero:
+without it, the rest of the level would be taken for a slow OU. The fit maximises a
+restricted likelihood in the frequency domain (`whittle.CrossSpectrum`). Intervals are quantiles
+from importance sampling about all its maxima over the rate; prior: flat in ln(alpha), arcsine in
+the share of the OU.
 
-Limits: samples count as evenly spaced within a stretch without gaps; a relaxation slower than 2.5
-s (a sixth of a window below 15 s) is the level's; OU and white noise change their size together,
-and are told at their mean size; repeats
-or rounding of slow changes, a load that neither throttle nor current shows, and noise of another
-spectrum (a filtered sensor), pass for the OU. On 1200 simulated rails under a quad's throttle
-(alpha 2 to 500 1/s, 50 to 1000 Hz, OU of 20 mV, white noise to 30 mV, windows of 20 s, above
-300 Hz of 8 s) 93 % of the 95 % intervals held alpha (most others lay above it), 93 % sigma, 92 %
-Var_inf; 90, 90 and 87 % without any white noise. Of the bounds 99 % held.
+Limits: samples are taken as evenly spaced within a stretch without gaps; a relaxation slower than
+2.5 s (a sixth of a window below 15 s) counts as level; OU and white noise change in proportion,
+and results are for their mean size. Taken for the OU: repeats or rounding of slow changes, a load
+that neither throttle nor current shows, and noise with another spectrum (a filtered sensor).
+
+On 1200 simulated rails under a quad's throttle (alpha 2 to 500 1/s, 50 to 1000 Hz, OU of 20 mV,
+white noise to 30 mV, windows of 20 s, above 300 Hz of 8 s) 93 % of the 95 % intervals contained
+alpha (most others lay above it), 93 % sigma, 92 % Var_inf; 90, 90 and 87 % without white noise.
+99 % of the bounds were correct.
 """
 
 from __future__ import annotations
@@ -55,13 +55,13 @@ _MOVED = 0.01
 _GAP, _STRETCH = 5.0, 16
 # Minimum share of the readings in pieces of equal length.
 _HELD = 0.8
-# The shortest of OU_WINDOWS in which alpha is known within this factor counts, else the longest.
+# The shortest of OU_WINDOWS in which alpha is known within this factor is used, else the longest.
 # Precision stops the search, not visibility: whether chance makes a relaxation visible in a short
 # window depends on its estimate, which would then be biased.
 PRECISE = 1.5
 # Minimum number of readings beyond the number of regressors.
 FEWEST = 40
-# Numbers in one array of the likelihood: 16 MB of complex ones.
+# Maximum size of an array of the likelihood: 16 MB of complex numbers.
 _AT_ONCE = 1 << 20
 # Points of the likelihood's first grid in ln(alpha), logit(share) and ln(walk); ends of the logit:
 # white noise of 1e-3 of the variance is half of the spectrum at the highest frequency of an OU of
@@ -78,8 +78,8 @@ _CHANGES, _SIZE_SD, _SIZE_ROUNDS = (0.03, 0.2, 1.0), 0.5, 12
 _LOOKS, _NEAR = 40, 0.05
 # Draws about the maxima in each round, and rounds; the least share of one maximum.
 _DRAWS, _ROUNDS, _FEWEST_DRAWN = 1000, 4, 0.05
-# Dips of the grid's profile over the rate that are searched, and maxima that count beside the
-# largest, nats: one of e^-6 of its height has none of the 95 %.
+# Minima of the cost over the rate that are searched, and distance from the lowest up to which they
+# count, nats: one of e^-6 of its likelihood does not affect the 95 %.
 _TRIED, _RIVAL = 10.0, 6.0
 # Sd of ln(alpha) by the curvature at the maximum, widened by 1.2, above which no interval within
 # PRECISE was seen: at most 0.28 in 190 precise ones of 437 simulated windows.
@@ -92,7 +92,7 @@ _FASTEST = 5.0
 # Profile log-likelihood that the edge of a 95 % region of rate and share lies below the maximum,
 # nats: chi^2 with 2 degrees of freedom.
 _DROP = 3.0
-# Share of the variance which an OU slower than `tau_below_s` stays below.
+# Highest share of the variance of an OU slower than `tau_below_s`.
 _QUARTER = 0.25
 # Relative size below which a direction of the regressors is spanned by the others.
 _SPANNED = 1e-5
@@ -141,7 +141,7 @@ def _basis(rows: FloatArray) -> FloatArray:
     rows = rows[size > 0.0] / size[size > 0.0, None]
     R = np.linalg.qr(rows.T, mode='r')
     kept = np.flatnonzero(np.abs(R.diagonal()) >= _SPANNED * math.sqrt(rows.shape[1]))
-    # A third of the time of Householder's Q, whose later columns lack what a spanned one took.
+    # Takes a third of the time of a QR by Householder, and handles dependent rows.
     return np.asarray(np.linalg.inv(np.linalg.qr(R[:, kept], mode='r')).T @ rows[kept])
 
 
@@ -171,14 +171,14 @@ class Regression:
 
     dt: float  # mean step within the stretches, s
     places: npt.NDArray[np.intp]  # of the readings in stretches without gaps, shape (n,)
-    voltage: FloatArray  # V, what the regressors leave, shape (n,)
-    size: FloatArray  # of the noise beside its rms, shape (n,)
+    voltage: FloatArray  # V, residual, shape (n,)
+    size: FloatArray  # size of the noise over its rms, shape (n,)
     # Orthonormal regressors, in units of the size, shape (p, n); without any each stretch has a
     # mean of its own.
     basis: FloatArray
     lengths: list[int]  # of the stretches
     walk: float  # usual walk of the level, V per sqrt(s)
-    slowest: float  # half the distance of the level's knots, s: slower changes are the level's
+    slowest: float  # half the distance of the level's knots, s: slower changes count as level
 
     @property
     def free(self) -> int:
@@ -188,7 +188,7 @@ class Regression:
 
 def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | None,
             reach: float = 0.0) -> Regression:
-    """Regress level and load out of a voltage; reach: most shift of the current, s."""
+    """Regress level and load out of a voltage; reach: maximum shift of the current, s."""
     parts = stretches(t)
     dt = float(np.median(np.diff(t)))
     if parts:
@@ -256,8 +256,8 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
 
 
 def _innovations(x: FloatArray) -> FloatArray:
-    """Return what each value adds to its prediction by the one before it."""
-    # The law counts values as independent: those of a slow OU would let it follow chance.
+    """Return the innovations of an AR(1)."""
+    # The law takes values as independent, so those of a slow OU would make it follow chance.
     power = float(x @ x)
     phi = float(x[1:] @ x[:-1]) / power if power > 0.0 else 0.0
     return x - phi * np.append(x[:1], x[:-1])
@@ -274,7 +274,7 @@ def load_signs(n: int, dt: float, *loads: FloatArray | None) -> FloatArray:
 
 
 class NoiseSize:
-    """The noise's size: ln is linear in signs of load; beyond those of the fit it is constant."""
+    """Size of the noise: its ln is linear in signs of load, constant beyond those of the fit."""
 
     def __init__(self, signs: FloatArray) -> None:
         n = max(1, signs.shape[1])
@@ -295,7 +295,7 @@ class NoiseSize:
         return np.asarray(np.log1p(signs[self._used] / self._scale))
 
     def fit(self, left: FloatArray) -> FloatArray:
-        """Fit the law to noise, V; return the sizes there beside their rms."""
+        """Fit the law to noise, V; return its sizes over their rms."""
         X, n = self._X, left.size
         mean = float(left @ left) / max(1, n)
         if not self.follows or not mean > 1e-18:
@@ -315,7 +315,7 @@ class NoiseSize:
         return np.asarray(np.sqrt(variance / variance.mean()))
 
     def of(self, signs: FloatArray) -> FloatArray:
-        """Return the sizes, V, that the last fit gives to such signs."""
+        """Return the sizes, V, of the last fit for such signs."""
         X = np.vstack([np.ones(signs.shape[1]), self._laws(signs) - self._mean])
         return np.asarray(self._rms * np.exp(0.5 * np.clip(self._beta @ X, *self._ends)))
 
@@ -332,7 +332,7 @@ class _Likelihood:
         Return minus the log-likelihood, and the variance, V^2, of OU and white noise together.
 
         Points of shape (k, 3): ln(alpha D), logit(share of the OU), and ln of the variance of a
-        step of the level beside that of the noise.
+        step of the level over that of the noise.
         """
         half = points.shape[0] // 2
         if half and points.shape[0] * self._cross.size > _AT_ONCE:
@@ -352,14 +352,14 @@ def _points(*axes: FloatArray) -> FloatArray:
 
 
 def fit_ou(part: Regression, span: float, *, precise: bool = False) -> OuFacts:
-    """Fit the noise to a window, s; precise: only a fit that knows alpha within PRECISE."""
+    """Fit the noise to a window, s; precise: None unless alpha is known within PRECISE."""
     dt = part.dt
     total = float(part.voltage @ part.voltage)
     if not total > 1e-18 * part.voltage.size:
         # A constant signal: no noise, thus no relaxation.
         return OuFacts('not_visible', span, tau_below_s=dt, var_inf_below=0.0)
     likelihood = _Likelihood(part)
-    # ln of the variance of the level's step beside that of the noise, by the prior.
+    # Prior of ln of the variance of a step of the level over that of the noise.
     usual = math.log(dt * part.walk ** 2 * part.free / total)
     low = np.array([math.log(dt / part.slowest), _LOGIT[0], usual - 6.0 * _WALK_SD])
     high = np.array([math.log(_FASTEST), _LOGIT[1], usual + 6.0 * _WALK_SD])
@@ -392,8 +392,8 @@ def fit_ou(part: Regression, span: float, *, precise: bool = False) -> OuFacts:
         roots.append(_curvature(cost, np.clip(rival[0], low, high)))
     if precise and len(peaks) > 1:
         return OuFacts('not_visible', span)
-    # Points from wide laws, one about each maximum with the grid nearest to it, weighted by their
-    # likelihood; the next laws have the moments of the last points.
+    # Draw from a wide distribution about each maximum and weight by likelihood; in later rounds,
+    # distributions have the moments of the last points.
     nearest = np.abs(points[:, :1] - [peak[0] for peak, _ in peaks]).argmin(axis=1)
     laws = [(1.0 / len(peaks), *_moments(
         np.vstack([np.clip(peak, low, high), points[nearest == k]]),
@@ -433,7 +433,7 @@ def fit_pieces(parts: Sequence[tuple[FloatArray, FloatArray]], dt: float, walk: 
     """Fit the noise to pieces (V, relative size of the noise), each with its own mean."""
     parts = [part for part in parts if part[0].size >= _STRETCH]
     total = sum(part[0].size for part in parts)
-    # Pieces of one length: the longest, at most that of a hat, in which most readings are.
+    # Pieces of equal length: the longest, up to a hat, that contain most readings.
     n = max([_STRETCH, *(part[0].size for part in parts)])
     n = min(n, max(_STRETCH, round(_HATS / dt)))
     while n > _STRETCH and sum(part[0].size // n * n for part in parts) < _HELD * total:
@@ -451,7 +451,7 @@ def fit_pieces(parts: Sequence[tuple[FloatArray, FloatArray]], dt: float, walk: 
 
 
 def white_variance(ou: OuFacts, steps: float, dt: float) -> float:
-    """Return the white variance beside an OU, V^2, by the mean square of steps over dt, s."""
+    """Return the white variance beside an OU, V^2, from the mean square of steps of dt, s."""
     relaxed = ou.var_inf * math.expm1(-ou.alpha * dt) if ou.status == 'ok' else 0.0
     return max(0.0, 0.5 * steps + relaxed)
 
@@ -487,7 +487,7 @@ def _pair(ends: Sequence[float]) -> tuple[float, float]:
 
 def _minimum(cost: Callable[[FloatArray], FloatArray], point: FloatArray, step: FloatArray,
              ) -> tuple[FloatArray, float]:
-    """Return the lowest of 27 points about one, then with half the step, and its cost."""
+    """Return the lowest point by a pattern search of 27 points with halved steps, and its cost."""
     around = _points(*(np.array([-1.0, 0.0, 1.0]),) * 3)
     lowest = math.inf
     for _ in range(_LOOKS):
@@ -504,7 +504,7 @@ def _minimum(cost: Callable[[FloatArray], FloatArray], point: FloatArray, step: 
 
 def _rivals(cost: Callable[[FloatArray], FloatArray], points: FloatArray, value: FloatArray,
             peak: tuple[FloatArray, float], step: FloatArray) -> list[tuple[FloatArray, float]]:
-    """Return minima of the cost at other rates than the lowest, and their costs."""
+    """Return the minima of the cost at other rates, and their costs."""
     by_rate = value.reshape(_GRID[0], -1)
     profile = np.pad(by_rate.min(axis=1), 1, constant_values=math.inf)
     dips = np.flatnonzero((profile[1:-1] <= profile[:-2]) & (profile[1:-1] < profile[2:])
@@ -557,7 +557,7 @@ def _curvature(cost: Callable[[FloatArray], FloatArray], centre: FloatArray) -> 
 
 
 def _quantiles(log: FloatArray, weight: FloatArray, extra: float) -> FloatArray:
-    """Return median, 2.5 and 97.5 % quantile of points, blurred by a normal of sd extra."""
+    """Return median, 2.5 and 97.5 % quantile of points with added normal errors (sd extra)."""
     if extra:
         nodes, w = np.polynomial.hermite_e.hermegauss(7)
         log = (log[:, None] + extra * nodes).ravel()
@@ -589,7 +589,7 @@ def _unseen(costs: Callable[[FloatArray], tuple[FloatArray, FloatArray]], low: F
             points = np.where(better, other, points)
             value, variance = (np.where(better[:, 0], x, y)
                                for x, y in ((cost, value), (size, variance)))
-    # Between the points, at the best walk; roots, as a parabola's are straight.
+    # Interpolate at the best walk; in roots, because those of a parabola are linear.
     lost = (value - min(least, float(value.min()))).reshape(shape)
     fine = _finer(np.sqrt(np.maximum(lost, 0.0))) ** 2
     size, logit = (_finer(x.reshape(shape))

@@ -1,26 +1,25 @@
 """
 Spectral lines: detected by a test, measured with their error, and removed.
 
-The one finder of the package: `analyze` asks it of each load level, `discover` of the scores that
-a model leaves and of samples that it leaves out.
+`analyze` uses it for each load level, `discover` for the scores of a model and for samples that
+the fit does not use.
 
-A periodogram ordinate of noise is exponential, and the sum of K of them gamma, whatever the law
-of the noise; a line stands out of its neighbours.  The level of the noise at each frequency is
-the median of neighbouring ordinates, whose law is known exactly, so the test needs no model of
-the spectrum and a second line nearby does not hide the first.  It looks twice: in pieces of some
-seconds, which tones of motors and converters do not outlive, and in pieces as long as can be, in
-which a crystal's tone stands out furthest.
+A periodogram ordinate of noise is exponential, and the sum of K of them gamma, whatever the
+distribution of the noise; a line exceeds its neighbours.  The noise at each frequency is the
+median of neighbouring ordinates, whose distribution is known exactly, so the test needs no model
+of the spectrum, and a second line nearby does not hide the first.  The search has two passes: in
+pieces of a few seconds, because tones of motors and converters drift, and in the longest possible
+pieces, where the tone of a crystal is clearest.
 
-A line of 4 mV beside an OU of 18 mV moves alpha by 30 % and sigma by 15 % (1 kHz, 120 Hz): the
-fit takes it for a part of the relaxation.  So each line is taken out as a sinusoid of its own
-amplitude, phase and frequency in each piece of the length in which it was found; a little noise
-of that bin goes with it.
+A line of 4 mV beside an OU of 18 mV changes the fitted alpha by 30 % and sigma by 15 % (1 kHz,
+120 Hz).  So each line is subtracted, as a sinusoid with its own amplitude, phase and frequency in
+each piece of the length in which it was found; this also removes a little noise.
 
-Limits: the noise is taken as level over the neighbours (some 60 bins either side), so a resonance
-narrower than that is reported as a line; samples are taken as evenly spaced; a line may be the
-alias of one above half the rate; below `FIRST` periods of a piece nothing is looked for; with
-the false-alarm rate go changes of frequency, which spread a line until it is not found.  A tone
-that moves by more than a bin within a piece, or is modulated, leaves its sidebands.
+Limits: the noise is taken as constant over the neighbours (about 60 bins either side), so a
+narrower resonance is reported as a line; samples are taken as evenly spaced; a line may be an
+alias; frequencies below `FIRST` periods of a piece are not searched.  A line whose frequency
+changes is spread over bins, and may be missed.  A tone that moves by more than a bin within a
+piece, or is modulated, leaves its sidebands.
 """
 
 from __future__ import annotations
@@ -49,9 +48,9 @@ _SHORT, _LONGEST = 4.0, 1 << 20
 _FEWEST = 128
 # Sufficient number of ordinates to estimate the noise.
 _FEWEST_TESTED = 32
-# Neighbours: every second ordinate (those next to each other are correlated by the window),
-# from this many bins away on, so many in all; in long pieces, whose bins are narrower, up to
-# so many times as many.
+# Neighbours: every second ordinate, because the window correlates adjacent ones; distance of the
+# nearest, in bins; their number; and the maximum factor on that number in long pieces, whose bins
+# are narrower.
 _GUARD, _NEIGHBOURS, _MORE = 4, 64, 4
 # Number of bins on either side over which the window spreads a steady line.
 _LOBE = 2
@@ -101,12 +100,12 @@ class EvenGrid:
 
 
 def on_grid(t: FloatArray, values: FloatArray) -> EvenGrid:
-    """Return samples on the even clock that their stamps follow, steps rounded (t in s)."""
+    """Return samples on an even clock, their steps rounded to whole periods (t in s)."""
     step = np.diff(t)
     usual = float(np.median(step)) if step.size else math.inf
     number = np.maximum(1.0, np.rint(step / usual))
     if number.sum() > _FILLED * t.size:
-        # Mostly pauses: the samples are joined without them.
+        # If most of the time is gaps, join the samples without them.
         number = np.ones(step.size)
     where = np.append(0.0, np.cumsum(number)).astype(np.intp)
     rate = float(where[-1] / (t[-1] - t[0])) if step.size else NAN
@@ -121,10 +120,10 @@ def find_lines(parts: Sequence[FloatArray], rate: float, *, false_alarm: float =
     """
     Look for lines in segments of evenly spaced samples, strongest first.
 
-    parts in V, rate and lowest in Hz; white holds their innovations, in whose level spectrum
-    lines are looked for where parts are not white themselves.
+    parts in V, rate and lowest in Hz; white: their innovations, whose flat spectrum is searched
+    if the parts are not white.
     """
-    # A detrended constant would be roundings.
+    # A detrended constant consists of rounding errors.
     parts, white = ([part - part.mean() for part in some if part.size]
                     for some in (parts, white or parts))
     sizes = [part.size for part in parts]
@@ -141,7 +140,7 @@ def find_lines(parts: Sequence[FloatArray], rate: float, *, false_alarm: float =
     for length, where in tested.items():
         lines, least = _search(parts, white, rate, length, where,
                                false_alarm / (levels * count))
-        # What wanders stands in the short pieces; a line that both show is measured there,
+        # Drifting lines show in short pieces.  A line found in both is measured in the short ones,
         # unless it is clear in the long ones alone.
         for line in lines:
             same = [other for other in found if abs(line.frequency - other.frequency)
@@ -174,7 +173,7 @@ def _search(parts: Sequence[FloatArray], whites: Sequence[FloatArray], rate: flo
     background = raw[where] / np.maximum(white[where], 1e-300) * middle
     # The median of a gamma variable, in units of its mean.
     background /= float(gammaincinv(k, 0.5)) / k
-    # Of the segments in which the line is measured, as short ones may be quieter.
+    # Variance of the segments in which the line is measured: short ones may be quieter.
     held = [part for part in parts if part.size >= length]
     total = float(sum(part @ part for part in held) / sum(part.size for part in held))
     lines = [_measure(raw, background, white[where], middle, where, group, p, df, total, k)
@@ -183,7 +182,7 @@ def _search(parts: Sequence[FloatArray], whites: Sequence[FloatArray], rate: flo
 
 
 def tail(ratio: FloatArray, pieces: float, neighbours: int) -> FloatArray:
-    """Return the probability that noise exceeds a multiple of its neighbours' median."""
+    """Return the probability that noise exceeds a multiple of the median of its neighbours."""
     at = _medians(pieces, neighbours)
     found: FloatArray = gammaincc(pieces, np.outer(ratio, at)) @ _WEIGHTS
     return found
@@ -198,7 +197,7 @@ def _medians(pieces: float, neighbours: int) -> FloatArray:
 
 @lru_cache(maxsize=256)
 def threshold(pieces: float, neighbours: int, level: float) -> float:
-    """Return the ratio that `tail` gives a probability `level` to."""
+    """Return the ratio at which `tail` is `level`."""
     def beyond(log: float) -> float:
         return math.log(max(float(tail(np.array([math.exp(log)]), pieces, neighbours)[0]),
                             1e-300)) - math.log(level)
@@ -213,7 +212,7 @@ def _piece_length(sizes: Sequence[int], most: int) -> int:
     top = min(longest, most)
     best, score = top, 0.0
     for length in {top, *(size for size in sizes if _FEWEST <= size < top)}:
-        # The power of a line adds up over the pieces, the scatter of noise with their root.
+        # The power of a line grows with the number of pieces, the scatter of noise with its root.
         gained = length * math.sqrt(sum(size // length for size in sizes))
         if gained > score:
             best, score = length, gained
@@ -241,7 +240,7 @@ def _local_median(density: FloatArray, where: np.ndarray, near: int) -> FloatArr
     for part in np.array_split(inner, max(1, inner.size * near // (1 << 18))):
         values = density[where[0] + centres[part, None] + both[None, :]]
         found[part] = np.partition(values, near // 2, axis=1)[:, near // 2]
-    # Near an end there are more on one side: the nearest, wherever they lie.
+    # Near an end, one side has too few: use the nearest on the other.
     reach = np.arange(guard, guard + 4 * near, 2)
     offsets = np.concatenate((-reach[::-1], reach))
     edges = np.flatnonzero(~inside)
@@ -322,7 +321,7 @@ def fit_sinusoid(piece: FloatArray, rate: float, frequency: float, reach: float)
     v = piece - piece.mean()
     size = max(1, v.size // _PHASES)
     count = v.size // size
-    # Each part of the piece as one complex number, in a frame that turns along.
+    # Each part of the piece as one complex number, in a rotating frame.
     turns = frequency / rate
     sums = v[:count * size].reshape(count, size) @ _turning(turns, size)
     sums *= _turning(turns * size, count)

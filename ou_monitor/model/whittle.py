@@ -3,9 +3,8 @@ Fits to a periodogram: all time scales of a recording at once, in milliseconds.
 
 The ordinates of a long series are nearly independent exponentials with the spectrum for their
 means (Whittle, Ark. Mat. 2 (1953) 423); in bins they are gamma.  `Ordinates` are those of scores;
-`CrossSpectrum` has regressors beside a voltage, and expects of each ordinate what it is in a
-window of this length (the debiased Whittle likelihood: Sykulski et al., Biometrika 106 (2019)
-251).
+`CrossSpectrum` has regressors beside a voltage, and uses the expected value of each ordinate for
+the length of the window (debiased Whittle likelihood: Sykulski et al., Biometrika 106 (2019) 251).
 """
 
 from __future__ import annotations
@@ -91,7 +90,7 @@ _ONE_BY_ONE, _WIDTH = 24, 0.06
 def cosines(x: FloatArray) -> FloatArray:
     """Return the orthonormal cosine transform (DCT-II) of rows, shape (q, n)."""
     n = x.shape[1]
-    # By one Fourier transform of the even places and, backwards, the odd ones: Makhoul, IEEE
+    # By one Fourier transform of the even samples followed by the reversed odd ones: Makhoul, IEEE
     # Trans. Acoust. Speech Signal Process. 28 (1980) 27.
     F = np.fft.rfft(np.concatenate([x[:, ::2], x[:, 1::2][:, ::-1]], axis=1), axis=1)
     F *= np.exp(-0.5j * np.pi / n * np.arange(F.shape[1])) * math.sqrt(2.0 / n)
@@ -106,14 +105,14 @@ class CrossSpectrum:
     rows: shape (q, n), in stretches of `lengths` evenly spaced readings; without regressors (q =
     1) each stretch has a mean of its own.
 
-    The ordinates are those of the cosine transform, whose window goes on as in a mirror: a voltage
-    that ends elsewhere than it began leaks into no other ordinate, as it does in Fourier's.
+    The ordinates are those of the cosine transform, which continues the window as a mirror image:
+    unlike in a Fourier transform, different values at its ends cause no leakage.
     """
 
     def __init__(self, rows: FloatArray, lengths: Sequence[int]) -> None:
         q, n = rows.shape
         self.free = n - (q - 1 or len(lengths))
-        # Stretches of nearly one length share their bins: lost messages make hundreds of them.
+        # Lost messages make hundreds of stretches; those of similar lengths share their bins.
         groups: dict[int, list[FloatArray]] = {}
         for part in np.split(rows, np.cumsum(lengths)[:-1], axis=1):
             groups.setdefault(round(math.log(part.shape[1]) / _WIDTH), []).append(part)
@@ -124,7 +123,7 @@ class CrossSpectrum:
             while edges[-1] < longest:
                 edges.append(min(longest, edges[-1] + max(1, int(_WIDTH * edges[-1]))))
             cross = np.zeros((len(edges) - 1, q, q))
-            # Number, sum of the places in the band, and of their signs by turns.
+            # Number of ordinates in the band, sum of their indices and of alternating signs.
             sums = np.zeros((3, len(edges) - 1))
             for part in group:
                 size = part.shape[1]
@@ -158,11 +157,11 @@ class CrossSpectrum:
 
     @property
     def size(self) -> int:
-        """Return the numbers that one spectrum takes."""
+        """Return the number of values of one spectrum."""
         return max(self._cross.shape)
 
     def ou(self, a: FloatArray) -> FloatArray:
-        """Return the ordinates expected of an OU of variance 1; a: alpha D, shape (k, 1)."""
+        """Return the expected ordinates of an OU of variance 1; a: alpha D, shape (k, 1)."""
         # The inverse covariance is (1 - phi)^2 + phi L, of which the cosines are eigenvectors,
         # but for phi (1 - phi) at both ends: Woodbury.
         phi, gap = np.exp(-a), -np.expm1(-a)
@@ -175,11 +174,11 @@ class CrossSpectrum:
         """
         Return minus the log-likelihood of spectra, shape (k, bins), restricted and profiled.
 
-        used: only so many of the regressors.  The second is the factor on the spectrum, the third
-        the products x' K^-1 z of all rows, shape (k, q, q).
+        used: number of regressors to use.  The second result is the factor on the spectrum, the
+        third the products x' K^-1 z of all rows, shape (k, q, q).
         """
         gram = ((1.0 / S) @ self._cross).reshape(-1, self._q, self._q)
-        # Rounding must not make it indefinite.
+        # Keep it definite despite rounding.
         gram[:, range(self._q), range(self._q)] *= 1.0 + 1e-10
         free, own = self.free, gram
         if used is not None and used < self._q - 1:

@@ -9,8 +9,8 @@ Delay: the voltage, without changes slower than a second, is correlated with thr
 late; the largest correlation wins.  A source slower than 7 Hz does not determine the delay.  A new
 delay is used only if it leaves a quarter less variance than the present one.
 
-Noise: ln variance = b . (1, ripple(u), sqrt|du|), learned by Fisher scoring; of a mean of n
-samples the part that scatters within a block counts 1/n.
+Noise: ln variance = b . (1, ripple(u), sqrt|du|), learned by Fisher scoring; in a mean of n
+samples, the part that varies within a block is divided by n.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from ou_monitor.records import FloatArray, NAN
 
 # Width of the bins, s: motors and pack respond more slowly.
 WIDTH = 0.02
-# Samples further apart than this, s, are blocks of their own.
+# Samples farther apart than this, s, are separate blocks.
 _APART = 0.75 * WIDTH
 # Difference below which throttles are equal: the sag differs by less than an ADC step.
 _EQUAL = 0.01
@@ -46,11 +46,11 @@ class LoadBlock:
     throttle: float  # Mean throttle, 0..1; NaN where unknown
     current: float  # Mean of the currents that are known, A; NaN without one
     n: int  # Samples
-    within: float  # Variance of one sample about the mean, V^2; NaN of a single one
+    within: float  # Variance of a sample about the mean, V^2; NaN for a single sample
 
 
 class LoadBlocks:
-    """Collects samples into blocks; one that comes 15 ms or more after the last is a block."""
+    """Collects samples into blocks; a sample 15 ms or more after the last one is a block."""
 
     def __init__(self) -> None:
         self.forget()
@@ -58,17 +58,17 @@ class LoadBlocks:
     def forget(self) -> None:
         """Start again with the next sample; drop the incomplete block."""
         self._sums: FloatArray | None = None
-        # Of the last sample: stamp, throttle, step to it, changes in its bin so far.
+        # Last sample: stamp, throttle, step before it, changes in its bin so far.
         self._last = (-math.inf, NAN, math.inf, 0)
         self._zero = NAN
 
     def push(self, columns: FloatArray) -> list[LoadBlock]:
-        """Return the blocks that samples complete (t, s, rising; V; 0..1; A; shape (4, n))."""
+        """Return the blocks that are complete with these samples (s, V, 0..1, A; shape (4, n))."""
         t, voltage, throttle, current = columns
         if not t.size:
             return []
         if math.isnan(self._zero):
-            # Squares are taken from here, so that they lose no digits.
+            # Offset of the squares, to keep digits.
             self._zero = float(voltage[0])
         before, held, step, changes = self._last
         dt = np.diff(t, prepend=before)
@@ -113,13 +113,14 @@ class LoadBlocks:
 DELAYS = (0.0, 0.05, 0.1, 0.15, 0.2)  # s
 # Changes slower than this, s, are discharge and recovery, not a response to the stick.
 _SLOW = 1.0
-# A third of the response lags by 60 ms: the prior of the filter.
+# A third of the response lags by 60 ms in the prior of the filter.
 _SHARE, _LAG = 1.0 / 3.0, 0.06
 # Minimum time compared, s, and memory, s.
 _FIRST, _MEMORY = 10.0, 60.0
-# Ratio of residual variances, another delay to the present one, below which it replaces it.
+# Ratio of the residual variance of another delay to that of the present one, below which the other
+# is used.
 _BETTER = 0.75
-# Minimum duration of that, s.
+# Time that this must last, s.
 _LASTING = 3.0
 # Length of the segments of a test, s, in which responses are nearly independent; memory, s;
 # minimum number.
@@ -133,7 +134,7 @@ _LONGEST = 0.15
 
 
 class LoadDelay:
-    """Running correlations of voltage and load at several delays (lists: faster here)."""
+    """Running correlations of voltage and load at several delays, in lists, which are faster."""
 
     def __init__(self, delay: float = 0.0, *, either: bool = False) -> None:
         # Whether the load may have either sign.
@@ -149,8 +150,8 @@ class LoadDelay:
         self._xx = 0.0
         none = [0.0] * len(DELAYS)
         self._xv, self._vv = none, none
-        # Of the piece that fills: time, load squared, products, voltage squared; of the
-        # correlations of whole pieces: weight, sums and sums of squares.
+        # Sums of the present piece: time, load squared, products, voltage squared.  Sums over the
+        # correlations of whole pieces: weight, values, squares.
         self._filled, self._own = 0.0, (0.0, none, none)
         self._pieces, self._sum, self._squares = 0.0, none, none
 
@@ -223,7 +224,7 @@ class LoadDelay:
         return True
 
 
-# Standard scores beyond this are weighed down; they score this much, squared, in the noise.
+# Limit of standard scores: larger ones have less weight, and count as this in the noise.
 CLIP, _OUTLIER = 4.0, 16.0
 # Variance of a prediction, V^2, above which the filter has diverged, as after readings of
 # megavolts, and restarts.
@@ -232,8 +233,8 @@ DIVERGED = 1e12
 _SAME = 1e-6
 # Minimum change of throttle.
 _HELD = 1e-3
-# Corrections after which the noise is forgotten; at first sooner, by a third of all so far, as the
-# coefficients are wrong then.
+# Memory of the noise, in corrections; at first a third of those so far, because the coefficients
+# are still wrong.
 _NOISE_MEMORY, _NOISE_FIRST, _NOISE_SHARE = 2000.0, 50.0, 1.0 / 3.0
 
 
@@ -242,18 +243,18 @@ def _dot(x: Sequence[float], y: Sequence[float]) -> float:
 
 
 class LoadNoise:
-    """Noise of blocks of samples of a pack of `volts`, V."""
+    """Noise of blocks of samples; volts: of the pack, V."""
 
     def __init__(self, volts: float, b: tuple[float, float, float] | None = None) -> None:
-        # 0.4 % of the voltage, and what ripple and changes of throttle usually add; or as it
-        # was in another flight, to a factor of 1.4 in the deviation.
+        # Prior: 0.4 % of the voltage, with the usual effect of ripple and changes of throttle; or
+        # the noise of another flight, within a factor of 1.4.
         self.b = [math.log((0.004 * volts) ** 2), 2.0, 4.0] if b is None else list(b)
         x, y, z = (4.0, 4.0, 9.0) if b is None else (0.5, 0.5, 1.0)
         self._covariance = [[x, 0.0, 0.0], [0.0, y, 0.0], [0.0, 0.0, z]]
-        # Of the standard scores: mean square, and correlation from one to the next.
+        # Mean square of the standard scores, and correlation of neighbours.
         self.scale, self.correlation = 1.0, 0.0
         self._last, self._n = 0.0, 0
-        # Step of the ADC, V, and share of the blocks that are another value than the one before.
+        # Step of the ADC, V, and share of blocks whose value differs from the previous one.
         self._step, self._changing, self._held = math.inf, 1.0, math.nan
         self._unseen = (0.05 * volts) ** 2
         # Samples in a block, the variance within one, and that of its mean, V^2.
@@ -295,9 +296,9 @@ class LoadNoise:
 
     @property
     def rounding(self) -> float:
-        """Return the variance of rounding, V^2; a constant value is rounded once."""
+        """Return the variance of rounding, V^2, which is common to repeated values."""
         if math.isinf(self._step):
-            # It has never changed: the step may be anything.
+            # The value has never changed, so the step is unknown.
             return self._unseen
         return self._step ** 2 / 12.0 / max(self._changing, 0.002)
 
@@ -310,7 +311,7 @@ class LoadNoise:
         self._n += 1
 
     def learn(self, e: float, s: float, u: float, du: float, n: int, within: float) -> None:
-        """Score ln variance (Fisher) by an innovation, V, of variance s beside the noise, V^2."""
+        """Update ln variance by an innovation, V (Fisher scoring); s: its other variance, V^2."""
         f = 1.0, ripple(u), math.sqrt(du)
         R = self.variance(u, du, n)
         square = min(e * e / (s + R), _OUTLIER)

@@ -2,7 +2,7 @@
 The voltage under load, learned in flight by a Kalman filter that needs no relaxation rate.
 
 Limits: late throttle makes the sag too small (100 ms: by a third on a racing quad); outside the
-throttles flown the sag is extrapolated; changes of the true sag are followed within minutes.
+throttle range flown, the sag is extrapolated; changes of the true sag are followed within minutes.
 doc/load.md has the equations and the figures.
 
 With a measured current: its scale and sign are not corrected, so a wrong scale makes the
@@ -45,15 +45,15 @@ _DRAWN_STATES = 2 + _SHARES.size
 _DRAWN_WALK = 0.003
 # Minimum time to empty a pack at the largest current, s; without discharge the level is constant.
 _EMPTY = 100.0
-# Change of each coefficient: 2 % of a fall of 12 % in 100 s.
+# Change of each coefficient in 100 s: 2 % of a sag of 12 %.
 _DRAWN_DRIFT = (0.02 * 0.12) ** 2 / 100.0 * np.eye(_SHARES.size)
 # Largest relative error of a known resistance, and minimum relative error, because the filter's
 # own error omits the warming of a pack.
 _KNOWN, LEAST_ERROR = 0.33, 0.1
 # Throttle at which an ESC ripples most (`ripple`).
 _LOUDEST = 0.7
-# Current over throttle: memory, s; time, s, in which deviations are one; prior deviation of
-# its coefficients, in such deviations.
+# Current over throttle: memory, s; correlation time of deviations, s; prior deviation of its
+# coefficients, in such deviations.
 _MEMORY, _ONE, _WIDE = 120.0, 1.0, 30.0
 
 
@@ -69,7 +69,7 @@ class CurrentFilter:
         # Last block: voltage without the response to load, V, and log density, nat.
         self.rest = self.density = NAN
         self.delay = LoadDelay(either=True)
-        # Of current over throttle: time-weighted squares of 1, x, u, u^3, and of them and current.
+        # Current over throttle: weighted products of 1, x, u, u^3 with one another and current.
         self._squares = np.zeros((5, 5))
 
     def time(self, block: LoadBlock) -> None:
@@ -89,7 +89,7 @@ class CurrentFilter:
         self._settle(voltage)
 
     def _settle(self, v: float) -> None:
-        """Open the level."""
+        """Make the level unknown."""
         m, P = self._m, self._P
         h = self._regressors()
         m[0] = v - h[1:] @ m[1:]
@@ -100,7 +100,7 @@ class CurrentFilter:
         return np.array([1.0, 0.0, *(-x / self._unit for x in self._drawn)])
 
     def take(self, block: LoadBlock, cells: float, *, fresh: bool) -> None:
-        """Take a block (cells in series); fresh: a new time line, or perhaps another supply."""
+        """Take a block (cells in series); fresh: on a new time line, or perhaps another supply."""
         x, self.density = block.current, NAN
         if not math.isfinite(x):
             if not block.t - self._heard <= _HOLD:
@@ -203,32 +203,33 @@ def _lagged(drawn: list[float], x: float, dt: float) -> list[float]:
     return [x, *(x + (low - x) * math.exp(-dt / tau) for low, tau in zip(drawn[1:], LAGS))]
 
 
-# Lag, s, of all: half of what an ESC takes to follow.
+# Lag of the whole response, s: half of the response time of an ESC.
 _LAG = 0.004
-# Level: V per sqrt(s) and cell, an OU of 4.6 mV and 20 s, which the batch found; and of a pack
-# that empties (chosen on bf_hiro_4s, where 0.02 to 0.05 do).
+# Random walk of the level, V per sqrt(s) and cell: that of an OU of 4.6 mV and 20 s, found by the
+# batch fit; and for an emptying pack (chosen on bf_hiro_4s, where 0.02 to 0.05 work).
 _WALK, _FAST_WALK = 0.0015, 0.03
-# The faster level must predict this, s, ahead with so small a share of the mean square over that
-# memory, s; least time compared, s; from one prediction to the next, s.
+# Faster level: prediction time, s; share of the mean square error below which it is used; memory,
+# s; minimum time compared, s; interval of predictions, s.
 _AHEAD, _PAYS, _COMPARED, _LEAST_COMPARED, _EVERY = 1.0, 0.98, 30.0, 10.0, 0.1
 # The load's size may change by 25 % in 100 s; each coefficient by 2 % of full sag by itself.
 _WARMING, _CHANGE = 0.25 ** 2 / 100.0, 0.02 ** 2 / 100.0
-# Time, s, in which the load's scale follows the level: faster, the regressors of a held throttle
-# would move with every correction, and the filter would learn from that.
+# Time constant of the scale of the load, which follows the level, s: if it were faster, every
+# correction would move the regressors at constant throttle, and the filter would learn from that.
 _RESIZE = 30.0
 # Memory of the throttle flown, s.
 _FLOWN_MEMORY = 120.0
-# Known: the error of the sag over the throttle flown is below that share of it, or of the noise.
+# The sag counts as known if its error over the throttle range flown is below this share of it, or
+# of the noise.
 # The share was widened from 0.25 so that one recording reached 95 %.
 _SAG_SHARE, _NOISE_SHARE = 0.33, 0.5
 # Minimum range of throttle that has moved.
 _MOVED = 0.02
-# Least relative error of the sag: that of the filter does not count change over a flight, and
-# was up to 9 of its own too small.
+# Minimum relative error of the sag: the filter omits changes during a flight, so its own standard
+# error was up to 9 times too small.
 _LEAST_ERROR = 0.1
-# Step of a stamp, s, above which the level is open: the battery may have been changed meanwhile.
+# Gap, s, after which the level is unknown: the battery may have been changed.
 _PAUSE = 60.0
-# Factor between two levels, up or down, above which the battery is another craft's.
+# Ratio of two levels, up or down, above which the battery is that of another craft.
 _OTHER_CRAFT = 1.6
 # Relative variance of the size of the sag on another day.
 _OTHER_DAY = 0.2 ** 2
@@ -245,10 +246,10 @@ _DRIFT = _CHANGE * np.eye(_MEAN.size) * _SIZE ** 2
 
 
 class FastLevel:
-    """A level that walks faster than the filter's, used once it predicts better."""
+    """A level that changes faster than that of the filter, used once it predicts better."""
 
     def __init__(self) -> None:
-        # Stamp, s; level, V, before what was drawn, V; its variance, V^2; time compared, s.
+        # Stamp, s; level before discharge, V; its discharge, V; variance, V^2; time compared, s.
         self._t = self._level = self._variance = NAN
         self._drawn = self._since = 0.0
         # Stamp, level of the filter and the faster one; mean square of their errors, V^2.
@@ -303,10 +304,10 @@ class LoadFilter:
         # None until a current has been measured.
         self._current: CurrentFilter | None = None
         self._delay = LoadDelay()
-        # Blocks that wait for their load, and all that may still be asked for theirs.
+        # Blocks that wait for their load, and received loads that may still be needed.
         self._waiting: deque[LoadBlock] = deque()
         self._heard_loads: deque[LoadBlock] = deque()
-        # Log density, nat, of the last block; by how much current predicts better, and since, s.
+        # Log density of the last block, nat; how much better current predicts, and since when, s.
         self._density, self._better, self._compared = NAN, NAN, 0.0
 
     def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike,
@@ -315,8 +316,8 @@ class LoadFilter:
         """
         Add samples in order, s, V, 0..1, A, of one time line.
 
-        NaN throttle, or one beyond 2, is unknown: the last one holds for a second; so is a current
-        beyond 1e6 A, in whatever unit.
+        Throttle that is NaN or beyond 2 is unknown, and so is a current beyond 1e6 A: the last one
+        holds for a second.
         """
         columns = np.stack(np.broadcast_arrays(*np.atleast_1d(*(
             np.asarray(NAN if x is None else x, dtype=np.float64)
@@ -385,7 +386,7 @@ class LoadFilter:
                 du = abs(u - self._throttle)
                 legs = [(block.t, u)]
                 if u != self._throttle and self._last > self._t:
-                    # The last throttle held to the end of its block.
+                    # The last throttle was held to the end of its block.
                     legs.insert(0, (self._last, self._throttle))
                 self._throttle = u
                 self._predict(legs)
@@ -421,7 +422,7 @@ class LoadFilter:
         # Whether the coefficients have met a throttle.
         self._loaded = math.isfinite(u)
         self._heard, self._highest = -math.inf, NAN
-        # Of each bin of throttle: seconds, samples, and their squares about the prediction, V^2.
+        # For each bin of throttle: seconds, samples, and sum of squared residuals, V^2.
         self._flown = np.zeros((3, _BINS + 1))
         self._m = np.zeros(_STATES)
         self._factor = 1.0
@@ -468,19 +469,19 @@ class LoadFilter:
         held = u if math.isfinite(u) else 0.0
         self._lagged = self._settled = held
         x = held ** POWER
-        # The slow lag may be anywhere between rest and a steady load.
+        # The state of the slow lag is unknown, between rest and a steady load.
         self._lags = [x, x, 0.5 * x]
         m, P = self._m, self._P
         h = self._regressors()
         m[0] = self._rest = v - float(h[2:] @ m[2:])
         if math.isnan(self._highest) and math.isfinite(u):
             self._highest = float(m[0])
-        # The level follows from the voltage: it shares the errors of the coefficients.
+        # The level is computed from the voltage, so it shares the errors of the coefficients.
         P[0, 1:] = P[1:, 0] = -P[1:, 1:] @ h[1:]
         P[0, 0] = (0.02 * self._volts) ** 2 + h[1:] @ P[1:, 1:] @ h[1:]
 
     def _resize(self, dt: float) -> None:
-        """Scale the load over dt, s: a propeller draws the less the lower the level."""
+        """Scale the load over dt, s: a propeller draws less at a lower level."""
         level = min(4.3, max(3.2, float(self._m[0]) / self._cells))
         self._factor += ((level / CELL) ** (POWER - 1.0) - self._factor) * (
             -math.expm1(-dt / _RESIZE))
@@ -508,7 +509,7 @@ class LoadFilter:
         return self._cells * float(_SLOPE_AT[min(len(_SLOPE_AT) - 1, max(0, place))])
 
     def _predict(self, legs: list[tuple[float, float]]) -> None:
-        """Predict to the last of some stamps, s, each with the throttle before it."""
+        """Predict to the last of some stamps, s, with the throttle before each."""
         m, P, used = self._m, self._P, 0.0
         dt = legs[-1][0] - self._t
         if math.isnan(self._throttle):
@@ -525,7 +526,7 @@ class LoadFilter:
         self._fast.fall(used * float(m[1]))
         P[0] -= P[1] * used
         P[:, 0] -= P[:, 1] * used
-        # A pack recovers in a gap by more than it walks: up to 2 % in a minute.
+        # In a gap, a pack recovers by more than its random walk: up to 2 % in a minute.
         self._resize(dt)
         P[0, 0] += (_WALK * self._cells) ** 2 * dt + (
             0.02 * self._volts) ** 2 * max(0.0, dt - 2.0) / 60.0
@@ -533,7 +534,7 @@ class LoadFilter:
         P[2:, 2:] += dt * (_WARMING * a[:, None] * a + self._volts ** 2 * _DRIFT)
 
     def _correct(self, block: LoadBlock, du: float) -> None:
-        """Take a block, V, whose throttle differs by du from the last one's."""
+        """Take a block, V, whose throttle differs from the last one by du."""
         m, P, noise = self._m, self._P, self._noise
         u = 0.0 if math.isnan(self._throttle) else self._throttle
         du = 0.0 if math.isnan(du) else du
@@ -547,7 +548,7 @@ class LoadFilter:
             return
         scale = max(1.0, noise.scale)
         score = e / math.sqrt(s + R * scale)
-        # Innovations that follow one another (ADC steps, errors of the form) tell less.
+        # Correlated innovations (ADC steps, errors of the model) contain less information.
         total = s + R * scale * (1.0 + noise.correlation) / (1.0 - noise.correlation)
         noise.see(block.voltage)
         total += noise.rounding
@@ -565,7 +566,7 @@ class LoadFilter:
         clipped = max(-CLIP, min(CLIP, score))
         noise.follow(clipped)
         self._density = log_density(clipped, s + R * scale)
-        # Far out on one side for half a second: another battery, so re-estimate the level.
+        # Large errors of one sign for half a second: another battery, so re-estimate the level.
         self._bias += 0.1 * (max(-6.0, min(6.0, score)) - self._bias)
         if abs(self._bias) > 3.0:
             P[0, 0] += (0.05 * self._volts) ** 2
@@ -676,8 +677,8 @@ class LoadFilter:
         load = self.load()
         if not (load.known and self._m[0] > 0.0):
             return None
-        # The size is that of the whole flight: the coefficients follow its last half minute, and
-        # their error is at least a tenth.
+        # The size is that of the whole flight, because the coefficients follow the last half
+        # minute; its error is at least a tenth.
         found, size, size_se = self._contrasts.against(self._m[2:]), 1.0, SIZE_ERROR
         if found.ratio > 0.0:
             size += (found.ratio - 1.0) / (1.0 + (found.se / SIZE_ERROR) ** 2)
@@ -706,12 +707,12 @@ class LoadFilter:
              current: FloatArray | None = None) -> FloatArray:
         """Return the mean voltage ahead, V, from throttle or current, A; NaN: unknown."""
         if not math.isfinite(self._t):
-            raise ValueError('no voltage has arrived: there is nothing to start from')
+            raise ValueError('no voltage has arrived: the prediction has no start')
         load, delay = (throttle, self._delay.delay) if current is None else (
             current, 0.0 if self._current is None else self._current.delay.delay)
         if load is None:
             raise ValueError('a path needs throttle or current')
-        # At each time works what is heard later; of the last ones what was heard last.
+        # The load at each time is received after the delay; at the end, the last one received.
         load = load[np.searchsorted(t, t + delay, 'right') - 1] if delay else load
         if current is not None and self._current is not None:
             return self._current.path(t, load)
@@ -721,7 +722,7 @@ class LoadFilter:
         now, level = self._t, self._level
         out = np.empty(t.size)
         for k in range(t.size):
-            # What lies before the last sample is now.
+            # Times before the last sample count as the last sample.
             dt = max(0.0, float(t[k]) - now)
             level -= self._m[1] * self._advance(dt, float(load[k])) * dt * self._fall(level)
             out[k] = level + self._regressors()[2:] @ self._m[2:]

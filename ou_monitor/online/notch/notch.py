@@ -83,7 +83,7 @@ _CHANGES, _FROZEN, _STUCK = 20, 50.0, 1.0
 
 
 class NewestSpeeds:
-    """Newest speeds of the motors (per_unit: Hz for one of what comes; stale_after in s)."""
+    """Newest speeds of the motors (per_unit: Hz per unit received; stale_after in s)."""
 
     def __init__(self, per_unit: float, stale_after: float) -> None:
         self._per_unit, self._stale_after = per_unit, stale_after
@@ -112,7 +112,7 @@ class NewestSpeeds:
         self._speeds, self._heard = speeds, t
 
     def now(self, t: float, most: int) -> list[float]:
-        """Return the speeds of at most `most` groups of motors, Hz; empty: unknown."""
+        """Return the speeds of up to `most` groups of motors, Hz; empty: unknown."""
         if not most or not t - self._heard <= self._stale_after:
             return []
         if self._changes >= _CHANGES:
@@ -133,7 +133,7 @@ class NewestSpeeds:
 # Square roots of throttle that define a law: the middle of the range flown.
 LOW, HIGH = 0.4, 0.85
 _GRID = 48
-# Width of the notch that weighs the laws, over frequency.
+# Relative width of the notch by which laws are scored.
 _WIDTH = 0.5
 # Memory of frames, s: the speed at one throttle falls with the charge, in minutes.
 _LAW_MEMORY = 30.0
@@ -143,7 +143,7 @@ _PRIOR, _FRAMES, _SPREAD = 0.1, 8.0, 0.3
 
 
 class MotorLaw:
-    """The law in force, `a` and `b`, Hz, NaN while unknown, and all other laws (all in Hz)."""
+    """All laws, and the one in force: `a` and `b`, Hz, NaN while unknown."""
 
     def __init__(self, frequencies: FloatArray, fmin: float, rate: float) -> None:
         highest = HIGHEST * rate
@@ -169,7 +169,7 @@ class MotorLaw:
 
     def learn(self, power: FloatArray, root: float, passed: float,
               lost: float) -> None:
-        """Take a frame: power in each bin, and the time passed, s; `lost` scales the past."""
+        """Take a frame: power in each bin, and time since the last, s; `lost` scales the past."""
         keep = float(np.exp(-passed / _LAW_MEMORY))
         removed = self._removed @ power
         f = self._a + self._b * root
@@ -183,7 +183,7 @@ class MotorLaw:
         self._found = keep * lost * self._found + got
         score = self._found + self._prior
         best = int(np.argmax(score))
-        # Around the best one all that are nearly as good: the mean is finer than the grid.
+        # The mean of all laws nearly as good as the best is finer than the grid.
         near = score - 0.98 * score[best]
         near = np.where((near > 0.0)
                         & (np.abs(np.log(self._low / self._low[best])) < 2.5 * self._log[1])
@@ -195,15 +195,15 @@ class MotorLaw:
         self.a = low - self.b * LOW
 
 
-# A notch is learned on what a quarter of a second shows: 4 Hz of resolution, and throttle moves
-# little in it; four looks at each sample.
+# Frames of a quarter of a second, in which throttle changes little: a resolution of 4 Hz; each
+# sample is in four frames.
 FRAME, HOP = 0.25, 0.0625
 _SMALLEST, _LONGEST = 16, 4096
 _MISSING, _UNEVEN = 5.0, 0.3
 
 
 class NotchFrames:
-    """Spectra of samples of an interval, s, and what went with them; `frequencies` in Hz."""
+    """Spectra of samples at an interval, s, with means of other inputs; `frequencies` in Hz."""
 
     def __init__(self, interval: float) -> None:
         self.interval = interval
@@ -217,7 +217,7 @@ class NotchFrames:
         self._due = self.size + 1
 
     def add(self, t: float, row: list[float]) -> bool:
-        """Take a sample (channels, then what goes with it); tell whether a frame is due."""
+        """Take a sample (channels, then other inputs); return whether a frame is complete."""
         if self._t and t - self._t[-1] > _MISSING * self.interval:
             self._t, self._rows, self._due = [], [], self.size + 1
         self._t.append(t)
@@ -226,7 +226,7 @@ class NotchFrames:
         return self._due <= 0
 
     def take(self, channels: int) -> tuple[FloatArray, FloatArray]:
-        """Return the power in each bin, shape (channels, K), and the means of the rest."""
+        """Return the power in each bin, shape (channels, K), and the means of the other inputs."""
         keep = self.size + 1
         self._t, self._rows = self._t[-keep:], self._rows[-keep:]
         self._due = self.hop
@@ -243,16 +243,15 @@ class NotchFrames:
 
 # Bandwidths over frequency tried for one notch and for one notch per motor.
 WIDTHS: FloatArray = np.array([1.0, 0.66, 0.45, 0.3, 0.2, 0.13, 0.085])
-# Low-passes behind, over `cutoff`; none is faster than that share of the sample rate.
+# Cutoffs of the low-passes after the notches, over `cutoff`; maximum share of the sample rate.
 _BEHIND, _FASTEST = (0.5, 1.0, 1.5), 0.25
 _ON, _OFF, _HARM, _BETTER = 0.9, 0.97, 0.99, 0.9
-# s over which the noise is averaged, and the loudest is forgotten; frames before anything is
-# decided.
+# Memory of the noise and of the loudest frame, s; frames before the first decision.
 _MEMORY, _LEVEL, _FEWEST = 5.0, 2.0, 6
-# Least share of the lag that is left to the low-pass in a frame (one ten times as fast hardly
-# filters), and in the mean of frames.
+# Minimum share of the lag that a low-pass keeps, in a frame (one ten times as fast hardly filters)
+# and in the mean of frames.
 _LEAST, _LEAST_MEAN = 0.1, 0.4
-# Frames count by their amplitude: by power one crash would be all that is remembered.
+# Frames are weighted by amplitude: by power, a single crash would dominate.
 _BY_AMPLITUDE = 0.5
 _TINY = 1e-300
 
@@ -280,7 +279,7 @@ def families(count: int) -> tuple[Family, ...]:
 
 
 class NotchChoice:
-    """Choice of the candidate of each channel; `chosen`: one a channel, None: no notch."""
+    """Choice of a candidate for each channel; `chosen`: by channel, None: no notch."""
 
     def __init__(self, frequencies: FloatArray, settings: tuple[float, float], rate: float,
                  channels: int, count: int) -> None:
@@ -289,7 +288,7 @@ class NotchChoice:
         self._used = frequencies >= self._fmin
         self._warped: FloatArray = np.tan(
             np.pi * np.minimum(frequencies[self._used] / rate, 0.499))
-        # Low-passes by the bilinear rule, as most are.
+        # Low-passes by the bilinear transform, the usual one.
         at = np.tan(np.pi * np.minimum(cutoff / rate * np.array(_BEHIND), _FASTEST))
         self._fourth: FloatArray = (self._warped[None, :] / at[:, None])**4
         self._lag: FloatArray = np.sqrt(2.0) / (2.0 * rate * at)
@@ -305,10 +304,10 @@ class NotchChoice:
 
     def usual(self, power: FloatArray, passed: float) -> tuple[FloatArray, float]:
         """
-        Return a frame over the loudest of late behind the low-pass, shape (channels, K).
+        Return a frame after the low-pass over the recently loudest, shape (channels, K).
 
-        Quiet frames count once the loud ones are past; a louder one makes those before it count
-        for less, by the factor that is returned beside it.
+        A louder frame reduces the weight of earlier ones by the second result; quiet frames count
+        again once loud ones are forgotten.
         """
         before = self._loudest * np.exp(-passed / _LEVEL)
         self._loudest = np.maximum(power[:, self._used] @ self._low[1], before)
@@ -318,7 +317,7 @@ class NotchChoice:
         return power / np.maximum(self._loudest, _TINY)[:, None], float(np.mean(lost))
 
     def low_passed(self, power: FloatArray) -> FloatArray:
-        """Return the power behind the low-pass, mean of the channels, shape (K,)."""
+        """Return the power after the low-pass, averaged over channels, shape (K,)."""
         seen: FloatArray = np.zeros(self._used.size)
         seen[self._used] = power[:, self._used].mean(axis=0) * self._low[1]
         return seen
@@ -346,7 +345,7 @@ class NotchChoice:
             self._left[j] += weight * (left - self._left[j])
 
     def _cascade(self, f: FloatArray, times: int) -> tuple[FloatArray, FloatArray]:
-        """Return the power that notches pass for each width, shape (W, K), and delays, s."""
+        """Return the power response of the notches for each width, shape (W, K), and delays, s."""
         at = np.tan(np.pi * f / self._rate)
         p = self._warped / at[:, None]
         off = (1.0 - p * p)**2
@@ -369,7 +368,7 @@ class NotchChoice:
             if old is not None:
                 k = self.families.index(old.family)
                 now = float(able[k, int(np.argmin(np.abs(WIDTHS - old.width)))])
-            # After a loss of the source the other one is held to what the first one was.
+            # If a source is lost, the other continues with its choice.
             limit = _ON if old is None else _OFF
             if best < limit**2 and best < _BETTER * now:
                 self.chosen[c] = found
@@ -378,10 +377,10 @@ class NotchChoice:
 
 
 NAN = math.nan
-# Beyond these a state could overflow, see `lowpass`.
+# Beyond these limits a state could overflow, see `lowpass`.
 _LARGEST, _LATEST, _SHORTEST = 1e150, 1e18, 1e-12
-# A step of so many intervals is a gap; samples from which the interval is known; a change of it
-# that is a new rate.
+# Minimum gap in intervals; number of samples that determine the interval; its relative change that
+# means a new rate.
 _GAP, _KNOWN, _OTHER = 5.0, 64, 0.1
 # Time constant, s, of motors after a step of throttle (25 ms on a 5 inch propeller), and of
 # changes of a notch's share, width and frequency.
@@ -433,7 +432,7 @@ class AdaptiveNotch:
         self._frames: NotchFrames | None = None
         self._law: MotorLaw | None = None
         self._choice: NotchChoice | None = None
-        # Square root of throttle as the motors follow it, and time of the last throttle.
+        # Square root of throttle after the lag of the motors, and time of the last throttle.
         self._root, self._asked, self._heard = NAN, NAN, -math.inf
         self._motors: list[float] = []
         self._sources: set[str] = set()
@@ -450,7 +449,7 @@ class AdaptiveNotch:
 
     @property
     def frequencies(self) -> FloatArray:
-        """Frequencies of the notches in force in the channel with most, Hz; empty: none."""
+        """Frequencies of the notches in the channel with the most of them, Hz; empty: none."""
         rate = self.rate
         each = [[one.ratio * rate for one in bank if one.share > 0.0] for bank in self._banks]
         return np.array(max(each, key=len, default=[]), dtype=np.float64)
@@ -490,12 +489,12 @@ class AdaptiveNotch:
 
     def configure(self, **options: object) -> None:
         """
-        Change options; the output does not jump, what was learned stays where it can.
+        Change options; the output does not jump, and what was learned is kept if it still applies.
 
         Raises
         ------
         ValueError
-            For an option that cannot be used; the old ones stay.
+            For an option that cannot be used; no option changes then.
 
         """
         old = self._settings
@@ -512,13 +511,13 @@ class AdaptiveNotch:
         Parameters
         ----------
         t : float or array_like, shape (n,)
-            Stamps, s.  At a repeat or a step back the output stays.
+            Stamps, s.  A repeated or earlier stamp does not change the output.
         x : float or array_like, shape (n,) or (n, channels)
-            Signal, any unit.  A sample with NaN is counted, and the output stays.
+            Signal, any unit.  A sample with NaN is counted and does not change the output.
         throttle : float or array_like, shape (n,), optional
-            Throttle, 0..1; NaN: as it was, for a second.
+            Throttle, 0..1; NaN: the last one, for a second.
         rpm : array_like, shape (n,) or (n, motors), or (motors,) with one number t, optional
-            Motor speeds, in `rpm_unit`; NaN: nothing came.
+            Motor speeds, in `rpm_unit`; NaN: not received.
 
         Returns
         -------
@@ -558,7 +557,7 @@ class AdaptiveNotch:
 
     def step(self, t: float, values: Sequence[float], throttle: float = NAN,
              rpm: Sequence[float] = ()) -> list[float]:
-        """Filter one sample of each channel as `filter` does (faster, for the node)."""
+        """Filter one sample of each channel like `filter`, but faster."""
         if self._out and len(values) != len(self._out):
             raise ValueError(f'the number of channels changed from {len(self._out)} to '
                              f'{len(values)}: make a new notch for another signal')
@@ -688,9 +687,9 @@ HIGHEST = 0.45
 
 class Notch:
     """
-    One notch of one channel; it begins as if its first sample x had always been there.
+    One notch of one channel, which starts as if its first sample x had lasted for ever.
 
-    `width`: bandwidth over frequency; `share`: how much of it is in force, 0..1.
+    `width`: bandwidth over frequency; `share`: depth, 0 (off) to 1.
     """
 
     __slots__ = ('_g', '_ratio', '_s1', '_s2', 'share', 'width')
