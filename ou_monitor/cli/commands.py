@@ -390,7 +390,7 @@ _DISCOVER = Command(
     ('flight.mcap --report causes.html', 'flight.bbl --save-model flight.yaml --force'))
 
 _FLEET = Command(
-    'fleet', 'many recordings -> a table (Parquet) and a report: outliers, drift of a vehicle',
+    'fleet', 'many recordings -> a table (Parquet) and a report: ageing packs, drift, outliers',
     'ou_monitor.cli.fleet',
     'Analyze many recordings on several processes: one Parquet table with a row for each '
     'recording and load level, and a report with outliers and with the drift of each vehicle over '

@@ -316,3 +316,15 @@ def test_the_date_of_a_flight(name, source, t, date, origin):
     assert found == origin
     assert (None if np.isnan(start) else datetime.fromtimestamp(start, timezone.utc).isoformat(
         ).removesuffix('+00:00')) == date
+
+
+def test_cells_that_a_recording_cannot_have_are_an_error(tmp_path):
+    """As in analyze; the number given is that of the row."""
+    t = np.arange(400) * 0.01
+    path = tmp_path / 'pack.csv'
+    rng = np.random.default_rng(1)
+    path.write_text('time_s,voltage_v\n' + ''.join(
+        f'{a:.2f},{b:.3f}\n' for a, b in zip(t, 16.0 + 0.05 * rng.standard_normal(t.size))))
+    right, wrong = (work(str(path), asdict(Options(cells=cells))) for cells in (4, 9))
+    assert (right['error'], right['cells'], right['cells_from']) == ('', 4, 'given')
+    assert 'it is likely 4 cells' in wrong['error'] and not wrong['levels']
