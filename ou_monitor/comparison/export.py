@@ -36,7 +36,7 @@ SOURCES = {
 _KEPT = {'px4': ('drift',), 'gazebo': ('drift', 'load_sag'), 'ardupilot': ('drift', 'load_sag')}
 # Voltages of a cell that counts as empty, and as critical, V.
 _EMPTY, _CRITICAL = 3.5, 3.3
-# The exponent of current over throttle that the model's discharge counts by.
+# Exponent of the current over throttle, for which the discharge of the model holds.
 _POWER = 1.8
 _SEEDS = 20
 
@@ -46,20 +46,20 @@ class Export:
     """A model for another simulator."""
 
     text: str  # What that simulator reads
-    notes: tuple[str, ...]  # A line for each term that it cannot express, and what that costs
-    model: SupplyModel  # What it simulates, as a model
+    notes: tuple[str, ...]  # A line for each term that it cannot express, with its effect
+    model: SupplyModel  # The part that it simulates, as a model
 
 
 @dataclass(frozen=True)
 class _Numbers:
-    """What the targets have parameters for."""
+    """Values of the parameters that the targets have."""
 
     cells: int
-    full: float  # Level at the begin, V
+    full: float  # Initial level, V
     empty: float  # Level that counts as empty, V
-    drain: float  # Time from the one to the other under the usual load, s; inf: it does not fall
+    drain: float  # Time between these levels under the usual load, s; inf: it does not fall
     charge: float  # Charge drawn meanwhile, 0..1 of the pack
-    share: float  # The usual load, of that at full throttle
+    share: float  # Usual load, as a share of that at full throttle
     sag: float  # Sag at full throttle, V
     usual_sag: float  # Sag under the usual load, V
 
@@ -69,8 +69,8 @@ def export(model: SupplyModel, target: str, *, throttle: FloatArray, rate: float
     """
     Return a model for another simulator (throttle at rate, Hz; full_current in A).
 
-    Throttle says what load is usual, and over which the cost of each term is measured; the
-    recording beside it what the exported model explains of it.
+    Throttle gives the usual load, and the effect of each term is measured over it; with the
+    recording, it is measured how much of it the exported model explains.
     """
     if target == 'json':
         data = {'model': [{'term': t.NAME, 'params': t.values()} for t in model.terms],
@@ -82,7 +82,7 @@ def export(model: SupplyModel, target: str, *, throttle: FloatArray, rate: float
         raise InputError(f'--full-current must be above 0 A, got {full_current:g}')
     if target != 'px4' and not known:
         raise InputError(f'--export {target} needs --full-current A, the current at full '
-                         'throttle: the model knows throttle alone')
+                         'throttle: the model has only throttle')
     text = _WRITERS[target](n, full_current)
     left = SupplyModel((replace(model.ou, sigma=0.0, u0=n.full - (
         n.usual_sag if target == 'gazebo' else 0.0)), *(
@@ -92,8 +92,8 @@ def export(model: SupplyModel, target: str, *, throttle: FloatArray, rate: float
     if target == 'gazebo' and n.usual_sag:
         notes.append(f'load_sag is that of a constant load, {n.usual_sag:.3g} V: throttle does '
                      'not move it')
-    notes += [f'load_sag is that of the begin: the model grows by {t.growth:.3g} V/s at full '
-              'throttle' for t in model.terms
+    notes += [f'load_sag is that at the start: in the model, it grows by {t.growth:.3g} V/s at '
+              'full throttle' for t in model.terms
               if target != 'px4' and isinstance(t, LoadSag) and t.growth]
     if recording is not None:
         notes += _cost(model, left, recording)
@@ -199,7 +199,7 @@ def _drawn(model: SupplyModel, throttle: FloatArray, rate: float) -> FloatArray:
 def _cost(model: SupplyModel, left: SupplyModel, recording: Recording) -> list[str]:
     """Compare the model, and its exported part, with a recording."""
     notes = []
-    for words, one in (('the model', model), ('what is exported', left)):
+    for words, one in (('the model', model), ('the exported part', left)):
         found = compare(recording, one, seeds=_SEEDS).as_data()
         path, lowest = found['mean_path'], found['lowest_v']
         notes.append(

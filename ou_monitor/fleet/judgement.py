@@ -538,7 +538,7 @@ def _is_of_vehicle(values: Values, vehicle: str) -> npt.NDArray[np.bool_]:
 
 def _vehicles(values: Values, within: Outliers, flat: FloatArray, rate: float, seed: int,
               ) -> VehicleValues:
-    """Compare the vehicles (flat: values without drift); pack values only among their like."""
+    """Compare the vehicles (flat: values without drift); pack values for equal cell counts."""
     names = tuple(sorted(set(values.vehicles) - {''}))
     scatter = float(np.nan_to_num(within.scatter))
     value, error = np.zeros(len(names)), np.zeros(len(names))
@@ -579,7 +579,7 @@ def _few(found: Outliers, places: Sequence[int], flights: Sequence[FloatArray]) 
     se = np.sqrt(variance + (variance.sum() - variance) / (len(means) - 1) ** 2)
     score, least = (means - others) / se, _APART / se
     p = stats.t.sf(np.abs(score) - least, freedom) + stats.t.sf(np.abs(score) + least, freedom)
-    # Of two vehicles there is one difference: it is told of the higher one.
+    # Two vehicles have a single difference, which is reported for the higher one.
     told = np.arange(len(means)) if len(means) > 2 else np.array([int(means.argmax())])
     reach = np.full(found.score.size, NAN) if found.reach is None else found.reach
     for column, values in ((found.score, score[told]), (found.chance, adjusted(p[told].tolist())),

@@ -124,7 +124,7 @@ def test_each_verdict_has_its_sentence(verdict, left, begin, gain):
     some = [left_over('skewness')] if left else []
     text = verdict_sentence(verdict, [tone_cause(31.0, '')], some, 0.02, 0.003)
     assert text.startswith(begin) and ('mnat' in text) == gain
-    assert ('lopsided' in text) == left
+    assert ('skewed' in text) == left
 
 
 @pytest.mark.parametrize('name', [name for name in catalogue() if name != 'ou'])

@@ -4,7 +4,7 @@ Alpha, sigma and Var_inf online: `SlidingEstimator`, and `RelaxationFits` for `w
 voltage = level + response to throttle + OU(alpha, sigma) + white noise, all
 estimated together.  Limits: one relaxation (no second pole, no resonance);
 sigma constant within the window; alpha known no better than sqrt(2/(alpha T));
-sources faster than `fastest` are averaged down to it.  Measured accuracy and
+faster sources are averaged down to `fastest`.  Measured accuracy and
 cost: doc/estimation.md.
 
 `RelaxationFits` keeps the readings of a minute.  `known_ou` of `ou_fit`, which `supply_facts` uses
@@ -12,9 +12,9 @@ too, fits the shortest of 2, 8, 30 and 60 s in which alpha is known well.  A fit
 of CPU, so it is repeated only after a quarter of its window, at least 1 s; in the background it
 runs in a thread that takes at most 5 % of a core.
 
-Between two fits of a window of 2 s the sliding estimate of 2 s goes on from the fit as long as
-their intervals overlap.  Limits: those of that fit; of a source above 1 kHz the last 65 536
-readings are kept; a change of the supply is followed a window late.
+Between two fits of a window of 2 s, the sliding estimate of 2 s is used as long as the intervals
+of both overlap.  Limits: those of that fit; a source above 1 kHz keeps its last 65 536 readings; a
+change of the supply is followed one window late.
 """
 
 from __future__ import annotations
@@ -198,7 +198,7 @@ class SlidingEstimator:
         if batch.restart:
             self._forget()
         if batch.again:
-            # Means of repeats and readings cannot be told apart.
+            # Block means do not show which readings were repeats.
             self._thinner = Thinner(self._fastest)
             self._kept = Kept(3)
             self._tail = np.empty(0)
@@ -206,7 +206,7 @@ class SlidingEstimator:
             [self._tail, batch.y])[-TAIL:]
         columns, restart = self._thinner.take(batch)
         if restart:
-            # Block means of another size do not go with the old ones.
+            # Block means of another size cannot be fitted with the old ones.
             self._line.count(resets=1)
             self._kept = Kept(3)
         if columns.size:
@@ -228,7 +228,7 @@ class SlidingEstimator:
             self._begin = max(self._begin, t.item(-1) - (1.0 + _HAIR) * self._window)
 
     def _look(self, t: FloatArray) -> Quality:
-        """Examine the raw samples, some times per window."""
+        """Examine the raw samples, several times per window."""
         if not 0.0 <= self._line.newest - self._looked < self._window / _LOOKS:
             self._quality = examine(self._tail, self._line.period)
             steps = np.diff(t[-TAIL:])
@@ -267,7 +267,7 @@ class SlidingEstimator:
             return Estimate(status=status, u0=float(y.mean()),
                             flags=tuple(input_flags(counters, quality, NAN)),
                             **measured)
-        # Throttle, or its lag, moves; where it is unknown nothing is regressed.
+        # Throttle, or its lag, moves; if it is unknown, nothing is regressed.
         known = not np.isnan(u).any()
         back = int(kept[0].searchsorted(t.item(0) - LOOK_BACK))
         before = kept[2, back:]
@@ -293,7 +293,7 @@ class SlidingEstimator:
             jitters = math.isfinite(a) and self._jitter * a / step > _JITTER
             return bool(m == 1 and t.size <= MOST and (uneven or jitters))
 
-        # The fits of two windows that share half of their samples are near each other.
+        # If two windows share half of their samples, their fits are similar.
         near = t.item(t.size // 2) < self._before_end
         before = self._before if near else None
         fit, self._before = fit_window(t, y, load, m, quality.step, stamps, before)
@@ -304,9 +304,9 @@ class SlidingEstimator:
         smoothness = NAN
         if one[1] > _RAMP * one[0]:
             smoothness = _smoothness(two[1] / one[1], fit.alpha_step, m)
-        # Faster than even a random walk of its increments would: to the fit of a window that does
-        # not come back every drift may be chance.  The increments over the longest lag stand for
-        # those that go on in one direction for a while; moving throttle explains what it can.
+        # The drift is faster than a random walk of these increments could be.  Needed because the
+        # fit of a window that does not return may take any drift for chance.  The increments over
+        # the longest lag include movements in one direction; moving throttle is regressed out.
         if not load.size and far[2] >= _EVEN * t.size and one[2] * (
                 one[0] - one[1]) > TREND_SCORE ** 2 * max(one[1], far[1] / _LAGS):
             fit = replace(fit, trend=True)
@@ -348,7 +348,7 @@ class RelaxationFits:
     def __init__(self, *, background: bool) -> None:
         self._background = background
         self._thread: threading.Thread | None = None
-        # What the thread has found: of which time line, and the fit or what went wrong.
+        # Result of the thread: its time line, the fit or the error, and the end of the readings.
         self._found: tuple[int, OuFacts | Exception, float] | None = None
         self._line = 0
         self._rest = -math.inf
@@ -408,7 +408,7 @@ class RelaxationFits:
 
     def _put(self, found: OuFacts | Exception, end: float) -> None:
         if isinstance(found, Exception):
-            # The monitor begins anew, and says why.
+            # The monitor restarts, and reports the reason.
             raise found
         self.facts, self.end = found, end
         self._due = end + max(_SOONEST, _SHARE * found.window_s)
@@ -417,16 +417,16 @@ class RelaxationFits:
         """Return the sliding estimate with the fitted relaxation, and its age, s."""
         facts, age = self.facts, e.t - self.end
         sliding = of_estimate(e)
-        # Newer readings than those fitted.
+        # Whether there are newer readings than those of the fit.
         later = not self.readings.size or self.readings[0, -1] > self.end
         if facts is None or e.status is Status.NO_DATA or (
                 later and sliding.status == 'ok' and facts.window_s < sliding.window_s):
-            # In the first seconds the sliding window is the longer one.
+            # In the first seconds, the sliding window is longer than that of the fit.
             return e, sliding, 0.0
         if facts.status in ('no_data', 'too_short'):
             return _unknown(e, Status.TOO_SHORT), facts, age
         if age > max(facts.window_s, SLIDING):
-            # The fits cannot keep up.
+            # Fits are too slow.
             return _unknown(e, Status.TOO_SHORT), OuFacts('no_data'), age
         if facts.status == 'not_visible':
             return _unknown(e, Status.NO_RELAXATION), facts, age
