@@ -570,7 +570,7 @@ _PATTERNS = {
     logs.CURRENT: (
         r'current_a', r'amperage(?:_?latest)?|current_in|i_?bat(?:t|tery)?|'
         r'batt?(?:ery)?_?(?:i|curr(?:ent)?|amps?)|current_?batt?(?:ery)?|'
-        r'(?:bus|input|supply|main|pack)_?current|curr',
+        r'(?:.*_)?(?:bus|input|supply|main|pack)_?current|i_?bus|curr',
         r'i|amps?|current|strom|courant|corriente'),
 }
 # Column that identifies a program -> units of its columns, not stated there.  Betaflight's

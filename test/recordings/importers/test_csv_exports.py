@@ -183,6 +183,13 @@ FORMS = {
     'flukeview': (table(['"Meter","289"', '', 'Reading,Sample,Start Time,Max'],
                         lambda k: f"{k},{V[k]} V DC,{clock(k, '%m/%d/%Y %H:%M:%S.%f')},"
                                   f'{V[k] + 1:.3f} V DC'), 0.01, False, False),
+    'unit_ut61e': (table(['Number,Date,Time,Value,Unit,Range'], lambda k: (
+        f"{k},{clock(k, '%d.%m.%Y,%H:%M:%S.')}{10 * k % 1000:03d},{V[k]},V,Auto")), 0.01, False,
+                   False),
+    'asammdf': (table(['timestamps,BMS_PackVoltage,BMS_PackCurrent'],
+                      lambda k: f'{0.01 * k:.2f},{V[k]},{AMPS[k]}'), 0.01, False, True),
+    'odrive': (table(['time [s];axis0.motor.current_control.Iq_measured;vbus_voltage;ibus'],
+                     lambda k: f'{0.01 * k:.2f};55;{V[k]};{AMPS[k]}'), 0.01, False, True),
     'mavlogdump': (table(
         ['timestamp,SYS_STATUS.load,SYS_STATUS.voltage_battery,SYS_STATUS.current_battery'],
         lambda k: f'{1.7e9 + 0.01 * k:.8f},325,{1e3 * V[k]:.0f},{100 * AMPS[k]:.0f}'), 0.01,
