@@ -80,7 +80,7 @@ def fit_composite(samples: Samples, terms: Sequence[Term | type[Term]], part: sl
         z, density, cost = gaussian.z, gaussian.density, cost + gaussian.cost
         fits = []
         push, error, moved = np.zeros(samples.n), np.zeros(samples.n), np.zeros(samples.n)
-        power = np.ones(samples.n)
+        power, white = np.ones(samples.n), np.ones(samples.n)
         for k, law in enumerate(laws):
             view = replace(view_of(samples, gaussian, z, part), variance=gaussian.variance * power)
             fit = (law.refit_law(view) if isinstance(law, Term) else
@@ -96,7 +96,8 @@ def fit_composite(samples: Samples, terms: Sequence[Term | type[Term]], part: sl
             error += 0.0 if fit.error is None else fit.error
             moved += 0.0 if fit.offset is None else fit.offset
             power *= 1.0 if fit.power is None else np.clip(fit.power, *_POWERS)
-        found = Events(push, error, power)
+            white *= 1.0 if fit.white is None else np.clip(fit.white, *_POWERS)
+        found = Events(push, error, power, white)
         if _same(events, offset, found, moved, gaussian) or turn == last:
             break
         if push.any() or error.any() or events is not None or (power != 1.0).any():
@@ -117,7 +118,7 @@ def _kinds(terms: Sequence[Term | type[Term]]) -> list[str]:
 def _same(events: Events | None, offset: FloatArray | None, found: Events, moved: FloatArray,
           gaussian: GaussianFit) -> bool:
     """Return whether the events and the offset of the laws have converged."""
-    before = events or Events(np.zeros(1), np.zeros(1), np.ones(1))
+    before = events or Events(np.zeros(1), np.zeros(1), np.ones(1), np.ones(1))
     if ((found.push > 0.0) != (before.push > 0.0)).any() or (
             (found.error > 0.0) != (before.error > 0.0)).any():
         return False

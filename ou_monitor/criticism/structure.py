@@ -48,10 +48,11 @@ class Events:
     push: FloatArray  # Added to the state, V^2; shape (n,)
     error: FloatArray  # Added to the measurement, V^2; shape (n,)
     power: FloatArray  # Factor on the state noise of the `ou`; shape (n,)
+    white: FloatArray  # Factor on the white noise; shape (n,)
 
     def part(self, part: slice) -> Events:
         """Return the events of some samples."""
-        return Events(self.push[part], self.error[part], self.power[part])
+        return Events(self.push[part], self.error[part], self.power[part], self.white[part])
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +160,8 @@ def _filter(samples: Samples, terms: Sequence[Term], events: Events | None) -> _
         s, space, _ = state_space(samples, terms, None)
         run = Filter(space, samples.n)
         q = s.sigma * s.sigma * -np.expm1(-2.0 * s.alpha * s.step) / (2.0 * s.alpha)
-        return _Run(s, run, run.variance, run.variance + (events.power - 1.0) * q + events.push,
+        return _Run(s, run, run.variance, run.variance + (events.power - 1.0) * q + events.push
+                    + (events.white - 1.0) * white_noise(samples, terms, s),
                     _cost(space, samples.n))
     s, space, own = state_space(samples, terms, events)
     run = Filter(space, samples.n)
@@ -194,12 +196,13 @@ def state_space(samples: Samples, terms: Sequence[Term], events: Events | None
         if isinstance(term, ACCoupling):
             blocks[0] = _coupled(term, s, phi, q)
     own: FloatArray | float = 0.0
+    white = white_noise(samples, terms, s)
     if events is not None:
         f, cov, h = blocks[0]
         more = (events.power - 1.0)[:, None, None] * cov
         more[:, 0, 0] += events.push
         blocks[0] = f, cov + more, h
-        own = (more @ h) @ h + events.error
+        own = (more @ h) @ h + events.error + (events.white - 1.0) * white
     blocks += [term.block(s) for term in terms
                if term.ROLE is Role.BLOCK and not isinstance(term, ACCoupling)]
     d = sum(h.size for _, _, h in blocks)
@@ -211,9 +214,7 @@ def state_space(samples: Samples, terms: Sequence[Term], events: Events | None
         to = at + h.size
         f_all[:, at:to, at:to], q_all[:, at:to, at:to], h_all[at:to] = f, cov, h
         at = to
-    r = floor + white_noise(samples, terms, s)
-    if events is not None:
-        r += events.error
+    r = floor + (white if events is None else events.white * white + events.error)
     return whole, StateSpace(f_all, q_all, h_all, r), own
 
 

@@ -11,6 +11,7 @@ from ou_monitor.criticism.curves import compare_curves
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate, Events, solved
 from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.reading import MeasurementNoise
 import pytest
 
 
@@ -80,14 +81,14 @@ def test_the_same_events_are_found_again_where_push_and_error_begin_at_the_same_
     fit = SimpleNamespace(variance=np.full(3, 4.0))
 
     def same(push, error, before, power=1.0, moved=0.0, offset=None):
-        found = Events(push, error, np.full(3, power))
+        found = Events(push, error, np.full(3, power), np.ones(3))
         return _same(before, offset, found, np.full(3, moved), fit)
-    none = Events(zero, zero, np.ones(3))
+    none = Events(zero, zero, np.ones(3), np.ones(3))
     assert same(zero, zero, None) and same(zero, zero, none)
     for push, error in ((one, zero), (zero, one)):
         assert not same(push, error, None) and not same(push, error, none)
-        assert same(9.0 * push, 9.0 * error, Events(push, error, np.ones(3)))
-        assert not same(zero, zero, Events(push, error, np.ones(3)))
+        assert same(9.0 * push, 9.0 * error, Events(push, error, np.ones(3), np.ones(3)))
+        assert not same(zero, zero, Events(push, error, np.ones(3), np.ones(3)))
     assert same(zero, zero, None, moved=0.199) and not same(zero, zero, None, moved=0.201)
     assert same(zero, zero, None, moved=5.1, offset=np.full(3, 5.0))
     assert not same(zero, zero, None, power=4.0)
@@ -103,23 +104,26 @@ def test_least_squares_of_few_and_of_many_columns(width):
 
 
 def test_events_add_to_the_joint_normal_law():
-    """Power of the diffusion, pushes of the state, errors of the sensor: dense covariance."""
+    """Powers of diffusion and white noise, pushes, errors of the sensor: dense covariance."""
     rng = np.random.default_rng(9)
     n, alpha, sigma, u0 = 40, 1.3, 0.5, 5.0
     t = np.cumsum(rng.choice([0.1, 0.2, 0.5], n))
     v = u0 + 0.4 * rng.standard_normal(n)
     push, error, power = np.zeros(n), np.zeros(n), np.ones(n)
     push[9], error[20], power[30:33] = 0.7, 0.9, 3.0
-    found = evaluate(Samples(t, v, None), [OU(alpha, sigma, u0)], Events(push, error, power))
+    std, white = 0.2, np.where(np.arange(n) // 4 == 4, 5.0, 1.0)
+    found = evaluate(Samples(t, v, None), [OU(alpha, sigma, u0), MeasurementNoise(std)],
+                     Events(push, error, power, white))
     keep = np.append(0.0, np.exp(-alpha * np.diff(t)))
     added = power * sigma**2 / (2.0 * alpha) * (1.0 - keep**2) + push
     spread = np.zeros(n)
     for k in range(n):
         spread[k] = (keep[k]**2 * spread[k - 1] if k else 0.0) + added[k]
     decay = np.exp(-alpha * np.abs(t[:, None] - t))
-    covariance = decay * spread[np.minimum.outer(np.arange(n), np.arange(n))] + np.diag(error)
+    covariance = decay * spread[np.minimum.outer(np.arange(n), np.arange(n))] + np.diag(
+        error + white * std**2)
     known = np.linalg.cholesky(covariance)
     assert_allclose(found.innovation, np.diag(known) * np.linalg.solve(known, v - u0), atol=1e-4)
     # What an event adds at its own sample is not in the variance there.
-    own = (power - 1.0) / power * (added - push) + push + error
+    own = (power - 1.0) / power * (added - push) + push + error + (white - 1.0) * std**2
     assert_allclose(found.variance, np.diag(known)**2 - own, rtol=1e-3)

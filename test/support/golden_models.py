@@ -179,7 +179,7 @@ def criticism():
     push, error, power = np.zeros(1500), np.zeros(1500), np.ones(1500)
     push[300], error[700], power[900:950] = 0.02, 0.01, 3.0
     fit = fit_gaussian(samples, [term('ou', **OU), term('measurement_noise', std=0.01)],
-                       slice(0, 1200), Events(push, error, power))
+                       slice(0, 1200), Events(push, error, power, np.ones(1500)))
     found['events'] = table([[one.values() for one in fit.terms], fit.z[::150],
                              float(fit.density.sum())])
     return found

@@ -288,6 +288,7 @@ class LawFit:
     # Estimated factor on the variance of the noise in the step before each sample, as the inverse
     # of the mean precision; shape (n,).
     power: FloatArray | None = None
+    white: FloatArray | None = None  # The same for the variance of the white noise; shape (n,)
     # Voltage that the law adds to the level, subtracted before the Gaussian fit, V; shape (n,).
     offset: FloatArray | None = None
 

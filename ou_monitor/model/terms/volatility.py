@@ -17,7 +17,7 @@ from scipy.special import comb, digamma, ndtr
 
 @dataclass(frozen=True)
 class Volatility(Term):
-    """Multiply sigma by the exponential of an OU, constant within a step."""
+    """Multiply sigma and the white noise by the exponential of an OU, constant within a step."""
 
     NAME: ClassVar[str] = 'volatility'
     FAMILY: ClassVar[str] = 'intensity'
@@ -45,6 +45,7 @@ class Volatility(Term):
             log = first_order(phi, e * rng.standard_normal(s.t.size), before)
             before = float(log[-1])
             s.sigma *= np.exp(log)
+            s.noise = s.noise * np.exp(log)
 
         return effect
 
@@ -101,8 +102,9 @@ class Volatility(Term):
         weight = np.exp(log - log.max(axis=1)[:, None])
         # Relative to the median, which thus becomes the sigma of the `ou`.
         power = weight.sum(axis=1) / (weight @ np.exp(2.0 * (x[2] - levels)))
+        power = np.repeat(power, size)[:view.z.size]
         return LawFit(term, {'std': term.std * float(e[0]), 'rate': term.rate * float(e[1])},
-                      scores, gain, 3, power=np.repeat(power, size)[:view.z.size])
+                      scores, gain, 3, power=power, white=power)
 
 
 def _segments(view: View) -> tuple[int, FloatArray, FloatArray]:
