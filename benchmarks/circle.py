@@ -22,7 +22,7 @@ from ou_monitor import compare, discover, read_recording, Recording, simulate
 from ou_monitor.cli.recorded import model_text
 from ou_monitor.comparison.yardstick import Likeness
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.tones import Tone
+from ou_monitor.model.terms.tones import Resonance, Tone
 from ou_monitor.recordings.model_file import read_model
 
 # Five flights and a robot.
@@ -31,8 +31,8 @@ MODELS = {**{name: FLIGHTS[name] for name in ('gecko', 'nazgul', 'bf3s', 'cf_sol
 # Part of each recording that is drawn again, s.
 SECONDS = 60.0
 # The tone that is added: its peak over the rms of the readings' differences, and its share of the
-# sampling rate, where neither load nor OU have much.
-AMPLITUDE, SHARE = 1.0, 0.23
+# sampling rate, where neither load nor OU have much: the one farther from the model's own lines.
+AMPLITUDE, SHARES = 1.0, (0.23, 0.13)
 # Relative error of a frequency that is called the same.
 NEAR = 1e-3
 
@@ -51,6 +51,13 @@ def named(recording: Recording, model: SupplyModel) -> list[str]:
     return [cause.name for cause in discover(recording).causes if cause.name not in own]
 
 
+def apart(model: SupplyModel, rate: float) -> float:
+    """Return a frequency for one more tone, Hz."""
+    own = [term.frequency for term in model.terms if isinstance(term, (Tone, Resonance))]
+    return rate * max(SHARES, key=lambda share: min(
+        (abs(share * rate - line) for line in own), default=0.0))
+
+
 def row(name: str, seeds: int) -> list[str]:
     """Draw a model of a recording, and judge what is drawn."""
     with tempfile.TemporaryDirectory() as folder:
@@ -62,7 +69,7 @@ def row(name: str, seeds: int) -> list[str]:
     rate = 1.0 / float(np.median(np.diff(recording.t)))
     draw = partial(simulate, throttle=recording, rate=rate)
     size = AMPLITUDE * float(np.diff(recording.voltage).std())
-    hum = SHARE * rate
+    hum = apart(model, rate)
     hummed = replace(filed, model=SupplyModel((*model.terms, Tone(size, hum, 0.0, 0.0))))
     for seed in range(seeds):
         drawn = draw(filed, seed=seed).recording

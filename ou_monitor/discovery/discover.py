@@ -25,7 +25,7 @@ from ou_monitor.discovery.gain import (
 from ou_monitor.discovery.named import INTERRUPTED, Named, named_causes
 from ou_monitor.discovery.pruning import prune_by_gain, Pruned, refusal
 from ou_monitor.discovery.regression import load_terms
-from ou_monitor.discovery.search import position, Progress, whole_load
+from ou_monitor.discovery.search import position, Progress, Search, under_load, whole_load
 from ou_monitor.discovery.words import (
     coupling_found, coupling_note, explain, left_out_note, NO_OTHER, no_relaxation_note,
     VAGUE, verdict_sentence)
@@ -167,7 +167,10 @@ def _uncoded(samples: Samples, state: Integrity, start: Composite) -> tuple[Samp
     """Return the samples drawn within coarse codes, and the start of the search."""
     rng, inside = np.random.default_rng(0), samples
     for _ in range(_REDRAWN):
-        model = whole_load(Fitter(inside), start, load_terms(inside)) or start
+        # The load that its evidence chooses: all terms of a load would confirm themselves.
+        search = Search(start)
+        under_load(Fitter(inside), search)
+        model = search.composite
         drawn = within_codes(samples, model, rng)
         if drawn is samples:
             break
