@@ -396,7 +396,7 @@ _FLEET = Command(
     'recording and load level, and a report with outliers and with the drift of each vehicle over '
     'its flights. The same command, started again, resumes a stopped run.',
     (Option('recordings', metavar='RECORDING', nargs='+',
-            help='.mcap files, rosbag2 folders, .csv files, and folders to search for them'),
+            help='bags, CSV files and logs, as for analyze, and folders to search for them'),
      Option('--output', metavar='DIR', required=True,
             help='folder for fleet.parquet, fleet.html and the parts of a run'),
      Option('--workers', metavar='N', help='local processes (default: one a core)',
