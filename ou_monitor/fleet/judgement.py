@@ -564,7 +564,8 @@ def _few(found: Outliers, places: Sequence[int], flights: Sequence[FloatArray]) 
     """
     Compare the mean of each of a few vehicles, 2 flights or more each, with the others'.
 
-    The p-value is that of a difference of at most `_APART`, either way.
+    One that stands out is left out of the comparison of the rest.  The p-value is that of a
+    difference of at most `_APART`, either way.
     """
     from ou_monitor.analysis.level_tests import adjusted
     from scipy import stats
@@ -575,15 +576,26 @@ def _few(found: Outliers, places: Sequence[int], flights: Sequence[FloatArray]) 
         return found
     means = np.array([one.mean() for one in flights])
     variance = squares / freedom / np.array([one.size for one in flights])
-    others = (means.sum() - means) / (len(means) - 1)
-    se = np.sqrt(variance + (variance.sum() - variance) / (len(means) - 1) ** 2)
-    score, least = (means - others) / se, _APART / se
-    p = stats.t.sf(np.abs(score) - least, freedom) + stats.t.sf(np.abs(score) + least, freedom)
-    # Two vehicles have a single difference, which is reported for the higher one.
-    told = np.arange(len(means)) if len(means) > 2 else np.array([int(means.argmax())])
     reach = np.full(found.score.size, NAN) if found.reach is None else found.reach
-    for column, values in ((found.score, score[told]), (found.chance, adjusted(p[told].tolist())),
-                           (found.centre, others[told]),
-                           (reach, float(stats.t.ppf(0.975, freedom)) * se[told])):
-        column[np.array(places)[told]] = values
+    rest = list(range(len(means)))
+    # One that stands out would move the mean with which the others are compared.
+    while len(rest) > 1:
+        m, v = means[rest], variance[rest]
+        others = (m.sum() - m) / (m.size - 1)
+        se = np.sqrt(v + (v.sum() - v) / (m.size - 1) ** 2)
+        score, least = (m - others) / se, _APART / se
+        p = stats.t.sf(np.abs(score) - least, freedom) + stats.t.sf(np.abs(score) + least, freedom)
+        chance = np.asarray(adjusted(p.tolist()))
+        worst = int(p.argmin())
+        odd = m.size > 2 and chance[worst] <= found.rate
+        # Two vehicles have a single difference, which is reported for the higher one.
+        told = [worst] if odd else [int(m.argmax())] if m.size == 2 else list(range(m.size))
+        places_told = np.array(places)[rest][told]
+        for column, values in ((found.score, score), (found.chance, chance),
+                               (found.centre, others),
+                               (reach, float(stats.t.ppf(0.975, freedom)) * se)):
+            column[places_told] = values[told]
+        if not odd:
+            break
+        del rest[worst]
     return replace(found, reach=reach)
