@@ -1,12 +1,15 @@
-"""scripts/demo and scripts/test: what they refuse, in one line, and what they do not do twice."""
+"""scripts/: what demo and test refuse, in one line, and do not do twice; the man page."""
 
+import importlib.util
 import os
 from pathlib import Path
+import re
 import shutil
 import subprocess
 import sys
 import time
 
+from ou_monitor.cli.commands import COMMANDS
 from project import ROOT
 import pytest
 
@@ -244,3 +247,19 @@ def test_demo_shows_estimates_and_leaves_a_report(tmp_path, source):
     # Open-circuit voltage of the 4S pack of the recorded flight, or of its model.
     assert ('grows old' in done.stdout) == bool(source)
     assert 15.0 < float(rows[-1][2]) < 17.5
+
+
+def test_the_man_page_has_the_texts_of_help():
+    """It is as scripts/make_man.py writes it, with every option of every command."""
+    name = 'make_man'
+    spec = importlib.util.spec_from_file_location(name, ROOT / 'scripts' / f'{name}.py')
+    maker = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(maker)
+    written = maker.PAGE.read_text(encoding='utf-8')
+    assert written == maker.page()
+    words = written.replace('\\-', '-')
+    for command in COMMANDS:
+        shown = subprocess.run([sys.executable, '-m', 'ou_monitor.cli.main', command, '--help'],
+                               cwd=ROOT, capture_output=True, text=True, check=True).stdout
+        assert f'.SS {command}\n' in words
+        assert all(option in words for option in re.findall(r'--[a-z-]+', shown))
