@@ -51,13 +51,6 @@ def named(recording: Recording, model: SupplyModel) -> list[str]:
     return [cause.name for cause in discover(recording).causes if cause.name not in own]
 
 
-def apart(model: SupplyModel, rate: float) -> float:
-    """Return a frequency for one more tone, Hz."""
-    own = [term.frequency for term in model.terms if isinstance(term, (Tone, Resonance))]
-    return rate * max(SHARES, key=lambda share: min(
-        (abs(share * rate - line) for line in own), default=0.0))
-
-
 def row(name: str, seeds: int) -> list[str]:
     """Draw a model of a recording, and judge what is drawn."""
     with tempfile.TemporaryDirectory() as folder:
@@ -69,7 +62,9 @@ def row(name: str, seeds: int) -> list[str]:
     rate = 1.0 / float(np.median(np.diff(recording.t)))
     draw = partial(simulate, throttle=recording, rate=rate)
     size = AMPLITUDE * float(np.diff(recording.voltage).std())
-    hum = apart(model, rate)
+    own = [term.frequency for term in model.terms if isinstance(term, (Tone, Resonance))]
+    hum = rate * max(SHARES, key=lambda share: min(
+        (abs(share * rate - line) for line in own), default=0.0))
     hummed = replace(filed, model=SupplyModel((*model.terms, Tone(size, hum, 0.0, 0.0))))
     for seed in range(seeds):
         drawn = draw(filed, seed=seed).recording
@@ -90,9 +85,8 @@ def main() -> None:
     parser = arguments(__doc__, names=True)
     parser.add_argument('--seeds', type=int, default=20)
     args = parser.parse_args()
-    head = ('model of', 'terms', 'looks like it', 'nothing new', 'new', 'tone found')
-    rows = [row(name, args.seeds) for name in args.names or MODELS]
-    deliver(table(head, rows), args.page, 'circle')
+    deliver(table(('model of', 'terms', 'looks like it', 'nothing new', 'new', 'tone found'),
+                  [row(name, args.seeds) for name in args.names or MODELS]), args.page, 'circle')
 
 
 if __name__ == '__main__':
