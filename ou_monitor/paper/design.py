@@ -117,6 +117,10 @@ class Lever:
     risk: float  # Risk with the value tried.
     least: float  # Value of the smallest change that meets the target; NaN: out of reach.
 
+    def words(self, value: float) -> str:
+        """Return a value as shown."""
+        return number(value) if self.unit else f'{value:g}'
+
 
 @dataclass(frozen=True)
 class Design:
@@ -385,8 +389,10 @@ def _network_answer(result: Design) -> str:
 
 
 def _others(result: Design) -> str:
-    found = [f'{lever.name} {number(lever.least, 3)} {lever.unit}'.rstrip()
-             for lever in result.levers[1:] if math.isfinite(lever.least)]
+    # A lever that already meets the target at its present value cannot help.
+    found = [f'{lever.name} {lever.words(lever.least)} {lever.unit}'.rstrip()
+             for lever in result.levers[1:]
+             if math.isfinite(lever.least) and lever.least != lever.present]
     if found:
         return 'What would help: ' + ', or '.join(found) + '.'
     return (f'Neither {_PACKS} packs in parallel, nor {_RESISTANCE:.0%} of the resistance, nor '

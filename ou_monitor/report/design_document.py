@@ -42,8 +42,8 @@ def design_document(result: Design, source: str, taken: str = '', command: str =
         Table(['C, uF', 'ESR, mOhm', 'alpha, 1/s', 'tau, us', 'sigma, V/sqrt(s)', 'Var_inf, V^2',
                'mean time', 'risk OU', 'crossing', ''], cells, left=[9]),
         Table(['what', 'unit', 'present', 'tried', 'risk then', f'for {result.target:g}'],
-              [[lever.name, lever.unit, number(lever.present), number(lever.tried),
-                probability(lever.risk), number(lever.least)
+              [[lever.name, lever.unit, lever.words(lever.present), lever.words(lever.tried),
+                probability(lever.risk), lever.words(lever.least)
                 if math.isfinite(lever.least) else 'out of reach'] for lever in result.levers],
               left=[0, 1]),
         *map(Text, (effect(result), *remarks(result), taken))], command)

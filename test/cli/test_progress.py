@@ -39,9 +39,9 @@ def test_what_is_short_says_nothing_off_a_terminal(capsys, clock):
 def test_a_program_that_reads_the_output_is_not_told(capsys, clock):
     """Beside JSON on standard output nothing is written, however long it takes."""
     with Progress('work', quiet=True) as progress:
-        for second in range(40):
+        for second in range(360):
             clock[0] = 100.0 + second
-            progress(second / 60.0)
+            progress(second / 360.0)
     assert capsys.readouterr() == ('', '')
 
 
@@ -80,7 +80,7 @@ def test_a_standard_error_that_is_closed_stops_nothing(monkeypatch, clock):
     with Progress('work') as progress:
         progress(0.1)
         gone.close()
-        clock[0] += 20.0
+        clock[0] += 90.0
         progress(0.5)
 
 

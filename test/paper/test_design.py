@@ -63,6 +63,13 @@ def test_a_capacitor_that_is_large_enough_is_said_so():
     assert 'No more capacitance is needed' in answer(result)
 
 
+def test_what_already_meets_the_target_is_no_remedy():
+    """A flight whose risk is worse than the network's: only throttle may help."""
+    result = design(PowerNetwork(), 0.1, **QUESTION, flown=(0.05, 0.02, 0.01))
+    assert result.verdict is DesignVerdict.ENOUGH
+    assert answer(result).endswith('What would help: throttle limit 5.00 %.')
+
+
 def test_a_fixed_esr_may_leave_no_capacitance():
     result = design(PowerNetwork(), 0.4, esr_follows=False, **QUESTION)
     assert result.verdict is DesignVerdict.OUT_OF_RANGE and result.least is None
