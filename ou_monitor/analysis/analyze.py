@@ -11,7 +11,7 @@ the state at the end of the recording.  Throttles not flown are NaN.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import math
 from typing import Any
 
@@ -27,10 +27,11 @@ from ou_monitor.analysis.quality import (
     coupling_items, line_item, quality_list, QualityItem, second_items)
 from ou_monitor.analysis.relaxation import (
     find_steps, fit_relaxation, judge_cause, Relaxation, ReleaseCause)
-from ou_monitor.analysis.supply import node_for, remainder, THROTTLES
+from ou_monitor.analysis.supply import fed, node_for, remainder, THROTTLES
 from ou_monitor.criticism.innovations import FAMILY_WISE
 from ou_monitor.model.spectral_lines import FALSE_ALARM
-from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
+from ou_monitor.online.estimator.estimator import SlidingEstimator
+from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, FloatArray, NAN, Recording
 from ou_monitor.text import Z95
@@ -159,7 +160,7 @@ class Sliding:
     # Voltage, V, and horizon, s, of the risk.
     brownout_voltage: float
     brownout_horizon: float
-    monitor: SupplyMonitor  # State at the end of the recording
+    monitor: SupplyMonitor | None  # State at the end of the recording; None without a limit
 
     def series(self, name: str) -> FloatArray:
         """Return one field of the estimates as an array."""
@@ -176,31 +177,37 @@ def slide(recording: Recording, window: float, brownout_voltage: float = NAN,
           brownout_horizon: float = 5.0,
           progress: Callable[[float], None] | None = None) -> Sliding:
     """
-    Run the node's monitor over a recording.
+    Run the node's monitor, or without a limit its estimator, over a recording.
 
     window in s, brownout_voltage in V, brownout_horizon in s, progress 0..1.
     """
     if not (math.isfinite(brownout_horizon) and brownout_horizon > 0.0):
         raise ValueError(f'the horizon must be a positive number of seconds, got '
                          f'{brownout_horizon}')
-    asked = math.isfinite(brownout_voltage)
-    settings = MonitorSettings(window=window, brownout_horizon=brownout_horizon)
-    if asked:
-        settings = replace(settings, brownout_voltage=brownout_voltage)
-    reports: list[MonitorReport] = []
-    duration = recording.duration
-    monitor, parts = node_for(recording, settings)
+    t, duration = recording.t, recording.duration
+    monitor, estimator = None, SlidingEstimator(window)
+    if math.isfinite(brownout_voltage):
+        monitor, parts = node_for(recording, MonitorSettings(
+            window=window, brownout_horizon=brownout_horizon, brownout_voltage=brownout_voltage))
+    else:
+        # Without a limit there is no risk, and the node's forecasts are not needed.
+        parts = fed(recording, window, lambda part: estimator.push(
+            t[part], recording.voltage[part], recording.throttle[part]))
+    found: list[tuple[Estimate, float]] = []
     for now, shown in parts:
-        # The monitor also learns from reports in between.
-        last = monitor.report(0.0)
+        if monitor is None:
+            seen = estimator.estimate(), NAN
+        else:
+            # The monitor also learns from reports in between.
+            last = monitor.report(0.0)
+            seen = last.estimate, last.risk
         # Estimates before the first window is full are too poor to show.
         if shown and now >= min(window, 0.5 * duration):
-            reports.append(last)
+            found.append(seen)
             if progress is not None:
                 progress(now / duration)
-    return Sliding(window, np.array([report.estimate.t for report in reports]),
-                   tuple(report.estimate for report in reports),
-                   np.array([report.risk if asked else NAN for report in reports]),
+    return Sliding(window, np.array([estimate.t for estimate, _ in found]),
+                   tuple(estimate for estimate, _ in found), np.array([risk for _, risk in found]),
                    brownout_voltage, brownout_horizon, monitor)
 
 

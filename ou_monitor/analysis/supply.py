@@ -14,7 +14,7 @@ for 130 s at 200 Hz, and 4 s with a limit, for the budget.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 import math
 from typing import Any
@@ -226,31 +226,33 @@ def _tuple(values: FloatArray) -> tuple[float, ...]:
 
 def node_for(recording: Recording, settings: MonitorSettings,
              ) -> tuple[SupplyMonitor, Iterator[tuple[float, bool]]]:
+    """Return a monitor, and the iterator `fed` that feeds it with a recording."""
+    monitor = SupplyMonitor(settings, look=max(LOOK, recording.duration / _LOOKS))
+    throttle, drawn = recording.throttle if recording.has_throttle else None, recording.current
+    return monitor, fed(
+        recording, SLIDING if isinstance(settings.window, str) else settings.window,
+        lambda part: monitor.push(recording.t[part], recording.voltage[part],
+                                  None if throttle is None else throttle[part],
+                                  current=None if drawn is None else drawn[part]))
+
+
+def fed(recording: Recording, window: float, push: Callable[[slice], None],
+        ) -> Iterator[tuple[float, bool]]:
     """
-    Return a monitor, and an iterator that feeds it with a recording part by part.
+    Push a recording part by part.
 
     After each part it yields the time, s, and whether this is one of `_POINTS`.
     """
-    t, drawn, duration = recording.t, recording.current, recording.duration
-    throttle = recording.throttle if recording.has_throttle else None
-    monitor = SupplyMonitor(settings, look=max(LOOK, duration / _LOOKS))
-    window = SLIDING if isinstance(settings.window, str) else settings.window
+    t, duration, done = recording.t, recording.duration, 0
     step = max(0.25 * window, duration / _POINTS)
     each = max(1, min(math.ceil(step / _STEP), _MOST // _POINTS))
     ends = np.searchsorted(t, t[:1] + step / each * np.arange(
         1, int(duration / step) * each + 1), 'right').tolist()
-
-    def feed() -> Iterator[tuple[float, bool]]:
-        done = 0
-        for k, stop in enumerate([*ends, t.size], 1):
-            if stop > done:
-                part, done = slice(done, stop), stop
-                monitor.push(t[part], recording.voltage[part],
-                             None if throttle is None else throttle[part],
-                             current=None if drawn is None else drawn[part])
-                yield float(t[stop - 1] - t[0]), k <= len(ends) and not k % each
-
-    return monitor, feed()
+    for k, stop in enumerate([*ends, t.size], 1):
+        if stop > done:
+            push(slice(done, stop))
+            done = stop
+            yield float(t[stop - 1] - t[0]), k <= len(ends) and not k % each
 
 
 def _at_the_end(recording: Recording, limit: float | None, monitor: SupplyMonitor | None,
