@@ -23,7 +23,7 @@ from ou_monitor.model.terms.load_dependent import LoadDependentSigma
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise, Quantization
 from ou_monitor.model.terms.slow import Drift
-from ou_monitor.recordings.importers.csv_table import (
+from ou_monitor.recordings.importers.csv_form import (
     form_of, numbers, THROTTLE, TIME, VOLTAGE)
 from ou_monitor.recordings.importers.log import CsvColumns
 from ou_monitor.recordings.model_file import ModelFile, read_model
