@@ -1,8 +1,8 @@
 """
 Compare a recording with simulations over its own throttle.
 
-Limits: the input of the fitted model is throttle or current only; the bands include errors of its
-parameters, estimated from held-out parts, but no later change of the craft.
+Limits: the only input of the fitted model is throttle or current; the bands include errors of its
+parameters, estimated from held-out parts, but not later changes of the craft.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from ou_monitor.model.supply import SupplyModel
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.text import counted, number
 
-# Minimum readings of a part, and its minimum duration, s; minimum simulations for a verdict at 5
-# %, and maximum.
+# Minimum readings of a part, and its minimum duration, s; minimum simulations (for a verdict at
+# 5 %), and maximum.
 _LEAST, _SHORTEST, _FEWEST_SEEDS, _MOST_SEEDS = 50, 0.2, 20, 10_000
 # Maximum points of the band on a page.
 _POINTS = 2000
-# Time at the begin by which a model from a file is aligned with the recording, s.
+# Time at the beginning over which a model from a file is aligned with the recording, s.
 _ALIGNED = 2.0
 
 
@@ -135,9 +135,9 @@ def _fit_notes(model: FlightModel, samples: Readings) -> list[str]:
     if model.load is not None:
         found = []
         if model.load.model.full_current:
-            found.append('Current explains the voltage better than throttle: it is the load that '
-                         'is simulated.' if samples.throttle is not None else
-                         'Current is the load that is simulated.')
+            found.append('The simulated load is current, which explains the voltage better than '
+                         'throttle.' if samples.throttle is not None else
+                         'The simulated load is current.')
         if math.isfinite(model.load.model.stands):
             found.append('No discharge is visible, so the level is constant.')
         return found
@@ -158,7 +158,7 @@ def _check_throttle(model: SupplyModel, samples: Readings) -> None:
 
 
 def _first(own: Readings) -> slice:
-    """Return the samples used for alignment: the first seconds, and at least ten."""
+    """Return the samples used for alignment: the first seconds, at least ten samples."""
     return slice(0, max(10, int(np.searchsorted(own.t, own.t[0] + _ALIGNED, side='right'))))
 
 
@@ -176,13 +176,13 @@ def _agreement(recording: Recording, samples: Readings, own: Readings, yardstick
     p, verdict, words, farthest = judge(found, explained, own.throttle is not None and bool(
         np.ptp(own.throttle) >= MOVES))
     pooled = np.mean([m.distribution for m in measured], axis=0)
-    answers = np.array([m.answer for m in measured])
+    responses = np.array([m.response for m in measured])
     dips = [one.band for one in found if one.kind == 'answer']
     stride = -(-own.t.size // traces.shape[1])
     low, high = np.percentile(traces, [2.5, 97.5], axis=0)
     empty = np.empty(0)
-    answer_low, answer_high = (np.percentile(answers, [2.5, 97.5], axis=0) if answers.size
-                               else (empty, empty))
+    response_low, response_high = (empty, empty) if not responses.size else np.percentile(
+        responses, [2.5, 97.5], axis=0)
     return Agreement(
         recording.name, fitted, simulated, tuple(drawn.names),
         explained, math.sqrt(float(np.mean(error ** 2))), float(error.mean()),
@@ -197,6 +197,6 @@ def _agreement(recording: Recording, samples: Readings, own: Readings, yardstick
         distance(real, pooled), seeds, p, verdict, words, farthest, tuple(notes),
         Traces(own.t + offset, own.voltage,
                np.full(own.t.size, np.nan) if own.throttle is None else own.throttle, first,
-               own.t[::stride] + offset, low, high, yardstick.after if answers.size else empty,
-               real.answer, answer_low, answer_high, yardstick.edges,
+               own.t[::stride] + offset, low, high, yardstick.after if responses.size else empty,
+               real.response, response_low, response_high, yardstick.edges,
                real.distribution, pooled))

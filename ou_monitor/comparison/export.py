@@ -1,9 +1,9 @@
 """
 Export a model to another simulator, and report what that simulator cannot express.
 
-According to their sources (`SOURCES`), PX4 has a linear discharge from full to empty, Gazebo also
-the sag of a constant load, and ArduPilot a charge curve less current times resistance.  None has
-noise, lags, an inrush or an ADC.
+According to their sources (`SOURCES`), PX4 simulates a linear discharge from full to empty, Gazebo
+also the sag of a constant load, and ArduPilot a charge curve minus current times resistance.  None
+has noise, lags, inrush or an ADC.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ou_monitor.comparison.compare import compare
 from ou_monitor.errors import InputError
 from ou_monitor.model.load import cells_in_series, charge_at
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_answer import LoadSag
+from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.slow import Drift
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.simulation import RunningSupply
@@ -36,7 +36,7 @@ SOURCES = {
 _KEPT = {'px4': ('drift',), 'gazebo': ('drift', 'load_sag'), 'ardupilot': ('drift', 'load_sag')}
 # Voltages of a cell that counts as empty, and as critical, V.
 _EMPTY, _CRITICAL = 3.5, 3.3
-# Exponent of the current over throttle, for which the discharge of the model holds.
+# Exponent of the current over throttle, for which the discharge of the model is valid.
 _POWER = 1.8
 _SEEDS = 20
 
@@ -46,8 +46,8 @@ class Export:
     """A model for another simulator."""
 
     text: str  # What that simulator reads
-    notes: tuple[str, ...]  # A line for each term that it cannot express, with its effect
-    model: SupplyModel  # The part that it simulates, as a model
+    notes: tuple[str, ...]  # A line for each term that it cannot express, with the term's effect
+    model: SupplyModel  # The part that it can simulate, as a model
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,8 @@ class _Numbers:
     full: float  # Initial level, V
     empty: float  # Level that counts as empty, V
     drain: float  # Time between these levels under the usual load, s; inf: it does not fall
-    charge: float  # Charge drawn meanwhile, 0..1 of the pack
-    share: float  # Usual load, as a share of that at full throttle
+    charge: float  # Charge drawn between these levels, 0..1 of the pack
+    share: float  # Usual load, as a share of the load at full throttle
     sag: float  # Sag at full throttle, V
     usual_sag: float  # Sag under the usual load, V
 
@@ -69,8 +69,8 @@ def export(model: SupplyModel, target: str, *, throttle: FloatArray, rate: float
     """
     Return a model for another simulator (throttle at rate, Hz; full_current in A).
 
-    Throttle gives the usual load, and the effect of each term is measured over it; with the
-    recording, it is measured how much of it the exported model explains.
+    The throttle determines the usual load, and the effect of each term is measured over it.  With
+    the recording, the notes say how much of it the model and the exported part explain.
     """
     if target == 'json':
         data = {'model': [{'term': t.NAME, 'params': t.values()} for t in model.terms],
@@ -90,9 +90,9 @@ def export(model: SupplyModel, target: str, *, throttle: FloatArray, rate: float
         t.at(0.0) for t in model.terms if target == 'ardupilot' and isinstance(t, LoadSag))))
     notes = _lost(model, target, throttle, rate)
     if target == 'gazebo' and n.usual_sag:
-        notes.append(f'load_sag is that of a constant load, {n.usual_sag:.3g} V: throttle does '
-                     'not move it')
-    notes += [f'load_sag is that at the start: in the model, it grows by {t.growth:.3g} V/s at '
+        notes.append(f'load_sag is for a constant load, {n.usual_sag:.3g} V: throttle does not '
+                     'change it')
+    notes += [f'load_sag is as at the start: in the model, it grows by {t.growth:.3g} V/s at '
               'full throttle' for t in model.terms
               if target != 'px4' and isinstance(t, LoadSag) and t.growth]
     if recording is not None:
@@ -127,7 +127,7 @@ def _px4(n: _Numbers, full_current: float) -> str:
         f'# {SOURCES["px4"]}', f'param set BAT1_N_CELLS {n.cells}',
         f'param set BAT1_V_CHARGED {n.full / n.cells:.3f}',
         f'param set BAT1_V_EMPTY {n.empty / n.cells:.3f}',
-        # 0 would switch it off.
+        # 0 would disable the discharge.
         f'param set SIM_BAT_DRAIN {n.drain if math.isfinite(n.drain) else 1e6:.0f}',
         'param set SIM_BAT_MIN_PCT 0'))
 
@@ -185,7 +185,7 @@ def _lost(model: SupplyModel, target: str, throttle: FloatArray, rate: float) ->
             continue
         rest = (replace(model.ou, sigma=0.0), *model.terms[1:]) if k == 0 else (
             *model.terms[:k], *model.terms[k + 1:])
-        # The draws of a term do not depend on the others, so the difference is its effect.
+        # A term's draws do not depend on other terms, so the difference is its effect.
         moved = whole - _drawn(SupplyModel(rest, model.load), throttle, rate)
         notes.append(f'{term.NAME} is left out: {1e3 * float(np.std(moved)):.3g} mV rms, up to '
                      f'{1e3 * float(np.abs(moved).max()):.3g} mV')

@@ -1,12 +1,12 @@
 """
 A model of one flight, fitted to a part of it, that can be simulated over any throttle.
 
-First the load is fitted, if it improves predictions, then the residual: an OU in white noise,
-whose size follows the load and its changes (`model.ou_fit`).
+First the load is fitted, if it improves predictions, then the residual: an OU in white noise; the
+size of both follows the load and its changes (`model.ou_fit`).
 
 Limits: errors come from four held-out parts, so a lasting change after the fitted part is not
-covered; all correlated noise is one OU, whose size follows the load like the white noise; readings
-are taken as evenly spaced.
+covered; all correlated noise is described by one OU, whose size follows the load as the white
+noise's does; readings are taken as evenly spaced.
 """
 
 from __future__ import annotations
@@ -81,8 +81,8 @@ class Damping:
     The share of fast changes of a path that the voltage does not follow.
 
     Throttle jitters, is not synchronous with the voltage, and is not a current.  So the voltage
-    follows fast changes only in part, and without damping they would count twice, as path and as
-    noise.
+    follows its fast changes only in part; without damping they would count twice, in the path and
+    in the noise.
     """
 
     share: float = 0.0  # Share of the fast part that is missing, 0..1
@@ -95,8 +95,8 @@ class Damping:
         return np.asarray(path - self.share * (path - lowpass(path, t, self.time)))
 
 
-# Errors are drawn from errors of similar size: this share of all on either side, and a minimum
-# number; tolerance for sizes that are equal.
+# Errors are drawn from readings with noise of similar size: this share of all readings on either
+# side, and at least this number; tolerance for sizes that count as equal.
 _ALIKE, _FEWEST, _ROUNDING = 0.02, 50, 1e-9
 # Minimum share of white noise in the variance, which the filter needs.
 _LEAST_WHITE = 1e-3
@@ -117,7 +117,8 @@ class FlightNoise:
     def draw(self, n: int, load: FloatArray | None, rng: np.random.Generator) -> FloatArray:
         """Return n samples of noise, V, under that throttle or current."""
         wanted = np.log(self.sizes.of(load_signs(n, self.spacing, load)))
-        # Any error of the same size (within rounding) and its neighbours; near the ends, as many.
+        # Draw from readings of the same size (within rounding) and their neighbours, near the ends
+        # from equally many.
         first = np.searchsorted(self.logs, wanted - _ROUNDING, side='left')
         last = np.searchsorted(self.logs, wanted + _ROUNDING, side='right')
         at = first + (rng.random(wanted.size) * (last - first)).astype(np.int64)
@@ -138,7 +139,7 @@ def fit_noise(samples: Readings, left: FloatArray, load: FloatArray | None, slow
     """
     Fit the noise to residuals, V, under a throttle or current.
 
-    slow: variance, V^2, of the process of `SLOW_TIME` that they also contain.
+    slow: variance, V^2, of the process with `SLOW_TIME` that the residuals also contain.
     """
     dt, lsb = samples.spacing, samples.lsb
     left = left - left.mean()
@@ -194,7 +195,7 @@ class FlightModel:
     # Level, V, without a load model, and its standard error.
     level: float
     level_se: float
-    damping: Damping  # Damping of its path
+    damping: Damping  # Damping of the load's path
     spread: float  # Factor on the variance of the slow process, from held-out parts
     sag_error: float  # Relative error of the sag, from held-out parts
     noise: FlightNoise  # The residual
@@ -234,7 +235,7 @@ class FlightModel:
             size = load.size * math.exp(self.sag_error * float(rng.standard_normal()))
             other = replace(load, size=size).path(
                 samples.t, samples.throttle, samples.current)
-            # The mean over the fitted part is known, so a larger sag goes with a higher level.
+            # The mean over the fitted part is known, so with a larger sag the level is higher.
             path = other - float((other - path)[samples.t <= self.until].mean())
             voltage = self.damping.of(path, samples.t)
             slow = self.spread * self.load.slow_std ** 2
@@ -252,7 +253,7 @@ def _simulated_load(fit: LoadFit | None, samples: Readings) -> FloatArray | None
 
 @dataclass(frozen=True, eq=False)
 class FiledModel:
-    """A model from a file; it is simulated at the readings only, without held samples."""
+    """A model from a file, simulated at the readings only, without repeats."""
 
     model: SupplyModel  # As in the file
 
@@ -276,9 +277,9 @@ class FiledModel:
 
 # Number of parts that are held out in turn.
 _PARTS = 4
-# Minimum range of a throttle that is used.
+# Minimum range of throttle; if it moves less, it is not used.
 MOVES = 0.01
-# Minimum log evidence, nats, for the more complex of two loads: odds of e to 1.
+# Minimum advantage in log evidence of the more complex of two loads, nats: odds of e to 1.
 _CLEAR = 1.0
 # Maximum readings in a fit of the load; more are averaged.
 _MOST = 40_000
@@ -318,7 +319,7 @@ def fit_flight(samples: Readings, progress: Callable[[float], None] | None = Non
 
 @dataclass(frozen=True, eq=False)
 class _Load:
-    """A load, its fit, and for each part the fit without it and its errors there, V."""
+    """A load, its fit, and for each part the fit to the rest, and its errors in the part, V."""
 
     fit: LoadFit
     current: FloatArray | None
@@ -357,7 +358,7 @@ def _parts(samples: Readings) -> list[slice]:
 
 def _fit(samples: Readings, current: FloatArray | None, stands: bool,
          without: slice | None = None, near: LoadFit | None = None) -> LoadFit:
-    """Fit the load, to means of neighbours if there are very many samples."""
+    """Fit the load; with very many samples, to means of neighbours."""
     width = -(-samples.t.size // _MOST)
     n = samples.t.size // width * width
 

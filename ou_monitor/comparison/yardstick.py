@@ -1,13 +1,13 @@
 """
 Compare a recording with simulations of it: measures, records, verdict.
 
-Levels lie halfway between two codes of the ADC, so that no reading is on them.  Falls through a
-level are dips as in `supply_facts`, with hysteresis.
+Levels lie halfway between two codes of the ADC, so that no reading equals a level.  Falls through
+a level are counted as dips are in `supply_facts`, with hysteresis.
 
 The score of a number is its distance from the median of the simulations, in half-widths of their
 95 % band; the half-width is at least a difference that a pilot would not notice.  The largest
-weighted score is compared with the scores of the simulations, so of recordings that follow the
-model, one in twenty is reported to differ.
+weighted score is ranked among those of the simulations, so one in twenty recordings that follow
+the model is reported to differ.
 """
 
 from __future__ import annotations
@@ -80,9 +80,9 @@ class Traces:
     high: FloatArray
     # Time after a rise of throttle, s, and the mean response to it, V.
     after: FloatArray
-    answer: FloatArray
-    answer_low: FloatArray
-    answer_high: FloatArray
+    response: FloatArray
+    response_low: FloatArray
+    response_high: FloatArray
     # Voltages, V, and the share of the samples below each.
     edges: FloatArray
     distribution: FloatArray
@@ -91,7 +91,7 @@ class Traces:
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """A recording beside its simulations."""
+    """A recording, compared with its simulations."""
 
     recording: str  # Name
     # Time ranges, s after the first sample; (0, 0) if nothing was fitted.
@@ -130,11 +130,11 @@ class Agreement:
 
     def measures(self) -> list[dict[str, Any]]:
         """Return all numbers of the recording and of the simulations."""
-        answer = [('dip after rises, V', self.dip), ('1 s after rises, V', self.recovery)]
+        response = [('dip after rises, V', self.dip), ('1 s after rises, V', self.recovery)]
         bands = [('lowest voltage, V', self.lowest), ('mean voltage, V', self.mean),
                  *((f'falls through {level:.4g} V, 1/min', falls)
                    for level, falls in zip(self.levels, self.falls)),
-                 *((name, one) for name, one in answer if one is not None),
+                 *((name, one) for name, one in response if one is not None),
                  *((f'power {one.low_hz:.3g} to {one.high_hz:.3g} Hz, V^2', one.power)
                    for one in self.spectrum)]
         return [{'measure': name, **one.as_data(), 'inside': one.inside} for name, one in bands]
@@ -164,10 +164,9 @@ def _ratio(power: Band) -> float:
 LOW_SHARES = (0.01, 0.05)
 # Bands of the spectrum, and maximum length of a Welch segment, s.
 _BANDS, _SEGMENT = 5, 20.0
-# A rise of throttle: minimum rise, the time in which it happens, s, and the time without another
-# one before, s.
+# A rise of throttle: minimum rise, maximum duration, s, and minimum time without a rise before, s.
 _RISE, _WITHIN, _QUIET = 0.1, 0.2, 1.0
-# Response: time before and after the begin of a rise, s, points, and minimum number of rises.
+# Response: time before and after a rise begins, s, points, and minimum number of rises.
 _BEFORE, _AFTER, _POINTS, _FEWEST = 0.2, 1.5, 86, 3
 # Bins of the distribution.
 _BINS = 2000
@@ -182,13 +181,13 @@ class Measures:
     lowest: float  # V
     falls: FloatArray  # Dips below each level per minute; shape (levels,)
     power: FloatArray  # Power in each band, V^2; shape (bands,)
-    answer: FloatArray  # Mean response to rises, V; empty with too few; shape (points,)
+    response: FloatArray  # Mean response to rises, V; empty with too few; shape (points,)
     distribution: FloatArray  # Share of the samples below each edge; shape (bins,)
 
 
 class Yardstick:
     """
-    Levels, bands and rises at which voltages are measured, from the recorded part.
+    Levels, frequency bands and rises, chosen from the recording, by which voltages are compared.
 
     lsb: step of the ADC, V, or 0; limits: levels, V, in addition to the two low ones.
     """
@@ -219,15 +218,15 @@ class Yardstick:
         power = np.array([density[at == k].sum() for k in range(_BANDS)]) * (f[1] - f[0])
         return Measures(
             float(v.mean()), np.array([part.mean() for part in np.array_split(v, 3)]),
-            float(v.min()), np.array(falls), power, self._answer(v),
+            float(v.min()), np.array(falls), power, self._response(v),
             np.searchsorted(np.sort(v), self._edges, side='right') / v.size)
 
-    def _answer(self, v: FloatArray) -> FloatArray:
+    def _response(self, v: FloatArray) -> FloatArray:
         if self.rises.size < _FEWEST:
             return np.empty(0)
         around = np.interp(self.rises[:, None] + self.after, self._t, v)
-        answers = around - around[:, self.after < 0.0].mean(axis=1, keepdims=True)
-        return np.asarray(answers.mean(axis=0), dtype=np.float64)
+        responses = around - around[:, self.after < 0.0].mean(axis=1, keepdims=True)
+        return np.asarray(responses.mean(axis=0), dtype=np.float64)
 
     @property
     def edges(self) -> FloatArray:
@@ -236,7 +235,7 @@ class Yardstick:
 
 
 def between_codes(level: float, lsb: float) -> float:
-    """Return the middle between two codes just above a level, V."""
+    """Return the first midpoint between two codes above a level, V."""
     return (np.floor(level / lsb + 1e-6) + 0.5) * lsb if lsb > 0.0 else level
 
 
@@ -252,7 +251,7 @@ def _rises(t: FloatArray, throttle: FloatArray | None) -> npt.NDArray[np.float64
         since = t[k]
         room = t[0] + _BEFORE < since - _WITHIN and since + _AFTER < t[-1]
         if room and (not found or since - found[-1] > _QUIET):
-            # The rise is detected at its end; its begin is the steepest point.
+            # The rise is detected at its end; its beginning is the steepest point.
             window = throttle[before[k]:k + 1]
             steepest = int(np.argmax(np.diff(window))) if window.size > 1 else 0
             found.append(float(t[before[k] + steepest]))
@@ -261,14 +260,14 @@ def _rises(t: FloatArray, throttle: FloatArray | None) -> npt.NDArray[np.float64
 
 # Probability of a false `DIFFERS`.
 LEVEL = 0.05
-# Importance for a pilot, relative to the lowest voltage and the dips.
+# Importance for a pilot, relative to the lowest voltage and the number of dips.
 _WEIGHTS = {'lowest': 1.0, 'falls': 1.0, 'level': 0.8, 'answer': 0.8, 'spectrum': 0.5, 'ks': 0.5}
 # Differences that a pilot would not notice: a share of the range of the voltage, factors of a rate
 # and of a power, and a KS distance.
 _RANGE, _RATE, _POWER, _KS = 0.03, 1.25, 1.5, 0.05
 # Ends of a 95 % band, %.
 _LOW, _HIGH = 2.5, 97.5
-# Time of the recovery after the begin of a rise, s.
+# Time after a rise begins at which the recovery is measured, s.
 RECOVERED = 1.0
 
 
@@ -301,8 +300,8 @@ def band(measured: float, simulated: FloatArray) -> Band:
     return Band(measured, low, median, high)
 
 
-def answer_times(yardstick: Yardstick) -> tuple[int, int]:
-    """Return the indices of the response at the begin of a rise and at `RECOVERED` after it."""
+def response_times(yardstick: Yardstick) -> tuple[int, int]:
+    """Return the indices of the response at the beginning of a rise, and `RECOVERED` later."""
     at = np.searchsorted(yardstick.after, [0.0, RECOVERED])
     return int(at[0]), int(at[1])
 
@@ -331,15 +330,15 @@ def differences(yardstick: Yardstick, own: Measures, others: Sequence[Measures],
             max((_RATE - 1.0) * float(rate), chance), lambda b, level=level: (  # type: ignore
                 f'the voltage falls through {number(level, 4)} V {number(b.median, 2)} times a '
                 f'minute ({_span(b, 2)}), measured {number(b.measured, 2)}')))
-    if own.answer.size:
-        begin, later = answer_times(yardstick)
+    if own.response.size:
+        begin, later = response_times(yardstick)
         found += [
-            Difference('answer', float(own.answer[begin:].min()),
-                       of(lambda m: float(m.answer[begin:].min())), volts, lambda b: (
+            Difference('answer', float(own.response[begin:].min()),
+                       of(lambda m: float(m.response[begin:].min())), volts, lambda b: (
                 f'after rises of throttle the voltage dips by {_fall(b.median)} '
                 f'({_fall(b.high)} to {_fall(b.low)}), measured {_fall(b.measured)}')),
-            Difference('answer', float(own.answer[later]),
-                       of(lambda m: float(m.answer[later])), volts, lambda b: (
+            Difference('answer', float(own.response[later]),
+                       of(lambda m: float(m.response[later])), volts, lambda b: (
                 f'a second after rises of throttle the voltage is down by {_fall(b.median)} '
                 f'({_fall(b.high)} to {_fall(b.low)}), measured {_fall(b.measured)}'))]
     for k in range(own.power.size):

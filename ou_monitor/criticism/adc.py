@@ -2,8 +2,8 @@
 Effects of the ADC and its input on the readings: steps, clipping, compression, repeats.
 
 Ties have probability zero in a diffusion, so steps and clipping need no model.  A protection diode
-before the ADC compresses readings beyond a knee to a logarithm; knee and scale are found by the
-maximum likelihood of an AR(1) of the expanded readings, Jacobian included.
+before the ADC compresses readings beyond a knee logarithmically; knee and scale maximise the
+likelihood of an AR(1) for the expanded readings, Jacobian included.
 
 Omitting clipped samples would truncate the distribution and bias every statistic of the rest.  So
 they are drawn from an AR(1), given their neighbours and the limit (Gibbs sampling; Tanner & Wong,
@@ -26,21 +26,21 @@ _MOST = 200_000
 _FLOAT32 = 2.5e-7
 # Minimum share of the samples on the lattice, and their maximum distance from it, steps.
 _SHARE, _NEAR = 0.99, 0.1
-# Minimum step of the ADC in printed steps: below two, every value is near some code.  Minimum gaps
-# between codes that show it; numbers of decimals tried.
+# Minimum step of the ADC in steps of the last printed digit (below two, every value is near some
+# code); minimum number of gaps between codes; numbers of decimals tried.
 _SPARSE, _FEWEST_CODES = 2.0, 4
 _DECIMALS = range(7)
-# Minimum number of equal changes: without codes no two are equal.
+# Minimum number of equal changes, because without codes no two are equal.
 _AGAIN = 20
 # Clipping: minimum samples at the limit, visits to it, and excess over neighbouring codes in
 # standard errors.
 _LEAST, _VISITS, _CLEAR = 8, 3, 5.0
-# Maximum codes by which later noise moves clipped readings.
+# Maximum number of codes by which noise added after clipping raises a reading.
 _LIFTED = 2
-# Maximum step, in standard deviations of the noise, at which counts of neighbouring codes follow a
+# Step, in standard deviations of the noise, up to which counts of neighbouring codes follow a
 # density.
 _COARSE = 2.0
-# Number of parts by throttle, each with its own noise; maximum throttle of idle above the lowest.
+# Number of throttle ranges, each with its own noise; throttle above the lowest that is still idle.
 _LOADS, _STILL = 8, 0.01
 # Sweeps of Gibbs sampling; excursions last a few relaxation times.
 _SWEEPS = 60
@@ -50,14 +50,14 @@ _SHARES = (0.01, 0.02, 0.03, 0.045, 0.06, 0.08, 0.1)
 _SCALES = (0.05, 0.1, 0.15, 0.2, 0.3)
 # Minimum log likelihood ratio, nats.
 _FOUND = 50.0
-# Minimum falls from just below the knee, their minimum rms relative to all falls, and parts of the
-# recording, half of which must have samples beyond the knee.
+# Minimum number of falls that begin just below the knee; their minimum rms, relative to all falls;
+# number of parts of the recording, half of which must have samples beyond the knee.
 _FEWEST, _AS_NOISY, _PARTS = 30, 0.6, 10
 # Order of the AR that also predicts lines: two for each line, and as many for the noise.
 _LINES = 16
 # Maximum excess over the knee, in scales, that is expanded exponentially.
 _FAR = 8.0
-# Lower limit of a sum of squares; its inverse is finite.
+# Lower limit of a sum of squares, so that its inverse is finite.
 _TINY = 1e-280
 
 
@@ -85,7 +85,7 @@ def find_step(voltage: FloatArray) -> float:
 
 def usual_change(voltage: FloatArray) -> float:
     """Return the most frequent change, V; 0 if no change is frequent."""
-    # If an offset was added at times, the codes lie on no lattice, but most changes do.
+    # If an offset was added at times, the codes are not on a lattice, but most changes are.
     rounding = 2.0 * _FLOAT32 * float(np.abs(voltage).max())
     size = np.sort(np.abs(np.diff(voltage[:_MOST])))
     size = size[size > rounding]
@@ -98,7 +98,7 @@ def _unprinted(codes: FloatArray, gaps: FloatArray, weight: FloatArray) -> float
     """Return the step of an ADC whose codes were printed with few decimals, V; 0 for none."""
     printed = next((10.0 ** -k for k in _DECIMALS if float(np.abs(
         codes * 10.0 ** k - np.rint(codes * 10.0 ** k)).max()) < 1e-3), 0.0)
-    # In the middle of the distribution every code occurs.
+    # In the middle of the distribution, every code occurs.
     middle = np.cumsum(weight) / weight.sum()
     dense = (middle[:-1] > 0.1) & (middle[1:] < 0.9)
     if not printed or int(dense.sum()) < _FEWEST_CODES:
@@ -175,7 +175,7 @@ def _limit(x: FloatArray, step: float, noisy: npt.NDArray[np.bool_]) -> float:
         others = below[~inside]
         if not others.size or float(others.min()) > (codes - 1) * step + max(
                 3.5 * step, 0.2 * float(others.std())):
-            # Far from all others: a separate code, not clipping.
+            # A code far from all others is not clipping.
             continue
         if step > 0.0:
             # In a falling tail no code is more frequent than the codes below.
@@ -183,10 +183,10 @@ def _limit(x: FloatArray, step: float, noisy: npt.NDArray[np.bool_]) -> float:
                                 < 0.5 * step).sum()) for k in (1, 2, 3)]
             expected = codes * max(next_ones)
             if codes > 1 and next_ones[0] > max(next_ones[1:]) + _CLEAR * math.sqrt(next_ones[0]):
-                # The flank of a peak: a rail at rest.
+                # The flank of a peak: the rail is at rest.
                 continue
         else:
-            # Expect the density of the nearest samples below.
+            # Expect the same density as for the nearest samples below.
             reach = float(np.partition(others, min(_LEAST, others.size - 1))[:_LEAST].max())
             expected = _LEAST * 2.0 * tie / max(reach, tie)
         if count - expected > _CLEAR * math.sqrt(count + codes * expected):
@@ -250,26 +250,26 @@ def find_knee(voltage: FloatArray, noise: float, side: float,
                 best, found, undone, squeezed = value, knee, whole, float(part.sum())
     if found is None or not _is_limit(x, found):
         return None
-    # If mostly idle is beyond the knee, the rail may be just quiet at idle.
+    # If the samples beyond the knee are mostly at idle, the rail may just be quiet there.
     idle = None if throttle is None else _idle(throttle)
     if idle is not None and not idle.all() and min(
             float(idle[x > found].mean()), float((x > found)[idle].mean())) > 0.5:
         return None
-    # A line is slow at its turning points, which an AR of higher order predicts.
+    # A spectral line is also slow at its turning points, but an AR of higher order predicts it.
     gain = squeezed + _likelihood(undone, _LINES) - _likelihood(x, _LINES)
     return side * found if gain > _FOUND else None
 
 
 def _is_limit(x: FloatArray, knee: float) -> bool:
     """
-    Return whether noise is compressed above a knee only, and repeatedly.
+    Return whether noise is compressed above the knee only, and repeatedly.
 
-    A rail that is quiet without load is also near its top, but it is quiet just below the knee
-    too, and for one long time.
+    A rail that is quiet without load also stays near its top, but it is quiet just below the knee
+    too, and only during one long time.
     """
     step = np.diff(x)
     near = (x[:-1] < knee) & (x[:-1] > knee - 3.0 * float(np.std(step)))
-    # Falls from just below the knee are not compressed.
+    # With a limit, falls from just below the knee are not compressed.
     below, all_ = step[near & (step < 0.0)], step[step < 0.0]
     if below.size < _FEWEST or float(np.sqrt(np.mean(below**2))) < _AS_NOISY * float(
             np.sqrt(np.mean(all_**2))):
@@ -289,13 +289,13 @@ def _likelihood(x: FloatArray, order: int = 1) -> float:
     return -0.5 * count * math.log(max(float(e @ e), _TINY) / count)
 
 
-# Minimum repeats, or runs of them; maximum chance of a tie at which the size of the changes
-# predicts the number of ties.
+# Minimum number of repeats, or of runs of repeats; chance of a tie up to which the size of the
+# changes predicts the number of ties.
 _FEWEST_TIES, _FINE = 20, 0.15
-# Lags at which equal values are counted (at 8, seven held samples of ten are still seen), and
-# lags at which the period of a line is sought, beyond those of holds.
+# Lags at which equal values are counted (lag 8 still detects that seven of ten samples are held),
+# and longer lags, at which the period of a line is sought.
 _APART, _PERIODS = (2, 4, 8), range(9, 101)
-# Maximum ratio of the noise of a rail to its noise at rest, and of the probabilities of a tie.
+# Maximum ratio of a rail's noise to its noise at rest, and hence of the probabilities of a tie.
 _CALMEST = 100.0
 # Minimum excess of ties, and maximum deficit of the changes at the ends of runs, standard errors.
 _CLEARLY, _SHORT = 6.0, 3.0
@@ -307,7 +307,7 @@ _LOOK = 200_000
 
 def without_repeats(t: FloatArray, v: FloatArray, u: FloatArray | None
                     ) -> tuple[FloatArray, FloatArray, FloatArray | None, float]:
-    """Return readings, and the number of samples a reading: 1 without repeats."""
+    """Return the readings, and the number of samples per reading (1 without repeats)."""
     places, period = reading_places(v)
     t, v, u = reading_times(t[places], period), v[places], None if u is None else u[places]
     if period > 1.0:
@@ -353,9 +353,9 @@ def _code(v: FloatArray) -> float:
 
 def _ties_of_codes(moved: FloatArray, code: float) -> tuple[float, float]:
     """
-    Return the ties expected from changes by one and by two codes (V), and their standard error.
+    Return the number of ties expected from changes by one and two codes, and its standard error.
 
-    The log density of a change is nearly a parabola about zero, whatever ramp, line or load is
+    The log density of a change is nearly a parabola about zero, even with a ramp, a line or a load
     added, because both signs are about equally likely.
     """
     size = np.abs(moved)
@@ -369,8 +369,8 @@ def _stuck(v: FloatArray) -> npt.NDArray[np.bool_]:
     """
     Return which samples (from the second on) belong to runs of repeats too long for chance.
 
-    A calm rail enters and leaves a run by a change of about one code.  A lost link stops between
-    ordinary changes, and the voltage has moved further when it is back.
+    A calm rail enters and leaves a run with a change of about one code.  A lost link stops between
+    ordinary changes, and the voltage has moved further when the link is back.
     """
     step = np.diff(v)
     none = np.zeros(step.size, dtype=np.bool_)
@@ -413,9 +413,9 @@ def _ties_without_holds(v: FloatArray, inner: npt.NDArray[np.bool_]) -> float:
     """
     Return the share of ties between neighbours that is expected without holds.
 
-    Values k samples apart are equal only by chance of their codes, or with probability h^k if a
-    share h is held.  Neighbours are equal more often, by the ratio of the rms differences at lags
-    k and 1: sqrt(k) in a diffusion, less in white noise.
+    Values k samples apart are equal by chance of their codes, or with probability h^k if a share h
+    of the samples is held.  By chance, neighbours are equal more often, by the ratio of the rms
+    differences at lags k and 1: sqrt(k) in a diffusion, less in white noise.
     """
     near = float(np.mean((v[1:] - v[:-1]) ** 2))
     shares = []

@@ -1,14 +1,14 @@
 """
 Signed statistics of normal scores: standard normal if the model is right.
 
-Each is scaled to be about N(0, 1) for independent normal scores.  Mean and spread come from
-simulations (`NullBank`) of the fitted baseline with the stamps and throttle of the data, and with
-the same fit and statistics; only lines that follow throttle (too slow to simulate) and errors
-after large ones use theory.  A name begins with its kind, to which the `SIGNS` of terms refer.
+Each is scaled to be about N(0, 1) for independent normal scores.  Mean and spread come from a
+`NullBank`: simulations of the fitted baseline with the stamps and throttle of the data, fitted and
+evaluated in the same way.  Only lines that follow throttle (too slow to simulate) and errors after
+large ones use theory.  A name begins with its kind, to which the `SIGNS` of terms refer.
 
 No term predicts loops of throttle, a growing effect of throttle, or errors after large ones.
-These statistics expose effects that imitate a term, by their course over minutes, by hysteresis,
-or after their onset.
+These statistics expose effects that imitate a term but develop over minutes, have hysteresis, or
+last after their onset.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ from ou_monitor.records import FloatArray
 from scipy.signal import lfilter
 from scipy.special import ndtri, stdtr, stdtrit
 
-# Groups of lags.
+# Groups of lags, samples.
 _LAGS = ((1, 1), (2, 2), (3, 5), (6, 15), (16, 50))
 # Number of spectral bands.
 _BANDS = 8
-# Maximum of small scores.
+# Scores up to this size count as small.
 _SMALL = 2.5
 # Spans over which power is averaged, s.
 _CLUSTERS = (0.02, 0.1, 0.5, 2.5, 8.0)
-# Lengths of segments for bursts, samples, and maximum lag of products of three.
+# Lengths of segments for bursts, samples; maximum lag of products of three, samples.
 _SEGMENTS, _TRIPLES = (32, 128, 512), 10
 # Quantiles of throttle at which a relay (hysteresis) switches down and up.
 _RELAYS = ((0.15, 0.85), (0.28, 0.72), (0.4, 0.6))
-# Minimum share of the power of a regressor that the static response to throttle leaves.
+# Minimum share of a regressor's power that must remain beside the static response to throttle.
 _LEAST = 0.02
-# Minimum large error, standard deviations, and minimum distance of two of them, samples.
+# Minimum size of a large error, standard deviations; minimum distance between two, samples.
 _LARGE, _APART = 4.0, 20
 # Minimum number of large errors.
 _FEW = 5
-# Edges of groups of samples after a large error.
+# Edges of the groups of samples after a large error.
 _AFTER = (1, 4, 16, 64, 256, 1024)
 
 
@@ -110,7 +110,7 @@ def _correlations(w: FloatArray) -> Iterator[tuple[str, float]]:
 
 
 def _among_small(w: FloatArray) -> Iterator[tuple[str, float]]:
-    """Yield the correlation of neighbours that are both small, without outliers."""
+    """Yield the correlation of neighbours that are both small, which outliers do not affect."""
     small = (np.abs(w[1:]) < _SMALL) & (np.abs(w[:-1]) < _SMALL)
     if int(small.sum()) > 30:
         yield 'small errors lag 1', score(w[1:][small], w[:-1][small])
@@ -129,8 +129,8 @@ def _spectrum(w: FloatArray, given: Covariates) -> Iterator[tuple[str, float]]:
             mean = float(power[a:b].mean())
             value = (mean ** (1.0 / 3.0) - 1.0 + 1.0 / (9.0 * m)) * 3.0 * math.sqrt(m)
             yield f'band {k}, {_hertz(a, n, given)} to {_hertz(b, n, given)} Hz', value
-    # The largest of many exponentials.  `find_lines`, which decides which lines are tried, allows
-    # for spectra that are not flat; under the null of the bank they are flat.
+    # The largest of many exponentials.  The spectrum is flat under the null hypothesis of the
+    # bank; `find_lines`, which decides which lines are tried, allows for other spectra.
     yield 'line', _gumbel(float(power[3:].max()), power.size - 3)
 
 
@@ -284,7 +284,7 @@ def alpha_score(w: FloatArray, state: FloatArray, throttle: FloatArray) -> float
     Return the score of a slope of ln alpha over throttle (0..1), orthogonal to the score of alpha.
 
     w: innovations; state: the standardised deviation before each.  `analyze` instead tests whether
-    levels of constant throttle share one alpha (`ou_monitor.analysis.level_comparison`).
+    levels of constant throttle have the same alpha (`ou_monitor.analysis.level_comparison`).
     """
     u = throttle - throttle.mean()
     return score(w, state * u - float((state * state * u).mean()) * state)
@@ -316,7 +316,7 @@ def _left(name: str, wanted: FloatArray, known: FloatArray, keep: float
 
 
 def large_ones(errors: FloatArray, found: npt.NDArray[np.bool_] | None = None) -> FloatArray:
-    """Return the signs of large errors, and 0 elsewhere and shortly after another one."""
+    """Return the signs of large errors; 0 elsewhere, and shortly after another large error."""
     large = np.abs(errors) > _LARGE
     if found is not None:
         large |= found
@@ -365,10 +365,10 @@ def covariates_of(samples: Samples, composite: Composite) -> Covariates:
 SIZE = 24
 # Weight, in recordings, of the theoretical spread of 1 in the estimated spread.
 _PRIOR = 24.0
-# Degrees of freedom of a score over that spread: with a weight w of m draws its square has
-# variance w^2 2/(m - 1), as a chi square of (m - 1)/w^2 degrees.  Of 8700 recordings of a plain OU
-# (2000 to 6000 samples, five throttles and rates), 0.89 % have a family-wise p below 1 %, and 0.14
-# % below 0.1 %; by the normal distribution 1.52 and 0.31 %.
+# Degrees of freedom of a score divided by that spread: if the m draws have weight w, the squared
+# spread has variance w^2 2/(m - 1), like a chi square with (m - 1)/w^2 degrees.  Of 8700 plain OU
+# recordings (2000 to 6000 samples, five throttles and rates), 0.89 % have a family-wise p below
+# 1 %, and 0.14 % below 0.1 %; with the normal distribution, 1.52 and 0.31 % do.
 _FREEDOM = (SIZE - 1) * ((SIZE + _PRIOR) / SIZE) ** 2
 
 
@@ -407,8 +407,8 @@ def simulate_bank_of(samples: Samples, composite: Composite, rng: np.random.Gene
     """
     Simulate the bank of a model with more terms than the `ou`.
 
-    If the step of the ADC is as large as the noise, errors of the right model are neither normal
-    nor independent.
+    Needed if the step of the ADC is as large as the noise: then errors of the right model are
+    neither normal nor independent.
     """
     model, rows, given = SupplyModel(composite.terms), [], covariates_of(samples, composite)
     for _ in range(size):
@@ -426,7 +426,7 @@ def _summary(rows: list[dict[str, float]]) -> NullBank:
     mean, std = {}, {}
     for name in rows[0]:
         v = np.array([row[name] for row in rows if name in row])
-        # A mean far from 0 is not shrunk.
+        # Do not shrink a mean far from 0.
         strange = abs(float(v.mean())) > 4.0 * float(v.std()) / math.sqrt(v.size) + 1.0
         mean[name] = (1.0 if strange else weight) * float(v.mean())
         std[name] = math.sqrt(weight * float(v.var(ddof=1)) + 1.0 - weight)
@@ -434,7 +434,7 @@ def _summary(rows: list[dict[str, float]]) -> NullBank:
 
 
 def refit(y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the scores and the states of a series after the fit of the baseline to it."""
+    """Fit the baseline to a series; return its scores and states."""
     before = np.concatenate(([y[0]], y[:-1]))
     a, b = before - before.mean(), y - y.mean()
     phi = float(a @ b) / float(a @ a)

@@ -24,7 +24,7 @@ _ROUNDS = 3
 # Limits of a factor on the noise; convergence tolerance of its mean logarithm.
 _POWERS = 1e-3, 1e3
 _ALIKE = 0.03
-# Processor time of the fit of a `DEAR` law, s a sample (of the fastest one).
+# Processor time of the fastest law with a `SLOW_FIT`, s per sample.
 LAW_COST = 1e-5
 # Fits a law for the first time.
 Look = Callable[[type[Term], View], LawFit | None]
@@ -35,7 +35,7 @@ class Composite:
     """A fitted model."""
 
     terms: tuple[Term, ...]  # All, laws included, with parameters
-    se: tuple[dict[str, float], ...]  # Standard errors, a dict a term
+    se: tuple[dict[str, float], ...]  # Standard errors, one dict per term
     gaussian: GaussianFit  # Its Gaussian part
     z: FloatArray  # Normal scores of the one-step predictions; shape (n,)
     density: FloatArray  # Log predictive density of each sample, nats; shape (n,)
@@ -63,8 +63,8 @@ def fit_composite(samples: Samples, terms: Sequence[Term | type[Term]], part: sl
     """
     Fit a model on a part; None if a law cannot be fitted.
 
-    A law without parameters yet is given as its class, and fitted by `first`.  `known` is a model
-    with the same laws, whose events and offset are the start.
+    A law that has no parameters yet is given as its class, and fitted by `first`.  The fit starts
+    from the events and offset of `known`, a model with the same laws.
     """
     structural = [term for term in terms
                   if isinstance(term, Term) and term.ROLE is not Role.LAW]
@@ -85,7 +85,7 @@ def fit_composite(samples: Samples, terms: Sequence[Term | type[Term]], part: sl
             view = replace(view_of(samples, gaussian, z, part), variance=gaussian.variance * power)
             fit = (law.refit_law(view) if isinstance(law, Term) else
                    first(law, view) if first else law.fit_law(view))
-            if law.DEAR:
+            if law.SLOW_FIT:
                 cost += LAW_COST * samples.n
             if fit is None:
                 return None

@@ -1,7 +1,7 @@
 """
-Curves of the data beside those of simulations of models: spectrum, distribution, by throttle.
+Curves of the data and of simulations of models: spectrum, distribution, dependence on throttle.
 
-Also the histograms that pages draw: bins after Freedman and Diaconis, and their outline.
+Also histograms for pages: bins by the rule of Freedman and Diaconis, and their outline.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from ou_monitor.model.supply import SupplyModel
 from ou_monitor.records import FloatArray
 from scipy.signal import welch
 
-# Simulations of each model; about one point in twenty lies outside their range.
+# Simulations of each model; their range misses about one point in twenty of the data.
 DRAWS = 40
 _BINS, _LEVELS, _LAGS, _BANDS = 60, 10, 40, 60
-# Maximum number of distinct throttles that are bins of their own.
+# Maximum number of distinct throttles for which each has its own bin.
 _DISTINCT = 12
 
 Curve = Callable[[FloatArray], FloatArray]
@@ -175,7 +175,7 @@ def _density(y: FloatArray, edges: FloatArray) -> FloatArray:
 
 
 def bin_width(values: FloatArray) -> float:
-    """Return the width of the bins of a histogram after Freedman and Diaconis (1981)."""
+    """Return the width of histogram bins by the rule of Freedman and Diaconis (1981)."""
     low, high = np.quantile(values, [0.25, 0.75])
     return float(2.0 * (high - low) / values.size ** (1.0 / 3.0))
 
@@ -185,8 +185,8 @@ def outline(edges: FloatArray, heights: npt.ArrayLike) -> tuple[FloatArray, Floa
     return np.repeat(edges, 2)[1:-1], np.repeat(np.asarray(heights, dtype=np.float64), 2)
 
 
-# Margin on either side of the recorded range, as a share of it.  Chosen: the extremes of two
-# halves of a stationary flight differ by less, those of a wrong sag or a growing drift by more.
+# Margin on either side of the recorded range, as a share of it.  The extremes of two halves of a
+# stationary flight differ by less; those of a wrong sag or a growing drift, by more.
 MARGIN = 0.5
 
 

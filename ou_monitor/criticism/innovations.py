@@ -1,15 +1,15 @@
 """
 One-step innovations of an OU in white noise, and a test of their spectrum for another pole.
 
-`analyze` uses it for the residual of a load level, `discover` for a whole recording.
+`analyze` applies it to the residual of a load level, `discover` to a whole recording.
 
 Under the right model the innovations are independent and standard normal, and the ordinates of
-their periodogram independent and exponential.  A second OU, slower or faster by a known factor,
-raises them in a known pattern.  The part of the pattern that the fit absorbs (alpha, sigma, white
-noise) is projected out, and the rest is compared with the ordinates.  Near the model this score
-test is the most powerful one; correlations at single lags miss a wander ten times slower, which is
-correlated over hundreds of samples.  An AC-coupled instrument subtracts what a second OU with the
-rate of its corner would add,
+their periodogram are independent and exponential.  A second OU, slower or faster by a known
+factor, raises the ordinates in a known pattern.  The part of it that the fit absorbs (alpha,
+sigma, white noise) is projected out, and the rest is compared with the ordinates.  For small
+deviations this score test is the most powerful one; correlations at single lags would miss a
+second OU ten times slower, which is correlated over hundreds of samples.  An AC-coupled instrument
+subtracts what a second OU with the rate of its corner would add,
 
     S r^2 / (w^2 + r^2) = (S - S_r) a^2 r^2 / (a^2 - r^2) up to factors,  S = 1 / (a^2 + w^2),
 
@@ -31,16 +31,16 @@ from ou_monitor.records import FloatArray, NAN
 from scipy import stats
 from scipy.signal import periodogram
 
-# Probability that any test of a right model rejects, over all levels of a recording in `analyze`,
-# and over a whole recording in `discover`.  One in a hundred, as for lines.
+# Probability that any test rejects a right model: in `analyze` over all levels of a recording, in
+# `discover` over the whole recording.  One in a hundred, as for lines.
 FAMILY_WISE = 0.01
-# Minimum variance of a second relaxation, over Var_inf, that matters.
+# Variance of a second relaxation, over Var_inf, from which it matters.
 LEAST_SHARE = 0.1
 # Rates of the other pole that are tested, over the rate of the first.
 FACTORS = (1.0 / 30.0, 1.0 / 10.0, 1.0 / 3.0, 3.0, 10.0)
 # Minimum ordinates of a test, and minimum samples of a segment.
 _FEWEST, _SHORTEST = 64, 64
-# Maximum relative difference of steps that count as equal.
+# Relative difference up to which steps count as equal.
 ALIKE = 0.3
 # Minimum measurement noise, for a regular filter, as a share of the variance of a step.
 _NO_NOISE = 1e-6
@@ -94,7 +94,7 @@ def innovations(t: FloatArray, deviation: FloatArray, alpha: float, var_inf: flo
 
 
 def join(parts: Sequence[FloatArray]) -> FloatArray:
-    """Concatenate parts, of which there may be none."""
+    """Concatenate parts; empty if there are none."""
     return np.concatenate(parts) if parts else np.zeros(0)
 
 
@@ -102,7 +102,7 @@ def other_pole(parts: Sequence[FloatArray], rate: float, alpha: float, var_inf: 
                noise_var: float, above: float = 0.0) -> OtherPole:
     """Test innovations for a second relaxation and for an AC coupling (rate, above in Hz)."""
     both = [periodogram(part, rate, detrend='linear') for part in parts if part.size >= _SHORTEST]
-    # The ordinates at 0 and at half the rate have another distribution.
+    # The ordinates at 0 and at half the rate have a different distribution.
     frequency = join([f[1:-1] if f[-1] == 0.5 * rate else f[1:] for f, _ in both])
     power = join([p[1:-1] if f[-1] == 0.5 * rate else p[1:] for f, p in both])
     frequency, power = frequency[frequency > above], power[frequency > above]

@@ -2,8 +2,7 @@
 Findings that need no model (stamps, repeats, ADC codes, clipping), and the samples to fit.
 
 These findings are exact, because ties have probability zero in a diffusion.  If stamps scatter
-about an even grid, the voltage increments tell whether the scatter is real: only then do they
-follow the steps.
+about an even grid, the scatter is real only if the voltage increments follow the steps.
 """
 
 from __future__ import annotations
@@ -30,9 +29,9 @@ from ou_monitor.timeline.line import on_grid, reading_places, reading_times
 LEAST = 100
 # Minimum step of the ADC that is named a cause, in standard deviations of the innovations.
 NAMED_STEP = 0.3
-# Minimum range of a throttle that is used.
+# Minimum range of throttle; if it moves less, it is not used.
 MOVES = 0.01
-# Maximum samples as logged that are kept for the score of the plain model.
+# Maximum samples, as logged, that are kept for the score of the plain model.
 _LOOK = 200_000
 
 
@@ -165,14 +164,14 @@ def _knees(v: FloatArray, noise: float, u: FloatArray | None) -> tuple[float, fl
 
 
 def _saturation(v: FloatArray, low: float, high: float) -> Term:
-    """Return the term; a limit that was not found is put far from all readings."""
+    """Return the term; a limit that was not found is set far from all readings."""
     far = 1e3 * (float(v.max()) - float(v.min()))
     return Saturation(low if math.isfinite(low) else float(v.min()) - far,
                       high if math.isfinite(high) else float(v.max()) + far)
 
 
 def _useful(u: FloatArray | None, recorded: bool, notes: list[str]) -> FloatArray | None:
-    """Return throttle if it moves; otherwise None, and a note of the causes not tested."""
+    """Return throttle if it moves; otherwise None, and note the causes that cannot be tested."""
     if u is not None and float(u.max() - u.min()) >= MOVES:
         return u
     names = [name for name, kind in catalogue().items() if kind.NEEDS_THROTTLE]
@@ -189,7 +188,7 @@ def _as_logged(t: FloatArray, v: FloatArray, u: FloatArray | None) -> Samples:
 # Scatter of stamps about a grid, as a share of a step: below the first it is ignored, above the
 # second there is no grid.
 _SMALL, _LARGE = 0.02, 0.45
-# Maximum correlation of neighbouring errors that count as independent.
+# Correlation of neighbouring errors up to which they count as independent.
 _WHITE = 0.3
 _TINY = 1e-6
 
@@ -211,7 +210,7 @@ def judge_stamps(t: FloatArray, voltage: FloatArray) -> Stamps:
     """
     step = np.diff(t)
     usual = float(np.median(step))
-    # First without gaps, because steps that scatter by half of their length look like gaps.
+    # First assume no gaps, because steps that scatter by half their length look like gaps.
     number = np.ones(step.size)
     grid = on_grid(t, number)
     if float((t - grid).std()) > _LARGE * usual:
@@ -246,8 +245,8 @@ def _wrong(step: FloatArray, number: FloatArray, voltage: FloatArray) -> bool:
     """
     Return whether increments do not follow the steps, so that the stamps are wrong.
 
-    By a likelihood ratio above the penalty of a parameter, as for causes.  White noise of the
-    sensor, which follows no step, is allowed for.
+    The likelihood ratio must exceed the penalty of a parameter, as for causes.  White noise of the
+    sensor, which does not depend on the steps, is allowed for.
     """
     change = np.diff(voltage)
     change = change - np.median(change)

@@ -16,30 +16,30 @@ from ou_monitor.records import FloatArray, Recording
 from ou_monitor.text import counted, number
 from ou_monitor.timeline.line import in_order
 
-# Minimum distance of an outlier from the median, in spreads of the samples, and in distances of
-# the farthest other sample.
+# Minimum distance of an outlier from the median, in spreads of the samples, and relative to the
+# farthest other sample's distance.
 _FAR, _GAP = 50.0, 5.0
-# Minimum repeats of an outlying value that is an error code, and maximum share of such samples.
+# Minimum repeats of an outlying value to be an error code; maximum share of such samples.
 _CODE, _MOST_CODES = 3, 0.2
 # Maximum single bad samples that are left out; for long recordings, one for each _EACH samples.
 _SINGLES, _EACH = 3, 100_000
-# Minimum other samples if a value has a larger share.
+# Minimum number of other samples, if the value has a larger share.
 _OTHERS = 100
 # Maximum values used for the spread.
 _LOOK = 200_000
-# Maximum number, or share, of samples that differ in a voltage that counts as constant.
+# A voltage counts as constant if at most this number, or this share, of samples differ.
 _ODD, _ODD_SHARE = 3, 1e-3
-# Limits of a voltage and of its range, V; their fourth powers are finite numbers.
+# Limits of a voltage and of its range, V, whose fourth powers still are finite numbers.
 _LARGEST, _SMALLEST = 1e30, 1e-30
 # Median above which volts may be millivolts.
 _MILLIVOLTS = 1000.0
 # Ranges of throttle as 0..1 with trim, as a percentage, and in microseconds of a servo pulse.
 _UNIT, _PERCENT, _PULSE = (-1.5, 1.5), (-1.0, 150.0), (700.0, 2400.0)
 _EDGE = 0.05
-# Maximum gap in a current, s; quantile of its size that is its scale; lags of the mean response to
-# a load, s.
+# Maximum gap in a current, s; quantile of its size that counts as full load; lags of the mean
+# response to a load, s.
 _HOLE, _FULL, _LAGS = 1.0, 0.99, np.array([0.02, 0.2, 2.0])
-# Maximum second difference of a straight line, in rounding errors.
+# Maximum second difference of a voltage that counts as a straight line, in rounding errors.
 _ROUNDINGS = 16.0
 
 
@@ -221,7 +221,7 @@ def why_nothing(v: FloatArray) -> str:
     if largest > _LARGEST:
         return f'The voltage reaches {_short(largest)} V: no supply does; check its unit.'
     if float(v.max()) - float(v.min()) < _SMALLEST:
-        return (f'The voltage moves by {_short(float(v.max()) - float(v.min()))} V only: no '
+        return (f'The voltage moves by only {_short(float(v.max()) - float(v.min()))} V: no '
                 'sensor resolves that; check its unit.')
     if float(np.abs(np.diff(v, 2)).max(initial=0.0)) <= _ROUNDINGS * 2.3e-16 * largest:
         return 'The voltage is a straight line without any noise: there is nothing to simulate.'
@@ -231,7 +231,7 @@ def why_nothing(v: FloatArray) -> str:
 def _as_share(u: FloatArray, notes: list[str]) -> FloatArray:
     """Return throttle as 0..1, NaN where implausible; note the unit."""
     known = u[np.isfinite(u)]
-    # A few wild values do not decide the unit.
+    # A few wild values must not decide the unit.
     low, high = _quantiles(known[::max(1, known.size // _LOOK)], 0.005, 0.995)
     within = _UNIT
     if _UNIT[0] <= low and high <= _UNIT[1]:

@@ -1,9 +1,9 @@
 """
 The samples that `discover` fits, and their choice in a long recording.
 
-Of a recording with too many samples, every k-th is used: every k-th sample of an OU is an OU, and
-all terms keep their meaning, unlike with averages.  If this would lose the relaxation, a segment
-from the middle is used instead.
+If a recording has too many samples, every k-th is used: unlike averages, these are again samples
+of an OU, and all terms keep their meaning.  If this would lose the relaxation, a segment from the
+middle is used instead.
 """
 
 from __future__ import annotations
@@ -34,18 +34,19 @@ _STEP = 0.3
 _RATIO = math.exp(_STEP) / (1.0 + math.exp(-_STEP))
 # Maximum values used for that ratio.
 _LOOK = 1_000_000
-# Samples with a common noise scale; probability that noise makes any change an event; margin for
-# the error of the scale.
+# Samples that share a noise scale; probability that noise alone makes any change an event; margin
+# for the error of the scale.
 _SHARE, _CHANCE, _MORE = 1024, 0.02, 1.05
 # Minimum change of throttle of a load step, and the time after it in which a change of voltage is
 # attributed to the load, s.
 _STEPS, _SOON = 0.01, 0.02
-# Maximum events that are kept; if there are more, the samples used contain enough of them.
+# Maximum number of events at which samples around them are kept; with more, the samples used
+# contain enough of them.
 _FEW = 300
-# Limit of changes when lines are sought, in standard deviations (larger ones are events); minimum
-# share of the power of a line that one sinusoid explains.
+# Changes are limited to this many standard deviations in the search for lines (larger ones are
+# events); minimum share of a line's power that one sinusoid explains.
 _EVENT, _COMMON = 5.0, 0.5
-# Maximum distance of stamps from an even grid, in steps; stamps checked at a time.
+# Maximum distance of stamps from an even grid, in steps; number of stamps checked at a time.
 _EVEN, _CHUNK = 0.1, 500_000
 
 
@@ -107,9 +108,9 @@ class Samples:
         """
         Return the samples with codes, V, spread evenly within their cells (cell in V; 0: as is).
 
-        The mean log density of a value spread within a cell is at most the log probability of the
-        code over the width (Jensen; Theis et al., ICLR 2016).  So a narrow distribution cannot
-        gain without limit where codes repeat, as it does with the density at the code itself.
+        The mean log density of a value spread within a cell is at most the log of the code's
+        probability over the width (Jensen; Theis et al., ICLR 2016).  So, where codes repeat, a
+        narrow distribution cannot gain without limit, as it does with the density at the code.
         """
         if not cell > 0.0:
             return replace(self, voltage=codes)
@@ -117,7 +118,7 @@ class Samples:
         return replace(self, voltage=drawn, longer=self.longer or self, codes=codes, cell=cell)
 
     def redrawn(self, at: npt.NDArray[np.int64], voltage: FloatArray) -> Samples:
-        """Return the samples with other voltages, V, at some indices."""
+        """Return the samples with the voltage, V, replaced at some indices."""
         v, codes = self.voltage.copy(), self.codes
         v[at] = voltage
         if codes is not None:
@@ -187,7 +188,7 @@ def events_between(voltage: FloatArray, throttle: FloatArray | None, rate: float
     """
     Return further samples to keep: around sudden changes.
 
-    A jump that is clear between neighbours may be hidden by the noise of k steps.
+    A jump that is clear between neighbours may be lost in the noise of k steps.
 
     voltage in V, rate in Hz.
     """
@@ -212,7 +213,7 @@ def events_between(voltage: FloatArray, throttle: FloatArray | None, rate: float
         at = at[since > _SOON * rate]
     if not 0 < at.size <= _FEW:
         return none
-    # The samples before and after it, and the next, which tells a bad sample from a jump.
+    # The samples before and after the change, and the next, which tells a bad sample from a jump.
     near: npt.NDArray[np.int64] = np.unique(np.concatenate((at, at + 1, at + 2)))
     kept: npt.NDArray[np.int64] = near[(near < stop) & ((near - first) % k != 0)]
     return kept
@@ -289,7 +290,7 @@ def _widest(voltage: FloatArray, factor: int) -> int:
             if (mid - near) / (far - mid) > _RATIO:
                 return lag
         elif risen:
-            # The variogram is level after its rise: the relaxation is faster.
+            # The variogram has flattened, so the relaxation is faster.
             return max(1, lag // 2)
         lag *= 2
     return factor
@@ -299,8 +300,8 @@ def _variogram(v: FloatArray, lag: int, coarse: bool) -> float:
     """
     Return the variogram at a lag, V^2, up to a factor.
 
-    Computed from the smaller half of the differences, because load steps, which are in the other
-    half, would hide how fast the rail itself relaxes.  Coarse codes need all differences.
+    Computed from the smaller half of the differences; load steps, which would hide how fast the
+    rail itself relaxes, are in the larger half.  Coarse codes need all differences.
     """
     d = np.square(v[lag:] - v[:-lag])
     if coarse:

@@ -3,8 +3,8 @@ The Gaussian part of a model: mean, poles, intensities and noise, fitted togethe
 
 A model is a list of terms: `Role.MEAN` terms are columns of a regression, `DRIVE` terms change
 alpha and sigma along the recording, `BLOCK` terms add states, and `NOISE` terms white errors.
-`LAW` terms, of the distribution of the innovations, are fitted in `composite`; events that they
-find enter here as extra variance at their samples.
+`LAW` terms (the distribution of the innovations) are fitted in `composite`; events that they find
+enter here as extra variance at their samples.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ _STEP = 1e-4
 # Maximum rounds of a fit, of a rough one, and of a last one that begins near the maximum.
 _ROUNDS, _FEW_ROUNDS, _LAST_ROUNDS = 12, 6, 2
 # Samples times additional states above which a fit begins with a part of the samples.
-_DEAR = 30000
-# With more states than this only the part is fitted; more lines than this are fitted separately.
+_EXPENSIVE = 30000
+# With more states, only that part is fitted; with more lines, they are fitted separately.
 _MANY = 4
 # Samples after which the gain of a time-invariant filter is constant (predictive variance within
 # 1e-5 of its limit).
 _SETTLES = 1024
-# Converged: a step gains less than this, nats; for a full and a rough fit.
+# A full and a rough fit have converged when a step gains less than this, nats.
 _SETTLED, _NEARLY = 0.02, 0.5
 _RNG = np.random.default_rng(0)
 
@@ -60,7 +60,7 @@ class GaussianFit:
     """A fitted Gaussian model."""
 
     terms: tuple[Term, ...]  # With their parameters; the first is the `ou`
-    se: tuple[dict[str, float], ...]  # Standard errors by parameter, a dict a term
+    se: tuple[dict[str, float], ...]  # Standard errors by parameter, one dict per term
     mean: FloatArray  # Of the voltage, V; shape (n,)
     # One-step errors, V, and their predictive variances, V^2, each without the event at its own
     # sample; shape (n,).
@@ -104,7 +104,7 @@ def evaluate(samples: Samples, terms: Sequence[Term], events: Events | None = No
     run = _filter(samples, terms, events)
     mean = mean_of(samples, terms, run.segment)
     e = run.kalman.innovations(samples.voltage - mean)
-    # The law predicts an event at its own sample, except during the fit of the Gaussian part.
+    # The law predicts the event at a sample itself, except during the fit of the Gaussian part.
     variance = run.full if inside else run.plain
     return GaussianFit(tuple(terms), tuple(se), mean, e, variance, _log_density(e, variance),
                        run.phi, run.cost)
@@ -155,8 +155,8 @@ class _Run:
 
 def _filter(samples: Samples, terms: Sequence[Term], events: Events | None) -> _Run:
     if events is not None and _states(terms) >= _MANY and not events.error.any():
-        # Extra variance of the state hardly changes the gains of several states, so a filter with
-        # constant gains is used, which saves most of the time.
+        # Extra variance hardly changes the gains if there are several states, so the filter has
+        # constant gains, which saves most of the time.
         s, space, _ = state_space(samples, terms, None)
         run = Filter(space, samples.n)
         q = s.sigma * s.sigma * -np.expm1(-2.0 * s.alpha * s.step) / (2.0 * s.alpha)
@@ -261,9 +261,9 @@ def _coupled(term: ACCoupling, s: Segment, phi: FloatArray, q: FloatArray
 def _beside_lines(samples: Samples, terms: tuple[Term, ...], events: Events | None, rough: bool,
                   begun: bool) -> GaussianFit:
     """
-    Fit by scoring; more than `_MANY` lines are first subtracted with the initial noise.
+    Fit by scoring; more than `_MANY` lines are first subtracted, given the initial noise.
 
-    The information about the noise does not involve coefficients of the mean, and a line depends
+    The estimates of noise and of coefficients of the mean are uncorrelated, and a line depends
     only on the noise at its own frequency.  So the other terms are fitted to the rest, then all
     coefficients together.
     """
@@ -290,12 +290,12 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
     rounds = _FEW_ROUNDS if rough else _ROUNDS
     run = _filter(samples, terms, events)
     states, cost = run.kalman.shape, run.cost
-    few = max(_DEAR // (2 * states[1]), 2000)
+    few = max(_EXPENSIVE // (2 * states[1]), 2000)
     if begun and rough:
         if states[1] > _MANY:
             return _with_mean(samples, terms, events)
-    elif states[0] * (states[1] - 1) > _DEAR and few < samples.n:
-        # Begin with a part of the samples; keep the start, which all samples may fit better.
+    elif states[0] * (states[1] - 1) > _EXPENSIVE and few < samples.n:
+        # Begin with a part of the samples; keep the start in case it fits all samples better.
         part = _liveliest(samples, few)
         begin = terms
         first = _maximise(
@@ -362,8 +362,8 @@ def _scored(samples: Samples, terms: tuple[Term, ...], events: Events | None, ba
     """
     Return scores, shape (n, free), expected information, and processor time, s.
 
-    The information assumes normal errors with the predicted variances.  The outer product of the
-    scores would shorten each step by the kurtosis of heavy tails.
+    The information assumes normal errors with the predicted variances.  With heavy tails, the
+    outer product of the scores would shorten each step in proportion to the kurtosis.
     """
     v, cost = base.variance, 0.0
     z = base.innovation / np.sqrt(v)
@@ -378,7 +378,7 @@ def _scored(samples: Samples, terms: tuple[Term, ...], events: Events | None, ba
 
 
 def _liveliest(samples: Samples, size: int) -> slice:
-    """Return the part of `size` samples in which throttle moves most; the first without it."""
+    """Return the part of `size` samples in which throttle moves most; without it, the first."""
     if samples.throttle is None:
         return slice(0, size)
     first = np.arange(0, samples.n - size + 1, max(size // 4, 1))

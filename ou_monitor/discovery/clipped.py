@@ -18,7 +18,7 @@ from ou_monitor.model.terms.reading import Saturation
 from ou_monitor.records import FloatArray
 from scipy.special import log_ndtr, ndtr, ndtri
 
-# Minimum white noise, as a share of the noise of a step, so that reading and path differ.
+# Minimum white noise, as a share of the noise of a step; 0 would make path and reading equal.
 _LEAST = 0.1
 # Sweeps of expectation propagation; factor on the white noise of a reading without information.
 _SWEEPS, _NOTHING = 8, 1e6
@@ -29,7 +29,7 @@ def redrawn(samples: Samples, model: Composite, ends: Saturation,
     """
     Return samples with clipped readings, shape (n,), drawn again beyond their limits.
 
-    Mean, `ou` and white noise are those of the model.
+    The model provides mean, `ou` and white noise.
     """
     s = driven(samples, model.gaussian.terms)
     phi = np.exp(-s.alpha * s.step)

@@ -1,10 +1,11 @@
 """
-Draw readings within their codes, where steps of the ADC are wider than the moves of the rail.
+Draw readings within their codes if steps of the ADC are wider than the moves of the rail.
 
-Rounding then leaves errors that are neither normal nor white, and a likelihood that takes them for
-white noise finds tails and states in them.  A path of the rail is drawn given all codes, then each
-reading given the path: if the model is right, the readings are its own.  A further cause gains in
-them, on average, at most what it gains in the probability of the codes (Jensen's inequality).
+Rounding errors are then neither normal nor white, and a likelihood that takes them for white noise
+finds heavy tails and switching.  So a path of the rail is drawn given all codes, then each reading
+given the path; if the model is right, these readings follow it exactly.  On average, a further
+cause gains at most as much in the readings as in the probability of the codes (Jensen's
+inequality).
 """
 
 from __future__ import annotations
@@ -21,12 +22,13 @@ from scipy.special import ndtr, ndtri
 
 # Step of the ADC, in moves of the rail between readings, up to which rounding passes for white
 # noise.  Rounding errors of neighbours correlate by exp(-2 (pi / step)^2): 11 % here, 73 % at 8.
-# Simulated, steps of 2.3 to 4 moves gave no false name in 8 recordings each, 8.3 in 9 of 20.
+# In simulations, steps of 2.3 to 4 moves gave no false name (8 recordings each), steps of 8.3 in 9
+# of 20 recordings.
 _COARSE = 3.0
-# Places of the rail across a code: two in each move (a sum at these is exact to 1e-9), within
-# limits; white noise of a reading beyond its code, in standard deviations.
+# Grid of the rail across a code: points in each move (with two, sums are exact to 1e-9), minimum
+# and maximum points; range of the white noise beyond a code, in standard deviations.
 _EACH, _FEWEST, _MOST, _BEYOND = 2.0, 16, 128, 3.0
-# Lower limit of a probability, and of the white noise in codes; both only avoid 0/0.
+# Lower limits of a probability, and of the white noise in codes, which only avoid 0/0.
 _NONE, _LEAST = 1e-300, 1e-9
 
 
@@ -34,7 +36,7 @@ def within_codes(samples: Samples, model: Composite, rng: np.random.Generator) -
     """
     Return samples drawn within their codes, or unchanged if rounding is white noise.
 
-    Mean, `ou` and white noise are those of the model.
+    The model provides mean, `ou` and white noise.
     """
     terms = [term for term in model.gaussian.terms if term.NAME != 'quantization']
     s = driven(samples, terms)
@@ -56,14 +58,14 @@ def within_codes(samples: Samples, model: Composite, rng: np.random.Generator) -
 
 def _path(low: FloatArray, cell: float, noise: FloatArray, phi: FloatArray, move: FloatArray,
           rng: np.random.Generator) -> FloatArray:
-    """Draw a path of the OU, V, by filtering forward and sampling backward on places in codes."""
+    """Draw a path of the OU, V, by forward filtering and backward sampling on a grid."""
     first, wide = low - _BEYOND * noise, cell + 2.0 * _BEYOND * noise
     count = int(np.clip(_EACH * float(np.median(wide)) / float(np.median(move)), _FEWEST, _MOST))
     places = (first[:, None] + wide[:, None] * ((np.arange(count) + 0.5) / count)) / move[:, None]
     least = np.maximum(noise, _LEAST * cell)[:, None]
     edge = (places * move[:, None] - low[:, None]) / least
     likely = np.maximum(ndtr(edge) - ndtr(edge - cell / least), _NONE)
-    # Places are in moves of their sample; the first has its deviation at rest as its move.
+    # The grid is in moves of each sample; for the first, in stationary standard deviations.
     keep = phi[1:] * move[:-1] / move[1:]
     known = likely
     known[0] *= np.exp(-0.5 * np.square(places[0]))

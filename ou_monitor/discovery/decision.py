@@ -14,7 +14,7 @@ from types import MappingProxyType
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.battery import is_sign
-from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
+from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
 from ou_monitor.model.terms.term import Role, Term
 
 Statistics = Mapping[str, float]
@@ -23,11 +23,11 @@ Kind = type[Term]
 # Minimum evidence of a cause, nats, after the penalties of its parameters (BIC) and of its search:
 # odds of e^6 = 403 give 5 % false names over 22 kinds.
 ACCEPT = 6.0
-# Difference in evidence below which two causes tie, nats: odds of 20.  A cause that gains less is
-# removed.
+# Difference in evidence below which two causes tie, nats: odds of 20.  A cause whose removal costs
+# less is removed.
 TIE = 3.0
-# Minimum share of the evidence of a larger effect for a further term of its kind (a response of
-# the mean, or a second curve of intensity over throttle); a smaller one only corrects the form.
+# Minimum evidence of a further term of a kind (a response of the mean, or a second curve of
+# intensity over throttle), as a share of the larger effect's; with less it only corrects the form.
 # A form that is wrong by 7 % leaves (7 %)^2 of the evidence; in simulated loads of ten shapes
 # (test/hidden), further terms gained at most 0.8 % if the form was right.
 FORM = 0.005
@@ -39,7 +39,7 @@ RELAXES = 20.0
 CHANCE = 0.05
 # Maximum number of causes accepted one by one: no recording of test/hidden has more effects.
 MOST = 8
-# Filter time after which kinds that take seconds are no longer tried, s.
+# Total filter time after which kinds whose fit takes seconds are no longer tried, s.
 MOST_COST = 10.0
 # A statistic beyond this fails: of 70, one by chance in 2300 recordings (3 of 8700 simulated).
 FAILS = 4.8
@@ -47,8 +47,8 @@ FAILS = 4.8
 # exact.
 OWN_SHARE = 0.07
 # Maximum share of its largest sign that a latent cause may leave beside measured ones.  In 70
-# independently simulated recordings (b052f3b), of the right causes that left more than FAILS, one
-# left 35 % and the others at most 13 %; wrong causes left 30 to 97 %.
+# independently simulated recordings (b052f3b), right causes with a sign still above FAILS left at
+# most 13 %, but for one with 35 %; wrong causes left 30 to 97 %.
 BESIDE_SHARE = 0.3
 
 
@@ -65,7 +65,7 @@ def kinds_to_try(kinds: Iterable[Kind], model: Sequence[Kind], given: Collection
     """
     return [kind for kind in kinds
             if kind.NAME not in ('ou', *given) and kind.ROLE is not Role.EXACT
-            and comes_first(kind) is first and (not is_answer(kind) or kind.FAMILY == 'slow')
+            and comes_first(kind) is first and (not is_response(kind) or kind.FAMILY == 'slow')
             and (throttle or not kind.NEEDS_THROTTLE)
             and (kind.ROLE is not Role.LAW or kind.CHANGES is None or kind.CHANGES in model)
             and (kind.RECURS or all(other.NAME != kind.NAME for other in model))
@@ -74,11 +74,11 @@ def kinds_to_try(kinds: Iterable[Kind], model: Sequence[Kind], given: Collection
 
 def comes_first(kind: Kind) -> bool:
     """Return whether a kind is tried before latent causes."""
-    return (kind.MEASURED and not is_answer(kind)) or kind.ROLE is Role.NOISE
+    return (kind.MEASURED and not is_response(kind)) or kind.ROLE is Role.NOISE
 
 
 def imitate(one: Kind, other: Kind) -> bool:
-    """Return whether two kinds imitate each other."""
+    """Return whether one of two kinds imitates the other."""
     return other.NAME in one.IMITATES or one.NAME in other.IMITATES
 
 
@@ -86,7 +86,7 @@ def scored(kind: Kind, values: Statistics) -> float:
     """
     Return the gain of a kind by score tests, nats: half the square of its largest sign.
 
-    Each statistic tests one size and span; the fitted kind may gain several times as much.
+    A score test is for one size and span; the fitted kind may gain several times as much.
     """
     return 0.5 * max((value ** 2 for name, value in values.items() for sign in kind.SIGNS
                       if is_sign(sign, name, value)), default=0.0)
@@ -94,7 +94,7 @@ def scored(kind: Kind, values: Statistics) -> float:
 
 def affordable(kind: Kind, cost: float) -> bool:
     """Return whether the search may still try a kind after fits of this cost (s)."""
-    return cost <= MOST_COST or not kind.DEAR
+    return cost <= MOST_COST or not kind.SLOW_FIT
 
 
 # Which trial is accepted, and what comes with it.
@@ -103,13 +103,13 @@ def least_evidence(kind: Kind, largest: float, again: bool = False) -> float:
     """
     Return the minimum evidence of a response of the mean, nats (largest: evidence of all).
 
-    again: whether there is one of this kind already, whose form it may only correct.
+    again: whether the model has a term of this kind, so that another may only correct its form.
     """
     share = max(kind.LEAST_SHARE, FORM if again else 0.0)
     return max(ACCEPT, share * largest)
 
 
-def is_answer(kind: Kind) -> bool:
+def is_response(kind: Kind) -> bool:
     """Return whether a cause is a response of the mean to a measured input."""
     return kind.MEASURED and kind.ROLE is Role.MEAN
 
@@ -121,7 +121,7 @@ def is_latent(kind: Kind) -> bool:
 
 def is_shared(gains: npt.ArrayLike, errors: float = 1.0) -> bool:
     """
-    Return whether the total gain of parts of a recording exceeds its standard error, nats.
+    Return whether the total gain of the parts of a recording exceeds its standard error, nats.
 
     If only one part gains, the standard error of the sum equals that gain; for an effect that
     gains g nats evenly, it is sqrt(2 g).
@@ -139,26 +139,26 @@ def rivals_of(best: str, evidence: Sequence[tuple[str, float]]) -> list[str]:
 
 
 def is_plainer(one: Kind, other: Kind) -> bool:
-    """Return whether a cause is preferred in a tie, because fewer alternatives were searched."""
+    """Return whether a cause wins a tie, because fewer alternatives were searched for it."""
     return one.SEARCH < other.SEARCH and one.FAMILY == other.FAMILY
 
 
-def only_to_changes(answers: Iterable[Kind]) -> bool:
+def only_to_changes(responses: Iterable[Kind]) -> bool:
     """
     Return whether a mean responds to throttle by transients alone.
 
     This is so behind an AC coupling, which removes steady currents.
     """
-    names = {kind.NAME for kind in answers}
+    names = {kind.NAME for kind in responses}
     return LoadTransient.NAME in names and LoadSag.NAME not in names
 
 
 def relaxes(rate: float, duration: float) -> bool:
-    """Return whether a rate (1/s) is not a trend in a recording (duration in s)."""
+    """Return whether a rate (1/s) is fast enough for a relaxation (duration in s)."""
     return rate * duration >= RELAXES
 
 
-def earns(gain: float, error: float, chance: float) -> bool:
+def improves_predictions(gain: float, error: float, chance: float) -> bool:
     """
     Return whether a cause improves predictions of held-out blocks (gain, error in nats).
 
@@ -180,11 +180,11 @@ def withdrawn(before: Statistics, after: Statistics, accepted: Sequence[Kind],
     """
     Return which accepted causes do not explain their statistics.
 
-    With measured causes, some statistic always fails on a real flight, because their form is not
-    exact.  Then a latent cause is tested only by its own signs, relative to their values with the
-    measured causes alone (`before`), or at its acceptance (`asked`, by name), because a larger
-    effect may have hidden them.  Without measured causes, latent ones are tested by all
-    statistics: the effect may not be in the catalogue.
+    The form of measured causes is never exact, so with them some statistic always fails on a real
+    flight.  Then a latent cause is tested by its own signs only, relative to their values with the
+    measured causes alone (`before`) or just before its acceptance (`asked`, by name), since a
+    larger effect may have hidden them.  Without measured causes, latent ones are tested by all
+    statistics, because the effect may not be in the catalogue.
     """
     beside = not all(map(is_latent, accepted))
     left = failing(before, after)

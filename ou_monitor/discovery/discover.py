@@ -31,14 +31,14 @@ from ou_monitor.discovery.words import (
     VAGUE, verdict_sentence)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import blamed, catalogue, left_out, withdraw
-from ou_monitor.model.terms.load_answer import LoadTransient, SHORTEST
+from ou_monitor.model.terms.load_response import LoadTransient, SHORTEST
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import Saturation
 from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.records import Recording
 from ou_monitor.text import listed, number, Z95
 
-# Reason why the gain of a line above the Nyquist frequency of the samples used is unknown.
+# Why the gain of a line above the Nyquist frequency of the samples used is unknown.
 FAST = 'the rate of the samples used is too low to show this line.'
 # Alternations between drawing clipped samples and fitting the load to them.
 _REDRAWN = 2
@@ -70,7 +70,7 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
         start = _start(samples, state)
         if state.drawn is not None:
             samples, start = _unclipped(samples, state, start)
-        # Causes are named from readings within codes, and scored where no model has drawn.
+        # Name causes from readings drawn within codes, but score them on the codes themselves.
         inside, start = _uncoded(samples, state, start) if samples.cell else (samples, start)
         done(0.1)
         named = named_causes(inside, start, rng, state.exact,
@@ -82,7 +82,7 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
         if blamed(error):
             raise
         return _insufficient(recording, state, 'No OU can be fitted to it and simulated: hardly '
-                             'any of its samples differ, or some are far beyond all others.',
+                             'any of its samples differ, or some are far from all others.',
                              seed)
     done(0.6)
     scored = covered(samples)
@@ -136,7 +136,7 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
 def _insufficient(recording: Recording, state: Integrity, reason: str, seed: int) -> Finding:
     return Finding(
         recording=recording.name, n=recording.n, duration=recording.duration,
-        verdict=Verdict.INSUFFICIENT_DATA, sentence=f'Nothing can be said of it. {reason}',
+        verdict=Verdict.INSUFFICIENT_DATA, sentence=f'Nothing can be said about it. {reason}',
         notes=state.notes, seed=seed)
 
 
@@ -167,7 +167,8 @@ def _uncoded(samples: Samples, state: Integrity, start: Composite) -> tuple[Samp
     """Return the samples drawn within coarse codes, and the start of the search."""
     rng, inside = np.random.default_rng(0), samples
     for _ in range(_REDRAWN):
-        # The load that its evidence chooses: all terms of a load would confirm themselves.
+        # Use the terms of the load that have evidence; with all terms, readings drawn from them
+        # would confirm them.
         search = Search(start)
         under_load(Fitter(inside), search)
         model = search.composite
@@ -179,7 +180,7 @@ def _uncoded(samples: Samples, state: Integrity, start: Composite) -> tuple[Samp
 
 
 def _coded(samples: Samples, state: Integrity, named: Named) -> tuple[Composite, tuple[str, ...]]:
-    """Return the named model fitted to the codes, and its causes, without laws that do not fit."""
+    """Fit the named model to the codes; return it and its causes, without laws that fail."""
     steps = [term for term in state.exact if term.ROLE is Role.NOISE]
     terms, names = list(named.whole.terms), list(named.names)
     while True:
@@ -192,7 +193,7 @@ def _coded(samples: Samples, state: Integrity, named: Named) -> tuple[Composite,
 
 
 def _refitted(samples: Samples, terms: Sequence[Term]) -> Composite | None:
-    """Return terms fitted to everything; None if a law has no fit."""
+    """Return terms fitted to everything; None if a law cannot be fitted."""
     return fit_composite(samples, terms, slice(0, samples.n))
 
 
@@ -218,10 +219,10 @@ def _causes(samples: Samples, state: Integrity, left: Pruned, se: tuple[dict[str
     """
     Return all causes: exact findings first, then those of the search.
 
-    The gain of a cause is the loss of the model without it, fitted again.  If there are many
+    The gain of a cause is how much the model loses without it, fitted again.  If there are many
     causes of one kind (harmonics of a line), they are left out together and share one gain.
     Repeats, clipping and wrong stamps, which are corrected in the samples, also share one gain:
-    the loss of the plain OU fitted to the samples as logged.
+    what the plain OU loses if it is fitted to the samples as logged.
     """
     found: list[Cause] = []
     model = left.full.model
@@ -258,7 +259,7 @@ def _causes(samples: Samples, state: Integrity, left: Pruned, se: tuple[dict[str
 
 
 def _criticism(before: Mapping[str, float], after: Mapping[str, float]) -> tuple[Criticism, ...]:
-    """Return all statistics with their band at the family-wise level `NOTHING`."""
+    """Return all statistics, with their band at the family-wise level `NOTHING`."""
     count = len(before)
     edge = family_edge(NOTHING, count)
     return tuple(Criticism(
@@ -293,7 +294,7 @@ def _notes(state: Integrity, named: Named, model: Composite, dropped: Sequence[s
 
 # Probability that any statistic of a correct model lies outside its band.
 NOTHING = 0.01
-# Step of a parameter that tests whether it is at the end of its range.
+# Step by which a parameter is moved to see whether it is at the end of its range.
 _STEP = 1e-4
 
 
@@ -314,9 +315,9 @@ def doubts(terms: Sequence[Term], crossing: CrossingRate, duration: float, step:
     found = ['its one-step errors are larger than those of the plain OU'] if larger else []
     if crossing.worse:
         found.append(f'it falls through {number(crossing.level, 4)} V '
-                     f'{number(crossing.extended)} times a minute; measured were '
-                     f'{number(crossing.observed)}, and the plain OU predicts '
-                     f'{number(crossing.baseline)}')
+                     f'{number(crossing.extended)} times a minute; the recording does so '
+                     f'{number(crossing.observed)} times, and the plain OU '
+                     f'{number(crossing.baseline)} times')
     ends = [f'{name} of {term.NAME}' for term in terms for name in _at_ends(term, duration, step)]
     if ends:
         found.append(f'{listed(ends)} {"are" if ends[1:] else "is"} at the end of the range')

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_answer import LoadSag
+from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.records import FloatArray, NAN, plain_data
@@ -61,12 +61,12 @@ class Cause:
 
     term: Term  # With its parameters
     se: Mapping[str, Any]  # Standard errors, in the units of the parameters; NaN where not known
-    # Loss of the held-out score without it, nats per sample.
+    # Loss of held-out score without it, nats per sample.
     gain: float
     gain_se: float
     p_value: float  # See `gain.cause_gain`; 0 for exact findings
     alternatives: tuple[str, ...]  # Causes that this recording cannot separate from it
-    explanation: str  # For people
+    explanation: str  # In words
     exact: bool  # Found without a model
 
     @property
@@ -117,12 +117,12 @@ class Finding:
     criticism: tuple[Criticism, ...] = ()  # All statistics
     causes: tuple[Cause, ...] = ()  # As accepted
     model: SupplyModel | None = None  # The extended model, fitted on everything
-    se: tuple[Mapping[str, Any], ...] = ()  # Its standard errors, a dict a term
-    # The same of the extended model, its gain and standard error, nats per sample.
+    se: tuple[Mapping[str, Any], ...] = ()  # Its standard errors, one dict per term
+    # Score of the extended model, its gain and the standard error of that, nats per sample.
     score: float = NAN
     gain: float = NAN
     gain_se: float = NAN
-    # Relative reduction of the rms of one-step errors on those blocks against the plain OU.
+    # Relative reduction of the rms of one-step errors on held-out blocks, against the plain OU.
     shrink: float = NAN
     larger: bool = False  # Whether these errors are significantly larger than the plain OU's
     crossing: CrossingRate = field(default_factory=CrossingRate)  # Falls through a low level
@@ -169,7 +169,7 @@ class Finding:
         Returns
         -------
         dict
-            The keys of doc/discovery.md; `se` and `units` stand beside all `params`.
+            The keys of doc/discovery.md; wherever there are `params`, there are `se` and `units`.
 
         """
         baseline = self.baseline
@@ -238,12 +238,12 @@ _MADE = 0.5
 
 @dataclass(frozen=True)
 class ThrottleEffects:
-    """Predicted effects of throttle: a punch-out (at half time), and the dips of the recording."""
+    """Effects of throttle in the model: a punch-out at half time, and dips of the recording."""
 
     # Throttle before and after the punch-out.
     low: float = NAN
     high: float = NAN
-    # Depth of the mean below the voltage before, V, and its time after the punch-out, s.
+    # Maximum fall of the mean, V, and its time after the punch-out, s.
     dip: float = NAN
     after: float = NAN
     # Recovery while throttle is held, V, and time to 90 % of it, s; 0 and NaN without any.
@@ -275,23 +275,23 @@ class ThrottleEffects:
         found += '.'
         if self.dips:
             made = (f'made {self.made} of the {self.dips} dips' if self.dips > 1 else
-                    f'{"made" if self.made else "did not make"} the one dip')
+                    f'{"made" if self.made else "did not make"} the only dip')
             found += f' Throttle {made} below {number(self.level, 4)} V.'
         return found
 
 
 def throttle_effects(samples: Samples, terms: Sequence[Term], level: float) -> ThrottleEffects:
     """Return what a model predicts for punch-outs and for dips below a level, V."""
-    answers = [term for term in terms if term.ROLE is Role.MEAN and term.MEASURED]
+    responses = [term for term in terms if term.ROLE is Role.MEAN and term.MEASURED]
     u = samples.throttle
-    if u is None or not any(term.NEEDS_THROTTLE for term in answers):
+    if u is None or not any(term.NEEDS_THROTTLE for term in responses):
         return ThrottleEffects()
     low, high = np.quantile(u, _FLOWN).tolist()
     step = max(float(np.median(samples.step[1:])), (_BEFORE + _AFTER) / _MOST)
     t = step * np.arange(math.ceil((_BEFORE + _AFTER) / step), dtype=np.float64)
     half = 0.5 * float(samples.t[-1] - samples.t[0])
     held = [term.at(half) if isinstance(term, LoadSag) else term
-            for term in answers if term.NEEDS_THROTTLE]
+            for term in responses if term.NEEDS_THROTTLE]
     path = _path(Samples(t, t, np.where(t < _BEFORE, low, high)), held)
     begin = int(np.searchsorted(t, _BEFORE))
     fall = path[begin - 1] - path[begin:]
@@ -302,16 +302,16 @@ def throttle_effects(samples: Samples, terms: Sequence[Term], level: float) -> T
     if not recovered > _COUNTS * dip:
         recovered = 0.0
     within = step * int(np.argmax(back >= _BACK * recovered)) if recovered else NAN
-    dips, made = _dips(samples, _path(samples, answers), level)
+    dips, made = _dips(samples, _path(samples, responses), level)
     return ThrottleEffects(low, high, dip, step * (deepest + 1), recovered, within, level, dips,
                            made)
 
 
-def _path(samples: Samples, answers: Sequence[Term]) -> FloatArray:
+def _path(samples: Samples, responses: Sequence[Term]) -> FloatArray:
     """Return the effect of throttle and time on the mean, V."""
     s = samples.segment(1.0, 0.0)
     path = np.zeros(samples.n)
-    for term in answers:
+    for term in responses:
         path += term.columns(s) @ np.array(term.linear_values())
     return path
 

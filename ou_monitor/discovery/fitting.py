@@ -25,14 +25,14 @@ from ou_monitor.model.terms.term import LawFit, Role, Term
 from ou_monitor.model.whittle import Ordinates
 from ou_monitor.records import FloatArray, NAN
 
-# Number of starting points that are fitted, of samples that select them, and of kinds that get a
-# full fit.
+# Number of starting points that are fitted, of samples used to select them, and of kinds that get
+# a full fit.
 _FULL, _GLANCE, _FEW = 2, 8000, 4
-# Minimum share of the best first estimate, because a full fit gains at most twice its estimate.
+# First estimates below this share of the best are dropped: a full fit at most doubles an estimate.
 _WITHIN = 0.5
 # Maximum alternations between the fit and terms with parameters of their own (`APART`).
 _AGAIN = 3
-# Minimum difference of two fits to one spectrum, nats, and of two scores.
+# Difference below which two fits to one spectrum, nats, and two scores, count as equal.
 _ALIKE, _SAME = 0.1, 1e-6
 
 
@@ -47,7 +47,7 @@ class Trial:
     name: str  # Name of the cause
     composite: Composite  # The model with it
     evidence: float  # nats
-    beside: str = ''  # Name of a cause that it needs and brings along; otherwise empty
+    beside: str = ''  # Name of a cause that it needs and that is added with it; otherwise empty
 
 
 @dataclass(eq=False)
@@ -56,7 +56,7 @@ class Fitter:
 
     samples: Samples  # The recording
     cost: float = 0.0  # Processor time of the fits, s, estimated from their filters
-    # For each law, the scores of its last fit, and the result.
+    # For each law, the scores to which it was last fitted, and the result.
     looks: dict[type[Term], tuple[FloatArray, LawFit | None]] = field(default_factory=dict)
     # Kinds tried without success, and their gain by score tests then, nats.
     failed: dict[str, float] = field(default_factory=dict)
@@ -126,19 +126,19 @@ class Fitter:
     def trials(self, composite: Composite, kinds: Sequence[type[Term]],
                statistics: Callable[[Composite], Mapping[str, float]]) -> list[Trial]:
         """
-        Return kinds that improve a model: a first estimate of all, a full fit of the best few.
+        Return kinds that improve a model: all are estimated, and the best few fitted in full.
 
-        Kinds that failed before are tried again if score tests show more than then.  Kinds whose
-        fit takes seconds come last, and only if score tests still show them with the best of the
-        others in the model, or if they imitate it.  statistics: function of a model.
+        Kinds that failed before are tried again if score tests show more than at that time.  Kinds
+        whose fit takes seconds come last, and only if score tests still show them after the best
+        of the others, or if they imitate it.  statistics: function of a model.
         """
         values = statistics(composite)
         shown = {kind: decision.scored(kind, values) for kind in kinds}
-        tried = [kind for kind in kinds if not kind.DEAR
+        tried = [kind for kind in kinds if not kind.SLOW_FIT
                  and shown[kind] > self.failed.get(kind.NAME, -1.0)]
         glances = self._glances(composite, tried, 0.0)
         found = self._in_full(composite, glances, [])
-        dear = [kind for kind in kinds if kind.DEAR and decision.affordable(kind, self.cost)
+        dear = [kind for kind in kinds if kind.SLOW_FIT and decision.affordable(kind, self.cost)
                 and shown[kind] > self.failed.get(
                     kind.NAME, decision.TIE if kind.ROLE is Role.LAW else -1.0)]
         top = max((glance[0] for glance in glances), default=0.0)
@@ -167,18 +167,18 @@ class Fitter:
             else:
                 start = self.best_start(composite, kind, view, least)
                 gain = -math.inf if start is None else self.evidence(start) - before
-            # Keep kinds that gain less than others: later they may be the best.
+            # Keep kinds that gain less than others, because they may later be the best.
             if gain > (least if kind.BROAD else 0.0):
                 found.append((gain, kind, start))
         return found
 
     def _in_full(self, composite: Composite, glances: Sequence[_Glance], known: list[Trial]
                  ) -> list[Trial]:
-        """Return the trials with the best estimates, fitted in full; known fits are reused."""
+        """Fit the trials with the best estimates in full, reusing known fits."""
         found, names = list(known), {trial.name for trial in known}
         best = sorted(glances, key=lambda glance: -glance[0])[:_FEW]
         for gain, kind, start in best:
-            # Compare with full fits, because a law may lose its whole first estimate in one.
+            # Compare with full fits, in which a law may lose all of its first estimate.
             top = max((trial.evidence for trial in found), default=0.0)
             if gain < _WITHIN * top or kind.NAME in names:
                 continue
@@ -203,7 +203,7 @@ class Fitter:
 
     def _law_gain(self, kind: type[Term], view: View) -> float:
         """Return the evidence for a law of scores, nats."""
-        if kind.DEAR:
+        if kind.SLOW_FIT:
             self.cost += LAW_COST * self.samples.n
         try:
             fit = self.look(kind, view)
@@ -241,7 +241,7 @@ class Fitter:
 
     def _by_spectrum(self, composite: Composite, starts: Sequence[Term], view: View,
                      least: float) -> Composite | None:
-        """Return the best fit from starts that the spectrum of the scores has moved."""
+        """Return the best fit from starts that were first fitted to the spectrum of the scores."""
         ou, *others = composite.gaussian.terms
         laws = [term for term in composite.terms if term.ROLE is Role.LAW]
         moved = [from_spectrum(self.samples, composite, [start.beside(ou), *others, start])
@@ -282,7 +282,7 @@ def is_trend(samples: Samples, model: Composite) -> bool:
 
 
 def _joined(composite: Composite) -> Term:
-    """Return the term that was joined last."""
+    """Return the term that was added last."""
     return [term for term in composite.terms if term.ROLE is not Role.LAW][-1]
 
 
@@ -315,7 +315,7 @@ def _by_scores(samples: Samples, starts: list[Term], view: View) -> list[Term]:
 def from_spectrum(samples: Samples, composite: Composite, starts: Sequence[Term]
                   ) -> tuple[tuple[Term, ...], float]:
     """
-    Return the terms of a model and more of them, fitted to the spectrum of its scores.
+    Return the terms of a model and further ones, fitted to the spectrum of its scores.
 
     starts: the terms of `composite` without its laws, with the initial `ou`, and further terms at
     the end.  The second result is the gain of the fit, nats.
@@ -376,7 +376,7 @@ class _Spectrum:
 
 
 def standard_errors(samples: Samples, model: Composite, part: slice) -> tuple[dict[str, Any], ...]:
-    """Return standard errors by parameter, a dict a term."""
+    """Return standard errors by parameter, one dict per term."""
     found = [_gathered(term, se) for term, se in zip(model.terms, model.se)]
     for k, more in _of_mean(samples, model, part).items():
         found[k] = {**more, **found[k]}
@@ -398,7 +398,7 @@ def with_reach(term: Term, se: dict[str, Any], samples: Samples) -> dict[str, An
 
 
 def _gathered(term: Term, se: dict[str, float]) -> dict[str, Any]:
-    """Return errors of single knots, named `parameter 2`, as a list."""
+    """Gather the errors of single knots, named `parameter 2` and so on, in lists."""
     gathered: dict[str, Any] = {}
     for name, value in se.items():
         base, _, at = name.partition(' ')
@@ -419,7 +419,7 @@ def _of_mean(samples: Samples, model: Composite, part: slice) -> dict[int, dict[
     through = np.empty((weight.size, len(where)))
     for column, (k, j) in enumerate(where):
         beta = coefficients(terms[k])
-        # Innovations are linear in the coefficients, so any step will do.
+        # Innovations are linear in the coefficients, so the size of the step does not matter.
         beta[j] += 1.0
         moved = evaluate(samples, (*terms[:k], _with(terms[k], beta), *terms[k + 1:]))
         through[:, column] = weight * (base.innovation - moved.innovation)[part]

@@ -3,9 +3,9 @@ Gain of a model on samples that were not used for its fit.
 
 Blocked cross-validation (Bergmeir & Benitez, Inf. Sci. 191 (2012) 192): each block in turn is
 predicted, one step ahead, with parameters from the other blocks.  One fit to everything is enough:
-one scoring step removes the contribution of the block, and the mean is solved again.  Scores are
-log densities; neighbouring scores are correlated, so errors come from means of blocks.  Only
-samples at throttle that the other blocks cover are scored, because elsewhere a model extrapolates.
+for each block, one scoring step removes its contribution, and the mean is solved again.  Scores
+are log densities; neighbouring scores are correlated, so their error comes from means of blocks.
+Only samples at throttle that the other blocks cover are scored; elsewhere a model extrapolates.
 
 Limits: laws of the innovations (jumps, tails, switching) and searched values (frequencies, time
 constants) are not fitted again without the block.  Instead one nat is subtracted for each of their
@@ -35,7 +35,7 @@ from scipy.stats import chi2
 
 # Number of blocks of the held-out samples: the minimum for a good estimate of their spread.
 BLOCKS = 24
-# Minimum error of an unknown gain: relative to the gain, and in nats per sample.
+# A gain is unknown if its error exceeds both: this multiple of the gain, and nats per sample.
 _VAGUE, _WIDE = 10.0, 0.1
 # Level of the crossings, in standard deviations below the mean: start, step and end of the search,
 # and the minimum number of crossings in the fitted and in the held-out part.
@@ -59,7 +59,7 @@ def mean_difference(new: FloatArray, old: FloatArray) -> tuple[float, float]:
     blocks = difference[:size * BLOCKS].reshape(BLOCKS, size).mean(axis=1)
     c = blocks - blocks.mean()
     own = float(c @ c) / (BLOCKS - 1)
-    # Half the weight of a full lag; a negative correlation is ignored.
+    # Neighbouring blocks count with half weight; a negative correlation is ignored.
     shared = max(float(c[1:] @ c[:-1]) / (BLOCKS - 1), 0.0)
     return mean, math.sqrt((own + shared) / BLOCKS)
 
@@ -74,7 +74,7 @@ def without(samples: Samples, model: Composite, *indices: int, plain: Composite 
     """
     Return the model fitted again to everything without some of its terms; None if that fails.
 
-    A fit that is worse than the plain one has not converged, and is repeated from another start.
+    If it is worse than the plain fit, it has not converged, and is repeated from another start.
     """
     kept = [term for k, term in enumerate(model.terms) if k not in indices]
     # Terms that modify a removed term are removed too.
@@ -146,8 +146,8 @@ def cause_gain(full: HeldOut, less: HeldOut, scored: npt.NDArray[np.bool_]
     """
     Return the gain of the larger of two models, its error, nats per sample, and a p-value.
 
-    The p-value is twice the smaller of two: of the likelihood ratio on everything, corrected for
-    the search, and of the gain on held-out samples.
+    The p-value is twice the smaller of two p-values: of the likelihood ratio on everything,
+    corrected for the search, and of the gain on held-out samples.
     """
     gain, error = gain_of(full, less, scored)
     ratio = 2.0 * float((full.model.density - less.model.density).sum())
@@ -207,7 +207,7 @@ def crossing_rates(samples: Samples, baseline: Sequence[Term], extended: Sequenc
             found = [NAN, NAN]
         rates.append((float(np.mean(found)), float(np.std(found, ddof=1)) / math.sqrt(len(found))))
     observed = crossings(t, samples.logged, level, scored)
-    # Poisson error; no crossing is as uncertain as one.
+    # Poisson error, at least that of one crossing.
     minutes = float(np.diff(t)[scored[1:] & scored[:-1]].sum()) / 60.0
     error = math.sqrt(max(observed * minutes, 1.0)) / minutes if minutes > 0.0 else NAN
     return CrossingRate(level, observed, rates[0][0], rates[1][0], error, rates[0][1],
@@ -220,12 +220,12 @@ FOLDS = 6
 _STEP = 1e-4
 # Maximum change of a parameter, in its logarithm, as in a fit.
 _FAR = 1.5
-# Maximum mean loss by errors of the parameters, nats per sample; at the limit these errors are as
-# large as the noise.
+# Maximum mean loss from errors of the parameters, nats per sample; at the limit they are as large
+# as the noise.
 _UNKNOWN = 0.5
-# Tolerance outside the throttle of the other blocks: share of its range, and minimum.
+# Tolerance beyond the throttle range of the other blocks: share of the range, and minimum.
 _BEYOND, _STILL = 0.05, 0.01
-# After throttle that no other block contains, samples are not scored for this time, s: most lags
+# Time, s, for which samples are not scored after throttle that no other block contains: most lags
 # of recorded flights are shorter.
 _AFTER = 0.2
 
@@ -299,9 +299,10 @@ def errors_grow(new: FloatArray, old: FloatArray, variance: FloatArray, errors: 
     """
     Return whether one-step errors (rms) grew by more than `errors` standard errors.
 
-    Under the right new model, its errors, with these variances, V^2, are independent of the
+    If the new model is right, its errors, with these variances, V^2, are independent of their
     difference from the old ones, which gives the standard error of the increase.  A likelihood may
-    miss larger errors: to explain a few bursts as noise may cost less than it gains elsewhere.
+    rise although errors grow: explaining a few bursts as noise may cost less than it gains
+    elsewhere.
     """
     difference = old - new
     error = 2.0 * math.sqrt(float(np.sum(variance * difference**2)))
@@ -322,7 +323,7 @@ def _stepped(term: Term, name: str) -> tuple[Term, float]:
 
 def _moved(terms: tuple[Term, ...], free: list[tuple[int, str]], step: FloatArray
            ) -> tuple[Term, ...]:
-    """Return terms with parameters moved, as far as their ranges go."""
+    """Return terms with parameters moved, but not beyond their ranges."""
     found = list(terms)
     for (k, name), by in zip(free, step.tolist(), strict=True):
         try:

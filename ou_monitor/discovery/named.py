@@ -1,5 +1,5 @@
 """
-Named causes: the causes of a search, without those that a second criticism refutes.
+Named causes: the causes that a search accepted and that a second criticism does not refute.
 
 The model is criticised on the whole recording; causes that do not explain their statistics are
 withdrawn, and the search continues without them.
@@ -29,12 +29,12 @@ from ou_monitor.model.terms.tones import Resonance, Tone
 
 # Maximum number of searches, each without the causes withdrawn before.
 _TURNS = 3
-# Minimum amplitude, in standard errors, of a line that is never withdrawn.
+# Amplitude, in standard errors, from which a line is never withdrawn.
 _SURE = 25.0
 
 # Note if the search was cut short.
-STOPPED = ('The search for causes was cut short because the next ones would have taken long; '
-           'there may be more causes.')
+STOPPED = ('The search for causes was cut short because the next ones would have taken too long; '
+           'there may be more.')
 
 # Note if the user stopped the search.
 INTERRUPTED = ('The search for causes was stopped by the user: these are the causes found so far; '
@@ -99,7 +99,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
         # A numerical failure; the criticism is still valid.
         failure = f'The search for causes failed: {error}.'
     if failure and begun is not None:
-        # After the load model, search and names are consistent.
+        # Once the load model has been chosen, the search is consistent at any time.
         found = _finished(fitter, search, bank)
     names = found.search.accepted
     return Named(found.whole, bank, tuple(names),
@@ -135,7 +135,7 @@ def _withdrawn(fitter: Fitter, found: _Result, begun: _Result) -> list[int]:
 
 def _with_trends(samples: Samples, whole: Composite, rivals: Mapping[str, list[str]]
                  ) -> dict[str, list[str]]:
-    """Return the rivals of each cause; a drift is a rival of a relaxation that is a trend."""
+    """Return the rivals of each cause; a relaxation that is a trend has a drift as a rival."""
     duration = float(samples.t[-1] - samples.t[0])
     slow = not whole.has(Drift.NAME) and any(
         isinstance(term, SecondRelaxation) and not decision.relaxes(term.alpha, duration)
@@ -146,7 +146,7 @@ def _with_trends(samples: Samples, whole: Composite, rivals: Mapping[str, list[s
 
 def _in_doubt(samples: Samples, whole: Composite, names: Sequence[str], out: Sequence[int]
               ) -> list[int]:
-    """Return the causes to withdraw, without strong lines, which always stay."""
+    """Return the causes to withdraw; strong lines always stay."""
     errors: Sequence[Mapping[str, float]] = ()
     if any(names[k] == Tone.NAME for k in out):
         errors = standard_errors(samples, whole, slice(0, samples.n))

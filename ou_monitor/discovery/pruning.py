@@ -1,8 +1,8 @@
 """
 Remove causes that do not improve predictions of held-out blocks, and check the model.
 
-A cause is removed if the rest, fitted again, predicts held-out blocks as well without it.  Then
-the others are tested again, because another cause may take over its effect.
+A cause is removed if the rest, fitted again, predicts held-out blocks equally well.  Then the
+others are tested again, because one of them may take over its effect.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def prune_by_gain(samples: Samples, model: Composite, names: Sequence[str], plai
             state.worth += [Worth(chance=0.0)] * missing
             return state
         failing = [k for k, worth in enumerate(state.worth) if worth.less is not None
-                   and not decision.earns(worth.gain, worth.error, worth.chance)
+                   and not decision.improves_predictions(worth.gain, worth.error, worth.chance)
                    and not _as_trend(samples, state, k)]
         if turn == _ROUNDS - 1:
             return state
@@ -104,9 +104,9 @@ def _straying(samples: Samples, state: Pruned) -> int | None:
     """
     Return the cause whose removal keeps simulations within the recorded range, if there is one.
 
-    One-step predictions hardly constrain the range of a process: an intensity or an event that
-    fits them may still exceed the recorded range.  Responses of the mean are not tested.  The
-    median simulation decides, because heavy tails may leave the range once.
+    One-step predictions hardly constrain the range of a process: with an intensity or an event
+    that fits them, simulations may still exceed the recorded range.  Responses of the mean are not
+    tested.  The median simulation decides, because heavy tails may leave the range once.
     """
     def far_of(model: Composite) -> float:
         try:
@@ -118,7 +118,7 @@ def _straying(samples: Samples, state: Pruned) -> int | None:
     if not far > 0.0:
         return None
     other = {k: far_of(worth.less.model) for k, worth in enumerate(state.worth)
-             if worth.less is not None and not decision.is_answer(catalogue()[state.names[k]])}
+             if worth.less is not None and not decision.is_response(catalogue()[state.names[k]])}
     # The cheapest single cause; combinations are not tried.
     return min((k for k, stays in other.items() if not stays > 0.0), default=None,
                key=lambda k: state.worth[k].gain)
@@ -126,7 +126,7 @@ def _straying(samples: Samples, state: Pruned) -> int | None:
 
 def _far(samples: Samples, terms: Sequence[Term]) -> FloatArray:
     """
-    Return how far the level of each simulation leaves the recorded range, V (fixed seeds).
+    Return by how much the level of each simulation leaves the recorded range, V (fixed seeds).
 
     The level is a running median of five samples, which single bad samples do not change.
     """
@@ -143,14 +143,14 @@ def _far(samples: Samples, terms: Sequence[Term]) -> FloatArray:
 def _as_trend(samples: Samples, state: Pruned, k: int) -> bool:
     """Return whether the `ou` would become a trend if this response of the mean were removed."""
     less = state.worth[k].less
-    return (decision.is_answer(catalogue()[state.names[k]]) and less is not None
+    return (decision.is_response(catalogue()[state.names[k]]) and less is not None
             and is_trend(samples, less.model) and not is_trend(samples, state.full.model))
 
 
 def _measure(samples: Samples, state: Pruned, plain: HeldOut, scored: npt.NDArray[np.bool_],
              progress: Callable[[float], None]) -> None:
     """
-    Measure the gain of each cause, or of all of one kind if there are many.
+    Measure the gain of each cause, or of all causes of one kind if there are many.
 
     If the rest predicts worse than the plain OU, the gain is relative to the plain OU.
     """
@@ -185,7 +185,7 @@ def refusal(samples: Samples, terms: Sequence[Term], gain: float, gain_se: float
 
     gain, gain_se in nats per sample; larger: whether its one-step errors are significantly larger.
     """
-    if math.isfinite(gain) and not decision.earns(gain, gain_se, 0.0):
+    if math.isfinite(gain) and not decision.improves_predictions(gain, gain_se, 0.0):
         return 'The extended model predicts worse than the plain OU'
     if larger:
         return 'One-step errors of the extended model are larger than those of the plain OU'

@@ -26,23 +26,23 @@ from ou_monitor.model.load import INRUSH_TIME
 from ou_monitor.model.load_fit import fit_load
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.laws import View
-from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient, SHORTEST
+from ou_monitor.model.terms.load_response import LoadSag, LoadTransient, SHORTEST
 from ou_monitor.model.terms.slow import Drift
 from ou_monitor.model.terms.term import NEXT_TO_ZERO, Role, Term
 from ou_monitor.records import FloatArray
 
 # Number of blocks that are held out in turn.
 FOLDS = 10
-# Maximum number of means that the load model is fitted to: its time constants are 20 ms and more.
+# Maximum number of bin means in a fit of the load model; its time constants are 20 ms and more.
 _MOST = 2000
-# Factor below which two time constants are equal: half an octave, the spacing of the list.
+# Ratio below which two time constants count as equal: half an octave, the spacing of the list.
 _ALIKE = 1.5
-# Maximum number of changes.
+# Maximum number of terms added, removed or exchanged.
 _ROUNDS = 40
 
 
 def load_terms(samples: Samples) -> tuple[Term, ...]:
-    """Return the terms of the load model that the catalogue has; none without throttle."""
+    """Return the fitted load model as terms of the catalogue; none without throttle."""
     if samples.throttle is None:
         return ()
     size = math.ceil(samples.n / _MOST)
@@ -66,24 +66,24 @@ def load_terms(samples: Samples) -> tuple[Term, ...]:
 
 
 @dataclass(frozen=True)
-class Answer:
+class MeanResponse:
     """Terms of the mean, and the evidence of each."""
 
     terms: tuple[Term, ...]  # In the order of their evidence, the largest first
     worth: tuple[float, ...]  # Evidence lost without each, nats
-    rivals: tuple[tuple[str, ...], ...]  # For each, the causes that tie in its place
+    rivals: tuple[tuple[str, ...], ...]  # For each, the causes that would do as well
 
 
-def mean_answer(samples: Samples, composite: Composite, view: View,
-                start: Sequence[Term] = ()) -> Answer:
-    """Return the terms of the mean in a recording, beside the other terms of a model."""
+def mean_response(samples: Samples, composite: Composite, view: View,
+                  start: Sequence[Term] = ()) -> MeanResponse:
+    """Choose the terms of the mean; the other terms of the model stay as they are."""
     own = [term for term in composite.terms if _measured(term)]
     pool = [*(term for term in start if not _there(term, own)), *own]
     # With only a rough noise model, a growing sag would take the place of other terms.
     pool += [term for term in _candidates(view) if not _there(term, pool)
              and not (start and isinstance(term, LoadSag) and term.growth)]
     if not pool:
-        return Answer((), (), ())
+        return MeanResponse((), (), ())
     return _Regression(samples, composite, pool).search([
         k for k, term in enumerate(pool) if term in own or term in start])
 
@@ -140,7 +140,7 @@ class _Regression:
         self._price = 0.5 * math.log(samples.n)
         self._known: dict[tuple[int, ...], tuple[float, FloatArray]] = {}
 
-    def search(self, start: Sequence[int]) -> Answer:
+    def search(self, start: Sequence[int]) -> MeanResponse:
         """Add and remove terms until no change improves the evidence."""
         chosen = self._one_of_a_kind(start)
         for _ in range(_ROUNDS):
@@ -152,12 +152,12 @@ class _Regression:
         worth = [self._value(chosen) - self._value(self._less(chosen, k)) for k in chosen]
         order = np.argsort(-np.array(worth)) if worth else np.zeros(0, dtype=int)
         found = [chosen[k] for k in order.tolist()]
-        return Answer(tuple(self._pool[k] for k in found),
-                      tuple(worth[k] for k in order.tolist()),
-                      tuple(self._rivals(chosen, k) for k in found))
+        return MeanResponse(tuple(self._pool[k] for k in found),
+                            tuple(worth[k] for k in order.tolist()),
+                            tuple(self._rivals(chosen, k) for k in found))
 
     def _best_move(self, chosen: tuple[int, ...]) -> tuple[int, ...] | None:
-        """Return the set after the best change; None if no change helps."""
+        """Return the set after the most useful change; None if no change helps."""
         value = self._value(chosen)
         largest = value - self._value(())
         best, most = None, 0.0
@@ -243,7 +243,7 @@ class _Regression:
         return chosen
 
     def _as_good(self, chosen: tuple[int, ...], k: int) -> list[int]:
-        """Return the terms of other kinds that do as well in the place of one."""
+        """Return the terms of other kinds that would do as well in the place of a term."""
         value, less = self._value(chosen), self._less(chosen, k)
         return [j for j, term in enumerate(self._pool)
                 if type(term) is not type(self._pool[k]) and j not in chosen
@@ -251,12 +251,12 @@ class _Regression:
                 and self._value(self._with(less, j)) > value - decision.TIE]
 
     def _rivals(self, chosen: tuple[int, ...], k: int) -> tuple[str, ...]:
-        """Return the causes that do as well in the place of one."""
+        """Return the causes that would do as well in the place of a term."""
         return tuple(dict.fromkeys(self._pool[j].NAME for j in self._as_good(chosen, k)))
 
 
 def _lost(fitted: FloatArray, scored: FloatArray, at: npt.NDArray[np.int64]) -> float:
-    """Return half the sum of squared residuals on some blocks of a fit to others."""
+    """Fit some blocks; return half the sum of squared residuals on other blocks."""
     gram = fitted[np.ix_(at, at)]
     # The columns are scaled; the ridge keeps equal columns from a division by zero.
     beta = np.linalg.solve(gram + 1e-10 * np.trace(gram) * np.eye(at.size), fitted[at, 0])

@@ -1,12 +1,12 @@
 """
 The search for the causes that a recording shows.
 
-It begins with the response of the mean to throttle and time, and the noise under load, which are
-nearly all of the variance on real flights and hide everything else.  Then, in each round, every
-candidate of the catalogue is fitted together with the model so far, and the one with most evidence
-is accepted; causes that are no longer worth their penalty are removed, and a law of throttle
-replaces another if it fits better.  Measured inputs come before latent causes, which can imitate
-them; causes that tie are named as alternatives.
+It begins with the response of the mean to throttle and time, and with the noise under load: on
+real flights they are nearly all of the variance and hide everything else.  Then, in each round,
+every candidate of the catalogue is fitted together with the model so far, and the one with most
+evidence is accepted; causes that are no longer worth their penalty are removed, and a law of
+throttle is exchanged for another that fits better.  Measured inputs come before latent causes,
+which can imitate them; causes that tie are named as alternatives.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from ou_monitor.criticism.composite import Composite
 from ou_monitor.discovery import decision
 from ou_monitor.discovery.fitting import Fitter, is_trend, Trial
 from ou_monitor.discovery.gain import BLOCKS
-from ou_monitor.discovery.regression import load_terms, mean_answer
+from ou_monitor.discovery.regression import load_terms, mean_response
 from ou_monitor.model.terms.ac_coupling import ACCoupling
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
 from ou_monitor.model.terms.load_dependent import (
     LoadDependentAlpha, LoadDependentNoise, LoadDependentSigma)
+from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.term import NEXT_TO_ZERO, Role, Term
@@ -35,14 +35,14 @@ from ou_monitor.text import Z95
 
 Progress = Callable[[float], None]
 
-# Laws of throttle: in one-step errors each can replace another.
+# Laws of throttle, which have similar effects on one-step errors and may be exchanged.
 LAWS: tuple[type[Term], ...] = (LoadDependentSigma, LoadDependentNoise, LoadDependentAlpha)
-# Intensities that follow throttle: each may only correct the form of the other.
+# Intensities that follow throttle: a second one may only be correcting the form of the first.
 _CURVES = {LoadDependentSigma.NAME: LoadDependentNoise.NAME,
            LoadDependentNoise.NAME: LoadDependentSigma.NAME}
 # Maximum loss of a fit with few rounds, nats.
 _ROUGH = 20.0
-# Maximum time of one fit, s, for which the mean is chosen again after each cause.
+# Maximum time of one fit, s, with which the mean is still chosen again after each cause.
 _SOON = 1.0
 # Maximum rounds that add lines to a tone (three motors or converters, each with harmonics), and
 # maximum lines added in one.
@@ -83,7 +83,7 @@ def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
             search.asked[best.name] = criticise(fitter.samples, search.composite, bank)
         _accept(search, best, trials)
         if best.composite.gaussian.cost < _SOON:
-            choose_answer(fitter, search, ())
+            choose_response(fitter, search, ())
         if best.name == Tone.NAME:
             # Weaker lines become visible once the strongest is in the model.
             for _ in range(_LINE_TURNS):
@@ -94,7 +94,7 @@ def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
 
 
 def backward(fitter: Fitter, search: Search) -> None:
-    """Remove or exchange causes, the best change first, while a change gains."""
+    """Remove or exchange causes, the best change first, until none gains."""
     for _ in range(2 * decision.MOST):
         if not _moved(fitter, search):
             return
@@ -109,29 +109,29 @@ def without_causes(fitter: Fitter, search: Search, out: Sequence[int]) -> Search
         name for k, name in enumerate(search.accepted) if k not in out])
 
 
-def choose_answer(fitter: Fitter, search: Search, start: Sequence[Term]) -> None:
-    """Choose the measured terms of the mean again, with the noise found so far."""
+def choose_response(fitter: Fitter, search: Search, start: Sequence[Term]) -> None:
+    """Choose the measured terms of the mean again, given the noise found so far."""
     composite = search.composite
-    answer = mean_answer(fitter.samples, composite, fitter.view(composite), start)
-    own = [term for term in composite.terms if decision.is_answer(type(term))]
+    response = mean_response(fitter.samples, composite, fitter.view(composite), start)
+    own = [term for term in composite.terms if decision.is_response(type(term))]
     shapes, others = ([term.with_linear([NEXT_TO_ZERO] * len(term.LINEAR)) for term in terms]
-                      for terms in (own, answer.terms))
+                      for terms in (own, response.terms))
     if not start and len(shapes) == len(others) and all(one in shapes for one in others):
         return
     structural = [term for term in composite.terms
-                  if term.ROLE is not Role.LAW and not decision.is_answer(type(term))]
+                  if term.ROLE is not Role.LAW and not decision.is_response(type(term))]
     laws = [term for term in composite.terms if term.ROLE is Role.LAW]
-    gone = {term.NAME for term in own} - {term.NAME for term in answer.terms}
+    gone = {term.NAME for term in own} - {term.NAME for term in response.terms}
     if gone and is_trend(fitter.samples, composite):
         return
-    fit = fitter.fit([*structural, *answer.terms, *laws], composite)
+    fit = fitter.fit([*structural, *response.terms, *laws], composite)
     if fit is None or (not start and fitter.evidence(fit) < fitter.evidence(composite)):
         return
     search.composite = fit
-    before = [name for name in search.accepted if decision.is_answer(catalogue()[name])]
-    names = [term.NAME for term in answer.terms]
+    before = [name for name in search.accepted if decision.is_response(catalogue()[name])]
+    names = [term.NAME for term in response.terms]
     search.accepted = [*names, *(name for name in search.accepted if name not in before)]
-    for term, worth, rivals in zip(answer.terms, answer.worth, answer.rivals, strict=True):
+    for term, worth, rivals in zip(response.terms, response.worth, response.rivals, strict=True):
         search.rivals[term.NAME] = list(rivals)
         search.log.append(f'{term.NAME}: {worth:.1f} nats')
 
@@ -201,7 +201,7 @@ def _more_lines(fitter: Fitter, search: Search) -> bool:
     """Add lines beside the one accepted last, such as its harmonics."""
     composite, samples = search.composite, fitter.samples
     view = fitter.view(composite)
-    # Penalty of amplitude, phase, and searched frequency.
+    # Penalty for amplitude, phase, and the search for the frequency.
     price = math.log(samples.train.stop) + Tone.SEARCH
     # A line of the scores, with variance 1, gains n rms^2 / 2 nats.
     lines = [Tone.at(line, view) for line in lines_of(view)[:_MOST_LINES]
@@ -230,7 +230,7 @@ def _moved(fitter: Fitter, search: Search) -> bool:
     """Make the best removal or exchange of one cause; return whether there was one."""
     value, moves = fitter.evidence(search.composite), []
     names = dict.fromkeys(name for name in search.accepted
-                          if not decision.is_answer(catalogue()[name]))
+                          if not decision.is_response(catalogue()[name]))
     swapped: dict[str, list[str]] = {name: [] for name in names if catalogue()[name] in LAWS}
     for name in names:
         less = _without(fitter, search.composite, name)
@@ -285,8 +285,8 @@ def _in_full(fitter: Fitter, found: Composite) -> Composite:
     return full if full is not None and fitter.evidence(full) > fitter.evidence(found) else found
 
 
-# Initial rate of the residual after load, 1/s; from it a fit converges to relaxation times from
-# tenths of a second to minutes.
+# Initial rate of the residual after load, 1/s; a fit that starts here converges to relaxation
+# times from tenths of a second to minutes.
 _SLOW = 1.0
 
 
@@ -294,22 +294,22 @@ def under_load(fitter: Fitter, search: Search) -> None:
     """
     Start from the load model: response to throttle, and noise that follows it, together.
 
-    They are nearly all of the variance of a flight; one by one, each would be fitted to the
-    residuals of the others.  Afterwards each must be worth its own penalty.
+    They are nearly all of the variance of a flight; if they came one by one, each would be fitted
+    to what the others leave.  Afterwards each must be worth its own penalty.
     """
     load, plain = load_terms(fitter.samples), search.composite
     noisy = whole_load(fitter, plain, load)
     if noisy is None:
-        choose_answer(fitter, search, ())
+        choose_response(fitter, search, ())
         return
     search.composite = noisy
-    choose_answer(fitter, search, load)
+    choose_response(fitter, search, load)
     if not any(catalogue()[name].FAMILY == LoadSag.FAMILY for name in search.accepted):
         # Throttle does not move the mean: the search tests the noise terms one by one.
         search.composite, search.accepted = plain, []
-        choose_answer(fitter, search, ())
+        choose_response(fitter, search, ())
         return
-    means = [term for term in search.composite.terms if decision.is_answer(type(term))]
+    means = [term for term in search.composite.terms if decision.is_response(type(term))]
     bare = fitter.fit([*plain.terms, *means], plain)
     if bare is None:
         return
@@ -320,19 +320,19 @@ def under_load(fitter: Fitter, search: Search) -> None:
         best = fitter.fit(search.composite.terms, search.composite) or search.composite
     search.composite = best
     for term in best.terms:
-        if term.NAME not in known and not decision.is_answer(type(term)):
+        if term.NAME not in known and not decision.is_response(type(term)):
             search.accepted.append(term.NAME)
             search.rivals.setdefault(term.NAME, [])
             search.log.append(f'{term.NAME}: with the load')
     backward(fitter, search)
-    choose_answer(fitter, search, ())
+    choose_response(fitter, search, ())
     _coupled(fitter, search)
 
 
 def _coupled(fitter: Fitter, search: Search) -> None:
     """Replace transients by a sag behind an AC coupling if that fits better; ties are rivals."""
     composite = search.composite
-    means = [term for term in composite.terms if decision.is_answer(type(term))]
+    means = [term for term in composite.terms if decision.is_response(type(term))]
     if ACCoupling.NAME not in catalogue() or not decision.only_to_changes(map(type, means)):
         return
     changes = [term for term in means if isinstance(term, LoadTransient)]
@@ -377,7 +377,7 @@ def _noise_beside(fitter: Fitter, composite: Composite) -> Composite:
     ou = composite.terms[0]
     assert isinstance(ou, OU)
     error = math.sqrt(float(np.median(composite.gaussian.variance)))
-    # The residual of the load is slow and smaller than the white noise, or it is the noise itself.
+    # Two starts: a slow residual of the load, smaller than the white noise, and all noise as `ou`.
     slow = replace(ou, alpha=_SLOW, sigma=0.3 * error * math.sqrt(2.0 * _SLOW))
     while True:
         view = fitter.view(best)

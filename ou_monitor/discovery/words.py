@@ -1,5 +1,5 @@
 """
-A finding in words: verdict, causes, gains, remaining discrepancies, and what would decide.
+A finding in words: verdict, causes, gains, remaining discrepancies, and what would settle them.
 
 `cause_rows` are the rows of the table of causes.
 """
@@ -44,12 +44,12 @@ _PLAIN = ((
     ('time', 'the mean changes with time'),
     ('throttle', 'the mean depends on throttle or its changes'),
     ('state throttle', 'the relaxation depends on throttle'),
-    ('state', 'the relaxation is not proportional to the deviation'),
+    ('state', 'the restoring force is not proportional to the deviation'),
     ('growing effect', 'the effect of throttle on the mean changes with time'),
     ('loop of throttle', 'the mean depends on whether throttle rose or fell before'),
     ('after large', 'the voltage after a large error does not follow the relaxation'),
     ('power after large', 'a large error is followed by more noise, or by less'),
-    ('irreversibility', 'it is not symmetric in time'),
+    ('irreversibility', 'the process is not symmetric in time'),
     ('small errors', 'neighbouring small errors are correlated'),
     ('bursts', 'power at some frequencies comes and goes'),
     ('products of three', 'neighbouring errors are dependent beyond their spectrum'),
@@ -72,9 +72,9 @@ def parameters(term: Term, se: Mapping[str, Any]) -> str:
 
 def with_error(value: Any, error: Any, *, positive: bool = False) -> str:
     """
-    Return a number, or a list of them, with its standard error if known.
+    Return a number, or a list of numbers, with its standard error if known.
 
-    A positive number is not determined beyond `LARGEST_LOG_SE`, as in an `Estimate`.
+    A positive number is "not determined" if its error exceeds `LARGEST_LOG_SE`, as in `Estimate`.
     """
     if isinstance(value, list):
         errors = error if isinstance(error, list) else [None] * len(value)
@@ -123,8 +123,8 @@ def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
 
 def left_out_note(count: int, scored: int) -> str:
     """Return the note for samples at throttle that other blocks do not cover."""
-    return (f'{count} samples are at throttle that the rest of the recording does not cover: a '
-            f'model fitted there does not apply to them. Only the other {scored} are scored.')
+    return (f'{count} samples are at throttle that the rest of the recording does not cover, so a '
+            f'model fitted to the rest does not apply. Only the other {scored} are scored.')
 
 
 def coupling_note(alpha: float, duration: float) -> str:
@@ -144,14 +144,14 @@ def coupling_note(alpha: float, duration: float) -> str:
 def no_relaxation_note(alpha: float, step: float) -> str:
     """Return the note for samples farther apart than the relaxation time."""
     return (f'Samples {number(1e3 * step)} ms apart are nearly uncorrelated: the rail is faster '
-            f'than the sampling, or the noise is that of the sensor, and alpha = {number(alpha)} '
-            '1/s is only a lower bound.')
+            f'than the sampling, or the noise comes from the sensor; alpha = {number(alpha)} 1/s '
+            'is only a lower bound.')
 
 
 def coupling_found(duration: float) -> str:
     """Return what would confirm an AC coupling that was found."""
     return (f'An AC coupling was found in {number(duration)} s; its evidence grows as 0.24 nats '
-            'times rate of the rail times duration. A DC-coupled recording confirms it.')
+            'times rate of the rail times duration. A DC-coupled recording would settle it.')
 
 
 def remaining_words(left: Sequence[Criticism]) -> str:
@@ -233,7 +233,7 @@ def why_named(gain: float, gain_se: float, chance: float) -> str:
 
 def overlap_words(causes: Sequence[Cause], gain: float) -> str:
     """
-    Return why single gains exceed the gain of the whole model; empty if none does.
+    Explain why single gains exceed the gain of the whole model; empty if none does.
 
     gain in nats.
     """
@@ -242,7 +242,7 @@ def overlap_words(causes: Sequence[Cause], gain: float) -> str:
     if not larger:
         return ''
     return (f'Without {" or without ".join(larger)} the rest of the model predicts worse than the '
-            'plain OU, so this gain exceeds the gain of the whole model: single gains overlap and '
+            'plain OU, so that gain exceeds the gain of the whole model: single gains overlap and '
             'do not add up.')
 
 
@@ -353,7 +353,7 @@ PLAIN_NAMES = {
     'quantization': 'a coarse ADC',
     'regime_switching': 'two states of the supply',
     'resonance': 'ringing of leads and capacitors',
-    'saturation': 'clipping at the end of the ADC',
+    'saturation': 'clipping at the end of the range of the ADC',
     'second_relaxation': 'a second time constant',
     'throttle_tone': 'a line that follows the motors',
     'tone': 'a line at a fixed frequency',

@@ -4,13 +4,13 @@ The ARMA(1,1) of a sampled or block-averaged OU with white noise, and the errors
 Samples of an OU are AR(1); white noise on top, or averaging over blocks, makes
 them ARMA(1,1): z_j - phi z_{j-1} = e_j - theta e_{j-1}, with phi = exp(-alpha D)
 for the step D.  Averages over blocks *without* noise have theta < 0; noise
-raises theta towards phi.  In units of sigma^2 D the shape depends on a = alpha D,
-on the samples per block m and on the noise share lam = noise variance of one
-z / (sigma^2 D) alone.
+raises theta towards phi.  In units of sigma^2 D the shape depends only on
+a = alpha D, the samples per block m, and the noise share
+lam = (noise variance of one z) / (sigma^2 D).
 
-Source of the block autocovariances: the double sums of phi^(|i-j|/m), closed
-by the geometric series; Hamilton, Time Series Analysis (1994), ch. 3, for the
-ARMA identities.
+The block autocovariances are double sums of phi^(|i-j|/m), evaluated by the
+geometric series; the ARMA identities are from Hamilton, Time Series Analysis
+(1994), ch. 3.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def block_autocovariance(a: float, m: int) -> tuple[float, float]:
     r = math.exp(-a / m)
     short, long = -math.expm1(-a / m), -math.expm1(-a)
     if a < 1e-3:
-        # The two terms of gamma0 cancel to order a; the series keeps 1e-9 here:
+        # The two terms of gamma0 cancel to order a; this series is accurate to 1e-9:
         # 1 - mean |i-j|/m a + mean (|i-j|/m)^2 a^2/2 - mean (|i-j|/m)^3 a^3/6.
         k = float(m)
         one = (k * k - 1.0) / (3.0 * k * k)
@@ -54,8 +54,8 @@ def log_covariance(a: float, theta: float, m: int, n: int) -> tuple[float, float
 
     The covariance of (phi, theta) is (1 - phi theta)/(phi - theta)^2 / n times
     [[(1-phi^2)(1-phi theta), (1-phi^2)(1-theta^2)], [., (1-theta^2)(1-phi
-    theta)]], and that of ln q is 2/n (Box & Jenkins, Time Series Analysis,
-    7.2.6); the delta method carries it to the logarithms.
+    theta)]], and the variance of ln q is 2/n (Box & Jenkins, Time Series
+    Analysis, 7.2.6); the delta method gives those of the logarithms.
     """
     phi = math.exp(-a)
     one, other = -math.expm1(-2.0 * a), 1.0 - theta * theta

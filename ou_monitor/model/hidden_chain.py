@@ -1,9 +1,9 @@
 """
-Hidden Markov chains over many samples, in library code.
+Hidden Markov chains over many samples, without a Python loop over samples.
 
-Forward probabilities are products of small matrices.  Those of equal blocks are
-computed side by side, so the Python loop has a few hundred iterations for any
-number of samples (for the recursion: Rabiner, Proc. IEEE 77 (1989) 257).
+Forward probabilities are products of small matrices (Rabiner, Proc. IEEE 77 (1989) 257).  The
+samples are split into blocks of equal length, whose products are computed side by side, so the
+Python loop has a few hundred iterations for any number of samples.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ from operator import mul
 import numpy as np
 from ou_monitor.records import FloatArray
 
-# Products, and levels of pairwise products, between two normalisations: without underflow, because
-# the largest density of each sample is scaled to 1.
+# Products, and levels of pairwise products, between two normalisations.  They do not underflow,
+# because the largest density of each sample is scaled to 1.
 _EVERY, _LEVELS = 8, 3
-# Samples per block, in square roots of their number: an iteration over blocks costs more.
+# Samples per block, over the square root of all samples: below 1, because an iteration over blocks
+# costs more.
 _SHORT = 0.4
 # Probability that counts as 0: no possible state explains the sample.
 _NONE = 1e-300
@@ -25,7 +26,7 @@ _NONE = 1e-300
 
 def forward(log_density: FloatArray, transition: FloatArray, start: FloatArray
             ) -> tuple[FloatArray, FloatArray]:
-    """Filter."""
+    """Return the law of the states before each sample, and the log density of each sample."""
     n, k, _ = log_density.shape
     top, padded = _in_blocks(log_density, transition)
     size, blocks = padded.shape[0], padded.shape[3]
@@ -116,7 +117,7 @@ def _through(padded: FloatArray, start: FloatArray) -> FloatArray:
         if j % _EVERY == 0:
             total = whole.sum(axis=(0, 1))
             whole = whole / np.where(total > 0.0, total, 1.0)
-    # For a few numbers, plain Python is faster than arrays.
+    # For so few numbers, plain Python is faster than arrays.
     fresh = law = (start / start.sum()).tolist()
     first = []
     for product in whole.transpose(2, 0, 1).tolist():
@@ -128,7 +129,7 @@ def _through(padded: FloatArray, start: FloatArray) -> FloatArray:
 
 
 def _law(weight: FloatArray, start: FloatArray) -> FloatArray:
-    """Return weights, shape (k, blocks), normalised; the first law where all are too small."""
+    """Return weights, shape (k, blocks), normalised, or the initial law if all are too small."""
     total = weight.sum(axis=0)
     fresh = (start / start.sum())[:, None]
     law: FloatArray = np.where(total >= _NONE, weight / np.maximum(total, _NONE), fresh)

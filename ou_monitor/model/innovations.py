@@ -1,17 +1,17 @@
 """
-One-step innovations of a linear Gaussian state-space model, in library code.
+One-step innovations of a linear Gaussian state-space model, without a Python loop over samples.
 
 x_k = F_k x_{k-1} + w_k, y_k = H x_k + v_k with F_k, Var w_k = Q_k and Var v_k =
 R_k changing from step to step.  The joint precision of all states is block
 tridiagonal; its banded Cholesky factor, in the order of time, is the
 information form of the Kalman filter (Rue & Held, Gaussian Markov Random
-Fields, 2005), so no Python loop runs over the samples.
+Fields, 2005).
 
 If the model is constant, the gain converges: it is computed from the first samples, and a filter
 with constant gain does the rest.
 
-Limits: Q_k must be regular and R_k above 0 (a millionth of Q_k for "no measurement
-noise"); the cost grows with the square of the number of states.
+Limits: Q_k must be regular and R_k above 0 (without measurement noise, use a millionth
+of Q_k); the cost grows with the square of the number of states.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class StateSpace:
 
     # Transition into each sample; the first is not used; shape (n, d, d).
     f: FloatArray
-    # Covariance of the noise added in that step, V^2; for the first sample the covariance of the
-    # state; shape (n, d, d).
+    # Covariance of the noise added in that transition, V^2; for the first sample, covariance of
+    # the state; shape (n, d, d).
     q: FloatArray
     h: FloatArray  # Observation vector; shape (d,)
     r: FloatArray  # Variance of the measurement noise, V^2, > 0; shape (n,)
@@ -42,9 +42,9 @@ class Filter:
     """
     Gains and predictive variances of a model; filters any number of series of n samples.
 
-    Beyond its samples the model is assumed constant and its gain settled.  `variance`, V^2, shape
-    (n,), is that of the innovations; `shape`: samples with gains of their own, and states.
-    ValueError when the precision is not positive definite.
+    Beyond the model's samples, its matrices and gain are taken as constant.  `variance`, V^2,
+    shape (n,), is for the innovations; `shape`: number of samples with their own gain, and of
+    states.  ValueError when the precision is not positive definite.
     """
 
     def __init__(self, model: StateSpace, n: int | None = None) -> None:
@@ -69,8 +69,8 @@ class Filter:
         count = max(1, round(n * d * d / _ELEMENTS))
         edges = [n * k // count for k in range(count + 1)]
         for begin, end in zip(edges[:-1], edges[1:]):
-            # One array along the samples for each element of the matrices, most of which are
-            # zero because of the blocks.
+            # One array along the samples for each matrix element; most elements are zero, because
+            # the matrices are made of blocks.
             f, q = _elements(model.f[begin:end]), _elements(model.q[begin:end])
             r = model.r[begin:end]
             variance[begin:end] += h @ _seen(h, q)
@@ -79,7 +79,7 @@ class Filter:
                 look[:, 0] = f[..., 0] = 0.0
             else:
                 variance[begin] += look[:, 0] @ known @ look[:, 0]
-                # Information on the last sample before, propagated by one step.
+                # Covariance of the previous segment's last sample, propagated by one step.
                 q[..., 0] += f[..., 0] @ known @ f[..., 0].T
             p = _filtered(f, q, h, r)
             for i in range(d):
@@ -108,7 +108,7 @@ class Filter:
         else:
             e = np.empty_like(columns, dtype=np.float64)
             e[:length], state = self._states(columns[:length])
-            # The gain at the last sample solved differs from an inner one.
+            # The gain at the last solved sample differs from that at inner ones.
             e[length - 1:] = self._steady.innovations(columns[length - 1:], state[-2])
         return e[:, 0] if y.ndim == 1 else e
 
@@ -116,7 +116,7 @@ class Filter:
         return self._states(columns)[0]
 
     def _states(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return innovations and filtered states of the samples solved."""
+        """Return innovations and filtered states of the solved samples."""
         n, p = columns.shape
         d = self._gain.shape[1]
         right = (self._gain[:, :, None] * columns[:, None, :]).reshape(n * d, p)
@@ -126,9 +126,9 @@ class Filter:
         return e, state
 
 
-# Condition number of the eigenvectors above which modes are not separated.
+# Condition number of the eigenvectors above which the modes are not filtered one by one.
 _APART = 1e10
-# Samples filtered at once where modes are not separated.
+# Samples filtered at once if the modes are not filtered one by one.
 _CHUNK = 4096
 
 
@@ -155,7 +155,7 @@ class _Steady:
                 continue
             if root.imag == 0.0:
                 root, drive, before = root.real, drive.real, before.real
-            # The conjugate of a complex mode contributes the same.
+            # The conjugate mode contributes the complex conjugate.
             seen = 2.0 * seen if root.imag > 0.0 else seen.real
             kept, _ = lfilter([drive], [1.0, -root], columns, axis=0, zi=root * before[None, :])
             e[0] -= (seen * before).real
@@ -194,7 +194,7 @@ Pattern = npt.NDArray[np.bool_]
 
 
 def _pattern(a: FloatArray) -> Pattern:
-    """Return which elements of matrices of shape (d, d, n) are not zero all along."""
+    """Return which elements of matrices, shape (d, d, n), are not zero for all n."""
     return np.asarray(a.any(axis=2))
 
 
@@ -207,7 +207,7 @@ def _seen(h: FloatArray, a: FloatArray) -> FloatArray:
 
 
 def _times(a: FloatArray, b: FloatArray, left: Pattern, right: Pattern) -> FloatArray:
-    """Multiply matrices of shape (d, d, n) of which some elements are zero."""
+    """Multiply matrices of shape (d, d, n), skipping elements that are zero."""
     product = np.zeros_like(a)
     for i, k in np.argwhere(left).tolist():
         for j in np.flatnonzero(right[k]).tolist():
@@ -301,8 +301,8 @@ _AT_ONCE = 1024
 def _band(diagonal: FloatArray, below: FloatArray) -> FloatArray:
     """Return a block bidiagonal or symmetric block tridiagonal matrix, lower band storage."""
     d, n = diagonal.shape[0], diagonal.shape[2]
-    # In the order of LAPACK, column by column; written in segments, because writing one element
-    # for all samples at a time would miss the caches.
+    # In LAPACK's order, column by column; written in segments, because writing an element for all
+    # samples at once would miss the caches.
     band = np.zeros((n, d, 2 * d))
     inside = [(i, j) for j in range(d) for i in range(j, d)]
     across = np.argwhere(_pattern(below)).tolist()

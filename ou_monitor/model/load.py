@@ -2,15 +2,15 @@
 The voltage of a battery under load, from throttle alone, and the start values for the next flight.
 
 Limits: the form and its constants were chosen on nine recordings (doc/load.md); charge is computed
-from throttle, so wind and payload are errors; one motor law for the craft.
+from throttle, so wind and payload cause errors; all motors follow one law.
 
 v = N E(s0 - q) - S [x + f1 LP(x, t1) + f2 LP(x, t2)] - S K (ul - LP(ul, 20 ms))_+
 x = ul^p (E/3.8)^(p-1) exp(-2 h), ul = LP(u, lag), dq = x dt / (mean x T), dh = (sag/V) dq,
 with LP(x, tau) a first-order low-pass of time constant tau.
 
-The start of the next flight, the response to throttle at take-off, is from one craft and one pack
-on one day; the filter increases its errors by the difference between packs.  It has no level,
-because the charge at take-off is unknown.
+The start values (the response to throttle at take-off) come from one craft and one pack on one
+day; the filter widens their errors by the scatter between packs.  They have no level, because the
+charge at take-off is unknown.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ FULL_CELL = 4.25
 # to a common table for hobby cells (7.7 mV rms).
 _KNEE_SIZE, _KNEE_RATE = -0.39705, 35.0
 _CUBIC = (3.66631, 0.35371, -0.22145, 0.41052)
-# Charge below which the curve is a straight line, and its slope, V: a prediction with a charge
-# wrong by a few per cent must not fall down the knee.  Slopes of 0.6 to 2.0 V work.
+# Charge below which the curve is a straight line, and its slope, V, because an error of a few per
+# cent in the charge must not put a prediction beyond the knee.  Slopes of 0.6 to 2.0 V work.
 _KNEE, _KNEE_SLOPE = 0.079, 1.2
-# Relative change of the response with the open-circuit voltage of a cell, 1/V, beyond that of the
-# propeller (a pack warms as it empties), and its scatter between packs.  Halves or successive
-# flights of four packs have 0.6 (gecko), 1.3 (nazgul), -0.1 +- 0.7 (hiro), 0.5 (roma): mean and
-# prediction error by DerSimonian & Laird, Control. Clin. Trials 7 (1986) 177.
+# Relative change of the response with the open-circuit voltage of a cell, 1/V, in addition to the
+# propeller's (a pack warms as it empties), and its scatter between packs.  Measured between halves
+# of a flight or successive flights of four packs: 0.6 (gecko), 1.3 (nazgul), -0.1 +- 0.7 (hiro),
+# 0.5 (roma); mean and prediction error by DerSimonian & Laird, Control. Clin. Trials 7 (1986) 177.
 WARMING, WARMING_SE = 0.7, 0.33
 # Time constant of the inrush, s: a motor's current settles in about 20 ms.
 INRUSH_TIME = 0.02
-# Fall of ln resistance per unit of charge and relative sag.  An adiabatic pack (150 Wh/kg,
-# 1 kJ/kg/K) of -1.5 %/K would have 8; cooling and wires leave 2, chosen on the recordings.
+# Fall of ln resistance per unit of charge and relative sag.  Without cooling (150 Wh/kg,
+# 1 kJ/kg/K, -1.5 %/K) it would be 8; with cooling and wires it is 2, chosen on the recordings.
 _HEATING = 2.0
 
 
@@ -74,7 +74,7 @@ def cells_in_series(voltage: float) -> int:
 
 
 def ripple(throttle: Number) -> Number:
-    """Return the ripple current of an ESC over throttle: largest, 1, at 0.7."""
+    """Return the ripple current of an ESC, relative to its maximum at a throttle of 0.7."""
     return throttle * (1.4 - throttle) / 0.49
 
 
@@ -110,12 +110,11 @@ class LoadModel:
     inrush: float = 0.5  # Inrush at a step from rest to full throttle, K, relative to the sag
     lag: float = 0.01  # Lag of the sag behind throttle, s
     endurance: float = 350.0  # Time at the mean load that would empty a full pack, T, s
-    before: float = 0.3  # Load before the first sample, relative to the mean load
-    # Current that counts as full load, A, negative if discharge is negative; 0 if throttle is the
-    # load.
+    before: float = 0.3  # Load before the first sample, relative to `mean_load`
+    # Current at full load, A, negative if discharge is negative; 0: the load is throttle.
     full_current: float = 0.0
     delay: float = 0.0  # Delay of the load behind the voltage, s
-    stands: float = NAN  # Constant level, V; NaN: the level of a discharging lithium pack
+    stands: float = NAN  # Constant level, V; NaN: a lithium pack that discharges
 
     def sag(self, throttle: npt.ArrayLike, cell: float = CELL) -> FloatArray:
         """Return the sag, V, at constant throttle, of cold cells at that voltage, V."""
@@ -153,11 +152,11 @@ class LoadModel:
             x = x * np.exp(-_HEATING * np.cumsum(total * x * x * dt / full))
             rest = self.cells * open_circuit(np.maximum(
                 self.charge - np.cumsum(x * dt) / full, -1.0))
-        answer = x + self.fast_share * lowpass(x, t, self.fast_time)
-        answer += self.slow_share * lowpass(x, t, self.slow_time, self.before * self.mean_load)
+        response = x + self.fast_share * lowpass(x, t, self.fast_time)
+        response += self.slow_share * lowpass(x, t, self.slow_time, self.before * self.mean_load)
         if not self.full_current:
-            answer += self.inrush * np.maximum(lagged - lowpass(lagged, t, INRUSH_TIME), 0.0)
-        return np.asarray(rest - self.size * CELL * self.cells * answer, dtype=np.float64)
+            response += self.inrush * np.maximum(lagged - lowpass(lagged, t, INRUSH_TIME), 0.0)
+        return np.asarray(rest - self.size * CELL * self.cells * response, dtype=np.float64)
 
 
 # Coefficients of x, u, u^3, x after three lags, and inrush, with x = u^1.8 (load/load_filter.py).
@@ -177,9 +176,9 @@ class LoadStart:
     coefficients: tuple[float, ...]
     covariance: tuple[tuple[float, ...], ...]  # Of the coefficients, V^2.
     discharge: float  # Charge drawn per time at full load, 1/s.
-    # ln of the variance, V^2, of white noise: constant, ripple, and by sqrt|du|.
+    # ln of the variance, V^2, of white noise: constant, and coefficients of ripple and sqrt|du|.
     log_variance: tuple[float, float, float]
-    flown: tuple[float, float]  # Throttles between which 80 % were flown.
+    flown: tuple[float, float]  # 10 % and 90 % quantile of throttle.
     delay: float = 0.0  # Delay of throttle, s.
     resistance: float = 0.0  # Ohm; 0: no current that affects the voltage.
     resistance_se: float = 0.0  # Its standard error, Ohm.
@@ -239,11 +238,11 @@ class LoadStart:
 
 
 def _numbers(value: Any) -> Any:
-    """Return lists as tuples of float; numbers as float."""
+    """Return a list as a tuple of float, and a number as float."""
     if isinstance(value, (list, tuple)):
         return tuple(_numbers(one) for one in value)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise TypeError(f'{value!r} is no number')
+        raise TypeError(f'{value!r} is not a number')
     return float(value)
 
 

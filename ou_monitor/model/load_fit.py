@@ -20,7 +20,7 @@ from ou_monitor.records import determined, FloatArray, log_interval, NAN
 from scipy.linalg import solve_banded
 from scipy.optimize import least_squares
 
-# Centre and deviation of each parameter, or of its logarithm unless it is in _LINEAR.  Usual
+# Prior centre and deviation of each parameter (of its logarithm unless it is in _LINEAR): usual
 # figures of lithium-polymer packs with two RC pairs, tightened on the recordings (doc/load.md).
 _PRIOR = {
     'size': (math.log(0.12), 0.7), 'power': (math.log(1.8), 0.1),
@@ -31,26 +31,26 @@ _PRIOR = {
 }
 _NAMES = tuple(_PRIOR)
 _LINEAR = {'charge': (0.0, 1.05), 'before': (0.0, 1.5)}
-# Deviations for a current as the load: its scale, and the loads that it includes, are unknown.
+# Prior deviations if the load is a current: its scale, and which loads it includes, are unknown.
 _OF_CURRENT = {'size': 2.0, 'fast_share': 0.7, 'slow_share': 0.7, 'endurance': 1.0}
 _CENTRE = {'endurance': math.log(2000.0)}
-# Deviation of a constant level, in place of the charge, V per cell.
+# Prior deviation of a constant level, which replaces the charge, V per cell.
 _STANDS = 0.2
-# Delay of the load: maximum steps tried either way, and s; ratio of residuals below which another
-# delay is used; changes slower than this, s, are not a response.
+# Delay of the load: maximum steps tried either way, and s; ratio of residuals below which a delay
+# is used; time constants, s, of the trend that is removed, and of the lagged load beside the load.
 _SHIFTS, _LATEST, _PAYS, _SLOWER, _LATE = 10, 0.2, 0.95, 1.0, 0.06
-# Bounds of the others: prior deviations from the centre.
+# Bounds of the parameters, in prior deviations from the centre.
 _REACH = 3.0
-# Mean of the data over this time, s, before the fit: OU and polarisation are slower;
-# but for a short recording this share, and the minimum number of samples.
+# Before a fit, the data are averaged over this time, s (OU and polarisation are slower), or over
+# this share of a short recording; minimum number of samples.
 _BIN, _BIN_SHARE, _LEAST = 0.05, 0.01, 20
-# Time constant, s, of the slow error of a load, an OU, and the deviations tried, V a cell
-# (cap: doc/load.md).
+# The slow error of a load is an OU: its time constant, s, and the standard deviations tried, V per
+# cell (maximum: doc/load.md).
 SLOW_TIME = 20.0
 _SLOW_STDS = np.geomspace(0.001, 0.00464, 5)
-# White and slow noise at the start, V a cell: the order of the recordings.
+# Initial white and slow noise, V per cell: the order of magnitude of the recordings.
 _WHITE_START, _SLOW_START = 0.02, 0.01
-# Sizes of standardised innovations tried, where their law has heavy tails.
+# Scales tried for standardised innovations, whose law has heavy tails.
 _SIZES = np.geomspace(0.05, 2.0, 40).tolist()
 # Rounds of fit and noise; evaluations of the model in each.
 _ROUNDS, _EVALUATIONS = 4, 30
@@ -61,8 +61,7 @@ class LoadFit:
     """A fitted load model, and its errors."""
 
     model: LoadModel  # The parameters
-    # Covariance of the parameters as fitted (logarithms, but for charge and before); shape (11,
-    # 11).
+    # Covariance of the parameters as fitted: logarithms, except charge and before; shape (11, 11).
     covariance: FloatArray
     condition: float  # Condition number of the Jacobian in prior deviations
     noise_std: float  # White noise of a 50 ms mean, V
@@ -110,7 +109,7 @@ def _moved(model: LoadModel, theta: FloatArray) -> LoadModel:
 
 
 def _bounds(model: LoadModel) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return lower and upper bounds, prior centre and deviation; the level is as the model's."""
+    """Return lower and upper bounds, prior centre and deviation, for the model's kind of level."""
     wide = _OF_CURRENT if model.full_current else {}
     other = _CENTRE if model.full_current else {}
     centre = np.array([other.get(name, _PRIOR[name][0]) for name in _NAMES])
@@ -186,7 +185,7 @@ class _Noise:
     def evidence(self, residuals: FloatArray) -> float:
         """Return the log-likelihood, nat, of innovations with Student's t of 4 degrees."""
         z, variance, _ = self.whiten(residuals)
-        # Heavy tails, because a few punch-outs would otherwise decide by their squares.
+        # Heavy tails, because otherwise the squares of a few punch-outs would decide.
         return float(max(np.sum(-2.5 * np.log1p(0.25 * (z / size) ** 2)) + z.size * math.log(
             0.375 / size) for size in _SIZES) - 0.5 * np.log(variance).sum())
 
@@ -209,7 +208,8 @@ def _template(t: FloatArray, voltage: FloatArray, throttle: FloatArray | None,
         raise ValueError('a fit of the load needs throttle or current')
     full = delay = 0.0
     if current is None:
-        # 1.6: below the prior's exponent, as the level takes a part; a scale of `endurance`.
+        # Only a scale for `endurance`.  1.6 is below the prior's exponent, because the level takes
+        # a part.
         moving = load > 0.05
         mean = float((load[moving] ** 1.6).mean()) if moving.any() else 0.1
     else:
@@ -221,7 +221,7 @@ def _template(t: FloatArray, voltage: FloatArray, throttle: FloatArray | None,
 
 
 def _bins(t: FloatArray) -> tuple[Callable[[FloatArray], FloatArray], npt.NDArray[np.intp]]:
-    """Return a function for means over bins of samples, and the first sample of each bin."""
+    """Return a function that averages over bins, and the first sample of each bin."""
     width = min(_BIN, _BIN_SHARE * float(t[-1] - t[0]))
     index = np.floor((t - t[0]) / width + 1e-9).astype(int)
     starts = np.concatenate(([0], np.flatnonzero(np.diff(index)) + 1))
@@ -246,11 +246,12 @@ def fit_load(t: FloatArray, voltage: FloatArray, throttle: FloatArray | None,
              current: FloatArray | None = None, *, stands: bool = False,
              left_out: tuple[float, float] | None = None, near: LoadFit | None = None) -> LoadFit:
     """
-    Fit the load model; with current, A, that is the load instead of throttle.
+    Fit the load model; if current, A, is given, it is the load instead of throttle.
 
     t in s, voltage in V, throttle in 0..1; all finite, stamps rising.  The level is that of a
-    lithium pack, or stands.  Voltage between the stamps left_out, s, is not looked at.  A fit
-    that is near by, as of all the voltage, saves most of the work, and decides the rest.
+    lithium pack, or constant (`stands`).  Voltage between the stamps left_out, s, is not used.
+    `near`, a similar fit (such as that of all the voltage), provides the start, and the cells,
+    scale and delay, which are not fitted.
     """
     if t.size < _LEAST:
         raise ValueError(f'a fit of the load needs {_LEAST} samples, got {t.size}')

@@ -21,7 +21,7 @@ def stationary_variance(alpha: float, sigma: float) -> float:
 
 
 def transition(alpha: float, sigma: float, dt: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return the exact one-step law over dt, s (alpha in 1/s, sigma in V/sqrt(s))."""
+    """Return decay and added variance, V^2, over dt, s (alpha in 1/s, sigma in V/sqrt(s))."""
     steps = np.asarray(dt, dtype=np.float64)
     if not alpha > 0.0 or not math.isfinite(alpha):
         raise ValueError(f'alpha must be positive and finite, got {alpha} 1/s')

@@ -1,26 +1,28 @@
 """
 Fit an Ornstein-Uhlenbeck process and white noise to a voltage, together with level and load.
 
-`known_ou` fits the shortest window in which alpha is known well.  `regress` takes a flexible
-level (linear hats every 5 s), throttle and measured current out of the voltage, both without lag
-and after several lags with free initial states; `fit_ou` fits the noise jointly with them.
+`known_ou` fits the shortest window in which alpha is known well.  `regress` removes a flexible
+level (linear hats every 5 s), throttle and measured current from the voltage; both loads enter
+without lag and after several lags with free initial states.  `fit_ou` fits the noise jointly with
+these regressors.
 
 The size of the noise depends on the load and its changes, and readings are weighted by it:
-otherwise the errors of the load model while the load moves would be taken for a fast OU. The noise
-is white noise, the OU, and a random walk of the level, whose size has a prior and may be zero:
-without it, the rest of the level would be taken for a slow OU. The fit maximises a
-restricted likelihood in the frequency domain (`whittle.CrossSpectrum`). Intervals are quantiles
-from importance sampling about all its maxima over the rate; prior: flat in ln(alpha), arcsine in
-the share of the OU.
+otherwise the errors of the load model while the load moves would be taken for a fast OU.  The
+noise is white noise, the OU, and a random walk of the level, whose size has a prior and may be
+zero; without the walk, the rest of the level would be taken for a slow OU.  The fit maximises a
+restricted likelihood in the frequency domain (`whittle.CrossSpectrum`).  Intervals are quantiles
+from importance sampling about all its maxima over the rate; the prior is flat in ln(alpha), and
+arcsine in the share of the OU.
 
 Limits: samples are taken as evenly spaced within a stretch without gaps; a relaxation slower than
 2.5 s (a sixth of a window below 15 s) counts as level; OU and white noise change in proportion,
-and results are for their mean size. Taken for the OU: repeats or rounding of slow changes, a load
-that neither throttle nor current shows, and noise with another spectrum (a filtered sensor).
+and results are for their mean size.  These are taken for the OU: repeats or rounding of slow
+changes, a load that neither throttle nor current shows, and noise with another spectrum (a
+filtered sensor).
 
 On 1200 simulated rails under a quad's throttle (alpha 2 to 500 1/s, 50 to 1000 Hz, OU of 20 mV,
 white noise to 30 mV, windows of 20 s, above 300 Hz of 8 s) 93 % of the 95 % intervals contained
-alpha (most others lay above it), 93 % sigma, 92 % Var_inf; 90, 90 and 87 % without white noise.
+alpha (most others lay above it), 93 % sigma, 92 % Var_inf; without white noise 90, 90 and 87 %.
 99 % of the bounds were correct.
 """
 
@@ -46,55 +48,55 @@ _HATS, _PARTS = 5.0, 3
 _LAGS = (0.004, 0.02, 0.06, 0.3, 1.0, 4.0)
 # Maximum shift of throttle and current, samples, and number of readings used to find it.
 _DELAYS, _DELAY_READINGS = 4, 8000
-# Maximum shift of a current, if one is searched.
+# Maximum shift of a current, samples, if a shift is searched for.
 _FAR = 20
 # Minimum range of a throttle that moves.
 _MOVED = 0.01
-# Minimum gap, in usual steps: a restart at each lost message would cost more than the error of the
-# time line.  Minimum number of readings in a stretch.
+# Minimum length of a gap, in usual steps: to restart at each lost message would cost more than the
+# error of the time line.  Minimum number of readings in a stretch.
 _GAP, _STRETCH = 5.0, 16
 # Minimum share of the readings in pieces of equal length.
 _HELD = 0.8
 # The shortest of OU_WINDOWS in which alpha is known within this factor is used, else the longest.
-# Precision stops the search, not visibility: whether chance makes a relaxation visible in a short
-# window depends on its estimate, which would then be biased.
+# The search ends when alpha is precise, not when the relaxation is visible: in a short window,
+# visibility by chance depends on the estimate, and selecting by it would bias the estimate.
 PRECISE = 1.5
 # Minimum number of readings beyond the number of regressors.
 FEWEST = 40
-# Maximum size of an array of the likelihood: 16 MB of complex numbers.
+# Maximum number of elements in an array of the likelihood: 16 MB of complex numbers.
 _AT_ONCE = 1 << 20
 # Points of the likelihood's first grid in ln(alpha), logit(share) and ln(walk); ends of the logit:
 # white noise of 1e-3 of the variance is half of the spectrum at the highest frequency of an OU of
 # alpha D = 0.004.
 _GRID, _LOGIT = (24, 16, 5), (-7.0, 12.0)
-# Bounds: additional distances in logit(share) from the best point of the grid, and steps that
+# For the bounds: further distances in logit(share) from the best point of the grid, and steps that
 # refine the walk.
 _ASIDE = np.linspace(-1.2, 1.2, 17)
 _REFINE = (1.2, 0.6, 0.3, 0.15)
-# Law of the noise's size: lags of the load whose differences enter, s; deviation of its
-# coefficients by the prior; rounds.
+# Law of the noise's size: lags of the load whose differences enter, s; prior deviation of its
+# coefficients; rounds.
 _CHANGES, _SIZE_SD, _SIZE_ROUNDS = (0.03, 0.2, 1.0), 0.5, 12
 # Maximum number of steps towards the maximum, and convergence tolerance of a step.
 _LOOKS, _NEAR = 40, 0.05
-# Draws about the maxima in each round, and rounds; the least share of one maximum.
+# Draws about the maxima in each round, and rounds; minimum share of the draws for a maximum.
 _DRAWS, _ROUNDS, _FEWEST_DRAWN = 1000, 4, 0.05
-# Minima of the cost over the rate that are searched, and distance from the lowest up to which they
-# count, nats: one of e^-6 of its likelihood does not affect the 95 %.
+# Minima of the cost over the rate: distance from the lowest, nats, up to which they are refined,
+# and up to which they count (with e^-6 of the likelihood one does not affect a 95 % interval).
 _TRIED, _RIVAL = 10.0, 6.0
-# Sd of ln(alpha) by the curvature at the maximum, widened by 1.2, above which no interval within
-# PRECISE was seen: at most 0.28 in 190 precise ones of 437 simulated windows.
+# Standard deviation of ln(alpha), from the curvature at the maximum and widened by 1.2, from which
+# a window is imprecise: among 437 simulated windows, the 190 precise ones had at most 0.28.
 _IMPRECISE = 0.37
-# The level's usual walk, V per sqrt(s) and cell, and the deviation of its logarithm above that:
-# .0015 to .015 follow the recordings (doc/load.md).
+# The level's usual walk, V per sqrt(s) and cell, and the prior deviation of its logarithm above
+# that: walks of .0015 to .015 fit the recordings (doc/load.md).
 _WALK, _WALK_SD = 0.004, 0.8
 # Largest alpha D tried: beyond, neighbouring readings are uncorrelated.
 _FASTEST = 5.0
-# Profile log-likelihood that the edge of a 95 % region of rate and share lies below the maximum,
-# nats: chi^2 with 2 degrees of freedom.
+# How far the profile log-likelihood at the edge of a 95 % region of rate and share lies below the
+# maximum, nats: chi^2 with 2 degrees of freedom.
 _DROP = 3.0
-# Highest share of the variance of an OU slower than `tau_below_s`.
+# Largest share of the variance that an OU slower than `tau_below_s` may have.
 _QUARTER = 0.25
-# Relative size below which a direction of the regressors is spanned by the others.
+# Relative size below which a regressor counts as spanned by the others.
 _SPANNED = 1e-5
 # Exponent of the load over throttle.
 _POWER = 1.8
@@ -125,7 +127,7 @@ def _lagged(x: FloatArray, share: float) -> FloatArray:
 
 
 def _filled(t: FloatArray, x: FloatArray | None) -> FloatArray | None:
-    """Return a load with its gaps filled; None: it is unknown or does not move."""
+    """Return a load with its gaps filled; None if it is unknown or does not move."""
     if x is None:
         return None
     known = np.isfinite(x)
@@ -149,7 +151,7 @@ def _beside(basis: FloatArray, rows: FloatArray) -> FloatArray:
     """Return an orthonormal basis of rows, orthogonal to a given one."""
     size = np.sqrt(np.mean(rows * rows, axis=1))
     rows = rows[size > 0.0] / size[size > 0.0, None]
-    # Twice, against rounding.
+    # Twice, because of rounding.
     for _ in range(2):
         rows = rows - (rows @ basis.T) @ basis
     rows = rows[np.sqrt(np.mean(rows * rows, axis=1)) >= _SPANNED]
@@ -182,13 +184,13 @@ class Regression:
 
     @property
     def free(self) -> int:
-        """Return the readings beyond the number of regressors."""
+        """Return the number of readings less the number of regressors."""
         return int(self.voltage.size - (self.basis.shape[0] or len(self.lengths)))
 
 
 def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | None,
             reach: float = 0.0) -> Regression:
-    """Regress level and load out of a voltage; reach: maximum shift of the current, s."""
+    """Remove level and load from a voltage by regression; reach: maximum shift of current, s."""
     parts = stretches(t)
     dt = float(np.median(np.diff(t)))
     if parts:
@@ -200,12 +202,12 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
     taus = [tau for tau in _LAGS if 0.5 * dt < tau < span / 3.0]
     u, i = _filled(t, u), _filled(t, i)
 
-    def answers(x: FloatArray) -> list[FloatArray]:
+    def responses(x: FloatArray) -> list[FloatArray]:
         return [x, *(_lagged(x, -math.expm1(-dt / tau)) for tau in taus)]
 
     def of_throttle(x: FloatArray) -> list[FloatArray]:
         x = np.clip(np.abs(x), 0.0, 2.0)
-        return [x, x ** 3, *answers(x ** _POWER)]
+        return [x, x ** 3, *responses(x ** _POWER)]
 
     columns = level
     last = slice(-_DELAY_READINGS, None)
@@ -215,12 +217,12 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
         left, held = {}, _basis(np.stack(columns)[:, last])
         rest = v[last] - (held @ v[last]) @ held
         for late in sorted(range(-most, most + 1), key=abs):
-            # Earlier samples only let the lags settle.
+            # The earlier half only lets the lags settle.
             loads = regressors(_moved(x[-2 * _DELAY_READINGS:], late))[:5]
             Q = _beside(held, np.stack([c[last] for c in loads]))
             left[late] = float(rest @ rest - np.sum((Q @ rest) ** 2))
         least = min(left, key=left.__getitem__)
-        # A delay must improve the fit clearly, or noise would choose it.
+        # A delay must improve the fit clearly; otherwise noise would choose it.
         late = least if left[least] < left[0] * (1.0 - 10.0 / rest.size) else 0
         found: list[FloatArray] = regressors(_moved(x, late))
         return found
@@ -228,7 +230,7 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
     walk = usual_walk(v)
     v = v - v.mean()
     if i is not None:
-        columns = [*columns, *best(i, answers, max(_DELAYS, min(_FAR, round(reach / dt))))]
+        columns = [*columns, *best(i, responses, max(_DELAYS, min(_FAR, round(reach / dt))))]
     if u is not None:
         columns = [*columns, *best(u, of_throttle)]
         if i is not None:
@@ -247,7 +249,7 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
         if again:
             size = law.fit(_innovations(left))
         basis, left = _basis(rows / size), v / size
-        # Twice, against rounding.
+        # Twice, because of rounding.
         for _ in range(2):
             left = left - (basis @ left) @ basis
         left = left * size
@@ -257,7 +259,7 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
 
 def _innovations(x: FloatArray) -> FloatArray:
     """Return the innovations of an AR(1)."""
-    # The law takes values as independent, so those of a slow OU would make it follow chance.
+    # The law assumes independent values; fitted to a slow OU, it would follow chance.
     power = float(x @ x)
     phi = float(x[1:] @ x[:-1]) / power if power > 0.0 else 0.0
     return x - phi * np.append(x[:1], x[:-1])
@@ -274,7 +276,7 @@ def load_signs(n: int, dt: float, *loads: FloatArray | None) -> FloatArray:
 
 
 class NoiseSize:
-    """Size of the noise: its ln is linear in signs of load, constant beyond those of the fit."""
+    """Size of the noise: its ln is linear in signs of load, constant beyond their fitted range."""
 
     def __init__(self, signs: FloatArray) -> None:
         n = max(1, signs.shape[1])
@@ -356,7 +358,7 @@ def fit_ou(part: Regression, span: float, *, precise: bool = False) -> OuFacts:
     dt = part.dt
     total = float(part.voltage @ part.voltage)
     if not total > 1e-18 * part.voltage.size:
-        # A constant signal: no noise, thus no relaxation.
+        # A constant signal has no noise, and so no relaxation.
         return OuFacts('not_visible', span, tau_below_s=dt, var_inf_below=0.0)
     likelihood = _Likelihood(part)
     # Prior of ln of the variance of a step of the level over that of the noise.
@@ -451,7 +453,7 @@ def fit_pieces(parts: Sequence[tuple[FloatArray, FloatArray]], dt: float, walk: 
 
 
 def white_variance(ou: OuFacts, steps: float, dt: float) -> float:
-    """Return the white variance beside an OU, V^2, from the mean square of steps of dt, s."""
+    """Return the white variance beside an OU, V^2, from the mean square of steps over dt, s."""
     relaxed = ou.var_inf * math.expm1(-ou.alpha * dt) if ou.status == 'ok' else 0.0
     return max(0.0, 0.5 * steps + relaxed)
 
@@ -530,7 +532,7 @@ def _moments(points: FloatArray, weight: FloatArray, more: FloatArray
 
 def _drawn(rng: np.random.Generator, part: float, centre: FloatArray, root: FloatArray
            ) -> FloatArray:
-    """Draw so many of `_DRAWS` from Student's t with 5 degrees of freedom."""
+    """Draw a share of `_DRAWS` from Student's t with 5 degrees of freedom."""
     n = round(part * _DRAWS)
     z = rng.standard_normal((n, 3)) / np.sqrt(rng.chisquare(5.0, (n, 1)) / 5.0)
     return np.asarray(centre + z @ root.T)
@@ -545,7 +547,7 @@ def _log_density(points: FloatArray, part: float, centre: FloatArray, root: Floa
 
 
 def _curvature(cost: Callable[[FloatArray], FloatArray], centre: FloatArray) -> FloatArray:
-    """Return a root of the covariance by the curvature of a cost, at most 2 in each direction."""
+    """Return a root of the covariance from a cost's curvature, at most 2 in each direction."""
     step = 0.15 * np.eye(3)
     signs = ((1, 1, 1.0), (1, -1, -1.0), (-1, 1, -1.0), (-1, -1, 1.0))
     H = np.zeros((3, 3))
@@ -589,7 +591,7 @@ def _unseen(costs: Callable[[FloatArray], tuple[FloatArray, FloatArray]], low: F
             points = np.where(better, other, points)
             value, variance = (np.where(better[:, 0], x, y)
                                for x, y in ((cost, value), (size, variance)))
-    # Interpolate at the best walk; in roots, because those of a parabola are linear.
+    # Interpolate at the best walk, and square roots, because the root of a parabola is linear.
     lost = (value - min(least, float(value.min()))).reshape(shape)
     fine = _finer(np.sqrt(np.maximum(lost, 0.0))) ** 2
     size, logit = (_finer(x.reshape(shape))

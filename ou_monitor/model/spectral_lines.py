@@ -4,10 +4,10 @@ Spectral lines: detected by a test, measured with their error, and removed.
 `analyze` uses it for each load level, `discover` for the scores of a model and for samples that
 the fit does not use.
 
-A periodogram ordinate of noise is exponential, and the sum of K of them gamma, whatever the
-distribution of the noise; a line exceeds its neighbours.  The noise at each frequency is the
-median of neighbouring ordinates, whose distribution is known exactly, so the test needs no model
-of the spectrum, and a second line nearby does not hide the first.  The search has two passes: in
+A periodogram ordinate of noise is exponential, and the sum of K ordinates is gamma, whatever the
+distribution of the noise; a line exceeds its neighbours.  The noise at each frequency is estimated
+by the median of neighbouring ordinates, whose distribution is known exactly; so the test needs no
+model of the spectrum, and a second line nearby does not hide the first.  There are two passes: in
 pieces of a few seconds, because tones of motors and converters drift, and in the longest possible
 pieces, where the tone of a crystal is clearest.
 
@@ -46,11 +46,11 @@ FIRST = 4
 # time).
 _SHORT, _LONGEST = 4.0, 1 << 20
 _FEWEST = 128
-# Sufficient number of ordinates to estimate the noise.
+# Minimum number of ordinates in which lines are searched for.
 _FEWEST_TESTED = 32
-# Neighbours: every second ordinate, because the window correlates adjacent ones; distance of the
-# nearest, in bins; their number; and the maximum factor on that number in long pieces, whose bins
-# are narrower.
+# Neighbours: every second ordinate, because the window correlates adjacent ones.  Distance of the
+# nearest, in bins; their number; maximum factor on that number in long pieces, whose bins are
+# narrower.
 _GUARD, _NEIGHBOURS, _MORE = 4, 64, 4
 # Number of bins on either side over which the window spreads a steady line.
 _LOBE = 2
@@ -73,7 +73,7 @@ class Line:
     rms_low: float
     rms_high: float
     share: float  # Share of the variance of the segments in which it is measured
-    p_value: float  # p-value of the ordinate, times the ordinates tested at all levels
+    p_value: float  # p-value of the ordinate, times the number of ordinates tested at all levels
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class EvenGrid:
 
 
 def on_grid(t: FloatArray, values: FloatArray) -> EvenGrid:
-    """Return samples on an even clock, their steps rounded to whole periods (t in s)."""
+    """Return samples on an even clock, with steps rounded to whole periods (t in s)."""
     step = np.diff(t)
     usual = float(np.median(step)) if step.size else math.inf
     number = np.maximum(1.0, np.rint(step / usual))
@@ -123,7 +123,7 @@ def find_lines(parts: Sequence[FloatArray], rate: float, *, false_alarm: float =
     parts in V, rate and lowest in Hz; white: their innovations, whose flat spectrum is searched
     if the parts are not white.
     """
-    # A detrended constant consists of rounding errors.
+    # The mean is removed first: a detrended constant consists of rounding errors.
     parts, white = ([part - part.mean() for part in some if part.size]
                     for some in (parts, white or parts))
     sizes = [part.size for part in parts]
@@ -133,15 +133,15 @@ def find_lines(parts: Sequence[FloatArray], rate: float, *, false_alarm: float =
     tested = {length: np.arange(max(FIRST, math.ceil(lowest * length / rate)), length // 2 - 1)
               for length in (short, _piece_length(sizes, _LONGEST))}
     if tested[short].size < _FEWEST_TESTED:
-        return LineSearch(why_not=f'next to nothing lies above {lowest:g} Hz')
+        return LineSearch(why_not=f'too few frequencies lie above {lowest:g} Hz')
     count = sum(where.size for where in tested.values())
     found: list[Line] = []
     detectable = NAN
     for length, where in tested.items():
         lines, least = _search(parts, white, rate, length, where,
                                false_alarm / (levels * count))
-        # Drifting lines show in short pieces.  A line found in both is measured in the short ones,
-        # unless it is clear in the long ones alone.
+        # Drifting lines show in short pieces.  A line found in both passes is measured in short
+        # pieces, unless only the long ones show it clearly.
         for line in lines:
             same = [other for other in found if abs(line.frequency - other.frequency)
                     < 2 * _LOBE * other.resolution]
@@ -173,7 +173,7 @@ def _search(parts: Sequence[FloatArray], whites: Sequence[FloatArray], rate: flo
     background = raw[where] / np.maximum(white[where], 1e-300) * middle
     # The median of a gamma variable, in units of its mean.
     background /= float(gammaincinv(k, 0.5)) / k
-    # Variance of the segments in which the line is measured: short ones may be quieter.
+    # Use only the segments in which the line is measured, because short ones may be quieter.
     held = [part for part in parts if part.size >= length]
     total = float(sum(part @ part for part in held) / sum(part.size for part in held))
     lines = [_measure(raw, background, white[where], middle, where, group, p, df, total, k)
@@ -190,7 +190,7 @@ def tail(ratio: FloatArray, pieces: float, neighbours: int) -> FloatArray:
 
 @lru_cache(maxsize=256)
 def _medians(pieces: float, neighbours: int) -> FloatArray:
-    """Return quantiles of the median of the neighbours, for the average over it."""
+    """Return quantiles of the median of the neighbours, over which `tail` averages."""
     j = neighbours // 2 + 1
     return np.asarray(gammaincinv(pieces, betaincinv(j, neighbours - j + 1, _QUANTILES)))
 
@@ -212,7 +212,8 @@ def _piece_length(sizes: Sequence[int], most: int) -> int:
     top = min(longest, most)
     best, score = top, 0.0
     for length in {top, *(size for size in sizes if _FEWEST <= size < top)}:
-        # The power of a line grows with the number of pieces, the scatter of noise with its root.
+        # The power of a line grows with the number of pieces, and the scatter of noise with the
+        # root of that number.
         gained = length * math.sqrt(sum(size // length for size in sizes))
         if gained > score:
             best, score = length, gained
@@ -220,7 +221,7 @@ def _piece_length(sizes: Sequence[int], most: int) -> int:
 
 
 def _neighbours(ordinates: int, share: float) -> int:
-    """Return how many neighbours are used: even, in the same band of Hz for long pieces."""
+    """Return the number of neighbours: even, and the same band in Hz for long pieces."""
     there = max(2, (ordinates - 2 * _GUARD) // 4 * 2)
     return min(there, _NEIGHBOURS * min(_MORE, max(1, int(share))))
 
@@ -228,7 +229,7 @@ def _neighbours(ordinates: int, share: float) -> int:
 def _local_median(density: FloatArray, where: np.ndarray, near: int) -> FloatArray:
     """Return the upper median of the nearest neighbours on either side, shape of `where`."""
     n = where.size
-    # Some ordinates share their neighbours where there are many.
+    # If there are many neighbours, several ordinates share them.
     hop = max(1, near // _NEIGHBOURS)
     centres = np.minimum(np.arange(0, n, hop) + hop // 2, n - 1)
     guard = _GUARD + hop // 2
@@ -287,7 +288,7 @@ def _measure(raw: FloatArray, background: FloatArray, white: FloatArray, middle:
 def _detectable(density: float, df: float, k: float, limit: float) -> float:
     """Return the RMS that passes the limit with 90 % probability, V."""
     lift = float(chndtrinc(2.0 * limit * float(gammaincinv(k, 0.5)), 2.0 * k, 0.1))
-    # A line on a bin has 2/3 of its power there; between two bins 0.48.
+    # A line at the centre of a bin has 2/3 of its power there; halfway between two bins, 0.48.
     return math.sqrt(lift / (2.0 * k) * density * df / 0.48)
 
 

@@ -22,12 +22,12 @@ from ou_monitor.records import FloatArray
 # terms in the processor's caches.
 SEGMENT = 15_000
 
-# Allocating and freeing an array of this size once makes the GNU allocator keep the memory of
+# Size of an array that is allocated and freed once, so that the GNU allocator keeps the memory of
 # segments.  Otherwise it returns and requests it page by page, which can take longer than the
 # arithmetic.
 _KEPT = 2**18
 
-# Relative difference below which steps are equal: rounding of stamps.
+# Relative difference below which steps count as equal, because stamps are rounded.
 _ROUNDING = 1e-6
 
 
@@ -42,7 +42,7 @@ class SupplyModel:
     --------
     >>> import numpy as np
     >>> from ou_monitor.model.supply import SupplyModel
-    >>> from ou_monitor.model.terms.load_answer import LoadSag
+    >>> from ou_monitor.model.terms.load_response import LoadSag
     >>> from ou_monitor.model.terms.ou import OU
     >>> model = SupplyModel((OU(alpha=63.0, sigma=0.3, u0=5.0), LoadSag(linear=0.4, square=0.0)))
     >>> t = np.arange(1000) / 1000.0
@@ -54,7 +54,7 @@ class SupplyModel:
 
     # The first is the `ou`, the only one of its kind.
     terms: tuple[Term, ...]
-    # Where the load filter starts at take-off, learned from this craft; None: unknown.
+    # Start values of the load filter at take-off, learned from this craft; None: unknown.
     load: LoadStart | None = None
     # Date of learning in the model file; empty: unknown.
     date: str = field(default='', compare=False)
@@ -112,11 +112,11 @@ _POWER = 1.8
 
 
 class Discharge:
-    """Drop of the level as the pack discharges; `charge` is the remaining charge, 0..1."""
+    """Fall of the level as the pack discharges; `charge` is the remaining charge, 0..1."""
 
     def __init__(self, load: LoadStart, level: float, charge: float = math.nan) -> None:
         self._load = load
-        # The charge at which the level is that of the model.
+        # The charge at which a pack has the model's level.
         self._origin = charge_at(level / load.cells)
         self.charge = self._origin if math.isnan(charge) else charge
 
@@ -132,10 +132,10 @@ class Simulation:
     """
     A simulation that continues from segment to segment; each term has its own generator.
 
-    The same seed gives the same samples, to rounding, whatever the segments.  `resistance`
-    multiplies the response to throttle, for an old pack, and may change between segments.  With
-    `charge`, 0..1 at the first sample, the level falls as throttle discharges the pack
-    (`model.load`) and not by the recording's drift; NaN: the charge at which the recording began.
+    The same seed gives the same samples, except for rounding, for any division into segments.
+    `resistance` multiplies the response to throttle, for an old pack, and may change between
+    segments.  With `charge`, 0..1 at the first sample, the level falls as throttle discharges the
+    pack (`model.load`), not by the recording's drift; NaN: the charge when the recording began.
     """
 
     def __init__(self, model: SupplyModel, rng: np.random.Generator, *,
@@ -149,7 +149,7 @@ class Simulation:
             self.discharge = Discharge(model.load, model.ou.u0, charge)
         np.empty(_KEPT)
         self._effects = self._in_order(rng)
-        # Without such a term, alpha, sigma, power and push are constants, broadcast to n samples.
+        # Without a `DRIVE` term, alpha, sigma, power and push are broadcast from constants.
         self._driven = any(term.STAGE is Stage.DRIVE for term in model.terms)
         self._origin = math.nan
         self._last = -math.inf
@@ -224,8 +224,8 @@ class Simulation:
             raise ValueError(f'throttle must have the shape of t, {stamps.shape}, got '
                              f'{load.shape}')
         if needs and not np.isfinite(load).all():
-            raise ValueError(f"the term '{needs[0]}' needs throttle at every sample, but not all "
-                             'of it is finite')
+            raise ValueError(f"the term '{needs[0]}' needs throttle at every sample, but some of "
+                             'it is not finite')
         return load
 
     def _segment(self, stamps: FloatArray, step: FloatArray, throttle: FloatArray) -> Segment:
@@ -242,5 +242,5 @@ class Simulation:
 
 
 def _join(s: Segment) -> None:
-    """Compute the voltage of the rail from its parts, before any instrument."""
+    """Add up the voltage of the rail, before any instrument."""
     s.voltage = s.x + s.level

@@ -1,10 +1,11 @@
 """
-Fits to a periodogram: all time scales of a recording at once, in milliseconds.
+Fits to a periodogram: all time scales of a recording at once, in milliseconds of processor time.
 
-The ordinates of a long series are nearly independent exponentials with the spectrum for their
-means (Whittle, Ark. Mat. 2 (1953) 423); in bins they are gamma.  `Ordinates` are those of scores;
-`CrossSpectrum` has regressors beside a voltage, and uses the expected value of each ordinate for
-the length of the window (debiased Whittle likelihood: Sykulski et al., Biometrika 106 (2019) 251).
+The ordinates of a long series are nearly independent exponential variables whose means are the
+spectrum (Whittle, Ark. Mat. 2 (1953) 423); averaged in bins they are gamma.  `Ordinates` is the
+periodogram of scores; `CrossSpectrum` also has regressors for a voltage, and uses the expected
+ordinates for the length of the window (debiased Whittle likelihood: Sykulski et al., Biometrika
+106 (2019) 251).
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import math
 import numpy as np
 from ou_monitor.records import FloatArray
 
-# Number of single ordinates at the slow end, and bins per octave above.
+# Number of ordinates at the slow end that are not binned, and bins per octave above them.
 _SINGLE, _TO_OCTAVE = 16, 10
 # Scores beyond this are outliers, and ignored.
 _FAR = 5.0
@@ -31,7 +32,8 @@ _DAMPED, _STUCK = 1e-3, 1e4
 class Ordinates:
     """The periodogram of scores, in bins."""
 
-    # Mean of the ordinates of each bin; 1 for white scores of variance 1; shape (k,).
+    # Mean of the ordinates of each bin, expected to be 1 for white scores of variance 1; shape
+    # (k,).
     power: FloatArray
     count: FloatArray  # Ordinates of each; shape (k,)
     omega: FloatArray  # Middle, radians per sample; shape (k,)
@@ -83,7 +85,7 @@ class Ordinates:
         return x, value - self.likelihood(np.zeros(self.power.size))
 
 
-# Number of single ordinates of a cross spectrum; relative width of the bins above.
+# Number of ordinates of a cross spectrum that are not binned; relative width of the bins above.
 _ONE_BY_ONE, _WIDTH = 24, 0.06
 
 
@@ -100,19 +102,19 @@ def cosines(x: FloatArray) -> FloatArray:
 
 class CrossSpectrum:
     """
-    Cross spectra of regressors and a voltage, the last row, and the likelihood of a noise.
+    Cross spectra of regressors and a voltage, and the likelihood of a noise spectrum.
 
-    rows: shape (q, n), in stretches of `lengths` evenly spaced readings; without regressors (q =
-    1) each stretch has a mean of its own.
+    rows: regressors, and the voltage as the last row, shape (q, n), in stretches of `lengths`
+    evenly spaced readings; without regressors (q = 1) each stretch has its own mean.
 
-    The ordinates are those of the cosine transform, which continues the window as a mirror image:
-    unlike in a Fourier transform, different values at its ends cause no leakage.
+    The ordinates come from the cosine transform, which continues the window as a mirror image; so
+    different values at its ends cause no leakage, as they do in a Fourier transform.
     """
 
     def __init__(self, rows: FloatArray, lengths: Sequence[int]) -> None:
         q, n = rows.shape
         self.free = n - (q - 1 or len(lengths))
-        # Lost messages make hundreds of stretches; those of similar lengths share their bins.
+        # Lost messages may cause hundreds of stretches; those of similar lengths share their bins.
         groups: dict[int, list[FloatArray]] = {}
         for part in np.split(rows, np.cumsum(lengths)[:-1], axis=1):
             groups.setdefault(round(math.log(part.shape[1]) / _WIDTH), []).append(part)
@@ -150,7 +152,7 @@ class CrossSpectrum:
         omega = np.pi * place / np.maximum(self._count, 1e-9)
         self._sign = sign / np.maximum(self._count, 1.0)
         self._chord = 4.0 * np.sin(0.5 * omega) ** 2
-        # Square of an ordinate's weight on the first reading and the last together.
+        # Sum of the squares of an ordinate's weights on the first and the last reading.
         self._ends = np.where(omega > 0.0, 4.0 - self._chord, 2.0) / self._n
         #: Inverse of the ordinates of a random walk; the mean is a regressor.
         self.walk = 4.0 * np.sin(0.5 * np.maximum(omega, 0.5 * np.pi / self._n)) ** 2
@@ -162,8 +164,8 @@ class CrossSpectrum:
 
     def ou(self, a: FloatArray) -> FloatArray:
         """Return the expected ordinates of an OU of variance 1; a: alpha D, shape (k, 1)."""
-        # The inverse covariance is (1 - phi)^2 + phi L, of which the cosines are eigenvectors,
-        # but for phi (1 - phi) at both ends: Woodbury.
+        # The inverse covariance is (1 - phi)^2 + phi L, whose eigenvectors are the cosines, plus
+        # phi (1 - phi) at both ends, which needs Woodbury's formula.
         phi, gap = np.exp(-a), -np.expm1(-a)
         square = gap * gap + phi * self._chord
         end = self._ends * phi * gap * (1.0 - self._sign * np.exp(-a * self._n)) / (1.0 + phi)
@@ -174,8 +176,8 @@ class CrossSpectrum:
         """
         Return minus the log-likelihood of spectra, shape (k, bins), restricted and profiled.
 
-        used: number of regressors to use.  The second result is the factor on the spectrum, the
-        third the products x' K^-1 z of all rows, shape (k, q, q).
+        used: number of regressors to use.  The second result is the factor on the spectrum, and
+        the third are the products x' K^-1 z of all rows, shape (k, q, q).
         """
         gram = ((1.0 / S) @ self._cross).reshape(-1, self._q, self._q)
         # Keep it definite despite rounding.

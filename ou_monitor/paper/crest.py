@@ -1,8 +1,8 @@
 """
 Crest factors Vpp/Vrms of an Ornstein-Uhlenbeck process on a screen, without and with jumps.
 
-Paths are drawn with the exact transition over a hundred samples of the paper; the extremes in
-between are those of a Brownian bridge, with a relative error of alpha dt = 0.006 a step.  The
+Paths are drawn with the exact transition over steps of a hundred samples of the paper.  Extremes
+within a step are those of a Brownian bridge; their relative error is alpha dt = 0.006.  The
 crest factor does not depend on sigma.  Section 5, "diffusion and jump components", is recomputed
 from jumps that relax at alpha.
 """
@@ -23,7 +23,7 @@ from ou_monitor.paper.published import over, Printed, Range, Row
 from ou_monitor.records import FloatArray
 from scipy.signal import lfilter
 
-# Screen lengths tried, ms; the paper does not give any.
+# Screen lengths tried, ms; the paper gives none.
 SCREENS_MS = (10, 100, 500)
 TYPICAL_MS = 100
 # Share of screens left out at either end.
@@ -179,7 +179,7 @@ def simulate_jumps(rng: np.random.Generator, seconds: float,
     """Draw screens of OUs with jumps (seconds in s, progress 0..1)."""
     alpha = published.ALPHA.value
     longest = max(JUMP_SCREENS_MS)
-    # One more screen, dropped later, in which the jumps become stationary.
+    # One more screen, dropped later, lets the jumps become stationary.
     t = np.arange(round((seconds + 1e-3 * longest) * _SAMPLING)) / _SAMPLING
     begin = round(1e-3 * longest * _SAMPLING)
     found = []

@@ -2,23 +2,24 @@
 Find the bulk capacitance that brings the brown-out risk of a rail under a target.
 
 Limits: a linear network with Gaussian noise (see `ou_monitor.paper.network`), constant throttle,
-ideal capacitors of one series, no ageing, no cold.  The larger of two risks decides: from the
-exact mean first passage of an OU with the slowest excited pole and the variance of the rail, and
-from the high-level crossing rate of the whole Gaussian process.  Compared with simulations at 2.5
-and 3.2 standard deviations (step extrapolated to 0), the first was 60 times too low (noise through
-a large ESR) to 4 times too high (no ESR), the second 1.1 to 3 times too high.
+ideal capacitors of one series, no ageing, no cold.  The risk is the larger of two.  The first
+comes from the exact mean first passage of an OU with the slowest excited pole and the variance of
+the rail; the second from the high-level crossing rate of the whole Gaussian process.  In
+simulations with levels at 2.5 and 3.2 standard deviations (step extrapolated to 0), the first was
+60 times too low (noise through a large ESR) to 4 times too high (no ESR), the second 1.1 to 3
+times too high.
 
 Without an LC filter, both risks fall as C rises once the network is slower than the noise; below
 that C, the second rose by up to 1.44 times in 39 of 6000 random networks.  With an LC filter the
-risk may rise, up to an oscillation.
+risk may rise with C, up to an oscillation.
 
 `network_of` chooses components that reproduce a flight; the error of its sag counts in all risks
 of the bus, and the throttle limit is the budget of the flight.  Limits: sag and noise are as
-measured, with the white noise of the sensor and its filter.  Noise added by changes of throttle,
-and an OU if one was found, count as slow fluctuations of the current, which no capacitor of a
-board changes; the rest is attributed to the switching of the ESCs.  Without a measured current,
-the resistance is the given or default one and the current is scaled to the sag: the effect of
-packs in parallel is then still right, the effect of an ESR is uncertain.
+measured, including the white noise and the filter of the sensor.  Noise added by changes of
+throttle, and an OU if one was found, count as slow fluctuations of the current, which capacitors
+on a board do not change; the rest is attributed to the switching of the ESCs.  Without a measured
+current, the resistance is the given or default one, and the current is scaled to the sag: the
+effect of packs in parallel is then still right, but the effect of an ESR is uncertain.
 """
 
 from __future__ import annotations
@@ -47,10 +48,10 @@ LEAST, MOST = 10e-6, 22e-3
 _GRID = 81
 # Lower limit of a rate of brown-outs, 1/s.
 _NEVER = 1e-300
-# Limits of the alternatives to capacitors: maximum packs in parallel, minimum shares of the
-# resistance (new leads and a fresh pack) and of the throttle.
+# Limits of the alternatives to capacitors: maximum packs in parallel, minimum share of the present
+# resistance (new leads and a fresh pack), and of the present throttle.
 _PACKS, _RESISTANCE, _THROTTLE = 3, 0.5, 0.5
-# Errors of a mean beyond this, in standard errors, are left out; nodes and weights of Gauss.
+# Quadrature over the error of a mean: range, standard errors; Gauss-Legendre nodes and weights.
 _FAR = 8.0
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(40)
 
@@ -81,8 +82,8 @@ class DesignRow:
     # Sag of the bus and mean of the rail, V; independent of the capacitor.
     sag: float
     mean: float
-    # Mean time to brown-out of the OU from its mean level, s, or the one that gives the risk if
-    # the mean has an error; may be inf.
+    # Mean time to brown-out of the OU from its mean, s; if the mean has an error, the time that
+    # gives the risk; may be inf.
     mean_time: float
     crossing_rate: float  # High-level crossing rate of the whole process, 1/s.
     # Probability within the horizon, by mean first passage of the OU and by the crossing rate.
@@ -133,10 +134,10 @@ class Design:
     voltage: float
     horizon: float
     target: float
-    esr_follows: bool  # Whether ESR is 1/C of the present one (capacitors in parallel).
+    esr_follows: bool  # Whether ESR falls as 1/C (capacitors in parallel).
     verdict: DesignVerdict  # Verdict.
     present: DesignRow  # With the present capacitor.
-    # With the smallest capacitance from which on all meet the target; None if there is none.
+    # With the smallest capacitance such that all larger ones meet the target; None: no such one.
     least: DesignRow | None
     rows: tuple[DesignRow, ...]  # A table over capacitances, rising.
     falls: bool  # Whether the risk never rises with capacitance in the table.
@@ -145,7 +146,7 @@ class Design:
     resistance: float
     levers: tuple[Lever, ...]  # More capacitance and its alternatives.
     sag_error: float = 0.0  # Standard error of the sag of the bus, relative.
-    flown_risk: float = math.nan  # At this throttle by the facts of a flight; NaN: unknown.
+    flown_risk: float = math.nan  # Risk at this throttle that a flight showed; NaN: unknown.
 
 
 def default_voltage(network: PowerNetwork, rail: str) -> tuple[float, str]:
@@ -174,7 +175,7 @@ def row_of(rail: Rail, voltage: float, horizon: float, sag_error: float = 0.0) -
     mean_time, crossing = _times(rail, voltage)
     se = sag_error * rail.load.sag if rail.name == 'bus' else 0.0
     if se > 0.0:
-        # Means below the voltage count with the risk 1, the others by quadrature.
+        # If the mean is below the voltage, the risk is 1; other means are integrated.
         lowest = max((voltage - rail.mean) / se, -_FAR)
         risks = np.full(2, float(ndtr((voltage - rail.mean) / se)))
         z = lowest + 0.5 * (_FAR - lowest) * (_NODES + 1.0)
@@ -278,7 +279,7 @@ def _levers(network: PowerNetwork, throttle: float, voltage: float, horizon: flo
         return risk(network, share * throttle)
 
     bulk, ohm = network.bulk_capacitance, network.battery_resistance
-    # The budget of the flight is the answer of all commands; 0: no throttle.
+    # The budget of the flight, as in other commands, limits throttle; 0: no throttle is safe.
     most, then = (100.0 * throttle * _share(limit, _THROTTLE, target), limit(0.8)) if (
         flown is None) else (100.0 * min(flown[0], throttle) if flown[0] > 0.0 else math.nan,
                              flown[2])
@@ -307,7 +308,7 @@ def _share(risk: Callable[[float], float], least: float, target: float) -> float
 
 def _least(at: Callable[[float], DesignRow], rows: list[DesignRow],
            allowed: float) -> DesignRow | None:
-    """Return the row from which on all rows have at most the allowed rate, 1/s."""
+    """Return the first row such that all later ones are within the allowed rate, 1/s."""
     def excess(log_capacitance: float) -> float:
         rate = at(math.exp(log_capacitance)).rate
         return math.log(min(max(rate, _NEVER), 1.0 / _NEVER) / allowed)
@@ -356,15 +357,15 @@ def answer(result: Design) -> str:
     fits = result.present.risk <= result.target
     more = '' if not (fits and result.flown_risk > result.target) else (
         f' But right after the flight the risk at this throttle is '
-        f'{probability(result.flown_risk)}, as analyze gives it, by level and excursions that no '
-        f'capacitor changes. {_others(result)}')
+        f'{probability(result.flown_risk)} (see analyze), from the level and from excursions that '
+        f'no capacitor changes. {_others(result)}')
     return _network_answer(result) + more
 
 
 def _network_answer(result: Design) -> str:
     present, least = result.present, result.least
     if result.verdict is DesignVerdict.ENOUGH:
-        also = '' if least is None else f' The target is met from {_uf(least)} on.'
+        also = '' if least is None else f' {_uf(least)} or more meets the target.'
         return (f'No more capacitance is needed: with the present {_uf(present)} the risk is '
                 f'{probability(present.risk)}.{also}')
     if result.verdict is DesignVerdict.FOUND:
@@ -482,21 +483,21 @@ class Flight:
     """Facts of a supply from a recording, as numbers; NaN: unknown."""
 
     level: float  # Open-circuit voltage at its end, V
-    full: float  # Highest voltage, without a few outliers, V
+    full: float  # Highest voltage, outliers excluded, V
     cells: int  # In series; 0: unknown
-    throttle: Sequence[float]  # 0..1, at which the next four are given
+    throttle: Sequence[float]  # 0..1, at which the next four fields are given
     sag: Sequence[float]  # V
     sag_se: Sequence[float]  # V
     noise: Sequence[float]  # Rms as flown, V
-    steady: Sequence[float]  # Rms while throttle stands still, V
-    flown: tuple[float, float]  # Throttles, 1 % and 99 % quantile
+    steady: Sequence[float]  # Rms while throttle is constant, V
+    flown: tuple[float, float]  # 1 % and 99 % quantile of throttle
     highest: float  # Highest throttle, 0..1
     resistance: float  # Instantaneous, from a measured current, Ohm
     alpha: float  # Relaxation rate of the OU, 1/s
     var_inf: float  # Variance of the OU, V^2
 
 
-# Components that a flight shows; if one of them is given, the flight is not the answer.
+# Components that a flight shows; if one of them is given, its throttle budget does not apply.
 SHOWN = frozenset(('battery_voltage', 'battery_resistance', 'current_max', 'current_exponent',
                    'switching_scale', 'flutter'))
 

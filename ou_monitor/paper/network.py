@@ -23,9 +23,10 @@ the paper would need 0.4 F.  Exceptions:
 
 - Slow noise.  If the noise relaxes more slowly than the pole (a small C, or flutter), alpha is the
   rate of the noise and does not depend on C.
-- ESR.  With r fixed, fast noise keeps a variance of (R r / (R + r))^2 times its own however large
-  C is, and the share of the pole falls; below 1 %, alpha jumps up to the next pole, the rate of
-  the noise.  With r C fixed (capacitors of one series in parallel), neither happens on the bus.
+- ESR.  With r fixed, fast noise of the current keeps a voltage variance of (R r / (R + r))^2 times
+  its own for any C, and the share of the pole falls; below 1 %, alpha jumps up to the next pole,
+  the rate of the noise.  With r C fixed (capacitors of one series in parallel), neither happens on
+  the bus.
 - LC filter.  C shorts the battery resistance that damps L, so the resonance rises; if it is
   excited, Var_inf of either rail may rise with C.  With a constant-power regulator it may become
   an oscillation.
@@ -92,7 +93,7 @@ class PowerNetwork:
     escs: int = _part(4)  # ESCs that switch independently.
     # PWM frequency, Hz (24..48 kHz, the paper's section 4.5).
     esc_frequency: float = _part(48e3, 'Hz')
-    # Measured rms of the random ESC current, relative to the telegraph process.
+    # Rms of the random ESC current, relative to the telegraph process.
     switching_scale: float = _part(1.0, zero=True)
     # Slow fluctuation of the motor current (control loop, gusts): rms as a share of the
     # mean, and its rate, 1/s (motor and propeller, 30 ms); off by default.
@@ -103,7 +104,7 @@ class PowerNetwork:
     filter_resistance: float = _part(0.05, 'Ohm', zero=True)
     filter_capacitance: float = _part(100e-6, 'F')
     filter_esr: float = _part(0.1, 'Ohm', zero=True)
-    # Set voltage, V, and output resistance within the bandwidth, Ohm.
+    # Output voltage, V, and output resistance within the bandwidth, Ohm.
     regulator_voltage: float = _part(5.0, 'V')
     regulator_resistance: float = _part(0.03, 'Ohm')
     # The regulator rejects changes of its input slower than this, Hz, and passes faster ones times

@@ -4,8 +4,7 @@ The paper's theory (section 3): matrix model, Markov switching, averaging and di
 A chain x(t) on n states has the generator Q: Q[x, y] is the rate of going from x to y, 1/s, and
 every row sums to zero.  All states must be reachable from all: then the stationary law pi (pi Q =
 0) is unique, and the potential R0 = integral_0^inf (exp(Q t) - Pi) dt exists.  Holding times are
-exponential and the next state comes from an alias table, so a jump costs the same for any number
-of states.
+exponential; the next state is drawn from the cumulative rates of the state left.
 
 A system switched by it is du/dt = D u + d + speed (A_x u + a_x), x = x(clock t).  Two scalings of
 the paper, both with a small eps; at eps = 1 the system is unchanged, and D and d are not sped up:
@@ -147,7 +146,7 @@ def check_times(t: npt.ArrayLike) -> FloatArray:
 
 
 def check_state(u0: npt.ArrayLike, d: int) -> FloatArray:
-    """Return a first state as an array."""
+    """Return an initial state as an array."""
     state = np.atleast_1d(np.asarray(u0, dtype=np.float64))
     if state.shape != (d,):
         raise ValueError(f'u0 must have shape ({d},), got {state.shape}')
@@ -165,10 +164,10 @@ def matrix_model(alpha: float, omega: float, beta: float, alpha_p: float, *,
     the carrier omega, rad/s, coupling beta of the amplitude to the power, unit of P per unit of A
     per second, and the power's relaxation rate alpha_p > 0, 1/s: the alpha of the
     Ornstein-Uhlenbeck supply voltage.  Two entries of the printed matrix contradict the text
-    around them: with +gamma on the diagonal the power grows as exp(gamma t), and relaxes only with
-    -alpha_p there; and dphi/dt = omega phi is a phase that grows as exp(omega t), where a carrier
-    has dphi/dt = omega.  This follows the text; `printed` follows the print, and alpha_p is then
-    the paper's gamma, of any sign.
+    around them: +gamma on the diagonal makes the power grow as exp(gamma t), while only -alpha_p
+    makes it relax; and dphi/dt = omega phi makes the phase grow as exp(omega t), while a carrier
+    has dphi/dt = omega.  The default follows the text; `printed` follows the printed matrix, and
+    alpha_p is then the paper's gamma, of any sign.
     """
     for name, value in (('alpha', alpha), ('omega', omega), ('beta', beta),
                         ('alpha_p', alpha_p)):
@@ -272,7 +271,7 @@ class Generator:
 
     @cached_property
     def _below(self) -> FloatArray:
-        """Return the cumulative kernel, shape (n, n); 1 from the last possible state on."""
+        """Return the cumulative kernel, shape (n, n), exactly 1 from the last possible state."""
         below = np.cumsum(self.jump_probabilities, axis=1)
         return np.asarray(below / below[:, -1:])
 
@@ -283,13 +282,13 @@ class Generator:
         return Generator(self.q * factor)
 
     def transition(self, t: float) -> FloatArray:
-        """Return exp(Q t), shape (n, n): the law at time t s, row by starting state."""
+        """Return exp(Q t), shape (n, n): the law at time t, s, one row per initial state."""
         if not 0.0 <= t < np.inf:
             raise ValueError(f't must be zero or positive and finite, got {t} s')
         return np.asarray(expm(self.q * t))
 
     def starts(self, paths: int, rng: np.random.Generator) -> IntArray:
-        """Return first states, from the stationary law."""
+        """Draw initial states from the stationary law."""
         if paths < 1:
             raise ValueError(f'paths must be 1 or more, got {paths}')
         return np.asarray(rng.choice(self.size, paths, p=self.stationary), dtype=np.intp)
@@ -346,7 +345,7 @@ def check_rates(q: FloatArray) -> None:
 
 
 def check_classes(rates: FloatArray) -> None:
-    """Refuse chains that do not visit every state for ever (rates in 1/s)."""
+    """Refuse chains that do not visit every state again and again (rates in 1/s)."""
     count, label = connected_components(rates > 0.0, directed=True, connection='strong')
     if count > 1:
         classes = [np.flatnonzero(label == c).tolist() for c in range(count)]
@@ -452,7 +451,7 @@ class SwitchedSystem:
         self, t: npt.ArrayLike, u0: npt.ArrayLike, rng: np.random.Generator, *,
         eps: float = 1.0, paths: int = 1, scaling: Scaling = 'averaging',
     ) -> FloatArray:
-        """Draw paths, exact between the jumps and exact in the jumps (t in s)."""
+        """Draw paths with exact jump times, and exact motion between jumps (t in s)."""
         at_eps, times = self.scaled(eps, scaling), check_times(t)
         state = at_eps.generator.starts(paths, rng)
         u = np.tile(check_state(u0, self.matrices.shape[1]), (paths, 1))

@@ -14,7 +14,7 @@ import math
 import numpy as np
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ac_coupling import ACCoupling
-from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
+from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.paper import published
 from ou_monitor.paper.published import Printed, Range, Row
@@ -27,8 +27,8 @@ WHERE = 'Fig. 5'
 # Corner of the AC coupling of many hand-held oscilloscopes, Hz.
 CORNER_HZ = 10.0
 CORNER = 2.0 * math.pi * CORNER_HZ
-# Rates of rails fitted through it, 1/s.  For comparison: 470 uF with 30 mOhm ESR behind a battery
-# of 40 mOhm relaxes at 3e4 1/s.
+# Rates of rails fitted through the coupling, 1/s.  For comparison: 470 uF with 30 mOhm ESR behind
+# a battery of 40 mOhm relaxes at 3e4 1/s.
 RAILS = (500.0, 1000.0, 2000.0, 5000.0)
 TYPICAL_RAIL = 1000.0
 # A simulated release: sampling rate, Hz, time under load and time recorded after it, s.
@@ -145,7 +145,7 @@ def fitted_through_coupling(time: FloatArray) -> tuple[FloatArray, float]:
     """
     Return the typical rail behind the coupling, scaled to the points of the paper's fit.
 
-    time in s from the peak of the curve; mV, and the largest relative misfit.
+    time in s from the peak of the curve; returns mV, and the largest relative misfit.
     """
     peak = peak_of(TYPICAL_RAIL)
     misfit = np.log(VALUE[USED] / through_coupling(peak + TIME[USED], TYPICAL_RAIL))

@@ -24,7 +24,7 @@ from ou_monitor.report.document import (
 from ou_monitor.report.svg import Plot, span
 from ou_monitor.text import chance, counted, listed, number, with_se
 
-# Maximum changes drawn in one plot, and its length in relaxation times.
+# Maximum changes of throttle drawn in one plot, and the length of the plot, relaxation times.
 _MOST_DRAWN, _DRAWN_TAUS = 6, 8.0
 # Maximum rows of a table on a terminal.
 _MOST_LINES, _MOST_CHANGES = 12, 8
@@ -65,7 +65,7 @@ def analysis_document(analysis: Analysis, command: str = '') -> Document:
 
 
 def answer(analysis: Analysis) -> list[str]:
-    """Return the answer: lowest voltage, safe throttle, sigma and tau as far as known."""
+    """Return the answer: lowest voltage, safe throttle, and sigma and tau if known."""
     curves, names = analysis.by_throttle, {item.name for item in analysis.quality}
     first, *others = answers(analysis.overview) or ['The recording holds no samples.']
     safe = [] if math.isnan(curves.budget) else [
@@ -285,7 +285,7 @@ def _interval(level: LevelResult, name: str) -> str:
 
 
 def _process(analysis: Analysis) -> list[Part]:
-    """Return the tests behind the type of process of each level, and the reasons."""
+    """Return the tests that decide the type of process of each level, and the reasons."""
     rows = []
     for level in analysis.levels:
         cells = []
@@ -474,7 +474,7 @@ def _shape(analysis: Analysis) -> list[Part]:
     spectrum = Plot('Spectrum (dashed: fitted OU and white noise)', 'frequency, Hz',
                     'PSD, V\u00b2/Hz', width=450, height=330, log_x=True, log_y=True,
                     legend_low=True)
-    histogram = Plot('Deviation and the normal law',
+    histogram = Plot('Deviation and the normal distribution',
                      'deviation / standard deviation', 'density', width=450, height=330,
                      log_y=True)
     drawn = _drawn(analysis)

@@ -1,4 +1,4 @@
-"""The report of `compare`: a recording and its simulations over each other."""
+"""The report of `compare`: a recording, overlaid with simulations of it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ou_monitor.text import number
 _MEASURED, _SIMULATED = 7, 1
 _VOLTAGE = ('Line: measured. Band: 95 % of the simulations at each moment. Pale line: one '
             'simulation. Dashed lines: levels at which falls are counted.')
-# Range of the fit if a model was given.
+# Fitted range if a model was given, so nothing was fitted.
 _NOTHING = (0.0, 0.0)
 
 
@@ -31,14 +31,14 @@ def comparison_document(found: Agreement, seen: Overview, command: str = '') -> 
         lambda: [Figure(_voltage(found), _VOLTAGE)],
         Table(['', 'measured', 'simulated\n[95 %]', ''], _rows(found), left=[0, 3]),
         Facts(_path(found)), Section('The whole recording', [Facts(known_lines(seen))]),
-        lambda: [Section('Throttle, answer to its rises, distribution, spectrum', _others(found),
+        lambda: [Section('Throttle, response to rises, distribution, spectrum', _others(found),
                          folded=True)],
         Notes.of(found.notes),
         Text(f'{found.seeds} simulations with the stamps, throttle and ADC steps of the '
              f'recording. {100.0 * found.p_value:.0f} % of them (the recording included) deviate '
              'at least as much as the recording; below 5 % the recording is reported to differ.',
              legend=True)]
-    return Document('Beside its simulation', subject, _answer(found), parts, command)
+    return Document('Compared with its simulation', subject, _answer(found), parts, command)
 
 
 def _answer(found: Agreement) -> list[str]:
@@ -46,7 +46,7 @@ def _answer(found: Agreement) -> list[str]:
     lowest = (f'lowest voltage is {number(low.median, 4)} V ({number(low.low, 4)} to '
               f'{number(low.high, 4)}), measured {number(low.measured, 4)} V')
     if found.verdict is Likeness.LOOKS_LIKE_IT:
-        # Without throttle the mean path is a level, which explains no variance.
+        # Without throttle the mean path is constant and explains no variance.
         path = [] if not found.explained > 0.0 else [
             f'Its mean path explains {100.0 * found.explained:.0f} % of the variance.']
         return [f'{found.verdict.value}: its {lowest}.', *path]
@@ -103,11 +103,11 @@ def _others(found: Agreement) -> list[Part]:
         drawn.append(Figure(Plot('Throttle', 'time, s', 'throttle', height=160).line(
             at.t, at.throttle, '', 2)))
     beside = []
-    if at.answer.size:
-        plot = Plot('Mean answer to rises of throttle', 'time after, s', 'change, V', width=450,
+    if at.response.size:
+        plot = Plot('Mean response to rises of throttle', 'time after, s', 'change, V', width=450,
                     height=250, legend_row=True)
-        plot.band(at.after, at.answer_low, at.answer_high, 'simulated, 95 %', _SIMULATED)
-        beside.append(Figure(plot.line(at.after, at.answer, 'measured', 0, 'thick')))
+        plot.band(at.after, at.response_low, at.response_high, 'simulated, 95 %', _SIMULATED)
+        beside.append(Figure(plot.line(at.after, at.response, 'measured', 0, 'thick')))
     plot = Plot('Distribution', 'voltage, V', 'share of time below', width=450, height=250,
                 legend_row=True)
     plot.line(at.edges, at.simulated_distribution, 'simulated', _SIMULATED, 'thick')

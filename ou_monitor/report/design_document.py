@@ -1,4 +1,4 @@
-"""The report of `design`: the minimum capacitance, a table over others, and alternatives."""
+"""The report of `design`: minimum capacitance, a table over capacitances, and alternatives."""
 
 from __future__ import annotations
 
@@ -69,8 +69,9 @@ def taken_words(flight: Flight, network: PowerNetwork, throttle: float, values: 
     known = flight.resistance > 0.0 and values.get('battery_resistance') is None
     sag, se = (float(np.interp(throttle, flight.throttle, one))
                for one in (flight.sag, flight.sag_se))
-    return (f'From the flight: {flight.level:.4g} V open at its end, {network.cells} cells '
-            f'({flight.full:.4g} V at most; --set cells=N), sag {sag:.3g} V (+- {2.0 * se:.2g} V, '
+    return (f'From the flight: {flight.level:.4g} V open-circuit at its end, {network.cells} '
+            f'cells ({flight.full:.4g} V at most; --set cells=N), sag {sag:.3g} V (+- '
+            f'{2.0 * se:.2g} V, '
             'which counts in the risks; the throttle limit is the budget of analyze at this risk) '
             'and noise '
             f'{1e3 * float(np.interp(throttle, flight.throttle, flight.noise)):.3g} mV rms at '
@@ -78,4 +79,4 @@ def taken_words(flight: Flight, network: PowerNetwork, throttle: float, values: 
             + (f'{1e3 * flight.resistance:.3g} mOhm.' if known else
                f'{1e3 * network.battery_resistance:.3g} mOhm as given or assumed: the current is '
                'scaled to the sag.')
-            + ' A flight does not show bulk capacitor and ESR: --set bulk_capacitance=470uF.')
+            + ' A flight shows neither bulk capacitor nor ESR: --set bulk_capacitance=470uF.')

@@ -86,7 +86,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Pair:
-    """Figures side by side if there is room; a single one keeps its half."""
+    """Figures side by side if there is room; a single one takes half the width."""
 
     figures: Sequence[Figure]
 
@@ -98,7 +98,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Section:
-    """Parts under a heading; a page shows a folded one at a click."""
+    """Parts under a heading; on a page, a click unfolds a folded one."""
 
     heading: str
     parts: Sequence[Part]
@@ -118,7 +118,7 @@ class Document:
     subject: str  # Recording and its size, one line
     answer: Sequence[str]  # Sentences, most important first
     parts: Sequence[Part]
-    command: str = ''  # Command that repeats it
+    command: str = ''  # Command that makes this report
 
     @property
     def headline(self) -> str:

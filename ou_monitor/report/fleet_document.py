@@ -39,10 +39,10 @@ _ONE_PACK = 1.6
 # Maximum ageing packs in the answer.
 _OLD = 3
 # Heads of the tables of packs and of vehicles.
-PACK_HEADS = ('vehicle', 'flights', 'dates', 'cells', 'resistance\na cell, mOhm',
-              'a flight\n[95 %]', 'sag\na cell, mV', 'a flight\n[95 %]')
-VEHICLE_HEADS = ('vehicle', 'flights', 'lowest, V', 'dips', 'sigma, V/sqrt(s)', '/flight',
-                 'alpha, 1/s', '/flight')
+PACK_HEADS = ('vehicle', 'flights', 'dates', 'cells', 'resistance\nper cell, mOhm',
+              'per flight\n[95 %]', 'sag\nper cell, mV', 'per flight\n[95 %]')
+VEHICLE_HEADS = ('vehicle', 'flights', 'lowest, V', 'dips', 'sigma, V/sqrt(s)', 'per flight',
+                 'alpha, 1/s', 'per flight')
 # Maximum characters of a vehicle's name in a table.
 _NAME = 30
 # Heads of the table of recordings.
@@ -55,7 +55,7 @@ def fleet_document(fleet: Fleet, command: str = '') -> Document:
     rows = worst(fleet)
     odd = finding_words(fleet)
     vehicles = vehicle_table(fleet)
-    copies = [f"{_of(row)}{row['path']} is {row['duplicate_of']}" for row in fleet.duplicates]
+    copies = [f"{_prefix(row)}{row['path']} is {row['duplicate_of']}" for row in fleet.duplicates]
     subject = (f'{counted(fleet.recordings, "recording")}, '
                f'{counted(len(fleet.vehicles), "vehicle")}, '
                f'{counted(len(fleet.rows), "row")} in the table')
@@ -75,8 +75,8 @@ def fleet_document(fleet: Fleet, command: str = '') -> Document:
         Section('Vehicles', [
             vehicles,
             Text('Lowest voltage and total dips of all flights. sigma and alpha: medians as '
-                 'measured; "/flight": drift of the values moved to the common throttle. A star '
-                 'marks what stands out.', legend=True), lambda: _strips(fleet)]
+                 'measured; "per flight": drift at the common throttle. A star marks what stands '
+                 'out.', legend=True), lambda: _strips(fleet)]
                 if vehicles.rows else [Text('No vehicle was identified.', legend=True)]),
         lambda: [Section('Drift over the flights', _drift(fleet)),
                  Section('Distributions', _distributions(fleet), folded=True),
@@ -94,7 +94,7 @@ def answer(fleet: Fleet) -> list[str]:
 
 
 def _ageing(fleet: Fleet) -> str:
-    """Return which packs age; else how fast one still could; empty without packs."""
+    """Return which packs age, or how fast one might age undetected; empty without packs."""
     judged = fleet.judgement
     if not any(judged.values[name].value.size for name in OF_PACK):
         return ''
@@ -112,8 +112,8 @@ def _ageing(fleet: Fleet) -> str:
     least = {vehicle: min((t for t in tested if t.vehicle == vehicle), key=lambda t: t.high)
              for vehicle in {t.vehicle for t in tested}}
     most = max(least.values(), key=lambda t: t.high)
-    return (f'No pack is seen to age; not excluded (95 %): {most.quantity} '
-            f'{change(most.high)} a flight on {most.vehicle}, which has {most.flights} flights.')
+    return (f'No ageing pack is detected; not excluded (95 %): {most.quantity} '
+            f'{change(most.high)} per flight on {most.vehicle}, which has {most.flights} flights.')
 
 
 def _flown(fleet: Fleet, trends: Sequence[Trend]) -> str:
@@ -129,7 +129,7 @@ def _growth(judged: Judgement, trend: Trend) -> str:
     values = judged.values[trend.quantity]
     first, last = (_plain(values, trend.line(np.array(float(flight))))
                    for flight in (trend.first, trend.last))
-    return (f'{trend.quantity} {change(trend.slope)} a flight (95 % {change(trend.low)} to '
+    return (f'{trend.quantity} {change(trend.slope)} per flight (95 % {change(trend.low)} to '
             f'{change(trend.high)}), {first} to {last} {_UNITS[trend.quantity]}'
             f'{_a_cell(judged, trend.quantity, trend.vehicle)}')
 
@@ -174,7 +174,7 @@ def change(value: float) -> str:
     if not math.isfinite(value):
         return UNKNOWN
     if value >= math.log(2.0):
-        # Few flights may leave nearly anything open.
+        # With few flights the interval may be enormous.
         return f'x {number(math.exp(value))}' if value < 7.0 else 'x 1000 or more'
     percent = 100.0 * math.expm1(value)
     return f'{percent:+.0f} %' if abs(percent) >= 10.0 else f'{percent:+.2g} %'
@@ -183,7 +183,7 @@ def change(value: float) -> str:
 def trend_words(trend: Trend) -> str:
     """Return a drift in a sentence."""
     flights = trend.last - trend.first
-    return (f'{trend.vehicle}: {trend.quantity} drifts by {change(trend.slope)} a flight (95 % '
+    return (f'{trend.vehicle}: {trend.quantity} drifts by {change(trend.slope)} per flight (95 % '
             f'{change(trend.low)} to {change(trend.high)}), '
             f'{change(flights * trend.slope)} over {trend.flights} flights; '
             f'{p_words(trend.p_value)}, over the fleet {chance(trend.p_family)}.')
@@ -225,12 +225,12 @@ def failure_words(fleet: Fleet) -> list[str]:
         # The rest may name a line of the file, or a file within it.
         if not re.match(r':\d+:|/', error):
             error = f": {error.lstrip(': ')}"
-        found.append(_of(row) + row['path'] + error)
+        found.append(_prefix(row) + row['path'] + error)
     return found
 
 
-def _of(row: Row) -> str:
-    """Return the vehicle of a row before its path."""
+def _prefix(row: Row) -> str:
+    """Return the vehicle of a row, to put before its path."""
     return '' if row['vehicle'] is None else f"{row['vehicle']}: "
 
 
@@ -250,9 +250,9 @@ def _thousandths(name: str) -> float:
 
 
 def _a_cell(judged: Judgement, name: str, vehicle: str) -> str:
-    """Return whether the values of a vehicle are per cell."""
+    """Return ' per cell' if the values of a vehicle are."""
     one = judged.vehicles[name]
-    return ' a cell' if vehicle in one.names and one.cells[one.names.index(vehicle)] else ''
+    return ' per cell' if vehicle in one.names and one.cells[one.names.index(vehicle)] else ''
 
 
 def _cells_of(fleet: Fleet, vehicle: str) -> str:
@@ -270,7 +270,7 @@ def _dates(fleet: Fleet, vehicle: str) -> str:
 
 
 def _at(values: Values, before: str) -> str:
-    """Return the throttle at which recordings are compared, after `before`; empty without one."""
+    """Return `before` and the throttle at which recordings are compared; empty without one."""
     if values.name in OF_PACK:
         return f'{before}full throttle' if values.name == 'sag' else ''
     at = values.curve.reference
@@ -301,33 +301,35 @@ def comparison_words(fleet: Fleet) -> list[str]:
                      + ' throttle along a curve common to all recordings; its error is '
                      'included.')
     if any(judged.values[name].value.size for name in OF_PACK):
-        notes.append('Resistance and sag are those of analyze, a cell where the cells are known; '
-                     'a question mark marks a guess by the voltage. The sag is compared at full '
-                     'throttle. A current sensor of another scale looks like another resistance.')
+        notes.append('Resistance and sag are computed as in analyze, per cell if the number of '
+                     'cells is known ("?": guessed from the voltage). The sag is compared at full '
+                     'throttle. A current sensor with a different scale looks like a different '
+                     'resistance.')
     tests = len(judged.trends)
     if tests:
         notes.append(f'Drift: {counted(tests, "test")}, with {100 * DRIFT_RATE:g} % probability '
                      'of any false alarm (Holm).')
     few = sorted({*fleet.vehicles} - {t.vehicle for t in judged.trends})
     if few:
-        notes.append(f'Drift unknown: {some(few, 5)}: it needs {LEAST_FLIGHTS} flights with known '
-                     'values.')
+        notes.append(f'Drift unknown for {some(few, 5)}: it needs {LEAST_FLIGHTS} flights with '
+                     'known values.')
     if any(o.compared for o in judged.recordings.values()):
         notes.append(
             f'Outliers: a fleet without faults shows one with {100 * OUTLIER_RATE:g} % '
             'probability (over all quantities, recordings and vehicles, if the scatter between '
             'good recordings is normal).')
     else:
-        notes.append(f'No vehicle has the {LEAST} flights with known values that outliers among '
-                     'them need.')
+        notes.append(f'No vehicle has the {LEAST} flights with known values that a search for '
+                     'outliers needs.')
     compared = any(v.outliers.compared for v in judged.vehicles.values())
     if len(fleet.vehicles) < LEAST_VEHICLES:
         notes.append(
-            'Vehicles: mean resistance and sag of each are compared with the mean of the others '
-            f'with as many cells, by the scatter between flights; below {LEAST_VEHICLES} vehicles '
-            'the spread between good ones is unknown, and only more than a tenth counts.'
-            if compared else 'Vehicles are not compared with each other: that needs two with as '
-            'many cells and two flights each with known resistance or sag.')
+            'Vehicles: the mean resistance and sag of each are compared with the mean of the '
+            'others with the same number of cells, by the scatter between flights; below '
+            f'{LEAST_VEHICLES} vehicles the spread between good ones is unknown, so only a '
+            'difference above 10 % counts.'
+            if compared else 'Vehicles are not compared with each other: that needs two with the '
+            'same number of cells, each with two flights of known resistance or sag.')
     return notes
 
 
@@ -372,8 +374,9 @@ def _packs(fleet: Fleet) -> list[Part]:
     if not made.rows:
         return []
     return [made, Text(
-        'Medians as measured, the sag at the highest throttle flown; without known cells, of the '
-        'whole supply. "a flight": drift, the sag at full throttle. A star marks what stands out.',
+        'Medians as measured, the sag at the highest throttle flown; of the whole supply if the '
+        'number of cells is unknown. "per flight": drift, the sag at full throttle. A star marks '
+        'what stands out.',
         legend=True)]
 
 
@@ -385,7 +388,7 @@ def _flights(fleet: Fleet, vehicle: str) -> int:
 def vehicle_table(fleet: Fleet) -> Table:
     """Return the table of vehicles."""
     judged = fleet.judgement
-    found, seen = [], once(fleet)
+    found, seen = [], one_each(fleet)
     shown_as = short_names(fleet.vehicles)
     for vehicle in fleet.vehicles:
         mine = [row for row in seen if row['vehicle'] == vehicle]
@@ -480,7 +483,7 @@ class DipCount:
     recordings: int = 0  # Recordings with dips
 
 
-def once(fleet: Fleet) -> list[Row]:
+def one_each(fleet: Fleet) -> list[Row]:
     """Return one row for each analysed recording with a known lowest voltage."""
     rows = {row['path']: row for row in fleet.rows if row['lowest'] is not None}
     return list(rows.values())
@@ -497,12 +500,13 @@ def dips_of(rows: Sequence[Row]) -> DipCount | None:
 
 def worst(fleet: Fleet) -> list[Row]:
     """Return the recordings by number of dips, most first, then by lowest voltage."""
-    return sorted(once(fleet), key=lambda row: (-(row['dips'] or 0), row['lowest'], row['path']))
+    return sorted(one_each(fleet),
+                  key=lambda row: (-(row['dips'] or 0), row['lowest'], row['path']))
 
 
 def sentences(fleet: Fleet) -> list[str]:
     """Return the main facts for a pilot; empty if no recording has a voltage."""
-    rows = once(fleet)
+    rows = one_each(fleet)
     if not rows:
         return []
     _, lowest = _lowest_of(rows)
@@ -535,7 +539,7 @@ def _lowest_of(rows: Sequence[Row]) -> tuple[Row, str]:
 
 def facts(fleet: Fleet) -> list[tuple[str, str]]:
     """Return the facts of a fleet: pairs of name and words."""
-    rows = once(fleet)
+    rows = one_each(fleet)
     if not rows:
         return []
     low, lowest = _lowest_of(rows)
@@ -575,7 +579,7 @@ def _name(row: Row) -> str:
 
 
 def short_names(names: Sequence[str]) -> dict[str, str]:
-    """Return names for tables; long ones lose their middle if they stay unique."""
+    """Return names for tables: long ones without their middle if that leaves them unique."""
     short = {name: name if len(name) <= _NAME else f'{name[:13]}\u2026{name[13 - _NAME + 1:]}'
              for name in names}
     uses = Counter(short.values())
@@ -664,16 +668,16 @@ def _drift(fleet: Fleet) -> list[Part]:
              chance(t.p_value), chance(t.p_family),
              'yes' if t.p_family <= DRIFT_RATE else 'no'] for t in listed[:_MOST]]
     more = len(judged.trends) - len(rows)
-    return [*parts, Table(['vehicle', 'quantity', 'flights', 'change a flight\n[95 %]', 'p',
+    return [*parts, Table(['vehicle', 'quantity', 'flights', 'change per flight\n[95 %]', 'p',
                            'p over the fleet', 'stands'], rows, left=[0, 1]), Text(
-        'Lines through the logarithms, weighted by the errors; p: t test by the scatter about the '
-        'line; over the fleet: Holm-adjusted.'
+        'Straight lines fitted to the logarithms, weighted by the errors; p: t test by the '
+        'scatter about the line; over the fleet: Holm-adjusted.'
         + (f' {more} less likely trends are not shown.' if more > 0 else ''), legend=True)]
 
 
 def _caption(trend: Trend, fleet: Fleet) -> str:
     at = _at(fleet.judgement.values[trend.quantity], ' at ') or ' as measured'
-    return (f'{change(trend.slope)} a flight; p over the fleet '
+    return (f'{change(trend.slope)} per flight; p over the fleet '
             f'{chance(trend.p_family)}. Values{at}, with 95 % intervals.')
 
 
@@ -682,7 +686,7 @@ def _trend_plot(values: Values, trend: Trend) -> Plot:
     x, y = values.flights[mine].astype(float), values.value[mine]
     low, high = values.interval()
     scale = _thousandths(values.name)
-    cell = ' a cell' * bool(values.cells[mine].all())
+    cell = ' per cell' * bool(values.cells[mine].all())
     plot = Plot(f'{trend.vehicle}: {_TITLES[values.name]}{cell}', 'flight', _UNITS[values.name],
                 width=450, height=260, log_y=True)
     plot.limits(x=(trend.first - 0.5, trend.last + 0.5))
@@ -714,8 +718,8 @@ def _distributions(fleet: Fleet) -> list[Part]:
     parts: list[Part] = [*Pair.two_by_two(figures)]
     if over:
         parts.append(Text(
-            'Histograms are at the reference throttle. Over throttle: every level of every '
-            'recording, and the common curve used to compare them, through their median.',
+            'Histograms show values at the reference throttle. Over throttle: every level of '
+            'every recording, and the common curve used to compare them, through their median.',
             legend=True))
     return parts
 
@@ -766,13 +770,13 @@ def _recordings(fleet: Fleet) -> list[Part]:
             UNKNOWN if first['dips'] is None else f"{first['dips']:g}", *measured,
             ', '.join(sorted(flags[path])) or UNKNOWN])
     heads = ['vehicle', 'flight', 'recording', 'cells', 's', 'lowest, V', 'dips', *[
-        f'{name}, {_UNITS[name]}' + '\na cell' * (name in OF_PACK) for name in QUANTITIES],
+        f'{name}, {_UNITS[name]}' + '\nper cell' * (name in OF_PACK) for name in QUANTITIES],
         'flags']
     more = len(firsts) - _RECORDINGS
     return [Table.of_known(heads, rows, left=[0, 2, len(heads) - 1]), Text(
-        'As measured, a cell where the cells are known; "?" is a guess. Small print: the throttle '
-        'and, if the vehicle has enough flights, the distance from its other flights in standard '
-        'deviations.' + (
+        'As measured, per cell if the number of cells is known ("?": guessed). Small print: the '
+        'throttle and, if the vehicle has enough flights, the distance from its other flights in '
+        'standard deviations.' + (
             f' {more} more recordings are in the Parquet table.' if more > 0 else ''),
         legend=True)]
 

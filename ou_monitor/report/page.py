@@ -5,11 +5,11 @@ A page with plots has one script, which makes them interactive from the data emb
 The content security policy allows that script by its hash, and forbids all other scripts and all
 network requests.
 
-The data of a plot: one JSON object with one block of bytes, compressed by zlib, in base64.
-Rounding: columns of up to 4096 values are exact (float64).  In longer ones, x is rounded to
-1/2000 of the median distance of its points, and y to 1 part in 16 million (float32) of its value
-or of its range, whichever is less.  If a plot has more than 150 000 points, its curves are reduced
-to the lowest and highest of each group of samples, which keeps every peak; the page says so.
+The data of a plot are one JSON object; its columns are one block of bytes (zlib, base64).  Columns
+of up to 4096 values are exact (float64).  In longer ones, x is rounded to within 1/2000 of the
+median step, and y (float32) to 1 part in 16 million of its value or its range, whichever is
+smaller.  If a plot has more than 150 000 points, its curves are reduced to the lowest and highest
+of each group of samples, which keeps every peak; the page says so.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ from ou_monitor.report.document import (
     Code, Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text, UNKNOWN)
 from ou_monitor.report.svg import Curve, extremes, Plot
 
-# Maximum points of a plot embedded in full: an hour at 1 kHz then makes a page of 1.5 MB.
+# Maximum points of a plot that is embedded in full; with it, an hour at 1 kHz takes 1.5 MB.
 MOST = 150_000
 _EXACT = 4096
-# Resolution of a time stamp: steps in the median distance of two samples.
+# Resolution of a long x column: grid steps per median step.
 _GRID = 1000
 _UNIT = re.compile(r'(10[\u207b\u00b2\u00b3\u00b9\u2070-\u2079]+ )?'
                    r'(%|1|[mk\u00b5]?(V|A|W|s|Hz|\u03a9))([\u00b2/].*)?')
@@ -94,7 +94,7 @@ def envelope(curve: Curve, every: int) -> Curve:
 
 
 def _changes(curve: Curve) -> Curve:
-    """Return steps without the points at which the value stays; lossless."""
+    """Drop the points of steps at which the value does not change; lossless."""
     x, y = curve.x, curve.y
     if x.size < 3:
         return curve
@@ -105,7 +105,7 @@ def _changes(curve: Curve) -> Curve:
 
 
 def _in_order(curve: Curve) -> Curve:
-    """Return markers and bars in the order of x, for searching; lines unchanged."""
+    """Sort markers and bars by x, for searching; leave other curves unchanged."""
     if curve.kind not in ('markers', 'bars'):
         return curve
     order = np.argsort(curve.x, kind='stable')
@@ -115,7 +115,7 @@ def _in_order(curve: Curve) -> Curve:
 
 
 def _axis(label: str, ends: tuple[float, float], log: bool) -> dict[str, Any]:
-    """Return an axis; its label split into name and unit."""
+    """Return an axis, with its label split into name and unit."""
     name, comma, unit = label.rpartition(', ')
     if not comma:
         name, unit = ('', label) if _UNIT.fullmatch(label) else (label, '')
@@ -140,7 +140,7 @@ def _abscissa(x: FloatArray, log: bool, block: bytearray) -> list[float | str]:
 
 
 def _ordinate(y: FloatArray, log: bool, block: bytearray) -> list[float | str]:
-    """Append y; a long column as float32, less its median if that is larger than the range."""
+    """Append y; a long column as float32, minus its median if that is larger than the range."""
     finite = y[np.isfinite(y)]
     if y.size > _EXACT and finite.size:
         middle, size = float(np.median(finite)), np.abs(finite[finite != 0.0])
@@ -152,7 +152,7 @@ def _ordinate(y: FloatArray, log: bool, block: bytearray) -> list[float | str]:
 
 def _append(kind: str, values: Any, block: bytearray, low: float = 0.0,
             by: float = 1.0) -> list[float | str]:
-    """Append a column; return type, offset, length, and the summand and factor to decode it."""
+    """Append a column; return its type, place and length, and the offset and factor to decode."""
     place = len(block)
     block += values.tobytes()
     return [kind, place, int(values.size), low, by]
@@ -295,7 +295,7 @@ def html(document: Document) -> str:
 
 def section(document: Document) -> str:
     """Return a document for inclusion in another page, with static plots."""
-    # Nesting limits the rules to this section.
+    # Nesting limits the CSS rules to this section.
     style = _stylesheet().replace(':root', 'article').replace('body {', 'article {')
     return (f'<div class="ou-monitor"><style>.ou-monitor {{{style}}}</style><article>\n'
             f'{_top(document)}{_joined(document.parts, live=False)}\n</article></div>\n')
@@ -332,7 +332,7 @@ def _part(part: Part, live: bool = True) -> str:
         below = f'<figcaption>{_set(part.caption)}</figcaption>' if part.caption else ''
         return f'<figure>{drawn}{below}</figure>'
     if isinstance(part, Pair):
-        # A single figure keeps its half.
+        # A single figure takes half the width.
         more = '<div></div>' if len(part.figures) == 1 else ''
         both = ''.join(_part(figure, live) for figure in part.figures)
         return f'<div class="pair">{both}{more}</div>'

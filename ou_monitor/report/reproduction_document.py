@@ -119,7 +119,7 @@ def _spectrum(result: Reproduction) -> list[Part]:
     plot.shade(low, high, 4)
     plot.mark(low, '').mark(high, 'ESC 24..48 kHz')
     return [Figure(plot, (
-        f'The ESC lines that section 4.5 expects would stand at {1e-3 * low:g} to '
+        f'The ESC lines that section 4.5 expects would lie at {1e-3 * low:g} to '
         f'{1e-3 * high:g} kHz, where the OU has {100 * share_above(low):.2g} % of its variance; '
         'an OU alone has no peak there. The corners of the AC coupling and of the Lorentzian '
         'coincide.'))]

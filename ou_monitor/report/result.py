@@ -136,9 +136,9 @@ class Result:
         Parameters
         ----------
         ax : matplotlib.axes.Axes, optional
-            Axes to draw on; those of a new figure when left out.
+            Axes to draw on; by default, of a new figure.
         title : str, optional
-            Title in `plots`; the main one when left out.
+            Title in `plots`; by default, the main one.
 
         Returns
         -------
@@ -196,7 +196,7 @@ def _plots(parts: Sequence[Part]) -> Iterator[Plot]:
 
 
 def draw(plot: Plot, ax: Axes | None = None) -> Axes:
-    """Draw on axes, or on those of a new figure, and return them."""
+    """Draw on axes, by default of a new figure, and return them."""
     if ax is None:
         try:
             from matplotlib import pyplot

@@ -20,11 +20,11 @@ from ou_monitor.records import FloatArray
 SERIES = 8
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 30, 42
-# Width of a letter of the 12-pixel sans serif, rounded up.
+# Width of a character of the 12-pixel sans serif, rounded up.
 _LETTER = 7.0
-# Half the width of the cap of a bar, pixels.
+# Half the width of an error bar's cap, pixels.
 _CAP = 7.0
-# Minimum letters of a cut name.
+# Minimum characters of a shortened name.
 _SHORTEST = 6
 # Height of a legend in a row of its own, pixels.
 _LEGEND = 18
@@ -155,7 +155,7 @@ class Curve:
 
 class Plot:
     """
-    One plot with two axes; screen readers read its title; its size is in pixels.
+    One plot with two axes; sizes are in pixels, and screen readers read the title.
 
     The legend stands beside the title, else in a row below it, else in the upper right of the
     axes.  legend_low: in the lower left instead.  legend_row: never beside the title, so that
@@ -386,7 +386,7 @@ def _legend_entry(curve: Curve, x: float, y: int) -> str:
 
 
 def short(names: Sequence[str], room: float) -> list[str]:
-    """Return names cut to `room` pixels each; empty if that is too little."""
+    """Return names shortened to `room` pixels each; empty if that is too little."""
     most = int(room / _LETTER) - 1
     if most < min(_SHORTEST, max(map(len, names), default=0)):
         return []

@@ -11,12 +11,12 @@ from ou_monitor.records import Severity
 from ou_monitor.report.document import (
     Document, Facts, Notes, Part, Section, Table, Text)
 
-# Maximum and minimum width of text, letters; between them the width of the terminal is used.
+# Maximum and minimum width of text, characters; in between, text is as wide as the terminal.
 COLUMNS, _NARROWEST = 100, 40
 
 
 def columns() -> int:
-    """Return the width of text: of the terminal if there is one, at most `COLUMNS`."""
+    """Return the width of text, characters: the terminal's if there is one, within limits."""
     if not sys.stdout.isatty():
         return COLUMNS
     return max(_NARROWEST, min(COLUMNS, shutil.get_terminal_size().columns))
@@ -80,7 +80,7 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[in
 
 
 def _parts(grid: Sequence[Sequence[str]], most: int) -> list[list[int]]:
-    """Return groups of columns that fit `most` letters; each begins with the first column."""
+    """Return groups of columns at most `most` characters wide; each repeats the first column."""
     widths = [max(len(line[k]) for line in grid) for k in range(len(grid[0]))]
     parts = [[0]]
     for k in range(1, len(widths)):

@@ -8,7 +8,7 @@ from command_line import failure
 import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_answer import LoadSag
+from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.recordings.model_file import as_yaml, ModelFile
 import pytest

@@ -13,7 +13,7 @@ from ou_monitor.discovery.finding import Cause, Finding, Verdict
 from ou_monitor.discovery.words import both_names, explain, plain, PLAIN_NAMES
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.model.terms.load_answer import LoadSag
+from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.slow import Drift

@@ -7,7 +7,7 @@ from ou_monitor.comparison.yardstick import Likeness
 from ou_monitor.errors import InputError
 from ou_monitor.model.load import LoadModel, lowpass
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_answer import LoadSag
+from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.records import Recording

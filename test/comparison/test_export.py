@@ -10,7 +10,7 @@ import numpy as np
 from ou_monitor.comparison.export import export, SOURCES
 from ou_monitor.errors import InputError
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_answer import LoadSag
+from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.recordings.model_file import read_model
 from ou_monitor.recordings.read import read_recording
@@ -54,7 +54,7 @@ def test_gazebo_is_a_line_and_a_constant_sag():
     # A full pack drawn by that current for the time that the model takes: to 3.5 V a cell.
     seconds = 3600.0 * c / (power / voltage)
     assert seconds == pytest.approx(1.0 / (GECKO.load.discharge * 0.4 ** 1.8), rel=0.02)
-    assert e1 < 0.0 and any('load_sag is that of a constant load' in note for note in found.notes)
+    assert e1 < 0.0 and any('load_sag is for a constant load' in note for note in found.notes)
 
 
 def test_ardupilot_has_charge_and_resistance():
@@ -79,7 +79,7 @@ def test_a_sag_that_grows_is_exported_as_it_begins(target):
     other = export(steady, target, throttle=HOVER, rate=100.0, full_current=60.0)
     assert (found.text, found.model.terms) == (other.text, other.model.terms)
     assert set(found.notes) - set(other.notes) == {
-        'load_sag is that at the start: in the model, it grows by -0.004 V/s at full throttle'}
+        'load_sag is as at the start: in the model, it grows by -0.004 V/s at full throttle'}
 
 
 def test_each_term_left_out_is_named_with_its_size():

@@ -62,19 +62,19 @@ def test_levels_lie_between_codes():
     assert np.allclose(np.mod(np.array(levels) / 0.1, 1.0), 0.5)
 
 
-def test_the_answer_to_rises():
-    """A step answer of -1 V for each unit of throttle, which decays to half of it."""
+def test_the_mean_response_to_rises_is_measured():
+    """A step response of -1 V for each unit of throttle, which decays to half of it."""
     t = np.arange(6000) / RATE
     u = np.where((t % 4.0) < 2.0, 0.2, 0.6)
     since = np.where(u > 0.4, t % 4.0 - 2.0, np.inf)
     v = 15.0 - 0.4 * (u > 0.4) * (0.5 + 0.5 * np.exp(-since / 0.3))
     yardstick = Yardstick(Readings(t, v, u), 0.0)
-    answer = yardstick.measure(v).answer
+    response = yardstick.measure(v).response
     assert yardstick.rises.size == 15
-    assert answer.min() == pytest.approx(-0.4, abs=0.02)
+    assert response.min() == pytest.approx(-0.4, abs=0.02)
     late = np.searchsorted(yardstick.after, 1.0)
-    assert answer[late] == pytest.approx(-0.2 - 0.2 * np.exp(-1.0 / 0.3), abs=0.005)
-    assert not Yardstick(Readings(t, v, None), 0.0).measure(v).answer.size
+    assert response[late] == pytest.approx(-0.2 - 0.2 * np.exp(-1.0 / 0.3), abs=0.005)
+    assert not Yardstick(Readings(t, v, None), 0.0).measure(v).response.size
 
 
 def test_the_worst_is_the_farthest_in_half_bands():

@@ -9,8 +9,8 @@ from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import columns_of, evaluate, state_space
 from ou_monitor.discovery.decision import rivals_of, TIE
 from ou_monitor.model.terms.ac_coupling import ACCoupling
-from ou_monitor.model.terms.load_answer import LoadSag
 from ou_monitor.model.terms.load_dependent import LoadDependentAlpha
+from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
 
 

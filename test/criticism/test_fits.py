@@ -27,7 +27,7 @@ def test_what_suits_a_part_is_not_taken_where_it_is_worse_for_all(monkeypatch):
     v = 5.0 + 0.02 * rng.standard_normal(t.size) * np.where(t < 30.0, 3.0, 1.0)
     samples = Samples(t, v + 0.005 * np.cumsum(rng.standard_normal(t.size)), None)
     best = fit_composite(samples, (OU(5.0, 0.1, 5.0), MeasurementNoise(0.02)), slice(0, t.size))
-    monkeypatch.setattr(structure, '_DEAR', -1)
+    monkeypatch.setattr(structure, '_EXPENSIVE', -1)
     monkeypatch.setattr(structure, '_MANY', 0)
     again = fit_composite(samples, best.terms, slice(0, t.size), best)
     assert again.density.sum() >= best.density.sum() - 1e-6

@@ -8,8 +8,8 @@ from ou_monitor.criticism.composite import fit_composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.clipped import redrawn
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_answer import LoadSag
 from ou_monitor.model.terms.load_dependent import LoadDependentSigma
+from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise, Saturation
 import pytest

@@ -6,7 +6,7 @@ from ou_monitor.cli.recorded import model_text
 from ou_monitor.criticism.readings import load_of
 from ou_monitor.errors import InputError
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_answer import LoadSag
+from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
 import pytest
 from scipy.signal import lfilter

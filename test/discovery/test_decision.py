@@ -24,7 +24,7 @@ class Dear(Cheap):
 
     NAME = 'dear'
     FAMILY = 'dolls'
-    DEAR = True
+    SLOW_FIT = True
 
 
 class Imitator(Dear):
@@ -100,7 +100,7 @@ def test_measured_inputs_and_white_noise_come_first():
     """No statistic is asked; answers of the mean are left to the regression, but for trends."""
     assert tried(first=True) == ['white', 'intensity']
     assert tried() == ['cheap', 'dear', 'imitator', 'law', 'ringing']
-    assert [kind for kind in TOYS if decision.is_answer(kind)] == [Mean, Trend]
+    assert [kind for kind in TOYS if decision.is_response(kind)] == [Mean, Trend]
     drift = KINDS['drift']
     assert tried(kinds=[drift]) == ['drift'] and tried(first=True, kinds=[drift]) == []
 
@@ -211,7 +211,7 @@ def test_an_ac_coupling_may_leave_three_quarters_of_the_slow_power_missing(left,
     (float('nan'), float('nan'), 0.83, False), (0.0, 0.0, 1.0, False)])
 def test_what_earns_its_place(gain, error, chance, earns):
     """A gain below zero by more than its error does not, nor what does not show: p above 0.05."""
-    assert decision.earns(gain, error, chance) is earns
+    assert decision.improves_predictions(gain, error, chance) is earns
 
 
 @pytest.mark.parametrize('before, asked, after, out', [

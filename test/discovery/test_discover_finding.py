@@ -11,8 +11,8 @@ from ou_monitor.discovery.finding import Cause, Criticism, CrossingRate, Finding
 from ou_monitor.discovery.fitting import with_reach
 from ou_monitor.discovery.words import parameters
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
 from ou_monitor.model.terms.load_dependent import LoadDependentSigma
+from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import Saturation
 from ou_monitor.model.terms.tones import Tone

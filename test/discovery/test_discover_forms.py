@@ -11,7 +11,7 @@ from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ac_coupling import ACCoupling
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.lines import order_lines
-from ou_monitor.model.terms.load_answer import LoadSag
+from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.nonlinear_restoring import NonlinearRestoring
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import ClockJitter, MeasurementNoise

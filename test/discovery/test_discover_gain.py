@@ -14,7 +14,7 @@ from ou_monitor.discovery.gain import (
     gain_of, guess, held_out, HeldOut, if_known, mean_difference, mean_score, why_unknown, without)
 from ou_monitor.model.ou import simulate
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_answer import LoadSag
+from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import Quantization
 import pytest

@@ -11,7 +11,7 @@ from ou_monitor.criticism.samples import choose_samples, MOST
 import ou_monitor.discovery.discover as discovering
 from ou_monitor.discovery.finding import Verdict
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_answer import LoadSag
+from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.tones import Tone
 from ou_monitor.records import Recording

@@ -12,7 +12,7 @@ from ou_monitor import discover
 from ou_monitor.discovery.finding import Verdict
 from ou_monitor.errors import InputError
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_answer import LoadSag
+from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import HeldSamples, Quantization
 from ou_monitor.records import Recording

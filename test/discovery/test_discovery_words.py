@@ -8,7 +8,7 @@ from ou_monitor.discovery.words import (
     cause_rows, coupling_note, explain, gain_remark, gain_text, gain_words, overlap_words,
     plain_words, remaining_words, verdict_sentence, why_named, with_error)
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.model.terms.load_answer import LoadSag
+from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.tones import Tone
 import pytest
 

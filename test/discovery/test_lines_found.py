@@ -12,7 +12,7 @@ from ou_monitor.criticism.structure import evaluate
 from ou_monitor.discovery.fitting import Fitter, standard_errors
 from ou_monitor.discovery.named import _in_doubt, _other, _SURE
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
+from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.tones import Resonance, Tone
 from ou_monitor.records import NAN, Recording

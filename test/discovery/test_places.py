@@ -6,8 +6,8 @@ from ou_monitor.discovery import decision
 from ou_monitor.discovery.gain import errors_grow
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.laws import View
-from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
 from ou_monitor.model.terms.load_dependent import INPUTS, Inputs, LoadDependentNoise
+from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
 import pytest

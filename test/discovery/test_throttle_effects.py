@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.discovery.pruning import refusal
 from ou_monitor.discovery.finding import throttle_effects
-from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
+from ou_monitor.discovery.pruning import refusal
+from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.shocks import Glitches
 import pytest

@@ -9,7 +9,7 @@ from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate
 from ou_monitor.discovery.coded import within_codes
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_answer import LoadSag
+from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.shocks import Jumps

@@ -7,7 +7,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from live import diagnosis, refusal, values_of, wait_until
 import numpy as np
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_answer import LoadSag
+from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.nodes.supply_simulator_node import SupplySimulatorNode
 from ou_monitor.recordings.model_file import as_yaml, ModelFile

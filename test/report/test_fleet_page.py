@@ -137,7 +137,7 @@ def test_an_ageing_pack_is_the_headline():
                            'guess): ') and 'uav0' not in said
     # 5 mOhm a cell at first, twice as much after seven more flights; three errors of a line.
     start, end = (float(word) for word in re.search(
-        r'resistance [^:]*, ([\d.]+) to ([\d.]+) mOhm a cell', said).groups())
+        r'resistance [^:]*, ([\d.]+) to ([\d.]+) mOhm per cell', said).groups())
     assert start == pytest.approx(5.0 * np.exp(0.1), rel=3 * 0.05) and end / start == (
         pytest.approx(np.exp(0.7), rel=3 * 0.05))
     packs = pack_table(made)
@@ -145,9 +145,9 @@ def test_an_ageing_pack_is_the_headline():
     assert [row[:4] for row in packs.rows] == [
         [name, '8', '2024-05-01 to 2024-05-08', '4?'] for name in ('uav0', 'uav1')]
     assert '*' in packs.rows[1][5] and '*' not in packs.rows[0][5]
-    assert 'Resistance a cell' in page_text(made)
+    assert 'Resistance per cell' in page_text(made)
     healthy = fleet_document(fleet(table(np.random.default_rng(9), 2, 5))).headline
-    assert healthy.startswith('No pack is seen to age; not excluded (95 %): ')
+    assert healthy.startswith('No ageing pack is detected; not excluded (95 %): ')
     assert fleet_document(fleet(table(np.random.default_rng(9), 2, 2))).headline.startswith(
         'Whether a pack ages is unknown: no vehicle has 3 flights')
 

@@ -7,7 +7,7 @@ from ou_monitor.cli.main import main
 from ou_monitor.errors import InputError
 from ou_monitor.model.load import charge_at, LoadStart, open_circuit
 from ou_monitor.model.supply import SEGMENT, SupplyModel
-from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
+from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
 from ou_monitor.model.terms.nonlinear_restoring import NonlinearRestoring
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise

@@ -17,7 +17,7 @@ from ou_monitor.discovery.decision import kinds_to_try
 from ou_monitor.discovery.fitting import Fitter, standard_errors
 from ou_monitor.discovery.gain import (
     cause_gain, covered, crossing_rates, gain_of, guess, held_out, without)
-from ou_monitor.discovery.regression import load_terms, mean_answer
+from ou_monitor.discovery.regression import load_terms, mean_response
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.term import Role
@@ -207,7 +207,7 @@ def discovery():
         fitter = Fitter(samples)
         bank = simulate_bank(covariates_of(samples, plain), 0.94, np.random.default_rng(1), 4)
         kinds = kinds_to_try(catalogue().values(), [type(plain.terms[0])], (), True, True)
-        answer = mean_answer(samples, plain, fitter.view(plain), load_terms(samples))
+        answer = mean_response(samples, plain, fitter.view(plain), load_terms(samples))
         found[name] = table({
             'errors': standard_errors(samples, full, every),
             'less': [one.values() for one in less.terms], 'guess': guess(samples).values(),

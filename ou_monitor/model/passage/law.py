@@ -4,24 +4,25 @@ First passage of the OU to a level: mean time, and probability within a time spa
 A continuous OU path has no finite crossing rate, so risk is stated as first passage.
 
 The unit OU is dX = -X ds + sqrt(2) dW: levels are in units of the stationary
-standard deviation, counted towards the barrier, and times in units of
-tau = 1/alpha.  The continuous path is meant; `sampled_passage` has the samples.
+standard deviation, positive towards the barrier, and times in units of
+tau = 1/alpha.  This is for the continuous path; `sampled_passage` is for samples.
 
 Numerical method.  With T = 1 - exp(-2 s) and w = (b - x) / sqrt(T) the
-probability is written as P = 2 Phi(-w exp(-s)) exp(R).  The first factor is the
-exact law for the barrier b = 0; R is smooth and vanishes at w = 0, at b = 0 and
-for s -> 0.  From the backward equation P_s = P_xx - x P_x it follows, with
-lambda = ln(exp(2 s) - 1) / 2, g = exp(-s) phi(y) / Phi(-y), y = w exp(-s), that
+probability is written as P = 2 Phi(-w exp(-s)) exp(R).  The first factor is
+exact for the barrier b = 0; R is smooth and vanishes at w = 0, at b = 0 and
+for s -> 0.  With lambda = ln(exp(2 s) - 1) / 2, y = w exp(-s) and
+g = exp(-s) phi(y) / Phi(-y), the backward equation P_s = P_xx - x P_x becomes
 
     R_lambda = R_ww + R_w^2 + (w (1 - 2 T) + b sqrt(T) - 2 g) R_w - b sqrt(T) g,
 
 which is solved once for all barriers by linearly implicit steps (BDF2) and kept
-as a table with cubic splines.  As a logarithm is solved for, small probabilities
-keep their relative accuracy.
+as a table with cubic splines.  Because R is a logarithm, small probabilities are
+accurate relatively too.
 
-Limits: within 0.15 % of P for barriers -3..30, starts above -10 and P down to 1e-12,
-by solving on finer grids; beyond the table a scaled problem stands in (the pull
-towards the mean taken as constant near the barrier), sensible rather than accurate.
+Limits: errors are within 0.15 % of P for barriers -3..30, starts above -10 and P
+down to 1e-12 (compared with finer grids).  Beyond the table, values come from a
+scaled problem (constant pull towards the mean near the barrier), and are
+plausible rather than accurate.
 """
 
 from __future__ import annotations
@@ -42,21 +43,21 @@ _B_SCALE, _W_SCALE = 4.0, 2.0
 _B_LOW, _B_HIGH, _B_NODES = -6.0, 30.0, 58
 _W_HIGH, _W_NODES = 30.0, 55
 _S_LOW, _S_HIGH, _S_NODES = 1e-5, 9.0, 88
-# Nodes of the solver from one node of the table to the next, in w and in lambda.
+# Steps of the solver per step of the table, in w and in lambda.
 _FINE_W, _FINE_S = 2, 4
-# Start of the solver, in lambda before the table.
+# How far before the table, in lambda, the solver starts.
 _LEAD = 1.0
 # Nodes added at each end of each axis, so that the ends do not affect the splines.
 _PAD = 5
 
 T = TypeVar('T')
 _LOG_TWO_PI = math.log(2.0 * math.pi)
-# Level above which the mean time exceeds 1e150 tau, which counts as never.
+# Level above which the mean time, more than 1e150 tau, counts as never.
 _NEVER = 26.0
 
 
-# Below this ln Phi comes from the asymptotic series, with errors up to 1e-12 (Abramowitz & Stegun
-# 26.2.12, last term first); erfc loses digits from -37 on.
+# Below this, ln Phi comes from the asymptotic series, with errors up to 1e-12 (Abramowitz & Stegun
+# 26.2.12, last term first); erfc loses digits below -37.
 _FAR = -20.0
 _SERIES = (10395.0, -945.0, 105.0, -15.0, 3.0, -1.0, 1.0)
 
@@ -155,7 +156,7 @@ class PassageTable:
 
 
 def prepare() -> PassageTable:
-    """Return the table; the first call, from any thread, makes it in tenths of a second."""
+    """Return the table, made in tenths of a second by the first call, in any thread."""
     global _table
     if _table is None:
         with _lock:
@@ -177,7 +178,7 @@ _DL = float(_LAMBDA[1] - _LAMBDA[0])
 
 def _build() -> PassageTable:
     b = _B_SCALE * np.sinh(_U)
-    # The steps err by the squares of their lengths: the leading error is taken out.
+    # Errors are proportional to squared steps, so combining two solutions removes the leading one.
     table = (4.0 * _solve(b, _FINE_W, _FINE_S) - _solve(b, _FINE_W // 2, _FINE_S // 2)) / 3.0
     return PassageTable(spline(table), spline(_log_rate(b)))
 
@@ -190,7 +191,7 @@ def spline(table: FloatArray) -> FloatArray:
             first = 4.0 * a - 6.0 * b + 4.0 * c - d
             a, b, c, d = (np.take(table, [-k], axis) for k in range(1, 5))
             table = np.concatenate((first, table, 4.0 * a - 6.0 * b + 4.0 * c - d), axis)
-        # The basis has 1/6, 2/3, 1/6 at the nodes; beyond the ends the table is mirrored.
+        # The basis is 1/6, 2/3, 1/6 at the nodes; the table is reflected at its ends.
         nodes = table.shape[axis]
         basis = 2.0 / 3.0 * np.eye(nodes) + (np.eye(nodes, k=1) + np.eye(nodes, k=-1)) / 6.0
         basis[0, 1] = basis[-1, -2] = 1.0 / 3.0
@@ -199,14 +200,14 @@ def spline(table: FloatArray) -> FloatArray:
 
 
 def spline_at(coefficients: FloatArray, at: FloatArray) -> FloatArray:
-    """Return the spline at places, shape (axes, n), at least one node from the ends."""
+    """Return the spline at points, shape (axes, n), at least one node from the ends."""
     first = np.floor(at).astype(np.intp)
     x = at - first
     left = 1.0 - x
     weights = np.stack((left * left * left, 4.0 - 3.0 * x * x * (2.0 - x),
                         4.0 - 3.0 * left * left * (2.0 - left), x * x * x)) / 6.0
-    # Places in the store of the four neighbours along each axis; the places asked for come last,
-    # where NumPy is fastest.
+    # Flat indices of the four neighbours along each axis; the points are the last dimension, where
+    # NumPy is fastest.
     corner, offsets, size = np.zeros(x.shape[1], np.intp), np.zeros(1, np.intp), 1
     for axis in reversed(range(coefficients.ndim)):
         corner += size * (first[axis] - 1)
@@ -222,9 +223,8 @@ def _solve(b: FloatArray, fine_w: int, fine_s: int) -> FloatArray:
     """
     Return R by linearly implicit BDF2 steps, shape (barriers, w, lambda).
 
-    Differences over three uneven nodes, exact for parabolas, which R is far out; at
-    the last w the path comes from nearer w, and the parabola through the last three
-    nodes is taken.
+    Differences use three uneven nodes and are exact for parabolas, such as R is for large w; the
+    value at the last w is extrapolated by the parabola through the three nodes before it.
     """
     w = _W_SCALE * np.sinh(_DV / fine_w * np.arange((_W_NODES - 1) * fine_w + 1))
     first, second = (weights[..., None] for weights in _differences(w))
@@ -233,7 +233,7 @@ def _solve(b: FloatArray, fine_w: int, fine_s: int) -> FloatArray:
     inner = w[1:-1, None]
     # Extrapolation to the last node by the parabola through the three before it.
     far = _parabola(w[-4:-1], w[-1])
-    # It begins with the limit of short spans, R = -b sqrt(T) w / 2.
+    # Start from the limit of short spans, R = -b sqrt(T) w / 2.
     r = -0.5 * b * math.exp(_LAMBDA[0] - lead * step) * w[:, None]
     before = math.exp(-step) * r
     table = np.empty((_S_NODES, _W_NODES, b.size))
@@ -264,7 +264,7 @@ def tridiagonal(bands: FloatArray, right: FloatArray, far: FloatArray) -> FloatA
     """
     low, main, high = bands
     p, q = np.empty_like(right), np.empty_like(right)
-    # The last row holds x[-1]: three of its neighbours, of which the farthest goes first.
+    # The last row contains x[-1], that is, its three neighbours; eliminate the farthest first.
     last = high[-1] * far[:, None]
     main[-1] += last[2]
     low[-1] += last[1]
@@ -303,9 +303,8 @@ def _log_rate(b: FloatArray) -> FloatArray:
 
     For 0 < b <= 8 from the power series of the Hermite function, in which all terms
     but the first are positive: nu = 2 Gamma(1 - nu/2) / sum over n >= 1 of
-    Gamma((n - nu)/2) (sqrt(2) b)^n / n!.  Beyond, nu is the inverse of the mean
-    time, an asymptotic series.  Below 0 it is the lowest energy above a wall.
-
+    Gamma((n - nu)/2) (sqrt(2) b)^n / n!.  For larger b, nu is the inverse of the mean
+    time, an asymptotic series; for b <= 0, the lowest energy above a wall.
     """
     result = np.empty(b.size)
     n = range(1, 260)
@@ -332,10 +331,10 @@ def _log_rate(b: FloatArray) -> FloatArray:
 
 def _lowest_energy(barrier: float) -> float:
     """
-    Return the least nu of -f'' + (x^2/4 - 1/2) f = nu f, f zero at the barrier and far below.
+    Return the least nu of -f'' + (x^2/4 - 1/2) f = nu f, with f zero at the barrier and far below.
 
-    f = exp(-x^2/4) times the backward equation's; by collocation at Chebyshev points
-    (Trefethen, Spectral Methods in MATLAB, 2000, program 6).
+    f is exp(-x^2/4) times the solution of the backward equation; by collocation at Chebyshev
+    points (Trefethen, Spectral Methods in MATLAB, 2000, program 6).
     """
     order, length = 64, 14.0
     x = np.cos(math.pi * np.arange(order + 1) / order)
@@ -350,7 +349,7 @@ def _lowest_energy(barrier: float) -> float:
 
 
 def _root(f: Callable[[float, T], float], argument: T, low: float, high: float) -> float:
-    """Return the zero between two ends to 1e-12 (Illinois; SciPy costs the nodes 25 MB)."""
+    """Return the zero between two ends to 1e-12 (Illinois; SciPy would cost nodes 25 MB)."""
     f_low, f_high = f(low, argument), f(high, argument)
     side = 0
     while True:

@@ -23,8 +23,8 @@ class ACCoupling(Term):
     A first-order high-pass between rail and reading.
 
     The reading is U - l with dl = rate (U - l) dt, rate = 2 pi corner.  The
-    effect on the OU is exact in law; all other terms are taken as straight
-    lines between samples.
+    effect on the OU is exact in law; all other terms are approximated by
+    straight lines between samples.
     """
 
     NAME: ClassVar[str] = 'ac_coupling'
@@ -32,7 +32,7 @@ class ACCoupling(Term):
     STAGE: ClassVar[Stage] = Stage.INSTRUMENT
     ROLE: ClassVar[Role] = Role.BLOCK
     FREE: ClassVar[tuple[str, ...]] = ('corner',)
-    DEAR: ClassVar[bool] = True
+    SLOW_FIT: ClassVar[bool] = True
     BROAD: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('-band',)
     STATES: ClassVar[int] = 1
@@ -90,7 +90,7 @@ class ACCoupling(Term):
         return [cls(rate, 0.0), cls(0.25 * rate, 0.0)]
 
     def beside(self, ou: Term) -> Term:
-        """Return a slow `ou`, since the fitted relaxation may be that of the instrument."""
+        """Return a slow `ou`, because the fitted relaxation may be the instrument's."""
         return ou.read({**ou.values(), 'alpha': 0.3 * math.pi * self.corner})
 
     def pass_through(self, columns: FloatArray, s: Segment) -> FloatArray:

@@ -99,7 +99,7 @@ def _check(kind: object, name: str, known: Mapping[str, type[Term]]) -> None:
         raise TypeError('it is not a class derived from Term')
     if name != kind.NAME or not re.fullmatch('[a-z][a-z0-9_]*', name) or name in known:
         raise ValueError(f"its NAME is '{kind.NAME}': it must be the name of the entry point, "
-                         'in small letters, and not the name of another cause')
+                         'in lower case, and not the name of another cause')
     if missing := [word for word in ('FAMILY', 'MEANING', 'REMEDY', 'SEPARATED_BY')
                    if not getattr(kind, word)]:
         raise ValueError(f"it has no {', '.join(missing)}")

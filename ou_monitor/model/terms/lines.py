@@ -16,7 +16,7 @@ _MOST = 3
 
 
 def wandering(linewidth: float, rng: np.random.Generator) -> Callable[[FloatArray], FloatArray]:
-    """Return a function that draws the phase noise of a line of a width, Hz, for steps, s."""
+    """Return a function of the steps, s, that draws the phase noise of a line (width in Hz)."""
     last = 0.0
 
     def walk(step: FloatArray) -> FloatArray:
@@ -59,10 +59,9 @@ def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float,
     return f, q, np.array([1.0, 0.0])
 
 
-# Segments in a coherence time of a line (over pi); minimum number of segments; and maximum mean
-# square of their powers over the squared mean.  This ratio is 1 for a line and 2 for ringing
-# driven by noise, whose powers are exponential; 12 such powers are below the maximum in 1 % of
-# cases.
+# Segments in a coherence time of a line (over pi); minimum number of segments; maximum ratio of
+# their mean square power to the squared mean.  The ratio is 1 for a line, and 2 for ringing driven
+# by noise, whose powers are exponential; 12 such powers stay below the maximum in 1 % of cases.
 _FINE, _ENOUGH, _LEVEL = 4.0, 12, 1.25
 
 
@@ -98,7 +97,7 @@ def broad_peaks(z: FloatArray, rate: float) -> list[tuple[float, float]]:
         if z.size < 4 * length:
             continue
         frequency, density = welch(z, rate, nperseg=length)
-        # The lowest bins are those of slow noise, not of ringing.
+        # The lowest bins contain slow noise, not ringing.
         density[:3] = 0.0
         at = int(np.argmax(density))
         # Tail of a mean of exponentials (Cramer bound), over the number of bins searched.
@@ -131,8 +130,8 @@ def order_power(z: FloatArray, u: FloatArray, rate: float) -> tuple[float, float
     return top, trials
 
 
-# Effective share of independent lines among those examined, because neighbours share most of their
-# bins.  From simulation: of 120 flights of white noise, 1 exceeded the 95 % point.
+# Effective share of independent lines among those examined; neighbours share most of their bins.
+# From simulation: with it, 1 of 120 flights of white noise exceeded the 95 % point.
 _INDEPENDENT = 0.02
 # Maximum slope examined, in sampling rates: from idle to full throttle a line may fold once and
 # return.
@@ -165,7 +164,7 @@ def _hough(z: FloatArray, u: FloatArray, rate: float, length: int) -> list[_Line
         return []
     shape = z[:count * length].reshape(count, length)
     power = np.abs(np.fft.rfft(shape * np.hanning(length), 2 * length, axis=1)) ** 2
-    # Power that every segment has at a frequency does not follow throttle.
+    # Power that is present at a frequency in every segment does not follow throttle.
     power = (power / power.mean(axis=0)).astype(np.float32)
     load = u[:count * length].reshape(count, length).mean(axis=1)
     width = rate / (2.0 * length)

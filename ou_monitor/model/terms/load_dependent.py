@@ -102,17 +102,17 @@ class LoadDependentSigma(Term):
 
 # Price of the search for the edge of a step, nats: ln of the edges tried.
 _STEP_PRICE = 4.5
-# Price of the search for a knot; number of bins, minimum scores in a bin, maximum knots.
+# Price of the search for a knot, nats; number of bins, minimum scores in a bin, maximum knots.
 _KNOT_PRICE = 3.5
 _BINS, _IN_BIN, _MOST_KNOTS = 40, 20, 9
-# Largest logarithm of a factor: where white noise hides the rail, nothing else limits it.
+# Largest logarithm of a factor; nothing else limits it where white noise hides the rail.
 _MOST = 4.0
 # Minimum distance of knots, and half the width of a step, in throttle.
 _APART, _EDGE = 0.02, 0.002
 
 
 def _ends(throttle: FloatArray) -> FloatArray:
-    """Return lowest and highest throttle, with the held-out part: knots of a straight line."""
+    """Return lowest and highest throttle, held-out part included: knots of a straight line."""
     return np.array([throttle.min(), throttle.max()])
 
 
@@ -219,8 +219,8 @@ class LoadDependentAlpha(Term):
 # Spans of the moving means of throttle from which changes are measured, s.
 _FAST, _SLOW = 0.03, 0.2
 # Inputs that the noise may depend on, and their time constants, s: throttle; its distance from
-# its mean of the last 30 ms; its change between samples; the distance between its means of the
-# last 30 and 200 ms; and sums of its rises and of its falls that decay.
+# its mean over the last 30 ms; its change between samples; the distance between its means over the
+# last 30 and 200 ms; and decaying sums of its rises and of its falls.
 INPUTS = (('throttle', 0.0), ('fast', _FAST), ('step', 0.0), ('slow', _SLOW), *(
     (what, span) for span in (0.1, 0.5, 2.5) for what in ('rises', 'falls')))
 # Price of choosing an input, nats: ln of their number.
@@ -229,11 +229,11 @@ _INPUT_PRICE = math.log(len(INPUTS))
 _LEAST_WHITE = 0.05
 # Quantiles between the bins of an input, dense at the top because most changes are zero.
 _SHARES = np.array([*np.linspace(0.0, 0.95, 39), 0.97, 0.98, 0.985, 0.99, 0.995, 0.998, 1.0])
-# Maximum squared score once the curves are roughly known: limits the effect of wrong samples.
+# Maximum squared score once the curves are roughly known, to limit the effect of wrong samples.
 _LARGEST = 25.0
 # Rounds of fitting each curve given the others; minimum distance of knots over the range.
 _ROUNDS, _SPACING = 2, 0.02
-# Index for the curve that bends the sum of the others.
+# Index of the curve that bends the sum of the others.
 SUM = len(INPUTS)
 
 
@@ -297,7 +297,7 @@ class LoadDependentNoise(Term):
         'Add capacitance at the ESCs or a filter before the ADC; give readings at high throttle '
         'less weight.')
     SEPARATED_BY: ClassVar[str] = (
-        'the same flight at several times the sampling rate, where white noise is still '
+        'the same flight at several times the sampling rate, at which white noise is still '
         'uncorrelated')
 
     number: tuple[float, ...] = parameters('', 'index of the input of each knot: see INPUTS, SUM')

@@ -104,9 +104,9 @@ class NonlinearRestoring(Term):
         errors = dict(zip(powers, error[1:].tolist(), strict=True))
         square, cube = by.get(2, 0.0), by.get(3, 0.0)
         if cube < 0.0:
-            # It would push the voltage away, which no term can represent.
+            # The force would push the voltage away, which no term can represent.
             return None
-        # The cube is at least what keeps the square from pushing the voltage away.
+        # The cube must be large enough to keep the square from pushing the voltage away.
         cube = max(cube, _HOLDS * square * square / alpha)
         return LawFit(cls(square, cube), {'square': errors.get(2, math.nan),
                                           'cube': errors.get(3, math.nan)}, scores,
@@ -116,7 +116,7 @@ class NonlinearRestoring(Term):
 def _linearised(x: FloatArray, span: FloatArray, linear: float, square: float, cube: float,
                 variance: float) -> tuple[FloatArray, FloatArray]:
     """
-    Return the movement of each deviation in a step, V, and its variance over `variance`.
+    Return how far each deviation moves in a step, V, and its variance over `variance`.
 
     Within a part of the step, the force is linearised about the deviation at its beginning,
     with the mean effect of its curvature (Shoji & Ozaki, Stoch. Anal. Appl. 16 (1998) 733).
@@ -169,8 +169,8 @@ def _climbed(density: Callable[[FloatArray], FloatArray], b: FloatArray, error: 
 
 # Minimum cube in square^2/alpha: from 1/4 on, the force has only one zero.
 _HOLDS = 0.26
-# Slope of the force times the step: the steepest, the smallest, and the largest in a part of the
-# step; maximum number of parts.
+# Slope of the force times the step: maximum, minimum, and maximum within a part of the step;
+# maximum number of parts.
 _STIFF, _FLAT, _TURN, _PARTS = 20.0, 1e-9, 0.4, 6
 # Maximum rounds of scoring, and minimum gain of a round to start another, nats.
 _ROUNDS, _SETTLED = 5, 0.05

@@ -276,7 +276,7 @@ class ClockJitter(Term):
     FAMILY: ClassVar[str] = 'sensor'
     STAGE: ClassVar[Stage] = Stage.CLOCK
     ROLE: ClassVar[Role] = Role.LAW
-    DEAR: ClassVar[bool] = True
+    SLOW_FIT: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('kurtosis', 'clustering')
     IMITATES: ClassVar[tuple[str, ...]] = ('glitches', 'heavy_tails', 'jumps')
     MEANING: ClassVar[str] = 'Time stamps have random errors.'
@@ -293,7 +293,7 @@ class ClockJitter(Term):
         def effect(s: Segment) -> None:
             nonlocal last, stamp
             gap = np.diff(s.t, prepend=stamp)
-            # The next step is unknown at the end of a segment, so the previous one is the bound.
+            # At the end of a segment the next step is unknown, so the previous one is used.
             bound = np.where(np.isfinite(gap), 0.45 * gap, 0.0)
             error = self.std * rng.standard_normal(s.t.size)
             # With uneven stamps, the previous sample may be later than this one.
@@ -348,10 +348,10 @@ def _together(square: FloatArray) -> float:
     return math.sqrt(c.size) * float(c[1:] @ c[:-1]) / float(c @ c)
 
 
-# Samples in a fit, the largest fourth moment that jitter causes, and the largest correlation of
-# neighbouring squares, which jitter makes negative.
+# Samples in a fit; maximum fourth moment that jitter causes; maximum correlation of neighbouring
+# squares, which jitter makes negative.
 _SHORT, _MOST_KURTOSIS, _MOST_TOGETHER = 15000, 6.0, 4.0
-# Levels of the error of a stamp.
+# Number of levels of a stamp's error.
 _LEVELS = 7
 
 
@@ -364,8 +364,8 @@ def _errors(z: FloatArray, state: FloatArray, phi: float, x: FloatArray
     """
     Return predicted law of the previous error, densities, stds and shifts of pairs, and prior.
 
-    A shift is the change of the score caused by the error of the step, per standard deviation
-    of the rail from its mean.
+    A shift is the change of the score that the error of the step causes, per standard deviation of
+    the rail from its mean.
     """
     nodes = np.linspace(-2.4, 2.4, _LEVELS)
     law = np.exp(-0.5 * nodes * nodes)

@@ -1,7 +1,7 @@
 """
 Markov switching of the mean or of sigma, unrelated to throttle.
 
-A filter without levels at first takes a change of level for noise, and follows it more slowly the
+A filter without levels takes a change of level for noise at first, and follows it more slowly the
 more white noise there is.  How far it has followed depends on all earlier states, which are
 replaced by their mean given the samples so far (generalised pseudo-Bayesian filter of first order;
 Blom & Bar-Shalom, IEEE Trans. Autom. Control 33 (1988) 780).
@@ -26,12 +26,13 @@ from scipy.special import ndtr
 
 # Median of the size of a normal score.
 _MEDIAN = 0.6745
-# Filter gain above which it counts as 1; level below which there is none, in standard deviations
-# of an innovation.
+# Filter gain above which it counts as 1; level, in standard deviations of an innovation, below
+# which it counts as 0.
 _ALL, NO_LEVEL = 0.98, 0.2
 # Minimum correlation of the residual for an OU beside the levels.
 _LEAST = 1e-3
-# Tried: shares of the fitted noise for an OU with levels; heights of levels over the spread.
+# Tried as a start: shares of the fitted noise that the OU keeps beside levels; heights of levels
+# over the spread.
 _CALMER, _HEIGHTS = (0.1, 0.01), (0.7, 1.2, 2.0)
 
 
@@ -149,7 +150,7 @@ def _direct(s: Scores, at_once: float, middle: float, states: int) -> FloatArray
 
 def chain_of(s: Scores, x: FloatArray, at_once: float, states: int = 2
              ) -> tuple[tuple[FloatArray, FloatArray, FloatArray], FloatArray, FloatArray]:
-    """Return the arguments of `forward`, the pairs' means, (states, states, n), and the stds."""
+    """Return the arguments of `forward`, the means of pairs, (states, states, n), and the stds."""
     state = np.arange(states, dtype=np.float64)
     chances = step_chances(x, s.step, states)
     law = stationary_law(rates_between(math.exp(x[0]), math.exp(x[1]), states))
@@ -170,7 +171,7 @@ def moving(view: View, size: int) -> slice:
 
 
 def relaxing(view: View, faster: float) -> View:
-    """Return the view for a rail that relaxes faster than the fit without levels says."""
+    """Return the view for a rail that relaxes faster than in the fit without levels."""
     if faster == 1.0:
         return view
     phi = view.phi**faster
@@ -190,10 +191,10 @@ def relaxing(view: View, faster: float) -> View:
 def calm_levels(view: View, part: slice, spread: float, rates: FloatArray
                 ) -> tuple[FloatArray, float, View] | None:
     """
-    Return a start for levels in white noise, and a view in which they show; None without noise.
+    Return a start for levels in white noise, and a view that shows them; None without noise.
 
-    An `ou` fitted to the levels follows them, so ones with less noise are tried; and heights up
-    to that of two levels that explain the whole spread, V.
+    An `ou` that was fitted to the levels follows them, so less noise is tried; and heights up to
+    that of two levels that explain the whole spread, V.
     """
     if bool((Scores.of(view).trust == 1.0).all()):
         return None
@@ -213,7 +214,7 @@ def calm_levels(view: View, part: slice, spread: float, rates: FloatArray
 
 
 def _calmer(view: View, share: float) -> View:
-    """Return the view for a rail with a share of its noise and the same white noise."""
+    """Return the view for a rail with a share of the noise, and the same white noise."""
     keep = min(float(np.median(view.phi[view.train])), 1.0 - 1e-9)
     trust = float(np.median(np.broadcast_to(view.trust, view.z.shape)[view.train]))
     variance = float(np.median(view.variance))
@@ -237,8 +238,8 @@ def without_levels(view: View, levels: FloatArray) -> View:
     """
     Return the view of the whole voltage for an OU fitted to the voltage without levels, V.
 
-    That is an OU, or an OU in white noise, whichever predicts the voltage without levels better;
-    both follow from its covariances at lags up to 2.
+    The OU has white noise if it then predicts the voltage without levels better; the parameters
+    come from covariances at lags up to 2.
     """
     r = (view.residual - levels)[view.train]
     r = r - r.mean()
@@ -286,7 +287,7 @@ class RegimeSwitching(Term):
     FAMILY: ClassVar[str] = 'switching'
     STAGE: ClassVar[Stage] = Stage.DRIVE
     ROLE: ClassVar[Role] = Role.LAW
-    DEAR: ClassVar[bool] = True
+    SLOW_FIT: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = (
         '+clustering', '+kurtosis', '+band 0', '+band 1', '+band 2', '+band 3', 'state squared',
         'state cubed')

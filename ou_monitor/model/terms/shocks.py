@@ -80,7 +80,7 @@ class Jumps(Term):
             return None
         share, mean, spread, unit = found
         if share > _OFTEN:
-            # So many jumps are not events: the noise itself has another distribution.
+            # Jumps this frequent are not events: the noise itself has another distribution.
             return None
         log_calm, log_jump = _parts(z, var, share, mean, spread, unit)
         both = np.logaddexp(log_calm, log_jump)
@@ -169,7 +169,7 @@ class Glitches(Term):
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
         """Find runs of up to three samples that contradict their neighbours on both sides."""
-        # Bad samples have widened the fitted noise, so the scale is a median.  It is that of a
+        # Bad samples have widened the fitted noise, so the scale is a median.  It comes from a
         # filter without measurement errors, in which a sample affects only the next one.
         plain = (view.residual - view.phi * view.state) / np.sqrt(view.variance)
         unit = float(np.median(np.abs(plain))) / 0.6745
@@ -337,11 +337,10 @@ class HeavyTails(Term):
 
 class _Mixture:
     """
-    Scores whose variance is in part that of a Student-t, otherwise of a normal distribution.
+    Scores that are the sum of a Student-t part and a normal part.
 
     A Student-t is a normal distribution whose variance is inverse-gamma distributed; the integral
     over the variance is a sum over close points of its logarithm.
-
     """
 
     def __init__(self, square: FloatArray, share: FloatArray, dof: float, scale: float) -> None:
@@ -389,9 +388,9 @@ def _cells(z: FloatArray, share: FloatArray) -> tuple[FloatArray, FloatArray, Fl
     return (np.bincount(cell, z * z) / count, np.bincount(cell, share) / count, count)
 
 
-# Share of the Student-t from which it is the only noise.  With white noise beside it, a power for
-# each sample would explain that noise too, and the next fit would find none; the variance is right
-# without.
+# Share of the variance from which the Student-t counts as the only noise.  Beside white noise, a
+# power for each sample would explain that noise too, and the next fit would find none; without
+# powers the variance is still right.
 _ALONE = 0.99
 # Points of the variance, and the probability outside them; bins of share, and number and width of
 # the bins of scores, in a fit.

@@ -65,7 +65,7 @@ class SecondRelaxation(Term):
     STAGE: ClassVar[Stage] = Stage.LEVEL
     ROLE: ClassVar[Role] = Role.BLOCK
     FREE: ClassVar[tuple[str, ...]] = ('alpha', 'sigma')
-    DEAR: ClassVar[bool] = True
+    SLOW_FIT: ClassVar[bool] = True
     BROAD: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('band', 'autocorrelation')
     STATES: ClassVar[int] = 1
@@ -115,13 +115,13 @@ class SecondRelaxation(Term):
         return phi[:, None, None], q[:, None, None], np.ones(1)
 
 
-# Octaves between poles: with the first the spectrum is 1/f within 0.2 %, with the second within
-# 6 %.
+# Octaves between poles: with the first value the spectrum is 1/f within 0.2 %, with the second
+# within 6 %.
 _FINE, _COARSE = 0.5, 3.0
 # Relaxation times in a step above which the old state is negligible (exp(-20) = 2e-9).
 _FORGOTTEN = 20.0
-# Last pole, and corner of the low-pass, relative to the upper frequency: there the low-pass
-# removes 1.5 %, and above the last pole most of the rest.
+# Last pole, and corner of the low-pass, relative to the upper frequency.  The low-pass removes 1.5
+# % at the upper frequency, and most of the noise above the last pole.
 _LADDER, _CORNER = 4.5, 8.0
 # Minimum ratio of the corner to the lower frequency; below it one or two relaxations suffice.
 _LEAST_SPAN = 30.0
@@ -142,7 +142,7 @@ class FlickerNoise(Term):
     STAGE: ClassVar[Stage] = Stage.LEVEL
     ROLE: ClassVar[Role] = Role.BLOCK
     FREE: ClassVar[tuple[str, ...]] = ('amplitude', 'high')
-    DEAR: ClassVar[bool] = True
+    SLOW_FIT: ClassVar[bool] = True
     BROAD: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('band', 'autocorrelation')
     # Minimum: one every three octaves.
@@ -227,7 +227,7 @@ class FlickerNoise(Term):
         return bool(_CORNER * self.high > _LEAST_SPAN * self.low)
 
     def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return one state for each pole, and the low-pass; a fit needs only few poles."""
+        """Return one state for each pole, and the low-pass; for a fit, few poles suffice."""
         poles, variances = _sum(self.low, _LADDER * self.high, _COARSE)
         variances = self.amplitude ** 2 * variances
         # Most recordings have only a few different steps.
@@ -235,7 +235,7 @@ class FlickerNoise(Term):
         rate, finite = self.corner, np.isfinite(step)
         fast = poles * float(step[finite].min(initial=math.inf)) > _FORGOTTEN
         if fast[1:].any():
-            # One state stands for all poles that have no memory from sample to sample.
+            # One state represents all poles without memory from sample to sample.
             seen = variances * rate / (rate + poles)
             first = int(np.argmax(fast))
             variances[first] *= float(seen[fast].sum() / seen[first])

@@ -101,18 +101,18 @@ class Term:
     LINEAR: ClassVar[tuple[str, ...]] = ()
     # Positive parameters found by maximum likelihood, on a log scale (`DRIVE`, `BLOCK`, `NOISE`).
     FREE: ClassVar[tuple[str, ...]] = ()
-    # Beginnings of the names of the statistics that show this term; + or - in front: only in that
-    # direction.
+    # Prefixes of the names of the statistics that show this term, with + or - if only that sign
+    # does.
     SIGNS: ClassVar[tuple[str, ...]] = ()
-    # Depends only on throttle or time: the search tries it before latent causes.
+    # Whether it depends on throttle or time only; the search tries it before latent causes.
     MEASURED: ClassVar[bool] = False
-    # Causes that are hard to tell from it, so that the search does not add one to the other; it is
-    # enough to name one of a pair in the class of the other.
+    # Causes that are hard to tell from it; the search does not add one of a pair to the other.  It
+    # is enough to name the pair in one of the two classes.
     IMITATES: ClassVar[tuple[str, ...]] = ()
     # Whether a model can have several, and whether the search looks for another one.
     SEVERAL: ClassVar[bool] = False
     RECURS: ClassVar[bool] = False
-    # Minimum evidence, as a share of that of the strongest cause.
+    # Minimum evidence, as a share of the strongest cause's.
     LEAST_SHARE: ClassVar[float] = 0.0
     # Share of its signs that may remain after the fit; 0: no statistic may fail.
     MAY_LEAVE: ClassVar[float] = 0.0
@@ -120,13 +120,13 @@ class Term:
     REFUTED_BY: ClassVar[tuple[str, ...]] = ()
     # Penalty for a search beyond the free parameters, nats.
     SEARCH: ClassVar[float] = 0.0
-    # Number of parameters found by `apart` and not by the fit.
+    # Number of parameters that `apart` finds instead of the fit.
     APART: ClassVar[int] = 0
-    # Whether a fit takes seconds, so that none starts late in a search.
-    DEAR: ClassVar[bool] = False
-    # Whether its spectrum is broad and stationary, so that a fit starts from the spectrum of the
-    # scores; the number of states that it adds to the linear system (`Role.BLOCK`).
+    # Whether a fit takes seconds; then none starts late in a search.
+    SLOW_FIT: ClassVar[bool] = False
+    # Whether its spectrum is broad and stationary; then a fit starts from the scores' spectrum.
     BROAD: ClassVar[bool] = False
+    # Number of states that it adds to the linear system (`Role.BLOCK`).
     STATES: ClassVar[int] = 0
     # The term that it modifies, which the model must have; None: the `ou`.
     CHANGES: ClassVar[type[Term] | None] = None
@@ -165,7 +165,7 @@ class Term:
         return ()
 
     def holds(self, view: View) -> bool:
-        """Return whether the fitted parameters still mean this cause; by default, yes."""
+        """Return whether the fitted parameters still describe this cause; by default, yes."""
         return True
 
     def beside(self, ou: Term) -> Term:
@@ -196,11 +196,11 @@ class Term:
         return self.FREE
 
     def moved(self, name: str, by: float) -> Self:
-        """Return the term with one coordinate moved; by default, that is the logarithm."""
+        """Return the term with one coordinate (by default the parameter's logarithm) moved."""
         return replace(self, **{name: getattr(self, name) * math.exp(by)})
 
     def apart(self, view: View) -> Self:
-        """Return the term with its `APART` parameters, found from the scores of a fit with it."""
+        """Return the term with its `APART` parameters, fitted to the scores of a model with it."""
         return self
 
     def per_coordinate(self, name: str) -> float:
@@ -211,8 +211,9 @@ class Term:
         """
         Return the states that this term adds (`Role.BLOCK`): f, q, h.
 
-        f, q, shape (n, d, d): transition into each sample, and covariance of the noise, V^2,
-        at the first sample the stationary one; h, shape (d,): weights of the states in the sum.
+        f, q, shape (n, d, d): transition into each sample, and covariance of the added noise, V^2
+        (at the first sample the stationary covariance); h, shape (d,): weights of the states in
+        the voltage.
         """
         raise NotImplementedError
 
@@ -221,12 +222,12 @@ class Term:
         return 0.0
 
     def variances(self, s: Segment) -> FloatArray | float:
-        """Return that variance at each sample of a segment, if a measured input changes it."""
+        """Return the variance at each sample of a segment, if a measured input changes it."""
         return self.variance()
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
-        """Fit another law to the normal scores (`Role.LAW`); None if it is not possible."""
+        """Fit the law to the normal scores (`Role.LAW`); None if that fails."""
         return None
 
     def refit_law(self, view: View) -> LawFit | None:
@@ -285,8 +286,8 @@ class LawFit:
     free: int  # Number of fitted parameters
     push: FloatArray | None = None  # Variance that events add to the state, V^2; shape (n,)
     error: FloatArray | None = None  # Variance that events add to the measurement, V^2; shape (n,)
-    # Estimated factor on the variance of the noise in the step before each sample, as the inverse
-    # of the mean precision; shape (n,).
+    # Estimated factor on the variance of the noise in the step before each sample (inverse of the
+    # mean precision); shape (n,).
     power: FloatArray | None = None
     white: FloatArray | None = None  # The same for the variance of the white noise; shape (n,)
     # Voltage that the law adds to the level, subtracted before the Gaussian fit, V; shape (n,).

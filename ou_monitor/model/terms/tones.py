@@ -19,7 +19,7 @@ from ou_monitor.records import FloatArray
 
 @dataclass(frozen=True)
 class Tone(Term):
-    """Add a sine whose random-walk phase makes its line `linewidth` wide at half height."""
+    """Add a sine; its phase is a random walk, which makes its line `linewidth` wide."""
 
     NAME: ClassVar[str] = 'tone'
     FAMILY: ClassVar[str] = 'line'
@@ -105,16 +105,16 @@ class Tone(Term):
 
 def lines_of(view: View) -> tuple[Line, ...]:
     """Return the lines of the residual, strongest first."""
-    # With the held-out part, because a line may begin late; the frequency is not fitted there but
-    # pays the price of a search.
+    # Include the held-out part, because a line may begin late; its frequency is searched for, not
+    # fitted, and pays for the search.
     grid = on_grid(view.at, view.z)
     return find_lines([grid.values], grid.rate, false_alarm=_PROPOSED).lines
 
 
-# Number of lines to try; false-alarm probability of proposing one, large because the evidence of a
+# Number of lines to try; false-alarm probability of trying one, large because the evidence of the
 # fit decides.
 _MOST, _PROPOSED = 3, 0.5
-# Initial linewidth, Hz; linewidth from which a line whose amplitude varies is ringing, Hz.
+# Initial linewidth, Hz; linewidth, Hz, from which a line with a varying amplitude is ringing.
 _WANDERS, WIDEST = 0.3, 2.0
 # Largest width of a line over its frequency.
 SHARP = 0.05
@@ -139,7 +139,7 @@ class Resonance(Term):
     FREE: ClassVar[tuple[str, ...]] = by_parameters(
         ('frequency', 'damping', 'std'),
         lambda term: ('frequency', 'damping', 'std', *(('tilt',) if term.tilt else ())))
-    DEAR: ClassVar[bool] = True
+    SLOW_FIT: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('line', '+band', 'autocorrelation')
     SEARCH: ClassVar[float] = 5.0
     STATES: ClassVar[int] = 2
@@ -229,7 +229,7 @@ class ThrottleTone(Term):
     NEEDS_THROTTLE: ClassVar[bool] = True
     ROLE: ClassVar[Role] = Role.BLOCK
     FREE: ClassVar[tuple[str, ...]] = ('amplitude', 'linewidth')
-    DEAR: ClassVar[bool] = True
+    SLOW_FIT: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('order', 'line')
     SEARCH: ClassVar[float] = 9.0
     STATES: ClassVar[int] = 2

@@ -23,7 +23,7 @@ class Volatility(Term):
     FAMILY: ClassVar[str] = 'intensity'
     STAGE: ClassVar[Stage] = Stage.DRIVE
     ROLE: ClassVar[Role] = Role.LAW
-    DEAR: ClassVar[bool] = True
+    SLOW_FIT: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('clustering', 'kurtosis')
     IMITATES: ClassVar[tuple[str, ...]] = ('heavy_tails', 'jumps', 'regime_switching')
     MEANING: ClassVar[str] = 'sigma changes slowly at random, independent of throttle.'

@@ -6,7 +6,7 @@ import math
 import numpy as np
 from ou_monitor.model.passage import law as passage_law
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_answer import LoadSag
+from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.shocks import Jumps

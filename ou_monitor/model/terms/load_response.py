@@ -78,10 +78,9 @@ class LoadTransient(Term):
     """
     Add gain * d + rise * max(d, 0), where d is the delayed throttle less its low-pass (tau).
 
-    A unit step up adds (gain + rise) * exp(-t/tau), one down -gain * exp(-t/tau): motors draw
-    more current while they speed up, and return none while they slow down.  gain > 0 delays a
-    sag that lowers the voltage: with gain equal to the sag, the sag is low-passed.  gain < 0
-    deepens it at first (inrush).
+    A unit step up adds (gain + rise) * exp(-t/tau), a unit step down -gain * exp(-t/tau): motors
+    draw more current while they speed up, and return none while they slow down.  gain > 0 delays
+    the sag (if it equals the sag, it low-passes it); gain < 0 deepens the sag at first (inrush).
     """
 
     NAME: ClassVar[str] = 'load_transient'
@@ -164,5 +163,5 @@ SHORTEST = 0.5
 _INRUSH = 0.2
 # Number of delays to try, and the longest, s.
 _DELAYS, _LATEST = 12, 0.1
-# Time constant of a response that never decays, in durations of the recording.
+# Time constant, in durations of the recording, for a response that never decays.
 _FOR_GOOD = 100.0

@@ -8,28 +8,28 @@ from ou_monitor.criticism.composite import fit_composite, view_of
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import decision, regression
 from ou_monitor.discovery.regression import (
-    _candidates, _nearby, _Regression, _there, FOLDS, mean_answer)
+    _candidates, _nearby, _Regression, _there, FOLDS, mean_response)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.model.terms.load_answer import LoadSag, LoadTransient
+from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.slow import Drift
 from ou_monitor.model.terms.term import Role
 import pytest
 
 
-def answer(tau, delay=0.0):
+def response(tau, delay=0.0):
     """Return a response to throttle with a time constant and a delay, s."""
     return LoadTransient(-0.1, tau, delay)
 
 
 @pytest.mark.parametrize('one, other, near, there', [
-    (answer(0.1), answer(0.1), True, True), (answer(0.1), answer(0.14), True, True),
-    (answer(0.1), answer(0.16), True, False), (answer(0.16), answer(0.1), True, False),
-    (answer(0.1), answer(0.21), False, False), (answer(0.21), answer(0.1), False, False),
-    (answer(10.0), answer(12.0), True, True), (answer(10.0), answer(0.09), False, False),
-    (answer(0.1), answer(0.1, 0.05), False, False),
-    (answer(0.1), LoadSag(0.1, 0.0), False, False),
+    (response(0.1), response(0.1), True, True), (response(0.1), response(0.14), True, True),
+    (response(0.1), response(0.16), True, False), (response(0.16), response(0.1), True, False),
+    (response(0.1), response(0.21), False, False), (response(0.21), response(0.1), False, False),
+    (response(10.0), response(12.0), True, True), (response(10.0), response(0.09), False, False),
+    (response(0.1), response(0.1, 0.05), False, False),
+    (response(0.1), LoadSag(0.1, 0.0), False, False),
     (Drift(0.1, 0.0), Drift(-0.2, 0.0), False, True)])
 def test_alike_and_next_to_each_other(one, other, near, there):
     """By the ratio of time constants, whichever is longer, at one delay."""
@@ -75,7 +75,7 @@ def driven():
     rng = np.random.default_rng(5)
     u = np.repeat(rng.random(N // 20), 20)
     slow = [np.convolve(u, np.exp(-np.arange(400) / tau) / tau)[:N] for tau in (20.0, 30.0, 300.0)]
-    pool = [LoadSag(0.1, 0.0), answer(0.2), answer(0.3), answer(3.0), Drift(0.1, 0.0)]
+    pool = [LoadSag(0.1, 0.0), response(0.2), response(0.3), response(3.0), Drift(0.1, 0.0)]
     columns = [np.column_stack([u, u * u][:len(pool[0].LINEAR)]), *slow,
                np.column_stack([np.linspace(-1.0, 1.0, N), np.linspace(-1.0, 1.0, N) ** 2][
                    :len(pool[4].LINEAR)])]
@@ -108,12 +108,12 @@ def test_the_search_ends_at_what_made_the_voltage(driven, start, monkeypatch):
     """From any start: sag and one lag, the one that is worth more first, none of them free."""
     pool, columns, voltage = driven
     found, _ = made(pool, columns, voltage, monkeypatch)
-    answered = found.search(start)
-    assert {type(term) for term in answered.terms} == {LoadSag, LoadTransient}
-    (lag,) = (term for term in answered.terms if isinstance(term, LoadTransient))
-    assert lag.tau in (0.2, 0.3) and answered.worth[0] >= answered.worth[1] > 3.0
-    chosen = tuple(sorted(pool.index(term) for term in answered.terms))
-    for k, worth in zip((pool.index(term) for term in answered.terms), answered.worth):
+    found_response = found.search(start)
+    assert {type(term) for term in found_response.terms} == {LoadSag, LoadTransient}
+    (lag,) = (term for term in found_response.terms if isinstance(term, LoadTransient))
+    assert lag.tau in (0.2, 0.3) and found_response.worth[0] >= found_response.worth[1] > 3.0
+    chosen = tuple(sorted(pool.index(term) for term in found_response.terms))
+    for k, worth in zip((pool.index(term) for term in found_response.terms), found_response.worth):
         assert worth == pytest.approx(found._value(chosen) - found._value(found._less(chosen, k)))
     # A lag nearby in its place is no better.
     assert found._best_exchange(chosen, found._value(chosen)) is None
@@ -144,7 +144,7 @@ def test_a_sag_that_stays_is_not_said_to_grow():
         samples = Samples(t, SupplyModel(model).simulate(t, rng, throttle), throttle)
         composite = fit_composite(samples, model, samples.train)
         view = view_of(samples, composite.gaussian, composite.z, samples.train)
-        (sag,) = (term for term in mean_answer(samples, composite, view).terms
+        (sag,) = (term for term in mean_response(samples, composite, view).terms
                   if isinstance(term, LoadSag))
         grown += sag.growth != 0.0
     assert grown == 0
@@ -157,6 +157,6 @@ def test_a_sag_stands_for_a_lag_that_does_no_better(driven, size, named, monkeyp
     columns = [columns[0], columns[0] + 0.1 * columns[1]]
     voltage = 3.0 - size * columns[1][:, 0] + np.random.default_rng(0).standard_normal(N)
     found, _ = made(pool[:2], columns, voltage, monkeypatch)
-    answered = found.search((1,))
-    assert [type(term) for term in answered.terms] == [named]
-    assert answered.rivals == ((('load_transient',) if named is LoadSag else ()),)
+    found_response = found.search((1,))
+    assert [type(term) for term in found_response.terms] == [named]
+    assert found_response.rivals == ((('load_transient',) if named is LoadSag else ()),)
