@@ -28,6 +28,7 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.records import FloatArray
 from ou_monitor.stream.config import FieldSpec
+from ou_monitor.timeline.line import BATCH
 
 if TYPE_CHECKING:
     from ou_monitor.online.monitor import SupplyMonitor
@@ -327,7 +328,13 @@ class ThrottleHold:
     def at(self, t: FloatArray) -> FloatArray:
         """Return the throttle at each stamp, s; NaN before the first one."""
         places, values = self.held()
-        return np.append(np.nan, values)[np.searchsorted(places, t + self._slack, 'right')]
+        values = np.append(np.nan, values)
+        found = np.empty(t.size)
+        # In parts: the places of all samples at once would take as much memory as the samples.
+        for k in range(0, t.size, BATCH):
+            part = slice(k, k + BATCH)
+            found[part] = values[np.searchsorted(places, t[part] + self._slack, 'right')]
+        return found
 
     def forget_before(self, t: float) -> None:
         """Drop the values that no sample from `t` (s) on can need."""
