@@ -322,9 +322,8 @@ class MonitorNode(Node):
         call.__signature__ = inspect.signature(callback)  # type: ignore[attr-defined]
         return call
 
-    def steady_now(self) -> float:
-        """Return the monotonic time, s, which measures silence (the wall clock may jump)."""
-        return time.monotonic()
+    # Monotonic time, s, which measures silence (the wall clock may jump).
+    steady_now = staticmethod(time.monotonic)
 
     def stamp_now(self) -> float:
         """Return the node's clock, s (simulated time when `use_sim_time`)."""

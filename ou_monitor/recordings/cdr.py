@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.records import FloatArray
-from ou_monitor.stream.config import FieldPath, FieldSpec, parse_field_path, ZeroRule
+from ou_monitor.stream.config import FieldPath, FieldSpec, parse_field_path
 
 IntArray = npt.NDArray[np.int64]
 TimeArray = npt.NDArray[np.uint64]
@@ -369,6 +369,25 @@ def _spread(begin: IntArray, count: IntArray) -> IntArray:
     ends = np.cumsum(count)
     places: IntArray = np.repeat(begin - (ends - count), count)
     return places + np.arange(places.size)
+
+
+class ZeroRule:
+    """Turns zeros that mean "not measured" into NaN, by a msg_config's `zero`."""
+
+    def __init__(self, rule: str) -> None:
+        self._rule = rule
+
+    def apply(self, values: FloatArray) -> FloatArray:
+        """Return values, in order of arrival, with such zeros as NaN."""
+        if self._rule == 'value':
+            return values
+        nothing = values == 0.0
+        if self._rule == 'unknown_at_first':
+            something = np.flatnonzero(np.isfinite(values) & ~nothing)
+            if something.size:
+                self._rule = 'value'
+                nothing[int(something[0]):] = False
+        return np.where(nothing, np.nan, values) if nothing.any() else values
 
 
 class FieldReader:

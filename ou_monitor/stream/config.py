@@ -248,25 +248,6 @@ def _field_spec(content: Any, where: str,
     return spec
 
 
-class ZeroRule:
-    """Turns zeros that mean "not measured" into NaN, by a msg_config's `zero`."""
-
-    def __init__(self, rule: str) -> None:
-        self._rule = rule
-
-    def apply(self, values: FloatArray) -> FloatArray:
-        """Return values, in order of arrival, with such zeros as NaN."""
-        if self._rule == 'value':
-            return values
-        nothing = values == 0.0
-        if self._rule == 'unknown_at_first':
-            something = np.flatnonzero(np.isfinite(values) & ~nothing)
-            if something.size:
-                self._rule = 'value'
-                nothing[int(something[0]):] = False
-        return np.where(nothing, np.nan, values) if nothing.any() else values
-
-
 def walk(msg: object, steps: FieldPath, path: str = '', kind: str = '') -> Any:
     """Follow a field path in a message; None: an array is too short (path, kind: for errors)."""
     at: Any = msg
