@@ -130,12 +130,12 @@ def number(value: float, form: str = '.1f') -> str:
     return format(value, form) if math.isfinite(value) else '-'
 
 
-def drawing(parts: Sequence[str], width: int, height: int, title: str) -> str:
+def drawing(parts: Sequence[str], width: int, height: int, title: str, style: str = STYLE) -> str:
     """Return a self-contained SVG document on white."""
     return '\n'.join([
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
         f'width="{width}" height="{height}" role="img" '
-        f'aria-label="{escape(title, quote=True)}">', STYLE,
+        f'aria-label="{escape(title, quote=True)}">', style,
         f'<rect width="{width}" height="{height}" fill="#ffffff"/>', *parts, '</svg>', ''])
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 import math
 
-# Half the width of a 95 % interval, in standard errors of a normal law.
+# Half the width of a 95 % interval of a normal distribution, in standard errors.
 Z95 = 1.959963984540054
 
 

@@ -26,7 +26,7 @@ from ou_monitor.paper import published  # noqa: E402
 CAUSES: dict[str, tuple[dict[str, object], float]] = {
     'ou': ({}, 1.0),
     'ac_coupling': ({'corner': 0.6, 'offset': 5.0}, 2.0),
-    'clock_jitter': ({'std': 2e-3}, 0.5),
+    'clock_jitter': ({'std': 3e-3}, 1.0),
     'drift': ({'rate': -0.12, 'curvature': 0.0}, 4.0),
     'flicker_noise': ({'amplitude': 0.06, 'low': 0.2, 'high': 50.0}, 10.0),
     'glitches': ({'probability': 0.02, 'std': 0.4}, 1.0),
@@ -53,11 +53,17 @@ CAUSES: dict[str, tuple[dict[str, object], float]] = {
     'tone': ({'amplitude': 0.1, 'frequency': 20.0, 'phase': 0.0, 'linewidth': 0.0}, 0.5),
     'volatility': ({'std': 1.2, 'rate': 2.0}, 2.0),
 }
-# Causes that are seen through another one; every other sketch has the OU alone beside it.
+# Causes that show only through another one; every other sketch has only the OU beside it.
 _SEEN_BY = {'ac_coupling': 'load_sag', 'clock_jitter': 'tone',
             'load_dependent_noise': 'measurement_noise', 'lopsided_noise': 'measurement_noise'}
 _POINTS, _WIDTH, _HEIGHT = 300, 240, 64
-# Of the OU behind a cause: calm, so that the cause stands out, but for those that change it.
+# The style of a sketch alone, which benchmarks do not change.
+_STYLE = """<style>
+.line { fill: none; stroke-width: 1.6; stroke-linejoin: round; }
+.s0 { stroke: #0072b2; } .s7 { stroke: #9aa5a9; }
+</style>"""
+# Sigma of the OU beside a cause, V/sqrt(s): small, so that the cause stands out, except for causes
+# that change the OU.
 _CALM, _LOUD = 0.15, 0.632
 _CHANGES_THE_OU = ('ou', 'saturation', 'nonlinear_restoring', 'held_samples', 'quantization')
 
@@ -96,7 +102,7 @@ def sketch(name: str) -> str:
     parts = [line(x, _HEIGHT - 6 - (voltage - low) / (high - low) * (_HEIGHT - 12), 's0')]
     if catalogue()[name].NEEDS_THROTTLE or _SEEN_BY.get(name) == 'load_sag':
         parts.insert(0, line(x, _HEIGHT - 4 - throttle * (_HEIGHT - 8), 's7'))
-    return drawing(parts, _WIDTH, _HEIGHT, f'A recording with {name}')
+    return drawing(parts, _WIDTH, _HEIGHT, f'A recording with {name}', _STYLE)
 
 
 def axes(width: int, height: int, texts: Sequence[tuple[float, float, str]]) -> list[str]:
@@ -128,7 +134,7 @@ def release() -> str:
 
 
 def load() -> str:
-    """Return the figure of the noise over load, with the chance of a deviation beyond 100 mV."""
+    """Return the figure of the noise over load, with the probability of more than 100 mV."""
     width, height, beyond = 560, 260, 100.0
     rms = [(state.load, state.vrms.value) for state in published.LOADED]
     x = np.array([80 + 1000.0 * u for u, _ in rms])

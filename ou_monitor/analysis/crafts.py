@@ -48,8 +48,8 @@ KNOWN: dict[str, dict[str, tuple[float, float, float, float]]] = {
            '3s_erpm2': (3, 0.280, 0.217, NAN), 'ar8': (6, 1.511, 0.051, 0.0248),
            'hiro': (4, 0.504, 0.767, NAN), 'roma': (6, 0.968, 0.538, 0.0302),
            'erle': (3, 0.625, 0.109, NAN), 'jd': (4, 0.394, NAN, 0.0168)}}
-_UNITS = {'sag': 'mV a cell at 50 % throttle', 'noise': 'mV rms a cell at 50 % throttle',
-          'resistance': 'mOhm a cell'}
+_UNITS = {'sag': 'mV per cell at 50 % throttle', 'noise': 'mV rms per cell at 50 % throttle',
+          'resistance': 'mOhm per cell'}
 # Measure, whether high -> (likely reason, remedy).
 _REASONS = {
     ('sag', True): ('a small, aged or cold pack, thin or long leads, or a poor connector',
@@ -124,7 +124,7 @@ def check_cells(full: float, cells: int) -> None:
     """Raise InputError if a pack with this voltage at rest, V, cannot have so many cells."""
     if math.isfinite(full) and not LOWEST_CELL <= full / cells <= HIGHEST_CELL:
         raise InputError(
-            f'--cells {cells}: {full:.4g} V at rest would be {full / cells:.3g} V a cell: it is '
+            f'--cells {cells}: {full:.4g} V at rest would be {full / cells:.3g} V per cell: it is '
             f'likely {cell_count(full) or round(full / 3.7) or 1} cells')
 
 

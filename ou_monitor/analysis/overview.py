@@ -136,7 +136,7 @@ def known_lines(found: Overview) -> list[tuple[str, str]]:
     lines = [('Lowest voltage',
               f'{number(least.voltage_v, 4)} V at {number(least.time_s)} s{where}')]
     if math.isfinite(found.limit):
-        cells = f'; {found.limit / found.cells:.3g} V a cell' if found.cells else ''
+        cells = f'; {found.limit / found.cells:.3g} V per cell' if found.cells else ''
         lines.append((f'Below {found.limit:g} V',
                       (_dips(found) or 'never') + cells))
     lines += [('Sag', _sag_words(found)), ('Noise', _noise_words(found))]

@@ -353,8 +353,8 @@ _DESIGN = Command(
      Option('--rail', choices=('bus', 'regulated'), default='bus',
             help='the battery bus at the ESCs, or the regulated rail (default: %(default)s)'),
      Option('--voltage', metavar='V', type=quantity('V'),
-            help='brown-out level, V (default: 3.3 V a cell on the bus; 4.5 V on a regulated rail '
-            'of 5 V, 2.88 V on one of 3.3 V)'),
+            help='brown-out level, V (default: 3.3 V per cell on the bus; 4.5 V on a regulated '
+            'rail of 5 V, 2.88 V on one of 3.3 V)'),
      Option('--horizon', metavar='S', type=quantity('s'), default='5',
             help='horizon, s (default: %(default)s)'),
      Option('--capacitance-min', metavar='F', type=quantity('F'), default='10uF',

@@ -61,7 +61,7 @@ COLUMNS = (
     Column('excess_kurtosis', 'number', '1', 'excess kurtosis of the innovations; 0 for a '
            'Gaussian'),
     Column('impulses', 'count', '', 'number of innovations above the largest expected from a '
-           'normal law'),
+           'normal distribution'),
     Column('line_hz', 'number', 'Hz', 'frequency of the strongest spectral line; null: none '
            'found'),
     Column('line_rms', 'number', 'V', 'its rms'),

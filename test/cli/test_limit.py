@@ -39,5 +39,5 @@ def test_the_limit_is_told_by_the_cell():
     voltage = np.where(t == t[50], 13.0, 15.0)
     made = Recording(t, voltage, np.full(t.size, np.nan), 'made')
     assert dict(known_lines(overview(made, 13.2, cells=4)))['Below 13.2 V'].endswith(
-        '; 3.3 V a cell')
-    assert 'a cell' not in dict(known_lines(overview(made, 13.2)))['Below 13.2 V']
+        '; 3.3 V per cell')
+    assert 'per cell' not in dict(known_lines(overview(made, 13.2)))['Below 13.2 V']

@@ -50,7 +50,7 @@ def normal_scores(cdf: FloatArray) -> FloatArray:
 
 def log_normal(z: FloatArray, mean: FloatArray | float = 0.0, var: FloatArray | float = 1.0
                ) -> FloatArray:
-    """Return log densities of the normal law."""
+    """Return log densities of a normal distribution."""
     result: FloatArray = -0.5 * (LOG_2PI + np.log(var) + (z - mean) ** 2 / var)
     return result
 
