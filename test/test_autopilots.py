@@ -51,7 +51,7 @@ class Port:
         self.rest = b''
 
 
-def test_betaflight_by_msp():
+def test_betaflight_msp_is_decoded():
     """Volts, amperes and the mean of the motors that are there; a broken answer is none."""
     code = re.search(r'```python\n(import struct.*?)```', PAGE, re.DOTALL)[1]
     space = {}

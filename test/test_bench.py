@@ -118,7 +118,7 @@ def frame(monkeypatch, result):
     return result.to_dataframe()
 
 
-def test_the_main_table(found, monkeypatch):
+def test_the_main_table_becomes_a_dataframe(found, monkeypatch):
     """A row a level, measure, frequency, cause, capacitance, number; scalars, unknown as NaN."""
     rows = {name: frame(monkeypatch, result) for name, result in found.items()}
     lowest = found['compare'].lowest

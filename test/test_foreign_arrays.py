@@ -57,7 +57,7 @@ def test_a_time_axis_is_seconds(axis):
     assert monitor.report(0.0).estimate.rate == pytest.approx(100.0, rel=0.01)
 
 
-def test_dates_to_the_microsecond():
+def test_dates_are_exact_to_the_microsecond():
     """Nanoseconds since 1970 are beyond float64, their seconds are not."""
     t = np.datetime64('2024-05-16T08:00:00.123456', 'ns') + np.arange(4) * np.timedelta64(10, 'us')
     np.testing.assert_allclose(np.diff(Recording(t, VOLTS[:4], VOLTS[:4]).t), 1e-5, atol=3e-7)
@@ -71,7 +71,7 @@ def test_dates_far_from_today_and_whole_numbers_to_the_microsecond():
     np.testing.assert_allclose(np.diff(as_seconds(ns)), 0.010010123, atol=3e-7)
 
 
-def test_one_clock_sample_by_sample():
+def test_one_clock_reads_sample_by_sample():
     estimator, monitor = SlidingEstimator(), SupplyMonitor(MonitorSettings())
     for t, volts in zip((1e3 * (BEGIN.timestamp() + SECONDS)).tolist(), VOLTS.tolist()):
         estimator.push(t, volts)
@@ -164,7 +164,7 @@ def test_series_of_two_orders_are_refused():
         Recording(Indexed(SECONDS, 'by size'), volts)
 
 
-def test_a_recording_without_throttle():
+def test_missing_throttle_is_unknown():
     """Left out or None it is unknown; a number holds for all samples."""
     for recording in (Recording(SECONDS, VOLTS), Recording(DATES, VOLTS, None)):
         assert recording.throttle.shape == (N,) and not recording.has_throttle

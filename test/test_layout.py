@@ -181,7 +181,7 @@ def test_a_circle_is_found():
     assert set(circle({**sources, 'p.c': 'import p.a'})) == set(sources)
 
 
-def test_a_command_says_a_document():
+def test_each_command_prints_a_document():
     """What it prints and its JSON go through one function; an export is for another program."""
     said = {path.stem: path.read_text(encoding='utf-8').count('output.say(')
             + path.read_text(encoding='utf-8').count('write_json(')

@@ -22,13 +22,13 @@ MACHINE_PATH = re.compile(rb'/(?:ho' rb'me|ro' rb'ot|Us' rb'ers|wo' rb'rk)/')
 
 
 @pytest.mark.filterwarnings('ignore')
-def test_flake8():
+def test_flake8_finds_nothing():
     """Ament's flake8 finds nothing."""
     code, errors = flake8(argv=FOLDERS)
     assert code == 0, '\n'.join(errors)
 
 
-def test_ruff():
+def test_ruff_finds_nothing():
     """The quick rules of ruff.toml, which the pre-commit hook runs, accept the tree."""
     done = subprocess.run([sys.executable, '-m', 'ruff', 'check', '--no-cache', str(ROOT)],
                           capture_output=True, text=True)
@@ -43,14 +43,14 @@ def test_pre_commit_runs_what_the_suite_runs():
 
 
 @pytest.mark.filterwarnings('ignore')
-def test_pep257(capsys):
+def test_pep257_finds_nothing(capsys):
     """Ament's PEP 257 finds nothing."""
     code = pep257(argv=FOLDERS)
     assert code == 0, capsys.readouterr().err
 
 
 @pytest.mark.skipif(np.__version__ < '2', reason='the types that NumPy 1 states are others')
-def test_types():
+def test_mypy_finds_nothing():
     """Strict mypy (setup.cfg) finds nothing in the package."""
     out, err, code = mypy.run(['--config-file', str(ROOT / 'setup.cfg'), '--cache-dir',
                                str(ROOT / '.mypy_cache'), str(ROOT / 'ou_monitor')])

@@ -85,7 +85,7 @@ def test_links_are_seen():
 
 @pytest.mark.parametrize('path', [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *PAGES],
                          ids=lambda path: path.name)
-def test_what_is_named_exists(path):
+def test_paths_named_in_the_documents_exist(path):
     text = path.read_text(encoding='utf-8')
     named = set(re.findall(
         r'(?<![\w/.])((?:bags|doc|scripts|msg_config|launch|config|benchmarks|test|ou_monitor)'

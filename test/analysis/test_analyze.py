@@ -216,7 +216,7 @@ def test_progress_ends_at_one():
 
 @pytest.mark.parametrize('options', [{'window': 0.0}, {'window': math.nan},
                                      {'brownout_horizon': -1.0}, {'levels': (2.0,)}])
-def test_options_out_of_range_are_a_callers_bug(options):
+def test_options_out_of_range_raise_value_error(options):
     """ValueError."""
     with pytest.raises(ValueError):
         analyze(recording(15, TRUTH, seconds=0.5), **options)

@@ -94,7 +94,7 @@ def test_limit_is_the_gain_detected_with_the_stated_power():
     assert seen[0.25] / DRAWS < 0.5
 
 
-def test_rates_gaps_nan_and_order():
+def test_the_gain_survives_jitter_gaps_and_nan():
     """A gyro at 400 Hz with jitter, gaps and NaN against a rail at 1 kHz: the same gain."""
     rng = np.random.default_rng(5)
     fine = 2000.0
@@ -187,7 +187,7 @@ def test_undecidable_input_is_refused(signal_t, signal, options, words):
 
 
 @pytest.mark.parametrize('tail', [0.0, 1e-160])
-def test_a_signal_that_stands_still_most_of_the_time(tail):
+def test_a_signal_that_is_mostly_constant_is_not_coupled(tail):
     """A flag of 0 and 1: what is left of it elsewhere by rounding does not decide."""
     rng = np.random.default_rng(1)
     t = np.arange(12_000) / 50.0

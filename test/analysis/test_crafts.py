@@ -26,12 +26,12 @@ def flown(cells=4, sag=0.6, noise=0.08, source=None, n=1500):
 @pytest.mark.parametrize('volts, cells', [
     (4.2, 1), (3.6, 1), (8.4, 2), (11.1, 3), (12.6, 3), (16.8, 4), (15.2, 4), (17.4, 4),
     (22.59, 6), (25.2, 6), (5.0, 0), (0.0, 0), (NAN, 0)])
-def test_cells_by_the_voltage(volts, cells):
+def test_cells_are_guessed_by_the_voltage(volts, cells):
     """The fewest that no charger overfills; a 5 V rail is no pack."""
     assert cell_count(volts) == cells
 
 
-def test_who_says_the_cells():
+def test_given_cells_override_the_log_and_the_log_the_guess():
     """What is given goes before the log, the log before the voltage."""
     log = {'cells': '6', 'cell_minimum': '3.5'}
     assert cells_of(flown(source=log), 3) == (3, 'given')
@@ -42,7 +42,7 @@ def test_who_says_the_cells():
         assert stated_limit({'log_cells': cells, 'log_cell_minimum': low}) is None
 
 
-def test_usual_high_and_low():
+def test_values_are_called_usual_high_or_low():
     """Against the median of a class, a cell; a reason and a remedy where it is not usual."""
     middle = {name: np.nanmedian([row[k] / row[0] for row in KNOWN[QUAD].values()])
               for k, name in ((1, 'sag'), (2, 'noise'))}
@@ -91,7 +91,7 @@ def test_a_verdict_is_by_the_interval(value, reach, verdict):
     assert _measure('sag', value, reach, 1.0).verdict == verdict
 
 
-def test_the_limit_of_the_log_and_impossible_cells(tmp_path, capsys):
+def test_impossible_cells_are_refused_with_the_likely_number(tmp_path, capsys):
     """Cells that the voltage cannot have are refused, with the likely number."""
     path = tmp_path / 'a.csv'
     one = flown(n=600)

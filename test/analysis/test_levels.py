@@ -162,6 +162,6 @@ def test_a_staircase_of_short_stays_keeps_its_levels():
     assert [level.throttle for level in found] == [0.1, 0.3, 0.6]
 
 
-def test_no_samples_no_levels():
+def test_an_empty_recording_has_no_levels():
     """An empty recording has none."""
     assert find_levels(np.zeros(0), np.zeros(0)) == ()

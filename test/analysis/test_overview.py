@@ -70,7 +70,7 @@ def test_another_time_scale_is_told_by_both_intervals(alpha, se, other):
     assert not other_scale(OuFacts('not_visible', 30.0), alpha, se, 0.1, 0.1)
 
 
-def test_what_is_not_known_is_said_and_the_rest_stands():
+def test_unknown_facts_are_stated_and_the_others_kept():
     """Without throttle; with one that does nothing; without a limit; with a limit never met."""
     blind = overview(flight(throttle=False, seconds=20.0))
     words = dict(known_lines(blind))

@@ -51,7 +51,7 @@ def test_each_kind_has_its_reason(estimate, tests, kind):
     assert found.sentence.endswith('.') and not found.sentence.endswith('..')
 
 
-def test_what_moves_is_still_called_something():
+def test_a_changing_level_keeps_its_process_type():
     """Apart from its changes the level keeps its name."""
     assert classify(USABLE, shape('correlated', 'mean_drift')).within is ProcessType.DIFFUSION
     assert classify(USABLE, shape('mean_drift', 'impulses')).within is ProcessType.IMPULSES

@@ -110,7 +110,7 @@ def test_windows_grow_until_the_relaxation_is_known():
 
 @pytest.mark.parametrize('name, status', [
     ('recorded/micromouse', 'not_visible'), ('flight', 'ok')])
-def test_recordings_that_ship(name, status):
+def test_shipped_recordings_have_their_known_facts(name, status):
     """What is known of them; of the flight the relaxation at hover is 63 1/s by its truth."""
     found = supply_facts(read_recording(ROOT / 'bags' / name)).ou
     assert found.status == status

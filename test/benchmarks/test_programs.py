@@ -69,7 +69,7 @@ def test_the_sweep_of_cutoffs_is_the_filter_of_the_package(order, mode):
 
 
 @pytest.mark.parametrize('seed', [11, 900_000])
-def test_a_small_attack(monkeypatch, capsys, seed):
+def test_a_small_attack_runs(monkeypatch, capsys, seed):
     monkeypatch.setattr(sys, 'argv', [
         'attack_files.py', '--mutated', '130', '--crafted', '60', '--sheets', '300', '--seed',
         str(seed)])
@@ -97,7 +97,7 @@ def flights(bench):
 
 
 @needs_recordings
-def test_false_alarms_and_a_gain_of_five(bench, flights):
+def test_false_alarms_keep_their_rate_and_a_gain_of_five_is_found(bench, flights):
     """
     At most what a test of 5 % exceeds once in 10^4; the gain is seen in six of six.
 
@@ -135,7 +135,7 @@ def ratios(name, seconds, cutoff):
 
 
 @needs_recordings
-def test_a_loud_craft():
+def test_notches_halve_the_noise_of_a_loud_craft():
     """Half and a third of the noise are left, on what was not learned from."""
     pytest.importorskip('orangebox')
     *_, throttle, nothing, _, rpm, _ = ratios('bf3s', 40.0, 80.0)
@@ -143,7 +143,7 @@ def test_a_loud_craft():
 
 
 @needs_recordings
-def test_a_quiet_craft():
+def test_notches_cost_a_quiet_craft_at_most_2_percent():
     """It may not cost more than 2 %."""
     pytest.importorskip('orangebox')
     *_, throttle, nothing, _, _, _ = ratios('nazgul', 25.0, 80.0)

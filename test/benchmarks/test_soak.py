@@ -74,7 +74,7 @@ def test_dips_that_the_node_cannot_see_do_not_count(change):
     assert dips_of(made)['asked'] == 0
 
 
-def test_silence_without_the_time_of_stops():
+def test_silence_excludes_the_time_of_stops():
     stops = [(1.0, 1.9), (1.95, 2.0)]
     assert overlap(0.5, 1.97, stops) == pytest.approx(0.92)
     assert overlap(2.0, 3.0, stops) == 0.0
@@ -86,7 +86,7 @@ def test_silence_without_the_time_of_stops():
     assert silence([*said, Said(9.0, None, 5)], stops) == (gap, net)
 
 
-def test_pauses_are_one_account():
+def test_overlapping_pauses_count_once():
     """Stopped or without CPU: their union, so that no time counts twice."""
     made = heard([11.4], stops=[(10.1, 10.3)])
     made.withheld = [(5.0, 6.0), (10.2, 10.6)]
@@ -96,7 +96,7 @@ def test_pauses_are_one_account():
     assert dips_of(made)['in_time'] == 0
 
 
-def test_false_flags_while_the_input_is_unusable():
+def test_false_flags_are_counted_while_the_input_is_unusable():
     """They count from when the node may no longer report what came before the phase."""
     made = heard([10.1])
     made.source = [{'kind': 'phase', 'name': 'silent', 'at': 5.0},

@@ -151,7 +151,7 @@ def test_levels_need_a_throttle(tmp_path, capsys):
     assert 'no throttle' in failure(capsys, 'analyze', path, '--levels', '0.1')
 
 
-def test_text_says_which_voltage_must_not_be_undershot(flight, capsys):
+def test_the_limit_is_stated(flight, capsys):
     """The node's default by name, or the one that was asked for; the JSON as well."""
     assert main(['analyze', str(flight)]) == 0
     text = ' '.join(capsys.readouterr().out.split())

@@ -58,7 +58,7 @@ def check(data, shape, where='$'):
 
 @pytest.mark.parametrize('name, options', [
     ('my flight', []), ('bench', ['--fit-until', '15']), ('my flight', ['--model', 'model.yaml'])])
-def test_json_is_that_of_the_contract(folder, capsys, name, options, monkeypatch):
+def test_json_has_the_documented_keys(folder, capsys, name, options, monkeypatch):
     """Names and types, with a model, without, and without throttle."""
     monkeypatch.chdir(folder)
     assert main(['compare', f'{name}.csv', '--seeds', '20', '--json', '-', *options]) == 0
@@ -116,7 +116,7 @@ def test_bad_input_is_one_line(folder, capsys, options, words, monkeypatch):
     assert words in failure(capsys, 'compare', 'my flight.csv', *options)
 
 
-def test_a_model_that_needs_throttle(folder, capsys):
+def test_a_model_that_needs_throttle_is_refused_without(folder, capsys):
     """It is named, with the term."""
     error = failure(capsys, 'compare', folder / 'bench.csv', '--model', folder / 'model.yaml')
     assert "the model's term 'load_sag' needs throttle, and the recording has none" in error

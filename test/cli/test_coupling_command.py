@@ -95,7 +95,7 @@ def test_column_and_field_path_say_the_same(table, bag, capsys):
     assert other['gain_per_v'] == pytest.approx(one['gain_per_v'], rel=1e-3)
 
 
-def test_a_csv_with_other_names_and_units(series, tmp_path, capsys):
+def test_a_csv_with_other_names_and_units_is_read(series, tmp_path, capsys):
     """The time of the signal is that of the voltage: its column, in ms."""
     path = tmp_path / 'other.csv'
     t, voltage, throttle, x, _ = series
@@ -119,7 +119,7 @@ def test_only_the_part_asked_for_counts(table, bag, capsys):
     assert "--to: '-1'" in failure(capsys, 'coupling', table, '--signal', 'gyro_x', '--to', '-1')
 
 
-def test_none_is_said_with_the_limit(table, capsys):
+def test_no_coupling_is_reported_with_the_detectable_gain(table, capsys):
     """In words and as null."""
     data = found(capsys, table, '--signal', 'gyro_y')
     assert not data['seen'] and data['gain_per_v'] is None
@@ -132,7 +132,7 @@ def test_none_is_said_with_the_limit(table, capsys):
     assert max(map(len, text.splitlines())) <= 100
 
 
-def test_seen_is_said_in_words(table, capsys):
+def test_a_coupling_is_reported_with_interval_and_lag(table, capsys):
     """Gain, interval, lag."""
     assert main(['coupling', str(table), '--signal', 'gyro_x', '--band', '10,60']) == 0
     text = capsys.readouterr().out

@@ -31,7 +31,7 @@ def told(capsys, *more):
     return json.loads(said(capsys, '--json', '-', *more), parse_constant=refuse)
 
 
-def test_answer_table_and_effect(capsys):
+def test_the_table_has_present_answer_and_both_ends(capsys):
     """The table has both ends, the present capacitor and the answer, in order of capacitance."""
     out = said(capsys)
     assert '2305 uF is the minimum capacitance that brings the risk under 0.001.' in out
@@ -58,7 +58,7 @@ def test_json_and_table_agree(capsys, tmp_path):
     assert json.loads(file.read_text(encoding='utf-8')) == data
 
 
-def test_components_by_file_and_option(capsys, tmp_path):
+def test_an_option_overrides_the_file(capsys, tmp_path):
     """An option goes before the file, the file before the default."""
     file = tmp_path / 'frame.yaml'
     file.write_text('cells: 4\nbattery_voltage: 14.8\nbulk_capacitance: 1000uF\nbulk_esr: 2e-2\n'
@@ -70,7 +70,7 @@ def test_components_by_file_and_option(capsys, tmp_path):
     assert network['current_max'] == PowerNetwork().current_max
 
 
-def test_rails_levels_and_esr(capsys):
+def test_each_rail_has_its_own_level(capsys):
     """Each rail has its own level; the ESR may be kept."""
     assert told(capsys, '--rail', 'regulated')['brownout_voltage'] == 4.5
     given = told(capsys, '--voltage', '18.5', '--horizon', '60s', '--esr-fixed')
@@ -95,7 +95,7 @@ def test_list_shows_every_component_with_its_unit(capsys):
 
 
 @pytest.mark.parametrize('given, missing', [('--risk=1e-3', '--throttle')])
-def test_what_is_missing_is_named(capsys, given, missing):
+def test_missing_options_are_named(capsys, given, missing):
     """Risk and throttle have no default."""
     assert main(['design', given]) == 2
     assert re.match(rf'.*{missing} is missing', capsys.readouterr().err)
@@ -154,7 +154,7 @@ def test_quantities_are_read_with_prefix_and_unit(text, unit, value):
 
 @pytest.mark.parametrize('text', [
     '', 'uF', '1e', '1..2', 'inf', 'nan', '1xF', '1 2', '\u0663', '9' * 100_000 + 'x', True, None])
-def test_what_is_no_quantity(text):
+def test_invalid_quantities_are_refused(text):
     """Refused."""
     with pytest.raises(ArgumentTypeError, match='is not a number|must'):
         quantity('F')(text)
@@ -194,7 +194,7 @@ def test_a_flight_gives_the_network(flight, capsys):
     assert found['brownout_voltage'] == pytest.approx(13.2) and '4 cells' in found['measured']
 
 
-def test_what_is_set_goes_before_the_flight(flight, capsys):
+def test_set_values_override_the_flight(flight, capsys):
     """Resistance and throttle; a number of cells that the voltage cannot have is refused."""
     found = asked(capsys, '--from', flight, '--set', 'battery_resistance=50mOhm', '--throttle',
                   '0.5')
@@ -214,7 +214,7 @@ def test_cells_set_the_voltage(capsys):
     assert both['network']['battery_voltage'] == 16.0
 
 
-def test_what_each_change_buys(flight, capsys):
+def test_each_lever_shows_its_effect(flight, capsys):
     """Packs, resistance and throttle meet a limit that no capacitor meets, or none does."""
     found = asked(capsys, '--from', flight, '--voltage', '14.9', '--risk', '0.01')
     levers = {one['name']: one for one in found['levers']}

@@ -68,7 +68,7 @@ def test_a_part_is_read_and_said_again(flight, tmp_path, capsys, monkeypatch):
     assert re.search(r'reading \[#+\] 100%', capsys.readouterr().err)
 
 
-def test_summary_model_and_page(flight, tmp_path, capsys):
+def test_one_run_writes_summary_model_and_page(flight, tmp_path, capsys):
     """All at once: within 100 columns; the model can be read and simulated; the page parses."""
     data, model, page = (tmp_path / name for name in ('d.json', 'm.yaml', 'r.html'))
     assert main(['discover', str(flight), '--seed', '5', '--json', str(data), '--save-model',
@@ -134,7 +134,7 @@ def made(*causes):
         simulated=SupplyModel((OU(60.0, 0.3, 5.0),)))
 
 
-def test_what_is_not_known_is_said_and_what_is_worse_too():
+def test_unknown_and_worse_gains_are_stated():
     """No nan, no '- +- -'; unknown is not 'none'; significantly negative is 'worse'."""
     nan = float('nan')
     finding = made((LoadSag(0.6, 0.0), nan, nan, nan), (Tone(0.01, 9.0, 0.0, 0.0), -0.01, 0.002,

@@ -235,7 +235,7 @@ def test_copies_are_analysed_once_and_named(rows, whole):
     assert '1 is a copy of another' in said and 'one of the two is in the wrong place' in said
 
 
-def test_what_was_passed_over_is_told(whole):
+def test_skipped_files_are_named(whole):
     """A CSV of something else and what only ends like a log are named."""
     said = ' '.join(whole[1].stdout.split())
     assert 'tuning.csv' in said and 'raw.ulg' in said and 'in no known format' in said
@@ -252,7 +252,7 @@ def test_vehicles_flights_and_dates(rows, whole):
     assert 'vehicles by their folder' in said and 'in the order of their names' in said
 
 
-def test_the_table_says_what_it_holds(whole):
+def test_each_column_has_unit_and_meaning(whole):
     """Each column has its unit and meaning, and the JSON holds the same rows."""
     table = parquet.read_table(whole[0] / 'fleet.parquet')
     assert tuple(table.column_names) == NAMES
@@ -272,7 +272,7 @@ def test_columns_are_documented():
         assert f'| `{column.name}` | {column.unit or "-"} |' in text
 
 
-def test_what_is_done_is_kept(story):
+def test_an_interrupted_run_keeps_its_results(story):
     """SIGKILL and Ctrl-C come in the middle; nothing of before is done again, nobody is left."""
     out, stops, _ = story
     for code, said, before, after, left in stops:
@@ -358,7 +358,7 @@ def test_a_fleet_of_bad_files_alone_is_refused(tmp_path, one_process, capsys):
     assert 'not an MCAP file' in table.column('error').to_pylist()[0]
 
 
-def test_a_strange_clock_and_a_strange_name(tmp_path, one_process):
+def test_millisecond_stamps_are_refused_and_odd_names_shown(tmp_path, one_process):
     """Stamps in milliseconds since 1970 are refused; a name that is no text is still told."""
     made = flight(1, n=3000)
     logs = tmp_path / 'logs'
@@ -400,7 +400,7 @@ def test_missing_extra_is_named(logs, tmp_path, capsys, monkeypatch):
     assert 'pyarrow is not installed: ' in said and "pip install '.[fleet]'" in said
 
 
-def test_full_disk_is_told_before_the_work(logs, tmp_path):
+def test_a_full_disk_is_reported_before_the_work(logs, tmp_path):
     """Nothing can be written: one line, at once, also where one is root."""
     done = run(logs, '--output', tmp_path / 'out', preexec_fn=lambda: resource.setrlimit(
         resource.RLIMIT_FSIZE, (0, 0)))

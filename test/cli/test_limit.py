@@ -14,7 +14,7 @@ import pytest
 @pytest.mark.parametrize('voltage, cells, limit', [
     (None, None, None), (14.0, None, 14.0), (None, 4, 13.2), (3.5, 4, 14.0), (3.5, 1, 3.5),
     (4.5, None, 4.5)])
-def test_with_cells_it_is_volts_a_cell(voltage, cells, limit):
+def test_with_cells_the_limit_is_volts_per_cell(voltage, cells, limit):
     """Without, of the whole; cells alone have a limit of their own."""
     found = brownout_limit(Namespace(brownout_voltage=voltage, cells=cells))
     assert found == (None if limit is None else pytest.approx(limit, rel=1e-12))
@@ -27,13 +27,13 @@ def test_volts_of_the_pack_beside_cells_are_refused():
 
 
 @pytest.mark.parametrize('cells', ['0', '-1', '2.5', 'four', '99'])
-def test_a_number_of_cells(cells, capsys):
+def test_an_invalid_number_of_cells_is_one_line(cells, capsys):
     """One line."""
     assert main(['analyze', 'x.csv', '--cells', cells]) == 2
     assert f"'{cells}' is not a number of cells, 1 to 28" in capsys.readouterr().err
 
 
-def test_the_limit_is_told_by_the_cell():
+def test_the_limit_is_shown_per_cell():
     """Beside its dips."""
     t = np.arange(200) * 0.01
     voltage = np.where(t == t[50], 13.0, 15.0)

@@ -81,7 +81,7 @@ def test_input_errors_are_one_line_whatever_their_text(monkeypatch, capsys):
 
 
 @pytest.mark.parametrize('encoding', ['utf-8', 'ascii'])
-def test_a_file_name_that_the_terminal_cannot_show(tmp_path, encoding):
+def test_file_names_that_the_terminal_cannot_show_are_escaped(tmp_path, encoding):
     """Its bytes are no text, or not in the encoding: shown by their numbers."""
     path = os.fsdecode(os.path.join(os.fsencode(tmp_path), b'\xff\xc3\xa4.csv'))
     with open(path, 'w') as file:
@@ -121,7 +121,7 @@ def test_closed_outputs_are_no_failure(tmp_path, closed):
     (OSError('a\nb'), 'analyze: a b'),
     (MemoryError(), 'not enough memory: take a part'),
 ])
-def test_what_the_system_refuses_is_one_line(monkeypatch, capsys, error, words):
+def test_system_errors_are_one_line(monkeypatch, capsys, error, words):
     """Whatever call it came from."""
     def run(args):
         raise error
@@ -132,7 +132,7 @@ def test_what_the_system_refuses_is_one_line(monkeypatch, capsys, error, words):
 
 @pytest.mark.parametrize('command', [['analyze'], ['convert', '--list'], ['discover'],
                                      ['fleet', '--output', 'out']])
-def test_a_path_that_is_too_long(tmp_path, monkeypatch, capsys, command):
+def test_a_path_that_is_too_long_is_one_line(tmp_path, monkeypatch, capsys, command):
     """The system refuses to look for it."""
     monkeypatch.chdir(tmp_path)
     assert 'File name too long' in failure(capsys, *command, 'x' * 300)
@@ -161,7 +161,7 @@ def test_a_shell_completes_commands_and_their_options(monkeypatch):
         name for action in parser._actions for name in action.choices or ()}
 
 
-def test_a_bug_is_not_dressed_up_as_bad_input(monkeypatch):
+def test_a_bug_keeps_its_traceback(monkeypatch):
     """What is not InputError keeps its traceback: it must be reported, not hidden."""
     def run(args):
         raise ZeroDivisionError

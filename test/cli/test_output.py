@@ -42,7 +42,7 @@ def test_write_json_to_a_file_and_to_standard_output(tmp_path, capsys):
     assert json.loads(target.read_text(encoding='ascii')) == {'unit': 'V/√s', 'x': None}
 
 
-def test_what_cannot_be_written_is_named(tmp_path):
+def test_unwritable_outputs_are_named(tmp_path):
     """A missing folder, a folder, and a file used as a folder; the last only when written."""
     (tmp_path / 'file').write_text('')
     for target in (tmp_path / 'no' / 'x.json', tmp_path):
@@ -87,7 +87,7 @@ def test_paths_that_collide_or_are_empty_are_named(tmp_path):
 @pytest.mark.parametrize('name, part', [
     ('metadata.yaml', True), ('bag_0.mcap', True), ('bag_1.db3', True), ('bag_0.mcap.zstd', True),
     ('report.html', False), ('result.json', False)])
-def test_what_a_bag_is_made_of_is_not_overwritten(tmp_path, name, part):
+def test_files_of_a_bag_are_not_overwritten(tmp_path, name, part):
     """Its metadata and storage files are refused; a report may lie beside them."""
     bag = tmp_path / 'bag'
     bag.mkdir()
@@ -99,7 +99,7 @@ def test_what_a_bag_is_made_of_is_not_overwritten(tmp_path, name, part):
         output.check_paths({'RECORDING': str(bag)}, {'--report': str(bag / name)}, force=True)
 
 
-def test_what_was_there_stays_when_the_disk_is_full(tmp_path, monkeypatch):
+def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch):
     """Half a page is left neither in its place nor beside it."""
     target = tmp_path / 'report.html'
     output.write_text('old', target)
@@ -114,7 +114,7 @@ def test_what_was_there_stays_when_the_disk_is_full(tmp_path, monkeypatch):
     assert target.read_text() == 'old' and list(tmp_path.iterdir()) == [target]
 
 
-def test_what_is_there_is_overwritten_when_forced_only(tmp_path):
+def test_files_are_overwritten_only_with_force(tmp_path):
     """A file of any output; what is no file, such as a device, is no loss."""
     there = tmp_path / 'report.html'
     there.write_text('old')
@@ -188,7 +188,7 @@ def test_an_output_within_another_or_around_an_input_is_refused(tmp_path):
         output.check_paths({'LOG': log}, {'OUT': log.parent}, force=True)
 
 
-def test_what_appears_during_the_work_is_not_overwritten(tmp_path):
+def test_files_that_appear_during_the_work_are_not_overwritten(tmp_path):
     """Nor is a link, wherever it leads; with force both are."""
     late, link = tmp_path / 'late.json', tmp_path / 'link.json'
     late.write_text('mine')
@@ -238,7 +238,7 @@ def test_a_file_is_as_wide_as_ever(monkeypatch):
     assert len(terminal.table(heads, [['1'] * 20]).splitlines()) == 3
 
 
-def test_the_last_lines(capsys):
+def test_the_last_lines_repeat_the_answer_and_name_the_files(capsys):
     """Three: the answer, what stands behind it, and what was written where."""
     said = ['It fell to 13 V.', 'It sags by 2 V.', 'It is safe up to half throttle.']
     output.summary(said, report='a.html', json='-', model=None)

@@ -22,7 +22,7 @@ def clock(monkeypatch):
     return now
 
 
-def test_what_is_short_says_nothing_off_a_terminal(capsys, clock):
+def test_short_work_shows_no_progress_off_a_terminal(capsys, clock):
     """Nothing reaches a log file in the first minute, and a line each minute then."""
     with Progress('work') as progress:
         for second in range(360):
@@ -36,7 +36,7 @@ def test_what_is_short_says_nothing_off_a_terminal(capsys, clock):
     assert lines[-1] == 'work: 83% done, 60 s left'
 
 
-def test_a_program_that_reads_the_output_is_not_told(capsys, clock):
+def test_json_on_standard_output_shows_no_progress(capsys, clock):
     """Beside JSON on standard output nothing is written, however long it takes."""
     with Progress('work', quiet=True) as progress:
         for second in range(360):
@@ -86,6 +86,6 @@ def test_a_standard_error_that_is_closed_stops_nothing(monkeypatch, clock):
 
 @pytest.mark.parametrize('seconds, words', [
     (0.2, '1 s'), (61.4, '61 s'), (100.0, '2 min'), (3000.0, '50 min'), (9000.0, '2.5 h')])
-def test_a_guess_is_round(seconds, words):
+def test_the_time_left_is_rounded(seconds, words):
     """Seconds, minutes, hours."""
     assert duration(seconds) == words

@@ -8,7 +8,7 @@ from ou_monitor.paper import reproduce as module
 import pytest
 
 
-def test_table_json_and_report(tmp_path, capsys, monkeypatch):
+def test_table_json_and_report_agree(tmp_path, capsys, monkeypatch):
     """
     One run writes all three, and they agree; test_bench.py has a second with the same seed.
 

@@ -34,7 +34,7 @@ def simulate(*argv):
 
 
 @pytest.mark.parametrize('name', ['a.mcap', 'folder'])
-def test_a_bag_that_analyze_takes(tmp_path, name, capsys):
+def test_the_simulated_bag_can_be_analyzed(tmp_path, name, capsys):
     """One file, or a rosbag2 folder: stamps, throttle, and the law of the preset."""
     path = tmp_path / name
     simulate('--preset', 'load_40', '--duration', 20, '--output', path)
@@ -125,7 +125,7 @@ def test_a_model_can_be_saved_without_a_recording(tmp_path, capsys):
     assert capsys.readouterr().err == ''
 
 
-def test_a_model_file_of_ones_own(tmp_path):
+def test_a_model_file_is_simulated_as_written(tmp_path):
     """Mean, sag and variance are those of the file; throttle by points."""
     (tmp_path / 'own.yaml').write_text(MODEL)
     simulate('--model', tmp_path / 'own.yaml', '--duration', 40, '--throttle', '0:0,20:0,20:0.5',
@@ -172,7 +172,7 @@ def test_blocks_say_their_own_rate(tmp_path, rate, duration):
     assert abs(steps.var() / (0.632 ** 2 / rate) - 1.0) < 4.0 * math.sqrt(2.0 / n) + 63.0 / rate
 
 
-def test_throttle_of_blocks(tmp_path):
+def test_throttle_changes_within_a_block(tmp_path):
     """A step within a block is at its sample."""
     path = tmp_path / 'a.mcap'
     simulate('--preset', 'loads', '--duration', 0.1, '--rate', 20_000, '--throttle',
@@ -306,7 +306,7 @@ def test_a_bag_is_not_named_like_another_file(name, tmp_path, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_export_and_an_old_pack(tmp_path, capsys):
+def test_export_prints_parameters_and_losses(tmp_path, capsys):
     """Parameters on stdout, what is lost on stderr; the pack that is aged sags more."""
     model = str(ROOT / 'models' / 'gecko.yaml')
     assert main(['simulate', '--model', model, '--duration', '5', '--export', 'px4']) == 0

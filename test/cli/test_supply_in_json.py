@@ -69,7 +69,7 @@ def near(found, wanted, tolerance=0.0):
 
 
 @pytest.mark.parametrize('path, limit, part', RECORDINGS, ids=lambda x: getattr(x, 'stem', ''))
-def test_whoever_gives_a_number_gives_the_same(path, limit, part, tmp_path):
+def test_commands_fleet_and_node_agree_on_the_facts(path, limit, part, tmp_path):
     """`analyze`, `compare`, a row of the fleet, and the node at the end of twelve recordings."""
     if not path.exists():
         pytest.skip('OU_MONITOR_REALDATA is not set')

@@ -41,7 +41,7 @@ def test_a_recording_of_the_model_looks_like_it():
     assert np.mean([one.p_value for one in found]) > 0.2
 
 
-def test_a_level_that_two_seconds_do_not_tell():
+def test_alignment_on_two_seconds_leaves_an_error_of_the_level():
     """
     A voltage that wanders for seconds: the level taken from the first two has an error.
 
@@ -89,7 +89,7 @@ def test_a_wrong_sag_is_the_worst(sag):
     assert any(word in found.worst for word in ('rises of throttle', 'lowest', 'falls through'))
 
 
-def test_only_what_follows_s_is_simulated():
+def test_only_the_part_after_fit_until_is_simulated():
     """--fit-until with a model: the part after it, aligned there."""
     found = compare(drawn(4), model(), fit_until=30.0, seeds=20)
     assert found.simulated == (30.0, pytest.approx(39.99))
@@ -173,7 +173,7 @@ def test_a_measured_current_is_the_load(seconds, rate):
     assert 'load_sag' in found.model and 'drift' not in found.model
 
 
-def test_a_current_without_some_readings_is_one():
+def test_a_current_with_gaps_is_used_and_one_that_ends_is_not():
     """A gap of the logger is no current that is missing; a current that ends is."""
     whole = robot(2)
     off = (whole.t < 3.0) | (whole.t > 4.2)
@@ -214,13 +214,13 @@ def test_held_samples_count_once():
     ({'fit_until': 0.0}, 'must end within the recording'),
     ({'fit_until': 0.2}, 'the part to be fitted has'),
     ({'fit_until': 39.9}, 'the part to be simulated has')])
-def test_parts_that_are_too_short(change, words):
+def test_parts_that_are_too_short_are_refused_by_name(change, words):
     """One line that says which part."""
     with pytest.raises(InputError, match=words):
         compare(drawn(6), **change)
 
 
-def test_what_cannot_be_compared():
+def test_recordings_that_cannot_be_compared_are_refused():
     """Too few samples, no voltage that changes, no throttle for a model that needs it."""
     t = np.arange(400) / 100.0
     none = np.full(t.size, np.nan)

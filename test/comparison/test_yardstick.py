@@ -18,7 +18,7 @@ def white(seed: int) -> Readings:
     return Readings(t, 5.0 + 0.1 * np.random.default_rng(seed).standard_normal(N), None)
 
 
-def test_falls_of_white_noise():
+def test_falls_of_white_noise_are_counted_as_theory_says():
     """Of independent samples p below and q above by the noise: p q / (p + q) falls a sample."""
     noise = white(1)
     found = Yardstick(noise, 0.0).measure(noise.voltage)
@@ -43,7 +43,7 @@ def test_a_fall_is_a_dip_of_the_facts():
     assert np.all(counts < 0.8 * np.array(crossings)) and np.all(counts > 0)
 
 
-def test_power_of_white_noise():
+def test_white_noise_has_equal_power_in_equal_bands():
     """A flat spectrum: each band has its share of the variance."""
     noise = white(2)
     yardstick = Yardstick(noise, 0.0)

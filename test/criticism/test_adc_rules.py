@@ -102,7 +102,7 @@ def test_a_rail_is_five_errors_above_its_neighbours():
 
 @pytest.mark.parametrize('side', (1.0, -1.0))
 @pytest.mark.parametrize('later', [0.0, 0.015, 0.03])
-def test_a_stage_that_clips_before_the_noise_of_the_adc(side, later):
+def test_the_limit_of_an_earlier_stage_is_the_code_where_readings_pile_up(side, later):
     """Some readings come out a code beyond; the limit is the code in which they pile up."""
     rng = np.random.default_rng(7)
     v = np.minimum(noise(), 1.5) + later * rng.standard_normal(noise().size)
@@ -167,7 +167,7 @@ def test_a_knee_is_found_where_it_is(side, share):
 
 
 @pytest.mark.parametrize('seed', range(3))
-def test_what_is_not_squeezed_has_no_knee(seed):
+def test_an_uncompressed_voltage_has_no_knee(seed):
     """An OU; nor where all beyond it is one long while."""
     v = noise(8000, seed)
     assert find_knee(v, math.sqrt(0.2), 1.0) is None and find_knee(v, math.sqrt(0.2), -1.0) is None

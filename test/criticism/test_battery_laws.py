@@ -78,7 +78,7 @@ def test_small_errors_leave_out_pairs_with_a_large_one():
     assert plain(z)['small errors lag 1'] == pytest.approx(correlation(*np.array(pairs).T))
 
 
-def test_moments_and_tails():
+def test_moments_and_tails_have_their_normal_scores():
     rng = np.random.default_rng(3)
     z = np.append(rng.exponential(0.7, 9995), [4.5, -5.0, 6.0, -7.0, 8.0])
     z[:-5] = np.minimum(z[:-5], 3.9)
@@ -137,7 +137,7 @@ def test_products_of_three_are_a_chi_square_tail():
     assert 'products of three' in plain(z[:41]) and 'products of three' not in plain(z[:40])
 
 
-def test_bursts_of_noise_that_is_none():
+def test_white_noise_has_no_bursts():
     """
     Independent scores: ordinates are exponential, their mean square 2 and its variance 24 - 4.
 

@@ -48,7 +48,7 @@ def kept(v, throttle=None, step=7):
 
 @pytest.mark.parametrize('share, found', ((0.99, False), (1.01, True), (-0.99, False),
                                           (-1.01, True)))
-def test_an_event_is_larger_than_any_of_so_many_changes(share, found):
+def test_an_event_exceeds_the_largest_change_expected_from_noise(share, found):
     """A chance of 0.02 for the largest of all, 1.05 times; the scale is 1 / 0.6745."""
     n = 64 * 1024
     limit = 1.05 * norm.isf(0.01 / n) / 0.6745
@@ -57,7 +57,7 @@ def test_an_event_is_larger_than_any_of_so_many_changes(share, found):
     assert kept(v).tolist() == wanted
 
 
-def test_three_hundred_events_are_few():
+def test_up_to_300_events_are_kept():
     v, at = jumps(np.full(300, 99.0))
     near = (at[:, None] + np.arange(3)).ravel()
     assert kept(v).tolist() == near[near % 7 != 0].tolist()
@@ -71,7 +71,7 @@ def test_nothing_is_kept_beside_all_samples_or_where_codes_are_coarse():
 
 @pytest.mark.parametrize('move, late, found', (
     (0.5, 21, True), (0.5, 20, False), (0.5, 0, False), (0.5, -1, True), (0.009, 0, True)))
-def test_what_follows_a_step_of_throttle_is_the_load(move, late, found):
+def test_changes_within_20_ms_of_a_throttle_step_belong_to_the_load(move, late, found):
     """For 20 ms after a step of more than 0.01."""
     v, (at,) = jumps([99.0])
     throttle = np.full(v.size, 0.3)

@@ -36,7 +36,7 @@ def test_edges_hold_all_values_and_room_for_tails(code, middle):
         assert ((y.min() - edges[0]) / code) % 1.0 == pytest.approx(0.5)
 
 
-def test_few_throttles_are_taken_as_they_are():
+def test_up_to_twelve_throttles_have_a_bin_each():
     """One bin a value up to twelve, ten bins of as many samples beyond; the end is within."""
     which, bins = _by_throttle(np.array([0.2, 0.5, 0.2, 0.9]))
     assert bins == 3 and which.tolist() == [0, 1, 0, 2]
@@ -60,14 +60,14 @@ def test_averages_need_five_samples():
     assert means[0] == 2.0 and math.isnan(means[1])
 
 
-def test_the_corners_of_a_histogram():
+def test_the_outline_of_a_histogram_encloses_the_area_of_its_bars():
     """Up, along, down: the area below is that of the bars."""
     x, y = outline(np.array([0.0, 1.0, 3.0]), [2.0, 1.0])
     assert float(np.sum(np.diff(x) * 0.5 * (y[1:] + y[:-1]))) == pytest.approx(4.0)
     assert x[0] == 0.0 and x[-1] == 3.0 and y.max() == 2.0
 
 
-def test_half_the_range_of_levels_is_room():
+def test_simulations_may_exceed_the_recorded_range_by_half_of_it():
     """Seen 14 to 16 V: 13 to 17 V may be simulated, and what is farther is said in volts."""
     seen = np.array([14.0, 15.0, 16.0])
     assert seen_range(seen) == (13.0, 17.0)

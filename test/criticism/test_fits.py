@@ -19,7 +19,7 @@ from ou_monitor.model.whittle import Ordinates
 import pytest
 
 
-def test_what_suits_a_part_is_not_taken_where_it_is_worse_for_all(monkeypatch):
+def test_parameters_that_fit_a_part_but_not_all_samples_are_rejected(monkeypatch):
     """Where there are too many states for more rounds a fit is no worse than its start."""
     rng = np.random.default_rng(4)
     t = np.arange(8000) / 100.0
@@ -52,7 +52,7 @@ RAIL = OU(20.0, 0.3, 5.0)
 
 @pytest.mark.parametrize('law', [
     RegimeSwitching(1.5, 1.0, 0.0, 3.0, 1.0, 2.0), Volatility(0.8, 3.0)])
-def test_what_is_fitted_spreads_as_far_as_the_data(law):
+def test_simulations_of_the_fit_spread_as_far_as_the_data(law):
     """
     Sigma and the spread of simulations, where sigma of all would be twice as large.
 
@@ -93,7 +93,7 @@ def begun(std, seed):
     return terms, gain
 
 
-def test_it_starts_near_the_truth():
+def test_a_start_of_a_second_relaxation_is_near_the_truth():
     """
     36 s hold 90 relaxations of it: rate and variance are known to about 15 %.
 
@@ -107,7 +107,7 @@ def test_it_starts_near_the_truth():
         assert gain > 30.0
 
 
-def test_without_one_it_gains_what_two_parameters_do():
+def test_without_a_second_relaxation_its_gain_is_that_of_two_parameters():
     """Twice the gain is chi-squared of two or fewer: 9.2 nats come once in 10 000."""
     assert max(begun(0.0, seed)[1] for seed in (3, 4, 5)) < 9.2
 

@@ -141,7 +141,7 @@ def test_gaps_stay_and_are_counted():
     assert any('2 gaps' in note and '0.401 s' in note for note in found.notes)
 
 
-def test_what_is_not_finite_or_not_in_order():
+def test_nan_is_dropped_and_stamps_are_sorted():
     """Not-a-number and doubles dropped, stamps sorted, holes of the throttle filled."""
     t, v = rail(9, 1000)
     u = np.linspace(0.0, 1.0, t.size)
@@ -169,7 +169,7 @@ def test_too_little_has_a_reason(n, value):
 
 
 @pytest.mark.parametrize('u, word', [(None, 'not recorded'), (0.4, 'constant')])
-def test_throttle_that_says_nothing(u, word):
+def test_throttle_that_does_not_move_is_left_out_with_a_note(u, word):
     """It is left out, and the causes that need it are said to be untestable."""
     t, v = rail(1, 2000)
     found = examined(t, v, None if u is None else np.full(t.size, u))

@@ -95,7 +95,7 @@ def test_the_same_events_are_found_again_where_push_and_error_begin_at_the_same_
 
 
 @pytest.mark.parametrize('width', (3, 400))
-def test_least_squares_of_few_and_of_many_columns(width):
+def test_least_squares_agree_for_few_and_for_many_columns(width):
     rng = np.random.default_rng(7)
     columns, y = rng.standard_normal((1000, width)), rng.standard_normal(1000)
     columns[:, 1] = 0.0

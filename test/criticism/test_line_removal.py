@@ -62,7 +62,7 @@ def test_a_faint_tone_does_not_bias_alpha_and_sigma():
     assert min(holds.values()) >= 16
 
 
-def test_what_the_line_would_have_done_is_said():
+def test_the_effect_of_a_removed_line_is_reported():
     """The quality list names the level's alpha and sigma with the line."""
     analysis = analyze(simulated(0.02, 3))
     (level,) = analysis.levels

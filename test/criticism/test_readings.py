@@ -70,7 +70,7 @@ def test_noise_has_no_bad_samples(seed):
         assert not find_bad(v).any()
 
 
-def test_what_goes_far_by_degrees_or_often_stays():
+def test_gradual_or_frequent_excursions_are_kept():
     """A brown-out that recovers, and glitches of many sizes, are for the models."""
     v = rail()
     v[3000:3400] -= 4.0 * np.exp(-np.arange(400) / 60.0)
@@ -91,7 +91,7 @@ NOTHING = {
 
 
 @pytest.mark.parametrize('what', sorted(NOTHING))
-def test_what_cannot_be_fitted_says_why_without_a_warning(what):
+def test_a_voltage_that_cannot_be_fitted_gives_a_reason_and_no_warning(what):
     v, part = NOTHING[what]
     with warnings.catch_warnings():
         warnings.simplefilter('error')

@@ -88,7 +88,7 @@ def throttle(u, t=None):
     (-1.5, 1.5, 'not 0 to 1'), (0.0, 1.6, 'percent'), (-1.0, 150.0, 'percent'),
     (0.0, 151.0, 'unknown unit'), (-1.6, 1.0, 'unknown unit'), (700.0, 2400.0, 'microseconds'),
     (699.0, 2000.0, 'unknown unit'), (1000.0, 2401.0, 'unknown unit')])
-def test_units_of_throttle_by_their_range(low, high, word):
+def test_the_unit_of_throttle_follows_from_its_range(low, high, word):
     raw = np.linspace(low, high, 101)
     raw[:3], raw[-3:] = low, high
     u, notes = throttle(raw)
@@ -114,7 +114,7 @@ def test_half_a_percent_of_wild_values_is_no_unit(wild, word):
     (lambda x: x, (-1.4, 1.4), (-1.6, 1.6)), (lambda x: 1000.0 + 1000.0 * x, (-0.29, 1.39),
                                               (-0.31, 1.41)),
     (lambda x: 100.0 * x, (-1.4, 1.4), (-1.6, 1.6))])
-def test_what_is_beyond_the_unit_is_unknown(unit, inside, outside):
+def test_throttle_beyond_its_range_is_unknown(unit, inside, outside):
     share = np.linspace(0.0, 1.0, 1001)
     for values, holes in ((inside, 0), (outside, 2)):
         some = share.copy()
@@ -138,7 +138,7 @@ def test_holes_of_throttle_are_held_and_measured():
     assert throttle(np.full(9, math.nan)) == (None, '')
 
 
-def test_samples_in_order_and_finite():
+def test_readings_are_sorted_and_finite():
     """What was dropped is counted; of two samples of one stamp the first stays."""
     t = np.array([0.0, 0.1, 0.3, 0.2, 0.2, math.nan, 0.5, 0.6])
     v = np.array([5.0, 5.1, 5.3, 5.2, 9.9, 5.4, math.inf, 5.6])
@@ -162,13 +162,13 @@ def test_voltages_above_a_thousand_may_be_millivolts(level, said):
 
 @pytest.mark.parametrize('n, odd, stuck', [(100, 3, True), (100, 4, False), (5000, 5, True),
                                            (5000, 6, False)])
-def test_three_or_a_thousandth_of_the_samples_say_nothing(n, odd, stuck):
+def test_a_voltage_in_which_few_samples_differ_is_constant(n, odd, stuck):
     v = np.full(n, 5.0)
     v[1:1 + odd] = 5.1 + 0.01 * np.arange(odd)
     assert why_nothing(v).startswith('All but') == stuck
 
 
-def test_what_no_sensor_measures():
+def test_voltages_that_no_sensor_measures_are_refused():
     """Beyond 1e30 V, below 1e-30 V; a straight line to 16 roundings."""
     rng = np.random.default_rng(2)
     noise = rng.standard_normal(200)

@@ -81,7 +81,7 @@ def test_too_few_samples_are_not_tested():
     assert np.isnan([pole.second_p, pole.second_share, pole.coupling_p]).all()
 
 
-def test_where_none_is_found_nothing_is_said():
+def test_without_an_ac_coupling_there_is_no_note():
     assert second_items([]) == coupling_items([]) == [] and FAMILY_WISE == 0.01
 
 

@@ -28,7 +28,7 @@ def flown(seed, share):
 
 
 @pytest.mark.parametrize('seed', range(3))
-def test_what_is_drawn_is_as_what_was_clipped(seed):
+def test_drawn_readings_have_the_mean_of_the_clipped_ones(seed):
     """In the mean to four errors, given the parameters: neighbours in time share a part of it."""
     t, v, u, low = flown(seed, 0.08)
     clipped = v <= low

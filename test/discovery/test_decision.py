@@ -124,7 +124,7 @@ def test_every_kind_of_the_catalogue_is_tried_once():
     # One that imitates what is there already, whichever of the two says so.
     ({'model': [Cheap]}, 'imitator'), ({'model': [Imitator]}, 'cheap'),
     ({'throttle': False, 'first': True}, 'intensity')])
-def test_what_is_not_tried(changes, missing):
+def test_kinds_that_do_not_apply_are_not_tried(changes, missing):
     assert missing in tried(first=changes.get('first', False))
     assert missing not in tried(**changes)
 
@@ -142,7 +142,7 @@ def test_a_kind_that_recurs_is_tried_again():
     (Cheap, {'band 3': 3.0}, 4.5), (Cheap, {'band 3': -3.0}, 0.0), (Cheap, {'line': -3.0}, 4.5),
     (Cheap, {'band 3': 3.0, 'line': 4.0, 'time': 20.0}, 8.0), (Cheap, {'order line': 9.0}, 0.0),
     (Cheap, {}, 0.0)])
-def test_what_score_tests_say_that_a_kind_gains(kind, values, nats):
+def test_the_score_gain_of_a_kind_is_half_the_square_of_its_largest_sign(kind, values, nats):
     """Half the square of its largest sign, in its direction."""
     assert decision.scored(kind, values) == nats
 
@@ -150,7 +150,7 @@ def test_what_score_tests_say_that_a_kind_gains(kind, values, nats):
 @pytest.mark.parametrize('kind, largest, again, least', [
     (Mean, 0.0, False, 6.0), (Mean, 1e4, False, 6.0), (Mean, 1e4, True, 50.0),
     (Mean, 100.0, True, 6.0), (Trend, 1e4, False, 200.0), (Trend, 100.0, False, 6.0)])
-def test_one_more_answer_needs_a_share_of_the_largest(kind, largest, again, least):
+def test_a_further_response_needs_a_share_of_the_largest_evidence(kind, largest, again, least):
     """A form that is right to 7 % leaves (7 %)^2 = 0.5 % of what it explains."""
     assert decision.least_evidence(kind, largest, again) == pytest.approx(least)
 
@@ -165,7 +165,7 @@ def test_more_than_one_part_must_gain(gains, shared):
 
 @pytest.mark.parametrize('kind, cost, may', [
     (Cheap, 99.0, True), (Dear, 9.9, True), (Dear, 10.1, False)])
-def test_dear_kinds_are_tried_while_time_is_left_for_them(kind, cost, may):
+def test_slow_kinds_are_tried_only_while_time_is_left(kind, cost, may):
     assert decision.affordable(kind, cost) is may
 
 
@@ -193,7 +193,7 @@ def test_a_statistic_fails_beyond_its_band_and_share(before, after, fails):
     ({'band 1': 60.0}, {'band 1': 6.1}, [Ringing], [0]),
     # What comes and goes does not ring.
     ({'band 1': 60.0}, {'bursts within 1 s': 9.0}, [Ringing, White], [0])])
-def test_what_is_withdrawn(before, after, accepted, out):
+def test_unexplained_statistics_withdraw_their_causes(before, after, accepted, out):
     assert decision.withdrawn(before, after, accepted) == out
 
 
@@ -209,7 +209,7 @@ def test_an_ac_coupling_may_leave_three_quarters_of_the_slow_power_missing(left,
     (0.01, 0.02, 0.01, True), (-0.019, 0.02, 0.01, True), (-0.021, 0.02, 0.01, False),
     (0.05, 0.02, 0.06, False), (0.05, 0.02, 0.04, True), (float('nan'), float('nan'), 0.01, True),
     (float('nan'), float('nan'), 0.83, False), (0.0, 0.0, 1.0, False)])
-def test_what_earns_its_place(gain, error, chance, earns):
+def test_a_cause_stays_if_its_gain_and_its_p_value_allow(gain, error, chance, earns):
     """A gain below zero by more than its error does not, nor what does not show: p above 0.05."""
     assert decision.improves_predictions(gain, error, chance) is earns
 
@@ -225,7 +225,7 @@ def test_what_earns_its_place(gain, error, chance, earns):
     ({'band 1': 5.0}, {}, {'band 1': 4.7}, []), ({'band 1': 5.0}, {}, {'band 1': 4.9}, [1]),
     ({'band 1': 2.0}, {}, {'band 1': 0.0}, [])])
 @pytest.mark.parametrize('measured', [Mean, Intensity])
-def test_what_is_withdrawn_beside_a_measured_cause(measured, before, asked, after, out):
+def test_a_latent_cause_is_tested_by_its_own_signs_only(measured, before, asked, after, out):
     found = decision.withdrawn(before, after, [measured, Cheap, measured], {Cheap.NAME: asked})
     assert found == out
 
@@ -233,19 +233,19 @@ def test_what_is_withdrawn_beside_a_measured_cause(measured, before, asked, afte
 @pytest.mark.parametrize('one, other, plainer', [
     ('load_sag', 'load_transient', True), ('load_transient', 'load_sag', False),
     ('load_sag', 'load_sag', False), ('drift', 'load_transient', False)])
-def test_what_was_not_searched_is_named_first(one, other, plainer):
+def test_a_tie_goes_to_the_cause_with_less_search(one, other, plainer):
     """Within a family: of a sag and a lag that do as well, the sag."""
     assert decision.is_plainer(catalogue()[one], catalogue()[other]) is plainer
 
 
 @pytest.mark.parametrize('rate, duration, shown', [
     (1.0, 19.9, False), (1.0, 20.1, True), (10.0, 2.1, True), (0.1, 100.0, False)])
-def test_twenty_relaxations_make_a_rate(rate, duration, shown):
+def test_a_rate_needs_twenty_relaxation_times(rate, duration, shown):
     assert decision.relaxes(rate, duration) is shown
 
 
 @pytest.mark.parametrize('names, changes', [
     (['load_transient'], True), (['load_transient', 'load_transient', 'drift'], True),
     (['load_transient', 'load_sag'], False), (['drift'], False), ([], False)])
-def test_a_mean_that_answers_to_changes_only(names, changes):
+def test_a_mean_of_transients_alone_responds_only_to_changes(names, changes):
     assert decision.only_to_changes(catalogue()[name] for name in names) is changes

@@ -124,7 +124,7 @@ def test_two_at_once_are_both_named():
     assert sum(one.all_named for one in found) >= least(len(found), 0.80), summary(found)
 
 
-def test_what_is_not_in_the_catalogue_is_not_dressed_up():
+def test_effects_outside_the_catalogue_get_no_wrong_name():
     """
     Required: said to be unexplained, wholly or partly, with no wrong name, in 90 %; 3 of 5.
 
@@ -145,7 +145,7 @@ def searched() -> list[str]:
 
 @pytest.mark.parametrize('cause', chosen(searched(), 3, 3),
                          ids=lambda cause: f'{cause}, {SEED}')
-def test_a_cause_out_of_the_catalogue_is_found_no_more(cause, monkeypatch):
+def test_a_cause_removed_from_the_catalogue_is_not_named(cause, monkeypatch):
     """What names a cause is its entry: with it found, without it not, nor as a rival."""
     number = next((k for k in range(TRIES) if cause in outcome_of('single', cause, k).named), None)
     assert number is not None, f'{cause} was not named with its entry either'

@@ -38,7 +38,7 @@ def finding(**changes):
     return Finding(**{**simulated, **changes})
 
 
-def test_json_is_that_of_the_contract():
+def test_json_has_the_documented_keys():
     """Every key of section 5, its values, and strict JSON."""
     data = finding().as_data()
     assert json.loads(json.dumps(data, allow_nan=False)) == data
@@ -106,7 +106,7 @@ def test_explained_needs_statistics_errors_falls_and_parameters():
         (replace(steep, log_factor=(0.0, 3.9)),), good, 60.0, 0.001)
 
 
-def test_parameters_beyond_the_reach_of_the_recording_are_not_told():
+def test_parameters_that_the_recording_cannot_determine_are_not_shown():
     """In 17 s no time of 1700 s and no rate of 0.01 1/s is seen, nor an end never met."""
     samples = Samples(np.linspace(0.0, 17.0, 50), np.linspace(14.0, 16.0, 50), None)
     late = LoadTransient(0.2, 1700.0, 0.02)

@@ -36,7 +36,7 @@ def score(a, b):
     return math.sqrt(a.size) * float(a @ b) / math.sqrt(float(a @ a) * float(b @ b))
 
 
-def test_line_that_throttle_moves_by_many_of_its_widths_in_a_quarter_of_a_second():
+def test_a_line_that_sweeps_40_bins_in_a_segment_is_found():
     """600 Hz/s: within 0.25 s the line crosses 40 bins of 4 Hz."""
     rng, n, rate = np.random.default_rng(1), 20000, 1000.0
     at = np.arange(n) / rate
@@ -52,7 +52,7 @@ def test_line_that_throttle_moves_by_many_of_its_widths_in_a_quarter_of_a_second
     assert math.copysign(idle, idle * slope) == pytest.approx(30.0, abs=0.5)
 
 
-def test_rail_that_relaxes_to_where_throttle_puts_it():
+def test_a_lagged_sag_under_jittering_throttle_is_found():
     """Throttle trembles: a sag at once explains nothing, and neither does a lag without it."""
     rng, n, rate = np.random.default_rng(2), 60000, 2000.0
     throttle = 0.5 + rail(rng, n, 2.0, rate, 0.2)
@@ -66,7 +66,7 @@ def test_rail_that_relaxes_to_where_throttle_puts_it():
     assert transient.tau == pytest.approx(1.0 / 30.0, rel=0.3)
 
 
-def test_a_sag_that_shrinks_as_the_pack_warms():
+def test_a_shrinking_sag_is_measured_and_simulated():
     """Within the errors given, and simulated by the model that is saved."""
     rng, n, rate = np.random.default_rng(5), 12000, 200.0
     throttle = 0.5 + rail(rng, n, 2.0, rate, 0.15)
@@ -81,7 +81,7 @@ def test_a_sag_that_shrinks_as_the_pack_warms():
     assert 'growth = -0.010' in cause.explanation and finding.model.terms[1] == cause.term
 
 
-def test_levels_that_hide_how_fast_the_rail_relaxes():
+def test_switching_between_large_levels_is_found():
     """With levels of 6 deviations the plain OU seems to relax at the rate of the switching."""
     rng, n, rate, alpha, std = np.random.default_rng(3), 40000, 2000.0, 180.0, 0.046
     turns = np.cumsum(rng.random(n) < 1.5 / rate)
@@ -99,7 +99,7 @@ def test_levels_that_hide_how_fast_the_rail_relaxes():
 
 @pytest.mark.parametrize('law, alpha', [
     (ClockJitter(4e-4), 600.0), (NonlinearRestoring(0.0, 6e4), 150.0)])
-def test_laws_where_a_step_is_long(law, alpha):
+def test_laws_are_fitted_where_steps_are_long(law, alpha):
     """The pull back changes within a step, or with its length: so do mean and spread."""
     n, rate = 60000, 1000.0
     terms = OU(alpha, 0.8, 5.0), law
@@ -115,7 +115,7 @@ def test_laws_where_a_step_is_long(law, alpha):
     assert abs(score(simulated.z[1:], state[1:]**3)) < FAR
 
 
-def test_a_sag_behind_a_coupling():
+def test_a_sag_behind_an_ac_coupling_is_named():
     """The mean answers to changes only: transients say so too, but not what the noise says."""
     rng, n, rate = np.random.default_rng(7), 12000, 200.0
     t = np.arange(n) / rate

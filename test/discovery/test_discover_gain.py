@@ -33,7 +33,7 @@ def simulated(seed, n=4000, sag=0.0):
 
 
 @pytest.mark.parametrize('keep', [0.0, 0.97])
-def test_the_error_of_a_mean_knows_correlation(keep):
+def test_the_error_of_a_mean_includes_correlation(keep):
     """
     Over 300 series the stated error is the true scatter within a quarter.
 
@@ -102,7 +102,7 @@ def test_a_cause_that_is_not_there_gains_nothing():
     assert min(chances) > 1e-4 and np.median(chances) > 0.1
 
 
-def test_a_block_whose_rest_gives_no_model_is_not_known(monkeypatch):
+def test_a_block_whose_rest_gives_no_model_is_not_scored(monkeypatch):
     """The step to the other blocks may end at a covariance that is singular."""
     samples = simulated(3)
     model = fit_composite(samples, [OU(50.0, 0.3, 5.0)], slice(0, samples.n))
@@ -139,7 +139,7 @@ def test_errors_of_the_mean_are_its_scatter():
     assert np.mean(stated, axis=0) == pytest.approx(scatter, rel=0.34)
 
 
-def test_crossing_rates_of_the_true_model_and_of_a_wrong_one():
+def test_crossing_rates_tell_a_wrong_sigma_from_the_true_one():
     """The truth within 4 joint errors of its own expectation; half of sigma far below."""
     true = SupplyModel((OU(ALPHA, SIGMA, 5.0), Quantization(0.005)))
     t = np.arange(30_000) / 1000.0
@@ -162,7 +162,7 @@ def test_a_model_that_cannot_be_simulated_has_no_rate():
 @pytest.mark.parametrize('gain, error, known', [
     (0.00072, 0.797, False), (-1e-4, 50.0, False), (0.00072, 0.05, True), (4.0, 4.0, True),
     (0.1, 0.02, True)])
-def test_an_error_that_leaves_nothing_known_is_no_gain(gain, error, known):
+def test_a_gain_with_a_huge_error_is_unknown(gain, error, known):
     """Ten times as large as the gain, and large beside any; small ones are just none."""
     found = if_known(gain, error)
     assert found == (gain, error) if known else all(map(math.isnan, found))
@@ -205,7 +205,7 @@ def test_a_gain_needs_as_many_samples_as_blocks():
             assert (why_unknown(a, b, masks[2], False) == '') == known
 
 
-def test_a_mean_and_the_error_of_its_blocks():
+def test_the_error_of_a_mean_comes_from_24_blocks():
     """24 blocks; a lag adds half of itself where it is positive; what is over is left out."""
     rng = np.random.default_rng(2)
     for keep in (0.9, -0.9):
@@ -260,7 +260,7 @@ def test_rates_of_crossings_have_errors_of_counts():
     assert math.isnan(none.level)
 
 
-def test_a_guess_is_that_of_an_autoregression():
+def test_the_first_guess_is_an_autoregression():
     t = np.arange(20_000) * 1e-3
     v = simulate(t, 63.0, 0.3, np.random.default_rng(5), u0=5.0)
     c = v - v.mean()

@@ -75,7 +75,7 @@ QUIET = {
 
 
 @pytest.mark.parametrize('what', sorted(QUIET))
-def test_what_is_wrong_is_reported_and_nothing_invented(what):
+def test_defects_are_notes_and_name_no_cause(what):
     """
     A plain rail stays one; what was dropped is a note; numbers are finite or null.
 
@@ -134,7 +134,7 @@ def test_too_little_is_insufficient_and_says_why(what):
 
 
 @pytest.mark.parametrize('n', [N, 8000])
-def test_one_sample_that_differs_is_no_rail(n):
+def test_a_constant_but_for_one_sample_is_not_a_plain_ou(n):
     """Constant but for one sample: a verdict, never that the plain OU is right."""
     t, v, u = simulated(n)
     found = discover(Recording(t, np.where(np.arange(n) == n // 2, 5.1, 5.0), u, 'one'))
@@ -159,7 +159,7 @@ def test_a_hundred_samples_are_enough_to_try(n):
 
 
 @pytest.mark.parametrize('what', ['two', '99', 'constant', 'gaps', 'no throttle', 'nothing'])
-def test_a_user_gets_a_line_and_no_traceback(what, tmp_path, capsys):
+def test_a_bad_csv_gives_one_line_and_no_traceback(what, tmp_path, capsys):
     """From a CSV: status 0 or 2, JSON to the last number; never an exception."""
     t, v, u = short(what) if what in SHORT else changed(what)
     path, target = tmp_path / 'x.csv', tmp_path / 'x.json'
@@ -178,7 +178,7 @@ def test_a_user_gets_a_line_and_no_traceback(what, tmp_path, capsys):
     assert ' '.join(data['sentence'].split()) in ' '.join(text.out.split())
 
 
-def test_ten_hertz_for_ten_minutes():
+def test_a_slow_rail_at_10_hz_keeps_its_sag():
     """A slow rail with a sag, at the rate of telemetry."""
     t, v, u = simulated(6000, 10.0, (LoadSag(0.3, 0.0),), OU(1.0, 0.1, 5.0))
     found = discover(Recording(t, v, u, 'slow'))

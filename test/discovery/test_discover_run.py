@@ -125,7 +125,7 @@ def test_a_path_is_read(tmp_path):
         discover(tmp_path / 'nowhere.csv')
 
 
-def test_the_page_shows_it_all(sag):
+def test_the_page_shows_verdict_causes_plots_and_command(sag):
     """Well formed, escaped, finite; verdict, cause, pictures before and after, command."""
     html = page_of(discovery_document(sag, command='ou-monitor discover x.csv'))
     root = self_contained(html)
@@ -195,7 +195,7 @@ def test_the_page_of_a_plain_rail_keeps_the_plain_model():
 
 
 @pytest.mark.parametrize('code, count', [(0.011, 60), (0.0007, 400), (0.05, 7)])
-def test_bins_hold_as_many_codes_each(code, count):
+def test_all_bins_hold_equally_many_codes(code, count):
     """Else the distribution of a coarse ADC would show a comb that is not in the data."""
     from ou_monitor.criticism.curves import _bins
     codes = 4.9 + code * np.arange(count)
@@ -209,7 +209,7 @@ def test_bins_hold_as_many_codes_each(code, count):
 
 
 @pytest.mark.parametrize('limit', [0.149, 0.61])
-def test_stopped_by_hand_it_says_what_it_found(limit):
+def test_ctrl_c_returns_the_causes_found_so_far(limit):
     """Ctrl-C in the search, and while gains are measured: the sag is there all the same."""
     shares = []
 

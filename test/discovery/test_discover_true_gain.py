@@ -136,7 +136,7 @@ def test_the_loss_by_parameters_is_that_of_theory():
 
 @pytest.mark.parametrize('seed', [0, 1])
 @pytest.mark.parametrize('name', sorted(set(KINDS) - {'parabola', 'curved drift'}))
-def test_what_discover_says_is_the_gain_of_the_true_model(name, seed):
+def test_the_gain_reported_is_the_true_models(name, seed):
     """
     Twelve recordings of 30 s: gain, scores and mask as they say.
 
@@ -188,7 +188,7 @@ def test_samples_soon_after_a_punch_of_one_block_are_not_scored():
     assert scored[(t < 31.0) | (t >= 33.0)].all()
 
 
-def test_what_one_block_alone_determines_has_no_gain():
+def test_a_cause_that_only_one_block_shows_has_no_gain():
     """The sag is seen in the last block only: it cannot be scored there, and why is said."""
     samples = late_start()
     found = discover(Recording(samples.t, samples.voltage, samples.throttle, 'late'))

@@ -25,7 +25,7 @@ def left_over(name):
     (0.0197, 0.01, 'Gain on', ''), (0.0195, 0.01, 'No measurable', 'not distinguishable'),
     (-0.0195, 0.01, 'No measurable', 'not distinguishable'), (-0.0197, 0.01, 'Worse on', 'worse'),
     (NAN, 0.01, 'cannot be measured on this recording.', ''), (0.1, NAN, 'No measurable', '')])
-def test_a_gain_is_one_beyond_its_error(gain, error, words, remark):
+def test_a_gain_counts_beyond_1_96_standard_errors(gain, error, words, remark):
     """1.96 standard errors; in mnat."""
     assert words in gain_words(gain, error)
     found = gain_remark(gain, error)
@@ -51,7 +51,7 @@ def test_digits_follow_the_error(value, error, text):
 
 @pytest.mark.parametrize('error, text', [
     (1.17, '1.0 +- 1.2'), (1.18, 'not determined'), (1e300, 'not determined')])
-def test_what_is_positive_is_known_to_a_factor_of_10(error, text):
+def test_a_positive_parameter_is_shown_if_known_to_a_factor_of_10(error, text):
     """A coefficient of either sign is shown with any error: it is known to be that small."""
     assert with_error(1.0, error, positive=True) == text
     assert with_error([1.0], [error], positive=True) == f'[{text}]'
@@ -60,7 +60,7 @@ def test_what_is_positive_is_known_to_a_factor_of_10(error, text):
 
 @pytest.mark.parametrize('chance, text', [
     (0.9e-3, '< 0.001'), (1.1e-3, '0.0011'), (0.25, '0.25')])
-def test_chances_as_text(chance, text):
+def test_p_values_are_written_with_one_rule(chance, text):
     assert cause_rows([replace(SAG, p_value=chance)])[0].chance == text
 
 
@@ -72,7 +72,7 @@ def test_causes_share_a_row_where_gain_and_chance_are_the_same():
     assert len(cause_rows([SAG, replace(other, p_value=0.5)])) == 2
 
 
-def test_what_is_left_names_four_things():
+def test_at_most_four_remaining_discrepancies_are_named():
     """And says how many more; each thing once."""
     def left(*names):
         return remaining_words([left_over(name) for name in names])

@@ -33,7 +33,7 @@ def test_ties_by_chance_of_the_codes_are_no_holds():
     (1.0, 0.0, False), (1.0, 0.02, True),
     # In its own codes of 10 mV.
     (0.0, 0.0, False), (0.0, 0.3, True), (0.0, 0.5, True), (0.0, 0.7, True)])
-def test_values_that_were_held(dither, share, found):
+def test_held_values_are_told_from_chance(dither, share, found):
     """Of an ADC without steps 80 of 4000 values that are held are no chance."""
     t, voltage, throttle = flown()
     rng = np.random.default_rng(4)
@@ -45,7 +45,7 @@ def test_values_that_were_held(dither, share, found):
 
 
 @pytest.mark.parametrize('effect', sorted(EFFECTS))
-def test_what_shows_without_a_model(effect):
+def test_holds_steps_and_clipping_are_named_without_a_model(effect):
     """Holds, steps and a rail are named; what is added to the supply is none of them."""
     t, voltage, throttle = flown()
     flight = Recording(t, voltage, throttle)
@@ -81,7 +81,7 @@ def piece(name):
 
 @pytest.mark.parametrize('name, effect', [
     ('gecko', 'jumps'), ('cf_solo', 'tone'), ('cf_solo', 'jumps')])
-def test_what_is_hidden_in_a_flight_is_named_beside_its_sag(name, effect):
+def test_an_effect_hidden_in_a_flight_is_named_beside_its_sag(name, effect):
     """At strength 2, the middle of the table in doc/discovery.md; the flight alone has none."""
     if not FLIGHTS[name][0].exists():
         pytest.skip('recorded runs are elsewhere')

@@ -55,7 +55,7 @@ def test_ringing_that_stands_out_on_both_sides_is_never_withdrawn():
     assert left(18.0, 6.0) == left(12.0, 6.0) == left(2.0, 6.0) == [0]
 
 
-def test_other_causes_have_no_such_right():
+def test_other_strong_causes_may_be_withdrawn():
     """Only lines stay for their size: withdrawn is withdrawn."""
     samples = Samples(T, voltage(Tone(0.2, 13.0, 0.5, 0.0)), None)
     whole = fit_composite(samples, [RAIL, Tone(0.0, 13.0, 0.0, 0.0)], slice(0, samples.n))
@@ -77,7 +77,7 @@ def test_ringing_that_dies_out_before_it_turns_is_something_else(damping, other)
     (0.25, (LoadSag(0.8, 0.6), LoadTransient(0.3, 1.0, 0.0))),
     (1.1, (LoadSag(1.0, 0.0), LoadTransient(0.5, 0.3, 0.0)))])
 @pytest.mark.parametrize('line', [False, True])
-def test_the_flown_path_is_no_line_of_the_supply(frequency, terms, line):
+def test_periodic_flying_is_not_a_line(frequency, terms, line):
     """Circles flown at some tenths of a hertz move throttle, and that the rail."""
     rng = np.random.default_rng(1)
     hold = np.repeat(rng.standard_normal(T.size // 5), 5)

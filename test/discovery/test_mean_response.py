@@ -31,7 +31,7 @@ def response(tau, delay=0.0):
     (response(0.1), response(0.1, 0.05), False, False),
     (response(0.1), LoadSag(0.1, 0.0), False, False),
     (Drift(0.1, 0.0), Drift(-0.2, 0.0), False, True)])
-def test_alike_and_next_to_each_other(one, other, near, there):
+def test_time_constants_are_compared_by_their_ratio(one, other, near, there):
     """By the ratio of time constants, whichever is longer, at one delay."""
     assert _nearby(one, other) is near
     assert _there(one, [other]) is there
@@ -84,7 +84,7 @@ def driven():
     return pool, columns, voltage
 
 
-def test_evidence_is_the_less_of_price_and_blocks_kept_back(driven, monkeypatch):
+def test_evidence_is_the_smaller_of_bic_and_held_out_gain(driven, monkeypatch):
     """By least squares on the rows themselves; what was searched for is taken off."""
     pool, columns, voltage = driven
     found, through = made(pool, columns, voltage, monkeypatch)
@@ -104,7 +104,7 @@ def test_evidence_is_the_less_of_price_and_blocks_kept_back(driven, monkeypatch)
 
 
 @pytest.mark.parametrize('start', [(), (4,), (0, 3), (0, 1, 3, 4)])
-def test_the_search_ends_at_what_made_the_voltage(driven, start, monkeypatch):
+def test_the_search_finds_the_true_terms_from_any_start(driven, start, monkeypatch):
     """From any start: sag and one lag, the one that is worth more first, none of them free."""
     pool, columns, voltage = driven
     found, _ = made(pool, columns, voltage, monkeypatch)
@@ -133,7 +133,7 @@ def test_another_cause_that_does_as_well_is_a_rival(driven, monkeypatch):
     assert found._rivals((0,), 0) == ()
 
 
-def test_a_sag_that_stays_is_not_said_to_grow():
+def test_a_steady_sag_gets_no_growth():
     """BIC of n = 2000 and 6 nats take a parameter without effect once in 10^5 recordings."""
     n, rate = 2000, 100.0
     model, grown = (OU(6.0, 0.2, 16.0), LoadSag(1.4, 0.5)), 0
@@ -151,7 +151,7 @@ def test_a_sag_that_stays_is_not_said_to_grow():
 
 
 @pytest.mark.parametrize('size, named', [(8.0, LoadSag), (20.0, LoadTransient)])
-def test_a_sag_stands_for_a_lag_that_does_no_better(driven, size, named, monkeypatch):
+def test_a_sag_replaces_a_lag_that_ties(driven, size, named, monkeypatch):
     """What a lag makes is named a sag while noise hides which, and a lag where it shows."""
     pool, columns, _ = driven
     columns = [columns[0], columns[0] + 0.1 * columns[1]]

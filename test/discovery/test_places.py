@@ -44,7 +44,7 @@ def scores_of(log, u):
     lambda u: 12.0 * np.abs(np.diff(u, prepend=u[0])),
     lambda u: 1.5 * lfilter([1.0], [1.0, -np.exp(-1.0 / (0.5 * RATE))],
                             np.maximum(np.diff(u, prepend=u[0]), 0.0))])
-def test_the_law_of_white_noise_is_free(form):
+def test_white_noise_may_follow_throttle_its_changes_and_its_rises(form):
     """Over throttle, its changes and its rises: the curves have nine tenths of the gain."""
     u = flown(1)
     view = scores_of(form(u), u)
@@ -106,7 +106,7 @@ def test_heavy_tails_are_no_curves():
 
 
 @pytest.mark.parametrize('n', [30, 60, 400])
-def test_a_few_samples_have_a_law_of_few_knots_or_none(n):
+def test_few_samples_give_few_knots_or_none(n):
     """Of 399 samples of a robot each bin had less than twenty, and the search broke off."""
     u = flown(1)[:n]
     whole = scores_of(np.zeros(N), flown(1))
@@ -127,7 +127,7 @@ def test_white_noise_that_grows_as_the_square_of_throttle_is_white_noise():
     assert not {'load_dependent_alpha', 'second_relaxation'} & set(named(found))
 
 
-def test_an_inrush_answers_to_rises_alone():
+def test_an_inrush_responds_to_rises_only():
     """A dip as throttle rises and none upwards as it falls is one transient, with its rise."""
     u = flown(6)
     rng = np.random.default_rng(6)
@@ -138,7 +138,7 @@ def test_an_inrush_answers_to_rises_alone():
     assert term.rise < -0.5 and abs(term.gain) < 0.25 * abs(term.rise)
 
 
-def test_a_model_of_before_the_rise_is_read():
+def test_a_model_file_without_a_rise_is_read():
     """A file without it has none."""
     old = {'gain': 0.1, 'tau': 0.02, 'delay': 0.0}
     assert LoadTransient.read(old).rise == 0.0

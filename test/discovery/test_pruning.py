@@ -38,7 +38,7 @@ def state_of(*names, sizes=()):
     # One of several alone, or all of them together.
     (['tone', 'drift', 'tone'], 0, ['drift', 'tone'], 1, ['drift', 'tone'], ['tone']),
     (['tone', 'drift', 'tone', 'tone', 'tone'], 0, ['drift'], 4, ['drift'], ['tone'])])
-def test_what_goes_with_a_cause(names, worst, less, size, left, out):
+def test_a_removed_cause_leaves_names_and_model_consistent(names, worst, less, size, left, out):
     """Names and model go on without it."""
     state = state_of(*names)
     rest = scored_model(*less)
@@ -47,7 +47,7 @@ def test_what_goes_with_a_cause(names, worst, less, size, left, out):
     assert state.names == left and sorted(state.out) == out and state.full is rest
 
 
-def test_many_of_a_kind_are_one_group():
+def test_four_or_more_of_a_kind_share_one_gain():
     """Up to three lines have a gain each, from four on one together."""
     few, many = ['tone'] * (MANY - 1) + ['drift'], ['tone', 'drift'] + ['tone'] * (MANY - 1)
     model = scored_model(*few).model
@@ -97,7 +97,7 @@ def test_after_four_rounds_what_is_left_stays(monkeypatch):
     (0.0, (0.0, 0.0), (0.1, 0.2), None), (1.0, (0.0, 1.0), (0.2, 0.1), 0),
     (1.0, (1.0, 0.0), (0.1, 0.2), 1), (1.0, (0.0, 0.0), (0.2, 0.1), 1),
     (1.0, (2.0, 0.5), (0.1, 0.2), None)])
-def test_the_cause_by_which_simulations_stray(full, less, gains, out, monkeypatch):
+def test_the_cheapest_cause_of_strays_is_found(full, less, gains, out, monkeypatch):
     """Of those without which they stay within what was seen, the one that costs least."""
     state = state_of('tone', 'measurement_noise')
     state.worth = [Worth(gain, 0.01, 0.0, 1, worth.less)
@@ -120,7 +120,7 @@ def test_a_model_that_cannot_be_simulated_strays_without_bound(monkeypatch):
     assert pruning._straying(None, state_of('drift')) is None
 
 
-def test_how_far_simulations_leave_what_was_seen():
+def test_the_excess_of_simulations_is_measured_beyond_the_margin():
     """Nothing where the model is that of the samples; its level by 2 V, less the margin."""
     rng = np.random.default_rng(3)
     t = 1e-3 * np.arange(3000)
@@ -138,7 +138,7 @@ def test_how_far_simulations_leave_what_was_seen():
     (0.1, 0.0, ''), (-0.1, 0.0, 'worse than the plain OU'), (float('nan'), 0.0, ''),
     (0.1, 0.25, 'by 0.25 V'), (0.1, float('inf'), 'without bound'),
     (0.1, None, 'cannot be simulated (runs away)')])
-def test_why_a_model_has_not_earned_its_place(gain, far, said, monkeypatch):
+def test_a_model_is_refused_for_its_gain_or_its_simulations(gain, far, said, monkeypatch):
     """Its gain first, then its simulations."""
     def given(samples, terms):
         if far is None:

@@ -93,7 +93,7 @@ def test_the_move_that_pays_most_comes_first():
     assert search.accepted == ['measurement_noise'] and search.composite.worth == 19.0
 
 
-def test_what_changes_a_term_goes_with_it():
+def test_a_term_that_modifies_a_removed_one_is_removed_too():
     """Noise that follows throttle is nothing without white noise."""
     law = LoadDependentNoise((0.0, 0.0), (0.0, 1.0), (0.0, 0.5))
     search = Search(Model([BASE, NOISE, law], 20.0), [NOISE.NAME, law.NAME])
@@ -103,7 +103,7 @@ def test_what_changes_a_term_goes_with_it():
     assert search.accepted == [] and search.composite.terms == (BASE,)
 
 
-def test_answers_of_the_mean_are_left_to_the_regression():
+def test_responses_of_the_mean_are_left_to_the_regression():
     """Nothing is fitted for them."""
     search = Search(Model([BASE, LoadSag(0.1, 0.0)], 20.0), ['load_sag'])
     fitter = Table({})
@@ -116,7 +116,7 @@ def trial(name, evidence, *terms):
     return Trial(name, Model([BASE, *terms], 10.0 + evidence), evidence)
 
 
-def test_the_best_glances_are_fitted_in_full():
+def test_the_best_first_estimates_are_fitted_in_full():
     """Those that gain at least half as much as the best; what a full fit makes worse stays."""
     kinds = {MeasurementNoise: NOISE, LoadDependentSigma: SIGMA, Drift: Drift(0.1, 0.0)}
     fitter = Table({('measurement_noise',): 26.0, ('load_dependent_sigma',): 14.0})
@@ -164,7 +164,7 @@ def test_starts_come_by_what_they_explain_or_by_their_likelihood(monkeypatch):
     assert [term.alpha for term in asked] == [4.0, 5.0]
 
 
-def test_what_scores_explain():
+def test_starts_are_ordered_by_the_scores_they_explain():
     """Starts in the order of the part of the scores that their columns explain."""
     rng = np.random.default_rng(1)
     n = 2000
@@ -198,7 +198,7 @@ def test_a_law_is_fitted_once_to_the_same_scores(monkeypatch):
     assert fitter.look(LopsidedNoise, one) is not found and made == [one, other, one]
 
 
-def test_positions_of_causes_that_recur():
+def test_the_nth_cause_of_a_kind_is_its_nth_term():
     """The n-th of a kind is the n-th of the model."""
     tones = [Tone(0.01, 10.0 * k, 0.0, 0.0) for k in (1, 2)]
     model = Model([BASE, tones[0], NOISE, tones[1]], 0.0)
@@ -208,7 +208,7 @@ def test_positions_of_causes_that_recur():
 
 @pytest.mark.parametrize('name, price', [
     ('load_dependent_noise', 10.0), ('drift', 6.0), ('load_dependent_sigma', 6.0)])
-def test_a_curve_that_may_only_mend_another_one(name, price):
+def test_a_second_curve_must_add_a_tenth_of_the_first(name, price):
     """It must bring a tenth of what the other one explains."""
     # A rough fit of the table is a nat worse.
     fitter = Table({('measurement_noise',): 401.0})
@@ -216,7 +216,7 @@ def test_a_curve_that_may_only_mend_another_one(name, price):
     assert rules._price(fitter, Model([BASE], 0.0), 'load_dependent_noise') == decision.ACCEPT
 
 
-def test_a_trial_that_is_accepted():
+def test_an_accepted_trial_is_recorded_with_its_rivals():
     """With what comes beside it, its rivals, and the largest evidence so far."""
     search = Search(Model([BASE], 0.0), ['tone'])
     best = Trial('ac_coupling', Model([BASE], 9.0), 9.0, beside='measurement_noise')

@@ -53,13 +53,13 @@ def test_a_sag_stays():
     assert grown.dip == pytest.approx(1.6, rel=1e-3) and grown.recovered == 0.0
 
 
-def test_without_an_answer_to_throttle_nothing_is_said():
+def test_without_a_response_to_throttle_there_is_no_effect():
     """Neither of a model without one, nor of a recording without throttle."""
     assert throttle_effects(flown(), (OU(1.0, 0.01, 15.0),), 14.5).words == ''
     assert throttle_effects(Samples(T, T, None), INRUSH, 14.5).words == ''
 
 
-def test_what_leaves_the_range_is_refused():
+def test_a_model_that_leaves_the_range_is_refused():
     """Bad samples of 100 V were never seen; the same model without them passes."""
     samples, ou = flown(*INRUSH), OU(1.0, 0.01, 15.0)
     assert refusal(samples, (ou, *INRUSH), 0.1, 0.01) == ''

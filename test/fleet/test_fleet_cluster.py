@@ -51,7 +51,7 @@ def scheduler(certificate) -> Iterator[str]:
         yield cluster.scheduler_address
 
 
-def test_work_over_tls(scheduler, certificate):
+def test_work_is_done_over_tls(scheduler, certificate):
     """With the certificates of Dask's configuration the tasks are done, and a failure is a row."""
     assert scheduler.startswith('tls://')
     with config.set({f'distributed.comm.tls.{name}': value

@@ -49,7 +49,7 @@ def test_the_curve_knows_its_error():
     assert np.mean(slopes) == pytest.approx(2.0, abs=4.0 * np.std(slopes) / math.sqrt(runs) + 0.05)
 
 
-def test_recordings_without_throttle_or_estimate():
+def test_without_throttle_recordings_are_compared_unchanged():
     """Without throttle they are compared unchanged, without an estimate not at all."""
     rng = np.random.default_rng(2)
     rows = table(rng, 1, 6, levels=((None, 20.0),))

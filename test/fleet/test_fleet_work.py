@@ -309,7 +309,7 @@ def test_flights_are_in_order_of_date_or_else_of_name():
     ('uav3_2024-05-03_2.csv', {}, 0.0, '2024-05-03T00:00:00', 'name'),
     ('flight_20241399.csv', {}, 0.0, None, ''), ('120240503.csv', {}, 0.0, None, ''),
     ('flight_12.csv', {}, 0.0, None, '')])
-def test_the_date_of_a_flight(name, source, t, date, origin):
+def test_the_date_comes_from_stamps_header_or_name(name, source, t, date, origin):
     """From the stamps, else the header of the log, else the name of the file."""
     at = np.array([t, t + 1.0])
     start, found = start_of(Recording(at, at, None, name, source))

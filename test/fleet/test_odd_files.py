@@ -111,7 +111,7 @@ def test_an_invalid_pattern_is_refused(text):
     assert '\n' not in str(caught.value)
 
 
-def test_the_vehicle_that_a_pattern_finds():
+def test_a_pattern_finds_the_vehicle():
     """The group `vehicle`, else the first one; bytes that are not text are escaped."""
     path = Path('/f/uav7_\x1b\udcff.csv')
     for text, name in ((r'/(uav\d+)_(.)', 'uav7'), (r'uav\d', 'uav7'), ('none', ''),

@@ -89,7 +89,7 @@ def test_seeds_reproduce_and_draws_differ(kind, cause):
     assert kind == 'none' or len({h.name for h in (first, *others)}) > 1
 
 
-def test_what_is_drawn_fills_its_ranges():
+def test_draws_fill_their_ranges():
     """Rails span the decade and more that real ones do, and flights always move."""
     many = [simulated('none', seed=s, duration=20.0, rate=100.0) for s in range(60)]
     for key, low, high in (('alpha', 20, 120), ('level_v', 3.3, 25)):
@@ -108,7 +108,7 @@ def test_what_is_drawn_fills_its_ranges():
         'hover', 'mission', 'aggressive', 'chirp', 'constant'}
 
 
-def test_none_is_a_clean_relaxation():
+def test_a_plain_rail_is_a_clean_ou():
     """A plain rail has alpha = 1/(RC), its sigma, and residuals white, normal and unmoved."""
     for seed in range(3):
         h = simulated('none', seed=seed)
@@ -136,7 +136,7 @@ FINER = ('throttle_tone', 'nonlinear_restoring/cubic', 'load_dependent_alpha')
 
 @pytest.mark.parametrize('kind, cause', [
     (k, c) for k, c in ALL if k in ('variant', 'unknown') and not c.startswith(FINER)])
-def test_other_shapes_and_unknowns_show(kind, cause):
+def test_other_shapes_and_unknowns_leave_a_sign(kind, cause):
     """Each leaves a sign beyond what a plain rail ever shows, in some simple average."""
     z = signs(simulated(kind, cause, seed=1))
     assert any(abs(value) > WEAKEST.get(name, QUIET) for name, value in z.items()), z
@@ -203,12 +203,12 @@ def test_grids_share_their_components():
     ('pair', {'cause': ('load_sag', 'load_transient')}, 'compatible'),
     ('pair', {'cause': 'tone'}, 'compatible'), ('single', {'rate': 0.0}, 'positive'),
     ('single', {'strength': -1.0}, 'positive'), ('single', {'duration': 0.01}, 'at least 100')])
-def test_what_cannot_be_drawn_is_refused(kind, options, words):
+def test_effects_that_cannot_be_drawn_are_refused(kind, options, words):
     with pytest.raises(ValueError, match=words):
         simulated(kind, **options)
 
 
-def test_a_cause_stands_for_its_shapes():
+def test_a_cause_selects_its_shapes():
     """Asking a variant or unknown by cause, shape or full name gives one of those."""
     assert simulated('variant', 'drift', duration=2.0).truth == ('drift',)
     assert simulated('variant', 'lc_rail', duration=2.0).name == 'resonance/lc_rail'

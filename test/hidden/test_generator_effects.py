@@ -13,7 +13,7 @@ import pytest
 from scipy.stats import kstest, t as student
 
 
-def test_resonance():
+def test_resonance_is_as_claimed():
     """The peak stands over the plain rail as claimed, and L, C, R give its place and width."""
     ratios = []
     for h, claimed, _ in each('resonance'):
@@ -38,7 +38,7 @@ def test_a_rail_of_two_poles_rings_where_it_should():
             1 / (2 * np.pi * np.sqrt(claimed['rail_henry'] * claimed['rail_farad'])))
 
 
-def test_tone():
+def test_tone_is_as_claimed():
     for h, claimed, rail in each('tone', 5):
         waves = [w(2 * np.pi * claimed['pwm_hz'] * h.t) for w in (np.sin, np.cos)]
         found, error = regress(h, *waves)
@@ -48,7 +48,7 @@ def test_tone():
 
 
 @pytest.mark.parametrize('shape', ['', '/lagging', '/square_root', '/harmonic'])
-def test_throttle_tone(shape):
+def test_throttle_tone_is_as_claimed(shape):
     """Turned back by the claimed speed, the line stands at zero with the claimed power."""
     ratios = []
     for h, claimed, rail in each('throttle_tone' + shape, 6):
@@ -69,7 +69,7 @@ def test_throttle_tone(shape):
 
 
 @pytest.mark.parametrize('cause', ['measurement_noise', 'measurement_noise/uniform'])
-def test_measurement_noise(cause):
+def test_measurement_noise_is_as_claimed(cause):
     """Whitening a white noise leaves -phi r^2 at lag 1 and adds (1 + phi^2) r^2."""
     for h, claimed, rail in each(cause, 4):
         e, phi = whitened(h), np.exp(-rail['alpha'] / 1000)
@@ -81,7 +81,7 @@ def test_measurement_noise(cause):
 
 @pytest.mark.parametrize('cause', [
     'quantization', 'quantization/mid_rise', 'quantization/dithered'])
-def test_quantization(cause):
+def test_quantization_is_as_claimed(cause):
     """All values are on a lattice of the claimed step, many neighbours on one code."""
     for h, claimed, rail in each(cause, 3):
         codes = (h.voltage - h.voltage[0]) / claimed['step_v']
@@ -91,7 +91,7 @@ def test_quantization(cause):
         assert 0.45 < claimed['step_v'] / rail['innovation_v'] < 2.7
 
 
-def test_held_samples():
+def test_held_samples_are_as_claimed():
     """Runs of equal values have the claimed mean length, whole numbers beside it."""
     fractional = 0
     for h, claimed, _ in each('held_samples', 8):
@@ -104,14 +104,14 @@ def test_held_samples():
 
 
 @pytest.mark.parametrize('cause, sides', [('saturation', 1), ('saturation/two_sided', 2)])
-def test_saturation(cause, sides):
+def test_saturation_is_as_claimed(cause, sides):
     for h, claimed, _ in each(cause, 4):
         on = [np.mean(h.voltage == limit) for limit in (h.voltage.min(), h.voltage.max())]
         assert sum(share > 1e-3 for share in on) == sides
         assert sum(on) == pytest.approx(sides * claimed['share'], abs=3e-4)
 
 
-def test_second_relaxation():
+def test_second_relaxation_is_as_claimed():
     """What is left when the rail has forgotten itself is the slow part, at its own rate."""
     ratios = []
     for h, claimed, rail in each('second_relaxation', 12, duration=180.0, rate=200.0):
@@ -124,7 +124,7 @@ def test_second_relaxation():
     assert_as_claimed(ratios, room=0.03)
 
 
-def test_flicker():
+def test_flicker_noise_is_as_claimed():
     """Over the slow decade the density is that of 1/f, and of the rail's variance in all."""
     f = np.geomspace(1e-4, 500, 20000)
     shape = np.maximum(f, 0.05)**-1 / (1 + (f / 200)**2)
@@ -140,7 +140,7 @@ def test_flicker():
     assert_as_claimed(ratios, room=0.02)
 
 
-def test_ac_coupling():
+def test_ac_coupling_is_as_claimed():
     """A fit finds the corner of the instrument, and at zero frequency there is nothing."""
     for h, claimed, rail in each('ac_coupling', 5):
         corner = 2 * np.pi * claimed['corner_hz']
@@ -156,7 +156,7 @@ def test_ac_coupling():
         assert 1.0 < rail['alpha'] < 6.6 and abs(h.voltage.mean() - claimed['bias_v']) < 0.05
 
 
-def test_jumps():
+def test_jumps_are_as_claimed():
     """At double strength each is a step of more than six innovations, and no sample undoes it."""
     for h, claimed, _ in each('jumps', 4, strength=2.0):
         e = whitened(h)
@@ -170,7 +170,7 @@ def test_jumps():
 
 @pytest.mark.parametrize('cause, run', [
     ('glitches', 1), ('glitches/double', 2), ('glitches/triple', 3)])
-def test_glitches(cause, run):
+def test_glitches_are_as_claimed(cause, run):
     """The error appears, stays for the claimed run, and goes as it came."""
     for h, claimed, rail in each(cause, 3, strength=2.0):
         e, phi = whitened(h), np.exp(-rail['alpha'] / 1000)
@@ -184,7 +184,7 @@ def test_glitches(cause, run):
         assert abs(back + phi) < 0.1
 
 
-def test_heavy_tails():
+def test_heavy_tails_are_as_claimed():
     for h, claimed, _ in each('heavy_tails', 4):
         e, dof = whitened(h), claimed['dof']
         scaled = e * np.sqrt(dof / (dof - 2))
@@ -198,12 +198,12 @@ def test_heavy_tails():
 @pytest.mark.parametrize('cause, excess', [
     ('heavy_tails/laplace', lambda c: 3 / c['gamma_shape']),
     ('heavy_tails/nig', lambda c: 3 / c['ig_shape'])])
-def test_other_heavy_tails(cause, excess):
+def test_other_heavy_tails_are_as_claimed(cause, excess):
     assert_as_claimed([(np.mean(whitened(h)**4) - 3) / excess(c) for h, c, _ in each(cause)],
                       room=0.02)
 
 
-def test_regimes_of_sigma_and_mean():
+def test_regimes_of_sigma_and_mean_are_as_claimed():
     """Local averages are two-valued, as far apart as claimed; both sorts are drawn."""
     sorts = []
     for h, claimed, rail in each('regime_switching', 12):
@@ -225,7 +225,7 @@ def test_regimes_of_sigma_and_mean():
     assert set(sorts) == {'sigma', 'mean'}
 
 
-def test_volatility():
+def test_volatility_is_as_claimed():
     """The logarithm of local sigma spreads as claimed, and slowly."""
     ratios = []
     for h, claimed, _ in each('volatility', 10, duration=150.0, rate=500.0):
@@ -237,7 +237,7 @@ def test_volatility():
     assert_as_claimed(ratios, room=0.05)
 
 
-def test_nonlinear_restoring():
+def test_nonlinear_restoring_is_as_claimed():
     """At two standard deviations the force is off the linear one by the claimed share."""
     shapes = set()
     for h, claimed, rail in each('nonlinear_restoring', 5, duration=80.0):
@@ -261,7 +261,7 @@ def test_nonlinear_restoring():
     assert shapes == {'diode', 'current_limit'}
 
 
-def test_cubic_restoring():
+def test_cubic_restoring_is_as_claimed():
     """A clamp adds the claimed share of force at two deviations on either side."""
     for h, claimed, rail in each('nonlinear_restoring/cubic', 4, duration=80.0):
         x, alpha = h.voltage - rail['level_v'], rail['alpha']
@@ -274,7 +274,7 @@ def test_cubic_restoring():
         assert 0.56 * claimed['change'] > 0.2
 
 
-def test_clock_jitter():
+def test_clock_jitter_is_as_claimed():
     """Times wrong by d make steps of variance 1 + d' - d: kurtosis 3 (1 + 2 var d)."""
     ratios, after = [], []
     for h, claimed, _ in each('clock_jitter', 10):
@@ -288,7 +288,7 @@ def test_clock_jitter():
     assert np.mean(after) < -5 / np.sqrt(10)
 
 
-def test_irregular_stamps():
+def test_irregular_stamps_are_as_claimed():
     h = simulated('clock_jitter/stamps')
     spread = np.std(h.t * rate(h) - np.arange(h.t.size))
     assert spread == pytest.approx(h.detail['clock_jitter/stamps']['std_steps'], rel=0.02)

@@ -13,7 +13,7 @@ import pytest
 
 @pytest.mark.parametrize('cause, exponent', [
     ('load_sag', 1.0), ('load_sag/power_1.5', 1.5), ('load_sag/quadratic', 2.0)])
-def test_sag(cause, exponent):
+def test_sag_is_as_claimed(cause, exponent):
     """Volts fall with throttle, at once, by the claimed resistance times current."""
     for h, claimed, _ in each(cause, 4):
         volts = claimed['battery_ohm'] * claimed['full_current_a']
@@ -21,7 +21,7 @@ def test_sag(cause, exponent):
         assert_regression(h, [h.throttle**exponent], -volts)
 
 
-def test_growing_sag():
+def test_growing_sag_is_as_claimed():
     """The coefficient of the current changes by the claimed ratio, in step with the charge."""
     for h, claimed, _ in each('load_sag/growing', 4):
         current = h.throttle**claimed['exponent']
@@ -36,7 +36,7 @@ def test_sag_at_the_capacitor_comes_at_the_rate_alpha():
         assert_regression(h, [late(h, h.throttle, 1 / rail['alpha'])], -claimed['sag_v_per_unit'])
 
 
-def test_transients():
+def test_transients_are_as_claimed():
     """Lag, inrush and polarisation have their two coefficients, and each is drawn."""
     shapes = set()
     for h, claimed, _ in each('load_transient', 12):
@@ -57,7 +57,7 @@ def test_transients():
     assert shapes == {'lag', 'inrush', 'polarisation'}
 
 
-def test_transients_of_other_shapes():
+def test_transients_of_other_shapes_are_as_claimed():
     """A regulator cures the step, a delay moves it, two poles follow each other."""
     for seed in range(3):
         h = simulated('load_transient/regulator', seed)
@@ -79,7 +79,7 @@ def test_transients_of_other_shapes():
 
 
 @pytest.mark.parametrize('cause', ['load_dependent_sigma', 'load_dependent_sigma/step'])
-def test_sigma_of_throttle(cause):
+def test_sigma_over_throttle_is_as_claimed(cause):
     """Squared innovations follow the claimed curve, and nothing is left over."""
     for h, claimed, rail in each(cause, 4):
         load = (h.throttle - h.throttle.min()) / np.ptp(h.throttle)
@@ -92,7 +92,7 @@ def test_sigma_of_throttle(cause):
         assert correlation(np.minimum(whitened(h)**2, 16), load[:-1]) > 8
 
 
-def test_white_noise_of_throttle():
+def test_white_noise_over_throttle_is_as_claimed():
     """Errors that only one sample has: their share of the changes of it follows the curve."""
     for h, claimed, rail in each('load_dependent_noise', 4):
         curve = h.throttle * (1.4 - h.throttle)
@@ -113,7 +113,7 @@ def test_white_noise_of_throttle():
     ('load_dependent_alpha', lambda load, c: 1 + (c['ratio'] - 1) * load),
     ('load_dependent_alpha/resistance', lambda load, c: 1 / (1 + (1 / c['ratio'] - 1) * load)),
     ('load_dependent_alpha/step', lambda load, c: np.where(load > c['step_at'], c['ratio'], 1))])
-def test_alpha_of_throttle(cause, shape):
+def test_alpha_over_throttle_is_as_claimed(cause, shape):
     ratios = []
     for h, claimed, rail in each(cause, 6):
         curve = shape((h.throttle - h.throttle.min()) / np.ptp(h.throttle), claimed)
@@ -129,7 +129,7 @@ def test_alpha_of_throttle(cause, shape):
 
 
 @pytest.mark.parametrize('cause', ['drift', 'drift/exponential', 'drift/square_root'])
-def test_drift(cause):
+def test_drift_is_as_claimed(cause):
     for h, claimed, _ in each(cause, 4):
         loss = claimed['slope_v_s'] * 60
         curve = {'drift': h.t / 60, 'drift/square_root': np.sqrt(h.t / 60)}.get(

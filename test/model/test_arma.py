@@ -59,7 +59,7 @@ def test_noise_raises_theta_between_its_ends(log_a, m, log_share):
     assert math.sqrt(3.0) - 2.0 - 1e-9 < low < theta < math.exp(-a)
 
 
-def test_long_blocks_of_a_random_walk():
+def test_theta_of_long_blocks_tends_to_that_of_a_random_walk():
     """Working, Econometrica 28 (1960) 916: theta = sqrt(3) - 2 as m grows."""
     assert arma.theta_at(1e-5, 4000, 0.0) == pytest.approx(math.sqrt(3.0) - 2.0, abs=1e-5)
     assert arma.theta_at(0.3, 1, 0.0) == pytest.approx(0.0, abs=1e-15)

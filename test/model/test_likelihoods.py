@@ -18,7 +18,7 @@ from scipy.linalg import toeplitz
 
 @pytest.mark.parametrize('states', [1, 2, 3, 7])
 @pytest.mark.parametrize('n', [1, 2, 24, 25, 1000])
-def test_chains_as_the_recursion(states, n):
+def test_blocks_give_the_laws_and_evidence_of_the_recursion(states, n):
     """Laws and evidence, whether or not the blocks come out even."""
     rng = np.random.default_rng(states * 1000 + n)
     density = 3.0 * rng.standard_normal((n, states, states))
@@ -34,7 +34,7 @@ def test_chains_as_the_recursion(states, n):
     assert log_likelihood(density, transition, start) == pytest.approx(evidence.sum(), abs=1e-9)
 
 
-def test_densities_far_apart():
+def test_densities_far_apart_give_no_zeros_and_no_nan():
     """Hundreds of nats between the states of one sample leave no zeros and no NaN."""
     density = np.zeros((5000, 2, 2))
     density[::2, :, 0] = -600.0
@@ -92,7 +92,7 @@ def relaxations(n, rates, noise, *, uneven=False, seed=1):
 @pytest.mark.parametrize('rates', [[63.0], [63.0, 2.0], [63.0, 8.0, 0.5], [300.0, 63.0, 8.0, 0.5]])
 @pytest.mark.parametrize('noise', [0.1, 1e-6])
 @pytest.mark.parametrize('uneven', [False, True])
-def test_as_the_recursion(rates, noise, uneven):
+def test_the_filter_equals_the_kalman_recursion(rates, noise, uneven):
     """
     Same innovations and variances, whatever the steps.
 
@@ -107,7 +107,7 @@ def test_as_the_recursion(rates, noise, uneven):
     np.testing.assert_allclose(run.variance, variance, rtol=1e-8)
 
 
-def test_states_that_turn_and_what_is_seen_of_them():
+def test_rotating_states_are_filtered_as_by_the_recursion():
     n, turn = 300, 0.7
     rotation = 0.99 * np.array([[math.cos(turn), -math.sin(turn)],
                                 [math.sin(turn), math.cos(turn)]])
@@ -141,7 +141,7 @@ def test_singular_is_refused():
 
 
 @pytest.mark.parametrize('pieces', [2, 7, 200])
-def test_in_pieces_as_at_once(monkeypatch, pieces):
+def test_a_filter_in_pieces_equals_one_at_once(monkeypatch, pieces):
     """Many states are worked on stretch by stretch; what is known is carried on."""
     model = relaxations(400, [63.0, 8.0, 0.5], 0.1, uneven=True)
     y = np.random.default_rng(4).standard_normal(400)
@@ -168,7 +168,7 @@ def test_ordinates_expected_of_an_ou_are_exact(n, a):
         np.diagonal(D @ toeplitz(np.exp(-a * np.arange(n))) @ D.T), rtol=1e-10)
 
 
-def test_ordinates_of_a_walk():
+def test_ordinates_of_a_random_walk_are_exact():
     """Its level is a regressor: of the others the covariance is diagonal."""
     n = 20
     D = dct(np.eye(n), axis=0, norm='ortho')

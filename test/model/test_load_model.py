@@ -15,7 +15,7 @@ STIFF = LoadModel(4, 0.2, charge=charge_at(CELL), endurance=1e12, before=0.0)
 GECKO = ROOT / 'bags/recorded/gecko.csv'
 
 
-def test_open_circuit_curve():
+def test_the_open_circuit_curve_rises_and_has_an_inverse():
     """It rises throughout, is full at 4.2 V a cell, and its inverse brings charge back."""
     charge = np.linspace(-0.2, 1.1, 200)
     assert (np.diff(open_circuit(charge)) > 0.0).all()
@@ -37,7 +37,7 @@ def test_a_held_throttle_ends_at_the_static_sag():
 
 
 @pytest.mark.parametrize('share, tau', [('fast_share', 1.0), ('slow_share', 20.0)])
-def test_time_constants_of_a_step(share, tau):
+def test_polarisation_reaches_63_percent_after_one_tau(share, tau):
     """One tau after a step 1 - 1/e of the polarisation is there."""
     model = replace(STIFF, **{'fast_share': 1e-12, 'slow_share': 1e-12, 'inrush': 1e-12,
                               'lag': 1e-6, share: 0.4})
@@ -60,7 +60,7 @@ def test_two_half_steps_are_one():
     np.testing.assert_allclose(lowpass(held, fine, 2.0)[::2], lowpass(x, t, 2.0), atol=1e-12)
 
 
-def test_current_as_the_load():
+def test_current_as_the_load_gives_ohms_law():
     """With current the sag is its Ohm's law; without it nothing is invented."""
     model = replace(STIFF, full_current=50.0, inrush=1e-12, fast_share=1e-12, slow_share=1e-12)
     t = np.arange(0.0, 5.0, 0.01)
@@ -117,7 +117,7 @@ def test_no_degenerate_fit_of_the_recorded_flight():
 
 
 @pytest.mark.parametrize('t', [np.array([0.0, 1.0, 1.0]), np.array([0.0, 0.1, 0.2])])
-def test_what_cannot_be_fitted_is_refused(t):
+def test_a_load_that_cannot_be_fitted_is_refused(t):
     with pytest.raises(ValueError, match='s'):
         fit_load(t, np.full(3, 16.0), np.full(3, 0.3))
 

@@ -116,7 +116,7 @@ def test_throttle_does_not_excuse_a_slow_relaxation():
     assert inside >= 13
 
 
-def test_noise_that_grows_with_changes_of_throttle():
+def test_intervals_hold_if_noise_grows_with_throttle_changes():
     """
     Of 16 rails whose white noise is as large again while throttle moves, intervals hold 13.
 
@@ -179,7 +179,7 @@ def test_lost_messages_cost_little_memory():
         0.0, abs=0.05 * np.log(whole.alpha_95[1] / whole.alpha_95[0]))
 
 
-def test_a_rail_without_white_noise_sampled_fast():
+def test_an_ou_without_white_noise_sampled_fast_is_found():
     """Of alpha D = 0.006 white noise of a thousandth of the variance would hide the OU's own."""
     inside = 0
     for seed in range(4):
@@ -196,7 +196,7 @@ def test_a_constant_signal_has_no_noise():
 
 
 @pytest.mark.parametrize('seed', [5, 7])
-def test_of_two_rates_that_are_nearly_as_likely_none_is_told_alone(seed):
+def test_two_nearly_equally_likely_rates_both_count(seed):
     """
     An OU of 2 1/s is one, or the level's walk beside one of 40 1/s: both maxima count.
 

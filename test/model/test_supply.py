@@ -22,7 +22,7 @@ def test_the_ou_comes_first():
 
 
 @pytest.mark.parametrize('name', sorted(EXAMPLES))
-def test_how_many_of_a_term(name):
+def test_terms_that_may_occur_once_are_refused_twice(name):
     """Lines, poles and events can be there several times; the others once."""
     if name == 'ou':
         return
@@ -56,7 +56,7 @@ def test_the_order_of_terms_does_not_matter():
     np.testing.assert_allclose(one, other, rtol=0, atol=1e-12)
 
 
-def test_everything_at_once():
+def test_all_terms_together_give_finite_samples():
     """All terms together: finite samples, the same whatever the cuts."""
     model = supply(*(term(name, **EXAMPLES[name]) for name in EXAMPLES if name != 'ou'))
     load = 0.3 + 0.2 * np.sin(40.0 * T)
@@ -89,7 +89,7 @@ def test_long_recordings_are_made_in_segments():
 
 
 @pytest.mark.parametrize('t', [[0.0, 0.0], [1.0, 0.5], [0.0, math.nan], [0.0, math.inf]])
-def test_stamps_that_do_not_rise(t):
+def test_stamps_that_do_not_rise_are_refused(t):
     """Refused, also when it is the next segment that goes back."""
     with pytest.raises(ValueError, match='finite and rise'):
         supply().simulate(t, np.random.default_rng(0))
@@ -127,7 +127,7 @@ def test_the_caller_keeps_his_arrays():
     np.testing.assert_allclose(first, again, rtol=0, atol=1e-12)
 
 
-def test_throttle_that_nobody_asks_for_may_be_unknown():
+def test_throttle_may_be_unknown_if_no_term_needs_it():
     """Unknown (NaN) is fine without a term of throttle, and changes nothing."""
     np.testing.assert_array_equal(
         supply().simulate(T, np.random.default_rng(1), math.nan),

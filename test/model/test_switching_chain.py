@@ -70,7 +70,7 @@ def test_scores_of_the_true_levels_are_standard_normal(height, at_once):
 
 
 @pytest.mark.parametrize('at_once', [0.0, 1.0])
-def test_what_is_followed_of_two_states(at_once):
+def test_the_followed_level_is_that_of_the_recursion(at_once):
     """The recursion, sample by sample and pair by pair."""
     view = filtered(drawn(0.4, at_once, 6)[0], DRIVE)
     x = np.array([math.log(UP), math.log(DOWN), 4.0, 0.2, 0.0])

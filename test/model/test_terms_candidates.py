@@ -57,7 +57,7 @@ def test_power_along_throttle_is_that_of_every_line(rate, lengths):
     assert found == pytest.approx((top, trials), rel=1e-4)
 
 
-def test_what_a_faster_rail_leaves_over():
+def test_the_view_of_a_faster_rail_has_its_residuals():
     """
     Residuals less phi^2 times the state before, over what noise of that phi makes of a step.
 
@@ -101,7 +101,7 @@ def test_noise_that_follows_throttle_is_no_level():
     assert all(_slow_levels(flown(seed=seed))[1] < _SLOW_AHEAD for seed in (1, 2))
 
 
-def test_levels_beside_noise_that_follows_throttle():
+def test_levels_are_found_beside_noise_that_follows_throttle():
     """Levels of three deviations of the calm rail are seen, and about as high as they are."""
     fit = RegimeSwitching.fit_law(flown(levels=0.1))
     assert abs(fit.term.level) == pytest.approx(0.1, rel=0.15)

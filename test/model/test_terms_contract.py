@@ -87,7 +87,7 @@ def throttle(t):
     return np.where((t - 7.0) % 0.5 < 0.2, 0.1, 0.2 + 0.5 * ((t - 7.0) % 0.5))
 
 
-def test_catalogue():
+def test_the_catalogue_has_the_causes_of_the_contract():
     """The 23 causes of the contract, one more, and the `ou` ahead of them; nothing else."""
     assert len(FAMILIES) == 24
     assert list(catalogue())[0] == 'ou' and set(catalogue()) == {'ou', *FAMILIES}
@@ -122,7 +122,7 @@ def test_missing_and_unknown_parameters_are_named(name):
 
 
 @pytest.mark.parametrize('name', EACH)
-def test_what_is_no_finite_number_is_refused(name):
+def test_parameters_that_are_not_finite_numbers_are_refused(name):
     """The message names term and parameter, whatever was given."""
     for key in (key for key, value in EXAMPLES[name].items() if not isinstance(value, list)):
         for value in (math.nan, math.inf, -math.inf, 'x', '5', True, None, [1.0], 1j, 10 ** 400):
@@ -156,7 +156,7 @@ def test_out_of_range_is_refused_with_the_unit(name, key, value, words):
     ('load_dependent_sigma', {'throttle': [0.0, 0.4, 0.4]}, 'must rise'),
     ('nonlinear_restoring', {'cube': 0.0}, 'runs away'),
 ])
-def test_parameters_that_contradict_each_other(name, change, words):
+def test_contradictory_parameters_are_refused(name, change, words):
     with pytest.raises(ValueError, match=words) as caught:
         term(name, **{**EXAMPLES[name], **change})
     assert str(caught.value).startswith(name)
@@ -182,7 +182,7 @@ def test_samples_do_not_depend_on_the_segments(name, uneven):
 
 
 @pytest.mark.parametrize('name', OTHERS)
-def test_it_does_something(name):
+def test_ordinary_parameters_change_the_samples(name):
     """The ordinary parameters change the samples, so that the test of neutral ones can fail."""
     t = stamps()
     needed = catalogue()[name].CHANGES
@@ -202,7 +202,7 @@ def test_neutral_parameters_change_nothing(name):
     np.testing.assert_allclose(same, plain, rtol=0, atol=2e-12)
 
 
-def test_limits_of_those_without_a_neutral_value():
+def test_terms_without_a_neutral_value_have_a_limit():
     """A corner far below takes away the level alone; many degrees of freedom are normal."""
     t = stamps()
     plain = supply().simulate(t, np.random.default_rng(4))
@@ -217,7 +217,7 @@ def test_limits_of_those_without_a_neutral_value():
 @pytest.mark.parametrize('name', [
     'load_sag', 'load_transient', 'drift', 'measurement_noise', 'second_relaxation', 'resonance',
     'tone', 'throttle_tone', 'flicker_noise', 'glitches', 'jumps'])
-def test_what_is_added_to_the_level_leaves_other_draws_alone(name):
+def test_a_term_of_the_level_leaves_other_draws_unchanged(name):
     """The sum is the ou alone plus the term alone, draw for draw, also beside others."""
     t = stamps()
     added = term(name, **EXAMPLES[name])

@@ -24,7 +24,7 @@ def covariance(alpha, rate, lag, var=VAR):
 
 
 @pytest.mark.parametrize('corner', [0.5, 5.0, 10.026, 10.03, 100.0, 1000.0])
-def test_covariance_at_any_spacing(corner):
+def test_the_covariance_is_exact_at_any_spacing(corner):
     """
     Variance Var alpha/(alpha + rate) and its autocovariance, steps from fine to very coarse.
 
@@ -93,7 +93,7 @@ def test_a_step_of_the_level_decays_at_the_corner(corner):
         found, np.where(since >= 0.0, 0.5 * ramp * np.exp(-rate * since), 0.0), rtol=0, atol=1e-12)
 
 
-def test_what_comes_after_the_instrument_is_not_coupled():
+def test_noise_after_the_instrument_is_not_high_passed():
     """Noise of the ADC and its offset codes are added after the high-pass."""
     t = np.arange(2000) / 1000.0
     ac = term('ac_coupling', corner=10.0, offset=0.0)

@@ -63,7 +63,7 @@ def test_samples_beyond_a_rail_read_the_rail():
         agrees(share, truth, math.sqrt(truth * (1.0 - truth) / 20_000), 0.15)
 
 
-def test_order_of_the_chain():
+def test_noise_comes_before_clipping_and_clipping_before_codes():
     """Noise, then the rails, then codes: codes of the clipped noisy voltage."""
     noise = term('measurement_noise', std=0.05)
     rail = term('saturation', low=4.93, high=5.06)

@@ -66,7 +66,7 @@ def test_ten_kilohertz_reach_the_estimator_without_loss(world, tmp_path):
     assert (folder / 'buffer/enable').read_text().startswith('0')
 
 
-def test_hwmon_is_a_battery(world, tmp_path):
+def test_hwmon_publishes_battery_states(world, tmp_path):
     """Asked at its rate, with the divider's gain; the estimator takes it without being told."""
     attributes(tmp_path / 'sys/class/hwmon/hwmon0', name='ina226', in1_input=5000,
                update_interval=10)
@@ -87,7 +87,7 @@ def test_hwmon_is_a_battery(world, tmp_path):
     assert adc.stop() == 0
 
 
-def test_no_such_device(world, tmp_path):
+def test_an_unknown_device_is_one_line(world, tmp_path):
     """One line, with what there is."""
     iio_device(tmp_path)
     adc = world.start('adc', '--ros-args', '-p', 'device:=ads1115', '-p', f'sysfs:={tmp_path}/sys')

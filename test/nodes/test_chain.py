@@ -144,7 +144,7 @@ def test_outputs_are_reliable_and_of_the_contracts_type(chain):
         assert all(end.qos_profile.reliability == ReliabilityPolicy.RELIABLE for end in ends)
 
 
-def test_diagnostics_of_the_filter(chain):
+def test_the_filter_reports_diagnostics(chain):
     """It waits, then works; it counts."""
     first, last = statuses(chain)[0], chain['ok']
     assert first.level == b'\x03' and first.message == 'Waiting for a publisher on /voltage.'

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 from ou_monitor.nodes.inputs import AGAIN, Console, MUTE
 
 
-def test_why_no_message_comes():
+def test_missing_messages_are_explained():
     """No publisher: at once and each minute; one that is silent: after 10 s, then each minute."""
     said, publishers, clock = [], 0, 0.0
     node = SimpleNamespace(

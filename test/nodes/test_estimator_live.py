@@ -62,7 +62,7 @@ def rig(rigs):
     return rigs[0]
 
 
-def test_one_does_not_hear_the_other(rigs):
+def test_two_namespaces_do_not_mix(rigs):
     """Relative names follow the namespace."""
     fed, silent = rigs
     fed.feed(ou_path(2000, DT, seed=1))

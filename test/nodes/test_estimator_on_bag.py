@@ -76,7 +76,7 @@ def test_says_what_it_waits_for(run):
     assert "msg_config 'battery_state'" in run['log']
 
 
-def test_quality_of_service(run):
+def test_inputs_are_best_effort(run):
     """Inputs best effort, whatever the publisher offers."""
     assert [end.qos_profile.reliability for end in run['inputs']] == [
         ReliabilityPolicy.BEST_EFFORT]
@@ -101,7 +101,7 @@ def test_standard_errors_have_power(states):
     assert float(fields['sigma_se']) < 2.0 * floor and float(fields['alpha_se']) < 0.2
 
 
-def test_the_mean_level(states):
+def test_u0_is_the_mean_level(states):
     """U0 within 4.5 standard errors of the mean of an OU over the window."""
     spread = math.sqrt(2.0 * TRUTH['var_inf'] / (TRUTH['alpha'] * WINDOW))
     for _, fields in states:
@@ -143,7 +143,7 @@ def test_the_same_numbers_as_offline(states):
     assert compared > len(states) / 5
 
 
-def test_risk_and_flag(states, run):
+def test_the_flag_is_published_only_with_a_risk(states, run):
     """Risk is a probability that follows the barrier; the flag is told only with a risk."""
     risks = [float(f['brownout_risk']) for _, f in states]
     assert all(0.0 < risk <= 1.0 for risk in risks)
@@ -161,7 +161,7 @@ def test_risk_and_flag(states, run):
     assert set(flags) <= {f['brownout'] == 'true' for f in told if f['brownout'] != 'unknown'}
 
 
-def test_what_is_not_known_is_nan(run):
+def test_unknown_values_are_nan(run):
     """Before the first voltage and after the last: never 0."""
     for name in NUMBERS:
         assert math.isnan(run[name][0].data) and math.isnan(run[name][-1].data)

@@ -47,7 +47,7 @@ def test_signals_end_the_nodes(world, number):
 
 
 @pytest.mark.parametrize('name', NODES)
-def test_arguments_that_rclpy_would_pass_over(world, name):
+def test_arguments_that_rclpy_ignores_are_refused(world, name):
     """A parameter without --ros-args is refused, not ignored; --help helps."""
     process = world.start(name, 'fmin:=30.0', '--ros-args', '-p', 'publish_rate:=5.0')
     assert process.wait() == 2
@@ -58,7 +58,7 @@ def test_arguments_that_rclpy_would_pass_over(world, name):
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM], ids=['SIGINT', 'SIGTERM'])
-def test_a_signal_at_any_moment_of_the_start(world, number):
+def test_a_signal_during_the_start_ends_with_status_0(world, number):
     """While it imports, while it makes its node: status 0 all the same."""
     for delay in (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8):
         process = world.start('estimator')
@@ -119,7 +119,7 @@ def test_a_signal_while_it_ends_is_only_noted(tmp_path):
     ('adaptive_filter', ['-p', 'law:=wiener'], 'law wiener needs n0'),
     ('adaptive_filter', ['-p', 'max_lag:=5.0'], 'allow more lag or raise fmax'),
 ], ids=lambda value: '' if isinstance(value, list) else value[:24])
-def test_what_is_refused(name, arguments, words):
+def test_bad_arguments_are_refused_with_the_reason(name, arguments, words):
     """With the reason."""
     assert words in refusal(lambda: KINDS[name](NODES[name]), *arguments)
 
@@ -215,7 +215,7 @@ def test_no_thread_holds_up_the_end(tmp_path):
     assert (done.returncode, done.stdout, done.stderr) == (3, 'done at exit\n', '')
 
 
-def test_a_middleware_that_does_not_let_go_is_left(tmp_path):
+def test_the_node_exits_although_the_middleware_hangs(tmp_path):
     """Nothing of Python runs while it waits, as for a lock that a stopped process holds."""
     code = ('import ctypes\n'
             'from ou_monitor.nodes import run\n'

@@ -44,7 +44,7 @@ def test_an_array_that_is_too_short_gives_nothing():
     ('std_msgs/msg/Float32MultiArray', 'data', 'is an array'),
     ('std_msgs/msg/Float64', 'da ta', 'not of the form'),
     ('no_such_msgs/msg/Rail', 'data', 'not installed')])
-def test_what_cannot_be_filtered_is_refused_in_a_line(kind, field, words):
+def test_types_that_cannot_be_filtered_are_one_line(kind, field, words):
     with pytest.raises(InputError, match=words) as caught:
         channels_of(kind, field)
     assert '\n' not in str(caught.value)
@@ -70,7 +70,7 @@ def state_of(**values):
         KeyValue(key=key, value=str(value)) for key, value in values.items()])])
 
 
-def test_time_line_of_the_supply():
+def test_sigma_falls_back_along_a_time_line():
     """Nothing, sigma, sigma and state, state silent, unusable, garbage, sigma silent."""
     clock = Clock()
     supply = SupplyInput(clock, ('/sigma', '/state'))
@@ -173,7 +173,7 @@ def test_an_imu_keeps_what_is_not_filtered(acceleration):
     assert channels.output == ''
 
 
-def test_what_an_imu_does_not_hold_stays_so():
+def test_absent_fields_of_an_imu_stay_absent():
     """An unknown covariance stays 0, an absent acceleration -1; no gyro, no output."""
     channels = channels_of(IMU, '', acceleration=True)
     message = imu(linear_acceleration=ABSENT)
@@ -193,7 +193,7 @@ def test_what_an_imu_does_not_hold_stays_so():
     ('sensor_msgs/msg/BatteryState', '', BatteryState(), 'geometry_msgs/msg/Vector3Stamped'),
     ('geometry_msgs/msg/Point', 'x', Point(x=1.0), 'std_msgs/msg/Float64'),
 ])
-def test_a_derivative_is_no_rate(kind, field, message, output):
+def test_a_derivative_has_a_message_of_its_own(kind, field, message, output):
     """It leaves in a message of its own, with the header; the input is not touched."""
     channels = channels_of(kind, field, mode='derivative')
     before = str(message)

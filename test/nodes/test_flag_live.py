@@ -59,7 +59,7 @@ def rig(shared_world):
     return Rig(shared_world, 'flag')
 
 
-def test_silent_while_unknown(rig):
+def test_no_flag_is_published_while_unknown(rig):
     """Three samples make no estimate: no flag is published, neither true nor false."""
     rig.feed([5.0, 5.01, 4.99])
     wait_until(lambda: int(rig.field('pushed')) >= 1)
@@ -73,7 +73,7 @@ def test_silent_while_unknown(rig):
     assert not answer.success and 'Nothing to clear' in answer.message
 
 
-def test_floor_latch_and_service(rig):
+def test_the_floor_sets_the_latch_and_the_service_clears_it(rig):
     """
     A dip that no estimate sees: set by the floor, latched, cleared by the service.
 
@@ -104,7 +104,7 @@ def test_floor_latch_and_service(rig):
     assert len(rig.flags) <= flags + 1 and rig.field('brownout') == 'unknown'
 
 
-def test_latch_off_clears(rig):
+def test_switching_the_latch_off_clears_it(rig):
     """And neither it nor any other parameter clears the window."""
     rig.give('brownout.latch', True)
     rig.feed(ou_path(300, DT, seed=4) + [4.2] * 100)

@@ -27,7 +27,7 @@ def use(latch):
     latch.close()
 
 
-def test_kept_until_it_is_cleared(tmp_path):
+def test_the_latch_is_kept_until_it_is_cleared(tmp_path):
     """In a folder, a file named after the node; nothing else is left there."""
     latch = LatchFile(tmp_path, '/a/ou_estimator')
     assert latch.read() == '' and latch.problem == ''
@@ -65,7 +65,7 @@ def test_a_file_that_is_not_its_own_is_left(tmp_path, text):
     assert (path.stat().st_ino, path.stat().st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
 
 
-def test_what_is_no_regular_file_is_left(tmp_path):
+def test_irregular_files_are_left_alone(tmp_path):
     """A FIFO hangs nothing; of a link neither end is touched, be it to a file of its own."""
     own, fifo, link, dangling = (tmp_path / name for name in ('own', 'fifo', 'link', 'dangling'))
     own.write_text(json.dumps(GOOD))
@@ -106,7 +106,7 @@ def test_of_two_nodes_on_one_file_the_second_refuses(tmp_path):
     after.close()
 
 
-def test_one_that_is_replaced_meanwhile_is_left(tmp_path):
+def test_a_file_replaced_meanwhile_is_left_alone(tmp_path):
     """By notes: not written until they are gone; then the latch comes back by itself."""
     path = tmp_path / 'state'
     latch = LatchFile(path, '/n')

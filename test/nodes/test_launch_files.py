@@ -39,7 +39,7 @@ def test_nodes_come_up_and_end(world, file):
             launched.wait()
 
 
-def test_a_parameter_file_that_is_not_there(tmp_path):
+def test_a_missing_parameter_file_starts_no_node(tmp_path):
     """An error, and no node."""
     done = subprocess.run(
         ['ros2', 'launch', 'ou_monitor', 'ou_monitor_launch.py',

@@ -101,7 +101,7 @@ def test_a_configuration_that_fails_can_be_mended(world):
     assert process.stop() == 0
 
 
-def test_a_restart_in_the_middle_of_a_dip(world):
+def test_a_restart_during_a_dip_sets_the_flag_again(world):
     """Silent while inactive; the flag is back with the first samples, and never false."""
     probe = world.probe()
     flags = probe.listen('/ou_estimator/brownout', Bool)

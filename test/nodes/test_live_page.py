@@ -192,6 +192,6 @@ def test_bad_options_are_one_line(world, arguments, words):
     assert len(process.err.strip().splitlines()) == 1
 
 
-def test_what_is_not_known_is_null():
+def test_unknown_values_are_null():
     """JSON has no NaN."""
     assert [known(x) for x in ('nan', 'inf', None, '', 'x', '0.5', 2)] == [None] * 5 + [0.5, 2.0]

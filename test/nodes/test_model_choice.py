@@ -14,7 +14,7 @@ from ou_monitor.recordings.model_file import read_model
 import pytest
 
 
-def test_what_is_no_file_is_refused(tmp_path):
+def test_a_model_file_that_is_no_file_is_refused(tmp_path):
     """At once, in one line; nothing is loaded for it."""
     choice = ModelChoice()
     fifo = tmp_path / 'fifo'

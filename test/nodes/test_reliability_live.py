@@ -143,7 +143,7 @@ def test_a_model_file_that_takes_long_to_refuse_is_answered_with_the_reason(rig,
         assert len(rig.states) > states and rig.field('model_terms') == ''
 
 
-def test_what_comes_as_a_parameter_kills_nothing(rig):
+def test_no_parameter_ends_the_node(rig):
     """Limits that no budget can keep are refused together, with their range."""
     request = SetParameters.Request(parameters=[
         Parameter(f'brownout.{name}', value=0.0).to_parameter_msg()
@@ -260,7 +260,7 @@ def own_domain():
     (True, 1500, (700, 800), 1500),
     # Else the newest 512 less those of other topics: a dip at the end of 5 s is seen.
     (False, 5000, (4800, 4900), 300)])
-def test_what_is_sent_to_a_stopped_node_waits_for_it(
+def test_messages_wait_for_a_stopped_node(
         own_domain, world, profile, number, dip, kept):
     """As many messages as its queue holds, and the dip in them."""
     # The default of ROS; limited to this machine it has Fast DDS's own queues.

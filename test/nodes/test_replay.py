@@ -104,7 +104,7 @@ def test_every_message_arrives_in_order_and_on_time(world, numbered):
     assert 'spacing error p50' in process.err
 
 
-def test_rate_and_remapping(world, numbered):
+def test_rate_and_remapping_are_applied(world, numbered):
     """Four times as fast on the wall, the same time on the clock, on another topic."""
     probe = world.probe()
     got = probe.listen('/elsewhere', Float32, QoSProfile(depth=3000))
@@ -136,7 +136,7 @@ def test_loop_jumps_back_until_ctrl_c(world, tmp_path):
     assert len(back) >= 3 and max(times) <= T0 * 1e-9 + 0.2
 
 
-def test_topics_and_no_clock(world, tmp_path):
+def test_only_selected_topics_are_played(world, tmp_path):
     """Only what was asked for."""
     path = tmp_path / 'two.mcap'
     with BagWriter(path) as bag:
@@ -196,7 +196,7 @@ def late(folder):
     return path
 
 
-def test_times_that_the_clock_cannot_tell(world, numbered):
+def test_log_times_beyond_the_clock_are_handled(world, numbered):
     """Without the clock they are played; a rate that outruns the clock holds it at its end."""
     processes = [world.start('replay', *arguments, '--wait', '0', '--json', '-') for arguments in (
         [late(world.folder), '--clock', '0'], [numbered, '--rate', '1e13'])]
@@ -209,7 +209,7 @@ def test_times_that_the_clock_cannot_tell(world, numbered):
     ([empty], 'no messages'),
     ([BAG, '--topics', '/volage'], "did you mean '/voltage'?"),
 ], ids=lambda value: '' if isinstance(value, list) else value[:20])
-def test_what_is_refused(tmp_path, arguments, words):
+def test_bad_bags_are_refused_with_the_reason(tmp_path, arguments, words):
     """With the reason."""
     chosen = options([str(a(tmp_path) if callable(a) else a) for a in arguments])
     assert words in refusal(lambda: Player('ou_replay', BagReader(chosen.bag), chosen))

@@ -84,7 +84,7 @@ def test_the_form_is_that_of_sros2():
     lambda root: root.find('.//topics').append(ElementTree.Element('service')),
     lambda root: root.find('.//services').clear(),
 ])
-def test_another_form_is_found(change):
+def test_a_wrong_form_is_detected(change):
     """The check above can fail."""
     root = policy()
     change(root)

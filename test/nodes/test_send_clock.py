@@ -37,7 +37,7 @@ def test_a_steady_source_becomes_even():
     assert np.abs(out - due[1000:]).max() < 0.04
 
 
-def test_sigma_through_a_busy_machine():
+def test_sigma_is_right_on_a_busy_machine():
     """The reason for it all: intervals of 20 us multiply sigma."""
     rng = np.random.default_rng(4)
     due, sent = sent_by_a_busy_machine(rng, 6000, 0.001)
@@ -69,7 +69,7 @@ def test_an_irregular_source_is_left_alone():
     assert math.isnan(clock.rate)
 
 
-def test_a_gap_is_a_gap():
+def test_a_gap_stays_in_the_stamps():
     """A second without messages is seen in the stamps, and the line goes on after it."""
     clock = SendClock()
     for k in range(1000):
@@ -78,7 +78,7 @@ def test_a_gap_is_a_gap():
     assert clock(2.001) == pytest.approx(2.001)
 
 
-def test_going_back_is_going_back():
+def test_backward_stamps_stay_backward():
     """A replay that begins anew, or a clock set back."""
     clock = SendClock()
     for k in range(1000):
@@ -116,7 +116,7 @@ def test_slow_sources_follow_their_stamps(period):
     assert out == pytest.approx([period * k for k in range(200)], abs=1e-6)
 
 
-def test_the_line_under_late_times():
+def test_late_messages_do_not_bias_the_period():
     """Half of the messages are late by up to 50 periods; the period is exact all the same."""
     rng = np.random.default_rng(6)
     late = rng.uniform(0.0, 0.05, 400) * (rng.random(400) < 0.5)
@@ -161,7 +161,7 @@ def estimates(stamps, sent, voltage):
 
 @pytest.mark.parametrize('lost', [0.0, 0.01])
 @pytest.mark.parametrize('pauses', [1, 20])
-def test_unstamped_scalars_at_10_khz(pauses, lost):
+def test_unstamped_scalars_at_10_khz_give_true_alpha_and_sigma(pauses, lost):
     """
     Alpha and sigma within 5 % of those from true stamps, with pauses of up to half the time.
 
@@ -193,7 +193,7 @@ def test_a_burst_is_not_a_rate():
 
 
 @pytest.mark.parametrize('n', [200, 400, 1000, 10_000])
-def test_steady_or_not_whatever_the_number(n):
+def test_steady_sources_are_told_from_random_ones(n):
     """
     Of a Poisson source fewer are near its line than `ON_LINE`, of a timer with losses more.
 
@@ -220,7 +220,7 @@ def test_a_gap_at_10_khz_keeps_the_rate():
 
 
 @pytest.mark.parametrize('period, mark', [(0.001, 50), (0.0001, 160)])
-def test_an_emptied_buffer_is_told(period, mark):
+def test_an_emptied_buffer_is_reported(period, mark):
     """When the samples of a burst were taken is not known, and is not guessed."""
     rng = np.random.default_rng(7)
     ends = period * mark * np.arange(1, int(4.0 / (period * mark)))
@@ -237,7 +237,7 @@ def test_an_emptied_buffer_is_told(period, mark):
     assert math.isnan(clock.rate) and clock.settled == 0
 
 
-def test_bursts_at_random_are_told():
+def test_random_bursts_are_reported():
     """Exponential gaps between bursts of 50: no even line, and no silence about it."""
     rng = np.random.default_rng(8)
     sent = (1.7e9 + np.cumsum(rng.exponential(0.05, 120))[:, None]
@@ -251,7 +251,7 @@ def test_bursts_at_random_are_told():
     assert math.isnan(clock.rate) and np.mean(told[-len(told) // 2:]) == 1.0
 
 
-def test_bursts_with_gaps_between_are_told():
+def test_bursts_with_gaps_are_reported():
     """Of 300 samples every 0.3 s each burst stands alone: the third one is told."""
     clock = SendClock()
     told = []
@@ -262,7 +262,7 @@ def test_bursts_with_gaps_between_are_told():
     assert told == [False, False, True, True, True, True]
 
 
-def test_a_steady_source_is_not_told():
+def test_a_steady_source_is_not_reported():
     """Neither a timer, a busy machine, a Poisson source, nor a battery message a second."""
     rng = np.random.default_rng(9)
     for sent in (0.001 * np.arange(3000), sent_by_a_busy_machine(rng, 6000, 0.001)[1],

@@ -22,7 +22,7 @@ def manager(tmp_path, monkeypatch):
         yield found
 
 
-def test_half_of_the_watchdogs_time(manager, monkeypatch):
+def test_the_watchdog_is_fed_twice_per_period(manager, monkeypatch):
     """In s; not that of another process, nor without a watchdog."""
     assert ServiceManager().interval == 0.0
     monkeypatch.setenv('WATCHDOG_USEC', '3000000')
@@ -33,7 +33,7 @@ def test_half_of_the_watchdogs_time(manager, monkeypatch):
     assert manager.recv(100) == b'READY=1'
 
 
-def test_an_abstract_socket(monkeypatch):
+def test_an_abstract_socket_is_notified(monkeypatch):
     """Its name begins with @ in the variable, and with a zero byte in the kernel."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as found:
         found.bind(f'\0ou_monitor_{os.getpid()}')
@@ -90,7 +90,7 @@ def test_the_unit_has_the_scheduling_that_was_measured():
 @pytest.mark.parametrize('name, names', [
     ('estimator', []), ('adaptive_filter', ['sigma:=ou_estimator/sigma',
                                             'state:=ou_estimator/state', 'input:=imu'])])
-def test_the_command_of_the_unit(tmp_path, name, names):
+def test_the_units_command_sources_ros_and_the_package(tmp_path, name, names):
     """As bash runs it: both set-ups sourced, the file of parameters, names of topics as words."""
     install = tmp_path / 'opt/ou_monitor/install'
     ros = tmp_path / 'opt/ros/jazzy'

@@ -17,7 +17,7 @@ SECONDS, RATE = 6, 3
 SIGMA = 0.3
 
 
-def test_loop_on_simulated_time(world):
+def test_a_loop_on_simulated_time_clears_the_window_once(world):
     """Stamps and sigma are those of the bag; each pass clears the window once or twice."""
     path = world.folder / 'plain.mcap'
     with BagWriter(path) as bag:

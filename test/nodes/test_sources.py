@@ -94,7 +94,7 @@ def test_a_refusal_says_what_to_do(changed, words):
     ('std_msgs/msg/Float23', "did you mean 'Float32'?"),
     ('px4_msgs/msg/BatteryStatus', "package 'px4_msgs', which is not installed"),
 ])
-def test_types_that_cannot_be_had(name, words):
+def test_unavailable_types_are_refused(name, words):
     """Malformed, misspelt, not installed."""
     with pytest.raises(InputError, match='.') as caught:
         message_class(name)

@@ -30,7 +30,7 @@ def saved(folder, model):
     return path
 
 
-def test_simulated_time_and_reset(world):
+def test_simulated_time_repeats_the_path_after_a_reset(world):
     """On /clock: the path that `simulate` has with that seed, sample by sample; again after."""
     model = PRESETS['flight_full'].model
     probe = world.probe()
@@ -77,7 +77,7 @@ def test_simulated_time_and_reset(world):
     assert node.stop() == 0
 
 
-def test_throttle_that_fails(world):
+def test_failed_throttle_is_held_and_then_idles(world):
     """Not a number is silence, held for 1 s, then idle; it says so, and of a second publisher."""
     probe = world.probe()
     got = probe.listen('/voltage', BatteryState)

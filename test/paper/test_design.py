@@ -63,7 +63,7 @@ def test_a_capacitor_that_is_large_enough_is_said_so():
     assert 'No more capacitance is needed' in answer(result)
 
 
-def test_what_already_meets_the_target_is_no_remedy():
+def test_changes_that_already_meet_the_target_are_not_offered():
     """A flight whose risk is worse than the network's: only throttle may help."""
     result = design(PowerNetwork(), 0.1, **QUESTION, flown=(0.05, 0.02, 0.01))
     assert result.verdict is DesignVerdict.ENOUGH

@@ -42,7 +42,7 @@ def test_intensity_and_drift_are_integrals_of_correlations():
     ([[[1.0]], [[1.0]]], [[0.0], [0.0]], r'component 0 has \+1 1/s times component 0'),
     ([[[0.0]], [[0.0]]], [[1.0], [-0.5]], r'component 0 is \+0.25 per second at u = 0'),
 ])
-def test_no_balance_no_limit(matrices, offsets, message):
+def test_without_balance_the_limit_is_refused(matrices, offsets, message):
     """Refused with the component and the amount; `balanced` is named and mends it."""
     system = SwitchedSystem(Generator.telegraph(1.0, 1.0), matrices, offsets)
     with pytest.raises(ValueError, match=message + r'.*balanced\(\)'):

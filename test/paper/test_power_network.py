@@ -134,7 +134,7 @@ def test_variance_is_the_integral_of_the_density(network, rail):
     assert here.shares.sum() == pytest.approx(1.0, rel=1e-8)
 
 
-def test_equal_poles_are_no_trouble():
+def test_equal_poles_are_handled():
     """Noise exactly as fast as the network: Var = v R^2 / 2 and that rate."""
     network = replace(RC, esc_frequency=0.24 / (0.04 * 470e-6))
     rail = rail_at(network, 0.4)
@@ -183,7 +183,7 @@ def test_ripple_is_largest_at_two_thirds_and_independent_escs_add_in_power():
     assert load_at(PowerNetwork(escs=4), 0.4).switching_rms == pytest.approx(one / 2.0)
 
 
-def test_no_noise_is_no_rate():
+def test_without_noise_the_rate_is_nan():
     rail = rail_at(PowerNetwork(), 0.0)
     assert rail.var_inf == 0.0 and math.isnan(rail.alpha)
     assert rail.crossing_rate(19.8) == 0.0 and math.isinf(rail.crossing_rate(22.5))
@@ -212,7 +212,7 @@ def test_without_filter_capacitance_lowers_the_variance(network, throttle, facto
         assert b.alpha <= a.alpha * (1.0 + 1e-6)
 
 
-def test_where_capacitance_does_not_help():
+def test_the_three_exceptions_for_capacitance_hold():
     """The three exceptions that the module names, each by an example."""
     fixed = [rail_at(PowerNetwork(bulk_capacitance=c), 0.4) for c in (10e-3, 40e-3)]
     assert fixed[1].alpha > 100.0 * fixed[0].alpha

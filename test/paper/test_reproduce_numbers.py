@@ -66,14 +66,14 @@ def test_chance_of_a_step_is_about_right():
 
 
 @pytest.mark.parametrize('label, percent', [('5 %', 50), ('10 %', 17), ('40 %', 8)])
-def test_half_a_step_of_vrms(label, percent):
+def test_half_a_step_of_vrms_is_as_stated(label, percent):
     """As THEORY has it: +-50, 17 and 8 %."""
     state = next(s for s in published.LOADED if s.label == label)
     low, high = state.vrms_range
     assert round(50.0 * (high - low) / state.vrms.value) == percent
 
 
-def test_amp_is_no_peak_but_at_5_percent(first_table):
+def test_amp_can_be_a_peak_at_5_percent_only(first_table):
     """25 < 31.25, 75 < 112.5, 66.7 < 143.75; 62.5 >= 40.65."""
     verdicts = {q: r.verdict for q, r in first_table.items() if q.startswith('Amp')}
     assert verdicts.pop('Amp, 5 %') is RowVerdict.AGREES
@@ -88,7 +88,7 @@ def test_idle_reads_zero_below_one_step(first_table):
     assert found.verdict is RowVerdict.ROUNDING
 
 
-def test_exponents_of_growth():
+def test_exponents_of_growth_agree_with_brute_force():
     """From the steps ln 3 / ln 2 = 1.585 and ln 2 / ln 4 = 0.5; ranges by brute force."""
     for pair, exact in (((published.LOW, published.MEDIUM), math.log(3) / math.log(2)),
                         ((published.MEDIUM, published.HIGH), 0.5)):
@@ -129,7 +129,7 @@ def test_only_one_local_rate_is_off_by_more_than_scatter(fig5):
     assert [row.verdict for row in found] == [RowVerdict.AGREES] * 3 + [RowVerdict.DOES_NOT_HOLD]
 
 
-def test_exponential_with_offset():
+def test_the_exponential_with_offset_agrees_with_profiling():
     """By profiling: for each rate start and offset are linear; 56.5 1/s, -14.7 mV, 7.4 times."""
     t, u = transient.TIME, transient.VALUE
 
@@ -155,7 +155,7 @@ def test_exponential_with_offset():
 
 
 @pytest.mark.parametrize('rail', [30.0, 500.0, 5000.0])
-def test_step_through_a_coupling(rail):
+def test_a_step_through_the_coupling_agrees_with_simulation(rail):
     """The closed form against the state-space simulation of both first-order systems."""
     w = 2.0 * math.pi * 10.0
     t = np.linspace(0.0, 0.05, 5001)
@@ -214,7 +214,7 @@ def test_table_2_is_recomputed_by_hand():
 
 @pytest.mark.parametrize('delta', [0.01, 0.1, 0.3])
 @pytest.mark.parametrize('var', [7.91e-4, 3.17e-3])
-def test_probability_three_ways(delta, var):
+def test_the_probability_agrees_in_three_ways(delta, var):
     """Closed form, printed integral, and the normal law."""
     exact = 2.0 * norm.sf(delta / math.sqrt(var))
     assert tables.beyond(delta, var) == pytest.approx(exact, rel=1e-12)
@@ -236,7 +236,7 @@ def test_probability_by_simulation():
     assert ratio == pytest.approx(norm.sf(100 / 56.3) / norm.sf(100 / 28.1))
 
 
-def test_falls_by_first_passage():
+def test_falls_agree_with_simulated_paths():
     """
     Mean time from the mean to 100 mV below, against simulated paths at 40 %.
 
@@ -258,7 +258,7 @@ def test_falls_by_first_passage():
     assert row.verdict is RowVerdict.AGREES
 
 
-def test_capacitance_lowers_alpha_and_variance():
+def test_more_capacitance_lowers_alpha_and_variance():
     """1/(R C) and S R/(2 C); both elasticities are -1, so alpha falls."""
     alpha, var = tables.rc_rail(0.05, 2e-3, 3e-6)
     assert alpha == pytest.approx(1e4) and var == pytest.approx(3e-6 * 0.05 / (2.0 * 2e-3))
@@ -279,7 +279,7 @@ def test_share_of_the_variance_at_the_esc_lines():
     assert tables.share_above(24e3) == pytest.approx(above, rel=1e-4)
 
 
-def test_matrix_as_printed_and_averaged():
+def test_the_printed_matrix_grows_and_the_averaged_one_relaxes():
     """Growth by e; a phase that is e times faster; a power of two exponentials."""
     rows = by_quantity(switching.averaging_rows(np.random.default_rng(7), paths=200))
     assert rows['P(tau)/P(0), +gamma on the diagonal'].recomputed == pytest.approx(math.e)

@@ -60,7 +60,7 @@ def test_intensity_is_twice_the_printed_one(formulas, name, system):
     assert row.verdict is RowVerdict.DOES_NOT_HOLD
 
 
-def test_telegraph_in_closed_form(formulas):
+def test_the_telegraph_has_its_closed_form(formulas):
     """c^2/q = 1e-3 V^2/s; printed c^2/(2 q)."""
     row = formulas['B of (6), telegraph']
     assert row.printed.value == pytest.approx(1e6 * 1.0 / 2000.0)
@@ -134,7 +134,7 @@ def test_crest_factors_grow_with_the_screen(crests):
     assert crests.quantile(500, 0.95) == pytest.approx(6.6, abs=0.3)
 
 
-def test_crest_of_white_noise(crests):
+def test_the_crest_of_white_noise_agrees_with_theory(crests):
     """Twice the median of the largest of 1e5 normal values, to its scatter: 2 x 4.4."""
     # F(x)^n = 1/2 at the median; the mean is larger by about 0.05.
     assert crests.white.mean() == pytest.approx(2.0 * 4.40, abs=0.15)

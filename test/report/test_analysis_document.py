@@ -59,7 +59,7 @@ def test_the_table_over_throttle_is_that_of_the_facts(analysis):
 
 @pytest.mark.parametrize('level, words', [(14.0, 'right after this flight'),
                                           (13.0, 'even at idle')])
-def test_no_budget_is_told_from_its_cause(analysis, level, words):
+def test_a_missing_budget_states_its_cause(analysis, level, words):
     """The supply at rest is below the limit, or what was flown just now takes it there."""
     curves = analysis.by_throttle
     none = replace(analysis, by_throttle=replace(

@@ -75,7 +75,7 @@ def test_a_terminal_leaves_out_rows_and_says_so():
     assert html(found).count('row ') == 9
 
 
-def test_signs_of_a_page():
+def test_a_page_has_typographic_signs():
     """Plus-minus, minus, unknown, symbols of heads, the small line of a cell; not in a command."""
     found = document(Table(['sigma, V/sqrt(s)\n[95 %]', 'time, s'],
                            [['-1.5 +- 0.2\n[-1.7, -1.3]', '-']]),

@@ -57,7 +57,7 @@ def test_the_page_tells_what_stands_out(odd):
         assert words in fleet_document(odd).headline
 
 
-def test_stars_mark_what_stands(odd):
+def test_stars_mark_significant_values_only(odd):
     """The drifting vehicle at its slope, the odd one at its median; no star elsewhere."""
     made = vehicle_table(odd)
     heads, rows = made.heads, made.rows
@@ -85,7 +85,7 @@ def test_plain_data_agrees(odd):
     ([{**row, 'vehicle': None, 'flight': None} for row in table(
         np.random.default_rng(3), 1, 8)], 'too few recordings per vehicle'),
 ])
-def test_little_is_known(rows, words):
+def test_fleets_with_little_data_have_a_report(rows, words):
     """A fleet of failures, of one recording, without estimates or vehicles has its report."""
     simulated = fleet(rows)
     assert words in fleet_document(simulated).headline and words in page_text(simulated)
@@ -163,7 +163,7 @@ def test_without_a_limit_no_dip_is_counted():
         'No recording fell below 14 V: the lowest was 14.20 V')
 
 
-def test_what_was_measured_is_shown():
+def test_tables_show_values_as_measured():
     """Recordings of one load each keep their order, as in `analyze`, however they are compared."""
     truth = {0.0: 0.05, 0.05: 0.10, 0.1: 0.32, 0.4: 0.63}
     known = fleet([seen(f'load {u}', 'rail', 4.8, None, flight=k + 1, level='x', throttle=u,

@@ -199,7 +199,7 @@ def test_pointing_reads_the_samples_to_the_digit(tab, data):
         assert number(value.removeprefix(EVIL)) == pytest.approx(v[k], abs=6e-4)
 
 
-def test_zooming_and_coming_back(tab):
+def test_zoom_and_reset_work_with_the_mouse(tab):
     """Drag, wheel, shift and drag, double click; the plots of one axis together, others not."""
     view, whole = View(tab, 0), [0.0, SECONDS]
     tab.drag(view.at(0.25, 0.5), view.at(0.5, 0.52))
@@ -292,7 +292,7 @@ def test_a_click_on_a_name_hides_it(tab):
     assert [row.split(':')[0] for row in view.point(0.5)[1:]] == ['simulated']
 
 
-def test_keys_do_all_of_it(tab):
+def test_every_action_has_a_key(tab):
     """Reached by Tab; arrows read, plus and minus zoom, shift moves, 0 shows all."""
     tab.run('document.querySelector(".live-name").focus()')
     tab.key('Tab', code='Tab', windowsVirtualKeyCode=9)

@@ -96,7 +96,7 @@ def test_a_line_goes_through_its_points_and_breaks_at_nan():
 @pytest.mark.parametrize('values', [[], [math.nan] * 3, [1.0], [5.0, 5.0, 5.0],
                                     [1e300, -1e300, 0.0], [math.inf, 0.0]])
 @pytest.mark.parametrize('log', [False, True])
-def test_plots_stand_any_data(values, log):
+def test_plots_accept_any_data(values, log):
     """Empty, unknown, constant, huge: well formed, and no nan among the coordinates."""
     y = np.array(values)
     plot = Plot('<&"', 'x', 'y', log_y=log)
@@ -142,7 +142,7 @@ def test_report_holds_the_numbers_of_the_levels():
     Recording(np.zeros(0), np.zeros(0), np.zeros(0), 'empty'),
     Recording(np.array([1e9]), np.array([5.0]), np.array([math.nan]), 'one'),
 ], ids=lambda simulated: simulated.name)
-def test_report_of_a_recording_that_tells_nothing(simulated):
+def test_a_recording_without_results_has_a_report(simulated):
     """Still a page, without nan in a drawing."""
     html = page_of(analysis_document(analyze(simulated)))
     parsed(html)

@@ -85,7 +85,7 @@ def test_points_are_joined_by_straight_lines():
     assert at(read_profile('0:0,1:0,1:1'), 0.999, 1.0, 5.0) == [0.0, 1.0, 1.0]
 
 
-def test_period_and_hold():
+def test_profiles_repeat_and_hold_their_values():
     """A period wraps; a held profile keeps the value of the last update."""
     ramp = through([(0.0, 0.0), (1.0, 1.0)], period=1.0, stick_rate=10.0)
     assert at(ramp, 0.0, 0.05, 0.1, 0.15, 0.9, 1.0, 1.25) == pytest.approx(

@@ -146,7 +146,7 @@ def test_each_value_holds_until_the_next(flight):
     np.testing.assert_allclose(part.profile(np.array([0.0, 1.0])), [0.6, 0.2])
 
 
-def test_what_is_a_recording(flight, tmp_path):
+def test_recordings_are_told_from_profiles(flight, tmp_path):
     """A CSV with voltage is one; one of throttle alone is a profile; so is a profile's name."""
     stick = tmp_path / 'stick.csv'
     stick.write_text('time_s,throttle\n0,0.1\n', encoding='utf-8')

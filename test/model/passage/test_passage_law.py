@@ -35,7 +35,7 @@ def test_additive_along_the_way():
         mean_first_passage(0.0, 1.0) + mean_first_passage(1.0, 2.0), rel=1e-10)
 
 
-def test_against_a_simulated_walk():
+def test_mean_passage_time_agrees_with_simulated_paths():
     """
     Mean over 4 000 paths of step 2e-3 tau, barrier moved for discreteness.
 
@@ -78,7 +78,7 @@ def constant_pull(gap, barrier, span):
 
 
 @pytest.mark.parametrize('span', [1e-5, 1e-3, 0.1, 1.0, 5.0, 20.0])
-def test_barrier_at_the_mean(span):
+def test_a_barrier_at_the_mean_has_its_closed_form(span):
     """2 Phi(-|x| e^-s / sqrt(1 - e^-2s)): by symmetry; down to 1e-12."""
     y = np.array([0.05, 0.5, 1.0, 2.0, 4.0, 7.0])
     x = -y * math.sqrt(math.expm1(2.0 * span))
@@ -143,7 +143,7 @@ def test_short_spans_are_those_of_a_brownian_motion(barrier, w):
 
 
 @pytest.mark.parametrize('barrier', [45.0, 100.0])
-def test_very_far_barriers(barrier):
+def test_very_far_barriers_have_a_constant_pull(barrier):
     """Near them the pull is constant; the mean is out of reach."""
     gap, span = 1.0 / barrier, 0.3 / barrier ** 2
     assert passage_probability(barrier - gap, barrier, span) == pytest.approx(
@@ -168,7 +168,7 @@ def test_rare_passages_come_at_the_inverse_of_the_mean_time(barrier):
             expected, rel=TABLE + 5.0 / span)
 
 
-def test_no_step_where_the_table_ends():
+def test_the_probability_is_continuous_at_the_ends_of_the_table():
     """Both sides of the longest span of the table and of the shortest agree."""
     b = np.array([-2.0, 0.5, 2.0, 5.0, 9.0])
     for span in (9.0, 1e-5):

@@ -190,7 +190,7 @@ def test_threshold_switches_at_sigma_ref(sigma, expected):
 @pytest.mark.parametrize('law, more', [
     ('threshold', {}), ('constant_noise', {}), ('constant_noise', {'coupling': 1.0}),
     ('wiener', {'n0': 1e-6}), ('throttle', {})])
-def test_what_is_not_known_is_nan(law, more):
+def test_unknown_values_give_nan(law, more):
     s = FilterSettings(law=law, **more)
     for bad in (NAN, math.inf, -1.0):
         assert math.isnan(wanted_cutoff(s, bad, NAN, NAN, 1e-3))
