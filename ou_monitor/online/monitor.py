@@ -25,7 +25,7 @@ from ou_monitor.online.trust import Doubt, InputTrust, patience, StampOrder
 from ou_monitor.records import (
     as_numbers, as_seconds, Counters, Estimate, Flag, Level, NAN, OuFacts, Status)
 from ou_monitor.timeline.line import (
-    as_column, MOST_CURRENT, plausible, plausible_samples, TimeLine)
+    as_column, as_columns, MOST_CURRENT, plausible, plausible_samples, TimeLine)
 
 if TYPE_CHECKING:
     from ou_monitor.model.supply import SupplyModel
@@ -167,8 +167,8 @@ class SupplyMonitor:
             as_numbers(current), stamps.shape)[part], MOST_CURRENT)
         came = math.inf if times is None or not times.size else float(times[-1])
         try:
-            for batch in self._line.take(stamps[part], volts[part], load, drawn,
-                                         self._sliding):
+            columns = as_columns(stamps[part], volts[part], load, drawn)
+            for batch in self._line.take(columns, self._sliding):
                 self._estimator.take(batch)
                 self._relaxation.take(batch)
                 if not batch.again:

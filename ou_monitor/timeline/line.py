@@ -25,7 +25,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 import math
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -64,12 +63,11 @@ _MIDDLE = 200_000
 
 @dataclass(slots=True)
 class Batch:
-    """Clean samples in order; views that hold until the next push."""
+    """Clean samples in order."""
 
-    t: FloatArray  # stamps, s, strictly increasing, shape (n,)
-    y: FloatArray  # voltage, V, shape (n,)
-    u: FloatArray | None  # throttle, NaN where unknown; None: unknown throughout
-    i: FloatArray | None  # current, A, NaN where unknown; None: unknown throughout
+    # Stamps, s, strictly increasing; voltage, V; throttle and current, A, NaN where unknown;
+    # shape (4, n), n > 0.
+    columns: FloatArray
     shortest: float  # least step, from the sample before on, s
     longest: float  # largest step, s
     restart: bool  # a new time line starts here: forget all earlier samples
@@ -78,18 +76,31 @@ class Batch:
     @classmethod
     def of(cls, columns: FloatArray, restart: bool, *, again: bool = False,
            before: float = -math.inf) -> Batch:
-        """Return columns t, V, throttle, current, shape (4, n), n > 0; `before`: last stamp, s."""
-        t, y, u, i = columns
-        steps = np.diff(t, prepend=before)
+        """Return a batch of columns (before: last stamp before them, s)."""
+        steps = np.diff(columns[0], prepend=before)
         # There is no pause before the very first sample.
-        rest = steps if steps[0] < math.inf or t.size == 1 else steps[1:]
-        return cls(t, y, None if np.isnan(u).all() else u, None if np.isnan(i).all() else i,
-                   float(steps.min()), float(rest.max()), restart, again)
+        rest = steps if steps[0] < math.inf or steps.size == 1 else steps[1:]
+        return cls(columns, float(steps.min()), float(rest.max()), restart, again)
 
-    def columns(self) -> FloatArray:
-        """Return stamps, voltage, throttle and current, shape (4, n); NaN where unknown."""
-        return np.stack([self.t, self.y, *(
-            np.full(self.t.size, NAN) if x is None else x for x in (self.u, self.i))])
+    @property
+    def t(self) -> FloatArray:
+        """Return the stamps, s."""
+        return np.asarray(self.columns[0])
+
+    @property
+    def y(self) -> FloatArray:
+        """Return the voltage, V."""
+        return np.asarray(self.columns[1])
+
+
+def as_columns(t: FloatArray, y: FloatArray, u: FloatArray | float | None = None,
+               i: FloatArray | None = None) -> FloatArray:
+    """Return a copy of samples (s, V, 0..1, A; None: unknown) as the columns of a `Batch`."""
+    columns = np.full((4, t.size), NAN)
+    for row, values in zip(columns, (t, y, u, i)):
+        if values is not None:
+            row[:] = values
+    return columns
 
 
 def refresh_period(y: FloatArray, known: float = 1.0) -> float:
@@ -200,7 +211,7 @@ class Repeats:
 
     def drop(self, batch: Batch) -> Batch | None:
         """Return the refreshes among samples; None when there are none."""
-        columns = np.concatenate([self._waiting, batch.columns()], axis=1)
+        columns = np.concatenate([self._waiting, batch.columns], axis=1)
         columns = columns[:, self.fresh(columns)]
         if not columns.size:
             return None
@@ -408,11 +419,7 @@ class TimeLine:
 
     def put(self, t: FloatArray, y: FloatArray, u: FloatArray | float | None) -> None:
         """Keep samples, copied, for the next `work_off`."""
-        columns = np.full((4, t.size), NAN)
-        columns[0], columns[1] = t, y
-        if u is not None:
-            columns[2] = u
-        self._parts.append(columns)
+        self._parts.append(as_columns(t, y, u))
         self._fill += t.size
 
     def count(self, **more: int) -> None:
@@ -434,76 +441,53 @@ class TimeLine:
     def work_off(self, pause: float) -> list[Batch]:
         """Empty the buffer; return its readings in order (pause in s)."""
         parts, self._parts, self._fill = self._parts, [], 0
-        t, y, u, _ = np.concatenate(parts, axis=1)
-        return self.take(t, y, None if np.isnan(u).all() else u, None, pause)
+        return self.take(np.concatenate(parts, axis=1), pause)
 
-    def take(self, t: FloatArray, y: FloatArray, u: FloatArray | None, i: FloatArray | None,
-             pause: float) -> list[Batch]:
-        """Return the readings of samples, without the buffer (s, V, 0..1, A; pause in s)."""
-        return [part for batch in self.order(t, y, u, i, pause) for part in self._readings(batch)]
+    def take(self, columns: FloatArray, pause: float) -> list[Batch]:
+        """Return the readings of columns as of a `Batch`, without the buffer (pause in s)."""
+        return [part for batch in self.order(columns, pause) for part in self._readings(batch)]
 
-    def order(self, t: FloatArray, y: FloatArray, u: FloatArray | None, i: FloatArray | None,
-              pause: float) -> list[Batch]:
+    def order(self, columns: FloatArray, pause: float) -> list[Batch]:
         """Process samples as `take` does, but keep repeats."""
-        self.count(pushed=t.size)
-        good = np.isfinite(t) & np.isfinite(y)
+        self.count(pushed=columns.shape[1])
+        good = np.isfinite(columns[:2]).all(axis=0)
         if not good.all():
-            self.count(non_finite=t.size - int(good.sum()))
-            t, y, u, i = _select(good, t, y, u, i)
-        return self._untangle(t, y, u, i, pause) if t.size else []
-
-    def _untangle(self, t: FloatArray, y: FloatArray, u: FloatArray | None, i: FloatArray | None,
-                  pause: float) -> list[Batch]:
-        """Split at jumps of time, sort late samples, drop repeated stamps."""
-        if pause == math.inf:
-            batch = self._ordered(t, y, u, i, restart=False)
-            return [] if batch is None else [batch]
-        newest = np.maximum.accumulate(np.concatenate(([self.newest], t)))[:-1]
-        fresh = (t < newest - pause) | (t > newest + pause)
+            self.count(non_finite=int(np.count_nonzero(~good)))
+            columns = columns[:, good]
         batches: list[Batch] = []
-        begin = 0
-        # One split at a time, because the running maximum starts again at each jump.
-        while begin < t.size:
-            jumps = np.flatnonzero(fresh[begin:])
-            restart = bool(jumps.size and jumps[0] == 0) and math.isfinite(self.newest)
-            later = jumps[jumps > 0]
-            end = begin + int(later[0]) if later.size else t.size
-            part = slice(begin, end)
-            batch = self._ordered(*_select(part, t, y, u, i), restart)
+        # One jump of time at a time, because the newest stamp starts anew at each.
+        while columns.size:
+            t = columns[0]
+            restart = math.isfinite(self.newest) and abs(t[0] - self.newest) > pause
+            newest = np.maximum.accumulate(t if restart else np.maximum(t, self.newest))
+            jumps = np.flatnonzero(np.abs(t[1:] - newest[:-1]) > pause)
+            end = int(jumps[0]) + 1 if jumps.size else t.size
+            batch = self._ordered(columns[:, :end], restart)
             if batch is not None:
                 batches.append(batch)
-            begin = end
-            if begin < t.size:
-                rest = np.concatenate(([self.newest], t[begin:]))
-                rest[0] = -math.inf
-                newest = np.maximum.accumulate(rest)[:-1]
-                fresh[begin:] = (t[begin:] < newest - pause) | (t[begin:] > newest + pause)
-                fresh[begin] = True
+            columns = columns[:, end:]
         return batches
 
-    def _ordered(self, t: FloatArray, y: FloatArray, u: FloatArray | None, i: FloatArray | None,
-                 restart: bool) -> Batch | None:
+    def _ordered(self, columns: FloatArray, restart: bool) -> Batch | None:
+        """Sort late samples, and drop repeated stamps."""
         if restart:
             self.newest = -math.inf
             self.count(resets=1)
-        t, y, u, i = _select(np.argsort(t, kind='stable'), t, y, u, i)
+        columns = columns[:, np.argsort(columns[0], kind='stable')]
+        t = columns[0]
         keep = (np.diff(t, prepend=self.newest) > 0.0) & (t > self.newest)
-        self.count(late=t.size - int(keep.sum()))
-        t, y, u, i = _select(keep, t, y, u, i)
-        if not t.size:
+        columns = columns[:, keep]
+        self.count(late=t.size - columns.shape[1], used=columns.shape[1])
+        if not columns.size:
             return None
-        steps = np.diff(t, prepend=self.newest)
-        # There is no pause before the very first sample.
-        rest = steps if steps[0] < math.inf or t.size == 1 else steps[1:]
-        self.count(used=t.size)
-        self.newest = float(t[-1])
-        return Batch(t, y, u, i, float(steps.min()), float(rest.max()), restart)
+        before, self.newest = self.newest, float(columns[0, -1])
+        return Batch.of(columns, restart, before=before)
 
     def _readings(self, batch: Batch) -> list[Batch]:
         """Drop repeats; when they are first recognised, restart the tail without them."""
         if batch.restart:
             self._begin_anew()
-        whole = np.concatenate([self._tail, batch.columns()], axis=1)
+        whole = np.concatenate([self._tail, batch.columns], axis=1)
         self._unseen += batch.t.size
         self._tail = whole[:, -TAIL:].copy()
         before = self._repeats.period
@@ -531,13 +515,6 @@ class TimeLine:
         return refresh_period(y, known)
 
 
-def _select(which: Any, t: FloatArray, y: FloatArray, u: FloatArray | None, i: FloatArray | None,
-            ) -> tuple[FloatArray, FloatArray, FloatArray | None, FloatArray | None]:
-    """Return the selected samples."""
-    return (t[which], y[which], None if u is None else u[which],
-            None if i is None else i[which])
-
-
 def in_order(t: FloatArray, rows: FloatArray, most: float, unit: str = '',
              ) -> tuple[Picked, list[str]]:
     """Return which samples a time line keeps, rows (n, m) up to `most`, and notes."""
@@ -556,7 +533,7 @@ def in_order(t: FloatArray, rows: FloatArray, most: float, unit: str = '',
     if (steps := int(np.count_nonzero(stamps[1:] < stamps[:-1]))):
         notes.append(Note(_late_words(steps, stamps), Defect.UNORDERED))
     line = TimeLine()
-    batches = line.order(stamps, np.flatnonzero(good).astype(np.float64), None, None, math.inf)
+    batches = line.order(as_columns(stamps, np.flatnonzero(good).astype(np.float64)), math.inf)
     if line.counters.late:
         notes.append(Note(f'{counted(line.counters.late)} dropped: repeated stamp; '
                           'the first of each was kept.', Defect.REPEATED_STAMPS))

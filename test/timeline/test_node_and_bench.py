@@ -63,7 +63,7 @@ def of_the_node(rng, sent, monkeypatch):
     def take(self, batch, through=SlidingEstimator.take):
         if batch.again:
             taken.clear()
-        taken.append(batch.columns())
+        taken.append(batch.columns)
         through(self, batch)
 
     monkeypatch.setattr(SlidingEstimator, 'take', take)

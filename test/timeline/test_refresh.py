@@ -6,7 +6,7 @@ from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.records import Counters, Flag, Recording, Status
-from ou_monitor.timeline.line import Batch, readings_of, refresh_period, Repeats
+from ou_monitor.timeline.line import as_columns, Batch, readings_of, refresh_period, Repeats
 import pytest
 from scipy.signal import lfilter
 from simulated_windows import ALPHA, DT, errors, estimate, LEVEL, paths, SIGMA, stamps
@@ -146,7 +146,7 @@ def test_a_known_period_is_kept_until_contradicted():
 def batch(y, first=0):
     """Return samples at 1, 2, 3..."""
     t = 1.0 + first + np.arange(len(y))
-    return Batch(t, np.asarray(y, dtype=np.float64), None, None, 1.0, 1.0, False)
+    return Batch.of(as_columns(t, np.asarray(y)), False)
 
 
 def dropped_to(y, period, sizes=()):
@@ -193,10 +193,10 @@ def test_steps_and_throttle_of_refreshes():
     repeats.period = 4.0
     y = np.repeat([0.0, 1.0, 2.0, 3.0, 4.0], 4)
     first = repeats.drop(batch(y[:12]))
-    assert (first.shortest, first.longest, first.u) == (4.0, 4.0, None)
+    assert (first.shortest, first.longest) == (4.0, 4.0)
     part = batch(y[12:], 12)
-    second = repeats.drop(Batch(part.t, part.y, np.arange(8.0), None, 1.0, 1.0, False))
-    assert second.t.tolist() == [13.0, 17.0] and second.u.tolist() == [0.0, 4.0]
+    second = repeats.drop(Batch.of(as_columns(part.t, part.y, np.arange(8.0)), False))
+    assert second.t.tolist() == [13.0, 17.0] and second.columns[2].tolist() == [0.0, 4.0]
     assert (second.shortest, second.longest) == (4.0, 4.0)
     assert repeats.drop(batch([4.0], 20)) is None
     repeats.forget()

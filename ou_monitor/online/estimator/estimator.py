@@ -375,7 +375,7 @@ class RelaxationFits:
             self._kept.cut(int(np.searchsorted(t, batch.t[0])))
         elif t.size and batch.t[0] <= t[-1]:
             self.forget()
-        self._kept.append(batch.columns()[:, -MOST_READINGS:], OU_WINDOWS[-1], MOST_READINGS)
+        self._kept.append(batch.columns[:, -MOST_READINGS:], OU_WINDOWS[-1], MOST_READINGS)
 
     def update(self) -> None:
         """Fit if it is due; in the background, take the result of the thread."""

@@ -121,7 +121,7 @@ class Thinner:
     def take(self, batch: Batch) -> tuple[FloatArray, bool]:
         """Return stamps, voltage and throttle to keep, and whether they begin anew."""
         t = batch.t
-        columns = batch.columns()[:3]
+        columns = batch.columns[:3]
         restart = False
         even = self._is_even(batch.shortest) and self._is_even(batch.longest)
         if not even:

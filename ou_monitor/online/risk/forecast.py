@@ -278,7 +278,7 @@ class Forecast:
 
     def take(self, batch: Batch, came: float = math.inf) -> None:
         """Take readings; came: arrival of the last, s, on a monotonic clock; inf: unknown."""
-        t, v, u, drawn = batch.columns()
+        t, v, u, drawn = batch.columns
         if t[0] < self._newest:
             # Stamps increase within one time line, so another one has begun.
             self.new_time_line()

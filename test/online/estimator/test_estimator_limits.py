@@ -89,13 +89,13 @@ def taken(thinner, t, y=None, u=None, window=1e9):
 def test_throttle_does_not_leak_into_the_next_batch():
     intake = TimeLine()
     got, _ = batches([0.0, 0.1], intake=intake, u=0.7)
-    assert got[0].u.tolist() == [0.7, 0.7]
+    assert got[0].columns[2].tolist() == [0.7, 0.7]
     intake.put(np.array([0.2]), np.zeros(1), 0.1)
     intake.put(np.array([0.3]), np.zeros(1), None)
-    u = intake.work_off(1.0)[0].u
+    u = intake.work_off(1.0)[0].columns[2]
     assert u[0] == 0.1 and math.isnan(u[1])
     got, _ = batches([0.4], intake=intake)
-    assert got[0].u is None or np.isnan(got[0].u).all()
+    assert np.isnan(got[0].columns[2]).all()
 
 
 def test_any_array_of_doubles_is_copied():
@@ -112,7 +112,7 @@ def test_any_array_of_doubles_is_copied():
         intake.put(0.1 * plain + 1.0, np.broadcast_to(2.0, 4), np.broadcast_to(0.5, 4))
         batch = intake.work_off(2.0)[0]
         assert batch.y.tolist() == [1.0, 2.0, 3.0, 4.0, 2.0, 2.0, 2.0, 2.0]
-        assert batch.u.tolist() == [1.0, 2.0, 3.0, 4.0, 0.5, 0.5, 0.5, 0.5]
+        assert batch.columns[2].tolist() == [1.0, 2.0, 3.0, 4.0, 0.5, 0.5, 0.5, 0.5]
 
 
 def test_blocks_do_not_reach_across_a_gap():

@@ -8,7 +8,7 @@ from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import LAGS, LoadStatus, SupplyLoad
 from ou_monitor.recordings.read import read_recording
 from project import ROOT
-from ou_monitor.timeline.line import TimeLine
+from ou_monitor.timeline.line import as_columns, TimeLine
 import pytest
 
 TRUE = LoadModel(4, 0.25, charge=0.85, size=0.15, power=1.8)
@@ -258,10 +258,10 @@ def test_garbage_raises_nothing(seed):
         v[rng.random(n) < 0.05] = np.nan
         u = rng.choice([np.nan, 0.0, 0.5, -1.0]) + rng.random(n)
         current = rng.choice([np.nan, 0.0, 10.0, -1e9, np.inf]) * rng.random(n)
-        for batch in line.take(stamps, v, u, current, 60.0):
+        for batch in line.take(as_columns(stamps, v, u, current), 60.0):
             if batch.restart:
                 loads.new_time_line()
-            loads.push(*batch.columns())
+            loads.push(*batch.columns)
         load = loads.load()
         assert load.status in LoadStatus and loads.path(t + np.arange(3.0), np.ones(3)).size == 3
         loads.learned()
