@@ -14,6 +14,7 @@ the header: `gyro_scale`, `acc_1G`, `motor_poles`, `blackbox_high_resolution`.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 import math
 from operator import itemgetter
 from pathlib import Path
@@ -30,6 +31,7 @@ from ou_monitor.recordings.importers.log import (
     CURRENT, DEGREE, GRAVITY, gyro_of, Log, log_of, Motion, quiet, Request, RPM, Series,
     SIGNAL, three_axes, THROTTLE, UNKNOWN, VELOCITY, VOLTAGE)
 from ou_monitor.records import FloatArray
+from ou_monitor.text import counted
 
 # The clock counts us in 32 bits.
 WRAP = 2**32
@@ -84,11 +86,11 @@ def read(path: Path, request: Request) -> Log:
         rest = parser.reader._frame_data[end:].removeprefix(b'End of log\0')
         broken = int(parser._ctx.invalid_frame_count)
     if dropped:
-        notes.append(f'At least {dropped} frame{"s" * (dropped != 1)} without a sound key frame '
-                     'before them dropped.')
+        notes.append(f'At least {counted(dropped, "frame")} without a sound key frame before them '
+                     'dropped.')
     if broken:
-        notes.append(f'{broken} piece{"s" * (broken != 1)} left out that orangebox does not '
-                     'know: broken bytes, or events of newer firmware.')
+        notes.append(f'{counted(broken, "piece")} left out that orangebox does not know: broken '
+                     'bytes, or events of newer firmware.')
     if not closed:
         notes.append(f'Flight {wanted} has no end mark: it was cut off or goes on at its end; '
                      f'{end} of {size} bytes of frames were read.')
@@ -98,7 +100,7 @@ def read(path: Path, request: Request) -> Log:
                      'not read.')
     table, odd = _in_time(table)
     if odd:
-        notes.append(f'{odd} frame{"s" * (odd != 1)} dropped: the time does not fit.')
+        notes.append(f'{counted(odd, "frame")} dropped: the time does not fit.')
     columns = {name: table[:, k] for k, name in enumerate(fields)}
     facts = _facts(headers)
     if len(held) > 1:
@@ -252,12 +254,10 @@ def _battery(t: FloatArray, columns: Fields, headers: Headers,
             notes.append(f'{field} was left out: its unit is not known for the firmware '
                          f"'{headers.get('Firmware revision', 'unknown')}'.")
             continue
-        values = columns[field] * scale
-        one = Series(field, quantity, t, values, f'{scale:.6g}', words, rank, 'battery')
-        if one.silent:
-            one = Series(field, quantity, t, values, f'{scale:.6g}',
-                         f'{words}, always 0: no sensor', None, 'battery')
-        yield one
+        one = Series(field, quantity, t, columns[field] * scale, f'{scale:.6g}', words, rank,
+                     'battery')
+        yield replace(one, words=f'{words}, always 0: no sensor', rank=None) if (
+            one.silent) else one
 
 
 def _throttles(t: FloatArray, columns: Fields,

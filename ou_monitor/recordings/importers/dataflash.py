@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 import re
 from tempfile import TemporaryDirectory
@@ -22,6 +23,7 @@ from ou_monitor.recordings.importers.log import (
     RPM, Series, SIGNAL, started, three_axes, THROTTLE, UNKNOWN, VELOCITY, VOLTAGE)
 from ou_monitor.records import FloatArray
 from ou_monitor.stream.files import open_regular
+from ou_monitor.text import counted
 from pymavlink import DFReader
 
 # Message, field, quantity, rank, words.
@@ -92,7 +94,7 @@ def read(path: Path, request: Request) -> Log:
         finally:
             _close(log)
     if bad:
-        notes.append(f'{bad} message{"s" * (bad != 1)} could not be read and were left out.')
+        notes.append(f'{counted(bad, "message")} could not be read and were left out.')
     series: list[Series] = []
     for (kind, instance), columns in sorted(table.items()):
         name = f'{kind}[{instance}]' if instance else kind
@@ -126,7 +128,7 @@ def _plain_text(path: Path, text: bool) -> Iterator[tuple[str, list[str]]]:
         copy = Path(folder) / 'log'
         copy.write_bytes(content.translate(bytes(range(0x80)) + b'?' * 0x80))
         odd = len(content) - len(content.translate(None, bytes(range(0x80, 0x100))))
-        yield str(copy), [f'{odd} byte{"s" * (odd != 1)} that are not ASCII were read as "?".']
+        yield str(copy), [f'{counted(odd, "byte")} that are not ASCII were read as "?".']
 
 
 def _close(log: Any) -> None:
@@ -237,7 +239,7 @@ def _lost_text(log: Any) -> list[str]:
         lost += bool(line.strip()) and (form is None or len(cells) <= len(form.format))
     notes = []
     if lost:
-        notes.append(f'{lost} line{"s" * (lost != 1)} left out: no message of this log.')
+        notes.append(f'{counted(lost, "line")} left out: no message of this log.')
     if not text.endswith('\n'):
         notes.append(f'The last line does not end: the log was cut off at byte {size}.')
     return notes
@@ -282,10 +284,8 @@ def _plain(name: str, kind: str, columns: dict[str, list[float]],
             scale = 0.001 if field == 'Vcc' else 0.01
         one = Series(f'{name}.{field}', quantity, t, values * scale, f'{scale:g}', words, rank,
                      name)
-        if quantity != THROTTLE and one.silent:
-            one = Series(one.name, quantity, t, one.values, one.scale,
-                         f'{words}, not connected', None, name)
-        yield one
+        yield replace(one, words=f'{words}, not connected', rank=None) if (
+            quantity != THROTTLE and one.silent) else one
 
 
 def _others(name: str, columns: dict[str, list[float]], units: dict[str, str],

@@ -10,6 +10,7 @@ are taken by name only.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 import io
 from pathlib import Path
 import re
@@ -20,7 +21,11 @@ from ou_monitor.recordings.importers.log import (
     CURRENT, FRD_TO_FLU, gyro_of, Log, log_of, Motion, one_flight, Progress, quiet, Request, RPM,
     Series, SIGNAL, started, three_axes, THROTTLE, UNKNOWN, VELOCITY, VOLTAGE)
 from ou_monitor.records import Defect, FloatArray, Note
+from ou_monitor.text import counted
 from pyulog import ULog
+
+# Field -> values over time.
+Columns = dict[str, FloatArray]
 
 CLOCK, UTC = 'vehicle_gps_position', 'time_utc_usec'
 TOPICS = ('battery_status', CLOCK, 'system_power', 'power_monitor', 'esc_status',
@@ -131,19 +136,21 @@ def read(path: Path, request: Request) -> Log:
                           'missing, those after them were read.', Defect.DAMAGED_FILE))
     lost = sum(one.duration for one in ulog.dropouts) * 1e-3
     if ulog.dropouts:
-        notes.append(f'The logger lost data {len(ulog.dropouts)} '
-                     f'time{"s" * (len(ulog.dropouts) != 1)}, {lost:.3f} s in all.')
+        notes.append(f'The logger lost data {counted(len(ulog.dropouts), "time")}, {lost:.3f} s '
+                     'in all.')
     series: list[Series] = []
     inertial: list[Motion] = []
     speeds: Motion | None = None
     for data in ulog.data_list:
-        columns: dict[str, Any] = data.data
+        columns = {field: np.asarray(values, dtype=np.float64)
+                   for field, values in data.data.items() if not field.startswith('_padding')}
         if 'timestamp' in columns:
-            name = f'{data.name}[{data.multi_id}]'
-            found = list(_series(name, data.name, columns))
-            series += [*found, *_others(name, data.name, columns, {one.name for one in found})]
-            inertial += _gyros(name, data.name, columns)
-            speeds = speeds or _speeds(data.name, columns)
+            t, name = columns.pop('timestamp') * 1e-6, f'{data.name}[{data.multi_id}]'
+            found = list(_series(name, data.name, t, columns))
+            series += [*found, *_others(name, data.name, t, columns,
+                                        {one.name for one in found})]
+            inertial += _gyros(name, data.name, t, columns)
+            speeds = speeds or _speeds(data.name, t, columns)
     return log_of('ulog', series, _facts(ulog) | _started(ulog), notes,
                   (*(one.name for one in series), *_declared(ulog)), inertial, speeds,
                   ulog.start_timestamp * 1e-6)
@@ -162,12 +169,12 @@ def _declared(ulog: Any) -> Iterator[str]:
                 yield f'{topic}[0].{field}' + ('[0]' if size else '')
 
 
-def _others(name: str, topic: str, columns: dict[str, Any], known: set[str]) -> Iterator[Series]:
+def _others(name: str, topic: str, t: FloatArray, columns: Columns, known: set[str],
+            ) -> Iterator[Series]:
     """Yield the fields of no other quantity, as logged."""
-    t = np.asarray(columns['timestamp'], dtype=np.float64) * 1e-6
     rates = ('vehicle_angular_velocity', 'sensor_gyro')
     for field, values in columns.items():
-        if field == 'timestamp' or field.startswith('_padding') or f'{name}.{field}' in known:
+        if f'{name}.{field}' in known:
             continue
         stem = field.split('[')[0].split('.')[-1]
         unit = next((unit for ending, unit in ENDINGS if stem.endswith(ending)), UNKNOWN)
@@ -175,11 +182,11 @@ def _others(name: str, topic: str, columns: dict[str, Any], known: set[str]) -> 
             unit = 'rad/s'
         elif unit == 'rad/s' and not stem.startswith('gyro'):
             unit = 'rad'
-        yield Series(f'{name}.{field}', SIGNAL, t, np.asarray(values, dtype=np.float64), '1',
-                     'as logged', group=name, own_unit=unit)
+        yield Series(f'{name}.{field}', SIGNAL, t, values, '1', 'as logged', group=name,
+                     own_unit=unit)
 
 
-def _gyros(name: str, topic: str, columns: dict[str, Any]) -> Iterator[Motion]:
+def _gyros(name: str, topic: str, t: FloatArray, columns: Columns) -> Iterator[Motion]:
     """Yield gyro and accelerometer of a topic along front, left and up."""
     for source, gyro, acc, rank, words in GYROS:
         if source != topic:
@@ -187,7 +194,6 @@ def _gyros(name: str, topic: str, columns: dict[str, Any]) -> Iterator[Motion]:
         rates = three_axes(columns, _axes(gyro))
         forces = three_axes(columns, _axes(acc)) if acc else None
         if rates is not None:
-            t = np.asarray(columns['timestamp'], dtype=np.float64) * 1e-6
             yield gyro_of(name, t, rates * FRD_TO_FLU,
                           None if forces is None else forces * FRD_TO_FLU,
                           'front, right, down turned to front, left, up', words, rank)
@@ -198,16 +204,15 @@ def _axes(stem: str) -> list[str]:
     return [f'{stem}[{axis}]' for axis in range(3)] if stem else ['x', 'y', 'z']
 
 
-def _speeds(topic: str, columns: dict[str, Any]) -> Motion | None:
+def _speeds(topic: str, t: FloatArray, columns: Columns) -> Motion | None:
     """Return the speeds reported by ESCs, or None."""
     fields = [f'esc[{k}].esc_rpm' for k in range(16) if f'esc[{k}].esc_rpm' in columns]
     fields = [name for name in fields if np.any(columns[name])]
     if topic != 'esc_status' or not fields:
         return None
-    values = np.column_stack([np.asarray(columns[name], dtype=np.float64) for name in fields])
+    values = np.column_stack([columns[name] for name in fields])
     return Motion(
-        '', np.asarray(columns['timestamp'], dtype=np.float64) * 1e-6,
-        {VELOCITY: np.abs(values) * RPM}, f'rpm {RPM:.6g}', 'speed reported by the ESC',
+        '', t, {VELOCITY: np.abs(values) * RPM}, f'rpm {RPM:.6g}', 'speed reported by the ESC',
         motors=tuple(f'motor_{name[4:name.index("]")]}' for name in fields))
 
 
@@ -246,30 +251,26 @@ def _started(ulog: Any) -> dict[str, str]:
     return {}
 
 
-def _series(name: str, topic: str, columns: dict[str, Any]) -> Iterator[Series]:
-    t = np.asarray(columns['timestamp'], dtype=np.float64) * 1e-6
+def _series(name: str, topic: str, t: FloatArray, columns: Columns) -> Iterator[Series]:
     connected = columns.get('connected')
     # A battery that was never connected is listed last.
     there = connected is None or bool(np.any(connected))
     for source, field, quantity, rank, words in PLAIN:
         if source != topic or field not in columns:
             continue
-        values = np.asarray(columns[field], dtype=np.float64)
+        values = columns[field]
         if quantity == CURRENT:
             # The message uses -1 for "unknown".
             values = np.where(values == -1.0, np.nan, values)
         one = Series(f'{name}.{field}', quantity, t, values, '1', words, rank, name)
-        if quantity != THROTTLE and (one.silent or not there):
-            one = Series(f'{name}.{field}', quantity, t, values, '1', f'{words}, not connected',
-                         None, name)
-        yield one
+        yield replace(one, words=f'{words}, not connected', rank=None) if (
+            quantity != THROTTLE and (one.silent or not there)) else one
     if topic == 'actuator_motors':
         yield from _motors(name, t, columns)
     elif topic == 'vehicle_thrust_setpoint':
         yield from _thrust(name, t, columns)
     elif topic == 'manual_control_setpoint' and 'throttle' in columns:
-        yield Series(f'{name}.throttle', THROTTLE, t,
-                     (np.asarray(columns['throttle'], dtype=np.float64) + 1.0) / 2.0,
+        yield Series(f'{name}.throttle', THROTTLE, t, (columns['throttle'] + 1.0) / 2.0,
                      '(x + 1) / 2', 'stick', 4, name)
     elif topic == 'actuator_outputs':
         yield from _outputs(name, t, columns)
@@ -277,15 +278,15 @@ def _series(name: str, topic: str, columns: dict[str, Any]) -> Iterator[Series]:
         yield from _escs(name, t, columns)
 
 
-def _stack(columns: dict[str, Any], stem: str) -> FloatArray:
+def _stack(columns: Columns, stem: str) -> FloatArray:
     """Return the elements of an array field as rows."""
     rows: list[FloatArray] = []
     while f'{stem}[{len(rows)}]' in columns:
-        rows.append(np.asarray(columns[f'{stem}[{len(rows)}]'], dtype=np.float64))
+        rows.append(columns[f'{stem}[{len(rows)}]'])
     return np.array(rows)
 
 
-def _motors(name: str, t: FloatArray, columns: dict[str, Any]) -> Iterator[Series]:
+def _motors(name: str, t: FloatArray, columns: Columns) -> Iterator[Series]:
     control = _stack(columns, 'control')
     # NaN: motor missing or stopped.
     used = control[np.isfinite(control).any(axis=1)] if control.size else control
@@ -297,18 +298,18 @@ def _motors(name: str, t: FloatArray, columns: dict[str, Any]) -> Iterator[Serie
                      f'mean of {len(used)} motors', 0, name)
 
 
-def _thrust(name: str, t: FloatArray, columns: dict[str, Any]) -> Iterator[Series]:
+def _thrust(name: str, t: FloatArray, columns: Columns) -> Iterator[Series]:
     for axis, sign, words, rank in ((2, -1.0, 'thrust upwards', 1),
                                     (0, 1.0, 'thrust forwards', 2)):
         field = f'xyz[{axis}]'
         if field in columns:
-            values = sign * np.asarray(columns[field], dtype=np.float64)
-            one = Series(f'{name}.{field}', THROTTLE, t, values, f'{sign:g}', words, rank, name)
+            one = Series(f'{name}.{field}', THROTTLE, t, sign * columns[field], f'{sign:g}', words,
+                         rank, name)
             if not one.silent:
                 yield one
 
 
-def _outputs(name: str, t: FloatArray, columns: dict[str, Any]) -> Iterator[Series]:
+def _outputs(name: str, t: FloatArray, columns: Columns) -> Iterator[Series]:
     output = _stack(columns, 'output')
     count = int(np.max(columns['noutputs'])) if 'noutputs' in columns else len(output)
     for k, values in enumerate(output[:count]):
@@ -321,13 +322,12 @@ def _outputs(name: str, t: FloatArray, columns: dict[str, Any]) -> Iterator[Seri
                          'one output, motor or servo', None, name)
 
 
-def _escs(name: str, t: FloatArray, columns: dict[str, Any]) -> Iterator[Series]:
+def _escs(name: str, t: FloatArray, columns: Columns) -> Iterator[Series]:
     for field in columns:
         quantity = (VOLTAGE if field.endswith('.esc_voltage')
                     else CURRENT if field.endswith('.esc_current') else None)
         if quantity is not None:
-            one = Series(f'{name}.{field}', quantity, t,
-                         np.asarray(columns[field], dtype=np.float64), '1', 'at the ESC', None,
+            one = Series(f'{name}.{field}', quantity, t, columns[field], '1', 'at the ESC', None,
                          f'{name}.{field.split(".")[0]}')
             if not one.silent:
                 yield one
