@@ -164,14 +164,10 @@ _TYPE = re.compile(r'(be|le):([su])(\d+)/(\d+)(?:X(\d+))?(?:>>(\d+))?')
 class Element:
     """One element of a scan."""
 
-    # 'in_voltage0', 'in_timestamp'.
-    name: str
-    # Its place among the elements.
-    index: int
-    # '<' or '>'.
-    order: str
-    # Whether two's complement.
-    signed: bool
+    name: str  # 'in_voltage0', 'in_timestamp'
+    index: int  # Its place among the elements
+    order: str  # '<' or '>'
+    signed: bool  # Whether two's complement
     # Valid bits, bits in memory, and bits below the valid ones.
     bits: int
     storage: int
@@ -252,12 +248,9 @@ _CLOCKS: dict[str, int] = {
 class Block:
     """Samples at an even spacing."""
 
-    # Time of the last sample, s since 1970.
-    stamp: float
-    # Voltages, V; shape (n,).
-    volts: FloatArray
-    # Spacing by the kernel's stamps, s; NaN without stamps.
-    interval: float
+    stamp: float  # Time of the last sample, s since 1970
+    volts: FloatArray  # Voltages, V; shape (n,)
+    interval: float  # Spacing by the kernel's stamps, s; NaN without stamps
 
 
 class IioBuffer:

@@ -41,12 +41,9 @@ _FOR_EVER = {'sec': 9223372036, 'nsec': 854775807}
 class BagFiles(NamedTuple):
     """Files and metadata of a bag."""
 
-    # MCAP files in recorded order.
-    paths: list[Path]
-    # Custom data of the recording, such as its vehicle.
-    about: dict[str, str]
-    # Description of missing files; '' when complete.
-    missing: str
+    paths: list[Path]  # MCAP files in recorded order
+    about: dict[str, str]  # Custom data of the recording, such as its vehicle
+    missing: str  # Description of missing files; '' when complete
 
 
 def _qos() -> list[dict[str, Any]]:
@@ -143,12 +140,10 @@ class RawMessage(NamedTuple):
 class Part(NamedTuple):
     """The messages of one chunk or run."""
 
-    #: Topic -> its messages, in the order of the file.
-    tables: dict[str, MessageTable]
+    tables: dict[str, MessageTable]  #: Topic -> its messages, in the order of the file
     #: No later part has a message before this log time, ns; None after the last part.
     later_ns: int | None
-    #: Share of the bytes to be read that is done, 0..1.
-    done: float
+    done: float  #: Share of the bytes to be read that is done, 0..1
 
 
 class BagReader:

@@ -31,14 +31,12 @@ from ou_monitor.timeline.line import check_throttle
 class TopicChoice:
     """The fields to read from a bag."""
 
-    # The source.
-    config: MsgConfig
+    config: MsgConfig  # The source
     # With the topics of this bag; None if there is no throttle or current.
     voltage: FieldSpec
     throttle: FieldSpec | None
     current: FieldSpec | None
-    # Notes on unexpected choices, one sentence each.
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # Notes on unexpected choices, one sentence each
 
 
 def choose(

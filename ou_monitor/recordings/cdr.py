@@ -55,8 +55,7 @@ class Field:
     # A key of `PRIMITIVES`, `TEXT`, or 'package/Type'.
     type: str  # noqa: A003
     array: bool = False
-    # Elements of an array of fixed size; None when a message states them.
-    size: int | None = None
+    size: int | None = None  # Elements of an array of fixed size; None when a message states them
 
 
 # package/Type -> its fields.
@@ -125,12 +124,9 @@ def stamp_paths(spec: FieldSpec, definitions: Definitions) -> tuple[FieldPath, .
 class Place:
     """The place of numbers in a message."""
 
-    # Byte of the first one.
-    offset: int
-    # NumPy type of each.
-    kind: str
-    # Number of elements; None for a single number that is not an array.
-    size: int | None = None
+    offset: int  # Byte of the first one
+    kind: str  # NumPy type of each
+    size: int | None = None  # Number of elements; None for a single number that is not an array
 
     def column(self, rows: Rows) -> FloatArray:
         """Return the numbers of many messages."""
@@ -266,12 +262,9 @@ Broken = Callable[[int, str], None]
 class MessageTable:
     """Messages in a block of bytes, in the order of the file."""
 
-    #: The block.
-    data: bytes
-    #: Channel of each message.
-    channel: npt.NDArray[np.uint16]
-    #: Log times, ns.
-    log_time: TimeArray
+    data: bytes  #: The block
+    channel: npt.NDArray[np.uint16]  #: Channel of each message
+    log_time: TimeArray  #: Log times, ns
     #: Start and end of the serialized messages in `data`.
     begin: IntArray
     end: IntArray
@@ -310,15 +303,12 @@ def gather(data: bytes, at: IntArray, kind: str) -> npt.NDArray[Any]:
 class FieldColumn(NamedTuple):
     """A field of many messages, and a second one of each."""
 
-    # Log times, ns; shape (m,).
-    log_time: TimeArray
+    log_time: TimeArray  # Log times, ns; shape (m,)
     # Stamps of the messages (of the LAST sample of a block), s; the log time where a message has
     # none; shape (m,).
     stamp: FloatArray
-    # Whether the message carries its stamp; shape (m,).
-    stamped: npt.NDArray[np.bool_]
-    # Values in each message: 1, unless the field is a block; shape (m,).
-    counts: IntArray
+    stamped: npt.NDArray[np.bool_]  # Whether the message carries its stamp; shape (m,)
+    counts: IntArray  # Values in each message: 1, unless the field is a block; shape (m,)
     # Values in SI units; NaN where missing or not finite; shape (counts.sum(),).
     values: FloatArray
     # The second field in SI units; NaN where missing, not finite or not asked for; shape (m,).

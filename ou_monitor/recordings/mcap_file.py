@@ -104,12 +104,9 @@ class Span(NamedTuple):
     offset: int
     length: int
     chunk: bool
-    #: Channels with messages in it; None: unknown.
-    channels: frozenset[int] | None = None
-    #: Bytes of message indexes right behind it.
-    index_length: int = 0
-    #: Bytes that the chunk unpacks to, as stated; 0: not stated.
-    unpacked: int = 0
+    channels: frozenset[int] | None = None  #: Channels with messages in it; None: unknown
+    index_length: int = 0  #: Bytes of message indexes right behind it
+    unpacked: int = 0  #: Bytes that the chunk unpacks to, as stated; 0: not stated
 
 
 class Topic(NamedTuple):
@@ -118,10 +115,8 @@ class Topic(NamedTuple):
     name: str
     type: str  # noqa: A003
     schema: Any
-    #: Rate of the samples within a block, Hz.
-    sample_rate: float | None
-    #: Origin of its values.
-    origin: dict[str, str]
+    sample_rate: float | None  #: Rate of the samples within a block, Hz
+    origin: dict[str, str]  #: Origin of its values
 
 
 def usable_memory() -> int:

@@ -35,18 +35,13 @@ _TOPIC = re.compile(r'[~/]?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
 class FieldSpec:
     """Where one quantity is found: value = sign * unit_factor * raw + offset."""
 
-    # Topic; relative ones ('voltage') are for remapping.
-    topic: str
+    topic: str  # Topic; relative ones ('voltage') are for remapping
     # Message type, 'package/msg/Type'.
     type: str  # noqa: A003
-    # Field path, 'data', 'channels[0].value'.
-    field: str
-    # SI units per unit of the field (1e-3 for mV).
-    unit_factor: float = 1.0
-    # 1 or -1.
-    sign: int = 1
-    # Added after scaling, SI units.
-    offset: float = 0.0
+    field: str  # Field path, 'data', 'channels[0].value'
+    unit_factor: float = 1.0  # SI units per unit of the field (1e-3 for mV)
+    sign: int = 1  # 1 or -1
+    offset: float = 0.0  # Added after scaling, SI units
     # Meaning of NaN or infinity: a transmission error, dropped and counted ('drop'), or "not
     # measured" ('unknown').
     nan: str = 'drop'
@@ -59,28 +54,20 @@ class FieldSpec:
     # Path of a builtin_interfaces/Time ('header.stamp') or of a number ('timestamp'); None: the
     # middleware's source timestamp.
     stamp_field: str | None = None
-    # Seconds per unit of a numeric stamp (1e-6 for microseconds).
-    stamp_factor: float = 1.0
+    stamp_factor: float = 1.0  # Seconds per unit of a numeric stamp (1e-6 for microseconds)
 
 
 @dataclass(frozen=True)
 class MsgConfig:
     """One source of voltage, with its throttle, current and motor speeds if it has them."""
 
-    # Name of the file without its ending.
-    name: str
-    # Description in one sentence, with limits.
-    description: str
-    # ROS package that defines the voltage's type.
-    package: str
-    # What to install when that package is missing.
-    install: str
-    # Whether the topics are relative, to be remapped, rather than fixed by a driver.
-    generic: bool
-    # Where the voltage is, V.
-    voltage: FieldSpec
-    # Where the throttle is, 0..1.
-    throttle: FieldSpec | None = None
+    name: str  # Name of the file without its ending
+    description: str  # Description in one sentence, with limits
+    package: str  # ROS package that defines the voltage's type
+    install: str  # What to install when that package is missing
+    generic: bool  # Whether the topics are relative, to be remapped, rather than fixed by a driver
+    voltage: FieldSpec  # Where the voltage is, V
+    throttle: FieldSpec | None = None  # Where the throttle is, 0..1
     # Where the current drawn is, A, in the messages of the voltage.
     current: FieldSpec | None = None
     # Where the speeds of the motors are, 1/min of the shaft unless `notch.rpm_unit` says

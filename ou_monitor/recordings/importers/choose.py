@@ -35,13 +35,11 @@ MOST, _LIST = 4, 'see convert LOG --list'
 class Chosen:
     """The series chosen from a log."""
 
-    # At least one sample.
-    voltage: Series
+    voltage: Series  # At least one sample
     # None if missing in the log, or not wanted.
     throttle: Series | None
     current: Series | None
-    # Dropped samples, and alternatives in the log.
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # Dropped samples, and alternatives in the log
 
 
 def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | None = None,
@@ -209,14 +207,10 @@ _GAP = 3.0
 class Extras:
     """Series chosen from a log beside voltage, throttle and current."""
 
-    # By topic, without the slash.
-    inertial: dict[str, Motion]
-    # Speeds of the motors.
-    speeds: Motion | None
-    # By topic, without the slash.
-    signals: dict[str, Series]
-    # Dropped samples, and quantities missing in the log.
-    notes: tuple[str, ...]
+    inertial: dict[str, Motion]  # By topic, without the slash
+    speeds: Motion | None  # Speeds of the motors
+    signals: dict[str, Series]  # By topic, without the slash
+    notes: tuple[str, ...]  # Dropped samples, and quantities missing in the log
 
 
 def choose_extras(path: Path, log: Log, *, imus: Sequence[str] = (),

@@ -34,14 +34,10 @@ BLACKBOX = b'H Product:Blackbox flight data recorder'
 class Format(NamedTuple):
     """One format."""
 
-    # Short name.
-    name: str
-    # What it is, with its usual ending.
-    words: str
-    # Whether a file with these first bytes has this format.
-    fits: Callable[[bytes], bool]
-    # Name of the module that reads it, beside this one; empty: not a log.
-    module: str
+    name: str  # Short name
+    words: str  # What it is, with its usual ending
+    fits: Callable[[bytes], bool]  # Whether a file with these first bytes has this format
+    module: str  # Name of the module that reads it, beside this one; empty: not a log
     # Package needed beyond the core, and the extra of pyproject.toml that installs it.
     package: str = ''
     extra: str = ''

@@ -44,17 +44,13 @@ RATE, FORCE, VELOCITY = 'angular_velocity', 'linear_acceleration', 'velocity'
 class Motion:
     """A gyro with its accelerometer, if it has one, or the speeds of all motors."""
 
-    # Name for the user.
-    name: str
-    # Stamps, s from the start of the log; shape (n,).
-    t: FloatArray
-    # Field -> values, shape (n, 3) or (n, motors).
-    vectors: dict[str, FloatArray]
+    name: str  # Name for the user
+    t: FloatArray  # Stamps, s from the start of the log; shape (n,)
+    vectors: dict[str, FloatArray]  # Field -> values, shape (n, 3) or (n, motors)
     # Conversion of the values, poles included; kind of series.
     scale: str
     words: str
-    # Default if no smaller rank exists; None: only by name.
-    rank: int | None = None
+    rank: int | None = None  # Default if no smaller rank exists; None: only by name
     # Names of the motors, as in the message: ``motor_0``; empty for a gyro.
     motors: tuple[str, ...] = ()
 
@@ -92,25 +88,17 @@ Progress = Callable[[float], None]
 class Series:
     """One quantity over time, in SI units."""
 
-    # Name for the user, unique in the log: ``BAT[0].Volt``.
-    name: str
-    # VOLTAGE, THROTTLE, CURRENT, SIGNAL or ANY.
-    quantity: str
-    # Stamps, s from the start of the log; shape (n,).
-    t: FloatArray
+    name: str  # Name for the user, unique in the log: ``BAT[0].Volt``
+    quantity: str  # VOLTAGE, THROTTLE, CURRENT, SIGNAL or ANY
+    t: FloatArray  # Stamps, s from the start of the log; shape (n,)
     # V, 0..1, or A (positive when the battery is drained); NaN where the log says "unknown";
     # shape (n,).
     values: FloatArray
-    # Conversion from the logged value.
-    scale: str
-    # Description.
-    words: str = ''
-    # Default if no smaller rank exists; None: only by name.
-    rank: int | None = None
-    # The sensor; a voltage and a current of one sensor share it.
-    group: str = ''
-    # Unit of a signal, ``?`` when the log does not state it.
-    own_unit: str = UNKNOWN
+    scale: str  # Conversion from the logged value
+    words: str = ''  # Description
+    rank: int | None = None  # Default if no smaller rank exists; None: only by name
+    group: str = ''  # The sensor; a voltage and a current of one sensor share it
+    own_unit: str = UNKNOWN  # Unit of a signal, ``?`` when the log does not state it
 
     @property
     def unit(self) -> str:
@@ -147,38 +135,27 @@ class Log:
 
     # Name of the format.
     format: str  # noqa: A003
-    # Candidates.
-    series: tuple[Series, ...]
+    series: tuple[Series, ...]  # Candidates
     # Vehicle, firmware, number of the flight, as far as known.
     facts: dict[str, str] = field(default_factory=dict)
-    # Dropped or unreadable parts, one sentence each.
-    notes: tuple[str, ...] = ()
-    # Gyros and accelerometers.
-    inertial: tuple[Motion, ...] = ()
-    # Speeds of the motors.
-    speeds: Motion | None = None
-    # Names of all series of the file, unread ones included.
-    names: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # Dropped or unreadable parts, one sentence each
+    inertial: tuple[Motion, ...] = ()  # Gyros and accelerometers
+    speeds: Motion | None = None  # Speeds of the motors
+    names: tuple[str, ...] = ()  # Names of all series of the file, unread ones included
 
 
 @dataclass(frozen=True, eq=False)
 class RawColumns:
     """Samples of a supply as a file holds them: unsorted, with repeated stamps."""
 
-    # Stamps, s; NaN if unknown.
-    t: FloatArray
-    # V, with all repeats of the logger; NaN if unknown.
-    voltage: FloatArray
-    # 0..1, held from its last value on; NaN if unknown.
-    throttle: FloatArray
+    t: FloatArray  # Stamps, s; NaN if unknown
+    voltage: FloatArray  # V, with all repeats of the logger; NaN if unknown
+    throttle: FloatArray  # 0..1, held from its last value on; NaN if unknown
     # A, positive while the battery is drained; NaN if unknown; None: unknown throughout.
     current: FloatArray | None
-    # Name of the file, printable.
-    name: str
-    # Origin: file, format, chosen series, firmware.
-    source: dict[str, str]
-    # Dropped or unreadable parts, one sentence each.
-    notes: tuple[str, ...] = ()
+    name: str  # Name of the file, printable
+    source: dict[str, str]  # Origin: file, format, chosen series, firmware
+    notes: tuple[str, ...] = ()  # Dropped or unreadable parts, one sentence each
 
 
 @dataclass(frozen=True)
@@ -193,33 +170,26 @@ class CsvColumns:
     unit: str | None = None
     time_unit: str | None = None
     throttle_unit: str | None = None
-    # Name of a column, as the throttle.
-    current: str | None = None
+    current: str | None = None  # Name of a column, as the throttle
     # What separates cells: a character, 'tab' or 'space'; the decimal mark: '.' or ','.
     delimiter: str | None = None
     decimal: str | None = None
-    # Lines above the header.
-    skip_rows: int | None = None
-    # Time from row to row, s, in place of a column of time.
-    sample_interval: float | None = None
+    skip_rows: int | None = None  # Lines above the header
+    sample_interval: float | None = None  # Time from row to row, s, in place of a column of time
 
 
 @dataclass(frozen=True)
 class Request:
     """The request to an importer."""
 
-    # Flight of a file with several.
-    flight: int | None = None
+    flight: int | None = None  # Flight of a file with several
     # Series named by the user, for formats that read only wanted ones.
     names: frozenset[str] = frozenset()
     # Magnets of a motor's rotor, if the log does not state them; needed for eRPM.
     poles: int | None = None
-    # Whether all candidates are wanted (``--list``).
-    everything: bool = False
-    # Called with the share done, 0..1.
-    progress: Progress | None = None
-    # How a CSV is to be read.
-    columns: CsvColumns | None = None
+    everything: bool = False  # Whether all candidates are wanted (``--list``)
+    progress: Progress | None = None  # Called with the share done, 0..1
+    columns: CsvColumns | None = None  # How a CSV is to be read
 
 
 def one_flight(path: Path, request: Request) -> None:
