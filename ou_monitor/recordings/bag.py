@@ -150,22 +150,20 @@ class BagReader:
     """
     Reads a bag (.mcap file or rosbag2 directory); with `partial` also a damaged one.
 
-    max_chunk: bytes that a chunk may unpack to; else OU_MONITOR_MAX_CHUNK_MB, or 256 times the
-    file, at least 64 MiB and at most an eighth of the memory.  By topic: message types in
-    `topics`, numbers in `counts`, rate of the samples within blocks, Hz, in `sample_rates`,
-    and origins of values in `origins`, if the bag states them.  `about` is the custom
-    data of metadata.yaml or of the files; `start_ns`, `end_ns` the log times of the first and last
-    message; `damage` the place and kind of damage, or None; `notes` topics left out, and the
-    like.  InputError: missing, empty, foreign, without messages, or damaged and not `partial`.
+    By topic: message types in `topics`, numbers in `counts`, rate of the samples within blocks,
+    Hz, in `sample_rates`, and origins of values in `origins`, if the bag states them.  `about` is
+    the custom data of metadata.yaml or of the files; `start_ns`, `end_ns` the log times of the
+    first and last message; `damage` the place and kind of damage, or None; `notes` topics left
+    out, and the like.  InputError: missing, empty, foreign, without messages, or damaged and not
+    `partial`.
     """
 
-    def __init__(self, path: Path | str, *, partial: bool = False,
-                 max_chunk: int | None = None) -> None:
+    def __init__(self, path: Path | str, *, partial: bool = False) -> None:
         """Index the bag; messages are read later, and files are closed between reads."""
         self.path = Path(path)
         self.partial = partial
         paths, about, missing = find_files(self.path, partial)
-        self._files = [McapFile(file, partial, max_chunk) for file in paths]
+        self._files = [McapFile(file, partial) for file in paths]
         # The metadata of the directory wins: people edit it.
         self.about = {key: value for known in (*(file.about for file in self._files), about)
                       for key, value in known.items()}

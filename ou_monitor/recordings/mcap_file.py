@@ -130,10 +130,8 @@ def usable_memory() -> int:
     return min(limits if allowed == resource.RLIM_INFINITY else [*limits, allowed])
 
 
-def _chunk_limit(size: int, stated: int | None) -> int:
+def _chunk_limit(size: int) -> int:
     """Return the bytes that a chunk of a file of `size` bytes may unpack to."""
-    if stated is not None:
-        return stated
     text = os.environ.get(_VARIABLE, '')
     if text:
         try:
@@ -160,12 +158,12 @@ class McapFile:
     """
     One .mcap file, its `topics` by channel, `counts` of messages, `spans` that hold them.
 
-    `partial`: walk the whole file; `max_chunk`: bytes that a chunk may unpack to.  `about` is
-    the file's own metadata, `start_ns` and `end_ns` the log times of the first and last message,
-    `origin_ns` the log time of the bag's first message.  InputError: missing, empty or foreign.
+    `partial`: walk the whole file.  `about` is the file's own metadata, `start_ns` and `end_ns`
+    the log times of the first and last message, `origin_ns` the log time of the bag's first
+    message.  InputError: missing, empty or foreign.
     """
 
-    def __init__(self, path: Path, partial: bool, max_chunk: int | None = None) -> None:
+    def __init__(self, path: Path, partial: bool) -> None:
         """Index the file."""
         self.path = path
         self.topics: dict[int, Topic] = {}
@@ -183,7 +181,7 @@ class McapFile:
         self._zstd = zstandard.ZstdDecompressor()
         with self._open() as file:
             self._size = file.seek(0, os.SEEK_END)
-            self._limit = _chunk_limit(self._size, max_chunk)
+            self._limit = _chunk_limit(self._size)
             self._limit_of_all = max(16 * self._limit, _MOST_RATIO * self._size)
             self._check_magic(file)
             self._summary = self._read_summary(file)

@@ -163,14 +163,11 @@ class Publishers:
     def _alone(self, numbers: npt.NDArray[np.int64], times: FloatArray, arrived: FloatArray
                ) -> None:
         """Register messages of the only publisher; numbers that start again are a new one."""
-        if self._tracks:
-            steps = np.diff(numbers, prepend=self._tracks[0].number)
-            self.lost += int(np.sum(steps[steps > 0] - 1))
-        else:
+        if not self._tracks:
             self._tracks = [_Track(int(numbers[0]), float(times[0]), float(arrived[0]))]
-            steps = np.diff(numbers)
-            self.lost += int(np.sum(steps[steps > 0] - 1))
         track = self._tracks[0]
+        steps = np.diff(numbers, prepend=track.number)
+        self.lost += int(np.sum(steps[steps > 0] - 1))
         step = int(numbers[-1]) - track.number
         if step > 0 and times[-1] > track.time:
             track.take(int(numbers[-1]), float(times[-1]), float(arrived[-1]))

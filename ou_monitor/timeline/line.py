@@ -253,12 +253,12 @@ def reading_period(y: FloatArray) -> float:
     return refresh_period(y[first:first + _MIDDLE])
 
 
-def reading_places(y: FloatArray) -> tuple[npt.NDArray[np.intp], float]:
+def reading_places(y: FloatArray) -> tuple[Picked, float]:
     """Return the places of new readings in a voltage, V, and samples per reading (1: all)."""
     repeats = Repeats()
     repeats.period = reading_period(y)
     if repeats.period <= 1.0:
-        return np.arange(y.size), 1.0
+        return slice(None), 1.0
     return np.flatnonzero(repeats.fresh(np.stack([np.empty(y.size), y]))), repeats.period
 
 
@@ -294,9 +294,9 @@ def on_grid(t: FloatArray, number: FloatArray) -> FloatArray:
 
 def readings_of(recording: Recording) -> Recording:
     """Return a recording with each reading of its source once; a note counts the repeats."""
-    if reading_period(recording.voltage) <= 1.0:
-        return recording
     places, period = reading_places(recording.voltage)
+    if period <= 1.0:
+        return recording
     t = reading_times(recording.t[places], period)
     held = recording.n - t.size
     logged = (recording.n - 1) / recording.duration

@@ -11,6 +11,7 @@ from ou_monitor.recordings.bag import BagWriter
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.stream.config import load_msg_config
 from ou_monitor.stream.samples import APART, APART_MIXED, ThrottleHold
+from ou_monitor.timeline.line import BATCH
 import pytest
 
 STAMPS = st.floats(0.0, 4.0).map(lambda x: round(x, 2))
@@ -36,10 +37,14 @@ def test_agrees_with_its_definition(pushed, asked):
         before = [(stamp, place) for place, (stamp, _) in enumerate(pushed) if stamp <= at]
         expected.append(pushed[max(before)[1]][1] if before else np.nan)
     np.testing.assert_array_equal(hold.at(np.array(asked)), expected)
-    # Stamps in order, and more of them than of throttles, go another way.
-    order = np.argsort(asked, kind='stable')
-    np.testing.assert_array_equal(hold.at(np.repeat(np.array(asked)[order], 31)),
-                                  np.repeat(np.array(expected)[order], 31))
+
+
+def test_more_samples_than_a_batch_are_placed():
+    """A multiple of it, and one more."""
+    hold = hold_of([(1.0, 0.3), (2.0, 0.4)])
+    at = np.linspace(0.0, 4.0, 2 * BATCH + 1)
+    np.testing.assert_array_equal(
+        hold.at(at), np.where(at < 1.0, np.nan, np.where(at < 2.0, 0.3, 0.4)))
 
 
 def test_unneeded_throttles_are_dropped():
