@@ -302,7 +302,7 @@ _CLEARLY, _SHORT = 6.0, 3.0
 # Share at either end of the range where readings may be compressed.
 _END = 0.1
 # Maximum samples used to find repeats.
-_LOOK = 200_000
+_EXAMINED = 200_000
 
 
 def without_repeats(t: FloatArray, v: FloatArray, u: FloatArray | None
@@ -312,8 +312,8 @@ def without_repeats(t: FloatArray, v: FloatArray, u: FloatArray | None
     t, v, u = reading_times(t[places], period), v[places], None if u is None else u[places]
     if period > 1.0:
         return t, v, u, period
-    first = max(0, (v.size - _LOOK) // 2)
-    held = v[1:] == v[:-1] if _ties(v[first:first + _LOOK]) else _stuck(v)
+    first = max(0, (v.size - _EXAMINED) // 2)
+    held = v[1:] == v[:-1] if _ties(v[first:first + _EXAMINED]) else _stuck(v)
     fresh = np.concatenate(([True], ~held))
     return t[fresh], v[fresh], None if u is None else u[fresh], v.size / int(fresh.sum())
 

@@ -27,7 +27,7 @@ _ALIKE = 0.03
 # Processor time of the fastest law with a `SLOW_FIT`, s per sample.
 LAW_COST = 1e-5
 # Fits a law for the first time.
-Look = Callable[[type[Term], View], LawFit | None]
+LawFitter = Callable[[type[Term], View], LawFit | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class Composite:
 
 def fit_composite(samples: Samples, terms: Sequence[Term | type[Term]], part: slice,
                   known: Composite | None = None, *, whole_mean: bool = False,
-                  rough: bool = False, begun: bool = False, first: Look | None = None
+                  rough: bool = False, begun: bool = False, first: LawFitter | None = None
                   ) -> Composite | None:
     """
     Fit a model on a part; None if a law cannot be fitted.

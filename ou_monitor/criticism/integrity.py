@@ -32,7 +32,7 @@ NAMED_STEP = 0.3
 # Minimum range of throttle; if it moves less, it is not used.
 MOVES = 0.01
 # Maximum samples, as logged, that are kept for the score of the plain model.
-_LOOK = 200_000
+_EXAMINED = 200_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +181,7 @@ def _useful(u: FloatArray | None, recorded: bool, notes: list[str]) -> FloatArra
 
 
 def _as_logged(t: FloatArray, v: FloatArray, u: FloatArray | None) -> Samples:
-    part = slice(0, min(v.size, _LOOK))
+    part = slice(0, min(v.size, _EXAMINED))
     return Samples(t[part], v[part], None)
 
 

@@ -26,7 +26,7 @@ _SINGLES, _EACH = 3, 100_000
 # Minimum number of other samples, if the value has a larger share.
 _OTHERS = 100
 # Maximum values used for the spread.
-_LOOK = 200_000
+_EXAMINED = 200_000
 # A voltage counts as constant if at most this number, or this share, of samples differ.
 _ODD, _ODD_SHARE = 3, 1e-3
 # Limits of a voltage and of its range, V, whose fourth powers still are finite numbers.
@@ -55,7 +55,7 @@ def usable(recording: Recording, notes: list[str]
     if bad.any():
         notes += _bad_notes(t, v, bad)
         t, v, u = t[~bad], v[~bad], None if u is None else u[~bad]
-    usual = _quantiles(v[:_LOOK], 0.5)[0] if v.size else 0.0
+    usual = _quantiles(v[:_EXAMINED], 0.5)[0] if v.size else 0.0
     if _MILLIVOLTS < abs(usual) <= _LARGEST:
         notes.append(f'The voltage is near {number(usual)}: taken as volts. If it is in '
                      'millivolts or counts of the ADC, every result in V is wrong by that factor; '
@@ -93,7 +93,7 @@ def load_of(recording: Recording, t: FloatArray, v: FloatArray, u: FloatArray | 
     current = current_at(recording, t)
     if current is None or not float(np.ptp(current)) > 0.0:
         return u
-    some = slice(None, None, -(-v.size // _LOOK))
+    some = slice(None, None, -(-v.size // _EXAMINED))
     late, sign = timing(t[some], v[some], current[some])
     full = sign * float(np.quantile(np.abs(current), _FULL))
     if not full:
@@ -127,7 +127,7 @@ def _explained(t: FloatArray, v: FloatArray, load: FloatArray) -> float:
 def find_bad(v: FloatArray) -> npt.NDArray[np.bool_]:
     """Return which samples are error codes or glitches (v in V)."""
     bad = np.zeros(v.size, dtype=np.bool_)
-    some = v[::max(1, v.size // _LOOK)]
+    some = v[::max(1, v.size // _EXAMINED)]
     if some.size < 2:
         return bad
     off = _resting(some)
@@ -232,7 +232,7 @@ def _as_share(u: FloatArray, notes: list[str]) -> FloatArray:
     """Return throttle as 0..1, NaN where implausible; note the unit."""
     known = u[np.isfinite(u)]
     # A few wild values must not decide the unit.
-    low, high = _quantiles(known[::max(1, known.size // _LOOK)], 0.005, 0.995)
+    low, high = _quantiles(known[::max(1, known.size // _EXAMINED)], 0.005, 0.995)
     within = _UNIT
     if _UNIT[0] <= low and high <= _UNIT[1]:
         if low < -_EDGE or high > 1.0 + _EDGE:

@@ -33,7 +33,7 @@ _STEP = 0.3
 # OU: exp(x) / (1 + exp(-x)).  White noise cancels.
 _RATIO = math.exp(_STEP) / (1.0 + math.exp(-_STEP))
 # Maximum values used for that ratio.
-_LOOK = 1_000_000
+_EXAMINED = 1_000_000
 # Samples that share a noise scale; probability that noise alone makes any change an event; margin
 # for the error of the scale.
 _SHARE, _CHANCE, _MORE = 1024, 0.02, 1.05
@@ -277,8 +277,8 @@ def _nth(k: int) -> str:
 
 def _widest(voltage: FloatArray, factor: int) -> int:
     """Return the largest step in samples, up to `factor`, that resolves the relaxation."""
-    first = max(0, (voltage.size - _LOOK) // 2)
-    v = voltage[first:first + _LOOK]
+    first = max(0, (voltage.size - _EXAMINED) // 2)
+    v = voltage[first:first + _EXAMINED]
     lag, risen = 1, False
     coarse = bool(np.mean(v[4:] == v[:-4]) > 0.1)
     while lag < factor and 16 * lag < v.size:

@@ -82,7 +82,7 @@ def imitate(one: Kind, other: Kind) -> bool:
     return other.NAME in one.IMITATES or one.NAME in other.IMITATES
 
 
-def scored(kind: Kind, values: Statistics) -> float:
+def score_gain(kind: Kind, values: Statistics) -> float:
     """
     Return the gain of a kind by score tests, nats: half the square of its largest sign.
 

@@ -27,7 +27,7 @@ from ou_monitor.records import FloatArray, NAN
 
 # Number of starting points that are fitted, of samples used to select them, and of kinds that get
 # a full fit.
-_FULL, _GLANCE, _FEW = 2, 8000, 4
+_FULL, _PREVIEW, _FEW = 2, 8000, 4
 # First estimates below this share of the best are dropped: a full fit at most doubles an estimate.
 _WITHIN = 0.5
 # Maximum alternations between the fit and terms with parameters of their own (`APART`).
@@ -37,7 +37,7 @@ _ALIKE, _SAME = 0.1, 1e-6
 
 
 # First estimate of the gain of a kind, nats, the kind, and a start (None for a law).
-_Glance = tuple[float, type[Term], Composite | None]
+_FirstEstimate = tuple[float, type[Term], Composite | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class Fitter:
     samples: Samples  # The recording
     cost: float = 0.0  # Processor time of the fits, s, estimated from their filters
     # For each law, the scores to which it was last fitted, and the result.
-    looks: dict[type[Term], tuple[FloatArray, LawFit | None]] = field(default_factory=dict)
+    law_fits: dict[type[Term], tuple[FloatArray, LawFit | None]] = field(default_factory=dict)
     # Kinds tried without success, and their gain by score tests then, nats.
     failed: dict[str, float] = field(default_factory=dict)
 
@@ -79,7 +79,7 @@ class Fitter:
         """Return a fit to the first part, its mean fitted to everything; None if it fails."""
         try:
             found = fit_composite(self.samples, terms, self.samples.train, known,
-                                  whole_mean=True, rough=rough, begun=begun, first=self.look)
+                                  whole_mean=True, rough=rough, begun=begun, first=self.law_fit)
         except (ValueError, ArithmeticError, np.linalg.LinAlgError):
             # Parameters out of range, or an overflow.
             return None
@@ -133,31 +133,31 @@ class Fitter:
         of the others, or if they imitate it.  statistics: function of a model.
         """
         values = statistics(composite)
-        shown = {kind: decision.scored(kind, values) for kind in kinds}
+        shown = {kind: decision.score_gain(kind, values) for kind in kinds}
         tried = [kind for kind in kinds if not kind.SLOW_FIT
                  and shown[kind] > self.failed.get(kind.NAME, -1.0)]
-        glances = self._glances(composite, tried, 0.0)
-        found = self._in_full(composite, glances, [])
-        dear = [kind for kind in kinds if kind.SLOW_FIT and decision.affordable(kind, self.cost)
+        estimates = self._first_estimates(composite, tried, 0.0)
+        found = self._in_full(composite, estimates, [])
+        slow = [kind for kind in kinds if kind.SLOW_FIT and decision.affordable(kind, self.cost)
                 and shown[kind] > self.failed.get(
                     kind.NAME, decision.TIE if kind.ROLE is Role.LAW else -1.0)]
-        top = max((glance[0] for glance in glances), default=0.0)
-        if dear and found:
+        top = max((estimate[0] for estimate in estimates), default=0.0)
+        if slow and found:
             best = max(found, key=lambda trial: trial.evidence)
             left = statistics(best.composite)
-            dear = [kind for kind in dear if decision.imitate(kind, catalogue()[best.name])
-                    or decision.scored(kind, left) > decision.TIE]
-        if dear:
-            glances += self._glances(composite, dear, _WITHIN * top)
-            found = self._in_full(composite, glances, found)
+            slow = [kind for kind in slow if decision.imitate(kind, catalogue()[best.name])
+                    or decision.score_gain(kind, left) > decision.TIE]
+        if slow:
+            estimates += self._first_estimates(composite, slow, _WITHIN * top)
+            found = self._in_full(composite, estimates, found)
             # A BROAD kind below `least` was not estimated in full, so it has not failed.
-            tried += [kind for kind in dear if not top or not kind.BROAD]
-        gained = {glance[1] for glance in glances}
+            tried += [kind for kind in slow if not top or not kind.BROAD]
+        gained = {estimate[1] for estimate in estimates}
         self.failed |= {kind.NAME: shown[kind] for kind in tried if kind not in gained}
         return found
 
-    def _glances(self, composite: Composite, kinds: Sequence[type[Term]], least: float
-                 ) -> list[_Glance]:
+    def _first_estimates(self, composite: Composite, kinds: Sequence[type[Term]], least: float
+                         ) -> list[_FirstEstimate]:
         """Return the estimated gains of kinds, if they are large enough, nats."""
         view, before = self.view(composite), self.evidence(composite)
         found = []
@@ -172,11 +172,11 @@ class Fitter:
                 found.append((gain, kind, start))
         return found
 
-    def _in_full(self, composite: Composite, glances: Sequence[_Glance], known: list[Trial]
-                 ) -> list[Trial]:
+    def _in_full(self, composite: Composite, estimates: Sequence[_FirstEstimate],
+                 known: list[Trial]) -> list[Trial]:
         """Fit the trials with the best estimates in full, reusing known fits."""
         found, names = list(known), {trial.name for trial in known}
-        best = sorted(glances, key=lambda glance: -glance[0])[:_FEW]
+        best = sorted(estimates, key=lambda estimate: -estimate[0])[:_FEW]
         for gain, kind, start in best:
             # Compare with full fits, in which a law may lose all of its first estimate.
             top = max((trial.evidence for trial in found), default=0.0)
@@ -194,11 +194,11 @@ class Fitter:
                     kind.CHANGES.NAME if kind.CHANGES and with_it else ''))
         return found
 
-    def look(self, kind: type[Term], view: View) -> LawFit | None:
+    def law_fit(self, kind: type[Term], view: View) -> LawFit | None:
         """Return a law fitted to a view, cached by the scores."""
-        last = self.looks.get(kind)
+        last = self.law_fits.get(kind)
         if last is None or not np.allclose(last[0], view.z, rtol=0.0, atol=_SAME):
-            last = self.looks[kind] = view.z, kind.fit_law(view)
+            last = self.law_fits[kind] = view.z, kind.fit_law(view)
         return last[1]
 
     def _law_gain(self, kind: type[Term], view: View) -> float:
@@ -206,7 +206,7 @@ class Fitter:
         if kind.SLOW_FIT:
             self.cost += LAW_COST * self.samples.n
         try:
-            fit = self.look(kind, view)
+            fit = self.law_fit(kind, view)
         except (ValueError, ArithmeticError, np.linalg.LinAlgError):
             return -math.inf
         return -math.inf if fit is None else (
@@ -259,7 +259,7 @@ class Fitter:
 
     def _by_likelihood(self, composite: Composite, starts: list[Term]) -> list[Term]:
         """Return starts by their likelihood without a fit, on a part of the samples."""
-        few = self.samples.part(slice(0, min(self.samples.train.stop, _GLANCE)))
+        few = self.samples.part(slice(0, min(self.samples.train.stop, _PREVIEW)))
         structural = [term for term in composite.terms if term.ROLE is not Role.LAW]
 
         def likelihood(start: Term) -> float:

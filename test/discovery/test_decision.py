@@ -144,7 +144,7 @@ def test_a_kind_that_recurs_is_tried_again():
     (Cheap, {}, 0.0)])
 def test_the_score_gain_of_a_kind_is_half_the_square_of_its_largest_sign(kind, values, nats):
     """Half the square of its largest sign, in its direction."""
-    assert decision.scored(kind, values) == nats
+    assert decision.score_gain(kind, values) == nats
 
 
 @pytest.mark.parametrize('kind, largest, again, least', [

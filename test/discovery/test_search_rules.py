@@ -191,11 +191,11 @@ def test_a_law_is_fitted_once_to_the_same_scores(monkeypatch):
         lambda cls, view: made.append(view) or (None if view.z[0] else SimpleNamespace())))
     fitter = Fitter(SimpleNamespace(n=9))
     one, same, other = (SimpleNamespace(z=np.full(9, z)) for z in (0.0, 1e-9, 1.0))
-    found = fitter.look(LopsidedNoise, one)
-    assert fitter.look(LopsidedNoise, same) is found is not None and made == [one]
-    assert fitter.look(LopsidedNoise, other) is None and fitter.look(LopsidedNoise, other) is None
+    found = fitter.law_fit(LopsidedNoise, one)
+    assert fitter.law_fit(LopsidedNoise, same) is found is not None and made == [one]
+    assert fitter.law_fit(LopsidedNoise, other) is None and fitter.law_fit(LopsidedNoise, other) is None
     assert made == [one, other]
-    assert fitter.look(LopsidedNoise, one) is not found and made == [one, other, one]
+    assert fitter.law_fit(LopsidedNoise, one) is not found and made == [one, other, one]
 
 
 def test_the_nth_cause_of_a_kind_is_its_nth_term():
