@@ -22,7 +22,7 @@ from ou_monitor.text import counted, number, volts, Z95
 _GROWS = 1.25
 # Minimum noise, V; less is rounding.
 _NOTHING = 1e-9
-# Minimum share of lines in the noise of their level to mention them in the answer.
+# Minimum share of the noise of a level that lines must make up to be mentioned in the answer.
 _LOUD = 0.25
 
 
@@ -45,7 +45,7 @@ class Overview:
 
     facts: SupplyFacts
     duration: float  # Duration of the recording, s
-    load: SupplyLoad  # Load model at the end, which the facts give at eleven throttles
+    load: SupplyLoad  # Load model at the end; `facts` has its values at eleven throttles
     highest: float  # Highest throttle; NaN without throttle
     line: LoudestLine | None = None  # Strongest spectral line
     cells: int = 0  # Cells in series to which the limit refers; 0: none
@@ -165,7 +165,7 @@ def _dips(found: Overview, below: float = NAN) -> str:
 
 
 def _bounded(found: Overview) -> bool:
-    """Return whether the voltage does not fall with throttle, and a sag would have shown."""
+    """Return whether there is no measurable sag, only an upper limit for it."""
     _, sag, se = found.sag
     return found.load.status is LoadStatus.NO_RELATION and sag < 2.0 * se
 

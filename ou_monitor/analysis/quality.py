@@ -22,7 +22,7 @@ from ou_monitor.timeline.line import TAIL
 
 # Flags for information; the others are warnings.
 _INFORMS = frozenset({Flag.HELD_SAMPLES, Flag.IRREGULAR, Flag.NO_EXCITATION})
-# Statuses that a good recording may have: its rate or length shows no more.
+# Statuses that are no defect of a recording: its rate or length allows no more.
 _LIMITS = frozenset({Status.TOO_FEW_SAMPLES, Status.TOO_SHORT, Status.UNBOUND, Status.BURIED,
                      Status.NO_RELAXATION})
 # Maximum scatter of the steps of an even clock: rms about the median, in medians.
@@ -66,8 +66,8 @@ def _of_estimate(e: Estimate, known: bool) -> list[tuple[str, Severity, str]]:
     items = []
     if e.status in _LIMITS and known:
         items.append(('LEVEL_ALONE', Severity.INFO, (
-            'The level alone does not show the relaxation that the whole recording shows beside '
-            'level and load.')))
+            'The relaxation that the whole recording shows is not visible at this level alone.'
+            )))
     elif e.status in _LIMITS:
         items.append((e.status.name, Severity.INFO, e.status.value))
     elif e.status is not Status.OK:

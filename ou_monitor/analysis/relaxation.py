@@ -152,7 +152,7 @@ class Window:
         return max(0.0, float(alone @ alone - rest @ rest)), int(rank) - 1
 
     def solve(self, tau: float, scale: float) -> tuple[float, float, float, float]:
-        """Return U0 and A with their standard errors; of U0 alone without a tau."""
+        """Return U0 and A with their standard errors; without a tau, A is not fitted."""
         x = self.whitened(np.column_stack([self.voltage, np.ones(self.n)]))
         if not tau < self.since[-1]:
             size = float(x[:, 1] @ x[:, 1])
@@ -224,8 +224,8 @@ class Relaxation:
     tau_low: float = NAN
     tau_high: float = NAN
     misfit: float = NAN  # Mean square of the standardised innovations; 1 if the model is right
-    # Twice the gain of log likelihood over no relaxation; large without a tau if the voltage keeps
-    # moving over the whole time.
+    # Twice the gain of log likelihood over no relaxation; also large, without a tau, if the
+    # voltage moves during the whole time.
     likelihood_gain: float = NAN
     misfit_p: float = NAN  # p-value of further exponentials; NaN if no relaxation is detected
     left_out: float = 0.0  # Time after the change that the fit leaves out, s
@@ -258,7 +258,7 @@ class Relaxation:
         return math.log(self.tau_high / self.tau_low) / (2.0 * Z95)
 
     def decay(self, change: Release, since: FloatArray) -> FloatArray:
-        """Return the fitted voltage less the level it settles at, V, some s after a change."""
+        """Return the fitted deviation from U0, V, at times since a change, s."""
         return change.amplitude * np.exp(-since / self.tau)
 
     @property
@@ -429,11 +429,11 @@ def _level_before(recording: Recording, step: LevelChange, estimate: Estimate, r
     return mean, math.sqrt(mean_variance(last - first, n, estimate, rms))
 
 
-# Minimum change of level, as a share of the transient, that excludes a high-pass, and maximum one
-# that is a return to the level before; minimum significance of both, standard errors.
+# Change of level, as a share of the transient, from which a high-pass is excluded, and up to which
+# the voltage counts as returned; minimum significance of both, standard errors.
 _ELSEWHERE, _BACK = 0.5, 0.25
 _SURE = 4.0
-# Maximum factor, at 95 %, between tau and 1/alpha that agree.
+# Factor up to which tau and 1/alpha agree, if it holds at 95 %.
 _CLOSE = 1.5
 
 

@@ -175,7 +175,7 @@ class MotorInputs:
     """
     Newest throttle, and the motor speeds received since the last call.
 
-    By the values of `sources.MOTOR_PARAMETERS` and a monotonic clock, s.
+    The parameters `sources.MOTOR_PARAMETERS` choose the topics; times are monotonic, s.
     """
 
     def __init__(self, node: MonitorNode, values: Mapping[str, Any],
@@ -221,7 +221,7 @@ class AdaptiveFilterNode(MonitorNode):
     RUN_TIME = (*(p for p in FILTER_PARAMETERS if p is not _MODE), *NOTCH_PARAMETERS,
                 PUBLISH_RATE)
     FIXED = (*INPUT_PARAMETERS, _MODE, *MOTOR_PARAMETERS)
-    # `check` reads it from the beginning on.
+    # `check` reads it before `start` has set it.
     _channels: Channels | None = None
     _type = AUTO
     _topic = ''

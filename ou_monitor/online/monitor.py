@@ -49,7 +49,7 @@ class SupplyMonitor:
         Whether with window ``auto`` the fits of alpha, sigma and Var_inf are made in a thread,
         so that reports never wait.
     look : float
-        Time between two looks of the risk at what became of its forecasts, s.
+        Interval at which the risk compares its forecasts with the outcomes, s.
 
     Examples
     --------
@@ -71,15 +71,15 @@ class SupplyMonitor:
         self._model = model
         self._flag = BrownoutFlag(self._settings)
         self._trust = InputTrust()
-        # As the last report judged them.
+        # The last report's verdict on the stamps and the input.
         self._stamps, self._doubt = StampOrder.GOOD, Doubt.NONE
         self._reset_reason = ''
         self._restarts, self._fault, self._faulty = 0, '', False
-        # Of samples that are thinned: how many were left out, and where the next one is.
+        # For thinning: samples left out so far, and samples until the next one that is used.
         self._thinned = self._phase = 0
-        # What the estimators before the present one have counted.
+        # Sum of the counts of earlier estimators.
         self._counted = Counters()
-        # Late and unusable samples so far, and the stamp at which there were last more of them.
+        # Number of late and unusable samples so far, and the stamp when it last rose.
         self._odd, self._odd_at = 0, -math.inf
         self._begin()
 
@@ -278,7 +278,7 @@ class SupplyMonitor:
             stamps = self._trust.stamps(limit, 1.0 / e.rate if e.rate > 0.0 else NAN)
             doubt, why = self._trust.doubt(stamps, self._settings.brownout_voltage)
             if self._doubt is Doubt.UNIT is not doubt:
-                # What was learned is of the other unit.
+                # Forget what was learned in the other unit.
                 self._counted = self._counters()
                 self._begin()
                 e = self._estimate()
@@ -305,7 +305,7 @@ class SupplyMonitor:
             doubt, why = Doubt.NONE, ''
             self._ahead = Ahead()
             told, ou, ou_age = e, of_estimate(e), 0.0
-        # Of the last seconds, whatever the window: what the risk stands on.
+        # The risk is always based on the sliding estimate of the last seconds.
         self._newest, e = e, told
         ahead = self._ahead
         risk = ahead.outcome.risk
@@ -404,7 +404,7 @@ class SupplyMonitor:
         return level, ahead
 
     def _estimate(self) -> Estimate:
-        """Return the newest estimate; IRREGULAR speaks of the window, not of all that was."""
+        """Return the newest estimate; IRREGULAR refers to the present window only."""
         e = self._estimator.estimate()
         counters = self._counters()
         odd = counters.late + counters.non_finite
@@ -440,8 +440,8 @@ class SupplyMonitor:
         if self._faulty:
             still = f' The brown-out flag is set: {flag.reason}.' if critical else ''
             return Level.ERROR, (
-                f'The estimator failed and was started anew ({self._restarts} times so far), and '
-                f'knows nothing yet: {self._fault}.{still}')
+                f'The estimator failed and was restarted ({self._restarts} times so far); it has '
+                f'no estimate yet: {self._fault}.{still}')
         if silence and critical and flag.low:
             return Level.ERROR, f'{self._of_risk(e, risk, flag)} {silence}'
         if silence:

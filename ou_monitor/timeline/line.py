@@ -17,8 +17,8 @@ always by one code, and two neighbouring gaps always have the same sum.
 
 Limits: repeats are recognised from 64 samples on and need at least two samples a reading; until
 then they count as readings, and `Batch.again` marks the restart without them.  They are not
-recognised where the ADC step exceeds 1.3 times the increment between readings at fewer than four
-samples a reading, or where readings jitter by more than a tenth of a period (standard deviation).
+recognised if readings jitter by more than a tenth of a period (standard deviation), or if there
+are fewer than four samples a reading and the ADC step exceeds 1.3 times the usual increment.
 """
 
 from __future__ import annotations

@@ -64,10 +64,11 @@ class Scores:
     # As in `View`; shape (n,).
     z: FloatArray
     phi: FloatArray
-    unit: FloatArray  # Median standard deviation of an innovation over its own; shape (n,)
+    # Median standard deviation of the innovations, over each innovation's own; shape (n,).
+    unit: FloatArray
     # Gain of the filter at the previous sample; shape (n,).
     trust: FloatArray
-    step: float  # From sample to sample, s
+    step: float  # Time between samples, s
     # How far the filter has followed the states up to two samples ago, in states; shape (n,).
     followed: FloatArray
 
@@ -110,7 +111,7 @@ class Scores:
         exp, found, before = math.exp, [], law.tolist()
         followed = moved = 0.0
         for off, high, keep, draw, slow in columns:
-            # The level itself has been followed, or the rail that moves towards it.
+            # The filter has followed the level (at_once), or the rail that moves towards it.
             behind = keep * (followed if at_once else followed - moved)
             found.append(behind)
             more = high * behind
@@ -139,10 +140,10 @@ class Scores:
 
 
 def _direct(s: Scores, at_once: float, middle: float, states: int) -> FloatArray:
-    """Return the error that each pair of states predicts with nothing followed, in states."""
+    """Return the error that each pair of states predicts, in states, if nothing is followed."""
     direct = np.empty((states, states, s.z.size))
     for i, j in np.ndindex(states, states):
-        # The new level less what the filter predicts from the old one; or the pull towards it.
+        # The new level less the filter's prediction from the old one, or the pull to the level.
         direct[i, j] = ((j - middle) - s.phi * s.trust * (i - middle) if at_once
                         else (1.0 - s.phi) * (i - middle))
     return direct
@@ -433,7 +434,7 @@ class RegimeSwitching(Term):
             if slow is not None and ahead > max(float(two.gain[view.train].sum()), _SLOW_AHEAD):
                 # The view relaxes as levels and noise together do; the next fit separates them.
                 return cls._finished(view, [slow], 0.0, 1, states) or two
-        # Three states that differ in what the two states differ in: sigma or the level.
+        # Try three states that differ as the two do: in sigma, or in the level.
         starts = [np.array([0.0, 0.0, 0.0, ratio, -ratio]) for ratio in (0.45, 0.9)]
         if two.power is None:
             starts = [np.array(begin) * [1.0, 1.0, 0.6, 0.0, 1.0]]
@@ -498,7 +499,7 @@ class RegimeSwitching(Term):
         if at_once == 0.0:
             moved = first_order(view.phi, (1.0 - view.phi) * moved, 0.0)
         offset = None if abs(x[2]) < NO_LEVEL else moved
-        # Given the samples up to each one.
+        # Probabilities of the states, given the samples so far.
         known = np.concatenate((before[1:], before[-1:]))
         # Relative to the sigma of the lowest state, which thus becomes that of the `ou`.
         power = 1.0 / (known @ np.exp(-2.0 * x[3] * np.arange(states)))
@@ -519,8 +520,8 @@ def _slow_levels(view: View) -> tuple[FloatArray | None, float, int]:
     """
     Return a start for levels much slower than the noise, its evidence, and the number of states.
 
-    Means over half a relaxation time are modelled as levels plus first-order noise, whose
-    correlation is fitted too, because that of the samples includes the levels.
+    Means over half a relaxation time are modelled as levels plus first-order noise.  The noise's
+    correlation is fitted too, because the samples' correlation includes the levels.
     """
     r = view.residual[view.train]
     a = -math.log(min(max(float(np.median(view.phi[view.train])), 1e-6), 1.0 - 1e-6))

@@ -63,10 +63,10 @@ def independent(cov: FloatArray) -> FloatArray:
 
 # Standard errors from which a trend enters the model: by chance once in 16 000 long windows.
 TREND_SCORE = 4.0
-# A few relaxations look like a trend more often, so the score asked for grows by 1 + 6/x, x =
-# alpha T. A false trend then remains in 1 % of windows of 4 to 13 relaxations, and in 5 % of
-# random walks (16 apparent relaxations). A drift of 8 standard deviations over 25 relaxations is
-# missed in one window of 12; twice the constant would miss it in one of 5.
+# Few relaxations look like a trend more often, so the required score grows by a factor of 1 + 6/x,
+# x = alpha T.  A false trend then remains in 1 % of windows of 4 to 13 relaxations, and in 5 % of
+# random walks (16 apparent relaxations).  A drift of 8 standard deviations over 25 relaxations is
+# missed in one window of 12; with twice the constant, in one of 5.
 _FEW = 6.0
 # Score from which a trend is examined (by chance once in 22 windows).
 SUSPECT = 2.0
@@ -98,7 +98,7 @@ class Fitted:
     trend: bool  # Whether the mean drifts
     n: int  # Samples, or block means, fitted
     alpha_step: float  # alpha times the step between them
-    high: float  # Bias of alpha, over the length of the window
+    high: float  # Bias of alpha, times the length of the window
 
 
 # Relaxations between two samples beyond which they are independent: exp(2 * 300) is a double.
@@ -253,7 +253,7 @@ class StampLikelihood:
         return _Point(value, slopes, rest / free, beta, inverse * (rest / free), gram)
 
     def start(self, used: int) -> FloatArray:
-        """Return ln a and z of the samples taken as evenly spaced."""
+        """Return ln a and z of a fit that takes the samples as evenly spaced."""
         even = SpectralLikelihood(self._table, [self.n], self.step)
         return maximise(even, used).place
 
@@ -417,9 +417,9 @@ def fit_window(t: FloatArray, y: FloatArray, load: FloatArray, m: int, adc: floa
     Fit the OU, the noise and the mean.
 
     t in s, y in V; load: variables of shape (c, n), none while throttle is constant; m: raw
-    samples averaged in each; adc: ADC step, V; stamps: whether the exact likelihood is needed at
-    an alpha times the mean step (inf: at any); before: the second value returned for a nearly
-    identical window.
+    samples averaged in each; adc: ADC step, V; stamps: function of alpha times the mean step that
+    tells whether the exact likelihood is needed (inf: for any alpha); before: the second value
+    returned for a nearly identical window.
     """
     level = np.append(y.mean(), load.mean(axis=1))
     centred = load - level[1:, None]

@@ -13,9 +13,9 @@ output variance is (coupling sigma)^2 V(w), by the integral of
 
 All grow with w, so each variance has one cutoff.
 
-The law `wiener` looks for the least mean square error of a low-pass of gain 1: for a signal of one
-or two poles in the noise of the supply and white noise, of the continuous filter; for the voltage
-itself in white noise, of the sampled one.
+The law `wiener` minimises the mean square error of a low-pass of gain 1.  For a signal of one or
+two poles in supply noise and white noise it uses the error of the continuous filter, for the
+voltage itself in white noise the error of the sampled filter.
 
 White noise: with the input linear between samples a step of the filter is z' = F z + a x_(k-1)
 + b x_k (its columns come from `LowPassState`), so independent samples of variance 1
@@ -48,7 +48,7 @@ from ou_monitor.records import FloatArray, NAN
 # Range of angles (2 pi cutoff interval) in the table, and step of their logarithms: interpolation,
 # and the power law below the first, are accurate to 1e-4.
 _LEAST_ANGLE, _MOST_ANGLE, _STEP = 1e-4, 300.0, 0.02
-# Minimum rise of ln noise between angles: from a smaller one on, all noise passes.
+# Minimum rise of ln noise from angle to angle; where it is smaller, all noise passes already.
 _STILL = 1e-6
 
 

@@ -4,9 +4,9 @@ Brown-out risk by the method that predicts this flight best, and the risk if thr
 Methods: `first_passage` (the OU in the window, at the present throttle), `load` (half the response
 to the pilot's future throttle, half the excursions), and `excursions` (the drops of this flight,
 used alone if the load is unknown).  First passage and the other method are averaged with weights
-from their predictions of completed horizons' lowest voltages (Bayes, with forgetting).  First
-passage is mixed with the excursions, and the conditional risk with a law as wide as the
-excursions, each in the share of horizons in which it was wrong.
+from their predictions of completed horizons' lowest voltages (Bayes, with forgetting).  Each law
+is replaced by a wider one in the share of horizons in which it was wrong: first passage by the
+excursions, the conditional risk by a law as wide as the excursions.
 
 The law learned in flight, from completed horizons: (lowest - start) / s = b0 + b1 (mu - start) / s
 + k e, with mean mu and deviation s of `lowest`, by least squares with forgetting; e has Student's
@@ -165,8 +165,8 @@ LOOK, _LOOK_SHARE = 0.2, 0.2
 _REST = 0.05
 # Largest error of ln sigma for averaging; with a larger one sigma is unknown.
 _LARGEST_ERROR = 1.0
-# Prior of first passage, since the tests of the window have found an OU: odds, and number of
-# horizons that count as predicted correctly.
+# Prior of first passage, which is in use only if the tests of the window have found an OU: odds,
+# and number of horizons that count as predicted correctly.
 _ODDS = 10.0
 # Share of the excursions in the method `load`, because the pilot's next throttle is unknown.
 # Half: the errors of the two forecasts differ, and no flight is long enough to learn weights (on
@@ -248,7 +248,7 @@ class _Rung:
 
 
 class Forecast:
-    """Risk with the pilot's future throttle, and with a given one (look: s between updates)."""
+    """Risk with the pilot's future throttle, and with a given one (look: update interval, s)."""
 
     def __init__(self, loads: LoadFilter, look: float = LOOK) -> None:
         # Takes a third of a second, once; done here so that no sample has to wait.
@@ -491,7 +491,7 @@ def look_ahead(forecast: Forecast, load: SupplyLoad, settings: MonitorSettings) 
 
 
 def throttle_budget(risks: FloatArray, highest: float, limit: float) -> tuple[float, str]:
-    """Return the highest throttle with risks, at `_GRID`, under a limit; 0: none; and why."""
+    """Return the highest throttle whose risk is under a limit (0: none), and why; risks: (51,)."""
     # The budget ends at the first throttle above the limit, even if the risk falls again beyond.
     risks = np.maximum.accumulate(risks)
     within = int(np.searchsorted(risks, limit, 'right'))

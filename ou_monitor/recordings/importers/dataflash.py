@@ -133,7 +133,7 @@ def _plain_text(path: Path, text: bool) -> Iterator[tuple[str, list[str]]]:
 
 def _close(log: Any) -> None:
     for name in ('data_map', 'filehandle'):
-        # A map in use by the failed set-up cannot be closed; it goes with it.
+        # A map still in use by a failed set-up cannot be closed here; it is freed with the log.
         with suppress(BufferError):
             if hasattr(log, name):
                 getattr(log, name).close()
@@ -246,7 +246,7 @@ def _lost_text(log: Any) -> list[str]:
 
 
 def _cells(parameters: dict[str, float]) -> dict[str, str]:
-    """Return the number of cells, from the full pack that scales thrust, and a cell's minimum."""
+    """Return the number of cells, from MOT_BAT_VOLT_MAX, and the lowest voltage of a cell."""
     full = parameters.get('MOT_BAT_VOLT_MAX', 0.0)
     if not full > 3.0:
         return {}
@@ -290,7 +290,7 @@ def _plain(name: str, kind: str, columns: dict[str, list[float]],
 
 def _others(name: str, columns: dict[str, list[float]], units: dict[str, str],
             known: set[str]) -> Iterator[Series]:
-    """Yield the fields of no other quantity, as logged."""
+    """Yield the fields that no other series uses, as logged."""
     t = np.array(columns['t'])
     for field, values in columns.items():
         if field != 't' and f'{name}.{field}' not in known:
