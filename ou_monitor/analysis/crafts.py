@@ -25,12 +25,12 @@ _AT, _NEAR = 0.5, 0.15
 # Maximum factor from the median that is usual.
 _USUAL = 2.0
 # A lithium cell at rest, V: highest after charging (LiHV 4.35 V, and 0.1 V for the sensor), lowest
-# without damage, and lowest at the begin of a flight.
+# without damage, and lowest at the beginning of a flight.
 HIGHEST_CELL, LOWEST_CELL, _BEGINS = 4.45, 2.0, 3.0
 # Voltage of an empty lithium cell under load, V (vbat_min_cell_voltage of Betaflight, and the
 # default of design).
 CELL_LIMIT = 3.3
-# The highest median of the voltage over this time is the voltage of the full pack, s.
+# The voltage of the full pack is the highest median over this time, s.
 _FULL = 0.5
 
 # Maximum cells of the known classes; the largest known quads have 6.
@@ -116,12 +116,12 @@ def cell_count(full: float) -> int:
 
 
 def fits(full: float, cells: int) -> bool:
-    """Return whether a pack with this voltage, V, begins a flight with so many cells."""
+    """Return whether a pack of this number of cells may begin a flight with this voltage, V."""
     return _BEGINS <= full / cells <= HIGHEST_CELL
 
 
 def check_cells(full: float, cells: int) -> None:
-    """Raise InputError if a pack with this voltage at rest, V, cannot have so many cells."""
+    """Raise InputError if a pack of this number of cells cannot have this voltage at rest, V."""
     if math.isfinite(full) and not LOWEST_CELL <= full / cells <= HIGHEST_CELL:
         raise InputError(
             f'--cells {cells}: {full:.4g} V at rest would be {full / cells:.3g} V per cell: it is '

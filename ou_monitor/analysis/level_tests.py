@@ -5,7 +5,7 @@ Each test works on the one-step innovations of the fitted model, which are indep
 normal if the level is a stationary OU in white noise:
 
 =============  ========================================================================
-mean_drift     means of blocks of innovations, F with the error of alpha in it
+mean_drift     means of blocks of innovations, F test that includes the error of alpha
 variance_drift Layard's test of equal variances of blocks (J. Am. Stat. Assoc. 68, 1973),
                which is robust against heavy tails
 gaussian       D'Agostino & Pearson's K^2 of skewness and kurtosis, of innovations over

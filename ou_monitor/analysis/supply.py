@@ -35,8 +35,8 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 # Throttles at which sag and noise are given.
 THROTTLES = tuple(k / 10.0 for k in range(11))
-# Length of a part with its own regression, s, and the minimum number of readings in it: five times
-# the most that a regression uses from 60 s.
+# Length of a part with its own regression, s, and its minimum number of readings: five times the
+# number of regressors in 60 s.
 _PART, _IN_PART = 60.0, 200
 # Maximum evaluations of the risk: as many as the node makes in 15 minutes.
 _LOOKS = 900.0 / LOOK
@@ -295,7 +295,7 @@ def rise_that_ends(v: FloatArray, u: FloatArray, noise: Noise) -> FloatArray:
 def dip_begins(v: FloatArray, limit: float, rise: FloatArray) -> npt.NDArray[np.intp]:
     """Return the indices at which dips below a limit begin."""
     below = v < limit
-    # Of readings outside the hysteresis, each one below after one above begins a dip.
+    # Ignore readings within the hysteresis; of the others, one below after one above begins a dip.
     decides = np.flatnonzero(below | (v > limit + rise))
     return np.asarray(decides[below[decides] & np.append(True, ~below[decides[:-1]])])
 

@@ -16,15 +16,15 @@ flights with a common cause (a season, a battery) look like a drift.
 
 Few vehicles (fewer than `LEAST_VEHICLES`): the mean resistance and sag of each are compared with
 the mean of the others by a t test, with the scatter between flights, pooled, for a difference of
-more than a tenth, as the usual spread between good vehicles is unknown.  Packs are compared among
-those with as many cells.
+more than a tenth, as the usual spread between good vehicles is unknown.  A pack is compared only
+with packs of the same number of cells.
 
 Outliers: the score of a value is its distance from the median of its group (or from the drift line
 of the group) divided by sqrt(s^2 + se^2), with its standard error se and the scatter s between
 recordings, a median absolute deviation.  The bound is a quantile of the largest score in simulated
 fleets without faults, with the same groups and errors and the same evaluation (and with s at its
 upper 90 % bound, which errs towards fewer false alarms).  Limits: the scatter between good
-recordings is assumed normal and equal on all vehicles, heavier tails give more alarms than
+recordings is assumed normal and equal on all vehicles; heavier tails give more alarms than
 stated; if many members of a group are off, its median is too; small groups have wide bounds
 (doc/fleet.md).
 """
@@ -73,7 +73,7 @@ class CommonCurve:
     covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __call__(self, throttle: FloatArray) -> FloatArray:
-        """Return the difference to the logarithm at the reference throttle; 0 where unknown."""
+        """Return the difference from the logarithm at the reference throttle; 0 where unknown."""
         u = np.asarray(throttle, dtype=np.float64)
         if not self.knots:
             return np.zeros(u.shape)
@@ -548,7 +548,7 @@ def _vehicles(values: Values, within: Outliers, flat: FloatArray, rate: float, s
         one = np.sqrt(np.mean(scatter ** 2 + values.error[mine] ** 2) / mine.size)
         # The median of two is their mean.
         error[k] = one * (_MEDIAN_ERROR if mine.size > 2 else 1.0)
-    # Packs of other numbers of cells are of other crafts.
+    # Packs with different numbers of cells belong to different crafts.
     cells = tuple(int(values.cells[mine].max()) for mine in of)
     found = outliers(value, error, [f'{one} cells' for one in cells], rate, least=LEAST_VEHICLES,
                      seed=seed)

@@ -101,7 +101,7 @@ class StampOrder(enum.Enum):
     def by_arrival(self) -> str:
         """Return the sentence for samples that are placed by their arrival."""
         found, _, advice = self.value.partition(': no estimate can be made of them')
-        return f'{found}: their arrival counts{advice}'
+        return f'{found}: their arrival times are used{advice}'
 
 
 class StampWatch:
@@ -125,7 +125,7 @@ class StampWatch:
             return
         highest = np.maximum.accumulate(np.concatenate(([self.newest], t)))
         late = t <= highest[:-1]
-        # Repeats of the newest message are no disorder.
+        # Repeats of the newest message are not disorder.
         self._count(t.size, int(np.count_nonzero(t < highest[:-1])))
         fresh = np.flatnonzero(~late)
         if fresh.size:
@@ -177,7 +177,7 @@ class InputClock:
     """
     Time of messages that must all be used: their stamps, or their arrival if stamps are invalid.
 
-    `stamps`: what the stamps are good for; `by_arrival`: messages placed by their arrival.
+    `stamps`: quality of the stamps; `by_arrival`: number of messages placed by their arrival.
     """
 
     def __init__(self) -> None:
@@ -206,10 +206,10 @@ class InputClock:
         return self._time
 
 
-# A reading that stands still for this long, s, and for so many readings is stuck; one that has
-# never changed, from so many readings on.  The longest
-# still readings of sources that worked: 2.81 s (139 readings) on the ground, in_xr_141340; 1.70 s
-# (172) in flight, cf_solo_large; 3 readings at 1 Hz in flight, ac_jd_2004.
+# A sensor is stuck if its reading is constant for this time, s, and this number of readings; if it
+# has never changed, the number is enough.  Longest constant readings of working sources: 2.81 s
+# (139 readings) on the ground, in_xr_141340; 1.70 s (172) in flight, cf_solo_large; 3 readings at
+# 1 Hz in flight, ac_jd_2004.
 _STUCK, _STUCK_READINGS = 5.0, 10
 # While throttle is constant too, the limit is this many times the longest constant reading that
 # ended by one ADC step: a coarse ADC on a slow discharge.
@@ -270,13 +270,13 @@ class StillReading:
 
     @property
     def why(self) -> str:
-        """Return why the reading may be stuck; empty while it is alive."""
+        """Return why the reading may be stuck; empty if it is not."""
         if self._n < _STUCK_READINGS:
             return ''
         if not self.changed:
             return (f'The voltage has been {self.value:g} V in all {self._n} readings since the '
-                    'start: the sensor is stuck, or its step is larger than what the supply '
-                    'moves; move the throttle, or check the sensor.')
+                    'start: the sensor is stuck, or its step is larger than the changes of the '
+                    'supply; move the throttle, or check the sensor.')
         limit = _STUCK
         low, high = self._throttle
         if high - low <= _STILL:
@@ -364,8 +364,8 @@ class InputTrust:
             return Doubt.STAMPS, stamps.value
         if limit <= 0.0:
             return Doubt.LIMIT, (
-                f'brownout.voltage is {limit:g} V: no voltage undershoots it, and the floor is '
-                'off; set the lowest voltage that the load bears.')
+                f'brownout.voltage is {limit:g} V: no voltage is below it, and the floor is off; '
+                'set the lowest voltage that the load tolerates.')
         usual = float(np.median(np.abs(self._recent))) if self._recent.size else NAN
         if usual > MOST_SUPPLY or usual > _UNIT * limit:
             return Doubt.UNIT, (

@@ -99,8 +99,8 @@ class _Track:
         if math.isnan(self.interval) or self.interval <= 0.0:
             return float(step - 1)
         expected = (time - self.time) / self.interval
-        # After a silence either messages were lost, or (less likely, by half a message) none was
-        # sent.
+        # After a silence either messages were lost, or none was sent, which counts as half a
+        # message less likely.
         return min(abs(step - expected), step - 0.5 if expected > PAUSE else math.inf)
 
     def take(self, number: int, time: float, arrived: float) -> None:

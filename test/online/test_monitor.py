@@ -368,7 +368,7 @@ def test_what_is_known_without_throttle_is_told():
     monitor = SupplyMonitor()
     monitor.push(t, 16.0 + 0.05 * np.random.default_rng(1).standard_normal(t.size))
     summary = monitor.report(0.0).summary
-    assert summary.startswith('Level 16.0') and 'Throttle is not known' in summary
+    assert summary.startswith('Level 16.0') and 'Throttle is unknown' in summary
     assert float(monitor.report(0.0).fields['load_noise']) == pytest.approx(0.05, rel=0.15)
 
 

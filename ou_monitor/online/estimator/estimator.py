@@ -46,9 +46,9 @@ _LAGS, _EVEN = 24, 0.5
 # Jitter of the stamps, in relaxation times, above which the exact stamps are used: the error of an
 # even grid is its square.
 _JITTER = 0.1
-# Share of the window by which stamps miss its edge through rounding.
+# Share of the window by which rounded stamps may miss its edge.
 _HAIR = 1e-6
-# Share of the mean square below which the variance of increments is a ramp's.
+# If the variance of increments is below this share of their mean square, the voltage is a ramp.
 _RAMP = 1e-9
 # Number of checks of the input's quality per window.
 _LOOKS = 4
@@ -304,9 +304,10 @@ class SlidingEstimator:
         smoothness = NAN
         if one[1] > _RAMP * one[0]:
             smoothness = _smoothness(two[1] / one[1], fit.alpha_step, m)
-        # The drift is faster than a random walk of these increments could be.  Needed because the
-        # fit of a window that does not return may take any drift for chance.  The increments over
-        # the longest lag include movements in one direction; moving throttle is regressed out.
+        # Set the trend if the drift is faster than a random walk of these increments could be: if
+        # the voltage does not return in the window, the fit may take any drift for chance.  The
+        # increments over the longest lag include movements in one direction.  Only for constant
+        # throttle, because moving throttle is regressed out.
         if not load.size and far[2] >= _EVEN * t.size and one[2] * (
                 one[0] - one[1]) > TREND_SCORE ** 2 * max(one[1], far[1] / _LAGS):
             fit = replace(fit, trend=True)

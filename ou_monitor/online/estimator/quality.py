@@ -21,11 +21,10 @@ _ENOUGH = 64
 # A lattice needs this many different steps, all whole multiples of one, and
 # at most this many codes: fewer distinct steps are chance, more are a fine ADC.
 _FEWEST_STEPS = 3
-# Share of samples that change, of those next to each other, below which the
-# ADC is coarse.
+# Share of adjacent samples that differ, below which the ADC is coarse.
 _TIED = 0.9
-# Share of samples at the extreme from which the ADC range counts as left, and
-# how many times more often than the code beside it.
+# Share of samples at the extreme from which the ADC range counts as exceeded, and
+# ratio to the number of samples at the code beside it.
 _CLIPPED_SHARE = 0.01
 _CLIPPED_EXCESS = 3.0
 
@@ -84,10 +83,10 @@ def _piles_up(y: FloatArray) -> bool:
 
 # Relaxation times in the window from which alpha is known to a quarter (doc/estimation.md).
 GOOD_RELAXATIONS = 25.0
-# Standard error of ln(alpha), before it is widened, beyond which alpha is not known to a factor.
+# Standard error of ln(alpha), before it is widened, beyond which alpha is buried in noise ...
 _BURIED = 0.5
-# ... provided that noise, and not the length of the window, is the cause: the
-# error is this many times that without noise.
+# ... provided that noise, and not the length of the window, is the cause: minimum
+# ratio of the error to that without noise.
 _BURIED_BY = 2.0
 # In short windows ln(alpha) has wider tails than its information says: its
 # standard error grows by 1 + 1.5/x + 70/x^2, x = alpha T + 1.5, which brings the
@@ -106,15 +105,14 @@ def log_errors(fit: Fitted, duration: float) -> tuple[float, float, float]:
     """
     Return the standard errors of ln(alpha), ln(sigma), ln(Var_inf).
 
-    Where no noise was found, theta sits on its bound or near it and the
-    information overstates the error of sigma: it shrinks by the width of a
-    half-normal there (its variance with one side cut is 0.68 of the whole,
-    and theta makes up most of the variance of sigma), within `_NEAR` standard
-    errors of the bound.
+    If no noise was found, theta is at its bound or near it, and the
+    information overstates the error of sigma.  Within `_NEAR` standard errors
+    of the bound, the error is therefore reduced as for a normal distribution
+    cut on one side (0.68 of the variance; theta makes up most of sigma's).
 
     duration in s.
     """
-    # Fewer than a thousandth are as good as none.
+    # Fewer than a thousandth count as none.
     relaxations = max(fit.alpha * duration - fit.high + _AS_FITTED, 1e-3)
     wider = 1.0 + (_WIDER + _MUCH_WIDER / relaxations) / relaxations
     near = math.exp(-0.5 * math.pow(min(fit.noise_score / _NEAR, 1e3), 2))
@@ -152,7 +150,7 @@ def judge(fit: Fitted, measured: Mapping[str, Any], quality: Quality, throttle_s
         return Estimate(status=Status.UNBOUND, flags=tuple(flags), **known)
     if fit.log_var[0] > max(_BURIED ** 2, _BURIED_BY ** 2 * 2.0 / relaxations):
         return Estimate(status=Status.BURIED, flags=tuple(flags), **known)
-    # A short window often looks longer than it is: one standard error is granted.
+    # A short window often looks longer than it is, so reduce it by one standard error.
     surely = relaxations * math.exp(-se[0])
     alpha = fit.alpha - fit.high / duration
     var_inf = fit.sigma ** 2 / (2.0 * alpha)

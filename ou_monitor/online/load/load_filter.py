@@ -8,8 +8,8 @@ doc/load.md has the equations and the figures.
 With a measured current: its scale and sign are not corrected, so a wrong scale makes the
 resistance wrong, and a load that follows throttle but is not in the current counts in it (0.1 V at
 full throttle makes 0.2 Ohm 0.4 on a robot that draws 1 A); a constant current gives no
-information.  Throttle as a regressor beside the current would take that load, but also, on quads
-with slow current sensors, half of the resistance and more.
+information.  Throttle as a further regressor would absorb that load, but on quads with slow
+current sensors also half of the resistance and more.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ from ou_monitor.records import FloatArray, NAN
 from ou_monitor.timeline.line import MOST_CURRENT, MOST_THROTTLE, plausible
 
 
-# Minimum largest current to start the filter, A, and relative rise of it that restarts the filter.
+# Current from which the filter starts, A; factor by which the largest current must rise to restart
+# it.
 _LEAST, _MORE = 1e-2, 4.0
 # Prior deviation of the voltage drop at the largest current, relative to the voltage; shares of
 # the drop that appear at once and after each of LAGS, and their deviations.
@@ -41,7 +42,8 @@ _SHARES = np.array([1.0, 0.1, 0.2, 0.3])
 _SHARE_STD = (0.3, 0.3, 0.1, 0.15)
 _PRIOR = _FALL ** 2 * (np.outer(_SHARES, _SHARES) + np.diag(np.square(_SHARE_STD)))
 _DRAWN_STATES = 2 + _SHARES.size
-# Level: V per sqrt(s) and cell, twice that under throttle, as charge is counted from a guess.
+# Random walk of the level, V per sqrt(s) and cell: twice that of the filter for throttle, because
+# the charge is counted from a guess.
 _DRAWN_WALK = 0.003
 # Minimum time to empty a pack at the largest current, s; without discharge the level is constant.
 _EMPTY = 100.0
@@ -410,7 +412,7 @@ class LoadFilter:
     def _begin(self, v: float, u: float) -> None:
         """Start a flight with the prior, scaled by the first voltage."""
         self._volts = max(v, 1e-3)
-        # Below 2.5 V no lithium cell: the curve is scaled.
+        # Below 2.5 V it is not a lithium cell, so the curve is scaled.
         self._cells = float(cells_in_series(self._volts)) if self._volts > 2.5 else \
             self._volts / CELL
         start = self._start
@@ -419,7 +421,7 @@ class LoadFilter:
             self._cells = start.cells
         else:
             self._start = None
-        # Whether the coefficients have met a throttle.
+        # Whether throttle has been known since the start.
         self._loaded = math.isfinite(u)
         self._heard, self._highest = -math.inf, NAN
         # For each bin of throttle: seconds, samples, and sum of squared residuals, V^2.
@@ -673,7 +675,7 @@ class LoadFilter:
             self._noise.log_variance, self._noise.ripple_se, self._between(0.02))
 
     def learned(self) -> LoadStart | None:
-        """Return the start of the next flight of this craft; None: the sag is unknown."""
+        """Return start values for the next flight of this craft; None: the sag is unknown."""
         load = self.load()
         if not (load.known and self._m[0] > 0.0):
             return None

@@ -17,21 +17,21 @@ import numpy.typing as npt
 from ou_monitor.model.load import LoadStart, SIZE, WARMING, WARMING_SE
 from ou_monitor.records import FloatArray, NAN
 
-# Length, s, of the stretches within which voltages and the model's answer are compared, so that
+# Length, s, of the stretches within which voltages and the model's response are compared, so that
 # the level cancels out (1 s and 4 s give the same); maximum number kept, five minutes.
 _STRETCH, _MOST = 2.0, 150
 # Minimum effective number of stretches: their scatter gives the error.
 _FEWEST = 4.0
-# Minimum relative error of the model: its form errs when throttle is flown differently.
+# Minimum relative error of the model, because its form errs if throttle is used differently.
 _FORM = 0.05
-# Relative error of the sag where only the filter has learned it.
+# Relative error of a sag that only the filter has learned.
 SIZE_ERROR = 0.1
 # Minimum relative error of the noise: its scatter between simulated flights of one model.
 _NOISE_FORM = 0.15
 # Lower limit of the noise, V.
 _LEAST_NOISE = 1e-6
-# Weaker: above both limits, relative and in standard errors of the logarithm (1 % of a normal law
-# lies above).
+# A pack is weaker above both limits: relative, and in standard errors of the logarithm (by chance
+# exceeded in 1 % of cases).
 _LEAST, _ERRORS = 0.10, 2.33
 # Relative error above which the ratio is not determined.
 _VAGUE = 0.15
@@ -83,7 +83,7 @@ class ModelComparison:
 class Contrast:
     """Measured response to throttle against the predicted one; NaN: too few stretches."""
 
-    ratio: float = NAN  # Slope of the voltage over the answer
+    ratio: float = NAN  # Slope of the voltage over the predicted response
     se: float = NAN
     noise: float = NAN  # Residual rms while throttle moves, outliers downweighted, V
     noise_se: float = NAN
@@ -116,7 +116,7 @@ class LoadContrasts:
         self._sums += np.outer(row / variance, row)
 
     def against(self, coefficients: npt.ArrayLike) -> Contrast:
-        """Compare the voltage with the answer, V, that these coefficients predict."""
+        """Compare the voltage with the response, V, that these coefficients predict."""
         if len(self._stretches) < _FEWEST:
             return Contrast()
         a = np.asarray(coefficients, dtype=np.float64)
@@ -142,13 +142,13 @@ class LoadContrasts:
 
 
 def _warming(levels: FloatArray, left: FloatArray, squares: FloatArray) -> tuple[float, float]:
-    """Return the slope of relative residuals over levels, V, and its error, beside usual ones."""
+    """Return the slope of relative residuals over levels, 1/V, and its error, with the prior."""
     weight = float(squares @ levels ** 2)
     if not weight > 0.0:
         return WARMING, WARMING_SE
     slope = float(levels @ left) / weight
     each = levels * (left - slope * levels * squares)
-    # An error of the form at each end of the levels, sqrt(12) deviations apart, turns the slope.
+    # An error of the form at the ends of the levels, sqrt(12) deviations apart, tilts the slope.
     variance = (float(each @ each) / weight + _FORM ** 2 * float(squares.sum()) / 6.0) / weight
     own, usual = 1.0 / variance, WARMING_SE ** -2
     return (slope * own + WARMING * usual) / (own + usual), (own + usual) ** -0.5
@@ -177,7 +177,7 @@ def judge(ratio: float, se: float, date: str) -> tuple[ModelVerdict, str]:
     more, model = ratio - 1.0, 'the model' + (f' of {date}' if date else '')
     sizes = sorted((100.0 * (abs(more) - 1.96 * se), 100.0 * (abs(more) + 1.96 * se)))
     found = f'Sag {100.0 * abs(more):.0f} % ({sizes[0]:.0f} to {sizes[1]:.0f})'
-    # Most errors are factors: they grow with the ratio, its logarithm has them as without ageing.
+    # Most errors are factors and grow with the ratio, so the logarithm has those without ageing.
     if more > _LEAST and math.log(ratio) > _ERRORS * se / ratio:
         return ModelVerdict.WEAKER, f'{found} above {model}: weak pack or cold.'
     if ratio + _ERRORS * se < _OTHER:

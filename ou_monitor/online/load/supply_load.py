@@ -19,7 +19,7 @@ from ou_monitor.records import Estimate, FloatArray, NAN, Status
 LAGS = (0.06, 2.0, 15.0)
 # Exponents of the load over throttle and over the level: the prior of `load_fit`.
 POWER = 1.8
-# Throttle at which the sag is tabled.
+# Throttles of the table of the sag.
 TABLE = np.linspace(0.0, 1.0, 101)
 # Sentences on the relaxation, used if level, sag and noise are known without it.
 _NO_ALPHA = {
@@ -41,7 +41,7 @@ class LoadStatus(enum.Enum):
 
     KNOWN = 'The sag is known over the throttles flown.'
     NO_DATA = 'No voltage has arrived.'
-    NO_THROTTLE = 'Throttle is not known: the level is that under load, the sag is not known.'
+    NO_THROTTLE = 'Throttle is unknown: so is the sag, and the level is the voltage under load.'
     STILL = 'Throttle has not moved: the sag is unknown.'
     UNCERTAIN = 'The sag is too uncertain: it needs more changes of throttle.'
     NO_RELATION = ('The voltage does not fall with throttle, as on a regulated rail; on a '
@@ -93,7 +93,7 @@ class SupplyLoad:
         return self._read(throttle, self._sag_se)
 
     def noise(self, throttle: npt.ArrayLike) -> FloatArray:
-        """Return the rms that the load does not explain, V; beyond what was flown the nearest."""
+        """Return the rms that the load does not explain, V, at the nearest throttle flown."""
         u = np.clip(np.asarray(throttle, dtype=np.float64), *np.nan_to_num(self._range))
         return np.asarray(np.interp(u, np.linspace(0.0, 1.0, len(self._noise)), self._noise))
 
@@ -107,7 +107,7 @@ class SupplyLoad:
             'load_delay': self.delay, 'load_basis': self.basis.name}
 
     def words(self, e: Estimate) -> str:
-        """Return what needs no alpha, and why that is unknown; empty: there is no such case."""
+        """Return sag, level, noise, and why alpha is unknown; empty for other statuses."""
         if math.isnan(self.level) or e.status not in _NO_ALPHA:
             return ''
         why = _NO_ALPHA[e.status].format(at=f' at {e.rate:.3g} Hz' if e.rate > 0.0 else '')
@@ -141,7 +141,7 @@ class LoadState:
     mean: FloatArray
     covariance: FloatArray
     lags: tuple[float, ...]  # x after the three lags.
-    size: float  # Load at this level over that at 3.8 V a cell.
+    size: float  # Load at this level, over the load at 3.8 V per cell.
     fall: float  # Fall of the level, V per unit of charge.
     # Coefficients of ln variance, V^2, of a sample: 1, ripple, sqrt|du|.
     log_variance: tuple[float, float, float]

@@ -56,8 +56,8 @@ s+ - s = 2 g (A v + b x) and s+ + s = 2 v, so that
 
 which is below 0 wherever |v| > 2 |P b| X / q (q: least eigenvalue of the form above, X: bound
 of the input); and |v| >= (|s| - g X) / |I - g A|, so that a large state has a large v while
-g is bounded, as it is by `HIGHEST` (test_biquads.py puts it in numbers; what is seen under
-adversarial sequences is a tenth).  m stays within 0..1 and is outside the loop.
+g is bounded, as it is by `HIGHEST` (test_biquads.py states the bound in numbers; adversarial
+sequences reach a tenth of it).  m stays within 0..1 and is outside the loop.
 
 Limits: a step of the coefficients moves y by what v1 changes within the sample; the caller
 moves them smoothly.
@@ -169,7 +169,7 @@ class MotorLaw:
 
     def learn(self, power: FloatArray, root: float, passed: float,
               lost: float) -> None:
-        """Take a frame: power in each bin, and time since the last, s; `lost` scales the past."""
+        """Take a frame: power in each bin, time since the last, s, and a factor on the past."""
         keep = float(np.exp(-passed / _LAW_MEMORY))
         removed = self._removed @ power
         f = self._a + self._b * root
@@ -304,7 +304,7 @@ class NotchChoice:
 
     def usual(self, power: FloatArray, passed: float) -> tuple[FloatArray, float]:
         """
-        Return a frame after the low-pass over the recently loudest, shape (channels, K).
+        Return a low-passed frame relative to the loudest recent one, shape (channels, K).
 
         A louder frame reduces the weight of earlier ones by the second result; quiet frames count
         again once loud ones are forgotten.

@@ -11,8 +11,8 @@ in the load filter.
 The pilot: each completed horizon is one course, with its highest throttle, the time spent there,
 and the mean of the rest.  Its weight is larger if its first throttle is near the present one, and
 if it is recent.  Courses never flown, a rise into each fifth of the remaining throttle, together
-have the weight of one horizon (rule of succession).  Limits: the order within a horizon is peak
-first.
+have the weight of one horizon (rule of succession).  Limits: within a horizon, the peak is taken
+to come first.
 
 Excursions give the risk from the margin alone, in units of the drops of this flight, if even the
 load is unknown: P = expit(b0 + b1 z1 + b2 z2), z1 = (now - L - m)/S within -4..8, z2 = (now - L)/S
@@ -212,7 +212,7 @@ class Past:
         self._place(at[begin], rows, count)
 
     def _place(self, at: np.ndarray, rows: FloatArray, count: np.ndarray) -> None:
-        """Put rows at their places; rows between are filled with the last, or unknown."""
+        """Put rows at their places; fill rows in between with the last one, or with NaN."""
         old = self.table.shape[1]
         if at[0] < old:
             # Earlier samples have started this block.
@@ -255,8 +255,8 @@ class Past:
         change = change[np.isfinite(change)]
         return float(np.sqrt(change).mean()) if change.size else 0.0
 
-    def became(self, t: float, horizon: float) -> tuple[float, float, float] | None:
-        """Return lowest voltage, highest throttle and s there in a horizon; None: incomplete."""
+    def outcome(self, t: float, horizon: float) -> tuple[float, float, float] | None:
+        """Return lowest voltage, highest throttle, and time there, s; None: incomplete horizon."""
         begin = math.floor((t - self._start) / BLOCK) + 1
         end = begin + max(1, round(horizon / BLOCK))
         if begin < 0 or end > self.table.shape[1]:

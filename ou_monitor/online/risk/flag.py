@@ -61,7 +61,7 @@ class FloorWatch:
     def reset(self) -> None:
         """Forget the samples, and start a new time line."""
         self._newest = self._arrived = -math.inf
-        # What is added to stamps, s: late samples move the time line on, and what follows.
+        # Added to stamps, s, because late samples move the time line, and all later samples, on.
         self._shift = 0.0
         self._t = np.empty(0)
         self._v = np.empty(0)
@@ -105,7 +105,7 @@ class FloorWatch:
                 order = np.argsort(t, kind='stable')
                 t, v = t[order], v[order]
         steps = np.diff(t, prepend=self._newest)
-        # The comparison is false for NaN too: no stamp is as good as a late one.
+        # The comparison is false for NaN too, so a missing stamp counts as a late one.
         late = ~(steps > 0.0)
         far = _FAR * self._together
         at = t + self._shift
@@ -132,13 +132,13 @@ class FloorWatch:
     def _waits(self, arrival: FloatArray | None) -> FloatArray | float:
         """Return the time by which late samples advance the time line, s."""
         if arrival is None or self._arrived == -math.inf:
-            # Not known: two samples fill the time, and two of three decide.
+            # Unknown interval: assume two per `brownout.floor_time`, so two of three decide.
             return (0.5 * self.settings.brownout_floor_time if math.isnan(self._usual)
                     else self._usual)
         return np.maximum(np.diff(arrival, prepend=self._arrived), 0.0)
 
     def _paced(self, elapsed: FloatArray, arrival: FloatArray | None) -> FloatArray:
-        """Return the time since the newest sample, s; what came at once is spaced as usual."""
+        """Return the time since the newest sample, s; space simultaneous samples as usual."""
         if arrival is None or math.isnan(self._usual):
             return elapsed
         least = self._usual * np.arange(1.0, elapsed.size + 1.0)
@@ -184,7 +184,7 @@ class FloorWatch:
         return int(self._t.size)
 
     def take(self, arriving: bool = True) -> bool:
-        """Return whether a sample since the last call was low, or a still arriving source is."""
+        """Return whether the voltage was low since the last call, or is (if samples arrive)."""
         low, self._was_low = self._was_low or (self._low and arriving), False
         return low and self.settings.floor > 0.0
 
@@ -278,11 +278,12 @@ class BrownoutFlag:
     def update(self, t: float, risk: float, soon: float | None = None, tight: bool = False, *,
                fresh: bool = True, arriving: bool | None = None) -> FlagState:
         """
-        Judge (t in s; risk, and that of the next second with throttle as it is, 0..1).
+        Judge the level (t in s).
 
-        `soon` left out, or NaN: as `risk`.  `tight`: the budget is below what is flown.  `fresh`:
-        the risk rests on samples that are not too old; `arriving`: samples still come, whatever
-        their stamps say, and a last one at the floor holds (as `fresh` when left out).
+        `risk`: within the horizon; `soon`: within the next second at the present throttle (omitted
+        or NaN: as `risk`).  `tight`: the budget is below the throttle in use.  `fresh`: the
+        samples behind the risk are not too old.  `arriving`: samples still arrive, whatever their
+        stamps, so a last one at the floor still counts (by default as `fresh`).
         """
         soon = risk if soon is None or math.isnan(soon) else soon
         for one in (risk, soon):

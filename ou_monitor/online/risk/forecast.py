@@ -358,9 +358,9 @@ class Forecast:
         for rung in self._rungs:
             while rung.looks and self._past.end >= rung.looks[0].t + rung.horizon + BLOCK:
                 look = rung.looks.popleft()
-                became = self._past.became(look.t, rung.horizon)
-                if became is not None:
-                    rung.learn(look, *became, self._sampling)
+                outcome = self._past.outcome(look.t, rung.horizon)
+                if outcome is not None:
+                    rung.learn(look, *outcome, self._sampling)
             if self._newest < rung.next:
                 continue
             rung.next = self._newest + max(

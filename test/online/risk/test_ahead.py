@@ -68,7 +68,7 @@ def test_without_throttle_there_is_a_risk_and_no_budget():
     monitor = SupplyMonitor(replace(SETTINGS, brownout_voltage=4.75))
     report = flown(monitor, [(0.8, 4.0)], throttle=False)
     assert 1e-4 < report.risk < 0.9
-    assert math.isnan(report.budget) and 'Throttle is not known' in report.budget_reason
+    assert math.isnan(report.budget) and 'Throttle is unknown' in report.budget_reason
     later = flown(monitor, [(0.2, 3.0)], seed=3, begin=4.0)
     assert later.risk < report.risk
 

@@ -30,12 +30,12 @@ def middle_of(v):
 
 def test_what_a_horizon_became():
     past, t, v, u = made()
-    lowest, peak, dwell = past.became(10.02, 2.0)
+    lowest, peak, dwell = past.outcome(10.02, 2.0)
     inside = slice(201 + 1004 - 200, 1205)
     assert lowest == middle_of(v)[inside].min()
     assert peak == u[inside].max()
     assert dwell == pytest.approx((u[inside] >= peak - 0.05).sum() / RATE)
-    assert past.became(59.0, 2.0) is None
+    assert past.outcome(59.0, 2.0) is None
 
 
 def test_slow_sources_are_held_and_silence_is_not():
@@ -43,7 +43,7 @@ def test_slow_sources_are_held_and_silence_is_not():
     past.push(np.arange(10.0), np.arange(10.0) + 10.0, np.full(10, 0.5))
     assert np.isfinite(past.table).all() and past.table.shape[1] == 181
     past.push(np.array([14.0]), np.array([9.0]), np.array([0.5]))
-    assert past.became(8.0, 3.0) is None
+    assert past.outcome(8.0, 3.0) is None
     assert past.drops(1.0).size < past.table.shape[1] - 60
     past.push(np.array([1e9]), np.array([9.0]), np.array([0.5]))
     assert past.table.shape[1] == 1
