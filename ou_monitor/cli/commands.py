@@ -150,9 +150,7 @@ CSV = (
     Option('--skip-rows', metavar='N', type=whole('a number of lines, 0 or more', 0),
            help='lines above the header of a CSV (default: detected)'))
 # How a log or a CSV is read.
-FILES = (
-    Option('--flight', metavar='N', type=FLIGHT,
-           help='flight of a log with several, from 1 (default: the largest)'),
+COLUMNS = (
     Option('--voltage-column', metavar='NAME',
            help='column of a CSV (default: found by its name), or series of a log (default: the '
            'battery)'),
@@ -161,6 +159,9 @@ FILES = (
     Option('--current-column', metavar='NAME',
            help="column of a CSV or series of a log, or 'none' (default: found)"),
     *CSV)
+FILES = (
+    Option('--flight', metavar='N', type=FLIGHT,
+           help='flight of a log with several, from 1 (default: the largest)'), *COLUMNS)
 JSON = Option(
     '--json', metavar='FILE',
     help="write the result as JSON ('-': to standard output, and nothing else)")
@@ -412,8 +413,8 @@ _FLEET = Command(
      Option('--discover', action='store_true',
             help='also search for causes; takes a few seconds per recording (default: off)'),
      seed(0, 'of discover'), levels('found in each recording'),
-     *estimate('count dips below this voltage, V, and give their risk'), *TOPICS, JSON,
-     FORCE),
+     *estimate('count dips below this voltage, V, and give their risk'), *TOPICS, *COLUMNS,
+     JSON, FORCE),
     ('logs/ --output fleet --cells 4', 'logs/ --output fleet --vehicle-from "(uav[0-9]+)"'))
 
 _LIVE = Command(

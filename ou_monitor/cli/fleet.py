@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 import hashlib
 import math
 import os
@@ -13,7 +14,7 @@ from typing import Any, TYPE_CHECKING
 
 from ou_monitor import __version__
 from ou_monitor.cli import output
-from ou_monitor.cli.arguments import brownout_limit, check_ranges, repeated
+from ou_monitor.cli.arguments import brownout_limit, check_ranges, columns_given, repeated
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import how_to_install, InputError
 
@@ -133,9 +134,11 @@ def _options(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
     limit = brownout_limit(args)
     check_ranges({'window': args.window, 'brownout_voltage': limit,
                   'brownout_horizon': args.brownout_horizon})
+    columns = columns_given(args)
     return Options(
         levels=args.levels, window=args.window,
         brownout_voltage=math.nan if limit is None else limit,
         brownout_horizon=args.brownout_horizon, cells=args.cells or 0,
         msg_config=config, voltage_topic=args.voltage_topic, throttle_topic=args.throttle_topic,
-        partial=args.partial, discover=args.discover, seed=args.seed), more
+        columns=None if columns is None else asdict(columns), partial=args.partial,
+        discover=args.discover, seed=args.seed), more

@@ -17,6 +17,7 @@ from ou_monitor.errors import InputError
 from ou_monitor.fleet.vehicles import start_of
 from ou_monitor.online.risk.first_passage import brownout_probability
 from ou_monitor.recordings.importers.formats import is_csv
+from ou_monitor.recordings.importers.log import CsvColumns
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import Defect, defect_of, NAN, Recording
 from ou_monitor.text import counted, printable
@@ -36,6 +37,7 @@ class Options:
     msg_config: str | None = None
     voltage_topic: str | None = None
     throttle_topic: str | None = None
+    columns: Mapping[str, Any] | None = None  # Fields of `CsvColumns`
     # Whether to read the intact part of damaged bags; CSVs are always read without bad lines.
     partial: bool = False
     discover: bool = False  # Whether to search for causes, which takes some seconds a recording
@@ -60,7 +62,8 @@ def work(path: str, options: Mapping[str, Any]) -> dict[str, Any]:
 def _analysed(path: str, options: Options) -> dict[str, Any]:
     recording = read_recording(
         path, msg_config=options.msg_config, voltage_topic=options.voltage_topic,
-        throttle_topic=options.throttle_topic, partial=options.partial or is_csv(Path(path)))
+        throttle_topic=options.throttle_topic, partial=options.partial or is_csv(Path(path)),
+        columns=None if options.columns is None else CsvColumns(**options.columns))
     if recording.n < 2:
         raise InputError(f'{recording.name} has {counted(recording.n, "usable sample")}: nothing '
                          'can be estimated from it')

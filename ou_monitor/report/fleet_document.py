@@ -112,6 +112,8 @@ def _ageing(fleet: Fleet) -> str:
     least = {vehicle: min((t for t in tested if t.vehicle == vehicle), key=lambda t: t.high)
              for vehicle in {t.vehicle for t in tested}}
     most = max(least.values(), key=lambda t: t.high)
+    if most.high <= 0.0:
+        return f'No pack ages: {most.quantity} falls on every vehicle tested.'
     return (f'No ageing pack is detected; not excluded (95 %): {most.quantity} '
             f'{change(most.high)} per flight on {most.vehicle}, which has {most.flights} flights.')
 
@@ -356,11 +358,13 @@ def _of_pack(fleet: Fleet, name: str, vehicle: str) -> str:
     mine = _known(fleet, name, vehicle)
     if not mine:
         return UNKNOWN
-    value = float(np.median([row[name] / (row['cells'] or 1) for row in mine]))
+    whole = not all(row['cells'] for row in mine)
+    value = float(np.median([row[name] / (1 if whole else row['cells']) for row in mine]))
     at = {row['sag_throttle'] for row in mine} if name == 'sag' else set()
     ends = [f'{100.0 * u:.0f}' for u in sorted({min(at), max(at)})] if at else []
     where = f'\nat {" to ".join(ends)} %' if ends else ''
-    return f'{number(1e3 * value)}{_star(fleet.judgement, name, vehicle)}{where}'
+    return (f'{number(1e3 * value)}{_star(fleet.judgement, name, vehicle)}{" (pack)" * whole}'
+            + where)
 
 
 def _star(judged: Judgement, name: str, vehicle: str) -> str:
@@ -374,8 +378,8 @@ def _packs(fleet: Fleet) -> list[Part]:
     if not made.rows:
         return []
     return [made, Text(
-        'Medians as measured, the sag at the highest throttle flown; of the whole supply if the '
-        'number of cells is unknown. "per flight": drift, the sag at full throttle. A star marks '
+        'Medians as measured, the sag at the highest throttle flown; (pack): of the whole supply, '
+        'because its cells are unknown. "per flight": drift, the sag at full throttle. A star marks '
         'what stands out.',
         legend=True)]
 
@@ -774,7 +778,7 @@ def _recordings(fleet: Fleet) -> list[Part]:
         'flags']
     more = len(firsts) - _RECORDINGS
     return [Table.of_known(heads, rows, left=[0, 2, len(heads) - 1]), Text(
-        'As measured, per cell if the number of cells is known ("?": guessed). Small print: the '
+        'As measured; "?": guessed; pack: of the whole supply. Small print: the '
         'throttle and, if the vehicle has enough flights, the distance from its other flights in '
         'standard deviations.' + (
             f' {more} more recordings are in the Parquet table.' if more > 0 else ''),
@@ -789,7 +793,8 @@ def _cell(values: Values, score: FloatArray, k: int | None) -> str:
     if k is None:
         return UNKNOWN
     at = values.throttle[k]
-    small = [f'at {100.0 * at:.0f} %'] if math.isfinite(at) else []
+    small = ['pack'] if values.name in OF_PACK and not values.cells[k] else []
+    small += [f'at {100.0 * at:.0f} %'] if math.isfinite(at) else []
     small += [f'{score[k]:+.1f} sd'] if math.isfinite(score[k]) else []
     return (number(_thousandths(values.name) * float(values.measured[k])) + '\n'
             + ', '.join(small)).rstrip()

@@ -216,6 +216,12 @@ def test_resistance_and_sag_are_those_of_analyze(tmp_path, one_process, capsys):
     told = ' '.join(said.split())
     assert 'uav7: f_2024-05-02.csv: 1 bad line left out' in told
     assert 'mOhm, f_2024-05-0' in told and '4?' in told
+    # Columns and series are chosen as in analyze, and other ones are another run.
+    assert main(['fleet', str(logs.parent), '--output', str(tmp_path / 'out'),
+                 '--current-column', 'none']) == 0
+    table = parquet.read_table(tmp_path / 'out' / 'fleet.parquet').to_pylist()
+    assert [one['resistance'] for one in table] == [None] * len(table)
+    assert all(one['sag_full'] is not None for one in table)
 
 
 def test_bad_files_are_rows(rows, whole):

@@ -146,8 +146,14 @@ def test_an_ageing_pack_is_the_headline():
         [name, '8', '2024-05-01 to 2024-05-08', '4?'] for name in ('uav0', 'uav1')]
     assert '*' in packs.rows[1][5] and '*' not in packs.rows[0][5]
     assert 'Resistance per cell' in page_text(made)
+    # Without its cells a value is marked as that of the pack.
+    unknown = pack_table(fleet([{**row, 'cells': None} for row in rows]))
+    assert ['(pack)' in ' '.join(row) for row in (*packs.rows, *unknown.rows)] == [
+        False, False, True, True]
     healthy = fleet_document(fleet(table(np.random.default_rng(9), 2, 5))).headline
     assert healthy.startswith('No ageing pack is detected; not excluded (95 %): ')
+    assert fleet_document(fleet(table(
+        np.random.default_rng(9), 1, 8, ageing={0: -0.2}))).headline.startswith('No pack ages: ')
     assert fleet_document(fleet(table(np.random.default_rng(9), 2, 2))).headline.startswith(
         'Whether a pack ages is unknown: no vehicle has 3 flights')
 
