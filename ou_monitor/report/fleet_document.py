@@ -379,8 +379,8 @@ def _packs(fleet: Fleet) -> list[Part]:
         return []
     return [made, Text(
         'Medians as measured, the sag at the highest throttle flown; (pack): of the whole supply, '
-        'because its cells are unknown. "per flight": drift, the sag at full throttle. A star marks '
-        'what stands out.',
+        'because its cells are unknown. "per flight": drift, the sag at full throttle. A star '
+        'marks what stands out.',
         legend=True)]
 
 

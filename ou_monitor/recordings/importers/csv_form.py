@@ -71,6 +71,7 @@ _WORD = f"({'|'.join(sorted(WORDS, key=len, reverse=True))})"
 _WITH_UNIT = re.compile(
     rf'(.*?) ?[\[({{] ?{_WORD} ?[\])}}]|(.+?) in {_WORD}|(.[^/]*?|.+? ) ?/ ?{_WORD}|'
     rf'(.+?)[ _]{_WORD}')
+_NAMES = re.compile(r'[^\s\[(]+(?: ?[\[(][^\])]*[\])])?')
 # A number with groups of thousands and decimals, or with a unit.
 _GROUPED = re.compile(r'[-+]?\d{1,3}(?:,\d{3})+\.\d+')
 _AND_UNIT = re.compile(r'(\S*[\d.])\s*+([^\d\s.]{1,12}+(?: [AaDd][Cc])?)')
@@ -291,9 +292,13 @@ def _header(rows: list[list[str]], lines: list[str], first: int, width: int, del
     else:
         # A header marked as a comment.
         for k in range(first - 1, skip - 1, -1):
-            cells = next(iter(csv.reader([lines[k].lstrip('# \t')], delimiter=delimiter)), [])
-            if len(cells) == width and width > 1:
-                names, line = [cell.strip() for cell in cells], k + 1
+            text = lines[k].lstrip('# \t')
+            # Delimited as the data, or by blanks, with units in brackets.
+            for cells in (next(iter(csv.reader([text], delimiter=delimiter)), []),
+                          _NAMES.findall(text)):
+                if not line and len(cells) == width and width > 1:
+                    names, line = [cell.strip() for cell in cells], k + 1
+            if line:
                 break
     names = names or [f'column {k + 1}' for k in range(width)]
     stated = [units[k] if k < len(units) and units[k] in WORDS else unit_of(name)[1]

@@ -55,6 +55,7 @@ _MOST_VOLTS = 1000.0
 
 # Quantity -> patterns of the end of a column's name without its unit, the best first; small
 # letters, other characters as '_'.  From the exports named in test_csv_exports.py.
+_VALUE_NAME = r'_?(?:values?|reading|data|wert|messwert)?'
 _TIME_NAME, _INDEX_NAME = 'time', r'sequence|index|sample|no|n|x|point|'
 _PATTERNS = {
     _TIME_NAME: (
@@ -72,8 +73,8 @@ _PATTERNS = {
         r'(?!.*(?:axis|cell|temp|limit|zelle|motor|servo|rssi|phase|cpu|mcu|5v|sag)).*(?:volt|'
         r'spannung|vbat).*'),
     logs.THROTTLE: (
-        r'throttle', r'thr(?:ottle)?_?(?:out|cmd|command|pct|percent)?|gas|duty(?:_cycle)?|tho?o|'
-        r'tastgrad|tastverh.*',
+        r'throttle', r'thr(?:ottle)?_?(?:out|cmd|command|pct|percent)?|ga[sz]|duty(?:_cycle)?|'
+        r'tho?o|tastgrad|tastverh.*',
         r'rc_?command_3', r'pwm|thrust|gas_?kanal|esc(?:_signal)?|'
         r'(?!.*(?:limit|trim|max|min)).*throttle.*'),
     logs.CURRENT: (
@@ -264,11 +265,13 @@ def _choose(form: Form, quantity: str, taken: Sequence[int] = ()) -> list[int]:
     free = [k for k in range(len(plain)) if k not in taken and plain[k] is not None
             and _of_kind(form, k, quantity == _TIME_NAME)]
     for pattern in _PATTERNS[quantity]:
-        for texts in ([form.names[k].strip() for k in range(len(plain))], plain, ends):
-            found = [k for k in free if re.fullmatch(pattern, texts[k] or ' ')
-                     and (not right or form.units[k] in right or not form.units[k])]
-            if found:
-                return found
+        found = list(dict.fromkeys(
+            k for texts in ([form.names[k].strip() for k in range(len(plain))], plain, ends)
+            for k in free if re.fullmatch(pattern, texts[k] or ' ')
+            and (not right or form.units[k] in right or not form.units[k])))
+        if found:
+            # Stated units decide between names: `v [V]` before `u`.
+            return sorted(found, key=lambda k: form.units[k] not in right)
     others = '|'.join(pattern for name, patterns in _PATTERNS.items() if name != quantity
                       for pattern in patterns[:3])
     found = [k for k in free if right and form.units[k] in right
@@ -343,9 +346,12 @@ def _parts_of_second(form: Form, clock: int) -> int | None:
 
 
 def _nameless_columns(form: Form) -> list[int]:
-    """Return the columns without a name that hold a number in each of the first rows."""
-    return [] if form.line else [k for k in range(form.width) if form.rows and all(
+    """Return the columns without a telling name whose first cells are numbers."""
+    filled = [k for k in range(form.width) if form.rows and all(
         k < len(row) and is_value(row[k]) for row in form.rows)]
+    # With names, only beside a time and nothing else: otherwise it may be of several series.
+    return filled if not form.line else [k for k in filled[1:] if form.width == 2
+                                         and re.fullmatch(_VALUE_NAME, form.names[k].lower())]
 
 
 def _clock_columns(form: Form) -> list[int]:

@@ -133,6 +133,20 @@ FORMS = {
     'us_clock': (table(['Time,Volts'], lambda k: f"{clock(k, '%m/%d/%Y %I:%M:%S.')}"
                                                  f'{10 * k % 1000:03d} AM,{V[k]}'), 0.01, False,
                  False),
+    # Names in a comment, between blanks whatever the delimiter; `u` is the throttle.
+    'gnuplot': (table(['# time voltage current'],
+                      lambda k: f'{0.01 * k:.2f}\t{V[k]}\t{AMPS[k]}'), 0.01, False, True),
+    'numpy': (table(['# t [s] v [V] u throttle'], lambda k: (
+        f'{0.01 * k:.18e} {V[k]:.18e} {U[k]:.18e} {U[k]:.18e}')), 0.01, True, False),
+    # A time and one value without a telling name.
+    'prometheus': (table(['"timestamp","value"'],
+                         lambda k: f'{1715846526000 + 1000 * k},{V[k]}'), 1.0, False, False),
+    'infiniium': (table(['Type:,raw', 'Points:,60', 'XInc:,1.0E-05', 'XOrg:,-2.0E-03',
+                         'Y Units:,Volt', 'Data:,'], lambda k: f'{1e-5 * k:.11E},{V[k]:.6E}',
+                        '\r\n'), 1e-5, False, False),
+    'excel_fr': ('\ufeff' + table(['Temps (s);Tension (V);Courant (A);Gaz (%)'], lambda k: (
+        f'{0.01 * k:.2f};{V[k]};{AMPS[k]};{100 * U[k]:.1f}'.replace('.', ','))), 0.01, True,
+                 True),
     'no_header': (table([], lambda k: f'{0.01 * k:.3f},{V[k]},', '\r\n'), 0.01, False, False),
     'edgetx_sticks': (table(['Date,Time,RxBt(V),Thr,TxBat(V)'],
                             lambda k: f"{clock(k, '%Y-%m-%d,%H:%M:%S.')}{10 * k % 1000:03d},"
@@ -301,6 +315,14 @@ def test_a_column_that_may_be_the_throttle_is_named(tmp_path):
     for name in ('load', 'none'):
         notes = read_recording(path, columns=CsvColumns(throttle=name)).notes
         assert 'not read' not in notes[0]
+
+
+def test_stacked_series_and_other_quantities_are_no_voltage(tmp_path):
+    """A value beside names of series, or a temperature, is taken only if it is named."""
+    for header, row in (('time,topic,value', '{},/bat,12.5'), ('time,temperature', '{},22.5')):
+        content = '\n'.join([header, *(row.format(k) for k in range(N))])
+        with pytest.raises(InputError, match="no column 'voltage_v'"):
+            read_recording(written(tmp_path, content))
 
 
 def test_one_column_is_one_series(tmp_path):
