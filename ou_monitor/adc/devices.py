@@ -205,19 +205,11 @@ class Scan:
 
     def __init__(self, elements: Sequence[Element]) -> None:
         self._elements = {element.name: element for element in elements}
-        at, offsets, largest = 0, [], 1
-        ordered = sorted(elements, key=lambda element: element.index)
-        for element in ordered:
-            length = element.storage // 8
-            at = -(-at // length) * length
-            offsets.append(at)
-            at += length
-            largest = max(largest, length)
-        self.size = -(-at // largest) * largest
-        self._dtype = np.dtype({
-            'names': [element.name for element in ordered], 'offsets': offsets,
-            'formats': [f'{element.order}u{element.storage // 8}' for element in ordered],
-            'itemsize': self.size})
+        # On 64-bit machines NumPy aligns as the kernel does, each element to its own size.
+        self._dtype = np.dtype([
+            (element.name, f'{element.order}u{element.storage // 8}')
+            for element in sorted(elements, key=lambda element: element.index)], align=True)
+        self.size = self._dtype.itemsize
 
     def integers(self, data: bytes, name: str) -> npt.NDArray[np.int64]:
         """Return the numbers of one element in whole scans."""
