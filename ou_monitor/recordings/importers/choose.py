@@ -239,11 +239,8 @@ def choose_extras(path: Path, log: Log, *, imus: Sequence[str] = (),
         speeds = speeds if speeds.t.size else None
     named: dict[str, Series] = {}
     for name in dict.fromkeys(signals):
-        series, said = clean(named_series(path, log, name))
-        notes += led(name, (*said, *pace_notes(series.t)))
-        if not series.n:
-            raise InputError(f'{path}: {name} has no usable sample'
-                             + ''.join(f' ({sentence})' for sentence in said))
+        series, said = _cleaned(path, name, named_series(path, log, name))
+        notes += said
         if series.unit == UNKNOWN:
             notes.append(f'{name}: the log does not state its unit; written as it is logged.')
         named[_free(topic_of(name), {*_TAKEN, *inertial, *named})] = series
@@ -272,11 +269,16 @@ def signal_of(path: Path, log: Log, signal: str) -> tuple[Series, tuple[str, ...
     """Return a series by its name or by the topic that `convert` gives it, and notes on it."""
     if not signal:
         raise InputError('the name of the signal is empty: ' + _LIST)
-    series, said = clean(_of_topic(path, log, signal) or named_series(path, log, signal))
+    return _cleaned(path, signal, _of_topic(path, log, signal) or named_series(path, log, signal))
+
+
+def _cleaned(path: Path, name: str, series: Series) -> tuple[Series, tuple[str, ...]]:
+    """Return the usable samples of a series, and notes on it."""
+    series, said = clean(series)
     if not series.n:
-        raise InputError(f'{path}: {signal} has no usable sample' + ''.join(
-            f' ({sentence})' for sentence in said))
-    return series, tuple(led(signal, (*said, *pace_notes(series.t))))
+        raise InputError(f'{path}: {name} has no usable sample'
+                         + ''.join(f' ({sentence})' for sentence in said))
+    return series, tuple(led(name, (*said, *pace_notes(series.t))))
 
 
 def _of_topic(path: Path, log: Log, signal: str) -> Series | None:
@@ -285,17 +287,14 @@ def _of_topic(path: Path, log: Log, signal: str) -> Series | None:
     if found is None:
         return None
     name, column, field = found.groups()
-    held = [log.speeds] if log.speeds else []
     if field is not None:
-        held = default_inertial(log) if name == IMU else [
-            one for one in log.inertial if one.name == name]
-        if not held:
-            known = ', '.join(one.name for one in log.inertial) or 'none'
-            raise InputError(f"{path} has no gyro '{name}': it holds {known}")
-    elif name != SPEEDS:
+        held = _inertial(path, log, () if name == IMU else (name,))
+    elif name == SPEEDS:
+        held = [log.speeds] if log.speeds else []
+    else:
         return None
     if not held:
-        raise InputError(f'{path} holds no motor speeds'
+        raise InputError(f"{path} holds no {'motor speeds' if field is None else 'gyro'}"
                          + ''.join(f' ({note})' for note in log.notes if 'eRPM' in note))
     one, _ = clean_motion(held[0])
     if column not in one.columns:
