@@ -176,16 +176,6 @@ def test_a_failed_write_removes_the_bag(tmp_path, name):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_full_disk_is_one_line(tmp_path, monkeypatch):
-    def full(*_):
-        raise OSError(28, 'No space left on device')
-    monkeypatch.setattr(bag_module.Writer, 'finish', full)
-    with pytest.raises(InputError, match='bag.mcap: No space left'):
-        with BagWriter(tmp_path / 'bag.mcap') as bag:
-            bag.add_topic('u', FLOAT32)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_an_error_in_the_block_removes_the_bag(tmp_path):
     """Bugs of the caller are not the user's."""
     with BagWriter(tmp_path / 'bag.mcap') as bag:
