@@ -61,7 +61,8 @@ _REASONS = {
                       'a low-ESR capacitor of 470 to 1000 uF at the battery pads of the ESCs'),
     ('noise', False): ('a sensor that is slow or filtered before it is logged',
                        'raise its rate or filter cutoff before judging the noise'),
-    ('resistance', True): ('an aged or cold pack, or a poor connector',
+    ('resistance', True): ('an aged or cold pack, a poor connector, or a load that bypasses the '
+                           'current sensor',
                            'warm the pack, then try a fresh one and other leads'),
     ('resistance', False): ('a large pack, or a current that is scaled too high',
                             "compare the consumed mAh with the charger's")}

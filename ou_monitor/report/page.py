@@ -221,7 +221,9 @@ svg .thick { stroke-width: 2.2; } svg .dash { stroke-dasharray: 6 4; }
 svg .faint { opacity: .55; } svg .band { stroke: none; opacity: .22; }
 svg .panel { fill: var(--paper); opacity: .8; }
 svg .shade { stroke: none; opacity: .10; }
-@media print { body { max-width: none; } section { break-inside: avoid; } }
+@media print { body { max-width: none; } figure, tr, dl.facts, li { break-inside: avoid; }
+  h2 { break-after: avoid; } .scroll { overflow: visible; background: none; }
+  table { font-size: 12px; } th, td { padding: 3px 6px 3px 0; } td.left { white-space: normal; } }
 """
 
 
