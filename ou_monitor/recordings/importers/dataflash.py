@@ -66,8 +66,10 @@ INSTANCES = ('Inst', 'Instance', 'I')
 # SERVOn_FUNCTION: motors 1..8, motors 9..12, throttle, left and right throttle.
 MOTOR_FUNCTIONS = frozenset((*range(33, 41), *range(82, 86), 70, 73, 74))
 
-# (message, instance) -> field -> values; 't' holds the stamps, s.
-Table = dict[tuple[str, str], dict[str, list[float]]]
+# Field -> values; 't' holds the stamps, s.
+Columns = dict[str, FloatArray]
+# (message, instance) -> its columns, in order.
+Table = dict[tuple[str, str], Columns]
 
 
 def read(path: Path, request: Request) -> Log:
@@ -96,14 +98,12 @@ def read(path: Path, request: Request) -> Log:
     if bad:
         notes.append(f'{counted(bad, "message")} could not be read and were left out.')
     series: list[Series] = []
-    for (kind, instance), columns in sorted(table.items()):
-        name = f'{kind}[{instance}]' if instance else kind
-        series += _plain(name, kind, columns, whole[kind])
+    for (kind, instance), columns in table.items():
+        series += _plain(_name(kind, instance), kind, columns, whole[kind])
     series += _outputs(table, parameters)
     known = {one.name for one in series}
-    for (kind, instance), columns in sorted(table.items()):
-        name = f'{kind}[{instance}]' if instance else kind
-        series += _others(name, columns, units[kind], known)
+    for (kind, instance), columns in table.items():
+        series += _others(_name(kind, instance), columns, units[kind], known)
     if not series:
         raise InputError(f'{path} holds none of the messages that carry a voltage or a throttle '
                          f'({", ".join(dict.fromkeys(row[0] for row in PLAIN))})'
@@ -112,6 +112,10 @@ def read(path: Path, request: Request) -> Log:
                   _facts(banner) | _cells(parameters) | started(boot + min(
                       columns['t'][0] for columns in table.values()) if boot else 0.0), notes,
                   (*(one.name for one in series), *names), _gyros(table), _speeds(table))
+
+
+def _name(kind: str, instance: str) -> str:
+    return f'{kind}[{instance}]' if instance else kind
 
 
 @contextmanager
@@ -148,7 +152,7 @@ def _collect(log: Any, request: Request) -> tuple[Table, list[str], int]:
         kind, _, field = name.partition('.')
         fields.setdefault(kind.partition('[')[0], []).append(field)
     wanted = None if request.everything else {*fields, *OUTPUTS, *ALSO}
-    table: Table = {}
+    table: dict[tuple[str, str], dict[str, list[float]]] = {}
     banner: list[str] = []
     bad = count = 0
     while (message := log.recv_match(type=wanted, strict=True)) is not None:
@@ -181,7 +185,8 @@ def _collect(log: Any, request: Request) -> tuple[Table, list[str], int]:
             continue
         for column, value in zip(held.values(), [t, *row]):
             column.append(value)
-    return table, banner, bad
+    return {key: {field: np.array(values) for field, values in columns.items()}
+            for key, columns in sorted(table.items())}, banner, bad
 
 
 def _whole_numbers(log: Any, kind: str) -> frozenset[str]:
@@ -269,47 +274,43 @@ def _facts(banner: list[str]) -> dict[str, str]:
     return facts
 
 
-def _plain(name: str, kind: str, columns: dict[str, list[float]],
-           whole: frozenset[str]) -> Iterator[Series]:
-    t = np.array(columns['t'])
+def _plain(name: str, kind: str, columns: Columns, whole: frozenset[str]) -> Iterator[Series]:
     for source, field, quantity, rank, words in PLAIN:
         if source != kind or field not in columns:
             continue
-        values = np.array(columns[field])
-        scale = 1.0
+        values, scale = columns[field], 1.0
         if quantity == THROTTLE:
             scale = _throttle_scale(values)
         elif field in whole:
             # Logs of before 2014 hold hundredths in whole numbers, and mV of the rail.
             scale = 0.001 if field == 'Vcc' else 0.01
-        one = Series(f'{name}.{field}', quantity, t, values * scale, f'{scale:g}', words, rank,
-                     name)
+        one = Series(f'{name}.{field}', quantity, columns['t'], values * scale, f'{scale:g}',
+                     words, rank, name)
         yield replace(one, words=f'{words}, not connected', rank=None) if (
             quantity != THROTTLE and one.silent) else one
 
 
-def _others(name: str, columns: dict[str, list[float]], units: dict[str, str],
-            known: set[str]) -> Iterator[Series]:
+def _others(name: str, columns: Columns, units: dict[str, str], known: set[str],
+            ) -> Iterator[Series]:
     """Yield the fields that no other series uses, as logged."""
-    t = np.array(columns['t'])
     for field, values in columns.items():
         if field != 't' and f'{name}.{field}' not in known:
             unit = units.get(field) or KNOWN_UNITS.get(field, UNKNOWN)
-            yield Series(f'{name}.{field}', SIGNAL, t, np.array(values), '1', 'as logged',
+            yield Series(f'{name}.{field}', SIGNAL, columns['t'], values, '1', 'as logged',
                          group=name, own_unit=unit)
 
 
 def _gyros(table: Table) -> Iterator[Motion]:
     """Yield each gyro, with the accelerometer of its message, along front, left and up."""
     first: set[str] = set()
-    for (kind, instance), columns in sorted(table.items()):
+    for (kind, instance), columns in table.items():
         rates, forces = three_axes(columns, RATES), three_axes(columns, FORCES)
         if kind not in GYROS or rates is None:
             continue
         rank = None if kind in first else GYROS[kind]
         first.add(kind)
-        yield gyro_of(f'{kind}[{instance}]' if instance else kind, np.array(columns['t']),
-                      rates * FRD_TO_FLU, None if forces is None else forces * FRD_TO_FLU,
+        yield gyro_of(_name(kind, instance), columns['t'], rates * FRD_TO_FLU,
+                      None if forces is None else forces * FRD_TO_FLU,
                       'front, right, down turned to front, left, up',
                       'gyro and accelerometer' if forces is not None else 'gyro', rank)
 
@@ -317,17 +318,16 @@ def _gyros(table: Table) -> Iterator[Motion]:
 def _speeds(table: Table) -> Motion | None:
     """Return the speeds that ESCs reported, at the stamps of the first one."""
     kind, field = SPEED
-    found = {instance: columns for (name, instance), columns in sorted(table.items())
-             if name == kind and any(columns.get(field, ()))}
+    found = {instance: columns for (name, instance), columns in table.items()
+             if name == kind and np.any(columns.get(field, 0.0))}
     if not found:
         return None
-    t = np.array(next(iter(found.values()))['t'])
+    t = next(iter(found.values()))['t']
     values = []
     for columns in found.values():
-        own = np.array(columns['t'])
         # ESCs report in turn: the last report holds.
-        last = np.maximum(np.searchsorted(own, t, 'right') - 1, 0)
-        values.append(np.array(columns[field])[last] * RPM)
+        last = np.maximum(np.searchsorted(columns['t'], t, 'right') - 1, 0)
+        values.append(columns[field][last] * RPM)
     return Motion('', t, {VELOCITY: np.column_stack(values)}, f'rpm {RPM:.6g}',
                   'speed reported by the ESC, the last report held',
                   motors=tuple(f'motor_{instance or 0}' for instance in found))
@@ -343,12 +343,11 @@ def _throttle_scale(values: FloatArray) -> float:
 def _outputs(table: Table, parameters: dict[str, float]) -> Iterator[Series]:
     """Yield the mean of the motors, which the parameters name, and each output."""
     found: dict[int, tuple[FloatArray, FloatArray]] = {}
-    for (kind, _), columns in sorted(table.items()):
+    for (kind, _), columns in table.items():
         if kind in OUTPUTS:
-            t = np.array(columns['t'])
-            found |= {int(name[1:]): (t, np.array(values))
+            found |= {int(name[1:]): (columns['t'], values)
                       for name, values in columns.items() if name != 't'}
-            yield from _motors(kind, t, columns, parameters)
+            yield from _motors(kind, columns, parameters)
     for number, (t, values) in sorted(found.items()):
         low, high = _span(number, parameters)
         one = Series(f'RCOU.C{number}', THROTTLE, t, (values - low) / (high - low),
@@ -357,8 +356,7 @@ def _outputs(table: Table, parameters: dict[str, float]) -> Iterator[Series]:
             yield one
 
 
-def _motors(kind: str, t: FloatArray, columns: dict[str, list[float]],
-            parameters: dict[str, float]) -> Iterator[Series]:
+def _motors(kind: str, columns: Columns, parameters: dict[str, float]) -> Iterator[Series]:
     numbers = [int(name[1:]) for name in columns if name != 't' and int(
         parameters.get(f'SERVO{name[1:]}_FUNCTION', 0)) in MOTOR_FUNCTIONS]
     if not numbers:
@@ -366,8 +364,8 @@ def _motors(kind: str, t: FloatArray, columns: dict[str, list[float]],
     shares = []
     for number in numbers:
         low, high = _span(number, parameters)
-        shares.append((np.array(columns[f'C{number}']) - low) / (high - low))
-    yield Series(f'{kind}.motors', THROTTLE, t, np.mean(shares, axis=0),
+        shares.append((columns[f'C{number}'] - low) / (high - low))
+    yield Series(f'{kind}.motors', THROTTLE, columns['t'], np.mean(shares, axis=0),
                  'mean of ' + ', '.join(f'C{number}' for number in numbers)
                  + ', each from its lowest to its highest pulse',
                  f'mean of {len(numbers)} motors', 2)
