@@ -365,7 +365,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     Raises
     ------
     InputError
-        When the recording has no throttle, or cannot have so many cells.
+        When the recording has no throttle, or its voltage does not fit the number of cells.
     ValueError
         When a number is out of its range, or the recording does not show sag or noise.
 

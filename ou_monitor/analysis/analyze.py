@@ -253,7 +253,7 @@ def by_throttle(found: Overview, voltage: float, horizon: float) -> ByThrottle:
     return ByThrottle(
         grid, (grid >= low) & (grid <= high), middle, middle - reach, middle + reach,
         np.array(found.facts.noise.rms_v), risk, NAN if last is None else last.budget,
-        'No voltage was asked for.' if last is None else last.budget_reason,
+        'No voltage limit was given.' if last is None else last.budget_reason,
         MonitorSettings().budget_limit, voltage, horizon,
         NAN if last is None else last.estimate.t)
 

@@ -4,8 +4,8 @@ How much of a signal, such as a gyro axis, is noise of the supply.
 Limits: white noise of the voltage sensor lowers the gain by its share of the voltage in the band.
 Effects of throttle are regressed out if they are linear in throttle and its square, with a lag
 shorter than a segment.  Motor rotation disturbs both gyro and supply; only its narrow line reveals
-this common cause.  A signal that *leads* the voltage is its cause, through the motors.  Both are
-reported, but not corrected.
+this common cause.  A signal that *leads* the voltage is its cause, through the motors.  These two
+cases are reported, but not corrected.
 
 Method: Fourier coefficients of half-overlapping Hann segments.  `measure_coherence` tests for
 coupling.  If there is any, the signal is regressed on voltage, throttle and its square.  Segments
@@ -15,8 +15,8 @@ logger.
 
 All series are brought to the even grid of the fastest one by cubic splines, which do not alias.
 The usable band ends at a quarter of the slowest rate; above, the spline attenuates by more than
-3 %.  Limits: aliases of the original sampling stay, and jitter of the stamps gives a phase error
-of that size.
+3 %.  Limits: aliases of the original sampling stay, and a stamp error of e seconds gives a phase
+error of 2 pi f e.
 
 `measure_coherence` tests whether two series are coherent, at a stated level for any spectra.
 Limits: both signs of the series must be equally likely.  A line with the same frequency and phase

@@ -8,8 +8,8 @@ spectral lines, is fitted by the model that all commands share (`ou_monitor.mode
 Limits: a relaxation slower than half of a segment, or than 2.5 s, counts as drift of the level.
 
 The types of process are those of Table 1 of the paper, which names them by eye; here each has
-tests (`ou_monitor.analysis.level_tests`), adjusted so that one recording in a hundred of
-stationary OU levels has any rejection.  The first rule that applies names the level:
+tests (`ou_monitor.analysis.level_tests`), adjusted so that any of them rejects in only one of a
+hundred recordings with stationary OU levels.  The first rule that applies names the level:
 
 1. mean or intensity changes from block to block: 'quasi-stationary' (the
    verdict also names what the level is apart from that);

@@ -182,7 +182,7 @@ def _untested(n: int, why: str) -> Shape:
 
 def _mean_drift(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Estimate, alpha: float,
                 var_inf: float, noise_var: float, spread: float) -> TestResult:
-    """Compare means of blocks of innovations, about one mean of the whole level."""
+    """Compare the means of blocks of innovations with the mean of the whole level."""
     total = join([v for _, v in parts])
     time = sum(float(t[-1] - t[0]) for t, _ in parts)
     blocks = _BLOCKS if math.isinf(alpha) else min(_BLOCKS, int(alpha * time / _MEAN_BLOCK))
@@ -224,7 +224,7 @@ def _mean_drift(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Estima
 
 def _constant_gain(parts: Sequence[tuple[FloatArray, FloatArray]], alpha: float, var_inf: float,
                    noise_var: float) -> float:
-    """Return the stationary innovation of a constant of 1 V, 1/V."""
+    """Return the innovation to which a constant input settles, 1/V."""
     t = max((t for t, _ in parts), key=len)
     step = float(np.median(np.diff(t)))
     steady: FloatArray = step * np.arange(float(max(64, t.size)))

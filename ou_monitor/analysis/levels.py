@@ -40,8 +40,8 @@ MIN_TIME = 0.25
 # paper.
 MIN_STAY = 0.5
 MAX_LEVELS = 20
-# Passages: maximum length, s, and minimum difference between the first and the last quarter, as a
-# share of the range (a ramp has 0.75) and of the half width.
+# Passages: maximum length, s; minimum difference between the means of the first and the last
+# quarter, as a share of the range (a ramp has 0.75), and as a share of the half width.
 _PASSAGE, _STEADY, _CROSSED = 3.0, 0.65, 0.75
 # Minimum pause that splits a segment, in median steps.
 GAP_STEPS = 20.0

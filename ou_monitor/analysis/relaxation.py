@@ -429,11 +429,11 @@ def _level_before(recording: Recording, step: LevelChange, estimate: Estimate, r
     return mean, math.sqrt(mean_variance(last - first, n, estimate, rms))
 
 
-# Change of level, as a share of the transient, from which a high-pass is excluded, and up to which
-# the voltage counts as returned; minimum significance of both, standard errors.
+# Change of level, as a share of the transient: above the first a high-pass is excluded, below the
+# second the voltage counts as returned.  Minimum significance of both, standard errors.
 _ELSEWHERE, _BACK = 0.5, 0.25
 _SURE = 4.0
-# Factor up to which tau and 1/alpha agree, if it holds at 95 %.
+# tau and 1/alpha agree if they differ by less than this factor with 95 % confidence.
 _CLOSE = 1.5
 
 
@@ -479,8 +479,8 @@ def judge_cause(relaxation: Relaxation, alpha: AlphaTest) -> ReleaseCause:
                     'this is not the high-pass of an AC-coupled instrument',
         'possible': 'the voltage returns to the level before although the load has changed: a '
                     f'high-pass of {corner:.2g} Hz (AC coupling) would do the same to the '
-                    'transient and to the noise, a regulator to the transient; this recording '
-                    'cannot separate them',
+                    'transient and to the noise, a regulator only to the transient; this '
+                    'recording cannot separate them',
         'undetermined': 'the level before is not known well enough to decide whether a high-pass '
                         f'of the instrument ({corner:.2g} Hz) explains it'}[instrument]
     return ReleaseCause(noise, ratio, low, high, p, instrument, corner, step, step_se,

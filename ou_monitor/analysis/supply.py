@@ -43,7 +43,7 @@ _LOOKS = 900.0 / LOOK
 # Number of reports of the node that are shown; maximum time between two reports, s, and maximum
 # number of reports in all.
 _POINTS, _STEP, _MOST = 300, 0.5, 1200
-# Maximum delay of a current, either way, s.
+# Maximum shift of the current against the voltage, s.
 _LATE = 0.06
 # Maximum range of a steady throttle, and the time over which it is taken, s.
 _STEADY, _STEADY_TIME = 0.02, 0.2

@@ -126,7 +126,7 @@ def model_text(finding: Finding, recording: Recording | None = None) -> str:
         'ou_monitor': __version__, 'verdict': finding.verdict.value,
         'heldout_score': known(finding.score), 'gain': known(finding.gain),
         'gain_se': known(finding.gain_se), 'seed': finding.seed,
-        # At which `simulate` draws the model.
+        # Rate at which `simulate` draws the model.
         'rate_hz': float(f'{(finding.n - 1) / finding.duration:.6g}')}
     loads = LoadFilter()
     if recording is not None:

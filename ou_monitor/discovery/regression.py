@@ -200,7 +200,7 @@ class _Regression:
         return tuple(j for j in chosen if j != k)
 
     def _with(self, chosen: tuple[int, ...], k: int) -> tuple[int, ...]:
-        """Return a set with one more term; it replaces another of a kind that occurs once."""
+        """Return a set with one more term; it replaces one of its kind if only one may occur."""
         kind = type(self._pool[k])
         kept = chosen if kind.SEVERAL else tuple(
             j for j in chosen if type(self._pool[j]) is not kind)
@@ -232,7 +232,7 @@ class _Regression:
         return decision.is_shared(self._evaluated(less)[1] - self._evaluated(more)[1])
 
     def _plainest(self, chosen: tuple[int, ...]) -> tuple[int, ...]:
-        """Return a set in which tied causes with less search replace others."""
+        """Return a set in which a term is replaced by a plainer one that does as well, if any."""
         for k in chosen:
             plain = [j for j in self._as_good(chosen, k)
                      if decision.is_plainer(type(self._pool[j]), type(self._pool[k]))]

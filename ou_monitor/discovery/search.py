@@ -42,7 +42,7 @@ _CURVES = {LoadDependentSigma.NAME: LoadDependentNoise.NAME,
            LoadDependentNoise.NAME: LoadDependentSigma.NAME}
 # Maximum loss of a fit with few rounds, nats.
 _ROUGH = 20.0
-# Maximum time of one fit, s, with which the mean is still chosen again after each cause.
+# Maximum time of a fit, s; with slower fits the mean is not chosen again after each cause.
 _SOON = 1.0
 # Maximum rounds that add lines to a tone (three motors or converters, each with harmonics), and
 # maximum lines added in one.

@@ -14,10 +14,10 @@ so that an error common to all flights does not count.  Holm's procedure limits 
 any false alarm in the fleet.  Limits: the scatter between flights is assumed normal; consecutive
 flights with a common cause (a season, a battery) look like a drift.
 
-Few vehicles (fewer than `LEAST_VEHICLES`): the mean resistance and sag of each are compared with
-the mean of the others by a t test, with the scatter between flights, pooled, for a difference of
-more than a tenth, as the usual spread between good vehicles is unknown.  A pack is compared only
-with packs of the same number of cells.
+Few vehicles (fewer than `LEAST_VEHICLES`): a t test compares the mean resistance and sag of each
+with the mean of the others, by the pooled scatter between flights.  The usual spread between good
+vehicles is unknown then, so the test is for a difference of more than a tenth.  A pack is compared
+only with packs of the same number of cells.
 
 Outliers: the score of a value is its distance from the median of its group (or from the drift line
 of the group) divided by sqrt(s^2 + se^2), with its standard error se and the scatter s between
@@ -69,7 +69,7 @@ class CommonCurve:
     # Throttles, and the difference there to the logarithm at the reference; empty: flat.
     knots: tuple[float, ...] = ()
     heights: tuple[float, ...] = ()
-    # Covariance of the slopes between k knots, with recordings as independent, shape (k-1, k-1).
+    # Covariance of the slopes between k knots, for independent recordings; shape (k - 1, k - 1).
     covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __call__(self, throttle: FloatArray) -> FloatArray:
@@ -100,8 +100,8 @@ class Values:
     value: FloatArray
     error: FloatArray
     curve: CommonCurve  # Curve that was subtracted
-    # Values as measured, in the unit of the quantity (of the mean logarithm, weighted by time),
-    # and their mean throttle, NaN where unknown; shape (n,).
+    # Values as measured, in the unit of the quantity (geometric means weighted by time), and their
+    # mean throttle, NaN where unknown; shape (n,).
     measured: FloatArray
     throttle: FloatArray
     cells: IntArray  # Cells by which values are divided; 0: they are not; shape (n,)
@@ -562,9 +562,9 @@ def _vehicles(values: Values, within: Outliers, flat: FloatArray, rate: float, s
 
 def _few(found: Outliers, places: Sequence[int], flights: Sequence[FloatArray]) -> Outliers:
     """
-    Compare the mean of each of a few vehicles, 2 flights or more each, with the others'.
+    Compare the mean of each of a few vehicles, with two flights or more, with that of the others.
 
-    One that stands out is left out of the comparison of the rest.  The p-value is that of a
+    A vehicle that stands out is left out when the rest are compared.  The p-value is that of a
     difference of at most `_APART`, either way.
     """
     from ou_monitor.analysis.level_tests import adjusted

@@ -36,8 +36,8 @@ _OF_CURRENT = {'size': 2.0, 'fast_share': 0.7, 'slow_share': 0.7, 'endurance': 1
 _CENTRE = {'endurance': math.log(2000.0)}
 # Prior deviation of a constant level, which replaces the charge, V per cell.
 _STANDS = 0.2
-# Delay of the load: maximum steps tried either way, and s; ratio of residuals below which a delay
-# is used; time constants, s, of the trend that is removed, and of the lagged load beside the load.
+# Delay of the load: maximum tried either way, in steps and in s; ratio of residuals below which it
+# is used; time constants, s, of the trend that is removed, and of the lagged load, a regressor.
 _SHIFTS, _LATEST, _PAYS, _SLOWER, _LATE = 10, 0.2, 0.95, 1.0, 0.06
 # Bounds of the parameters, in prior deviations from the centre.
 _REACH = 3.0
@@ -208,8 +208,8 @@ def _template(t: FloatArray, voltage: FloatArray, throttle: FloatArray | None,
         raise ValueError('a fit of the load needs throttle or current')
     full = delay = 0.0
     if current is None:
-        # Only a scale for `endurance`.  1.6 is below the prior's exponent, because the level takes
-        # a part.
+        # The mean is only a scale for `endurance`.  1.6 is below the prior's exponent, because the
+        # level explains a part of the effect.
         moving = load > 0.05
         mean = float((load[moving] ** 1.6).mean()) if moving.any() else 0.1
     else:

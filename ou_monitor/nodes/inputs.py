@@ -35,7 +35,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 # for 0.2 s at 10 kHz while the estimator fits.
 INPUT_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000,
                        reliability=ReliabilityPolicy.BEST_EFFORT)
-# Fewer blocks: 2000 of 10 000 samples would take 80 MB.
+# Smaller for blocks: 2000 blocks would take 80 MB.
 BLOCK_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=200,
                        reliability=ReliabilityPolicy.BEST_EFFORT)
 # Maximum messages and bytes taken at a time: all that can wait, limited in bytes so that they need

@@ -30,9 +30,9 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 BAD_INPUT = 2
 # Maximum wait inside the executor, s; a signal wakes it anyway.
 NAP = 1.0
-# Timeout of ending a node, s.  It takes 0.02 s of CPU, and at most 0.5 s measured with 12 tasks on
-# two cores.  But Fast DDS waits 10 s, and then aborts, for a lock in shared memory that another
-# process held when it was stopped, and Python does not run while it waits.
+# Timeout of ending a node, s.  Ending takes 0.02 s of CPU, and took at most 0.5 s with 12 tasks on
+# two cores.  But if another process was stopped while it held a lock in shared memory, Fast DDS
+# waits 10 s for the lock and then aborts, and Python does not run while it waits.
 END = 1.0
 # Variables that give Fast DDS its profiles (the older name first), or its transports.
 PROFILES = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
@@ -150,9 +150,10 @@ def _choose_queues() -> None:
     """
     Make Fast DDS use a queue that needs no CPU, unless the user has configured it.
 
-    Its own queue holds 512 messages of all topics together, and is dropped after 1 s.  Other
-    middlewares ignore these variables.  If discovery is limited to this machine,
-    rmw_fastrtps adds its own transports, and either one may take a message.
+    By default a queue holds 512 messages of all topics together, and is given up with its content
+    if the process does not read for 1 s.  Other middlewares ignore these variables.  If discovery
+    is limited to this machine, the configuration is not changed: rmw_fastrtps would add transports
+    of its own, and a message might arrive through either.
     """
     beside = (Path('DEFAULT_FASTRTPS_PROFILES.xml'), Path('DEFAULT_FASTDDS_PROFILES.xml'))
     local = (os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() in ('LOCALHOST', 'OFF')

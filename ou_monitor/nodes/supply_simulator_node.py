@@ -59,7 +59,7 @@ _EACH, _AHEAD = 200.0, 0.02
 _HOLD = 1.0
 # Throttle beyond this is invalid (as in the estimator); below, it is clipped to 0..1.
 _MOST_THROTTLE = 2.0
-# Difference between the clock and the next sample, s, above which the clock was set, and samples
+# If the clock and the next sample differ by more than this, s, the clock was set, and samples
 # continue from its time.  A machine under load pauses for up to a second.
 _JUMP = 5.0
 # Maximum sleep, s, and period of checking simulated time, s.

@@ -79,7 +79,7 @@ class PowerNetwork:
     cells: int = _part(6)  # LiPo cells in series; sets the default brown-out level of the bus.
     battery_voltage: float = _part(22.2, 'V')  # Open-circuit voltage, V (6 x 3.7 V nominal).
     # Battery, connector and leads, Ohm (a 6S pack of 1.3..2.2 Ah has 20..60 mOhm; PX4
-    # assumes 5 mOhm a cell).
+    # assumes 5 mOhm per cell).
     battery_resistance: float = _part(0.04, 'Ohm')
     # Capacitor at the battery pads of the ESC, F and Ohm (470 uF..1000 uF of a low-ESR 35 V
     # series have 20..40 mOhm).
@@ -107,10 +107,9 @@ class PowerNetwork:
     # Output voltage, V, and output resistance within the bandwidth, Ohm.
     regulator_voltage: float = _part(5.0, 'V')
     regulator_resistance: float = _part(0.03, 'Ohm')
-    # The regulator rejects changes of its input slower than this, Hz, and passes faster ones times
-    # `line_gain`; None: the duty of a buck converter, regulator_voltage over battery_voltage,
-    # which is its open-loop gain (Erickson & Maksimovic, Fundamentals of Power Electronics,
-    # section 8.2).
+    # The regulator rejects changes of its input slower than this, Hz, and multiplies faster ones
+    # by `line_gain`; None: by the open-loop gain of a buck converter, its duty regulator_voltage /
+    # battery_voltage (Erickson & Maksimovic, Fundamentals of Power Electronics, section 8.2).
     regulator_bandwidth: float = _part(20e3, 'Hz')
     regulator_efficiency: float = _part(0.9)  # Output power over input power, 0..1.
     line_gain: float | None = _part(None, zero=True)
@@ -358,14 +357,14 @@ class Rail:
 
     def crossing_rate(self, voltage: float) -> float:
         """
-        Return the rate of passages below a voltage at high levels, 1/s.
+        Return the rate at which the rail falls below a voltage, V, far from its mean, 1/s.
 
-        For the whole Gaussian process, not its OU: with the distance d to the voltage, V, in
-        standard deviations, the quadratic variation q of the rail per second and the variance v
-        of the smooth part of its slope, the larger of q/(2 Var) d/sqrt(2 pi) exp(-d^2/2) (rough
-        paths: Pickands, Trans. AMS 145 (1969) 51) and sqrt(v/Var)/(2 pi) exp(-d^2/2) (smooth
-        paths: Rice, Bell Syst. Tech. J. 24 (1945) 46).  For an OU, the first is the rate of its
-        mean first passage.
+        It is that of the whole Gaussian process, not of its OU: the larger of two rates.  For
+        rough paths it is q/(2 Var) d/sqrt(2 pi) exp(-d^2/2) (Pickands, Trans. AMS 145 (1969) 51),
+        for smooth paths sqrt(v/Var)/(2 pi) exp(-d^2/2) (Rice, Bell Syst. Tech. J. 24 (1945) 46).
+        d: distance to the voltage in standard deviations; q: quadratic variation per second; v:
+        variance of the smooth part of the slope.  For an OU, the first is the rate of its mean
+        first passage.
         """
         if self.mean <= voltage:
             return math.inf

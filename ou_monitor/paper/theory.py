@@ -299,7 +299,8 @@ class Generator:
         """
         Advance an ensemble of paths from jump to jump, stopping at every edge.
 
-        Yields interval, paths, their states and the time spent in them; at an edge all paths.
+        Yields index of the interval, paths that leave a state (at an edge: all paths), these
+        states, and the time spent in them since the last yield.
 
         edges in s.
         """

@@ -120,7 +120,7 @@ def find_files(path: Path, partial: bool) -> BagFiles:
 
 
 def remove_bag(files: Iterable[Path], folder: Path | None) -> None:
-    """Remove files and metadata of a bag, and its folder if that is empty then."""
+    """Remove files and metadata of a bag, and its folder if it is then empty."""
     for file in (*files, *(() if folder is None else [folder / FILE])):
         file.unlink(missing_ok=True)
     if folder is not None:

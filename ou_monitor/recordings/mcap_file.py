@@ -61,11 +61,11 @@ _LENGTHS = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
 # the origin of the values.
 SAMPLE_RATE, ORIGIN = 'sample_rate_hz', 'origin.'
 # Metadata records on the origin of the recording: our own, and rosbag2's, which holds the text of
-# a metadata.yaml; maximum bytes and values of that (2000 topics).
+# a metadata.yaml.  Maximum bytes and values of that text (2000 topics).
 ABOUT, ROSBAG2 = 'ou_monitor', 'rosbag2'
 MOST_BYTES, MOST_NODES = 8_000_000, 200_000
-# Maximum bytes of a metadata record (of all: twice that), and number of rosbag2's tables of
-# contents that are read; it writes two.
+# Maximum bytes of a metadata record (all together: twice that); maximum number of rosbag2's
+# records that are read (it writes two).
 _MOST_METADATA, _MOST_TABLES = 10_000_000, 3
 # Maximum size of a definition (usual: some kB) and of a name (DDS: 256 characters).
 _MOST_DEFINITION, _MOST_OF_NAME = 256 * 1024, 256
@@ -289,7 +289,7 @@ class McapFile:
             Span(index.message_start_time, index.message_end_time,
                  index.chunk_start_offset + _HEAD.size, index.chunk_length - _HEAD.size, True,
                  frozenset(index.message_index_offsets) or None,
-                 # A message of 31 bytes or more has 16 in the index, beside its head.
+                 # An index has 16 bytes per message, which has at least 31, and 15 per channel.
                  index.message_index_length if index.message_index_length
                  <= index.uncompressed_size + 15 * 65536 else 0, index.uncompressed_size)
             for index in indexes if index.message_index_offsets or not indexed]
@@ -355,7 +355,7 @@ class McapFile:
                 elif op >= _PRIVATE and counted_there is None and not private:
                     private = True
                     raise Damage(f'a record of a private kind (0x{op:02x}) may have been a '
-                                 'message, and no count tells that none is missing')
+                                 'message, and no count shows whether one is missing')
             except Damage as error:
                 # The frame is whole: later records may be intact.
                 self._break(at, error)
@@ -366,7 +366,7 @@ class McapFile:
                 self._break(at, 'the file ends without its closing mark')
             elif at + len(MAGIC) < self._size:
                 self._break(at + len(MAGIC), f'{self._size - at - len(MAGIC)} bytes follow the '
-                            'end of the recording, which may be another one')
+                            'end of the recording; they may be another recording')
         if counted_there is not None and not self.breaks:
             for key, stated in counted_there.channel_message_counts.items():
                 found = self.counts.get(key, 0)
@@ -381,7 +381,7 @@ class McapFile:
     def _content(self, file: BinaryIO, length: int, limit: int) -> bytes:
         """Return the content of the record whose head was just read."""
         if length > limit:
-            raise Damage(f'a record of {length} bytes is longer than the {limit} that it may have')
+            raise Damage(f'a record has {length} bytes, more than the maximum of {limit}')
         return file.read(length)
 
     def _learn(self, op: int, content: bytes) -> None:
@@ -407,7 +407,7 @@ class McapFile:
         """Read the metadata record whose head was just read."""
         self._metadata += length
         if self._metadata > 2 * _MOST_METADATA:
-            raise Damage('the metadata records before it are too many')
+            raise Damage(f'metadata records exceed {2 * _MOST_METADATA} bytes')
         record = _parse(Metadata, self._content(file, length, _MOST_METADATA))
         if record.name == ABOUT:
             self.about |= plain_texts(record.metadata)
@@ -468,7 +468,7 @@ class McapFile:
         self._add_span(_table(data, places), span._replace(unpacked=len(data)))
 
     def _walk_messages(self, file: BinaryIO, at: int, end: int) -> int:
-        """Count messages outside of chunks, from one that ends at `end` on; return their end."""
+        """Count messages outside of chunks, the first from `at` to `end`; return their end."""
         if end - at > self._limit:
             raise Damage(_over_limit('a message has', end - at, self._limit))
         file.seek(at)
@@ -480,7 +480,7 @@ class McapFile:
         return at + length
 
     def _walk_index(self, file: BinaryIO, at: int, length: int) -> None:
-        """Count a message index to the chunk right before it."""
+        """Add a message index to the chunk just before it."""
         size = int.from_bytes(file.read(6)[2:], 'little')
         if length < 6 or size % 16 or size != length - 6:
             raise Damage(f'a message index of {length} bytes is inconsistent')
@@ -722,7 +722,7 @@ def _records(data: bytes, *, messages_only: bool = False, at: int = 0, end: int 
 
 
 def _all_records(data: bytes, begins: IntArray) -> tuple[IntArray, list[tuple[int, int, int]]]:
-    """Return the records of chunks as `_records`; begins: as of `_by_index`."""
+    """Return the records of chunks as `_records` does; for `begins` see `_by_index`."""
     parts: list[IntArray] = []
     others: list[tuple[int, int, int]] = []
     for begin, end in zip(begins.tolist(), begins[1:].tolist()):

@@ -196,7 +196,7 @@ def encode_scalars(kind: str, values: npt.ArrayLike) -> list[bytes]:
 
 
 def encode_battery(stamps_ns: npt.NDArray[np.int64], voltage: npt.ArrayLike) -> list[bytes]:
-    """Return one BatteryState for each voltage, V, else "not measured" (stamps_ns in ns)."""
+    """Return one BatteryState per voltage, V, with all else "not measured" (stamps_ns in ns)."""
     return _encode(BATTERY_STATE, {'voltage': np.asarray(voltage)}, stamps_ns, present=True,
                    **dict.fromkeys(('temperature', 'current', 'charge', 'capacity',
                                     'design_capacity', 'percentage'), math.nan))
@@ -204,7 +204,7 @@ def encode_battery(stamps_ns: npt.NDArray[np.int64], voltage: npt.ArrayLike) -> 
 
 def encode_imu(stamps_ns: npt.NDArray[np.int64], vectors: Mapping[str, npt.NDArray[np.float64]],
                ) -> list[bytes]:
-    """Return one Imu in `base_link` for each stamp, ns, of rad/s and m/s^2, (n, 3)."""
+    """Return one Imu per stamp, ns, in `base_link` (vectors in rad/s and m/s^2, shape (n, 3))."""
     # By the message definition -1 means not measured, and 0 an unknown covariance.
     unmeasured = {f'{name}_covariance': [-1.0, *[0.0] * 8] for name in (
         'orientation', 'angular_velocity', 'linear_acceleration') if name not in vectors}

@@ -34,7 +34,7 @@ _LEAST, _MOST = 6, 30
 _WORST, _SHOWN = 12, 10
 # Maximum sentences and recordings listed; the table has all of them.
 _SENTENCES, _RECORDINGS = 40, 500
-# Maximum ratio of mean voltages of one pack: 4.35 V a cell full to 2.8 V empty under load.
+# Maximum ratio of mean voltages of one pack: 4.35 V per cell if full, 2.8 V if empty under load.
 _ONE_PACK = 1.6
 # Maximum ageing packs in the answer.
 _OLD = 3

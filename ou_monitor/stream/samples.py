@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from ou_monitor.online.monitor import SupplyMonitor
 
 
-# Largest lead and lag of a stamp that counts as one of the receiver's clock, s: unsynchronized
-# clocks and queues.
+# Largest lead (unsynchronized clocks) and lag (queues) of a stamp that counts as taken from the
+# receiver's clock, s.
 AHEAD, BEHIND = 0.25, 5.0
 # Largest delay once the clock is known, s: no queue holds ten minutes.
 MOST_DELAY = 600.0
@@ -203,7 +203,7 @@ BoolArray = npt.NDArray[np.bool_]
 # spacing by at most 5e-4 (0.05 us at 10 kHz); a clock error of 100 ppm is followed 1 ms behind.
 FOLLOW = 10.0  # s
 
-# Minimum difference, also two blocks, that counts as a gap: a busy companion computer delays
+# A difference above this and above two blocks counts as a gap: a busy companion computer delays
 # blocks by about 100 ms and then sends them all.
 GAP_LEAST = 0.25  # s
 

@@ -6,7 +6,7 @@ Node, estimator and bench share these rules:
 - samples with a non-finite or implausible stamp or voltage are dropped (`non_finite`);
 - an implausible throttle or current becomes NaN;
 - late stamps are sorted within one push; later ones, and repeated stamps, are dropped (`late`);
-- a stamp more than a pause earlier or later starts a new time line;
+- a stamp that is earlier or later by more than a pause starts a new time line;
 - a reading that a logger repeats counts once (`held`).
 
 Repeats: a voltage read at 100 Hz and logged at 1 kHz appears ten times, and the repeats would look
@@ -336,11 +336,11 @@ MOST_CURRENT = 1.0e6
 MOST_THROTTLE = 2.0
 # Share of implausible throttles up to which they count as errors of single samples.
 WILD = 0.05
-# Samples that are collected at most: NumPy's overhead per call vanishes.
+# Maximum samples in a batch; NumPy's overhead per call is then negligible.
 BATCH = 32768
 # Search for repeats: samples used, minimum number, new samples between two searches.
 TAIL, _ENOUGH, _LOOK = 1024, 64, 256
-# Samples behind per backward step above which the clock itself went back.
+# Number of late samples per backward step from which the clock itself went back.
 _STRETCH = 20
 # Places of samples; all of them as a slice.
 Picked = npt.NDArray[np.intp] | slice

@@ -107,7 +107,7 @@ class ACCoupling(Term):
 def bridge(alpha: FloatArray, rate: float, step: FloatArray
            ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """
-    Return the law of the step of an OU's low-pass, given the OU at both ends.
+    Return start, end and spread of one step of a low-passed OU, given the OU at both ends.
 
     l_k = exp(-rate step) l_{k-1} + start x_{k-1} + end x_k + sigma sqrt(spread) z.
 

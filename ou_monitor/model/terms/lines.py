@@ -11,7 +11,7 @@ from ou_monitor.model.terms.laws import View
 from ou_monitor.records import FloatArray
 from scipy.signal import welch
 
-# Number of lines that follow throttle examined.
+# Number of candidate lines examined.
 _MOST = 3
 
 
@@ -59,9 +59,9 @@ def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float,
     return f, q, np.array([1.0, 0.0])
 
 
-# Segments in a coherence time of a line (over pi); minimum number of segments; maximum ratio of
-# their mean square power to the squared mean.  The ratio is 1 for a line, and 2 for ringing driven
-# by noise, whose powers are exponential; 12 such powers stay below the maximum in 1 % of cases.
+# Segments per 1 / linewidth; minimum number of segments; maximum ratio of the mean square of their
+# powers to the squared mean.  The ratio is 1 for a line, and 2 for ringing driven by noise, whose
+# powers are exponential; 12 such powers stay below the maximum in 1 % of cases.
 _FINE, _ENOUGH, _LEVEL = 4.0, 12, 1.25
 
 
@@ -181,7 +181,7 @@ def _hough(z: FloatArray, u: FloatArray, rate: float, length: int) -> list[_Line
         for row, first in zip(folded, (shift % (2 * bins)).tolist(), strict=True):
             total += row[first:first + bins]
         k = int(np.argmax(total))
-        # About a mean of `count` exponentials, whose tail has the Cramer bound.
+        # Cramer bound of the tail of a mean of `count` exponentials.
         mean = float(total[k]) / count
         rise = count * (mean - 1.0 - math.log(max(mean, 1e-9)))
         best.append(_Line(rise if mean > 1.0 else 0.0, k * width, float(slope), length))

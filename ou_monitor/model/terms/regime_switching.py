@@ -31,8 +31,8 @@ _MEDIAN = 0.6745
 _ALL, NO_LEVEL = 0.98, 0.2
 # Minimum correlation of the residual for an OU beside the levels.
 _LEAST = 1e-3
-# Tried as a start: shares of the fitted noise that the OU keeps beside levels; heights of levels
-# over the spread.
+# Starts tried: share of the fitted noise that remains when levels are added; heights of levels
+# relative to the spread.
 _CALMER, _HEIGHTS = (0.1, 0.01), (0.7, 1.2, 2.0)
 
 
@@ -140,7 +140,7 @@ class Scores:
 
 
 def _direct(s: Scores, at_once: float, middle: float, states: int) -> FloatArray:
-    """Return the error that each pair of states predicts, in states, if nothing is followed."""
+    """Return the error that each pair of states predicts, in levels, if nothing is followed."""
     direct = np.empty((states, states, s.z.size))
     for i, j in np.ndindex(states, states):
         # The new level less the filter's prediction from the old one, or the pull to the level.
@@ -194,8 +194,8 @@ def calm_levels(view: View, part: slice, spread: float, rates: FloatArray
     """
     Return a start for levels in white noise, and a view that shows them; None without noise.
 
-    An `ou` that was fitted to the levels follows them, so less noise is tried; and heights up to
-    that of two levels that explain the whole spread, V.
+    An `ou` that was fitted to the levels follows them, so starts with less noise are tried.
+    Heights are tried up to twice the spread, V, where two levels explain all of it.
     """
     if bool((Scores.of(view).trust == 1.0).all()):
         return None
@@ -237,7 +237,7 @@ def _filtered(view: View, keep: float, trust: float, variance: float) -> View:
 
 def without_levels(view: View, levels: FloatArray) -> View:
     """
-    Return the view of the whole voltage for an OU fitted to the voltage without levels, V.
+    Return the view for an OU that is fitted to the voltage without the levels, V.
 
     The OU has white noise if it then predicts the voltage without levels better; the parameters
     come from covariances at lags up to 2.
@@ -453,8 +453,8 @@ class RegimeSwitching(Term):
         states = int(self.states)
         law = stationary_law(rates_between(self.rate_up, self.rate_down, states))
         square = float(law @ np.exp(2.0 * ratio * np.arange(states)))
-        # The first scale yields the mean square of the scores, or 1 if levels are clear; the other
-        # is for an `ou` that already has the sigma of the lowest state.
+        # Two scales: one for which the scores have their mean square (1 if levels are clear), and
+        # 1, for an `ou` that already has the sigma of the lowest state.
         mean = float(np.mean(view.z[view.train] ** 2)) if abs(self.level) < unit else 1.0
         starts = [np.array([math.log(self.rate_up), math.log(self.rate_down), self.level / unit,
                             ratio, scale])

@@ -75,7 +75,7 @@ def white_noise(mode: str, order: int, angle: float) -> float:
 
 @lru_cache(maxsize=256)
 def noise_left(order: int, angle: int) -> float:
-    """Return the share of the variance of white samples after a low-pass (log of w dt, to 1 %)."""
+    """Return the share of the variance of white noise after a low-pass (angle: 100 ln(w dt))."""
     return white_noise('lowpass', order, math.exp(angle / 100.0))
 
 

@@ -241,7 +241,7 @@ class FilterCounters:
     """Numbers of samples by outcome."""
 
     samples: int = 0  # Samples used
-    # Samples that were NaN, infinite or beyond 1e150, or whose stamp was so or beyond 1e18 s.
+    # Samples that were not finite or beyond 1e150, or whose stamp was not finite or beyond 1e18 s.
     non_finite: int = 0
     repeated: int = 0  # Samples less than 1 ps after the previous one
     back: int = 0  # Samples with an earlier stamp, from which time continues

@@ -50,7 +50,7 @@ class LoadBlock:
 
 
 class LoadBlocks:
-    """Collects samples into blocks; a sample 15 ms or more after the last one is a block."""
+    """Collects samples into blocks; one 15 ms or more after the last forms a block of its own."""
 
     def __init__(self) -> None:
         self.forget()
@@ -311,7 +311,7 @@ class LoadNoise:
         self._n += 1
 
     def learn(self, e: float, s: float, u: float, du: float, n: int, within: float) -> None:
-        """Update ln variance by an innovation, V (Fisher scoring); s: its other variance, V^2."""
+        """Update ln variance by an innovation, V (Fisher scoring); s: state variance, V^2."""
         f = 1.0, ripple(u), math.sqrt(du)
         R = self.variance(u, du, n)
         square = min(e * e / (s + R), _OUTLIER)

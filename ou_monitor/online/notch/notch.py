@@ -137,8 +137,8 @@ _GRID = 48
 _WIDTH = 0.5
 # Memory of frames, s: the speed at one throttle falls with the charge, in minutes.
 _LAW_MEMORY = 30.0
-# Share of noise that the prior gives to the law f ~ sqrt(u), frames that it counts for, and
-# its spread in a / f(HIGH).
+# Prior of the laws: share of noise that f ~ sqrt(u) removes, number of frames that the prior
+# counts as, and its spread in a / f(HIGH).
 _PRIOR, _FRAMES, _SPREAD = 0.1, 8.0, 0.3
 
 
@@ -169,7 +169,7 @@ class MotorLaw:
 
     def learn(self, power: FloatArray, root: float, passed: float,
               lost: float) -> None:
-        """Take a frame: power in each bin, time since the last, s, and a factor on the past."""
+        """Take a frame: power per bin, s since the last frame, and a factor on earlier frames."""
         keep = float(np.exp(-passed / _LAW_MEMORY))
         removed = self._removed @ power
         f = self._a + self._b * root
@@ -272,7 +272,7 @@ class Candidate(NamedTuple):
 
 
 def families(count: int) -> tuple[Family, ...]:
-    """Return the families with at most `most` notches."""
+    """Return the families with at most `count` notches."""
     found = [Family(source, False, times) for source in ('throttle', 'rpm')
              for times in range(1, min(count, 2) + 1)]
     return (*found, Family('rpm', True, 1)) if count > 1 else tuple(found)
@@ -288,7 +288,7 @@ class NotchChoice:
         self._used = frequencies >= self._fmin
         self._warped: FloatArray = np.tan(
             np.pi * np.minimum(frequencies[self._used] / rate, 0.499))
-        # Low-passes by the bilinear transform, the usual one.
+        # Low-passes by the bilinear transform.
         at = np.tan(np.pi * np.minimum(cutoff / rate * np.array(_BEHIND), _FASTEST))
         self._fourth: FloatArray = (self._warped[None, :] / at[:, None])**4
         self._lag: FloatArray = np.sqrt(2.0) / (2.0 * rate * at)
@@ -324,7 +324,12 @@ class NotchChoice:
 
     def take(self, power: FloatArray, throttle: float, motors: FloatArray,
              passed: float) -> None:
-        """Take a frame: power, (channels, K); Hz by throttle (NaN: unknown) and motors."""
+        """
+        Take a frame.
+
+        power: shape (channels, K); throttle: frequency by the law, Hz, NaN if unknown; motors:
+        their frequencies, Hz; passed: time since the last frame, s.
+        """
         power = power[:, self._used]
         none = power @ self._low.T
         mean = motors.mean(keepdims=True) if motors.size else motors

@@ -61,14 +61,14 @@ class FloorWatch:
     def reset(self) -> None:
         """Forget the samples, and start a new time line."""
         self._newest = self._arrived = -math.inf
-        # Added to stamps, s, because late samples move the time line, and all later samples, on.
+        # Added to stamps, s: each late sample shifts the time line of all later samples.
         self._shift = 0.0
         self._t = np.empty(0)
         self._v = np.empty(0)
         self._low = self._was_low = self._in_dip = False
 
     def new_time_line(self) -> None:
-        """Take stamps that start anew; what is known by its arrival goes on."""
+        """Accept stamps that start anew; samples that came with an arrival time stay valid."""
         if self._arrived == -math.inf:
             self.reset()
 

@@ -134,7 +134,7 @@ def _wanted(names: list[str], request: Request) -> list[str]:
 
 
 def _frames(parser: Any, places: list[int], request: Request) -> tuple[FloatArray, int]:
-    """Return the wanted fields of the sound frames, shape (n, fields), and the rest's number."""
+    """Return the wanted fields of sound frames, shape (n, fields), and the number of others."""
     pick = itemgetter(*places) if len(places) > 1 else (lambda data: (data[places[0]],))
     reader, context = parser.reader, parser._ctx
     rows: list[tuple[int, ...]] = []

@@ -75,7 +75,7 @@ def read(path: Path, request: Request) -> Log:
     if not sound:
         notes.append(Note('The checksum does not match: the log was cut off or is damaged, and '
                           'wrong values cannot be detected.', Defect.DAMAGED_FILE))
-    # Too few bytes for a record are the checksum, or its beginning.
+    # Up to four bytes may be a damaged or truncated checksum.
     if end - read_to > (0 if sound else 4):
         notes.append(f'{counted(end - read_to, "byte")} from byte {read_to} on were not read: no '
                      'record of this log.')

@@ -49,7 +49,7 @@ _HEAD, _HEAD_LINES, _CHUNK, _BLOCK = 65536, 200, 1 << 20, 8192
 
 DELIMITERS = {'tab': '\t', 'space': ' '}
 
-# Words of units, in small letters -> unit.
+# Words of units, in lower case -> unit.
 TIME_WORDS = {
     's': 's', 'sec': 's', 'secs': 's', 'second': 's', 'seconds': 's', 'sekunden': 's', 'ms': 'ms',
     'msec': 'ms', 'millis': 'ms', 'millisecond': 'ms', 'milliseconds': 'ms', 'us': 'us',
@@ -226,7 +226,7 @@ def _prepared(lines: list[str], delimiter: str, comma: bool) -> list[str]:
 
 
 def number_of(cell: str) -> tuple[float, str]:
-    """Return a number and the unit written behind it, in small letters; '': none."""
+    """Return a number and the unit written after it, in lower case; '': none."""
     try:
         return plain_number(cell), ''
     except ValueError:
@@ -266,7 +266,7 @@ def swapped(cell: str) -> str:
 
 
 def unit_of(name: str) -> tuple[str, str]:
-    """Split a name into its quantity and the unit it states, in small letters; '': none."""
+    """Split a name into its quantity and the unit it states, in lower case; '': none."""
     text = ' '.join(name.strip().strip('\'"').split())
     if found := re.match(r'(millis|micros|ms|us|ns)(?![A-Za-z])', text):
         return text, found[1]

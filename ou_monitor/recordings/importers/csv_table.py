@@ -36,12 +36,12 @@ from ou_monitor.timeline.line import hold, MOST_THROTTLE, WILD
 CURRENT = 'current_a'
 NONE = 'none'
 VOLTAGE_UNITS = {'V': 1.0, 'mV': 1e-3}
-# Unit -> the summand that is subtracted from a value, and the factor; '1024' are the sticks of
-# EdgeTX, -1024 to 1024, '65535' is the thrust of a Crazyflie.
+# Unit -> offset to subtract, factor; '1024': sticks of EdgeTX, -1024 to 1024; '65535': thrust of a
+# Crazyflie.
 THROTTLE_UNITS = {'1': (0.0, 1.0), '%': (0.0, 0.01), 'us': (1000.0, 1e-3),
                   '1024': (-1024.0, 1.0 / 2048.0), '65535': (0.0, 1.0 / 65535.0)}
 CURRENT_UNITS = {'A': 1.0, 'mA': 1e-3, 'uA': 1e-6}
-# Maximum columns listed; loggers of autopilots write some hundred.
+# Maximum columns listed; autopilots log a few hundred.
 MOST_COLUMNS = 300
 # Share of backward steps above which a column is not a time.
 _BACK = 0.25
@@ -103,7 +103,7 @@ class _Column(NamedTuple):
     place: tuple[int, ...]  # Its cells: two for a date and a time; none: rows are counted
     name: str
     unit: str  # As stated or given, '' if neither
-    scale: float  # Factor if the maker's is known; 0: by the unit
+    scale: float  # Factor that the maker states; 0: by the unit
 
 
 class _Table(NamedTuple):
@@ -398,7 +398,7 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: _Column, needed
             continue
         places = _choose(form, quantity, taken)
         if not places and quantity == logs.VOLTAGE:
-            # It may be what another option took, which is refused below.
+            # Another option may have taken it; that is refused below.
             places = [k for k in _choose(form, quantity) if k in given]
         if not places and quantity == logs.VOLTAGE:
             rest = [k for k in _nameless_columns(form) if k not in taken]
@@ -501,7 +501,7 @@ def _clock_seconds(found: Sequence[re.Match[str] | None], day_first: bool) -> Fl
 
 def _check_backwards(path: Path, t: FloatArray, voltage: FloatArray, name: str,
                      found: dict[str, _Column]) -> None:
-    """Refuse a time that is the voltage."""
+    """Raise InputError if time and voltage are likely swapped."""
     step = np.diff(t)
     step = step[np.isfinite(step)]
     if step.size and logs.VOLTAGE in found and float(np.mean(step < 0.0)) > _BACK and (

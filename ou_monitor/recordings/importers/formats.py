@@ -196,7 +196,7 @@ def import_log(path: Path, request: Request) -> Log:
 
 
 def _terminal_progress(progress: Progress) -> Progress:
-    """Return a progress that reaches the terminal from where parsers are kept quiet."""
+    """Return a progress that reaches the terminal while the output of parsers is suppressed."""
     terminal = sys.stderr
 
     def show(share: float) -> None:

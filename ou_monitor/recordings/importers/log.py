@@ -50,7 +50,7 @@ class Motion:
     # Conversion of the values, poles included; kind of series.
     scale: str
     words: str
-    rank: int | None = None  # Default if no smaller rank exists; None: only by name
+    rank: int | None = None  # The smallest rank is the default; None: only taken by name
     # Names of the motors, as in the message: ``motor_0``; empty for a gyro.
     motors: tuple[str, ...] = ()
 
@@ -96,7 +96,7 @@ class Series:
     values: FloatArray
     scale: str  # Conversion from the logged value
     words: str = ''  # Description
-    rank: int | None = None  # Default if no smaller rank exists; None: only by name
+    rank: int | None = None  # The smallest rank is the default; None: only taken by name
     group: str = ''  # The sensor; a voltage and a current of one sensor share it
     own_unit: str = UNKNOWN  # Unit of a signal, ``?`` when the log does not state it
 
@@ -228,7 +228,7 @@ def clean(series: Series) -> tuple[Series, tuple[str, ...]]:
 
 
 def near(t: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return which stamps are not in a small group beyond a pause over an hour."""
+    """Return which stamps are not in a small group more than an hour away from all others."""
     order = np.argsort(t, kind='stable')
     good = np.ones(t.size, dtype=bool)
     pauses = np.flatnonzero(np.diff(t[order]) > _FAR) + 1

@@ -63,17 +63,17 @@ PLAIN = (
 # Bytes before the content of a message: its length and its kind.
 HEAD = 3
 KINDS = frozenset(b'BFIMPQARDLCSO')
-# Larger messages of unknown kind are broken bytes to pyulog, which restarts one byte after their
-# first.
+# pyulog takes a larger message of unknown kind for damage, and continues one byte after its start.
 LARGEST = 10_000
 
 
 class _Watched(io.BufferedReader):
     """
-    A file that records the bytes its reader skips silently.
+    A file that records which bytes pyulog skips silently.
 
-    pyulog steps back by the length that a message claims even if the file ended before: an endless
-    loop.  And it reads the rest of the file at each byte of a damaged part.
+    It also prevents two faults of pyulog: an endless loop, because it steps back by the stated
+    length of a message even if the file ended before; and a read of the rest of the file at each
+    byte of a damaged part.
     """
 
     progress: Progress | None = None
@@ -109,7 +109,7 @@ class _Watched(io.BufferedReader):
         return data
 
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        """Move; a step back over more than was read counts from the reader's assumed position."""
+        """Move; a step back by more than was read starts where the reader believes it is."""
         if whence == io.SEEK_CUR and -offset > self.had:
             offset += self.missing
         return super().seek(offset, whence)
@@ -171,7 +171,7 @@ def _declared(ulog: Any) -> Iterator[str]:
 
 def _others(name: str, topic: str, t: FloatArray, columns: Columns, known: set[str],
             ) -> Iterator[Series]:
-    """Yield the fields of no other quantity, as logged."""
+    """Yield the fields that no other series uses, as logged."""
     rates = ('vehicle_angular_velocity', 'sensor_gyro')
     for field, values in columns.items():
         if f'{name}.{field}' in known:
