@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 from ou_monitor.analysis.analyze import Analysis
-from ou_monitor.analysis.crafts import craft_advice, craft_line
+from ou_monitor.analysis.crafts import CELL_LIMIT, craft_advice, craft_line
 from ou_monitor.analysis.level_comparison import sigma_change
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.overview import answers, known_lines
@@ -90,7 +90,12 @@ def _budget(analysis: Analysis) -> str:
     """Return the throttle budget, and the risk of a throttle beyond it."""
     curves = analysis.by_throttle
     if math.isnan(curves.voltage):
-        middle = float(np.median(analysis.recording.voltage))
+        middle, craft = float(np.median(analysis.recording.voltage)), analysis.craft
+        if craft.kind:
+            # The user has to confirm that it is a lithium pack.
+            source = 'by the log' if craft.cells_from == 'log' else 'a guess by the voltage'
+            return (f'unknown: no limit; --cells {craft.cells} ({source}) makes it '
+                    f'{CELL_LIMIT * craft.cells:g} V, --brownout-voltage any other')
         return ('unknown: no limit; --brownout-voltage or --cells sets one (the default of '
                 f'{MonitorSettings().brownout_voltage:g} V is for a 5 V rail, and this supply is '
                 f'at {number(middle)} V)')
