@@ -103,7 +103,7 @@ def as_seconds(values: npt.ArrayLike) -> FloatArray:
     # Whole seconds and the rest separately: float64 cannot hold 1.7e18 ns exactly, int64 not 1e19.
     whole = data.astype(f'{data.dtype.kind}8[s]')
     seconds = whole.astype(np.int64) + (data - whole) / np.timedelta64(1, 's')
-    return np.where(np.isnat(data) | np.ma.getmaskarray(values), NAN, seconds)
+    return np.where(np.isnat(data) | np.ma.getmask(values), NAN, seconds)
 
 
 def _fine_unit(stamps: npt.NDArray[Any], masked: npt.NDArray[np.bool_] | np.bool_) -> str:

@@ -183,3 +183,14 @@ def test_other_arrays_are_refused(t, volts):
                 lambda: SupplyMonitor(MonitorSettings()).push(t, volts)):
         with pytest.raises(ValueError):
             use()
+
+
+def test_a_dtype_of_another_library():
+    """Dates of polars have a dtype that NumPy does not know."""
+    class Dates:
+        dtype = 'Datetime'
+
+        def __array__(self, dtype=None, copy=None):
+            return np.array([1000, 1500], dtype='datetime64[ms]')
+
+    assert as_seconds(Dates()).tolist() == [1.0, 1.5]
