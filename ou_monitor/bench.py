@@ -393,8 +393,8 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
             **completed(dict(network or {})))
         level, source = default_voltage(circuit, rail) if voltage is None else (voltage, 'given')
     elif isinstance(network, PowerNetwork):
-        raise ValueError('a PowerNetwork leaves nothing for the recording to give: pass a mapping '
-                         'of the components that the recording does not show')
+        raise ValueError('a PowerNetwork has all components already: with a recording, pass a '
+                         'mapping of those that it does not show')
     else:
         flown, values = readings_of(_read(recording)), dict(network or {})
         full, stated = full_voltage(flown), stated_limit(flown.source)
@@ -402,7 +402,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
         if not cells:
             raise InputError(f'{full:.4g} V fits no number of cells: give --set cells=N')
         check_cells(full, cells)
-        level, source = cells * CELL_BROWNOUT, f'{CELL_BROWNOUT} V a LiPo cell'
+        level, source = cells * CELL_BROWNOUT, f'{CELL_BROWNOUT} V per LiPo cell'
         if stated is not None and stated[0] == cells:
             level, source = stated[1], 'by the log'
         level, source = (level, source) if voltage is None else (voltage, 'given')

@@ -8,7 +8,7 @@ describe (more than one relaxation, or lines with impulses) are withheld, becaus
 errors do not include this.  Limits: only levels with a usable fit count; weak spectral lines stay
 in the fit; a test that does not reject proves nothing, so the detectable ratio is reported too.
 
-The significance level of both is `LEVEL`, as of the printed intervals.  Each level is fitted by
+The tests have the significance level `LEVEL`, like the printed intervals.  Each level is fitted by
 itself here; `discover` fits one model to a whole recording, and uses `alpha_score` and
 `sigma_score` (`ou_monitor.criticism.battery`) to decide whether they depend on throttle.
 """

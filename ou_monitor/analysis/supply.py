@@ -66,8 +66,8 @@ class Dips:
 
     limit_v: float  # V
     count: int  # dips
-    seconds: float  # of the readings below, s
-    longest_s: float  # of the readings below in the longest dip, s
+    seconds: float  # total time below, s
+    longest_s: float  # time below in the longest dip, s
 
 
 @dataclass(frozen=True)

@@ -217,11 +217,11 @@ class Command:
 
     name: str  # As on the command line
     job: str  # One line
-    # Module of its function of the arguments, which returns the exit status: ``run``, or the name
-    # after a colon.
+    # Module, and after a colon the name of the function (default: ``run``) that takes the parsed
+    # arguments and returns the exit status.
     module: str
     description: str  # Start of its help
-    # Options; of a tuple of two or more at most one may be given.
+    # Options; those in a tuple exclude one another.
     options: tuple[Option | tuple[Option, ...], ...]
     examples: tuple[str, ...]  # Command lines, without ``ou-monitor`` and its name
     epilog: str = ''  # Text before the examples at the end of its help
@@ -363,8 +363,8 @@ _DESIGN = Command(
      Option('--capacitance-max', metavar='F', type=quantity('F'), default='22mF',
             help='largest capacitance to try (default: %(default)s)'),
      Option('--esr-fixed', action='store_true',
-            help='keep the ESR (default: ESR falls as 1/C, as of more capacitors of one series in '
-            'parallel)'),
+            help='keep the ESR (default: ESR falls as 1/C, as with more capacitors of one series '
+            'in parallel)'),
      Option('--set', metavar='NAME=VALUE', action='append', default=[],
             help='a component, such as bulk_capacitance=1000uF; may be repeated (see --list)'),
      Option('--network', metavar='FILE.yaml',
@@ -400,7 +400,7 @@ _FLEET = Command(
             help='bags, CSV files and logs, as for analyze, and folders to search for them'),
      Option('--output', metavar='DIR', required=True,
             help='folder for fleet.parquet, fleet.html and the parts of a run'),
-     Option('--workers', metavar='N', help='local processes (default: one a core)',
+     Option('--workers', metavar='N', help='local processes (default: one per core)',
             type=whole('a number of processes from 1 to 1024', 1, 1024)),
      Option('--scheduler', metavar='ADDRESS',
             help='Dask scheduler whose workers are used instead, tls://HOST:8786; they need the '

@@ -108,8 +108,8 @@ def _samples(recording: Recording, notes: list[str]) -> tuple[Readings, float]:
         raise InputError(f"'{recording.name}': {reason}")
     t, v, u, period = without_repeats(t, v, u)
     if period > 1.0:
-        notes.append(f'The logger repeats its last value, {number(period, 3)} samples a reading: '
-                     'each reading is simulated and counted once.')
+        notes.append(f'The logger repeats its last value, {number(period, 3)} samples per '
+                     'reading: each reading is simulated and counted once.')
     if u is not None:
         u = np.clip(u, 0.0, 1.0)
     return Readings(t - t[0], v, u, current_at(recording, t)), float(t[0])

@@ -29,7 +29,7 @@ _OTHERS = 100
 _EXAMINED = 200_000
 # A voltage counts as constant if at most this number, or this share, of samples differ.
 _ODD, _ODD_SHARE = 3, 1e-3
-# Limits of a voltage and of its range, V, whose fourth powers still are finite numbers.
+# Limits of a voltage and of its range, V, for which fourth powers neither overflow nor vanish.
 _LARGEST, _SMALLEST = 1e30, 1e-30
 # Median above which volts may be millivolts.
 _MILLIVOLTS = 1000.0

@@ -118,7 +118,7 @@ def _candidates(view: View) -> Iterator[Term]:
         if kind.ROLE is Role.MEAN and kind.MEASURED and (
                 view.throttle is not None or not kind.NEEDS_THROTTLE):
             for term in kind.candidates(view):
-                # A delayed response has no rate.
+                # A delayed response need not relax.
                 if (not isinstance(term, LoadTransient) or term.delay > 0.0
                         or decision.relaxes(1.0 / term.tau, duration)):
                     yield term

@@ -186,8 +186,8 @@ def _verdict(verdict: Verdict, causes: Sequence[Cause], left: Sequence[Criticism
                   + ('.' if why else '; a recording that covers its whole range of throttle more '
                      'than once would decide.'))
     if verdict is Verdict.NO_EFFECT:
-        return ('The plain OU simulates this recording: no statistic that a recording of this '
-                'length supports deviates.')
+        return ('The plain OU simulates this recording: none of the statistics that can be '
+                'computed at this length deviates.')
     if verdict is Verdict.UNEXPLAINED:
         return ('The simulation deviates from the recording, and no known cause explains it: '
                 f'{remaining_words(left)}.{tried}')

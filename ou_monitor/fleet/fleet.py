@@ -191,7 +191,7 @@ def _table(sources: Sequence[FoundRecording], results: dict[Path, dict[str, Any]
 
 
 def _raise_guesses(flights: Sequence[dict[str, Any]]) -> None:
-    """Set guesses of cells to the largest number of the vehicle that a flight can have."""
+    """Replace guessed cells by the vehicle's largest number that fits the flight's voltage."""
     known = sorted({one['cells'] for one in flights if one['cells']}, reverse=True)
     for one in flights:
         if one['cells_from'] == 'guessed':

@@ -30,7 +30,7 @@ from urllib.parse import urlsplit
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.mcap_file import usable_memory
 
-# Several processes with several threads of linear algebra each are slower than with one.
+# Several processes with several threads of linear algebra each are slower than with one thread.
 _ONE_THREAD = dict.fromkeys(
     ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'NUMBA_NUM_THREADS'), '1')
 # Share of the memory that all workers together may use, and the minimum for one, bytes.

@@ -145,7 +145,7 @@ class _Steady:
             self._seen = look @ vectors
 
     def innovations(self, columns: FloatArray, state: FloatArray) -> FloatArray:
-        """Return innovations from a filtered state of shape (d, p) on."""
+        """Return the innovations after a filtered state of shape (d, p)."""
         e = columns.astype(np.float64)
         if not self._modal:
             return self._in_chunks(e, state)

@@ -79,7 +79,7 @@ doc/simulation.md. {_DESCRIBED}.
 
 
 def replay() -> int:
-    """Publish a bag; the bag reader is imported here, because an apt-only Jazzy lacks it."""
+    """Publish a bag; the bag reader is imported here, because a Jazzy from apt alone lacks it."""
     from ou_monitor.nodes.replay import main
     return main()
 

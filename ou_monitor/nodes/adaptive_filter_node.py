@@ -120,7 +120,7 @@ class SupplyInput:
         Return the latest values that are not older than `stale_after`, s.
 
         Without a sigma, derive it from the noise that the load does not explain at the present
-        throttle, as of an OU process with relaxation `rate`, 1/s.  This sigma includes the
+        throttle, as that of an OU with relaxation `rate`, 1/s.  This sigma includes the
         ADC's white noise, so it is never below the supply's own.
         """
         fresh = within(self._state_silence.age, stale_after)

@@ -367,7 +367,7 @@ class SupplyMonitor:
         dwell : float
             Time there, s.
         voltage, horizon : float, optional
-            As of `risk`.
+            As for `risk`.
 
         Returns
         -------
@@ -377,7 +377,7 @@ class SupplyMonitor:
         Raises
         ------
         ValueError
-            When the throttle lies outside 0..1, the dwell is negative, or as `risk`.
+            When the throttle lies outside 0..1 or the dwell is negative, and as `risk` does.
 
         """
         level, ahead = self._asked(voltage, horizon)

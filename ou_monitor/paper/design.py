@@ -152,7 +152,7 @@ class Design:
 def default_voltage(network: PowerNetwork, rail: str) -> tuple[float, str]:
     """Return the brown-out level of a rail and its source (result in V)."""
     if rail == 'bus':
-        return CELL_BROWNOUT * network.cells, f'{CELL_BROWNOUT} V a LiPo cell'
+        return CELL_BROWNOUT * network.cells, f'{CELL_BROWNOUT} V per LiPo cell'
     for voltage, level in REGULATED_BROWNOUT.items():
         if math.isclose(network.regulator_voltage, voltage, rel_tol=0.01):
             return level

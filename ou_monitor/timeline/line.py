@@ -15,10 +15,10 @@ period, which need not be whole (3, 3, 4).  A coarse ADC also makes ties, but at
 distances.  A ramp, square wave or ripple through a coarse ADC changes at regular distances, but
 always by one code, and two neighbouring gaps always have the same sum.
 
-Limits: repeats are recognised from 64 samples on and need at least two samples a reading; until
+Limits: repeats are recognised from 64 samples on and need at least two samples per reading; until
 then they count as readings, and `Batch.again` marks the restart without them.  They are not
 recognised if readings jitter by more than a tenth of a period (standard deviation), or if there
-are fewer than four samples a reading and the ADC step exceeds 1.3 times the usual increment.
+are fewer than four samples per reading and the ADC step exceeds 1.3 times the usual increment.
 """
 
 from __future__ import annotations
@@ -344,7 +344,7 @@ TAIL, _ENOUGH, _LOOK = 1024, 64, 256
 _STRETCH = 20
 # Places of samples; all of them as a slice.
 Picked = npt.NDArray[np.intp] | slice
-# Share of ties above which repeats are searched: two samples a reading make a third or more.
+# Share of ties above which repeats are searched: two samples per reading make a third or more.
 _TIED = 0.25
 
 

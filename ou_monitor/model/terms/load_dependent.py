@@ -212,7 +212,7 @@ class LoadDependentAlpha(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return a rate that does not depend on throttle."""
+        """Return a slope of 0 as the start."""
         return () if view.throttle is None else (cls(0.0),)
 
 

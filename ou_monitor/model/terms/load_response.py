@@ -80,7 +80,7 @@ class LoadTransient(Term):
 
     A unit step up adds (gain + rise) * exp(-t/tau), a unit step down -gain * exp(-t/tau): motors
     draw more current while they speed up, and return none while they slow down.  gain > 0 delays
-    the sag (if it equals the sag, it low-passes it); gain < 0 deepens the sag at first (inrush).
+    the sag (equal to the sag, it gives a low-pass); gain < 0 deepens the sag at first (inrush).
     """
 
     NAME: ClassVar[str] = 'load_transient'

@@ -535,7 +535,7 @@ def _slow_levels(view: View) -> tuple[FloatArray | None, float, int]:
         return None, 0.0, 2
     mean = (mean - mean.mean()) / spread
     step = size / view.rate
-    # Keeps noise that depends on throttle from being taken for levels.
+    # Weights, so that noise that depends on throttle is not taken for levels.
     noisy = view.variance[view.train][:count * size].reshape(count, size).mean(axis=1)[1:]
     noisy /= math.exp(float(np.mean(np.log(noisy))))
 

@@ -332,7 +332,7 @@ class Maximum:
 
 
 def maximise(likelihood: _Likelihood, used: int, before: Maximum | None = None) -> Maximum:
-    """Fit rate, noise and mean, of `used` regressors (before: fit of a window nearly the same)."""
+    """Fit rate, noise and mean, of `used` regressors (before: fit of a nearly equal window)."""
     low, high = likelihood.low, likelihood.high
     place, at, curved = _least(
         lambda p: likelihood.at(p.item(0), p.item(1), used),

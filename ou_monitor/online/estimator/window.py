@@ -12,31 +12,30 @@ import numpy as np
 from ou_monitor.records import FloatArray, NAN
 from ou_monitor.timeline.line import BATCH, Batch
 
-# Lags of the supply behind the throttle that the load can take, s: motors
-# follow the command within 5..20 ms, the current settles within 40 ms
-# (doc/estimation.md).
+# Time constants, s, with which the load may follow throttle: motors follow the command within
+# 5 to 20 ms, and the current settles within 40 ms (doc/estimation.md).
 LOAD_LAGS = (0.010, 0.040)
 # After this long without a change of throttle all lags have settled, s.
 LOOK_BACK = 16.0 * LOAD_LAGS[1]
 
-# exp(_SPAN) stays far inside the range of a double.
+# Maximum exponent; exp(_SPAN) is far below the largest double.
 _SPAN = 300.0
-# A lagged throttle this near to the throttle has settled.
+# Difference from the throttle below which a lagged throttle has settled.
 _SETTLED = 1e-7
-# Samples from which the rate is known.
+# Minimum samples to determine the rate.
 MIN_FOR_RATE = 8
 # A step that differs from the usual one by more than this share breaks the run.
 UNEVEN = 0.5
-# The usual step is taken anew when a batch's median differs by this factor.
+# The usual step is measured again when a batch's median differs by this factor.
 NEW_RATE = 1.3
-# Stamps remembered for that from batch to batch.
+# Number of stamps kept from batch to batch for that median.
 MEMORY = 32
 # Maximum samples per block: 10 MHz; stamps that are closer are invalid.
 MOST_BLOCK = 1000.0
 
 
 class Kept:
-    """The newest readings as columns, stamps, s, first; older ones go when room is needed."""
+    """The newest readings in columns; row 0 holds the stamps, s.  Old ones are dropped."""
 
     def __init__(self, rows: int) -> None:
         self._store = np.empty((rows, 1024))
@@ -52,7 +51,7 @@ class Kept:
         self._size = size
 
     def append(self, columns: FloatArray, reach: float, most: int = 1 << 62) -> None:
-        """Add readings; those of the last `reach`, s, are kept, the last `most` at most."""
+        """Add readings; keep those of the last `reach` seconds, but no more than `most`."""
         count = columns.shape[1]
         if self._size + count > self._store.shape[1]:
             # One more, to know that the window is shorter than the data.

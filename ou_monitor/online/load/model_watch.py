@@ -30,14 +30,14 @@ SIZE_ERROR = 0.1
 _NOISE_FORM = 0.15
 # Lower limit of the noise, V.
 _LEAST_NOISE = 1e-6
-# A pack is weaker above both limits: relative, and in standard errors of the logarithm (by chance
-# exceeded in 1 % of cases).
+# A pack is weaker if its sag exceeds that of the model by both limits: a share, and a number of
+# standard errors of the logarithm (exceeded by chance in 1 % of cases).
 _LEAST, _ERRORS = 0.10, 2.33
 # Relative error above which the ratio is not determined.
 _VAGUE = 0.15
-# Sag over the model's below which it is another pack or load: warm packs have 0.75 and more.
+# Ratio of sag to the model's below which pack or load is another: warm packs have 0.75 and more.
 _OTHER = 0.7
-# Level over the model's beyond which it is another pack, up or down.
+# Factor between level and the model's level, up or down, beyond which it is another pack.
 OTHER_LEVEL = 1.3
 # Level of a lithium cell at rest, V: at take-off, later, and at most (LiHV).
 _TAKE_OFF, _EMPTY, _FULL = 3.4, 3.2, 4.4

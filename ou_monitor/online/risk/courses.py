@@ -279,7 +279,7 @@ class Past:
 
 
 def sliding(least: np.ufunc, x: FloatArray, width: int) -> FloatArray:
-    """Return the minimum or maximum of each window of `n` values, by doubling."""
+    """Return the minimum or maximum of each window of `width` values, by doubling."""
     size, out = 1, x
     while 2 * size <= width:
         out = least(out[:-size], out[size:])

@@ -86,13 +86,13 @@ def read(path: Path, request: Request) -> Log:
         rest = parser.reader._frame_data[end:].removeprefix(b'End of log\0')
         broken = int(parser._ctx.invalid_frame_count)
     if dropped:
-        notes.append(f'At least {counted(dropped, "frame")} without a sound key frame before them '
-                     'dropped.')
+        notes.append(f'At least {counted(dropped, "frame")} dropped: no sound key frame before '
+                     'them.')
     if broken:
-        notes.append(f'{counted(broken, "piece")} left out that orangebox does not know: broken '
-                     'bytes, or events of newer firmware.')
+        notes.append(f'{counted(broken, "piece")} unknown to orangebox left out: broken bytes, or '
+                     'events of newer firmware.')
     if not closed:
-        notes.append(f'Flight {wanted} has no end mark: it was cut off or goes on at its end; '
+        notes.append(f'Flight {wanted} has no end mark, so it was probably cut off; '
                      f'{end} of {size} bytes of frames were read.')
     elif rest.strip(b'\xff\0'):
         # Bytes of erased flash and padding of cards do not count.

@@ -65,8 +65,8 @@ OTHER_WORDS = frozenset((
     '', '-', 'sequence', 'w', 'wh', 'ah', 'mah', 'hz', 'khz', 'rpm', '1/min', '°', 'deg', '°c',
     'degc', '°f', 'm', 'm/s', 'km/h', 'g', 'kg', 'n', 'nm', 'ohm', 'mohm'))
 WORDS = {**TIME_WORDS, **VOLT_WORDS, **AMPERE_WORDS, **SHARE_WORDS}
-# A quantity with one of these words at the end of its name: first in brackets.  Without unbounded
-# repetitions after the quantity, so that long names cost no more than their length.
+# A quantity with one of these words at the end of its name, preferably in brackets.  Repetitions
+# after the quantity are bounded, so that the time is proportional to the length of a name.
 _WORD = f"({'|'.join(sorted(WORDS, key=len, reverse=True))})"
 _WITH_UNIT = re.compile(
     rf'(.*?) ?[\[({{] ?{_WORD} ?[\])}}]|(.+?) in {_WORD}|(.[^/]*?|.+? ) ?/ ?{_WORD}|'
@@ -231,7 +231,7 @@ def number_of(cell: str) -> tuple[float, str]:
         return plain_number(cell), ''
     except ValueError:
         pass
-    # Graphtec aligns numbers behind their sign.
+    # Graphtec puts blanks between sign and digits.
     cell = re.sub(r'^([-+]) +', r'\1', cell.strip())
     found = _AND_UNIT.fullmatch(cell)
     text, unit = (found[1], found[2].lower()) if found else (cell, '')
@@ -362,7 +362,7 @@ def numbers(path: Path, form: Form, places: Sequence[int],
     """
     Return columns of numbers, NaN where blank; `texts` gets cells as written.
 
-    A bad line is an InputError, unless `left_out` is there to get the errors of those left out.
+    A bad line raises InputError; with `left_out`, it is dropped and its error is appended there.
     """
     parts: list[list[FloatArray]] = [[] for _ in places]
     last = max([*places, *(texts or {})])
@@ -472,8 +472,8 @@ def _floats(cells: Sequence[str], where: Callable[[int], str], comma: bool, stat
     """
     Return cells as numbers (where: words for the place of one; stated: their unit).
 
-    A bad one is an InputError; if `good` is there, its line is marked, and `left_out` gets the
-    error, once a line.
+    A bad cell raises InputError; with `good`, its line is marked there instead, and the error is
+    appended to `left_out`, once per line.
     """
     try:
         values = np.fromiter(map(float, cells), np.float64, len(cells))

@@ -53,8 +53,8 @@ _FEW_ROWS = 8
 _MOST_VOLTS = 1000.0
 
 
-# Quantity -> patterns of the end of a column's name without its unit, the best first; small
-# letters, other characters as '_'.  From the exports named in test_csv_exports.py.
+# Quantity -> patterns of the end of a column's name without its unit, the best first; in lower
+# case, other characters as '_'.  From the exports named in test_csv_exports.py.
 _VALUE_NAME = r'_?(?:values?|reading|data|wert|messwert)?'
 _TIME_NAME, _INDEX_NAME = 'time', r'sequence|index|sample|no|n|x|point|'
 _PATTERNS = {
@@ -622,7 +622,7 @@ def _read_note(form: Form, time: _Column, found: dict[str, _Column], units: dict
               if form.names[k] not in {column.name for column in found.values()}]
     also = f'; also there: {", ".join(others)} (--voltage-column)' if others else ''
     if search and logs.THROTTLE not in found:
-        # A throttle by another name is not lost in silence.
+        # Mention columns that may be a throttle under another name.
         used = {*time.place, *(column.place[0] for column in found.values())}
         rest = [name for k, name in enumerate(form.names[:form.width]) if form.line
                 and k not in used and name not in others
