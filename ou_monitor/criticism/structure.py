@@ -31,7 +31,8 @@ _STEP = 1e-4
 _ROUNDS, _FEW_ROUNDS, _LAST_ROUNDS = 12, 6, 2
 # Samples times additional states above which a fit begins with a part of the samples.
 _EXPENSIVE = 30000
-# With more states, only that part is fitted; with more lines, they are fitted separately.
+# With more states than this, only a part of the samples is fitted; more lines than this are fitted
+# separately.
 _MANY = 4
 # Samples after which the gain of a time-invariant filter is constant (predictive variance within
 # 1e-5 of its limit).

@@ -132,12 +132,12 @@ def local_rates() -> FloatArray:
 
 
 def through_coupling(time: FloatArray, rail: float) -> FloatArray:
-    """Return a unit step of a rail, 1/s, through the high-pass in closed form (time in s)."""
+    """Return the unit step of a rail of this rate, 1/s, behind the high-pass (time in s)."""
     return np.asarray(rail / (rail - CORNER) * (np.exp(-CORNER * time) - np.exp(-rail * time)))
 
 
 def peak_of(rail: float) -> float:
-    """Return the time of the peak of a step of a rail, 1/s, behind the high-pass, s."""
+    """Return when `through_coupling` peaks, s, for a rail of this rate, 1/s."""
     return math.log(rail / CORNER) / (rail - CORNER)
 
 

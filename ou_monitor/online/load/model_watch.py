@@ -148,7 +148,8 @@ def _warming(levels: FloatArray, left: FloatArray, squares: FloatArray) -> tuple
         return WARMING, WARMING_SE
     slope = float(levels @ left) / weight
     each = levels * (left - slope * levels * squares)
-    # An error of the form at the ends of the levels, sqrt(12) deviations apart, tilts the slope.
+    # The slope is also uncertain by errors of the form at both ends of the range of levels, which
+    # is sqrt(12) standard deviations wide.
     variance = (float(each @ each) / weight + _FORM ** 2 * float(squares.sum()) / 6.0) / weight
     own, usual = 1.0 / variance, WARMING_SE ** -2
     return (slope * own + WARMING * usual) / (own + usual), (own + usual) ** -0.5
@@ -162,8 +163,8 @@ def other_pack(start: LoadStart, highest: float, level: float) -> str:
         other = not 1.0 / OTHER_LEVEL < level / start.volts < OTHER_LEVEL
     elif highest / cells < _TAKE_OFF:
         # A pack that was fuller before has emptied.
-        return (f'{highest:.2f} V at rest at most is {highest / cells:.2f} V for each of the '
-                f"model's {cells:.0f} cells: another pack, or an empty one.")
+        return (f'The highest voltage at rest, {highest:.2f} V, is {highest / cells:.2f} V for '
+                f"each of the model's {cells:.0f} cells: another pack, or an empty one.")
     else:
         other = level / cells > _FULL
     return (f'{level:.2f} V at rest, where the model has {start.volts:.2f} V: another pack.'
@@ -177,7 +178,7 @@ def judge(ratio: float, se: float, date: str) -> tuple[ModelVerdict, str]:
     more, model = ratio - 1.0, 'the model' + (f' of {date}' if date else '')
     sizes = sorted((100.0 * (abs(more) - 1.96 * se), 100.0 * (abs(more) + 1.96 * se)))
     found = f'Sag {100.0 * abs(more):.0f} % ({sizes[0]:.0f} to {sizes[1]:.0f})'
-    # Most errors are factors and grow with the ratio, so the logarithm has those without ageing.
+    # Most errors are factors, so the error of the logarithm hardly depends on ageing.
     if more > _LEAST and math.log(ratio) > _ERRORS * se / ratio:
         return ModelVerdict.WEAKER, f'{found} above {model}: weak pack or cold.'
     if ratio + _ERRORS * se < _OTHER:

@@ -85,7 +85,7 @@ class SupplyLoad:
         return self.status is LoadStatus.KNOWN
 
     def sag(self, throttle: npt.ArrayLike) -> FloatArray:
-        """Return the sag, V, of constant throttle; unless `known`, by the prior; NaN: unknown."""
+        """Return the sag, V, at constant throttle, by the prior unless `known`; NaN: unknown."""
         return self._read(throttle, self._sag)
 
     def sag_se(self, throttle: npt.ArrayLike) -> FloatArray:
