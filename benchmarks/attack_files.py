@@ -386,9 +386,8 @@ def verdict_of_sheet(data: bytes, found: Recording) -> str:
                           current.tolist()):
         if not any(v in line and (math.isnan(i) or i in line) for line in stand.get(t, ())):
             return '! wrong value'
-        # A guessed unit of a column that the header names the throttle is in the notes.
         if not math.isnan(u) and u not in everything and 'a guess' not in ''.join(found.notes):
-            return '! wrong throttle'
+            return '! wrong throttle, and no note of a guessed unit'
     said = [re.match(r'(\d+) samples? dropped', note) for note in found.notes]
     dropped = found.held + sum(int(one[1]) for one in said if one)
     if found.n + dropped != len(lines):

@@ -180,14 +180,18 @@ def _uncoded(samples: Samples, state: Integrity, start: Composite) -> tuple[Samp
 
 
 def _coded(samples: Samples, state: Integrity, named: Named) -> tuple[Composite, tuple[str, ...]]:
-    """Fit the named model to the codes; return it and its causes, without laws that fail."""
+    """Fit the named model to the codes; return it and its causes, without terms that fail."""
     steps = [term for term in state.exact if term.ROLE is Role.NOISE]
     terms, names = list(named.whole.terms), list(named.names)
     while True:
-        found = _refitted(samples, [terms[0], *steps, *terms[1:]])
+        try:
+            found = _refitted(samples, [terms[0], *steps, *terms[1:]])
+        except (ValueError, ArithmeticError, np.linalg.LinAlgError):
+            # Parameters out of range, or an overflow.
+            found = None
         if found is not None:
             return found, tuple(names)
-        if terms[-1].ROLE is not Role.LAW:
+        if len(terms) == 1:
             raise ArithmeticError('the model within codes does not fit the codes')
         names.remove(terms.pop().NAME)
 

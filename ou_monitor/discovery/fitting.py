@@ -213,13 +213,17 @@ class Fitter:
             float(fit.gain.sum()) - fit.term.SEARCH
             - 0.5 * fit.free * math.log(self.samples.train.stop))
 
-    def best_start(self, composite: Composite, kind: type[Term], view: View, least: float = 0.0
-                   ) -> Composite | None:
-        """Return the best fit with one more term of a kind, if its spectrum gains enough nats."""
+    def best_start(self, composite: Composite, kind: type[Term], view: View, least: float = 0.0,
+                   starts: Sequence[Term] | None = None) -> Composite | None:
+        """
+        Return the best fit with one more term of a kind, if its spectrum gains enough nats.
+
+        starts: by default, the candidates of the kind.
+        """
         if kind.ROLE is Role.LAW:
             found = self.fit([*composite.terms, kind], composite)
             return found if found is not None and found.terms[-1].holds(view) else None
-        starts = list(kind.candidates(view))
+        starts = list(kind.candidates(view)) if starts is None else list(starts)
         if kind.BROAD and not any(term.ROLE is Role.BLOCK and term.NEEDS_THROTTLE
                                   for term in composite.terms):
             return self._by_spectrum(composite, starts, view, least)

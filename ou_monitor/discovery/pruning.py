@@ -14,23 +14,19 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.composite import Composite
-from ou_monitor.criticism.curves import stray
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import decision
 from ou_monitor.discovery.fitting import is_trend
 from ou_monitor.discovery.gain import cause_gain, held_out, HeldOut, without
-from ou_monitor.discovery.search import position
-from ou_monitor.model.supply import SupplyModel
+from ou_monitor.discovery.search import outside_range, position
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.term import Term
-from ou_monitor.records import FloatArray, NAN
+from ou_monitor.records import NAN
 
 # Minimum number of causes of one kind whose gain is measured together.
 MANY = 4
 # Maximum number of rounds.
 _ROUNDS = 4
-# Number of simulations whose range is compared.
-_DRAWS = 16
 
 
 @dataclass(frozen=True)
@@ -106,11 +102,11 @@ def _straying(samples: Samples, state: Pruned) -> int | None:
 
     One-step predictions hardly constrain the range of a process: with an intensity or an event
     that fits them, simulations may still exceed the recorded range.  Responses of the mean are not
-    tested.  The median simulation decides, because heavy tails may leave the range once.
+    tested.
     """
     def far_of(model: Composite) -> float:
         try:
-            return float(np.median(_far(samples, model.terms)))
+            return outside_range(samples, model.terms)
         except ValueError:
             return math.inf
 
@@ -122,22 +118,6 @@ def _straying(samples: Samples, state: Pruned) -> int | None:
     # The cheapest single cause; combinations are not tried.
     return min((k for k, stays in other.items() if not stays > 0.0), default=None,
                key=lambda k: state.worth[k].gain)
-
-
-def _far(samples: Samples, terms: Sequence[Term]) -> FloatArray:
-    """
-    Return by how much the level of each simulation leaves the recorded range, V (fixed seeds).
-
-    The level is a running median of five samples, which single bad samples do not change.
-    """
-    rng, model = np.random.default_rng(0), SupplyModel(tuple(terms))
-
-    def level(voltage: FloatArray) -> FloatArray:
-        near = np.lib.stride_tricks.sliding_window_view(voltage, 5)
-        return np.asarray(np.median(near, axis=1))
-
-    return np.array([stray(level(model.simulate(samples.t, rng, samples.throttle)),
-                           samples.logged) for _ in range(_DRAWS)])
 
 
 def _as_trend(samples: Samples, state: Pruned, k: int) -> bool:
@@ -190,7 +170,7 @@ def refusal(samples: Samples, terms: Sequence[Term], gain: float, gain_se: float
     if larger:
         return 'One-step errors of the extended model are larger than those of the plain OU'
     try:
-        far = float(_far(samples, terms).max())
+        far = outside_range(samples, terms)
     except ValueError as error:
         return f'The extended model cannot be simulated ({error})'
     if far > 0.0:

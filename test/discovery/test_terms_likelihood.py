@@ -37,8 +37,10 @@ GAUSSIAN = {
         {'log_factor': [0.0, 0.3, 0.8]}, {'log_factor': [0.0, 0.5, 0.65]}),
     'load_dependent_alpha': ({'slope': 1.0}, {'slope': -0.6}),
     'load_dependent_noise': (
-        {'number': [0, 0, 2, 2], 'at': [0.2, 0.9, 0.0, 0.2], 'log_factor': [0.0, 1.0, 0.0, 1.0]},
-        {'log_factor': [0.0, 0.5, 0.0, 1.0]}, {'log_factor': [0.0, 1.0, 0.0, 0.2]}),
+        {'number': [0, 0, 2, 2], 'at': [0.2, 0.9, 0.0, 0.2], 'log_factor': [0.0, 1.0, 0.0, 1.0],
+         'on_sigma': 0.5},
+        {'log_factor': [0.0, 0.5, 0.0, 1.0]}, {'log_factor': [0.0, 1.0, 0.0, 0.2]},
+        {'on_sigma': 0.1}),
     'drift': ({'rate': -0.01, 'curvature': 2e-4}, {'rate': 0.0}, {'curvature': 0.0}),
     'measurement_noise': ({'std': 0.5 * STEP}, {'std': 0.4 * STEP}, {'std': 0.6 * STEP}),
     'quantization': ({'step': 0.5 * STEP}, {'step': STEP}),

@@ -53,7 +53,7 @@ NEUTRAL = {
     'load_sag': {'linear': 0.0, 'square': 0.0},
     'load_transient': {'gain': 0.0, 'tau': 0.03, 'delay': 0.01},
     'load_dependent_sigma': {'throttle': [0.3], 'log_factor': [0.0]},
-    'load_dependent_noise': {name: [] for name in EXAMPLES['load_dependent_noise']},
+    'load_dependent_noise': {'number': [], 'at': [], 'log_factor': []},
     'load_dependent_alpha': {'slope': 0.0}, 'drift': {'rate': 0.0, 'curvature': 0.0},
     'measurement_noise': {'std': 0.0}, 'lopsided_noise': {'skew': 0.0, 'tail': 1.0},
     'quantization': {'step': 1e-12},

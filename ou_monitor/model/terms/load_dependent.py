@@ -274,13 +274,13 @@ class LoadDependentNoise(Term):
     Multiply the white noise by a factor that depends on throttle and its changes.
 
     The logarithm of the factor is a sum of curves, each of one of `INPUTS`, linear between knots
-    and constant beyond them; a last curve may bend the sum.  Without a `measurement_noise` to
-    scale, it does nothing.
+    and constant beyond them; a last curve may bend the sum.  A power of the factor may multiply
+    sigma too, where the rail itself shakes.
     """
 
     NAME: ClassVar[str] = 'load_dependent_noise'
     FAMILY: ClassVar[str] = 'intensity'
-    STAGE: ClassVar[Stage] = Stage.INSTRUMENT
+    STAGE: ClassVar[Stage] = Stage.DRIVE
     NEEDS_THROTTLE: ClassVar[bool] = True
     ROLE: ClassVar[Role] = Role.DRIVE
     SIGNS: ClassVar[tuple[str, ...]] = ('variance throttle', 'variance change')
@@ -303,6 +303,7 @@ class LoadDependentNoise(Term):
     number: tuple[float, ...] = parameters('', 'index of the input of each knot: see INPUTS, SUM')
     at: tuple[float, ...] = parameters('', 'value of the input at the knot, rising for each input')
     log_factor: tuple[float, ...] = parameters('', 'ln of the factor there')
+    on_sigma: float = parameter('', 'power of the factor that multiplies sigma', 0.0, default=0.0)
 
     def check(self) -> None:
         """Check that the knots rise and match."""
@@ -326,9 +327,16 @@ class LoadDependentNoise(Term):
         inputs = Inputs(self.curves())
 
         def effect(s: Segment) -> None:
-            s.noise = s.noise * np.exp(self.log_of(inputs(s.step, s.throttle)))
+            log = self.log_of(inputs(s.step, s.throttle))
+            s.noise = s.noise * np.exp(log)
+            if self.on_sigma:
+                s.sigma = s.sigma * np.exp(self.on_sigma * log)
 
         return effect
+
+    def free(self) -> tuple[str, ...]:
+        """Return the power of sigma, unless sigma does not follow."""
+        return ('on_sigma',) if self.on_sigma else ()
 
     def log_of(self, inputs: Mapping[int, FloatArray]) -> FloatArray:
         """Return ln of the factor for the inputs that `Inputs` returns."""
@@ -341,11 +349,14 @@ class LoadDependentNoise(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return the curves fitted to the squares of the scores."""
-        return [] if view.throttle is None else [cls((), (), ()).apart(view)]
+        """Return the curves fitted to the squares of the scores, for white noise and for both."""
+        if view.throttle is None:
+            return []
+        white = cls((), (), ()).apart(view)
+        return [white, replace(white, on_sigma=0.5)] if white.at else [white]
 
     def apart(self, view: View) -> LoadDependentNoise:
-        """Return the curves fitted to the scores of a model with this term."""
+        """Return the curves, for white noise alone, fitted to the scores of a model with them."""
         assert view.throttle is not None
         inputs = {k: x[view.train] for k, x in Inputs(range(len(INPUTS)))(
             view.step, view.throttle).items()}
@@ -373,10 +384,11 @@ class LoadDependentNoise(Term):
         bent = _curve(square * np.exp(-2.0 * total), total, shares, np.zeros(square.size))
         if bent is not None:
             found[SUM] = bent[0], bent[0] + bent[1]
-        return LoadDependentNoise(*(tuple(float(value) for part in parts for value in part)
-                                    for parts in (
-            [[k] * knots.size for k, (knots, _) in found.items()],
-            [knots for knots, _ in found.values()], [values for _, values in found.values()])))
+        number, at, log_factor = (
+            tuple(float(value) for part in parts for value in part) for parts in (
+                [[k] * knots.size for k, (knots, _) in found.items()],
+                [knots for knots, _ in found.values()], [values for _, values in found.values()]))
+        return LoadDependentNoise(number, at, log_factor)
 
 
 class Inputs:
