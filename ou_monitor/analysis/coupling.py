@@ -199,7 +199,7 @@ _QUIET = 1e-9
 def _weighted(pieces: list[ComplexArray]) -> tuple[ComplexArray, ComplexArray, FloatArray]:
     """Return weighted voltage and signal without the causes, and the signal's residual power."""
     weight = np.sqrt(np.mean(np.abs(pieces[1])**2, axis=1))
-    # A quieter segment is rounding, or the decay of a filter.
+    # A quieter segment contains only rounding errors, or the decay of a filter.
     weight = np.maximum(weight, _QUIET * weight.max())
     scaled = [one / weight[:, None] for one in pieces]
     basis = basis_of(scaled[2:])
@@ -222,7 +222,7 @@ def _band(band: tuple[float, float] | None, grid: Grid) -> tuple[float, float]:
 
 
 def _segment_length(grid: Grid, low: float) -> int:
-    """Return the samples of a segment: short, but with the band from the third bin on."""
+    """Return the samples of a segment: short, but the band starts at the third bin or later."""
     seconds = min(max(grid.duration / _PIECES, _SHORTEST), _LONGEST)
     return max(32, round(max(seconds, 3.0 / low) * grid.rate))
 
@@ -406,7 +406,7 @@ ComplexArray = npt.NDArray[np.complex128]
 
 # Bins over which the power of the signal is averaged.
 _AROUND = 11
-# Neighbouring bins of the Hann window are correlated by 2/3, every second by 1/6.
+# Neighbouring bins of the Hann window are correlated by 2/3, bins two apart by 1/6.
 STRIDE = 2
 # Power correlation of half-overlapping Hann segments: (1/6)^2.
 OVERLAP = 1.0 / 36.0
@@ -501,7 +501,7 @@ def basis_of(causes: list[ComplexArray]) -> list[ComplexArray]:
         size = (np.abs(cause)**2).sum(0)
         part = without(cause, basis)
         norm = np.sqrt((np.abs(part)**2).sum(0))
-        # Of a cause that repeats another, only rounding is left (float32: 1e-7).
+        # If a cause repeats another, only rounding errors remain (float32: 1e-7).
         basis.append(np.where(norm**2 > 1e-10 * size, part / np.where(norm > 0.0, norm, 1.0),
                               0.0))
     return basis

@@ -223,6 +223,6 @@ def _ou_words(ou: OuFacts) -> str:
     if ou.status == 'not_visible':
         if not ou.var_inf_below:
             return f'none: no noise; {window}'
-        return (f'not visible: slower than {number(1e3 * ou.tau_below_s)} ms it stays below '
+        return (f'not visible: one slower than {number(1e3 * ou.tau_below_s)} ms is below '
                 f'{number(1e3 * math.sqrt(ou.var_inf_below))} mV rms; {window}')
     return 'unknown: too few readings'

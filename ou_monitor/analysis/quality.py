@@ -22,7 +22,7 @@ from ou_monitor.timeline.line import TAIL
 
 # Flags for information; the others are warnings.
 _INFORMS = frozenset({Flag.HELD_SAMPLES, Flag.IRREGULAR, Flag.NO_EXCITATION})
-# Statuses that are no defect of a recording: its rate or length allows no more.
+# Statuses that are not defects: the rate or length of the recording allows no more.
 _LIMITS = frozenset({Status.TOO_FEW_SAMPLES, Status.TOO_SHORT, Status.UNBOUND, Status.BURIED,
                      Status.NO_RELAXATION})
 # Maximum scatter of the steps of an even clock: rms about the median, in medians.
@@ -100,8 +100,8 @@ def _of_units(recording: Recording) -> list[QualityItem]:
     if step > _LONG_STEP or (step > _SLOW and recording.duration > _LONG_FLIGHT):
         items.append(QualityItem('TIME_UNIT', Severity.WARNING, (
             f'The samples are {step:.3g} s apart, over {recording.duration / 3600.0:.3g} hours: '
-            'is the time in ms or us? If so, all rates and times are wrong by that factor; '
-            '--time-unit ms reads a CSV in ms.')))
+            'is the time in ms or us? If so, all rates and times are wrong by a factor of 1000 or '
+            '1e6; --time-unit ms reads a CSV in ms.')))
     known = recording.throttle[np.isfinite(recording.throttle)]
     low, high = np.quantile(known, (_RARE, 1.0 - _RARE)) if known.size else (0.0, 1.0)
     if low < -_TRIM or high > 1.0 + _TRIM:

@@ -128,7 +128,7 @@ class Finding:
     crossing: CrossingRate = field(default_factory=CrossingRate)  # Falls through a low level
     notes: tuple[str, ...] = ()  # What was dropped, left out or cannot be decided
     samples: Samples | None = None  # Samples that were fitted
-    # The extended model of `samples`, without effects removed from them, such as repeats.
+    # The extended model of `samples`; it lacks effects removed from them, such as repeats.
     simulated: SupplyModel | None = None
     refused: str = ''  # Why the extended model is refused, in words; otherwise empty
     load: str = 'throttle'  # The load: 'throttle', or 'current' if that predicts better

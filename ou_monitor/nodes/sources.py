@@ -165,8 +165,8 @@ def _overridden(source: Source, topic: str, field: str, rate: float) -> Source:
     spec = source.spec
     if spec is None:
         return source
-    # A rate makes a block of a field only if the message config says so, or if the user named the
-    # field.
+    # A rate applies only to a field that the msg_config declares as a block, or that the user
+    # named.
     block = rate > 0.0 and (spec.sample_rate is not None or source.config == 'parameters')
     spec = replace(spec, topic=topic or spec.topic, field=field or spec.field,
                    sample_rate=rate if block else spec.sample_rate)

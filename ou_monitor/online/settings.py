@@ -151,7 +151,7 @@ class MonitorSettings:
             raise ValueError(
                 f'brownout.budget_limit ({self.brownout_budget_limit:g}; 0: brownout.warn, '
                 f'{self.brownout_warn:g}) must give a limit above 0 and below 1: no throttle '
-                'has a risk below 0, and any has one of at most 1')
+                'has a risk below 0, and no risk exceeds 1')
 
     @cached_property
     def floor(self) -> float:
@@ -194,7 +194,7 @@ class FilterSettings:
         'then relative to sigma_ref.', 0.0, 1.0e9)
     noise_wanted: float = _parameter(
         0.0, 'Rms of the output noise that constant_noise keeps constant, unit of the output, '
-        'with coupling; 0: that at sigma_ref and fmax.', 0.0, 1.0e12)
+        'with coupling; 0: the noise at sigma_ref and fmax.', 0.0, 1.0e12)
     n0: float = _parameter(
         0.0, 'White measurement noise for wiener and kalman, unit^2/Hz, two-sided: variance of a '
         'sample over the sample rate.', 0.0, 1.0e12)

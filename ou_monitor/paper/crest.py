@@ -131,7 +131,7 @@ def rows(crests: Crests) -> list[Row]:
             f'{max(SCREENS_MS)} ms',
             f'One OU shows {mean:.1f} on a {TYPICAL_MS} ms screen and lies within '
             f'{crests.band[0]:.1f} to {crests.band[1]:.1f} on screens of {min(SCREENS_MS)} to '
-            f'{max(SCREENS_MS)} ms; half a step of Vpp and Vrms allows {inputs[0]:.1f} to '
+            f'{max(SCREENS_MS)} ms; the resolution of Vpp and Vrms allows {inputs[0]:.1f} to '
             f'{inputs[1]:.1f}{beyond}.',
             error=error, band=crests.band, printed_inputs=inputs, point=5))
     return found
@@ -218,7 +218,7 @@ def jump_rows(found: list[JumpCrest], crests: Crests) -> list[Row]:
     result = [Row(
         WHERE, 'Vpp/Vrms, 40 % over 5 %', '', Printed('> 1'), high / low, 'quotient from Table 1',
         f'"From Gaussian noise to impulse disturbances with load" would raise it; it falls from '
-        f'{low:.1f} to {high:.1f}; half a step of each reading allows a quotient of '
+        f'{low:.1f} to {high:.1f}; the resolution of the readings allows a quotient of '
         f'{inputs[0]:.2f} to {inputs[1]:.2f}.', inputs=inputs, point=8)]
     for state in (published.LOW, published.MEDIUM):
         value, inputs = state.crest, state.crest_range

@@ -146,7 +146,7 @@ def _of_load(state: PrintedLoad) -> list[Row]:
             'is printed with four digits.', point=4),
         Row('Table 2', f'Var_inf, {state.label}', 'V^2', VAR_INF[state.label], var,
             'sigma^2 / (2 alpha) with the printed numbers',
-            f'The arithmetic is right; half a step of Vrms allows {1e-6 * low ** 2:.2g} to '
+            f'The arithmetic is right; the resolution of Vrms allows {1e-6 * low ** 2:.2g} to '
             f'{1e-6 * high ** 2:.2g} V^2.')]
 
 
@@ -210,7 +210,7 @@ def _of_thresholds() -> list[Row]:
         Row('Section 4.4', f'P(|U| > {1e3 * DELTA:g} mV), 40 % over 10 %', '',
             Printed(f'> {load:g}'), ratio, 'quotient of the formula',
             f'"Nonlinear" holds: {load:.0f} times the load gives {ratio:.0f} times the '
-            f'probability; half a step of each Vrms allows {spread[2] / spread[1]:.0f} to '
+            f'probability; the resolution of Vrms allows {spread[2] / spread[1]:.0f} to '
             f'{spread[3] / spread[0]:.0f}.',
             inputs=(spread[2] / spread[1], spread[3] / spread[0])),
         Row('Section 4.4', f'falls by {1e3 * DELTA:g} mV a second, 40 over 10 %', '',

@@ -94,8 +94,8 @@ def _budget(analysis: Analysis) -> str:
         if craft.kind:
             # The user has to confirm that it is a lithium pack.
             source = 'by the log' if craft.cells_from == 'log' else 'a guess by the voltage'
-            return (f'unknown: no limit; --cells {craft.cells} ({source}) makes it '
-                    f'{CELL_LIMIT * craft.cells:g} V, --brownout-voltage any other')
+            return (f'unknown: no limit; --cells {craft.cells} ({source}) sets it to '
+                    f'{CELL_LIMIT * craft.cells:g} V, --brownout-voltage to any other')
         return ('unknown: no limit; --brownout-voltage or --cells sets one (the default of '
                 f'{MonitorSettings().brownout_voltage:g} V is for a 5 V rail, and this supply is '
                 f'at {number(middle)} V)')
@@ -106,7 +106,7 @@ def _budget(analysis: Analysis) -> str:
         return f'unknown: {curves.budget_reason} The risk is that {what}.'
     if not curves.budget:
         return f'no throttle, {_why_none(analysis)}: the risk {what} is {curves.risk[0]:.2g}'
-    words = (f'{100.0 * curves.budget:.0f} % throttle, held: the risk {what} stays under '
+    words = (f'{100.0 * curves.budget:.0f} % throttle if held: the risk {what} stays under '
              f'{100.0 * curves.limit:g} %')
     beyond = [(u, p) for u, p in zip(curves.throttle, curves.risk)
               if u > curves.budget and p >= max(0.05, 2.0 * curves.limit)]
@@ -457,7 +457,7 @@ def _sliding(analysis: Analysis) -> list[Part]:
         low, high = sliding.interval(name)
         plot = _over(recording, f'{title} in a sliding window of {sliding.window:g} s', unit,
                      200, log=True)
-        # One window without information must not flatten the others.
+        # Keep one very uncertain window from compressing the scale.
         plot.limits(y=span([value, low, high], log=True, trim=0.01))
         plot.band(t, low, high, '95 % interval').line(t, value, 'estimate', style='thick')
         drawn.append(Figure(plot))

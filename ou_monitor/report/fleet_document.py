@@ -243,7 +243,7 @@ def shown(values: Values, value: float | FloatArray) -> str:
 
 
 def _plain(values: Values, value: float | FloatArray) -> str:
-    """Return one value without its unit, of a pack in thousandths."""
+    """Return one value without its unit; resistance and sag in thousandths (mOhm, mV)."""
     return number(_thousandths(values.name) * float(values.shown(value)))
 
 

@@ -64,17 +64,17 @@ class Scores:
     # As in `View`; shape (n,).
     z: FloatArray
     phi: FloatArray
-    # Median standard deviation of the innovations, over each innovation's own; shape (n,).
+    # Median standard deviation of the innovations, divided by each one's own; shape (n,).
     unit: FloatArray
     # Gain of the filter at the previous sample; shape (n,).
     trust: FloatArray
     step: float  # Time between samples, s
-    # How far the filter has followed the states up to two samples ago, in states; shape (n,).
+    # How far the filter has followed the states up to two samples ago, in levels; shape (n,).
     followed: FloatArray
 
     @classmethod
     def of(cls, view: View) -> Scores:
-        """Return the scores of a view, with nothing followed."""
+        """Return the scores of a view, with `followed` still zero."""
         unit: FloatArray = np.sqrt(float(np.median(view.variance)) / view.variance)
         trust = np.concatenate(([1.0], np.broadcast_to(view.trust, view.z.shape)[:-1]))
         if float(np.median(trust)) > _ALL:
@@ -140,10 +140,11 @@ class Scores:
 
 
 def _direct(s: Scores, at_once: float, middle: float, states: int) -> FloatArray:
-    """Return the error that each pair of states predicts, in levels, if nothing is followed."""
+    """Return the error that each pair of states predicts, in levels, while `followed` is zero."""
     direct = np.empty((states, states, s.z.size))
     for i, j in np.ndindex(states, states):
-        # The new level less the filter's prediction from the old one, or the pull to the level.
+        # If at_once, the new level less the filter's prediction from the old one; otherwise the
+        # pull towards the old one.
         direct[i, j] = ((j - middle) - s.phi * s.trust * (i - middle) if at_once
                         else (1.0 - s.phi) * (i - middle))
     return direct
@@ -303,7 +304,7 @@ class RegimeSwitching(Term):
     rate_up: float = parameter('1/s', 'rate of switching to each higher state', 0.0, above=True)
     rate_down: float = parameter('1/s', 'rate of switching to each lower state', 0.0, above=True)
     level: float = parameter('V', 'voltage that each further state adds')
-    sigma_ratio: float = parameter('', 'sigma in a state over that in the state below', 0.0)
+    sigma_ratio: float = parameter('', 'ratio of sigma to sigma in the state below', 0.0)
     at_once: float = parameter(
         '', 'share of the level that acts at once; the rest relaxes at alpha', 0.0, 1.0)
     states: float = parameter('', 'number of states, 2 or 3', 2.0, 3.0)
@@ -453,8 +454,8 @@ class RegimeSwitching(Term):
         states = int(self.states)
         law = stationary_law(rates_between(self.rate_up, self.rate_down, states))
         square = float(law @ np.exp(2.0 * ratio * np.arange(states)))
-        # Two scales: one for which the scores have their mean square (1 if levels are clear), and
-        # 1, for an `ou` that already has the sigma of the lowest state.
+        # Two starting scales: one gives the scores their mean square (taken as 1 if levels are
+        # clear); the other is 1, for an `ou` that already has the sigma of the lowest state.
         mean = float(np.mean(view.z[view.train] ** 2)) if abs(self.level) < unit else 1.0
         starts = [np.array([math.log(self.rate_up), math.log(self.rate_down), self.level / unit,
                             ratio, scale])
@@ -571,7 +572,7 @@ def _slow_levels(view: View) -> tuple[FloatArray | None, float, int]:
     return np.array([x[0], x[1], x[2] * spread / unit, 0.0, 0.0]), best[0] - least, best[2]
 
 
-# Factors by which the rail may relax faster than it seems to because of levels.
+# Factors by which the rail may relax faster than in a fit without levels.
 _FASTER = 1.0, 3.0, 9.0
 # Minimum evidence to try slow levels, nats.
 _SLOW_AHEAD = 8.0

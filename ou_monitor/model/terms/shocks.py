@@ -223,7 +223,7 @@ def _scored(view: View, bad: npt.NDArray[np.bool_], share: float, spread: float,
 
 def _alike(e: FloatArray, bad: npt.NDArray[np.bool_], train: slice, spread: float
            ) -> tuple[float, float]:
-    """Return the regression of an error on the previous one of its run, and the rest, V."""
+    """Return the regression of an error on the one before in its run, and its residual std, V."""
     e, bad = e[train], bad[train]
     second = np.flatnonzero(bad[1:] & bad[:-1]) + 1
     if second.size < _PAIRS:
@@ -274,7 +274,7 @@ def _best_runs(begin: npt.NDArray[np.int64], end: npt.NDArray[np.int64], gain: F
     """Return the samples of the best set of runs (weighted interval scheduling)."""
     order = np.argsort(end, kind='stable')
     begin, end = begin[order], end[order]
-    # A run uses the innovations up to its end: the number of runs that end before each begins.
+    # For each run, how many end before it begins (a run also uses the innovation at its end).
     clear = np.searchsorted(end, begin, side='left').tolist()
     best, taken = [0.0], []
     for value, k in zip(gain[order].tolist(), clear, strict=True):
@@ -388,9 +388,9 @@ def _cells(z: FloatArray, share: FloatArray) -> tuple[FloatArray, FloatArray, Fl
     return (np.bincount(cell, z * z) / count, np.bincount(cell, share) / count, count)
 
 
-# Share of the variance from which the Student-t counts as the only noise.  Beside white noise, a
-# power for each sample would explain that noise too, and the next fit would find none; without
-# powers the variance is still right.
+# Share of the variance from which the Student-t counts as the only noise, and each sample gets a
+# power.  If there is white noise, the powers would explain it too, and the next fit would find
+# none; without powers the variance is still right.
 _ALONE = 0.99
 # Points of the variance, and the probability outside them; bins of share, and number and width of
 # the bins of scores, in a fit.

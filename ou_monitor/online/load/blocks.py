@@ -5,9 +5,9 @@ Blocks have equal throttle, at most about 50 per second.  Limits: an incomplete 
 returned, so a fast source is followed 20 ms late; of several throttle changes within 20 ms only
 the first three are resolved.
 
-Delay: the voltage, without changes slower than a second, is correlated with throttle 0 to 200 ms
-late; the largest correlation wins.  A source slower than 7 Hz does not determine the delay.  A new
-delay is used only if it leaves a quarter less variance than the present one.
+Delay: the voltage, without changes slower than a second, is correlated with throttle that is taken
+to be 0 to 200 ms late; the largest correlation wins.  A source slower than 7 Hz does not determine
+the delay.  A new delay is used only if it leaves a quarter less variance than the present one.
 
 Noise: ln variance = b . (1, ripple(u), sqrt|du|), learned by Fisher scoring; in a mean of n
 samples, the part that varies within a block is divided by n.
@@ -50,7 +50,7 @@ class LoadBlock:
 
 
 class LoadBlocks:
-    """Collects samples into blocks; one 15 ms or more after the last forms a block of its own."""
+    """Collects samples into blocks; a sample 15 ms or more after the last is its own block."""
 
     def __init__(self) -> None:
         self.forget()
@@ -201,7 +201,7 @@ class LoadDelay:
 
     @property
     def unrelated(self) -> bool:
-        """Whether the correlations in segments of 2 s are not below zero, by a t-test."""
+        """Whether the mean correlation of 2 s segments is not significantly negative (t-test)."""
         if self._pieces < _FEWEST:
             return False
         now = DELAYS.index(self.delay)
@@ -233,8 +233,8 @@ DIVERGED = 1e12
 _SAME = 1e-6
 # Minimum change of throttle.
 _HELD = 1e-3
-# Memory of the noise, in corrections; at first a third of those so far, because the coefficients
-# are still wrong.
+# Memory of the noise, in updates: maximum, initial value, and growth per update; short at first,
+# while the coefficients are still wrong.
 _NOISE_MEMORY, _NOISE_FIRST, _NOISE_SHARE = 2000.0, 50.0, 1.0 / 3.0
 
 
@@ -243,7 +243,7 @@ def _dot(x: Sequence[float], y: Sequence[float]) -> float:
 
 
 class LoadNoise:
-    """Noise of blocks of samples; volts: of the pack, V."""
+    """Noise of blocks of samples; volts: voltage of the pack."""
 
     def __init__(self, volts: float, b: tuple[float, float, float] | None = None) -> None:
         # Prior: 0.4 % of the voltage, with the usual effect of ripple and changes of throttle; or
@@ -277,7 +277,7 @@ class LoadNoise:
 
     @property
     def ripple_se(self) -> float:
-        """Return the standard error of the second b."""
+        """Return the standard error of b[1], the coefficient of ripple."""
         return math.sqrt(max(self._covariance[1][1], 0.0))
 
     @property
