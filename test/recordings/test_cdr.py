@@ -54,7 +54,9 @@ def one_by_one(spec, text, messages, table):
         held = np.empty(0) if raw is None else numbers(raw)
         if held is None or (raw is not None and held.ndim and spec.sample_rate is None):
             return None
-        held = np.atleast_1d(held) * (spec.sign * spec.unit_factor) + spec.offset
+        # Random bytes may be a signalling NaN.
+        with np.errstate(invalid='ignore'):
+            held = np.atleast_1d(held) * (spec.sign * spec.unit_factor) + spec.offset
         held[~np.isfinite(held)] = np.nan
         if raw is None and spec.sample_rate is None:
             held = np.array([np.nan])
