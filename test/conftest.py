@@ -12,7 +12,9 @@ _ROS = ('nodes/', 'test_package.py', 'test_scripts.py', 'test_readme.py')
 
 
 # A machine that is busy with something else generates examples slowly.
-settings.register_profile('suite', deadline=None, suppress_health_check=[HealthCheck.too_slow])
+# The same examples in every run; `--hypothesis-profile=hunt` draws others.
+settings.register_profile('hunt', deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile('suite', settings.get_profile('hunt'), derandomize=True)
 settings.load_profile('suite')
 
 
