@@ -273,3 +273,31 @@ def test_fits_add_up_their_cost():
     assert one.cost > 0.0 and fitter.cost == one.cost
     two = fitter.whole(one)
     assert_allclose(fitter.cost, one.cost + two.cost)
+
+
+def test_a_cause_that_was_removed_again_is_not_accepted_twice(monkeypatch):
+    """Otherwise it takes all turns, and the other causes are never tried."""
+    asked = []
+
+    def tried(fitter, search, bank, given, latent):
+        asked.append(list(given))
+        found = SimpleNamespace(gaussian=SimpleNamespace(cost=math.inf))
+        return [] if 'drift' in given else [Trial('drift', found, 9.0)]
+
+    monkeypatch.setattr(rules, '_round', tried)
+    monkeypatch.setattr(rules, 'backward', lambda fitter, search: search.accepted.clear())
+    rules.name_causes(SimpleNamespace(cost=0.0), Search(None), None, given=['tone'])
+    assert asked == [['tone'], ['tone', 'drift']]
+
+
+@pytest.mark.parametrize('on_sigma, leaves', [(0.0, False), (0.1, False), (3.0, True)])
+def test_sigma_follows_only_if_all_simulations_stay_in_the_recorded_range(on_sigma, leaves):
+    """A factor of 20 on white noise is one of 8000 on sigma by its third power."""
+    t = 0.01 * np.arange(2000)
+    u = (np.sin(t) > 0.9).astype(float)
+    law = LoadDependentNoise((0.0, 0.0), (0.0, 1.0), (0.0, math.log(20.0)))
+    terms = (OU(8.0, 0.02, 15.0), MeasurementNoise(0.002), law)
+    fitter = Fitter(Samples(t, SupplyModel(terms).simulate(t, np.random.default_rng(1), u), u))
+    model = SimpleNamespace(terms=(*terms[:2], LoadDependentNoise(
+        law.number, law.at, law.log_factor, on_sigma)))
+    assert rules._leaves(fitter, model) is leaves
