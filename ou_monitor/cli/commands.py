@@ -107,6 +107,15 @@ def band(text: str) -> tuple[float, float]:
     return low, high
 
 
+def ends(text: str) -> str:
+    """Check a unit of a throttle, or its ends."""
+    low, _, high = text.partition(':')
+    read = number('1, %, us or the ends LOW:HIGH, such as 364:1684', math.isfinite)
+    if text not in ('1', '%', 'us') and read(low) == read(high):
+        raise argparse.ArgumentTypeError(f"'{text}' must have two different ends")
+    return text
+
+
 FLIGHT = whole('a number from 1 on', 1)
 NUMBER = number('a number', math.isfinite)
 POSITIVE = number('a positive number', lambda value: 0.0 < value < math.inf)
@@ -138,9 +147,9 @@ CSV = (
     Option('--unit', choices=('V', 'mV'), help='unit of the voltage in a CSV (default: detected)'),
     Option('--time-unit', choices=('s', 'ms', 'us', 'ns'),
            help='unit of the time in a CSV (default: detected)'),
-    Option('--throttle-unit', choices=('1', '%', 'us', '1024', '65535'),
-           help='unit of the throttle in a CSV: 0..1, percent, a pulse of 1000 to 2000 us, -1024 '
-           'to 1024, or 0 to 65535 (default: detected)'),
+    Option('--throttle-unit', metavar='{1,%,us,LOW:HIGH}', type=ends,
+           help='unit of the throttle in a CSV: 0..1, percent, a pulse of 1000 to 2000 us, or '
+           'its ends, such as 364:1684 or (with =) =-1024:1024 (default: detected)'),
     Option('--sample-interval', metavar='S', type=POSITIVE,
            help='time from row to row of a CSV, s, in place of a column'),
     Option('--delimiter', metavar='C',

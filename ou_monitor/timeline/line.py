@@ -370,8 +370,8 @@ def check_throttle(name: str, throttle: FloatArray, voltage: FloatArray | None =
             f'{known.min():g} to {known.max():g}: are the two columns swapped?')
     raise InputError(
         f'{name}: throttle runs from {known.min():g} to {known.max():g}, and 0 to 1 is '
-        'expected: divide a percentage by 100 (of a bag: unit_factor of a msg config), turn '
-        'a pulse of w microseconds into (w - 1000) / 1000')
+        'expected: state its ends (of a CSV: --throttle-unit LOW:HIGH; of a bag: unit_factor '
+        'of a msg config)')
 
 
 def hold(values: FloatArray) -> FloatArray:

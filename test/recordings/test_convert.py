@@ -72,7 +72,7 @@ def test_json_goes_to_standard_output_or_a_file(log, tmp_path, capsys):
     ('time_s,voltage_v\n1.7e12,5\n1.8e12,5\n', ['log.csv', 'out'],
      ["1e+11 s apart by 'time_s'", 'in ms']),
     ('time_s,voltage_v,throttle\n0,5,400\n1,5,500\n', ['log.csv', 'out'],
-     ['throttle runs from 400 to 500', 'percentage']),
+     ['throttle runs from 400 to 500', '--throttle-unit LOW:HIGH']),
     ('time_s,bus\n0,5\n1,5\n', ['log.csv', 'out'], ["no column 'voltage_v'", '--voltage']),
 ])
 def test_bad_input_exits_with_2(tmp_path, monkeypatch, capsys, log_text, arguments, words):

@@ -55,22 +55,29 @@ TIME_WORDS = {
     'msec': 'ms', 'millis': 'ms', 'millisecond': 'ms', 'milliseconds': 'ms', 'us': 'us',
     'µs': 'us', 'μs': 'us', 'usec': 'us', 'micros': 'us', 'microseconds': 'us', 'ns': 'ns',
     'nsec': 'ns', 'nanoseconds': 'ns'}
-VOLT_WORDS = {'v': 'V', 'volt': 'V', 'volts': 'V', 'vdc': 'V', 'mv': 'mV', 'millivolt': 'mV',
-              'millivolts': 'mV'}
-AMPERE_WORDS = {'a': 'A', 'amp': 'A', 'amps': 'A', 'ampere': 'A', 'amperes': 'A', 'ma': 'mA',
-                'µa': 'uA', 'μa': 'uA', 'ua': 'uA'}
+VOLT_WORDS = {'v': 'V', 'volt': 'V', 'volts': 'V', 'vdc': 'V', 'mv': 'mV', 'mvdc': 'mV',
+              'millivolt': 'mV', 'millivolts': 'mV', 'cv': 'cV', 'dv': 'dV'}
+AMPERE_WORDS = {'a': 'A', 'amp': 'A', 'amps': 'A', 'ampere': 'A', 'amperes': 'A', 'adc': 'A',
+                'da': 'dA', 'ca': 'cA', 'ma': 'mA', 'madc': 'mA', 'µa': 'uA', 'μa': 'uA',
+                'ua': 'uA'}
 SHARE_WORDS = {'%': '%', 'percent': '%', 'pct': '%', 'prozent': '%'}
 # Other units, which a line of units holds beside those.
 OTHER_WORDS = frozenset((
     '', '-', 'sequence', 'w', 'wh', 'ah', 'mah', 'hz', 'khz', 'rpm', '1/min', '°', 'deg', '°c',
     'degc', '°f', 'm', 'm/s', 'km/h', 'g', 'kg', 'n', 'nm', 'ohm', 'mohm'))
 WORDS = {**TIME_WORDS, **VOLT_WORDS, **AMPERE_WORDS, **SHARE_WORDS}
+# Units in V, A, s and 1; the last letter is the quantity.
+SCALES = {**TIME_UNITS, 'V': 1.0, 'dV': 0.1, 'cV': 0.01, 'mV': 1e-3, 'A': 1.0, 'dA': 0.1,
+          'cA': 0.01, 'mA': 1e-3, 'uA': 1e-6, '%': 0.01}
 # A quantity with one of these words at the end of its name, preferably in brackets.  Repetitions
 # after the quantity are bounded, so that the time is proportional to the length of a name.
 _WORD = f"({'|'.join(sorted(WORDS, key=len, reverse=True))})"
 _WITH_UNIT = re.compile(
     rf'(.*?) ?[\[({{] ?{_WORD} ?[\])}}]|(.+?) in {_WORD}|(.[^/]*?|.+? ) ?/ ?{_WORD}|'
     rf'(.+?)[ _]{_WORD}')
+# Volts*100; current (10 mA).
+_MULTIPLE = re.compile(r'(.*?)(?: ?\* ?(10+)|([\[(] ?)(10+|0?\.0*1) ?([a-zµμ%]+ ?[\])]))',
+                       re.IGNORECASE)
 _NAMES = re.compile(r'[^\s\[(]+(?: ?[\[(][^\])]*[\])])?')
 # A number with groups of thousands and decimals, or with a unit.
 _GROUPED = re.compile(r'[-+]?\d{1,3}(?:,\d{3})+\.\d+')
@@ -79,8 +86,9 @@ _AND_UNIT = re.compile(r'(\S*[\d.])\s*+([^\d\s.]{1,12}+(?: [AaDd][Cc])?)')
 _NUMBER = r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?'
 # Possessive, so that lines of blanks cost no more than their length.
 _INTERVAL = re.compile(
-    r'(sampl(?:e|ing)[ _]*(?:interval|period|time)|t_?inc(?:rement)?|x[ _-]?inc(?:rement)?|'
-    r'increment|delta[ _]?t|h_?resolution|sampl(?:e|ing)[ _]*(?:rate|frequency))\b'
+    r'((?:sampl(?:e|ing)|time)[ _]*(?:interval|period)|sampl(?:e|ing)[ _]*time|'
+    r't_?inc(?:rement)?|x[ _-]?inc(?:rement)?|increment|delta[ _]?t|h_?resolution|'
+    r'sampl(?:e|ing)[ _]*(?:rate|frequency))\b'
     r'["\s]*+(?:[\[(](\w+)[\])])?+'
     rf'[\s"=:,;]*+(?:\w+:)?[\s"]*+({_NUMBER})\s*+(n|u|µ|m|k|M|G)?(s|sec|hz|sa/s)?',
     re.IGNORECASE)
@@ -90,6 +98,10 @@ CLOCK = re.compile(
     r'\s*+(?:(\d{4})[-/.](\d\d?)[-/.](\d\d?)|(\d\d?)([./-])(\d\d?)[./-](\d{4}|\d\d))?+[T ,]*+'
     r'(?:(\d\d?):([0-5]\d)(?::([0-5]\d|60)(?:[.,:](\d{1,9}))?)?)?+\s*+'
     r'(Z|UTC|[-+](?:0\d|1[0-4]):?[0-5]\d)?+\s*+([AaPp][Mm])?+\s*+')
+_MONTHS = 'jan feb mar apr may jun jul aug sep oct nov dec'
+_MONTH = re.compile(rf"[- ]({_MONTHS.replace(' ', '|')})[a-z]*[- ]", re.IGNORECASE)
+# A serial monitor's time before the first cell: 10:15:23.123 -> 12.3
+_RECEIVED = re.compile(r'\[?(\d\d:\d\d:\d\d[.,]\d+)(?:\]| -?>) *')
 CHANNEL = re.compile(r'(?:ch|channel|chan|kanal|analog)[_ ]?[0-9a-d]|a[0-3]', re.IGNORECASE)
 
 
@@ -208,16 +220,19 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool, sk
 def _after_names(rows: list[list[str]], skip: int, first: int, width: int, places: list[int],
                  ) -> int:
     """Return the first row below the names; `first` is the first without a bad cell."""
-    full = [k for k in range(skip, first) if len(rows[k]) == width]
-    numeric = [any(is_value(rows[k][place]) for place in places) for k in full]
-    names = max((k for k, some in zip(full, numeric) if not some and all(
-        rows[k][place] for place in places)), default=first)
-    return next((k for k, some in zip(full, numeric)
-                 if k > names and some and not _are_units(rows[k])), first)
+    filled = [k for k in range(skip, first) if any(rows[k])]
+    numeric = [k for k in filled if len(rows[k]) == width and any(
+        is_value(rows[k][place]) for place in places)]
+    names = max(set(filled).difference(numeric), default=first)
+    if names == first or len(rows[names]) != width or not all(rows[names][k] for k in places):
+        return first
+    return next((k for k in numeric if k > names and not _are_units(rows[k])), first)
 
 
 def _prepared(lines: list[str], delimiter: str, comma: bool) -> list[str]:
     """Return lines with decimal points, and single blanks if blanks separate the cells."""
+    if lines and _RECEIVED.match(lines[0]):
+        lines = [_RECEIVED.sub(rf'\1{delimiter}', line, count=1) for line in lines]
     if comma:
         # A point becomes a comma, so that a thousands separator is not taken for a decimal mark.
         lines = ['\0'.join(line.split('.')).replace(',', '.').replace('\0', ',')
@@ -261,20 +276,31 @@ def is_clock(cell: str) -> bool:
 
 
 def swapped(cell: str) -> str:
-    """Return a date whose points were taken for decimal marks, with points again."""
+    """Return a date with a number for the month, and points that were taken for decimal marks."""
+    if found := _MONTH.search(cell):
+        month = 1 + _MONTHS.index(found[1].lower()) // 4
+        cell = f'{cell[:found.start()]}-{month}-{cell[found.end():]}'
     return cell.replace(',', '.') if cell.count(',') > 1 else cell
 
 
 def unit_of(name: str) -> tuple[str, str]:
     """Split a name into its quantity and the unit it states, in lower case; '': none."""
     text = ' '.join(name.strip().strip('\'"').split())
-    if found := re.match(r'(millis|micros|ms|us|ns)(?![A-Za-z])', text):
+    if found := _MULTIPLE.fullmatch(text):
+        text = found[1] + (found[3] or '') + (found[5] or '')
+    if found := re.match(r'(milli(?:second)?s|micro(?:second)?s|[mun]s)(?![a-z])', text.lower()):
         return text, found[1]
     found = _WITH_UNIT.fullmatch(text.lower()) or re.fullmatch(r'(CH\d+)(V|A)', text)
     if found is None or CHANNEL.fullmatch(text):
         return text, ''
     quantity, unit = (part for part in found.groups() if part is not None)
     return quantity, unit.lower()
+
+
+def factor_of(name: str) -> float:
+    """Return the factor to the unit in a name: 0.01 of 'Volts*100', 10 of 'I (10 mA)'."""
+    found = _MULTIPLE.fullmatch(' '.join(name.split()))
+    return 1.0 if found is None else 1.0 / float(found[2]) if found[2] else float(found[4])
 
 
 def _header(rows: list[list[str]], lines: list[str], first: int, width: int, delimiter: str,
@@ -287,7 +313,9 @@ def _header(rows: list[list[str]], lines: list[str], first: int, width: int, del
     if len(above) > 1 and (_are_units_of_channels(rows[above[-2]], rows[above[-1]]) or _are_units(
             rows[above[-1]]) and len(rows[above[-2]]) >= min(width, len(rows[above[-1]]))):
         units = [cell.strip('[](){} ').lower() for cell in rows[above.pop()]]
-    if above:
+    # An index at the left has no name, any other column has one.
+    if above and all(rows[above[-1]][k:k + 1] != [''] or not any(
+            row[k:k + 1] not in ([], ['']) for row in rows[first:]) for k in range(1, width)):
         names, line = rows[above[-1]], above[-1] + 1
     else:
         # A header marked as a comment.
@@ -303,6 +331,11 @@ def _header(rows: list[list[str]], lines: list[str], first: int, width: int, del
     names = names or [f'column {k + 1}' for k in range(width)]
     stated = [units[k] if k < len(units) and units[k] in WORDS else unit_of(name)[1]
               for k, name in enumerate(names)]
+    # Else the unit of a channel in a line above, such as 'Vertical Units,V,CH2:A'.
+    for k, cell in ((k, cell) for row in rows[:first] if row and 'unit' in row[0].lower()
+                    for k, cell in enumerate(row[1:len(stated)], 1) if not stated[k]):
+        word = cell.split(':')[-1].strip().lower()
+        stated[k] = word if word in VOLT_WORDS or word in AMPERE_WORDS else ''
     # Else the unit behind the first number of the column.
     for k, unit in enumerate(stated):
         cell = next((row[k] for row in rows[first:] if k < len(row) and is_number(row[k])), '0')
@@ -326,11 +359,12 @@ def _are_units_of_channels(names: list[str], row: list[str]) -> bool:
 
 
 def _are_units(row: list[str]) -> bool:
-    """Return whether cells are units, in brackets, numbers, or blank, and some are units."""
+    """Return whether cells are units, in brackets, numbers, or blank, save a few of several."""
     words = [cell.strip('[](){} ').lower() for cell in row]
-    return any(word in WORDS for word in words) and all(
-        word in WORDS or word in OTHER_WORDS or is_number(word) or cell[0] in '[({'
-        for cell, word in zip(row, words))
+    some = sum(word in WORDS for word in words)
+    others = sum(word not in WORDS and word not in OTHER_WORDS and not is_number(word)
+                 and cell[0] not in '[({' for cell, word in zip(row, words))
+    return some > 1 and some >= others or some == 1 and not others
 
 
 def _stated_step(lines: list[str], above: list[list[str]]) -> tuple[float, float, str]:
@@ -486,9 +520,10 @@ def _floats(cells: Sequence[str], where: Callable[[int], str], comma: bool, stat
     for k, cell in enumerate(cells):
         try:
             value, unit = number_of(cell)
+            value *= _ratio(unit, stated)
         except ValueError:
-            value, unit = math.nan, ''
-        if value == value and unit in ('', stated):
+            value = math.nan
+        if value == value:
             found.append(value)
         elif cell.strip().lower() in MISSING:
             found.append(math.nan)
@@ -505,6 +540,13 @@ def _floats(cells: Sequence[str], where: Callable[[int], str], comma: bool, stat
             good[k] = False
             found.append(math.nan)
     return np.array(found, dtype=np.float64)
+
+
+def _ratio(unit: str, stated: str) -> float:
+    """Return the factor from the unit of a cell to its column's; NaN: another quantity."""
+    one, other = WORDS.get(unit, ''), WORDS.get(stated, '')
+    return 1.0 if not unit or unit == stated else (
+        SCALES[one] / SCALES[other] if one[-1:] == other[-1:] else math.nan)
 
 
 def _place(path: Path, form: Form, place: int, begin: int, rows: list[list[str]], k: int) -> str:

@@ -23,9 +23,9 @@ import numpy as np
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.importers import log as logs
 from ou_monitor.recordings.importers.csv_form import (
-    AMPERE_WORDS, CHANNEL, CLOCK, Form, form_of, is_clock, is_number, is_value, MISSING, number_of,
-    numbers, SHARE_WORDS, shown, swapped, THROTTLE, TIME, TIME_WORDS, unit_of, VOLT_WORDS,
-    VOLTAGE)
+    AMPERE_WORDS, CHANNEL, CLOCK, factor_of, Form, form_of, is_clock, is_number, is_value, MISSING,
+    number_of, numbers, SCALES, SHARE_WORDS, shown, swapped, THROTTLE, TIME, TIME_WORDS, unit_of,
+    VOLT_WORDS, VOLTAGE)
 from ou_monitor.recordings.importers.log import (
     ANY, CsvColumns, Log, one_flight, RawColumns, Request, Series)
 from ou_monitor.records import (
@@ -35,12 +35,11 @@ from ou_monitor.timeline.line import hold, MOST_THROTTLE, WILD
 
 CURRENT = 'current_a'
 NONE = 'none'
-VOLTAGE_UNITS = {'V': 1.0, 'mV': 1e-3}
-# Unit -> offset to subtract, factor; '1024': sticks of EdgeTX, -1024 to 1024; '65535': thrust of a
-# Crazyflie.
-THROTTLE_UNITS = {'1': (0.0, 1.0), '%': (0.0, 0.01), 'us': (1000.0, 1e-3),
-                  '1024': (-1024.0, 1.0 / 2048.0), '65535': (0.0, 1.0 / 65535.0)}
-CURRENT_UNITS = {'A': 1.0, 'mA': 1e-3, 'uA': 1e-6}
+# Unit -> ends of the throttle; other ends are written LOW:HIGH.
+THROTTLE_UNITS = {'1': (0.0, 1.0), '%': (0.0, 100.0), 'us': (1000.0, 2000.0)}
+_PULSE_WORDS = {word: unit for word, unit in TIME_WORDS.items() if unit == 'us'}
+# Ends of sticks that are centred at 0: EdgeTX, DJI, 16 bits.
+_STICKS = (1024, 10000, 32768)
 # Maximum columns listed; autopilots log a few hundred.
 MOST_COLUMNS = 300
 # Share of backward steps above which a column is not a time.
@@ -55,12 +54,13 @@ _MOST_VOLTS = 1000.0
 
 # Quantity -> patterns of the end of a column's name without its unit, the best first; in lower
 # case, other characters as '_'.  From the exports named in test_csv_exports.py.
-_VALUE_NAME = r'_?(?:values?|reading|data|wert|messwert)?'
+_VALUE_NAME = r'_?(?:values?|reading|data|ampl(?:itude)?|wert|messwert)?'
 _TIME_NAME, _INDEX_NAME = 'time', r'sequence|index|sample|no|n|x|point|'
 _PATTERNS = {
     _TIME_NAME: (
         r'time_s',
-        r'(?:__|_)?time|t|zeit|ms_today|millis|micros|elapsed(?:_time)?|x_axis|x_value|seconds?',
+        r'(?:__|_)?time|t|zeit|ms_today|millis|micros|elapsed(?:_time)?|x_axis|x_value|'
+        r'(?:milli|micro)?seconds?',
         r'timestamp|date_?time|datum_?(?:und_)?(?:uhr)?zeit|temps|tiempo|tempo|uhrzeit',
         r'.*(?:time|zeit|stamp).*', r'date|datum'),
     logs.VOLTAGE: (
@@ -73,15 +73,15 @@ _PATTERNS = {
         r'(?!.*(?:axis|cell|temp|limit|zelle|motor|servo|rssi|phase|cpu|mcu|5v|sag)).*(?:volt|'
         r'spannung|vbat).*'),
     logs.THROTTLE: (
-        r'throttle', r'thr(?:ottle)?_?(?:out|cmd|command|pct|percent)?|ga[sz]|duty(?:_cycle)?|'
-        r'tho?o|tastgrad|tastverh.*',
+        r'throttle', r'thr(?:ottle)?_?(?:out|cmd|command|pct|percent)?|ga[sz]|'
+        r'acelerador|duty(?:_cycle)?|tho?o|tastgrad|tastverh.*',
         r'rc_?command_3', r'pwm|thrust|gas_?kanal|esc(?:_signal)?|'
         r'(?!.*(?:limit|trim|max|min)).*throttle.*'),
     logs.CURRENT: (
         r'current_a', r'amperage(?:_?latest)?|current_in|i_?bat(?:t|tery)?|'
         r'batt?(?:ery)?_?(?:i|curr(?:ent)?|amps?)|current_?batt?(?:ery)?|'
-        r'(?:.*_)?(?:bus|input|supply|main|pack)_?current|i_?bus|curr',
-        r'i|amps?|current|strom|courant|corriente'),
+        r'(?:.*_)?(?:bus|input|supply|main|pack|total)_?current|i_?bus|curr',
+        r'(?:i|curr(?:ent)?|amps?|strom|courant|corriente)(?:_(?:avg|average|mean))?(?:_?1)?'),
 }
 # Column that identifies a program -> units of its columns, not stated there.  Betaflight's
 # blackbox explorer writes the numbers of the log: us, 0.01 V and 0.01 A from version 4.0 on.
@@ -138,7 +138,7 @@ def read_csv(path: Path, columns: CsvColumns | None = None, *, partial: bool = F
                    if quantity != logs.CURRENT}
     # A blank cell is not a message: the last command holds.
     return RawColumns(table.t, volts, hold(held.get(logs.THROTTLE, nothing)),
-                      held.get(logs.CURRENT, nothing), name, source, tuple(said))
+                      hold(held.get(logs.CURRENT, nothing)), name, source, tuple(said))
 
 
 def read(path: Path, request: Request) -> Log:
@@ -228,9 +228,11 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
             # Cells of a pack; those that are not there are unknown.
             column_values = column_values + sum(np.where(np.isfinite(cell) & (
                 cell != 65535.0), cell, 0.0) for cell in values[len(found) + len(others):])
+        column_values = column_values * factor_of(column.name)
         si, guesses[quantity] = _of_mavlink(
             column, column_values, wanted.unit, guesses.get(logs.VOLTAGE, '')) or _in_si(
-                quantity, column, column_values, units.get(quantity), volts)
+                quantity, column, column_values, units.get(quantity), volts,
+                guesses.get(logs.VOLTAGE, ''))
         scaled[quantity] = column, si
     note = _read_note(form, time, found, guesses, wanted.throttle is None)
     return _Table(form, t, scaled, dict(zip(others, values[len(found):])), note)
@@ -257,10 +259,11 @@ def _choose(form: Form, quantity: str, taken: Sequence[int] = ()) -> list[int]:
     plain = [name if name is None else name or 'time' if form.names[k].strip('_% ') else name
              for k, name in enumerate(plain)]
     ends = [name if name is None else re.sub(r'\W+', '_', re.split(
-        r'[/.](?=[^/.])', form.names[k].strip().lower())[-1]).strip('_')
+        r'[/.:](?=[^/.:])(?![^\[(]*[\])]$)', form.names[k].strip().lower())[-1]).strip('_')
         for k, name in enumerate(plain)]
     kinds: dict[str, dict[str, str]] = {
-        _TIME_NAME: TIME_WORDS, logs.VOLTAGE: VOLT_WORDS, logs.CURRENT: AMPERE_WORDS}
+        _TIME_NAME: TIME_WORDS, logs.VOLTAGE: VOLT_WORDS, logs.CURRENT: AMPERE_WORDS,
+        logs.THROTTLE: {**SHARE_WORDS, **_PULSE_WORDS}}
     right = kinds.get(quantity, {})
     free = [k for k in range(len(plain)) if k not in taken and plain[k] is not None
             and _of_kind(form, k, quantity == _TIME_NAME)]
@@ -274,7 +277,7 @@ def _choose(form: Form, quantity: str, taken: Sequence[int] = ()) -> list[int]:
             return sorted(found, key=lambda k: form.units[k] not in right)
     others = '|'.join(pattern for name, patterns in _PATTERNS.items() if name != quantity
                       for pattern in patterns[:3])
-    found = [k for k in free if right and form.units[k] in right
+    found = [k for k in free if quantity != logs.THROTTLE and form.units[k] in right
              and not re.fullmatch(others, plain[k] or ' ')]
     if not found and quantity == logs.VOLTAGE:
         found = [k for k in free if CHANNEL.fullmatch(plain[k] or ' ')]
@@ -304,15 +307,16 @@ def _time_of(path: Path, form: Form, wanted: CsvColumns) -> _Column:
         beside = [k for k in range(min(form.width, len(form.names))) if k != first and any(
             k < len(row) and _has_day(row[k]) and ':' not in row[k] for row in form.rows[:3])]
         cells = [row[first] for row in form.rows if first < len(row)]
-        if (parts := _parts_of_second(form, first)) is not None:
-            return _Column((first, parts), f'{form.names[first]}, {form.names[parts]}', 's', 0.0)
+        if parts := _parts_of_second(form, first):
+            return parts
         if beside and cells and ':' in cells[0] and not _has_day(cells[0]):
             return _Column((beside[0], first),
                            f'{form.names[beside[0]]}, {form.names[first]}', 's', 0.0)
         return _unit_column(form, first, wanted.time_unit)
     filled = _nameless_columns(form)
     if len(filled) > 1 and _rises(form, filled[0]):
-        return _unit_column(form, filled[0], wanted.time_unit)
+        return _parts_of_second(form, filled[0]) or _unit_column(
+            form, filled[0], wanted.time_unit)
     if not math.isfinite(form.step):
         raise InputError(_absent(
             path, form, TIME, ' (--time-column or --sample-interval)'))
@@ -334,15 +338,23 @@ def _tells_apart(form: Form, place: int) -> bool:
     return 2 * len(set(cells)) > len(cells) or len(cells) < _FEW_ROWS
 
 
-def _parts_of_second(form: Form, clock: int) -> int | None:
-    """Return the column of milliseconds beside a clock in whole seconds, if there is one."""
+def _parts_of_second(form: Form, clock: int) -> _Column | None:
+    """Return a time in whole seconds with the column of ms or ns beside it, if there is one."""
     cells = [row[clock] for row in form.rows if clock < len(row)]
-    if _tells_apart(form, clock) or not all(re.search(r':\d\d:\d\d$', cell) for cell in cells):
+    if all(map(str.isdigit, cells)):
+        unit, pattern = 'ns', r'.*n(?:ano)?_?se?cs?'
+        rest = [clock + 1] if not form.line and clock_unit(float(cells[0])) == 's' else []
+    elif not _tells_apart(form, clock) and all(
+            re.search(r':\d\d:\d\d$', cell) for cell in cells):
+        unit, pattern, rest = 'ms', 'ms|millis|milliseconds', []
+    else:
         return None
-    return next((k for k, name in enumerate(form.names[:form.width])
-                 if name.strip().lower() in ('ms', 'millis', 'milliseconds') and all(
-                     k < len(row) and re.fullmatch(r'\d{1,3}', row[k]) for row in form.rows)),
-                None)
+    most = 3 if unit == 'ms' else 9
+    return next((_Column((clock, k), f'{form.names[clock]}, {form.names[k]}', unit, 0.0)
+                 for k, name in enumerate(form.names[:form.width])
+                 if k != clock and (k in rest or re.fullmatch(pattern, name.strip().lower()))
+                 and all(k < len(row) and re.fullmatch(rf'\d{{1,{most}}}', row[k])
+                         for row in form.rows)), None)
 
 
 def _nameless_columns(form: Form) -> list[int]:
@@ -352,6 +364,23 @@ def _nameless_columns(form: Form) -> list[int]:
     # With names, only beside a time and nothing else: otherwise it may be of several series.
     return filled if not form.line else [k for k in filled[1:] if form.width == 2
                                          and re.fullmatch(_VALUE_NAME, form.names[k].lower())]
+
+
+def _like_voltage(form: Form, places: list[int]) -> list[int]:
+    """
+    Return the only column, or the first of several if it varies least for its size.
+
+    A load changes a supply's voltage by a few percent, and its current by far more; columns
+    that are constant, or below 1 somewhere, are not compared.
+    """
+    if len(places) < 2 or form.line or len(form.rows) < _FEW_ROWS:
+        return places if len(places) == 1 else []
+    values = np.array([[number_of(row[k])[0] if is_number(row[k]) else math.nan for k in places]
+                       for row in form.rows])
+    spread = np.ptp(values, axis=0) / values.mean(axis=0)
+    able = np.flatnonzero((values.min(axis=0) >= 1.0) & (spread > 0.0) & (spread < 1.0))
+    least = able.size and np.argmin(spread[able]) == 0
+    return [places[k] for k in able] if least else []
 
 
 def _clock_columns(form: Form) -> list[int]:
@@ -401,8 +430,7 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: _Column, needed
             # Another option may have taken it; that is refused below.
             places = [k for k in _choose(form, quantity) if k in given]
         if not places and quantity == logs.VOLTAGE:
-            rest = [k for k in _nameless_columns(form) if k not in taken]
-            places = rest if len(rest) == 1 else []
+            places = _like_voltage(form, [k for k in _nameless_columns(form) if k not in taken])
         if places:
             found[quantity] = _unit_column(form, places[0], unit)
             taken.append(places[0])
@@ -440,8 +468,11 @@ def _read(path: Path, form: Form, time: _Column, places: list[int],
         elif len(clocks) > 1:
             cells = [' '.join(pair) for pair in zip(*clocks)]
         return _clock(path, [swapped(cell) for cell in cells], time.name, left_out), values
-    t, *values = numbers(path, form, [time.place[0], *places], left_out=left_out)
-    return t, values
+    t, *values = numbers(path, form, [*time.place, *places], left_out=left_out)
+    if len(time.place) > 1:
+        part, *values = values
+        t = t + part * TIME_UNITS[time.unit]
+    return t * factor_of(time.name), values
 
 
 @lru_cache(maxsize=64)
@@ -515,7 +546,7 @@ def _stamps(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: _Co
     """Return the time in s, and its unit in words."""
     if not time.place:
         return t, f'{time.scale:g} s'
-    if len(time.place) > 1 or form.rows and time.place[0] < len(form.rows[0]) \
+    if form.rows and time.place[0] < len(form.rows[0]) \
             and not is_number(form.rows[0][time.place[0]]) \
             and is_clock(form.rows[0][time.place[0]]):
         return t, 'dates and times'
@@ -523,7 +554,9 @@ def _stamps(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: _Co
         return t * time.scale, time.unit
     known = t[np.isfinite(t)]
     usual = float(np.median(np.abs(np.diff(known)))) if known.size > 1 else 0.0
-    if time.unit:
+    if len(time.place) > 1:
+        unit, words = 's', ''
+    elif time.unit:
         unit, words = time.unit if wanted.time_unit else TIME_WORDS[time.unit], ''
     else:
         # Clocks that count from 1970 show their unit by their size.
@@ -562,28 +595,35 @@ def _of_mavlink(column: _Column, values: FloatArray, given: str | None, beside: 
 
 
 def _in_si(quantity: str, column: _Column, values: FloatArray, given: str | None,
-           volts: FloatArray) -> tuple[FloatArray, str]:
-    """Return values in V, 0..1 or A, and their unit in words."""
+           volts: FloatArray, beside: str) -> tuple[FloatArray, str]:
+    """
+    Return values in V, 0..1 or A, and their unit in words.
+
+    beside: the words of the voltage's unit; a current of whole numbers beside a guess of mV is in
+    mA.
+    """
     known = np.abs(values[np.isfinite(values)])
     if quantity == logs.THROTTLE:
-        unit = given or SHARE_WORDS.get(column.unit) or ('us' if column.unit == 'us' else None)
+        unit = given or SHARE_WORDS.get(column.unit) or _PULSE_WORDS.get(column.unit)
         words = ''
         if unit is None:
             unit = _throttle_unit(values[np.isfinite(values)], volts)
             words = '' if unit == '1' else ', a guess: --throttle-unit'
-        zero, scale = THROTTLE_UNITS[unit]
-        return (values - zero) * scale if unit != '1' else values, (
+        low, high = THROTTLE_UNITS.get(unit) or map(float, unit.split(':'))
+        return (values - low) / (high - low), (
             '0..1' if unit == '1' else unit) + words
     if column.scale:
         return values * column.scale, column.unit
     if quantity == logs.CURRENT:
-        unit = AMPERE_WORDS.get(column.unit, 'A')
-        return values * CURRENT_UNITS[unit] if unit != 'A' else values, unit
+        whole = not column.unit and bool((known == np.rint(known)).all())
+        small = whole and beside.startswith('mV,')
+        unit = 'mA' if small else AMPERE_WORDS.get(column.unit, 'A')
+        return values * SCALES[unit], unit + ', a guess' * small
     unit, words = given or VOLT_WORDS.get(column.unit) or '', ''
     if not unit:
         wild = known.size > 0 and float(np.median(known)) > _MOST_VOLTS
         unit, words = ('mV', ', a guess: --unit') if wild else ('V', '')
-    return values * VOLTAGE_UNITS[unit] if unit != 'V' else values, unit + words
+    return values * SCALES[unit], unit + words
 
 
 def _throttle_unit(values: FloatArray, volts: FloatArray) -> str:
@@ -598,10 +638,10 @@ def _throttle_unit(values: FloatArray, volts: FloatArray) -> str:
         return '%'
     if low >= 800.0 and high <= 2200.0:
         return 'us'
-    if high <= 1024.0 and float(np.mean(values < -MOST_THROTTLE)) > WILD:
-        return '1024'
-    # Other counts end at 10 000 at most, and 16 bits hold whole numbers.
-    return '65535' if 10000.0 < high <= 65535.0 and values.min() >= 0.0 and (
+    if float(np.mean(values < -MOST_THROTTLE)) > WILD:
+        return next((f'{-end}:{end}' for end in _STICKS if high <= end), '1')
+    # The thrust of a Crazyflie; other counts end at 10 000 at most.
+    return '0:65535' if 10000.0 < high <= 65535.0 and values.min() >= 0.0 and (
         values == np.rint(values)).all() else '1'
 
 
@@ -618,7 +658,9 @@ def _read_note(form: Form, time: _Column, found: dict[str, _Column], units: dict
     parts = [f"time from '{time.name}' ({units[_TIME_NAME]})"]
     parts += [f"{quantity} from '{column.name}' ({units[quantity]})"
               for quantity, column in found.items()]
-    others = [form.names[k] for k in _choose(form, logs.VOLTAGE, time.place)[1:3]
+    places = _choose(form, logs.VOLTAGE, time.place)[1:3] if form.line else [
+        k for k in _nameless_columns(form) if k not in time.place][:3]
+    others = [form.names[k] for k in places
               if form.names[k] not in {column.name for column in found.values()}]
     also = f'; also there: {", ".join(others)} (--voltage-column)' if others else ''
     if search and logs.THROTTLE not in found:

@@ -136,7 +136,8 @@ def detect(path: Path) -> Format:
 
 
 # Endings of text tables; their first bytes must not fit another format.
-_TABLES = ('.csv', '.tsv', '.tab', '.txt', '.dat', '.asc', '.log', '.lvm', '.prn')
+_TABLES = ('.csv', '.tsv', '.tab', '.txt', '.dat', '.asc', '.log', '.lvm', '.msl', '.prn',
+           '.xls')
 
 
 def _begins_as(path: Path) -> Format | None:

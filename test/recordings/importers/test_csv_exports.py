@@ -64,8 +64,9 @@ FORMS = {
     'tektronix_mdo': (table(
         ['Model,MDO3024', 'Firmware Version,1.26', '', 'Waveform Type,ANALOG', 'Point Format,Y',
          'Horizontal Units,s', 'Horizontal Scale,4e-05', 'Sample Interval,1e-05',
-         'Record Length,60', 'Probe Attenuation,10', 'Vertical Units,V', 'Label,,', 'TIME,CH1'],
-        lambda k: f'{1e-5 * k:.6e},{V[k]:.4f}'), 1e-5, False, False),
+         'Record Length,60', 'Probe Attenuation,10', 'Vertical Units,V,A', 'Label,,',
+         'TIME,CH1,CH2'],
+        lambda k: f'{1e-5 * k:.6e},{V[k]:.4f},{AMPS[k]}'), 1e-5, False, True),
     'siglent': (table(['Record Length,Analog:60', 'Sample Interval,CH1:1.00E-5', 'Vertical Units,'
                        'CH1:V', 'Model Number,SDS1104', 'Source,CH1', 'Second,Volt'],
                       lambda k: f'{1e-5 * k:.7f},{V[k]:.3f}'), 1e-5, False, False),
@@ -212,6 +213,40 @@ FORMS = {
         ['time_s,voltages[0],voltages[1],voltages[2],current_battery'],
         lambda k: f'{0.01 * k:.2f},{1e3 * V[k] - 8000:.0f},8000,65535,{100 * AMPS[k]:.0f}'), 0.01,
         False, True),
+    # A unit behind each number, not always the column's.
+    'grafana': (table(['Time,Battery voltage,Battery current'], lambda k: (
+        f'"{clock(k)}","{V[k]} V","' + (f'{AMPS[k]} A"' if k % 3 else f'{1e3 * AMPS[k]:.0f} mA"'))
+    ), 0.01, False, True),
+    # Multiples of a unit, in a name and in brackets.
+    'eagle_tree': (table(['Milliseconds,PackVolt*100,Amps*100,Throttle*100'], lambda k: (
+        f'{10 * k},{100 * V[k]:.1f},{100 * AMPS[k]:.0f},{1e4 * U[k]:.0f}')), 0.01, True, True),
+    'tattu': (table(['Time(10ms),Volt[cV],Current(10mA),Thr(0.1%)'], lambda k: (
+        f'{k},{100 * V[k]:.1f},{100 * AMPS[k]:.0f},{1e3 * U[k]:.0f}')), 0.01, True, True),
+    # The column whose unit is known is the throttle.
+    'airdata': (table(['time(millisecond),voltage(v),rc_throttle,rc_throttle(percent)'],
+                      lambda k: f'{10 * k},{V[k]},{364 + 1320 * U[k]:.0f},{100 * U[k]:.1f}'),
+                0.01, True, False),
+    'datcon': (table(['Clock:offsetTime,RC:Throttle,Battery(0):current,Battery(0):totalVolts'],
+                     lambda k: f'{0.01 * k:.3f},{2e4 * U[k] - 1e4:.0f},{AMPS[k]},{V[k]}'), 0.01,
+               True, True),
+    'bqstudio': (table(['Sample\tElapsedTime\tVoltage\tCurrent'], lambda k: (
+        f'{k}\t{0.01 * k:.3f}\t{1e3 * V[k]:.0f}\t{1e3 * AMPS[k]:.0f}')), 0.01, False, True),
+    'lecroy': (table(['LECROYWS3054,1,Waveform', '#1,26-Nov-2023 10:15:23,0', 'Time,Ampl'],
+                     lambda k: f'{1e-5 * k:.6e},{V[k]}'), 1e-5, False, False),
+    'gwinstek': (table(['Vertical Units,V,', 'Sampling Period,1.000e-05,', 'Waveform Data,'],
+                       lambda k: f'{1e-5 * k:.4E},{V[k]},'), 1e-5, False, False),
+    'matlab': (table(['Time,Voltage'], lambda k: clock(k, '%d-%b-%Y %H:%M:%S.%f') + f',{V[k]}'),
+               0.01, False, False),
+    # No names: of the columns beside the time, the first varies least.
+    'serial_monitor': (table([], lambda k: clock(k, '%H:%M:%S.%f') + f' -> {V[k]},{AMPS[k]}'),
+                       0.01, False, False),
+    'ros2_topic_echo': (table([], lambda k: (
+        f'{1700000000 + k // 40},{25000000 * (k % 40)},base_link,{V[k]},nan,{-AMPS[k]},0.9,True')),
+        0.025, False, False),
+    # Units below the names; a few are unknown.
+    'megasquirt': (table(['"MS3"', 'Time\tRPM\tMAP\tBatt V\tAFR', 's\tRPM\tkPa\tV\tAFR'],
+                         lambda k: f'{0.01 * k:.3f}\t2100\t45\t{V[k]}\t14.7'), 0.01, False,
+                   False),
 }
 
 
@@ -299,12 +334,23 @@ def test_the_unit_of_a_throttle(tmp_path):
 
 
 def test_counts_of_unknown_size_and_mixed_units_are_refused(tmp_path):
-    """0 to 10 000 is no unit that is known; a cell in mV is not read in V."""
+    """0 to 10 000 is no known unit, unless its ends are given; a cell in mA is no voltage."""
     rows = 't,U,thr\n' + ''.join(f'{k},12 V,{100 * k}\n' for k in range(99))
     with pytest.raises(InputError, match='throttle runs from 0 to 9800'):
         read_recording(written(tmp_path, rows))
-    with pytest.raises(InputError, match="holds '12 mV', not a number"):
-        read_recording(written(tmp_path, rows.replace('9,12 V', '9,12 mV')))
+    found = read_recording(tmp_path / 'export.csv', columns=CsvColumns(throttle_unit='0:10000'))
+    np.testing.assert_allclose(found.throttle, 0.01 * np.arange(99))
+    with pytest.raises(InputError, match="holds '12 mA', not a number"):
+        read_recording(written(tmp_path, rows.replace('9,12 V', '9,12 mA')))
+
+
+@pytest.mark.parametrize('row', [
+    lambda k: (k, 10.0 + AMPS[k], V[k]), lambda k: (k, k + 1, 2 * k), lambda k: (k, 0.9, U[k])])
+def test_columns_without_names_are_not_mistaken(row, tmp_path):
+    """A column before one that varies less, counters and numbers below 1 are no voltage."""
+    lines = [','.join(map(str, row(k))) for k in range(N)]
+    with pytest.raises(InputError, match='first line holds numbers'):
+        read_recording(written(tmp_path, '\n'.join(lines)))
 
 
 def test_a_column_that_may_be_the_throttle_is_named(tmp_path):
@@ -344,7 +390,9 @@ def test_options_of_the_command_line(tmp_path, capsys):
     found = read_recording(tmp_path / 'bag')
     np.testing.assert_allclose(found.t, 0.01 * np.arange(300), atol=1e-9)
     np.testing.assert_allclose(found.voltage[:3], [0.012, 0.0121, 0.0122], rtol=1e-6)
-    assert main(['analyze', str(path), '--sample-interval', '0']) == 2
+    for wrong in (['--sample-interval', '0'], *(
+            ['--throttle-unit', unit] for unit in ('1024', '5:5', 'a:b'))):
+        assert main(['analyze', str(path), *wrong]) == 2
 
 
 @pytest.mark.parametrize('content, words', [
