@@ -80,7 +80,7 @@ def analyze(recording: Given, *, levels: tuple[float, ...] | None = None, window
     window : float
         Window of the sliding estimate, s.
     brownout_voltage : float, optional
-        Brown-out limit, V; by default that of the log's header, else the node's.
+        Brown-out limit, V; by default from the log's header, else the node's.
     brownout_horizon : float
         Horizon of the risk, s.
     cells : int
@@ -387,14 +387,14 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     taken, facts, error, known = '', None, 0.0, None
     if recording is None:
         if throttle is None:
-            raise ValueError('the throttle is missing: 0.4 asks for 40 %, and a recording gives '
-                             'that of a flight')
+            raise ValueError('the throttle is missing: pass 0.4 for 40 %, or a recording, whose '
+                             'highest throttle is used')
         circuit = network if isinstance(network, PowerNetwork) else PowerNetwork(
             **completed(dict(network or {})))
         level, source = default_voltage(circuit, rail) if voltage is None else (voltage, 'given')
     elif isinstance(network, PowerNetwork):
         raise ValueError('a PowerNetwork has all components already: with a recording, pass a '
-                         'mapping of those that it does not show')
+                         'mapping of the components that the flight does not show')
     else:
         flown, values = readings_of(_read(recording)), dict(network or {})
         full, stated = full_voltage(flown), stated_limit(flown.source)
@@ -404,7 +404,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
         check_cells(full, cells)
         level, source = cells * CELL_BROWNOUT, f'{CELL_BROWNOUT} V per LiPo cell'
         if stated is not None and stated[0] == cells:
-            level, source = stated[1], 'by the log'
+            level, source = stated[1], 'from the log'
         level, source = (level, source) if voltage is None else (voltage, 'given')
         flight, facts, risks = _flight(flown, full, cells, level if rail == 'bus' else None,
                                        horizon, risk)

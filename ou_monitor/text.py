@@ -23,7 +23,7 @@ def printable(text: object, most: int | None = None) -> str:
 
 
 def plain_number(text: str) -> float:
-    """Return a number as files and options hold it; ValueError also for 5_01 and an Arabic 5."""
+    """Parse a number; unlike `float`, raise ValueError for 5_01 and for an Arabic 5."""
     if '_' in text or not text.isascii():
         raise ValueError(f"'{printable(text, 60)}' is not a number")
     return float(text)

@@ -221,7 +221,7 @@ class Scan:
 
 
 STAMP = 'in_timestamp'
-# Interval, in typical ones, above which samples are missing because the buffer was full.
+# Ratio to the typical interval above which samples are missing, because the buffer was full.
 HOLE = 1.5
 # Number of newest intervals whose median is the typical one.
 INTERVALS = 64

@@ -2,8 +2,8 @@
 A recording -> Tables 1 and 2 of the paper, with intervals, tests and curves over throttle.
 
 The recording also goes through `SupplyMonitor`, as in flight, so that node and command agree on
-the same data, even if throttle never stands still.  Limits: those of the monitor; the risk is for
-the state at the end of the recording.  Throttles not flown are NaN.
+the same data, even if throttle never stands still.  The limits of the monitor apply; the risk is
+for the state at the end of the recording.  Throttles not flown are NaN.
 
 `as_data` returns the JSON of `analyze`; see doc/analysis.md.
 """
@@ -130,8 +130,8 @@ def _left_out(recording: Recording, found: tuple[LoadLevel, ...]) -> tuple[str, 
     if not recording.has_throttle:
         return ('The recording has no throttle: it is taken as one load level.',)
     if any(math.isnan(level.throttle) for level in found):
-        return ('No throttle was held long enough for a load level: the recording is taken as '
-                'one, with throttle as a regressor; --levels names levels.',)
+        return ('No throttle was held long enough for a load level: the whole recording is one '
+                'level, with throttle as a regressor; --levels can name levels.',)
     held = sum(float(recording.t[s.stop - 1] - recording.t[s.start])
                for level in found for s in level.segments)
     settling = sum(level.settling for level in found)

@@ -198,8 +198,8 @@ def craft_line(craft: Craft) -> str:
                                              f' (usual: {low} to {high})'))
     if not found:
         return ''
-    source = {'given': '', 'log': ' by the log', 'guessed': ' by the voltage'}[craft.cells_from]
-    return f'{counted(craft.cells, "cell")}{source} ({craft.kind}): {"; ".join(found)}'
+    source = {'log': ' (from the log)', 'guessed': ' (from the voltage)'}.get(craft.cells_from, '')
+    return f'{counted(craft.cells, "cell")}{source}, class "{craft.kind}": {"; ".join(found)}'
 
 
 def craft_advice(craft: Craft) -> list[str]:

@@ -214,15 +214,15 @@ def other_scale(ou: OuFacts, alpha: float, ln_alpha_se: float, sigma: float, ln_
 
 
 def _ou_words(ou: OuFacts) -> str:
-    window = f'last {number(ou.window_s)} s'
+    window = f'the last {number(ou.window_s)} s'
     if ou.status == 'ok':
         alpha, sigma = (f'{number(x)} (95 % {number(low)} to {number(high)})'
                         for x, (low, high) in ((ou.alpha, ou.alpha_95), (ou.sigma, ou.sigma_95)))
-        return (f'alpha {alpha} 1/s, sigma {sigma} V/sqrt(s), '
-                f'{number(1e3 * math.sqrt(ou.var_inf))} mV rms, beside level and load; {window}')
+        return (f'alpha {alpha} 1/s, sigma {sigma} V/sqrt(s), without level and load '
+                f'{number(1e3 * math.sqrt(ou.var_inf))} mV rms; from {window}')
     if ou.status == 'not_visible':
         if not ou.var_inf_below:
-            return f'none: no noise; {window}'
-        return (f'not visible: one slower than {number(1e3 * ou.tau_below_s)} ms is below '
-                f'{number(1e3 * math.sqrt(ou.var_inf_below))} mV rms; {window}')
+            return f'none: no noise in {window}'
+        return (f'not visible in {window}: one slower than {number(1e3 * ou.tau_below_s)} ms '
+                f'would be below {number(1e3 * math.sqrt(ou.var_inf_below))} mV rms')
     return 'unknown: too few readings'

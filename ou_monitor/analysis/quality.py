@@ -174,7 +174,7 @@ def line_item(throttle: float, without: Estimate, with_lines: Estimate | None) -
     else:
         moved = without.usable or with_lines.usable
         left = ', and the remainder cannot be fitted' if not without.usable else (
-            ', and the fit succeeds only then: the node, which keeps them, gives no numbers')
+            ', and the fit succeeds only then: the node keeps the lines and gives no numbers')
         text = f'{taken}{left}.'
     return QualityItem('LINES_TAKEN_OUT', Severity.WARNING if moved else Severity.INFO, text,
                        (throttle,))

@@ -452,8 +452,8 @@ class ReleaseCause:
     p_value: float  # p-value of a ratio of 1
     instrument: str  # ``excluded``, ``possible`` or ``undetermined``
     corner: float  # Of the high-pass that would explain it, 1/(2 pi tau), Hz
-    # Level after less level before, in the direction of the transient, V: mean of the changes with
-    # a significant amplitude; NaN without any.
+    # Level after minus level before, in the direction of the transient, V: mean of the changes
+    # with a significant amplitude; NaN without any.
     step: float
     step_se: float
     sentence: str  # Both verdicts in words

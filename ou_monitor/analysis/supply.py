@@ -1,14 +1,14 @@
 """
 The facts of a supply, the same for all commands: `supply_facts`.
 
-Sag, resistance and budget are those of the node at the end of the recording.  Noise, alpha, sigma
-and Var_inf come from one regression of the voltage on level, throttle and current
-(`ou_monitor.model.ou_fit`): noise is its residual; alpha, sigma and Var_inf are those of the
-shortest window at the end of the recording in which alpha is known within a factor of 1.5, else of
-the longest.
+Sag, resistance and budget are the node's at the end of the recording.  Noise, alpha, sigma and
+Var_inf come from one regression of the voltage on level, throttle and current
+(`ou_monitor.model.ou_fit`): noise is its residual; alpha, sigma and Var_inf come from the shortest
+window at the end of the recording in which alpha is known within a factor of 1.5, else from the
+longest.
 
-Limits: those of that fit and of the node's filter.  The filter takes most of the time: 1.6 CPU s
-for 130 s at 200 Hz, and 4 s with a limit, for the budget.
+Limits: as of that fit and of the node's filter.  The filter takes most of the time: 1.6 CPU s for
+130 s at 200 Hz, and 4 s with a limit, for the budget.
 """
 
 from __future__ import annotations
@@ -295,7 +295,8 @@ def rise_that_ends(v: FloatArray, u: FloatArray, noise: Noise) -> FloatArray:
 def dip_begins(v: FloatArray, limit: float, rise: FloatArray) -> npt.NDArray[np.intp]:
     """Return the indices at which dips below a limit begin."""
     below = v < limit
-    # Ignore readings within the hysteresis; of the others, one below after one above begins a dip.
+    # Without readings within the hysteresis, a dip begins where one above is followed by one
+    # below.
     decides = np.flatnonzero(below | (v > limit + rise))
     return np.asarray(decides[below[decides] & np.append(True, ~below[decides[:-1]])])
 

@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
         if args.save_model is None:
             raise InputError('--output PATH.mcap is needed: where the recording goes')
         if args.json is not None:
-            raise InputError('--json says what was simulated: it needs --output PATH.mcap')
+            raise InputError('--json describes the simulated bag: it needs --output PATH.mcap')
     if args.save_model is not None:
         output.write_text(as_yaml(found.file), args.save_model, args.force)
     if args.output is None:

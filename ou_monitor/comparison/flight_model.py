@@ -213,7 +213,7 @@ class FlightModel:
 
     @property
     def alone(self) -> bool:
-        """Return that its level is valid."""
+        """Return True: the level is valid."""
         return True
 
     def path(self, samples: Readings) -> FloatArray:
@@ -264,7 +264,7 @@ class FiledModel:
 
     @property
     def alone(self) -> bool:
-        """Return that its level is of another flight."""
+        """Return False: the level is from another flight."""
         return False
 
     def draw(self, samples: Readings, rng: np.random.Generator) -> FloatArray:

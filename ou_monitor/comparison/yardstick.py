@@ -125,8 +125,8 @@ class Agreement:
     @property
     def worst(self) -> str:
         """Return the largest difference in a sentence."""
-        begin = 'Most wrong' if self.verdict is Likeness.DIFFERS else 'Farthest, but within chance'
-        return f'{begin}: in the simulation, {self.words}.'
+        chance = '' if self.verdict is Likeness.DIFFERS else ', within chance'
+        return f'Largest difference{chance}: in the simulation, {self.words}.'
 
     def measures(self) -> list[dict[str, Any]]:
         """Return all numbers of the recording and of the simulations."""

@@ -6,9 +6,9 @@ Each is scaled to be about N(0, 1) for independent normal scores.  Mean and spre
 evaluated in the same way.  Only lines that follow throttle (too slow to simulate) and errors after
 large ones use theory.  A name begins with its kind, to which the `SIGNS` of terms refer.
 
-No term predicts loops of throttle, a growing effect of throttle, or errors after large ones.
-These statistics expose effects that imitate a term but develop over minutes, have hysteresis, or
-last after their onset.
+Three kinds of statistics belong to no term: loops of throttle, a growing effect of throttle, and
+errors after large ones.  They expose effects that imitate a term but have hysteresis, develop over
+minutes, or outlast their onset.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ _FAR, _GAP = 50.0, 5.0
 _CODE, _MOST_CODES = 3, 0.2
 # Maximum single bad samples that are left out; for long recordings, one for each _EACH samples.
 _SINGLES, _EACH = 3, 100_000
-# Minimum number of other samples, if the value has a larger share.
+# Minimum number of other samples, if an error code has a larger share.
 _OTHERS = 100
 # Maximum values used for the spread.
 _EXAMINED = 200_000

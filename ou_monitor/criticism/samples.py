@@ -40,8 +40,8 @@ _SHARE, _CHANCE, _MORE = 1024, 0.02, 1.05
 # Minimum change of throttle of a load step, and the time after it in which a change of voltage is
 # attributed to the load, s.
 _STEPS, _SOON = 0.01, 0.02
-# Maximum number of events at which samples around them are kept; with more, the samples used
-# contain enough of them.
+# Maximum number of events around which more samples are kept; if there are more events, the
+# samples used contain enough of them.
 _FEW = 300
 # Changes are limited to this many standard deviations in the search for lines (larger ones are
 # events); minimum share of a line's power that one sinusoid explains.

@@ -41,7 +41,7 @@ CHANCE = 0.05
 MOST = 8
 # Total filter time after which kinds whose fit takes seconds are no longer tried, s.
 MOST_COST = 10.0
-# A statistic beyond this fails: of 70, one by chance in 2300 recordings (3 of 8700 simulated).
+# A statistic beyond this fails: one of 70 does by chance in 2300 recordings (3 of 8700 simulated).
 FAILS = 4.8
 # Maximum share of its initial value that a statistic may keep, because the form of a cause is not
 # exact.

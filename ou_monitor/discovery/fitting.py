@@ -129,8 +129,8 @@ class Fitter:
         Return kinds that improve a model: all are estimated, and the best few fitted in full.
 
         Kinds that failed before are tried again if score tests show more than at that time.  Kinds
-        whose fit takes seconds come last, and only if score tests still show them after the best
-        of the others, or if they imitate it.  statistics: function of a model.
+        whose fit takes seconds come last, and only if score tests still show them once the best
+        other kind is added, or if they imitate that kind.  statistics: function of a model.
         """
         values = statistics(composite)
         shown = {kind: decision.score_gain(kind, values) for kind in kinds}

@@ -301,8 +301,8 @@ def errors_grow(new: FloatArray, old: FloatArray, variance: FloatArray, errors: 
 
     If the new model is right, its errors, with these variances, V^2, are independent of their
     difference from the old ones, which gives the standard error of the increase.  A likelihood may
-    rise although errors grow: explaining a few bursts as noise may cost less than it gains
-    elsewhere.
+    rise although errors grow: to explain a few bursts as noise may cost less likelihood than it
+    gains elsewhere.
     """
     difference = old - new
     error = 2.0 * math.sqrt(float(np.sum(variance * difference**2)))

@@ -32,7 +32,7 @@ class Options:
     # Voltage, V, and horizon, s, of the risk; a voltage of NaN leaves the risk unknown.
     brownout_voltage: float = NAN
     brownout_horizon: float = 5.0
-    cells: int = 0  # Cells in series; 0: those of the log, else a guess
+    cells: int = 0  # Cells in series; 0: from the log, else a guess
     # Arguments of `read_recording`.
     msg_config: str | None = None
     voltage_topic: str | None = None

@@ -2,11 +2,11 @@
 The fleet table -> drifting vehicles, and outliers among recordings and vehicles.
 
 Common throttle: the logarithms of sigma and alpha follow one curve over throttle for all vehicles
-(straight between knots, by Huber's estimate, with a level for each vehicle).  Recordings are moved
-along it to the median throttle; the error of the move is included.  Resistance and sag are those
-of `supply`, per cell where the cells are known, the sag at full throttle, extrapolated by the load
-model (doc/load.md).  Limits: the curve assumes the same shape, and the same load at a throttle, on
-all vehicles; recordings without throttle are not moved.
+(straight between knots, by Huber's estimate, with a level for each vehicle).  Values are moved
+along this curve to the median throttle, with the error of the move.  Resistance and sag come from
+the `supply` facts, per cell where cells are known; the load model extrapolates the sag to full
+throttle (doc/load.md).  Limits: the curve assumes the same shape, and the same load at a throttle,
+on all vehicles; recordings without throttle are not moved.
 
 Drift: a line through the logarithms over the number of the flight, weighted by their errors and a
 scatter between flights (Paule and Mandel); t test, with the scatter about the line as the scale,
@@ -81,7 +81,7 @@ class CommonCurve:
         return rise
 
     def pieces(self, throttle: FloatArray) -> FloatArray:
-        """Return the derivative by each slope at some throttles, shape (n, k - 1)."""
+        """Return the derivative with respect to each slope at some throttles, shape (n, k - 1)."""
         u = np.asarray(throttle, dtype=np.float64)
         known = np.where(np.isfinite(u), u, self.reference)
         return _pieces(known, self.knots)
@@ -450,7 +450,7 @@ def _scatter(rest: FloatArray, error: FloatArray, share: float = 0.5) -> FloatAr
     """
     Return s of each row; shape (k, 1).
 
-    The median of |rest| / sqrt(s^2 + se^2) is that of a normal distribution, `_MEDIAN`, if s^2 is
+    The median of |rest| / sqrt(s^2 + se^2) is `_MEDIAN`, as for a normal distribution, if s^2 is
     the median of rest^2 / `_MEDIAN`^2 - se^2.  A share of 0.5 + z / (2 sqrt(n)) gives an upper
     bound of one-sided level Phi(z).
     """
@@ -463,8 +463,8 @@ DRIFT_RATE = 0.05
 OUTLIER_RATE = 0.05
 # Minimum number of vehicles to judge one by the spread of the others.
 LEAST_VEHICLES = 6
-# Difference of ln resistance and ln sag that two good vehicles may have: the least error of these
-# facts (`LEAST_ERROR`), which the flights of one vehicle share.
+# Difference of ln resistance and ln sag that two good vehicles may have: the minimum error of
+# these facts (`LEAST_ERROR`), because it is common to all flights of a vehicle.
 _APART = math.log(1.0 + LEAST_ERROR)
 # Standard error of a median relative to the mean, for many normal values.
 _MEDIAN_ERROR = 1.2533141373155
@@ -562,9 +562,9 @@ def _vehicles(values: Values, within: Outliers, flat: FloatArray, rate: float, s
 
 def _few(found: Outliers, places: Sequence[int], flights: Sequence[FloatArray]) -> Outliers:
     """
-    Compare the mean of each of a few vehicles, with two flights or more, with that of the others.
+    Compare the mean of each of a few vehicles, with two flights or more, with the others' mean.
 
-    A vehicle that stands out is left out when the rest are compared.  The p-value is that of a
+    A vehicle that stands out is left out when the rest are compared.  The null hypothesis is a
     difference of at most `_APART`, either way.
     """
     from ou_monitor.analysis.level_tests import adjusted

@@ -84,7 +84,7 @@ class LoadFit:
 
     @property
     def resistance(self) -> tuple[float, float, float]:
-        """Return the resistance, Ohm, and its 95 % interval, statistical only; NaN without I."""
+        """Return resistance, Ohm, and its 95 % interval, statistical only; NaN without current."""
         if not self.model.full_current:
             return NAN, NAN, NAN
         value = self.model.size * self.model.cells * CELL / abs(self.model.full_current)
@@ -248,10 +248,10 @@ def fit_load(t: FloatArray, voltage: FloatArray, throttle: FloatArray | None,
     """
     Fit the load model; if current, A, is given, it is the load instead of throttle.
 
-    t in s, voltage in V, throttle in 0..1; all finite, stamps rising.  The level is that of a
-    lithium pack, or constant (`stands`).  Voltage between the stamps left_out, s, is not used.
-    `near`, a similar fit (such as that of all the voltage), provides the start, and the cells,
-    scale and delay, which are not fitted.
+    t in s, voltage in V, throttle in 0..1; all finite, stamps rising.  The level follows a lithium
+    pack, or is constant (`stands`).  Voltage between the stamps left_out, s, is not used. `near`,
+    a similar fit (such as that of all the voltage), provides the start, and the cells, scale and
+    delay, which are not fitted.
     """
     if t.size < _LEAST:
         raise ValueError(f'a fit of the load needs {_LEAST} samples, got {t.size}')

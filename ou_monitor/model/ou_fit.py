@@ -276,11 +276,11 @@ def load_signs(n: int, dt: float, *loads: FloatArray | None) -> FloatArray:
 
 
 class NoiseSize:
-    """Size of the noise: its ln is linear in signs of load, constant beyond their fitted range."""
+    """Size of the noise: its ln is linear in `load_signs`, constant beyond their fitted range."""
 
     def __init__(self, signs: FloatArray) -> None:
         n = max(1, signs.shape[1])
-        # A constant one carries no information.
+        # A constant sign carries no information.
         self._used = (signs != signs[:, :1]).any(axis=1)
         self._scale = 0.3 * np.sqrt((signs[self._used] ** 2).sum(axis=1, keepdims=True) / n)
         laws = self._laws(signs)

@@ -318,7 +318,7 @@ class LatchFile:
             raise ValueError('it is not a regular file')
         text = os.read(handle, _MOST + 1)
         if len(text) > _MOST:
-            raise ValueError(f'it is larger than {_MOST} bytes, and not of this node')
+            raise ValueError(f'it is larger than {_MOST} bytes, so it is of another program')
         try:
             data = json.loads(text)
         except (ValueError, RecursionError):

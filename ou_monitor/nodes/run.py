@@ -60,7 +60,7 @@ def run(name: str, work: Callable[[], int], args: list[str] | None = None) -> in
         if _loading.is_set():
             os._exit(0)
         stopped.append(number)
-        # Only the first: another would interrupt the cleanup.
+        # Only the first signal: a second would interrupt the cleanup.
         if _making.is_set() and len(stopped) == 1:
             from rclpy.executors import ExternalShutdownException
             raise ExternalShutdownException
@@ -217,7 +217,7 @@ def turn(executor: Any, node: Any) -> bool:
     """Serve a node until its context ends; return whether a signal has ended it."""
     from rclpy.executors import ExternalShutdownException
     try:
-        # Not spin(): in rclpy 7.1.6 the EventsExecutor's continues for ever after a signal.
+        # Not executor.spin(), which in rclpy 7.1.6 goes on for ever after a signal.
         while node.context.ok():
             executor.spin_once(timeout_sec=NAP)
     except ExternalShutdownException:

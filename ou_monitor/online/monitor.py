@@ -174,7 +174,7 @@ class SupplyMonitor:
                 if not batch.again:
                     self._forecast.take(batch, came)
         except Exception as error:
-            # Any error: a monitor that ended with it would report nothing any more.
+            # Catch every error, because a monitor that stops here would report nothing.
             self.restart(error)
 
     def watch(self, voltage: npt.ArrayLike, arrival: npt.ArrayLike) -> None:
@@ -291,7 +291,7 @@ class SupplyMonitor:
             fresh = (silent <= limit and e.status is not Status.NO_DATA and doubt is Doubt.NONE)
             if again or not fresh:
                 self._load = self._load_filter.load()
-                # Use the better sigma of a longer window only if the short one sees an OU too;
+                # Use the better sigma of a longer window only if the short one shows an OU too;
                 # otherwise the load model is more accurate.
                 self._forecast.follow(*((told, ou.window_s, ou_age) if e.usable and told.usable
                                         else (e, e.duration)))

@@ -1,8 +1,8 @@
 """
 Whether an input can be trusted: stamps against arrival, readings against each other, the unit.
 
-`SupplyMonitor` asks `InputTrust`, and so do the node and the bench; the adaptive filter judges its
-own messages by the same `StampWatch` and goes on by arrival (`InputClock`).
+`SupplyMonitor` uses `InputTrust`, in the node and offline; the adaptive filter checks its messages
+by the same `StampWatch`, and falls back to arrival times (`InputClock`).
 
 Limits: a source with few late samples (below a tenth), or one that repeats messages, has good
 stamps.  A stuck sensor and a coarse one read alike until the first change; both are UNKNOWN until
@@ -91,16 +91,16 @@ class StampOrder(enum.Enum):
 
     GOOD = 'The stamps increase.'
     FROZEN = (
-        'Samples arrive, but their stamps do not advance: no estimate can be made of them; the '
+        'Samples arrive, but their stamps do not advance: they allow no estimate; the '
         'driver must set header.stamp for every message.')
     IRREGULAR = (
-        'The stamps of the samples go back and forth: no estimate can be made of them; look for '
+        'The stamps of the samples go back and forth: they allow no estimate; look for '
         'a second source of the topic, or a driver with two clocks.')
 
     @property
     def by_arrival(self) -> str:
         """Return the sentence for samples that are placed by their arrival."""
-        found, _, advice = self.value.partition(': no estimate can be made of them')
+        found, _, advice = self.value.partition(': they allow no estimate')
         return f'{found}: their arrival times are used{advice}'
 
 
@@ -211,8 +211,8 @@ class InputClock:
 # (139 readings) on the ground, in_xr_141340; 1.70 s (172) in flight, cf_solo_large; 3 readings at
 # 1 Hz in flight, ac_jd_2004.
 _STUCK, _STUCK_READINGS = 5.0, 10
-# While throttle is constant too, the limit is this many times the longest constant reading that
-# ended by one ADC step: a coarse ADC on a slow discharge.
+# Factor on the longest constant reading that ended with one ADC step, while throttle is constant
+# too: a coarse ADC repeats its reading during a slow discharge.
 _QUIET = 4.0
 # Range within which throttle counts as constant (cf_solo_large: 0.019 within 1.06 s of hover).
 _STILL = 0.05

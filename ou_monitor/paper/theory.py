@@ -2,9 +2,9 @@
 The paper's theory (section 3): matrix model, Markov switching, averaging and diffusion limits.
 
 A chain x(t) on n states has the generator Q: Q[x, y] is the rate of going from x to y, 1/s, and
-every row sums to zero.  All states must be reachable from all: then the stationary law pi (pi Q =
-0) is unique, and the potential R0 = integral_0^inf (exp(Q t) - Pi) dt exists.  Holding times are
-exponential; the next state is drawn from the cumulative rates of the state left.
+every row sums to zero.  Every state must be reachable from every other: then the stationary law pi
+(pi Q = 0) is unique, and the potential R0 = integral_0^inf (exp(Q t) - Pi) dt exists.  Holding
+times are exponential; the next state is drawn from the cumulative rates of the state left.
 
 A system switched by it is du/dt = D u + d + speed (A_x u + a_x), x = x(clock t).  Two scalings of
 the paper, both with a small eps; at eps = 1 the system is unchanged, and D and d are not sped up:
@@ -438,7 +438,7 @@ class SwitchedSystem:
             matrices=self.matrices - matrix, offsets=self.offsets - offset)
 
     def scaled(self, eps: float, scaling: Scaling) -> SwitchedSystem:
-        """Return the system at eps with clock and speed built in, nothing left unswitched."""
+        """Return the system at eps, with scaled rates and with the unswitched part merged."""
         if not 0.0 < eps < np.inf:
             raise ValueError(f'eps must be positive and finite, got {eps}')
         if scaling not in get_args(Scaling):

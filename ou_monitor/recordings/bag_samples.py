@@ -165,7 +165,7 @@ def _throttle(
         raise InputError(f"{path}: throttle topic '{topic}' is {topics[topic]}, which no msg "
                          'config reads: name one in a YAML file of your own')
     if spec is None:
-        return None, (f"Msg config '{config.name}' has no throttle: it is unknown.",)
+        return None, (f"Msg config '{config.name}' has no throttle, so throttle is unknown.",)
     found = _by_name(spec, topics)
     if not found and not config.generic:
         found = [name for name, kind in topics.items() if kind == spec.type and name != voltage]
@@ -193,7 +193,7 @@ def span_words(start: float | None, end: float | None) -> str:
 
 
 def outside_words(name: str, start: float | None, end: float | None, length: float) -> str:
-    """Return the words of the error that a part holds no sample (length of the recording in s)."""
+    """Return the text of the error for a part without samples (length of the recording in s)."""
     return f'{name} holds no sample {span_words(start, end)}: it lasts {length:.3f} s'
 
 

@@ -93,7 +93,7 @@ def _budget(analysis: Analysis) -> str:
         middle, craft = float(np.median(analysis.recording.voltage)), analysis.craft
         if craft.kind:
             # The user has to confirm that it is a lithium pack.
-            source = 'by the log' if craft.cells_from == 'log' else 'a guess by the voltage'
+            source = 'from the log' if craft.cells_from == 'log' else 'a guess from the voltage'
             return (f'unknown: no limit; --cells {craft.cells} ({source}) sets it to '
                     f'{CELL_LIMIT * craft.cells:g} V, --brownout-voltage to any other')
         return ('unknown: no limit; --brownout-voltage or --cells sets one (the default of '

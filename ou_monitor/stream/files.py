@@ -167,7 +167,7 @@ class _BoundedLoader(yaml.SafeLoader):
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode):
                 if (key.tag, key.value) in known:
-                    self._refuse('a key is there twice', key)
+                    self._refuse('a key occurs twice', key)
                 known.add((key.tag, key.value))
         return node
 

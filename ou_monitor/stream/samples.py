@@ -99,8 +99,8 @@ class _Track:
         if math.isnan(self.interval) or self.interval <= 0.0:
             return float(step - 1)
         expected = (time - self.time) / self.interval
-        # After a silence either messages were lost, or none was sent, which counts as half a
-        # message less likely.
+        # After a silence either messages were lost, or none was sent; the latter costs half a
+        # message more.
         return min(abs(step - expected), step - 0.5 if expected > PAUSE else math.inf)
 
     def take(self, number: int, time: float, arrived: float) -> None:

@@ -194,8 +194,8 @@ class Repeats:
     Drops repeats from a stream, in batches of any size; `period`: samples per refresh.
 
     A refresh may return the same value as the one before.  In a run longer than a period it is
-    placed where it is due, so that dropping repeats does not select changes.  It is passed on half
-    a period later.
+    placed where it is due, because to keep only changes would bias the noise.  It is passed on
+    half a period later.
     """
 
     def __init__(self) -> None:
@@ -340,7 +340,7 @@ WILD = 0.05
 BATCH = 32768
 # Search for repeats: samples used, minimum number, new samples between two searches.
 TAIL, _ENOUGH, _LOOK = 1024, 64, 256
-# Number of late samples per backward step from which the clock itself went back.
+# Minimum number of late samples per backward step if the clock itself went back.
 _STRETCH = 20
 # Places of samples; all of them as a slice.
 Picked = npt.NDArray[np.intp] | slice

@@ -75,7 +75,7 @@ def test_a_doubled_sigma_differs():
     found = compare(Recording(t, v, np.full(t.size, np.nan), 'bench'),
                     SupplyModel((OU(ALPHA, 2.0 * SIGMA, LEVEL),)), seeds=40)
     assert found.verdict is Likeness.DIFFERS
-    assert found.worst.startswith('Most wrong')
+    assert found.worst.startswith('Largest difference:')
     top = found.spectrum[-1].power
     # 2000 ordinates: 2 % each for the recording and for the median.
     assert top.median / top.measured == pytest.approx(4.0, rel=0.15)

@@ -67,7 +67,7 @@ def blamed(error: BaseException) -> tuple[str, ...]:
 
 
 def withdraw(error: BaseException) -> bool:
-    """Remove the causes that raised an error, or else all installed; False without any."""
+    """Remove installed causes that raised an error, else all; return False if there are none."""
     names = blamed(error) or _installed()
     for name in names:
         _leave_out(name, error)

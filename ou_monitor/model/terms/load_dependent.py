@@ -275,7 +275,7 @@ class LoadDependentNoise(Term):
 
     The logarithm of the factor is a sum of curves, each of one of `INPUTS`, linear between knots
     and constant beyond them; a last curve may bend the sum.  A power of the factor may multiply
-    sigma too, where the rail itself shakes.
+    sigma too, if the load disturbs the rail itself.
     """
 
     NAME: ClassVar[str] = 'load_dependent_noise'
@@ -356,14 +356,14 @@ class LoadDependentNoise(Term):
         return [white, replace(white, on_sigma=0.5)] if white.at else [white]
 
     def apart(self, view: View) -> LoadDependentNoise:
-        """Return the curves, for white noise alone, fitted to the scores of a model with them."""
+        """Return curves of white noise alone, refitted to the scores of a model with this term."""
         assert view.throttle is not None
         inputs = {k: x[view.train] for k, x in Inputs(range(len(INPUTS)))(
             view.step, view.throttle).items()}
         square = view.z[view.train] ** 2
         white = 1.0 - np.broadcast_to(view.trust, view.z.shape)[view.train]
         if float(white.mean()) > _LEAST_WHITE:
-            # Without the part of the rail, which the term does not scale.
+            # Subtract the rail's part, which the term does not scale.
             square = np.maximum(square - (1.0 - white), 0.0) / np.maximum(white, _LEAST_WHITE)
         square = square * np.exp(2.0 * self.log_of(inputs))
         few = max(1, math.ceil(2.0 * _IN_BIN * _SHARES.size / square.size))

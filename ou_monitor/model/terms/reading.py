@@ -270,7 +270,7 @@ class HeldSamples(Term):
 
 @dataclass(frozen=True)
 class ClockJitter(Term):
-    """Take each sample a normally distributed time off its stamp, at most 0.45 of the step."""
+    """Take each sample at its stamp plus a normal error, clipped at 0.45 of the step."""
 
     NAME: ClassVar[str] = 'clock_jitter'
     FAMILY: ClassVar[str] = 'sensor'

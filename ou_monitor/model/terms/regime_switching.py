@@ -152,7 +152,7 @@ def _direct(s: Scores, at_once: float, middle: float, states: int) -> FloatArray
 
 def chain_of(s: Scores, x: FloatArray, at_once: float, states: int = 2
              ) -> tuple[tuple[FloatArray, FloatArray, FloatArray], FloatArray, FloatArray]:
-    """Return the arguments of `forward`, the means of pairs, (states, states, n), and the stds."""
+    """Return the arguments of `forward`, then means, (states, states, n), and stds by states."""
     state = np.arange(states, dtype=np.float64)
     chances = step_chances(x, s.step, states)
     law = stationary_law(rates_between(math.exp(x[0]), math.exp(x[1]), states))
@@ -454,8 +454,8 @@ class RegimeSwitching(Term):
         states = int(self.states)
         law = stationary_law(rates_between(self.rate_up, self.rate_down, states))
         square = float(law @ np.exp(2.0 * ratio * np.arange(states)))
-        # Two starting scales: one gives the scores their mean square (taken as 1 if levels are
-        # clear); the other is 1, for an `ou` that already has the sigma of the lowest state.
+        # Start from two scales: the scores' mean square (1 if levels are clear), and 1, which is
+        # right if the `ou` already has the sigma of the lowest state.
         mean = float(np.mean(view.z[view.train] ** 2)) if abs(self.level) < unit else 1.0
         starts = [np.array([math.log(self.rate_up), math.log(self.rate_down), self.level / unit,
                             ratio, scale])

@@ -28,8 +28,8 @@ from ou_monitor.model.ou_fit import stretches
 from ou_monitor.model.whittle import CrossSpectrum
 from ou_monitor.records import FloatArray
 
-# Minimum variance of a combination of load variables, relative to the largest; the window does not
-# determine the coefficients of others.
+# Minimum variance of a combination of load variables, relative to the largest; with less, the
+# window does not determine its coefficient.
 _UNSEEN = 1e-5
 # Minimum variance of a load variable, full scale squared; below it the variable is constant.
 _STILL = 1e-12

@@ -247,7 +247,7 @@ def wanted_cutoff(settings: FilterSettings, sigma: float, alpha: float, throttle
 
 def threshold_law(settings: FilterSettings, sigma: float, alpha: float,
                   interval: float) -> float:
-    """Return fmax up to `sigma_ref` and the lowest cutoff above it (the paper, section 6)."""
+    """Return fmax for sigma up to `sigma_ref`, else the lowest cutoff (the paper, section 6)."""
     return settings.fmax if sigma <= settings.sigma_ref else settings.lowest
 
 
@@ -261,7 +261,7 @@ def constant_noise_law(settings: FilterSettings, sigma: float, alpha: float,
     at `sigma_ref` and fmax).
 
     Otherwise the noise is white with a variance proportional to sigma^2, and
-    the output noise is kept at that for `sigma_ref` and fmax: `relative_cutoff`.
+    the output noise is kept at its value for `sigma_ref` and fmax: `relative_cutoff`.
     """
     if settings.coupling:
         wanted = settings.noise_wanted or settings.coupling * settings.sigma_ref * math.sqrt(

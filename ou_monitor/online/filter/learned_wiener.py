@@ -8,9 +8,9 @@ sigma and alpha, and white noise n0.  Of all linear combinations of z
     w = (C_s + C_n)^-1 c_s,    C_s = C_z - C_n,
 
 has the least mean square error to the last of z_s, the signal or its slope: the multichannel
-Wiener filter (Doclo & Moonen 2002, IEEE Trans. Signal Process. 50, 2230).  C_z is a running mean
-of z z^T over `_MEMORY`; a hop has the weight 1 / noise^2, because the variance of z z^T grows with
-noise^2.  C_s is the part of C_z - C_n that exceeds its sampling error, in each direction.
+Wiener filter (Doclo & Moonen 2002, IEEE Trans. Signal Process. 50, 2230).  C_z is a mean of z z^T
+over `_MEMORY`; a hop of 10 ms has weight 1 / noise^2, as the variance of z z^T grows with noise^2.
+C_s is the part of C_z - C_n that exceeds its sampling error, in each direction.
 
 - If the stated noise is too large, so that the power of the signal would be negative, the noise is
   reduced accordingly.  For a slope, whose power is finite, some direction has almost no signal; if

@@ -224,7 +224,7 @@ class LoadDelay:
         return True
 
 
-# Limit of standard scores: larger ones have less weight, and count as this in the noise.
+# Limit of standard scores: larger ones have less weight, and enter the noise as this limit.
 CLIP, _OUTLIER = 4.0, 16.0
 # Variance of a prediction, V^2, above which the filter has diverged, as after readings of
 # megavolts, and restarts.

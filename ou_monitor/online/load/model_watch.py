@@ -35,7 +35,7 @@ _LEAST_NOISE = 1e-6
 _LEAST, _ERRORS = 0.10, 2.33
 # Relative error above which the ratio is not determined.
 _VAGUE = 0.15
-# Ratio of sag to the model's below which pack or load is another: warm packs have 0.75 and more.
+# Ratio of sag to the model's below which pack or load differs: warm packs have 0.75 or more.
 _OTHER = 0.7
 # Factor between level and the model's level, up or down, beyond which it is another pack.
 OTHER_LEVEL = 1.3

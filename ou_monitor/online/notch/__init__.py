@@ -1,1 +1,1 @@
-"""Notches that follow the motors, and whether they pay."""
+"""Notches that follow the motors, and whether they help."""

@@ -12,7 +12,7 @@ throttle is a thrust, and with an offset otherwise.  Each pair of a frequency at
 `HIGH` is a law.  Each frame gives the share of its noise that a notch at each frequency would
 remove; the score of a law is the share of all noise so far that it would have removed, with old
 frames forgotten.  The best law is in force.  A median of the data would follow the most frequent
-peak; this follows the loud peaks, which have to be removed.  No future data are used.
+peak; this law follows the loud peaks, which have to be removed.  No future data are used.
 
 Limits of the law: lines aliased at half the sample rate fall with throttle and are not followed;
 speeds of single motors are not resolved.
@@ -59,7 +59,7 @@ of the input); and |v| >= (|s| - g X) / |I - g A|, so that a large state has a l
 g is bounded, as it is by `HIGHEST` (test_biquads.py states the bound in numbers; adversarial
 sequences reach a tenth of it).  m stays within 0..1 and is outside the loop.
 
-Limits: a step of the coefficients moves y by what v1 changes within the sample; the caller
+Limits: a step of the coefficients moves y by the change of v1 within the sample, so the caller
 moves them smoothly.
 """
 
@@ -77,7 +77,7 @@ from ou_monitor.online.filter.lowpass import FilterCounters
 from ou_monitor.online.settings import NotchSettings
 from ou_monitor.records import FloatArray
 
-# Number of changes after which a speed counts as frozen if it is constant for this many mean times
+# A speed that has changed this often is frozen if it then stays constant for this many mean times
 # between changes, and for this time, s: no motor in flight holds its speed to the last digit.
 _CHANGES, _FROZEN, _STUCK = 20, 50.0, 1.0
 
@@ -384,8 +384,8 @@ class NotchChoice:
 NAN = math.nan
 # Beyond these limits a state could overflow, see `lowpass`.
 _LARGEST, _LATEST, _SHORTEST = 1e150, 1e18, 1e-12
-# Minimum gap in intervals; number of samples that determine the interval; its relative change that
-# means a new rate.
+# Minimum gap in intervals; number of samples that determine the interval; relative change of it
+# that is a new rate.
 _GAP, _KNOWN, _OTHER = 5.0, 64, 0.1
 # Time constant, s, of motors after a step of throttle (25 ms on a 5 inch propeller), and of
 # changes of a notch's share, width and frequency.

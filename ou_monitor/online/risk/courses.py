@@ -56,8 +56,8 @@ def _largest_medians() -> tuple[FloatArray, FloatArray, FloatArray]:
     """
     Return ln n, and mean and deviation of the largest of n running medians of three normals.
 
-    It stays below x unless two of three neighbours pass x: a chain of three states (samples
-    since the last that passed), whose steps are doubled.
+    A median stays below x unless two of three neighbours pass x: a chain of three states (samples
+    since the last that passed x), computed for n = 1, 2, 4, ... steps by squaring.
     """
     x = np.linspace(-6.0, 8.0, 561)
     over = normal_below(-x)

@@ -45,7 +45,7 @@ _FAR = 4.0
 
 class FloorWatch:
     """
-    Whether the voltage is at or below the floor; `dips` counts how often it has reached it.
+    Whether the voltage is at or below the floor; `dips` counts its falls to the floor.
 
     Three samples that span more than twice `stale_after` are not combined in a median, unless the
     source is slower: `interval` is the time between its samples, s, 0 for a fast one.
@@ -347,7 +347,7 @@ class BrownoutFlag:
             word = level.name.lower()
             if level in above and not self._waits(level):
                 return level, (f'{words} (brownout.{word}: {enter:g})' if found >= enter else
-                               'the throttle budget is below what is flown')
+                               'the throttle budget is below the throttle in use')
             leave = s.brownout_leave * enter
             if self._level.value >= level.value and found >= leave:
                 return level, (f'{words}, has not fallen below {leave:.2g} '

@@ -5,8 +5,8 @@ Methods: `first_passage` (the OU in the window, at the present throttle), `load`
 to the pilot's future throttle, half the excursions), and `excursions` (the drops of this flight,
 used alone if the load is unknown).  First passage and the other method are averaged with weights
 from their predictions of completed horizons' lowest voltages (Bayes, with forgetting).  Each law
-is replaced by a wider one in the share of horizons in which it was wrong: first passage by the
-excursions, the conditional risk by a law as wide as the excursions.
+is mixed with a wider one by the share of horizons in which it was wrong: first passage with the
+excursions, the conditional risk with a law as wide as these.
 
 The law learned in flight, from completed horizons: (lowest - start) / s = b0 + b1 (mu - start) / s
 + k e, with mean mu and deviation s of `lowest`, by least squares with forgetting; e has Student's
@@ -50,7 +50,7 @@ _NORM = math.exp(math.lgamma(0.5 * FREEDOM + 0.5) - math.lgamma(0.5 * FREEDOM)) 
 # Coefficients of the power series of its tail in FREEDOM / (FREEDOM + t^2), highest power first.
 _TAIL = [8.0 / (3.0 * math.pi) * math.comb(2 * k, k) / 4.0**k / (2 * k + 5)
          for k in range(9, -1, -1)]
-# Horizons' worth of the prior, its variance, and the prior of bias and gain.
+# Prior: its weight in horizons, its variance, and its deviations of bias and gain.
 _PRIOR, _PRIOR_VARIANCE = 5.0, 3.0
 _BIAS, _GAIN = 0.5, 0.4
 _PRECISION = (_BIAS ** -2, 0.0, _GAIN ** -2)
@@ -330,7 +330,8 @@ class Forecast:
         plain, state = Supply.of(self.estimate), self._loads.state()
         if state is None:
             return plain
-        # sigma averages over the throttles of the window; the load model scales it to the present.
+        # sigma averages over the throttles of the window; the load model scales it to the present
+        # throttle.
         flown = np.clip(np.append(self._past.throttles(*self._window), state.throttle),
                         *state.flown)
         apart = ripple(flown) - ripple(flown[-1])

@@ -329,7 +329,7 @@ def _inertial(path: Path, log: Log, names: Sequence[str]) -> list[Motion]:
     for name in dict.fromkeys(names):
         if name == NONE:
             if len(names) > 1:
-                raise InputError("--imu: 'none' leaves no room for another")
+                raise InputError("--imu: 'none' cannot be combined with a gyro")
             return []
         held = [one for one in log.inertial if one.name == name]
         if not held:

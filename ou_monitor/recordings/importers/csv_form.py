@@ -6,8 +6,8 @@ stated units with which most cells of the first lines are numbers, dates or time
 
 The csv module of the standard library reads the rows, in blocks whose columns are converted
 to numbers at once.  Measured for 10^6 rows of 3 columns: 1.1 s of CPU, 3.2 s row by row;
-`numpy.loadtxt` and the CSV reader of pyarrow take 0.3 s, but the first accepts no blank cell or
-text, the second reports no line number and no row of another width, and is a dependency of 100 MB.
+`numpy.loadtxt` and the CSV reader of pyarrow take 0.3 s, but the first rejects blank cells and
+text; the second rejects rows of another width, gives no line numbers, and takes 100 MB.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ _GROUPED = re.compile(r'[-+]?\d{1,3}(?:,\d{3})+\.\d+')
 _AND_UNIT = re.compile(r'(\S*[\d.])\s*+([^\d\s.]{1,12}+(?: [AaDd][Cc])?)')
 # Lines above the data that state the time between rows, or its inverse.
 _NUMBER = r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?'
-# Possessive, so that lines of blanks cost no more than their length.
+# Possessive, so that the time is proportional to the length of a line of blanks.
 _INTERVAL = re.compile(
     r'((?:sampl(?:e|ing)|time)[ _]*(?:interval|period)|sampl(?:e|ing)[ _]*time|'
     r't_?inc(?:rement)?|x[ _-]?inc(?:rement)?|increment|delta[ _]?t|h_?resolution|'
@@ -93,7 +93,7 @@ _INTERVAL = re.compile(
     rf'[\s"=:,;]*+(?:\w+:)?[\s"]*+({_NUMBER})\s*+(n|u|µ|m|k|M|G)?(s|sec|hz|sa/s)?',
     re.IGNORECASE)
 _PREFIX = {'n': 1e-9, 'u': 1e-6, 'µ': 1e-6, 'm': 1e-3, 'k': 1e3, 'M': 1e6, 'G': 1e9, '': 1.0}
-# Without a date hours may have gone by, up to 99; zones reach from -12:00 to +14:00.
+# Without a date, hours may count up to 99; time zones reach from -12:00 to +14:00.
 CLOCK = re.compile(
     r'\s*+(?:(\d{4})[-/.](\d\d?)[-/.](\d\d?)|(\d\d?)([./-])(\d\d?)[./-](\d{4}|\d\d))?+[T ,]*+'
     r'(?:(\d\d?):([0-5]\d)(?::([0-5]\d|60)(?:[.,:](\d{1,9}))?)?)?+\s*+'

@@ -215,7 +215,7 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
             re.escape(cells[1]) + r'[1-9]\]', name))]
     for place in (*time.place, *places):
         if form.names.count(form.names[place]) > 1:
-            raise InputError(f"{path}:{form.line}: column '{form.names[place]}' is there twice")
+            raise InputError(f"{path}:{form.line}: column '{form.names[place]}' occurs twice")
     t, values = _read(path, form, time, places, left_out)
     volts = next(zip(found, values), (None, t))[1] if logs.VOLTAGE in found else t
     if time.place:
@@ -225,7 +225,7 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
     scaled, guesses = {}, {_TIME_NAME: words}
     for (quantity, column), column_values in zip(found.items(), values):
         if quantity == logs.VOLTAGE:
-            # Cells of a pack; those that are not there are unknown.
+            # Add the cells of a pack; absent ones read as unknown.
             column_values = column_values + sum(np.where(np.isfinite(cell) & (
                 cell != 65535.0), cell, 0.0) for cell in values[len(found) + len(others):])
         column_values = column_values * factor_of(column.name)
@@ -570,7 +570,7 @@ def _stamps(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: _Co
     t = t * TIME_UNITS[unit]
     if usual * TIME_UNITS[unit] > LONGEST_STEP:
         raise InputError(f'{path}: the samples are {usual * TIME_UNITS[unit]:g} s apart by '
-                         f"'{time.name}': is it in ms, us or ns? --time-unit says so")
+                         f"'{time.name}': is it in ms, us or ns? Give --time-unit")
     return t, unit + words
 
 
@@ -662,7 +662,7 @@ def _read_note(form: Form, time: _Column, found: dict[str, _Column], units: dict
         k for k in _nameless_columns(form) if k not in time.place][:3]
     others = [form.names[k] for k in places
               if form.names[k] not in {column.name for column in found.values()}]
-    also = f'; also there: {", ".join(others)} (--voltage-column)' if others else ''
+    also = f'; also found: {", ".join(others)} (--voltage-column)' if others else ''
     if search and logs.THROTTLE not in found:
         # Mention columns that may be a throttle under another name.
         used = {*time.place, *(column.place[0] for column in found.values())}

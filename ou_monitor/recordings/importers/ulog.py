@@ -109,7 +109,7 @@ class _Watched(io.BufferedReader):
         return data
 
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        """Move; a step back by more than was read starts where the reader believes it is."""
+        """Move; count a step back beyond the last read from where pyulog assumes to be."""
         if whence == io.SEEK_CUR and -offset > self.had:
             offset += self.missing
         return super().seek(offset, whence)
