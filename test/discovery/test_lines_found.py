@@ -14,6 +14,7 @@ from ou_monitor.discovery.named import _in_doubt, _other, _SURE
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.shocks import HeavyTails
 from ou_monitor.model.terms.tones import Resonance, Tone
 from ou_monitor.records import NAN, Recording
 from project import needs_recordings, REAL, recorded
@@ -70,6 +71,21 @@ def test_ringing_that_dies_out_before_it_turns_is_something_else(damping, other)
     gaussian = evaluate(samples, terms)
     whole = Composite(terms, ({}, {}), gaussian, gaussian.z, gaussian.density, 6, 0.0)
     assert _other(Fitter(samples), whole, ['resonance']) == other
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_a_line_many_widths_wide_is_a_tone_in_spite_of_outliers(seed):
+    """
+    A line 9 Hz wide turns its phase eight times in 0.9 s, so no pure tone fits it.
+
+    Eight turns determine the logarithm of the width to 1/sqrt(8), with three errors to 1.06.
+    """
+    t = np.arange(900) / 1000.0
+    model = SupplyModel((OU(9650.0, 14.3, 4.1), Tone(0.2, 241.4, 0.0, 9.0), HeavyTails(2.9)))
+    found = discover(Recording(t, model.simulate(t, np.random.default_rng(seed))))
+    lines = [cause.term for cause in found.causes if cause.name in ('tone', 'resonance')]
+    assert [type(line) for line in lines] == [Tone]
+    assert abs(np.log(lines[0].linewidth / 9.0)) < 1.06
 
 
 @pytest.mark.parametrize('frequency, terms', [

@@ -11,7 +11,7 @@ import numpy as np
 from ou_monitor.model.spectral_lines import find_lines, fit_sinusoid, Line, on_grid
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.lines import (
-    broad_peaks, keeps_its_height, order_lines, rotation, wandering)
+    broad_peaks, CONSTANT, order_lines, power_spread, RINGING, rotation, wandering)
 from ou_monitor.model.terms.segment import Effect, first_order, Segment, Stage
 from ou_monitor.model.terms.term import by_parameters, parameter, Role, Term
 from ou_monitor.records import FloatArray
@@ -64,7 +64,8 @@ class Tone(Term):
         """Return the strongest lines of the residual, and the first with a wandering phase too."""
         found = [cls.at(line, view) for line in lines_of(view)[:_MOST]]
         spread = math.sqrt(float(np.median(view.variance)))
-        return [*found, *(cls(0.3 * spread, line.frequency, 0.0, _WANDERS) for line in found[:1])]
+        return [*found, *(cls(0.3 * spread, line.frequency, 0.0, width) for line in found[:1]
+                          for width in _WANDERS if width < SHARP * line.frequency)]
 
     @classmethod
     def at(cls, line: Line, view: View) -> Tone:
@@ -77,7 +78,7 @@ class Tone(Term):
         """Return whether it is a line, not ringing."""
         return self.linewidth < SHARP * self.frequency and (
             self.linewidth < WIDEST
-            or keeps_its_height(view, self.frequency, self.linewidth))
+            or not power_spread(view, self.frequency, self.linewidth) > CONSTANT)
 
     def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the two rotating states of a line whose phase wanders."""
@@ -114,8 +115,8 @@ def lines_of(view: View) -> tuple[Line, ...]:
 # Number of lines to try; false-alarm probability of trying one, large because the evidence of the
 # fit decides.
 _MOST, _PROPOSED = 3, 0.5
-# Initial linewidth, Hz; linewidth, Hz, from which a line with a varying amplitude is ringing.
-_WANDERS, WIDEST = 0.3, 2.0
+# Initial linewidths, Hz; linewidth, Hz, from which a line with a varying amplitude is ringing.
+_WANDERS, WIDEST = (0.3, 3.0), 2.0
 # Largest width of a line over its frequency.
 SHARP = 0.05
 
@@ -212,7 +213,7 @@ class Resonance(Term):
         width = self.damping / math.pi
         # Too wide for a tone, or a tone whose amplitude varies.
         return width < 2.0 * self.frequency and (width >= SHARP * self.frequency or (
-            width > WIDEST and not keeps_its_height(view, self.frequency, width)))
+            width > WIDEST and not power_spread(view, self.frequency, width) < RINGING))
 
 
 # Initial tilt, and the largest: at 1, a step would add no noise to one of the states.
