@@ -27,7 +27,7 @@ from ou_monitor.analysis.quality import (
     coupling_items, line_item, quality_list, QualityItem, second_items)
 from ou_monitor.analysis.relaxation import (
     find_steps, fit_relaxation, judge_cause, Relaxation, ReleaseCause)
-from ou_monitor.analysis.supply import fed, node_for, remainder, THROTTLES
+from ou_monitor.analysis.supply import fed, flown_near, node_for, remainder, THROTTLES
 from ou_monitor.criticism.innovations import FAMILY_WISE
 from ou_monitor.model.spectral_lines import FALSE_ALARM
 from ou_monitor.online.estimator.estimator import SlidingEstimator
@@ -96,7 +96,7 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
                             [wanders or level.doubted for level in judged])
     return Analysis(
         recording, judged, relaxations, tuple(judge_cause(r, alpha) for r in relaxations), alpha,
-        by_throttle(seen, voltage, brownout_horizon), sliding,
+        by_throttle(recording, seen, voltage, brownout_horizon), sliding,
         quality_list(recording, throttles, estimates,
                      lines + second_items([level.throttle for level in judged if level.wanders])
                      + coupling_items([level.throttle for level in judged if level.coupled]),
@@ -216,7 +216,7 @@ class ByThrottle:
     """Curves over throttle."""
 
     throttle: FloatArray  # 0, 0.1, .. 1; shape (k,)
-    # Whether that throttle was flown; beyond, sag and noise are extrapolated; shape (k,).
+    # Whether that throttle was flown; else sag and noise are inter- or extrapolated; shape (k,).
     known: npt.NDArray[np.bool_]
     # Sag and its 95 % interval, V; NaN if unknown; shape (k,).
     sag: FloatArray
@@ -239,10 +239,10 @@ class ByThrottle:
         return float(np.interp(throttle, self.throttle, getattr(self, name)))
 
 
-def by_throttle(found: Overview, voltage: float, horizon: float) -> ByThrottle:
+def by_throttle(recording: Recording, found: Overview, voltage: float, horizon: float,
+                ) -> ByThrottle:
     """Return sag and noise of the facts, and risk of the node, over throttle (V, s)."""
     grid, sag, last = np.array(THROTTLES), found.facts.sag, found.end
-    low, high = sag.flown
     middle, reach = np.array(sag.sag_v), Z95 * np.array(sag.se_v)
     if not sag.known:
         middle = np.full(grid.size, NAN)
@@ -251,7 +251,7 @@ def by_throttle(found: Overview, voltage: float, horizon: float) -> ByThrottle:
         # RISK_CURVE has the same throttles; keep one beyond the highest flown, to interpolate.
         risk = np.where(grid < found.highest + 0.1, last.risk_curve, NAN)
     return ByThrottle(
-        grid, (grid >= low) & (grid <= high), middle, middle - reach, middle + reach,
+        grid, flown_near(recording, grid), middle, middle - reach, middle + reach,
         np.array(found.facts.noise.rms_v), risk, NAN if last is None else last.budget,
         'No voltage limit was given.' if last is None else last.budget_reason,
         MonitorSettings().budget_limit, voltage, horizon,

@@ -15,7 +15,7 @@ import re
 from typing import Any
 
 import numpy as np
-from ou_monitor.analysis.supply import SupplyFacts
+from ou_monitor.analysis.supply import flown_near, SupplyFacts
 from ou_monitor.errors import InputError
 from ou_monitor.records import NAN, plain_data, Recording
 from ou_monitor.text import counted, number
@@ -158,8 +158,7 @@ def craft_of(recording: Recording, facts: SupplyFacts, given: int = 0) -> Craft:
     kind = '' if not 0 < cells <= _MOST_CELLS else MICRO if cells == 1 else QUAD
     if not kind or not recording.has_throttle:
         return Craft(cells, source, full_voltage(recording), '', ())
-    low, high = facts.sag.flown
-    seen = low - _NEAR <= _AT <= high + _NEAR
+    seen = bool(flown_near(recording, _AT, _NEAR)[0])
     # Values and standard errors; the error of the noise is negligible.
     values = {
         'sag': [float(np.interp(_AT, facts.sag.throttle, one)) if seen and facts.sag.known else NAN

@@ -365,6 +365,13 @@ def _still(t: FloatArray, u: FloatArray) -> npt.NDArray[np.bool_]:
     return np.asarray(span <= _STEADY)
 
 
+def flown_near(recording: Recording, throttle: npt.ArrayLike, reach: float = _BAND,
+               ) -> npt.NDArray[np.bool_]:
+    """Return whether there are enough readings within `reach` of throttles, shape (k,)."""
+    return np.array([np.count_nonzero(np.abs(recording.throttle - u) <= reach) >= _IN_BAND
+                     for u in np.atleast_1d(throttle)])
+
+
 def _over_throttle(u: FloatArray, square: FloatArray, flown: tuple[float, float],
                    ) -> tuple[float, ...]:
     """Return rms, V, at THROTTLES: interpolated, and constant beyond the flown range."""

@@ -185,17 +185,15 @@ def _by_throttle(analysis: Analysis) -> Part:
     """Return the table of sag, noise and risk at the throttles of `supply`."""
     curves, sag, noise = (analysis.by_throttle, analysis.overview.facts.sag,
                           analysis.overview.facts.noise)
-    low, high = noise.flown
-    if math.isnan(low):
+    if math.isnan(noise.flown[0]):
         return Text('The recording has no throttle: sag and risk over throttle are unknown.')
 
     def millivolts(value: float) -> str:
         return number(1e3 * value) if not abs(value) < 5e-7 else '0'
 
     rows = []
-    for u, fall, se, rms, still in zip(sag.throttle, sag.sag_v, sag.se_v, noise.rms_v,
-                                       noise.steady_rms_v):
-        flown = low - 0.05 <= u <= high + 0.05
+    for u, flown, fall, se, rms, still in zip(sag.throttle, curves.known, sag.sag_v, sag.se_v,
+                                              noise.rms_v, noise.steady_rms_v):
         rows.append([
             f'{100.0 * u:.0f} %' + ('' if flown else '\nnot flown'),
             f'{millivolts(fall)} +- {millivolts(2.0 * se)}' if math.isfinite(fall) else UNKNOWN,
@@ -218,11 +216,9 @@ def _curves(analysis: Analysis) -> list[Part]:
     _with_levels(sag, at, 1e3 * _column([level.sag.sag for level in levels]),
                  1e3 * _column([level.sag.interval for level in levels]))
     noise = _empty('Noise', 'mV rms')
-    low, high = found.noise.flown
     for values, label, colour in ((found.noise.rms_v, 'as flown', 0),
                                   (found.noise.steady_rms_v, 'throttle steady', 2)):
-        rms = np.where((x >= 100.0 * low - 5.0) & (x <= 100.0 * high + 5.0),
-                       1e3 * _column(values), NAN)
+        rms = np.where(learned.known, 1e3 * _column(values), NAN)
         noise.line(x, rms, label, colour, 'thick').markers(x, rms, '', colour)
     highest = np.nanmax(np.concatenate([[1e-6], *(curve.y for curve in noise.curves)]))
     noise.limits(y=(0.0, 1.1 * float(highest)))

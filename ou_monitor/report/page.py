@@ -204,7 +204,7 @@ dl.facts dt { color: var(--soft); } dl.facts dd { margin: 0; overflow-wrap: anyw
   dl.facts dd { margin: 0 0 6px; }
   body { padding: 16px 14px 32px; } .headline { font-size: 16px; padding: 10px 12px; }
   table { font-size: 13px; } th, td { padding: 4px 7px 4px 0; }
-  td.left { white-space: normal; overflow-wrap: anywhere; min-width: 92px; } }
+  td.left { white-space: normal; min-width: 92px; } }
 li { margin: 3px 0; overflow-wrap: anywhere; } li.warn::marker { color: var(--warn); }
 code { font: 13px/1.5 ui-monospace, Menlo, Consolas, monospace; background: var(--panel);
   padding: 2px 5px; border-radius: 3px; overflow-wrap: anywhere; }

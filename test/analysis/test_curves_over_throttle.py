@@ -24,7 +24,7 @@ def test_throttle_that_only_passes_is_known():
     """Sag within 4 standard errors, noise within 15 %, where flown; the risk up to there."""
     found = analyze(swept(1), brownout_voltage=4.5).by_throttle
     at, inside = found.throttle, found.known
-    assert at[inside] == pytest.approx([0.3, 0.4, 0.5, 0.6])
+    assert at[inside] == pytest.approx([0.2, 0.3, 0.4, 0.5, 0.6, 0.7])
     error = (found.sag_high - found.sag_low) / 3.92
     assert (np.abs(found.sag - 0.4 * at) < 4.0 * error)[inside].all()
     truth = (0.1 + at[inside]) / math.sqrt(2.0 * ALPHA)
