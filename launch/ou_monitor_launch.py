@@ -1,10 +1,10 @@
 """
-Start the estimator and the adaptive filter, the one's sigma driving the other.
+Start the estimator, and the adaptive filter, which uses the estimator's sigma.
 
 ros2 launch ou_monitor ou_monitor_launch.py namespace:=uav1 params_file:=my.yaml voltage:=/rail
 
-They are heard on this machine alone, unless discovery_range:=SUBNET or the
-environment says otherwise: ROS 2 asks nobody who he is (doc/security.md).
+Only this machine can discover the nodes, unless discovery_range:=SUBNET or the environment
+variable changes that, because ROS 2 does not authenticate anybody (doc/security.md).
 
 """
 
@@ -17,19 +17,19 @@ from launch.substitutions import EnvironmentVariable, LaunchConfiguration
 from launch_ros.actions import Node
 
 RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
-# Installed and in a source tree alike, config/ lies beside launch/.
+# The folder config/ is beside launch/, both installed and in a source tree.
 PARAMS = Path(__file__).resolve().parents[1] / 'config' / 'ou_monitor.yaml'
 # Name, default, description.
 ARGUMENTS = (
     ('namespace', '', 'Namespace of both.'),
     ('params_file', str(PARAMS), 'Parameters of both nodes.'),
     ('use_sim_time', 'false', 'Whether time comes from /clock.'),
-    ('voltage', 'voltage', 'Topic of the voltage (of a driver with a msg_config of its own: as '
-                           'that says).'),
+    ('voltage', 'voltage', 'Topic of the voltage (not used if the msg_config names an absolute '
+                           'topic).'),
     ('throttle', 'throttle', 'Topic of the throttle (likewise).'),
     ('input', 'input', 'Topic of the signal that is filtered.'),
     ('filter', 'true', 'Whether the adaptive filter is started.'),
-    ('respawn', 'false', 'Whether a node that has ended is started again, 2 s later.'),
+    ('respawn', 'false', 'Whether a node that has ended is restarted after 2 s.'),
     ('log_level', 'info', 'debug, info, warn, error, fatal.'),
 )
 
@@ -62,7 +62,7 @@ def generate_launch_description():
                                           'SYSTEM_DEFAULT.'),
         OpaqueFunction(function=refuse_missing_file),
         SetEnvironmentVariable(RANGE, LaunchConfiguration('discovery_range')),
-        # The enclaves of security/ou_monitor_policy.xml; without SROS2 they are names only.
+        # Enclaves of security/ou_monitor_policy.xml; without SROS2 they have no effect.
         Node(executable='estimator', name='ou_estimator',
              ros_arguments=['--enclave', '/ou_monitor/estimator', *level],
              remappings=[('voltage', LaunchConfiguration('voltage')),

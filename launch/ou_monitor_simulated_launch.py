@@ -1,10 +1,10 @@
 """
-Start a simulated supply, and the estimator and the adaptive filter that watch it: no hardware.
+Start a simulated supply, with the estimator and the adaptive filter; needs no hardware.
 
 ros2 launch ou_monitor ou_monitor_simulated_launch.py scale_resistance:=1.4
 ros2 param set /supply_simulator scale_resistance 2.0
 
-The throttle is a profile that the simulator plays; with play:='' it is the topic of yours.
+The simulator plays a throttle profile; with play:='' it uses your throttle topic.
 `ou-monitor live` shows voltage, budget, risk and flag on a page.
 
 """
@@ -26,10 +26,10 @@ ARGUMENTS = (
     ('play', 'flight', 'Throttle that is played: a profile, a number, points or a recording.'),
     ('scale_resistance', '1.0', 'Factor on the response to throttle: 1.4 is an old pack.'),
 )
-# Handed on as they are.
+# Arguments passed on unchanged.
 COMMON = (
-    ('namespace', '', 'Namespace of all.'),
-    ('params_file', str(HERE.parent / 'config' / 'simulated.yaml'), 'Parameters of the others.'),
+    ('namespace', '', 'Namespace of all nodes.'),
+    ('params_file', str(HERE.parent / 'config' / 'simulated.yaml'), 'Parameters of other nodes.'),
     ('use_sim_time', 'false', 'Whether time comes from /clock.'),
     ('input', 'voltage', 'Topic of the signal that is filtered.'),
     ('log_level', 'info', 'debug, info, warn, error, fatal.'),
@@ -44,7 +44,7 @@ def generate_launch_description():
     return LaunchDescription([
         *(DeclareLaunchArgument(name, default_value=default, description=text)
           for name, default, text in (*ARGUMENTS, *COMMON)),
-        # First, because it says who may find the nodes.
+        # First, because it sets the discovery range of all nodes.
         IncludeLaunchDescription(
             PythonLaunchDescriptionSource(str(HERE / 'ou_monitor_launch.py')),
             launch_arguments=common.items()),

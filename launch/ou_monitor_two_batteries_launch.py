@@ -3,9 +3,9 @@ Start one estimator for each of two batteries, in a namespace each.
 
 ros2 launch ou_monitor ou_monitor_two_batteries_launch.py voltage_1:=/bat1 voltage_2:=/bat2
 
-Each has its own flag and latch (`state_file` names the file after the node).  The throttle is
-that of both.  There is no filter: start one with the sigma of the battery that feeds what you
-filter.
+Each has its own flag and latch (in a folder given as `state_file`, files are named after the
+node).  Both use the same throttle.  No filter is started: start one that subscribes to the sigma
+of the battery that supplies your sensor.
 
 """
 
@@ -18,10 +18,10 @@ from launch.substitutions import LaunchConfiguration
 
 HERE = Path(__file__).resolve().parent
 PARAMS = HERE.parent / 'config' / 'ou_monitor.yaml'
-# Handed on as they are.
-COMMON = (('throttle', '/throttle', 'Topic of the throttle, of both.'),
+# Arguments passed on unchanged.
+COMMON = (('throttle', '/throttle', 'Topic of the throttle, for both.'),
           ('use_sim_time', 'false', 'Whether time comes from /clock.'),
-          ('respawn', 'false', 'Whether a node that has ended is started again.'),
+          ('respawn', 'false', 'Whether a node that has ended is restarted.'),
           ('log_level', 'info', 'debug, info, warn, error, fatal.'))
 
 

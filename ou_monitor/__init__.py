@@ -1,9 +1,8 @@
 """
 Noise-aware state estimation for UAV supply rails.
 
-The public names are loaded on first use (PEP 562), so that ``import
-ou_monitor`` costs nothing and the onboard half never pays for the readers of
-the bench.
+The public names are loaded on first use (PEP 562), so that ``import ou_monitor`` takes no time,
+and the nodes never load the readers of recordings.
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> object:
-    """Load a public name from its home on first use."""
+    """Load a public name from its module on first use."""
     home = _HOMES.get(name)
     if home is None:
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'")

@@ -288,7 +288,7 @@ class Counters:
     resets: int = 0  # Times the window was cleared (gap, or a clock that jumped back)
 
 
-# Parameters of an estimate whose standard errors are those of the logarithm.
+# Parameters of an estimate whose standard errors are of the logarithm.
 LOG_NAMES = ('alpha', 'sigma', 'var_inf')
 
 
@@ -441,7 +441,7 @@ class OuFacts:
     The relaxation beside white noise, or bounds.
 
     `not_visible`: a relaxation slower than `tau_below_s`, but faster than the level, has a
-    variance below `var_inf_below` (95 %); a faster one may be all of the noise.
+    variance below `var_inf_below` (95 %); a faster one may make up all of the noise.
     """
 
     status: str  # ok, not_visible, too_short or no_data
@@ -473,8 +473,8 @@ class Recording:
     voltage : ndarray, shape (n,)
         Voltage, V, finite.
     throttle : ndarray, shape (n,)
-        Throttle 0..1, the last value known at each stamp; NaN where unknown, as without it.  A
-        number holds for all samples.
+        Throttle 0..1, the last value known at each stamp; NaN where unknown, and everywhere
+        without a throttle.  A number holds for all samples.
     name : str
         Name for messages and pages.
     source : dict
@@ -482,7 +482,7 @@ class Recording:
     notes : tuple of str
         What the reader dropped or repaired, one sentence each.
     current : ndarray, shape (n,), or None
-        Current drawn, A, the last value known at each stamp, NaN where unknown; None without.
+        Current drawn, A, the last value known at each stamp, NaN where unknown; None: no current.
     held : int
         Number of samples left out because they repeat a reading.
 

@@ -1,4 +1,4 @@
-"""A consumer that draws a rectified sine of current: a heartbeat."""
+"""Example of a cause: a consumer whose current is a rectified sine, like a heartbeat."""
 
 from __future__ import annotations
 

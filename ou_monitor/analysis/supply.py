@@ -7,7 +7,7 @@ Var_inf come from one regression of the voltage on level, throttle and current
 window at the end of the recording in which alpha is known within a factor of 1.5, else from the
 longest.
 
-Limits: as of that fit and of the node's filter.  The filter takes most of the time: 1.6 CPU s for
+The limits of that fit and of the node's filter apply.  The filter takes most time: 1.6 CPU s for
 130 s at 200 Hz, and 4 s with a limit, for the budget.
 """
 

@@ -24,7 +24,7 @@ from scipy.special import ndtr, ndtri
 _MOST = 200_000
 # Relative rounding error of the difference of two float32.
 _FLOAT32 = 2.5e-7
-# Minimum share of the samples on the lattice, and their maximum distance from it, steps.
+# Minimum share of the samples on the grid of codes, and their maximum distance from it, steps.
 _SHARE, _NEAR = 0.99, 0.1
 # Minimum step of the ADC in steps of the last printed digit (below two, every value is near some
 # code); minimum number of gaps between codes; numbers of decimals tried.
@@ -62,10 +62,10 @@ _TINY = 1e-280
 
 
 def find_step(voltage: FloatArray) -> float:
-    """Return the step of the lattice on which the values lie (voltage in V)."""
+    """Return the step of the grid on which the values lie (voltage in V)."""
     v = voltage[:_MOST]
     if v.size > 16:
-        # The extremes may be clipped off the lattice.
+        # The extremes may be clipped off the grid.
         inner = v[(v > v.min()) & (v < v.max())]
         v = inner if np.unique(inner).size > 2 else v
     values, counts = np.unique(v, return_counts=True)
@@ -85,7 +85,7 @@ def find_step(voltage: FloatArray) -> float:
 
 def usual_change(voltage: FloatArray) -> float:
     """Return the most frequent change, V; 0 if no change is frequent."""
-    # If an offset was added at times, the codes are not on a lattice, but most changes are.
+    # If an offset was added at times, the codes are not on a grid, but most changes are.
     rounding = 2.0 * _FLOAT32 * float(np.abs(voltage).max())
     size = np.sort(np.abs(np.diff(voltage[:_MOST])))
     size = size[size > rounding]

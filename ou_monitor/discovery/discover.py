@@ -167,8 +167,8 @@ def _uncoded(samples: Samples, state: Integrity, start: Composite) -> tuple[Samp
     """Return the samples drawn within coarse codes, and the start of the search."""
     rng, inside = np.random.default_rng(0), samples
     for _ in range(_REDRAWN):
-        # Use the terms of the load that have evidence; with all terms, readings drawn from them
-        # would confirm them.
+        # Use the terms of the load that have evidence: readings drawn from a model with all terms
+        # would confirm each of them.
         search = Search(start)
         under_load(Fitter(inside), search)
         model = search.composite

@@ -118,7 +118,7 @@ class Finding:
     causes: tuple[Cause, ...] = ()  # As accepted
     model: SupplyModel | None = None  # The extended model, fitted on everything
     se: tuple[Mapping[str, Any], ...] = ()  # Its standard errors, one dict per term
-    # Score of the extended model, its gain and the standard error of that, nats per sample.
+    # Score of the extended model, its gain, and the gain's standard error, nats per sample.
     score: float = NAN
     gain: float = NAN
     gain_se: float = NAN
@@ -141,7 +141,7 @@ class Finding:
 
     @property
     def closer(self) -> bool:
-        """Whether neither errors nor falls of the extended model are worse than the plain OU's."""
+        """Whether errors and falls of the extended model are no worse than the plain OU's."""
         return bool(self.causes) and not self.larger and not self.crossing.worse
 
     @property
@@ -268,14 +268,14 @@ class ThrottleEffects:
         if not self.dip > 0.0:
             return ''
         found = (f'A punch-out from throttle {number(self.low, 2)} to {number(self.high, 2)} '
-                 f'costs {number(self.dip, 2)} V')
+                 f'lowers the voltage by {number(self.dip, 2)} V')
         if self.recovered > 0.0:
             found += (f' after {number(1e3 * self.after, 2)} ms, of which '
-                      f'{number(self.recovered, 2)} V come back within {number(self.within, 2)} s')
+                      f'{number(self.recovered, 2)} V recover within {number(self.within, 2)} s')
         found += '.'
         if self.dips:
-            made = (f'made {self.made} of the {self.dips} dips' if self.dips > 1 else
-                    f'{"made" if self.made else "did not make"} the only dip')
+            made = (f'caused {self.made} of the {self.dips} dips' if self.dips > 1 else
+                    f'{"caused" if self.made else "did not cause"} the only dip')
             found += f' Throttle {made} below {number(self.level, 4)} V.'
         return found
 

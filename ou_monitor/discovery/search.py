@@ -2,9 +2,9 @@
 The search for the causes that a recording shows.
 
 It begins with the response of the mean to throttle and time, and with the noise under load: on
-real flights they are nearly all of the variance and hide everything else.  Then, in each round,
-every candidate of the catalogue is fitted together with the model so far, and the one with most
-evidence is accepted; causes that are no longer worth their penalty are removed, and a law of
+real flights they make up nearly all of the variance and hide everything else.  Then, in each
+round, every candidate of the catalogue is fitted together with the model so far, and the one with
+most evidence is accepted; causes that are no longer worth their penalty are removed, and a law of
 throttle is exchanged for another that fits better.  Measured inputs come before latent causes,
 which can imitate them; causes that tie are named as alternatives.
 """
@@ -295,7 +295,7 @@ def _in_full(fitter: Fitter, found: Composite) -> Composite:
 
 def _leaves(fitter: Fitter, model: Composite) -> bool:
     """Return whether sigma follows a law of noise, and a simulation leaves the recorded range."""
-    # All must stay: the model is still Gaussian.
+    # No simulation may leave it (share 1), because the model is still Gaussian.
     follows = any(isinstance(term, LoadDependentNoise) and term.on_sigma for term in model.terms)
     return follows and outside_range(fitter.samples, model.terms, 1.0) > 0.0
 
@@ -309,8 +309,8 @@ def under_load(fitter: Fitter, search: Search) -> None:
     """
     Start from the load model: response to throttle, and noise that follows it, together.
 
-    They are nearly all of the variance of a flight; if they came one by one, each would be fitted
-    to what the others leave.  Afterwards each must be worth its own penalty.
+    They make up nearly all of the variance of a flight; added one by one, each would also absorb
+    the effects of the others.  Afterwards each must be worth its own penalty.
     """
     load, plain = load_terms(fitter.samples), search.composite
     noisy = whole_load(fitter, plain, load)
@@ -391,8 +391,8 @@ def _noise_beside(fitter: Fitter, composite: Composite, on_sigma: bool) -> Compo
     Return a model with the noise of a recording under load.
 
     on_sigma: whether sigma may follow the law of the white noise.  Before the response to throttle
-    is chosen it must not: noise with memory imitates one.  Nor may it where simulations then leave
-    the recorded range, which one-step predictions hardly constrain.
+    is chosen it must not: noise with memory imitates one.  It must not either if simulations then
+    leave the recorded range, which one-step predictions hardly constrain.
     """
     best = composite
     ou = composite.terms[0]
@@ -432,9 +432,9 @@ def outside_range(samples: Samples, terms: Sequence[Term], share: float = 0.5) -
     Return by how much the level of simulations leaves the recorded range, V: a quantile of them.
 
     The level is a running median of five samples, which single bad samples do not change.  Seeds
-    are fixed.  The largest of two equal recordings with tails of index a is more than twice as
-    far out in one pair of 1 + 2^a: of simulations of a right model with a = 2, one in five leaves
-    the range and its margin, and the median does in fewer than 1 %.
+    are fixed.  With heavy tails of index a, the extreme of one of two recordings of one process is
+    more than twice the other's in one of 1 + 2^a pairs.  So with a = 2, one in five simulations of
+    a right model leaves the range and its margin, but the median of them does in fewer than 1 %.
     """
     rng, model = np.random.default_rng(0), SupplyModel(tuple(terms))
 

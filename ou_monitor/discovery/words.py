@@ -129,16 +129,16 @@ def left_out_note(count: int, scored: int) -> str:
 
 def coupling_note(alpha: float, duration: float) -> str:
     """
-    Return how far an AC coupling is excluded (alpha in 1/s, duration in s).
+    Return for which rails an AC coupling is ruled out (alpha in 1/s, duration in s).
 
     Evidence for one grows as 0.24 alpha T nats with the rate alpha of the rail behind it.
     """
     slowest = 6.0 / (0.24 * duration)
     corner = alpha / (2.0 * math.pi)
     return (f'An AC-coupled instrument with a corner at {number(corner)} Hz would show '
-            f'the same relaxation. {number(duration)} s exclude that only for rails whose own '
-            f'rate exceeds {number(slowest)} 1/s (a rate of 1 1/s takes 25 s, of 0.1 1/s 250 s): '
-            'in case of doubt, repeat with the instrument DC-coupled.')
+            f'the same relaxation. {number(duration)} s of data rule it out only if the rail '
+            f'itself is faster than {number(slowest)} 1/s (a rail of 1 1/s needs 25 s, one of 0.1 '
+            '1/s 250 s): if in doubt, repeat with a DC-coupled instrument.')
 
 
 def no_relaxation_note(alpha: float, step: float) -> str:

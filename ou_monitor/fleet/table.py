@@ -86,8 +86,8 @@ COLUMNS = (
     Column('sag_full', 'number', 'V', 'sag extrapolated to full throttle; recordings are compared '
            'by it'),
     Column('sag_full_se', 'number', 'V', 'standard error of sag_full'),
-    Column('cells', 'count', '', 'cells in series; a guess is the largest number among the '
-           "vehicle's flights that the voltage allows"),
+    Column('cells', 'count', '', 'cells in series; if guessed, the largest guess among the '
+           "vehicle's flights that fits this flight's voltage"),
     Column('cells_from', 'text', '', 'origin of the cells: given, log, guessed (by the voltage), '
            'unknown'),
     Column('resistance', 'number', 'Ohm', 'instantaneous resistance of the whole pack, as in '

@@ -36,7 +36,7 @@ class SupplyModel:
     """
     Terms that add up to a supply.
 
-    ValueError: the first term is not the `ou`, or a term that a model can have once occurs twice.
+    ValueError: the first term is not the `ou`, or a term that may occur only once occurs twice.
 
     Examples
     --------

@@ -108,7 +108,7 @@ class CrossSpectrum:
     evenly spaced readings; without regressors (q = 1) each stretch has its own mean.
 
     The ordinates come from the cosine transform, which continues the window as a mirror image; so
-    different values at its ends cause no leakage, as they do in a Fourier transform.
+    different values at its ends cause no leakage, unlike in a Fourier transform.
     """
 
     def __init__(self, rows: FloatArray, lengths: Sequence[int]) -> None:

@@ -120,8 +120,8 @@ class SupplyInput:
         Return the latest values that are not older than `stale_after`, s.
 
         Without a sigma, derive it from the noise that the load does not explain at the present
-        throttle, as that of an OU with relaxation `rate`, 1/s.  This sigma includes the
-        ADC's white noise, so it is never below the supply's own.
+        throttle, as the sigma of an OU with relaxation `rate`, 1/s.  This sigma includes the ADC's
+        white noise, so it is never below the supply's own.
         """
         fresh = within(self._state_silence.age, stale_after)
         error, (alpha, throttle, level, level_se, noise) = (

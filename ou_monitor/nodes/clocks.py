@@ -202,8 +202,8 @@ class SendClock:
 # Pairs fitted: half a second at the usual 100 Hz averages the jitter of single publications, and
 # still follows a change of the replay rate within half a second.
 PAIRS = 50
-# A clock off the line by more than this, s of the sender's time, was stepped (next pass, seek): no
-# publication is that late.
+# A clock that is off the line by more than this, s of the sender's time, has jumped (next pass of
+# a bag, seek): no publication is that late.
 STEP = 0.25
 # A clock silent for this time, s of the sender's clock, and this number of its own intervals, has
 # stopped: later messages have no simulated time.

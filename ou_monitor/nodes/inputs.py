@@ -46,7 +46,7 @@ MOST_WAIT = 60.0
 # Period of reminders, and silence of a publisher before it is reported, s.
 AGAIN = 60.0
 MUTE = 10.0
-# The one sentence for it in the diagnostics of every node.
+# Sentence for a missing clock in the diagnostics of every node.
 NO_CLOCK = 'use_sim_time is set, but no message arrives on /clock.'
 CLOCK_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 

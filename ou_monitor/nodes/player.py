@@ -199,7 +199,7 @@ class Player(Node):
             self.get_logger().warning(self._skipped[topic])
 
     def going(self) -> bool:
-        """Whether no signal has come."""
+        """Whether no signal has arrived."""
         return bool(self.context.ok())
 
     def play(self) -> dict[str, Any]:

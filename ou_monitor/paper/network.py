@@ -359,7 +359,7 @@ class Rail:
         """
         Return the rate at which the rail falls below a voltage, V, far from its mean, 1/s.
 
-        It is that of the whole Gaussian process, not of its OU: the larger of two rates.  For
+        This rate of the whole Gaussian process, not of its OU, is the larger of two rates.  For
         rough paths it is q/(2 Var) d/sqrt(2 pi) exp(-d^2/2) (Pickands, Trans. AMS 145 (1969) 51),
         for smooth paths sqrt(v/Var)/(2 pi) exp(-d^2/2) (Rice, Bell Syst. Tech. J. 24 (1945) 46).
         d: distance to the voltage in standard deviations; q: quadratic variation per second; v:

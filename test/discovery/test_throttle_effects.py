@@ -37,8 +37,9 @@ def test_a_punch_out_dips_and_comes_back():
     assert found.recovered == pytest.approx(0.5 * math.exp(-0.1), rel=1e-6)
     assert found.within == pytest.approx(0.1 * math.log(10.0), abs=0.011)
     assert (found.dips, found.made) == (13, 12)
-    assert 'costs 1.5 V after 10 ms, of which 0.45 V come back within 0.24 s' in found.words
-    assert 'Throttle made 12 of the 13 dips below 14.50 V.' in found.words
+    assert ('lowers the voltage by 1.5 V after 10 ms, of which 0.45 V recover within 0.24 s'
+            in found.words)
+    assert 'Throttle caused 12 of the 13 dips below 14.50 V.' in found.words
     assert found.as_data()['dips'] == {'level_v': 14.5, 'count': 13, 'made_by_throttle': 12}
 
 
@@ -46,7 +47,7 @@ def test_a_sag_stays():
     """Nothing comes back, and nothing is said of it."""
     found = throttle_effects(flown(INRUSH[0]), (OU(1.0, 0.01, 15.0), INRUSH[0]), 14.5)
     assert found.recovered == 0.0 and math.isnan(found.within)
-    assert 'come back' not in found.words and 'costs 1.0 V' in found.words
+    assert 'recover' not in found.words and 'voltage by 1.0 V' in found.words
     # One that grows is that of half time, 30 s.
     grown = throttle_effects(flown(INRUSH[0]), (OU(1.0, 0.01, 15.0), LoadSag(1.0, 0.0, 0.02)),
                              14.5)

@@ -29,7 +29,7 @@ class Drift(Term):
         lambda term: ('rate', 'curvature') if term.curvature else ('rate',))
     SIGNS: ClassVar[tuple[str, ...]] = ('time', 'band 0')
     MEASURED: ClassVar[bool] = True
-    # A trend always explains a little of the error in the form of a larger effect.
+    # A larger effect whose form is not exact always leaves a little for a trend to explain.
     LEAST_SHARE: ClassVar[float] = 0.02
     MEANING: ClassVar[str] = 'The mean moves slowly with time: discharge or warming.'
     REMEDY: ClassVar[str] = 'Use a window in which the drift is small, or remove the trend first.'

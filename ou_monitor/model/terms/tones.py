@@ -107,7 +107,7 @@ class Tone(Term):
 def lines_of(view: View) -> tuple[Line, ...]:
     """Return the lines of the residual, strongest first."""
     # Include the held-out part, because a line may begin late; its frequency is searched for, not
-    # fitted, and pays for the search.
+    # fitted, and a penalty covers the search.
     grid = on_grid(view.at, view.z)
     return find_lines([grid.values], grid.rate, false_alarm=_PROPOSED).lines
 

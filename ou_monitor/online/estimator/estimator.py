@@ -13,7 +13,7 @@ of CPU, so it is repeated only after a quarter of its window, at least 1 s; in t
 runs in a thread that takes at most 5 % of a core.
 
 Between two fits of a window of 2 s, the sliding estimate of 2 s is used as long as the intervals
-of both overlap.  Limits: those of that fit; a source above 1 kHz keeps its last 65 536 readings; a
+of both overlap.  Limits: as in `ou_fit`; a source above 1 kHz keeps its last 65 536 readings; a
 change of the supply is followed one window late.
 """
 
@@ -73,8 +73,8 @@ class SlidingEstimator:
     window : float
         Length of the window, s, > 0.
     fastest : float
-        Highest rate kept, Hz; sources faster than this are averaged in blocks,
-        and the fit knows it.
+        Highest rate kept, Hz; sources faster than this are averaged in blocks, which the fit
+        allows for.
 
     Raises
     ------

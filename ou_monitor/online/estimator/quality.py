@@ -18,8 +18,8 @@ from ou_monitor.records import Counters, Estimate, Flag, FloatArray, NAN, Status
 
 # Minimum number of samples for any finding.
 _ENOUGH = 64
-# A lattice needs this many different steps, all whole multiples of one, and
-# at most this many codes: fewer distinct steps are chance, more are a fine ADC.
+# Minimum number of different steps, all whole multiples of one, that reveal the grid of an ADC;
+# fewer may be chance.
 _FEWEST_STEPS = 3
 # Share of adjacent samples that differ, below which the ADC is coarse.
 _TIED = 0.9
@@ -33,7 +33,7 @@ _CLIPPED_EXCESS = 3.0
 class Quality:
     """Findings about readings."""
 
-    step: float = 0.0  # ADC step, V; 0 when the values lie on no lattice
+    step: float = 0.0  # ADC step, V; 0 if the values lie on no grid
     held: float = 1.0  # Samples per refresh of a source that repeats its last value; 1: none
     saturated: bool = False  # Whether samples pile up at an extreme
     rms_increment: float = math.nan  # Root mean square of the steps between fresh samples, V
@@ -47,7 +47,7 @@ def examine(y: FloatArray, held: float = 1.0) -> Quality:
     changes = np.flatnonzero(steps)
     if changes.size < _FEWEST_STEPS:
         return Quality(held=held)
-    # Where many neighbours are equal, a few different steps are a lattice, too.
+    # Where many neighbours are equal, a few different steps reveal a grid, too.
     tied = changes.size < _TIED * steps.size
     rms = float(np.sqrt(np.mean(steps * steps)))
     # Steps whose squares are zero have no size to compare with.
@@ -59,7 +59,7 @@ def lattice(sizes: FloatArray, fewest: int = _FEWEST_STEPS) -> float:
     """Return the common step of increments, V, from 1e-3 of the largest on; 0: none."""
     ordered = np.unique(sizes)
     least = float(ordered[0])
-    # Rounding splits one step into several: join what is within 1e-3 of the least.
+    # Rounding splits one step into several: join those within 1e-3 of the smallest.
     near = ordered[ordered < 1.001 * least]
     unit = float(near.mean())
     multiples = np.rint(ordered / unit)
@@ -85,8 +85,8 @@ def _piles_up(y: FloatArray) -> bool:
 GOOD_RELAXATIONS = 25.0
 # Standard error of ln(alpha), before it is widened, beyond which alpha is buried in noise ...
 _BURIED = 0.5
-# ... provided that noise, and not the length of the window, is the cause: minimum
-# ratio of the error to that without noise.
+# ... provided that noise, and not the length of the window, is the cause: minimum ratio of the
+# error to the error without noise.
 _BURIED_BY = 2.0
 # In short windows ln(alpha) has wider tails than its information says: its
 # standard error grows by 1 + 1.5/x + 70/x^2, x = alpha T + 1.5, which brings the
@@ -112,7 +112,7 @@ def log_errors(fit: Fitted, duration: float) -> tuple[float, float, float]:
 
     duration in s.
     """
-    # Fewer than a thousandth count as none.
+    # At least a thousandth, to avoid a division by zero.
     relaxations = max(fit.alpha * duration - fit.high + _AS_FITTED, 1e-3)
     wider = 1.0 + (_WIDER + _MUCH_WIDER / relaxations) / relaxations
     near = math.exp(-0.5 * math.pow(min(fit.noise_score / _NEAR, 1e3), 2))

@@ -84,9 +84,9 @@ def time_constant(settings: FilterSettings, error: float) -> float:
 
     A random walk of intensity q, measured with an error e
     over a correlation time T, is tracked best (steady Kalman filter) with the
-    time constant e sqrt(T) / q.  So the time constant is proportional to the
-    error, and `smoothing` at `smoothing_error`, within a factor of
-    `smoothing_range` (Betaflight moves its notches 1 to 10 times as fast).
+    time constant e sqrt(T) / q.  So the time constant is proportional to the error, and equal to
+    `smoothing` at `smoothing_error`, within a factor of `smoothing_range` (Betaflight moves its
+    notches 1 to 10 times as fast).
 
     result in s.
     """
@@ -146,7 +146,7 @@ class CutoffControl:
             self._aim = self._moving = self._cutoff = settings.fallback
 
     def update(self, wanted: float, error: float, dt: float, interval: float) -> float:
-        """Take the law's cutoff, Hz; return that in force, Hz (dt, interval in s)."""
+        """Take the law's cutoff, Hz; return the cutoff in force, Hz (dt, interval in s)."""
         self._choose(wanted)
         if not self._started:
             self._started, self._moving = True, self._aim

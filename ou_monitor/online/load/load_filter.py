@@ -6,10 +6,10 @@ throttle range flown, the sag is extrapolated; changes of the true sag are follo
 doc/load.md has the equations and the figures.
 
 With a measured current: its scale and sign are not corrected, so a wrong scale makes the
-resistance wrong, and a load that follows throttle but is not in the current counts in it (0.1 V at
-full throttle makes 0.2 Ohm 0.4 on a robot that draws 1 A); a constant current gives no
-information.  Throttle as a further regressor would absorb that load, but on quads with slow
-current sensors also half of the resistance and more.
+resistance wrong; a load that follows throttle but bypasses the current sensor makes it too high (a
+sag of 0.1 V at full throttle turns 0.2 into 0.4 Ohm on a robot that draws 1 A); a constant current
+gives no information.  Throttle as a further regressor would absorb that load, but on quads with
+slow current sensors at least half of the resistance too.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _KNOWN, LEAST_ERROR = 0.33, 0.1
 # Throttle at which an ESC ripples most (`ripple`).
 _LOUDEST = 0.7
 # Current over throttle: memory, s; correlation time of deviations, s; prior deviation of its
-# coefficients, in such deviations.
+# coefficients, in units of those deviations.
 _MEMORY, _ONE, _WIDE = 120.0, 1.0, 30.0
 
 
@@ -207,7 +207,7 @@ def _lagged(drawn: list[float], x: float, dt: float) -> list[float]:
 
 # Lag of the whole response, s: half of the response time of an ESC.
 _LAG = 0.004
-# Random walk of the level, V per sqrt(s) and cell: that of an OU of 4.6 mV and 20 s, found by the
+# Random walk of the level, V per sqrt(s) and cell: as in an OU of 4.6 mV and 20 s, found by the
 # batch fit; and for an emptying pack (chosen on bf_hiro_4s, where 0.02 to 0.05 work).
 _WALK, _FAST_WALK = 0.0015, 0.03
 # Faster level: prediction time, s; share of the mean square error below which it is used; memory,
@@ -220,9 +220,8 @@ _WARMING, _CHANGE = 0.25 ** 2 / 100.0, 0.02 ** 2 / 100.0
 _RESIZE = 30.0
 # Memory of the throttle flown, s.
 _FLOWN_MEMORY = 120.0
-# The sag counts as known if its error over the throttle range flown is below this share of it, or
-# of the noise.
-# The share was widened from 0.25 so that one recording reached 95 %.
+# The sag counts as known if its error over the throttle range flown is below this share of the sag
+# (raised from 0.25 because of one recording), or below this share of the noise.
 _SAG_SHARE, _NOISE_SHARE = 0.33, 0.5
 # Minimum range of throttle that has moved.
 _MOVED = 0.02

@@ -195,7 +195,7 @@ class Request:
 def one_flight(path: Path, request: Request) -> None:
     """Refuse a flight other than the first for formats that hold one flight a file."""
     if request.flight not in (None, 1):
-        raise InputError(f'{path} holds one flight: --flight {request.flight} is not there')
+        raise InputError(f'{path} holds one flight, so --flight {request.flight} does not exist')
 
 
 def sound(t: FloatArray, rows: FloatArray) -> tuple[Picked, list[str]]:
