@@ -1,9 +1,9 @@
-# Sourced by scripts/demo and scripts/test: the repository's folder and its virtual environment.
+# Sourced by scripts/demo and scripts/test: finds the repository and sets up its virtual environment.
 #
-# open_venv LEVEL      LEVEL is run (the package and its nodes), test (run, and the test tools) or
-#                      noble (test, with Ubuntu 24.04's NumPy, SciPy and PyYAML, in a folder of its
-#                      own); leaves $ROOT as the present folder and $VENV_PYTHON ready for use.
-# Nothing is installed a second time: .venv/.installed-LEVEL holds a hash of what was asked for.
+# open_venv LEVEL      LEVEL is run (the package and its nodes), test (run and the test tools) or
+#                      noble (test with Ubuntu 24.04's NumPy, SciPy and PyYAML, in another venv);
+#                      changes to the folder $ROOT and sets $VENV_PYTHON.
+# Installs only when the requirements changed: .venv/.installed-LEVEL holds a hash of them.
 
 ROOT="$(cd -- "$(dirname -- "${BASH_SOURCE[0]}")/.." && pwd -P)"
 SUPPORTED='3.11 3.12'
@@ -21,7 +21,7 @@ stop() {
     exit 2
 }
 
-# Print "MAJOR.MINOR" when the interpreter really runs (a pyenv shim may exist and yet fail).
+# Print "MAJOR.MINOR" if the interpreter really runs (a pyenv shim may exist and still fail).
 version_of() {
     "$1" -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null
 }
@@ -54,7 +54,7 @@ $(uname -m): install ROS 2 Jazzy (apt: ros-jazzy-ros-base) and source /opt/ros/j
 find_python() {
     local candidate version without_venv='' candidates
     candidates=("${PYTHON:-}" python3.12 python3.11 python3)
-    # The interpreter that ROS 2 was built for is the only one that can import its rclpy.
+    # Only the interpreter that ROS 2 was built for can import its rclpy.
     [ "$SOURCE" = wheels ] || candidates=(python3)
     for candidate in "${candidates[@]}"; do
         [ -n "$candidate" ] || continue
@@ -90,13 +90,13 @@ make_venv() {
     echo "$ME: making ${VENV##*/} with $("$PYTHON" --version) ($SOURCE ROS 2)" >&2
     rm -rf -- "$VENV"
     "$PYTHON" -m venv "${options[@]}" "$VENV" >&2 || stop "'$PYTHON -m venv' failed, see above."
-    # Colcon takes every folder with a package.xml or setup.py; there are some in site-packages.
+    # Colcon would build the packages in site-packages that have a package.xml or setup.py.
     touch "$VENV/COLCON_IGNORE"
     echo "$SOURCE" >"$VENV/.source"
 }
 
-# Wheels: the locked versions, with hashes.  A sourced ROS 2 keeps the versions of the system that it
-# was built for, NumPy's among them, and only bounds are asked for.
+# Wheels: locked versions with hashes.  A sourced ROS 2 needs the system's versions (of NumPy, for
+# example), so its lists have only bounds.
 lists_of() {
     if [ "$SOURCE" = wheels ]; then
         echo "scripts/${1/noble/test}.lock"
@@ -122,9 +122,9 @@ install() {
     local level="$1" list lists options=()
     mapfile -t lists < <(lists_of "$level")
     for list in "${lists[@]}"; do options+=(-r "$list"); done
-    # What builds packages comes from a lock too, so that pip fetches nothing without a hash.
-    # A lock is complete: pip 23 looks for the newest `coverage[toml]` beside a pinned `coverage`,
-    # and then refuses it for want of a hash.
+    # The build tools are locked too, so that pip downloads nothing without a hash.  --no-deps, as
+    # the lock is complete: otherwise pip 23 looks for the newest `coverage[toml]` in spite of the
+    # pinned `coverage`, and then rejects it because it has no hash.
     [ "$SOURCE" = sourced ] || options+=(--require-hashes --no-deps --no-build-isolation)
     echo "$ME: installing ${lists[*]} into ${VENV##*/}, once; this takes some minutes" >&2
     : >"$LOG"
@@ -135,11 +135,11 @@ install() {
 reachable? Whole log: $LOG"
     fi
     hash_of "$level" >"$VENV/.installed-$level"
-    # What the tests need contains what the nodes need.
+    # The requirements of the tests include those of the nodes.
     [ "$level" = run ] || hash_of run >"$VENV/.installed-run"
 }
 
-# Print the most telling line of pip's log: the cause, else its last error.
+# Print the most useful line of pip's log: the cause, otherwise the last error.
 reason() {
     grep -m 1 -o -E "Failed to establish a new connection.*|ProxyError.*|SSLError.*|No space left\
  on device|No matching distribution found for .*" "$LOG" | head -c 160 ||
@@ -148,16 +148,16 @@ reason() {
 
 open_venv() {
     cd -- "$ROOT"
-    # Set by the wheels' bootstrapper for its own children only; a leftover would disable it here.
+    # The wheels' bootstrapper sets this for its children; inherited, it would disable it here.
     unset _ROS_WHEELS_BOOTSTRAP_COMPLETE
     find_ros "$1"
     if [ "$1" = noble ]; then
-        # A sourced Jazzy has these versions anyway, and its own Python.
-        [ "$SOURCE" = wheels ] || stop "a sourced ROS 2 has versions of its own: leave --versions away."
+        # A sourced Jazzy already has these versions, and its own Python.
+        [ "$SOURCE" = wheels ] || stop "a sourced ROS 2 has its own versions: omit --versions."
         SUPPORTED=3.12
         place_venv .venv-noble
     fi
-    # One at a time: the demo and the tests may be started together.
+    # Lock: the demo and the tests may be started at the same time.
     exec 9<"$ROOT/scripts/common.sh"
     if command -v flock >/dev/null; then flock 9; fi
     venv_works || make_venv

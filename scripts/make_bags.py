@@ -2,9 +2,9 @@
 """
 Write the library of bags: `scripts/make_bags.py [FOLDER]` (default: bags/).
 
-Each is a rosbag2 directory with a `truth.yaml`: what it was made from, so that
-an estimate from it can be checked.  The same seed gives the same messages.
-Parameters are those of the paper's Tables 1 and 2 unless said otherwise.
+Each is a rosbag2 directory with a `truth.yaml`, the parameters of its simulation, against which an
+estimate can be checked.  The same seed gives the same messages.  Parameters are those of the
+paper's Tables 1 and 2 unless said otherwise.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from ou_monitor.records import FloatArray, Recording  # noqa: E402
 from ou_monitor.simulation import (  # noqa: E402
     ALPHA, FLIGHT, FLIGHT_NOISE, FLIGHT_SAG, PROFILES, SIGMA, TRANSIENT_SAG, U0)
 
-# 2024-01-01T00:00:00Z: a fixed start, for a bag must not depend on the day.
+# 2024-01-01T00:00:00Z: a fixed start, so that a bag does not depend on the day.
 START_NS = 1_704_067_200 * 1_000_000_000
 
 
 @dataclass(frozen=True)
 class Bag:
-    """One bag to be written: its samples, and the truth about them."""
+    """One bag to be written: its samples and their true parameters."""
 
     name: str
     description: str
@@ -65,7 +65,7 @@ def steady(name: str, throttle: float, duration: float, rate: float, kind: str,
 
 
 def transient(duration: float = 10.0, rate: float = 1000.0, seed: int = 20) -> Bag:
-    """Return the step 0 -> 20 -> 0 %: the rail relaxes to its level with alpha, both ways."""
+    """Return the step 0 -> 20 -> 0 %: the rail relaxes at rate alpha after both changes."""
     t = grid(duration, rate)
     on, off = 3.0, 6.0
     throttle = np.where((t >= on) & (t < off), 0.20, 0.0)
@@ -83,15 +83,15 @@ def transient(duration: float = 10.0, rate: float = 1000.0, seed: int = 20) -> B
 
 
 def flight_sigma(throttle: npt.ArrayLike) -> FloatArray:
-    """Return sigma, V/sqrt(s): straight lines between the paper's loads, level beyond 40 %."""
+    """Return sigma, V/sqrt(s): linear between the paper's loads, constant above 40 %."""
     return np.interp(throttle, list(SIGMA), list(SIGMA.values()))
 
 
 def flight(duration: float = 40.0, rate: float = 1000.0, seed: int = 40) -> Bag:
-    """Return a flight: sag in proportion to throttle, sigma by throttle, sensor noise."""
+    """Return a flight: sag proportional to throttle, sigma depending on it, sensor noise."""
     t = grid(duration, rate)
     throttle = PROFILES['flight'][0](t)
-    # What a bag can hold is what the truth is made from.
+    # Rounded as in the bag (float32), so that the truth is made from the same values.
     throttle = throttle.astype(np.float32).astype(np.float64)
     rng = np.random.default_rng(seed)
     u = simulate(t, ALPHA, flight_sigma(throttle), rng, u0=U0 - FLIGHT_SAG * throttle)
@@ -147,9 +147,10 @@ def write(bag: Bag, folder: Path) -> Path:
     """Write one bag and its truth, in place of an older one; return its directory."""
     target = folder / bag.name
     if target.exists():
-        # Only what this script made is ever removed.
+        # Only folders that this script made are ever removed.
         if not (target / 'truth.yaml').is_file():
-            raise SystemExit(f'make_bags: {target} has no truth.yaml: not mine, remove it first')
+            raise SystemExit(f'make_bags: {target} has no truth.yaml, so another program '
+                             'made it: remove it first')
         shutil.rmtree(target)
     write_recording(bag.recording, target, type=bag.type, start_ns=START_NS, sample_rate=bag.rate)
     text = yaml.safe_dump(truth_of(bag), sort_keys=False, allow_unicode=True)

@@ -2,10 +2,10 @@
 """
 Write the golden tables: `scripts/make_golden.py [NAME or RUN ...]` (default: all).
 
-test/analysis/golden/NAME.json is what `ou-monitor analyze bags/NAME --json -` finds, without the
-long series (of those every sixteenth value); test/golden/RUN.json is what a run of
-test/support/golden_*.py finds.  Run it after a change that is meant to move the numbers, and look
-at the difference before it is committed.
+test/analysis/golden/NAME.json is the output of `ou-monitor analyze bags/NAME --json -`, with only
+every sixteenth value of long series; test/golden/RUN.json is the result of a run of
+test/support/golden_*.py.  Run this script after a change that is meant to change numbers, and look
+at the differences before you commit them.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def table(analysis: Analysis) -> Any:
     Parameters
     ----------
     analysis : Analysis
-        What `analyze` found.
+        Result of `analyze`.
 
     Returns
     -------
@@ -44,9 +44,9 @@ def table(analysis: Analysis) -> Any:
 
     """
     data = as_data(analysis)
-    # Where it was read from is the reader's to say.
+    # The source is the path that was passed, which differs between machines.
     del data['source']
-    # Told by the load filter, which has tests of its own.
+    # From the load filter, which has its own tests.
     del data['overview']
     return thinned(plain_data(data))
 
@@ -57,7 +57,7 @@ def thinned(value: Any) -> Any:
         return {key: thinned(item) for key, item in value.items()}
     if isinstance(value, list):
         return [thinned(item) for item in (value[::_EVERY] if len(value) > _LONG else value)]
-    # More digits change with the machine.
+    # Further digits differ between machines.
     return float(f'{value:.9g}') if isinstance(value, float) else value
 
 
@@ -73,7 +73,7 @@ def main(argv: list[str]) -> int:
         found = runs[name]() if name in runs else table(
             analyze(read_recording(BAGS / name)))
         path = (ROOT / 'test' / 'golden' if name in runs else GOLDEN) / f'{name}.json'
-        # A table of a run is read by a program: one line for each part of it.
+        # Only programs read the table of a run: one line for each part is enough.
         text = json.dumps(found, indent=None if name in runs else 1, allow_nan=False,
                           ensure_ascii=False)
         path.write_text(text.replace('}, {', '},\n{') + '\n', encoding='utf-8')

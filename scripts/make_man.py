@@ -17,7 +17,7 @@ PAGE = ROOT / 'doc' / 'ou-monitor.1'
 
 
 def plain(text: str | None) -> str:
-    """Return a text as troff reads it, without its control characters."""
+    """Return a text escaped for troff."""
     text = ' '.join((text or '').split()).replace('\\', r'\e').replace('-', r'\-')
     return r'\&' + text if text[:1] in ("'", '.') else text
 

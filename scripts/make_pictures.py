@@ -2,9 +2,9 @@
 """
 Write the pictures in doc/pages/: the first screen of each report and of `ou-monitor live`.
 
-Each page is made by its own command from what is in bags/, and photographed in a headless Chromium
-or Chrome, 1000 px wide; that of `analyze` also 390 px wide and dark.  The live page is that of a
-bag that plays into the nodes, after half a minute.
+Each page is made by its command from a recording in bags/, and captured in a headless Chromium or
+Chrome, 1000 px wide; the page of `analyze` also 390 px wide and dark.  The live page is captured
+after a bag has played into the nodes for half a minute.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def photograph(program: str, page: Path, picture: Path, width: int, theme: str) 
 
 
 def live(program: str, picture: Path) -> None:
-    """Write the live page of a bag that plays."""
+    """Capture the live page while a bag plays."""
     environment = {**os.environ, 'ROS_DOMAIN_ID': str(random.randint(60, 99)),
                    'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
 
@@ -97,7 +97,7 @@ def live(program: str, picture: Path) -> None:
 
 
 def main() -> int:
-    """Write all pictures, or those that are named."""
+    """Write all pictures, or those named as arguments."""
     program = find_browser()
     if program is None:
         print('no Chromium or Chrome: the pictures stay as they are', file=sys.stderr)

@@ -2,10 +2,9 @@
 """
 Write the example and the picture of README.md: `scripts/make_readme.py`.
 
-The example is what the command of README.md really prints about a recorded flight, shortened to
-its first paragraphs; the picture is its report in a headless Chromium or Chrome, reduced to
-`_SHOWN`.  test/test_readme.py runs the same command and compares.  Without a browser the picture
-stays as it is.
+The example is the real output of README.md's command for a recorded flight, shortened to its first
+paragraphs.  The picture shows part of its report (`_SHOWN`) in a headless Chromium or Chrome;
+without a browser it is not changed.  test/test_readme.py runs the same command and compares.
 """
 
 from __future__ import annotations
@@ -24,9 +23,9 @@ from browser import Browser, find_browser  # noqa: E402
 README = ROOT / 'README.md'
 PICTURE = ROOT / 'doc' / 'report.png'
 _MARKS = ('<!-- example begins -->\n', '<!-- example ends -->')
-# Paragraphs of the output that are shown.
+# Number of paragraphs of the output that are shown.
 _FIRST = 3
-# Of the report: voltage and throttle with its load levels, and what lies over throttle.
+# Part of the report shown: voltage, throttle with its load levels, and the plot over throttle.
 _SHOWN = """
     const figures = [...document.querySelectorAll('figure')];
     const wanted = new Set(figures.slice(0, 2));
@@ -50,7 +49,7 @@ def command(text: str) -> list[str]:
 
 
 def run(words: list[str], report: Path) -> str:
-    """Return what the command prints, its report written to `report`."""
+    """Run the command with its report written to `report`; return its output."""
     named = words[1:]
     words = [str(report) if word.endswith('.html') else word for word in named]
     done = subprocess.run([sys.executable, '-m', 'ou_monitor.cli.main', *words], cwd=ROOT,
@@ -71,7 +70,7 @@ def photograph(page: Path) -> bool:
         return False
     with tempfile.TemporaryDirectory() as folder, \
             Browser(program, folder, width=860, height=640) as tab:
-        # Plots come to life as they are seen; the page then adds how to use them.
+        # Plots become interactive when they are scrolled into view; the page then adds a hint.
         tab.visit(page, 'document.querySelector(".live-hint")')
         tab.run(_SHOWN)
         tab.until('!document.querySelector("figure:not(.is-live)")')

@@ -2,7 +2,7 @@
 """
 Write the sketches of doc/glossary.md and the two figures of doc/theory.md.
 
-A sketch is a simulated recording of a rail with one cause, as `discover` names it.
+A sketch is a simulated recording of a rail with one of the causes that `discover` names.
 """
 
 from __future__ import annotations
@@ -53,17 +53,17 @@ CAUSES: dict[str, tuple[dict[str, object], float]] = {
     'tone': ({'amplitude': 0.1, 'frequency': 20.0, 'phase': 0.0, 'linewidth': 0.0}, 0.5),
     'volatility': ({'std': 1.2, 'rate': 2.0}, 2.0),
 }
-# Causes that show only through another one; every other sketch has only the OU beside it.
+# Causes that are visible only together with another one; other sketches have only the OU besides.
 _SEEN_BY = {'ac_coupling': 'load_sag', 'clock_jitter': 'tone',
             'load_dependent_noise': 'measurement_noise', 'lopsided_noise': 'measurement_noise'}
 _POINTS, _WIDTH, _HEIGHT = 300, 240, 64
-# The style of a sketch alone, which benchmarks do not change.
+# The sketches' own style, independent of the benchmarks'.
 _STYLE = """<style>
 .line { fill: none; stroke-width: 1.6; stroke-linejoin: round; }
 .s0 { stroke: #0072b2; } .s7 { stroke: #9aa5a9; }
 </style>"""
-# Sigma of the OU beside a cause, V/sqrt(s): small, so that the cause stands out, except for causes
-# that change the OU.
+# Sigma of the OU in a sketch, V/sqrt(s): small, so that the cause is easy to see, except for
+# causes that change the OU.
 _CALM, _LOUD = 0.15, 0.632
 _CHANGES_THE_OU = ('ou', 'saturation', 'nonlinear_restoring', 'held_samples', 'quantization')
 
@@ -106,7 +106,7 @@ def sketch(name: str) -> str:
 
 
 def axes(width: int, height: int, texts: Sequence[tuple[float, float, str]]) -> list[str]:
-    """Return a frame and the words at their places."""
+    """Return a frame with labels at their positions."""
     floor = height - 40
     return [f'<polyline class="line s7" points="60,20 60,{floor} {width - 20},{floor}"/>',
             *(f'<text x="{x:.0f}" y="{y:.0f}">{text}</text>' for x, y, text in texts)]

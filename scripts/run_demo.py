@@ -2,8 +2,8 @@
 """
 Drive the demo: start the nodes, replay a bag into them, show a live table, write a report.
 
-Estimator, adaptive filter and replay (or, with --simulated, supply_simulator under the recorded
-throttle) run as processes of their own and talk over DDS, as on a vehicle; this program only
+Estimator, adaptive filter and replay (or, with --simulated, supply_simulator with the recorded
+throttle) run as separate processes that communicate over DDS, as on a vehicle; this program only
 listens.  Exit status: 0 when estimates and filtered samples arrived, 1 when they did not, 2 when
 the demo could not start, 130 after Ctrl-C.
 """
@@ -27,11 +27,11 @@ from ou_monitor.errors import InputError
 
 ROOT = Path(__file__).resolve().parent.parent
 START_TIMEOUT = 30.0
-# A node that has not ended so long after SIGINT is killed.
+# A node that is still running this long after SIGINT is killed, s.
 STOP_TIMEOUT = 5.0
-# A recorded flight of a 4S quad, 3.3 V a cell as its limit; a model of it.
+# A recorded flight of a 4S quad, its limit (3.3 V per cell), and a model of its supply.
 RECORDED, LIMIT, MODEL = 'bags/recorded/gecko', 13.2, 'models/gecko.yaml'
-# With --simulated: seed, samples per second, Hz, and how old the pack is in the second half.
+# With --simulated: seed, sampling rate in Hz, and how much larger sag is in the second half.
 SEED, RATE, OLD = 1, 200.0, 1.6
 HEADER = (f'{"t":>6} {"throttle":>8} {"level":>7} {"noise":>6} {"sag":>6} {"error":>6} '
           f'{"alpha":>7} {"risk":>7} {"cutoff":>7}  load, relaxation\n'
@@ -40,11 +40,11 @@ HEADER = (f'{"t":>6} {"throttle":>8} {"level":>7} {"noise":>6} {"sag":>6} {"erro
 
 
 class DemoError(Exception):
-    """The demo cannot go on; the text is the one line for the user."""
+    """The demo cannot continue; the text is the one-line message for the user."""
 
 
 def unused_domain() -> int:
-    """Return a DDS domain in which no participant of this machine listens."""
+    """Return a DDS domain that no participant on this machine uses."""
     # Up to 101 the ports of a domain stay below Linux' ephemeral range (DDSI-RTPS 9.6.1.1).
     for domain in random.sample(range(1, 101), 100):
         try:
@@ -58,7 +58,7 @@ def unused_domain() -> int:
 
 
 class Children:
-    """The processes of the demo, each with a log; all end with the block."""
+    """The processes of the demo, each with a log; all are stopped when the `with` block ends."""
 
     def __init__(self, logs: Path) -> None:
         self._logs = logs
@@ -77,7 +77,7 @@ class Children:
     def start(self, name: str, *arguments: str) -> None:
         """Start one executable of the package."""
         with self._log(name).open('wb') as log:
-            # A session of its own: Ctrl-C reaches this program, which ends the others in order.
+            # In a new session: Ctrl-C reaches only this program, which stops the others in order.
             self._running[name] = subprocess.Popen(
                 [sys.executable, '-u', '-m', *([] if '.' in name else ['ou_monitor.nodes']), name,
                  *arguments],
@@ -89,7 +89,7 @@ class Children:
         return self._running[name].poll()
 
     def stop(self, name: str) -> None:
-        """End one as Ctrl-C would."""
+        """Stop one as Ctrl-C would."""
         process = self._running[name]
         if process.poll() is None:
             process.send_signal(signal.SIGINT)
@@ -106,12 +106,12 @@ class Children:
                 raise DemoError(f'{name} ended with status {self.status(name)}: {self.last(name)}')
 
     def last(self, name: str) -> str:
-        """Return the last line that it wrote, and where the rest is."""
+        """Return the last line of its output and the path of its log."""
         lines = self._log(name).read_text(errors='replace').strip().splitlines()
         return f'{lines[-1] if lines else "no output"} (log: {self._log(name)})'
 
     def said(self, name: str) -> str:
-        """Return all that it wrote."""
+        """Return all of its output."""
         return self._log(name).read_text(errors='replace').strip()
 
     def _log(self, name: str) -> Path:
@@ -119,7 +119,7 @@ class Children:
 
 
 class Listener:
-    """What the nodes publish, and how it looks as a line of the table."""
+    """Receives what the nodes publish, and formats it as a line of the table."""
 
     def __init__(self, node: Any) -> None:
         from diagnostic_msgs.msg import DiagnosticArray
@@ -133,7 +133,7 @@ class Listener:
         node.create_subscription(Float64, '/ou_adaptive_filter/cutoff', self._on_cutoff, 10)
 
     def ready(self) -> bool:
-        """Whether both nodes are there."""
+        """Whether both nodes are running."""
         return all(self._node.count_publishers(topic) > 0
                    for topic in ('/ou_estimator/state', '/ou_adaptive_filter/cutoff'))
 
@@ -160,7 +160,7 @@ class Listener:
         return float(self.fields.get(name, 'nan'))
 
     def line(self) -> str:
-        """Return the newest state as a line of the table; '-' is not known."""
+        """Return the newest state as a line of the table, with '-' for unknown values."""
         if not math.isfinite(self._first):
             self._first = self.number('t')
         cells = [
@@ -185,7 +185,7 @@ class Table:
         print(HEADER, flush=True)
 
     def show(self, listener: Listener) -> None:
-        """Show the newest state when it is time to."""
+        """Show the newest state if a new line or a refresh is due."""
         now = time.monotonic()
         if now >= self._next_line:
             self._next_line = now + 1.0
@@ -201,7 +201,7 @@ class Table:
 
 
 def signal_of(bag: str) -> tuple[str, str]:
-    """Return what the filter shall filter: an IMU, else the busiest scalar but the throttle."""
+    """Return the topic to filter: an IMU, else the fastest scalar other than the throttle."""
     from ou_monitor.nodes.filter_channels import CHANNELS
     from ou_monitor.recordings.bag import BagReader
     reader = BagReader(bag)
@@ -213,7 +213,7 @@ def signal_of(bag: str) -> tuple[str, str]:
 
 
 def live_page(children: Children) -> str:
-    """Start the live page; return the line with its address, empty where it cannot be served."""
+    """Start the live page; return the line with its address, empty if it cannot be served."""
     children.start('ou_monitor.cli.main', 'live', '--port', '0')
     deadline = time.monotonic() + START_TIMEOUT
     while children.status('ou_monitor.cli.main') is None and time.monotonic() < deadline:
@@ -225,12 +225,12 @@ def live_page(children: Children) -> str:
 
 
 def make_old(node: Any) -> None:
-    """Turn the simulated pack old while it flies."""
+    """Age the simulated pack in flight."""
     from rclpy.parameter import Parameter
     from rclpy.parameter_client import AsyncParameterClient
     AsyncParameterClient(node, '/supply_simulator').set_parameters(
         [Parameter('scale_resistance', value=OLD)])
-    print(f'The pack grows old: its response to throttle is {OLD:g} times as large', flush=True)
+    print(f'The pack ages: its sag is now {OLD:g} times as large', flush=True)
 
 
 def watch(bag: str, seconds: float, logs: Path, limit: float | None,
@@ -288,7 +288,7 @@ def watch(bag: str, seconds: float, logs: Path, limit: float | None,
 
 
 def simulate(bag: str, report: Path) -> str:
-    """Return a recording of the supply of the demo: the same seed, the same path, not aged."""
+    """Return a simulated recording of the demo's supply, with the same seed but no ageing."""
     path = report.with_suffix('.mcap')
     done = subprocess.run(
         [sys.executable, '-m', 'ou_monitor.cli.main', 'simulate', '--model', str(ROOT / MODEL),
@@ -301,7 +301,7 @@ def simulate(bag: str, report: Path) -> str:
 
 
 def write_report(bag: str, report: Path) -> None:
-    """Have the command line analyze the same bag."""
+    """Analyze the same bag with the command line."""
     report.parent.mkdir(parents=True, exist_ok=True)
     done = subprocess.run(
         [sys.executable, '-m', 'ou_monitor.cli.main', 'analyze', bag, '--report', str(report),
@@ -321,19 +321,19 @@ def options() -> argparse.Namespace:
                         help=f'bag to replay ({RECORDED}, a recorded flight)')
     parser.add_argument('--simulated', action='store_true',
                         help=f'simulate {MODEL} under the throttle of the bag; in the second half '
-                             f'the pack is {OLD:g} times as weak')
+                             f'sag is {OLD:g} times as large')
     parser.add_argument('--limit', type=float, metavar='V',
                         help=f"voltage of a brown-out ({LIMIT} for {RECORDED}, else the nodes' "
                              'own)')
     parser.add_argument('--seconds', type=float, default=60.0,
                         help='replay no more than that many seconds (60)')
     parser.add_argument('--report', type=Path, default=Path('out/demo_report.html'),
-                        help='where the report goes (out/demo_report.html)')
+                        help='file of the report (out/demo_report.html)')
     return parser.parse_args()
 
 
 class Interrupt:
-    """Ends the demo on SIGINT and SIGTERM, but not inside the executor, which cannot bear it."""
+    """Ends the demo on SIGINT and SIGTERM, but never inside the executor, which has to finish."""
 
     inside = came = False
 
@@ -359,7 +359,7 @@ class Interrupt:
 def main() -> int:
     """Run the demo; return the exit status."""
     chosen = options()
-    # Not by way of SIGINT, which a shell may let all its children ignore.
+    # Set explicitly, because a shell may start its children with SIGINT ignored.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, Interrupt.handle)
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')

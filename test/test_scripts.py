@@ -245,7 +245,7 @@ def test_demo_shows_estimates_and_leaves_a_report(tmp_path, source):
     assert 3 <= len(rows) <= 10
     assert all(float(cell) > 0.0 for cell in (*rows[-1][2:4], rows[-1][8]))
     # Open-circuit voltage of the 4S pack of the recorded flight, or of its model.
-    assert ('grows old' in done.stdout) == bool(source)
+    assert ('pack ages' in done.stdout) == bool(source)
     assert 15.0 < float(rows[-1][2]) < 17.5
 
 
