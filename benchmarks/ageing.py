@@ -1,11 +1,11 @@
 """
 Verdicts on a flight beside a saved model: aged packs, and recorded pairs (5 min a model).
 
-`aged`: a model learned from one simulated flight, and 60 s of other ones under the recorded
-throttle, begun at three places of it, with 1, 1.1, 1.2 and 1.4 times the answer, and 5 s with
-three quarters of the voltage.  The verdict counts at any second, not only at the last.
-`pairs`: recorded flights or halves of one craft, each with the model of the other; at the last
-sample, and whether WEAKER at any second.  Needs `OU_MONITOR_REALDATA`.
+`aged`: a model is learned from one simulated flight and compared with 60 s of others, which have
+1, 1.1, 1.2 and 1.4 times the sag and start at three places of the recorded throttle, and with 5 s
+at three quarters of the voltage.  A verdict at any second counts, not only the last. `pairs`:
+recorded flights of one craft, or halves of one, each compared with the model of the other: at the
+last sample, and whether WEAKER at any second.  Needs `OU_MONITOR_REALDATA`.
 
     python benchmarks/ageing.py aged models/gecko.yaml:bags/recorded/gecko.csv --page PAGE
 """
@@ -27,7 +27,7 @@ from ou_monitor.recordings.model_file import read_model
 from ou_monitor.records import Recording
 from ou_monitor.simulation import read_throttle, RecordedThrottle, simulated
 
-# Hz; length of the flight that teaches and of those compared, s.
+# Hz; length of the flight for learning and of those compared, s.
 RATE, TAUGHT, LENGTH = 100.0, 120.0, 60.0
 AGES, PLACES = (1.0, 1.1, 1.2, 1.4), (0.0, 1.0 / 3.0, 2.0 / 3.0)
 # Recorded flights by craft; a craft with one flight is compared by its halves.
@@ -39,7 +39,7 @@ CRAFTS: dict[str, dict[str, tuple[str, int | None]]] = {
 
 
 def seconds(made: Recording, start: LoadStart, factor: float = 1.0) -> Iterator[ModelComparison]:
-    """Yield what each second of a flight says beside a model, its voltages times a factor."""
+    """Compare a flight, its voltages scaled, with a model; yield the result of each second."""
     loads = LoadFilter()
     loads.begin_with(start)
     edges = np.searchsorted(made.t, np.arange(made.t[0], made.t[-1] + 1.0))
@@ -50,7 +50,7 @@ def seconds(made: Recording, start: LoadStart, factor: float = 1.0) -> Iterator[
 
 
 def learned(made: Recording) -> LoadStart | None:
-    """Return what a flight teaches."""
+    """Return the model learned from a flight."""
     loads = LoadFilter()
     loads.push(made.t, made.voltage, made.throttle)
     return loads.learned()
@@ -99,7 +99,7 @@ def half(made: Recording, second: bool) -> Recording:
 
 
 def pairs() -> list[list[str]]:
-    """Return a row for each recorded pair, either way."""
+    """Return two rows for each recorded pair, one in each direction."""
     rows = []
     for craft in CRAFTS.values():
         parts = list(flights(of=craft))
@@ -133,7 +133,7 @@ def main() -> int:
             path, _, recording = run.partition(':')
             rows += aged(read_model(path).model, read_throttle(recording), Path(path).stem,
                          options.seeds)
-        text = table(('model', 'answer', 'ever weaker', 'median s', 'sag now / then',
+        text = table(('model', 'sag factor', 'ever weaker', 'median s', 'sag now / then',
                       'noise now / then', 'another pack'), rows)
     else:
         text = table(('flight', 'model of', 'sag now / then', 'noise now / then', 'verdict',

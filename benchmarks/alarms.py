@@ -1,27 +1,27 @@
 """
 The brown-out flag on recorded flights, beside the battery alarms of PX4 and ArduPilot (8 min).
 
-Reports at 10 Hz of one monitor a limit; limits passed by 1 and 5 % of the seconds, and 3.3 and
-3.5 V a cell.  A dip: the middle one of three readings at or below the limit; dips less than 0.3 s
-apart are one.  Caught: the alarm is on at some time from 2 s before the dip begins to 0.25 s
-after; its lead counts from the first such report.  Lone: no dip within 4 s before.  Quiet: 2 s
-away from any dip.  A false rise: no dip follows within 2 s.  Limits that the voltage undershoots
-for more than 30 % of the flight are left out.
+Each limit has its own monitor, with reports at 10 Hz.  Limits: undershot in 1 and 5 % of the
+seconds, and 3.3 and 3.5 V per cell.  A dip: the median of three readings is at or below the limit;
+dips less than 0.3 s apart count as one.  Caught: the alarm is on at some time from 2 s before the
+dip begins to 0.25 s after; its lead is measured from the first such report.  Lone: no other dip in
+the 4 s before.  Quiet: at least 2 s away from any dip.  A false rise: no dip follows within 2 s.
+Limits that the voltage undershoots for more than 30 % of the flight are left out.
 
 The autopilots' alarms, with their defaults and the cells of the pack, are taken to be on while
-their condition holds; both keep them until the landing.  Without a current neither compensates
-the sag.
+their condition holds, although both latch them until landing.  Without a current neither
+compensates the sag.
 
-PX4 (`src/lib/battery/battery.cpp`, `battery.h`, `module.yaml`, `battery_params_common.c`):
-charge = (E - 3.6 V) / 0.45 V of a cell, E = voltage + R current through a low-pass of 1 s, R by
-recursive least squares that forget by 0.95 and learn while their covariance shrinks; critical
-below 0.07.
+PX4 (`src/lib/battery/battery.cpp`, `battery.h`, `module.yaml`, `battery_params_common.c`): charge
+= (E - 3.6 V) / 0.45 V per cell, with E = voltage + R current through a low-pass of 1 s; R comes
+from recursive least squares with a forgetting factor of 0.95, updated only while its covariance
+shrinks; critical below 0.07.
 
 ArduPilot Copter (`AP_BattMonitor_Params.cpp`, `AP_BattMonitor_Backend.cpp`, read at 10 Hz): low
 after more than BATT_LOW_TIMER = 10 s below BATT_LOW_VOLT = 10.5 V; raw voltage, or with
-BATT_FS_VOLTSRC = 1 that at rest.  Also with BATT_LOW_VOLT set to the limit.
+BATT_FS_VOLTSRC = 1 the voltage at rest.  Also with BATT_LOW_VOLT set to the limit.
 
-The closed loop is simulated: dips that no throttle announces, and an hour without any.
+The closed loop is simulated: dips that throttle does not announce, and an hour without any.
 
     OU_MONITOR_REALDATA=... python benchmarks/alarms.py flights --page doc/results/alarms.md
     OU_MONITOR_REALDATA=... python benchmarks/alarms.py flights gecko --strips doc/results
@@ -47,22 +47,22 @@ from ou_monitor.report.svg import Plot
 FLOWN = {**{name: FLIGHTS[name] for name in ('gecko', 'nazgul', 'roma', 'bf3s')}, 'hiro': HIRO,
          'erle': FLIGHTS['erle']}
 CELLS = {'gecko': 4, 'nazgul': 4, 'roma': 6, 'bf3s': 3, 'hiro': 4, 'erle': 3}
-# Time between two reports, and before the first that counts, s.
+# Time between reports, and before the first one that is counted, s.
 LOOK, SETTLED = 0.1, 20.0
-# An alarm catches a dip from so long before it to so long after, s; a lone dip has none before.
+# An alarm from BEFORE a dip to AFTER it catches it, s; a lone dip has no other for ALONE before.
 BEFORE, AFTER, ALONE = 2.0, 0.25, 4.0
-# The limit that is drawn, and what is drawn of the voltage: the lowest of so many seconds.
+# The limit drawn; the voltage is drawn as its lowest value in each COLUMN seconds.
 DRAWN, COLUMN = '5 %', 0.3
 OURS, PX4 = 'CRITICAL', 'PX4, critical'
 ARDUPILOT = ('ArduPilot, 10.5 V', 'ArduPilot, the limit', 'ArduPilot, the limit at rest')
 ALARMS = (OURS, PX4, *ARDUPILOT)
-# Of the rows of a strip, WARN first.
+# Short names for the rows of a strip, WARN first.
 SHORT = ('WARN', 'CRITICAL', 'PX4', 'AP 10.5 V', 'AP limit', 'AP rest')
 SHADES = ('#e0b84c', '#d55e00', *4 * ['#444444'])
 
 
 def dips_of(t: np.ndarray, middle: np.ndarray, limit: float, step: float) -> list[list[float]]:
-    """Return begin and end, s, of each dip."""
+    """Return start and end of each dip, s."""
     over = middle > limit + max(step, 0.003 * limit)
     decides = np.flatnonzero((middle <= limit) | over)
     low = middle[decides] <= limit
@@ -78,14 +78,14 @@ def dips_of(t: np.ndarray, middle: np.ndarray, limit: float, step: float) -> lis
 
 
 def px4_charge(t: np.ndarray, voltage: np.ndarray, current: np.ndarray, cells: int) -> np.ndarray:
-    """Return the state of charge by voltage, 0..1, as `battery.cpp` has it without capacity."""
+    """Return the state of charge from voltage, 0..1, as `battery.cpp` without a capacity does."""
     resistance = 0.005
     state, covariance = np.zeros(2), np.eye(2)
     filtered, out = 0.0, np.empty(t.size)
     for k in range(t.size):
         v, i, dt = float(voltage[k]), float(current[k]), float(t[k] - t[max(k - 1, 0)])
         if t[k] - t[0] <= 2.0:
-            # The pack has just been connected: all begins anew.
+            # The pack has just been connected: everything restarts.
             resistance = 0.005
             state = np.array([v, resistance * cells])
             covariance = np.diag([1.5, 0.1]) * cells
@@ -109,7 +109,7 @@ def px4_charge(t: np.ndarray, voltage: np.ndarray, current: np.ndarray, cells: i
 
 def ardupilot_low(t: np.ndarray, voltage: np.ndarray, current: np.ndarray, limit: float,
                   at_rest: bool) -> np.ndarray:
-    """Return whether the failsafe is on, from readings at 10 Hz, as `AP_BattMonitor` has it."""
+    """Return whether the failsafe is on, from readings at 10 Hz, as in `AP_BattMonitor`."""
     resistance = most = v_filtered = i_filtered = reference_i = reference_v = 0.0
     since, out = np.nan, np.zeros(t.size, bool)
     for k in range(t.size):
@@ -169,7 +169,7 @@ class Watch:
                 for x in rises), flown.sum()])
 
     def leads(self, alarm: str) -> list[float]:
-        """Return how long before each dip that it catches the alarm came on, s."""
+        """Return the lead of an alarm over each dip that it catches, s."""
         found = []
         for begin, _ in self.dips:
             near = self.at[self.on[alarm] & (self.at >= begin - BEFORE) & (
@@ -180,7 +180,7 @@ class Watch:
 
 
 def fly(flight: str, recording: Recording, cells: int) -> Iterator[tuple[str, Watch]]:
-    """Yield name and watch of each limit."""
+    """Yield name and `Watch` of each limit."""
     good = np.isfinite(recording.throttle)
     t, v = recording.t[good] - recording.t[good][0], recording.voltage[good]
     u, middle = np.clip(recording.throttle[good], 0.0, 1.0), median3(v)
@@ -298,10 +298,10 @@ def recorded_flights(options: argparse.Namespace) -> str:
     return tables(watches)
 
 
-# The closed loop: readings and reports a second (`publish_rate`), limit, V, and seconds that are
-# left for the load to become known.
+# The closed loop: readings and reports per second (`publish_rate`), limit, V, and time in which
+# the load becomes known, s.
 RATE, REPORTS, LIMIT, WARM_UP = 100, 10, 13.2, 30.0
-# Between two dips, and how long one is, s; from where on an alarm is that of a dip, s.
+# Time between dips, and their length, s; an alarm later than this after a dip is not its own, s.
 APART, DIP, ITS_OWN = (6.0, 12.0), (0.02, 0.5), 0.5
 
 
@@ -317,7 +317,7 @@ def supply(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray, np
         x += (u ** 1.8 - x) / (0.06 * RATE)
         y += (u ** 1.8 - y) / (2.0 * RATE)
         throttle[k], lagged[k], slow[k] = u, x, y
-    # An hour is flown with several packs: the level goes down and is that of a full one again.
+    # An hour needs several packs: the level falls, and returns to that of a full pack.
     level = 16.3 - 0.8 * (t % 600.0) / 600.0
     noise = 0.02 * (1.0 + throttle) * rng.standard_normal(n)
     voltage = level - 1.2 * lagged - 0.5 * slow + noise
@@ -326,10 +326,10 @@ def supply(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray, np
 
 def fly_loop(seed: int, minutes: float, dips: int) -> tuple[int, list[float], int]:
     """
-    Return false rises of CRITICAL, delays of dips, s, and dips that were missed, of one flight.
+    Return false rises of CRITICAL, delays of dips, s, and the number of missed dips of a flight.
 
-    A dip: another load takes the supply 0.1 to 1 V below the limit for 20 to 500 ms, at any
-    throttle; without any the flight lasts for some minutes.
+    In a dip another load pulls the supply 0.1 to 1 V below the limit for 20 to 500 ms, at any
+    throttle.  A flight without dips lasts `minutes`.
     """
     rng = np.random.default_rng(seed)
     gaps = rng.uniform(*APART, dips)

@@ -1,8 +1,8 @@
 """
-How often `analyze` finds what is there, and what is not (10 min).
+How often `analyze` finds effects that are there, and effects that are not (10 min).
 
 Recordings of three load levels, 5 s each at 1 kHz, with the paper's alpha, white noise of 3 mV and
-a sag; or six stays of 2.5 s at 0 and 50 %, with the noise unbroken over the changes.
+a sag; or six stays of 2.5 s at 0 and 50 %, with noise that continues over the changes.
 """
 
 from __future__ import annotations
@@ -74,16 +74,16 @@ def line(found: Analysis) -> bool:
 
 
 def differs(found: Analysis) -> bool:
-    """Return whether alpha is said to differ."""
+    """Return whether alpha is reported to differ."""
     return found.alpha_test.verdict == 'differs'
 
 
-# What is looked for in plain OU levels.
+# False alarms that are counted in plain OU levels.
 ALARMS: dict[str, Callable[[Analysis], bool]] = {
     "a process type other than 'diffusion'": lambda found: kinds(found) != {'diffusion'},
     'a line': line, 'alpha differs (stated 5 %)': differs,
     'a transient': lambda found: any(fit.detected for fit in found.relaxations)}
-# What is there, and whether it is found.
+# Effects that are there, and the check that finds them.
 THERE: dict[str, tuple[Callable[[Analysis], bool], dict[str, Any]]] = {
     'tone of 1.4 mV rms: a line': (line, {'effect': tone}),
     'one sample in 1000 off by 8 steps: with impulses': (

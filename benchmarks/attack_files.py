@@ -1,10 +1,10 @@
 """
-Damage bags and CSVs at random: does the reader return true values or report the damage (3 min).
+Damage bags and CSVs at random: the reader must return true values or report damage (3 min).
 
-In a bag each voltage belongs to its stamp by a formula, so a wrong value shows itself; of a CSV
-each value must stand in the line of its stamp.  A mutated file may be refused in one line, or read
-with notes that count what was dropped, or read whole; anything else is a fault, and its seed is
-printed.  The exit status is 1 when something was found.
+In a bag each voltage is a function of its stamp, so wrong values are recognized; in a CSV each
+value must come from the line of its stamp.  A mutated file may be refused with one line, or read
+with notes that count dropped samples, or read completely; anything else is a fault, whose seed is
+printed.  The exit status is 1 if there were faults.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ import zstandard
 START = 1_704_067_200_000_000_000
 MS = 1_000_000
 COUNT = 400
-# Longest time of one reading, s, on a loaded machine; a hang takes for ever.
+# Longest time of one reading, s, on a busy machine; more is a hang.
 PATIENCE = 60
 LIES = (0, 1, 2, 7, 8, 0x7f, 0xff, 2**16, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**63,
         2**64 - 1)
@@ -63,7 +63,7 @@ def volts(k: Any) -> Any:
 
 
 def written(path: Path, stamped: bool, **options: Any) -> bytes:
-    """Return a sound file."""
+    """Return an undamaged file."""
     k = np.arange(COUNT)
     kind = BATTERY_STATE if stamped else FLOAT64
     data = (encode_battery(START + k * MS, volts(k)) if stamped
@@ -100,7 +100,7 @@ BYTES = ('bits', 'bytes', 'zeros', 'cut', 'hole')
 
 
 def damage(data: bytearray, kind: str, at: int, most: int, rng: np.random.Generator) -> None:
-    """Damage bytes from a place on, at most so many."""
+    """Damage at most `most` bytes from `at` on."""
     size = int(rng.integers(1, most))
     if kind == 'bits':
         for place in rng.integers(len(data), size=int(rng.integers(1, 9))).tolist():
@@ -116,7 +116,7 @@ def mutated(sound: bytes, rng: np.random.Generator) -> tuple[str, bytes]:
     """Return the kind of an attack, and a file after it."""
     data = bytearray(sound)
     parts = records(sound)
-    # A record that is gone without a trace from a file that counts nothing cannot be missed.
+    # Without statistics nobody can know that a record was removed.
     if not any(sound[begin] == Opcode.STATISTICS for begin, _ in parts):
         parts = [part for part in parts if sound[part[0]] != Opcode.CHUNK]
     kind = str(rng.choice([*BYTES, 'more', 'swap', 'twice', 'lost', 'length', 'word', 'kind',
@@ -139,7 +139,7 @@ def mutated(sound: bytes, rng: np.random.Generator) -> tuple[str, bytes]:
     elif kind == 'length':
         data[one[0] + 1:one[0] + 9] = struct.pack('<Q', int(rng.choice(np.array(LIES, object))))
     elif kind == 'word':
-        # Within a record: a count, the length of a text, a size.
+        # Within a record: a count, the length of a string, or a size.
         place = int(rng.integers(one[0] + 9, max(one[1], one[0] + 10)))
         data[place:place + 4] = struct.pack('<I', int(rng.choice(LIES[:11])))
     elif kind == 'kind':
@@ -150,7 +150,7 @@ def mutated(sound: bytes, rng: np.random.Generator) -> tuple[str, bytes]:
 
 
 def text(value: str | bytes) -> bytes:
-    """Return a text as a record holds it."""
+    """Return a string as stored in a record."""
     data = value.encode() if isinstance(value, str) else value
     return struct.pack('<I', len(data)) + data
 
@@ -162,10 +162,10 @@ def record(op: int, *parts: bytes, length: int | None = None) -> bytes:
 
 
 class Crafted:
-    """A file made by hand, of chunks that are sound and of parts that lie."""
+    """A crafted file of correct chunks and of parts with false contents."""
 
     def __init__(self, rng: np.random.Generator) -> None:
-        """Choose what lies."""
+        """Choose the parts that lie."""
         self.rng, self.count = rng, 0
 
     def lies(self, chance: float = 0.12) -> bool:
@@ -173,11 +173,11 @@ class Crafted:
         return bool(self.rng.random() < chance)
 
     def lie(self) -> int:
-        """Return a number that is wrong nearly everywhere."""
+        """Return a number that is wrong nearly anywhere."""
         return int(self.rng.choice(np.array(LIES, object)))
 
     def definitions(self) -> bytes:
-        """Return a schema and a channel, and some that nobody needs or that differ."""
+        """Return a schema and a channel, and some that are unused or contradict them."""
         name, definition = FLOAT64, 'float64 data\n'
         out = record(Opcode.SCHEMA, struct.pack('<H', 1), text(name), text('ros2msg'),
                      text(definition))
@@ -212,7 +212,7 @@ class Crafted:
         return out
 
     def chunk(self, content: bytes, first: int) -> bytes:
-        """Return a chunk; what it states of itself may be a lie."""
+        """Return a chunk; its header may lie."""
         way = str(self.rng.choice(['', 'zstd', 'lz4']))
         packed, size, crc = content, len(content), zlib.crc32(content)
         if self.lies(0.05):
@@ -237,7 +237,7 @@ class Crafted:
             text(way), struct.pack('<Q', length), packed)
 
     def file(self) -> bytes:
-        """Return the whole of it."""
+        """Return the whole file."""
         data = MAGIC + record(Opcode.HEADER, text('ros2'), text(''))
         indexes = b''
         chunks = int(self.rng.integers(1, 6))
@@ -281,16 +281,16 @@ class Crafted:
         return data + record(Opcode.FOOTER, struct.pack('<QQI', start, 0, 0)) + MAGIC
 
 
-# What a cell of a CSV may hold in place of its number.
+# Replacements for the number in a cell of a CSV.
 CELLS = ('', ' ', 'nan', 'NaN', 'null', 'inf', '-inf', '1e308', '-1e308', '1e400', '1e-320',
          '5,01', '0x10', '1_000', '\u0661\u0662', '--5', '+5', ' 5 ', '5V', '9' * 400, '1e5',
          '"5"', '"5', '\0', '\x1b[31m5', '\u2028', '#5', '1;2', '5\t', '=1+1')
-# A number of a CSV, in full; `float` takes more than that.
+# A number of a CSV must match this; `float` accepts more.
 _NUMBER = re.compile(r'[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?', re.ASCII)
 
 
 def sheet() -> bytes:
-    """Return a sound CSV; a blank throttle holds the last, and nobody reads the note."""
+    """Return a correct CSV; a blank throttle repeats the last one, and `note` is not read."""
     lines = ['time_s,voltage_v,throttle,current_a,note']
     lines += [f'{k / 1000},{float(volts(k))},{k % 90 / 100 if k % 7 else ""},{k % 31 / 8},n{k}'
               for k in range(COUNT)]
@@ -363,13 +363,13 @@ def mutated_sheet(sound: bytes, rng: np.random.Generator) -> tuple[str, bytes]:
 
 
 def numbers(line: str) -> list[float]:
-    """Return the numbers that stand in a line of a CSV."""
+    """Return the numbers in a line of a CSV."""
     cells = (cell.strip(' "') for cell in re.split('[,;\t]', line))
     return [float(cell) for cell in cells if _NUMBER.fullmatch(cell)]
 
 
 def verdict_of_sheet(data: bytes, found: Recording) -> str:
-    """Return what came of a CSV that was read."""
+    """Return the verdict on a CSV that was read."""
     wide = 'utf-16' if data[:2] in (b'\xff\xfe', b'\xfe\xff') else 'utf-16-le'
     code = wide if wide == 'utf-16' or data[1:2] == b'\0' else 'utf-8-sig'
     lines = [line for line in re.split('\r\n|\n|\r', data.decode(code, 'replace'))
@@ -396,7 +396,7 @@ def verdict_of_sheet(data: bytes, found: Recording) -> str:
 
 
 def verdict(path: Path, count: int, partial: bool) -> str:
-    """Read a file; return what came of it, '!' first where it is a fault."""
+    """Read a file; return the verdict, which starts with '!' for a fault."""
     def hang(*_: object) -> None:
         raise TimeoutError
 
@@ -454,7 +454,7 @@ def main() -> int:
     faults, slowest = 0, 0.0
     with tempfile.TemporaryDirectory() as name:
         bag, table = Path(name) / 'attack.mcap', Path(name) / 'attack.csv'
-        # A warning of NumPy is a number that was not thought of.
+        # NumPy's warnings count as faults: they come from numbers that were not considered.
         warnings.simplefilter('error')
         for kind, seed, data, count in attacks(given, bag):
             path = table if kind.startswith('csv') else bag

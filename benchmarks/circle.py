@@ -3,9 +3,9 @@ Do `compare` and `discover` recognise simulations of the models that `discover` 
 
     OU_MONITOR_REALDATA=FOLDER python benchmarks/circle.py --page doc/results/circle.md
 
-Each model is drawn under the throttle of its own recording, with fresh seeds.  `compare` with the
-model must call the drawing alike; `discover` must find no cause that the model lacks; a tone that
-is added to the model must be found, with its frequency.
+Each model is simulated with the throttle of its own recording and new seeds.  `compare` must say
+that this looks like the model; `discover` must find no cause that the model lacks; a tone that is
+added to the model must be found at its frequency.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from ou_monitor.recordings.model_file import read_model
 # Five flights and a robot.
 MODELS = {**{name: FLIGHTS[name] for name in ('gecko', 'nazgul', 'bf3s', 'cf_solo')},
           'hiro': HIRO, 'mm_bench_3': BENCHES['mm_bench_3']}
-# Part of each recording that is drawn again, s.
+# Part of each recording that is simulated, s.
 SECONDS = 60.0
-# The tone that is added: its peak over the rms of the readings' differences, and its share of the
-# sampling rate, where neither load nor OU have much: the one farther from the model's own lines.
+# The added tone: its amplitude over the rms of the readings' differences, and its frequency over
+# the rate (the one farther from the model's lines; load and OU hardly reach either).
 AMPLITUDE, SHARES = 1.0, (0.23, 0.13)
-# Relative error of a frequency that is called the same.
+# Largest relative error of a frequency that counts as found.
 NEAR = 1e-3
 
 
@@ -52,7 +52,7 @@ def named(recording: Recording, model: SupplyModel) -> list[str]:
 
 
 def row(name: str, seeds: int) -> list[str]:
-    """Draw a model of a recording, and judge what is drawn."""
+    """Simulate the model of a recording, and judge the simulations."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / 'model.yaml'
         recording = saved(name, file)

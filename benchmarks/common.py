@@ -1,8 +1,8 @@
 """
-Shared by all programs: where things are, arguments, Markdown tables, drawings.
+Shared by all programs: paths, arguments, Markdown tables, drawings.
 
-Import it before NumPy: it puts the checkout on the path and gives each process one thread, so
-that CPU times compare.
+Import it before NumPy: it adds the checkout to the path and limits each process to one thread, so
+that CPU times are comparable.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ text.light { fill: #ffffff; } .grid { stroke: #dde3e5; stroke-width: 1; }
 
 def arguments(doc: str | None, names: bool = False, help_option: bool = True
               ) -> argparse.ArgumentParser:
-    """Return a parser with `--page`; `names`: and with names of recordings."""
+    """Return a parser with `--page` and, if `names` is true, names of recordings."""
     parser = argparse.ArgumentParser(description=(doc or '').strip().partition('\n')[0],
                                      add_help=help_option)
     if names:
@@ -97,7 +97,7 @@ def flights(names: Sequence[str] = (), of: Mapping[str, tuple[str, int | None]] 
 
 
 def environment(*packages: str) -> str:
-    """Return what numbers depend on: date, versions, processor and commit."""
+    """Return the conditions of a measurement: date, versions, processor and commit."""
     about = [date.today().isoformat(), f'Python {platform.python_version()}']
     for name in ('numpy', 'scipy', *packages):
         try:

@@ -1,5 +1,5 @@
 """
-Recorded flights beside their simulations: fitted on the first half, the second simulated (1 min).
+Recorded flights and their simulations: first half fitted, second half simulated (1 min).
 
 All flights use the same settings.
 """

@@ -1,15 +1,15 @@
 """
-Used by filter.py: the loop that an adaptive D term closes through the supply.
+Used by filter.py: the control loop that an adaptive D term closes through the supply.
 
     throttle -> load -> sigma and sag -> SlidingEstimator -> cutoff -> D term -> throttle
 
-One rate axis of a multirotor in hover: four motors in two pairs, first-order motors, no air.  The
-order of magnitude of the margins counts, not the third digit of a boundary.
+One rate axis of a multirotor in hover: four motors in two pairs, first-order motors, no air.  Only
+the order of magnitude of the margins is meaningful.
 
 The load is the rms of the motors' commands, sqrt(u^2 + d^2) for the collective u and the
-differential d: noise in d costs current.  sigma is `intensity` (load / hover)^steepness; the
+differential d, so noise in d draws current.  sigma is `intensity` (load / hover)^steepness; the
 paper's loads of 10 and 40 % have a steepness of ln(0.632 / 0.3156) / ln(4) = 0.5.  The collective
-holds the thrust as the voltage sags.
+keeps the thrust constant when the voltage sags.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.online.filter.lowpass import AdaptiveLowPass
 from ou_monitor.records import FloatArray, NAN
 
-# Of the cutoff, octaves: below, whatever it does is of no consequence to a loop.
+# A smaller swing of the cutoff, octaves, does not matter to the loop.
 SWING = 0.5
-# How much more the cutoff must swing than with the loop cut.
+# The cutoff hunts if it swings at least this many times as much as with the loop cut.
 FACTOR = 3.0
 COUPLINGS = (0.1, 0.3, 1.0, 1.5, 2.0, 3.0, 4.0)
-# The threshold just above what a quiet hover has: where a law is most tempted.
+# A threshold just above sigma in a quiet hover, where a law is most likely to hunt.
 _ABOVE = 0.72
 _BARE = {'smoothing': 0.0, 'slew': 0.0, 'dead_band': 0.0}
-# Its coupling is that of the loop.
+# The coupling of this law is set to that of the loop.
 _KALMAN = {'law': 'kalman', 'n0': 1e-7}
 CASES: dict[str, dict[str, object]] = {
     'constant_noise, defaults': {},
@@ -110,14 +110,14 @@ class Loop:
     rate: float = 500.0
     every: float = 0.05
     window: float = 2.0  # Of the estimator, s.
-    # Options of `AdaptiveLowPass` beside its mode.
+    # Options of `AdaptiveLowPass` other than its mode.
     filter: Mapping[str, Any] = field(default_factory=dict)  # noqa: A003
-    closed: bool = True  # Whether what the D term commands counts as load.
+    closed: bool = True  # Whether the D term's command is part of the load.
 
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """What happened, at the estimates."""
+    """Time series at the times of the estimates."""
 
     t: FloatArray  # s.
     cutoff: FloatArray  # Hz.
@@ -132,9 +132,9 @@ class Flight:
 class Verdict:
     """Whether the cutoff hunts."""
 
-    cycle: bool  # Whether it does.
-    # 95 % less 5 % quantile of the cutoff, octaves, and the same with the loop cut (NaN
-    # where the first is below `SWING`: no need).
+    cycle: bool  # Whether the cutoff hunts.
+    # 95 % minus 5 % quantile of the cutoff, octaves, and the same with the loop cut (NaN, as not
+    # needed, where the first is below `SWING`).
     swing: float
     quiet: float
     period: float  # s; NaN when there is no cycle.
@@ -171,7 +171,7 @@ def fly(loop: Loop, seconds: float, seed: int) -> Flight:
         slope = low_pass.step(t, measured, seen, error, alpha, collective)
         integral = min(max(integral - loop.i * measured * dt, -0.3), 0.3)
         command = min(max(integral - loop.p * measured - loop.d * slope, -1.0), 1.0)
-        # Nominal collective: a sagging supply takes more of it for one thrust.
+        # A sagging supply needs a larger collective for the same thrust.
         collective = min(loop.hover * loop.nominal / max(level, 0.5 * loop.nominal), 1.0)
         load = math.sqrt(collective * collective + (command * command if loop.closed else 0.0))
         level += motor * (loop.nominal - loop.sag * load - level)
@@ -213,7 +213,7 @@ def _swing(octaves: FloatArray) -> float:
 
 
 def _period(octaves: FloatArray) -> float:
-    """Return the steps of the first maximum of the autocorrelation behind its first zero."""
+    """Return the lag (in steps) of the autocorrelation's first maximum after its first zero."""
     x = octaves - octaves.mean()
     correlation = np.correlate(x, x, 'full')[x.size - 1:]
     below = np.flatnonzero(correlation < 0.0)

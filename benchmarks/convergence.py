@@ -1,10 +1,10 @@
 """
 Orders of convergence of a switched supply to its limits, and a rail under an ESC (10 s).
 
-Averaging (paper, 3.2): u^eps - u^0 is sqrt(eps) times a Gaussian process, so its root mean square
-has order 1/2 in eps.  Diffusion (3.3): a rail driven by a fast chain x(t), dU = -alpha U dt +
-c(x) dt, tends to the Ornstein-Uhlenbeck process with sigma^2 = 2 sum pi c R0 c, c less its mean.
-Its variance at any eps is exact, so the distance from the limit has no sampling noise.
+Averaging (paper, 3.2): u^eps - u^0 is sqrt(eps) times a Gaussian process, so its rms has order 1/2
+in eps.  Diffusion (3.3): a rail driven by a fast chain x(t), dU = -alpha U dt + c(x) dt, tends to
+the Ornstein-Uhlenbeck process with sigma^2 = 2 sum pi c R0 c, c less its mean. Its variance at any
+eps is exact, so the distance from the limit has no sampling noise.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def averaging_convergence(
     system: SwitchedSystem, t: npt.ArrayLike, u0: npt.ArrayLike, eps: npt.ArrayLike,
     rng: np.random.Generator, paths: int,
 ) -> tuple[Convergence, Convergence]:
-    """Return how u^eps tends to u^0 (t in s): the largest distance, and the last."""
+    """Return the convergence of u^eps to u^0 (t in s): largest distance, and the last one."""
     limit = system.averaged().solve(t, u0)
     small = np.asarray(eps, dtype=float)
     squares = np.empty((2, small.size, paths))
@@ -101,7 +101,7 @@ class SwitchedOU:
 
 
 def variance_convergence(rail: SwitchedOU, eps: list[float], factor: float) -> Convergence:
-    """Return how the variance of a switched rail tends to its limit (relative error)."""
+    """Return the convergence of a switched rail's variance to its limit (relative error)."""
     limit = rail.sigma(factor)**2 / (2.0 * rail.alpha)
     return fit_order(eps, [abs(rail.variance(one) / limit - 1.0) for one in eps])
 

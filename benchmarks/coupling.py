@@ -1,10 +1,10 @@
 """
 False alarms and power of `coupling` on recorded gyros (3 min).
 
-Nothing couples: a simulated supply of constant sigma, one whose sigma follows the throttle of
-another flight, or the flight's own voltage against its gyro turned in time.  Power: the same
-simulated supplies added to the gyro with a gain of 5 deg/s per V (their rms is 50 mV).
-Every gyro axis of the recordings is used, unfiltered where the log has it so.
+False alarms, without any coupling: a simulated supply with constant sigma, one whose sigma follows
+the throttle of another flight, or the flight's own voltage with its gyro shifted in time.  Power:
+the same simulated supplies added to the gyro with a gain of 5 deg/s per V (their rms is 50 mV).
+Every gyro axis of the recordings is used, unfiltered if the log has it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ LOGS = {**{name: FLIGHTS[name] for name in ('nazgul', 'roma', 'bf3s', 'erle', 'j
 TABLES = {'crazyflie solo': 'cf_solo_large.csv', 'crazyflie pair': 'cf_pair_large.csv'}
 KINDS = ('constant sigma', "sigma of another flight's throttle", 'gyro shifted')
 ALPHAS, DEVIATION, GAIN = (20.0, 63.0, 200.0), 0.05, math.radians(5.0)
-# Highest rate of a simulated supply, Hz: that of an ADC.
+# Highest rate of a simulated supply, Hz, as of an ADC.
 FASTEST = 500.0
 
 
@@ -74,7 +74,7 @@ def flights(folder: Path) -> Iterator[Flight]:
 
 
 def supply(rng: np.random.Generator, t: np.ndarray, rise: np.ndarray) -> np.ndarray:
-    """Return an OU whose driving noise goes with `rise`, V."""
+    """Return an OU whose driving noise is proportional to `rise`, V."""
     phi = math.exp(-float(rng.choice(ALPHAS)) * float(np.median(np.diff(t))))
     drive = math.sqrt(1.0 - phi**2) * DEVIATION * rise * rng.standard_normal(t.size)
     return lfilter([1.0], [1.0, -phi], drive)
@@ -82,7 +82,7 @@ def supply(rng: np.random.Generator, t: np.ndarray, rise: np.ndarray) -> np.ndar
 
 def draw(rng: np.random.Generator, kind: str, flight: Flight, axis: np.ndarray,
          other: Flight) -> dict[str, list[bool]]:
-    """Return whether coupling was seen where there is none, and where there is."""
+    """Return whether coupling was seen without any, and with coupling added."""
     turned = np.roll(axis, rng.integers(axis.size // 10, axis.size - axis.size // 10))
     if kind == KINDS[2]:
         found = estimate_coupling(flight.t, flight.voltage, flight.gyro_t, turned,
@@ -106,7 +106,7 @@ def draw(rng: np.random.Generator, kind: str, flight: Flight, axis: np.ndarray,
 
 
 def share(values: list[bool], whole: bool = False) -> str:
-    """Return a count; of all with its share and 95 % interval (Clopper and Pearson, 1934)."""
+    """Return a count, with its share and 95 % interval (Clopper and Pearson, 1934) if `whole`."""
     if not values:
         return '-'
     if not whole:

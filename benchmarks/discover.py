@@ -6,11 +6,11 @@ Causes named by `discover`: hidden effects, nothing hidden, recorded runs (5 min
     python benchmarks/discover.py flights [NAME...]
     python benchmarks/discover.py injected [--effects NAME...] [NAME...]
 
-`blind`: everything but the name of an effect is drawn from the seed; the order is shuffled, so a
-part of a run is a fair sample.  `nulls`: a plain rail, or one with what each flight has under
-throttle (sag, noise, ADC steps); each name beyond these is a false alarm.  `flights`: recorded
-runs, whole and in halves.  `injected`: effects hidden in pieces of recorded runs.  README.md
-beside this file defines what counts as right.
+`blind`: all but the name of an effect is drawn from the seed; the order is shuffled, so part of a
+run is a fair sample.  `nulls`: a plain rail, or one with the effects of any flight under throttle
+(sag, noise, ADC steps); each other name is a false alarm.  `flights`: recorded runs, whole and in
+halves.  `injected`: effects hidden in pieces of recorded runs.  benchmarks/README.md defines which
+answers are right.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def interval(hits: int, of: int) -> str:
 
 
 def counted(names: Iterable[str]) -> str:
-    """Return names with their number."""
+    """Return names with their counts."""
     return ', '.join(name if many == 1 else f'{name} {many}'
                      for name, many in Counter(names).most_common()) or '-'
 
@@ -61,7 +61,7 @@ def counted(names: Iterable[str]) -> str:
 def resumed(tasks: Sequence[tuple[Any, ...]], lines: Path | None,
             run: Callable[[list[tuple[Any, ...]]], Iterator[dict[str, Any]]]
             ) -> list[dict[str, Any]]:
-    """Return a result for each task: from the JSON lines of a file, or run and added to it."""
+    """Return the result of each task, read from a file of JSON lines, or run and added to it."""
     known: dict[str, dict[str, Any]] = {}
     if lines is not None and lines.exists():
         for line in lines.read_text().splitlines():
@@ -99,7 +99,7 @@ def plan(given: argparse.Namespace) -> list[tuple[Any, ...]]:
 
 
 def examine(task: tuple[Any, ...], limit: float) -> dict[str, Any]:
-    """Return what `discover` made of a hidden effect, and its time, s."""
+    """Return the result of `discover` for a hidden effect, and its time, s."""
     def late(*_: object) -> None:
         raise TimeoutError(f'not done after {limit:g} s')
     *what, duration, rate, strength = task
@@ -111,7 +111,7 @@ def examine(task: tuple[Any, ...], limit: float) -> dict[str, Any]:
         finding = discover(Recording(hidden.t, hidden.voltage, hidden.throttle, 'blind'))
         made, failure = outcome(hidden, finding.verdict.value, finding.causes), ''
     except Exception as error:
-        # A failure counts as missed; the benchmark goes on.
+        # A failure counts as missed; the benchmark continues.
         made, failure = outcome(hidden), f'{type(error).__name__}: {error}'
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
@@ -119,7 +119,7 @@ def examine(task: tuple[Any, ...], limit: float) -> dict[str, Any]:
             'seconds': time.perf_counter() - began}
 
 
-# Kind, what is counted, and which recordings count.
+# Kind, name of the count, and condition to be counted.
 SHARES: tuple[tuple[str, str, Callable[[Outcome], bool]], ...] = (
     ('single', 'named right, alone', lambda o: o.alone),
     ('single', 'named right or in the reported set', lambda o: o.in_set),
@@ -137,7 +137,7 @@ SHARES: tuple[tuple[str, str, Callable[[Outcome], bool]], ...] = (
 def blind(given: argparse.Namespace) -> str:
     """Score effects hidden blind."""
     def run(tasks: list[tuple[Any, ...]]) -> Iterator[dict[str, Any]]:
-        # A process for each recording: its memory ends with it.
+        # A process for each recording, so that its memory is freed.
         with multiprocessing.get_context('fork').Pool(given.jobs, maxtasksperchild=1) as pool:
             yield from pool.imap_unordered(partial(examine, limit=given.limit), tasks)
     lines = resumed(plan(given), given.lines, run)
@@ -158,7 +158,7 @@ def blind(given: argparse.Namespace) -> str:
 
 # -- nothing hidden
 
-# What a base may have, each with a chance of one half.
+# Terms that a base may have, each with a probability of one half.
 BASE = ('load_sag', 'load_dependent_sigma', 'measurement_noise', 'quantization')
 RATES, DURATIONS = (50, 100, 200, 500, 1000), (20.0, 60.0, 120.0)
 
@@ -174,7 +174,7 @@ def throttles(known: list[np.ndarray] = []) -> list[np.ndarray]:
 
 
 def examine_null(base: str, seed: int, number: int) -> dict[str, Any]:
-    """Return what `discover` names in a recording without an effect, and what of it is false."""
+    """Return the names from `discover` in a recording without an effect, and the false ones."""
     word = int.from_bytes(sha256(base.encode()).digest()[:8], 'big')
     rng = np.random.default_rng([seed, number, word])
     rate, duration = float(rng.choice(RATES)), float(rng.choice(DURATIONS))
@@ -237,7 +237,7 @@ def agreement(one: dict[str, Any], other: dict[str, Any]) -> float:
 
 
 def recorded_runs(given: argparse.Namespace) -> str:
-    """Discover recorded runs, whole and in halves."""
+    """Run `discover` on recorded runs, whole and in halves."""
     rows, agreed, spent = [], [], []
     for name, run in flights(given.names, KNOWN):
         middle = run.t.size // 2
@@ -271,7 +271,7 @@ def recorded_runs(given: argparse.Namespace) -> str:
 
 # -- hidden in recorded runs
 
-# Seconds of each recording; a shorter one is taken whole, and jd, with one sample a second.
+# Part of each recording, s; a shorter one is used whole, as is jd (one sample per second).
 PIECES = {'gecko': (30.0, 60.0), 'nazgul': (40.0, 80.0), 'roma': (40.0, 80.0),
           'bf3s': (0.0, 40.0), 'jd': (0.0, 400.0), 'cf_solo': (10.0, 50.0),
           'cf_pair': (10.0, 50.0), 'cf_takeoff': (0.0, 40.0), 'mm_bench_3': (0.0, 4.0),
@@ -283,21 +283,21 @@ STRENGTHS = (1.0, 3.0)
 
 @dataclass(frozen=True)
 class Injected:
-    """What `discover` named in a piece with an effect, beside the piece as it is."""
+    """Names from `discover` in a piece with a hidden effect, and in the original piece."""
 
     effect: str
     strength: float
-    clean: tuple[str, ...]  # Names in the piece as it is.
+    clean: tuple[str, ...]  # Names in the original piece.
     named: tuple[str, ...]
     alternatives: tuple[str, ...]
 
     @property
     def outcome(self) -> str:
         """
-        Return 'yes', 'no', or 'there' if the piece gets the name without the effect.
+        Return 'yes', 'no', or 'there' if the original piece already gets the name.
 
-        An effect is named if a right name is in the set and is not, or not as often, in that of
-        the piece as it is.
+        An effect is named if a right name is in the set, and occurs less often in the set of the
+        original piece.
         """
         right = EFFECTS[self.effect][1]
         if any(self.named.count(name) > self.clean.count(name) for name in right) or (
@@ -307,12 +307,12 @@ class Injected:
 
     @property
     def kept(self) -> tuple[int, int]:
-        """Return how many causes of the piece as it is are still named, and how many it has."""
+        """Return how many causes of the original piece are still named, and how many it has."""
         return len(set(self.clean) & set(self.named)), len(set(self.clean))
 
     @property
     def false(self) -> set[str]:
-        """Return the names that are neither right nor in the piece as it is."""
+        """Return the names that are neither right nor in the original piece."""
         return set(self.named) - set(self.clean) - EFFECTS[self.effect][1]
 
 

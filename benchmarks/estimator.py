@@ -1,10 +1,10 @@
 """
-The sliding-window estimator beside the exact likelihood and AR(1), and its speed (10 min).
+The sliding-window estimator against the exact likelihood and AR(1), and its speed (10 min).
 
     python benchmarks/estimator.py [--windows 500] [--parts awts] [--quick]
         [--page doc/results/estimator.md]
 
-The likelihood shares nothing with the package.  README.md beside this file defines the columns.
+The likelihood uses no code of the package.  benchmarks/README.md defines the columns.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from windows import Array, cells, errors, Fit, SENSORS, statuses
 SEED = 20260131
 HEAD = [f'{name} {what}' for name in ('alpha', 'sigma', 'Var_inf')
         for what in ('bias %', 'RMSE %', 'cover %')]
-# alpha T of the short and long windows, which are measured with this sensor.
+# alpha T of the short and long windows, and their sensor.
 RELAXATIONS, SENSOR = (5, 8, 12, 25, 40, 126, 630), '5 mV noise'
 # Name, time constant, dead time (s), and whether steps fall on the sampling grid.
 RESPONSES: tuple[tuple[str, float, float, bool], ...] = (
@@ -41,7 +41,7 @@ RESPONSES: tuple[tuple[str, float, float, bool], ...] = (
 
 
 def ours(y: Array, dt: float, throttle: Array | None = None) -> Fit:
-    """Return the estimate of one window, from nothing."""
+    """Return the estimate of one window by a new estimator."""
     estimator = SlidingEstimator(y.size * dt)
     estimator.push(1000.0 * y.size * dt + np.arange(y.size) * dt, y, throttle)
     e = estimator.estimate()
@@ -100,8 +100,8 @@ def _log_errors(y: Array, log_a: float, log_scale: float, noise: float) -> Array
     """
     Return standard errors of ln(alpha), ln(sigma), ln(Var_inf).
 
-    Observed information by central differences.  The noise variance counts as
-    unknown on its bound too, where that is on the careful side.
+    Observed information by central differences.  The noise variance counts as unknown even on its
+    bound, where this makes the errors larger.
     """
     def value(p: Array) -> float:
         form, log_det, by_level = _filtered(y, math.exp(p[0]), p[2])
@@ -131,8 +131,8 @@ def kalman(y: Array, dt: float) -> Fit:
     Return the restricted maximum-likelihood fit by the Kalman filter.
 
     The level is integrated out (its flat prior gives the term in `by_level`), the scale is
-    profiled out, and the noise variance is bounded at 0: the bound is searched by itself, the
-    interior from several starts, so the global maximum is found.
+    profiled out, and the noise variance is bounded at 0: the bound is searched separately, and the
+    interior from several starts, to find the global maximum.
     """
     centred = y - y.mean()
     edge = minimize_scalar(lambda x: _deviance(centred, x, 0.0), bounds=(_LOW, _HIGH),
@@ -157,7 +157,7 @@ def kalman(y: Array, dt: float) -> Fit:
 
 def corrected(plain: Fit, duration: float) -> Fit:
     """
-    Return a restricted fit less its small-sample bias.
+    Return a restricted fit with its small-sample bias removed.
 
     2/T of alpha remain (Tang & Chen 2009, less the half that comes from the level); Var_inf,
     convex in alpha, is taken at alpha - 1/T.
@@ -170,7 +170,7 @@ def corrected(plain: Fit, duration: float) -> Fit:
 
 
 def autoregression(y: Array, dt: float) -> Fit:
-    """Return the least-squares AR(1), carried to continuous time exactly; delta-method errors."""
+    """Return the least-squares AR(1), exactly in continuous time; delta-method errors."""
     x, later = y[:-1] - y[:-1].mean(), y[1:] - y[1:].mean()
     phi = float(x @ later / (x @ x))
     if not 0.0 < phi < 1.0:
@@ -186,7 +186,7 @@ def autoregression(y: Array, dt: float) -> Fit:
 
 
 def run(method: Callable[..., Fit], windows: Array, *columns: Array) -> list[Fit]:
-    """Fit each window; with the CPU time of this process."""
+    """Fit each window; add the CPU time of this process."""
     out = []
     for row, y in enumerate(windows):
         begin = time.process_time()
@@ -220,7 +220,7 @@ def accuracy(windows: int) -> str:
 
 
 def lengths(windows: int) -> str:
-    """Shorten and lengthen the window."""
+    """Vary the length of the window."""
     rng = np.random.default_rng(SEED + 1)
     rows, shares = [], []
     for relaxations in RELAXATIONS:

@@ -3,9 +3,9 @@ Run every command on every recording of a folder: no traceback, one line of erro
 
 python benchmarks/every_command.py FOLDER [--quick] [--only NAME ...]
 
-One process at a time.  `--quick` leaves out discover, compare, fleet and reproduce (hours of a
-core for 30 flights, beside minutes).  It also looks into each JSON for an interval that spans
-more than a factor of 10 either way.  Status 1 when anything is wrong.
+One process at a time.  `--quick` leaves out discover, compare, fleet and reproduce (minutes
+instead of hours of a core for 30 flights).  Each JSON is also searched for intervals that span
+more than a factor of 10 either way.  The exit status is 1 if anything is wrong.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from common import ROOT
 from ou_monitor.records import determined
 
 ENDINGS = ('.csv', '.bbl', '.bfl', '.txt', '.bin', '.ulg', '.mcap')
-# Longest that one command may take, s: discover of a long flight, on a busy machine.
+# Longest time of one command, s: `discover` of a long flight on a busy machine.
 MOST = 3600.0
 
 
@@ -42,7 +42,7 @@ class Run:
 
 
 def run(*words: object, cwd: Path) -> Run:
-    """Run one command in a process of its own and judge how it ended."""
+    """Run one command in a process and judge how it ended."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     shown = ' '.join(Path(str(word)).name for word in words)
     try:
@@ -54,7 +54,7 @@ def run(*words: object, cwd: Path) -> Run:
         return Run(shown, -1, MOST, f'not done after {MOST:g} s')
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    # Progress stands before the one line of an error.
+    # Progress may precede the one line of an error.
     lines = [line for line in done.stderr.splitlines() if line.startswith('ou-monitor')]
     fault = ''
     if 'Traceback' in done.stderr:
@@ -69,7 +69,7 @@ def run(*words: object, cwd: Path) -> Run:
 
 
 def wide(data: Any, at: str = '') -> Iterator[str]:
-    """Yield the places of values in a JSON whose interval is too wide for them to be known."""
+    """Yield the paths of values in a JSON whose intervals are too wide."""
     if isinstance(data, dict):
         for key, value in data.items():
             ends = data.get(f'{key}_ci95')
@@ -84,7 +84,7 @@ def wide(data: Any, at: str = '') -> Iterator[str]:
 
 
 def signals(listed: str) -> list[str]:
-    """Return series beside the voltage that `convert --list` names: a gyro, a current."""
+    """Return series other than voltages that `convert --list` lists: a gyro, a current."""
     names = [line.split()[0].lstrip('*') for line in listed.splitlines() if line.strip()]
     return [name for name in names if name.startswith(('gyro', 'IMU.Gyr', 'current', 'CURR'))][:1]
 

@@ -1,16 +1,16 @@
 r"""
-The adaptive low-pass beside the best fixed cutoff and the truth, and in a control loop (15 min).
+The adaptive low-pass against the best fixed cutoff and the truth; its control loop (15 min).
 
     python benchmarks/filter.py error --page doc/results/filter.md
     python benchmarks/filter.py dterm --page doc/results/filter.md \
         --figure doc/results/filter_dterm.svg
     python benchmarks/filter.py loop --page doc/results/filter.md
 
-sigma follows throttle, which moves in steps and ramps.  A signal is a stochastic process with a
-state, so its best linear estimate is that of a Kalman filter that knows sigma at every sample; it
-uses nothing of the package.  *In hindsight*: of 41 cutoffs (21 curves) the one with the least mean
-square error in that flight.  `sweep` runs many cutoffs at once; a test compares it with the
-package.  The first 3 s of a flight are not scored: the estimator fills its window.
+sigma follows throttle, which moves in steps and ramps.  Each signal has a linear model, so its
+best linear estimate is that of a Kalman filter that knows sigma at every sample; it uses no code
+of the package.  *In hindsight*: the one of 41 cutoffs (21 curves) with the least mean square error
+in that flight.  `sweep` runs many cutoffs at once; a test compares it with the package.  The first
+3 s of a flight, in which the estimator fills its window, are not scored.
 """
 
 from __future__ import annotations
@@ -33,32 +33,32 @@ from scipy.linalg import expm
 
 SEED = 20261121
 RATE = 1000.0
-# Stationary deviation of the supply at half throttle, V, and that of the body rate, rad/s.
+# Standard deviation of the supply at half throttle, V, and of the body rate, rad/s.
 SPREAD, BODY = 0.05, 1.0
 # Noise of an ADC that needs a filter, V; of a gyro, rad/s.
 ADC, GYRO = 0.03, 0.01
-# Supply noise in the gyro, rad/s per V: at half throttle as strong as the body rate.
+# Supply noise in the gyro, rad/s per V: at half throttle as large as the body rate.
 COUPLING = 20.0
 _DWELL, _RAMP = (2.0, 6.0), (0.5, 1.5)
 
 
 @dataclass(frozen=True)
 class Case:
-    """What is filtered."""
+    """One kind of signal to be filtered."""
 
     name: str  # For the table.
-    # The voltage itself in noise of the ADC; a body rate with one pole, or with two
-    # (Butterworth), in supply noise and noise of the gyro.
+    # 'voltage': the voltage with noise of the ADC; 'ou' or 'smooth': a body rate with one pole or
+    # two (Butterworth), with noise of the supply and of the gyro.
     kind: str
     alpha: float  # Of the supply, 1/s.
     bandwidth: float  # Of the body rate, Hz.
-    order: int  # Of the filters that are compared.
+    order: int  # Order of the compared filters.
     limits: tuple[float, float]  # fmin and fmax for all of them, Hz.
     coupling: float = COUPLING  # Supply noise in the gyro, rad/s per V.
 
     @property
     def white(self) -> float:
-        """Deviation of the white noise of a sample."""
+        """Standard deviation of the white noise of a sample."""
         return ADC if self.kind == 'voltage' else GYRO
 
 
@@ -79,11 +79,11 @@ class Flights:
     # 0..1; V/sqrt(s).
     throttle: np.ndarray
     sigma: np.ndarray
-    voltage: np.ndarray  # What the estimator gets, V.
-    # The signal and its derivative (NaN for one pole), unit and unit/s.
+    voltage: np.ndarray  # Input of the estimator, V.
+    # The signal and its derivative (NaN for one pole), in its unit and unit/s.
     truth: np.ndarray
     slope: np.ndarray
-    # The signal with all noise, and the noise alone.
+    # The signal with all noise, and only the noise.
     measured: np.ndarray
     noise: np.ndarray
 
@@ -123,7 +123,7 @@ def fly(case: Case, rng: np.random.Generator, flights: int, seconds: float) -> F
     """Simulate."""
     n = int(seconds * RATE)
     throttle = throttles(rng, flights, n)
-    # Flights show noise that grows 3 to 13 times from low to high throttle.
+    # In recorded flights noise grows 3 to 13 times from low to high throttle.
     growth = np.exp(rng.uniform(math.log(3.0), math.log(13.0), (flights, 1)))
     power = np.log(growth) / math.log(9.0)
     sigma = SPREAD * math.sqrt(2.0 * case.alpha) * (throttle / 0.5)**power
@@ -155,7 +155,7 @@ def fly(case: Case, rng: np.random.Generator, flights: int, seconds: float) -> F
 
 
 def kalman(case: Case, flights: Flights) -> tuple[np.ndarray, np.ndarray]:
-    """Return the estimates of signal and slope (NaN for one pole) that know sigma."""
+    """Return the estimates of signal and slope (NaN for one pole) with known sigma."""
     count, n = flights.measured.shape
     phi, driven, still = _motion(case)
     decay = math.exp(-case.alpha / RATE)
@@ -192,7 +192,7 @@ def kalman(case: Case, flights: Flights) -> tuple[np.ndarray, np.ndarray]:
     return out[0], out[1]
 
 
-# Seconds between estimates, and those at the beginning that are not scored.
+# Seconds between estimates, and seconds at the start that are not scored.
 EVERY, SETTLE = 0.05, 3.0
 _ROOT2 = math.sqrt(2.0)
 
@@ -271,14 +271,14 @@ def _parts(cutoff: np.ndarray, order: int) -> tuple[np.ndarray, ...]:
 
 
 def square_error(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Return the mean square error of each flight behind `SETTLE`."""
+    """Return the mean square error of each flight after `SETTLE`."""
     first = int(SETTLE * RATE)
     found: np.ndarray = np.mean((estimate[..., first:] - truth[..., first:])**2, axis=-1)
     return found
 
 
 def lag_ms(output: np.ndarray, truth: np.ndarray) -> float:
-    """Return the delay of the output behind the truth by their cross-correlation, ms."""
+    """Return the delay of the output relative to the truth from their cross-correlation, ms."""
     first = int(SETTLE * RATE)
     lags = []
     for y, s in zip(output[:, first:], truth[:, first:]):
@@ -313,7 +313,7 @@ def laws(case: Case) -> dict[str, dict[str, Any]]:
 def mistaken(case: Case) -> dict[str, dict[str, Any]]:
     """Return the options of `kalman` with one parameter wrong by a factor of 2."""
     right = laws(case)['kalman']
-    # The gyro's own noise is next to nothing beside the supply's.
+    # The gyro's own noise is negligible against the supply's.
     name = 'n0' if case.kind == 'voltage' else 'coupling'
     return {f'kalman, {name} {word} the true one': {**right, name: factor * right[name]}
             for factor, word in ((0.5, 'half'), (2.0, 'twice'))}
@@ -346,7 +346,7 @@ class Point:
     method: str
     setting: str
     noise: float  # Rms of the output noise, rad/s^2.
-    loud: float  # Rms of its loudest second in twenty, rad/s^2.
+    loud: float  # Rms of the loudest second in twenty, rad/s^2.
     lag: float  # Delay of the signal, ms.
     rms_error: float  # Of the output against the true derivative, rad/s^2.
     cutoff: str = '-'  # 5 % and 95 % quantile, Hz.
@@ -385,8 +385,8 @@ def run_dterm(flights: int, seconds: float, seed: int, window: float) -> list[Po
                    'fmax': 300.0, 'max_lag': limit, 'n0': CASE.white**2 / RATE}
         setting = f'lag <= {limit:g} degrees' if limit else 'free'
         say(f'{KALMAN}, {setting}')
-        # It learns from powers, which are the same to sampling error with the noise turned over:
-        # half the difference of both is the noise, half the sum the signal.
+        # It learns from powers, which hardly change with the sign of the noise: half the
+        # difference of both outputs is the noise, half the sum the signal.
         both, cutoff = adaptive(options, flown, seen, flown.truth + flown.noise)
         other, _ = adaptive(options, flown, seen, flown.truth - flown.noise)
         points.append(point(KALMAN, setting, flown, 0.5 * (both - other), 0.5 * (both + other),
@@ -400,7 +400,7 @@ def run_dterm(flights: int, seconds: float, seed: int, window: float) -> list[Po
 
 def point(method: str, setting: str, flown: Flights, noise: np.ndarray, signal: np.ndarray,
           cutoff: np.ndarray) -> Point:
-    """Return what one setting does to noise and signal."""
+    """Return the noise and lag of one setting."""
     second = int(RATE)
     rest = noise[:, int(SETTLE * RATE):]
     pieces = rest[:, :rest.shape[1] // second * second].reshape(-1, second)
@@ -458,7 +458,7 @@ def score(case: Case, flights: Flights, window: float) -> list[list[str]]:
     seen, x = estimates(flights, window), flights.measured
     found = {TRUTH: (kalman(case, flights)[0], np.full((1, 1), np.nan)),
              FIXED: hindsight(flights, np.geomspace(fmin, fmax, 41)[:, None, None], case.order),
-             # The curve spans an octave, so both may use the whole range.
+             # The curve spans an octave, so f stays an octave below the upper limit.
              CURVE: hindsight(flights, np.minimum(curve(
                  flights.throttle, np.geomspace(fmin, fmax / 2.0, 21)), fmax), case.order)}
     middle = float(np.median(found[FIXED][1]))
@@ -510,7 +510,7 @@ def dterm(given: argparse.Namespace) -> tuple[str, Plot | None]:
 
 
 def loop(given: argparse.Namespace) -> tuple[str, Plot | None]:
-    """Find the coupling at which the loop through the supply begins to hunt."""
+    """Find the coupling at which the loop through the supply starts to hunt."""
     return control_loop.render(control_loop.scan(given.seconds, given.seed)), None
 
 

@@ -3,9 +3,8 @@ Throughput of `ou-monitor fleet` against the number of workers (10 min).
 
     python benchmarks/fleet.py --workers 1 2 --recordings 64 --markdown doc/results/fleet.md
 
-One run: recordings are simulated into a temporary folder, then analysed again
-and again with each number of workers in turn, and once in this process
-alone, which is what the workers are measured against.
+Recordings are simulated into a temporary folder.  Each round then analyses them with each number
+of workers in turn, and in this process alone for comparison.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ def make(folder: Path, count: int, seconds: float) -> list[str]:
 
 
 def cpu() -> float:
-    """Return the CPU time of this process and of those that it started and that ended, s."""
+    """Return the CPU time of this process and of its children that have ended, s."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(one.ru_utime + one.ru_stime for one in used)
 
@@ -64,14 +63,14 @@ def on_workers(tasks: Sequence[tuple], count: int) -> tuple[float, float, float]
     """Return the wall times of start and work, and the CPU time of both together, s."""
     used, start = cpu(), time.perf_counter()
     with LocalWorkers(count) as pool:
-        # Each worker imports the package at its first task, which is part of the start.
+        # Each worker imports the package in its first task, which counts as start.
         for _, result, why in pool.each(work, [tasks[0]] * (2 * count)):
             assert not why and not result['error']
         middle = time.perf_counter()
         for _, result, why in pool.each(work, tasks):
             assert not why and not result['error']
         end = time.perf_counter()
-    # The workers have ended, so their time is known.
+    # The workers have ended, so their CPU time is known.
     return middle - start, end - middle, cpu() - used
 
 

@@ -1,15 +1,15 @@
 """
-Keep the JSON of every command on recorded runs, and print what moved between states (10 min).
+Keep the JSON of every command on recorded runs, and print what changed between two (10 min).
 
     python benchmarks/freeze.py keep BEFORE --root OTHER_CHECKOUT
     python benchmarks/freeze.py keep AFTER
     python benchmarks/freeze.py moved BEFORE AFTER
 
-`keep` runs the commands of a checkout on the recordings of `RUNS` (`OU_MONITOR_REALDATA`; runs
-that are not there are left out, with a word on stderr) and writes one JSON a run and command,
-about ten minutes; parts that are kept already are not run again.  `--parts` adds what takes
-longer: the examination (`--exam FOLDER`, with `examine.py`), effects hidden in recorded runs, the
-risk and the load on recorded flights.  `moved` compares two such folders, number by number.
+`keep` runs the commands of a checkout on the recordings of `RUNS` (in `OU_MONITOR_REALDATA`;
+missing ones are left out with a message) and writes one JSON per run and command in about ten
+minutes; existing files are not written again.  `--parts` adds slower parts: the examination
+(`--exam FOLDER`, with `examine.py`), effects hidden in recorded runs, and risk and load on
+recorded flights.  `moved` compares two such folders number by number.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import tempfile
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
-# Name, file (of the checkout, else below OU_MONITOR_REALDATA), options of the commands.
+# Name, file (in the checkout or below OU_MONITOR_REALDATA), options of the commands.
 RUNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ('flight', 'bags/flight', ()),
     ('transient', 'bags/transient', ()),
@@ -45,11 +45,11 @@ RUNS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ('xt_pico', 'xt_pico_a.csv', ()),
 )
 COMMANDS = ('analyze', 'compare', 'coupling', 'discover')
-# The signal of `coupling`, where a log has a gyro; elsewhere the command is left out.
+# The signal for `coupling`; the command is left out for logs without a gyro.
 SIGNALS = {'gecko_log': 'gyroADC[0]', 'nazgul': 'gyroADC[0]', 'roma': 'gyroADC[0]'}
 BENCHMARKS = {'injected': ('discover.py', 'injected'), 'risk': ('risk_real.py',),
               'load': ('real_flights.py',)}
-# The node's code over a recording, one message at a time, and its report at the end.
+# Runs the node's monitor over a recording, 20 samples at a time; prints the last report.
 MONITOR = """
 import dataclasses, enum, json, math, sys
 import numpy as np
@@ -71,7 +71,7 @@ print(json.dumps({
              'sag': [float(load.sag(u)) for u in (0.0, 0.5, 1.0)],
              'noise': [float(load.noise(u)) for u in (0.0, 0.5, 1.0)]}}))
 """
-# Numbers that differ by less than this share are the same.
+# Numbers whose relative difference is smaller are the same.
 SAME = 1e-6
 _NUMBER = re.compile(r'-?\d+(?:\.\d+)?(?:e[+-]?\d+)?')
 
@@ -85,7 +85,7 @@ def run(words: list[str], root: Path, **more: Any) -> subprocess.CompletedProces
 
 def keep(into: Path, root: Path, parts: list[str], names: list[str], exam: Path | None,
          python: str) -> None:
-    """Write what the commands of a checkout say."""
+    """Write the output of a checkout's commands."""
     into.mkdir(parents=True, exist_ok=True)
     data = Path(os.environ.get('OU_MONITOR_REALDATA', '/nowhere'))
     for name, file, options in RUNS if 'commands' in parts else ():
@@ -143,7 +143,7 @@ def leaves(value: Any, path: str = '') -> Iterator[tuple[str, Any]]:
 
 
 def contents(path: Path) -> dict[str, Any]:
-    """Return the leaves of one kept file; of a page, each line with its numbers taken out."""
+    """Return the leaves of a kept file; for a page, each line with its numbers extracted."""
     if path.suffix == '.json':
         text = path.read_text()
         return dict(leaves(json.loads(text))) if text.strip() else {'': None}
@@ -173,7 +173,7 @@ def differ(before: Any, after: Any, share: float) -> bool:
 
 
 def moved(before: Path, after: Path, share: float, most: int) -> int:
-    """Print what moved; return the number of leaves that did."""
+    """Print the changed leaves; return their number."""
     count = 0
     for file in sorted({path.name for path in (*before.iterdir(), *after.iterdir())}):
         if not ((before / file).exists() and (after / file).exists()):

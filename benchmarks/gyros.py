@@ -20,7 +20,7 @@ FLIGHTS = (
     ('bf3s', *known['bf3s'], 'gyroUnfilt'), ('nazgul', *known['nazgul'], 'debug'),
     *((f'roma {k}', known['roma'][0], k, 'debug') for k in (1, 2, 3)),
     ('gecko', 'raw/ie_btfl_002.bbl', 1, 'gyroADC'))
-# Gyros logged at 50 Hz, below what a notch follows.
+# Gyros logged at 50 Hz, too slow for a notch.
 SLOW = (('erle', known['erle'][0], 1, 'IMU'), ('jd', known['jd'][0], 1, 'IMU'))
 
 
@@ -32,13 +32,13 @@ class Gyro:
     t: np.ndarray  # s.
     rate: float  # Mean sample rate, Hz.
     signal: np.ndarray  # Angular velocity, degree/s.
-    # As `convert` chooses it: where the log has them the mean of the motors' commands, 0..1.
+    # As in `convert`: the mean of the motors' commands if the log has them, 0..1.
     throttle: np.ndarray
-    rpm: np.ndarray | None  # Of the shafts.
+    rpm: np.ndarray | None  # Speed of the shafts.
 
 
 def read(name: str, seconds: float = np.inf) -> Gyro | None:
-    """Read a flight up to so many s; None where it is not there, with a word on stderr."""
+    """Read a flight up to `seconds`; None, with a message, if its file is missing."""
     file, number, kind = next(one[1:] for one in (*FLIGHTS, *SLOW) if one[0] == name)
     where = recorded()
     if not (where / file).exists():

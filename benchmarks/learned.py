@@ -1,16 +1,16 @@
 """
-Law `kalman` on recorded gyros, given the noise and nothing of the signal (4 min).
+Law `kalman` on recorded gyros, which knows the noise but not the signal (4 min).
 
     OU_MONITOR_REALDATA=FOLDER python benchmarks/learned.py --page doc/results/learned.md
 
-The truth is a gyro axis below 30 Hz (an eighth of the rate, if that is less) without phase, in
-stretches of 20 s from 8 s on; to it come supply noise (an OU of 63 1/s, 0.09 of the truth's
-deviation) and white noise of 0.01 rad/s, or a tenth of the truth's deviation if that is less.  The
-mean square error, from the 200th sample on, is over that of the best of 15 fixed cutoffs of 2 to
-110 Hz (0.44 of the rate) in hindsight, stretch by stretch.
+The truth is a gyro axis after a zero-phase low-pass at 30 Hz (or an eighth of the rate, if less),
+in stretches of 20 s from 8 s on.  Supply noise (an OU of 63 1/s with 0.09 of the truth's
+deviation) and white noise of 0.01 rad/s (or a tenth of the truth's deviation, if less) are added.
+The mean square error from the 200th sample on is divided, in each stretch, by that of the best of
+15 fixed cutoffs from 2 to 110 Hz (0.44 of the rate) in hindsight.
 
 The constants of `learned_wiener` and `low_pass_span` were chosen on bf3s, roma and jd, and for the
-first second on gecko; nazgul and erle were held out.
+first second on gecko; nazgul and erle were not used for this.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def ratio(t: np.ndarray, truth: np.ndarray, mode: str, rng: np.random.Generator)
 
 
 def measure(gyro: gyros.Gyro, most: int) -> list[list[str]]:
-    """Return a row a mode: geometric mean and worst of all stretches."""
+    """Return a row for each mode: geometric mean and worst of all stretches."""
     rows = []
     for mode, name in MODES.items():
         rng = np.random.default_rng(SEED)

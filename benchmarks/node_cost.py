@@ -1,12 +1,12 @@
 """
-CPU of the nodes for each message, beside nodes that only count or read it (1 min).
+CPU of the nodes for each message, against nodes that only count or read it (1 min).
 
     .venv/bin/python benchmarks/node_cost.py [--seconds 10] [--page doc/results/node_cost.md]
 
-All nodes listen to the same publisher at the same time, each a process of its own with the same
-executor, so a busy machine is equally busy for all: read the ratios, not the microseconds.  CPU
-time is that of the whole process, timers and all, from /proc, over voltages taken.  The voltage is
-an OU rail that sags under a throttle of 50 Hz, so the estimator finds alpha, load and risk.
+All nodes listen to the same publisher at the same time, as separate processes with the same
+executor.  A busy machine affects all of them alike, so compare the ratios, not the microseconds.
+CPU time is that of the whole process from /proc, divided by the number of voltages.  The voltage
+is an OU rail that sags under a throttle of 50 Hz, so the estimator finds alpha, load and risk.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import numpy as np
 from ou_monitor.model.ou import simulate
 
 DOMAIN = '63'
-# What listens on a topic and publishes how many it has had, 10 times a second as the nodes do.
+# Listens to a topic and publishes the number of messages, 10 times per second as the nodes do.
 _LISTENER = """
 import sys, rclpy
 from rclpy.experimental.events_executor import EventsExecutor
@@ -55,7 +55,7 @@ executor.add_node(node)
 while rclpy.ok():
     executor.spin_once(timeout_sec=1.0)
 """
-# Throttle messages a second, beside the voltages.
+# Throttle messages per second, sent with the voltages.
 STICK = 50.0
 # Label, kind and rate of the messages, command.
 CASES: tuple[tuple[str, list[tuple[str, list[str]]]], ...] = (
@@ -99,7 +99,7 @@ def rail(rate: float) -> tuple[list[float], list[float]]:
 
 def trial(kind: str, nodes: list[tuple[str, list[str]]], rate: float, seconds: float
           ) -> list[list[str]]:
-    """Return one row for each node: all of them on one topic at once."""
+    """Return one row for each node; all run on one topic at once."""
     import rclpy
     from rclpy.qos import QoSProfile, ReliabilityPolicy
     from sensor_msgs.msg import Imu
@@ -112,7 +112,7 @@ def trial(kind: str, nodes: list[tuple[str, list[str]]], rate: float, seconds: f
     stick = node.create_publisher(Float64, 'throttle', 10)
     values, sticks = rail(rate)
     moved = 0
-    # A node that distrusts its input costs little: how often it knew the risk stands beside.
+    # A node that distrusts its input costs little, so the table shows how often it knew the risk.
     risks: list[float] = []
     node.create_subscription(
         Float64, '/ou_estimator/brownout_risk', lambda m: risks.append(m.data), 10)

@@ -3,16 +3,15 @@ Notches that follow the motors, against low-passes of the same lag, on recorded 
 
     OU_MONITOR_REALDATA=FOLDER python benchmarks/notch.py --page doc/results/notch.md
 
-A D term is the difference quotient of the gyro through the filters.  Its noise is what of it
-lies above 60 Hz (Butterworth of order 4, forwards and backwards, so without phase), as rms over
-the scored part; its lag the phase delay at 10 Hz of all filters, mean over the scored part.
-Each notch stands before a low-pass whose cutoff is raised until both have the lag of a Butterworth
-low-pass of order 2 alone; the noise is divided by that of the best fixed low-pass of that lag.
-Low-passes are Butterworth or one, two or three equal poles; with and without notch the best on
-the scored part counts.
+A D term is the difference quotient of the gyro through the filters.  Its noise is the rms of its
+part above 60 Hz (zero-phase Butterworth of order 4); its lag is the phase delay at 10 Hz of all
+filters; both over the scored part.  Each notch is followed by a low-pass whose cutoff is raised
+until both together have the lag of a Butterworth low-pass of order 2 alone; the noise is divided
+by that of the best fixed low-pass of that lag.  Low-passes are Butterworth or one, two or three
+equal poles, whichever is best on the scored part, with and without notch.
 
-The first half of a flight is for learning; the second is scored.  `from nothing`: the whole
-flight, nothing known before.
+The first half of a flight is for learning; the second is scored.  `from nothing`: the whole flight
+is scored, with nothing known before.
 
 Betaflight's RPM filter: three harmonics of each motor up to 0.48 of the rate, Q 5, faded in over
 100..150 Hz, motor speeds through a low-pass of 150 Hz (src/main/flight/rpm_filter.c and
@@ -38,7 +37,7 @@ from scipy import optimize, signal
 
 LAG_AT, NOISE_FROM = 10.0, 60.0
 CUTOFFS = (40.0, 60.0, 80.0, 120.0)
-# A low-pass nearer to the sample rate is none.
+# Highest cutoff over the sample rate; above it there is no low-pass.
 OF_RATE = 0.25
 KINDS = ('butter', '1', '2', '3')
 _BLOCK = 0.05
@@ -63,7 +62,7 @@ def low_pass(kind: str, cutoff: float, rate: float) -> tuple[np.ndarray, np.ndar
 
 
 def of_lag(kind: str, delay: float, rate: float) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the low-pass of a delay, s; None where no cutoff has it."""
+    """Return the low-pass with a delay, s; None if no cutoff gives it."""
     def off(cutoff: float) -> float:
         return response(*low_pass(kind, cutoff, rate), rate) - delay
     if off(0.49 * rate) > 0.0 or off(1.0) < 0.0:
@@ -81,11 +80,11 @@ def noise(x: np.ndarray, filters: list[tuple[np.ndarray, np.ndarray]], rate: flo
     return np.mean(signal.sosfiltfilt(sos, d, axis=0)[part]**2, axis=0)
 
 
-# -- methods: a gyro -> its axes filtered, and what that lags in each sample and axis, s
+# -- methods: a gyro -> its filtered axes, and the lag of each sample and axis, s
 
 
 def ours(gyro: gyros.Gyro, rpm: bool) -> tuple[np.ndarray, np.ndarray]:
-    """`AdaptiveNotch` at its defaults, from nothing."""
+    """Filter with `AdaptiveNotch` and its defaults, from nothing."""
     notch = AdaptiveNotch()
     out, lag = np.empty_like(gyro.signal), np.zeros_like(gyro.signal)
     block = max(int(_BLOCK * gyro.rate), 1)
@@ -99,7 +98,7 @@ def ours(gyro: gyros.Gyro, rpm: bool) -> tuple[np.ndarray, np.ndarray]:
 
 def notches(gyro: gyros.Gyro, f: np.ndarray, width: float, share: np.ndarray,
             floor: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Return notches in a row (f and share of shape (n, notches)); `floor`: what is left at f."""
+    """Return notches in series (f and share of shape (n, notches)); `floor`: the gain at f."""
     out, lag = gyro.signal.copy(), np.zeros_like(gyro.signal)
     ratios = np.clip(f / gyro.rate, 1e-6, 0.48)
     for j in range(f.shape[1]):
@@ -155,7 +154,7 @@ def harmonic_notch(gyro: gyros.Gyro) -> tuple[np.ndarray, np.ndarray]:
 
 
 def measure(gyro: gyros.Gyro, cutoffs: tuple[float, ...]) -> Iterator[list[str]]:
-    """Yield a row a cutoff: noise over that of the best fixed low-pass of the lag."""
+    """Yield a row per cutoff: noise over that of the best fixed low-pass with the same lag."""
     second = gyro.t > 0.5 * gyro.t[-1]
     whole = gyro.t >= 0.0
     methods: list[tuple[np.ndarray, np.ndarray, np.ndarray] | None] = [
@@ -190,7 +189,7 @@ def measure(gyro: gyros.Gyro, cutoffs: tuple[float, ...]) -> Iterator[list[str]]
 
 def _behind(gyro: gyros.Gyro, out: np.ndarray, delays: np.ndarray,
             part: np.ndarray) -> np.ndarray:
-    """Return the noise of each axis behind the best low-pass of what lag is left to it."""
+    """Return the noise of each axis after the best low-pass for the remaining lag."""
     tried = []
     for kind in KINDS:
         low = [of_lag(kind, float(delay), gyro.rate) for delay in delays]

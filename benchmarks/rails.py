@@ -1,9 +1,9 @@
 """
-Measured current as the load: voltage a second ahead and resistance, beside PX4's fit (1 min).
+Measured current as the load: voltage a second ahead and resistance, against PX4's fit (1 min).
 
 The peer fits voltage = level - R current to each reading with a forgetting factor of 0.95, as PX4
-does onboard (its pull request 23205); it leaves out the updates that do not shrink its covariance.
-Both are given the current of that second.  The first quarter of a recording is not scored.
+does onboard (its pull request 23205); it skips updates that do not shrink its covariance.  Both
+get the current of the predicted second.  The first quarter of a recording is not scored.
 """
 
 from __future__ import annotations

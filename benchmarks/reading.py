@@ -1,10 +1,10 @@
 """
-Reading bags beside rosbags, which decodes message by message; and memory (2 min).
+Reading bags against rosbags, which decodes message by message; and memory (2 min).
 
     python benchmarks/reading.py peers --page doc/results/reading.md
     python benchmarks/reading.py memory --page doc/results/reading.md
 
-CPU time of both readers on the same file, in turn; their arrays must be equal.
+CPU time of both readers on the same file, alternating; their arrays must be equal.
 """
 
 from __future__ import annotations
@@ -62,9 +62,9 @@ CASES = (
 
 def messages(case: Case, count: int) -> list[tuple[str, int, bytes]]:
     """
-    Return (topic, log time in ns, message), a throttle with every twentieth.
+    Return (topic, log time in ns, message), with a throttle after every twentieth voltage.
 
-    Messages come at 1 kHz, blocks so that their samples are at 10 kHz.
+    Messages come at 1 kHz; blocks come so that their samples are at 10 kHz.
     """
     rng = np.random.default_rng(7)
     times = START + np.arange(1, count + 1) * (10_000_000 if case.block else 1_000_000)
@@ -145,7 +145,7 @@ def ours(path: Path, case: Case) -> Columns:
 
 
 def timed(call: Callable[[], Any], repeats: int) -> tuple[float, Any]:
-    """Return the least CPU time of some calls, s, and what the last one returned."""
+    """Return the least CPU time of some calls, s, and the result of the last one."""
     best, result = np.inf, None
     for _ in range(repeats):
         begin = time.process_time()
@@ -173,14 +173,14 @@ def peers(given: argparse.Namespace, folder: Path) -> str:
     return table(['type of the voltage', 'compression', 'this package', 'rosbags', 'times'], rows)
 
 
-# Program that reads a bag, or only loads what that needs, and prints samples, peak resident memory
-# (MB) and CPU time (s).
+# Program that reads a bag, or only imports the libraries, and prints the number of samples, peak
+# resident memory (MB) and CPU time (s).
 CHILD = """
 import re, sys, time
 from ou_monitor.recordings.read import read_recording
 begin = time.process_time()
 count = read_recording(sys.argv[1]).n if sys.argv[2] == 'whole' else 0
-# getrusage would give that of the parent, where it is larger.
+# getrusage would include the parent's peak, if that is larger.
 peak = int(re.search(r'VmHWM:\\s*(\\d+) kB', open('/proc/self/status').read())[1])
 print(count, peak * 1.024e-3, time.process_time() - begin)
 """

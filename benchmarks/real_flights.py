@@ -1,8 +1,9 @@
 """
-The load model on recorded flights: how much of the voltage follows from throttle (2 min).
+The load model on recorded flights: share of the voltage explained by throttle (2 min).
 
-Simulated ahead: fitted on the first half, the second predicted from its throttle; offset included.
-One second ahead: the filter, on the second half, the throttle of that second given.
+Simulated ahead: the model is fitted to the first half and predicts the second from its throttle;
+offset included.  One second ahead: predictions by the filter in the second half, given the
+throttle of that second.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from ou_monitor.records import Recording
 
 # Seconds until a load should be known; of a flight shorter than 30 s.
 SETTLED, SHORT_SETTLED = 20.0, 8.0
-# Seconds from one look at the filter to the next: it is read as a node would.
+# Time between reports of the filter, s, as in a node.
 LOOK = 0.1
 
 

@@ -3,10 +3,10 @@ Predicted and observed frequency of brown-outs of simulated rails (1 h).
 
     python benchmarks/risk.py --table doc/results/risk.md --figure doc/results/risk_reliability.svg
 
-The flights use nothing of the package.  The rail is C dv/dt = (source - v)/R - i(throttle) -
-noise, stepped twenty times a sample by the exponential Euler scheme; between two fine steps the
-lowest point is drawn by the Brownian bridge, so that what is counted is the continuous path.
-sigma depends on throttle and wanders; throttle changes in steps; the ADC adds white noise.
+The flights use no code of the package.  The rail is C dv/dt = (source - v)/R - i(throttle) -
+noise, stepped twenty times per sample by the exponential Euler scheme; the lowest point between
+two steps is drawn from the Brownian bridge, so that brown-outs of the continuous path are counted.
+sigma depends on throttle and drifts; throttle changes in steps; the ADC adds white noise.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from scipy.stats import binomtest
 SEED = 20261121
 # Flights simulated at once: bounds memory.
 _BATCH = 100
-# Predictions within this factor of what is observed are called calibrated.
+# Predictions within this factor of the observed frequency are called calibrated.
 _FACTOR = 1.5
 # Names that fit into a legend.
 _SHORT = {'published risk': 'published', 'window alone, errors averaged': 'window alone',
           'stationary, as the paper': 'paper'}
 
 RATE, FINE = 1000.0, 20
-# Throttle as a flight has it: what it is set to, and for how long, s.
+# Throttle of a flight: range of its values, and of their durations, s.
 _THROTTLE, _DWELL = (0.15, 0.9), (2.0, 9.0)
-# Seconds before the first prediction, and between looks.
+# Seconds before the first prediction, and between predictions.
 WARM, WINDOW = 3.0, 2.0
 # Samples from one report of the monitor to the next: a slow companion computer.
 STEP = 250
@@ -52,25 +52,25 @@ EDGES = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 
 @dataclass(frozen=True)
 class Horizon:
-    """One prediction, and what happened."""
+    """One prediction and its outcome."""
 
     flight: int
     t: float  # When it was made, s.
     predicted: dict[str, float]  # Probability by method.
-    happened: bool  # Whether the path went below the level within the horizon.
+    happened: bool  # Whether the path fell below the level within the horizon.
     steady: bool  # Whether throttle did not change within the horizon.
 
 
 def predict(flights: Flights, levels: np.ndarray, horizon: float, every: float
             ) -> Iterator[Horizon]:
     """
-    Predict each `every` s, over horizons (s) that do not overlap, with a level (V) a flight.
+    Predict each `every` s, over horizons (s) without overlap, with a level (V) for each flight.
 
-    Only where the estimate is usable and the rail not already below.
+    Only if the estimate is usable and the rail is not already below the level.
     """
     count, ahead = flights.t.size, round(horizon * RATE)
     for f, level in enumerate(levels.tolist()):
-        # Without a floor, which would answer for the risk.
+        # Without a floor, which would replace the risk.
         monitor = SupplyMonitor(MonitorSettings(
             window=WINDOW, brownout_voltage=level, brownout_horizon=horizon, brownout_floor=0.0))
         v, u = flights.voltage[f].astype(np.float64), flights.throttle[f]
@@ -95,7 +95,7 @@ def predict(flights: Flights, levels: np.ndarray, horizon: float, every: float
 
 @dataclass(frozen=True)
 class Bin:
-    """Predictions that are alike: how many, their mean, and how often it happened."""
+    """Similar predictions: their number and mean, and the number of brown-outs."""
 
     low: float
     high: float
@@ -131,7 +131,7 @@ class Flights:
     """Some flights of one length: shape (flights, n), or (flights,)."""
 
     t: np.ndarray  # s, shape (n,).
-    voltage: np.ndarray  # What the ADC tells, V.
+    voltage: np.ndarray  # Samples of the ADC, V.
     throttle: np.ndarray
     low: np.ndarray  # Lowest point of the path from the sample before to this one, V.
     path: np.ndarray  # The rail itself at the samples, V.
@@ -174,11 +174,11 @@ def fly(rng: np.random.Generator, flights: int, seconds: float) -> Flights:
     voltage, low, path = (np.empty((flights, n), np.float32) for _ in range(3))
     for k in range(n):
         u = throttle[:, k]
-        # ln sigma wanders by 0.08 in a second and comes back within a minute.
+        # ln sigma drifts by 0.08 in a second and returns within a minute.
         log += 0.08 / math.sqrt(RATE) * rng.standard_normal(flights) - log / (60.0 * RATE)
         current = sag * u / resistance
         rest = source - resistance * current
-        # White current through the capacitor, its intensity as throttle and time have it.
+        # White current through the capacitor; its intensity depends on throttle and time.
         sigma = intensity * (1.0 + growth * (u - 0.5)) * np.exp(log)
         lowest = v
         kicks = rng.standard_normal((FINE, flights))

@@ -1,10 +1,10 @@
 """
-The brown-out risk on recorded flights, causally, beside simpler forecasts (10 min).
+The brown-out risk on recorded flights, causally, against simpler forecasts (10 min).
 
-One monitor with the default window is asked at 5 Hz; its fits count in the CPU of reports.  The
-levels are undershot in 1, 5 and 20 % of the flight's horizons, by the median of three samples or
-by single samples.  Horizons overlap: n of them count as n / (5 Hz x horizon).  Skill: 1 minus the
-Brier score divided by that of the climatology so far.
+One monitor with the default window reports at 5 Hz; the CPU time of reports includes its fits.
+Levels are those undershot in 1, 5 and 20 % of the flight's horizons, by the median of three
+samples or by single samples.  Horizons overlap: n of them count as n / (5 Hz x horizon).  Skill: 1
+minus the Brier score divided by that of the climatology so far.
 
     OU_MONITOR_REALDATA=... python benchmarks/risk_real.py --page doc/results/risk_real.md
 """
@@ -36,7 +36,7 @@ EDGES = (0.0, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0001)
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One flight, horizon and event: (n, 3) of each method, what happened, and features."""
+    """One flight, horizon and event: (n, 3) of each method, the outcomes, and features."""
 
     flight: str
     horizon: float
@@ -48,7 +48,7 @@ class Case:
 
 
 def climatology(happened: np.ndarray, horizon: float) -> np.ndarray:
-    """Return the share of completed horizons so far, half a one before any; (n, 3)."""
+    """Return the share of events in completed horizons, half an event at first; (n, 3)."""
     done = np.cumsum(happened, axis=0)
     lag = round(horizon / LOOK)
     n = np.maximum(np.arange(happened.shape[0]) - lag, 0)[:, None]
@@ -57,13 +57,13 @@ def climatology(happened: np.ndarray, horizon: float) -> np.ndarray:
 
 
 def fly(name: str, recording: Recording) -> tuple[list[Case], list[Case], dict[str, float]]:
-    """Return cases by the middle one of three samples, by single samples, and what else counts."""
+    """Return cases by the median of three samples, by single samples, and further figures."""
     good = np.isfinite(recording.throttle)
     t, v = recording.t[good] - recording.t[good][0], recording.voltage[good]
     u = np.clip(recording.throttle[good], 0.0, 1.0)
     middle = median3(v)
     looks = np.unique(np.searchsorted(t, np.arange(LOOK, t[-1] - max(HORIZONS), LOOK)))
-    # Where samples are rarer than the horizon, or in a gap, there is no lowest one ahead.
+    # Without a sample within the horizon (slow sampling, or a gap) there is no lowest one.
     looks = looks[np.searchsorted(t, t[looks] + min(HORIZONS), 'right') > looks + 1]
     begin = SETTLED if t[-1] >= 30.0 else SHORT_SETTLED
     late = t[looks] >= begin
@@ -143,7 +143,7 @@ def logistic(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def with_logistics(cases: list[Case]) -> None:
-    """Add what logistic regressions say that were trained on the other airframes."""
+    """Add the probabilities of logistic regressions trained on the other airframes."""
     for case in cases:
         others = [c for c in cases if c.flight != case.flight and c.horizon == case.horizon]
         for name, make in (('margin', lambda f: f[..., :1]), ('margin and sd', shape)):
@@ -157,13 +157,13 @@ def with_logistics(cases: list[Case]) -> None:
 
 
 def shape(features: np.ndarray) -> np.ndarray:
-    """Return margin, recent deviation, and the one in units of the other."""
+    """Return the margin, the recent deviation, and their ratio."""
     ratio = np.clip(features[..., 0] / np.maximum(features[..., 1], 1e-4), 0.0, 10.0)
     return np.concatenate((features, ratio[..., None]), axis=-1)
 
 
 def pooled(cases: list[Case], method: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return probabilities, climatology and outcomes of all; where nothing is said, the latter."""
+    """Return probabilities (the climatology if unknown), climatology and outcomes of all cases."""
     base = np.concatenate([c.said['climatology'] for c in cases]).ravel()
     said = np.concatenate([c.said[method] for c in cases]).ravel()
     happened = np.concatenate([c.happened for c in cases]).ravel().astype(float)
@@ -177,7 +177,7 @@ def skill(cases: list[Case], method: str) -> float:
 
 
 def small(cases: list[Case], method: str) -> str:
-    """Return what was observed and predicted below 0.01, their ratio, and events in all."""
+    """Return observed and predicted frequency below 0.01, their ratio, and events of horizons."""
     p, _, y = pooled(cases, method)
     below = p < 0.01
     if not below.any():
@@ -189,7 +189,7 @@ def small(cases: list[Case], method: str) -> str:
 
 
 def reliability(cases: list[Case], method: str) -> str:
-    """Return predicted -> observed of bins with ten events or more."""
+    """Return predicted -> observed for bins with ten events or more."""
     p, _, y = pooled(cases, method)
     out = []
     for low, high in zip(EDGES[:-1], EDGES[1:]):
@@ -201,11 +201,11 @@ def reliability(cases: list[Case], method: str) -> str:
 
 
 def false_alarms(cases: list[Case], says: Callable[[Case], np.ndarray], share: float) -> float:
-    """Return alarms a minute that no dip of the 5 % level follows, at a share of dips caught."""
+    """Return alarms per minute without a dip below the 5 % level, at a share of caught dips."""
     highest, rises, minutes = [], [], 0.0
     for case in cases:
         y, loud = case.happened[:, 1].astype(int), says(case)
-        # Looks in a row before a dip, or before several: caught with an alarm at one of them.
+        # A run of reports before a dip, or several: caught if one of them has an alarm.
         begins = np.flatnonzero(np.diff(y, prepend=0) == 1)
         ends = np.flatnonzero(np.diff(y, append=0) == -1) + 1
         highest += [loud[a:b].max() for a, b in zip(begins, ends)]

@@ -1,9 +1,9 @@
 """
-Simulated samples a second beside other ways to draw an OU process (1 min).
+Simulated samples per second, against other ways to draw an OU process (1 min).
 
-All ways run in turn, `--repeats` times; the least CPU time of each counts.  Ours make stamps and
-throttle anew for each piece, as `ou-monitor simulate` does.  The variance over that of the OU
-process shows whether a way keeps the law.
+All ways run in turn, `--repeats` times; the least CPU time of each counts.  Ours also makes stamps
+and throttle for each piece, as `ou-monitor simulate` does.  The ratio of variance to that of the
+OU process shows whether the distribution is right.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def numba_loop() -> Draw:
 
 
 def ways() -> dict[str, tuple[Draw, float, bool]]:
-    """Return name, function, share of the samples, and whether the law is the plain OU's."""
+    """Return name, function, share of the samples, and whether it draws a plain OU."""
     found: dict[str, tuple[Draw, float, bool]] = {
         'numpy standard_normal alone':
             (lambda n: np.random.default_rng(SEED).standard_normal(n), 1.0, False),

@@ -1,8 +1,8 @@
 """
-An hour of faults for the real `estimator`: dips reported, silence, memory (1 h).
+An hour of faults for the real `estimator`: reported dips, silence, memory (1 h).
 
-1 kHz with dips, wrong stamps, values and types, parameters, publishers that come and go, and a
-CPU that is taken away (`soak_source.py` has the schedule).
+Voltages at 1 kHz with dips, wrong stamps, values and types; publishers that come and go; changes
+of parameters; and no CPU at times (`soak_source.py` has the schedule).
 
     .venv/bin/python benchmarks/soak.py [--minutes 60] [--seed 1] [--markdown doc/results/soak.md]
 
@@ -12,9 +12,9 @@ busy loop keep it, and source and listener get the next higher one.  Ctrl-C ends
 figures so far.
 
 A dip that was not reported in time has one of three causes: its messages did not reach the node
-(lost); the node counted it (`floor_dips`), and the message that says so did not reach the listener
-(unheard, by the numbers of the messages); or it was missed.  Messages count from when the node
-sent them: a listener without CPU receives them late.
+(lost); the node counted it (`floor_dips`), but that message did not reach the listener (unheard,
+known from sequence numbers); or the node missed it.  Times are those when the node sent its
+messages, because a listener without CPU receives them late.
 """
 
 from __future__ import annotations
@@ -55,11 +55,11 @@ model:
 COUNTERS = ('messages', 'messages_lost', 'foreign_messages', 'pushed', 'used', 'non_finite',
             'late', 'resets', 'floor_dips', 'samples_thinned', 'restarts', 'callback_errors')
 Span = tuple[float, float]
-# s: between two readings of the memory, and two reports of progress; timeouts of a service, of
-# the node's start, and of its end.
+# Times between readings of the memory and between reports of progress, and timeouts of a service,
+# of the node's start, and of its end, s.
 LOOK, PROGRESS, ANSWER, START, END = 2.0, 60.0, 20.0, 60.0, 20.0
-# A dip is reported in time within this time of its begin, s, without pauses: time in which this
-# program stopped the node, or in which the node was ready and had no CPU.
+# A dip is reported in time if within this time of its start, s, without pauses (times when this
+# program had stopped the node, or when the node was ready but had no CPU).
 IN_TIME = 1.0
 # A dip with fewer low samples on the wire is shorter than 40 ms.
 SAMPLES = 40
@@ -73,7 +73,7 @@ WAIT = 0.05
 REAL_TIME = (os.SCHED_FIFO, os.SCHED_RR)
 
 
-# -- what was received, and what follows from it
+# -- received messages, and the figures computed from them
 
 
 class State(NamedTuple):
@@ -107,7 +107,7 @@ class Heard:
     outputs: dict[str, list[Said]] = field(default_factory=dict)
     memory: list[tuple[float, float]] = field(default_factory=list)
     stops: list[Span] = field(default_factory=list)  # The node was stopped.
-    withheld: list[Span] = field(default_factory=list)  # The node was ready and had no CPU.
+    withheld: list[Span] = field(default_factory=list)  # The node was ready but had no CPU.
     deaths: list[float] = field(default_factory=list)
     source: list[dict[str, Any]] = field(default_factory=list)  # Lines of the source's log.
 
@@ -127,7 +127,7 @@ class Heard:
 
 
 def overlap(begin: float, end: float, spans: Sequence[Span]) -> float:
-    """Return how much of a time lies in ordered spans, s."""
+    """Return how much of an interval lies in ordered spans, s."""
     first = max(bisect_right(spans, (begin, math.inf)) - 1, 0)
     total = 0.0
     for a, b in spans[first:]:
@@ -138,7 +138,7 @@ def overlap(begin: float, end: float, spans: Sequence[Span]) -> float:
 
 
 def unheard(messages: Sequence[State] | Sequence[Said]) -> int:
-    """Return the number of messages missing between these."""
+    """Return the number of messages missing between the given ones."""
     return sum(max(b.number - a.number - 1, 0) for a, b in zip(messages, messages[1:]))
 
 
@@ -148,11 +148,11 @@ def low(state: State) -> bool:
 
 
 def delay(dip: Mapping[str, Any], heard: Heard, pauses: Sequence[Span]) -> float:
-    """Return the time from a dip's begin to state and flag, s, without pauses; inf: neither."""
+    """Return the time from a dip's start to state and flag, s, without pauses; inf: none."""
     begin = dip['begin']
     when = math.inf
     for state in heard.states[bisect_right(heard.states, (begin,)):]:
-        # A later dip must not count as this one.
+        # A later dip must not be taken for this one.
         if state.at - begin - overlap(begin, state.at, pauses) > IN_TIME:
             break
         if low(state):
@@ -180,7 +180,7 @@ def fate(dip: Mapping[str, Any], heard: Heard) -> str:
     # Messages of the last 20 ms may wait for the next poll.
     due = float(np.diff(np.interp([before.at, after.at - 0.02], [line['at'] for line in sent],
                                   [line['count'] for line in sent]))[0])
-    # By what was sent, or by the node's count: received messages may be older ones.
+    # From the messages sent, or the node's own count: received messages may be older ones.
     gone = max(due - (after.messages - before.messages), after.lost - before.lost)
     return 'lost' if gone > 0.5 * dip['samples'] else 'missed'
 
@@ -316,7 +316,7 @@ def steady(wall: float) -> float:
 
 
 class Soak:
-    """One run: its processes, what is received from them, and what is done to them."""
+    """One run: its processes, their messages, and the actions on them."""
 
     def __init__(self, seed: int, seconds: float, folder: Path, domain: int, dense: bool) -> None:
         self.heard = Heard(outputs={name: [] for name in ('/diagnostics', '~/brownout_risk')})
@@ -355,13 +355,13 @@ class Soak:
         return node
 
     def _watch_cpu(self) -> None:
-        """Note when the node's main thread was ready and had no CPU, by the kernel's account."""
+        """Record from the kernel when the node's main thread was ready but had no CPU."""
         last, waited = 0, 0.0
         while True:
             time.sleep(0.02)
             pid = self._node.popen.pid
             with suppress(OSError):
-                # Time on the CPU, and time ready without it, since the thread began, ns.
+                # Time on the CPU, and time ready without CPU, since the thread started, ns.
                 account = Path(f'/proc/{pid}/task/{pid}/schedstat').read_text()
                 total, now = 1e-9 * int(account.split()[1]), time.monotonic()
                 if pid == last and total - waited > WAIT:
@@ -394,7 +394,7 @@ class Soak:
         self._clearer = node.create_client(Trigger, f'{NODE}/clear_brownout')
 
     def run(self) -> None:
-        """Do what is scheduled until the source ends."""
+        """Carry out the schedule until the source ends."""
         until = time.monotonic() + START
         while not self.heard.states:
             if time.monotonic() > until or self._node.popen.poll() is not None:
@@ -427,7 +427,7 @@ class Soak:
         return [json.loads(line) for line in whole.splitlines()]
 
     def _look(self, now: float) -> None:
-        """Note the node's memory; start the node again if it is dead."""
+        """Record the node's memory; restart the node if it has died."""
         if self._node.popen.poll() is None:
             self.heard.memory.append((now, memory_of(self._node.popen.pid)))
             return
@@ -441,7 +441,7 @@ class Soak:
                         for name in COUNTERS})
 
     def _release(self, now: float) -> None:
-        """Give back the CPU when the time of an event is over (now: time of the schedule, s)."""
+        """Return the CPU to the node when an event is over (now: time of the schedule, s)."""
         if self._starved is not None and now > self._starved[0]:
             self._starved[1].stop()
             self.heard.stops += self._starved[1].stops
@@ -453,7 +453,7 @@ class Soak:
             self._busy = None
 
     def _pin(self, cores: set[int]) -> None:
-        """Put every thread of the node on cores."""
+        """Bind every thread of the node to cores."""
         for task in Path(f'/proc/{self._node.popen.pid}/task').iterdir():
             # A thread may end meanwhile.
             with suppress(OSError):
@@ -478,7 +478,7 @@ class Soak:
             self._busy = event.begin + event.about[0], process
 
     def _call(self, client: Any, request: Any) -> Any:
-        """Return the answer of a service; None if there is none."""
+        """Return the response of a service; None if there is none."""
         begin = time.monotonic()
         future = client.call_async(request)
         while not future.done():
@@ -539,7 +539,7 @@ def main() -> None:
     options = parser.parse_args()
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     os.environ['FASTDDS_BUILTIN_TRANSPORTS'] = options.transport
-    # A shell lets its background processes ignore SIGINT.
+    # A shell starts its background processes with SIGINT ignored.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
     with tempfile.TemporaryDirectory() as folder:

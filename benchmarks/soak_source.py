@@ -3,11 +3,11 @@ Used by soak.py: its schedule, drawn from a seed, and the source of voltages at 
 
     python soak_source.py SEED SECONDS LOG [dense]
 
-Two schedules run side by side: what is sent (phases, with dips at random times), and what is done
-to the node (parameters, services, CPU).  Each phase and each dip is one line of JSON in the log:
-when its first and last sample were sent (monotonic clock, s), and how many; the number of messages
-sent so far is one line ten times a second.  Samples that are due while the process has no CPU are
-sent as soon as it has, with the stamps of when they were due.
+Two schedules run in parallel: voltages (phases, with dips at random times), and actions on the
+node (parameters, services, CPU).  Each phase and each dip is one line of JSON in the log, with the
+times of its first and last sample (monotonic clock, s) and their number; ten times per second
+another line has the number of messages sent so far.  Samples that are due while the process has no
+CPU are sent later, with the stamps at which they were due.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from std_msgs.msg import Float64
 # -- the schedule
 
 RATE = 1000.0  # Hz.
-# What comes: a weight each.  Stamps: `good` (the time of the sample), `none` (0), `frozen` at
-# that of the phase's begin, `backwards`, `jumps` (steps of 10 ms to 12 days, either way),
+# Kinds of phases with their weights.  Stamps: `good` (the time of the sample), `none` (0),
+# `frozen` (the start of the phase), `backwards`, `jumps` (steps of 10 ms to 12 days, either way),
 # `future` (nine years ahead), `wild` (each within 100 s of the truth), `fast` (milliseconds taken
 # for seconds).  Values: `nan`, `huge` (a fifth of the samples).  Also: `burst` (sent 100 at once),
 # `lumps` (no stamps, and three of six seconds sent 100 at once), `second` (another publisher of
@@ -40,17 +40,17 @@ RATE = 1000.0  # Hz.
 SEEN = {'good': 6.0, 'none': 2.0, 'frozen': 1.0, 'backwards': 1.0, 'jumps': 1.0, 'future': 1.0,
         'wild': 1.0, 'fast': 1.0, 'nan': 1.0, 'huge': 1.0, 'burst': 1.0, 'lumps': 1.0,
         'second': 1.0}
-# What holds no voltage that the node can take for one: all samples NaN, millivolts, another
-# message type, a publisher that pauses, or that ends and begins anew.
+# Phases without usable voltages: all samples NaN, millivolts, another message type, a publisher
+# that pauses, or one that ends and restarts.
 UNSEEN = {'only_nan': 0.7, 'millivolts': 0.7, 'type': 0.7, 'silent': 0.7, 'restart': 1.0}
-# During these no estimate can be made, so the flag must never be false.
+# In these phases no estimate is possible, so the flag must never be false.
 NEVER_FALSE = ('frozen', 'backwards', 'wild', 'only_nan', 'type', 'silent')
 LONG, SHORT = (4.0, 12.0), (2.0, 4.0)
-# Nothing is asked of a dip so shortly after the start, or after a new publisher, s: discovery;
-# nor so shortly before a publisher ends: what has been sent may go with it.
+# A dip need not be seen so shortly after the start or after a new publisher, s (discovery), nor so
+# shortly before a publisher ends (its last messages may be lost).
 SETTLE, FIRST, LEAVE = 1.0, 3.0, 0.3
-# Of dips: s between them (dense ones: never less than two can be told apart), s, and V; all at or
-# below the lowest floor that is ever set.
+# Of dips: time between them, s (dense: the least at which they can be distinguished), length, s,
+# and voltage, V (never above the lowest floor that is set).
 BETWEEN, DENSE, DIP, DEPTH = (1.5, 5.0), (1.3, 2.0), (0.04, 0.08), (3.0, 4.1)
 # Events at the node: s between them.
 PAUSE = (1.0, 5.0)
@@ -59,7 +59,7 @@ SLICES = ((0.02, 0.01), (0.05, 0.05), (0.2, 0.1), (0.4, 0.2))
 
 @dataclass(frozen=True)
 class Phase:
-    """What the source sends from `begin` to `end`, s."""
+    """Messages of the source from `begin` to `end`, s."""
 
     kind: str
     begin: float
@@ -78,7 +78,7 @@ class Dip:
 
 @dataclass(frozen=True)
 class Event:
-    """Something done to the node at `begin`, s."""
+    """An action on the node at `begin`, s."""
 
     kind: str
     begin: float
@@ -86,12 +86,13 @@ class Event:
 
 
 def phases(seed: int, seconds: float) -> list[Phase]:
-    """Return what is sent, phase by phase."""
+    """Return the phases."""
     rng = random.Random(f'phases {seed}')
     weights = {**SEEN, **UNSEEN}
     made, now = [Phase('good', 0.0, FIRST + 2.0)], FIRST + 2.0
     while now < seconds:
-        # A publisher that pauses or changes while another is there would lose its place to it.
+        # If a publisher paused or changed while another is there, the node would switch to that
+        # one.
         kind = rng.choices(list(weights), list(weights.values()))[0]
         length = rng.uniform(*(LONG if kind in SEEN else SHORT))
         if kind == 'second':
@@ -127,7 +128,7 @@ def _unseen(begin: float, end: float, sent: list[Phase]) -> str:
 
 
 def events(seed: int, seconds: float, fifo: str, model: str) -> list[Event]:
-    """Return what is done to the node (fifo, model: paths of files)."""
+    """Return the actions on the node (fifo, model: paths of files)."""
     rng = random.Random(f'events {seed}')
     made, now = [], FIRST
     while True:
@@ -148,7 +149,7 @@ def events(seed: int, seconds: float, fifo: str, model: str) -> list[Event]:
 
 
 def good_parameter(rng: random.Random, model: str) -> tuple[str, Any]:
-    """Return a parameter and a value that are taken, whatever the others are."""
+    """Return a parameter and a value that are accepted whatever the others are."""
     return rng.choice([
         lambda: ('window', rng.uniform(0.5, 4.0)),
         lambda: ('stale_after', rng.uniform(0.5, 2.0)),
@@ -179,16 +180,16 @@ def bad_parameters(fifo: str) -> list[tuple[str, Any]]:
         ('voltage.topic', 'elsewhere'), ('lock_parameters', True), ('no_such_parameter', 1.0)]
 
 
-# -- what is sent
+# -- the source
 
 FLOOD = Path(__file__).resolve().parents[1] / 'test/support/flood.py'
 TOPIC = '/soak/voltage'
 # Of the supply: relaxation, 1/s, noise, V/sqrt(s), level, V.
 ALPHA, SIGMA, LEVEL = 63.0, 0.2, 5.0
-# Share of bad values where there are some, and what they are, V.
+# Share of bad values in a phase that has them, and the values, V.
 BAD = 0.2
 HUGE = (1e200, 1e30, -1e30, math.inf, -math.inf, 1e-160, 1e5)
-# Samples sent at once; and at most to catch up.
+# Number of samples sent at once, and at most to catch up.
 BURST, MOST = 100, 1000
 
 
@@ -282,7 +283,7 @@ class Source:
         self._end_second()
 
     def _end_second(self) -> None:
-        """End the other publisher, in order or not."""
+        """End the other publisher, cleanly or not."""
         if self._second is not None:
             self._second.send_signal(self._rng.choice([signal.SIGINT, signal.SIGKILL]))
             self._second.wait()
@@ -299,8 +300,8 @@ class Source:
         self._away = phi * self._away + SIGMA * math.sqrt(
             (1.0 - phi * phi) / (2.0 * ALPHA)) * self._rng.gauss(0.0, 1.0)
         kind, value = self._phase.kind, LEVEL + self._away
-        # The last seconds of a phase are the first publisher's alone: what is lost of the other
-        # is not taken for its own.
+        # In the last seconds of a phase only the first publisher sends, so that messages lost with
+        # the other are not counted as its own.
         if kind == 'second' and now > self._phase.end - 2.0:
             self._end_second()
         low = bool(near) and near[0].begin <= now <= _end(near[0])
@@ -320,7 +321,7 @@ class Source:
             value *= 1000.0
         elif low:
             self._low.append(time.monotonic())
-        # A value that a float32 takes.
+        # As float32: infinity if too large.
         message = BatteryState(
             voltage=math.copysign(math.inf, value) if abs(value) > 3e38 else value)
         stamp = self._stamp(kind, now)

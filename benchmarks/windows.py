@@ -1,4 +1,4 @@
-"""Used by estimator.py and uneven.py: simulated supplies with known parameters, and fits."""
+"""Used by estimator.py: simulated supplies with known parameters, and fits."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Z95 = 1.96  # 97.5 % quantile of the normal distribution.
 
 @dataclass(frozen=True)
 class Fit:
-    """One fit; NaN where the method gave nothing."""
+    """One fit; NaN where the method gave no value."""
 
     values: tuple[float, ...] = (math.nan,) * 3  # alpha 1/s, sigma V/sqrt(s), Var_inf V^2.
     log_se: tuple[float, ...] = (math.nan,) * 3  # Standard errors of the logarithms.
