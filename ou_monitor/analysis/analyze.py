@@ -199,7 +199,7 @@ def slide(recording: Recording, window: float, brownout_voltage: float = NAN,
             seen = estimator.estimate(), NAN
         else:
             # The monitor also learns from reports in between.
-            last = monitor.report(0.0)
+            last = monitor.report(0.0, alone=True)
             seen = last.estimate, last.risk
         # Estimates before the first window is full are too poor to show.
         if shown and now >= min(window, 0.5 * duration):

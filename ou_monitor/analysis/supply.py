@@ -227,7 +227,7 @@ def _tuple(values: FloatArray) -> tuple[float, ...]:
 def node_for(recording: Recording, settings: MonitorSettings,
              ) -> tuple[SupplyMonitor, Iterator[tuple[float, bool]]]:
     """Return a monitor, and the iterator `fed` that feeds it with a recording."""
-    monitor = SupplyMonitor(settings, look=max(LOOK, recording.duration / _LOOKS))
+    monitor = SupplyMonitor(settings, look=max(LOOK, recording.duration / _LOOKS), replay=True)
     throttle, drawn = recording.throttle if recording.has_throttle else None, recording.current
     return monitor, fed(
         recording, SLIDING if isinstance(settings.window, str) else settings.window,

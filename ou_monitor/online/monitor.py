@@ -50,6 +50,8 @@ class SupplyMonitor:
         so that reports never wait.
     look : float
         Interval at which the risk compares its forecasts with the outcomes, s.
+    replay : bool
+        Whether only the horizon of the settings will be asked for, and not the flag.
 
     Examples
     --------
@@ -65,9 +67,9 @@ class SupplyMonitor:
 
     def __init__(self, settings: MonitorSettings | None = None,
                  model: SupplyModel | None = None, *, background: bool = False,
-                 look: float = LOOK) -> None:
+                 look: float = LOOK, replay: bool = False) -> None:
         self._settings = settings or MonitorSettings()
-        self._background, self._look = background, look
+        self._background, self._look, self._replay = background, look, replay
         self._model = model
         self._flag = BrownoutFlag(self._settings)
         self._trust = InputTrust()
@@ -90,7 +92,9 @@ class SupplyMonitor:
         self._load_filter, self._load = LoadFilter(), SupplyLoad()
         self._load_filter.begin_with(None if self._model is None else self._model.load)
         self._newest = Estimate()
-        self._forecast = Forecast(self._load_filter, self._look)
+        self._forecast = Forecast(
+            self._load_filter, self._look,
+            self._settings.brownout_horizon if self._replay else NAN)
         # Risk and budget of the last report.
         self._ahead = Ahead()
 
@@ -244,7 +248,8 @@ class SupplyMonitor:
         self._reset_reason = reason
 
     def report(self, age: float | None, now: float | None = None,
-               arrived: float | None = None, *, again: bool = True) -> MonitorReport:
+               arrived: float | None = None, *, again: bool = True,
+               alone: bool = False) -> MonitorReport:
         """
         Return what is known now.
 
@@ -261,6 +266,8 @@ class SupplyMonitor:
         again : bool
             Whether to estimate again; if not, the numbers of the last report are kept, and only
             floor, flag and ages are updated.
+        alone : bool
+            Whether of the forecasts only the risk is needed, not the budget.
 
         Returns
         -------
@@ -295,8 +302,9 @@ class SupplyMonitor:
                 # otherwise the load model is more accurate.
                 self._forecast.follow(*((told, ou.window_s, ou_age) if e.usable and told.usable
                                         else (e, e.duration)))
-                self._ahead = look_ahead(self._forecast, self._load, self._settings) if (
-                    fresh) else Ahead(budget_reason=why)
+                self._ahead = look_ahead(
+                    self._forecast, self._load, self._settings, alone=alone) if (
+                        fresh) else Ahead(budget_reason=why)
         except Exception as error:
             # As in `push`.
             self.restart(error)

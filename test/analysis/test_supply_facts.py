@@ -2,11 +2,13 @@
 
 from dataclasses import replace
 import json
+import math
 
 import numpy as np
 from ou_monitor import read_recording, Recording, supply_facts
 from ou_monitor.analysis.supply import node_for
 from ou_monitor.online.load.load_filter import LoadFilter
+from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.settings import MonitorSettings
 from project import ROOT
 import pytest
@@ -118,8 +120,8 @@ def test_shipped_recordings_have_their_known_facts(name, status):
 
 def test_a_long_recording_is_looked_at_no_more_often_than_15_minutes(monkeypatch):
     """Once every 0.8 s of an hour, as every 0.2 s of a flight."""
-    looks, load = [], LoadFilter.load
-    monkeypatch.setattr(LoadFilter, 'load', lambda self: (looks.append(1), load(self))[1])
+    looks = []
+    monkeypatch.setattr(LoadFilter, 'known', property(lambda self: looks.append(1) is None))
     t = np.arange(500) / 50.0
     for seconds, wanted in ((600.0, 50), (3600.0, 12.5)):
         ends = np.array([0.0, seconds])
@@ -127,3 +129,22 @@ def test_a_long_recording_is_looked_at_no_more_often_than_15_minutes(monkeypatch
         monitor, _ = node_for(Recording(ends, ends, ends), MonitorSettings())
         monitor.push(t, 12.0 - t / 1e3, t / 10.0)
         assert abs(len(looks) - wanted) <= 1.5
+
+
+@pytest.mark.parametrize('horizon', [1.0, 3.0, 20.0])
+def test_a_replay_takes_less_time_and_has_the_same_risk(horizon):
+    """It learns from the horizons about its own only; without a budget the risk is the same."""
+    recording = flight(np.random.default_rng(4))
+    settings = MonitorSettings(window=2.0, brownout_voltage=15.0, brownout_horizon=horizon)
+    replayed, parts = node_for(recording, settings)
+    node, risks, done = SupplyMonitor(settings), [], 0
+    for now, _ in parts:
+        part = slice(done, done := int(np.searchsorted(recording.t, now, 'right')))
+        node.push(recording.t[part], recording.voltage[part], recording.throttle[part])
+        shown, known = replayed.report(0.0, alone=True), node.report(0.0)
+        assert shown.risk == pytest.approx(known.risk, rel=1e-9, nan_ok=True)
+        assert math.isnan(shown.budget)
+        assert node.load_filter.known == node.load_filter.load().known
+        risks.append(known.risk)
+    assert len(set(risks)) > 20 and node.load_filter.known
+    assert replayed.report(0.0).risk_curve == pytest.approx(known.risk_curve, rel=1e-9)

@@ -158,6 +158,8 @@ class FarShare:
 # Horizons, s, from which the flight learns; those between are interpolated in ln h.
 RUNGS = (0.5, 1.0, 2.0, 5.0, 15.0)
 _LN_RUNGS = np.log(RUNGS)
+# Share in the interpolation below which a horizon does not count: more than rounding.
+_LEAST_SHARE = 1e-9
 # Time between updates, s, and as a share of the horizon.
 LOOK, _LOOK_SHARE = 0.2, 0.2
 # Minimum time between updates by arrival, s: stamps may run a thousand times too fast, and an
@@ -247,15 +249,28 @@ class _Rung:
             self.evidence += weight * math.log(max(first, 1e-300) / max(other, 1e-300))
 
 
-class Forecast:
-    """Risk with the pilot's future throttle, and with a given one (look: update interval, s)."""
+def _shares(horizon: float) -> list[float]:
+    """Return the share of each of RUNGS in a law for a horizon, s."""
+    place = np.interp(math.log(horizon), _LN_RUNGS, np.arange(_LN_RUNGS.size))
+    shares: list[float] = np.maximum(1.0 - np.abs(np.arange(_LN_RUNGS.size) - place), 0.0).tolist()
+    return shares
 
-    def __init__(self, loads: LoadFilter, look: float = LOOK) -> None:
+
+class Forecast:
+    """
+    Risk with the pilot's future throttle, and with a given one.
+
+    look: update interval, s; horizon: the only one of the risks, s; NaN: any may be asked for.
+    """
+
+    def __init__(self, loads: LoadFilter, look: float = LOOK, horizon: float = NAN) -> None:
         # Takes a third of a second, once; done here so that no sample has to wait.
         prepare()
         self._loads, self._look_time = loads, look
         self.follow(Estimate(), 0.0)
-        self._rungs = tuple(_Rung(horizon) for horizon in RUNGS)
+        self._rungs = tuple(map(_Rung, RUNGS))
+        self._learning = self._rungs if math.isnan(horizon) else tuple(
+            rung for rung, share in zip(self._rungs, _shares(horizon)) if share > _LEAST_SHARE)
         self.new_time_line()
         self._known = False
         # Earliest arrival for the next update, s.
@@ -350,13 +365,14 @@ class Forecast:
         """Complete horizons, and start new ones."""
         self._kept.clear()
         self._laws.clear()
-        self._known = self._loads.load().known
+        self._known = self._loads.known
         if self._samples > 1:
             interval = (self._newest - self._begun) / (self._samples - 1)
             self._sampling = Sampling(interval, self._past.activity())
-        state = self._loads.state() if self._known else None
-        now, passage = self.voltage, self.passage()
-        for rung in self._rungs:
+        due = any(self._newest >= rung.next for rung in self._learning)
+        state = self._loads.state() if self._known and due else None
+        now, passage = self.voltage, self.passage() if due else None
+        for rung in self._learning:
             while rung.looks and self._past.end >= rung.looks[0].t + rung.horizon + BLOCK:
                 look = rung.looks.popleft()
                 outcome = self._past.outcome(look.t, rung.horizon)
@@ -382,10 +398,8 @@ class Forecast:
     def _learned(self, horizon: float) -> tuple[LowestLaw, float, float, float]:
         """Return the law, both shares, and the evidence for a horizon."""
         if horizon not in self._laws:
-            place = float(np.interp(math.log(horizon), _LN_RUNGS, np.arange(_LN_RUNGS.size)))
-            low = min(int(place), _LN_RUNGS.size - 2)
-            share = place - low
-            values = (1.0 - share) * self._rungs[low].values + share * self._rungs[low + 1].values
+            values = np.sum([share * rung.values for rung, share in zip(
+                self._rungs, _shares(horizon)) if share > _LEAST_SHARE], axis=0)
             self._laws[horizon] = (LowestLaw(values[:6]), *values[6:].tolist())
         return self._laws[horizon]
 
@@ -473,11 +487,14 @@ class Ahead:
     tight: bool = False
 
 
-def look_ahead(forecast: Forecast, load: SupplyLoad, settings: MonitorSettings) -> Ahead:
-    """Return risk, risk curve and throttle budget for the settings."""
+def look_ahead(forecast: Forecast, load: SupplyLoad, settings: MonitorSettings, *,
+               alone: bool = False) -> Ahead:
+    """Return risk, risk curve and throttle budget for the settings; alone: only the risk."""
     s = settings
     voltage, horizon = s.brownout_voltage, s.brownout_horizon
     outcome = forecast.risk(voltage, horizon)
+    if alone:
+        return Ahead(outcome)
     soon = forecast.risk_held(voltage, SOON)
     if math.isnan(soon):
         soon = forecast.risk(voltage, min(SOON, horizon)).risk
