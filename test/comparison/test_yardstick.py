@@ -117,3 +117,22 @@ def test_the_verdict_follows_from_path_and_level():
         p, said, words, kind = judge([*others, of('level', level)], explained, moved)
         assert p > 0.05 and said is verdict
     assert words == kind == 'level'
+
+
+def test_a_recording_is_the_farthest_as_often_as_each_simulation():
+    """
+    Four numbers of a recording and of 20 simulations, all of one law: p is uniform.
+
+    Of 600, 28.6 are expected to be the farthest (standard deviation 5.2), and 30 to lie outside
+    a band of 50 simulations.
+    """
+    rng, farthest, outside = np.random.default_rng(3), 0, 0
+    for _ in range(600):
+        x = rng.standard_normal((4, 21))
+        p, *_ = judge([Difference(kind, row[0], row[1:], 1e-12, lambda b: '') for kind, row in zip(
+            ('lowest', 'level', 'spectrum', 'ks'), x)], 1.0, True)
+        farthest += p < 1.5 / 21.0
+        y = rng.standard_normal(51)
+        outside += not band(y[0], y[1:]).inside
+    assert abs(farthest - 28.6) < 4.0 * 5.2
+    assert abs(outside - 30.0) < 4.0 * 5.3
