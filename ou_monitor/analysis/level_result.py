@@ -12,7 +12,7 @@ tests (`ou_monitor.analysis.level_tests`), adjusted so that any of them rejects 
 hundred recordings with stationary OU levels.  The first rule that applies names the level:
 
 1. mean or intensity changes from block to block: 'quasi-stationary' (the
-   verdict also names what the level is apart from that);
+   verdict also names the type apart from these changes);
 2. isolated extreme innovations, or heavy tails: 'with impulses';
 3. not a normal distribution: 'not Gaussian';
 4. too few samples to detect heavy tails: 'undetermined';

@@ -232,7 +232,7 @@ class EstimatorNode(MonitorNode):
         self._arrived.record(messages.arrived.item(-1))
         ends = self._times(messages, self._send_clock)
         if self._send_clock is not None and self._send_clock.settled > self._settled:
-            # Earlier messages are on another time line, and this poll may include some of them.
+            # Earlier messages, perhaps also some of this poll, have times of another clock.
             self._settled = self._send_clock.settled
             self._stream.reset('a steady source was found behind messages in bursts')
             ends = np.full(ends.size, math.nan)

@@ -31,7 +31,7 @@ from ou_monitor.simulation import (
     is_recording, lacks, Profile, read_profile, read_throttle, RunningSupply, STICK_RATE)
 from ou_monitor.stream.config import parse_field_path, put, walk
 
-# Read again at each reset, except the last one, which takes effect at once.
+# Read again at each reset; scale_resistance also takes effect at once.
 LIVE_PARAMETERS: tuple[Parameter, ...] = (
     Parameter('seed', 0, 'Seed of the random numbers, from the next ~/reset on.', 0, 2**31 - 1),
     Parameter('capacity_left', -1.0,

@@ -88,8 +88,8 @@ class MonitorSettings:
         AUTO, 'Length of the sliding window, s; auto: the shortest of 2, 8, 30 and 60 s in which '
         'alpha is known within a factor of 1.5, else the longest.', 0.05, 3600.0, (AUTO,))
     stale_after: float = _parameter(
-        1.0, 'Silence after which the input counts as stale, s; less for a fast source: 300 '
-        'samples, but at least 0.3 s; more for a slow source: 2.5 of its intervals.',
+        1.0, 'Silence after which the input counts as stale, s.  A fast source needs less (300 '
+        'intervals, but at least 0.3 s), a slow one more (2.5 intervals).',
         0.01, 3600.0)
     brownout_voltage: float = _parameter(
         4.5, 'Lowest permitted supply voltage, V (default: the lower limit of PX4 for a 5 V '
@@ -105,7 +105,7 @@ class MonitorSettings:
         'begins, 0.001..1, less than 1 (default: half, our choice).', 0.001, 1.0)
     brownout_hold: float = _parameter(
         1.0, 'Minimum duration of WARN and CRITICAL, also while the risk is unknown, s (default: '
-        'with 2 s, the flag of five recorded quads was set twice as long without a dip).',
+        '2 s doubled the time of the flag without a dip on five recorded quads).',
         0.0, 3600.0)
     brownout_delay: float = _parameter(
         0.15, 'Time that a risk must last before WARN or CRITICAL begins, s (default: three '
@@ -135,12 +135,12 @@ class MonitorSettings:
                 f'({self.brownout_critical})')
         if not self.brownout_leave < 1.0:
             raise ValueError(
-                f'brownout.leave ({self.brownout_leave}) must be less than 1: a level ends at '
-                'brownout.leave times the risk at which it begins')
+                f'brownout.leave ({self.brownout_leave}) must be less than 1: WARN and '
+                'CRITICAL end at brownout.leave times the risk at which they begin')
         if self.brownout_floor > self.brownout_voltage:
             raise ValueError(
                 f'brownout.floor ({self.brownout_floor} V) must not exceed brownout.voltage '
-                f'({self.brownout_voltage} V): lower it, or set 0 (off) or -1 (the same)')
+                f'({self.brownout_voltage} V): lower it, or set 0 (off) or -1 (equal)')
         if self.brownout_budget_limit > self.brownout_critical:
             raise ValueError(
                 f'brownout.budget_limit ({self.brownout_budget_limit}) must not exceed '
@@ -203,7 +203,7 @@ class FilterSettings:
         1.0e-6, 1.0e9)
     signal_bandwidth: float = _parameter(
         0.0, 'Bandwidth of the true signal for wiener, Hz; 0: the signal is the voltage itself '
-        '(for kalman: unless coupling is above 0).', 0.0, 1.0e6)
+        '(for kalman: only if coupling is 0).', 0.0, 1.0e6)
     signal_rms: float = _parameter(
         0.0, 'Rms of the true signal for wiener, unit of the signal.', 0.0, 1.0e12)
     signal_poles: int = _parameter(

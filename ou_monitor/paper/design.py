@@ -5,9 +5,9 @@ Limits: a linear network with Gaussian noise (see `ou_monitor.paper.network`), c
 ideal capacitors of one series, no ageing, no cold.  The risk is the larger of two.  The first
 comes from the exact mean first passage of an OU with the slowest excited pole and the variance of
 the rail; the second from the high-level crossing rate of the whole Gaussian process.  In
-simulations with levels at 2.5 and 3.2 standard deviations (step extrapolated to 0), the first was
-60 times too low (noise through a large ESR) to 4 times too high (no ESR), the second 1.1 to 3
-times too high.
+simulations with levels at 2.5 and 3.2 standard deviations (extrapolated to a time step of 0), the
+first was 60 times too low (noise through a large ESR) to 4 times too high (no ESR), the second 1.1
+to 3 times too high.
 
 Without an LC filter, both risks fall as C rises once the network is slower than the noise; below
 that C, the second rose by up to 1.44 times in 39 of 6000 random networks.  With an LC filter the
@@ -82,8 +82,8 @@ class DesignRow:
     # Sag of the bus and mean of the rail, V; independent of the capacitor.
     sag: float
     mean: float
-    # Mean time to brown-out of the OU from its mean, s; if the mean has an error, the time that
-    # gives the risk; may be inf.
+    # Mean time to brown-out of the OU from its mean, s; may be inf.  If the mean has an error,
+    # this is computed back from `risk_ou`.
     mean_time: float
     crossing_rate: float  # High-level crossing rate of the whole process, 1/s.
     # Probability within the horizon, by mean first passage of the OU and by the crossing rate.

@@ -152,7 +152,7 @@ class ReadingStep:
     low: float
     high: float
     multiples: tuple[int, ...]  # Steps in each reading
-    chance: float  # Approximate probability of a step as large in readings without steps
+    chance: float  # Approximate probability that readings without steps show such a step
 
     @property
     def size(self) -> float:

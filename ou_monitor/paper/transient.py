@@ -170,8 +170,8 @@ def simulate_fitted(rng: np.random.Generator, draws: int) -> FloatArray:
     """
     Release a load behind an AC-coupled oscilloscope and fit it as the paper does.
 
-    The rail is an OU with half a step of the oscilloscope as noise, the largest that reads as
-    "~0"; the points are taken 0, 10, 25 and 35 ms after the peak of the noiseless trace.  Result
+    The rail is an OU whose noise is half a step of the oscilloscope (the most that is read as
+    "~0"); the points are taken 0, 10, 25 and 35 ms after the peak of the noiseless trace.  Result
     in 1/s.
     """
     t = np.arange(round((_HOLD + _WATCH) * _RATE)) / _RATE

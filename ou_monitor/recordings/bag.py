@@ -1,11 +1,11 @@
 """
 Bags: an .mcap file, or a rosbag2 directory of several with its `metadata.yaml`.
 
-`BagReader` reads messages one by one, and `batches` fields of topics as arrays, in the order of
-log times; memory holds the chunks that overlap in time.  A truncated or damaged bag is
-refused with the byte and the recording time of the damage or, on request, read as
-far as it is intact.  `BagWriter` writes bags with metadata.yaml version 9 (ROS 2 Jazzy); every
-version is read, because only the list of files and the custom data are used.
+`BagReader` reads single messages, and `batches` reads fields of topics as arrays, in the order of
+log times; only chunks that overlap in time are in memory together.  A truncated or damaged bag is
+refused with the byte and the recording time of the damage or, on request, read as far as it is
+intact.  `BagWriter` writes bags with metadata.yaml version 9 (ROS 2 Jazzy); every version is read,
+because only the list of files and the custom data are used.
 
 This module, `mcap_file.py` and `standard_types.py` are the only ones that import mcap.
 """
@@ -47,7 +47,7 @@ class BagFiles(NamedTuple):
 
 
 def _qos() -> list[dict[str, Any]]:
-    """Return the QoS that rosbag2 writes for bags; no alias in the YAML."""
+    """Return the QoS that rosbag2 writes for bags, with copies, so that YAML needs no alias."""
     return [{
         'history': 'keep_last', 'depth': 10, 'reliability': 'reliable', 'durability': 'volatile',
         'deadline': dict(_FOR_EVER), 'lifespan': dict(_FOR_EVER), 'liveliness': 'automatic',

@@ -99,7 +99,7 @@ def tick_text(value: float, step: float) -> str:
 
 def span(values: list[FloatArray], log: bool = False, pad: float = 0.05,
          trim: float = 0.0) -> tuple[float, float]:
-    """Return the ends of an axis for all finite values, less a share `trim`, with a margin."""
+    """Return the ends of an axis with a margin, without a share `trim` of values at either end."""
     joined = np.concatenate([np.ravel(v) for v in values]) if values else np.zeros(0)
     joined = joined[np.abs(joined) < _HUGE]
     if log:
