@@ -1,4 +1,4 @@
-"""Which tests may run beside each other: files may, but all that starts ROS goes one by one."""
+"""Scheduling of tests: files run in parallel, but those that start ROS run one by one."""
 
 import compileall
 import os
@@ -11,8 +11,8 @@ import pytest
 _ROS = ('nodes/', 'test_package.py', 'test_scripts.py', 'test_readme.py')
 
 
-# A machine that is busy with something else generates examples slowly.
-# The same examples in every run; `--hypothesis-profile=hunt` draws others.
+# A busy machine generates examples slowly. The same examples in every run;
+# `--hypothesis-profile=hunt` draws others.
 settings.register_profile('hunt', deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile('suite', settings.get_profile('hunt'), derandomize=True)
 settings.load_profile('suite')
@@ -20,9 +20,9 @@ settings.load_profile('suite')
 
 def pytest_configure(config):
     """Compile the package once; let processes that the tests start receive Ctrl-C."""
-    # A process whose files are limited, as by a full disk, would leave byte code cut short.
+    # A process with a limited file size (as with a full disk) would leave truncated byte code.
     os.environ['PYTHONDONTWRITEBYTECODE'] = '1'
-    # A worker of pytest-xdist finds what the controller has compiled.
+    # Workers of pytest-xdist use the controller's byte code.
     if not hasattr(config, 'workerinput'):
         compileall.compile_dir(Path(__file__).parents[1] / 'ou_monitor', force=True, quiet=1)
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
@@ -32,14 +32,14 @@ def pytest_configure(config):
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
     """
-    Keep a file together on one worker of pytest-xdist, and all ROS on the same one.
+    Run each file on one worker of pytest-xdist, and all ROS tests on the same one.
 
     Groups of xdist itself are ignored from pytest 9.2 on (pytest-xdist issue 1386).
     """
     from xdist.scheduler import LoadScopeScheduling
 
     class ByFile(LoadScopeScheduling):
-        """Hands out files."""
+        """Schedules whole files."""
 
         def _split_scope(self, nodeid):
             path = nodeid.split('::', 1)[0].removeprefix('test/')
@@ -50,12 +50,12 @@ def pytest_xdist_make_scheduler(config, log):
 
 @pytest.fixture
 def one_process(monkeypatch):
-    """Let `fleet` do its work in this process."""
+    """Make `fleet` work in this process."""
     class Here:
-        """Workers that are none."""
+        """Replaces the pool of workers."""
 
         def __init__(self, *_: object) -> None:
-            """Take no notice."""
+            """Ignore all options."""
 
         def each(self, function, arguments):
             for k, given in enumerate(arguments):

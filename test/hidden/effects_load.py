@@ -7,14 +7,14 @@ from hidden_registry import effect
 import numpy as np
 
 TYPICAL_INNOVATION = 12e-3      # V at 1 kHz: middle of what is drawn
-# What a minute must hold for an effect of load, in nats, where the flight happens to be quiet.
+# Evidence for an effect of load that a minute must have even in a quiet flight, nats.
 LEAST_NATS = 25.0
 BOTH = ('load_sag', 'load_transient')
 
 
 def _battery(bench: Bench, gain: float) -> tuple[float, float, dict[str, float]]:
     """
-    Draw a battery and motors; returns ohm, ampere at full throttle, and the particulars.
+    Draw a battery and motors; return ohm, ampere at full throttle, and the parameters.
 
     The sag at full throttle is 0.15..0.4 V on a rail of ordinary noise, less on a quiet one and
     more on a noisy one: as the square root, which is half way between equal volts and equal
@@ -35,7 +35,7 @@ def _drop(bench: Bench, drop: np.ndarray, found: dict[str, float]) -> None:
 
 
 def _transient(bench: Bench, gain: float, drop: np.ndarray, found: dict[str, float]) -> None:
-    """Do the same for a transient, with heavier motors where a flight would not show it."""
+    """Do the same for a transient, with heavier motors if the flight would not show it."""
     enough = LEAST_NATS * gain**2 * bench.duration / REFERENCE_TIME
     more = max(1.0, math.sqrt(enough / bench.nats(drop, bench.throttle)))
     for key in ('full_current_a', 'sag_v_per_unit'):
@@ -164,7 +164,7 @@ def transient_asymmetric(bench: Bench, gain: float) -> dict[str, object]:
 
 @effect('load_transient/regulator', truth=('load_transient',))
 def transient_regulator(bench: Bench, gain: float) -> dict[str, object]:
-    """Sense behind a regulator, which cures every step of the load within its loop time."""
+    """Sense behind a regulator, which corrects every step of the load within its loop time."""
     ohm, ampere, found = _battery(bench, 1.3 * gain)
     time = bench.draw.uniform(0.08, 0.4)
     high = bench.throttle - bench.lagged(bench.throttle, time)

@@ -62,7 +62,7 @@ def quantization_dithered(bench: Bench, gain: float) -> dict[str, object]:
 
 @effect('held_samples')
 def held_samples(bench: Bench, gain: float) -> dict[str, object]:
-    """Let the ADC renew its value 2..6 times slower than the logger writes, in step or not."""
+    """Let the ADC update its value 2..6 times slower than the logger writes, in step or not."""
     factor = 1 + min(bench.draw.uniform(1.5, 5.0) * gain, 5.0)
     if bench.draw.random() < 0.5:
         factor = max(2.0, float(round(factor)))
@@ -163,7 +163,7 @@ def ac_coupling_twice(bench: Bench, gain: float) -> dict[str, object]:
 
 
 def _glitches(bench: Bench, gain: float, run: int) -> dict[str, object]:
-    """Corrupt runs of samples on the bus by 5..10 innovations; the rail knows nothing."""
+    """Corrupt runs of samples on the bus by 5..10 innovations; the rail is not affected."""
     share = bench.draw.uniform(0.002, 0.01) / run**0.5
     size = bench.innovation * gain
 
@@ -202,7 +202,7 @@ def _latency(bench: Bench, gain: float) -> tuple[np.ndarray, dict[str, object]]:
     """
     Draw delays, s, inside nine tenths of each sample's own slot: a symmetric beta law.
 
-    So conversions keep their order, and no two fall on one instant of the fine grid.
+    So conversions stay in order, and no two have the same time on the fine grid.
     """
     spread, slot = min(bench.draw.uniform(0.22, 0.35) * gain, 0.35), 0.9
     shape = 0.5 * (slot**2 / (4 * spread**2) - 1)
@@ -212,7 +212,7 @@ def _latency(bench: Bench, gain: float) -> tuple[np.ndarray, dict[str, object]]:
 
 @effect('clock_jitter', substeps=16)
 def clock_jitter(bench: Bench, gain: float) -> dict[str, object]:
-    """Convert when the task gets the processor, and stamp as if it had been on time."""
+    """Convert when the task gets the processor, but stamp as if on time."""
     bench.sample_delay, found = _latency(bench, gain)
     return found
 

@@ -1,4 +1,4 @@
-"""Effects outside the catalogue: a program must say that it cannot explain them."""
+"""Effects outside the catalogue: a program must report that it cannot explain them."""
 
 import math
 
@@ -74,7 +74,7 @@ def state_noise(bench: Bench, gain: float) -> dict[str, object]:
 
 @effect('unknown/sawtooth', near=('tone', 'resonance', 'jumps'))
 def sawtooth(bench: Bench, gain: float) -> dict[str, object]:
-    """Let a converter hiccup: it charges slowly, discharges at once, and never to the clock."""
+    """Let a converter hiccup: it charges slowly and discharges at once, at irregular times."""
     period = bench.draw.uniform(20.0, 60.0) / bench.rate
     blur = bench.draw.uniform(0.15, 0.3)
     volts = bench.draw.uniform(3.0, 4.5) * gain * bench.innovation
@@ -127,8 +127,7 @@ def slew_limit(bench: Bench, gain: float) -> dict[str, object]:
     """
     Let the amplifier before the ADC be slow for large signals: dv/dt = S tanh((x - v)/(S time)).
 
-    It settles in half a sample when it may, and follows no faster than about one innovation a
-    sample.
+    It settles in half a sample, but follows no faster than about one innovation per sample.
     """
     limit = bench.draw.uniform(0.9, 1.4) * bench.innovation / gain**0.5
     step, scale, tanh = limit / bench.substeps, 0.5 * limit, math.tanh
@@ -166,7 +165,7 @@ def chaotic_converter(bench: Bench, gain: float) -> dict[str, object]:
 
 @effect('unknown/spread_spectrum', near=('tone', 'resonance', 'throttle_tone'))
 def spread_spectrum(bench: Bench, gain: float) -> dict[str, object]:
-    """Sweep a converter's clock up and down to spread its line, never twice alike."""
+    """Sweep a converter's clock up and down irregularly to spread its line."""
     middle = bench.draw.uniform(0.15, 0.3) * bench.rate
     width = bench.draw.uniform(0.05, 0.12) * bench.rate
     sweeps = bench.draw.uniform(2.0, 9.0)
@@ -182,7 +181,7 @@ def spread_spectrum(bench: Bench, gain: float) -> dict[str, object]:
 
 @effect('unknown/leverage', near=('volatility', 'heavy_tails', 'regime_switching'))
 def leverage(bench: Bench, gain: float) -> dict[str, object]:
-    """Let each fall of the rail make the noise of the next samples larger, each rise not."""
+    """Let each fall of the rail, but not a rise, increase the noise of the next samples."""
     feed = min(bench.draw.uniform(0.5, 0.8) * gain, 0.9)
     keep, slots, gains = 0.6, bench.n_fine // bench.substeps, []
     kicks = bench.white().reshape(slots, bench.substeps)

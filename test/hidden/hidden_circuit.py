@@ -1,9 +1,9 @@
 """
-The bench: a rail made of components, what hangs on it, and the instrument that reads it.
+The bench: a rail made of components, the loads and sources on it, and its instrument.
 
 Everything runs on a grid finer than the samples, by the trapezoidal rule where the circuit is
-linear and by Heun's method where it is not. No formula here is exact for the sampling step, so a
-program that fits exact discrete formulas is judged by data made another way.
+linear and by Heun's method where it is not. No formula here is exact for the sampling step, so the
+data are made differently from the exact discrete formulas that a program may fit.
 
 The sensed voltage is ``level + u(t) + series sources``, where ``u`` is the voltage of a capacitor
 fed through a resistance and shaken by a white current::
@@ -23,7 +23,7 @@ LEAD = 1.0                  # s simulated before the first sample, in which filt
 FINE_RATE = 8000.0          # 1/s: the coarsest fine grid
 REFERENCE_RATE = 1000.0     # 1/s: at which the innovation of the rail is drawn
 REFERENCE_TIME = 60.0       # s: the length for which moderate strengths are chosen
-# Order in which an instrument works; each stage takes and returns volts.
+# Stages of an instrument in their order; each takes and returns volts.
 STAGES = ('front_end', 'sampled', 'noise', 'range', 'converter', 'bus', 'logger')
 
 Stage = Callable[[np.ndarray], np.ndarray]
@@ -31,7 +31,7 @@ Stage = Callable[[np.ndarray], np.ndarray]
 
 @dataclass
 class Bench:
-    """One set-up under construction: effects change it, `run` reads it."""
+    """A set-up: effects change it, and `run` simulates it."""
 
     # Samples per second, and length, s.
     rate: float
@@ -49,7 +49,7 @@ class Bench:
     level: float
     commands: np.ndarray
     pieces: list[str]
-    # 1/(R C), 1/s, and K/C, V/sqrt(s): numbers, or one a fine step.
+    # 1/(R C), 1/s, and K/C, V/sqrt(s): numbers, or one per fine step.
     alpha: float | np.ndarray = 0.0
     sigma: float | np.ndarray = 0.0
     setpoint: np.ndarray | None = None
@@ -64,7 +64,7 @@ class Bench:
     stamp_error: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        """Lay the grids and connect the plain rail."""
+        """Set up the grids and the plain rail."""
         self.n = int(round(self.duration * self.rate))
         self.h = 1.0 / (self.rate * self.substeps)
         self.lead = int(round(LEAD * self.rate)) * self.substeps
@@ -85,7 +85,7 @@ class Bench:
         self.capacitance = 1.0 / (self.alpha0 * self.resistance)
         self.stationary = self.sigma0 / math.sqrt(2 * self.alpha0)
         self.phi = math.exp(-self.alpha0 / self.rate)
-        # What one sample says that the one before did not: the yardstick of all small effects.
+        # Standard deviation of a sample given the one before: the unit of all small effects.
         self.innovation = self.stationary * math.sqrt(1 - self.phi**2)
         reference = math.exp(-2 * self.alpha0 / REFERENCE_RATE)
         self.reference_innovation = self.stationary * math.sqrt(1 - reference)
@@ -102,8 +102,8 @@ class Bench:
         """
         Return the log-likelihood that knowing an additive signal gains, nats.
 
-        Signals are in V on the fine grid; the linear effect of those that are known, and a
-        constant, are explained already.
+        Signals are in V on the fine grid; linear effects of `known` signals, and a constant, are
+        removed first.
         """
         def whitened(fine: np.ndarray) -> np.ndarray:
             at = self.samples(fine)
@@ -120,7 +120,7 @@ class Bench:
     def filtered(self, x: np.ndarray, num: list[float], den: list[float]) -> np.ndarray:
         """Pass a fine series through an analogue transfer function, by the trapezoidal rule."""
         b, a = bilinear(num, den, 1.0 / self.h)
-        # Started at rest on the first value, as a circuit that was on long before.
+        # Starts at rest at the first value, like a circuit that has been on for long.
         rest = num[-1] / den[-1] if len(num) == len(den) or num[-1] else 0.0
         return lfilter(b, a, x - x[0]) + rest * x[0]
 
@@ -186,7 +186,8 @@ class Bench:
         moved = np.diff(target, prepend=target[0]).tolist()
         out, x = [start], start
         for dm, step in zip(shaken.tolist()[1:], moved[1:], strict=True):
-            # x is the deviation from the set-point, so a step of that moves x the other way.
+            # x is the deviation from the set-point, so a step of the set-point moves x the other
+            # way.
             dm = gain(x) * dm - step
             slope = force(x)
             x += 0.5 * h * (slope + force(x + h * slope + dm)) + dm

@@ -1,8 +1,8 @@
 """
-Recordings with a hidden effect, made at the level of the circuit and the instrument.
+Recordings with a hidden effect, simulated by circuit and instrument.
 
-`draw` makes one; `causes`, `variants` and `unknowns` list what exists. Nothing here is known to
-the program under test: neither its formulas nor its code is used.
+`draw` makes one; `causes`, `variants` and `unknowns` list the effects. This module uses neither
+formulas nor code of the program under test.
 """
 
 from dataclasses import dataclass
@@ -20,10 +20,10 @@ import numpy as np
 KINDS = ('single', 'pair', 'none', 'variant', 'unknown')
 _MODULES = (effects_lines, effects_load, effects_noise, effects_sensor, effects_unknown)
 
-# What can be seen behind a series capacitor, on a rail too slow to relax by itself.
+# Causes that are visible behind a series capacitor, on a rail too slow to relax by itself.
 _WITH_AC = {'measurement_noise', 'tone', 'throttle_tone', 'resonance', 'jumps', 'glitches',
             'load_dependent_sigma', 'heavy_tails', 'quantization', 'held_samples', 'saturation'}
-# Pairs of which one hides, undoes or imitates the other at moderate strength.
+# Pairs in which one cause hides, cancels or imitates the other at moderate strength.
 _APART = [
     {'load_sag', 'load_transient'},
     {'second_relaxation', 'flicker_noise', 'drift'},
@@ -56,18 +56,18 @@ class Hidden:
     voltage: np.ndarray
     # 0..1.
     throttle: np.ndarray
-    # Names of the causes, sorted; empty for a plain rail and for what has no name.
+    # Names of the causes, sorted; empty for a plain rail and for unknown effects.
     truth: tuple[str, ...]
     # One of KINDS.
     kind: str
-    # Physical parameters of the rail ('rail') and of each effect; 'nats' of an effect is what
-    # knowing its signal would add to the log-likelihood.
+    # Physical parameters of the rail ('rail') and of each effect; 'nats' of an effect is the gain
+    # in log-likelihood from knowing its signal.
     detail: dict[str, dict[str, object]]
     # Family of each name in `truth`.
     families: tuple[str, ...]
     # Realisation: names in the table of effects, joined by '+'; 'none' if none.
     name: str
-    # Lists of names, sorted, that describe this circuit as truly as `truth`, which is first.
+    # Lists of names, sorted, that describe this circuit correctly; `truth` is the first.
     accepted: tuple[tuple[str, ...], ...]
     # For 'unknown': names that describe a part, acceptable beside "not explained".
     near: tuple[str, ...]
@@ -89,7 +89,7 @@ def unknowns() -> tuple[str, ...]:
 
 
 def compatible(first: str, second: str) -> bool:
-    """Return whether two causes can be hidden together and both be found."""
+    """Return whether two causes can both be found in one recording."""
     both = {first, second}
     if 'ac_coupling' in both:
         return bool(both & _WITH_AC) and len(both) == 2
@@ -118,18 +118,18 @@ def _choose(kind: str, cause: str | tuple[str, str] | None,
         if kind not in table:
             raise ValueError(f'kind is {kind!r}; it must be one of {KINDS}')
         known = table[kind]()
-        # A cause alone stands for any of its variants.
+        # The name of a cause selects any of its variants.
         fit = [k for k in known if cause is None or k == cause or (
             kind != 'single' and cause in k.split('/'))]
         if not fit:
             raise ValueError(f'{cause!r} is not one of {known}')
         names = [fit[rng.integers(len(fit))]]
-    # The coupling replaces the rail, so that all others are measured by the new one.
+    # The coupling replaces the rail, so it comes first: other effects are scaled to the new rail.
     return sorted((EFFECTS[name] for name in names), key=lambda e: e.cause != 'ac_coupling')
 
 
 def _rail(bench: Bench) -> dict[str, object]:
-    """Return the particulars of the plain rail."""
+    """Return the parameters of the plain rail."""
     return {'alpha': bench.alpha0, 'sigma': bench.sigma0, 'resistance_ohm': bench.resistance,
             'capacitance_f': bench.capacitance, 'level_v': bench.level,
             'noise_current_a_sqrt_s': bench.sigma0 * bench.capacitance,
@@ -138,7 +138,7 @@ def _rail(bench: Bench) -> dict[str, object]:
 
 
 def _plain(value: object) -> object:
-    """Return a value in Python's own types, as JSON wants them."""
+    """Return a value in Python's own types, for JSON."""
     if isinstance(value, dict):
         return {key: _plain(part) for key, part in value.items()}
     if isinstance(value, list):
@@ -152,12 +152,12 @@ def draw(kind: str, rng: np.random.Generator, *,
     """
     Draw a recording of one of KINDS: rail, flight, effect and noise are drawn from `rng`.
 
-    `cause` is what to hide instead of any: a cause; for 'pair' two of them; for 'variant' and
+    `cause` selects the effect (otherwise any): a cause; for 'pair' two of them; for 'variant' and
     'unknown' a name from `variants` or `unknowns`, or the cause or shape in it.  Length in s, rate
-    in Hz.  Strength 1 is moderate: found almost always in a minute at 1 kHz with the right
-    likelihood.  It scales amplitudes, the logarithms of ratios, and the inverse of degrees of
-    freedom; on top of it the strength of each effect varies by 30 % either way.  `substeps` are
-    fine steps a sample, by default what the effects need.
+    in Hz.  Strength 1 is moderate: the right likelihood almost always finds it in a minute at 1
+    kHz.  It scales amplitudes, the logarithms of ratios, and the inverse of degrees of freedom; in
+    addition the strength of each effect varies by 30 % either way.  `substeps` are fine steps per
+    sample, by default as many as the effects need.
     """
     if not (duration > 0 and rate > 0 and strength > 0):
         raise ValueError(f'duration {duration} s, rate {rate} 1/s and strength {strength} '
@@ -173,7 +173,7 @@ def draw(kind: str, rng: np.random.Generator, *,
         detail[e.name] = e.apply(bench, strength * bench.draw.uniform(0.7, 1.3))
     detail['rail'] = _rail(bench)
     t, voltage, throttle = bench.run()
-    # Every way to name each effect, with every way to name the other; the first is the truth.
+    # All names of each effect, combined with all names of the other; the first is the truth.
     accepted = tuple(tuple(sorted({name for names in ways for name in names}))
                      for ways in product(*((e.truth, *e.also) for e in chosen)))
     truth = accepted[0]

@@ -70,7 +70,7 @@ def local_std(e: np.ndarray, block: int) -> np.ndarray:
 
 def signs(h: Hidden) -> dict[str, float]:
     """
-    Return z-scores that are about N(0,1) on a plain rail, and large where something is hidden.
+    Return z-scores that are about N(0,1) on a plain rail, and large with a hidden effect.
 
     They know the true alpha and innovation; all but 'line' and the bands are plain averages.
     """
@@ -119,7 +119,7 @@ def largest(z: dict[str, float]) -> tuple[float, str]:
 
 
 def simulated(cause: str, seed: int = 0, **options: float) -> Hidden:
-    """Draw by seed; names with a shape are variants."""
+    """Draw a recording by seed; names with a shape are variants."""
     kind = 'variant' if '/' in cause else 'single'
     return draw(kind, np.random.default_rng(seed), cause=cause, **options)
 
@@ -134,7 +134,7 @@ def each(cause: str, count: int = 8,
 
 def assert_as_claimed(ratios: list[float], room: float = 0.0,
                       power: float = 0.15) -> None:
-    """Check that measured over claimed is 1 within 5 standard errors, themselves below `power`."""
+    """Check that measured over claimed is 1 within 5 standard errors, which are below `power`."""
     ratios = np.asarray(ratios)
     error = ratios.std(ddof=1) / np.sqrt(ratios.size)
     assert error < power, f'no power: {ratios}'

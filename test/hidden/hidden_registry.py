@@ -1,4 +1,4 @@
-"""The table of hidden effects; each module of effects enters its own on import."""
+"""The table of hidden effects; each module of effects adds its own on import."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,21 +22,21 @@ Apply = Callable[[Bench, float], dict[str, object]]
 
 @dataclass(frozen=True)
 class Effect:
-    """One physical realisation of something hidden."""
+    """One physical realisation of a hidden effect."""
 
     # ``cause``, ``cause/shape`` for another realisation, ``unknown/shape`` outside the catalogue.
     name: str
     # Name in the catalogue, or 'unknown'.
     cause: str
-    # Changes a bench at a strength; returns the physical parameters.
+    # Changes a bench with a given strength; returns the physical parameters.
     apply: Apply
     # Names that a program must report.
     truth: tuple[str, ...]
-    # Other lists of names that describe this circuit as truly.
+    # Other lists of names that also describe this circuit correctly.
     also: tuple[tuple[str, ...], ...] = ()
     # For 'unknown': names that describe a part of it, acceptable beside "not explained".
     near: tuple[str, ...] = ()
-    # Fine steps a sample that it needs.
+    # Fine steps per sample that it needs.
     substeps: int = 8
 
 
@@ -46,7 +46,7 @@ EFFECTS: dict[str, Effect] = {}
 def effect(name: str, *, truth: tuple[str, ...] | None = None,
            also: tuple[tuple[str, ...], ...] = (), near: tuple[str, ...] = (),
            substeps: int = 8) -> Callable[[Apply], Apply]:
-    """Enter a function into the table; `truth` defaults to its cause, or nothing if unknown."""
+    """Add a function to the table; `truth` defaults to its cause, or nothing if unknown."""
     cause = name.partition('/')[0]
 
     def enter(function: Apply) -> Apply:

@@ -1,4 +1,4 @@
-"""Throttle commands as pilots and autopilots give them, drawn blind."""
+"""Throttle commands as of pilots and autopilots, drawn at random."""
 
 import numpy as np
 
@@ -61,10 +61,10 @@ KINDS = {'hover': (_hover, 0.3), 'mission': (_mission, 0.25), 'aggressive': (_ag
 
 def draw_commands(duration: float, rng: np.random.Generator) -> tuple[np.ndarray, list[str]]:
     """
-    Draw the commands of a flight of that length (s), one for each update, and its pieces in order.
+    Draw the commands of a flight of a length (s), one for each update, and its pieces in order.
 
     Throttle, 0..1, has a standard deviation of at least 0.08 and a 2..98 % range of at least 0.3,
-    so that what depends on it has something to show itself by.
+    so that effects of throttle are visible.
     """
     n = int(np.ceil(UPDATE_RATE * duration)) + 1
     while True:

@@ -1,5 +1,5 @@
 """
-Recordings drawn blind, and what a program said of them: right, in the set, false.
+Recordings with hidden effects, and scores of a program's answers: right, in the set, false.
 
 Shared by the tests and by `benchmarks/discover.py`.
 """
@@ -13,7 +13,7 @@ from hidden_effects import draw, Hidden, labels
 import numpy as np
 
 
-# Verdicts that say that something is left that no cause explains.
+# Verdicts with something left that no cause explains.
 OPEN = ('unexplained', 'partly_explained')
 
 
@@ -22,7 +22,7 @@ def hide(kind: str, effect: str, seed: int, number: int, *, duration: float, rat
     """
     Hide an effect; all but its name comes from the seed and the number of this effect.
 
-    Kind and effect as `draw` takes them: for a pair two names joined by '+', for 'none' ''.
+    Kind and effect as for `draw`: for a pair two names joined by '+', for 'none' ''.
     """
     word = int.from_bytes(sha256(f'{kind} {effect}'.encode()).digest()[:8], 'big')
     cause = tuple(effect.split('+')) if kind == 'pair' else effect or None
@@ -40,24 +40,23 @@ class Outcome:
     # As in `Hidden`.
     accepted: tuple[tuple[str, ...], ...]
     near: tuple[str, ...]
-    # As in the JSON of `discover`; empty when there is none.
+    # As in the JSON of `discover`; empty without a result.
     verdict: str
     # Causes named, each with its alternatives.
     named: Mapping[str, tuple[str, ...]]
 
     @property
     def alone(self) -> bool:
-        """Whether the names are right, none missing and none more."""
+        """Whether the names are right, with none missing and none in excess."""
         return bool(self.verdict) and tuple(sorted(self.named)) in self.accepted
 
     @property
     def in_set(self) -> bool:
         """
-        Whether all that is true was reported, and nothing false.
+        Whether all true names were reported, and no false ones.
 
-        A true name is reported when it is named or an alternative of what is;
-        a name is false unless it, or one of its alternatives, stands for a
-        true name that no other does.
+        A true name is reported if it is named or is an alternative of a name; a name is false
+        unless it or one of its alternatives matches a true name that no other name matches.
         """
         return bool(self.verdict) and any(
             set(way) <= self.reported and _each_stands(list(self.named.items()), set(way))
@@ -65,34 +64,34 @@ class Outcome:
 
     @property
     def all_named(self) -> bool:
-        """Whether all that is true was named, whatever else was."""
+        """Whether all true names were named, perhaps with others."""
         return bool(self.verdict) and any(set(way) <= set(self.named) for way in self.accepted)
 
     @property
     def covered(self) -> bool:
-        """Whether all that is true was named or an alternative, whatever else was."""
+        """Whether all true names were named or alternatives, perhaps with others."""
         return bool(self.verdict) and any(set(way) <= self.reported for way in self.accepted)
 
     @property
     def family(self) -> bool:
-        """Whether the families of the names are those of the truth."""
+        """Whether the families of the names are the true ones."""
         found = {labels[name] for name in self.named}
         return bool(self.verdict) and any(
             found == {labels[name] for name in way} for way in self.accepted)
 
     @property
     def alarm(self) -> bool:
-        """Whether something was reported wrong with the recording."""
+        """Whether any cause was reported, or something unexplained."""
         return self.verdict != 'no_effect'
 
     @property
     def left_open(self) -> bool:
-        """Whether it was said that something is not explained."""
+        """Whether something was reported as not explained."""
         return self.verdict in OPEN
 
     @property
     def misnamed(self) -> bool:
-        """Whether a name has nothing to do with what is hidden, nor has an alternative."""
+        """Whether neither a name nor its alternatives belong to the hidden effect."""
         true = set(self.near).union(*self.accepted)
         return any(not true & {name, *also} for name, also in self.named.items())
 
@@ -106,7 +105,7 @@ class Outcome:
 
 
 def from_data(data: Mapping[str, Any]) -> Outcome:
-    """Return an outcome from what `Outcome.as_data` made, whatever is beside it."""
+    """Return an outcome from the data of `Outcome.as_data`; other entries are ignored."""
     return Outcome(
         data['kind'], data['effect'], tuple(tuple(way) for way in data['accepted']),
         tuple(data['near']), data['verdict'],
@@ -115,7 +114,7 @@ def from_data(data: Mapping[str, Any]) -> Outcome:
 
 def outcome(hidden: Hidden, verdict: str = '', causes: Iterable[Any] = ()) -> Outcome:
     """
-    Return what became of a recording; no verdict where the program failed.
+    Return the outcome for a recording; without a verdict if the program failed.
 
     A cause that is named twice counts once.
     """
@@ -127,7 +126,7 @@ def outcome(hidden: Hidden, verdict: str = '', causes: Iterable[Any] = ()) -> Ou
 
 
 def _each_stands(named: Sequence[tuple[str, tuple[str, ...]]], true: set[str]) -> bool:
-    """Return whether each of `named` can stand for a true name of its own."""
+    """Return whether each of `named` can be matched with a different true name."""
     if not named:
         return True
     (name, also), *rest = named

@@ -1,4 +1,4 @@
-"""A headless Chromium, spoken to over two pipes by its DevTools protocol: nothing to install."""
+"""A headless Chromium, controlled over two pipes by the DevTools protocol, without a driver."""
 
 import base64
 import fcntl
@@ -13,19 +13,19 @@ import time
 
 _NAMES = ('chromium', 'chromium-browser', 'google-chrome', 'google-chrome-stable', 'chrome')
 _TIMEOUT = 30.0
-# The browser reads commands from 3 and writes answers to 4.
+# The browser reads commands from descriptor 3 and writes answers to 4.
 _START = ('import os, sys; os.dup2(int(sys.argv[1]), 3); os.dup2(int(sys.argv[2]), 4); '
           'os.execv(sys.argv[3], sys.argv[3:])')
 
 
 def find_browser():
-    """Return the path of a Chromium or Chrome: OU_MONITOR_BROWSER, else of the PATH; or None."""
+    """Return the path of a Chromium or Chrome, from OU_MONITOR_BROWSER or the PATH; or None."""
     given = os.environ.get('OU_MONITOR_BROWSER')
     return shutil.which(given) if given else next(filter(None, map(shutil.which, _NAMES)), None)
 
 
 def _pipe():
-    """Return the ends of a pipe, out of the way of what the browser expects."""
+    """Return the ends of a pipe, with numbers that the browser does not use."""
     ends = os.pipe()
     moved = [fcntl.fcntl(end, fcntl.F_DUPFD_CLOEXEC, 10) for end in ends]
     for end in ends:
@@ -34,7 +34,7 @@ def _pipe():
 
 
 class Browser:
-    """One tab, with what happened in it: requests, messages and errors of the page."""
+    """One tab, which records the requests, messages and errors of its page."""
 
     def __init__(self, program, folder, width=1000, height=900):
         there, there_end = _pipe()
@@ -79,7 +79,7 @@ class Browser:
             os.close(self._in)
 
     def send(self, method, **arguments):
-        """Send one command and return its answer; what happens meanwhile is noted."""
+        """Send one command and return its answer; events are recorded meanwhile."""
         self._number += 1
         message = {'id': self._number, 'method': method, 'params': arguments}
         if self._session:
@@ -100,7 +100,7 @@ class Browser:
             ready, _, _ = select.select([self._in], [], [], max(end - time.monotonic(), 0.0))
             more = os.read(self._in, 1 << 20) if ready else b''
             if not more:
-                raise RuntimeError('the browser says nothing more')
+                raise RuntimeError('the browser has stopped answering')
             self._rest += more
         line, self._rest = self._rest.split(b'\0', 1)
         message = json.loads(line)
@@ -118,7 +118,7 @@ class Browser:
             self.errors.append(about['entry']['text'])
 
     def visit(self, path, wanted='true'):
-        """Open a file and wait until it is there and an expression is true."""
+        """Open a file and wait until it is loaded and an expression is true."""
         self.run('window.before = true')
         self.send('Page.navigate', url=Path(path).resolve().as_uri())
         self.until('!window.before && document.readyState === "complete"')
@@ -131,14 +131,14 @@ class Browser:
             time.sleep(0.02)
 
     def run(self, expression):
-        """Return the value of an expression, as JSON has it."""
+        """Return the value of an expression, by way of JSON."""
         answer = self.send('Runtime.evaluate', expression=expression, returnByValue=True,
                            awaitPromise=True)
         assert 'exceptionDetails' not in answer, answer
         return answer['result'].get('value')
 
     def mouse(self, kind, x, y, **more):
-        """Move, press, release or turn the wheel at a place of the window."""
+        """Move, press, release or scroll the mouse at a place in the window."""
         held = {'mousePressed': {'button': 'left', 'clickCount': 1, 'buttons': 1},
                 'mouseReleased': {'button': 'left', 'clickCount': 1}}.get(kind, {})
         self.send('Input.dispatchMouseEvent', type=kind, x=x, y=y, **{**held, **more})
@@ -167,6 +167,6 @@ class Browser:
                   features=[{'name': 'prefers-color-scheme', 'value': theme}])
 
     def picture(self, path, whole=True):
-        """Write what is seen as a PNG file."""
+        """Write a screenshot as a PNG file."""
         shot = self.send('Page.captureScreenshot', captureBeyondViewport=whole)
         Path(path).write_bytes(base64.b64decode(shot['data']))

@@ -1,7 +1,7 @@
 """
-A program that sends voltages of 5 V at once, as many as each line on its input says.
+A program that sends bursts of 5 V messages, as commanded by lines on its input.
 
-    python burst.py TOPIC    then lines of: NUMBER of messages, FIRST and LAST of those at 3 V
+    python burst.py TOPIC    each line: NUMBER of messages, FIRST and LAST of those at 3 V
 """
 
 import sys
@@ -14,7 +14,7 @@ from sensor_msgs.msg import BatteryState
 
 
 def main(topic):
-    """Send, with stamps 1 ms apart, and say when it is done."""
+    """Send with stamps 1 ms apart; print a line when done."""
     rclpy.init()
     node = rclpy.create_node('burst')
     output = node.create_publisher(BatteryState, topic, QoSProfile(

@@ -1,11 +1,11 @@
-"""Markov chains and switched systems that several tests look at, and what a chain did."""
+"""Markov chains and switched systems shared by several tests, and simulated paths of chains."""
 
 from convergence import cycle
 import numpy as np
 from ou_monitor.paper.theory import Generator, SwitchedSystem
 from scipy.linalg import expm
 
-# Three states, not reversible, every entry switched, in balance, and a stable drift.
+# Three states, not reversible, every entry switched, balanced, with a stable drift.
 THREE = Generator(np.array([[-3.0, 2.0, 1.0], [0.5, -1.5, 1.0], [3.0, 0.2, -3.2]]))
 CYCLE = cycle([3.0, 5.0, 4.0])
 # The matrix model of the paper, all of its coefficients switched.
@@ -24,7 +24,7 @@ def vector_system() -> SwitchedSystem:
 
 
 def drawn(chain, edges, paths, rng):
-    """Return states on a grid, (paths, k), and times spent between, (paths, k - 1, states)."""
+    """Return states on a grid, (paths, k), and times spent in each, (paths, k - 1, states)."""
     grid = np.asarray(edges, dtype=np.float64)
     state = chain.starts(paths, rng)
     states = np.empty((paths, grid.size), dtype=np.intp)

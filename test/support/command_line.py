@@ -1,4 +1,4 @@
-"""What tests of several commands do: write a CSV, read strict JSON, see a command fail."""
+"""Helpers for the tests of commands: write a CSV, read strict JSON, expect a failure."""
 
 import json
 import re
@@ -25,7 +25,7 @@ def failure(capsys, *argv):
     """Run a command that must fail; return its one line."""
     assert main([*map(str, argv)]) == 2
     out, err = capsys.readouterr()
-    # The finding is told even where its model is refused.
+    # The finding is printed even if its model is refused.
     assert out == '' or '--save-model' in argv
     assert re.fullmatch(rf'ou-monitor( {argv[0] if argv else None})?: [^\n]+\n', err), out + err
     return err

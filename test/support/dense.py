@@ -1,4 +1,4 @@
-"""Dense linear algebra and a plain Kalman filter: what the fast likelihoods must agree with."""
+"""References for the fast likelihoods: dense linear algebra and a plain Kalman filter."""
 
 import math
 
@@ -10,8 +10,7 @@ def block_autocovariances(a, m, count):
     """
     Return autocovariances of OU block means at lags 0..count-1, by double sums.
 
-    The sums over both samples are taken over their distance; in units of
-    sigma^2 D.
+    The double sum runs over the distance of both samples; result in units of sigma^2 D.
     """
     distance = np.arange(1 - m, m)
     weight = (m - np.abs(distance)) / m ** 2
@@ -27,7 +26,7 @@ def ou_covariance(t, alpha, sigma, noise_var):
 
 def restricted(cov, y, x):
     """
-    Return the restricted log-likelihood, nats, profiled over scale; the scale; beta, covariance.
+    Return restricted log-likelihood, nats, profiled over scale; scale; beta and its covariance.
 
     `cov` is the covariance up to that scale, `x` the regressors.
     """
@@ -55,7 +54,7 @@ def fisher(covariance, at, steps):
 
 
 def kalman_log_likelihood(t, y, alpha, sigma, noise_var, level):
-    """Return the log-likelihood of an OU in white noise about a known level, one by one."""
+    """Return the log-likelihood of an OU in white noise about a known level, sample by sample."""
     stationary = sigma ** 2 / (2.0 * alpha)
     state, variance, total = 0.0, stationary, 0.0
     for j in range(t.size):

@@ -1,5 +1,5 @@
 """
-A program that sends voltages at a rate, Hz, in bursts each ms, with a dip each 2 s.
+A program that sends voltages at a rate, Hz, in a burst every ms, with a dip every 2 s.
 
     python flood.py RATE DIP [TOPIC [TYPE]]
 """
@@ -12,7 +12,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import BatteryState
 from std_msgs.msg import Float64
 
-# Samples that may be sent at once to catch up.
+# Maximum samples sent at once to catch up.
 MOST = 2000
 
 

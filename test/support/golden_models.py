@@ -1,4 +1,4 @@
-"""What causes and the criticism of models find in made recordings, for golden tables."""
+"""Results of causes and of the criticism of models on made recordings, for golden tables."""
 
 from dataclasses import replace
 import math
@@ -43,12 +43,12 @@ def view_at(samples, *terms, share=1.0):
     return view_of(samples, gaussian, gaussian.z, slice(0, round(share * samples.n)))
 
 
-# What the likelihood of a term stands beside.
+# Other terms needed for the likelihood of a term.
 _BESIDE = {'load_dependent_noise': ('measurement_noise',)}
 
 
 def terms():
-    """Return of each term a simulation, scores at the truth, and where a fit begins."""
+    """Return a simulation of each term, scores at the truth, and the start of a fit."""
     found = {}
     for name, params in EXAMPLES.items():
         one = term(name, **params)
@@ -85,7 +85,7 @@ _LAWS = {
 
 
 def laws():
-    """Return laws as they are fitted at the true OU."""
+    """Return laws fitted at the true OU."""
     found = {}
     for name, params in _LAWS.items():
         samples = samples_of(2000 if name == 'regime_switching' else 6000, term(name, **params))
@@ -99,7 +99,7 @@ def laws():
 
 
 def _recordings():
-    """Return recordings with what an instrument may do to them."""
+    """Return recordings with faults of instruments."""
     t, v, u = flight(np.random.default_rng(81), 4000)
     rng = np.random.default_rng(82)
     noise = rng.standard_normal(t.size)
@@ -120,7 +120,7 @@ def _recordings():
 
 
 def integrity():
-    """Return what is found of recordings before any model."""
+    """Return the findings about recordings before any model is fitted."""
     found = {}
     for name, (t, v, u) in _recordings().items():
         made = examine(Recording(t, v, u, name))
@@ -186,7 +186,7 @@ def criticism():
 
 
 def discovery():
-    """Return what `discover` measures of a right model: gains, errors, answers, crossings."""
+    """Return measures of a correct model by `discover`: gains, errors, responses, crossings."""
     found = {}
     for name, others, uneven in (
             ('sag', [term('load_sag', linear=0.3, square=0.1)], False),

@@ -1,4 +1,4 @@
-"""What parts of the online side and of the criticism find at their edges, for golden tables."""
+"""Results of online parts and of the criticism in edge cases, for golden tables."""
 
 
 from golden_models import samples_of, view_at
@@ -19,7 +19,7 @@ from term_examples import EXAMPLES, OU, term
 
 
 def flags():
-    """Return levels, reasons and dips of the flag through dips, late and odd samples, clocks."""
+    """Return levels, reasons and dips of the flag for dips, late and odd samples, and clocks."""
     found = []
     for more in ({}, {'brownout_latch': True, 'brownout_hold': 0.3}, {'brownout_delay': 0.5},
                  {'brownout_floor_time': 0.2, 'stale_after': 0.4}, {'brownout_floor': 0.0}):
@@ -59,7 +59,7 @@ def flags():
 
 
 def stamps():
-    """Return what stamps and readings are good for, batch by batch."""
+    """Return the quality of stamps and readings, batch by batch."""
     rng = np.random.default_rng(121)
     found = []
     for late in (0.0, 0.08, 0.15, 0.6):
@@ -86,7 +86,7 @@ def stamps():
 
 
 def chains():
-    """Return filters that run for long: what is checked against the low-passes, and arrays."""
+    """Return outputs of long runs of filters: sample by sample for low-passes, and as arrays."""
     rng = np.random.default_rng(131)
     n = 7000
     t = np.cumsum(rng.choice([1.95e-3, 2e-3, 2.05e-3], n))
@@ -105,7 +105,7 @@ def chains():
             y = one.filter(t[part], x[part], 0.6, sigma_se=0.1)
             found.append(table([y[::350], one.cutoff, one.phase_lag, one.bound.name,
                                 one.noise_left]))
-    # The voltage itself, whose level is told with an error that changes, comes and goes.
+    # The voltage itself, with a level whose error changes and is unknown at times.
     level = np.repeat(5.0 + 0.02 * rng.standard_normal(14), 500)
     level[4000:4500] = np.nan
     error = np.repeat(rng.choice([0.0, 0.01, 0.0104, 0.03, np.nan], 28), 250)
@@ -139,7 +139,7 @@ def chains():
 
 
 def long():
-    """Return which samples of long recordings are used, events beside them, lines above them."""
+    """Return the samples used of long recordings, with events next to them and lines above."""
     rng = np.random.default_rng(141)
     n = 260_000
     t = np.arange(n) * 1e-3
@@ -164,7 +164,7 @@ def long():
 
 
 def latent():
-    """Return where fits with one more state begin, and laws with levels or three states."""
+    """Return starts of fits with one more state, and laws with levels or three states."""
     found = {}
     for name, others, more in (
             ('second', [], [term('second_relaxation', alpha=4.0, sigma=0.1)]),
@@ -175,7 +175,7 @@ def latent():
              [term('resonance', frequency=120.0, damping=40.0, std=0.03, tilt=-0.5)])):
         samples = samples_of(4000, *others, *more, seed=151)
         ou = term('ou', **OU)
-        # At the truth: where a likelihood is flat, versions of SciPy end elsewhere.
+        # At the truth, because fits of a flat likelihood depend on the version of SciPy.
         gaussian = evaluate(samples, [ou, *others])
         composite = Composite((ou, *others), (), gaussian, gaussian.z, gaussian.density, 3, 0.0)
         terms, gain = from_spectrum(samples, composite, [*composite.terms, *more])

@@ -1,9 +1,9 @@
 """
-What the online parts find in made signals, number by number, for golden tables.
+Results of the online parts on made signals, number by number, for golden tables.
 
-Other tests say what is right; these say that no number moves unnoticed, also where a tolerance
-would hide it: gaps, lost throttle, clocks that jump, edges, coarse readings.
-`scripts/make_golden.py RUN` writes the table of a run anew, test/golden/RUN.json.
+Other tests check correctness; these detect any change of a number, even within tolerances: gaps,
+lost throttle, clocks that jump, edges, coarse readings.  `scripts/make_golden.py RUN` updates the
+table of a run, test/golden/RUN.json.
 """
 
 from dataclasses import fields, is_dataclass
@@ -27,7 +27,7 @@ def table(value):
     if isinstance(value, dict):
         return {str(name): table(one) for name, one in value.items()}
     if isinstance(value, str):
-        # Sentences have tests of their own.
+        # Sentences have their own tests.
         return '...' if ' ' in value else value
     if isinstance(value, bool) or value is None:
         return value
@@ -53,7 +53,7 @@ def _sticks(t, rng, pace):
 
 
 def load():
-    """Return the load filter through a flight with everything: it is asked after each part."""
+    """Return states of the load filter after each part of a flight with all kinds of events."""
     rng = np.random.default_rng(31)
     loads, found, ends = LoadFilter(), [], [-np.inf]
 
@@ -64,7 +64,7 @@ def load():
         if t[0] < ends[-1]:
             loads.new_time_line()
         ends.append(t[-1])
-        # What the first samples say, before they have taught it the rest.
+        # After the first few samples, when little is known.
         for n in (0, 1, 2, 4, 9):
             some = slice(n, max(2 * n, 1))
             loads.push(t[some], v[some], u[some], drawn[some])
@@ -110,7 +110,7 @@ def load():
 
 
 def delays():
-    """Return when a delay is found, and when voltage and throttle count as unrelated."""
+    """Return when a delay is found, and when voltage and throttle are judged unrelated."""
     found = {}
     for late in (0.0, 0.06, 0.12, 0.3):
         rng = np.random.default_rng(7)
@@ -224,7 +224,7 @@ _LAWS = ({'law': 'constant_noise'}, {'law': 'constant_noise', 'coupling': 2.0, '
 
 
 def filters():
-    """Return outputs of the filter under every law, order and mode, and what it says of itself."""
+    """Return outputs and states of the filter for every law, order and mode."""
     found = []
     rng = np.random.default_rng(61)
     n = 1500
@@ -243,7 +243,7 @@ def filters():
                                          and law.get('signal_poles') != 2):
                 continue
             for order in (1, 2):
-                # Samples that come singly, and arrays of them.
+                # Single samples, and arrays of samples.
                 one = AdaptiveLowPass(mode=mode, order=order, **law)
                 y = [one.filter(t[:700], x[:700], sigma[:700], **{
                     name: value[:700] if np.ndim(value) else value
@@ -262,7 +262,7 @@ def filters():
 
 
 def notches():
-    """Return outputs of notches under throttle and under motor speeds, and what is in force."""
+    """Return outputs and frequencies of notches with throttle and with motor speeds."""
     rng = np.random.default_rng(71)
     n = 3000
     t = np.arange(n) * 1e-3

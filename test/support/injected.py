@@ -1,9 +1,9 @@
 """
-Effects hidden in recorded flights, in units of what the recording itself shows.
+Effects hidden in recorded flights, in units of the recording's own noise.
 
-Sizes are in standard deviations of white noise with the second differences of the recording, in
-which no slow motion shows; a twentieth of them, the largest, are the load's.  An ADC is coarse
-beside less than half of its step.  Strengths of 1 to 3 are moderate.
+Sizes are in standard deviations of white noise with the second differences of the recording, which
+hardly contain slow changes; the largest twentieth is left out, because the load causes it.  The
+noise is taken as at least half a step of the ADC.  Strengths of 1 to 3 are moderate.
 """
 
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from ou_monitor.criticism.adc import find_step
 from ou_monitor.records import FloatArray
 from scipy.signal import lfilter
 
-# Effect of a recording and its strength times its noise, V: what to add, or what to do.
+# Applies an effect to a recording, given strength times noise, V.
 Inject = Callable[[Recording, float, np.random.Generator], Recording]
 
 
@@ -27,11 +27,11 @@ def noise_of(voltage: FloatArray) -> float:
 
 
 def _added(recording: Recording, more: FloatArray) -> Recording:
-    """Return a recording with something on the supply, read by its own ADC."""
+    """Return a recording with a voltage added to the supply, as read by its own ADC."""
     voltage = recording.voltage + more
     step = find_step(recording.voltage)
     if step > 0.0:
-        # As printed: a code of 5.28 mV may be there as 5 or as 6.
+        # Rounded as in the recording, where a code of 5.28 mV may be 5 or 6.
         decimals = next((k for k in range(7) if np.allclose(
             recording.voltage, recording.voltage.round(k), 0.0, 1e-8)), 9)
         low = float(recording.voltage.min())
@@ -40,7 +40,7 @@ def _added(recording: Recording, more: FloatArray) -> Recording:
 
 
 def _relaxing(drive: FloatArray, rate: float, step: float) -> FloatArray:
-    """Return what pushes leave behind that relax at a rate (1/s; step in s)."""
+    """Return the response to pushes that relax at a rate (1/s; step in s)."""
     return np.asarray(lfilter([1.0], [1.0, -np.exp(-rate * step)], drive))
 
 
@@ -49,7 +49,7 @@ def _step(recording: Recording) -> float:
 
 
 def _often(recording: Recording, rate: float) -> float:
-    """Return the chance a sample of events at a rate (1/s), or of 40 in a short recording."""
+    """Return the probability per sample of events at a rate, 1/s, or of 40 in all if short."""
     step = _step(recording)
     return step * max(rate, 40.0 / (recording.t.size * step))
 
@@ -61,7 +61,7 @@ def tone(recording: Recording, noise: float, rng: np.random.Generator) -> Record
 
 
 def jumps(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
-    """Add falls of six deviations, one a second, that recover within ten samples."""
+    """Add falls of six deviations, one per second, that recover within ten samples."""
     step = _step(recording)
     hit = rng.random(recording.t.size) < _often(recording, 1.0)
     drive = hit * noise * rng.uniform(-8.0, -4.0, recording.t.size)
@@ -69,13 +69,13 @@ def jumps(recording: Recording, noise: float, rng: np.random.Generator) -> Recor
 
 
 def glitches(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
-    """Add single wrong values, one of a hundred, of six deviations either way."""
+    """Add errors of six deviations, up or down, to one sample in a hundred."""
     hit = rng.random(recording.t.size) < 0.01
     return _added(recording, hit * noise * 6.0 * rng.standard_normal(recording.t.size))
 
 
 def dropouts(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
-    """Add falls by six deviations for two or three samples, one a second."""
+    """Add falls by six deviations for two or three samples, one per second."""
     begins = rng.random(recording.t.size) < _often(recording, 1.0)
     longer = begins & (rng.random(recording.t.size) < 0.5)
     down = begins | np.roll(begins, 1) | np.roll(longer, 2)
@@ -83,7 +83,7 @@ def dropouts(recording: Recording, noise: float, rng: np.random.Generator) -> Re
 
 
 def held(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
-    """Let three values of ten repeat the one before."""
+    """Replace three values in ten by the one before."""
     voltage = recording.voltage.copy()
     for k in np.flatnonzero(rng.random(voltage.size) < 0.3)[1:]:
         voltage[k] = voltage[k - 1]
@@ -91,12 +91,12 @@ def held(recording: Recording, noise: float, rng: np.random.Generator) -> Record
 
 
 def steps(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
-    """Read in codes two deviations apart."""
+    """Round to steps of two deviations."""
     return replace(recording, voltage=2.0 * noise * np.rint(recording.voltage / (2.0 * noise)))
 
 
 def white(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
-    """Add white noise as large again as what is there."""
+    """Add white noise as large as that of the recording."""
     return _added(recording, noise * rng.standard_normal(recording.t.size))
 
 
@@ -108,7 +108,7 @@ def tails(recording: Recording, noise: float, rng: np.random.Generator) -> Recor
 
 
 def regimes(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
-    """Add an OU as fast that is three times as intense for a second now and then."""
+    """Add such an OU that is three times as intense for a second at times."""
     step = _step(recording)
     flips = rng.random(recording.t.size) < _often(recording, 1.0)
     push = (1.0 + 2.0 * (np.cumsum(flips) % 2)) * rng.standard_normal(recording.t.size)
@@ -116,7 +116,7 @@ def regimes(recording: Recording, noise: float, rng: np.random.Generator) -> Rec
 
 
 def drift(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
-    """Add a fall by four deviations from begin to end."""
+    """Add a fall by four deviations from start to end."""
     return _added(recording, -4.0 * noise * np.linspace(0.0, 1.0, recording.t.size))
 
 
@@ -135,18 +135,18 @@ def levels(recording: Recording, noise: float, rng: np.random.Generator) -> Reco
 
 
 def jitter(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
-    """Make stamps wrong by a tenth of a step."""
+    """Add errors of a tenth of a step to the stamps."""
     off = 0.1 * _step(recording) * rng.standard_normal(recording.t.size)
     return replace(recording, t=recording.t + off)
 
 
 def rail(recording: Recording, noise: float, rng: np.random.Generator) -> Recording:
-    """Read by an ADC that ends where one reading of fifty would be below."""
+    """Clip at the voltage that one reading in fifty is below."""
     return replace(recording, voltage=np.maximum(
         recording.voltage, np.quantile(recording.voltage, 0.02)))
 
 
-# Each with the names that are right for it.
+# Each effect with its correct names.
 EFFECTS: dict[str, tuple[Inject, frozenset[str]]] = {
     'tone': (tone, frozenset({'tone'})),
     'jumps': (jumps, frozenset({'jumps'})),

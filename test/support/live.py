@@ -1,4 +1,4 @@
-"""Real processes over DDS: start them, listen to them, end them."""
+"""Real processes over DDS: start them, listen to them, stop them."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 BAGS = ROOT / 'bags'
-# A deadline is only ever reached by a failure: what takes 2 s alone takes 20 s where ten share
-# two cores, and a start of a process, its imports and its discovery, five times that.
+# Only failures should reach a deadline: work of 2 s takes 20 s if ten processes share two cores,
+# and starting a process (imports, discovery) five times that.
 DEADLINE = 120.0
-# What has not ended by itself so long after a test, s, is killed.
+# A process that is still running this long after a test, s, is killed.
 _END = 10.0
-# A service that has not answered for so long, s, is asked again: ten starts on a busy machine.
+# A service is called again after this time without an answer, s: ten starts on a busy machine.
 _ASK_AGAIN = 20.0
 _counter = itertools.count()
 
 
 def new_domain() -> int:
-    """Return a ROS domain nobody on this machine uses just now, be it another run of tests."""
-    # Runs at the same time begin at different places, and one passes by what another has taken:
-    # the first participant of a domain has this port (DDSI-RTPS 9.6.1).
+    """Return a ROS domain that nobody on this machine uses, including other runs of tests."""
+    # Parallel runs start at different domains and skip those in use: the first participant of a
+    # domain has this port (DDSI-RTPS 9.6.1).
     for _ in range(200):
         domain = 10 + (37 * os.getpid() + next(_counter)) % 90
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as first:
@@ -49,20 +49,20 @@ def new_domain() -> int:
 
 
 def queues(domain: int) -> list[Path]:
-    """Return where Fast DDS keeps its queues of a domain in shared memory."""
+    """Return the paths of Fast DDS's queues of a domain in shared memory."""
     return [Path(f'/dev/shm/fastrtps_port{port}')
             for port in range(7400 + 250 * domain, 7650 + 250 * domain)]
 
 
 def remove_queues(domain: int) -> None:
-    """Remove what killed programs have left of a domain that was ours alone."""
+    """Remove the queues that killed programs left in a domain that only we used."""
     for port in queues(domain):
         for left in (port, port.with_name(port.name + '_el'),
                      port.with_name(f'sem.{port.name}_mutex')):
             left.unlink(missing_ok=True)
 
 
-# `new_domain` gives none of these; each is given once in a run.
+# `new_domain` never returns these; each is used once in a run.
 _UNUSED = [*range(1, 10), 100, 101]
 
 
@@ -71,8 +71,8 @@ def unused_domain() -> Iterator[int]:
     """
     Give a ROS domain in which no killed program has left a queue in shared memory.
 
-    A node takes such a queue as it is, with the size that its maker chose.  What the test's own
-    programs leave in that domain goes with it.
+    A node reuses such a queue with the size that its creator chose.  Queues that the test's own
+    programs leave in the domain are removed.
     """
     while _UNUSED:
         domain = _UNUSED.pop(0)
@@ -88,7 +88,7 @@ def unused_domain() -> Iterator[int]:
 
 
 def wait_until(predicate: Callable[[], Any], timeout: float = DEADLINE, what: str = '') -> Any:
-    """Return what the predicate returns once it is true; fail after the timeout, s."""
+    """Return the value of the predicate once it is true; fail after the timeout, s."""
     until = time.monotonic() + timeout
     while True:
         value = predicate()
@@ -100,14 +100,14 @@ def wait_until(predicate: Callable[[], Any], timeout: float = DEADLINE, what: st
 
 
 class Process:
-    """One executable of the package, or any other module of it, its output in files."""
+    """One executable, or any other module, of the package, with its output in files."""
 
     def __init__(self, name: str, arguments: list[str], domain: int, folder: Path,
                  reach: str = 'LOCALHOST') -> None:
         self.name = name
         self._out = folder / f'{name}_{next(_counter)}.out'
         self._err = self._out.with_suffix('.err')
-        # The bootstrapper of the ROS wheels leaves its mark in a process that it has set up.
+        # The bootstrapper of the ROS wheels marks the environment of a process that it has set up.
         inherited = {key: value for key, value in os.environ.items()
                      if key != '_ROS_WHEELS_BOOTSTRAP_COMPLETE'}
         env = {**inherited, 'ROS_DOMAIN_ID': str(domain), 'PYTHONUNBUFFERED': '1',
@@ -145,7 +145,7 @@ class Process:
             self.popen.wait()
 
     def ask_to_end(self) -> None:
-        """Send SIGINT, also to what was stopped."""
+        """Send SIGINT, also to a stopped process."""
         if self.popen.poll() is None:
             self.popen.send_signal(signal.SIGINT)
             self.popen.send_signal(signal.SIGCONT)
@@ -153,12 +153,12 @@ class Process:
 
 class Starved:
     """
-    A process that has the CPU in slices only: stopped and continued in turn, s.
+    A process that gets the CPU only in slices: it is stopped and continued in turn, s.
 
     Attributes
     ----------
     stops : list of tuple of float
-        When it was stopped, and when it went on, by the monotonic clock, s.
+        Times at which it was stopped and continued, by the monotonic clock, s.
     """
 
     def __init__(self, pid: int, stopped: float = 0.02, running: float = 0.01) -> None:
@@ -190,7 +190,7 @@ class Starved:
 
     @property
     def longest(self) -> float:
-        """Return the longest stop, s: as asked, and what this machine itself pauses."""
+        """Return the longest stop, s, including pauses of the machine itself."""
         return max(end - begin for begin, end in self.stops)
 
 
@@ -201,7 +201,7 @@ def memory_of(pid: int) -> float:
 
 
 class Probe:
-    """A node in this process: it listens, publishes and sets parameters of others."""
+    """A node in this process that listens, publishes and sets parameters of other nodes."""
 
     def __init__(self, domain: int) -> None:
         import rclpy
@@ -226,7 +226,7 @@ class Probe:
 
     def listen(self, topic: str, kind: Any, qos: Any = 100,
                sent: list[float] | None = None) -> list[Any]:
-        """Return the list to which messages of a topic will be added; to `sent` when, s."""
+        """Return the list to which messages of a topic are added; their times, s, go to `sent`."""
         got: list[Any] = []
         if sent is None:
             self.node.create_subscription(kind, topic, got.append, qos)
@@ -241,13 +241,13 @@ class Probe:
 
     def numbered(self, topic: str, kind: Any, take: Callable[[Any, int, float], None],
                  qos: Any = 100) -> None:
-        """Hand over each message of a topic, its publisher's number of it, and when sent, s."""
+        """Call `take` with each message of a topic, its sequence number and sending time, s."""
         self._subscribe(topic, kind, lambda message, info: take(
             message, info['publication_sequence_number'], info['source_timestamp'] * 1e-9), qos)
 
     def _subscribe(self, topic: str, kind: Any, take: Callable[[Any, Any], None], qos: Any
                    ) -> None:
-        # The EventsExecutor of rclpy 7.1 hands over one tuple instead of two arguments.
+        # The EventsExecutor of rclpy 7.1 passes one tuple instead of two arguments.
         def call(*args: Any) -> None:
             take(*(args if len(args) == 2 else args[0]))
         call.__signature__ = inspect.signature(take)  # type: ignore[attr-defined]
@@ -260,8 +260,8 @@ class Probe:
         """
         Return the answer of a service.
 
-        A client may have discovered a service that has not discovered the client: after .1 s the
-        middleware drops the answer.  So it is asked again where there is none.
+        If a client has discovered a service before the service has discovered the client, the
+        middleware drops the answer after .1 s; so the call is repeated.
         """
         if service not in self._clients:
             self._clients[service] = self.node.create_client(kind, service)
@@ -299,12 +299,12 @@ class World:
 
     def __init__(self, folder: Path) -> None:
         self.domain = new_domain()
-        # The range of discovery of its processes.
+        # Discovery range of its processes.
         self.reach = 'LOCALHOST'
         self.folder = folder
         self._processes: list[Process] = []
         self._probes: list[Probe] = []
-        # The middleware of this process reads it at the first context.
+        # The middleware of this process reads this at the first context.
         os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
         os.environ['ROS_LOG_DIR'] = str(folder)
 
@@ -319,10 +319,10 @@ class World:
 
     def close(self) -> None:
         """
-        End everything; a traceback anywhere is a failure, whatever the test looked at.
+        Stop everything; a traceback in any process is a failure, whatever the test checked.
 
-        A killed process leaves its queues in shared memory, and what comes next in that domain
-        may lose messages in them.
+        A killed process leaves its queues in shared memory, in which later processes of the domain
+        may lose messages.
         """
         for process in self._processes:
             process.ask_to_end()
@@ -340,7 +340,7 @@ class World:
 
 
 class Estimator:
-    """An estimator in a namespace: what it says, and stamped messages into it."""
+    """An estimator in a namespace, with its outputs and a publisher of stamped messages."""
 
     def __init__(self, world: World, namespace: str, *arguments: str,
                  probe: Probe | None = None) -> None:
@@ -357,7 +357,7 @@ class Estimator:
         self.t = 1000.0
 
     def connect(self, kind: Any) -> None:
-        """Publish a type; wait until the estimator has subscribed and says something."""
+        """Publish a type; wait until the estimator has subscribed and published."""
         self.output = self.probe.publisher(f'/{self.namespace}/voltage', kind, 1000)
         wait_until(lambda: self.output.get_subscription_count() and self.states, what='its input')
 
@@ -372,7 +372,7 @@ class Estimator:
 
     def feed(self, voltages: list[float], dt: float = 0.001,
              currents: list[float] | None = None) -> None:
-        """Send stamped samples, dt apart; do not flood best effort."""
+        """Send stamped samples, dt apart, slowly enough for best effort."""
         for k, voltage in enumerate(voltages):
             self.t += dt
             self.send(voltage, self.t, current=math.nan if currents is None else currents[k])
@@ -392,7 +392,7 @@ class Estimator:
 
 
 def refusal(make: Callable[[], Any], *arguments: object) -> str:
-    """Return why what `make` makes in this process, under ROS arguments, is refused."""
+    """Return the error of `make` in this process with ROS arguments, which must fail."""
     from ou_monitor.errors import InputError
     import rclpy
     from rclpy.exceptions import ParameterException
@@ -418,7 +418,7 @@ def seconds(stamp: Any) -> float:
 
 
 def diagnosis(messages: list[Any], name: str) -> Any:
-    """Return the newest status with a name out of DiagnosticArrays; None when there is none."""
+    """Return the newest status with a name from DiagnosticArrays, or None."""
     for message in reversed(messages):
         for status in message.status:
             if status.name == name:

@@ -1,4 +1,4 @@
-"""Bags for the tests of reading: by the library in every way, and by hand, record by record."""
+"""Bags for the tests of reading: by the library with all options, and by hand from records."""
 
 from functools import cache
 import struct
@@ -47,12 +47,12 @@ def _way(generate, kind, text):
 
 
 def encode(kind, content, text=None):
-    """Return a message of a type, given as a dict, as the library writes it."""
+    """Return a message of a type, given as a dict, encoded by the library."""
     return _way(serialize_dynamic, kind, text)(content)
 
 
 def decode(kind, data, text=None):
-    """Return a message as an object, as the library reads it."""
+    """Return a message as an object, decoded by the library."""
     return _way(generate_dynamic, kind, text)(data)
 
 
@@ -61,7 +61,7 @@ def encode_block(samples):
 
 
 def supply(count=COUNT):
-    """Return the rows of a voltage each ms, and of a throttle a ns behind each tenth."""
+    """Return the rows of a voltage every ms, and of a throttle 1 ns after every tenth."""
     rows = []
     values = np.random.default_rng(1).normal(5.0, 0.1, count)
     for k, data in enumerate(encode_scalars(FLOAT64, values)):
@@ -73,7 +73,7 @@ def supply(count=COUNT):
 
 
 def records(data):
-    """Return (begin, end, messages in it) of the records of `supply`, by a walk of their own."""
+    """Return (begin, end, messages in it) of the records of `supply`, without the reader."""
     at, found, done = len(MAGIC), [], 0
     while at < len(data) - len(MAGIC):
         opcode, length = struct.unpack_from('<BQ', data, at)
@@ -82,7 +82,7 @@ def records(data):
         if opcode == Op.MESSAGE:
             inside = 1
         elif opcode == Op.CHUNK:
-            # Chunks are in the order of time here: their last log time tells how many.
+            # Chunks are in the order of time here, so the last log time gives the number.
             last = struct.unpack_from('<Q', data, at + 17)[0] - START
             k = last // MS
             inside = (k + 1) + (k // 10 + (last % MS == 1 or k % 10 != 0)) - done
@@ -123,7 +123,7 @@ def messages(n):
 
 
 def chunk(content, *, n=100, compression='', packed=None, stated=None, crc=None):
-    """Return a chunk of the first n messages; what it states may be a lie."""
+    """Return a chunk of the first n messages; its header may lie."""
     packed = content if packed is None else packed
     return record(Op.CHUNK, struct.pack(
         '<QQQI', 1000, 1000 * n, len(content) if stated is None else stated,
@@ -132,7 +132,7 @@ def chunk(content, *, n=100, compression='', packed=None, stated=None, crc=None)
 
 
 def by_hand(path, *parts, summary=b''):
-    """Write a file, whose summary may be a lie."""
+    """Write a file, whose summary may lie."""
     head = MAGIC + record(Op.HEADER, text('ros2'), text('')) + b''.join(parts) + record(
         Op.DATA_END, bytes(4))
     start = len(head) if summary else 0

@@ -1,11 +1,11 @@
-"""Devices of IIO and hwmon, made of plain files: a sysfs tree, and a FIFO as character device."""
+"""Simulated devices of IIO and hwmon: a sysfs tree of files, and a FIFO as character device."""
 
 import os
 from pathlib import Path
 
 import numpy as np
 
-# Counts of 12 bits, signed, in the upper bits of 16: as the MCP3xxx and ADS1015 drivers have them.
+# Signed counts of 12 bits in the upper bits of 16, as from the MCP3xxx and ADS1015 drivers.
 KIND, SHIFT = 'be:s12/16>>4', 4
 SCALE, OFFSET = 2.5, 10.0
 
@@ -22,7 +22,7 @@ def iio_device(root: Path, rate: float = 10_000.0, clock: str = 'realtime') -> t
     """
     Make an IIO device of two channels and a timestamp; return its sysfs folder and its FIFO.
 
-    Only channel 0 is enabled, as another program may have left it.
+    Only channel 0 is enabled, as if another program had done so.
     """
     folder = root / 'sys/bus/iio/devices/iio:device0'
     attributes(
@@ -52,5 +52,5 @@ def scans(counts: np.ndarray, stamps: np.ndarray) -> bytes:
 
 
 def volts(counts: np.ndarray) -> np.ndarray:
-    """Return what the kernel's ABI makes of counts, V."""
+    """Return the voltages of counts by the kernel's ABI, V."""
     return (counts + OFFSET) * SCALE * 1e-3

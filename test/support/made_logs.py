@@ -17,7 +17,7 @@ from ou_monitor.recordings.importers.log import Request
 
 
 def load(folder, content, name='a.log', **request):
-    """Write a log, whole or in pieces; return its path, and what the importer makes of it."""
+    """Write a log, whole or in pieces; return its path, and the importer's result."""
     path = folder / name
     path.write_bytes(content if isinstance(content, bytes) else b''.join(content))
     return path, import_log(path, Request(**request))
@@ -25,9 +25,9 @@ def load(folder, content, name='a.log', **request):
 
 def outcomes_of_flipped_bytes(folder, whole, first, seed, tries, samples=60):
     """
-    Return how many logs with three bytes flipped were refused, and how many mended with a note.
+    Return the numbers of logs with three flipped bytes that were refused, and read with a note.
 
-    Each refusal is one line; what is read is in order, and what is lost is noted.
+    Each refusal is one line; samples are in order, and lost ones are mentioned in a note.
     """
     rng, refused, mended = np.random.default_rng(seed), 0, 0
     for _ in range(tries):
@@ -125,7 +125,7 @@ class Dataflash:
     """Collects the messages of a dataflash log, binary and text."""
 
     def __init__(self):
-        """Begin with the format of formats."""
+        """Start with the format of format messages."""
         self.pieces, self.lines, self.known = [], [], {}
         self.form(FMT, 'FMT', 'BBnNZ', 'Type,Length,Name,Format,Columns')
 
@@ -193,7 +193,7 @@ END = b'E\xffEnd of log\x00'
 
 
 def unsigned_vb(value):
-    """Return a number of 32 bits, seven a byte, the lowest first."""
+    """Return a number of 32 bits, seven per byte, lowest first."""
     value &= 0xffffffff
     out = bytearray()
     while value > 127:
@@ -233,7 +233,7 @@ def blackbox(rows, fields=('loopIteration', 'time', 'rcCommand[3]', 'vbatLatest'
             frame = b'I' + b''.join(unsigned_vb(value) for value in row)
             past = [row, row]
         else:
-            # The time goes on as it did; the others stay.
+            # Time is predicted linearly; other fields are predicted unchanged.
             line = 2 * past[0][1] - past[1][1]
             frame = b'P' + signed_vb(row[1] - line) + b''.join(
                 signed_vb(value - before) for value, before in zip(row[2:], past[0][2:]))

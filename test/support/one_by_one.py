@@ -1,11 +1,11 @@
-"""Messages one by one into a `SampleStream`, with the source's time where one has no stamp."""
+"""Single messages into a `SampleStream`, with the source's time for those without a stamp."""
 
 import numpy as np
 from ou_monitor.stream.samples import SampleStream
 
 
 def extracted(spec, message):
-    """Return the values and the stamp, s, of a message; None: it carries none."""
+    """Return the values and the stamp, s, of a message; None: there is none."""
     values = np.atleast_1d(np.array(getattr(message, spec.field), dtype=float))
     values[~np.isfinite(values)] = np.nan
     if spec.nan == 'drop' and spec.sample_rate is None:

@@ -1,4 +1,4 @@
-"""What every page must be: one file that is well formed and reaches for nothing outside."""
+"""Requirements of every page: one well-formed file that loads nothing from outside."""
 
 import base64
 import hashlib
@@ -10,18 +10,18 @@ import zlib
 import numpy as np
 
 _TYPES = {'f8': '<f8', 'f4': '<f4', 'i4': '<i4'}
-# Elements that load something, whatever their attributes.
+# Elements that load something with any attributes.
 _LOADING = {'link', 'img', 'iframe', 'object', 'embed', 'audio', 'video', 'source', 'base',
             'image', 'use', 'a', 'form', 'input'}
 
 
 def parsed(html):
-    """Parse a page as XML: it must be well formed, no entity undefined."""
+    """Parse a page as XML: it must be well formed, without undefined entities."""
     return ElementTree.fromstring(html.replace('<!DOCTYPE html>\n', ''))
 
 
 def self_contained(html):
-    """Assert that a page loads nothing and runs nothing but its own script; return its tree."""
+    """Assert that a page loads nothing and runs only its own script; return its tree."""
     tree = parsed(html)
     data = [e for e in tree.iter('script') if e.get('type') == 'application/json']
     code = [e for e in tree.iter('script') if e.get('type') is None]

@@ -1,4 +1,4 @@
-"""Files of the project for the tests that look at or copy all of them; recordings of others."""
+"""Lists of the project's files, for tests that read or copy all of them; recordings of others."""
 
 from functools import cache
 import os
@@ -14,14 +14,14 @@ ROOT = Path(__file__).resolve().parents[2]
 REAL = Path(os.environ.get('OU_MONITOR_REALDATA', 'nowhere'))
 needs_recordings = pytest.mark.skipif(
     not REAL.is_dir(), reason='OU_MONITOR_REALDATA names no folder of recordings')
-# What running the project makes; in an unpacked archive there is no git to say so.
+# Files made by running the project, for an unpacked archive, where git cannot tell.
 GENERATED = {'.venv', '.venv-noble', 'build', 'install', 'log', 'out', '__pycache__', '.git',
              '.hypothesis', '.pytest_cache', '.mypy_cache', 'ou_monitor.egg-info'}
 
 
 @cache
 def recorded(path: Path, **options: Any) -> Any:
-    """Return a recording that many tests look at, read once by all tests of a process."""
+    """Return a recording that many tests use, read once per process."""
     from ou_monitor.recordings.read import read_recording
     return read_recording(path, **options)
 

@@ -1,4 +1,4 @@
-"""Tables of a fleet whose truth is known."""
+"""Tables of a fleet with known truth."""
 
 import math
 
@@ -16,9 +16,10 @@ def table(rng: np.random.Generator, vehicles: int, flights: int, *, scatter: flo
           odd_vehicles: dict | None = None, levels=LEVELS, ageing: dict | None = None,
           ohms: dict | None = None) -> list[dict]:
     """
-    Return a fleet table: a row a level; effects are on ln sigma.
+    Return a fleet table with a row per level; effects are on ln sigma.
 
-    ageing: vehicle -> growth of ln resistance and ln sag a flight; ohms: -> offset of them.
+    ageing: vehicle -> growth of ln resistance and ln sag per flight; ohms: vehicle -> their
+    offset.
     """
     rows = []
     for v in range(vehicles):

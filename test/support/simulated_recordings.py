@@ -30,17 +30,17 @@ def without_throttle(simulated: Recording) -> Recording:
 
 
 def bare(simulated: Recording) -> Remainder:
-    """Return the deviation of a recording from its mean: neither level nor load are taken out."""
+    """Return the deviation of a recording from its mean, without subtracting level or load."""
     return Remainder(simulated.voltage - simulated.voltage.mean(), np.ones(simulated.n),
                      float(np.median(np.diff(simulated.t))), 1e-3)
 
 
 def as_one_level(simulated: Recording) -> LevelResult:
-    """Return what `analyze` says of a recording as one load level, in a tenth of its time."""
+    """Return the result of `analyze` for a recording as one load level, ten times as fast."""
     level = fit_level(simulated, bare(simulated), LoadLevel(NAN, (Stay(0, simulated.n),)), 1)
     return replace(level, shape=holm([level.shape])[0])
 
 
 def fitted(simulated: Recording, start: int, stop: int) -> Estimate:
-    """Return what a level of these samples would say."""
+    """Return the estimate of a level of these samples."""
     return fit_parts(simulated, bare(simulated), [Stay(start, stop)])[1]

@@ -26,7 +26,7 @@ def stamps(n, dt=DT):
 
 
 def estimate(t, y, throttle=None, window=None, **more):
-    """Return the estimate of one window that holds all samples."""
+    """Return the estimate of one window with all samples."""
     estimator = SlidingEstimator(window or 1.03 * float(t[-1] - t[0]), **more)
     estimator.push(t, y, throttle)
     return estimator.estimate()
@@ -38,7 +38,7 @@ def errors(estimates, truth=TRUTH):
 
 
 def covered(estimates, truth=TRUTH):
-    """Return the share of 95 % intervals that hold the truth, for each parameter."""
+    """Return the share of 95 % intervals that contain the truth, for each parameter."""
     inside = [[e.interval(name)[0] <= value <= e.interval(name)[1]
                for name, value in zip(NAMES, truth)] for e in estimates]
     return np.mean(inside, axis=0)

@@ -9,7 +9,7 @@ from ou_monitor.model.terms.catalogue import catalogue
 ALPHA, SIGMA, U0 = 63.0, 0.632, 5.0
 OU = {'alpha': ALPHA, 'sigma': SIGMA, 'u0': U0}
 
-# One of each, none of them neutral.
+# One of each, all with an effect.
 EXAMPLES = {
     'ou': OU,
     'load_sag': {'linear': 0.3, 'square': 0.1, 'growth': -0.02},
@@ -55,18 +55,18 @@ def supply(*others, **ou):
 
 
 def still(*others, alpha=ALPHA):
-    """Return a model whose `ou` does nothing, so that the others are seen alone."""
+    """Return a model whose `ou` has no effect, so that only the other terms are seen."""
     return supply(*others, alpha=alpha, sigma=0.0, u0=0.0)
 
 
 def clusters(model, offsets, gap, count, seed, throttle=None):
     """
-    Draw `count` groups of samples so far apart that they are independent.
+    Draw `count` groups of samples, far enough apart to be independent.
 
     Returns
     -------
     ndarray, shape (count, len(offsets))
-        Voltage, V; the group at the very start is left out.
+        Voltage, V, without the first group.
     """
     t = (np.arange(count + 1)[:, None] * gap + np.asarray(offsets)[None, :]).ravel()
     voltage = model.simulate(t, np.random.default_rng(seed), throttle)
@@ -75,11 +75,10 @@ def clusters(model, offsets, gap, count, seed, throttle=None):
 
 def agrees(found, truth, error, change=0.05):
     """
-    Say whether an estimate is within 4 of its standard errors.
+    Return whether an estimate is within 4 standard errors of the truth.
 
-    It first makes sure of the power of the question: a truth changed by the
-    share `change` must be 6 standard errors away, so be found out of 4 in
-    97.7 of 100 cases.  An infinite `change` asks for no power.
+    First checks the power: a truth changed by the share `change` must be 6 standard errors away,
+    so that it is rejected in 97.7 of 100 cases.  An infinite `change` requires no power.
     """
     if math.isfinite(change):
         assert 6.0 * error <= change * abs(truth), f'no power: {6 * error / abs(truth):.3f}'
@@ -92,9 +91,8 @@ def has_covariance(groups, offsets, cov, change=0.05):
     Check all second moments of independent groups of a zero-mean process.
 
     `cov` is the autocovariance as a function of the lag.  The standard error of
-    the mean of M products is their standard deviation / sqrt(M).  Moments that
-    are small beside the variance have the same error but no power of their
-    own; they are held to 4 errors.
+    the mean of M products is their standard deviation / sqrt(M).  Moments that are small against
+    the variance have the same error but too little power; they must only be within 4 errors.
     """
     for j, early in enumerate(offsets):
         for k in range(j, len(offsets)):
