@@ -7,7 +7,8 @@ doc/load.md has the equations and the figures.
 
 With a measured current: its scale and sign are not corrected, so a wrong scale makes the
 resistance wrong; a load that follows throttle but bypasses the current sensor makes it too high (a
-sag of 0.1 V at full throttle turns 0.2 into 0.4 Ohm on a robot that draws 1 A); a constant current
+sag of 0.1 V at full throttle turns 0.2 into 0.4 Ohm on a robot that draws 1 A), and its error
+covers that only if throttle then explains more of the rest than noise does; a constant current
 gives no information.  Throttle as a further regressor would absorb that load, but on quads with
 slow current sensors at least half of the resistance too.
 """
@@ -57,6 +58,8 @@ _LOUDEST = 0.7
 # Current over throttle: memory, s; correlation time of deviations, s; prior deviation of its
 # coefficients, in units of those deviations.
 _MEMORY, _ONE, _WIDE = 120.0, 1.0, 30.0
+# Ends of the band, s, in which throttle is tried beside current.
+_BAND = np.array([[1.0], [20.0]])
 
 
 class CurrentFilter:
@@ -73,6 +76,8 @@ class CurrentFilter:
         self.delay = LoadDelay(either=True)
         # Current over throttle: weighted products of 1, x, u, u^3 with one another and current.
         self._squares = np.zeros((5, 5))
+        # Weighted products of x, current and voltage after a band-pass; the two lags of these.
+        self._beside, self._lags = np.zeros((3, 3)), np.zeros((2, 0))
 
     def time(self, block: LoadBlock) -> None:
         """Update the delay of the current from a block as received."""
@@ -129,7 +134,35 @@ class CurrentFilter:
         else:
             self._follow(block, dt, cells)
         self._load = self._drawn[0] / self._largest
+        if math.isfinite(block.throttle):
+            self._compare(np.array([block.throttle ** POWER, x, block.voltage]),
+                          0.0 if lost else dt)
         self.rest = block.voltage - float(self._regressors()[2:] @ self._m[2:])
+
+    def _compare(self, now: FloatArray, dt: float) -> None:
+        """Take x, current and voltage for `_bypassed`."""
+        if not dt or not self._lags.size:
+            self._lags = np.stack((now, now))
+        self._lags = self._lags - np.expm1(-dt / _BAND) * (now - self._lags)
+        changes = self._lags[0] - self._lags[1]
+        self._beside = self._beside * math.exp(-dt / _MEMORY) + dt * changes * changes[:, None]
+
+    @property
+    def _bypassed(self) -> float:
+        """
+        Return the relative error of the resistance by loads that bypass the current sensor.
+
+        It is the change of the resistance with throttle as a further regressor, times the share
+        of the rest of the voltage that throttle explains.  Both are taken after a band-pass,
+        because throttle also explains what a slow sensor misses, and charge lowers the level.
+        """
+        (xx, xi, xv), (_, ii, iv), (_, _, vv) = self._beside.tolist()
+        # Voltage and throttle without current.
+        rest, moved, both = (vv - iv * iv / ii, xx - xi * xi / ii, xv - xi * iv / ii
+                             ) if ii > 0.0 else (0.0, 0.0, 0.0)
+        if not (rest > 0.0 and moved > 1e-9 * xx and iv):
+            return 0.0
+        return abs(both / moved * xi / iv) * both * both / (moved * rest)
 
     def _follow(self, block: LoadBlock, dt: float, cells: float) -> None:
         m, P = self._m, self._P
@@ -169,9 +202,11 @@ class CurrentFilter:
             return NAN, NAN
         value = abs(float(self._m[2] + self._m[3]))
         error = math.sqrt(float(self._P[2:4, 2:4].sum()) * max(1.0, self.noise.scale))
+        if 0.0 < error < _KNOWN * value:
+            error = math.hypot(max(error, LEAST_ERROR * value), self._bypassed * value)
         if not 0.0 < error < _KNOWN * value:
             return NAN, NAN
-        return value / self._unit, max(error, LEAST_ERROR * value) / self._unit
+        return value / self._unit, error / self._unit
 
     def sag(self, throttle: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the sag, V, from the current at full throttle, and its standard error."""

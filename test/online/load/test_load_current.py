@@ -70,6 +70,19 @@ def test_level_from_current_without_throttle(flight):
     assert load.resistance == pytest.approx(OHM, rel=0.1)
 
 
+def test_the_error_covers_a_load_that_bypasses_the_sensor(flight):
+    """1.5 V by throttle, as much as by current; a sensor that is slow by 0.1 s costs nothing."""
+    t, v, u, current = flight
+    load = loaded(t, v - 1.5 * u ** 1.8, u, current)
+    # The least error, a tenth, would not cover it.
+    assert 0.4 * load.resistance < load.resistance - OHM < 2.0 * load.resistance_se
+    slow = current.copy()
+    for k in range(1, t.size):
+        slow[k] += (slow[k - 1] - slow[k]) * np.exp(-0.02 / 0.1)
+    load = loaded(t, v, u, slow)
+    assert load.resistance_se == pytest.approx(0.1 * load.resistance, rel=0.05)
+
+
 def test_a_current_that_pauses(flight):
     """Holes of a second and of ten; the resistance is kept over both."""
     t, v, u, current = flight
