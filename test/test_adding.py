@@ -1,4 +1,4 @@
-"""Adding a cause, a format, a parameter, a command or a fact: one place each, in a copy."""
+"""A new cause, format, parameter, command or fact needs a change in one place; tried in a copy."""
 
 import json
 import os

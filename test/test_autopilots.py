@@ -1,4 +1,4 @@
-"""The page on autopilots: its descriptions of messages load, and its MSP reads what is sent."""
+"""The page on autopilots: its message descriptions load, and its MSP reader reads real frames."""
 
 from pathlib import Path
 import re

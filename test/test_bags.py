@@ -1,4 +1,4 @@
-"""The library of bags: sound, and what its truth.yaml says it is."""
+"""The library of bags: valid, and as stated in truth.yaml."""
 
 import importlib.util
 import math

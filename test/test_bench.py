@@ -1,4 +1,4 @@
-"""The commands as functions: their JSON, tables, plots and HTML, and what is missing without."""
+"""The commands as functions: JSON, tables, plots and HTML, and missing packages."""
 
 import copy
 from dataclasses import replace

@@ -1,8 +1,7 @@
 """
-Golden tables of online parts, causes and criticism: no number moves unnoticed.
+Golden tables of online parts, causes and criticism: every change of a number is noticed.
 
-After a change that is meant to move them: `scripts/make_golden.py RUN`, and look at the
-difference.
+After an intended change, run `scripts/make_golden.py RUN` and look at the differences.
 """
 
 import json

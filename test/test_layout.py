@@ -1,4 +1,4 @@
-"""The arrows of doc/architecture.md, walked import by import."""
+"""The dependencies in doc/architecture.md, checked import by import."""
 
 import ast
 from collections.abc import Iterator, Mapping

@@ -1,4 +1,4 @@
-"""What users get: a colcon package, a pip package, and scripts that set both up."""
+"""What users install: a colcon package, a pip package, and scripts that set up both."""
 
 from collections.abc import Iterator
 from email.utils import parseaddr

@@ -1,4 +1,4 @@
-"""`import ou_monitor`: quick, complete, and honest about what is not there."""
+"""`import ou_monitor`: fast, complete, and with clear errors for missing names."""
 
 import doctest
 import pathlib

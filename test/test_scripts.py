@@ -1,4 +1,4 @@
-"""scripts/: what demo and test refuse, in one line, and do not do twice; the man page."""
+"""scripts/: one line for what demo and test refuse, no repeated installation; the man page."""
 
 import importlib.util
 import os

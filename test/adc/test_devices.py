@@ -1,4 +1,4 @@
-"""IIO devices in a folder as of sysfs, and the scans that they give."""
+"""IIO and hwmon devices in a simulated sysfs, and the samples read from them."""
 
 import os
 import threading

@@ -1,4 +1,4 @@
-"""The JSON of `analyze`: keys that stay, each of them documented."""
+"""The JSON of `analyze`: stable keys, all of them documented."""
 
 import math
 import re

@@ -1,4 +1,4 @@
-"""A recording with known truth -> its tables."""
+"""`analyze` on recordings with known truth: its numbers and words."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Whether alpha is the same at all loads: level, power, and honest doubt."""
+"""The test of a common alpha at all loads: false alarms, power, and undecided cases."""
 
 from dataclasses import replace
 import math

@@ -1,4 +1,4 @@
-"""Cells of a pack, and how a supply stands among known crafts."""
+"""The number of cells of a pack, and a comparison of its supply with those of known crafts."""
 
 from dataclasses import replace
 import json

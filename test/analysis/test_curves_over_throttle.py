@@ -1,4 +1,4 @@
-"""What is said over throttle: the facts, and the risk of the node at the end."""
+"""Results over throttle: the supply facts, and the risk of the node at the end."""
 
 import math
 

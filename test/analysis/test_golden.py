@@ -1,8 +1,7 @@
 """
-Golden tables: what `analyze` finds in the bags, number by number, and against their truth.
+Golden tables: results of `analyze` for the bags, number by number, and against their truth.
 
-After a change that is meant to move the numbers: `scripts/make_golden.py`, and look at the
-difference.
+After an intended change of numbers, run `scripts/make_golden.py` and look at the differences.
 """
 
 import importlib.util
@@ -18,9 +17,9 @@ import pytest
 import yaml
 
 NAMES = sorted(path.parent.name for path in (ROOT / 'bags').glob('*/truth.yaml'))
-# Another BLAS moves numbers by 1e-10 and risks of 1e-184 by 1e-6 (measured).
+# Another BLAS changes numbers by 1e-10 and risks of 1e-184 by 1e-6 (measured).
 RELATIVE = 1e-6
-# Voltages and probabilities smaller than this are nothing.
+# Voltages and probabilities smaller than this count as 0.
 ABSOLUTE = 1e-12
 
 
@@ -44,7 +43,7 @@ def found():
 
 
 def differences(found, wanted, where=''):
-    """Return the places at which two tables differ by more than another BLAS explains."""
+    """Return the paths at which two tables differ by more than another BLAS explains."""
     if isinstance(wanted, dict) and isinstance(found, dict):
         if found.keys() != wanted.keys():
             return [f'{where}: keys {sorted(found.keys() ^ wanted.keys())}']
@@ -63,13 +62,13 @@ def differences(found, wanted, where=''):
 
 @pytest.mark.parametrize('name', NAMES)
 def test_the_tables_are_the_golden_ones(maker, found, name):
-    """Every number, word and flag; `scripts/make_golden.py` writes them anew."""
+    """Every number, word and flag; `scripts/make_golden.py` updates them."""
     wanted = json.loads((maker.GOLDEN / f'{name}.json').read_text(encoding='utf-8'))
     assert differences(maker.table(found[name][1]), wanted)[:10] == []
 
 
 def test_a_small_change_of_a_number_is_a_difference(maker):
-    """A hundred thousandth of one, a missing entry, a lost key, another word."""
+    """A change by 1e-5, a missing entry, a lost key, another word."""
     wanted = json.loads((maker.GOLDEN / 'transient.json').read_text(encoding='utf-8'))
     for change in (lambda d: d['levels'][0].update(alpha=d['levels'][0]['alpha'] * 1.00001),
                    lambda d: d['levels'].pop(), lambda d: d['brownout'].pop('horizon_s'),

@@ -1,4 +1,4 @@
-"""Tests of a level: false alarms as stated, and power."""
+"""Tests of a level: their false alarms are as stated, and their power."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Load levels: found, given, split at pauses, settled."""
+"""Load levels: found, given, split at pauses, without transients."""
 
 import numpy as np
 from ou_monitor.analysis.levels import find_levels, half_width, SETTLE

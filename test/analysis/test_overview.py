@@ -1,4 +1,4 @@
-"""What is always known of a recording: lowest voltage, dips, sag, noise; in numbers and words."""
+"""Facts known of any recording (lowest voltage, dips, sag, noise), in numbers and words."""
 
 from dataclasses import replace
 import math

@@ -1,4 +1,4 @@
-"""Kinds of process: each word has its test."""
+"""Types of process: each is named by its test."""
 
 from dataclasses import replace
 import math

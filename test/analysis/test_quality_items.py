@@ -1,4 +1,4 @@
-"""One list of all that is doubtful: each thing is found, named and ranked."""
+"""The list of all doubts about a recording: each is found, named and ranked."""
 
 from dataclasses import replace
 import math

@@ -1,4 +1,4 @@
-"""Transients after changes of load: tau with its interval, and what it is of."""
+"""Transients after changes of load: tau with its interval, and the cause of the transient."""
 
 from dataclasses import replace
 import math

@@ -1,4 +1,4 @@
-"""Spectra: the fitted curve and the measured one are of the same kind."""
+"""Spectra: the fitted and the measured one agree in kind and scale."""
 
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""The loop of an adaptive D term: quiet at the defaults, and where it begins to hunt."""
+"""The control loop of an adaptive D term: quiet at the defaults, and where it starts to hunt."""
 
 from dataclasses import replace
 

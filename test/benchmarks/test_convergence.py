@@ -1,4 +1,4 @@
-"""How switched systems tend to their limits, and the rail under an ESC: exact and Monte Carlo."""
+"""Convergence of switched systems to their limits, and the rail under an ESC."""
 
 import math
 import re

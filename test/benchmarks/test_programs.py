@@ -1,4 +1,4 @@
-"""Benchmarks on a case that is quick."""
+"""Benchmarks on small cases."""
 
 import sys
 

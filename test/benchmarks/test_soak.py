@@ -1,4 +1,4 @@
-"""What a soak counts: dips in time, missed or lost, silence, memory, and false flags."""
+"""Figures of a soak: dips in time, missed or lost, silence, memory, and false flags."""
 
 import math
 

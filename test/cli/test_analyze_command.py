@@ -1,4 +1,4 @@
-"""`ou-monitor analyze`: CSV in; table, JSON and page out; every bad input one line."""
+"""`ou-monitor analyze`: CSV in; table, JSON and page out; one line for every bad input."""
 
 import math
 import re

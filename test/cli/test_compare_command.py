@@ -1,4 +1,4 @@
-"""`ou-monitor compare`: one sentence, a table, JSON as the contract has it, a page; errors."""
+"""`ou-monitor compare`: its sentence, table, JSON and page, and errors."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""`ou-monitor coupling`: columns and topics in, table and JSON out, bad input one line."""
+"""`ou-monitor coupling`: columns and topics in; table and JSON out; one line for bad input."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""`ou-monitor design`: question in, table, sentence and JSON out; bad input one line."""
+"""`ou-monitor design`: options in; table, sentence and JSON out; one line for bad input."""
 
 from argparse import ArgumentTypeError
 import json

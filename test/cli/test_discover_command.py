@@ -1,4 +1,4 @@
-"""`ou-monitor discover`: CSV in; summary, JSON, model and page out; bad input one line."""
+"""`ou-monitor discover`: CSV in; summary, JSON, model, page out; one line for bad input."""
 
 from dataclasses import replace
 import math

@@ -1,4 +1,4 @@
-"""Every cheap command on a recorded run, and on real ones where they are: no traceback."""
+"""Every fast command on a recorded run, and on real ones if available: no traceback."""
 
 
 from every_command import run, runs_of, wide

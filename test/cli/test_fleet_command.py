@@ -1,4 +1,4 @@
-"""`ou-monitor fleet` as a user runs it: whole, with bad files, killed, interrupted, taken up."""
+"""`ou-monitor fleet` for users: complete, with bad files, killed, interrupted, resumed."""
 
 import csv
 import json

@@ -1,4 +1,4 @@
-"""The limit: of the pack, or by the cell."""
+"""The voltage limit, given for the pack or per cell."""
 
 from argparse import Namespace
 

@@ -1,4 +1,4 @@
-"""`ou-monitor`: which command, which exit status, one line on standard error."""
+"""`ou-monitor`: choice of the command, exit status, one line on standard error."""
 
 from dataclasses import replace
 import os

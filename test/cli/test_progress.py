@@ -1,4 +1,4 @@
-"""The bar on a terminal, the lines elsewhere, and the time left."""
+"""Progress: a bar on a terminal, lines elsewhere, and the time left."""
 
 import io
 

@@ -1,4 +1,4 @@
-"""`ou-monitor reproduce` as a user meets it."""
+"""`ou-monitor reproduce` for users."""
 
 from xml.etree import ElementTree
 

@@ -1,4 +1,4 @@
-"""`ou-monitor simulate` as a user has it: bags, presets, models, seeds, bad options, Ctrl-C."""
+"""`ou-monitor simulate` for users: bags, presets, models, seeds, bad options, Ctrl-C."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""One set of facts: what two commands, a row of the fleet and the node give is the same number."""
+"""One set of supply facts: two commands, a row of the fleet and the node give equal numbers."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""A recording beside its simulations: what is like it, what differs, and which is worst."""
+"""A recording compared with its simulations: verdicts, and the largest difference."""
 
 import numpy as np
 from ou_monitor.comparison.compare import compare

@@ -1,4 +1,4 @@
-"""A model for other simulators: their parameters, what is lost, what it costs."""
+"""Export of a model to other simulators: parameters, losses, costs."""
 
 from dataclasses import replace
 import json

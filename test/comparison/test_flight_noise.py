@@ -1,4 +1,4 @@
-"""The noise that a load leaves: an OU beside white noise, its size, and what is drawn of it."""
+"""The noise that the load leaves: an OU in white noise, its size, and its simulation."""
 
 import numpy as np
 from ou_monitor.comparison.flight_model import fit_noise, FlightNoise, Readings

@@ -1,4 +1,4 @@
-"""What is measured of a voltage, against closed forms; and which difference is the worst."""
+"""Measures of a voltage, against closed forms; and the choice of the largest difference."""
 
 import numpy as np
 from ou_monitor.analysis.supply import supply_facts

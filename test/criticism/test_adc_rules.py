@@ -1,4 +1,4 @@
-"""Steps, rails and squeezed ends of an ADC, each at its edge."""
+"""Steps, clipping and compressed ends of an ADC, each rule at its edge."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Statistics of what went before: N(0, 1) when nothing is there, and off when it is."""
+"""Statistics of scores: N(0, 1) without an effect, and far off with one."""
 
 import numpy as np
 from numpy.testing import assert_allclose

@@ -1,4 +1,4 @@
-"""Which samples of a long recording are used: limits, ranges and lines by their formulas."""
+"""The choice of samples from a long recording: limits, ranges and lines by their formulas."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Histograms, averages by throttle and bands: closed forms of what the plots are made of."""
+"""Histograms, averages by throttle and bands behind the plots, against closed forms."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""What begins a series: the law of the first sample, and models that cannot be simulated."""
+"""The start of a series: the law of the first sample, and models that cannot be simulated."""
 
 import math
 

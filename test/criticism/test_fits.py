@@ -1,4 +1,4 @@
-"""Fits of many states and of laws, and where the spectrum lets a slow state start."""
+"""Fits of many states and of laws, and starts of slow states from the spectrum."""
 
 import math
 

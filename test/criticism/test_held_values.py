@@ -1,4 +1,4 @@
-"""Values that were held, told from codes alike by chance, by lines, and at rest."""
+"""Held values, distinguished from codes equal by chance, from lines, and from rest."""
 
 import numpy as np
 from ou_monitor.criticism.adc import find_knee, without_repeats

@@ -1,4 +1,4 @@
-"""Exact findings: each is seen where it is, and not where it is not."""
+"""Exact findings: each is found if it is there, and only then."""
 
 import math
 import tracemalloc

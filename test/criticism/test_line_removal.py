@@ -1,4 +1,4 @@
-"""Spectral lines are taken out before the fit, and what they would have done is said."""
+"""Spectral lines are removed before the fit, and their effect on it is reported."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Spectral lines: false alarms as stated, power as stated, amplitudes that hold."""
+"""Spectral lines: false alarms and power as stated, correct amplitudes."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The bank of simulated nulls: how often the largest of many statistics is as far off."""
+"""The bank of simulated nulls: probability that the largest of many statistics is as far off."""
 
 import math
 

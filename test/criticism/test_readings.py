@@ -1,4 +1,4 @@
-"""What is no reading: codes, single bad samples, units of throttle; left out and said."""
+"""Invalid readings (codes, single bad samples, units of throttle): left out, with a note."""
 
 import math
 import warnings

@@ -1,4 +1,4 @@
-"""Rules of readings, each at its edge: codes, single samples, units and holes of throttle."""
+"""Rules for readings, each at its edge: codes, single samples, units and holes of throttle."""
 
 import math
 

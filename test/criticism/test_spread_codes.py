@@ -1,4 +1,4 @@
-"""Codes coarser than the noise count as any value of their cells, so that ties pay for no law."""
+"""With codes coarser than the noise, values are spread over their cells, so ties gain nothing."""
 
 import math
 

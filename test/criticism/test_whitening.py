@@ -1,4 +1,4 @@
-"""A second relaxation, an AC coupling: found in the innovations, and not where there is none."""
+"""A second relaxation or an AC coupling: found in the innovations if it is there, only then."""
 
 import numpy as np
 from ou_monitor.analysis.analyze import analyze

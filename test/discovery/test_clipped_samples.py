@@ -1,4 +1,4 @@
-"""Clipped readings are drawn from what was measured: throttle and white noise of the sensor."""
+"""Clipped readings are drawn given the others: throttle, and white noise of the sensor."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The load of a recording is throttle, or the measured current where that says more."""
+"""The load of a recording: throttle, or the measured current if it explains more."""
 
 import numpy as np
 from ou_monitor import discover, Recording

@@ -1,4 +1,4 @@
-"""What the search decides, by tables: each constant held from both sides, each rule by a case."""
+"""Decisions of the search, from tables: each constant from both sides, each rule by a case."""
 
 from typing import ClassVar
 

@@ -1,13 +1,10 @@
 """
-Effects hidden blind, each to be found: the fast part of `benchmarks/discover.py`.
+Randomly drawn hidden effects, which must be found: the fast part of `benchmarks/discover.py`.
 
-Rail, flight, strength and noise are drawn from a base seed, which the names of
-the tests carry; OU_MONITOR_BLIND_SEED sets another.  Recordings are shorter
-than the minute for which levels are required, and effects stronger by as much
-as makes amplitude squared times duration the same.
-
-Removing the module of any cause makes its test below fail: what is not in the
-catalogue is never named.
+Rail, flight, strength and noise are drawn from a base seed, which is in the names of the tests;
+OU_MONITOR_BLIND_SEED sets another. Recordings are shorter than the minute of the requirements, but
+effects are stronger, so that amplitude squared times duration is the same. If the module of a
+cause is removed, its test below fails: a cause outside the catalogue is never named.
 """
 
 from collections.abc import Mapping
@@ -29,15 +26,15 @@ from scipy.stats import binom
 BASE = int(os.environ.get('OU_MONITOR_BLIND_SEED', '20260131'))
 SEED = f'seed {BASE}'
 MINUTE, DURATION, SHORT, RATE = 60.0, 20.0, 10.0, 1000.0
-# The generator limits how far a force can bend: no strength makes up for a short recording.
+# The generator limits how nonlinear a force can be: no strength compensates a short recording.
 WHOLE = ('nonlinear_restoring',)
-# A count is too low, or too high, when the required level gives it so rarely.
+# A count fails if it is less probable than this at the required level.
 RARE = 0.01
 TRIES = 3
 
 
 def drawn(kind: str, effect: str, number: int) -> tuple[Recording, object]:
-    """Return a recording and what is hidden in it."""
+    """Return a recording and its hidden effect."""
     duration = MINUTE if effect in WHOLE else SHORT if kind in ('none', 'unknown') else DURATION
     hidden = hide(kind, effect, BASE, number, duration=duration, rate=RATE,
                   strength=math.sqrt(MINUTE / duration))
@@ -45,7 +42,7 @@ def drawn(kind: str, effect: str, number: int) -> tuple[Recording, object]:
 
 
 def outcome_of(kind: str, effect: str, number: int = 0) -> Outcome:
-    """Return what `discover` makes of a recording; once for all tests."""
+    """Return the finding of `discover` for a recording, computed once for all tests."""
     return _outcome_of(kind, effect, number)
 
 
@@ -57,18 +54,18 @@ def _outcome_of(kind: str, effect: str, number: int) -> Outcome:
 
 
 def chosen(what: list, count: int, word: int) -> list:
-    """Return some, drawn without replacement."""
+    """Return some names, drawn without replacement."""
     rng = np.random.default_rng([BASE, word])
     return [what[k] for k in rng.choice(len(what), count, replace=False)]
 
 
 def least(count: int, share: float) -> int:
-    """Return the lowest number of `count` that is no rarity where `share` is required."""
+    """Return the lowest number of `count` that is not too improbable if `share` is required."""
     return int(binom.ppf(RARE, count, share))
 
 
 def summary(outcomes: list[Outcome]) -> str:
-    """Return what was said of each, for the message of a failure."""
+    """Return the finding for each, for the message of a failure."""
     return f'{SEED}: ' + '; '.join(
         f"{one.effect}: {one.verdict}, {dict(one.named) or 'nothing'}" for one in outcomes)
 
@@ -76,11 +73,11 @@ def summary(outcomes: list[Outcome]) -> str:
 @pytest.mark.parametrize('cause', causes(), ids=lambda cause: f'{cause}, {SEED}')
 def test_each_cause_is_named(cause):
     """
-    In one of three recordings at least; most need the first only.
+    In at least one of three recordings; most are found in the first.
 
-    At the required nine in ten, a cause is missed three times once in 1000; one
-    of the 22 so, by an unlucky base seed, once in 46.  A cause without its module is
-    never named; one that is named in half of recordings fails once in 8.
+    At the required nine in ten, a cause is missed three times with probability 1/1000; one of the
+    22 causes (for an unlucky base seed) with 1/46.  A cause without its module is never named; one
+    that is named in half of the recordings fails with 1/8.
     """
     tried = []
     for number in range(TRIES):
@@ -92,7 +89,7 @@ def test_each_cause_is_named(cause):
 
 def test_most_causes_are_named_alone_or_in_the_set():
     """
-    Required: 90 % alone and 95 % in the set; of 22, 16 and 18 at least.
+    Required: 90 % alone and 95 % in the set; at least 16 and 18 of 22.
 
     Fewer have chances of 0.4 % each at those levels, and of 84 % and 97 % at 60 %.
     """
@@ -105,9 +102,9 @@ def test_most_causes_are_named_alone_or_in_the_set():
 
 def test_nothing_is_found_where_nothing_is_hidden():
     """
-    Alarms in 5 % at most; of eight, two at most.
+    Required: alarms in at most 5 %; at most two of eight.
 
-    Three or more have a chance of 0.6 % at 5 %, and of 86 % where half are alarms.
+    Three or more have a chance of 0.6 % at 5 %, and of 86 % if half are alarms.
     """
     found = [outcome_of('none', '', number) for number in range(8)]
     most = len(found) - least(len(found), 0.95)
@@ -116,7 +113,7 @@ def test_nothing_is_found_where_nothing_is_hidden():
 
 def test_two_at_once_are_both_named():
     """
-    Required: 80 %; of five pairs, two at least.
+    Required: 80 %; at least two of five pairs.
 
     Fewer have a chance of 0.7 % at that level, and of 53 % at 30 %.
     """
@@ -126,7 +123,7 @@ def test_two_at_once_are_both_named():
 
 def test_effects_outside_the_catalogue_get_no_wrong_name():
     """
-    Required: said to be unexplained, wholly or partly, with no wrong name, in 90 %; 3 of 5.
+    Required: 90 % reported as unexplained, wholly or partly, with no wrong name; 3 of 5.
 
     Fewer have a chance of 0.9 % at that level, and of 84 % at 30 %.
     """
@@ -137,7 +134,7 @@ def test_effects_outside_the_catalogue_get_no_wrong_name():
 
 
 def searched() -> list[str]:
-    """Return the causes that are found by the search of the catalogue, not by looking."""
+    """Return the causes that the search finds from the catalogue, not from exact findings."""
     kinds = catalogue()
     return [cause for cause in causes() if cause in kinds and kinds[cause].SIGNS
             and kinds[cause].ROLE is not Role.EXACT and cause != 'clock_jitter']
@@ -146,7 +143,7 @@ def searched() -> list[str]:
 @pytest.mark.parametrize('cause', chosen(searched(), 3, 3),
                          ids=lambda cause: f'{cause}, {SEED}')
 def test_a_cause_removed_from_the_catalogue_is_not_named(cause, monkeypatch):
-    """What names a cause is its entry: with it found, without it not, nor as a rival."""
+    """A cause is named by its entry: found with it; without it neither found nor a rival."""
     number = next((k for k in range(TRIES) if cause in outcome_of('single', cause, k).named), None)
     assert number is not None, f'{cause} was not named with its entry either'
     every = catalogue
@@ -166,10 +163,10 @@ SAG, NOISE = 'load_sag', 'measurement_noise'
 @pytest.mark.parametrize('accepted, named, alone, in_set, all_named, family', [
     ([[SAG]], {SAG: ()}, True, True, True, True),
     ([[SAG]], {}, False, False, False, False),
-    # In the set of a neighbour: reported, not named; the families are those of the names.
+    # In the set of a similar cause: reported, not named; the families are those of the names.
     ([[SAG]], {'load_transient': (SAG,)}, False, True, False, True),
     ([['tone']], {'drift': ('tone',)}, False, True, False, False),
-    # Named, and something false beside it.
+    # Named, together with a false name.
     ([[SAG]], {SAG: (), 'tone': ()}, False, False, True, False),
     # A false name is not excused by an alternative that is named already.
     ([[SAG]], {SAG: (), 'tone': (SAG,)}, False, False, True, False),
@@ -177,11 +174,11 @@ SAG, NOISE = 'load_sag', 'measurement_noise'
     ([[SAG, NOISE]], {SAG: (), 'tone': (NOISE,)}, False, True, False, False),
     ([[SAG, NOISE]], {SAG: (), NOISE: ()}, True, True, True, True),
     ([[SAG, NOISE]], {SAG: ()}, False, False, False, False),
-    # Any list that is accepted will do.
+    # Any accepted list is right.
     ([['tone'], ['resonance']], {'resonance': ()}, True, True, True, True),
 ])
 def test_outcomes_are_scored_by_what_is_true(accepted, named, alone, in_set, all_named, family):
-    """What counts as right, as in the set, as named, and as of the family."""
+    """The definitions of right, in the set, named, and right family."""
     one = Outcome('single', 'x', tuple(map(tuple, accepted)), (), 'explained', named)
     assert (one.alone, one.in_set, one.all_named, one.family) == (
         alone, in_set, all_named, family)
@@ -195,6 +192,6 @@ def test_outcomes_are_scored_by_what_is_true(accepted, named, alone, in_set, all
     ({}, False), ({'jumps': ()}, False), ({'tone': ()}, True), ({'tone': ('jumps',)}, False),
     ({'jumps': (), 'tone': ()}, True)])
 def test_a_name_near_the_unknown_is_not_wrong(named, wrong):
-    """Only names of its part are; the verdict is counted apart."""
+    """Only names for a part of it are not wrong; the verdict is counted separately."""
     one = Outcome('unknown', 'unknown/x', ((),), ('jumps',), 'partly_explained', named)
     assert one.misnamed is wrong and one.left_open

@@ -1,4 +1,4 @@
-"""Records, verdicts and words: the JSON of the contract, strict, and each rule."""
+"""Records, verdicts and words of a finding: strict JSON with its keys, and each rule."""
 
 from dataclasses import replace
 import json

@@ -1,4 +1,4 @@
-"""Forms of an effect that a fit near the plain OU does not see: fast, large, or both at once."""
+"""Effects that a fit near the plain OU does not see: fast, large, or both at once."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Gains, their errors, and crossings: against truth that is known."""
+"""Gains, their errors, and crossings, against known truth."""
 
 import math
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""From a recording to a finding, and to its page: clear causes, bad input, honest verdicts."""
+"""From a recording to a finding and its page: clear causes, bad input, correct verdicts."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""What `discover` says a model gains: against the gain of the true model, and crossings."""
+"""Gains of models by `discover`, against the gain of the true model; and crossings."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Words of a finding: gains, chances and what is left, at the edges where they change."""
+"""Words of a finding: gains, probabilities and remainders, at the edges where they change."""
 
 from dataclasses import replace
 import math

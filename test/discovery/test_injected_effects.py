@@ -1,4 +1,4 @@
-"""Effects hidden in a recorded flight are found; what it shows by itself is not taken for them."""
+"""Effects hidden in a recorded flight are found, and its own effects are not mistaken for them."""
 
 from functools import cache
 

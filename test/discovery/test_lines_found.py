@@ -1,4 +1,4 @@
-"""Which lines `discover` names: those of the supply, however much else is left, and no others."""
+"""Lines that `discover` names: all lines of the supply, whatever else is left, and no others."""
 
 from dataclasses import replace
 

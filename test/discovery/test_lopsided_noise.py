@@ -1,4 +1,4 @@
-"""Noise with falls deeper than its rises: what it simulates, and where discover names it."""
+"""Noise with falls deeper than its rises: its simulation, and where `discover` names it."""
 
 import numpy as np
 from ou_monitor import discover

@@ -1,4 +1,4 @@
-"""What the regression of the mean counts as alike, as next to each other, as a candidate."""
+"""Regression of the mean: similar responses, neighbours, and candidates."""
 
 import math
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""An effect is first an input and a place: rises of throttle, white noise in any form."""
+"""The search first finds input and place of an effect: rises of throttle, white noise."""
 
 import numpy as np
 from ou_monitor import discover, Recording

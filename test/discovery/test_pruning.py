@@ -1,4 +1,4 @@
-"""Which causes are left out, one after the other: tables, with fits and scores that are given."""
+"""The removal of causes one after the other, from tables with given fits and scores."""
 
 from types import SimpleNamespace
 

@@ -1,4 +1,4 @@
-"""The order and bookkeeping of fits in a search, with models that are names and evidence."""
+"""Order and bookkeeping of fits in a search, with models that are only names and evidence."""
 
 import math
 from types import SimpleNamespace

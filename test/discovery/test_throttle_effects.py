@@ -1,4 +1,4 @@
-"""What a model says in a pilot's units."""
+"""Effects of a model in a pilot's units."""
 
 import math
 

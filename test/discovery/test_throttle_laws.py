@@ -1,4 +1,4 @@
-"""The laws of throttle are compared with each other, each fitted beside the same other terms."""
+"""Laws of throttle are compared with each other, each fitted with the same other terms."""
 
 from types import SimpleNamespace
 

@@ -1,4 +1,4 @@
-"""Readings within coarse codes are drawn as the rail was, so that rounding names no cause."""
+"""Readings within coarse codes are drawn from the model, so that rounding names no cause."""
 
 import math
 

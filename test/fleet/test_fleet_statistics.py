@@ -1,4 +1,4 @@
-"""False-alarm rates and power of what the fleet report says, on tables whose truth is known."""
+"""False-alarm rates and power of the fleet report, on tables with known truth."""
 
 import math
 

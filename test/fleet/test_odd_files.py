@@ -1,4 +1,4 @@
-"""Files that only have the name of a recording: one row each, and the others are analysed."""
+"""Files that are not recordings despite their names: one row each; the others are analysed."""
 
 import os
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The voltage under load: closed forms, recovery of a simulated pack, no degenerate fit."""
+"""The model of voltage under load: closed forms, fit of a simulated pack, no degenerate fit."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The OU in what the load leaves: coverage, white noise, bounds, gaps."""
+"""The fit of the OU after removal of the load: coverage, white noise, bounds, gaps."""
 
 import tracemalloc
 

@@ -1,4 +1,4 @@
-"""A supply as a sum of terms: what makes a model, stamps, throttle, seeds, memory."""
+"""A supply as a sum of terms: valid models, stamps, throttle, seeds, memory."""
 
 import math
 import tracemalloc

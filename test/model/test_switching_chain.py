@@ -1,4 +1,4 @@
-"""Levels under white noise: a filter that knows of none follows them slowly; chains know it."""
+"""Levels under white noise: an OU follows them slowly; a hidden chain knows them."""
 
 import math
 

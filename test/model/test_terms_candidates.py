@@ -1,4 +1,4 @@
-"""Where terms start a fit: closed forms, and noise that follows throttle."""
+"""Starts of fits of terms: closed forms, and noise that depends on throttle."""
 
 from dataclasses import replace
 import math

@@ -1,4 +1,4 @@
-"""What all terms have in common: names, parameters, messages, and independence of cuts."""
+"""Properties of all terms: names, parameters, messages, and independence of pieces."""
 
 import math
 

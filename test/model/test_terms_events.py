@@ -1,4 +1,4 @@
-"""Jumps, heavy tails and switching: rates, moments and what happens within a step."""
+"""Jumps, heavy tails and switching: rates, moments and events within a step."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The EM behind `jumps`, against the largest likelihood found without it, and its law."""
+"""The EM algorithm of `jumps`, against the largest likelihood found otherwise, and its law."""
 
 import numpy as np
 from ou_monitor.model.terms.laws import View

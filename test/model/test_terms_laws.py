@@ -1,4 +1,4 @@
-"""What terms share when they are fitted: standard errors, mixtures, runs, the view."""
+"""Shared parts of fits of terms: standard errors, mixtures, runs, the view."""
 
 from itertools import combinations
 import math

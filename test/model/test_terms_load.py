@@ -1,4 +1,4 @@
-"""What throttle and time do to the level: closed forms, without noise."""
+"""Effects of throttle and time on the level: closed forms, without noise."""
 
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""What sensor, ADC, logger and clock do to the samples."""
+"""Effects of sensor, ADC, logger and clock on the samples."""
 
 import math
 

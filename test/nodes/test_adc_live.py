@@ -1,4 +1,4 @@
-"""A device of 10 kHz, made of files, through the node into the estimator."""
+"""A simulated 10 kHz device, through the node into the estimator."""
 
 import threading
 import time

@@ -1,4 +1,4 @@
-"""Messages without stamps, in bursts, over DDS: reported, and no estimate is made of them."""
+"""Messages without stamps, in bursts, over DDS: reported, and not used for an estimate."""
 
 import time
 

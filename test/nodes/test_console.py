@@ -1,4 +1,4 @@
-"""What is said on the console while no message comes, and when."""
+"""Messages on the console while no data arrive, and their timing."""
 
 from types import SimpleNamespace
 

@@ -1,4 +1,4 @@
-"""Two real estimators on one machine: silence, NaN, time going back, parameters, types."""
+"""Two real estimators on one machine: silence, NaN, time that jumps back, parameters, types."""
 
 import math
 import time

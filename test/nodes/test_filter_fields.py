@@ -1,4 +1,4 @@
-"""Any field of any installed type through the real filter; and the two modules beside it."""
+"""Any field of any installed type through the real filter, and through its two modules."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The layouts of Foxglove and PlotJuggler name only what the nodes publish and take."""
+"""The layouts of Foxglove and PlotJuggler use only topics of the nodes."""
 
 from importlib import import_module
 import json

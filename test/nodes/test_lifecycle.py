@@ -1,4 +1,4 @@
-"""Managed nodes over DDS: transitions, those that fail, and a restart in the middle of a dip."""
+"""Managed nodes over DDS: transitions, failing transitions, and a restart during a dip."""
 
 import contextlib
 import threading

@@ -1,4 +1,4 @@
-"""The live page: in a real browser while a bag plays, and who is let in."""
+"""The live page: in a real browser while a bag plays, and its access control."""
 
 import asyncio
 from contextlib import suppress

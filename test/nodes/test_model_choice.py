@@ -1,4 +1,4 @@
-"""The model file in force: it is read before the answer, and a refusal has its reason."""
+"""Setting model_file: the file is read before the answer, and a refusal gives its reason."""
 
 from dataclasses import replace
 import os

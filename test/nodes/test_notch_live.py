@@ -1,4 +1,4 @@
-"""The notches in the node: rpm of any field, throttle, lag, and how they are switched off."""
+"""Notches in the node: motor speeds from any field, throttle, lag, and switching off."""
 
 import time
 

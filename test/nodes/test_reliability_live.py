@@ -1,4 +1,4 @@
-"""A real estimator under load, and attacked: it speaks on, says what is wrong, sees every dip."""
+"""A real estimator under load and attack: it keeps publishing and sees every dip."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""The real replay: spacing, rate, loop, clock, and what it refuses."""
+"""The real replay: spacing, rate, loop, clock, and refused input."""
 
 import json
 import threading

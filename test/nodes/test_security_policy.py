@@ -1,4 +1,4 @@
-"""security/ou_monitor_policy.xml: of SROS2's form, and of exactly what the nodes open."""
+"""security/ou_monitor_policy.xml: valid for SROS2, with exactly the topics of the nodes."""
 
 import time
 import xml.etree.ElementTree as ElementTree

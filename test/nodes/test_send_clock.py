@@ -1,4 +1,4 @@
-"""Stamps from source timestamps: even where the source is steady, untouched where it is not."""
+"""Stamps from source timestamps: smoothed for a steady source, unchanged for others."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""What systemd is told, on a socket of its kind."""
+"""Notifications to systemd, on a socket like its own."""
 
 import os
 import re

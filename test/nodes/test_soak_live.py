@@ -1,4 +1,4 @@
-"""The soak runs: six seconds of it."""
+"""Six seconds of the soak run."""
 
 import json
 import os

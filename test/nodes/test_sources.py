@@ -1,4 +1,4 @@
-"""Where voltage and throttle come from: msg_config, overrides, what is not installed."""
+"""Sources of voltage and throttle: msg_config, overrides, packages that are not installed."""
 
 from ou_monitor.errors import InputError
 from ou_monitor.nodes.sources import find_source, message_class, SOURCE_PARAMETERS

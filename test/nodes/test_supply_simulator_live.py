@@ -1,4 +1,4 @@
-"""The supply simulator as a process: the batch's path, rules of its throttle, bad input."""
+"""The supply simulator as a process: equal to a batch, rules for throttle, bad input."""
 
 import math
 

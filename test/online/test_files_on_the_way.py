@@ -1,4 +1,4 @@
-"""How many files of the package one voltage message passes on its way to a report."""
+"""The number of files of the package between a voltage message and a report."""
 
 import math
 from pathlib import Path

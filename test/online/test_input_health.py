@@ -1,4 +1,4 @@
-"""Whatever arrives: no exception, nothing called fine that is not, and no more memory."""
+"""Any input: no exception, no bad input called good, and bounded memory."""
 
 import math
 import tracemalloc

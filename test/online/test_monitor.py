@@ -1,4 +1,4 @@
-"""The monitor: health, risk, flag and load; never silently fine."""
+"""The monitor: health, risk, flag and load; it is never wrongly OK."""
 
 import math
 

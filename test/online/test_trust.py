@@ -1,4 +1,4 @@
-"""What the monitor says of an input that cannot be trusted, and of a slow one that can."""
+"""The monitor's words for an input that cannot be trusted, and for a slow one that can."""
 
 import math
 

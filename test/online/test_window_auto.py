@@ -1,4 +1,4 @@
-"""Alpha, sigma and Var_inf in as long a window as it takes: node and bench, bounds, settings."""
+"""Automatic windows for alpha, sigma and Var_inf: node and offline, bounds, settings."""
 
 from dataclasses import replace
 import math

@@ -1,4 +1,4 @@
-"""Which capacitance meets a risk: the root, the verdicts, the two risks, what falls."""
+"""The capacitance for a target risk: the root, the verdicts, the two risks, monotonicity."""
 
 from dataclasses import replace
 import math

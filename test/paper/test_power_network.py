@@ -1,4 +1,4 @@
-"""The power network against closed forms, integrals and drawn paths."""
+"""The power network against closed forms, integrals and simulated paths."""
 
 from dataclasses import fields, replace
 import math

@@ -1,4 +1,4 @@
-"""Recomputed numbers against an evaluation of their own, made here another way."""
+"""Recomputed numbers against an independent calculation."""
 
 import math
 import re

@@ -1,4 +1,4 @@
-"""The verdict follows from the ranges, and from nothing else."""
+"""The verdict follows only from the ranges."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The Monte Carlo rows: right within their own errors, and able to see a missing 2."""
+"""The Monte Carlo rows: right within their own errors, and able to detect a missing 2."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Bags: written and read here, and by the independent rosbags library."""
+"""Bags: written and read by this package and by the independent rosbags library."""
 
 import shutil
 

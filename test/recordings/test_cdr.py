@@ -1,4 +1,4 @@
-"""Fields in bulk: bit for bit what the MCAP library decodes, or refused."""
+"""Decoding of fields in bulk: bit for bit as by the MCAP library, or refused."""
 
 import itertools
 import re

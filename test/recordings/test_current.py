@@ -1,4 +1,4 @@
-"""Current beside voltage: from a CSV, from a topic of its own, from the battery's message."""
+"""Current with voltage: from a CSV, from its own topic, from the battery's message."""
 
 import numpy as np
 from ou_monitor.recordings.bag import BagWriter

@@ -1,4 +1,4 @@
-"""Bags that are missing, foreign, cut off or damaged: one line says why, the rest is read."""
+"""Missing, foreign, truncated or damaged bags: one line gives the reason, the rest is read."""
 
 import re
 import shutil

@@ -1,4 +1,4 @@
-"""Logs and any CSV are read without a detour: as `convert` and a bag would have it."""
+"""Logs and any CSV are read directly, with the same result as after `convert`."""
 
 import json
 

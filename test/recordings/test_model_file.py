@@ -1,4 +1,4 @@
-"""Model files: round trips, and one line for everything that can be wrong."""
+"""Model files: round trips, and one line for every error."""
 
 import datetime
 import math

@@ -1,4 +1,4 @@
-"""Bags written in every way, read whole and in part: always the same samples."""
+"""Bags with all options of writing, read whole and in part: always the same samples."""
 
 import itertools
 

@@ -1,4 +1,4 @@
-"""Recording -> bag -> Recording, and what cannot be written."""
+"""Recording -> bag -> Recording, and recordings that cannot be written."""
 
 from made_bags import decode
 import numpy as np

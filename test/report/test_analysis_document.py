@@ -1,4 +1,4 @@
-"""What `analyze` says: its records, in the order in which they matter."""
+"""The report of `analyze`: its records, the most important first."""
 
 from dataclasses import replace
 

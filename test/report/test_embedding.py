@@ -1,4 +1,4 @@
-"""The data inside the page: what was plotted, within the rounding stated, peaks never lost."""
+"""The data in the page: the plotted values within the stated rounding, with all peaks."""
 
 from hypothesis import given, strategies as st
 import numpy as np

@@ -1,4 +1,4 @@
-"""The report and the words of a fleet: complete, escaped, and there also when little is known."""
+"""The report and the words of a fleet: complete, escaped, and present even if little is known."""
 
 from dataclasses import replace
 from datetime import datetime, timezone

@@ -1,4 +1,4 @@
-"""The pages in a real browser without a window: what a reader points at, drags and presses."""
+"""The pages in a headless browser: what a reader points at, drags and presses."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""Pictures by throttle: few distinct levels are separate points, with what simulations span."""
+"""Plots by throttle: few levels are separate points, with the range of simulations."""
 
 import re
 from xml.etree import ElementTree

@@ -1,4 +1,4 @@
-"""All rows together, their words, and the page: complete, well formed, true to the rows."""
+"""All rows, their words, and the page: complete, well formed, equal to the rows."""
 
 from collections import Counter
 import re

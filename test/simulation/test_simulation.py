@@ -1,4 +1,4 @@
-"""Simulated supplies: seeds, a running one, recorded throttle, a brown-out."""
+"""Simulated supplies: seeds, a running simulation, recorded throttle, a brown-out."""
 
 from live import ROOT
 import numpy as np

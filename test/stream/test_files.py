@@ -1,4 +1,4 @@
-"""Files that users name: which are refused, and that errors quote nothing of them."""
+"""Files named by users: those that are refused, and errors that quote none of their content."""
 
 import os
 import time

@@ -1,4 +1,4 @@
-"""The throttle that held when a sample was taken: the rule, and node and bench side by side."""
+"""The throttle in force when a sample was taken: the rule, in the node and offline."""
 
 import math
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""The same messages through the node's way, in pieces, and from a recording: equal readings."""
+"""The same messages through the node in pieces and from a recording give equal readings."""
 
 import numpy as np
 from ou_monitor.online.estimator.estimator import SlidingEstimator

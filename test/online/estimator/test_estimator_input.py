@@ -1,4 +1,4 @@
-"""Bad input: every sample is accounted for; what cannot be is refused in words."""
+"""Bad input: every sample is counted, and unusable input is refused with a reason."""
 
 from dataclasses import astuple
 

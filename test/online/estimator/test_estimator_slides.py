@@ -1,4 +1,4 @@
-"""The window slides: blocks or singles, hours, other lengths, bounded memory."""
+"""The sliding window: blocks or single samples, hours, other lengths, bounded memory."""
 
 import tracemalloc
 

@@ -1,4 +1,4 @@
-"""Each status and each flag: a case that raises it, and the clean case that does not."""
+"""Each status and each flag: a case that causes it, and a clean case."""
 
 import math
 

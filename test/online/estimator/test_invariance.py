@@ -1,4 +1,4 @@
-"""What an estimate must not depend on: where time begins, and in which pieces samples come."""
+"""Estimates do not depend on the origin of time or on the pieces in which samples come."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""From a fit to what is published: the limits, each from both sides."""
+"""From a fit to published values: each limit from both sides."""
 
 from dataclasses import replace
 import math

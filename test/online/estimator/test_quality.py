@@ -1,4 +1,4 @@
-"""Findings about raw samples: lattices, repeats, piles at an extreme; ramps."""
+"""Findings about raw samples: lattices, repeats, clipping at an extreme, ramps."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The way from the wanted cutoff to the one in force, as time lines."""
+"""From the wanted cutoff to the one in force, as time series."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Whatever comes, no cutoff is published or in force outside fmin..fmax, and no output breaks."""
+"""With any input the cutoff stays within fmin..fmax and the output stays finite."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The law kalman of a signal that is not the voltage: learned, limited, and robust."""
+"""Law kalman for a signal that is not the voltage: learned, limited, and robust."""
 
 import cmath
 import math

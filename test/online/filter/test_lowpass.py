@@ -1,4 +1,4 @@
-"""The adaptive low-pass as a whole: what moves its output and what must not."""
+"""The adaptive low-pass as a whole: inputs that change its output, and those that must not."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The law kalman of the voltage: against dense algebra, a Riccati solver, and sines."""
+"""Law kalman for the voltage: against dense algebra, a Riccati solver, and sines."""
 
 import cmath
 import math

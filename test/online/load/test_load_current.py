@@ -1,4 +1,4 @@
-"""Current in the load filter: resistance, level without throttle, and no harm by a wrong one."""
+"""Current in the load filter: resistance, level without throttle, and no harm from a wrong one."""
 
 import numpy as np
 from ou_monitor.model.load import LoadModel

@@ -1,4 +1,4 @@
-"""Throttle that is late, foreign, or met by a coarse ADC."""
+"""Throttle that is late or unrelated to the voltage, and coarse ADCs."""
 
 import numpy as np
 from ou_monitor.model.load import LoadModel

@@ -1,4 +1,4 @@
-"""The load in flight: closed forms, recovery, bad input, and the recorded flight."""
+"""The load in flight: closed forms, simulated packs, bad input, and the recorded flight."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""What one flight tells the next: saved, read, and known at take-off."""
+"""From one flight to the next: the load is saved, read, and known at take-off."""
 
 from dataclasses import replace
 

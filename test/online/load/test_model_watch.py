@@ -1,4 +1,4 @@
-"""This flight beside the model of its supply: an old pack is found, a good one is not blamed."""
+"""A flight compared with the model of its supply: an old pack is found, a good one is not."""
 
 from dataclasses import replace
 import math

@@ -1,4 +1,4 @@
-"""The notch itself: its response, and that no sequence of coefficients can make it unstable."""
+"""One notch: its response, and stability with any sequence of coefficients."""
 
 import cmath
 import math

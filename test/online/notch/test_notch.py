@@ -1,4 +1,4 @@
-"""Notches that follow the motors: what they follow, when they are off, and bad input."""
+"""Notches that follow the motors: their frequencies, when they are off, and bad input."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""What lies ahead: the risk after a step of throttle, terms of a model, the budget, unknown."""
+"""The risk ahead: after a step of throttle, with terms of a model, the budget, and unknown."""
 
 from dataclasses import replace
 import math

@@ -1,4 +1,4 @@
-"""The flag as time lines: risk and voltage at each time, and the level that must follow."""
+"""The flag as time series: given risk and voltage at each time, the level that must follow."""
 
 from dataclasses import replace
 import math

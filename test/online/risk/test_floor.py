@@ -1,4 +1,4 @@
-"""The floor: no model, every sample, and no lone glitch."""
+"""The floor: works without a model, uses every sample, and ignores single glitches."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Risk with throttle to come, and the budget: simulated pilots and packs, without the package."""
+"""Risk with future throttle, and the budget: simulated pilots and packs, without the package."""
 
 from copy import copy, deepcopy
 from functools import cache

@@ -1,4 +1,4 @@
-"""The lowest voltage of a course: Monte Carlo, closed forms, and what a flight makes of it."""
+"""The lowest voltage of a course: Monte Carlo, closed forms, and calibration by a flight."""
 
 from dataclasses import replace
 import math

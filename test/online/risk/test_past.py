@@ -1,4 +1,4 @@
-"""Blocks of the flight so far, its excursions, and what its pilot did: brute force, formulas."""
+"""Past blocks of the flight, its excursions and its pilot: by brute force and formulas."""
 
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Brown-out probability: limits, monotonicity, unknown."""
+"""Brown-out probability: limits, monotonicity, unknown input."""
 
 from dataclasses import replace
 import math

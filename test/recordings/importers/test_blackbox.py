@@ -1,4 +1,4 @@
-"""Betaflight and INAV blackbox: scales, flights, the clock, and logs that are cut or broken."""
+"""Betaflight and INAV blackbox: scales, flights, the clock, and truncated or damaged logs."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""Tables as loggers, oscilloscopes and spreadsheets write them; made after their manuals."""
+"""Tables in the formats of loggers, oscilloscopes and spreadsheets, made from their manuals."""
 
 from datetime import datetime, timedelta
 

@@ -1,4 +1,4 @@
-"""Gyros, accelerometers, motor speeds and named series of logs, and their way into a bag."""
+"""Gyros, accelerometers, motor speeds and named series of logs, also converted to a bag."""
 
 import json
 

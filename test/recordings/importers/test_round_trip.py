@@ -1,4 +1,4 @@
-"""A log becomes a bag that gives the same numbers back, and says where they came from."""
+"""A log converted to a bag gives the same numbers, and the bag states their origin."""
 
 import json
 from pathlib import Path
