@@ -142,7 +142,7 @@ def known_lines(found: Overview) -> list[tuple[str, str]]:
     lines += [('Sag', _sag_words(found)), ('Noise', _noise_words(found))]
     if math.isfinite(resistance.ohm):
         lines.append(('Resistance', f'{number(1e3 * resistance.ohm)} mOhm (+- '
-                      f'{number(2e3 * resistance.se_ohm, 2)})'))
+                      f'{number(2e3 * resistance.se_ohm, 2)}) within 0.1 s'))
     lines.append(('Relaxation', _ou_words(found.facts.ou)))
     if found.line is not None:
         line = found.line

@@ -231,7 +231,8 @@ def _after_names(rows: list[list[str]], skip: int, first: int, width: int, place
 
 def _prepared(lines: list[str], delimiter: str, comma: bool) -> list[str]:
     """Return lines with decimal points, and single blanks if blanks separate the cells."""
-    if lines and _RECEIVED.match(lines[0]):
+    received = _RECEIVED.match(lines[0]) if lines else None
+    if received and (delimiter in (rest := lines[0][received.end():].strip()) or ' ' not in rest):
         lines = [_RECEIVED.sub(rf'\1{delimiter}', line, count=1) for line in lines]
     if comma:
         # A point becomes a comma, so that a thousands separator is not taken for a decimal mark.
@@ -310,8 +311,8 @@ def _header(rows: list[list[str]], lines: list[str], first: int, width: int, del
     names: list[str] = []
     units: list[str] = []
     line = 0
-    if len(above) > 1 and (_are_units_of_channels(rows[above[-2]], rows[above[-1]]) or _are_units(
-            rows[above[-1]]) and len(rows[above[-2]]) >= min(width, len(rows[above[-1]]))):
+    if len(above) > 1 and _are_units(rows[above[-1]]) and len(rows[above[-2]]) >= min(
+            width, len(rows[above[-1]])):
         units = [cell.strip('[](){} ').lower() for cell in rows[above.pop()]]
     # An index at the left has no name, any other column has one.
     if above and all(rows[above[-1]][k:k + 1] != [''] or not any(
@@ -349,13 +350,6 @@ def _unit_beside(names: Sequence[str], rows: list[list[str]], place: int) -> str
     words = rows[0][place + 1].lower().split() if beside in ('unit', 'units') and rows and len(
         rows[0]) > place + 1 else []
     return words[0] if words and words[0] in WORDS else ''
-
-
-def _are_units_of_channels(names: list[str], row: list[str]) -> bool:
-    """Return whether a row holds units below the names of channels, whatever else it holds."""
-    below = [name for name, cell in zip(names, row)
-             if cell.lower() in VOLT_WORDS or cell.lower() in AMPERE_WORDS]
-    return len(names) == len(row) and bool(below) and all(map(CHANNEL.fullmatch, below))
 
 
 def _are_units(row: list[str]) -> bool:

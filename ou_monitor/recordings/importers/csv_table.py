@@ -79,7 +79,7 @@ _PATTERNS = {
         r'(?!.*(?:limit|trim|max|min)).*throttle.*'),
     logs.CURRENT: (
         r'current_a', r'amperage(?:_?latest)?|current_in|i_?bat(?:t|tery)?|'
-        r'batt?(?:ery)?_?(?:i|curr(?:ent)?|amps?)|current_?batt?(?:ery)?|'
+        r'batt?(?:ery)?_?\d?_?(?:i|curr(?:ent)?|amps?)|current_?batt?(?:ery)?|'
         r'(?:.*_)?(?:bus|input|supply|main|pack|total)_?current|i_?bus|curr',
         r'(?:i|curr(?:ent)?|amps?|strom|courant|corriente)(?:_(?:avg|average|mean))?(?:_?1)?'),
 }
@@ -377,7 +377,7 @@ def _like_voltage(form: Form, places: list[int]) -> list[int]:
         return places if len(places) == 1 else []
     values = np.array([[number_of(row[k])[0] if is_number(row[k]) else math.nan for k in places]
                        for row in form.rows])
-    spread = np.ptp(values, axis=0) / values.mean(axis=0)
+    spread = np.ptp(values, axis=0) / np.maximum(values.mean(axis=0), 1e-9)
     able = np.flatnonzero((values.min(axis=0) >= 1.0) & (spread > 0.0) & (spread < 1.0))
     least = able.size and np.argmin(spread[able]) == 0
     return [places[k] for k in able] if least else []

@@ -240,6 +240,8 @@ FORMS = {
     # No names: of the columns beside the time, the first varies least.
     'serial_monitor': (table([], lambda k: clock(k, '%H:%M:%S.%f') + f' -> {V[k]},{AMPS[k]}'),
                        0.01, False, False),
+    'stamped_lines': (table([], lambda k: f"[{clock(k, '%H:%M:%S.%f')}] {V[k]} {AMPS[k]}"), 0.01,
+                      False, False),
     'ros2_topic_echo': (table([], lambda k: (
         f'{1700000000 + k // 40},{25000000 * (k % 40)},base_link,{V[k]},nan,{-AMPS[k]},0.9,True')),
         0.025, False, False),
