@@ -8,7 +8,7 @@ that CPU times are comparable.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import date
 from html import escape
 from importlib import metadata
@@ -118,11 +118,30 @@ def median3(v: np.ndarray) -> np.ndarray:
     return np.median(np.stack((padded[:-2], padded[1:-1], padded[2:])), axis=0)
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a Markdown table; all columns but the first are aligned right."""
-    lines = ['| ' + ' | '.join(head) + ' |', '|---|' + '---:|' * (len(head) - 1)]
-    lines += ['| ' + ' | '.join(row) + ' |' for row in rows]
-    return '\n'.join(lines) + '\n'
+def throttles(rng: np.random.Generator, flights: int, n: int, rate: float,
+              dwell: tuple[float, float], span: tuple[float, float],
+              ramp: tuple[float, float] | None = None) -> np.ndarray:
+    """Return throttle in steps, half of them as ramps (all ranges in s), shape (flights, n)."""
+    out = np.empty((flights, n))
+    for row in out:
+        at, before = 0, float(rng.uniform(*span))
+        while at < n:
+            after = float(rng.uniform(*span))
+            rise = int(rng.uniform(*ramp) * rate) if ramp and rng.random() < 0.5 else 1
+            end = at + rise + int(rng.uniform(*dwell) * rate)
+            piece = np.concatenate((np.linspace(before, after, rise + 1)[1:],
+                                    np.full(end - at - rise, after)))
+            row[at:end] = piece[:n - at]
+            at, before = end, after
+    return out
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a Markdown table; columns of words are aligned left, like the first."""
+    right = ['---' if k == 0 or any(re.match('[a-z]{2}', row[k]) for row in rows) else '---:'
+             for k in range(len(head))]
+    lines = ['| ' + ' | '.join(row) + ' |' for row in (head, *rows)]
+    return '\n'.join([lines[0], '|' + '|'.join(right) + '|', *lines[1:]]) + '\n'
 
 
 def number(value: float, form: str = '.1f') -> str:

@@ -31,7 +31,7 @@ import time
 from typing import Any
 import zlib
 
-from common import arguments, BENCHES, deliver, environment, FLIGHTS, flights, say, table
+from common import arguments, BENCHES, deliver, environment, FLIGHTS, flights, HIRO, say, table
 from blind_scores import from_data, hide, Outcome, outcome  # noqa: I100
 from hidden_circuit import FINE_RATE, make_bench, UPDATE_RATE
 from hidden_effects import causes, KINDS, pairs, unknowns, variants
@@ -44,6 +44,12 @@ from scipy.stats import binomtest
 
 SEED = 20260131
 KNOWN = {**FLIGHTS, **BENCHES}
+# All recordings: two more flights of one log, and other vehicles.
+EVERY = {**KNOWN, 'roma 1': (FLIGHTS['roma'][0], 1), 'roma 2': (FLIGHTS['roma'][0], 2),
+         'bf3s 1': (FLIGHTS['bf3s'][0], 1), 'hiro': HIRO, 'ar8': ('raw/bf_ar8_6s.BFL', None),
+         'in_xr': ('raw/in_xr_141340.TXT', None), **{name: (f'{name}.csv', None) for name in (
+             'cf_bl00', 'px_tg1', 'frc_ol_1', 'regbot_10', 'regbot_19', 'regbot_28', 'regbot_30',
+             'regbot_62', 'regbot_81', 'as_f60', 'hebi_x', 'euc_1', 'js_11t_6s')}}
 
 
 def interval(hits: int, of: int) -> str:
@@ -239,7 +245,7 @@ def agreement(one: dict[str, Any], other: dict[str, Any]) -> float:
 def recorded_runs(given: argparse.Namespace) -> str:
     """Run `discover` on recorded runs, whole and in halves."""
     rows, agreed, spent = [], [], []
-    for name, run in flights(given.names, KNOWN):
+    for name, run in flights(given.names, EVERY):
         middle = run.t.size // 2
         began = time.process_time()
         whole = discover(run).as_data()
@@ -250,20 +256,21 @@ def recorded_runs(given: argparse.Namespace) -> str:
                                 for part in (slice(0, middle), slice(middle, None))))
         extended = whole['extended']
         falls = [extended['crossing_rate'][key] for key in ('observed', 'baseline', 'extended')]
+        left = len(whole['remaining'])
         rows.append([
-            name, whole['verdict'].replace('_', ' '),
+            name + (', by current' if whole['load'] == 'current' else ''),
             ', '.join(one if many == 1 else f'{one} x{many}' for one, many in Counter(
                 cause['name'] for cause in whole['causes']).items()) or '-',
-            '-' if extended['gain'] is None else
-            f'{extended["gain"]:.2f} ± {extended["gain_se"]:.2f}',
+            'explained' if whole['verdict'] == 'explained' else f'{left}'
+            + (', refused' if whole['refused'] else ''),
+            *('-' if extended[key] is None else f'{factor * extended[key]:.{digits}f}'
+              for key, factor, digits in (('gain', 1.0, 2), ('errors_shrink', 100.0, 0))),
             ', '.join('-' if one is None else f'{one:.3g}' for one in falls),
-            'yes' if whole['refused'] else 'no',
             '-' if np.isnan(alike) else f'{alike:.2f}', f'{spent[-1]:.1f}'])
         say(' | '.join(rows[-1]))
         agreed += [] if np.isnan(alike) else [alike]
-    text = table(['recording', 'verdict', 'causes', 'gain, nats',
-                  'falls a minute: seen, plain OU, extended', 'refused', 'halves agree', 'CPU s'],
-                 rows)
+    text = table(['recording', 'causes', 'statistics left', 'gain, nats', 'errors shrink, %',
+                  'falls a minute: seen, plain OU, extended', 'halves agree', 'CPU s'], rows)
     text += f'\nCPU time: {median(spent):.1f} s at the median, {max(spent):.1f} s at most.'
     return text + (f' Halves name the same causes (Jaccard): {mean(agreed):.2f} in the mean of '
                    f'{len(agreed)} recordings.\n' if agreed else '\n')

@@ -24,7 +24,7 @@ from pathlib import Path
 import sys
 from typing import Any
 
-from common import arguments, deliver, drawing, number, say, table
+from common import arguments, deliver, drawing, number, say, table, throttles
 import control_loop
 import numpy as np
 from ou_monitor import AdaptiveLowPass, SlidingEstimator
@@ -88,22 +88,6 @@ class Flights:
     noise: np.ndarray
 
 
-def throttles(rng: np.random.Generator, flights: int, n: int) -> np.ndarray:
-    """Return throttle in steps and ramps, shape (flights, n)."""
-    out = np.empty((flights, n))
-    for row in out:
-        at, before = 0, float(rng.uniform(0.1, 0.9))
-        while at < n:
-            after = float(rng.uniform(0.1, 0.9))
-            ramp = int(rng.uniform(*_RAMP) * RATE) if rng.random() < 0.5 else 1
-            end = at + ramp + int(rng.uniform(*_DWELL) * RATE)
-            piece = np.concatenate((np.linspace(before, after, ramp + 1)[1:],
-                                    np.full(end - at - ramp, after)))
-            row[at:end] = piece[:n - at]
-            at, before = end, after
-    return out
-
-
 def _motion(case: Case) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the transition over a sample, its noise and the stationary covariance."""
     if case.kind != 'smooth':
@@ -122,7 +106,7 @@ def _motion(case: Case) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def fly(case: Case, rng: np.random.Generator, flights: int, seconds: float) -> Flights:
     """Simulate."""
     n = int(seconds * RATE)
-    throttle = throttles(rng, flights, n)
+    throttle = throttles(rng, flights, n, RATE, _DWELL, (0.1, 0.9), _RAMP)
     # In recorded flights noise grows 3 to 13 times from low to high throttle.
     growth = np.exp(rng.uniform(math.log(3.0), math.log(13.0), (flights, 1)))
     power = np.log(growth) / math.log(9.0)

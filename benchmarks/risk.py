@@ -20,7 +20,7 @@ import math
 from pathlib import Path
 import sys
 
-from common import deliver, drawing, number, say, table
+from common import deliver, drawing, number, say, table, throttles
 import numpy as np
 from ou_monitor import brownout_probability
 from ou_monitor.online.monitor import SupplyMonitor
@@ -141,23 +141,11 @@ class Flights:
     spread: np.ndarray
 
 
-def throttle_steps(rng: np.random.Generator, flights: int, n: int) -> np.ndarray:
-    """Return steps of throttle, shape (flights, n)."""
-    out = np.empty((flights, n))
-    for row in out:
-        at = 0
-        while at < n:
-            end = at + int(rng.uniform(*_DWELL) * RATE)
-            row[at:end] = rng.uniform(*_THROTTLE)
-            at = end
-    return out
-
-
 def fly(rng: np.random.Generator, flights: int, seconds: float) -> Flights:
     """Simulate."""
     n = int(seconds * RATE)
     h = 1.0 / RATE / FINE
-    throttle = throttle_steps(rng, flights, n)
+    throttle = throttles(rng, flights, n, RATE, _DWELL, _THROTTLE)
     # Components: 20..120 1/s, 20..150 mV.
     resistance = rng.uniform(0.05, 0.4, flights)
     alpha = np.exp(rng.uniform(math.log(20.0), math.log(120.0), flights))
