@@ -341,12 +341,9 @@ def mutated_sheet(sound: bytes, rng: np.random.Generator) -> tuple[str, bytes]:
     elif kind == 'header':
         names = lines[0].split(',')
         change = int(rng.integers(5))
-        if change == 0:
-            names[which] = str(rng.choice(names))
-        elif change == 1:
-            names[which] = '"' + names[which]
-        elif change == 2:
-            names[which] = str(rng.choice(CELLS))
+        if change < 3:
+            names[which] = [str(rng.choice(names)), '"' + names[which],
+                            str(rng.choice(CELLS))][change]
         elif change == 3:
             rng.shuffle(names)
         lines[0] = ','.join(names)
@@ -373,20 +370,25 @@ def verdict_of_sheet(data: bytes, found: Recording) -> str:
     wide = 'utf-16' if data[:2] in (b'\xff\xfe', b'\xfe\xff') else 'utf-16-le'
     code = wide if wide == 'utf-16' or data[1:2] == b'\0' else 'utf-8-sig'
     lines = [line for line in re.split('\r\n|\n|\r', data.decode(code, 'replace'))
-             if line.strip() and not line.lstrip().startswith('#')][1:]
-    stand: dict[float, list[list[float]]] = {}
-    everything = {math.nan}
+             if line.strip() and not line.lstrip().startswith('#')]
+    lines = lines[not any("'column 1'" in note for note in found.notes):]
+    # The lines of each number, and the lines before, whose current replaces a blank one.
+    stand: dict[float, list[tuple[list[float], list[float]]]] = {}
+    everything, before = {math.nan}, list[float]()
     for line in lines:
         values = numbers(line)
         everything.update(values)
         for value in values:
-            stand.setdefault(value, []).append(values)
+            stand.setdefault(value, []).append((values, before))
+        before = values
     current = np.full(found.n, np.nan) if found.current is None else found.current
     for t, v, u, i in zip(found.t.tolist(), found.voltage.tolist(), found.throttle.tolist(),
                           current.tolist()):
-        if not any(v in line and (math.isnan(i) or i in line) for line in stand.get(t, ())):
+        if not any(v in line and (math.isnan(i) or i in line or i in last)
+                   for line, last in stand.get(t, ())):
             return '! wrong value'
-        if not math.isnan(u) and u not in everything and 'a guess' not in ''.join(found.notes):
+        if not (math.isnan(u) or u in everything
+                or re.search(r"throttle from '[^']*' \([^)]*a guess", ' '.join(found.notes))):
             return '! wrong throttle, and no note of a guessed unit'
     said = [re.match(r'(\d+) samples? dropped', note) for note in found.notes]
     dropped = found.held + sum(int(one[1]) for one in said if one)

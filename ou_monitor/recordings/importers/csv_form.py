@@ -208,6 +208,10 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool, sk
         if len(filled) != 1 or any(map(is_value, filled[0])):
             return None
     names, units, at = _header(rows, lines, first, width, delimiter, skip)
+    if not at and any(len(row) > 2 and all(row) and not any(map(is_value, row))
+                      for row in rows[skip:first]):
+        # Names of other columns: rows have lost or gained cells.
+        return None
     cells = [cell for row in rows[first:] for cell in row if cell]
     fit = sum(map(is_value, cells)) / max(len(cells), 1)
     start, step, stated = _stated_step(lines[:max(first, 20)], rows[:first])
