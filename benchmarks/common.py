@@ -37,7 +37,7 @@ FLIGHTS: dict[str, tuple[str, int | None]] = {
     'cf_solo': ('cf_solo_large.csv', None), 'cf_pair': ('cf_pair_large.csv', None),
     'cf_takeoff': ('cf_takeoff.csv', None)}
 HIRO = ('raw/bf_hiro_4s.BFL', None)
-# Recordings on the bench.
+# Bench recordings.
 BENCHES = {name: (f'{name}.csv', None) for name in (
     'mm_bench_1', 'mm_bench_3', 'mm_bench_5', 'xt_pico_a')}
 

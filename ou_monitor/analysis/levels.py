@@ -194,7 +194,7 @@ def _modes(t: FloatArray, throttle: FloatArray, width: float) -> list[float]:
 
 
 def _triangle(reach: int) -> FloatArray:
-    """Return triangular weights; with a box, the middle of two levels would be a mode."""
+    """Return triangular weights; a box would give a false mode midway between two levels."""
     return 1.0 - np.abs(np.arange(-reach, reach + 1)) / (reach + 1.0)
 
 

@@ -101,7 +101,7 @@ def _list(args: argparse.Namespace, log: Any) -> int:
             'rate_hz': one.rate, 'min': low, 'max': high, 'unit': one.unit,
             'repeats': one.repeats, 'scale': one.scale})
     gyros = _gyros(log, {one.name for one in default_inertial(log)})
-    several = [f'Several would be taken as {quantity}: choose with --{quantity} NAME.'
+    several = [f'Several series are candidates for {quantity}: choose by --{quantity} NAME.'
                for quantity in (VOLTAGE, THROTTLE) if len(taken[quantity]) > 1]
     speeds = [] if log.speeds is None else list(log.speeds.motors)
     parts: list[Part] = [

@@ -132,7 +132,7 @@ def application(node: Any, token: str) -> Any:
     html, policy = _html()
 
     class Guarded(RequestHandler):
-        """Refuses requests without the token, or under a foreign name of this machine."""
+        """Refuses requests without the token, or with a foreign host name (DNS rebinding)."""
 
         def prepare(self) -> None:
             """Check the request."""

@@ -1,8 +1,8 @@
 """
 The node behind the live page: listens to estimator and filter, and keeps the last minute.
 
-Limits first: five rows a second, so a dip between two rows shows in the flag but not in the line;
-for the filter's signals each row has the lowest and highest value.
+Limits first: there are five rows per second, so the flag shows a dip between two rows but the plot
+of the voltage does not; the filter's signals have their extremes in each row.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@ One .mcap file, read by the MCAP library: topics, places of their messages, and 
 
 A file with an intact summary is read by its summary; any other, and every file read with
 `partial`, is walked record by record.  Every stated size is compared with its limit before
-anything is read or unpacked.  The message indexes behind a chunk are used only if their records
-fill the chunk.  Damage is reported by chunk.  https://mcap.dev/spec
+anything is read or unpacked.  The message indexes after a chunk are used only if they account for
+every byte of the chunk.  Damage is reported by chunk.  https://mcap.dev/spec
 
 Limits: without checksums a wrong byte within a message is not detected.  A lost message is
 detected only if the summary counts the messages, or the walk meets a broken record.
@@ -289,7 +289,7 @@ class McapFile:
             Span(index.message_start_time, index.message_end_time,
                  index.chunk_start_offset + _HEAD.size, index.chunk_length - _HEAD.size, True,
                  frozenset(index.message_index_offsets) or None,
-                 # An index has 16 bytes per message, which has at least 31, and 15 per channel.
+                 # Longest index: 15 bytes per channel and 16 per message (of 31 bytes or more).
                  index.message_index_length if index.message_index_length
                  <= index.uncompressed_size + 15 * 65536 else 0, index.uncompressed_size)
             for index in indexes if index.message_index_offsets or not indexed]

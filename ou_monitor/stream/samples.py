@@ -4,11 +4,11 @@ Messages -> samples in order, throttle beside each, ready for the monitor.
 Publishers: rclpy does not report the sender, so the sequence numbers of the messages tell
 publishers apart; two with equal numbers and times cannot be told apart.
 
-Throttle: one rule for node and bench.  A throttle holds from its own stamp on if its clock is the
-voltage's, otherwise from the next voltage message on.  The clocks are compared at each throttle
-message, with the newest voltage stamp received by then.  A throttle has no maximum age; the caller
-knows the present time and decides when it is too old.  Samples handed to the monitor are final: a
-throttle that arrives later applies to later samples only.
+Throttle: one rule for the node and offline.  A throttle holds from its own stamp on if its clock
+is the voltage's, otherwise from the next voltage message on.  The clocks are compared at each
+throttle message, with the newest voltage stamp received by then.  A throttle has no maximum age;
+the caller knows the present time and decides when it is too old.  Samples handed to the monitor
+are final: a throttle that arrives later applies to later samples only.
 
 Blocks: the stamp of a block of ADC samples is the *arrival* time of its last sample, late by some
 milliseconds of bus and scheduler that vary from block to block.  A quartz times the samples

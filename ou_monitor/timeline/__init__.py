@@ -1,1 +1,1 @@
-"""Samples of any source -> samples in order, on one time line; for node and bench alike."""
+"""Samples of any source -> samples in order, on one time line; for the node and offline."""

@@ -1,7 +1,7 @@
 """
 The time line: samples of any source in order, each reading once, with counters for the rest.
 
-Node, estimator and bench share these rules:
+Node, estimator and offline reading share these rules:
 
 - samples with a non-finite or implausible stamp or voltage are dropped (`non_finite`);
 - an implausible throttle or current becomes NaN;

@@ -122,7 +122,7 @@ class Term:
     SEARCH: ClassVar[float] = 0.0
     # Number of parameters that `apart` finds instead of the fit.
     APART: ClassVar[int] = 0
-    # Whether a fit takes seconds; then none starts late in a search.
+    # Whether a fit takes seconds; late in a search no such fit is started.
     SLOW_FIT: ClassVar[bool] = False
     # Whether its spectrum is broad and stationary; then a fit starts from the scores' spectrum.
     BROAD: ClassVar[bool] = False

@@ -159,9 +159,9 @@ def _scores(z: FloatArray, before: FloatArray, levels: FloatArray, size: int) ->
     return normal_scores(chance.ravel())
 
 
-# Segments per recording; levels of ln sigma, which span 8 standard deviations because it may
-# leave the range of the fit; and steps between two normalisations: few, because a segment can be
-# unlikely at all levels but one.
+# Segments per recording; levels of ln sigma, spanning 8 standard deviations (later samples may
+# leave the range of the fit); steps between normalisations, so few that probabilities do not
+# underflow.
 _SEGMENTS = 1500
 _LEVELS = 65
 _EVERY = 4
