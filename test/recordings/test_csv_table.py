@@ -37,7 +37,8 @@ def test_valid_csv_variants_are_read(tmp_path, text):
 
 def test_names_of_other_columns_than_the_rows_have_are_not_ignored(tmp_path):
     """Points that became commas: rows have eight cells, so no name can be matched to a cell."""
-    rows = [f'{k // 100},{k % 100:02d},12,{k:03d},0,{k % 90:02d},1,5,x\n' for k in range(300)]
+    rows = ['0,0,12,0,,0,0,n0\n', *(f'0,{k:03d},12,{7 * k},0,{k:02d},0,125,n{k}\n'
+                                      for k in range(1, 300))]
     with pytest.raises(InputError, match='header'):
         read_csv(written(tmp_path, 'time_s,voltage_v,throttle,current_a,note\n' + ''.join(rows)))
 
