@@ -23,6 +23,7 @@ from ou_monitor.discovery.search import (
     kinds_of, name_causes, position, Progress, Search, under_load, without_causes)
 from ou_monitor.model.terms.catalogue import blamed
 from ou_monitor.model.terms.lines import prominence
+from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.slow import Drift, SecondRelaxation
 from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.model.terms.tones import Resonance, Tone
@@ -137,8 +138,9 @@ def _with_trends(samples: Samples, whole: Composite, rivals: Mapping[str, list[s
                  ) -> dict[str, list[str]]:
     """Return the rivals of each cause; a relaxation that is a trend has a drift as a rival."""
     duration = float(samples.t[-1] - samples.t[0])
-    slow = not whole.has(Drift.NAME) and any(
-        isinstance(term, SecondRelaxation) and not decision.relaxes(term.alpha, duration)
+    # The `ou` may be the slower of the two.
+    slow = whole.has(SecondRelaxation.NAME) and not whole.has(Drift.NAME) and any(
+        isinstance(term, (OU, SecondRelaxation)) and not decision.relaxes(term.alpha, duration)
         for term in whole.terms)
     return {name: [*others, Drift.NAME] if slow and name == SecondRelaxation.NAME
             and Drift.NAME not in others else others for name, others in rivals.items()}

@@ -9,6 +9,7 @@ from ou_monitor.criticism.composite import fit_composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import decision, fitting, search as rules
 from ou_monitor.discovery.fitting import Fitter, Trial
+from ou_monitor.discovery.named import _with_trends
 from ou_monitor.discovery.search import Search
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_dependent import LoadDependentNoise, LoadDependentSigma
@@ -301,3 +302,13 @@ def test_sigma_follows_only_if_all_simulations_stay_in_the_recorded_range(on_sig
     model = SimpleNamespace(terms=(*terms[:2], LoadDependentNoise(
         law.number, law.at, law.log_factor, on_sigma)))
     assert rules._leaves(fitter, model) is leaves
+
+
+@pytest.mark.parametrize('rate, other, drift', [(0.05, 45.0, True), (45.0, 0.05, True),
+                                                (45.0, 5.0, False)])
+def test_a_relaxation_too_slow_for_the_recording_may_be_a_drift(rate, other, drift):
+    """In 30 s a rate of 0.05 1/s is a trend, whichever of the two terms has it."""
+    samples = SimpleNamespace(t=np.array([0.0, 30.0]))
+    model = Model([OU(rate, 0.5, 5.0), SecondRelaxation(other, 0.1)], 0.0)
+    rivals = _with_trends(samples, model, {SecondRelaxation.NAME: ['flicker_noise']})
+    assert (Drift.NAME in rivals[SecondRelaxation.NAME]) is drift
