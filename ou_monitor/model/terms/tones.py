@@ -64,8 +64,10 @@ class Tone(Term):
         """Return the strongest lines of the residual, and the first with a wandering phase too."""
         found = [cls.at(line, view) for line in lines_of(view)[:_MOST]]
         spread = math.sqrt(float(np.median(view.variance)))
+        least = _WANDERS / float(view.at[-1])
         return [*found, *(cls(0.3 * spread, line.frequency, 0.0, width) for line in found[:1]
-                          for width in _WANDERS if width < SHARP * line.frequency)]
+                          for width in (least, math.sqrt(least * SHARP * line.frequency))
+                          if width < SHARP * line.frequency)]
 
     @classmethod
     def at(cls, line: Line, view: View) -> Tone:
@@ -115,8 +117,9 @@ def lines_of(view: View) -> tuple[Line, ...]:
 # Number of lines to try; false-alarm probability of trying one, large because the evidence of the
 # fit decides.
 _MOST, _PROPOSED = 3, 0.5
-# Initial linewidths, Hz; linewidth, Hz, from which a line with a varying amplitude is ringing.
-_WANDERS, WIDEST = (0.3, 3.0), 2.0
+# First initial linewidth, over the resolution of the recording (the second lies halfway to the
+# largest); linewidth, Hz, from which a line with a varying amplitude is ringing.
+_WANDERS, WIDEST = 3.0, 2.0
 # Largest width of a line over its frequency.
 SHARP = 0.05
 
