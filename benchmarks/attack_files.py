@@ -372,20 +372,17 @@ def verdict_of_sheet(data: bytes, found: Recording) -> str:
     lines = [line for line in re.split('\r\n|\n|\r', data.decode(code, 'replace'))
              if line.strip() and not line.lstrip().startswith('#')]
     lines = lines[not any("'column 1'" in note for note in found.notes):]
-    # The lines of each number, and the lines before, whose current replaces a blank one.
-    stand: dict[float, list[tuple[list[float], list[float]]]] = {}
-    everything, before = {math.nan}, list[float]()
+    stand: dict[float, list[list[float]]] = {}
+    everything = {math.nan}
     for line in lines:
         values = numbers(line)
         everything.update(values)
         for value in values:
-            stand.setdefault(value, []).append((values, before))
-        before = values
+            stand.setdefault(value, []).append(values)
     current = np.full(found.n, np.nan) if found.current is None else found.current
     for t, v, u, i in zip(found.t.tolist(), found.voltage.tolist(), found.throttle.tolist(),
                           current.tolist()):
-        if not any(v in line and (math.isnan(i) or i in line or i in last)
-                   for line, last in stand.get(t, ())):
+        if not any(v in line and (math.isnan(i) or i in line) for line in stand.get(t, ())):
             return '! wrong value'
         if not (math.isnan(u) or u in everything
                 or re.search(r"throttle from '[^']*' \([^)]*a guess", ' '.join(found.notes))):

@@ -157,7 +157,7 @@ def test_the_verdict_counts_its_causes_and_says_what_is_left():
     assert plain_words('order line') != plain_words('line')
     # 0.24 alpha T = 6 nats; a corner is a rate over a turn.
     note = coupling_note(20.0 * math.pi, 100.0)
-    assert 'exceeds 0.250 1/s' in note and 'corner at 10.0 Hz' in note
+    assert 'faster than 0.250 1/s' in note and 'corner at 10.0 Hz' in note
 
 
 @pytest.mark.parametrize('gain, error, chance, told', [

@@ -43,6 +43,15 @@ def test_names_of_other_columns_than_the_rows_have_are_not_ignored(tmp_path):
         read_csv(written(tmp_path, 'time_s,voltage_v,throttle,current_a,note\n' + ''.join(rows)))
 
 
+@pytest.mark.parametrize('blank, held', [(2, False), (3, True)])
+def test_a_current_that_most_voltages_lack_is_held(tmp_path, blank, held):
+    """One in two is missing at times; one in three is measured at a pace of its own."""
+    rows = ''.join(f'{k},12.{k % 7},{"" if k % blank else 1 + k % 5}\n' for k in range(60))
+    current = read_csv(written(tmp_path, 'time_s,voltage_v,current_a\n' + rows)).current
+    assert np.isfinite(current).all() == held
+    assert current[30] == 1.0
+
+
 def test_missing_throttle_is_unknown(tmp_path):
     """Unknown, not zero."""
     recording = read_recording(written(tmp_path, 'time_s,voltage_v\n0,5\n1,5.5\n'))

@@ -58,8 +58,10 @@ _LOUDEST = 0.7
 # Current over throttle: memory, s; correlation time of deviations, s; prior deviation of its
 # coefficients, in units of those deviations.
 _MEMORY, _ONE, _WIDE = 120.0, 1.0, 30.0
-# Ends of the band, s, in which throttle is tried beside current.
-_BAND = np.array([[1.0], [20.0]])
+# Ends of the band, s, in which throttle is tried beside current, and minimum share of its variance
+# that current must not explain: of a closer one, rounding of the current is most (1e-6 in
+# simulations; 0.007 to 0.8 on 12 recordings).
+_BAND, _APART = np.array([[1.0], [20.0]]), 1e-3
 
 
 class CurrentFilter:
@@ -160,7 +162,7 @@ class CurrentFilter:
         # Voltage and throttle without current.
         rest, moved, both = (vv - iv * iv / ii, xx - xi * xi / ii, xv - xi * iv / ii
                              ) if ii > 0.0 else (0.0, 0.0, 0.0)
-        if not (rest > 0.0 and moved > 1e-9 * xx and iv):
+        if not (rest > 0.0 and moved > _APART * xx and iv):
             return 0.0
         return abs(both / moved * xi / iv) * both * both / (moved * rest)
 

@@ -136,9 +136,13 @@ def read_csv(path: Path, columns: CsvColumns | None = None, *, partial: bool = F
     if column.name != VOLTAGE:
         source |= {quantity: printable(one.name) for quantity, (one, _) in table.found.items()
                    if quantity != logs.CURRENT}
+    current = held.get(logs.CURRENT, nothing)
+    if 2 * np.isfinite(current[np.isfinite(volts)]).sum() < np.isfinite(volts).sum():
+        # Measured beside the voltage, not with it.
+        current = hold(current)
     # A blank cell is not a message: the last command holds.
-    return RawColumns(table.t, volts, hold(held.get(logs.THROTTLE, nothing)),
-                      hold(held.get(logs.CURRENT, nothing)), name, source, tuple(said))
+    return RawColumns(table.t, volts, hold(held.get(logs.THROTTLE, nothing)), current, name,
+                      source, tuple(said))
 
 
 def read(path: Path, request: Request) -> Log:

@@ -83,6 +83,17 @@ def test_the_error_covers_a_load_that_bypasses_the_sensor(flight):
     assert load.resistance_se == pytest.approx(0.1 * load.resistance, rel=0.05)
 
 
+@pytest.mark.parametrize('seed', range(4))
+def test_a_current_that_throttle_determines_is_still_a_resistance(seed):
+    """Only the rounding of the current tells it from throttle, and says nothing of a bypass."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(0.1, 0.9, 60), 25)
+    current = (40.0 * u ** 1.8).round(2)
+    v = 16.4 - 0.03 * current + 0.02 * rng.standard_normal(u.size)
+    load = loaded(0.02 * np.arange(u.size), v, u, current)
+    assert abs(load.resistance - 0.03) < 2.0 * load.resistance_se
+
+
 def test_a_current_that_pauses(flight):
     """Holes of a second and of ten; the resistance is kept over both."""
     t, v, u, current = flight
