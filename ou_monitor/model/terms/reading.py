@@ -86,6 +86,7 @@ class LopsidedNoise(Term):
     SIGNS: ClassVar[tuple[str, ...]] = ('skewness', 'kurtosis', 'tails')
     IMITATES: ClassVar[tuple[str, ...]] = ('clock_jitter', 'glitches', 'heavy_tails', 'jumps')
     CHANGES: ClassVar[type[Term] | None] = MeasurementNoise
+    MAY_LEAVE: ClassVar[float] = 0.3
     MEANING: ClassVar[str] = (
         'The white noise is asymmetric, with dips rarer and deeper than rises or the reverse: '
         'load pulses that are shorter than the time between readings and not visible in throttle.')
