@@ -137,7 +137,7 @@ def test_the_powers_of_ringing_spread_and_those_of_a_line_do_not():
     A wandering phase at one amplitude, and noise that rings, both 4 Hz wide at 90 Hz.
 
     Of 32 powers, hardly dependent, the interquartile range over the median is near 0 for a line;
-    for ringing it is ln 3 / ln 2 = 1.58, with a standard error of 0.35: 1 in 100 is below 0.85.
+    for ringing it is ln 3 / ln 2 = 1.58, with a standard error of 0.41: 10 of 400 are below 0.85.
     """
     n, rate, width = 2000, 1000.0, 4.0
     at = np.arange(n) / rate

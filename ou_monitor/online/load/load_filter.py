@@ -60,7 +60,8 @@ _LOUDEST = 0.7
 _MEMORY, _ONE, _WIDE = 120.0, 1.0, 30.0
 # Ends of the band, s, in which throttle is tried beside current, and minimum share of its variance
 # that current must not explain: of a closer one, rounding of the current is most (1e-6 in
-# simulations; 0.007 to 0.8 on 12 recordings).
+# simulations, 5e-5 on hebi_x; 0.007 to 0.8 on roma 1 and 3, ar8, jd, in_xr, js_11t, as_f60, euc_1,
+# frc_ol_1, and regbot_28, 62 and 81).
 _BAND, _APART = np.array([[1.0], [20.0]]), 1e-3
 
 
