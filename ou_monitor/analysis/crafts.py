@@ -35,7 +35,7 @@ _FULL = 0.5
 
 # Maximum cells of the known classes; the largest known quads have 6.
 _MOST_CELLS = 8
-MICRO, QUAD = '1S micro', 'quad, 2S and more'
+MICRO, QUAD, ROBOT = '1S micro', 'quad, 2S and more', 'robot on 12 V'
 # Class -> craft -> cells, sag and noise at half throttle, V, and instantaneous resistance, Ohm, of
 # the pack; by `supply_facts` in November 2026.
 KNOWN: dict[str, dict[str, tuple[float, float, float, float]]] = {
@@ -47,7 +47,15 @@ KNOWN: dict[str, dict[str, tuple[float, float, float, float]]] = {
     QUAD: {'gecko': (4, 0.615, 0.080, NAN), 'nazgul': (4, 0.479, 0.565, NAN),
            '3s_erpm2': (3, 0.280, 0.217, NAN), 'ar8': (6, 1.511, 0.051, 0.0248),
            'hiro': (4, 0.504, 0.767, NAN), 'roma': (6, 0.968, 0.538, 0.0302),
-           'erle': (3, 0.625, 0.109, NAN), 'jd': (4, 0.394, NAN, 0.0168)}}
+           'erle': (3, 0.625, 0.109, NAN), 'jd': (4, 0.394, NAN, 0.0168)},
+    # DTU REGBOT (zachasme/regbot), where sag and resistance are known; an FRC robot of 2022 with a
+    # lead-acid battery (orangelight/DSLOG-Reader), which counts as 3 cells.
+    ROBOT: {'regbot_10': (3, 0.049, 0.0058, NAN), 'regbot_19': (3, 0.066, 0.0113, NAN),
+            'regbot_28': (3, 0.103, 0.0108, NAN), 'regbot_30': (3, 0.067, 0.0079, 0.160),
+            'regbot_62': (3, 0.128, 0.0169, 0.449), 'regbot_81': (3, NAN, 0.0117, NAN),
+            'frc_ol_1': (3, NAN, NAN, 0.0249)}}
+# Cells of the class of robots, and formats that do not say what recorded them.
+_ROBOT_CELLS, _ANY_VEHICLE = 3, ('csv', 'mcap', '')
 _UNITS = {'sag': 'mV per cell at 50 % throttle', 'noise': 'mV rms per cell at 50 % throttle',
           'resistance': 'mOhm per cell'}
 # Measure, whether high -> (likely reason, remedy).
@@ -72,6 +80,7 @@ _REASONS = {
 class Measure:
     """One number of a supply, compared with known crafts."""
 
+    kind: str  # Class that it is compared with
     name: str  # sag, noise or resistance
     value: float  # V, V or Ohm per cell
     usual: tuple[float, float]  # Usual range, likewise
@@ -87,15 +96,16 @@ class Craft:
     cells: int  # 0: unknown
     cells_from: str  # given, log, guessed or unknown
     full_v: float  # Highest median of half a second, V
-    kind: str  # Class; empty if there is none
+    kind: str  # Class; empty if there is none, or more than one
     measures: tuple[Measure, ...]
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as strict JSON holds it."""
         return {'cells': self.cells or None, 'cells_from': self.cells_from,
                 'full_v': plain_data(self.full_v), 'class': self.kind or None, 'measures': [
-                    {'name': one.name, 'value': plain_data(one.value), 'usual': list(one.usual),
-                     'verdict': one.verdict, 'reason': one.reason, 'remedy': one.remedy}
+                    {'class': one.kind, 'name': one.name, 'value': plain_data(one.value),
+                     'usual': list(one.usual), 'verdict': one.verdict, 'reason': one.reason,
+                     'remedy': one.remedy}
                     for one in self.measures]}
 
 
@@ -153,10 +163,13 @@ def stated_limit(source: Mapping[str, str]) -> tuple[int, float] | None:
 
 
 def craft_of(recording: Recording, facts: SupplyFacts, given: int = 0) -> Craft:
-    """Compare a supply with known crafts of its class."""
+    """Compare a supply with known crafts of its class, or of all classes that it may be of."""
     cells, source = cells_of(recording, given)
-    kind = '' if not 0 < cells <= _MOST_CELLS else MICRO if cells == 1 else QUAD
-    if not kind or not recording.has_throttle:
+    kinds = [MICRO if cells == 1 else QUAD] if 0 < cells <= _MOST_CELLS else []
+    if source == 'guessed' and cells == _ROBOT_CELLS and (
+            recording.source.get('format', '') in _ANY_VEHICLE):
+        kinds.append(ROBOT)
+    if not kinds or not recording.has_throttle:
         return Craft(cells, source, full_voltage(recording), '', ())
     seen = bool(flown_near(recording, _AT, _NEAR)[0])
     # Values and standard errors; the error of the noise is negligible.
@@ -167,38 +180,42 @@ def craft_of(recording: Recording, facts: SupplyFacts, given: int = 0) -> Craft:
                   0.0],
         'resistance': [facts.resistance.ohm, facts.resistance.se_ohm]}
     found = []
-    for k, (name, (value, se)) in enumerate(values.items()):
-        known = [row[1 + k] / row[0] for row in KNOWN[kind].values()
-                 if math.isfinite(row[1 + k])]
-        if known:
-            found.append(_measure(name, value / cells, 2.0 * se / cells, float(np.median(known))))
-    return Craft(cells, source, full_voltage(recording), kind, tuple(found))
+    for kind in kinds:
+        for k, (name, (value, se)) in enumerate(values.items()):
+            known = [row[1 + k] / row[0] for row in KNOWN[kind].values()
+                     if math.isfinite(row[1 + k])]
+            if known:
+                found.append(_measure(kind, name, value / cells, 2.0 * se / cells,
+                                      float(np.median(known))))
+    return Craft(cells, source, full_voltage(recording), kinds[0] if len(kinds) == 1 else '',
+                 tuple(found))
 
 
-def _measure(name: str, value: float, reach: float, middle: float) -> Measure:
+def _measure(kind: str, name: str, value: float, reach: float, middle: float) -> Measure:
     """Judge a value by its interval, value +- reach."""
     usual = middle / _USUAL, middle * _USUAL
     high = value - reach > usual[1]
     if high or value + reach < usual[0]:
-        return Measure(name, value, usual, 'high' if high else 'low', *_REASONS[name, high])
+        return Measure(kind, name, value, usual, 'high' if high else 'low', *_REASONS[name, high])
     # Also false for NaN.
     known = reach <= value and usual[0] <= value <= usual[1]
-    return Measure(name, value, usual, 'usual' if known else 'unknown', '', '')
+    return Measure(kind, name, value, usual, 'usual' if known else 'unknown', '', '')
 
 
 def craft_line(craft: Craft) -> str:
     """Return the comparison in words; empty if there is none."""
-    found = []
+    found: dict[str, list[str]] = {}
     for one in craft.measures:
         if one.verdict != 'unknown':
             low, high = (number(1e3 * x, 2) for x in one.usual)
-            found.append(f'{one.name} {number(1e3 * one.value)} {_UNITS[one.name]} is '
-                         f'{one.verdict}' + ('' if one.verdict == 'usual' else
-                                             f' (usual: {low} to {high})'))
+            found.setdefault(one.kind, []).append(
+                f'{one.name} {number(1e3 * one.value)} {_UNITS[one.name]} is {one.verdict}'
+                + ('' if one.verdict == 'usual' else f' (usual: {low} to {high})'))
     if not found:
         return ''
     source = {'log': ' (from the log)', 'guessed': ' (from the voltage)'}.get(craft.cells_from, '')
-    return f'{counted(craft.cells, "cell")}{source}, class "{craft.kind}": {"; ".join(found)}'
+    return f'{counted(craft.cells, "cell")}{source}, ' + '; or '.join(
+        f'class "{kind}": {"; ".join(words)}' for kind, words in found.items())
 
 
 def craft_advice(craft: Craft) -> list[str]:

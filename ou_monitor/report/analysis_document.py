@@ -91,7 +91,7 @@ def _budget(analysis: Analysis) -> str:
     curves = analysis.by_throttle
     if math.isnan(curves.voltage):
         middle, craft = float(np.median(analysis.recording.voltage)), analysis.craft
-        if craft.kind:
+        if craft.measures:
             # The user has to confirm that it is a lithium pack.
             source = 'from the log' if craft.cells_from == 'log' else 'a guess from the voltage'
             return (f'unknown: no limit; --cells {craft.cells} ({source}) sets it to '

@@ -6,7 +6,7 @@ import json
 import numpy as np
 from ou_monitor.analysis.crafts import (
     _measure, cell_count, cells_of, craft_advice, craft_line, craft_of, KNOWN, MICRO, QUAD,
-    stated_limit)
+    ROBOT, stated_limit)
 from ou_monitor.analysis.overview import answers, overview
 from ou_monitor.analysis.supply import supply_facts
 from ou_monitor.cli.main import main
@@ -69,6 +69,19 @@ def test_values_are_called_usual_high_or_low():
     assert {one.name: one.verdict for one in found.measures} == {'sag': 'usual', 'noise': 'high'}
 
 
+def test_twelve_volts_of_an_unknown_vehicle_may_be_a_robots():
+    """Both classes are compared then; a flight controller's log, or given cells, decides."""
+    small = flown(cells=3, sag=0.08, noise=0.012)
+    craft = craft_of(small, supply_facts(small))
+    assert craft.kind == ''
+    assert {(one.kind, one.name): one.verdict for one in craft.measures if one.name != 'resistance'
+            } == {(QUAD, 'sag'): 'low', (QUAD, 'noise'): 'low',
+                  (ROBOT, 'sag'): 'usual', (ROBOT, 'noise'): 'usual'}
+    assert f'or class "{ROBOT}": sag' in craft_line(craft)
+    for one, given in ((small, 3), (replace(small, source={'format': 'blackbox'}), 0)):
+        assert craft_of(one, supply_facts(one), given).kind == QUAD
+
+
 def test_a_sag_that_its_error_hides_is_neither_judged_nor_said():
     """As of a robot whose log has a flag for a throttle: 8 mV a cell, +- volts, is not low."""
     one = flown(noise=0.3)
@@ -88,7 +101,7 @@ def test_a_sag_that_its_error_hides_is_neither_judged_nor_said():
     (1.0, 0.9, 'usual'), (1.0, 1.1, 'unknown'), (NAN, NAN, 'unknown'), (1.0, NAN, 'unknown')])
 def test_a_verdict_is_by_the_interval(value, reach, verdict):
     """Usual is 0.5 to 2: beyond it with the whole interval, or in it with half of one."""
-    assert _measure('sag', value, reach, 1.0).verdict == verdict
+    assert _measure(QUAD, 'sag', value, reach, 1.0).verdict == verdict
 
 
 def test_impossible_cells_are_refused_with_the_likely_number(tmp_path, capsys):
