@@ -32,7 +32,7 @@ from common import arguments, deliver, say, table
 import gyros
 import numpy as np
 from ou_monitor import AdaptiveNotch
-from ou_monitor.online.notch.notch import Notch, phase_lag
+from ou_monitor.online.notch import Notch, phase_lag
 from scipy import optimize, signal
 
 LAG_AT, NOISE_FROM = 10.0, 60.0

@@ -15,7 +15,7 @@ from common import arguments, deliver, FLIGHTS, flights, table
 import numpy as np
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.records import Recording
-from ou_monitor.timeline.line import readings_of
+from ou_monitor.timeline import readings_of
 
 # File below OU_MONITOR_REALDATA, flight of a log.
 RAILS: dict[str, tuple[str, int | None]] = {

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ou_monitor.online.estimator.estimator import SlidingEstimator
     from ou_monitor.online.filter.lowpass import AdaptiveLowPass
     from ou_monitor.online.monitor import SupplyMonitor
-    from ou_monitor.online.notch.notch import AdaptiveNotch
+    from ou_monitor.online.notch import AdaptiveNotch
     from ou_monitor.online.risk.first_passage import brownout_probability
     from ou_monitor.online.settings import MonitorSettings
     from ou_monitor.recordings.read import read_recording
@@ -29,7 +29,7 @@ __version__ = '0.3.0'
 
 _HOMES = {
     'AdaptiveLowPass': 'ou_monitor.online.filter.lowpass',
-    'AdaptiveNotch': 'ou_monitor.online.notch.notch',
+    'AdaptiveNotch': 'ou_monitor.online.notch',
     'Estimate': 'ou_monitor.records',
     'Flag': 'ou_monitor.records',
     'InputError': 'ou_monitor.errors',

@@ -20,7 +20,7 @@ from ou_monitor.errors import InputError
 from ou_monitor.records import as_numbers, as_seconds, Recording
 from ou_monitor.report.result import Result
 from ou_monitor.text import counted
-from ou_monitor.timeline.line import ordered, readings_of
+from ou_monitor.timeline import ordered, readings_of
 
 if TYPE_CHECKING:
     from ou_monitor.analysis.analyze import Analysis

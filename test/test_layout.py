@@ -237,7 +237,7 @@ def test_a_wrong_import_is_found(module, source):
     ('ou_monitor.model.ou', 'import math\nimport numpy as np\nfrom scipy import optimize'),
     ('ou_monitor.model.ou', 'from . import passage\nfrom .passage import x'),
     ('ou_monitor.model.__init__', 'from .ou import x\nfrom . import ou'),
-    ('ou_monitor.online.monitor', 'from ou_monitor.model.passage.law import x'),
+    ('ou_monitor.online.monitor', 'from ou_monitor.model.passage import x'),
     ('ou_monitor.recordings.bag', 'import mcap.reader\nfrom mcap_ros2.decoder import D'),
     ('ou_monitor.recordings.importers.ulog', 'from pyulog import ULog'),
     ('ou_monitor.report.page', 'import matplotlib'),

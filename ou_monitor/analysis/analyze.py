@@ -35,7 +35,7 @@ from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, FloatArray, NAN, Recording
 from ou_monitor.text import Z95
-from ou_monitor.timeline.line import readings_of
+from ou_monitor.timeline import readings_of
 
 Progress = Callable[[float], None]
 

@@ -42,7 +42,7 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.records import FloatArray, NAN
-from ou_monitor.timeline.line import refreshes
+from ou_monitor.timeline import refreshes
 from scipy import stats
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d

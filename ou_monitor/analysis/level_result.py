@@ -48,7 +48,7 @@ from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.records import (
     Counters, Estimate, Flag, FloatArray, LOG_NAMES, NAN, OuFacts, Recording, Status)
 from ou_monitor.text import p_words, Z95
-from ou_monitor.timeline.line import TAIL
+from ou_monitor.timeline import TAIL
 from scipy import stats
 from scipy.signal import welch
 

@@ -18,7 +18,7 @@ from ou_monitor.analysis.levels import GAP_STEPS
 from ou_monitor.online.estimator.quality import examine
 from ou_monitor.records import defect_of, Estimate, Flag, Recording, Severity, Status
 from ou_monitor.text import counted, Z95
-from ou_monitor.timeline.line import TAIL
+from ou_monitor.timeline import TAIL
 
 # Flags for information; the others are warnings.
 _INFORMS = frozenset({Flag.HELD_SAMPLES, Flag.IRREGULAR, Flag.NO_EXCITATION})

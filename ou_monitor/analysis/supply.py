@@ -30,7 +30,7 @@ from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.online.risk.forecast import LOOK
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import FloatArray, NAN, OuFacts, plain_data, Recording
-from ou_monitor.timeline.line import ordered, readings_of
+from ou_monitor.timeline import ordered, readings_of
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 # Throttles at which sag and noise are given.

@@ -17,7 +17,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.records import FloatArray
-from ou_monitor.timeline.line import reading_places, reading_times
+from ou_monitor.timeline import reading_places, reading_times
 from scipy.special import ndtr, ndtri
 
 # Maximum values used to find the step.

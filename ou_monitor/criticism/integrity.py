@@ -23,7 +23,7 @@ from ou_monitor.model.terms.reading import ClockJitter, HeldSamples, Quantizatio
 from ou_monitor.model.terms.term import Term
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.text import counted
-from ou_monitor.timeline.line import on_grid, reading_places, reading_times
+from ou_monitor.timeline import on_grid, reading_places, reading_times
 
 # Minimum samples of a fit.
 LEAST = 100

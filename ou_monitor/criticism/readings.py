@@ -14,7 +14,7 @@ from ou_monitor.model.load import lowpass
 from ou_monitor.model.load_fit import timing
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.text import counted, number
-from ou_monitor.timeline.line import in_order
+from ou_monitor.timeline import in_order
 
 # Minimum distance of an outlier from the median, in spreads of the samples, and relative to the
 # farthest other sample's distance.

@@ -14,8 +14,6 @@ from ou_monitor.criticism.composite import Composite, fit_composite
 from ou_monitor.criticism.integrity import examine, Integrity
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate, fit_gaussian
-from ou_monitor.discovery.clipped import redrawn
-from ou_monitor.discovery.coded import within_codes
 from ou_monitor.discovery.decision import relaxes
 from ou_monitor.discovery.finding import Cause, Criticism, CrossingRate, Finding, Verdict
 from ou_monitor.discovery.fitting import Fitter, standard_errors, with_reach
@@ -24,6 +22,7 @@ from ou_monitor.discovery.gain import (
     why_unknown, without)
 from ou_monitor.discovery.named import INTERRUPTED, Named, named_causes
 from ou_monitor.discovery.pruning import prune_by_gain, Pruned, refusal
+from ou_monitor.discovery.redraw import redrawn, within_codes
 from ou_monitor.discovery.regression import load_terms
 from ou_monitor.discovery.search import position, Progress, Search, under_load, whole_load
 from ou_monitor.discovery.words import (

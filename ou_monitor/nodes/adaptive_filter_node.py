@@ -35,7 +35,7 @@ from ou_monitor.nodes.inputs import (
 from ou_monitor.nodes.sources import message_class, MOTOR_PARAMETERS, Source
 from ou_monitor.online.filter.cutoff_control import Bound
 from ou_monitor.online.filter.lowpass import AdaptiveLowPass, FilterCounters
-from ou_monitor.online.notch.notch import AdaptiveNotch
+from ou_monitor.online.notch import AdaptiveNotch
 from ou_monitor.online.settings import (
     FILTER_PARAMETERS, FilterSettings, notch_options, NOTCH_PARAMETERS, NotchSettings, Parameter)
 from ou_monitor.online.trust import InputClock, SLOW_MISSED, SourceInterval, StampOrder

@@ -20,7 +20,7 @@ from pathlib import Path
 import time
 from typing import Any
 
-from ou_monitor.adc.devices import Block, find_device, IioBuffer, PolledChannel
+from ou_monitor.adc import Block, find_device, IioBuffer, PolledChannel
 from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import MonitorNode, to_time, wait_until
 from ou_monitor.nodes.inputs import Silence

@@ -24,7 +24,7 @@ from ou_monitor.online.settings import AUTO, MonitorSettings
 from ou_monitor.online.trust import Doubt, InputTrust, patience, StampOrder
 from ou_monitor.records import (
     as_numbers, as_seconds, Counters, Estimate, Flag, Level, NAN, OuFacts, Status)
-from ou_monitor.timeline.line import (
+from ou_monitor.timeline import (
     as_column, as_columns, MOST_CURRENT, plausible, plausible_samples, TimeLine)
 
 if TYPE_CHECKING:

@@ -31,7 +31,7 @@ import math
 from typing import Any
 
 import numpy as np
-from ou_monitor.model.passage.law import mean_first_passage
+from ou_monitor.model.passage import mean_first_passage
 from ou_monitor.paper.network import (
     completed, PowerNetwork, Rail, rail_at, UnstableNetworkError)
 from ou_monitor.text import number

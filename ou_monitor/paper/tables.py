@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 from ou_monitor.model.ou import simulate, stationary_variance
-from ou_monitor.model.passage.law import mean_first_passage
+from ou_monitor.model.passage import mean_first_passage
 from ou_monitor.paper.network import PowerNetwork, Rail, rail_at
 from ou_monitor.paper.published import (
     ALPHA, BATTERY_CELLS, BATTERY_V, ESC_HZ, HIGH, IDLE, LOADED, LOW, MEDIUM, over, Printed,

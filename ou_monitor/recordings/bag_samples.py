@@ -24,7 +24,7 @@ from ou_monitor.records import Defect, defect_of, FloatArray, Note
 from ou_monitor.stream.config import FieldSpec, list_msg_configs, load_msg_config, MsgConfig
 from ou_monitor.stream.samples import BlockClock, ThrottleHold
 from ou_monitor.text import counted, printable, some
-from ou_monitor.timeline.line import check_throttle
+from ou_monitor.timeline import check_throttle
 
 
 @dataclass(frozen=True)

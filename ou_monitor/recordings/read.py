@@ -28,7 +28,7 @@ from ou_monitor.recordings.importers.log import (
 from ou_monitor.recordings.standard_types import IMU
 from ou_monitor.records import defect_of, Recording
 from ou_monitor.stream.config import FieldSpec
-from ou_monitor.timeline.line import (
+from ou_monitor.timeline import (
     check_throttle, in_order, MOST_CURRENT, MOST_THROTTLE, MOST_VOLTAGE, part_of, plausible,
     plausible_samples, readings_of)
 

@@ -28,7 +28,7 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.records import FloatArray
 from ou_monitor.stream.config import FieldSpec
-from ou_monitor.timeline.line import BATCH
+from ou_monitor.timeline import BATCH
 
 if TYPE_CHECKING:
     from ou_monitor.online.monitor import SupplyMonitor

@@ -8,7 +8,7 @@ import numpy as np
 from ou_monitor.analysis.quality import quality_list
 from ou_monitor.records import (
     Defect, defect_of, Estimate, Flag, led, Note, Recording, Severity, Status)
-from ou_monitor.timeline.line import in_order, readings_of
+from ou_monitor.timeline import in_order, readings_of
 import pytest
 from simulated_recordings import recording
 

@@ -6,7 +6,7 @@ import numpy as np
 from ou_monitor import discover, Recording
 from ou_monitor.criticism.composite import fit_composite
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.discovery.clipped import redrawn
+from ou_monitor.discovery.redraw import redrawn
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_dependent import LoadDependentSigma
 from ou_monitor.model.terms.load_response import LoadSag

@@ -7,7 +7,7 @@ from ou_monitor import discover, Recording
 from ou_monitor.criticism.composite import Composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate
-from ou_monitor.discovery.coded import within_codes
+from ou_monitor.discovery.redraw import within_codes
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU

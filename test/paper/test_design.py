@@ -5,7 +5,7 @@ import math
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
-from ou_monitor.model.passage.law import mean_first_passage
+from ou_monitor.model.passage import mean_first_passage
 from ou_monitor.paper.design import (
     answer, default_voltage, design, DesignVerdict, effect, remarks, row_of, with_capacitance)
 from ou_monitor.paper.network import PowerNetwork, rail_at

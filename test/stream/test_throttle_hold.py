@@ -11,7 +11,7 @@ from ou_monitor.recordings.bag import BagWriter
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.stream.config import load_msg_config
 from ou_monitor.stream.samples import APART, APART_MIXED, ThrottleHold
-from ou_monitor.timeline.line import BATCH
+from ou_monitor.timeline import BATCH
 import pytest
 
 STAMPS = st.floats(0.0, 4.0).map(lambda x: round(x, 2))

@@ -13,7 +13,7 @@ from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.online.risk.flag import BrownoutFlag
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.online.trust import patience, StampWatch
-from ou_monitor.timeline.line import plausible_samples
+from ou_monitor.timeline import plausible_samples
 from scipy.signal import lfilter
 from term_examples import EXAMPLES, OU, term
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.records import Counters, Flag, Recording, Status
-from ou_monitor.timeline.line import as_columns, Batch, readings_of, refresh_period, Repeats
+from ou_monitor.timeline import as_columns, Batch, readings_of, refresh_period, Repeats
 import pytest
 from scipy.signal import lfilter
 from simulated_windows import ALPHA, DT, errors, estimate, LEVEL, paths, SIGMA, stamps

@@ -36,7 +36,7 @@ from ou_monitor.online.estimator.window import (
 from ou_monitor.records import (
     as_numbers, as_seconds, Counters, Estimate, Flag, FloatArray, LARGEST_LOG_SE, LOG_NAMES,
     MOST_READINGS, NAN, OU_WINDOWS, OuFacts, Status)
-from ou_monitor.timeline.line import as_column, BATCH, Batch, TAIL, TimeLine
+from ou_monitor.timeline import as_column, BATCH, Batch, TAIL, TimeLine
 
 # Minimum number of samples for a fit.
 MIN_SAMPLES = 20

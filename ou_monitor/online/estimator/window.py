@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 from ou_monitor.records import FloatArray, NAN
-from ou_monitor.timeline.line import BATCH, Batch
+from ou_monitor.timeline import BATCH, Batch
 
 # Time constants, s, with which the load may follow throttle: motors follow the command within
 # 5 to 20 ms, and the current settles within 40 ms (doc/estimation.md).

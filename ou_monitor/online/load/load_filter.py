@@ -30,7 +30,7 @@ from ou_monitor.online.load.model_watch import (
 from ou_monitor.online.load.supply_load import (
     Basis, LAGS, LoadState, LoadStatus, POWER, static, SupplyLoad, TABLE)
 from ou_monitor.records import FloatArray, NAN
-from ou_monitor.timeline.line import MOST_CURRENT, MOST_THROTTLE, plausible
+from ou_monitor.timeline import MOST_CURRENT, MOST_THROTTLE, plausible
 
 
 # Current from which the filter starts, A; factor by which the largest current must rise to restart

@@ -36,7 +36,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 import numpy.typing as npt
 from ou_monitor.model.load import INRUSH_TIME, ripple
-from ou_monitor.model.passage.law import normal_below
+from ou_monitor.model.passage import normal_below
 from ou_monitor.online.load.supply_load import LAGS, LoadState, POWER
 from ou_monitor.records import FloatArray, NAN
 

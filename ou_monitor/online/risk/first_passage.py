@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.model.passage.law import passage_probability
+from ou_monitor.model.passage import passage_probability
 from ou_monitor.records import Estimate, FloatArray, NAN
 
 # Quadrature nodes over the present voltage; those of the other averages are below.

@@ -32,7 +32,7 @@ from statistics import median
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.load import ripple
-from ou_monitor.model.passage.law import prepare
+from ou_monitor.model.passage import prepare
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import LoadState, LoadStatus, SupplyLoad
 from ou_monitor.online.risk.courses import (
@@ -41,7 +41,7 @@ from ou_monitor.online.risk.courses import (
 from ou_monitor.online.risk.first_passage import Passage, risk_of, Supply
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, FloatArray, NAN
-from ou_monitor.timeline.line import Batch
+from ou_monitor.timeline import Batch
 
 # Degrees of freedom: heavy tails for a model that is sometimes wrong.
 FREEDOM = 5.0

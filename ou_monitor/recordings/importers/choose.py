@@ -22,7 +22,7 @@ from ou_monitor.recordings.importers.log import (
     UNKNOWN, VELOCITY, VOLTAGE)
 from ou_monitor.records import Defect, FloatArray, led, Note
 from ou_monitor.text import counted, printable
-from ou_monitor.timeline.line import check_throttle
+from ou_monitor.timeline import check_throttle
 
 # Word that leaves a quantity out.
 NONE = 'none'

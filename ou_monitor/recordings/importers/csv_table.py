@@ -31,7 +31,7 @@ from ou_monitor.recordings.importers.log import (
 from ou_monitor.records import (
     clock_unit, Defect, FloatArray, LEAST_STEP, LONGEST_STEP, Note, TIME_UNITS)
 from ou_monitor.text import counted, printable, some
-from ou_monitor.timeline.line import hold, MOST_THROTTLE, WILD
+from ou_monitor.timeline import hold, MOST_THROTTLE, WILD
 
 CURRENT = 'current_a'
 NONE = 'none'

@@ -26,7 +26,7 @@ import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.records import clock_unit, Defect, FloatArray, Note
 from ou_monitor.text import counted, printable
-from ou_monitor.timeline.line import in_order, Picked
+from ou_monitor.timeline import in_order, Picked
 
 # Front, right, down -> front, left, up.
 FRD_TO_FLU = np.array([1.0, -1.0, -1.0])

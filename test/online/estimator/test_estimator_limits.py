@@ -6,7 +6,7 @@ import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.online.estimator.window import Thinner
 from ou_monitor.records import Flag, Status
-from ou_monitor.timeline.line import TimeLine
+from ou_monitor.timeline import TimeLine
 import pytest
 from simulated_windows import ALPHA, LEVEL, paths, SIGMA, stamps
 

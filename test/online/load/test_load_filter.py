@@ -8,7 +8,7 @@ from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import LAGS, LoadStatus, SupplyLoad
 from ou_monitor.recordings.read import read_recording
 from project import ROOT
-from ou_monitor.timeline.line import as_columns, TimeLine
+from ou_monitor.timeline import as_columns, TimeLine
 import pytest
 
 TRUE = LoadModel(4, 0.25, charge=0.85, size=0.15, power=1.8)

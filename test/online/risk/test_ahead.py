@@ -4,7 +4,7 @@ from dataclasses import replace
 import math
 
 import numpy as np
-from ou_monitor.model.passage import law as passage_law
+from ou_monitor.model import passage as passage_law
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU

@@ -13,7 +13,7 @@ from ou_monitor.online.risk.flag import FlagLevel
 from ou_monitor.online.risk.forecast import Forecast, throttle_budget
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, Status
-from ou_monitor.timeline.line import Batch
+from ou_monitor.timeline import Batch
 from project import ROOT
 import pytest
 from scipy.signal import lfilter

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 from ou_monitor import brownout_probability
-from ou_monitor.model.passage.law import mean_first_passage, passage_probability
+from ou_monitor.model.passage import mean_first_passage, passage_probability
 from ou_monitor.records import Estimate, Status
 import pytest
 from scipy.special import ndtr

@@ -13,7 +13,7 @@ import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.recordings.read import (
     read_beside, read_recording, read_signal)
-from ou_monitor.timeline.line import readings_of
+from ou_monitor.timeline import readings_of
 from project import ROOT
 import pytest
 from rosbags.highlevel import AnyReader

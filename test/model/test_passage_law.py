@@ -5,8 +5,8 @@ import math
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
-from ou_monitor.model.passage import law
-from ou_monitor.model.passage.law import mean_first_passage, passage_probability, prepare
+from ou_monitor.model import passage as law
+from ou_monitor.model.passage import mean_first_passage, passage_probability, prepare
 import pytest
 from scipy.integrate import quad, trapezoid
 from scipy.special import log_ndtr, ndtr, pbdv

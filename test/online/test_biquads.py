@@ -5,7 +5,7 @@ import math
 import random
 
 import numpy as np
-from ou_monitor.online.notch.notch import HIGHEST, Notch, phase_lag, WIDTHS
+from ou_monitor.online.notch import HIGHEST, Notch, phase_lag, WIDTHS
 import pytest
 
 # Bandwidths over frequency that the proof is for.

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 from ou_monitor import AdaptiveNotch
-from ou_monitor.online.notch.notch import phase_lag
+from ou_monitor.online.notch import phase_lag
 import pytest
 
 RATE = 1000.0

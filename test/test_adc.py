@@ -6,7 +6,7 @@ import time
 
 from made_devices import attributes, iio_device, scans, volts
 import numpy as np
-from ou_monitor.adc.devices import (
+from ou_monitor.adc import (
     BLOCKS, find_device, IioBuffer, parse_element, PolledChannel, Scan, USUAL_RATE)
 from ou_monitor.errors import InputError
 import pytest

@@ -1,1 +1,0 @@
-"""A voltage from the kernel: Linux IIO and hwmon."""

@@ -1,1 +1,0 @@
-"""First passage of the supply to a level: laws, means, samples."""

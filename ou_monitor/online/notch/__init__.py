@@ -1,1 +1,0 @@
-"""Notches that follow the motors, and whether they help."""

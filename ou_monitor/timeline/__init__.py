@@ -1,1 +1,0 @@
-"""Samples of any source -> samples in order, on one time line; for the node and offline."""
