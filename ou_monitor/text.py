@@ -81,3 +81,18 @@ def p_words(p: float) -> str:
 def volts(value: float) -> str:
     """Return a difference of voltage in V, or in mV below 1 V."""
     return f'{number(value)} V' if abs(value) >= 1.0 else f'{number(1e3 * value)} mV'
+
+
+def span_words(start: float | None, end: float | None) -> str:
+    """Return 'from 2 s to 5 s'."""
+    return f"from {start or 0.0:g} s to {'the end' if end is None else f'{end:g} s'}"
+
+
+def outside_words(name: str, start: float | None, end: float | None, length: float) -> str:
+    """Return the text of the error for a part without samples (length of the recording in s)."""
+    return f'{name} holds no sample {span_words(start, end)}: it lasts {length:.3f} s'
+
+
+def part_words(start: float | None, end: float | None) -> str:
+    """Return the note on a part."""
+    return f'Only the part {span_words(start, end)} of the recording was read.'

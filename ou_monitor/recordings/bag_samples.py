@@ -18,12 +18,14 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.bag import BagReader, batches
-from ou_monitor.recordings.cdr import FieldColumn, join, TimeArray, value_path
-from ou_monitor.recordings.importers.log import RawColumns
+from ou_monitor.recordings.cdr import (
+    Field, FieldColumn, join, short_name, TimeArray, value_path)
+from ou_monitor.recordings.importers.log import RawColumns, Series, SIGNAL, UNKNOWN
+from ou_monitor.recordings.standard_types import FLOAT32, FLOAT64, IMU
 from ou_monitor.records import Defect, defect_of, FloatArray, Note
 from ou_monitor.stream.config import FieldSpec, list_msg_configs, load_msg_config, MsgConfig
 from ou_monitor.stream.samples import BlockClock, ThrottleHold
-from ou_monitor.text import counted, printable, some
+from ou_monitor.text import counted, outside_words, part_words, printable, some
 from ou_monitor.timeline import check_throttle
 
 
@@ -139,7 +141,7 @@ def _topic_error(path: Path, config: MsgConfig, topics: Mapping[str, str]) -> st
 def _current(config: MsgConfig, topics: Mapping[str, str], voltage: str) -> FieldSpec | None:
     """Return the field of the current: a topic `current` beside the voltage, or as configured."""
     beside = voltage.rsplit('/', 1)[0] + '/current'
-    if topics.get(beside) in ('std_msgs/msg/Float32', 'std_msgs/msg/Float64'):
+    if topics.get(beside) in _SCALARS:
         return FieldSpec(beside, topics[beside], 'data', nan='unknown')
     spec = config.current
     if spec is None or spec.topic != config.voltage.topic:
@@ -160,7 +162,7 @@ def _throttle(
         for one in specs:
             if one is not None and one.type == topics[topic]:
                 return replace(one, topic=topic), ()
-        if topics[topic] == 'std_msgs/msg/Float64':
+        if topics[topic] == FLOAT64:
             return FieldSpec(topic, topics[topic], 'data'), ()
         raise InputError(f"{path}: throttle topic '{topic}' is {topics[topic]}, which no msg "
                          'config reads: name one in a YAML file of your own')
@@ -175,7 +177,7 @@ def _throttle(
     if len(found) == 1:
         return replace(spec, topic=found[0]), ()
     wanted = _absolute(spec.topic)
-    if not found and topics.get(wanted) == 'std_msgs/msg/Float64' and config.generic:
+    if not found and topics.get(wanted) == FLOAT64 and config.generic:
         return replace(spec, topic=wanted, type=topics[wanted]), ()
     if wanted in topics and not found:
         why = f"topic '{wanted}' is {topics[wanted]}, not {spec.type}"
@@ -185,29 +187,17 @@ def _throttle(
 
 
 VOLTAGE, THROTTLE, CURRENT = 'voltage', 'throttle', 'current'
-
-
-def span_words(start: float | None, end: float | None) -> str:
-    """Return 'from 2 s to 5 s'."""
-    return f"from {start or 0.0:g} s to {'the end' if end is None else f'{end:g} s'}"
-
-
-def outside_words(name: str, start: float | None, end: float | None, length: float) -> str:
-    """Return the text of the error for a part without samples (length of the recording in s)."""
-    return f'{name} holds no sample {span_words(start, end)}: it lasts {length:.3f} s'
-
-
-def part_words(start: float | None, end: float | None) -> str:
-    """Return the note on a part."""
-    return f'Only the part {span_words(start, end)} of the recording was read.'
+# Types with a single number, whose field need not be named.
+_SCALARS = (FLOAT32, FLOAT64)
 
 
 def read_bag(
-    bag: BagReader, *, msg_config: str | Path | None, voltage_topic: str | None,
+    path: Path, *, partial: bool, msg_config: str | Path | None, voltage_topic: str | None,
     throttle_topic: str | None, start: float | None, end: float | None,
     progress: Callable[[float], None] | None,
 ) -> RawColumns:
     """Read voltage, throttle and current of a bag, start and end in s; see `read_recording`."""
+    bag = BagReader(path, partial=partial)
     choice = choose(bag.path, bag.topics, msg_config=msg_config, voltage_topic=voltage_topic,
                     throttle_topic=throttle_topic)
     specs = _specs(bag, choice)
@@ -393,3 +383,37 @@ def _clock(spec: FieldSpec) -> BlockClock | None:
 def _stamps(clock: BlockClock | None, column: FieldColumn) -> FloatArray:
     """Return the stamp of each value, s."""
     return column.stamp if clock is None else clock.stamps(column.stamp, column.counts)
+
+
+def read_bag_signal(path: Path, signal: str, partial: bool) -> Series:
+    """Read one scalar of a bag over time."""
+    bag = BagReader(path, partial=partial)
+    topic, field = _split(path, signal, bag.topics)
+    kind = bag.topics[topic]
+    stamped = Field('header', 'std_msgs/Header') in bag.definitions(kind)[short_name(kind)]
+    spec = FieldSpec(topic, kind, field, nan='unknown',
+                     stamp_field='header.stamp' if stamped else None)
+    parts = [batch['signal'] for batch in batches(bag, {'signal': spec})]
+    if not parts:
+        raise InputError(f"{path}: topic '{topic}' holds no message")
+    column = join(parts)
+    unit = bag.origins.get(topic, {}).get(f'{topic[1:]}_unit', UNKNOWN)
+    if spec.type == IMU:
+        unit = {'angular_velocity': 'rad/s', 'linear_acceleration': 'm/s^2'}.get(
+            field.partition('.')[0], UNKNOWN)
+    return Series(signal, SIGNAL, column.stamp, column.values, '1', own_unit=unit)
+
+
+def _split(path: Path, signal: str, topics: Mapping[str, str]) -> tuple[str, str]:
+    """Return the topic and the field that a signal names."""
+    wanted = '/' + signal.lstrip('/')
+    if topics.get(wanted) in _SCALARS:
+        return wanted, 'data'
+    topic, _, field = wanted.rpartition('/')
+    if topic in topics:
+        return topic, field
+    if wanted in topics:
+        raise InputError(f"{path}: topic '{wanted}' is {topics[wanted]}: name the field too, "
+                         f'{wanted}/FIELD')
+    raise InputError(f"{path}: no topic '{topic or wanted}' for the signal '{signal}': "
+                     f'{nearest(topic or wanted, topics)}')

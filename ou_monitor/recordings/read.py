@@ -8,35 +8,28 @@ bag; if the voltage has the other kind of stamps, the signal is shifted by the t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 import math
 from pathlib import Path
 from typing import TypedDict, Unpack
 
 import numpy as np
-from ou_monitor.errors import InputError, nearest
-from ou_monitor.recordings.bag import BagReader, batches
-from ou_monitor.recordings.bag_samples import outside_words, part_words, read_bag
-from ou_monitor.recordings.cdr import Field, join, short_name
+from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.choose import (
     choose as choose_series, columns_of, NONE, signal_of)
 from ou_monitor.recordings.importers.csv_table import read_column, read_csv
 from ou_monitor.recordings.importers.formats import import_log, is_csv, is_log
 from ou_monitor.recordings.importers.log import (
-    CsvColumns, Log, RawColumns, Request, Series, SIGNAL, UNKNOWN)
-from ou_monitor.recordings.standard_types import IMU
+    CsvColumns, Log, RawColumns, Request, Series, SIGNAL)
 from ou_monitor.records import defect_of, Recording
-from ou_monitor.stream.config import FieldSpec
+from ou_monitor.text import outside_words, part_words
 from ou_monitor.timeline import (
     check_throttle, in_order, MOST_CURRENT, MOST_THROTTLE, MOST_VOLTAGE, part_of, plausible,
     plausible_samples, readings_of)
 
 # Spacing, s, from which another unit of time is more likely than a slow logger.
 _SPARSE = 5.0
-
-# Types with a single number, whose field need not be named.
-_SCALARS = ('std_msgs/msg/Float32', 'std_msgs/msg/Float64')
 
 
 def read_recording(
@@ -131,8 +124,11 @@ def _read(path: Path, options: ReadOptions, signal: str | None = None,
     if flight is not None or columns is not None:
         raise InputError(f'{path} is a bag: --flight is for logs, names and units of columns are '
                          'for logs and CSVs')
+    # A CSV or a log needs none of the modules that read bags.
+    from ou_monitor.recordings.bag_samples import read_bag
+
     return tidy(read_bag(
-        BagReader(path, partial=options.get('partial', False)),
+        path, partial=options.get('partial', False),
         msg_config=options.get('msg_config'), voltage_topic=options.get('voltage_topic'),
         throttle_topic=options.get('throttle_topic'), start=start, end=end,
         progress=options.get('progress'))), None
@@ -226,33 +222,6 @@ def read_signal(path: str | Path, signal: str, *, partial: bool = False,
         raise InputError('the name of the signal is empty: TOPIC/FIELD or a column')
     if is_csv(path):
         return Series(signal, SIGNAL, *read_column(path, signal, columns), '1')
-    bag = BagReader(path, partial=partial)
-    topic, field = _split(path, signal, bag.topics)
-    kind = bag.topics[topic]
-    stamped = Field('header', 'std_msgs/Header') in bag.definitions(kind)[short_name(kind)]
-    spec = FieldSpec(topic, kind, field, nan='unknown',
-                     stamp_field='header.stamp' if stamped else None)
-    parts = [batch['signal'] for batch in batches(bag, {'signal': spec})]
-    if not parts:
-        raise InputError(f"{path}: topic '{topic}' holds no message")
-    column = join(parts)
-    unit = bag.origins.get(topic, {}).get(f'{topic[1:]}_unit', UNKNOWN)
-    if spec.type == IMU:
-        unit = {'angular_velocity': 'rad/s', 'linear_acceleration': 'm/s^2'}.get(
-            field.partition('.')[0], UNKNOWN)
-    return Series(signal, SIGNAL, column.stamp, column.values, '1', own_unit=unit)
+    from ou_monitor.recordings.bag_samples import read_bag_signal
 
-
-def _split(path: Path, signal: str, topics: Mapping[str, str]) -> tuple[str, str]:
-    """Return the topic and the field that a signal names."""
-    wanted = '/' + signal.lstrip('/')
-    if topics.get(wanted) in _SCALARS:
-        return wanted, 'data'
-    topic, _, field = wanted.rpartition('/')
-    if topic in topics:
-        return topic, field
-    if wanted in topics:
-        raise InputError(f"{path}: topic '{wanted}' is {topics[wanted]}: name the field too, "
-                         f'{wanted}/FIELD')
-    raise InputError(f"{path}: no topic '{topic or wanted}' for the signal '{signal}': "
-                     f'{nearest(topic or wanted, topics)}')
+    return read_bag_signal(path, signal, partial)
