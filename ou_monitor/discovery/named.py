@@ -8,7 +8,7 @@ withdrawn, and the search continues without them.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -73,24 +73,30 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
     given = [term.NAME for term in exact if term.FAMILY != 'line']
     failure, begun = '', None
     dropped: list[str] = []
+    refuted = -math.inf
     try:
         under_load(fitter, search)
         begun = found = _finished(fitter, search, bank)
         for turn in range(_TURNS):
+            less = search.copy()
             # The last turn is without latent causes, which were withdrawn repeatedly.
             name_causes(fitter, search, bank, given=[*given, *dropped],
                         latent=turn < _TURNS - 1,
                         progress=None if turn else lambda share: progress(0.1 + 0.9 * share))
+            if fitter.evidence(search.composite) < refuted:
+                # These causes came in place of a better one that does not explain its statistics.
+                search = replace(less, stopped=search.stopped)
             found = _finished(fitter, search, bank)
             out = _withdrawn(fitter, found, begun)
             if not out:
                 break
             dropped += [search.accepted[k] for k in out]
+            refuted = max(refuted, fitter.evidence(search.composite))
             found = begun
-            less = without_causes(fitter, search, out)
-            if less is None:
+            rest = without_causes(fitter, search, out)
+            if rest is None:
                 break
-            search = less
+            search = rest
             found = _finished(fitter, search, bank)
     except KeyboardInterrupt:
         failure = INTERRUPTED

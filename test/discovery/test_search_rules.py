@@ -1,5 +1,6 @@
 """Order and bookkeeping of fits in a search, with models that are only names and evidence."""
 
+from dataclasses import replace
 import math
 from types import SimpleNamespace
 
@@ -7,7 +8,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 from ou_monitor.criticism.composite import fit_composite
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.discovery import decision, fitting, search as rules
+from ou_monitor.discovery import decision, fitting, named as rules_of_names, search as rules
 from ou_monitor.discovery.fitting import Fitter, Trial
 from ou_monitor.discovery.named import _with_trends
 from ou_monitor.discovery.search import Search
@@ -312,3 +313,32 @@ def test_a_relaxation_too_slow_for_the_recording_may_be_a_drift(rate, other, dri
     model = Model([OU(rate, 0.5, 5.0), SecondRelaxation(other, 0.1)], 0.0)
     rivals = _with_trends(samples, model, {SecondRelaxation.NAME: ['flicker_noise']})
     assert (Drift.NAME in rivals[SecondRelaxation.NAME]) is drift
+
+
+@pytest.mark.parametrize('worth, named', [
+    (15.0, ['drift']), (25.0, ['drift', 'second_relaxation'])])
+def test_a_cause_in_place_of_a_better_one_that_was_withdrawn_is_not_named(
+        worth, named, monkeypatch):
+    """It imitates it: the withdrawn one had an evidence of 20 nats."""
+    def add(fitter, search, bank, given, **_):
+        name = SLOW.NAME if NOISE.NAME in given else NOISE.NAME
+        value = worth if NOISE.NAME in given else 20.0
+        search.composite, search.accepted = Model([], value), ['drift', name]
+
+    monkeypatch.setattr(rules_of_names, 'Fitter', lambda samples, cost: Table({}))
+    monkeypatch.setattr(Table, 'fit', lambda self, terms, known: Model([], 0.0))
+    for name in ('covariates_of', 'simulate_bank', 'criticise'):
+        monkeypatch.setattr(rules_of_names, name, lambda *_: {})
+    monkeypatch.setattr(rules_of_names, 'under_load', lambda fitter, search:
+                        search.accepted.append('drift'))
+    monkeypatch.setattr(rules_of_names, 'name_causes', add)
+    monkeypatch.setattr(rules_of_names, '_finished', lambda fitter, search, bank:
+                        rules_of_names._Result(search.copy(), search.composite, {}))
+    monkeypatch.setattr(rules_of_names, '_withdrawn', lambda fitter, found, begun: [
+        k for k, name in enumerate(found.search.accepted) if name == NOISE.NAME])
+    monkeypatch.setattr(rules_of_names, 'without_causes', lambda fitter, search, out: replace(
+        search, composite=Model([], 5.0), accepted=['drift']))
+    start = Model([BASE], 0.0)
+    start.gaussian.phi = np.ones(3)
+    found = rules_of_names.named_causes(SimpleNamespace(t=np.arange(3.0)), start, None, (), print)
+    assert list(found.names) == named and found.dropped == (NOISE.NAME,)
