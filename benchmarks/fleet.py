@@ -1,10 +1,10 @@
 """
 Throughput of `ou-monitor fleet` against the number of workers (10 min).
 
-    python benchmarks/fleet.py --workers 2 --recordings 64 --markdown doc/results/fleet.md
+    python benchmarks/fleet.py --workers 1 2 --recordings 64 --markdown doc/results/fleet.md
 
 Recordings are simulated into a temporary folder.  Each round then analyses them with each number
-of workers in turn, and in this process alone, as `fleet` does with one worker.
+of workers in turn, and in this process alone for comparison.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import time
 from common import deliver, table
 import numpy as np
 from ou_monitor.fleet.analysis import Options, work
-from ou_monitor.fleet.workers import local_workers, usable_cores
+from ou_monitor.fleet.workers import LocalWorkers, usable_cores
 from ou_monitor.recordings.write import write_recording
 from ou_monitor.records import Recording
 from ou_monitor.simulation import PRESETS, read_profile, simulated
@@ -62,12 +62,12 @@ def alone(tasks: Sequence[tuple]) -> tuple[float, float, float]:
 def on_workers(tasks: Sequence[tuple], count: int) -> tuple[float, float, float]:
     """Return the wall times of start and work, and the CPU time of both together, s."""
     used, start = cpu(), time.perf_counter()
-    with local_workers(count) as each:
+    with LocalWorkers(count) as pool:
         # Each worker imports the package in its first task, which counts as start.
-        for _, result, why in each(work, [tasks[0]] * (2 * count)):
+        for _, result, why in pool.each(work, [tasks[0]] * (2 * count)):
             assert not why and not result['error']
         middle = time.perf_counter()
-        for _, result, why in each(work, tasks):
+        for _, result, why in pool.each(work, tasks):
             assert not why and not result['error']
         end = time.perf_counter()
     # The workers have ended, so their CPU time is known.
@@ -77,7 +77,7 @@ def on_workers(tasks: Sequence[tuple], count: int) -> tuple[float, float, float]
 def main() -> int:
     """Measure and print, or put the table into a Markdown file."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--workers', type=int, nargs='+', default=[2])
+    parser.add_argument('--workers', type=int, nargs='+', default=[1, 2])
     parser.add_argument('--recordings', type=int, default=64)
     parser.add_argument('--seconds', type=float, default=60.0)
     parser.add_argument('--repeats', type=int, default=3)
@@ -97,7 +97,7 @@ def main() -> int:
             for count in args.workers:
                 times[count].append(on_workers(tasks, count))
     rows = []
-    for name, found in (('1 (this process)', one), *((str(n), t) for n, t in times.items())):
+    for name, found in (('none (this process)', one), *((str(n), t) for n, t in times.items())):
         start, wall, used = (statistics.median(column) for column in zip(*found))
         ratios = [b[1] / t[1] for b, t in zip(one, found)]
         rows.append([name, f'{start:.1f}', f'{wall:.1f}', f'{args.recordings / wall:.2f}',
@@ -107,7 +107,7 @@ def main() -> int:
             f'on {usable_cores()} cores (load before the run: {os.getloadavg()[0]:.1f}); '
             f'median of {args.repeats} rounds, in each of which all ways ran in turn; ratios '
             'within a round, with their range.\n\n' + table(
-                ['workers', 'start s', 'work s', 'recordings a second', 'times as fast as one',
+                ['workers', 'start s', 'work s', 'recordings a second', 'times as fast as none',
                  'CPU s, all processes'], rows))
     deliver(text, args.markdown, 'benchmark')
     return 0

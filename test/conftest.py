@@ -50,5 +50,21 @@ def pytest_xdist_make_scheduler(config, log):
 
 @pytest.fixture
 def one_process(monkeypatch):
-    """Make `fleet` work in this process, as on one core."""
-    monkeypatch.setattr('ou_monitor.fleet.workers.usable_cores', lambda: 1)
+    """Make `fleet` work in this process."""
+    class Here:
+        """Replaces the pool of workers."""
+
+        def __init__(self, *_: object) -> None:
+            """Ignore all options."""
+
+        def each(self, function, arguments):
+            for k, given in enumerate(arguments):
+                yield k, function(*given), ''
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            pass
+
+    monkeypatch.setattr('ou_monitor.fleet.fleet.LocalWorkers', Here)

@@ -9,7 +9,6 @@ import math
 import os
 from pathlib import Path
 import shlex
-import shutil
 import sys
 from typing import Any, TYPE_CHECKING
 
@@ -27,11 +26,13 @@ TABLE, REPORT = 'fleet.parquet', 'fleet.html'
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from ou_monitor.fleet.workers import usable_cores
+
     if not args.output:
         raise InputError('--output: the path is empty')
     if args.scheduler is not None and args.workers is not None:
         raise InputError('--workers is for local processes, --scheduler for a cluster: give one')
-    workers = _workers(args)
+    _check_installed(args)
     folder = Path(args.output)
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--output '{folder}' is a file: name a folder")
@@ -59,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
         with Progress('comparing', quiet) as comparing, \
                 Progress('analyzing', quiet) as progress:
             fleet = run_fleet(
-                found, folder, options, version, workers=workers,
+                found, folder, options, version, workers=args.workers or usable_cores(),
                 scheduler=args.scheduler, insecure=args.insecure, pattern=pattern,
                 stated_options=more, comparing=comparing, progress=progress)
     except KeyboardInterrupt:
@@ -73,29 +74,20 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _workers(args: argparse.Namespace) -> int:
-    """Return the number of local workers; InputError if a package is missing, or unsafe."""
+def _check_installed(args: argparse.Namespace) -> None:
+    """Refuse to start if a package is missing or the scheduler is unsafe."""
     from importlib.util import find_spec
 
-    from ou_monitor.fleet.workers import check_address, usable_cores
-
-    dask = ['dask', 'distributed']
-    needed = ['pyarrow'] + (dask if args.scheduler or (args.workers or 1) > 1 else [])
+    needed = ['pyarrow'] + ([] if args.scheduler is None else ['dask', 'distributed'])
     missing = [name for name in needed if find_spec(name) is None]
     if missing:
         raise InputError(f"{' and '.join(missing)} {'is' if len(missing) == 1 else 'are'} not "
                          f"installed: {how_to_install('fleet')}")
     if args.scheduler is not None:
+        from ou_monitor.fleet.workers import check_address
         check_address(args.scheduler, args.insecure)
     elif args.insecure:
-        raise InputError('--insecure is for --scheduler: local workers always use TLS')
-    workers: int = args.workers or usable_cores()
-    if args.scheduler is None and args.workers is None and workers > 1 and not (
-            all(map(find_spec, dask)) and shutil.which('openssl')):
-        print('dask, distributed or openssl is not installed: recordings are analysed one after '
-              f"another; for workers, {how_to_install('fleet')}", file=sys.stderr)
-        return 1
-    return workers
+        raise InputError('--insecure is for --scheduler: local processes open no connection')
 
 
 def version() -> str:

@@ -24,7 +24,7 @@ from ou_monitor.fleet.find import duplicates, Found, FoundRecording
 from ou_monitor.fleet.judgement import judge, Judgement
 from ou_monitor.fleet.table import Row, rows_of
 from ou_monitor.fleet.vehicles import assign, number_flights
-from ou_monitor.fleet.workers import Each, local_workers, scheduler_workers
+from ou_monitor.fleet.workers import ClusterWorkers, LocalWorkers, Workers
 from ou_monitor.records import NAN
 from ou_monitor.stream.files import open_regular, write_whole
 from ou_monitor.text import printable
@@ -138,16 +138,16 @@ def run_fleet(found: Found, folder: Path, options: Options, version: Callable[[]
         else:
             results[source.path] = known
     if missing:
-        with (local_workers(min(workers, len(missing))) if scheduler is None else
-              scheduler_workers(scheduler, version, insecure)) as each:
-            _work(missing, results, parts, options, each, progress)
+        with (LocalWorkers(min(workers, len(missing))) if scheduler is None else
+              ClusterWorkers(scheduler, version, insecure)) as pool:
+            _work(missing, results, parts, options, pool, progress)
     rows, notes = _table(found.sources, results, twice, pattern)
     notes = list(map(printable, (*found.notes, *notes)))
     return Fleet(rows, judge(rows), tuple(notes), len(found.sources), options.brownout_voltage)
 
 
 def _work(missing: Sequence[FoundRecording], results: dict[Path, dict[str, Any]], parts: Parts,
-          options: Options, each: Each, progress: Progress | None) -> None:
+          options: Options, pool: Workers, progress: Progress | None) -> None:
     """Analyse unfinished recordings, and save each result."""
     kept = len(results)
     # The largest first, so that no long one is left at the end.
@@ -155,7 +155,7 @@ def _work(missing: Sequence[FoundRecording], results: dict[Path, dict[str, Any]]
     tell = progress or (lambda share: None)
     tell(kept / (kept + len(order)))
     tasks = [(str(source.path), asdict(options)) for source in order]
-    for done, (k, result, why) in enumerate(each(work, tasks)):
+    for done, (k, result, why) in enumerate(pool.each(work, tasks)):
         if result is None:
             result = {'error': why, 'levels': []}
         if not result['error']:

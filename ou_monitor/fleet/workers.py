@@ -1,8 +1,7 @@
 """
-Run tasks in this process, on Dask workers of this machine, or on those of a given scheduler.
+Run tasks in many processes: on this machine, or on the workers of a Dask scheduler.
 
-Local workers listen on the loopback, to TLS with the key of this run only; no other user can read
-it.  Only this module imports Dask.
+Local processes are reached over pipes, so no port is open.  Only this module imports Dask.
 
 Limits: a worker that dies loses its tasks.  Other workers may have used up the memory for which it
 was killed, so its task is tried once more, alone, before it fails.
@@ -10,18 +9,20 @@ was killed, so its task is tried once more, alone, before it fails.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, ExitStack, suppress
-from functools import partial
 import ipaddress
 import logging
-from multiprocessing import resource_tracker
+import multiprocessing
+from multiprocessing.connection import Connection
 import os
 import resource
 import signal
-import subprocess
-from tempfile import TemporaryDirectory
+import threading
 import time
 from typing import Any
 from urllib.parse import urlsplit
@@ -32,20 +33,10 @@ from ou_monitor.recordings.mcap_file import usable_memory
 # Several processes with several threads of linear algebra each are slower than with one thread.
 _ONE_THREAD = dict.fromkeys(
     ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'NUMBA_NUM_THREADS'), '1')
-# Dask's settings for local workers.  `Workers` repeats lost tasks; Dask's web server has no
-# authentication, so it serves no pages; the environment that Dask would set lets malloc return all
-# memory at once, which takes 60 % more CPU time.
-_LOCAL = {'distributed.scheduler.allowed-failures': 0, 'distributed.scheduler.http.routes': [],
-          'distributed.worker.http.routes': [], 'distributed.nanny.pre-spawn-environ': {}}
-# Writes a key and its certificate to a pipe.  Dask's own function needs the package cryptography.
-_NEW_KEY = ('openssl', 'req', '-x509', '-newkey', 'ec', '-pkeyopt', 'ec_paramgen_curve:P-256',
-            '-nodes', '-days', '365', '-subj', '/CN=ou_monitor', '-keyout', '/dev/stdout')
 # Share of the memory that all workers together may use, and the minimum for one, bytes.
 _MEMORY_SHARE, _MEMORY_LEAST = 0.9, 1 << 29
 # Timeout for a scheduler and for a worker, s.
 _PATIENCE = 30.0
-# Timeout for closing the local scheduler, s.
-_CLOSING = 5.0
 # Period of checking whether workers are left, s.
 _LOOK = 1.0
 LOST = ('The worker died on this recording, also in a second attempt on its own: it was killed, '
@@ -53,8 +44,6 @@ LOST = ('The worker died on this recording, also in a second attempt on its own:
 _RESUME = 'finished recordings are kept, and the same command resumes'
 # Index of a task in the list of arguments, its result, and its error.
 Outcome = tuple[int, Any, str]
-# Calls a function for each tuple of arguments, and yields the outcomes.
-Each = Callable[[Callable[..., Any], Sequence[tuple[Any, ...]]], Iterator[Outcome]]
 
 
 def usable_cores() -> int:
@@ -63,91 +52,156 @@ def usable_cores() -> int:
         os.cpu_count() or 1)
 
 
+class Workers(ABC):
+    """Processes that call a function; a context manager."""
+
+    @abstractmethod
+    def _room(self) -> int:
+        """Return the maximum number of running tasks."""
+
+    @abstractmethod
+    def _submit(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+        """Start a call; return its future."""
+
+    @abstractmethod
+    def _wait(self, futures: Sequence[Any]) -> list[Any]:
+        """Wait until a future is done; return all finished ones."""
+
+    @abstractmethod
+    def _outcome(self, future: Any) -> tuple[Any, str]:
+        """Return the result of a finished future, or its error."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Cancel the running tasks, and release the workers."""
+
+    def each(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]
+             ) -> Iterator[Outcome]:
+        """Call a function for each tuple of arguments; yield the outcomes."""
+        waiting = deque(range(len(arguments)))
+        alone: deque[int] = deque()
+        retried: set[int] = set()
+        running: dict[Any, int] = {}
+
+        def start(k: int) -> None:
+            running[self._submit(function, arguments[k])] = k
+
+        while waiting or alone or running:
+            while waiting and len(running) < self._room():
+                start(waiting.popleft())
+            if not running:
+                start(alone.popleft())
+            for future in self._wait(list(running)):
+                k = running.pop(future)
+                result, why = self._outcome(future)
+                if why == LOST and k not in retried:
+                    retried.add(k)
+                    alone.append(k)
+                else:
+                    yield k, result, why
+
+    def __enter__(self) -> Workers:
+        """Return itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Cancel the running tasks."""
+        self.close()
+
+
+class LocalWorkers(Workers):
+    """Processes of this machine, each with a share of the memory."""
+
+    def __init__(self, count: int) -> None:
+        # The workers wait at the reading end: they exit when this process closes its end or dies.
+        self._watched, self._alive = multiprocessing.get_context('spawn').Pipe(duplex=False)
+        self._memory = max(int(_MEMORY_SHARE * usable_memory()) // count, _MEMORY_LEAST)
+        # One pool for each worker, so that a broken pool identifies its task.
+        self._pools: list[ProcessPoolExecutor | None] = [None] * count
+        self._at: dict[Future[Any], int] = {}
+
+    def _room(self) -> int:
+        return len(self._pools)
+
+    def _submit(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Future[Any]:
+        k = min(set(range(len(self._pools))) - set(self._at.values()))
+        pool = self._pools[k]
+        if pool is not None:
+            future = pool.submit(function, *arguments)
+        else:
+            # Spawned, because forking with threads is unsafe.  The first task starts the process.
+            pool = self._pools[k] = ProcessPoolExecutor(
+                1, multiprocessing.get_context('spawn'), _prepare, (self._watched, self._memory))
+            with _environment_of_workers():
+                future = pool.submit(function, *arguments)
+        self._at[future] = k
+        return future
+
+    def _wait(self, futures: Sequence[Future[Any]]) -> list[Future[Any]]:
+        return list(wait(futures, return_when=FIRST_COMPLETED).done)
+
+    def _outcome(self, future: Future[Any]) -> tuple[Any, str]:
+        k = self._at.pop(future)
+        try:
+            return future.result(), ''
+        except BrokenProcessPool:
+            pool, self._pools[k] = self._pools[k], None
+            if pool is not None:
+                pool.shutdown()
+            return None, LOST
+        except Exception as error:
+            # The function catches its own errors: this one is of the transport.
+            return None, failure(error)
+
+    def close(self) -> None:
+        """End the workers at once."""
+        self._alive.close()
+        for pool in self._pools:
+            if pool is not None:
+                pool.shutdown(cancel_futures=True)
+        self._watched.close()
+
+
+def failure(error: Exception) -> str:
+    """Return the message for an error in the transport to or from a worker."""
+    return ' '.join(f'The worker failed ({type(error).__name__}: {error}).'.split())
+
+
 @contextmanager
-def local_workers(count: int) -> Iterator[Each]:
-    """Start workers on this machine, each with a share of the memory; one is this process."""
-    memory = max(int(_MEMORY_SHARE * usable_memory()) // count, _MEMORY_LEAST)
-    with ExitStack() as stack:
-        each = _here if count == 1 else Workers(_start(count, stack), 1).each
-        yield lambda function, arguments: each(partial(_with_memory, memory, function), arguments)
+def _environment_of_workers() -> Iterator[None]:
+    """
+    Start processes with one thread each and with Ctrl-C blocked.
 
-
-def _start(count: int, stack: ExitStack) -> Any:
-    """Start local workers, which end with the stack; return their client."""
-    import dask
-    from distributed import Client, LocalCluster
-
-    _quiet()
-    security = _security()
-    folder = stack.enter_context(TemporaryDirectory(
-        prefix='ou_monitor_', ignore_cleanup_errors=True))
-    # Dask imports NumPy before a task could set them.
+    A terminal sends Ctrl-C to all processes of the group; the main process ends its workers
+    itself, and their tracebacks would hide its message.
+    """
+    before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(_ONE_THREAD)
-    # Workers inherit that Ctrl-C is blocked: a terminal sends it to them too, and their tracebacks
-    # would hide the message of this process.  Starting the tracker later would unblock it.
-    resource_tracker.ensure_running()
+    # A child inherits the mask; in this process, Ctrl-C is delayed until the child has started.
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        stack.enter_context(dask.config.set({**_LOCAL, 'temporary-directory': folder}))
-        cluster = LocalCluster(
-            n_workers=count, threads_per_worker=1, memory_limit=None, security=security,
-            death_timeout=_PATIENCE, silence_logs=logging.CRITICAL, dashboard_address=None,
-            scheduler_kwargs={'dashboard_address': '127.0.0.1:0'})
-        stack.callback(_end, cluster)
-    except Exception as error:
-        # Dask raises errors of many types.
-        raise InputError(f'--workers: the local workers do not start ({type(error).__name__}: '
-                         f'{error}); use --workers 1') from error
+        yield
     finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-    return stack.enter_context(Client(cluster))
 
 
-def _end(cluster: Any) -> None:
-    """End the workers at once; Dask would wait for their tasks."""
-    for nanny in cluster.workers.values():
-        nanny.close_gracefully()
-        # It may have died at this moment.
-        with suppress(ProcessLookupError):
-            if nanny.pid is not None:
-                os.kill(nanny.pid, signal.SIGKILL)
-    # Dask closes again at exit.
-    cluster.shutdown_on_close = False
-    # If a worker is being restarted, some versions of Dask wait for it for ever, others fail; new
-    # processes end with this one.
-    with suppress(AssertionError, TimeoutError):
-        cluster.close(timeout=_CLOSING)
+def _prepare(watched: Connection, memory: int) -> None:
+    """Limit the memory of this worker (bytes), and end it with the main process."""
+    hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+    if hard == resource.RLIM_INFINITY or memory < hard:
+        resource.setrlimit(resource.RLIMIT_DATA, (memory, hard))
 
+    def end_with_parent() -> None:
+        with suppress(EOFError, OSError):
+            watched.recv_bytes()
+        os._exit(1)
 
-def _here(function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]) -> Iterator[Outcome]:
-    """Call a function for each tuple of arguments in this process; yield the outcomes."""
-    for k, given in enumerate(arguments):
-        yield k, function(*given), ''
-
-
-def _with_memory(memory: int, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a function while this process may have only so much memory, bytes."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    limit = memory if soft == resource.RLIM_INFINITY else min(memory, soft)
-    resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
-    try:
-        return function(*arguments)
-    finally:
-        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
-
-
-def _security() -> Any:
-    """Return Dask's settings for TLS with a new key."""
-    from distributed.security import Security
-
-    try:
-        made = subprocess.run(_NEW_KEY, capture_output=True, check=True, text=True).stdout
-    except (OSError, subprocess.CalledProcessError) as error:
-        raise InputError('--workers: openssl, which makes the key of local workers, failed '
-                         f'({error}); install it, or use --workers 1') from error
-    return Security(require_encryption=True, tls_ca_file=made, **{
-        f'tls_{role}_{what}': made
-        for role in ('client', 'scheduler', 'worker') for what in ('key', 'cert')})
+    threading.Thread(target=end_with_parent, daemon=True).start()
 
 
 def check_address(address: str, insecure: bool = False) -> None:
@@ -168,29 +222,36 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
-@contextmanager
-def scheduler_workers(address: str, check: Callable[[], str], insecure: bool = False
-                      ) -> Iterator[Each]:
+class ClusterWorkers(Workers):
     """
-    Use the workers of a scheduler, which have this package and the recordings at the same paths.
+    The workers of a Dask scheduler, which have this package and the recordings at the same paths.
 
     Dask's configuration (``distributed.comm.tls``) names the certificates for ``tls://``; `check`
     must return the same here and on every worker; `insecure` allows another machine without TLS.
     InputError: the address is not safe, no scheduler or worker answers, or the versions differ.
     """
-    check_address(address, insecure)
-    from distributed import Client
 
-    _quiet()
-    try:
-        connected = Client(address, timeout=_PATIENCE)
-    # Dask raises a TypeError if there is no certificate.
-    except (OSError, TypeError, ValueError) as error:
-        raise InputError(f"--scheduler: no scheduler answers at '{address}' "
-                         f"({str(error).splitlines()[0] if str(error) else 'time-out'}); "
-                         "start one by 'dask scheduler'; doc/security.md explains certificates"
-                         ) from error
-    with connected as client:
+    def __init__(self, address: str, check: Callable[[], str], insecure: bool = False) -> None:
+        check_address(address, insecure)
+        self._stack = ExitStack()
+        try:
+            self._client = self._connect(address, check)
+        except BaseException:
+            self._stack.close()
+            raise
+
+    def _connect(self, address: str, check: Callable[[], str]) -> Any:
+        from distributed import Client
+
+        _quiet()
+        try:
+            client = self._stack.enter_context(Client(address, timeout=_PATIENCE))
+        # Dask raises a TypeError if there is no certificate.
+        except (OSError, TypeError, ValueError) as error:
+            raise InputError(f"--scheduler: no scheduler answers at '{address}' "
+                             f"({str(error).splitlines()[0] if str(error) else 'time-out'}); "
+                             "start one by 'dask scheduler'; doc/security.md explains certificates"
+                             ) from error
         try:
             client.wait_for_workers(1, timeout=_PATIENCE)
         except TimeoutError as error:
@@ -206,49 +267,16 @@ def scheduler_workers(address: str, check: Callable[[], str], insecure: bool = F
                 f"--scheduler: the workers of '{address}' have ou_monitor "
                 f"{', '.join(sorted(there))}, this machine has {check()}: install the same "
                 'version')
-        # Two tasks a thread, so that no worker idles between tasks.
-        yield Workers(client, 2).each
-
-
-class Workers:
-    """The workers of a Dask scheduler, each thread with at most `depth` tasks."""
-
-    def __init__(self, client: Any, depth: int) -> None:
-        self._client, self._depth = client, depth
-
-    def each(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]
-             ) -> Iterator[Outcome]:
-        """Call a function for each tuple of arguments; yield the outcomes."""
-        waiting = deque(range(len(arguments)))
-        alone: deque[int] = deque()
-        retried: set[int] = set()
-        running: dict[Any, int] = {}
-
-        def start(k: int) -> None:
-            running[self._client.submit(function, *arguments[k], pure=False)] = k
-
-        while waiting or alone or running:
-            while waiting and len(running) < self._room():
-                start(waiting.popleft())
-            if not running:
-                start(alone.popleft())
-            for future in self._wait(list(running)):
-                k = running.pop(future)
-                result, why = self._outcome(future)
-                # Otherwise Dask repeats the task if its worker dies later.
-                future.release()
-                if why == LOST and k not in retried:
-                    retried.add(k)
-                    alone.append(k)
-                else:
-                    yield k, result, why
+        return client
 
     def _room(self) -> int:
-        """Return the maximum number of running tasks."""
-        return self._depth * max(1, sum(int(n) for n in self._client.nthreads().values()))
+        # Two tasks a thread, so that no worker idles between tasks.
+        return 2 * max(1, sum(int(count) for count in self._client.nthreads().values()))
+
+    def _submit(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+        return self._client.submit(function, *arguments, pure=False)
 
     def _wait(self, futures: Sequence[Any]) -> list[Any]:
-        """Wait until a future is done; return all finished ones."""
         from distributed import wait
 
         alone_since = time.monotonic()
@@ -273,7 +301,6 @@ class Workers:
             time.sleep(0.05)
 
     def _outcome(self, future: Any) -> tuple[Any, str]:
-        """Return the result of a finished future, or its error."""
         from distributed import KilledWorker
 
         try:
@@ -281,9 +308,11 @@ class Workers:
         except (KilledWorker, TimeoutError):
             return None, LOST
         except Exception as error:
-            # The function catches its own errors: this one is of the transport.
-            why = f'The worker failed ({type(error).__name__}: {error}).'
-            return None, ' '.join(why.split())
+            return None, failure(error)
+
+    def close(self) -> None:
+        """Release the workers."""
+        self._stack.close()
 
 
 def _quiet() -> None:

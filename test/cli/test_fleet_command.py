@@ -108,7 +108,7 @@ def story(logs, tmp_path_factory) -> tuple[Path, list, subprocess.CompletedProce
 
     """
     out = tmp_path_factory.mktemp('fleet') / 'out'
-    arguments = (logs, '--output', out, '--workers', 2, '--brownout-voltage', 4.5, '--json',
+    arguments = (logs, '--output', out, '--workers', 1, '--brownout-voltage', 4.5, '--json',
                  out.parent / 'fleet.json')
     stops = []
     before: dict[str, int] = {}
@@ -404,24 +404,6 @@ def test_missing_extra_is_named(logs, tmp_path, capsys, monkeypatch):
                         lambda name, *a: None if name == 'pyarrow' else real(name, *a))
     said = refused(capsys, logs, '--output', tmp_path / 'out')
     assert 'pyarrow is not installed: ' in said and "pip install '.[fleet]'" in said
-
-
-def test_without_dask_recordings_are_analysed_in_turn(tmp_path, capsys, monkeypatch):
-    """The default says so in one line; if workers are asked for, the line says what to install."""
-    for name in ('dask', 'distributed'):
-        monkeypatch.setitem(sys.modules, name, None)
-    monkeypatch.setattr('ou_monitor.fleet.workers.usable_cores', lambda: 2)
-    logs, out = tmp_path / 'logs', tmp_path / 'out'
-    logs.mkdir()
-    for k in range(2):
-        write_csv(flight(k, n=3000), logs / f'{k}.csv')
-    said = refused(capsys, logs, '--output', out, '--workers', '2')
-    assert 'dask and distributed are not installed: ' in said and "pip install '.[fleet]'" in said
-    for more in ([], ['--workers', '1', '--force']):
-        assert main(['fleet', str(logs), '--output', str(out), *more]) == 0
-        notes = capsys.readouterr().err.splitlines()
-        assert ['one after another' in note for note in notes] == ([] if more else [True])
-    assert len(parts(out)) == 2
 
 
 def test_a_full_disk_is_reported_before_the_work(logs, tmp_path):

@@ -9,7 +9,6 @@ from pathlib import Path
 import re
 import resource
 import signal
-import threading
 from types import SimpleNamespace
 
 from made_logs import crazyflie, hover
@@ -19,7 +18,7 @@ from ou_monitor.fleet.analysis import Options, work
 from ou_monitor.fleet.find import duplicates, find_recordings
 from ou_monitor.fleet.fleet import Parts
 from ou_monitor.fleet.vehicles import assign, natural, number_flights, read_pattern, start_of
-from ou_monitor.fleet.workers import check_address, local_workers, LOST
+from ou_monitor.fleet.workers import check_address, LocalWorkers, LOST, usable_memory
 from ou_monitor.recordings.read import read_recording
 from ou_monitor.records import Recording
 from ou_monitor.report.fleet_document import failure_words
@@ -40,16 +39,44 @@ def deadly(task: int, folder: str) -> dict:
 
 def test_a_worker_that_dies_is_one_row(tmp_path):
     """A recording that kills its worker twice is lost; all others are done."""
-    with local_workers(2) as each:
-        done = list(each(deadly, [(k, str(tmp_path)) for k in range(8)]))
+    with LocalWorkers(2) as pool:
+        done = list(pool.each(deadly, [(k, str(tmp_path)) for k in range(8)]))
     results = {k: result for k, result, why in done if not why}
     assert {k: why for k, _, why in done if why} == {3: LOST}
     assert sorted(results) == [0, 1, 2, 4, 5, 6, 7]
-    # These twice each, in two processes; finished ones are not repeated.
+    # Twice each, in two processes.
     assert len(list(tmp_path.glob('tried_3_*'))) == len(list(tmp_path.glob('tried_5_*'))) == 2
-    assert len(list(tmp_path.glob('tried_*'))) == 10
     # One thread of linear algebra in each, whatever the machine has.
     assert all(set(result['threads'].values()) == {'1'} for result in results.values())
+
+
+def sockets(process: int | str) -> set[str]:
+    found = set()
+    for link in Path(f'/proc/{process}/fd').iterdir():
+        try:
+            target = os.readlink(link)
+        except OSError:
+            continue
+        if target.startswith('socket:'):
+            found.add(target)
+    return found
+
+
+def look(_: int) -> dict:
+    """Return what a worker has open, and its limit of memory."""
+    return {'sockets': sorted(sockets('self')), 'pid': os.getpid(),
+            'memory': resource.getrlimit(resource.RLIMIT_DATA)[0]}
+
+
+def test_no_process_opens_a_socket():
+    """Neither the workers nor this process open a network or local socket."""
+    before = sockets('self')
+    with LocalWorkers(2) as pool:
+        done = [result for _, result, why in pool.each(look, [(k,) for k in range(4)]) if not why]
+        assert sockets('self') == before
+    assert len(done) == 4 and all(set(result['sockets']) <= before for result in done)
+    limits = {result['memory'] for result in done}
+    assert len(limits) == 1 and 2 * limits.pop() <= usable_memory()
 
 
 def fill(size: int) -> str:
@@ -60,26 +87,23 @@ def fill(size: int) -> str:
         return 'refused'
 
 
-@pytest.mark.parametrize('count', [1, 2])
-def test_a_worker_has_its_share_of_the_memory(count, monkeypatch):
-    """A larger allocation fails in the worker, which continues; so in this process."""
-    before = resource.getrlimit(resource.RLIMIT_DATA)
-    monkeypatch.setattr('ou_monitor.fleet.workers.usable_memory', lambda: count << 30)
-    with local_workers(count) as each:
-        done = {k: result for k, result, _ in each(fill, [(1 << 20,), (3 << 29,), (9,)])}
+def test_a_worker_has_its_share_of_the_memory(monkeypatch):
+    """A larger allocation fails in the worker, which continues."""
+    monkeypatch.setattr('ou_monitor.fleet.workers.usable_memory', lambda: 2 << 30)
+    with LocalWorkers(2) as pool:
+        done = {k: result for k, result, _ in pool.each(fill, [(1 << 20,), (3 << 29,), (9,)])}
     assert done == {0: str(1 << 20), 1: 'refused', 2: '9'}
-    assert resource.getrlimit(resource.RLIMIT_DATA) == before
 
 
 def unpicklable(_: int) -> object:
     """Return what cannot come back."""
-    return threading.Lock()
+    return lambda: None
 
 
 def test_a_result_that_cannot_come_back_is_one_row():
-    with local_workers(2) as each:
-        found = list(each(unpicklable, [(0,), (1,)]))
-    assert sorted(k for k, _, _ in found) == [0, 1]
+    with LocalWorkers(1) as pool:
+        found = list(pool.each(unpicklable, [(0,), (1,)]))
+    assert [k for k, _, _ in found] == [0, 1]
     assert all('The worker failed' in why and '\n' not in why for _, _, why in found)
 
 
