@@ -408,6 +408,9 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
         level, source = (level, source) if voltage is None else (voltage, 'given')
         flight, facts, risks = _flight(flown, full, cells, level if rail == 'bus' else None,
                                        horizon, risk)
+        if not facts.sag.known and 'battery_resistance' not in values:
+            raise InputError(f'the sag of {flown.name} is unknown, so a remedy cannot be chosen: '
+                             'give --set battery_resistance=OHM, or fly more changes of throttle')
         throttle = flight.highest if throttle is None else throttle
         circuit = network_of(flight, throttle, values)
         if rail != 'bus' and voltage is None:

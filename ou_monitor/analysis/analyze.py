@@ -132,7 +132,8 @@ def _left_out(recording: Recording, found: tuple[LoadLevel, ...]) -> tuple[str, 
     if any(math.isnan(level.throttle) for level in found):
         return ('No throttle was held long enough for a load level: the whole recording is one '
                 'level, with throttle as a regressor; --levels can name levels.',)
-    held = sum(float(recording.t[s.stop - 1] - recording.t[s.start])
+    step = float(np.median(np.diff(recording.t))) if recording.n > 1 else 0.0
+    held = sum(float(recording.t[s.stop - 1] - recording.t[s.start]) + step
                for level in found for s in level.segments)
     settling = sum(level.settling for level in found)
     notes = []

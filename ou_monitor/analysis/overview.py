@@ -12,7 +12,8 @@ import math
 
 import numpy as np
 from ou_monitor.analysis.level_result import LevelResult
-from ou_monitor.analysis.supply import facts_and_end, Remainder, SupplyFacts, THROTTLES
+from ou_monitor.analysis.supply import (
+    facts_and_end, flown_near, Remainder, SupplyFacts, THROTTLES)
 from ou_monitor.online.load.supply_load import LoadStatus, SupplyLoad
 from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.records import NAN, OuFacts, Recording
@@ -47,6 +48,8 @@ class Overview:
     duration: float  # Duration of the recording, s
     load: SupplyLoad  # Load model at the end; `facts` has its values at eleven throttles
     highest: float  # Highest throttle; NaN without throttle
+    # Lowest and highest index of THROTTLES near which there are enough readings.
+    flown: tuple[int, int]
     line: LoudestLine | None = None  # Strongest spectral line
     cells: int = 0  # Cells in series to which the limit refers; 0: none
     end: MonitorReport | None = None  # Report of the node at the end; None without a limit
@@ -59,21 +62,15 @@ class Overview:
     @property
     def sag(self) -> tuple[float, float, float]:
         """Return throttle, sag and its error, V, near the highest throttle flown."""
-        sag = self.facts.sag
-        k = _next_to(sag.flown[1])
+        sag, k = self.facts.sag, self.flown[1]
         return THROTTLES[k], sag.sag_v[k], sag.se_v[k]
 
     @property
     def noise(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Return throttle and noise, V, near the lowest and the highest throttle flown."""
-        low, high = (_next_to(u) for u in self.facts.noise.flown)
+        low, high = self.flown
         rms = self.facts.noise.rms_v
         return (THROTTLES[low], rms[low]), (THROTTLES[high], rms[high])
-
-
-def _next_to(throttle: float) -> int:
-    """Return the index of the nearest of THROTTLES; 0 for NaN."""
-    return round(10.0 * min(max(throttle, 0.0), 1.0)) if math.isfinite(throttle) else 0
 
 
 def overview(recording: Recording, limit: float | None = None,
@@ -87,8 +84,10 @@ def overview(recording: Recording, limit: float | None = None,
     """
     facts, load, end = facts_and_end(recording, limit, left, monitor)
     known = recording.throttle[np.isfinite(recording.throttle)]
+    near = np.flatnonzero(flown_near(recording, THROTTLES)).tolist() or [0]
     return Overview(facts, recording.duration if recording.n else 0.0, load,
-                    float(known.max()) if known.size else NAN, _strongest(levels), cells, end)
+                    float(known.max()) if known.size else NAN, (near[0], near[-1]),
+                    _strongest(levels), cells, end)
 
 
 def _strongest(levels: Sequence[LevelResult]) -> LoudestLine | None:

@@ -48,7 +48,9 @@ _LATE = 0.06
 # Maximum range of a steady throttle, and the time over which it is taken, s.
 _STEADY, _STEADY_TIME = 0.02, 0.2
 # Half width of the band of throttle about each of THROTTLES; minimum readings in it.
-_BAND, _IN_BAND = 0.05, 20
+_BAND, _IN_BAND = 0.05, 10
+# Minimum time of these readings, s, and as a share of a short recording.
+_IN_TIME, _IN_SHARE = 0.5, 0.02
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,7 @@ class Noise:
     throttle: tuple[float, ...]  # 0..1
     rms_v: tuple[float, ...]  # in flight, including changes of throttle, V
     steady_rms_v: tuple[float, ...]  # at steady throttle, V
-    flown: tuple[float, float]  # 1 % and 99 % quantile of throttle; constant beyond
+    flown: tuple[float, float]  # 1 % and 99 % quantile of throttle
 
 
 @dataclass(frozen=True)
@@ -349,8 +351,9 @@ def noise_of(recording: Recording, left: Remainder | None = None) -> Noise:
         rms = (math.sqrt(float(square[seen].mean())),) * len(THROTTLES)
         return Noise(THROTTLES, rms, rms, flown)
     still = _still(recording.t, u)
-    return Noise(THROTTLES, _over_throttle(u[seen], square[seen], flown),
-                 _over_throttle(u[seen & still], square[seen & still], flown), flown)
+    enough = _enough(recording)
+    return Noise(THROTTLES, _over_throttle(u[seen], square[seen], enough),
+                 _over_throttle(u[seen & still], square[seen & still], enough), flown)
 
 
 def _still(t: FloatArray, u: FloatArray) -> npt.NDArray[np.bool_]:
@@ -368,17 +371,23 @@ def _still(t: FloatArray, u: FloatArray) -> npt.NDArray[np.bool_]:
 def flown_near(recording: Recording, throttle: npt.ArrayLike, reach: float = _BAND,
                ) -> npt.NDArray[np.bool_]:
     """Return whether there are enough readings within `reach` of throttles, shape (k,)."""
-    return np.array([np.count_nonzero(np.abs(recording.throttle - u) <= reach) >= _IN_BAND
+    enough = _enough(recording)
+    return np.array([np.count_nonzero(np.abs(recording.throttle - u) <= reach) >= enough
                      for u in np.atleast_1d(throttle)])
 
 
-def _over_throttle(u: FloatArray, square: FloatArray, flown: tuple[float, float],
-                   ) -> tuple[float, ...]:
-    """Return rms, V, at THROTTLES: interpolated, and constant beyond the flown range."""
+def _enough(recording: Recording) -> float:
+    """Return how many readings near a throttle show that it was flown."""
+    share = min(_IN_TIME / max(recording.duration, 1e-9), _IN_SHARE)
+    return max(_IN_BAND, share * recording.n)
+
+
+def _over_throttle(u: FloatArray, square: FloatArray, enough: float) -> tuple[float, ...]:
+    """Return rms, V, at THROTTLES: measured, else interpolated; constant beyond those measured."""
     at, rms = [], []
-    for throttle in np.unique(np.clip(THROTTLES, *flown)):
+    for throttle in THROTTLES:
         near = np.abs(u - throttle) <= _BAND
-        if near.sum() >= _IN_BAND:
+        if near.sum() >= enough:
             at.append(float(throttle))
             rms.append(math.sqrt(float(square[near].mean())))
     return _tuple(np.interp(THROTTLES, at, rms)) if at else (NAN,) * len(THROTTLES)

@@ -62,13 +62,15 @@ def discover(args: argparse.Namespace) -> int:
     """Run `discover`: what the simulation gets wrong, why, and the gain."""
     given = _bench_arguments(args, 'seed')
     recording, finding = _read_and_run(args, 'discovering', bench.discover, given)
-    output.deliver(args, finding, _command(args, given),
-                   model=args.save_model if args.force or not finding.refused else None)
+    why = _unsaved(finding.record)
+    if finding.refused and not (why or args.force):
+        why = (f'no model saved: {finding.refused[0].lower()}{finding.refused[1:]}; --force saves '
+               'it anyway')
+    output.deliver(args, finding, _command(args, given), model=None if why else args.save_model)
     if args.save_model is not None:
         # Last, so that a refused model does not stop the other files from being written.
-        if finding.refused and not args.force:
-            raise InputError(f'no model saved: {finding.refused[0].lower()}{finding.refused[1:]}; '
-                             '--force saves it anyway')
+        if why:
+            raise InputError(why)
         output.write_text(model_text(finding.record, recording), args.save_model, args.force)
     return 0
 
@@ -106,17 +108,24 @@ def _command(args: argparse.Namespace, names: Iterable[str]) -> str:
     return shlex.join(['ou-monitor', args.command, args.recording, *repeated(args, *names)])
 
 
+def _unsaved(finding: Finding) -> str:
+    """Return why the extended model cannot be saved; empty if it can."""
+    if finding.model is None:
+        return f"no model to save: '{finding.recording}' was not fitted. {finding.sentence}"
+    if finding.load == 'current':
+        return ('no model saved: its load is the measured current, and a model file is for '
+                'throttle')
+    return ''
+
+
 def model_text(finding: Finding, recording: Recording | None = None) -> str:
     """Return the extended model, with the state at take-off, as the text of a model file."""
     from ou_monitor.online.load.load_filter import LoadFilter
     from ou_monitor.recordings.model_file import as_yaml, ModelFile
 
-    if finding.model is None:
-        raise InputError(f"no model to save: '{finding.recording}' was not fitted. "
-                         f'{finding.sentence}')
-    if finding.load == 'current':
-        raise InputError('no model saved: its load is the measured current, and a model file is '
-                         'for throttle')
+    if why := _unsaved(finding):
+        raise InputError(why)
+    assert finding.model is not None
 
     def known(value: float) -> float | None:
         return value if math.isfinite(value) else None

@@ -70,7 +70,8 @@ def answer(analysis: Analysis) -> list[str]:
     first, *others = answers(analysis.overview) or ['The recording holds no samples.']
     safe = [] if math.isnan(curves.budget) else [
         f'Safe up to {100.0 * curves.budget:.0f} % throttle.' if curves.budget > 0.0 else
-        f'No throttle is safe {_why_none(analysis)}.']
+        f'No throttle keeps the risk below {100.0 * curves.limit:g} % {_why_none(analysis)}: at '
+        f'idle it is {100.0 * curves.risk[0]:.2g} %.']
     return [first, *safe, *others, *craft_advice(analysis.craft),
             *_numbers(analysis.overview.facts.ou), *_change(analysis),
             *(words for name, words in _BEWARE.items() if name in names)]

@@ -8,7 +8,7 @@ from ou_monitor.comparison.yardstick import Agreement, Band, Likeness
 from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text)
 from ou_monitor.report.svg import Plot
-from ou_monitor.text import number
+from ou_monitor.text import listed, number
 
 # Colours: measured, simulated.
 _MEASURED, _SIMULATED = 7, 1
@@ -49,6 +49,11 @@ def _answer(found: Agreement) -> list[str]:
         # Without throttle the mean path is constant and explains no variance.
         path = [] if not found.explained > 0.0 else [
             f'Its mean path explains {100.0 * found.explained:.0f} % of the variance.']
+        rows = _rows(found)
+        outside = [name.split(', ')[0] for name, _, _, remark in rows if remark]
+        if outside:
+            path.append(f'Outside their own bands, as chance allows with {len(rows)} numbers: '
+                        f'{listed(outside)}.')
         return [f'{found.verdict.value}: its {lowest}.', *path]
     more = [] if found.farthest == 'lowest' else [f'Its {lowest}.']
     return [f'{found.verdict.value}: {found.words}.', *more]

@@ -183,6 +183,15 @@ def test_time_between_levels_is_accounted_for():
     assert any('between load levels' in note for note in notes)
 
 
+def test_a_reading_a_second_counts_a_second():
+    """Sixty readings at two throttles, of which none lies between the levels."""
+    rng = np.random.default_rng(2)
+    u = np.repeat((0.2, 0.6) * 5, 6)
+    found = analyze(Recording(np.arange(60.0), 12.0 - u + 0.01 * rng.standard_normal(60), u),
+                    levels=(0.2, 0.6))
+    assert not any('between load levels' in note for note in found.notes)
+
+
 def test_sliding_is_what_the_node_would_say():
     """The last point equals the estimator fed with every sample."""
     simulated = recording(12, TRUTH)

@@ -194,6 +194,17 @@ def test_a_flight_gives_the_network(flight, capsys):
     assert found['brownout_voltage'] == pytest.approx(13.2) and '4 cells' in found['measured']
 
 
+def test_an_unknown_sag_is_not_designed_with(tmp_path, capsys):
+    """As of a stand whose inrush hides the sag: `analyze` calls it unknown too."""
+    rng = np.random.default_rng(1)
+    path = tmp_path / 'a.csv'
+    path.write_text('time_s,voltage_v,throttle\n' + ''.join(
+        f'{k / 100.0:.2f},{16.0 + 0.3 * rng.standard_normal():.4f},{0.4 + 0.01 * (k > 150)}\n'
+        for k in range(200)))
+    assert main(['design', '--from', str(path), '--set', 'cells=4', '--throttle', '0.4']) == 2
+    assert 'the sag of a.csv is unknown' in capsys.readouterr().err
+
+
 def test_set_values_override_the_flight(flight, capsys):
     """Resistance and throttle; a number of cells that the voltage cannot have is refused."""
     found = asked(capsys, '--from', flight, '--set', 'battery_resistance=50mOhm', '--throttle',

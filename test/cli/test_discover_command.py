@@ -214,3 +214,18 @@ def test_the_headline_names_the_strongest_and_what_all_are_worth():
     assert 'No measurable gain' in answer(replace(finding, gain=0.19))[1]
     nothing = replace(finding, causes=(), sentence='load_sag was tried.')
     assert answer(nothing) == ['Sag (load_sag) was tried.']
+
+
+def test_a_model_that_is_not_saved_is_not_announced(tmp_path, capsys):
+    """Its load is the measured current; the finding names no file."""
+    rng = np.random.default_rng(4)
+    t = np.arange(3000) / 50.0
+    amps = np.repeat(rng.uniform(1.0, 40.0, 60), 50)
+    path = tmp_path / 'a.csv'
+    path.write_text('time_s,voltage_v,current_a\n' + ''.join(
+        f'{a:.3f},{16.0 - 0.03 * i + 0.01 * e:.4f},{i:.2f}\n'
+        for a, i, e in zip(t, amps, rng.standard_normal(t.size))))
+    model = tmp_path / 'm.yaml'
+    assert main(['discover', str(path), '--save-model', str(model)]) == 2
+    out, err = capsys.readouterr()
+    assert 'no model saved' in err and str(model) not in out and not model.exists()

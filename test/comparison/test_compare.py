@@ -1,5 +1,7 @@
 """A recording compared with its simulations: verdicts, and the largest difference."""
 
+from dataclasses import replace
+
 import numpy as np
 from ou_monitor.comparison.compare import compare
 from ou_monitor.comparison.flight_model import damping, Readings
@@ -11,6 +13,7 @@ from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.records import Recording
+from ou_monitor.report.comparison_document import _answer
 import pytest
 
 ALPHA, SIGMA, LEVEL, SAG = 20.0, 0.3, 15.0, 1.5
@@ -232,3 +235,13 @@ def test_recordings_that_cannot_be_compared_are_refused():
         compare(Recording(t, np.sin(t), none, 'bench'), model())
     with pytest.raises(ValueError, match='20 to 10000, got 3'):
         compare(drawn(7), seeds=3)
+
+
+def test_numbers_outside_their_bands_are_named_beside_the_verdict():
+    """A joint verdict may hold although one of many numbers lies outside its own band."""
+    found = compare(drawn(1), model())
+    low = found.lowest
+    far = replace(found, verdict=Likeness.LOOKS_LIKE_IT,
+                  lowest=replace(low, measured=low.high + 1.0))
+    said = ' '.join(_answer(far))
+    assert 'Outside their own bands' in said and 'lowest voltage' in said.split('Outside')[1]
