@@ -1,9 +1,10 @@
 """Coupling of supply noise into a signal: gain, false alarms, common causes, resampling."""
 
 import numpy as np
-from ou_monitor.analysis.coupling import estimate_coupling, on_grid, POWER
+from ou_monitor.analysis.coupling import _tail, estimate_coupling, on_grid, POWER
 from ou_monitor.errors import InputError
 import pytest
+from scipy import stats
 from scipy.signal import lfilter
 
 RATE, SECONDS, ALPHA = 500.0, 20.0, 63.0
@@ -196,3 +197,14 @@ def test_a_signal_that_is_mostly_constant_is_not_coupled(tail):
     signal[7000:] = tail * rng.standard_normal(5000)
     found = estimate_coupling(t, 12.0 + rng.normal(0.0, 0.1, t.size), t, signal)
     assert not found.seen and np.isfinite(found.limit)
+
+
+@pytest.mark.parametrize('law, tail', [
+    ('gumbel', stats.gumbel_r(3.0, 0.2)), ('gamma', stats.gamma(4.0, scale=0.5))])
+def test_rare_chances_come_from_the_law_of_the_draws(law, tail):
+    """The first is at one in 10 000; of 20 000 draws none is counted, because few reach it."""
+    drawn = tail.rvs(20_000, random_state=np.random.default_rng(3))
+    first = tail.isf(1e-4)
+    found = _tail(np.append(first, drawn[drawn < first]), law)
+    # Mean and variance have errors of 1 %, which the tail magnifies.
+    assert found == pytest.approx(1e-4, rel=0.3)

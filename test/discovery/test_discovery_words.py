@@ -3,7 +3,7 @@
 from dataclasses import replace
 import math
 
-from ou_monitor.discovery.finding import Cause, Criticism, Verdict
+from ou_monitor.discovery.finding import Cause, Criticism, ThrottleEffects, Verdict
 from ou_monitor.discovery.words import (
     cause_rows, coupling_note, explain, gain_remark, gain_text, gain_words, overlap_words,
     plain_words, remaining_words, verdict_sentence, why_named, with_error)
@@ -170,3 +170,19 @@ def test_a_cause_without_a_gain_is_named_for_the_whole_recording(gain, error, ch
     text = explain(SAG.term, {}, gain, error, [], False, chance=chance)
     assert (f'{told})' in text) if told else '(p ' not in text
     assert 'p = ' not in explain(SAG.term, {}, gain, error, [], True, chance=0.0)
+
+
+@pytest.mark.parametrize('gain, error, text', [
+    (NAN, 0.1, 'not known'), (0.25, NAN, '250, error not known'), (0.25, 0.01, '250 +- 10')])
+def test_a_gain_has_its_error_or_says_that_it_is_unknown(gain, error, text):
+    """In thousandths of a nat."""
+    assert gain_text(gain, error) == text
+
+
+@pytest.mark.parametrize('dips, made, words', [
+    (1, 1, 'Throttle caused the only dip'), (1, 0, 'Throttle did not cause the only dip'),
+    (2, 1, 'Throttle caused 1 of the 2 dips')])
+def test_the_dips_that_throttle_caused_are_counted(dips, made, words):
+    """One dip needs no count."""
+    effects = ThrottleEffects(0.2, 0.8, 1.5, 0.1, level=13.2, dips=dips, made=made)
+    assert f'{words} below 13.20 V.' in effects.words

@@ -1,6 +1,7 @@
 """Lines that `discover` names: all lines of the supply, whatever else is left, and no others."""
 
 from dataclasses import replace
+import math
 
 import numpy as np
 from ou_monitor import discover
@@ -12,6 +13,7 @@ from ou_monitor.criticism.structure import evaluate
 from ou_monitor.discovery.fitting import Fitter, standard_errors
 from ou_monitor.discovery.named import _in_doubt, _other, _SURE
 from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.lines import prominence
 from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.shocks import HeavyTails
@@ -121,3 +123,12 @@ def test_analyze_and_discover_name_the_same_lines_of_a_comb():
         assert sum(clear for _, clear in some) >= 5
         for frequency, clear in some:
             assert not clear or any(abs(frequency - other) < 2.0 for other, _ in others), frequency
+
+
+def test_a_peak_is_measured_in_standard_errors_of_its_neighbours():
+    """Five bins have e^2 times the power of five on either side: 2 / sqrt(1/5 + 1/5)."""
+    power = np.ones(51)
+    power[19:24] = math.e ** 2
+    power[0] = 0.0
+    z = np.fft.irfft(np.sqrt(power) * np.exp(1j * np.arange(51.0)))
+    assert prominence(z, float(z.size), 21.0, 4.0) == pytest.approx(math.sqrt(10.0))
