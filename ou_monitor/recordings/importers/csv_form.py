@@ -98,6 +98,8 @@ CLOCK = re.compile(
     r'\s*+(?:(\d{4})[-/.](\d\d?)[-/.](\d\d?)|(\d\d?)([./-])(\d\d?)[./-](\d{4}|\d\d))?+[T ,]*+'
     r'(?:(\d\d?):([0-5]\d)(?::([0-5]\d|60)(?:[.,:](\d{1,9}))?)?)?+\s*+'
     r'(Z|UTC|[-+](?:0\d|1[0-4]):?[0-5]\d)?+\s*+([AaPp][Mm])?+\s*+')
+# Minutes, seconds and a part of a second: 03:12.0 (Excel).
+_MINUTES = re.compile(r'\d\d?:[0-5]\d[.,]\d{1,9}')
 _MONTHS = 'jan feb mar apr may jun jul aug sep oct nov dec'
 _MONTH = re.compile(rf"[- ]({_MONTHS.replace(' ', '|')})[a-z]*[- ]", re.IGNORECASE)
 # A serial monitor's time before the first cell: 10:15:23.123 -> 12.3
@@ -281,10 +283,12 @@ def is_clock(cell: str) -> bool:
 
 
 def swapped(cell: str) -> str:
-    """Return a date with a number for the month, and points that were taken for decimal marks."""
+    """Return a clock with hours, a number for the month, and points for decimal marks."""
     if found := _MONTH.search(cell):
         month = 1 + _MONTHS.index(found[1].lower()) // 4
         cell = f'{cell[:found.start()]}-{month}-{cell[found.end():]}'
+    if _MINUTES.fullmatch(cell):
+        cell = f'0:{cell}'
     return cell.replace(',', '.') if cell.count(',') > 1 else cell
 
 

@@ -94,7 +94,7 @@ _MAVLINK = {'voltage_battery': (1e-3, 'mV', 65535.0), 'voltages[0]': (1e-3, 'mV'
             'vcc': (1e-3, 'mV', 0.0), 'vservo': (1e-3, 'mV', 0.0),
             'current_battery': (1e-2, '10 mA', -1.0)}
 _CELLS = re.compile(r'(.*voltages\[)0\]', re.IGNORECASE)
-_DAY = 86400.0  # s
+_DAY, _HOUR = 86400.0, 3600.0  # s
 
 
 class _Column(NamedTuple):
@@ -193,8 +193,10 @@ def read_column(path: Path, name: str, columns: CsvColumns | None = None,
 def holds_supply(path: Path) -> bool:
     """Return whether columns of time and voltage are found in the first lines of a file."""
     try:
-        form = form_of(path, CsvColumns())
-        return bool(_time_of(path, form, CsvColumns()) and _choose(form, logs.VOLTAGE))
+        nothing = CsvColumns()
+        form = form_of(path, nothing)
+        _supply_of(path, form, nothing, _time_of(path, form, nothing), needed=True)
+        return True
     except InputError:
         return False
 
@@ -427,7 +429,11 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: _Column, needed
         if name == NONE and quantity != logs.VOLTAGE:
             continue
         if name is not None:
-            found[quantity] = _unit_column(form, _column_place(path, form, name, option), unit)
+            place = _column_place(path, form, name, option)
+            if quantity == logs.VOLTAGE and unit is None and form.units[place] in AMPERE_WORDS:
+                raise InputError(f"{path}: '{name}' has a unit of current: name a column of "
+                                 'volts, or give --unit')
+            found[quantity] = _unit_column(form, place, unit)
             continue
         places = _choose(form, quantity, taken)
         if not places and quantity == logs.VOLTAGE:
@@ -502,7 +508,9 @@ def _clock(path: Path, cells: list[str], name: str, left_out: list[str] | None) 
     # In 04/05 either may be the day: choose the shorter recording.
     t = either[0] if spans[0] <= spans[1] else either[1]
     if any(one is not None and not (one[1] or one[4]) for one in found):
-        t = t + _DAY * np.concatenate(([0.0], np.cumsum(np.diff(t) < -0.5 * _DAY)))
+        # Minutes and seconds alone start anew each hour.
+        turn = _DAY if not np.nanmax(t, initial=0.0) < _HOUR else _HOUR
+        t = t + turn * np.concatenate(([0.0], np.cumsum(np.diff(t) < -0.5 * turn)))
     return t
 
 

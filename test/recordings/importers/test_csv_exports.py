@@ -6,6 +6,7 @@ import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.choose import choose, columns_of
+from ou_monitor.recordings.importers.csv_table import holds_supply
 from ou_monitor.recordings.importers.formats import import_log
 from ou_monitor.recordings.importers.log import CsvColumns, Request
 from ou_monitor.recordings.read import read_recording, tidy
@@ -293,6 +294,8 @@ def test_an_export_is_read_without_an_option(form, tmp_path):
     ('t|U\n0|12\n1|13\n', CsvColumns(delimiter='|'), 1.0, [12, 13]),
     ('t,V1,V2\n0,5,12\n1,5,13\n', CsvColumns(voltage='V2'), 1.0, [12, 13]),
     (' 0  12  0.1\n 1  13  0.2\n', CsvColumns(voltage='column 2'), 1.0, [12, 13]),
+    # Excel's mm:ss.0 drops the hours.
+    ('Time,V\n59:59.0,12\n59:59.5,13\n00:00.0,14\n', CsvColumns(), 0.5, [12, 13, 14]),
 ])
 def test_a_guess_is_overruled(content, columns, step, volts, tmp_path):
     """Units, delimiter, decimal mark, lines above and the time from row to row."""
@@ -333,6 +336,22 @@ def test_the_unit_of_a_throttle(tmp_path):
     found = read_recording(percent, columns=CsvColumns(throttle_unit='%', current='none'))
     assert found.throttle[0] == pytest.approx(0.01) and found.current is None
     assert not read_recording(path, columns=CsvColumns(throttle='none')).has_throttle
+
+
+def test_a_current_is_not_read_as_a_voltage(tmp_path):
+    """A power profiler exports only a current; a unit that is given overrules its header."""
+    path = written(tmp_path, 'time_s,Current(uA)\n0,12\n1,13\n')
+    with pytest.raises(InputError, match=r"'Current\(uA\)' has a unit of current"):
+        read_recording(path, columns=CsvColumns(voltage='Current(uA)'))
+    read_recording(path, columns=CsvColumns(voltage='Current(uA)', unit='mV'))
+
+
+def test_a_table_is_taken_for_a_supply_if_it_can_be_read(tmp_path):
+    """Fleet takes what analyze reads: an oscilloscope's columns without names, too."""
+    path = written(tmp_path, ''.join(
+        f',,,{k / 50.0},{12.0 + 0.1 * (k % 7)}\n' for k in range(200)))
+    assert read_recording(path).n == 200 and holds_supply(path)
+    assert not holds_supply(written(tmp_path, 'name,text\na,b\nc,d\n', 'other.csv'))
 
 
 def test_counts_of_unknown_size_and_mixed_units_are_refused(tmp_path):
