@@ -760,7 +760,8 @@ class LoadFilter:
             return ModelComparison()
         ohm = (NAN, NAN) if self._current is None else self._current.resistance
         return compare(self._contrasts.against(start.coefficients), start, *ohm,
-                       other_pack(start, self._highest, self._level), date)
+                       other_pack(start, self._highest, self._level), date, float(self._m[1]),
+                       math.sqrt(max(0.0, float(self._P[1, 1])) * max(1.0, self._noise.scale)))
 
     def path(self, t: FloatArray, throttle: FloatArray | None,
              current: FloatArray | None = None) -> FloatArray:

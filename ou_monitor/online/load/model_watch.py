@@ -28,6 +28,9 @@ _FORM = 0.05
 SIZE_ERROR = 0.1
 # Minimum relative error of the noise: its scatter between simulated flights of one model.
 _NOISE_FORM = 0.15
+# Minimum relative error of the discharge per load: rms of ln of its ratio on 12 recorded pairs
+# (halves of gecko, nazgul and hiro, three flights of roma), whose packs were at other charges.
+_DISCHARGE_FORM = 0.64
 # Lower limit of the noise, V.
 _LEAST_NOISE = 1e-6
 # A pack is weaker if its sag exceeds that of the model by both limits: a share, and a number of
@@ -64,6 +67,9 @@ class ModelComparison:
     # Of the residual while throttle moves; NaN where the model has none.
     noise_ratio: float = NAN
     noise_ratio_se: float = NAN
+    # Of the discharge per load, known to a factor of two.
+    discharge_ratio: float = NAN
+    discharge_ratio_se: float = NAN
     words: str = ''  # One sentence; empty: nothing to do
 
     def fields(self) -> dict[str, object]:
@@ -186,8 +192,8 @@ def judge(ratio: float, se: float, date: str) -> tuple[ModelVerdict, str]:
     return ModelVerdict.AS_MODEL, ''
 
 
-def compare(found: Contrast, start: LoadStart, ohm: float, ohm_se: float, other: str, date: str
-            ) -> ModelComparison:
+def compare(found: Contrast, start: LoadStart, ohm: float, ohm_se: float, other: str, date: str,
+            discharge: float, discharge_se: float) -> ModelComparison:
     """Compare this flight with an earlier model (ohm: now; other: why another pack, or empty)."""
     # Levels at which the two were measured: the sag of a pack falls as it empties and warms.
     apart = found.level - (start.level or start.volts / start.cells)
@@ -199,7 +205,9 @@ def compare(found: Contrast, start: LoadStart, ohm: float, ohm_se: float, other:
     return ModelComparison(
         verdict, ratio, se, *_over(ohm, ohm_se, start.resistance, start.resistance_se),
         *_over(found.noise, math.hypot(found.noise_se, _NOISE_FORM * found.noise), start.noise,
-               start.noise_se), words)
+               start.noise_se),
+        *_over(discharge, math.hypot(discharge_se, _DISCHARGE_FORM * discharge), start.discharge,
+               0.0), words)
 
 
 def _over(now: float, now_se: float, then: float, then_se: float) -> tuple[float, float]:

@@ -53,6 +53,19 @@ def test_a_pack_that_has_aged_is_found_within_a_minute(age, verdict):
     assert bool(found.words) is weaker and (report.level >= Level.WARN or not weaker)
 
 
+def test_a_load_that_empties_the_pack_faster_is_measured():
+    """Four times as fast: within 30 % beside the usual flight; either within its wide error."""
+    found = []
+    for factor in (1.0, 4.0):
+        (made,) = simulated(
+            replace(GECKO, load=replace(GECKO.load, discharge=factor * GECKO.load.discharge)),
+            FLOWN, duration=60.0, rate=100.0, seed=11, charge=math.nan, resistance=1.0)
+        model = watched(GECKO, made).model
+        found.append(model.discharge_ratio)
+        assert abs(found[-1] - factor) < 1.96 * model.discharge_ratio_se < 1.5 * found[-1]
+    assert found[1] / found[0] == pytest.approx(4.0, rel=0.3)
+
+
 @pytest.mark.parametrize('voltage', [0.75, 1.5])
 def test_another_number_of_cells_is_said_within_five_seconds(voltage):
     report = watched(GECKO, flight(5.0, 3), voltage)
