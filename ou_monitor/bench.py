@@ -46,6 +46,9 @@ _BLOCKS_FROM = 5000.0
 def _read(recording: Given) -> Recording:
     if isinstance(recording, Recording):
         return ordered(recording)
+    if not isinstance(recording, (str, Path)):
+        raise TypeError('a Recording or a path is needed, got a '
+                        f'{type(recording).__name__}: make a Recording(t, voltage, throttle)')
     from ou_monitor.recordings.read import read_recording
 
     return read_recording(recording)
@@ -384,6 +387,9 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
         SHOWN)
     from ou_monitor.report.design_document import design_document, taken_words
 
+    if throttle is not None and not hasattr(throttle, '__float__'):
+        raise TypeError(f'the throttle is a number, 0..1, got a {type(throttle).__name__}: pass '
+                        'a Recording or a path as recording=')
     taken, facts, error, known = '', None, 0.0, None
     if recording is None:
         if throttle is None:

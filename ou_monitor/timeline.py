@@ -321,6 +321,7 @@ def ordered(recording: Recording) -> Recording:
     """Return a recording in the order of its stamps, each once; notes count dropped samples."""
     which, said = in_order(recording.t, recording.voltage[:, None], MOST_VOLTAGE, ' V')
     recording = part_of(recording, which, *said) if said else recording
+    check_throttle(recording.name or 'the recording', recording.throttle, recording.voltage)
     if recording.n > 1 and not LEAST_STEP <= (
             step := float(np.median(np.diff(recording.t)))) <= LONGEST_STEP:
         raise InputError(f"the samples of '{recording.name}' are {step:.4g} s apart: are the "
@@ -371,7 +372,7 @@ def check_throttle(name: str, throttle: FloatArray, voltage: FloatArray | None =
     raise InputError(
         f'{name}: throttle runs from {known.min():g} to {known.max():g}, and 0 to 1 is '
         'expected: state its ends (of a CSV: --throttle-unit LOW:HIGH; of a bag: unit_factor '
-        'of a msg config)')
+        'of a msg config), or divide percent by 100 in a Recording')
 
 
 def hold(values: FloatArray) -> FloatArray:

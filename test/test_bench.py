@@ -235,3 +235,24 @@ def test_the_namespace_is_light():
     import ou_monitor.analysis.coupling  # noqa: F401
 
     assert ou_monitor.coupling is coupling
+
+
+@pytest.mark.parametrize('call, words', [
+    (lambda: design(FLIGHT), 'got a str: pass a Recording or a path as recording='),
+    (lambda: design(Recording([0.0, 1.0], [5.0, 5.1])), 'got a Recording: pass'),
+    (lambda: analyze({'voltage': [5.0]}), 'a Recording or a path is needed, got a dict')])
+def test_an_argument_of_a_wrong_type_is_named(call, words):
+    """Not by an error from deep inside."""
+    with pytest.raises(TypeError, match=words):
+        call()
+
+
+@pytest.mark.parametrize('scale', [100.0, 2000.0])
+def test_a_throttle_in_another_unit_is_refused(scale):
+    """Percent and us, as the readers do; a single wild value is an error of its own."""
+    t = np.arange(100) / 10.0
+    throttle = 0.5 + 0.01 * (t % 3.0)
+    supply_facts(Recording(t, 12.0 - throttle, np.where(t == 5.0, 50.0, throttle)))
+    for function in (analyze, supply_facts):
+        with pytest.raises(InputError, match='0 to 1 is expected.*percent'):
+            function(Recording(t, 12.0 - throttle, scale * throttle))

@@ -6,6 +6,7 @@ import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.csv_table import CsvColumns, read_csv
 from ou_monitor.recordings.read import read_recording
+from ou_monitor.records import Defect, defect_of
 import pytest
 
 
@@ -117,10 +118,13 @@ def test_repairs_are_noted(tmp_path):
     assert recording.voltage.tolist() == [5.0, 5.1, 5.2, 5.6]
     # A blank cell holds the value of the line before.
     assert recording.throttle.tolist() == [0.0, 0.0, 0.0, 0.6]
-    assert len(recording.notes) == 3
-    assert recording.notes[0].startswith('4 samples dropped: not a finite')
-    assert recording.notes[1].startswith('1 sample came after')
-    assert recording.notes[2].startswith('1 sample dropped: repeated stamp')
+    # An empty cell is normal where each signal has rows of its own, and no defect.
+    assert [defect_of(note) for note in recording.notes] == [
+        Defect.READER, Defect.NON_FINITE, Defect.UNORDERED, Defect.REPEATED_STAMPS]
+    assert recording.notes[0] == "1 row left out: the cell of 'voltage_v' is empty."
+    assert recording.notes[1].startswith('3 samples dropped: not a finite')
+    assert recording.notes[2].startswith('1 sample came after')
+    assert recording.notes[3].startswith('1 sample dropped: repeated stamp')
 
 
 def test_a_single_sample_is_a_recording(tmp_path):

@@ -81,6 +81,8 @@ _MULTIPLE = re.compile(r'(.*?)(?: ?\* ?(10+)|([\[(] ?)(10+|0?\.0*1) ?([a-zµμ%]
 _NAMES = re.compile(r'[^\s\[(]+(?: ?[\[(][^\])]*[\])])?')
 # A number with groups of thousands and decimals, or with a unit.
 _GROUPED = re.compile(r'[-+]?\d{1,3}(?:,\d{3})+\.\d+')
+# A number with points between thousands, not a part of a date or a clock.
+_THOUSANDS = re.compile(r'(?<![\d.,:])\d{1,3}(?:\.\d{3})+(?![\d.:])')
 _AND_UNIT = re.compile(r'(\S*[\d.])\s*+([^\d\s.]{1,12}+(?: [AaDd][Cc])?)')
 # Lines above the data that state the time between rows, or its inverse.
 _NUMBER = r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?'
@@ -113,6 +115,7 @@ class Form(NamedTuple):
     encoding: str
     delimiter: str
     comma: bool  # Whether the decimal mark is a comma
+    stated_comma: bool  # Whether that was given: then a point separates thousands
     skip: int  # Lines above the first row of numbers
     line: int  # Number of the line with the names; 0: there is none
     names: tuple[str, ...]  # Names of the columns as written, else 'column 1' and so on
@@ -150,7 +153,7 @@ def form_of(path: Path, wanted: CsvColumns) -> Form:
         for mark in (wanted.decimal,) if wanted.decimal else ('.', ','):
             if mark == delimiter or best and delimiter == ' ' and best[1].width > 1:
                 continue
-            found = _score_form(lines, encoding, delimiter, mark == ',', wanted.skip_rows or 0)
+            found = _score_form(lines, encoding, delimiter, mark == ',', wanted)
             if found and (best is None or found[0] > best[0]):
                 best = found
     if best is None:
@@ -177,15 +180,16 @@ def _encoding(path: Path, head: bytes) -> str:
     return 'utf-8'
 
 
-def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool, skip: int,
-                ) -> tuple[float, Form] | None:
+def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool,
+                wanted: CsvColumns) -> tuple[float, Form] | None:
     """Return how well a delimiter and a decimal mark fit, and the form; None if they do not."""
+    skip, stated_comma = wanted.skip_rows or 0, wanted.decimal == ','
     rows: list[list[str]] = []
     for line in lines:
         plain = '' if line.lstrip().startswith('#') else line
         try:
             rows.append([cell.strip() for cell in next(iter(csv.reader(
-                _prepared([plain], delimiter, comma), delimiter=delimiter,
+                _prepared([plain], delimiter, comma, stated_comma), delimiter=delimiter,
                 skipinitialspace=True)), [])])
         except csv.Error:
             rows.append([])
@@ -219,8 +223,8 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool, sk
     start, step, stated = _stated_step(lines[:max(first, 20)], rows[:first])
     first_rows = tuple(tuple(row) for row in rows[first:] if any(row))
     return fit * (1.0 if width > 1 else 0.4) + 0.01 * min(width, 20) / 20, Form(
-        encoding, delimiter, comma, first, at, names, units, width, first_rows, start, step,
-        stated)
+        encoding, delimiter, comma, stated_comma, first, at, names, units, width, first_rows,
+        start, step, stated)
 
 
 def _after_names(rows: list[list[str]], skip: int, first: int, width: int, places: list[int],
@@ -235,11 +239,13 @@ def _after_names(rows: list[list[str]], skip: int, first: int, width: int, place
     return next((k for k in numeric if k > names and not _are_units(rows[k])), first)
 
 
-def _prepared(lines: list[str], delimiter: str, comma: bool) -> list[str]:
+def _prepared(lines: list[str], delimiter: str, comma: bool, stated_comma: bool) -> list[str]:
     """Return lines with decimal points, and single blanks if blanks separate the cells."""
     received = _RECEIVED.match(lines[0]) if lines else None
     if received and (delimiter in (rest := lines[0][received.end():].strip()) or ' ' not in rest):
         lines = [_RECEIVED.sub(rf'\1{delimiter}', line, count=1) for line in lines]
+    if stated_comma:
+        lines = [_THOUSANDS.sub(lambda found: found[0].replace('.', ''), line) for line in lines]
     if comma:
         # A point becomes a comma, so that a thousands separator is not taken for a decimal mark.
         lines = ['\0'.join(line.split('.')).replace(',', '.').replace('\0', ',')
@@ -474,7 +480,7 @@ def _lines(path: Path, file: TextIO, form: Form) -> Iterator[list[str]]:
 def _without_comments(lines: list[str], form: Form, text: str) -> list[str]:
     if '#' in text:
         lines = ['\n' if line.lstrip().startswith('#') else line for line in lines]
-    return _prepared(lines, form.delimiter, form.comma)
+    return _prepared(lines, form.delimiter, form.comma, form.stated_comma)
 
 
 def _line(before: int, rows: list[list[str]], k: int) -> int:

@@ -129,7 +129,8 @@ def read_csv(path: Path, columns: CsvColumns | None = None, *, partial: bool = F
         said.append(Note(
             f'{counted(len(left_out), "bad line")} left out, such as '
             f'{"line " * first[0].isdigit()}{first}.', Defect.DAMAGED_FILE))
-    (column, volts), nothing = table.found[logs.VOLTAGE], np.full(table.t.shape, np.nan)
+    t, (column, volts) = table.t, table.found[logs.VOLTAGE]
+    nothing = np.full(t.shape, np.nan)
     name = printable(path.name)
     held = {quantity: values for quantity, (_, values) in table.found.items()}
     source = {'file': name, 'format': 'csv'}
@@ -140,9 +141,18 @@ def read_csv(path: Path, columns: CsvColumns | None = None, *, partial: bool = F
     if 2 * np.isfinite(current[np.isfinite(volts)]).sum() < np.isfinite(volts).sum():
         # Measured beside the voltage, not with it.
         current = hold(current)
+    filled = np.ones(volts.shape, dtype=bool)
+    if np.isnan(volts).any():
+        cells = _cells(path, table.form, column.place[0], volts.size)
+        filled[:len(cells)] = [bool(cell.strip()) for cell in cells]
+        if not filled.all() and filled.any():
+            said.append(f"{counted(int((~filled).sum()), 'row')} left out: the cell of "
+                        f"'{printable(column.name)}' is empty.")
     # A blank cell is not a message: the last command holds.
-    return RawColumns(table.t, volts, hold(held.get(logs.THROTTLE, nothing)), current, name,
-                      source, tuple(said))
+    throttle = hold(held.get(logs.THROTTLE, nothing))
+    if filled.any():
+        t, volts, throttle, current = (one[filled] for one in (t, volts, throttle, current))
+    return RawColumns(t, volts, throttle, current, name, source, tuple(said))
 
 
 def read(path: Path, request: Request) -> Log:
@@ -240,6 +250,8 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
                 quantity, column, column_values, units.get(quantity), volts,
                 guesses.get(logs.VOLTAGE, ''))
         scaled[quantity] = column, si
+    if logs.VOLTAGE in scaled:
+        _check_one_series(path, form, t, *scaled[logs.VOLTAGE])
     note = _read_note(form, time, found, guesses, wanted.throttle is None)
     return _Table(form, t, scaled, dict(zip(others, values[len(found):])), note)
 
@@ -553,6 +565,44 @@ def _check_backwards(path: Path, t: FloatArray, voltage: FloatArray, name: str,
                          'ever rises: are the two columns swapped?')
 
 
+def _check_one_series(path: Path, form: Form, t: FloatArray, column: _Column,
+                      values: FloatArray) -> None:
+    """
+    Raise InputError if a column of text names several series that share a column of values.
+
+    The stamps rise within each series.  Overall they overlap; or the column has no telling name,
+    and the series alternate.
+    """
+    known = np.isfinite(t) & np.isfinite(values)
+    stamps = t[known]
+    overlap = np.count_nonzero(
+        stamps[1:] <= np.maximum.accumulate(stamps)[:-1]) > WILD * stamps.size
+    if not overlap and not re.fullmatch(_VALUE_NAME, column.name.lower()):
+        return
+    for place, label in enumerate(form.names[:form.width]):
+        first = [row[place] for row in form.rows if place < len(row) and row[place]]
+        cells = [] if not first or any(map(is_value, first)) else _cells(path, form, place, t.size)
+        if not cells:
+            continue
+        names, which = np.unique(np.array(cells)[known], return_inverse=True)
+        if not 1 < names.size <= which.size / _FEW_ROWS:
+            continue
+        order = np.argsort(which, kind='stable')
+        within = np.diff(stamps[order])[np.diff(which[order]) == 0]
+        if np.mean(within <= 0.0) <= WILD and (overlap or np.mean(np.diff(which) != 0) > _BACK):
+            raise InputError(
+                f"{path}: '{column.name}' holds several series, named in '{label}': "
+                f'{shown(some(map(printable, names), 3))}; pivot the table to one column for '
+                'each series')
+
+
+def _cells(path: Path, form: Form, place: int, size: int) -> list[str]:
+    """Return the cells of a column as written; none if bad lines make them fewer or more."""
+    cells: list[str] = []
+    numbers(path, form, [], {place: cells}, [])
+    return cells if len(cells) == size else []
+
+
 def _stamps(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: _Column,
             ) -> tuple[FloatArray, str]:
     """Return the time in s, and its unit in words."""
@@ -670,8 +720,8 @@ def _read_note(form: Form, time: _Column, found: dict[str, _Column], units: dict
     parts = [f"time from '{time.name}' ({units[_TIME_NAME]})"]
     parts += [f"{quantity} from '{column.name}' ({units[quantity]})"
               for quantity, column in found.items()]
-    places = _choose(form, logs.VOLTAGE, time.place)[1:3] if form.line else [
-        k for k in _nameless_columns(form) if k not in time.place][:3]
+    places = _choose(form, logs.VOLTAGE, time.place)[1:3] if form.line else _like_voltage(
+        form, [k for k in _nameless_columns(form) if k not in time.place])[:3]
     others = [form.names[k] for k in places
               if form.names[k] not in {column.name for column in found.values()}]
     also = f'; also found: {", ".join(others)} (--voltage-column)' if others else ''

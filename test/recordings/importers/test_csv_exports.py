@@ -346,6 +346,43 @@ def test_a_current_is_not_read_as_a_voltage(tmp_path):
     read_recording(path, columns=CsvColumns(voltage='Current(uA)', unit='mV'))
 
 
+@pytest.mark.parametrize('order', ['one after another', 'equal stamps', 'in turn'])
+def test_several_series_in_one_column_are_refused(tmp_path, order):
+    """Foxglove, InfluxDB: a column of text names the series of each value."""
+    late = 0.5 if order == 'in turn' else 0.0
+    rows = [(k + late * place, name, size + 0.1 * (k % 7))
+            for place, (name, size) in enumerate((('pack/voltage', 12.0), ('pack/current', 3.0)))
+            for k in range(40)]
+    if order != 'one after another':
+        rows.sort()
+    text = 'time,topic,value\n' + ''.join(f'{t},{name},{value}\n' for t, name, value in rows)
+    with pytest.raises(InputError, match="'value' holds several series, named in 'topic': "
+                                         'pack/current, pack/voltage; pivot'):
+        read_recording(written(tmp_path, text), columns=CsvColumns(voltage='value'))
+    # The mode of a flight is no series, nor is a lone topic.
+    for names in ('pack', 'arm', 'fly'), ('pack', 'pack', 'pack'):
+        text = 'time,mode,value\n' + ''.join(
+            f'{k},{names[k // 20]},{12.0 + 0.1 * (k % 7)}\n' for k in range(60))
+        assert read_recording(written(tmp_path, text), columns=CsvColumns(voltage='value')).n == 60
+
+
+def test_a_given_decimal_comma_makes_points_separate_thousands(tmp_path):
+    """Excel in German: 24.674 mV; dates and clocks keep their points."""
+    text = 'Zeit;U [mV]\n27.11.2026 10:15:23.125;24.674\n27.11.2026 10:15:23.250;1.024.673,5\n'
+    recording = read_recording(written(tmp_path, text), columns=CsvColumns(decimal=','))
+    np.testing.assert_allclose(recording.voltage, [24.674, 1024.6735])
+    np.testing.assert_allclose(np.diff(recording.t), 0.125, atol=1e-6)
+
+
+def test_only_likely_voltages_are_listed_beside_the_chosen(tmp_path):
+    """In a table without names a current, or a column of NaN, is not offered."""
+    path = written(tmp_path, ''.join(
+        f'{k / 20} {12.0 + 0.1 * (k % 7)} {0.5 + k % 9} nan {11.0 + 0.2 * (k % 7)}\n'
+        for k in range(40)))
+    note = read_recording(path).notes[0]
+    assert "voltage from 'column 2'" in note and 'also found: column 5 (' in note
+
+
 def test_a_table_is_taken_for_a_supply_if_it_can_be_read(tmp_path):
     """Fleet takes what analyze reads: an oscilloscope's columns without names, too."""
     path = written(tmp_path, ''.join(
