@@ -6,7 +6,8 @@ to the pilot's future throttle, half the excursions), and `excursions` (the drop
 used alone if the load is unknown).  First passage and the other method are averaged with weights
 from their predictions of completed horizons' lowest voltages (Bayes, with forgetting).  Each law
 is mixed with a wider one by the share of horizons in which it was wrong: first passage with the
-excursions, the conditional risk with a law as wide as these.
+excursions, the conditional risk with a law as wide as these, but at most `_WIDEST` times as wide
+as itself (they include punches, which say nothing about idling).
 
 The law learned in flight, from completed horizons: (lowest - start) / s = b0 + b1 (mu - start) / s
 + k e, with mean mu and deviation s of `lowest`, by least squares with forgetting; e has Student's
@@ -58,6 +59,8 @@ _PRECISION = (_BIAS ** -2, 0.0, _GAIN ** -2)
 MEMORY, _LARGEST, _HUBER = 120.0, 36.0, 3.0
 # Error of the model as a share of the drop.
 _SHARE = 0.1
+# Chosen on gecko, nazgul, roma, bf3s, erle and cf_solo (2 to 6 tried).
+_WIDEST = 4.0
 
 
 def density(x: FloatArray, mean: FloatArray, deviation: FloatArray) -> FloatArray:
@@ -76,6 +79,10 @@ def below(level: float, mean: FloatArray, deviation: FloatArray) -> FloatArray:
     tail = (angle - np.cos(angle) * c * (1.0 + 2.0 / 3.0 * c * c)) / math.pi
     tail = np.where(c < 0.2, c**5 * np.polyval(_TAIL, c * c), tail)
     return np.asarray(np.where(t < 0.0, tail, 1.0 - tail))
+
+
+def _wider(spread: FloatArray, deviation: float) -> FloatArray:
+    return np.asarray(np.minimum(np.hypot(spread, deviation), _WIDEST * spread))
 
 
 class LowestLaw:
@@ -239,7 +246,7 @@ class _Rung:
                 sampling)
             middle, spread = law.moments(mean, deviation, start)
             found = density(y, middle, spread)
-            wide = density(y, middle[:1], np.hypot(spread[:1], look.deviation))
+            wide = density(y, middle[:1], _wider(spread[:1], look.deviation))
             self.held.add(float(found[0]), float(wide[0]), weight, elapsed)
             other = _HALF * far + (1.0 - _HALF) * float(shares @ found[1:])
             self.calibrator.add(low, float(mean[0]), float(deviation[0]), start, weight, elapsed)
@@ -459,7 +466,7 @@ class Forecast:
         courses = held(u, dwell, state.throttle)
         middle, spread = law.moments(*lowest(state, courses, horizon, self._sampling),
                                      mean_now(state))
-        return np.asarray(wrong * below(voltage, middle, np.hypot(spread, deviation))
+        return np.asarray(wrong * below(voltage, middle, _wider(spread, deviation))
                           + (1.0 - wrong) * below(voltage, middle, spread))
 
     def _state(self) -> LoadState | None:
