@@ -387,7 +387,7 @@ def verdict_of_sheet(data: bytes, found: Recording) -> str:
         if not (math.isnan(u) or u in everything
                 or re.search(r"throttle from '[^']*' \([^)]*a guess", ' '.join(found.notes))):
             return '! wrong throttle, and no note of a guessed unit'
-    said = [re.match(r'(\d+) samples? dropped', note) for note in found.notes]
+    said = [re.match(r'(\d+) (?:samples? dropped|rows? left out)', note) for note in found.notes]
     dropped = found.held + sum(int(one[1]) for one in said if one)
     if found.n + dropped != len(lines):
         return '! silent loss'
