@@ -43,6 +43,8 @@ _LOOKS = 900.0 / LOOK
 # Number of reports of the node that are shown; maximum time between two reports, s, and maximum
 # number of reports in all.
 _POINTS, _STEP, _MOST = 300, 0.5, 1200
+# Samples pushed at once: limits memory.
+_SLICE = 100_000
 # Maximum shift of the current against the voltage, s.
 _LATE = 0.06
 # Maximum range of a steady throttle, and the time over which it is taken, s.
@@ -262,8 +264,10 @@ def _at_the_end(recording: Recording, limit: float | None, monitor: SupplyMonito
     if monitor is None:
         if limit is None:
             load = LoadFilter()
-            load.push(recording.t, recording.voltage,
-                      recording.throttle if recording.has_throttle else None, recording.current)
+            for begin in range(0, recording.n, _SLICE):
+                part = slice(begin, begin + _SLICE)
+                load.push(recording.t[part], recording.voltage[part], recording.throttle[part],
+                          None if recording.current is None else recording.current[part])
             return load.load(), None, None
         # The budget does not depend on the fit of `window: auto`.
         monitor, parts = node_for(
