@@ -92,6 +92,10 @@ def test_paths_named_in_the_documents_exist(path):
         r'/[\w./*-]*\w)', text)) | set(re.findall(r'`(\w+\.yaml)`', text)) - OTHERS
     missing = [name for name in named
                if not any(ROOT.glob(name)) and not (ROOT / 'msg_config' / name).exists()]
+    modules = [f'/{path.relative_to(ROOT).as_posix()}' for folder in (
+        'ou_monitor', 'test', 'benchmarks', 'scripts') for path in (ROOT / folder).rglob('*.py')]
+    missing += [name for name in re.findall(r'`([\w/]+\.py)`', text)
+                if not any(module.endswith(f'/{name}') for module in modules)]
     assert not missing
 
 
