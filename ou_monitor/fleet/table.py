@@ -66,7 +66,7 @@ COLUMNS = (
            'found'),
     Column('line_rms', 'number', 'V', 'its rms'),
     Column('process', 'text', '', 'type of process'),
-    Column('risk', 'number', '1', 'probability of a brown-out within the horizon, from the level; '
+    Column('risk', 'number', '1', 'probability of a brown-out within the horizon at this level; '
            'needs --brownout-voltage'),
     Column('status', 'text', '', 'result of the fit: OK, SHORT_WINDOW, or why it failed'),
     Column('flags', 'texts', '', 'cautions about the input'),
