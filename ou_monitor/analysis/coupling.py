@@ -126,9 +126,9 @@ def estimate_coupling(
         notes.append('Throttle is unknown: its effect on both series would count as coupling.')
     grid = on_grid(series)
     if grid.duration < _MOST * grid.shared:
-        notes.append(f'Only {grid.duration:.3g} s of the {grid.shared:.3g} s in common were used: '
-                     'the rest has gaps, or a series has another rate there; --from and --to '
-                     'choose a part.')
+        notes.append(f'Only {grid.duration:.3g} s of the {grid.shared:.3g} s covered by both were '
+                     'used: the rest has gaps, or a series has another rate there; --from and '
+                     '--to choose a part.')
     low, high = _band(band, grid)
     length = _segment_length(grid, low)
     frequency, pieces = _segments(grid, length, low, high)

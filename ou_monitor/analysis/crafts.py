@@ -226,6 +226,6 @@ def craft_advice(craft: Craft) -> list[str]:
     """
     if craft.cells_from == 'guessed':
         return []
-    return [f'The {one.name} is {_USUAL * one.value / one.usual[1]:.1f} times that of known '
-            f'crafts ({craft.kind}): likely {one.reason}. Remedy: {one.remedy}.'
+    return [f'The {one.name} is {_USUAL * one.value / one.usual[1]:.1f} times the median of '
+            f'known craft ({craft.kind}): likely {one.reason}. Remedy: {one.remedy}.'
             for one in craft.measures if one.verdict == 'high']

@@ -217,11 +217,12 @@ def _ou_words(ou: OuFacts) -> str:
     if ou.status == 'ok':
         alpha, sigma = (f'{number(x)} (95 % {number(low)} to {number(high)})'
                         for x, (low, high) in ((ou.alpha, ou.alpha_95), (ou.sigma, ou.sigma_95)))
-        return (f'alpha {alpha} 1/s, sigma {sigma} V/sqrt(s), without level and load '
-                f'{number(1e3 * math.sqrt(ou.var_inf))} mV rms; from {window}')
+        return (f'alpha {alpha} 1/s, sigma {sigma} V/sqrt(s), '
+                f'{number(1e3 * math.sqrt(ou.var_inf))} mV rms (level and load removed); '
+                f'from {window}')
     if ou.status == 'not_visible':
         if not ou.var_inf_below:
             return f'none: no noise in {window}'
-        return (f'not visible in {window}: one slower than {number(1e3 * ou.tau_below_s)} ms '
-                f'would be below {number(1e3 * math.sqrt(ou.var_inf_below))} mV rms')
+        return (f'not visible in {window}: if slower than {number(1e3 * ou.tau_below_s)} ms, it '
+                f'is below {number(1e3 * math.sqrt(ou.var_inf_below))} mV rms')
     return 'unknown: too few readings'

@@ -56,10 +56,11 @@ def analysis_document(analysis: Analysis, command: str = '') -> Document:
         Section('Load levels', [*_levels(analysis.levels)]),
         lambda: [Section('Sigma and alpha over time', _sliding(analysis), folded=True)],
         Section('After changes of throttle', _transients(analysis), folded=True),
-        Section('Shape', [lambda: _shape(analysis), *_lines(analysis)], folded=True),
+        Section('Spectrum and distribution', [lambda: _shape(analysis), *_lines(analysis)],
+                folded=True),
         Section('Type of process', _process(analysis), folded=True)]
     if recording.source:
-        parts.append(lambda: [Section('Where it comes from', [Facts(list(
+        parts.append(lambda: [Section('Source of the recording', [Facts(list(
             recording.source.items()))], folded=True)])
     return Document('Supply noise', subject, answer(analysis), parts, command)
 
@@ -83,7 +84,7 @@ def facts(analysis: Analysis) -> list[tuple[str, str]]:
     if not found:
         return []
     beside = craft_line(analysis.craft)
-    return [*found[:-1], *([('Known crafts', beside)] if beside else []),
+    return [*found[:-1], *([('Known craft', beside)] if beside else []),
             ('Safe up to', _budget(analysis)), *found[-1:]]
 
 
@@ -148,10 +149,10 @@ def _numbers(ou: OuFacts) -> list[str]:
     if ou.status != 'ok':
         return []
     low, high = ou.alpha_95
-    return [f'Apart from level and load the supply wanders with sigma = {number(ou.sigma)} (95 % '
-            f'{number(ou.sigma_95[0])} to {number(ou.sigma_95[1])}) V/sqrt(s) and relaxes in '
+    return [f'The noise (level and response to load removed) has sigma = {number(ou.sigma)} (95 % '
+            f'{number(ou.sigma_95[0])} to {number(ou.sigma_95[1])}) V/sqrt(s), relaxes in '
             f'tau = {number(1e3 / ou.alpha)} (95 % {number(1e3 / high)} to {number(1e3 / low)}) '
-            f'ms: a standard deviation of {number(1e3 * math.sqrt(ou.var_inf))} mV.']
+            f'ms, and has a standard deviation of {number(1e3 * math.sqrt(ou.var_inf))} mV.']
 
 
 def _change(analysis: Analysis) -> list[str]:
@@ -200,7 +201,8 @@ def _by_throttle(analysis: Analysis) -> Part:
             f'{millivolts(fall)} +- {millivolts(2.0 * se)}' if math.isfinite(fall) else UNKNOWN,
             millivolts(rms) if flown else UNKNOWN, millivolts(still) if flown else UNKNOWN,
             chance(curves.at(u, 'risk'))])
-    heads = ['throttle', 'sag, mV', 'noise, mV rms', 'steady, mV rms', 'brown-out risk']
+    heads = ['throttle', 'sag, mV', 'noise, mV rms', 'at steady\nthrottle, mV rms',
+             'brown-out risk']
     return Table.of_known(heads, rows, left=[0])
 
 
@@ -213,12 +215,12 @@ def _curves(analysis: Analysis) -> list[Part]:
     at = _column([100.0 * level.throttle for level in levels])
     answer, error = 1e3 * _column(found.sag.sag_v), 2e3 * _column(found.sag.se_v)
     sag = _empty('Sag', 'mV').band(x, np.maximum(answer - error, 0.0), answer + error, '95 %', 0)
-    sag.line(x, answer, 'of the table', 0, 'thick')
+    sag.line(x, answer, 'estimate', 0, 'thick')
     _with_levels(sag, at, 1e3 * _column([level.sag.sag for level in levels]),
                  1e3 * _column([level.sag.interval for level in levels]))
     noise = _empty('Noise', 'mV rms')
-    for values, label, colour in ((found.noise.rms_v, 'as flown', 0),
-                                  (found.noise.steady_rms_v, 'throttle steady', 2)):
+    for values, label, colour in ((found.noise.rms_v, 'all samples', 0),
+                                  (found.noise.steady_rms_v, 'steady throttle', 2)):
         rms = np.where(learned.known, 1e3 * _column(values), NAN)
         noise.line(x, rms, label, colour, 'thick').markers(x, rms, '', colour)
     highest = np.nanmax(np.concatenate([[1e-6], *(curve.y for curve in noise.curves)]))
@@ -233,7 +235,7 @@ def _curves(analysis: Analysis) -> list[Part]:
     if math.isfinite(learned.budget):
         risk.mark(100.0 * learned.budget, f'budget {100.0 * learned.budget:.0f} %')
     least, most = analysis.alpha_test.interval
-    alpha.band(np.array([0.0, 100.0]), np.full(2, least), np.full(2, most), 'common, 95 %', 2)
+    alpha.band(np.array([0.0, 100.0]), np.full(2, least), np.full(2, most), 'all levels, 95 %', 2)
     _with_estimates(alpha, at, levels, 'alpha')
     drawn = [Figure(plot) for plot, values in (
         (sag, answer), (noise, noise.curves[0].y), (risk, learned.risk),
@@ -358,7 +360,7 @@ def _relaxation_sentence(analysis: Analysis, k: int) -> str:
 def _relaxation_plot(analysis: Analysis, fit: Relaxation) -> list[Part]:
     recording = analysis.recording
     what = 'falls' if fit.kind == 'release' else 'rises'
-    plot = Plot(f'After throttle {what} (dashed: fit)', 'time since throttle arrived, ms', 'mV',
+    plot = Plot(f'After throttle {what} (dashed: fit)', 'time since throttle settled, ms', 'mV',
                 height=240)
     for k, change in enumerate(fit.releases[:_MOST_DRAWN]):
         if not math.isfinite(change.amplitude):
@@ -384,7 +386,7 @@ def _changes(analysis: Analysis, fit: Relaxation) -> Table:
              with_se(change.level, change.level_se, 4),
              with_se(1e3 * change.amplitude, 1e3 * change.amplitude_se),
              number(1e3 * change.beyond), chance(change.beyond_p)] for change in fit.clear]
-    return Table(['at, s', 'throttle', 'before, V', 'after, V', 'A, mV', side, 'p of noise'],
+    return Table(['at, s', 'throttle', 'before, V', 'after, V', 'A, mV', side, 'p (noise only)'],
                  rows, left=[1], most=_MOST_CHANGES)
 
 
@@ -423,12 +425,12 @@ def _over_time(analysis: Analysis) -> list[Part]:
     recording, sliding = analysis.recording, analysis.sliding
     drawn: list[Part] = []
     if recording.has_throttle:
-        plot = _over(recording, 'Throttle, and the load levels found in it', '%', 150)
+        plot = _over(recording, 'Throttle and load levels', '%', 150)
         plot.limits(y=(-5.0, 105.0)).steps(
             _since_start(recording, recording.t), 100.0 * recording.throttle, colour=7)
         drawn.append(Figure(_with_segments(plot, analysis), (
             'Shaded: segments used for the load levels, in the colours of the plots under '
-            '"Shape".')))
+            '"Spectrum and distribution".')))
     if np.isfinite(sliding.risk).any():
         plot = _over(recording, f'Risk of going below {sliding.brownout_voltage:g} V within '
                      f'{sliding.brownout_horizon:g} s', 'probability', 170)
@@ -498,9 +500,9 @@ def _shape(analysis: Analysis) -> list[Part]:
     z = np.linspace(-5.0, 5.0, 201)
     histogram.line(z, np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi), 'normal', 7, 'dash thick')
     histogram.limits(x=(-6.0, 6.0), y=(1e-5, 1.0))
-    text = ('An OU is flat below its corner \u03b1/(2\u03c0) and falls with the square of '
-            'frequency above it. A narrow peak is a tone; a flat floor at high frequency is '
-            'white noise of the sensor.')
+    text = ('The spectrum of an OU is flat below the corner \u03b1/(2\u03c0) and falls with the '
+            'square of frequency above it. A narrow peak is a tone; a flat floor at high '
+            'frequency is white noise of the sensor.')
     extra = len(analysis.levels) - len(drawn)
     if extra > 0:
         text += f' The {extra} shortest levels are in the tables only.'

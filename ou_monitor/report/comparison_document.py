@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from ou_monitor.analysis.overview import known_lines, Overview
-from ou_monitor.comparison.yardstick import Agreement, Band, Likeness
+from ou_monitor.comparison.yardstick import Agreement, Band, LEVEL, Likeness
 from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text)
 from ou_monitor.report.svg import Plot
@@ -36,7 +36,8 @@ def comparison_document(found: Agreement, seen: Overview, command: str = '') -> 
         Notes.of(found.notes),
         Text(f'{found.seeds} simulations with the stamps, throttle and ADC steps of the '
              f'recording. {100.0 * found.p_value:.0f} % of them (the recording included) deviate '
-             'at least as much as the recording; below 5 % the recording is reported to differ.',
+             f'at least as much as the recording; at {100.0 * LEVEL:g} % or less the recording is '
+             'reported to differ.',
              legend=True)]
     return Document('Compared with its simulation', subject, _answer(found), parts, command)
 
@@ -52,7 +53,7 @@ def _answer(found: Agreement) -> list[str]:
         rows = _rows(found)
         outside = [name.split(', ')[0] for name, _, _, remark in rows if remark]
         if outside:
-            path.append(f'Outside their own bands, as chance allows with {len(rows)} numbers: '
+            path.append(f'Outside their own bands (chance allows this with {len(rows)} numbers): '
                         f'{listed(outside)}.')
         return [f'{found.verdict.value}: its {lowest}.', *path]
     more = [] if found.farthest == 'lowest' else [f'Its {lowest}.']
@@ -72,7 +73,7 @@ def _rows(found: Agreement) -> list[tuple[str, str, str, str]]:
             for level, falls in zip(found.levels, found.falls)]
     if found.dip is not None and found.recovery is not None:
         out += [row(f'dip after {found.rises} rises, mV', found.dip, 3, -1e3),
-                row('1 s after a rise, mV', found.recovery, 3, -1e3)]
+                row('dip left after 1 s, mV', found.recovery, 3, -1e3)]
     out += [row(f'rms {number(one.low_hz, 2)} to {number(one.high_hz, 2)} Hz, mV',
                 Band(*(max(x, 0.0) ** 0.5 for x in (
                     one.power.measured, one.power.low, one.power.median, one.power.high))), 3,
@@ -82,10 +83,10 @@ def _rows(found: Agreement) -> list[tuple[str, str, str, str]]:
 
 def _path(found: Agreement) -> list[tuple[str, str]]:
     thirds = ', '.join(number(1e3 * b, 2) for b in found.bias_by_third)
-    worst = [('Farthest off', found.words)] if found.verdict is Likeness.LOOKS_LIKE_IT else []
+    worst = [('Largest difference', found.words)] * (found.verdict is Likeness.LOOKS_LIKE_IT)
     return [('Mean path', f'explains {number(100.0 * found.explained, 3)} % of the variance; rms '
-             f'error {number(1e3 * found.rmse, 3)} mV, bias {number(1e3 * found.bias, 2)} mV (by '
-             f'thirds {thirds})'),
+             f'error {number(1e3 * found.rmse, 3)} mV, bias {number(1e3 * found.bias, 2)} mV (in '
+             f'each third: {thirds})'),
             ('Distributions', f'{number(found.ks_distance, 2)} apart (KS distance)'), *worst]
 
 
@@ -109,8 +110,8 @@ def _others(found: Agreement) -> list[Part]:
             at.t, at.throttle, '', 2)))
     beside = []
     if at.response.size:
-        plot = Plot('Mean response to rises of throttle', 'time after, s', 'change, V', width=450,
-                    height=250, legend_row=True)
+        plot = Plot('Mean response to rises of throttle', 'time since the rise, s', 'change, V',
+                    width=450, height=250, legend_row=True)
         plot.band(at.after, at.response_low, at.response_high, 'simulated, 95 %', _SIMULATED)
         beside.append(Figure(plot.line(at.after, at.response, 'measured', 0, 'thick')))
     plot = Plot('Distribution', 'voltage, V', 'share of time below', width=450, height=250,
@@ -123,7 +124,7 @@ def _others(found: Agreement) -> list[Part]:
 def _spectrum(found: Agreement) -> Plot:
     middle = np.array([np.sqrt(one.low_hz * one.high_hz) for one in found.spectrum])
     power = [one.power for one in found.spectrum]
-    plot = Plot('Power by band of frequency', 'frequency, Hz', 'power, V\u00b2', height=220,
+    plot = Plot('Power by frequency band', 'frequency, Hz', 'power, V\u00b2', height=220,
                 log_x=True, log_y=True, legend_row=True)
     plot.bars(middle, np.array([one.low for one in power]), np.array([one.high for one in power]),
               'simulated, 95 %', _SIMULATED)

@@ -16,7 +16,7 @@ def coupling_document(found: Coupling, recording: Recording, signal: tuple[Float
                       name: str, unit: str, seen: Overview, command: str = '') -> Document:
     """Return the report of a coupling; `signal` holds stamps, s, and values."""
     grid, per = found.grid, f'{unit} per V'.lstrip()
-    subject = (f'{recording.name or "recording"}, {name}: {grid.duration:.4g} s in common, '
+    subject = (f'{recording.name or "recording"}, {name}: {grid.duration:.4g} s covered by both, '
                f'{found.segments:.0f} segments'
                + (', throttle removed' if found.partial else ''))
     lost = [f'{counted(n)} of the {what} dropped.' for n, what in
@@ -25,8 +25,8 @@ def coupling_document(found: Coupling, recording: Recording, signal: tuple[Float
     parts: list[Part] = [
         lambda: [Figure(voltage_plot(recording, seen.limit))],
         Facts([*_facts(found, per), *known_lines(seen)]),
-        lambda: [Figure(_coherence(found), 'Squared coherence of the two: 1 where the signal is '
-                        'the voltage, 0 where they are unrelated.'),
+        lambda: [Figure(_coherence(found), 'Squared coherence: 1 where the signal follows the '
+                        'voltage exactly, 0 where they are unrelated.'),
                  Section('Signal and gain', [
                      Figure(_signal(recording, signal, name, unit)),
                      Figure(_gain(found, per),
@@ -41,9 +41,9 @@ def coupling_document(found: Coupling, recording: Recording, signal: tuple[Float
 def _answer(found: Coupling, name: str, per: str) -> str:
     band = f'{number(found.frequency[0], 2)} to {number(found.frequency[-1], 2)} Hz'
     if found.seen:
-        return (f'{number(100.0 * found.noise_share, 2)} % of {name} from {band} is noise of the '
-                f'supply: {number(found.gain)} {per}.')
-    return (f'No noise of the supply is detected in {name} from {band}; a gain of '
+        return (f'{number(100.0 * found.noise_share, 2)} % of {name} from {band} is supply '
+                f'noise: {number(found.gain)} {per}.')
+    return (f'No supply noise is detected in {name} from {band}; a gain of '
             f'{number(found.limit)} {per} would have been detected.')
 
 
@@ -75,7 +75,7 @@ def _signal(recording: Recording, signal: tuple[FloatArray, FloatArray], name: s
 
 def _coherence(found: Coupling) -> Plot:
     ends = float(found.frequency[0]), float(found.frequency[-1])
-    plot = Plot('What the voltage and the signal share', 'frequency, Hz', 'coherence', height=220)
+    plot = Plot('Coherence of voltage and signal', 'frequency, Hz', 'coherence', height=220)
     plot.limits(ends, (0.0, 1.05 * max(found.threshold, float(found.coherence.max()))))
     plot.line(found.frequency, found.coherence, 'measured', 0)
     return plot.level(found.frequency, found.threshold,
@@ -88,5 +88,5 @@ def _gain(found: Coupling, per: str) -> Plot:
     if found.seen:
         low, high = found.gain_ci95
         ends = np.array([found.frequency[0], found.frequency[-1]])
-        plot.band(ends, np.full(2, low), np.full(2, high), 'of the band, 95 %', 1)
+        plot.band(ends, np.full(2, low), np.full(2, high), 'whole band, 95 %', 1)
     return plot

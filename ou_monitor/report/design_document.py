@@ -25,7 +25,7 @@ def design_document(result: Design, source: str, taken: str = '', command: str =
     present = result.present
     chosen = [(present, 'present')]
     if result.least is not None:
-        chosen.append((result.least, 'just meets it'))
+        chosen.append((result.least, 'minimum'))
     for row in result.rows[::_EVERY]:
         if not any(math.isclose(row.capacitance, r.capacitance, rel_tol=0.01) for r, _ in chosen):
             chosen.append((row, '' if row.stable else 'unstable'))
@@ -35,13 +35,13 @@ def design_document(result: Design, source: str, taken: str = '', command: str =
              for r, mark in sorted(chosen, key=lambda item: item[0].capacitance)]
     name = 'battery bus' if result.rail == 'bus' else 'regulated rail'
     subject = (f'{name} at throttle {result.throttle:g}: mean {present.mean:.4g} V (sag of the '
-               f'bus {present.sag:.3g} V), brown-out at {result.voltage:g} V ({source}), risk '
-               f'allowed {result.target:g} within {result.horizon:g} s')
+               f'bus {present.sag:.3g} V), brown-out at {result.voltage:g} V ({source}), allowed '
+               f'risk {result.target:g} within {result.horizon:g} s')
     return Document('Which capacitance', subject, [answer(result)], [
         lambda: [Figure(_risk(result))],
         Table(['C, uF', 'ESR, mOhm', 'alpha, 1/s', 'tau, us', 'sigma, V/sqrt(s)', 'Var_inf, V^2',
                'mean time', 'risk OU', 'crossing', ''], cells, left=[9]),
-        Table(['what', 'unit', 'present', 'tried', 'risk then', f'for {result.target:g}'],
+        Table(['what', 'unit', 'present', 'tried', 'risk then', f'needed for {result.target:g}'],
               [[lever.name, lever.unit, lever.words(lever.present), lever.words(lever.tried),
                 probability(lever.risk), lever.words(lever.least)
                 if math.isfinite(lever.least) else 'out of reach'] for lever in result.levers],

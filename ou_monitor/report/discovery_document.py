@@ -43,8 +43,7 @@ def discovery_document(finding: Finding, seen: Overview | None = None, command: 
     known = [] if seen is None else known_lines(seen)
     if seen is not None and baseline is not None and other_scale(
             seen.facts.ou, baseline.alpha, 0.0, baseline.sigma, 0.0):
-        known.append(('Plain OU', 'describes another time scale than this relaxation: it includes '
-                      'level and load'))
+        known.append(('Plain OU', 'has another time scale, because it includes level and load'))
     parts: list[Part] = [
         lambda: [] if samples is None else [Figure(_voltage(finding), (
             f'Band: range of {_DRAWS} simulations of the {_model_name(finding)} at each moment, '
@@ -55,7 +54,7 @@ def discovery_document(finding: Finding, seen: Overview | None = None, command: 
         parts += [Section('Causes', _causes(finding)),
                   Section('Gain' if finding.causes else 'What it predicts', _gain(finding)),
                   lambda: [Section(f'Statistics{after}', _statistics(finding), folded=True),
-                           Section('Data beside simulations', _comparisons(finding),
+                           Section('Data and simulations', _comparisons(finding),
                                    folded=True)],
                   Section('What is left', [_discrepancies(finding)], folded=True),
                   lambda: [Section('Parameters', _parameters(finding), folded=True)]]
@@ -136,8 +135,8 @@ def _causes(finding: Finding) -> list[Part]:
              'fitted again; its standard error combines the scatter of block means and the '
              'errors of the parameters. p: twice the smaller of two p-values: the likelihood '
              'ratio on the fitted part (corrected for the search) and the gain. "Exact" causes '
-             'are visible in the samples themselves; those corrected there share one gain. Terms '
-             'of one kind that share a gain are one row.', legend=True)]
+             'are visible in the samples themselves; causes corrected in the samples share one '
+             'gain. Terms of one kind that share a gain are one row.', legend=True)]
 
 
 def _gain(finding: Finding) -> list[Part]:
@@ -155,7 +154,7 @@ def _gain(finding: Finding) -> list[Part]:
     return [Table(['', 'observed', 'plain OU', 'extended', 'gain'][:kept],
                   [row[:kept] for row in rows], left=[0]), Text(
                       '' if finding.refused else finding.throttle_effects.words),
-            Text(f'Plain OU, with nothing else in the model: {plain_model_words(baseline)}.')]
+            Text(f'The plain OU has {plain_model_words(baseline)}.')]
 
 
 def _statistics(finding: Finding) -> list[Part]:
@@ -166,7 +165,7 @@ def _statistics(finding: Finding) -> list[Part]:
             + (f', {len(finding.remaining)} for the extended model. ' if finding.causes else '. '))
     dots = 'Hollow: plain OU. Full: extended model' if finding.causes else 'Dot: plain OU'
     return [Figure(
-        _dot_rows(f'{dots}. Band: what simulations produce', 'standard scores', rows),
+        _dot_rows(f'{dots}. Band: range of simulations', 'standard scores', rows),
         text + 'The band comes from simulations that are fitted in the same way: with a correct '
         'model, one recording in a hundred has a statistic outside it.')]
 

@@ -188,7 +188,7 @@ def trend_words(trend: Trend) -> str:
     return (f'{trend.vehicle}: {trend.quantity} drifts by {change(trend.slope)} per flight (95 % '
             f'{change(trend.low)} to {change(trend.high)}), '
             f'{change(flights * trend.slope)} over {trend.flights} flights; '
-            f'{p_words(trend.p_value)}, over the fleet {chance(trend.p_family)}.')
+            f'{p_words(trend.p_value)}, fleet-wide {chance(trend.p_family)}.')
 
 
 def finding_words(fleet: Fleet) -> list[str]:
@@ -205,7 +205,7 @@ def finding_words(fleet: Fleet) -> list[str]:
             f' (95 % {change(off - float(reach[k]))} to {change(off + float(reach[k]))})')
         found.append(f'{one.names[k]}: {name} is {shown(values, one.value[k])}'
                      f'{_a_cell(judged, name, one.names[k])}{_at(values, " at ")}, '
-                     f'{change(off)}{interval} from {beside}; p over the fleet '
+                     f'{change(off)}{interval} from {beside}; fleet-wide p '
                      f'{chance(float(one.outliers.chance[k]))}.')
     for name, k in judged.odd_recordings():
         values, out = judged.values[name], judged.recordings[name]
@@ -214,7 +214,7 @@ def finding_words(fleet: Fleet) -> list[str]:
                      f'{shown(values, values.value[k])}{_a_cell(judged, name, values.vehicles[k])}'
                      f'{_at(values, " at ")} '
                      f'({_raw_value(values, k)}), '
-                     f'{away} from the other flights; p over the fleet '
+                     f'{away} from the other flights; fleet-wide p '
                      f'{chance(float(out.chance[k]))}.')
     return found
 
@@ -378,9 +378,9 @@ def _packs(fleet: Fleet) -> list[Part]:
     if not made.rows:
         return []
     return [made, Text(
-        'Medians as measured, the sag at the highest throttle flown; (pack): of the whole supply, '
-        'because its cells are unknown. "per flight": drift, the sag at full throttle. A star '
-        'marks what stands out.',
+        'Medians as measured; sag at the highest throttle flown. (pack): of the whole supply, '
+        'because the number of cells is unknown. "per flight": drift (of the sag: at full '
+        'throttle). A star marks what stands out.',
         legend=True)]
 
 
@@ -663,7 +663,7 @@ def _drift(fleet: Fleet) -> list[Part]:
     if not drawn:
         return [Text('No vehicle has enough flights for a test.')]
     parts: list[Part] = [] if judged.drifting else [
-        Text('No drift is significant over the fleet; the most likely ones are drawn.')]
+        Text('No drift is significant; the most likely ones are drawn.')]
     parts += Pair.two_by_two([
         Figure(_trend_plot(judged.values[t.quantity], t), _caption(t, fleet)) for t in drawn])
     listed = [t for k, t in enumerate(judged.trends) if k < _LEAST or t.p_value < DRIFT_RATE]
@@ -673,15 +673,15 @@ def _drift(fleet: Fleet) -> list[Part]:
              'yes' if t.p_family <= DRIFT_RATE else 'no'] for t in listed[:_MOST]]
     more = len(judged.trends) - len(rows)
     return [*parts, Table(['vehicle', 'quantity', 'flights', 'change per flight\n[95 %]', 'p',
-                           'p over the fleet', 'stands'], rows, left=[0, 1]), Text(
+                           'fleet-wide p', 'significant'], rows, left=[0, 1]), Text(
         'Straight lines fitted to the logarithms, weighted by the errors; p: t test by the '
-        'scatter about the line; over the fleet: Holm-adjusted.'
+        'scatter about the line; fleet-wide p: Holm-adjusted.'
         + (f' {more} less likely trends are not shown.' if more > 0 else ''), legend=True)]
 
 
 def _caption(trend: Trend, fleet: Fleet) -> str:
     at = _at(fleet.judgement.values[trend.quantity], ' at ') or ' as measured'
-    return (f'{change(trend.slope)} per flight; p over the fleet '
+    return (f'{change(trend.slope)} per flight; fleet-wide p '
             f'{chance(trend.p_family)}. Values{at}, with 95 % intervals.')
 
 

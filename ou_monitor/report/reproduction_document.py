@@ -24,7 +24,7 @@ def reproduction_document(result: Reproduction, command: str = '') -> Document:
     parts: list[Part] = [
         lambda: [Section('Figures, simulated from the numbers printed', [
             *_screens(result), *_transient(), *_spectrum(result), *_crest_and_factor(result)])],
-        Section('Eight points to read the paper with', [
+        Section('Eight points to know when reading the paper', [
             Text(f'{point.number}. {point.title} ({point.outcome}): {point.text}')
             for point in result.points]),
         Section('Every number', [Text(
@@ -67,9 +67,9 @@ def _screens(result: Reproduction) -> list[Part]:
             plot, f'Vpp {1e3 * float(np.ptp(screen.u)):.4g} mV here, '
             f'{state.vpp.text} mV printed.'))
     return [Pair(drawn), Text(
-        'As Figs. 1 to 4: an OU with the printed alpha and Vrms (motors off: half a step), at 1 '
-        'MHz, in steps of the oscilloscope. Where the printed Vpp is much wider than the trace, '
-        'the rail also carries something faster.', legend=True)]
+        'As Figs. 1 to 4: an OU with the printed alpha and Vrms (motors off: half a step of the '
+        'oscilloscope), at 1 MHz, rounded to such steps. Where the printed Vpp is much wider than '
+        'the trace, the rail also carries something faster.', legend=True)]
 
 
 def _transient() -> list[Part]:
@@ -143,8 +143,8 @@ def _crest_and_factor(result: Reproduction) -> list[Part]:
                 'switching system, 3 standard errors', 0)
     factor.line(t, 1e6 * s.variance, '', 0)
     factor.line(t, 1e6 * s.printed * s.t, '(6) as printed', 1, 'thick')
-    factor.line(t, 1e6 * s.correct * s.t, '(6) with the 2', 2, 'dash thick')
-    left = Figure(crests, 'Vertical: Table 1. Screens of 10, 100 and 500 ms at 1 MHz.')
+    factor.line(t, 1e6 * s.correct * s.t, '(6) with the factor of 2', 2, 'dash thick')
+    left = Figure(crests, 'Vertical lines: Table 1. Screens of 10, 100 and 500 ms at 1 MHz.')
     right = Figure(factor, (
         'dU/dt = \u00b11 V/s, 1000 switches a second each way; the simulated variance lags behind '
         '(6) by the memory of the chain.'))

@@ -126,9 +126,9 @@ def test_no_coupling_is_reported_with_the_detectable_gain(table, capsys):
     assert 0.0 < data['gain_limit_per_v'] < GAIN
     assert main(['coupling', str(table), '--signal', 'gyro_y']) == 0
     text = capsys.readouterr().out
-    assert 'No noise of the supply is detected in gyro_y' in text
+    assert 'No supply noise is detected in gyro_y' in text
     assert 'would have been' in ' '.join(text.split())
-    assert text.index('No noise') < text.index('Chance') < text.index('Lowest voltage')
+    assert text.index('No supply noise') < text.index('Chance') < text.index('Lowest voltage')
     assert max(map(len, text.splitlines())) <= 100
 
 
@@ -136,7 +136,7 @@ def test_a_coupling_is_reported_with_interval_and_lag(table, capsys):
     """Gain, interval, lag."""
     assert main(['coupling', str(table), '--signal', 'gyro_x', '--band', '10,60']) == 0
     text = capsys.readouterr().out
-    assert re.search(r'gyro_x from 10 to 60 Hz is noise of the supply: 2\d\.\d per V\.', text)
+    assert re.search(r'gyro_x from 10 to 60 Hz is supply noise: 2\d\.\d per V\.', text)
     assert 'p < 0.001' in text and not re.search(r'\de-\d', text)
     assert text.splitlines()[-1].startswith('Nothing was written')
 
@@ -153,7 +153,7 @@ def test_the_page_says_what_the_text_says(table, tmp_path, capsys):
     answer = said.split('\n\n')[1].replace('\n', ' ')
     assert answer in text and 'limit 4.9 V' in text
     assert html.index(answer) < html.index('>Voltage<') < html.index('Below 4.9 V') < (
-        html.index('What the voltage and the signal share'))
+        html.index('Coherence of voltage and signal'))
     # Not again without being asked to.
     assert 'exists already: --force' in failure(
         capsys, 'coupling', table, '--signal', 'gyro_x', '--report', target)

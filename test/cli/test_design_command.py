@@ -42,7 +42,7 @@ def test_the_table_has_present_answer_and_both_ends(capsys):
     sizes = [float(row[0]) for row in rows]
     assert sizes == sorted(sizes) and (sizes[0], sizes[-1]) == (10.0, 22000.0)
     assert [row[0] for row in rows if row[-1] == 'present'] == ['470']
-    assert [row[0] for row in rows if row[-1] == 'it'] == ['2305']
+    assert [row[0] for row in rows if row[-1] == 'minimum'] == ['2305']
     assert all(len(line) <= 120 for line in out.splitlines())
 
 
