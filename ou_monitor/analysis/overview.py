@@ -11,18 +11,21 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.supply import (
     facts_and_end, flown_near, Remainder, SupplyFacts, THROTTLES)
 from ou_monitor.online.load.supply_load import LoadStatus, SupplyLoad
 from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
-from ou_monitor.records import NAN, OuFacts, Recording
+from ou_monitor.records import FloatArray, NAN, OuFacts, Recording
 from ou_monitor.text import counted, number, volts, Z95
 
 # Minimum ratio of the noise at both ends of throttle that is reported as a change.
 _GROWS = 1.25
 # Minimum noise, V; less is rounding.
 _NOTHING = 1e-9
+# Time within which the resistance acts, s.
+_AT_ONCE = 0.1
 # Minimum share of the noise of a level that lines must make up to be mentioned in the answer.
 _LOUD = 0.25
 
@@ -50,6 +53,8 @@ class Overview:
     highest: float  # Highest throttle; NaN without throttle
     # Lowest and highest index of THROTTLES near which there are enough readings.
     flown: tuple[int, int]
+    drawn: float = NAN  # Largest current by the median of three readings, A; NaN without one
+    step: float = 0.0  # Median time between readings, s
     line: LoudestLine | None = None  # Strongest spectral line
     cells: int = 0  # Cells in series to which the limit refers; 0: none
     end: MonitorReport | None = None  # Report of the node at the end; None without a limit
@@ -87,7 +92,14 @@ def overview(recording: Recording, limit: float | None = None,
     near = np.flatnonzero(flown_near(recording, THROTTLES)).tolist() or [0]
     return Overview(facts, recording.duration if recording.n else 0.0, load,
                     float(known.max()) if known.size else NAN, (near[0], near[-1]),
+                    _largest(recording.current),
+                    float(np.median(np.diff(recording.t))) if recording.n > 1 else 0.0,
                     _strongest(levels), cells, end)
+
+
+def _largest(current: FloatArray | None) -> float:
+    known = np.empty(0) if current is None else np.abs(current[np.isfinite(current)])
+    return float(np.median(sliding_window_view(known, 3), axis=1).max()) if known.size > 2 else NAN
 
 
 def _strongest(levels: Sequence[LevelResult]) -> LoudestLine | None:
@@ -110,11 +122,14 @@ def answers(found: Overview) -> list[str]:
     elif math.isfinite(least.voltage_v):
         parts.append(f'The voltage fell to {number(least.voltage_v, 4)} V at '
                      f'{number(least.time_s)} s.')
-    if found.facts.sag.known or _bounded(found):
-        at, sag, se = found.sag
-        parts.append(f'The rail sags by {volts(sag)} at {100.0 * at:.0f} % throttle.'
-                     if sag > 2.0 * se else
-                     f'No sag is measurable: at {100.0 * at:.0f} % throttle it is below '
+    at, sag, se = found.sag
+    known = found.facts.sag.known or _bounded(found)
+    if known and sag > 2.0 * se:
+        parts.append(f'The rail sags by {volts(sag)} at {100.0 * at:.0f} % throttle.')
+    elif fall := _fall(found):
+        parts.append(f'The rail falls by {fall}; no sag over throttle is measurable.')
+    elif known:
+        parts.append(f'No sag is measurable: at {100.0 * at:.0f} % throttle it is below '
                      f'{volts(sag + 2.0 * se)}.')
     if found.line is not None and found.line.all_share > _LOUD:
         line = found.line
@@ -141,7 +156,9 @@ def known_lines(found: Overview) -> list[tuple[str, str]]:
     lines += [('Sag', _sag_words(found)), ('Noise', _noise_words(found))]
     if math.isfinite(resistance.ohm):
         lines.append(('Resistance', f'{number(1e3 * resistance.ohm)} mOhm (+- '
-                      f'{number(2e3 * resistance.se_ohm, 2)}) within 0.1 s'))
+                      f'{number(2e3 * resistance.se_ohm, 2)}) within '
+                      f'{max(_AT_ONCE, found.step):.2g} s'
+                      + (f': {fall}' if (fall := _fall(found)) else '')))
     lines.append(('Relaxation', _ou_words(found.facts.ou)))
     if found.line is not None:
         line = found.line
@@ -150,6 +167,12 @@ def known_lines(found: Overview) -> list[tuple[str, str]]:
                       f'{number(1e3 * line.rms)} mV rms{where} ({100.0 * line.share:.2g} % of the '
                       'noise there)'))
     return lines
+
+
+def _fall(found: Overview) -> str:
+    """Return the fall by the resistance and its current, in words; empty if unknown."""
+    drop = found.facts.resistance.ohm * found.drawn
+    return f'{volts(drop)} at {number(found.drawn)} A' if drop > 0.0 else ''
 
 
 def _dips(found: Overview, below: float = NAN) -> str:

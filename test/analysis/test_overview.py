@@ -39,6 +39,23 @@ def test_a_gap_after_a_low_sample_is_not_time_below():
     assert (dips.count, dips.seconds) == (1, pytest.approx(0.1))
 
 
+@pytest.mark.parametrize('step', [0.02, 0.2])
+def test_a_current_that_throttle_does_not_tell_gives_the_fall(step):
+    """Of its largest value that lasts three readings, not of one wild reading."""
+    rng, n = np.random.default_rng(1), 4000
+    drawn = np.repeat(rng.uniform(0.0, 60.0, n // 10), 10)
+    drawn[1000] = 500.0
+    v = 12.0 - 0.02 * drawn + 0.005 * rng.standard_normal(n)
+    v[1000] = 12.0
+    throttle = np.repeat(rng.uniform(0.0, 1.0, n // 10), 10)
+    found = overview(Recording(step * np.arange(n), v, throttle, current=drawn))
+    assert 59.0 < found.drawn < 60.0
+    ohm = found.facts.resistance.ohm
+    assert ohm == pytest.approx(0.02, rel=0.1)
+    assert f'falls by {ohm * found.drawn:.2f} V' in answers(found)[1]
+    assert f'within {max(0.1, step):g} s' in dict(known_lines(found))['Resistance']
+
+
 def test_words_are_those_of_the_facts():
     """The sag within three errors of the truth; each number in words is one of `supply_facts`."""
     found, facts = overview(flight(), 15.2), supply_facts(flight(), 15.2)

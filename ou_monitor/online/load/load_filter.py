@@ -70,7 +70,7 @@ class CurrentFilter:
 
     def __init__(self) -> None:
         self._t = self._heard = self._unit = NAN
-        self._largest = self._peak = 0.0
+        self._largest = self._peak = self._before = 0.0
         # Current at once and after each of LAGS, A.
         self._drawn: list[float] = []
         self.lost = False
@@ -115,6 +115,11 @@ class CurrentFilter:
         if not math.isfinite(x):
             if not block.t - self._heard <= _HOLD:
                 self.lost = True
+            return
+        # A single wild reading must not restart the filter: another one must follow.
+        alone = max(self._before, self._largest) < abs(x) / _MORE and self._largest >= _LEAST
+        self._before = abs(x)
+        if alone:
             return
         lost, self.lost, self._heard = self.lost or fresh, False, block.last
         self._largest = max(self._largest, abs(x))
