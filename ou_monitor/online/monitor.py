@@ -475,16 +475,16 @@ class SupplyMonitor:
 
     def _of_risk(self, e: Estimate, risk: float, flag: FlagState) -> str:
         s = self._settings
-        load = f' at throttle {e.throttle:.2f}' if math.isfinite(e.throttle) else ''
+        load = f'; throttle {e.throttle:.2f}' if math.isfinite(e.throttle) else ''
         known = 'unknown' if math.isnan(risk) else f'{risk:.2g}'
         outcome = self._ahead.outcome
         if outcome.basis != 'none':
             words = outcome.basis.replace('_', ' ')
-            known += f' (from {words}; most of it: {outcome.cause})' if outcome.cause else \
+            known += f' (from {words}; main cause: {outcome.cause})' if outcome.cause else \
                 f' (from {words})'
-        supply = f'; supply now {e.voltage:.3f} V' if math.isfinite(e.voltage) else ''
-        return (f'Brown-out risk {known} within {s.brownout_horizon:g} s of '
-                f'{s.brownout_voltage:g} V (critical from {s.brownout_critical:g}){load}{supply}; '
+        supply = f'; supply {e.voltage:.3f} V' if math.isfinite(e.voltage) else ''
+        return (f'Risk of falling below {s.brownout_voltage:g} V within {s.brownout_horizon:g} s: '
+                f'{known}, critical from {s.brownout_critical:g} within 1 s{load}{supply}; '
                 f'{flag.level.name} for {flag.age:.1f} s: {flag.reason}.')
 
 

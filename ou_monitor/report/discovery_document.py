@@ -73,9 +73,10 @@ def answer(finding: Finding) -> list[str]:
     worse = [*(['one-step errors are larger'] if finding.larger else []),
              *(['the rate of falls is further from the measured one']
                if finding.crossing.worse else [])]
-    closer = ('With them it passes every test.' if finding.verdict is Verdict.EXPLAINED else
-              'With them it comes closer, but is not yet right.' if finding.closer else
-              f'With them it does not come closer: {listed(worse)} than with the plain OU.')
+    closer = ('With them the simulation ' + (
+        'passes every test.' if finding.verdict is Verdict.EXPLAINED else
+        'comes closer, but is not yet right.' if finding.closer else
+        f'does not come closer: {listed(worse)} than with the plain OU.'))
     refused = [f'{finding.refused}: trust the named causes, not the fitted values.'
                ] if finding.refused else []
     return [f'A plain simulation lacks {listed([*names[:_FIRST], *others])}.',
@@ -88,10 +89,10 @@ def _gain_words(finding: Finding) -> str:
     if not gain > Z95 * finding.gain_se or not math.isfinite(size):
         return gain_words(gain, finding.gain_se)
     errors = ('shrink by ' if shrink > 0.0 else 'grow by ') + f'{number(100.0 * abs(shrink), 2)} %'
-    return (f'One-step errors on samples not used for the fit {errors} (rms), and their size is '
-            f'{"better" if size >= 0.0 else "worse"} predicted: {1e3 * (gain - size):+.3g} and '
-            f'{1e3 * size:+.3g} mnat per sample, {number(1e3 * gain)} +- '
-            f'{number(1e3 * finding.gain_se, 2)} in all.')
+    return (f'On samples not used for the fit, one-step errors {errors} (rms; '
+            f'{1e3 * (gain - size):+.3g} mnat per sample) and their size is predicted '
+            f'{"better" if size >= 0.0 else "worse"} ({1e3 * size:+.3g}): '
+            f'{number(1e3 * gain)} +- {number(1e3 * finding.gain_se, 2)} mnat in all.')
 
 
 def _model_name(finding: Finding) -> str:

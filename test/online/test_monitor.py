@@ -122,8 +122,8 @@ def test_summary_says_why():
     """Risk, horizon, level, throttle, what the flag does and since when."""
     report = Feed(brownout_voltage=4.93, brownout_delay=0.0).feed(5.0)
     assert report.level is Level.ERROR and report.flag.level is FlagLevel.CRITICAL
-    for words in ('Brown-out risk', 'within 5 s of 4.93 V', 'critical from 0.5',
-                  'at throttle 0.62', 'CRITICAL for 0.0 s', 'brownout.critical'):
+    for words in ('Risk of falling below 4.93 V within 5 s: ', 'critical from 0.5 within 1 s',
+                  'throttle 0.62', 'CRITICAL for 0.0 s', 'brownout.critical'):
         assert words in report.summary
     assert report.fields['brownout_level'] == 'CRITICAL'
     assert report.fields['brownout_reason'] == report.flag.reason
@@ -198,7 +198,7 @@ def test_floor_without_an_estimate():
     report = monitor.report(0.0)
     assert math.isnan(report.risk) and not report.estimate.usable
     assert report.level is Level.ERROR and report.brownout is True
-    assert 'brownout.floor (4.5 V)' in report.summary and 'risk unknown' in report.summary
+    assert 'brownout.floor (4.5 V)' in report.summary and 'within 5 s: unknown' in report.summary
 
 
 def test_silence_keeps_a_flag_that_is_set_for_the_hold():
