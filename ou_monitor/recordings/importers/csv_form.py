@@ -36,8 +36,8 @@ from ou_monitor.text import plain_number
 
 TIME, VOLTAGE, THROTTLE = 'time_s', 'voltage_v', 'throttle'
 
-# Words of loggers for a missing number.
-MISSING = frozenset(('', 'nan', 'null', 'none', 'na', 'n/a', '#n/a', '-', '--', 'x'))
+# Words of loggers for a missing number, or for one beyond the range.
+MISSING = frozenset(',nan,null,none,na,n/a,#n/a,-,--,x,∞,-∞,ol,-ol,ovl,overload'.split(','))
 # Added to the error about a cell with a decimal comma.
 _MARK = ': the decimal mark is a point'
 # Maximum characters of a cell that are shown.
@@ -54,7 +54,10 @@ TIME_WORDS = {
     's': 's', 'sec': 's', 'secs': 's', 'second': 's', 'seconds': 's', 'sekunden': 's', 'ms': 'ms',
     'msec': 'ms', 'millis': 'ms', 'millisecond': 'ms', 'milliseconds': 'ms', 'us': 'us',
     'µs': 'us', 'μs': 'us', 'usec': 'us', 'micros': 'us', 'microseconds': 'us', 'ns': 'ns',
-    'nsec': 'ns', 'nanoseconds': 'ns'}
+    'nsec': 'ns', 'nanoseconds': 'ns', 'min': 'min', 'mins': 'min', 'minutes': 'min', 'h': 'h',
+    'hr': 'h', 'hours': 'h', 'd': 'd', 'days': 'd'}
+# These end the names of other quantities too: Voltage (min).
+_LONG = 'min|mins|minutes|h|hr|hours|d|days'
 VOLT_WORDS = {'v': 'V', 'volt': 'V', 'volts': 'V', 'vdc': 'V', 'mv': 'mV', 'mvdc': 'mV',
               'millivolt': 'mV', 'millivolts': 'mV', 'cv': 'cV', 'dv': 'dV'}
 AMPERE_WORDS = {'a': 'A', 'amp': 'A', 'amps': 'A', 'ampere': 'A', 'amperes': 'A', 'adc': 'A',
@@ -67,12 +70,13 @@ OTHER_WORDS = frozenset((
     'degc', '°f', 'm', 'm/s', 'km/h', 'g', 'kg', 'n', 'nm', 'ohm', 'mohm'))
 WORDS = {**TIME_WORDS, **VOLT_WORDS, **AMPERE_WORDS, **SHARE_WORDS}
 # Units in V, A, s and 1; the last letter is the quantity.
-SCALES = {**TIME_UNITS, 'V': 1.0, 'dV': 0.1, 'cV': 0.01, 'mV': 1e-3, 'A': 1.0, 'dA': 0.1,
-          'cA': 0.01, 'mA': 1e-3, 'uA': 1e-6, '%': 0.01}
+SCALES = {**TIME_UNITS, 'min': 60.0, 'h': 3600.0, 'd': 86400.0, 'V': 1.0, 'dV': 0.1, 'cV': 0.01,
+          'mV': 1e-3, 'A': 1.0, 'dA': 0.1, 'cA': 0.01, 'mA': 1e-3, 'uA': 1e-6, '%': 0.01}
 # A quantity with one of these words at the end of its name, preferably in brackets.  Repetitions
 # after the quantity are bounded, so that the time is proportional to the length of a name.
-_WORD = f"({'|'.join(sorted(WORDS, key=len, reverse=True))})"
+_WORD = '|'.join(sorted(WORDS.keys() - _LONG.split('|'), key=len, reverse=True)).join('()')
 _WITH_UNIT = re.compile(
+    rf'(.*(?:time|zeit|stamp|elapsed)|t)(?: ?[\[({{/_ ] ?| in )({_LONG})[\])}}]?|'
     rf'(.*?) ?[\[({{] ?{_WORD} ?[\])}}]|(.+?) in {_WORD}|(.[^/]*?|.+? ) ?/ ?{_WORD}|'
     rf'(.+?)[ _]{_WORD}')
 # Volts*100; current (10 mA).
@@ -106,6 +110,10 @@ _MONTHS = 'jan feb mar apr may jun jul aug sep oct nov dec'
 _MONTH = re.compile(rf"[- ]({_MONTHS.replace(' ', '|')})[a-z]*[- ]", re.IGNORECASE)
 # A serial monitor's time before the first cell: 10:15:23.123 -> 12.3
 _RECEIVED = re.compile(r'\[?(\d\d:\d\d:\d\d[.,]\d+)(?:\]| -?>) *')
+# The name that a serial plotter takes before each number: Voltage:12.3
+_LABEL = re.compile(r'[^\W\d][\w ()%/-]*[:=]')
+# A time span: 0 days 00:00:01.5
+_DAYS = re.compile(r'(\d{1,2}) days?,? \+?(\d\d?):')
 CHANNEL = re.compile(r'(?:ch|channel|chan|kanal|analog)[_ ]?[0-9a-d]|a[0-3]', re.IGNORECASE)
 
 
@@ -118,6 +126,8 @@ class Form(NamedTuple):
     stated_comma: bool  # Whether that was given: then a point separates thousands
     skip: int  # Lines above the first row of numbers
     line: int  # Number of the line with the names; 0: there is none
+    labels: tuple[str, ...]  # Words before the numbers of each column, '' if none
+    above: str  # The lines above the rows
     names: tuple[str, ...]  # Names of the columns as written, else 'column 1' and so on
     units: tuple[str, ...]  # As stated, '' if not stated
     width: int  # Cells of a row
@@ -200,6 +210,10 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool,
         return None
     width = max(widths, key=lambda size: (widths[size], size))
     full = [row for row in filled if len(row) == width]
+    either = [[found[0] if (found := _LABEL.match(cell)) and is_number(cell[found.end():]) else ''
+               for cell in row] for row in full[len(full) // 2:][:2]]
+    labels = tuple(one if one == other else '' for one, other in zip(either[0], either[-1]))
+    rows, full = ([_unlabelled(row, labels) for row in some] for some in (rows, full))
     good = [[is_value(row[k]) for row in full if row[k]] for k in range(width)]
     places = [k for k, ok in enumerate(good) if ok and (ok[-1] or 2 * sum(ok) >= len(ok))]
     first = next((k for k, row in enumerate(rows) if k >= skip and len(row) >= min(width, 2)
@@ -213,7 +227,7 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool,
         first, places = len(rows), []
         if len(filled) != 1 or any(map(is_value, filled[0])):
             return None
-    names, units, at = _header(rows, lines, first, width, delimiter, skip)
+    names, units, at = _header(rows, lines, first, width, delimiter, skip, labels)
     if not at and any(len(row) > 2 and all(row) and not any(map(is_value, row))
                       for row in rows[skip:first]):
         # Names of other columns: rows have lost or gained cells.
@@ -223,8 +237,14 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool,
     start, step, stated = _stated_step(lines[:max(first, 20)], rows[:first])
     first_rows = tuple(tuple(row) for row in rows[first:] if any(row))
     return fit * (1.0 if width > 1 else 0.4) + 0.01 * min(width, 20) / 20, Form(
-        encoding, delimiter, comma, stated_comma, first, at, names, units, width, first_rows,
-        start, step, stated)
+        encoding, delimiter, comma, stated_comma, first, at, labels, ''.join(lines[:first]), names,
+        units, width, first_rows, start, step, stated)
+
+
+def _unlabelled(row: list[str], labels: Sequence[str]) -> list[str]:
+    """Return cells without the words before their numbers."""
+    return [cell.strip().removeprefix(label).strip() for cell, label in zip(row, labels)] + row[
+        len(labels):] if any(labels) else row
 
 
 def _after_names(rows: list[list[str]], skip: int, first: int, width: int, places: list[int],
@@ -241,9 +261,10 @@ def _after_names(rows: list[list[str]], skip: int, first: int, width: int, place
 
 def _prepared(lines: list[str], delimiter: str, comma: bool, stated_comma: bool) -> list[str]:
     """Return lines with decimal points, and single blanks if blanks separate the cells."""
-    received = _RECEIVED.match(lines[0]) if lines else None
-    if received and (delimiter in (rest := lines[0][received.end():].strip()) or ' ' not in rest):
-        lines = [_RECEIVED.sub(rf'\1{delimiter}', line, count=1) for line in lines]
+    if lines and _RECEIVED.match(lines[0]):
+        lines = [f'{found[1]}{delimiter}{rest}' if (found := _RECEIVED.match(line)) and (
+            delimiter in (rest := line[found.end():]).strip() or ' ' not in rest.strip())
+            else line for line in lines]
     if stated_comma:
         lines = [_THOUSANDS.sub(lambda found: found[0].replace('.', ''), line) for line in lines]
     if comma:
@@ -290,6 +311,8 @@ def is_clock(cell: str) -> bool:
 
 def swapped(cell: str) -> str:
     """Return a clock with hours, a number for the month, and points for decimal marks."""
+    if found := _DAYS.match(cell):
+        cell = f'{24 * int(found[1]) + int(found[2])}:{cell[found.end():]}'
     if found := _MONTH.search(cell):
         month = 1 + _MONTHS.index(found[1].lower()) // 4
         cell = f'{cell[:found.start()]}-{month}-{cell[found.end():]}'
@@ -319,7 +342,7 @@ def factor_of(name: str) -> float:
 
 
 def _header(rows: list[list[str]], lines: list[str], first: int, width: int, delimiter: str,
-            skip: int) -> tuple[tuple[str, ...], tuple[str, ...], int]:
+            skip: int, labels: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...], int]:
     """Return names, units as stated, and the line of the names."""
     above = [k for k in range(skip, first) if any(rows[k])]
     names: list[str] = []
@@ -329,9 +352,13 @@ def _header(rows: list[list[str]], lines: list[str], first: int, width: int, del
             width, len(rows[above[-1]])):
         units = [cell.strip('[](){} ').lower() for cell in rows[above.pop()]]
     # An index at the left has no name, any other column has one.
-    if above and all(rows[above[-1]][k:k + 1] != [''] or not any(
-            row[k:k + 1] not in ([], ['']) for row in rows[first:]) for k in range(1, width)):
+    if above and (not any(labels) or len(rows[above[-1]]) == width) and all(
+            rows[above[-1]][k:k + 1] != [''] or not any(
+                row[k:k + 1] not in ([], ['']) for row in rows[first:]) for k in range(1, width)):
         names, line = rows[above[-1]], above[-1] + 1
+    elif any(labels):
+        names, line = [label[:-1].strip() or ('time' if is_clock(cell) else f'column {k + 1}')
+                       for k, (label, cell) in enumerate(zip(labels, rows[first]))], first + 1
     else:
         # A header marked as a comment.
         for k in range(first - 1, skip - 1, -1):
@@ -361,8 +388,8 @@ def _header(rows: list[list[str]], lines: list[str], first: int, width: int, del
 def _unit_beside(names: Sequence[str], rows: list[list[str]], place: int) -> str:
     """Return the unit in the next column, such as Volt DC, if that is named so."""
     beside = names[place + 1].lower() if place + 1 < len(names) else ''
-    words = rows[0][place + 1].lower().split() if beside in ('unit', 'units') and rows and len(
-        rows[0]) > place + 1 else []
+    words = rows[0][place + 1].lower().split() if beside in (
+        'unit', 'units', 'einheit') and rows and len(rows[0]) > place + 1 else []
     return words[0] if words and words[0] in WORDS else ''
 
 
@@ -390,7 +417,7 @@ def _stated_step(lines: list[str], above: list[list[str]]) -> tuple[float, float
             words, unit, number, prefix, _ = found.groups()
             value = float(number) * _PREFIX[prefix or '']
             if unit and unit.lower() in TIME_WORDS:
-                value *= TIME_UNITS[TIME_WORDS[unit.lower()]]
+                value *= SCALES[TIME_WORDS[unit.lower()]]
             if re.search('rate|frequency', words, re.IGNORECASE):
                 value = 1.0 / value if value else math.nan
             if value > 0.0:
@@ -415,7 +442,8 @@ def numbers(path: Path, form: Form, places: Sequence[int],
                 rows = block
                 if len(rows[0]) <= last or len(rows[0]) > width or len(set(map(len, rows))) > 1:
                     rows = _fitting(path, rows, width, last, form, begin, left_out)
-                columns: list[tuple[str, ...]] = list(zip(*rows))
+                columns: list[tuple[str, ...]] = list(zip(*(
+                    _unlabelled(row, form.labels) for row in rows)))
                 if not columns:
                     continue
                 good = np.ones(len(rows), dtype=bool)

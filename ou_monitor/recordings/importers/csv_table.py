@@ -46,6 +46,8 @@ MOST_COLUMNS = 300
 _BACK = 0.25
 # A time without a unit has the coarsest unit with steps, and span, of at most these, s.
 _USUAL_STEP, _USUAL_SPAN = 2.0, 43200.0
+# Number of the first day of 1970 in Excel and MATLAB; days from there to 2100.
+_OF_1970, _TO_2100 = (25569.0, 719529.0), 47482.0
 # Rows from which repeated stamps are the resolution of a clock.
 _FEW_ROWS = 8
 # A voltage without a unit above this is in mV: no craft's pack has that many volts.
@@ -75,7 +77,7 @@ _PATTERNS = {
     logs.THROTTLE: (
         r'throttle', r'thr(?:ottle)?_?(?:out|cmd|command|pct|percent)?|ga[sz]|'
         r'acelerador|duty(?:_cycle)?|tho?o|tastgrad|tastverh.*',
-        r'rc_?command_3', r'pwm|thrust|gas_?kanal|esc(?:_signal)?|'
+        r'rc_?command_3', r'pwm|thrust|gas_?(?:kanal|stellung|hebel)|esc(?:_signal)?|'
         r'(?!.*(?:limit|trim|max|min)).*throttle.*'),
     logs.CURRENT: (
         r'current_a', r'amperage(?:_?latest)?|current_in|i_?bat(?:t|tery)?|'
@@ -87,7 +89,8 @@ _PATTERNS = {
 # blackbox explorer writes the numbers of the log: us, 0.01 V and 0.01 A from version 4.0 on.
 _MAKERS: dict[str, dict[str, tuple[float, str]]] = {
     'loopIteration': {'time': (1e-6, 'us'), 'vbatLatest': (0.01, '0.01 V'),
-                      'amperageLatest': (0.01, '0.01 A'), 'rcCommand[3]': (0.0, 'us')}}
+                      'vbat': (0.01, '0.01 V'), 'amperageLatest': (0.01, '0.01 A'),
+                      'amperage': (0.01, '0.01 A'), 'rcCommand[3]': (0.0, 'us')}}
 # Fields of MAVLink's SYS_STATUS, BATTERY_STATUS and POWER_STATUS (common.xml): factor to V or A,
 # unit, and the number that stands for unknown.  All are whole numbers.
 _MAVLINK = {'voltage_battery': (1e-3, 'mV', 65535.0), 'voltages[0]': (1e-3, 'mV', 65535.0),
@@ -152,6 +155,8 @@ def read_csv(path: Path, columns: CsvColumns | None = None, *, partial: bool = F
     throttle = hold(held.get(logs.THROTTLE, nothing))
     if filled.any():
         t, volts, throttle, current = (one[filled] for one in (t, volts, throttle, current))
+    if t.size >= _FEW_ROWS and 2 * np.unique(t).size < t.size:
+        said.append('Most rows repeat the stamp before: if evenly spaced, give --sample-interval.')
     return RawColumns(t, volts, throttle, current, name, source, tuple(said))
 
 
@@ -380,8 +385,8 @@ def _nameless_columns(form: Form) -> list[int]:
     filled = [k for k in range(form.width) if form.rows and all(
         k < len(row) and is_value(row[k]) for row in form.rows)]
     # With names, only beside a time and nothing else: otherwise it may be of several series.
-    return filled if not form.line else [k for k in filled[1:] if form.width == 2
-                                         and re.fullmatch(_VALUE_NAME, form.names[k].lower())]
+    return filled if not form.line else [k for k in filled[1:] if form.width == 2 and re.fullmatch(
+        _VALUE_NAME, re.split('[./]', form.names[k].lower())[-1])]
 
 
 def _like_voltage(form: Form, places: list[int]) -> list[int]:
@@ -423,7 +428,9 @@ def _unit_column(form: Form, place: int, unit: str | None) -> _Column:
     name = form.names[place]
     maker = next((units for column, units in _MAKERS.items() if column in form.names), {})
     if unit is None and name in maker:
-        return _Column((place,), name, maker[name][1], maker[name][0])
+        scale, words = (0.1, '0.1 V') if name == 'vbatLatest' and re.search(
+            r'Betaflight 3\.[1-9]|Cleanflight [2-9]', form.above) else maker[name]
+        return _Column((place,), name, words, scale)
     return _Column((place,), name, unit or form.units[place], 0.0)
 
 
@@ -628,10 +635,13 @@ def _stamps(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: _Co
         if not unit or usual * TIME_UNITS[unit] > LONGEST_STEP:
             unit = next((name for name, scale in TIME_UNITS.items() if (
                 usual * scale <= _USUAL_STEP and span * scale <= _USUAL_SPAN)), 's')
+        first = next((day for day in _OF_1970 if 0.0 < size - day < _TO_2100), 0.0)
+        if unit == 's' and first and 0.0 < usual < 1e-4:
+            unit, t = 'd', t - first
         words = '' if unit == 's' else ', a guess: --time-unit'
-    t = t * TIME_UNITS[unit]
-    if usual * TIME_UNITS[unit] > LONGEST_STEP:
-        raise InputError(f'{path}: the samples are {usual * TIME_UNITS[unit]:g} s apart by '
+    t = t * SCALES[unit]
+    if usual * SCALES[unit] > LONGEST_STEP:
+        raise InputError(f'{path}: the samples are {usual * SCALES[unit]:g} s apart by '
                          f"'{time.name}': is it in ms, us or ns? Give --time-unit")
     return t, unit + words
 
@@ -674,7 +684,9 @@ def _in_si(quantity: str, column: _Column, values: FloatArray, given: str | None
         low, high = THROTTLE_UNITS.get(unit) or map(float, unit.split(':'))
         return (values - low) / (high - low), (
             '0..1' if unit == '1' else unit) + words
-    if column.scale:
+    # A tool that has converted the numbers keeps the names: no supply is below 1 V.
+    if column.scale and beside != 'V' and (
+            quantity == logs.CURRENT or known.size and np.median(known) * column.scale >= 1.0):
         return values * column.scale, column.unit
     if quantity == logs.CURRENT:
         whole = not column.unit and bool((known == np.rint(known)).all())
@@ -704,7 +716,7 @@ def _throttle_unit(values: FloatArray, volts: FloatArray) -> str:
         return next((f'{-end}:{end}' for end in _STICKS if high <= end), '1')
     # The thrust of a Crazyflie; other counts end at 10 000 at most.
     return '0:65535' if 10000.0 < high <= 65535.0 and values.min() >= 0.0 and (
-        values == np.rint(values)).all() else '1'
+        high > 32768.0 or (values == np.rint(values)).all()) else '1'
 
 
 def _read_note(form: Form, time: _Column, found: dict[str, _Column], units: dict[str, str],

@@ -246,6 +246,24 @@ FORMS = {
     'ros2_topic_echo': (table([], lambda k: (
         f'{1700000000 + k // 40},{25000000 * (k % 40)},base_link,{V[k]},nan,{-AMPS[k]},0.9,True')),
         0.025, False, False),
+    # The format of Arduino's serial plotter, in its serial monitor.
+    'serial_plotter': (table([], lambda k: clock(k, '%H:%M:%S.%f') + (
+        f' -> Voltage:{V[k]},Current:{AMPS[k]},Throttle:{100 * U[k]:.1f}')), 0.01, True, True),
+    'labels_and_units': (table(['booted', 'Logger 1.0 ready'], lambda k: (
+        f'Time: {10 * k} ms, Vbat: {1e3 * V[k]:.0f} mV, Throttle: {100 * U[k]:5.1f} %')), 0.01,
+        True, False),
+    'metrawin': (table(['METRAwin 10', '', 'Datum;Zeit;Messwert;Einheit'], lambda k: (
+        f"{clock(k, '%d.%m.%Y;%H:%M:%S,%f')};{german(V[k])};V DC")), 0.01, False, False),
+    'minutes': (table(['Time (min),Voltage'], lambda k: f'{k / 6000:.9f},{V[k]}'), 0.01, False,
+                False),
+    # A number of days, as Excel exports a date without a format.
+    'excel_days': (table(['Time,Voltage'], lambda k: f'{45428.335 + k / 8640000:.12f},{V[k]}'),
+                   0.01, False, False),
+    'pandas_timedelta': (table([',voltage'], lambda k: (
+        f'{k // 30} days {23 * (k < 30):02d}:{59 * (k < 30):02d}:'
+        f'{59.7 * (k < 30) + 0.01 * (k % 30):09.6f},{V[k]}')), 0.01, False, False),
+    'rostopic_float': (table(['%time,field.data'], lambda k: (
+        f'{1715846526000000000 + 10000000 * k},{V[k]}')), 0.01, False, False),
     # Units below the names; a few are unknown.
     'megasquirt': (table(['"MS3"', 'Time\tRPM\tMAP\tBatt V\tAFR', 's\tRPM\tkPa\tV\tAFR'],
                          lambda k: f'{0.01 * k:.3f}\t2100\t45\t{V[k]}\t14.7'), 0.01, False,
@@ -326,11 +344,48 @@ def test_fields_of_mavlink_have_its_units(cells, given, volts, amps, tmp_path):
     assert ('mV by MAVLink' in said) == (given != 'V' and '.' not in cells)
 
 
+@pytest.mark.parametrize('firmware, name, volts', [
+    ('Betaflight 4.4.2', 'vbatLatest', 1580), ('Betaflight 3.5.7', 'vbatLatest', 158),
+    ('INAV 7.1.2', 'vbat', 1580), ('INAV 7.1.2', 'vbat', 15.8)])
+def test_the_explorer_of_blackboxes_writes_the_units_of_the_firmware(
+        firmware, name, volts, tmp_path):
+    """0.01 V, and 0.1 V before Betaflight 4.0; volts where a tool has converted them."""
+    amps = 300 if volts > 100 else 3
+    rows = ''.join(f'{k},{125 * k},{volts},{amps}\n' for k in range(9))
+    found = read_recording(written(tmp_path, (
+        f'"Firmware revision","{firmware} (0) F7"\n'
+        f'"loopIteration","time","{name}","amperage"\n{rows}')))
+    np.testing.assert_allclose(found.voltage, 15.8)
+    np.testing.assert_allclose(found.current, 3.0)
+
+
+def test_labels_are_names_only_if_each_row_has_them(tmp_path):
+    """A header has priority, and a number with the label of another is refused."""
+    rows = ''.join(f'{0.01 * k:.2f},12.5,MODE:{k % 3}\n' for k in range(N))
+    found = read_recording(written(tmp_path, f't,U,throttle\n{rows}'))
+    np.testing.assert_allclose(found.throttle, (K % 3))
+    rows = ''.join(f'Time:{k},Voltage:12.5\n' for k in range(N)) + 'Time:99,Current:3\n'
+    with pytest.raises(InputError, match=":61: column 'Voltage' holds 'Current:3', not a number"):
+        read_recording(written(tmp_path, rows))
+
+
+def test_a_cell_beyond_the_range_is_missing_and_a_coarse_clock_is_reported(tmp_path):
+    path = written(tmp_path, 't,U,I\n0,12,1\n1,OL,1\n2,13,∞\n3,14,1\n')
+    np.testing.assert_allclose(read_recording(path).voltage, [12, 13, 14])
+    rows = ''.join(f'10:00:0{k // 50},12.5\n' for k in range(150))
+    found = read_recording(written(tmp_path, f'time,U\n{rows}'))
+    assert found.n == 3 and any('--sample-interval' in note for note in found.notes)
+
+
 def test_the_unit_of_a_throttle(tmp_path):
     """Percent and pulses are found by their size, and overruled; none, and no current, by name."""
     rows = 't,U,gas,I\n' + ''.join(f'{k},12,{g},3\n' for k, g in enumerate((1100, 1500, 1900)))
     path = written(tmp_path, rows)
     np.testing.assert_allclose(read_recording(path).throttle, [0.1, 0.5, 0.9])
+    # The thrust of a Crazyflie may have decimals.
+    thrust = written(tmp_path, rows.replace('1100', '0').replace('1500', '6553.5').replace(
+        '1900', '58981.5'), 'a.csv')
+    np.testing.assert_allclose(read_recording(thrust).throttle, [0.0, 0.1, 0.9])
     percent = written(tmp_path, rows.replace('1100', '1').replace('1500', '2').replace(
         '1900', '1.5'), 'b.csv')
     found = read_recording(percent, columns=CsvColumns(throttle_unit='%', current='none'))
