@@ -50,6 +50,12 @@ def number(value: float, digits: int = 3) -> str:
     return f'{mantissa}e{size}'
 
 
+def percent(share: float) -> str:
+    """Return a share with at least two digits and its sign: '0.056 %', '100 %'."""
+    value = float(f'{100.0 * share:.2g}')
+    return f'{value:g} %'
+
+
 def with_se(value: float, se: float, digits: int = 3) -> str:
     """Return a number with its standard error, if both are known."""
     return number(value, digits) + (

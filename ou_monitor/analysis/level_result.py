@@ -47,7 +47,7 @@ from ou_monitor.online.estimator.quality import examine, input_flags
 from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.records import (
     Counters, Estimate, Flag, FloatArray, LOG_NAMES, NAN, OuFacts, Recording, Status)
-from ou_monitor.text import p_words, Z95
+from ou_monitor.text import p_words, percent, Z95
 from ou_monitor.timeline import TAIL
 from scipy import stats
 from scipy.signal import welch
@@ -175,7 +175,7 @@ def _gaussian(estimate: Estimate, shape: Shape, line_share: float, normal: str) 
         return _plain(ProcessType.STATIONARY, 'the innovations show a second relaxation, '
                       'slower or faster than the fitted one, so alpha is a mixture',
                       f'{_share(second.effect)}, {_p(second)}; {normal}')
-    beside = f'; beside lines of {100.0 * line_share:.2g} % of the variance' if line_share else ''
+    beside = f'; beside lines of {percent(line_share)} of the variance' if line_share else ''
     return _plain(ProcessType.DIFFUSION, 'one relaxation, slower than the sampling, leaves '
                   'independent Gaussian innovations', f'alpha dt = {step:.2g}; {normal}{beside}')
 

@@ -18,7 +18,7 @@ from ou_monitor.analysis.supply import (
 from ou_monitor.online.load.supply_load import LoadStatus, SupplyLoad
 from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.records import FloatArray, NAN, OuFacts, Recording
-from ou_monitor.text import counted, number, volts, Z95
+from ou_monitor.text import counted, number, percent, volts, Z95
 
 # Minimum ratio of the noise at both ends of throttle that is reported as a change.
 _GROWS = 1.25
@@ -164,7 +164,7 @@ def known_lines(found: Overview) -> list[tuple[str, str]]:
         line = found.line
         where = '' if line.level == 'all' else f' at {line.level} throttle'
         lines.append(('Strongest line', f'{number(line.frequency, 4)} Hz, '
-                      f'{number(1e3 * line.rms)} mV rms{where} ({100.0 * line.share:.2g} % of the '
+                      f'{number(1e3 * line.rms)} mV rms{where} ({percent(line.share)} of the '
                       'noise there)'))
     return lines
 
@@ -180,10 +180,10 @@ def _dips(found: Overview, below: float = NAN) -> str:
     dips = found.facts.dips
     if dips is None or not dips.count:
         return ''
-    share = 100.0 * dips.seconds / found.duration if found.duration > 0.0 else 100.0
+    share = dips.seconds / found.duration if found.duration > 0.0 else 1.0
     limit = '' if math.isnan(below) else f' below {below:g} V'
     return (f'{counted(dips.count, "dip")}{limit}, '
-            f'{number(dips.seconds, 2)} s in all ({share:.2g} % of the time)')
+            f'{number(dips.seconds, 2)} s in all ({percent(share)} of the time)')
 
 
 def _bounded(found: Overview) -> bool:

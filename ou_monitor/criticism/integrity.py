@@ -22,7 +22,7 @@ from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.reading import ClockJitter, HeldSamples, Quantization, Saturation
 from ou_monitor.model.terms.term import Term
 from ou_monitor.records import FloatArray, Recording
-from ou_monitor.text import counted
+from ou_monitor.text import counted, percent
 from ou_monitor.timeline import on_grid, reading_places, reading_times
 
 # Minimum samples of a fit.
@@ -227,7 +227,7 @@ def judge_stamps(t: FloatArray, voltage: FloatArray) -> Stamps:
         return Stamps(t if gaps else grid, 0.0, tuple(notes))
     white = abs(_correlation(off[1:], off[:-1])) < _WHITE
     if scatter < _SMALL:
-        notes.append(f'Stamps scatter by {100.0 * scatter:.2g} % of a step about an even grid, '
+        notes.append(f'Stamps scatter by {percent(scatter)} of a step about an even grid, '
                      'which was used instead.')
         return Stamps(grid, 0.0, tuple(notes))
     if white and scatter < _LARGE and _wrong(step / usual, number, voltage):
@@ -237,7 +237,7 @@ def judge_stamps(t: FloatArray, voltage: FloatArray) -> Stamps:
         return Stamps(grid, error, tuple(notes))
     uneven = float(step[number == 1.0].std()) / usual
     if uneven > _SMALL:
-        notes.append(f'Steps between stamps scatter by {100.0 * uneven:.2g} %: kept.')
+        notes.append(f'Steps between stamps scatter by {percent(uneven)}: kept.')
     return Stamps(t, 0.0, tuple(notes))
 
 

@@ -15,7 +15,7 @@ from ou_monitor.paper.published import (
     PrintedLoad, Range, ReadingStep, RESTATED, ROOT_2_ALPHA, Row, SAMPLING_HZ, SIGMA, TABLE_1,
     TAU_MS, VAR_INF, VPP_STEP, VRMS_STEP)
 from ou_monitor.paper.transient import PAPER_FIT
-from ou_monitor.text import counted
+from ou_monitor.text import counted, percent
 from scipy.integrate import quad
 from scipy.linalg import solve_continuous_lyapunov
 from scipy.special import erfc
@@ -43,7 +43,7 @@ def _multiples(name: str, known: str, step: ReadingStep, readings: Sequence[Prin
         'Table 1', f'{name}, {state.label}', 'mV', reading, k * step.size,
         f'multiple of a common step of {step.low:.4g} to {step.high:.4g} mV',
         f'{counted(k, "step")}, so {known} known to half a step, '
-        f'{50.0 * step.size / reading.value:.2g} %.',
+        f'{percent(0.5 * step.size / reading.value)}.',
         point=4) for state, reading, k in zip(states, readings, step.multiples)]
 
 
@@ -261,7 +261,7 @@ def _hardware() -> list[Row]:
         Row('Section 4.2', 'Nyquist frequency at 1 MHz', 'kHz', Printed(f'> {1e-3 * high:g}'),
             1e-3 * nyquist, 'half of the sampling frequency',
             f'ESC lines at {1e-3 * low:g} to {1e-3 * high:g} kHz are resolved with '
-            f'{int(nyquist / high)} harmonics; the OU itself has {100 * share_above(low):.2g} % '
+            f'{int(nyquist / high)} harmonics; the OU itself has {percent(share_above(low))} '
             'of its variance there.')]
 
 

@@ -22,7 +22,7 @@ from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text, UNKNOWN,
     worst_first)
 from ou_monitor.report.svg import Plot, span
-from ou_monitor.text import chance, counted, listed, number, with_se
+from ou_monitor.text import chance, counted, listed, number, percent, with_se
 
 # Maximum changes of throttle drawn in one plot, and the length of the plot, relaxation times.
 _MOST_DRAWN, _DRAWN_TAUS = 6, 8.0
@@ -72,7 +72,7 @@ def answer(analysis: Analysis) -> list[str]:
     safe = [] if math.isnan(curves.budget) else [
         f'Safe up to {100.0 * curves.budget:.0f} % throttle.' if curves.budget > 0.0 else
         f'No throttle keeps the risk below {100.0 * curves.limit:g} % {_why_none(analysis)}: at '
-        f'idle it is {100.0 * curves.risk[0]:.2g} %.']
+        f'idle it is {percent(curves.risk[0])}.']
     return [first, *safe, *others, *craft_advice(analysis.craft),
             *_numbers(analysis.overview.facts.ou), *_change(analysis),
             *(words for name, words in _BEWARE.items() if name in names)]
@@ -114,7 +114,7 @@ def _budget(analysis: Analysis) -> str:
               if u > curves.budget and p >= max(0.05, 2.0 * curves.limit)]
     if beyond:
         u, p = beyond[0]
-        words += f'; at {100.0 * u:.0f} % it is {100.0 * p:.2g} %'
+        words += f'; at {100.0 * u:.0f} % it is {percent(p)}'
     elif curves.budget < 1.0:
         words += '; higher throttle was not flown'
     return words
@@ -322,7 +322,7 @@ def _lines(analysis: Analysis) -> list[Part]:
         return []
     rows = [[level.label, f'{number(line.frequency, 4)} +- {number(line.resolution, 2)}',
              f'{number(1e3 * line.rms)}\n[{number(1e3 * line.rms_low)}, '
-             f'{number(1e3 * line.rms_high)}]', f'{100.0 * line.share:.2g} %',
+             f'{number(1e3 * line.rms_high)}]', percent(line.share),
              chance(line.p_value)]
             for level in searched for line in level.lines.lines]
     least = max(level.lines.detectable for level in searched)

@@ -15,6 +15,7 @@ from ou_monitor.paper.tables import share_above
 from ou_monitor.report.document import (
     Document, Figure, Notes, Pair, Part, Section, Table, Text)
 from ou_monitor.report.svg import Plot, span
+from ou_monitor.text import percent
 
 _BINS = 40
 
@@ -120,7 +121,7 @@ def _spectrum(result: Reproduction) -> list[Part]:
     plot.mark(low, '').mark(high, 'ESC 24..48 kHz')
     return [Figure(plot, (
         f'The ESC lines that section 4.5 expects would lie at {1e-3 * low:g} to '
-        f'{1e-3 * high:g} kHz, where the OU has {100 * share_above(low):.2g} % of its variance; '
+        f'{1e-3 * high:g} kHz, where the OU has {percent(share_above(low))} of its variance; '
         'an OU alone has no peak there. The corners of the AC coupling and of the Lorentzian '
         'coincide.'))]
 
