@@ -141,8 +141,8 @@ def _left_out(recording: Recording, found: tuple[LoadLevel, ...]) -> tuple[str, 
     if unknown:
         notes.append(f'{unknown} samples before the first throttle belong to no load level.')
     if settling > 0.0:
-        notes.append(f'{settling:.3g} s after changes of throttle were left out of the levels '
-                     '(settling).')
+        notes.append(f'The levels leave out {settling:.3g} s in which the voltage settled after '
+                     'changes of throttle.')
     moving = recording.duration - held - settling
     if moving > 0.01 * recording.duration:
         notes.append(f'{moving:.3g} of {recording.duration:.3g} s were spent between load '

@@ -41,7 +41,8 @@ class LoadStatus(enum.Enum):
 
     KNOWN = 'The sag is known over the throttles flown.'
     NO_DATA = 'No voltage has arrived.'
-    NO_THROTTLE = 'Throttle is unknown: so is the sag, and the level is the voltage under load.'
+    NO_THROTTLE = ('Throttle is unknown, so the sag is unknown too; the level is the voltage '
+                   'under load.')
     STILL = 'Throttle has not moved: the sag is unknown.'
     UNCERTAIN = 'The sag is too uncertain: it needs more changes of throttle.'
     NO_RELATION = ('The voltage does not fall with throttle, as on a regulated rail; on a '

@@ -347,7 +347,8 @@ class BrownoutFlag:
             word = level.name.lower()
             if level in above and not self._waits(level):
                 return level, (f'{words} (brownout.{word}: {enter:g})' if found >= enter else
-                               'the throttle budget is below the throttle in use')
+                               'throttle was above the present budget for a tenth of the last '
+                               '30 s')
             leave = s.brownout_leave * enter
             if self._level.value >= level.value and found >= leave:
                 return level, (f'{words}, has not fallen below {leave:.2g} '
