@@ -59,7 +59,8 @@ TIME_WORDS = {
 # These end the names of other quantities too: Voltage (min).
 _LONG = 'min|mins|minutes|h|hr|hours|d|days'
 VOLT_WORDS = {'v': 'V', 'volt': 'V', 'volts': 'V', 'vdc': 'V', 'mv': 'mV', 'mvdc': 'mV',
-              'millivolt': 'mV', 'millivolts': 'mV', 'cv': 'cV', 'dv': 'dV'}
+              'millivolt': 'mV', 'millivolts': 'mV', 'cv': 'cV', 'dv': 'dV', 'kv': 'kV',
+              'uv': 'uV', 'µv': 'uV', 'μv': 'uV'}
 AMPERE_WORDS = {'a': 'A', 'amp': 'A', 'amps': 'A', 'ampere': 'A', 'amperes': 'A', 'adc': 'A',
                 'da': 'dA', 'ca': 'cA', 'ma': 'mA', 'madc': 'mA', 'µa': 'uA', 'μa': 'uA',
                 'ua': 'uA'}
@@ -71,7 +72,8 @@ OTHER_WORDS = frozenset((
 WORDS = {**TIME_WORDS, **VOLT_WORDS, **AMPERE_WORDS, **SHARE_WORDS}
 # Units in V, A, s and 1; the last letter is the quantity.
 SCALES = {**TIME_UNITS, 'min': 60.0, 'h': 3600.0, 'd': 86400.0, 'V': 1.0, 'dV': 0.1, 'cV': 0.01,
-          'mV': 1e-3, 'A': 1.0, 'dA': 0.1, 'cA': 0.01, 'mA': 1e-3, 'uA': 1e-6, '%': 0.01}
+          'mV': 1e-3, 'kV': 1e3, 'uV': 1e-6, 'A': 1.0, 'dA': 0.1, 'cA': 0.01, 'mA': 1e-3,
+          'uA': 1e-6, '%': 0.01}
 # A quantity with one of these words at the end of its name, preferably in brackets.  Repetitions
 # after the quantity are bounded, so that the time is proportional to the length of a name.
 _WORD = '|'.join(sorted(WORDS.keys() - _LONG.split('|'), key=len, reverse=True)).join('()')

@@ -223,6 +223,8 @@ FORMS = {
         f'{10 * k},{100 * V[k]:.1f},{100 * AMPS[k]:.0f},{1e4 * U[k]:.0f}')), 0.01, True, True),
     'tattu': (table(['Time(10ms),Volt[cV],Current(10mA),Thr(0.1%)'], lambda k: (
         f'{k},{100 * V[k]:.1f},{100 * AMPS[k]:.0f},{1e3 * U[k]:.0f}')), 0.01, True, True),
+    'uv': (table(['Time(ms),Pack(uV)'], lambda k: f'{10 * k},{1e6 * V[k]:.0f}'), 0.01, False,
+           False),
     # The column whose unit is known is the throttle.
     'airdata': (table(['time(millisecond),voltage(v),rc_throttle,rc_throttle(percent)'],
                       lambda k: f'{10 * k},{V[k]},{364 + 1320 * U[k]:.0f},{100 * U[k]:.1f}'),
