@@ -15,7 +15,7 @@ import itertools
 
 from ou_monitor.text import printable
 
-# Maximum number of valid words that a hint is chosen from (columns of a table), and that it lists.
+# Maximum number of valid words to choose a hint from (a table may have many columns), and to list.
 _MOST_CHOICES, _MOST_SHOWN = 1000, 60
 
 

@@ -43,9 +43,9 @@ FEWEST = 50
 _BLOCKS = 16
 # Minimum relaxation times of a block in the test of the mean.
 _MEAN_BLOCK = 5.0
-# Limit of innovations in the test of intensity, standard deviations, without which a few impulses
-# would determine the variance of a block.  With heavy tails (Student's t with 5 degrees), it
-# removes 1 in 10^4.
+# The test of intensity leaves out innovations beyond this, standard deviations; otherwise a few
+# impulses would determine the variance of a block.  With heavy tails (Student's t with 5 degrees),
+# it removes 1 in 10^4.
 _FAR = 10.0
 _LAGS_RAW, _LAGS_FITTED = 5, 10
 # Minimum effects that matter, in the unit of each test.
@@ -158,7 +158,7 @@ def holm(shapes: Sequence[Shape]) -> tuple[Shape, ...]:
     """Adjust the p-values of all levels together (Holm 1979)."""
     flat = [test.p_value for shape in shapes for test in shape.tests]
     found = iter(adjusted(flat))
-    # The instrument is a family of its own, because it is not a type of process.
+    # AC coupling is a family of its own, because it describes the instrument, not the process.
     coupling = adjusted([shape.coupling_p for shape in shapes])
     return tuple(replace(shape, coupling_p=p, tests=tuple(
         replace(test, p_adjusted=next(found)) for test in shape.tests))
@@ -208,7 +208,7 @@ def _mean_drift(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Estima
         near = sum(float(c[lag:] @ c[:-lag]) for c in centred
                    for lag in range(1, _LAGS_RAW + 1)) / square
         scale = square / (z.size - blocks) * max(1.0, 1.0 + 2.0 * near)
-    # The gain from a constant to its innovations has the relative error of alpha.
+    # Innovations of a constant have the relative error of the fit, which limits the freedom.
     freedom = math.inf
     if math.isfinite(alpha):
         error = 2.0 * math.hypot(estimate.alpha_se, estimate.sigma_se)

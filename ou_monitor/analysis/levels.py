@@ -1,11 +1,11 @@
 """
 Load levels: segments of a recording at constant throttle.
 
-Segments of a level begin within its half width and end outside twice that, so that jitter of the
-stick does not split them.  The half width is `HALF_WIDTH`, or more if the stick jitters more.  A
-ramp through a throttle is not a segment.  Limits: throttle is a command, not a current, so two
-segments at one throttle can have different loads, and a segment need not be stationary; levels
-closer than the jitter of the stick are merged.
+A segment starts when throttle comes within the half width of a level, and ends when it is farther
+away than twice that, so that jitter of the stick does not split it.  The half width is
+`HALF_WIDTH`, or more if the stick jitters more.  A ramp through a throttle is not a segment.
+Limits: throttle is a command, not a current, so two segments at one throttle can have different
+loads, and a segment need not be stationary; levels closer than the jitter are merged.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ _LOOK, _QUIETER = 1.0, 0.75
 # Time left out after a change of throttle by more than two half widths, s: six relaxation times of
 # the rail of the paper (15.9 ms), after which 0.2 % of a step is left.
 SETTLE = 0.1
-# Minimum share of the recording, or minimum length of one segment, s, of a level that is found: a
-# few seconds at full throttle matter.
+# A level needs this share of the recording, or one segment of this length, s: a few seconds at
+# full throttle matter.
 MIN_SHARE, LONG_STAY = 0.02, 2.0
 # Minimum time at a throttle to consider it, s.
 MIN_TIME = 0.25
@@ -40,15 +40,15 @@ MIN_TIME = 0.25
 # paper.
 MIN_STAY = 0.5
 MAX_LEVELS = 20
-# Passages: maximum length, s; minimum difference between the means of the first and the last
-# quarter, as a share of the range (a ramp has 0.75), and as a share of the half width.
+# A passage is shorter than this, s, and the means of its first and last quarter differ by more
+# than these shares of its range (a ramp has 0.75) and of the half width.
 _PASSAGE, _STEADY, _CROSSED = 3.0, 0.65, 0.75
 # Minimum pause that splits a segment, in median steps.
 GAP_STEPS = 20.0
 
 # Bin width of the histogram of throttle.
 _GRID = 0.0025
-# Maximum density of time between two levels, relative to the smaller of them.
+# Two peaks are separate levels if the histogram falls below this share of the lower one between.
 _VALLEY = 0.7
 
 
@@ -128,7 +128,7 @@ def _most(t: FloatArray, found: tuple[LoadLevel, ...]) -> tuple[LoadLevel, ...]:
 
 def _split(t: FloatArray, throttle: FloatArray, centres: list[float], width: float,
            named: bool) -> tuple[LoadLevel, ...]:
-    """Return levels with their segments; `named` ones keep passages."""
+    """Return levels with their segments; levels given by the user (`named`) keep passages."""
     broken = _gaps(t)
     runs: list[list[Stay]] = [[] for _ in centres]
     for run, k in stays(throttle, centres, width):
@@ -209,7 +209,7 @@ def _apart(density: FloatArray, peak: int, other: int, reach: int) -> bool:
 
 def stays(throttle: FloatArray, centres: Sequence[float], width: float
           ) -> list[tuple[Stay, int]]:
-    """Return the stays of throttle at levels."""
+    """Return the segments of throttle at levels, each with the index of its level."""
     if not centres:
         return []
     level = np.asarray(centres)

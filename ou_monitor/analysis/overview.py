@@ -53,7 +53,7 @@ class Overview:
     highest: float  # Highest throttle; NaN without throttle
     # Lowest and highest index of THROTTLES near which there are enough readings.
     flown: tuple[int, int]
-    drawn: float = NAN  # Largest current by the median of three readings, A; NaN without one
+    drawn: float = NAN  # Largest current, A, after a median of three readings; NaN without one
     step: float = 0.0  # Median time between readings, s
     line: LoudestLine | None = None  # Strongest spectral line
     cells: int = 0  # Cells in series to which the limit refers; 0: none
@@ -228,7 +228,7 @@ def _noise_words(found: Overview) -> str:
 
 def other_scale(ou: OuFacts, alpha: float, ln_alpha_se: float, sigma: float, ln_sigma_se: float,
                 ) -> bool:
-    """Return whether alpha or sigma of another fit contradicts the facts, by both intervals."""
+    """Return whether the interval of alpha or sigma of another fit is apart from the facts'."""
     return ou.status == 'ok' and any(
         x * math.exp(Z95 * se) < low or x * math.exp(-Z95 * se) > high
         for x, se, (low, high) in ((alpha, ln_alpha_se, ou.alpha_95),

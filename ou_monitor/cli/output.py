@@ -102,7 +102,7 @@ def duration(seconds: float) -> str:
 
 
 STDOUT = '-'
-_NO_FILE = 'Nothing was written: --report FILE.html draws it, --json FILE keeps the numbers.'
+_NO_FILE = 'No file was written: --report FILE.html saves a report, --json FILE the numbers.'
 # Files of a rosbag2 folder, beside its metadata.yaml: storage files, compressed or not.
 _STORAGE = ('.mcap', '.db3', '.zst', '.zstd', '.lz4')
 
@@ -289,7 +289,7 @@ def deliver(args: argparse.Namespace, found: Result, command: str = '',
     """
     Write a command's result to the page, JSON file and terminal that its arguments name.
 
-    report: a page whose place was checked, and which may be overwritten.
+    report: path of a page, already checked; an existing page is overwritten.
     """
     force = args.force or report is not None
     report = report or getattr(args, 'report', None)

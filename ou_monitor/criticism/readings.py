@@ -1,5 +1,5 @@
 """
-The readings of a recording, without error codes and bad samples, and throttle as 0..1.
+Clean the readings of a recording: drop error codes and bad samples, convert throttle to 0..1.
 
 Each correction adds a note.
 """
@@ -16,14 +16,14 @@ from ou_monitor.records import FloatArray, Recording
 from ou_monitor.text import counted, number
 from ou_monitor.timeline import in_order
 
-# Minimum distance of an outlier from the median, in spreads of the samples, and relative to the
-# farthest other sample's distance.
+# An outlier is farther from the median than this number of standard deviations, and than this
+# multiple of the distance of the next nearer sample.
 _FAR, _GAP = 50.0, 5.0
 # Minimum repeats of an outlying value to be an error code; maximum share of such samples.
 _CODE, _MOST_CODES = 3, 0.2
 # Maximum single bad samples that are left out; for long recordings, one for each _EACH samples.
 _SINGLES, _EACH = 3, 100_000
-# Minimum number of other samples, if an error code has a larger share.
+# Minimum number of other samples beside an error code whose share exceeds _MOST_CODES.
 _OTHERS = 100
 # Maximum values used for the spread.
 _EXAMINED = 200_000

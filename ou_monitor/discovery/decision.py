@@ -26,8 +26,8 @@ ACCEPT = 6.0
 # Difference in evidence below which two causes tie, nats: odds of 20.  A cause whose removal costs
 # less is removed.
 TIE = 3.0
-# Minimum evidence of a further term of a kind (a response of the mean, or a second curve of
-# intensity over throttle), as a share of the larger effect's; with less it only corrects the form.
+# A further term with less than this share of the larger effect's evidence only corrects the form
+# of that effect (FORM: a response of the mean, CURVE: a second curve of intensity over throttle).
 # A form that is wrong by 7 % leaves (7 %)^2 of the evidence; in simulated loads of ten shapes
 # (test/hidden), further terms gained at most 0.8 % if the form was right.
 FORM = 0.005
@@ -46,9 +46,9 @@ FAILS = 4.8
 # Maximum share of its initial value that a statistic may keep, because the form of a cause is not
 # exact.
 OWN_SHARE = 0.07
-# Maximum share of its largest sign that a latent cause may leave beside measured ones.  In 70
-# independently simulated recordings (b052f3b), right causes with a sign still above FAILS left at
-# most 13 %, but for one with 35 %; wrong causes left 30 to 97 %.
+# In a model with measured causes: maximum share of a latent cause's largest sign that may remain.
+# In 70 independently simulated recordings (b052f3b), right causes with a sign still above FAILS
+# left at most 13 %, but for one with 35 %; wrong causes left 30 to 97 %.
 BESIDE_SHARE = 0.3
 
 
@@ -57,7 +57,7 @@ BESIDE_SHARE = 0.3
 def kinds_to_try(kinds: Iterable[Kind], model: Sequence[Kind], given: Collection[str],
                  throttle: bool, first: bool) -> list[Kind]:
     """
-    Return the kinds to try beside those of a model: those that come first, or the others.
+    Return the kinds to add to a model: those that come first (`first`), or else the others.
 
     Measured inputs come first, because latent causes imitate them, and white noise, because every
     sensor has it.  The regression chooses responses of the mean, except that a trend is also tried
@@ -115,7 +115,7 @@ def is_response(kind: Kind) -> bool:
 
 
 def is_latent(kind: Kind) -> bool:
-    """Return whether a cause is inferred without a measured input or time."""
+    """Return whether a cause is inferred from the voltage alone, not from throttle or time."""
     return not (kind.NEEDS_THROTTLE or kind.MEASURED)
 
 

@@ -47,7 +47,7 @@ _BLIND = 1.0
 
 def discover(recording: Recording, *, seed: int = 0,
              progress: Progress | None = None) -> Finding:
-    """Criticise the simulation of a recording, name the cause, extend; see `ou_monitor`."""
+    """Criticise the simulation of a recording, name causes, extend its model; see `ou_monitor`."""
     while True:
         try:
             found = _discover(recording, seed, progress)
@@ -69,7 +69,7 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
         start = _start(samples, state)
         if state.drawn is not None:
             samples, start = _unclipped(samples, state, start)
-        # Name causes from readings drawn within codes, but score them on the codes themselves.
+        # Name causes from readings drawn within the ADC's codes, but score them on logged codes.
         inside, start = _uncoded(samples, state, start) if samples.cell else (samples, start)
         done(0.1)
         named = named_causes(inside, start, rng, state.exact,

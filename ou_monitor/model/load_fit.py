@@ -31,13 +31,13 @@ _PRIOR = {
 }
 _NAMES = tuple(_PRIOR)
 _LINEAR = {'charge': (0.0, 1.05), 'before': (0.0, 1.5)}
-# Prior deviations if the load is a current: its scale, and which loads it includes, are unknown.
+# Deviations and centres if the load is a current: its scale, and what it feeds, are unknown.
 _OF_CURRENT = {'size': 2.0, 'fast_share': 0.7, 'slow_share': 0.7, 'endurance': 1.0}
 _CENTRE = {'endurance': math.log(2000.0)}
 # Prior deviation of a constant level, which replaces the charge, V per cell.
 _STANDS = 0.2
-# Delay of the load: maximum tried either way, in steps and in s; ratio of residuals below which it
-# is used; time constants, s, of the trend that is removed, and of the lagged load, a regressor.
+# Delay of the load: maximum in steps and in s; it is used if the residuals fall below this ratio.
+# Time constants of its fit, s: slower trends are removed; the load also enters with this lag.
 _SHIFTS, _LATEST, _PAYS, _SLOWER, _LATE = 10, 0.2, 0.95, 1.0, 0.06
 # Bounds of the parameters, in prior deviations from the centre.
 _REACH = 3.0

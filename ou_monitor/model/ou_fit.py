@@ -65,16 +65,16 @@ PRECISE = 1.5
 FEWEST = 40
 # Maximum number of elements in an array of the likelihood: 16 MB of complex numbers.
 _AT_ONCE = 1 << 20
-# Points of the likelihood's first grid in ln(alpha), logit(share) and ln(walk); ends of the logit:
-# white noise of 1e-3 of the variance is half of the spectrum at the highest frequency of an OU of
-# alpha D = 0.004.
+# Points of the likelihood's first grid in ln(alpha), logit(share) and ln(walk); ends of the logit.
+# The share reaches that close to 1 because white noise of 1e-3 of the variance is half of the
+# spectrum at the highest frequency, if alpha dt = 0.004.
 _GRID, _LOGIT = (24, 16, 5), (-7.0, 12.0)
 # For the bounds: further distances in logit(share) from the best point of the grid, and steps that
 # refine the walk.
 _ASIDE = np.linspace(-1.2, 1.2, 17)
 _REFINE = (1.2, 0.6, 0.3, 0.15)
-# Law of the noise's size: lags of the load whose differences enter, s; prior deviation of its
-# coefficients; rounds.
+# Law of the noise's size: time constants, s, between whose lagged loads differences are taken;
+# prior deviation of the coefficients; rounds of the fit.
 _CHANGES, _SIZE_SD, _SIZE_ROUNDS = (0.03, 0.2, 1.0), 0.5, 12
 # Maximum number of steps towards the maximum, and convergence tolerance of a step.
 _LOOKS, _NEAR = 40, 0.05
@@ -89,7 +89,7 @@ _IMPRECISE = 0.37
 # The level's usual walk, V per sqrt(s) and cell, and the prior deviation of its logarithm above
 # that: walks of .0015 to .015 fit the recordings (doc/load.md).
 _WALK, _WALK_SD = 0.004, 0.8
-# Largest alpha D tried: beyond, neighbouring readings are uncorrelated.
+# Largest alpha dt tried: beyond, neighbouring readings are uncorrelated.
 _FASTEST = 5.0
 # How far the profile log-likelihood at the edge of a 95 % region of rate and share lies below the
 # maximum, nats: chi^2 with 2 degrees of freedom.
@@ -333,7 +333,7 @@ class _Likelihood:
         """
         Return minus the log-likelihood, and the variance, V^2, of OU and white noise together.
 
-        Points of shape (k, 3): ln(alpha D), logit(share of the OU), and ln of the variance of a
+        Points of shape (k, 3): ln(alpha dt), logit(share of the OU), and ln of the variance of a
         step of the level over that of the noise.
         """
         half = points.shape[0] // 2
@@ -354,7 +354,7 @@ def _points(*axes: FloatArray) -> FloatArray:
 
 
 def fit_ou(part: Regression, span: float, *, precise: bool = False) -> OuFacts:
-    """Fit the noise to a window, s; precise: None unless alpha is known within PRECISE."""
+    """Fit the noise to a window of `span` s; `precise` stops early if alpha is imprecise."""
     dt = part.dt
     total = float(part.voltage @ part.voltage)
     if not total > 1e-18 * part.voltage.size:
@@ -591,7 +591,7 @@ def _unseen(costs: Callable[[FloatArray], tuple[FloatArray, FloatArray]], low: F
             points = np.where(better, other, points)
             value, variance = (np.where(better[:, 0], x, y)
                                for x, y in ((cost, value), (size, variance)))
-    # Interpolate at the best walk, and square roots, because the root of a parabola is linear.
+    # At the best walk, interpolate the root of the loss: a parabola's root is linear.
     lost = (value - min(least, float(value.min()))).reshape(shape)
     fine = _finer(np.sqrt(np.maximum(lost, 0.0))) ** 2
     size, logit = (_finer(x.reshape(shape))

@@ -1,9 +1,9 @@
 """
 `ou-monitor live`: a page to watch while flying, served from the topics of the nodes.
 
-Limits first: read-only; HTTP without encryption; on 127.0.0.1, or on another address with the
-token that is printed.  Connections beyond `CONNECTIONS` are closed, and so is a connection without
-a complete request after `PATIENCE`.
+The page is read-only.  Limits: HTTP without encryption; on any address but 127.0.0.1, requests
+need the token that the command prints.  Connections beyond `CONNECTIONS` are closed, and so is a
+connection without a complete request after `PATIENCE`.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ def make_server(app: Any, patience: float = PATIENCE) -> Any:
             else:
                 super().handle_stream(stream, address)
 
-    # Both times count from the last request, which includes a page that streams rows.
+    # Neither timeout runs while a request is answered, so a stream of rows stays open.
     return Bounded(app, idle_connection_timeout=patience, body_timeout=patience,
                    max_header_size=_HEADER, max_body_size=_BODY)
 

@@ -7,7 +7,7 @@ A multirotor's power network: components, the load at a throttle, and a rail as 
 
 The network is linear about its operating point, dx = A x dt + B dW, and the rail's deviation is
 c x.  Noise is coloured, with one state per source, so that the variance stays finite where a
-capacitor's ESR turns current directly into voltage.
+capacitor's ESR, r below, turns current directly into voltage.
 
 Limits: leads have no inductance, so edges faster than R/L (0.1 to 1 us) are not modelled.  The
 battery is one resistance without polarisation, so recovery over 0.3 s and more is missing.  The
@@ -357,9 +357,9 @@ class Rail:
 
     def crossing_rate(self, voltage: float) -> float:
         """
-        Return the rate at which the rail falls below a voltage, V, far from its mean, 1/s.
+        Return the rate, 1/s, at which the rail falls below a voltage, V, far from its mean.
 
-        This rate of the whole Gaussian process, not of its OU, is the larger of two rates.  For
+        It is for the full Gaussian process, not only its OU, and is the larger of two rates.  For
         rough paths it is q/(2 Var) d/sqrt(2 pi) exp(-d^2/2) (Pickands, Trans. AMS 145 (1969) 51),
         for smooth paths sqrt(v/Var)/(2 pi) exp(-d^2/2) (Rice, Bell Syst. Tech. J. 24 (1945) 46).
         d: distance to the voltage in standard deviations; q: quadratic variation per second; v:

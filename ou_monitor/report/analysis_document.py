@@ -121,7 +121,7 @@ def _budget(analysis: Analysis) -> str:
 
 
 def _why_none(analysis: Analysis) -> str:
-    """Return why no throttle meets the limit: the flight just ended, or the supply at rest."""
+    """Return why no throttle meets the limit: the flight before, or a supply low even at rest."""
     rest = analysis.overview.load.level
     if rest > analysis.by_throttle.voltage:
         return f'right after this flight, though the supply at rest is at {number(rest, 4)} V'

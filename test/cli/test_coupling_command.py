@@ -138,7 +138,7 @@ def test_a_coupling_is_reported_with_interval_and_lag(table, capsys):
     text = capsys.readouterr().out
     assert re.search(r'gyro_x from 10 to 60 Hz is supply noise: 2\d\.\d per V\.', text)
     assert 'p < 0.001' in text and not re.search(r'\de-\d', text)
-    assert text.splitlines()[-1].startswith('Nothing was written')
+    assert text.splitlines()[-1].startswith('No file was written')
 
 
 def test_the_page_says_what_the_text_says(table, tmp_path, capsys):

@@ -245,4 +245,4 @@ def test_the_last_lines_repeat_the_answer_and_name_the_files(capsys):
     output.summary(said, report=None)
     first, second = capsys.readouterr().out.strip('\n').split('\n\n')
     assert first.splitlines() == ['It fell to 13 V.', 'It sags by 2 V.', 'Report: a.html']
-    assert second.splitlines()[-1].startswith('Nothing was written: --report')
+    assert second.splitlines()[-1].startswith('No file was written: --report')

@@ -131,7 +131,7 @@ def _binned(square: FloatArray, x: FloatArray, edges: FloatArray) -> Bins:
 
 
 def _hats(x: FloatArray, knots: FloatArray) -> FloatArray:
-    """Return the weight of each knot, shape (sets, knots), at x: (sets, inputs, knots)."""
+    """Return weights (sets, inputs, knots) that interpolate at x between knots (sets, knots)."""
     sets, count = knots.shape
     at = np.clip((x[None, :, None] >= knots[:, None, :]).sum(axis=2) - 1, 0, count - 2)
     rows = np.arange(sets)[:, None]
@@ -240,10 +240,10 @@ SUM = len(INPUTS)
 def _curve(square: FloatArray, x: FloatArray, shares: FloatArray, log: FloatArray | None
            ) -> tuple[FloatArray, FloatArray] | None:
     """
-    Return knots in x and ln of the scores' std there, relative to the first; None: constant.
+    Return knots in x and ln of the scores' std there, relative to the first; None if constant.
 
-    square: squared scores, shape (n,); shares: quantiles between the bins of x; log: ln of the
-    scores' std once roughly known, shape (n,).
+    square: squared scores, shape (n,); shares: quantiles between the bins of x; log: a rough
+    estimate of ln of the scores' std, shape (n,), if there is one.
     """
     edges = np.unique(np.quantile(x, shares))
     if edges.size < 3:
@@ -273,8 +273,8 @@ class LoadDependentNoise(Term):
     """
     Multiply the white noise by a factor that depends on throttle and its changes.
 
-    The logarithm of the factor is a sum of curves, each of one of `INPUTS`, linear between knots
-    and constant beyond them; a last curve may bend the sum.  A power of the factor may multiply
+    The logarithm of the factor is a sum of curves over some of `INPUTS`, linear between knots and
+    constant beyond them; a last curve may bend the sum.  A power of the factor may multiply
     sigma too, if the load disturbs the rail itself.
     """
 
@@ -297,8 +297,7 @@ class LoadDependentNoise(Term):
         'Add capacitance at the ESCs or a filter before the ADC; give readings at high throttle '
         'less weight.')
     SEPARATED_BY: ClassVar[str] = (
-        'the same flight at several times the sampling rate, at which white noise is still '
-        'uncorrelated')
+        'the same flight at several times the sampling rate: white noise stays uncorrelated')
 
     number: tuple[float, ...] = parameters('', 'index of the input of each knot: see INPUTS, SUM')
     at: tuple[float, ...] = parameters('', 'value of the input at the knot, rising for each input')
@@ -335,7 +334,7 @@ class LoadDependentNoise(Term):
         return effect
 
     def free(self) -> tuple[str, ...]:
-        """Return the power of sigma, unless sigma does not follow."""
+        """Return the power that multiplies sigma, if sigma follows the factor."""
         return ('on_sigma',) if self.on_sigma else ()
 
     def log_of(self, inputs: Mapping[int, FloatArray]) -> FloatArray:

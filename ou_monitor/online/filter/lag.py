@@ -3,8 +3,8 @@ Phase lag of the low-passes, and the cutoff for a given lag.
 
 With r = f / fc, the continuous filter of order 1 lags by atan r, the second-order
 Butterworth by atan2(sqrt(2) r, 1 - r^2).  The filter of this package takes its
-input as linear between samples, which adds no phase, so its lags are the same (for
-a derivative, relative to the true one).
+input as linear between samples, which adds no phase, so its lags are the same.
+The lag of a derivative is relative to the true derivative.
 """
 
 from __future__ import annotations

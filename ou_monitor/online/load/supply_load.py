@@ -17,7 +17,7 @@ from ou_monitor.records import Estimate, FloatArray, NAN, Status
 
 # Time constants of the load, s: motors, and polarisation (rounded medians of `load_fit`).
 LAGS = (0.06, 2.0, 15.0)
-# Exponents of the load over throttle and over the level: the prior of `load_fit`.
+# Exponent of the load over throttle, and, less 1, over the level: the prior of `load_fit`.
 POWER = 1.8
 # Throttles of the table of the sag.
 TABLE = np.linspace(0.0, 1.0, 101)
@@ -137,12 +137,12 @@ class LoadState:
     # Stamp, s, and throttle now.
     t: float
     throttle: float
-    # Mean of level, V, discharge per load, and the coefficients, V, of x, u, u^3, x after three
-    # lags, and inrush; the covariance is corrected by the scores of the innovations.
+    # Of level, V, discharge per load, and the coefficients, V, of x = u^1.8, u, u^3, x after each
+    # lag, and inrush (u: throttle); covariance: enlarged if innovations exceed their prediction.
     mean: FloatArray
     covariance: FloatArray
     lags: tuple[float, ...]  # x after the three lags.
-    size: float  # Load at this level, over the load at 3.8 V per cell.
+    size: float  # Load at the present level, relative to the load at 3.8 V per cell.
     fall: float  # Fall of the level, V per unit of charge.
     # Coefficients of ln variance, V^2, of a sample: 1, ripple, sqrt|du|.
     log_variance: tuple[float, float, float]

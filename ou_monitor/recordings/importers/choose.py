@@ -88,7 +88,7 @@ def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | 
 
 
 def columns_of(path: Path, log: Log, chosen: Chosen) -> RawColumns:
-    """Return the samples of a log exactly as the bag made of it returns them."""
+    """Return the samples of a log, rounded as in the bag that `convert` writes."""
     volts = chosen.voltage
     t = _in_a_bag(volts.t)
     held = {}
@@ -157,7 +157,7 @@ def _pick(path: Path, log: Log, quantity: str, name: str | None, option: str
 
 
 def _current(log: Log, voltage: Series) -> Series | None:
-    """Return the current of the voltage's sensor, or the only one of a single battery."""
+    """Return the current measured with a voltage, or the only current of a single battery."""
     ranked = [one for one in _series_of(log, CURRENT) if one.rank is not None and one.n]
     beside = [one for one in _series_of(log, CURRENT)
               if one.group and one.group == voltage.group and not one.silent]
@@ -185,7 +185,7 @@ def _alternatives(log: Log, chosen: tuple[Series, Series | None], option: str) -
     for quantity, one in zip((VOLTAGE, THROTTLE), chosen):
         others = [other for other in _series_of(log, quantity)
                   if not other.silent and (one is None or other.name != one.name)]
-        # Throttles that could be defaults; voltages, including rails.
+        # Prefer throttles that could be the default; list all voltages, rails included.
         ranked = [other for other in others if other.rank is not None]
         others = ranked or others if quantity == THROTTLE else others
         if others:
@@ -197,7 +197,7 @@ def _alternatives(log: Log, chosen: tuple[Series, Series | None], option: str) -
 IMU, SPEEDS = 'imu', 'motor_speed'
 # Topics that a named series must not take.
 _TAKEN = ('voltage', 'throttle', 'current', IMU, SPEEDS)
-# Parts of a series whose spacings are compared; minimum ratio for a note on a change.
+# Number of parts of a series whose rates are compared; ratio above which a change is noted.
 _PARTS, _UNEQUAL = 10, 1.5
 # Minimum length of a gap, in typical steps.
 _GAP = 3.0
@@ -282,7 +282,7 @@ def _cleaned(path: Path, name: str, series: Series) -> tuple[Series, tuple[str, 
 
 
 def _of_topic(path: Path, log: Log, signal: str) -> Series | None:
-    """Return a series of a topic of `convert`: NAME/angular_velocity.x, motor_speed/..."""
+    """Return the series behind a topic of `convert`: NAME/angular_velocity.x, motor_speed/..."""
     found = re.fullmatch(rf'/?(.+)/(({RATE}|{FORCE})\.[xyz]|{VELOCITY}\[\d+\])', signal)
     if found is None:
         return None
