@@ -100,7 +100,7 @@ def as_seconds(values: npt.ArrayLike) -> FloatArray:
         return as_numbers(values)
     if np.datetime_data(data.dtype)[0] == 'generic':
         raise ValueError('stamps without a unit: timedelta64 needs one, such as [ns]')
-    # Whole seconds and the rest separately: float64 cannot hold 1.7e18 ns exactly, int64 not 1e19.
+    # Seconds and the rest apart: float64 holds 1.7e18 ns inexactly, and int64 overflows at 1e19.
     whole = data.astype(f'{data.dtype.kind}8[s]')
     seconds = whole.astype(np.int64) + (data - whole) / np.timedelta64(1, 's')
     return np.where(np.isnat(data) | np.ma.getmask(values), NAN, seconds)
@@ -438,7 +438,7 @@ OU_WINDOWS, MOST_READINGS = (2.0, 8.0, 30.0, 60.0), 65536
 @dataclass(frozen=True)
 class OuFacts:
     """
-    The relaxation beside white noise, or bounds.
+    The fitted relaxation (an OU beside white noise), or bounds on it.
 
     `not_visible`: a relaxation slower than `tau_below_s`, but faster than the level, has a
     variance below `var_inf_below` (95 %); a faster one may make up all of the noise.
@@ -456,7 +456,7 @@ class OuFacts:
     var_inf_below: float = NAN  # V^2
 
     def log_se(self, name: str) -> float:
-        """Return the standard error of ln of alpha, sigma or var_inf, by its interval."""
+        """Return the standard error of ln of alpha, sigma or var_inf, from its interval."""
         low, high = getattr(self, name + '_95')
         return math.log(high / low) / (2.0 * Z95)
 
@@ -508,7 +508,7 @@ class Recording:
 
     def __post_init__(self) -> None:
         """Convert dates and masked values; refuse arrays that cannot be one recording."""
-        # Series of pandas are paired by place, so that two orders would be mixed in silence.
+        # Samples are paired by position: pandas series in different orders would be mixed.
         found: list[Any] = [getattr(given, 'index', None) for given in (
             self.t, self.voltage, self.throttle, self.current)]
         # `index` of a list is a method.

@@ -7,8 +7,8 @@ a level are counted as dips are in `supply_facts`, with hysteresis.
 The score of a number is its distance from the median, in half-widths of a band that is estimated
 from the simulations and the recording; the half-width is at least a difference that a pilot would
 not notice.  The largest weighted score is ranked among those of the simulations.  Of recordings
-that follow the model, at most 2 % are reported to differ by it, and 5 % by their level, which must
-lie in its band.
+that follow the model, this rank reports at most 2 % to differ; the level, which must lie in its
+band, reports 5 %.
 """
 
 from __future__ import annotations
@@ -259,8 +259,8 @@ def _rises(t: FloatArray, throttle: FloatArray | None) -> npt.NDArray[np.float64
     return np.array(found)
 
 
-# Probability of a false `DIFFERS` by the largest score, or that of a larger one than in all
-# simulations if there are fewer than 49: at 5 %, one good model in twenty was refused.
+# Probability of a false `DIFFERS` by the largest score; of fewer than 49 simulations, the score
+# must exceed all.  At 5 %, one good model in twenty was refused.
 LEVEL = 0.02
 # Importance for a pilot, relative to the lowest voltage and the number of dips.
 _WEIGHTS = {'lowest': 1.0, 'falls': 1.0, 'level': 0.8, 'answer': 0.8, 'spectrum': 0.5, 'ks': 0.5}
@@ -308,7 +308,7 @@ class Difference:
 
 def band(measured: float, simulated: FloatArray) -> Band:
     """Return a number of the recording with the band of the simulations, shape (seeds,)."""
-    # These quantiles contain a further simulation in 95 %; of 50, the default ones do in 91 %.
+    # In 95 % of cases a further simulation lies within these; by NumPy's default, of 50, in 91 %.
     low, median, high = np.percentile(simulated, [_LOW, 50.0, _HIGH], method='weibull').tolist()
     return Band(measured, low, median, high)
 

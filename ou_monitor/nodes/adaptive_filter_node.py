@@ -1,5 +1,5 @@
 """
-The node of `adaptive_filter`.
+The node `adaptive_filter`: low-pass a topic, with a cutoff that follows the noise of the supply.
 
 Inputs (relative names): `input` (a type of `filter_channels.CHANNELS`, or any
 installed type with `input.field`), `sigma` (std_msgs/Float64), and `state`

@@ -6,9 +6,9 @@ Nodes that a manager configures, activates and deactivates (managed nodes, desig
 | unconfigured, inactive | parameters and the life-cycle services only |
 | active | the whole plain node |
 
-Configuring checks what the parameters name (message types, model file), so that activating, which
-starts without data, does not fail for them.  A failure is logged, and the node stays in its
-former state.  A latched flag survives all transitions in its file, `state_file`.
+Configuring checks what the parameters name (message types, model file), so that activating does
+not fail because of them; an active node starts without data.  A failure is logged, and the node
+stays in its former state.  A latched flag survives all transitions in its file, `state_file`.
 """
 
 from __future__ import annotations

@@ -51,7 +51,7 @@ class SupplyMonitor:
     look : float
         Interval at which the risk compares its forecasts with the outcomes, s.
     replay : bool
-        Whether only the horizon of the settings will be asked for, and not the flag.
+        Whether only risks within the horizon of the settings are needed, and no flag.
 
     Examples
     --------
@@ -144,8 +144,8 @@ class SupplyMonitor:
         t, voltage, throttle : array_like, shape (n,), or float
             Stamps, s; voltage, V; throttle, 0..1 (one number for all samples; None: unknown).
         arrival : array_like, shape (n,), optional
-            Arrival of each sample, s, on the clock of `now` of `report`.  The floor uses it for
-            samples whose stamps are late.
+            Arrival of each sample, s, on the clock of `now` of `report`.  The check against the
+            voltage floor uses it for samples whose stamps are late.
         current : array_like, shape (n,), or float, optional
             Current drawn from the supply, A, positive; NaN where unknown.
         thin : int
@@ -267,7 +267,7 @@ class SupplyMonitor:
             Whether to estimate again; if not, the numbers of the last report are kept, and only
             floor, flag and ages are updated.
         alone : bool
-            Whether of the forecasts only the risk is needed, not the budget.
+            Whether only the risk is needed, not the budget.
 
         Returns
         -------

@@ -1,5 +1,5 @@
 """
-The paper, recomputed: all rows, the eight points to read it with, figures, headline, JSON.
+Recompute the paper: each printed number, eight points to consider when reading it, figures, JSON.
 
 One seed determines all random numbers.
 """
@@ -31,7 +31,7 @@ from ou_monitor.text import number
 from scipy.signal import welch
 
 Progress = Callable[[float], None]
-# Independent segments of 0.5 s (95 % quantile within 0.03), and seconds with jumps.
+# Simulated segments of 0.5 s (95 % quantile within 0.03), and simulated seconds with jumps.
 CREST_PATHS, JUMP_SECONDS = 4000, 100.0
 # Sections in the order of the paper.
 _ORDER = ('Section 3.1', 'Section 3.3', 'Section 4.1', 'Section 4.2', 'Section 4.4',
@@ -98,7 +98,7 @@ def _factor(rows: Sequence[Row]) -> str:
     return (f'With the generator as printed in (4), the variance of a switching system grows '
             f'{ratio(two)} times as fast as (6) says for telegraph noise ({away:.0f} standard '
             f'errors from 1), and {ratio(three)} times for a chain of three states that is not '
-            f'reversible. So B = 2 sum pi C R0 C. A second way: under multiplicative noise ln U '
+            f'reversible. So B = 2 sum pi C R0 C. A second check: under multiplicative noise ln U '
             f'must not grow; (4) to (6) as printed say {log.printed.value:g} 1/s, the simulation '
             f'{log.recomputed:.2f} +- {log.error or 0.0:.2f} 1/s. A sigma computed from a chain '
             'by (6) is too small by sqrt(2); a sigma measured from Vrms is not affected.')
@@ -114,8 +114,8 @@ def _coupling(rows: Sequence[Row]) -> str:
     return (f'{alpha} 1/s is 2 pi x {published.ALPHA.value / (2.0 * math.pi):.2f} Hz, and '
             f'AC coupling is a first-order high-pass, on many oscilloscopes at 10 Hz. Behind '
             f'it a rail of {transient.TYPICAL_RAIL:g} 1/s is read as {fitted.recomputed:.1f} 1/s, '
-            f'and a change of its rate changes the reading by only {100 * slope.recomputed:.1f} '
-            f'+- {100 * (slope.error or 0.0):.1f} % of that. The reading never exceeds the '
+            f'and of any change of its rate the reading shows only {100 * slope.recomputed:.1f} '
+            f'+- {100 * (slope.error or 0.0):.1f} %. The reading never exceeds the '
             f'corner, and a rail slower than the corner is read slower: with that coupling, Fig. '
             f'5 ({line.alpha:.1f} +- {line.half_width:.1f} 1/s) shows that the rail is faster '
             f'than about {transient.slowest_rail():.0f} 1/s, not that it is {alpha}. An OU of '

@@ -2,10 +2,10 @@
 Write a `Recording`, or the series of a log, as a bag.
 
 `replay`, `ros2 bag play` and `analyze` read it.  Limits: messages hold float32 (except
-std_msgs/Float64), 0.5 uV at 5 V.
+std_msgs/Float64), which resolves 0.5 uV at 5 V.
 
-Every series of a log keeps its own stamps, counted from the start of the log, to 10 ns in a
-day.  Gyros are sensor_msgs/Imu, motor speeds sensor_msgs/JointState (velocity, rad/s), named
+Every series of a log keeps its own stamps, counted from the start of the log, within 10 ns over
+a day.  Gyros are sensor_msgs/Imu, motor speeds sensor_msgs/JointState (velocity, rad/s), named
 series std_msgs/Float64; the metadata of each topic have its unit.
 """
 
@@ -34,7 +34,7 @@ TYPES = {
     'adc_block': FLOAT32_ARRAY,
 }
 
-# Maximum samples encoded at once; limits memory.  Whole blocks.
+# Maximum samples encoded at once, which limits memory; a multiple of BLOCK.
 SLICE = 1000
 
 # An adc_block of a log: rate of its samples, Hz, and samples per block.
@@ -161,13 +161,13 @@ def check_steady(name: str, since_first: npt.NDArray[np.int64], before: int,
     grid = (before + np.arange(since_first.size)) * (1e9 / sample_rate)
     if np.abs(since_first - grid).max() > 0.5e9 / sample_rate:
         raise InputError(
-            f"'{name}' is not sampled at a steady {sample_rate:g} Hz, as blocks of samples "
-            'need it: use another type')
+            f"'{name}' is not sampled at a steady {sample_rate:g} Hz, which blocks of samples "
+            'need: use another type')
 
 
 @dataclass(frozen=True, eq=False)
 class _Stream:
-    """One topic: stamps (s), messages of a part of them, and their origin."""
+    """One topic: its stamps (s), how to encode a part of its samples, and its origin."""
 
     topic: str
     kind: str

@@ -50,7 +50,7 @@ _LEARN = 0.05
 
 
 class SourceClock:
-    """Age of the newest sample; `name`: 'ros' if its stamp counts, 'foreign', 'unknown'."""
+    """Age of the newest sample; `name`: clock of its stamp, 'ros', 'foreign' or 'unknown'."""
 
     def __init__(self) -> None:
         self.name = 'unknown'
@@ -436,7 +436,7 @@ class SampleStream:
         last = np.cumsum(counts) - 1
         firsts, ends = stamps[last + 1 - counts], stamps[last]
         columns = stamps, values, np.repeat(arrived, counts), np.repeat(current, counts)
-        # Late blocks stay on one time line; only its restart goes back.
+        # Stamps of late blocks stay on the time line; only its restart makes them go back.
         before = np.concatenate(([self._newest], ends[:-1]))
         back = np.flatnonzero(firsts < before - BACK)
         if back.size:

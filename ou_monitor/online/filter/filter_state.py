@@ -7,12 +7,12 @@ With w = 2 pi fc, input x, output y:
     order 2:  y' = w s,  s' = w (x - y - sqrt(2) s)     (Butterworth)
 
 A changing cutoff only stretches time (dtau = w dt), so with *any* sequence of
-cutoffs y is the response of one fixed filter to the input in stretched time.  It
+cutoffs y is the response of one fixed filter to the input in stretched time.  So y
 is continuous, and at most the largest input times the integral of the absolute
 impulse response: 1 for order 1, coth(pi / 2) = 1.0903 for order 2.
 
-Between samples the input is linear.  Held at the newest value, it would lead by
-half a sample (18 degrees at a tenth of the sample rate); linear, it has no phase
+Between samples the input is linear.  An input held at its newest value would lead by
+half a sample (18 degrees at a tenth of the sample rate); a linear one has no phase
 error, and its amplitude is too small by (pi f dt)^2 / 3.
 """
 

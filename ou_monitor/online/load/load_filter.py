@@ -6,11 +6,11 @@ throttle range flown, the sag is extrapolated; changes of the true sag are follo
 doc/load.md has the equations and the figures.
 
 With a measured current: its scale and sign are not corrected, so a wrong scale makes the
-resistance wrong; a load that follows throttle but bypasses the current sensor makes it too high (a
-sag of 0.1 V at full throttle turns 0.2 into 0.4 Ohm on a robot that draws 1 A), and its error
-covers that only if throttle then explains more of the rest than noise does; a constant current
-gives no information.  Throttle as a further regressor would absorb that load, but on quads with
-slow current sensors at least half of the resistance too.
+resistance wrong.  A load that follows throttle but bypasses the current sensor makes it too high
+(a sag of 0.1 V at full throttle turns 0.2 into 0.4 Ohm on a robot that draws 1 A); the stated
+error includes this only if throttle explains more of the residual than noise does.  A constant
+current gives no information.  Throttle as a further regressor would absorb the other load, but on
+quads with slow current sensors at least half of the resistance too.
 """
 
 from __future__ import annotations
@@ -58,18 +58,18 @@ _LOUDEST = 0.7
 # Current over throttle: memory, s; correlation time of deviations, s; prior deviation of its
 # coefficients, in units of those deviations.
 _MEMORY, _ONE, _WIDE = 120.0, 1.0, 30.0
-# Ends of the band, s, in which throttle is tried beside current, and minimum share of its variance
-# that current must not explain: of a closer one, rounding of the current is most (1e-6 in
-# simulations, 5e-5 on hebi_x; 0.007 to 0.8 on roma 1 and 3, ar8, jd, in_xr, js_11t, as_f60, euc_1,
-# frc_ol_1, and regbot_28, 62 and 81).
+# Ends of the band, s, in which throttle is tried beside current, and minimum share of the variance
+# of throttle that current leaves unexplained; of a smaller one, most is rounding of the current
+# (1e-6 in simulations, 5e-5 on hebi_x; 0.007 to 0.8 on roma 1 and 3, ar8, jd, in_xr, js_11t,
+# as_f60, euc_1, frc_ol_1, and regbot_28, 62 and 81).
 _BAND, _APART = np.array([[1.0], [20.0]]), 1e-3
 
 
 class CurrentFilter:
-    """Level and resistance of a supply from blocks with current; states level, use, falls."""
+    """Level and resistance from blocks with current; states: level, discharge, voltage drops."""
 
     def __init__(self) -> None:
-        self._t = self._heard = self._unit = NAN
+        self._t = self._known_at = self._unit = NAN
         self._largest = self._peak = self._before = 0.0
         # Current at once and after each of LAGS, A.
         self._drawn: list[float] = []
@@ -113,7 +113,7 @@ class CurrentFilter:
         """Take a block (cells in series); fresh: on a new time line, or perhaps another supply."""
         x, self.density = block.current, NAN
         if not math.isfinite(x):
-            if not block.t - self._heard <= _HOLD:
+            if not block.t - self._known_at <= _HOLD:
                 self.lost = True
             return
         # A single wild reading must not restart the filter: another one must follow.
@@ -121,7 +121,7 @@ class CurrentFilter:
         self._before = abs(x)
         if alone:
             return
-        lost, self.lost, self._heard = self.lost or fresh, False, block.last
+        lost, self.lost, self._known_at = self.lost or fresh, False, block.last
         self._largest = max(self._largest, abs(x))
         if lost or not self._drawn:
             # Start as if steady: a constant current then gives no information.
@@ -306,7 +306,7 @@ class FastLevel:
         self._drawn += volts
 
     def take(self, t: float, rest: float, variance: float, level: float, walk: float) -> None:
-        """Take a voltage at rest, V, its variance, V^2, the level before, and V per sqrt(s)."""
+        """Take a rest voltage, V, its variance, the filter's level, and walk, V per sqrt(s)."""
         rest, level = rest + self._drawn, level + self._drawn
         if math.isnan(self._t):
             self._t, self._level, self._variance = t, level, variance
@@ -350,8 +350,8 @@ class LoadFilter:
         self._delay = LoadDelay()
         # Blocks that wait for their load, and received loads that may still be needed.
         self._waiting: deque[LoadBlock] = deque()
-        self._heard_loads: deque[LoadBlock] = deque()
-        # Log density of the last block, nat; how much better current predicts, and since when, s.
+        self._received: deque[LoadBlock] = deque()
+        # Log density of the last block, nat; how much better current predicts; time compared, s.
         self._density, self._better, self._compared = NAN, NAN, 0.0
 
     def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike,
@@ -383,7 +383,7 @@ class LoadFilter:
         """Start a new time line: keep coefficients and noise, re-estimate the level."""
         self._blocks.forget()
         self._waiting.clear()
-        self._heard_loads.clear()
+        self._received.clear()
         self._delay.forget()
         if self._current is not None:
             self._current.delay.forget()
@@ -404,14 +404,14 @@ class LoadFilter:
             self._take(block)
             return
         self._waiting.append(block)
-        self._heard_loads.append(block)
+        self._received.append(block)
         while self._waiting and self._waiting[0].t + max(late) <= block.last:
             first = self._waiting.popleft()
-            while len(self._heard_loads) > 1 and self._heard_loads[1].last <= first.t + min(late):
-                self._heard_loads.popleft()
+            while len(self._received) > 1 and self._received[1].last <= first.t + min(late):
+                self._received.popleft()
             throttle, current = (next(
-                one for one in reversed(self._heard_loads)
-                if one.last <= first.t + by or one is self._heard_loads[0]) for by in late)
+                one for one in reversed(self._received)
+                if one.last <= first.t + by or one is self._received[0]) for by in late)
             self._take(replace(first, throttle=throttle.throttle, current=current.current))
 
     def _take(self, block: LoadBlock) -> None:
@@ -423,8 +423,8 @@ class LoadFilter:
         else:
             self._opening = self._opening or block.t - self._t > _PAUSE
             if math.isfinite(u):
-                self._heard = block.last
-            elif not self._opening and block.t - self._heard <= _HOLD:
+                self._known_at = block.last
+            elif not self._opening and block.t - self._known_at <= _HOLD:
                 u = self._throttle
             if self._opening or math.isfinite(u) is not math.isfinite(self._throttle):
                 self._open(block.voltage, u)
@@ -441,7 +441,7 @@ class LoadFilter:
             self._current.take(block, self._cells, fresh=fresh)
             self._compare(self._current, block.t - before)
         self._t, self._last, self._throttle = block.t, block.last, u
-        self._heard = block.last if math.isfinite(block.throttle) else self._heard
+        self._known_at = block.last if math.isfinite(block.throttle) else self._known_at
 
     def _compare(self, current: CurrentFilter, dt: float) -> None:
         """Update the difference in log density between current and throttle."""
@@ -467,7 +467,7 @@ class LoadFilter:
             self._start = None
         # Whether throttle has been known since the start.
         self._loaded = math.isfinite(u)
-        self._heard, self._highest = -math.inf, NAN
+        self._known_at, self._highest = -math.inf, NAN
         # For each bin of throttle: seconds, samples, and sum of squared residuals, V^2.
         self._flown = np.zeros((3, _BINS + 1))
         self._m = np.zeros(_STATES)
@@ -681,7 +681,7 @@ class LoadFilter:
 
     @property
     def known(self) -> bool:
-        """Whether the sag is known, as `load` reports it in several times the time."""
+        """Whether the sag is known, as in `load`, which takes several times as long."""
         low, high = self._flown_range() if math.isfinite(self._t + self._throttle) else (0.0, 0.0)
         return high - low >= _MOVED and (
             self._by_throttle(low, high)[0] is LoadStatus.KNOWN

@@ -65,7 +65,7 @@ AMPERE_WORDS = {'a': 'A', 'amp': 'A', 'amps': 'A', 'ampere': 'A', 'amperes': 'A'
                 'da': 'dA', 'ca': 'cA', 'ma': 'mA', 'madc': 'mA', 'µa': 'uA', 'μa': 'uA',
                 'ua': 'uA'}
 SHARE_WORDS = {'%': '%', 'percent': '%', 'pct': '%', 'prozent': '%'}
-# Other units, which a line of units holds beside those.
+# Other units that a line of units may hold.
 OTHER_WORDS = frozenset((
     '', '-', 'sequence', 'w', 'wh', 'ah', 'mah', 'hz', 'khz', 'rpm', '1/min', '°', 'deg', '°c',
     'degc', '°f', 'm', 'm/s', 'km/h', 'g', 'kg', 'n', 'nm', 'ohm', 'mohm'))
@@ -85,11 +85,11 @@ _WITH_UNIT = re.compile(
 _MULTIPLE = re.compile(r'(.*?)(?: ?\* ?(10+)|([\[(] ?)(10+|0?\.0*1) ?([a-zµμ%]+ ?[\])]))',
                        re.IGNORECASE)
 _NAMES = re.compile(r'[^\s\[(]+(?: ?[\[(][^\])]*[\])])?')
-# A number with groups of thousands and decimals, or with a unit.
+# A number with commas between thousands, and decimals.
 _GROUPED = re.compile(r'[-+]?\d{1,3}(?:,\d{3})+\.\d+')
 # A number with points between thousands, not a part of a date or a clock.
 _THOUSANDS = re.compile(r'(?<![\d.,:])\d{1,3}(?:\.\d{3})+(?![\d.:])')
-_AND_UNIT = re.compile(r'(\S*[\d.])\s*+([^\d\s.]{1,12}+(?: [AaDd][Cc])?)')
+_AND_UNIT = re.compile(r'(\S*[\d.])\s*+([^\d\s.]{1,12}+(?: [AaDd][Cc])?)')  # 12.3 mV DC
 # Lines above the data that state the time between rows, or its inverse.
 _NUMBER = r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?'
 # Possessive, so that the time is proportional to the length of a line of blanks.
@@ -312,7 +312,7 @@ def is_clock(cell: str) -> bool:
 
 
 def swapped(cell: str) -> str:
-    """Return a clock with hours, a number for the month, and points for decimal marks."""
+    """Return a clock in the form of `CLOCK`: days become hours, a month's name its number."""
     if found := _DAYS.match(cell):
         cell = f'{24 * int(found[1]) + int(found[2])}:{cell[found.end():]}'
     if found := _MONTH.search(cell):
@@ -396,7 +396,7 @@ def _unit_beside(names: Sequence[str], rows: list[list[str]], place: int) -> str
 
 
 def _are_units(row: list[str]) -> bool:
-    """Return whether cells are units, in brackets, numbers, or blank, save a few of several."""
+    """Return whether a row states units: several, not outnumbered by other words, or just one."""
     words = [cell.strip('[](){} ').lower() for cell in row]
     some = sum(word in WORDS for word in words)
     others = sum(word not in WORDS and word not in OTHER_WORDS and not is_number(word)
