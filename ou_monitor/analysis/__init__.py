@@ -1,1 +1,1 @@
-"""What `analyze` finds beyond the fit of each level: tests, lines, transients, curves."""
+"""`analyze` (load levels, tests, transients), `coupling`, and the facts all commands report."""

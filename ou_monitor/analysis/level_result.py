@@ -282,7 +282,7 @@ def ou_spectrum(frequency: FloatArray, alpha: float, sigma: float, rate: float,
 _MIN_SEGMENT = 16
 # Minimum samples of a histogram.
 _LEAST_BINNED = 50
-# Maximum mean square of the steps, relative to white noise, of a random walk.
+# Half the mean square of the steps over the mean square, 1 for white noise: below, a random walk.
 _WANDERS = 0.5
 
 
@@ -400,7 +400,7 @@ class LevelResult:
         if self.n < _LEAST_BINNED or not self.vrms > 0.0:
             return np.zeros(0), np.zeros(0)
         z = self.deviation / self.vrms
-        # Limit of a plot.
+        # Limits for a plot.
         width = min(max(bin_width(z), 0.05), 0.5)
         edges = np.arange(-6.0, 6.0 + width, width)
         return edges, np.histogram(z, edges)[0] / (self.n * np.diff(edges))

@@ -1,5 +1,5 @@
 """
-The facts of a supply, the same for all commands: `supply_facts`.
+Compute the facts of a supply that all commands report: `supply_facts`.
 
 Sag, resistance and budget are the node's at the end of the recording.  Noise, alpha, sigma and
 Var_inf come from one regression of the voltage on level, throttle and current

@@ -1,1 +1,1 @@
-"""The `ou-monitor` command, one module per verb."""
+"""The `ou-monitor` program: its commands, arguments and output."""

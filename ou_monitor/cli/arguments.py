@@ -1,4 +1,4 @@
-"""Arguments shared by several commands: checked, read, and repeated."""
+"""Check and use the arguments that several commands share, and write them as a command line."""
 
 from __future__ import annotations
 

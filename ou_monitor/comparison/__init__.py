@@ -1,1 +1,1 @@
-"""A recording beside simulations of it: what they get right, and what wrong."""
+"""`compare`: what simulations of a recording get right and wrong; export to other simulators."""

@@ -1,1 +1,1 @@
-"""What a model leaves in a recording: integrity, innovations, lines, statistics and their null."""
+"""Test a model against a recording: integrity of the samples, fit, innovations, statistics."""

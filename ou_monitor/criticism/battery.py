@@ -1,5 +1,5 @@
 """
-Signed statistics of normal scores: standard normal if the model is right.
+Test statistics of a model's scores: each is about standard normal if the model is right.
 
 Each is scaled to be about N(0, 1) for independent normal scores.  Mean and spread come from a
 `NullBank`: simulations of the fitted baseline with the stamps and throttle of the data, fitted and

@@ -1,1 +1,1 @@
-"""What a simulation gets wrong: integrity -> fit -> criticise -> name -> extend -> gain."""
+"""`discover`: find what a simulation gets wrong, name causes, extend the model, score the gain."""

@@ -1,1 +1,1 @@
-"""Many recordings: find -> group -> work (Dask) -> parts -> table -> statistics -> report."""
+"""`fleet`: find recordings, group by vehicle, analyse in parallel, find drifts and outliers."""

@@ -1,1 +1,1 @@
-"""The mathematics: no data, no files, no ROS."""
+"""Models of supply noise and load: OU, terms, likelihoods, load model; reads no files."""

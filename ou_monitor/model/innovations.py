@@ -73,8 +73,8 @@ class Filter:
             # the matrices are made of blocks.
             f, q = _elements(model.f[begin:end]), _elements(model.q[begin:end])
             r = model.r[begin:end]
-            variance[begin:end] += h @ _seen(h, q)
-            look = _seen(h, f)
+            variance[begin:end] += h @ _row_sum(h, q)
+            look = _row_sum(h, f)
             if known is None:
                 look[:, 0] = f[..., 0] = 0.0
             else:
@@ -87,7 +87,7 @@ class Filter:
                     variance[begin + 1:end] += (1.0 + (i > j)) * p[i, j, :-1] * (
                         look[i, 1:] * look[j, 1:])
             known = p[..., -1].copy()
-            gain = _seen(h, p) / r
+            gain = _row_sum(h, p) / r
             loop = f - gain[:, None] * look[None]
             self._gain[begin:end], self._look[begin:end] = gain.T, look.T
             first = max(begin, 1)
@@ -198,7 +198,7 @@ def _pattern(a: FloatArray) -> Pattern:
     return np.asarray(a.any(axis=2))
 
 
-def _seen(h: FloatArray, a: FloatArray) -> FloatArray:
+def _row_sum(h: FloatArray, a: FloatArray) -> FloatArray:
     """Return the weighted sum of the rows of matrices, shape (d, d, n)."""
     total = np.zeros(a.shape[1:])
     for k in np.flatnonzero(h).tolist():
@@ -217,7 +217,7 @@ def _times(a: FloatArray, b: FloatArray, left: Pattern, right: Pattern) -> Float
 
 def _symmetric(a: FloatArray, b: FloatArray, left: Pattern, right: Pattern, out: FloatArray
                ) -> None:
-    """Write the symmetric product of the transpose of a with b into zeros."""
+    """Write the product of the transpose of a with b, which is symmetric, into `out` (zeros)."""
     for k, i in np.argwhere(left).tolist():
         for j in np.flatnonzero(right[k, :i + 1]).tolist():
             out[i, j] += a[k, i] * b[k, j]

@@ -1,1 +1,1 @@
-"""The only folder that imports ROS."""
+"""The ROS 2 nodes, executables and the live page; no other folder imports ROS."""

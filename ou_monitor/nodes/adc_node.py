@@ -1,5 +1,5 @@
 """
-The node of `adc`.
+The node `adc`: publish the voltage of a Linux IIO or hwmon device.
 
 A thread reads an IIO device with a buffer in blocks and publishes them on `voltage` as
 sensor_msgs/JointState, which has a header and an array: `position` holds the samples, V, and the

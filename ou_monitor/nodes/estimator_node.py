@@ -1,5 +1,5 @@
 """
-The node of `estimator`.
+The node `estimator`: voltage and throttle -> OU estimate, brown-out risk and flag.
 
 Inputs: voltage and throttle, as a msg_config says (`voltage`, `throttle` by
 default), best effort.  Outputs at `publish_rate` of real time, reliable:
@@ -8,7 +8,7 @@ default), best effort.  Outputs at `publish_rate` of real time, reliable:
 only while it is known, so that it is never silently false), `~/state`
 (DiagnosticArray, every field of one estimate, stamped with the estimate's
 newest sample), and `/diagnostics` at 1 Hz.  alpha, sigma and Var_inf are estimated from `window`;
-fits of up to a minute run in a thread.  Messages wait in the middleware, which keeps the
+windows of up to a minute are fitted in a thread.  Messages wait in the middleware, which keeps the
 newest 2000, and are fetched 50 times a second and read before each report, so that a flood of
 messages does not delay an output.  Services: `~/clear_brownout` (std_srvs/Trigger) drops a flag
 that is latched or held, unless `lock_parameters` is set; `~/save_model` writes what the flight has
@@ -69,7 +69,7 @@ STATE_FILE = Parameter(
     'state_file', '',
     'File that keeps a latched flag over a restart of the node (a folder: a file in it, named '
     "after the node; relative: under ROS's log directory); empty: off.")
-# Throttle above which the craft may fly.
+# Throttle above which the craft may be flying.
 LANDED = 0.05
 OUTPUTS = ('alpha', 'sigma', 'var_inf', 'brownout_risk', 'throttle_budget')
 
@@ -139,7 +139,7 @@ class EstimatorNode(MonitorNode):
         return latch
 
     def recover(self, error: Exception) -> None:
-        """Restart without data of the supply after a callback has raised."""
+        """Restart the monitor, without the data so far, after a callback has raised."""
         if self.running:
             self._monitor.restart(error)
 
@@ -313,7 +313,7 @@ class EstimatorNode(MonitorNode):
     # -- reports out
 
     def _report(self) -> tuple[MonitorReport, Level, str]:
-        """Return the monitor's report, the node's own findings first."""
+        """Return the monitor's report, and its level and summary with the node's findings."""
         self._poll()
         now = self.steady_now()
         bursts = self._send_clock is not None and self._send_clock.in_bursts

@@ -1,8 +1,8 @@
 """
 The node behind the live page: listens to estimator and filter, and keeps the last minute.
 
-Limits first: there are five rows per second, so the flag shows a dip between two rows but the plot
-of the voltage does not; the filter's signals have their extremes in each row.
+Limits: with five rows per second, the plot of the voltage misses a dip between two rows, which the
+flag shows; of the filter's signals, each row has the extremes.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 """
-The node of `replay`: messages as recorded, and /clock.
+The node of `replay`: publish the messages of a bag as recorded, and /clock.
 
 The schedule is absolute, so a late message does not delay the next ones.  Unpacking a chunk of a
 bag takes longer than the spacing of its messages, so a separate thread reads a bounded number of

@@ -1,5 +1,5 @@
 """
-The node of `supply_simulator`.
+The node `supply_simulator`: publish the voltage of a saved model under throttle.
 
 A thread simulates samples under the newest throttle and publishes each when the node's clock
 (also simulated time) reaches its time, in the format of `msg_config`: by default

@@ -1,1 +1,1 @@
-"""Onboard: samples -> window -> estimate -> risk and cutoff."""
+"""What runs on the craft, without ROS: samples -> window -> estimate -> risk and cutoff."""

@@ -93,8 +93,8 @@ def _draw(rng: np.random.Generator, paths: int) -> dict[int, FloatArray]:
     middle, square = left + right, (right - left) ** 2
     top, bottom = (middle + sign * np.sqrt(
         square + 2.0 * q * rng.standard_exponential(square.shape)) for sign in (1.0, -1.0))
-    # Sampling at 1 MHz gives a little less (Broadie, Glasserman & Kou, Math.
-    # Finance 7 (1997) 325): 0.5826 sigma sqrt(1 us) on each side.
+    # Sampled at 1 MHz, extremes are smaller by 0.5826 sigma sqrt(1 us) on each side (Broadie,
+    # Glasserman & Kou, Math. Finance 7 (1997) 325).
     unseen = 2.0 * 0.5826 * sigma / math.sqrt(published.SAMPLING_HZ)
     found = {}
     for ms in SCREENS_MS:

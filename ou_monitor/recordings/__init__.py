@@ -1,1 +1,1 @@
-"""File formats <-> Recording."""
+"""Read and write recordings: MCAP bags, CSV and logs of autopilots <-> `Recording`."""

@@ -1,1 +1,1 @@
-"""Self-contained HTML pages: scale -> svg -> page -> one module per kind of report."""
+"""Reports of the commands: one `*_document` for each, written as HTML page or terminal text."""

@@ -1,1 +1,1 @@
-"""A message, as msg_config/*.yaml describes it -> samples."""
+"""Messages, as msg_config/*.yaml describes them -> samples for the monitor."""

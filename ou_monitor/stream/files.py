@@ -1,5 +1,5 @@
 """
-Files named by users: regular ones only, and YAML of bounded size and shape.
+Read and write files that users name: regular ones only, and YAML of bounded size and shape.
 
 A FIFO or a device is refused before a byte is read.  Errors about YAML are one line of at most
 300 characters and quote nothing of the file, which may have been named by mistake.

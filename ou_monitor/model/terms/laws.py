@@ -1,4 +1,4 @@
-"""Laws of the innovations: the input of their fits, and common functions."""
+"""What terms that change the law of the innovations are fitted to, and common functions."""
 
 from __future__ import annotations
 

@@ -14,10 +14,10 @@ if it is recent.  Courses never flown, a rise into each fifth of the remaining t
 have the weight of one horizon (rule of succession).  Limits: within a horizon, the peak is taken
 to come first.
 
-Excursions give the risk from the margin alone, in units of the drops of this flight, if even the
-load is unknown: P = expit(b0 + b1 z1 + b2 z2), z1 = (now - L - m)/S within -4..8, z2 = (now - L)/S
-within 0..8.  m and S are mean and deviation of the drops of completed horizons, with one more drop
-of twice the deviation of the last 5 s.  The coefficients were fitted on eight quadcopters.
+Excursions: if even the load is unknown, the risk follows from the margin of the voltage now over
+the limit L alone: P = expit(b0 + b1 z1 + b2 z2), z1 = (now - L - m)/S within -4..8, z2 = (now -
+L)/S within 0..8.  m and S are mean and deviation of the drops of completed horizons, with one more
+drop of twice the deviation of the last 5 s.  The coefficients were fitted on eight quadcopters.
 Limits: throttle is not used; between 1, 2 and 5 s the coefficients are interpolated in ln h,
 beyond these horizons the nearest ones apply, with the drops of the horizon itself.  Beyond 8 S the
 risk falls with the fifth power of the margin, like the tail of Student's t in the other laws; this
@@ -173,7 +173,7 @@ AT_PEAK = 0.05
 
 
 class Past:
-    """Blocks: lowest and last median of three, V; mean and highest throttle (`table`)."""
+    """Past blocks; rows of `table`: lowest and last median of three, V; mean, highest throttle."""
 
     def __init__(self) -> None:
         self._clear()
@@ -238,7 +238,7 @@ class Past:
         return (float(known[0].min()), float(known[1].max())) if known.size else (NAN, NAN)
 
     def throttles(self, seconds: float, ago: float) -> FloatArray:
-        """Return the mean throttle of each block in a time span, s, that ended earlier, s."""
+        """Return the mean throttle of each block in `seconds` that ended `ago`, s, before now."""
         end = self.table.shape[1] - round(ago / BLOCK)
         mean = self.table[2, max(0, end - round(seconds / BLOCK)):max(0, end)]
         return np.asarray(mean[np.isfinite(mean)])
@@ -292,7 +292,7 @@ _LN_HORIZON = np.log([1.0, 2.0, 5.0])
 _COEFFICIENTS = np.array([(-0.90, -0.62, -0.34), (-0.52, -0.12, -0.68), (-1.08, 0.23, -0.52)])
 # Largest margin of the fit, in S, and power with which the risk falls beyond it.
 _FARTHEST, _POWER = 8.0, 5.0
-_RECENT = 5.0
+_RECENT = 5.0  # Time whose deviation gives the further drop, s
 # Minimum deviation as a share of the voltage, for a constant source.
 _LEAST = 1e-3
 # Minimum deviation at 0 V, V.
@@ -309,7 +309,7 @@ def excursions(past: Past, horizon: float) -> tuple[float, float]:
     recent = last[-round(_RECENT / BLOCK):]
     recent = recent[np.isfinite(recent)]
     drops = past.drops(horizon)
-    # Blocks that overlap count as n dt / h.
+    # The n drops overlap: they count as n dt / h.
     n = drops.size * BLOCK / max(horizon, BLOCK)
     first = 2.0 * float(recent.std())
     least = max(_LEAST * abs(float(last[-1])), _SMALLEST)

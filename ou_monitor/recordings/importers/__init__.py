@@ -1,1 +1,1 @@
-"""Logs of autopilots, one module per format -> series of voltage, throttle and current."""
+"""Read CSV and autopilot logs, one module per format -> series of voltage, throttle, current."""
