@@ -61,6 +61,9 @@ MEMORY, _LARGEST, _HUBER = 120.0, 36.0, 3.0
 _SHARE = 0.1
 # Chosen on gecko, nazgul, roma, bf3s, erle and cf_solo (2 to 6 tried).
 _WIDEST = 4.0
+# Horizons that initially count as agreeing with the conditional law: chosen on these, hiro,
+# cf_pair, cf_bl00, frc_ol_1 and euc_1 (1, 4, 9 and 19 tried).
+_AGREE = 4.0
 
 
 def density(x: FloatArray, mean: FloatArray, deviation: FloatArray) -> FloatArray:
@@ -142,7 +145,7 @@ class Calibrator:
 class FarShare:
     """Share of horizons that contradict a law; initially `right` horizons count as agreeing."""
 
-    def __init__(self, right: float = 1.0) -> None:
+    def __init__(self, right: float) -> None:
         self._right, self._wrong = right, 1.0
         self._first = right
 
@@ -218,7 +221,7 @@ class _Rung:
         self.looks: deque[_Look] = deque()
         self.next = self.learned = -math.inf
         self.calibrator = Calibrator()
-        self.held, self.passage = FarShare(), FarShare(_ODDS - 1.0)
+        self.held, self.passage = FarShare(_AGREE), FarShare(_ODDS - 1.0)
         # Log-likelihood ratio of first passage to the other method.
         self.evidence = 0.0
 
