@@ -1,5 +1,5 @@
 """
-Compute the facts of a supply that all commands report: `supply_facts`.
+Compute the facts that all commands report (sag, noise, dips, resistance, OU): `supply_facts`.
 
 Sag, resistance and budget are the node's at the end of the recording.  Noise, alpha, sigma and
 Var_inf come from one regression of the voltage on level, throttle and current
@@ -301,7 +301,7 @@ def rise_that_ends(v: FloatArray, u: FloatArray, noise: Noise) -> FloatArray:
 def dip_begins(v: FloatArray, limit: float, rise: FloatArray) -> npt.NDArray[np.intp]:
     """Return the indices at which dips below a limit begin."""
     below = v < limit
-    # Without readings within the hysteresis, a dip begins where one above is followed by one
+    # Ignore readings within the hysteresis: a dip begins where a reading above is followed by one
     # below.
     decides = np.flatnonzero(below | (v > limit + rise))
     return np.asarray(decides[below[decides] & np.append(True, ~below[decides[:-1]])])

@@ -225,8 +225,8 @@ def _discrepancy(c: Criticism, observed: float, chance: float) -> dict[str, Any]
             'simulated_high': c.high, 'p_value': chance}
 
 
-# Punch-out: quantiles of throttle before and after it, its duration before and after, s, and its
-# maximum number of samples.
+# Punch-out: quantiles of throttle from which and to which it goes, simulated time before and after
+# it, s, and maximum number of samples.
 _FLOWN, _BEFORE, _AFTER, _MOST = (0.01, 0.99), 1.0, 5.0, 6000
 # Share of the recovery that counts as complete, and minimum recovery as a share of the dip.
 _BACK, _COUNTS = 0.9, 0.1
@@ -238,7 +238,7 @@ _MADE = 0.5
 
 @dataclass(frozen=True)
 class ThrottleEffects:
-    """Effects of throttle in the model: a punch-out at half time, and dips of the recording."""
+    """Effects of throttle: a punch-out halfway through the recording, and the recorded dips."""
 
     # Throttle before and after the punch-out.
     low: float = NAN

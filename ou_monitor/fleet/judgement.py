@@ -538,7 +538,7 @@ def _is_of_vehicle(values: Values, vehicle: str) -> npt.NDArray[np.bool_]:
 
 def _vehicles(values: Values, within: Outliers, flat: FloatArray, rate: float, seed: int,
               ) -> VehicleValues:
-    """Compare the vehicles (flat: values without drift); pack values for equal cell counts."""
+    """Compare vehicles (flat: values without drift); packs only with equal numbers of cells."""
     names = tuple(sorted(set(values.vehicles) - {''}))
     scatter = float(np.nan_to_num(within.scatter))
     value, error = np.zeros(len(names)), np.zeros(len(names))
@@ -589,12 +589,12 @@ def _few(found: Outliers, places: Sequence[int], flights: Sequence[FloatArray]) 
         worst = int(p.argmin())
         odd = m.size > 2 and chance[worst] <= found.rate
         # Two vehicles have a single difference, which is reported for the higher one.
-        told = [worst] if odd else [int(m.argmax())] if m.size == 2 else list(range(m.size))
-        places_told = np.array(places)[rest][told]
+        reported = [worst] if odd else [int(m.argmax())] if m.size == 2 else list(range(m.size))
+        places_reported = np.array(places)[rest][reported]
         for column, values in ((found.score, score), (found.chance, chance),
                                (found.centre, others),
                                (reach, float(stats.t.ppf(0.975, freedom)) * se)):
-            column[places_told] = values[told]
+            column[places_reported] = values[reported]
         if not odd:
             break
         del rest[worst]

@@ -93,7 +93,7 @@ class SpacingError:
 
 
 class Prefetch(Generic[Item]):
-    """Iterate over a source that a thread reads ahead, up to `ahead` items; errors pass on."""
+    """Iterate over a source that a thread reads ahead, up to `ahead` items; raise its errors."""
 
     def __init__(self, source: Iterable[Item], ahead: int = AHEAD) -> None:
         self._source = source
@@ -107,7 +107,7 @@ class Prefetch(Generic[Item]):
         self._thread.start()
 
     def fill(self) -> None:
-        """Wait until as much has been read as may be held, or all of it."""
+        """Wait until `ahead` items or the whole source have been read."""
         with self._changed:
             self._changed.wait_for(
                 lambda: self._finished or self._closed or len(self._items) >= self._ahead)

@@ -17,7 +17,7 @@ peak; this law follows the loud peaks, which have to be removed.  No future data
 Limits of the law: lines aliased at half the sample rate fall with throttle and are not followed;
 speeds of single motors are not resolved.
 
-Choice of the notches: by the noise of a D term at equal lag, from the signal's own spectrum.
+Choice of the notches: the least noise in a D term at equal lag, by the signal's own spectrum.
 
 The noise of a candidate is the power of the derivative above `fmin` after its notches and a
 low-pass of order 2, whose cutoff is raised so that both together lag as much as the low-pass
@@ -88,7 +88,7 @@ class NewestSpeeds:
     def __init__(self, per_unit: float, stale_after: float) -> None:
         self._per_unit, self._stale_after = per_unit, stale_after
         self._speeds: list[float] = []
-        self._heard = self._changed = self._first = -math.inf
+        self._received = self._changed = self._first = -math.inf
         self._changes = 0
 
     def configure(self, per_unit: float, stale_after: float) -> None:
@@ -102,18 +102,18 @@ class NewestSpeeds:
         speeds = [abs(one) * self._per_unit if math.isfinite(one) else NAN for one in values]
         if all(one != one for one in speeds):
             return
-        if self._first == -math.inf or t < self._heard:
+        if self._first == -math.inf or t < self._received:
             self._first, self._changes = t, 0
             self._changed = t
         elif any(one != other for one, other in zip(speeds, self._speeds)
                  if one == one or other == other):
             self._changes += 1
             self._changed = t
-        self._speeds, self._heard = speeds, t
+        self._speeds, self._received = speeds, t
 
     def now(self, t: float, most: int) -> list[float]:
         """Return the speeds of up to `most` groups of motors, Hz; empty: unknown."""
-        if not most or not t - self._heard <= self._stale_after:
+        if not most or not t - self._received <= self._stale_after:
             return []
         if self._changes >= _CHANGES:
             usual = (self._changed - self._first) / self._changes
@@ -198,8 +198,8 @@ class MotorLaw:
 # Frames of a quarter of a second, in which throttle changes little: a resolution of 4 Hz; each
 # sample is in four frames.
 FRAME, HOP = 0.25, 0.0625
-_SMALLEST, _LONGEST = 16, 4096
-_MISSING, _UNEVEN = 5.0, 0.3
+_SMALLEST, _LONGEST = 16, 4096  # Samples in a frame
+_MISSING, _UNEVEN = 5.0, 0.3  # In intervals: gap that restarts, deviation that is interpolated
 
 
 class NotchFrames:
@@ -245,7 +245,7 @@ class NotchFrames:
 WIDTHS: FloatArray = np.array([1.0, 0.66, 0.45, 0.3, 0.2, 0.13, 0.085])
 # Cutoffs of the low-passes after the notches, over `cutoff`; maximum share of the sample rate.
 _BEHIND, _FASTEST = (0.5, 1.0, 1.5), 0.25
-_ON, _OFF, _HARM, _BETTER = 0.9, 0.97, 0.99, 0.9
+_ON, _OFF, _HARM, _BETTER = 0.9, 0.97, 0.99, 0.9  # See above; _HARM: "worse", share of the rms
 # Memory of the noise and of the loudest frame, s; frames before the first decision.
 _MEMORY, _LEVEL, _FEWEST = 5.0, 2.0, 6
 # Minimum share of the lag that a low-pass keeps, in a frame (one ten times as fast hardly filters)
@@ -257,7 +257,7 @@ _TINY = 1e-300
 
 
 class Family(NamedTuple):
-    """Notches without their width."""
+    """Kind of notches, of any width."""
 
     source: str  # 'rpm' or 'throttle'
     many: bool  # Whether each motor has its own notch
@@ -265,7 +265,7 @@ class Family(NamedTuple):
 
 
 class Candidate(NamedTuple):
-    """Some notches."""
+    """Notches that may be chosen."""
 
     family: Family  # Which
     width: float  # Bandwidth over frequency
@@ -438,7 +438,7 @@ class AdaptiveNotch:
         self._law: MotorLaw | None = None
         self._choice: NotchChoice | None = None
         # Square root of throttle after the lag of the motors, and time of the last throttle.
-        self._root, self._asked, self._heard = NAN, NAN, -math.inf
+        self._root, self._asked, self._received = NAN, NAN, -math.inf
         self._motors: list[float] = []
         self._sources: set[str] = set()
 
@@ -609,8 +609,8 @@ class AdaptiveNotch:
 
     def _listen(self, t: float, dt: float, throttle: float, rpm: Sequence[float]) -> None:
         if throttle == throttle:
-            self._asked, self._heard = math.sqrt(min(max(throttle, 0.0), 1.0)), t
-        elif not t - self._heard <= _HELD:
+            self._asked, self._received = math.sqrt(min(max(throttle, 0.0), 1.0)), t
+        elif not t - self._received <= _HELD:
             self._root = self._asked = NAN
         if self._asked == self._asked:
             off = self._asked - self._root if self._root == self._root else NAN

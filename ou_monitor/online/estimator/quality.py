@@ -56,7 +56,7 @@ def examine(y: FloatArray, held: float = 1.0) -> Quality:
 
 
 def lattice(sizes: FloatArray, fewest: int = _FEWEST_STEPS) -> float:
-    """Return the common step of increments, V, from 1e-3 of the largest on; 0: none."""
+    """Return the common step of increments, V; 0 if there is none above 1e-3 of the largest."""
     ordered = np.unique(sizes)
     least = float(ordered[0])
     # Rounding splits one step into several: join those within 1e-3 of the smallest.
@@ -92,7 +92,7 @@ _BURIED_BY = 2.0
 # standard error grows by 1 + 1.5/x + 70/x^2, x = alpha T + 1.5, which brings the
 # coverage of 95 % intervals to 94 % at x = 12; doc/estimation.md.
 _WIDER, _MUCH_WIDER, _AS_FITTED = 1.5, 70.0, 1.5
-# Width of the zone beside "no noise" in which errors of sigma shrink (measured).
+# Distance from "no noise", in standard errors, within which errors of sigma shrink (measured).
 _NEAR = 0.75
 # Minimum standard deviation of throttle to estimate the sag.
 MIN_THROTTLE_STD = 0.005
@@ -150,7 +150,7 @@ def judge(fit: Fitted, measured: Mapping[str, Any], quality: Quality, throttle_s
         return Estimate(status=Status.UNBOUND, flags=tuple(flags), **known)
     if fit.log_var[0] > max(_BURIED ** 2, _BURIED_BY ** 2 * 2.0 / relaxations):
         return Estimate(status=Status.BURIED, flags=tuple(flags), **known)
-    # A short window often looks longer than it is, so reduce it by one standard error.
+    # In a short window alpha is often too high, so reduce `relaxations` by one standard error.
     surely = relaxations * math.exp(-se[0])
     alpha = fit.alpha - fit.high / duration
     var_inf = fit.sigma ** 2 / (2.0 * alpha)

@@ -1,5 +1,5 @@
 """
-Blocks of samples: voltage, delay of throttle, and noise.
+Group samples into blocks, and learn the delay of throttle and the noise from them.
 
 Blocks have equal throttle, at most about 50 per second.  Limits: an incomplete block is not
 returned, so a fast source is followed 20 ms late; of several throttle changes within 20 ms only
@@ -231,7 +231,7 @@ CLIP, _OUTLIER = 4.0, 16.0
 DIVERGED = 1e12
 # Difference below which voltages are one reading of an ADC, V.
 _SAME = 1e-6
-# Minimum change of throttle.
+# Change of throttle below which it counts as held.
 _HELD = 1e-3
 # Memory of the noise, in updates: maximum, initial value, and growth per update; short at first,
 # while the coefficients are still wrong.

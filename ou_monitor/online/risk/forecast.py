@@ -6,8 +6,8 @@ to the pilot's future throttle, half the excursions), and `excursions` (the drop
 used alone if the load is unknown).  First passage and the other method are averaged with weights
 from their predictions of completed horizons' lowest voltages (Bayes, with forgetting).  Each law
 is mixed with a wider one by the share of horizons in which it was wrong: first passage with the
-excursions, the conditional risk with a law as wide as these, but at most `_WIDEST` times as wide
-as itself (they include punches, which say nothing about idling).
+excursions, the risk for a given throttle with a law as wide as the excursions, but at most
+`_WIDEST` times its own width (excursions include punches, which say nothing about idling).
 
 The law learned in flight, from completed horizons: (lowest - start) / s = b0 + b1 (mu - start) / s
 + k e, with mean mu and deviation s of `lowest`, by least squares with forgetting; e has Student's
@@ -59,7 +59,7 @@ _PRECISION = (_BIAS ** -2, 0.0, _GAIN ** -2)
 MEMORY, _LARGEST, _HUBER = 120.0, 36.0, 3.0
 # Error of the model as a share of the drop.
 _SHARE = 0.1
-# Chosen on gecko, nazgul, roma, bf3s, erle and cf_solo (2 to 6 tried).
+# Maximum widening of a law (chosen on gecko, nazgul, roma, bf3s, erle and cf_solo; 2 to 6 tried).
 _WIDEST = 4.0
 # Horizons that initially count as agreeing with the conditional law: chosen on these, hiro,
 # cf_pair, cf_bl00, frc_ol_1 and euc_1 (1, 4, 9 and 19 tried).
@@ -270,7 +270,7 @@ class Forecast:
     """
     Risk with the pilot's future throttle, and with a given one.
 
-    look: update interval, s; horizon: the only one of the risks, s; NaN: any may be asked for.
+    look: update interval, s; horizon: the only horizon that risks have, s; NaN: any.
     """
 
     def __init__(self, loads: LoadFilter, look: float = LOOK, horizon: float = NAN) -> None:
