@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 import math
 from typing import Any
 
@@ -19,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.analysis.crafts import Craft, craft_of
 from ou_monitor.analysis.level_comparison import alpha_constancy, AlphaTest, LEVEL
-from ou_monitor.analysis.level_result import fit_level, judge_levels, LevelResult
+from ou_monitor.analysis.level_result import fit_all, fit_level, judge_levels, LevelResult
 from ou_monitor.analysis.level_tests import EFFECT, LEAST
 from ou_monitor.analysis.levels import find_levels, LoadLevel
 from ou_monitor.analysis.overview import Overview, overview
@@ -77,8 +78,9 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
     found = find_levels(recording.t, recording.throttle, levels)
     left = remainder(recording)
     results = []
+    whole = cache(lambda: fit_all(recording, left, found)) if len(found) > 1 else None
     for k, level in enumerate(found):
-        results.append(fit_level(recording, left, level, len(found)))
+        results.append(fit_level(recording, left, level, len(found), whole))
         report(0.5 * (k + 1) / len(found))
     sliding = slide(recording, window, voltage, brownout_horizon,
                     lambda share: report(0.5 + 0.5 * share))

@@ -28,7 +28,7 @@ intensity that changes within a block.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 import enum
 import math
@@ -411,9 +411,9 @@ class LevelResult:
         return 'all' if math.isnan(self.throttle) else f'{100.0 * self.throttle:.3g} %'
 
 
-def fit_level(recording: Recording, left: Remainder, level: LoadLevel, levels: int
-              ) -> LevelResult:
-    """Return the result of one level, without the verdict."""
+def fit_level(recording: Recording, left: Remainder, level: LoadLevel, levels: int,
+              whole: Callable[[], Estimate] | None = None) -> LevelResult:
+    """Return the result of one level, without the verdict (whole: fits all levels together)."""
     segments = [s for s in level.segments if s.stop - s.start >= _MIN_SEGMENT]
     if not segments:
         segments = [s for s in level.segments if s.stop - s.start >= 2]
@@ -426,9 +426,11 @@ def fit_level(recording: Recording, left: Remainder, level: LoadLevel, levels: i
     still = replace(recording, voltage=left.voltage)
     grids = [on_grid(still.t[s.start:s.stop], still.voltage[s.start:s.stop]) for s in within]
     even = _grid_rate(grids)
+    # Without whitening, the spectrum of a slow relaxation, steep at low frequencies, shows lines.
+    model = estimate if estimate.usable or whole is None else whole()
     lines = find_lines([grid.values for grid in grids], even, levels=levels, white=[
-        _white(still.t[s.start:s.stop], still.voltage[s.start:s.stop], estimate)
-        for s in within] if estimate.usable else ())
+        _white(still.t[s.start:s.stop], still.voltage[s.start:s.stop], model)
+        for s in within] if model.usable else ())
     shape = examine_level(_parts(still, within), estimate, left.above)
     with_lines = None
     # Periodic impulses have spectral lines too, which are not subtracted.
@@ -448,6 +450,12 @@ def fit_level(recording: Recording, left: Remainder, level: LoadLevel, levels: i
         vrms=float(np.sqrt(np.mean(deviation ** 2))), deviation=deviation, ou=ou,
         estimate=estimate, shape=shape, spectrum=level_spectrum(still, within, estimate),
         lines=lines, with_lines=with_lines)
+
+
+def fit_all(recording: Recording, left: Remainder, levels: Sequence[LoadLevel]) -> Estimate:
+    """Fit the segments of all levels together."""
+    return fit_parts(recording, left, [part for level in levels for s in level.segments
+                                       for part in _known(s, left.voltage)])[1]
 
 
 def _known(segment: Stay, voltage: FloatArray) -> list[Stay]:

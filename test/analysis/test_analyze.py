@@ -118,6 +118,17 @@ def test_loads_that_come_and_go_are_no_lines():
     assert [line for level in found.levels for line in level.lines.lines] == []
 
 
+def test_a_slow_relaxation_at_levels_too_short_to_fit_is_no_line():
+    """An OU of 10 1/s in white noise, in segments of 3 s: only all levels together show it."""
+    rng = np.random.default_rng(3)
+    t = np.arange(12000) / 200.0
+    throttle = np.repeat(np.resize((0.1, 0.3, 0.5, 0.2, 0.4, 0.6), 20), 600)
+    v = simulate(t, 10.0, 0.08, rng, u0=15.0) - throttle + 0.01 * rng.standard_normal(t.size)
+    found = analyze(Recording(t, v, throttle)).levels
+    assert any(not level.estimate.usable for level in found)
+    assert [line for level in found for line in level.lines.lines] == []
+
+
 def test_without_throttle_there_is_one_level_and_it_is_said():
     """The level is called 'all'."""
     analysis = analyze(without_throttle(recording(6, ((0.1, 0.3),))))
