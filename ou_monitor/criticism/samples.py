@@ -30,7 +30,7 @@ MOST = 80_000
 # Maximum step, in relaxation times, at which alpha stays identifiable.
 _STEP = 0.3
 # (gamma(2L) - gamma(L)) / (gamma(4L) - gamma(2L)) at that step L, with the variogram gamma of an
-# OU: exp(x) / (1 + exp(-x)).  White noise cancels.
+# OU: exp(x) / (1 + exp(-x)), x = _STEP.  White noise cancels.
 _RATIO = math.exp(_STEP) / (1.0 + math.exp(-_STEP))
 # Maximum values used for that ratio.
 _EXAMINED = 1_000_000

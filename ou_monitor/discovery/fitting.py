@@ -216,9 +216,9 @@ class Fitter:
     def best_start(self, composite: Composite, kind: type[Term], view: View, least: float = 0.0,
                    starts: Sequence[Term] | None = None) -> Composite | None:
         """
-        Return the best fit with one more term of a kind, if its spectrum gains enough nats.
+        Return the best fit with one more term of a kind.
 
-        starts: by default, the candidates of the kind.
+        least: nats that its spectrum must gain; starts: by default, the candidates of the kind.
         """
         if kind.ROLE is Role.LAW:
             found = self.fit([*composite.terms, kind], composite)

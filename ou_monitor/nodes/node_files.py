@@ -318,15 +318,15 @@ class LatchFile:
             raise ValueError('it is not a regular file')
         text = os.read(handle, _MOST + 1)
         if len(text) > _MOST:
-            raise ValueError(f'it is larger than {_MOST} bytes, so it is of another program')
+            raise ValueError(f'it is larger than {_MOST} bytes, so it belongs to another program')
         try:
             data = json.loads(text)
         except (ValueError, RecursionError):
-            raise ValueError('it is damaged, or not of this node') from None
+            raise ValueError("it is damaged, or not this node's") from None
         if not isinstance(data, dict) or set(data) != _KEYS or (
                 data['level'] not in ('OK', 'CRITICAL') or not isinstance(data['reason'], str)
                 or not isinstance(data['time'], (int, float)) or not 0.0 <= data['time'] < 1e11):
-            raise ValueError('it is damaged, or not of this node')
+            raise ValueError("it is damaged, or not this node's")
         if data['node'] != self._node:
             raise ValueError('it belongs to another node')
         return data

@@ -50,7 +50,7 @@ def patience(settings: MonitorSettings, rate: float, n: int, interval: float = 0
 
 
 class SourceInterval:
-    """Interval between arrivals of a source slower than 0.12 s, s; 0: fast or unknown."""
+    """Interval between arrivals of a slow source, s; 0 if it is unknown or up to 0.12 s."""
 
     def __init__(self) -> None:
         self.value = 0.0

@@ -459,7 +459,7 @@ def untimed(e: Estimate) -> Estimate:
 
 
 def _unknown(e: Estimate, status: Status) -> Estimate:
-    """Return an estimate without a relaxation; defects of the input precede `status`."""
+    """Return an estimate without a relaxation; a usable one gets the given status."""
     return replace(e, alpha=NAN, alpha_se=NAN, sigma=NAN, sigma_se=NAN, var_inf=NAN,
                    var_inf_se=NAN, status=status if e.usable else e.status)
 

@@ -13,8 +13,8 @@ risk; with an unknown risk the level is UNKNOWN, never OK, and the flag is never
 The voltage floor is a threshold on the samples that needs no model.  The median of the last
 `brownout.floor_time` seconds decides, so a single wrong sample does not.  Every sample is checked,
 also between two reports, and also if its stamp is late, frozen, irregular or missing: then it
-counts in order of arrival.  Samples that arrive together with stamps of that time are spaced by
-their usual interval.  The next update reports a dip, even if nothing has arrived since.  A wrong
+counts in order of arrival.  Such samples that arrive at the same time are spaced by their usual
+interval.  The next update reports a dip, even if nothing has arrived since.  A wrong
 value that a logger repeats for more than half of `brownout.floor_time` counts.
 """
 
@@ -145,7 +145,7 @@ class FloorWatch:
         return least + np.maximum.accumulate(np.maximum(elapsed - least, 0.0))
 
     def _learn(self, times: FloatArray, before: float) -> None:
-        """Learn the usual interval (times in s); a pause counts as two of them for each sample."""
+        """Learn the usual interval (times in s); a pause counts at most as twice the usual one."""
         known = before > -math.inf
         n = times.size - 1 + known
         if not n:

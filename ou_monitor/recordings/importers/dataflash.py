@@ -244,7 +244,7 @@ def _lost_text(log: Any) -> list[str]:
         lost += bool(line.strip()) and (form is None or len(cells) <= len(form.format))
     notes = []
     if lost:
-        notes.append(f'{counted(lost, "line")} left out: no message of this log.')
+        notes.append(f'Left out: {counted(lost, "line")} in no format of this log.')
     if not text.endswith('\n'):
         notes.append(f'The last line does not end: the log was cut off at byte {size}.')
     return notes
@@ -282,7 +282,7 @@ def _plain(name: str, kind: str, columns: Columns, whole: frozenset[str]) -> Ite
         if quantity == THROTTLE:
             scale = _throttle_scale(values)
         elif field in whole:
-            # Logs of before 2014 hold hundredths in whole numbers, and mV of the rail.
+            # Logs from before 2014 hold integers: hundredths, and for the rail millivolts.
             scale = 0.001 if field == 'Vcc' else 0.01
         one = Series(f'{name}.{field}', quantity, columns['t'], values * scale, f'{scale:g}',
                      words, rank, name)

@@ -133,7 +133,7 @@ def test_text_log_with_binary_bytes(tmp_path):
     path, log = load(tmp_path, text[:at] + b'\xfe\xff' + text[at + 2:], 'a.log')
     assert choose(path, log).voltage.n == 29
     assert log.notes == ('2 bytes that are not ASCII were read as "?".',
-                         '1 line left out: no message of this log.')
+                         'Left out: 1 line in no format of this log.')
 
 
 def test_messages_of_the_parser_are_suppressed(tmp_path, capfd):
@@ -148,7 +148,7 @@ def test_a_text_log_cut_off(tmp_path):
     text = copter(30)[0].text
     path, log = load(tmp_path, text[:-7], 'a.log')
     assert log.notes == (
-        '1 line left out: no message of this log.',
+        'Left out: 1 line in no format of this log.',
         f'The last line does not end: the log was cut off at byte {len(text) - 7}.')
     assert choose(path, log).voltage.n == 30
 
