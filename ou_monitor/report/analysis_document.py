@@ -70,7 +70,8 @@ def answer(analysis: Analysis) -> list[str]:
     curves, names = analysis.by_throttle, {item.name for item in analysis.quality}
     first, *others = answers(analysis.overview) or ['The recording holds no samples.']
     safe = [] if math.isnan(curves.budget) else [
-        f'Safe up to {100.0 * curves.budget:.0f} % throttle.' if curves.budget > 0.0 else
+        f'Safe up to {100.0 * curves.budget:.0f} % throttle{_despite(analysis)}.'
+        if curves.budget > 0.0 else
         f'No throttle keeps the risk below {100.0 * curves.limit:g} % {_why_none(analysis)}: at '
         f'idle it is {percent(curves.risk[0])}.']
     return [first, *safe, *others, *craft_advice(analysis.craft),
@@ -117,7 +118,19 @@ def _budget(analysis: Analysis) -> str:
         words += f'; at {100.0 * u:.0f} % it is {percent(p)}'
     elif curves.budget < 1.0:
         words += '; higher throttle was not flown'
-    return words
+    return words + _despite(analysis)
+
+
+def _despite(analysis: Analysis) -> str:
+    """Return the fall below the limit at a throttle within the budget, in words; empty: none."""
+    recording, curves = analysis.recording, analysis.by_throttle
+    k = int(np.argmin(recording.voltage))
+    # The voltage may follow throttle late.
+    top = recording.throttle[(recording.t > recording.t[k] - 0.5) & (
+        recording.t <= recording.t[k])].max()
+    if recording.voltage[k] >= curves.voltage or not top <= curves.budget + 0.01:
+        return ''
+    return f'; yet the voltage was below {curves.voltage:g} V at {100.0 * top:.0f} % throttle'
 
 
 def _why_none(analysis: Analysis) -> str:

@@ -70,3 +70,15 @@ def test_a_missing_budget_states_its_cause(analysis, level, words):
     safe = dict(facts(none))['Safe up to']
     assert safe.startswith(f'no throttle, {words}') and f'{level:.2f} V' in safe
     assert safe.endswith('within 5 s is 0.3')
+
+
+@pytest.mark.parametrize('budget, warned', [(1.0, True), (0.05, False)])
+def test_a_safe_throttle_that_did_fall_below_the_limit_is_contradicted(analysis, budget, warned):
+    """The risk is a model's; the flight itself has the last word."""
+    lowest = float(analysis.recording.voltage.min())
+    safe = replace(analysis, by_throttle=replace(
+        analysis.by_throttle, voltage=lowest + 0.01, budget=budget))
+    for words in (dict(facts(safe))['Safe up to'], ' '.join(answer(safe))):
+        assert ('yet the voltage was below' in words) == warned
+    above = replace(safe, by_throttle=replace(safe.by_throttle, voltage=lowest - 0.01))
+    assert 'yet the voltage' not in ' '.join(answer(above))
