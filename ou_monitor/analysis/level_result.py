@@ -47,7 +47,7 @@ from ou_monitor.online.estimator.quality import examine, input_flags
 from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.records import (
     Counters, Estimate, Flag, FloatArray, LOG_NAMES, NAN, OuFacts, Recording, Status)
-from ou_monitor.text import p_words, percent, Z95
+from ou_monitor.text import number, p_words, percent, Z95
 from ou_monitor.timeline import TAIL
 from scipy import stats
 from scipy.signal import welch
@@ -129,12 +129,12 @@ def _apart_from_changes(estimate: Estimate, shape: Shape, line_share: float) -> 
     if tails.rejects:
         return _plain(ProcessType.IMPULSES, 'single innovations lie beyond the range of '
                       'the noise, or the tails are heavy',
-                      f'{shape.impulses} of {shape.n}, excess kurtosis {shape.kurtosis:.2g}, '
-                      f'{_p(tails)}')
+                      f'{shape.impulses} of {shape.n}, excess kurtosis '
+                      f'{number(shape.kurtosis, 2)}, {_p(tails)}')
     if normal.rejects:
         return _plain(ProcessType.NOT_GAUSSIAN, 'the innovations do not follow the normal '
-                      'law', f'skewness {shape.skewness:.2g}, excess kurtosis '
-                      f'{shape.kurtosis:.2g}, {_p(normal)}')
+                      'law', f'skewness {number(shape.skewness, 2)}, excess kurtosis '
+                      f'{number(shape.kurtosis, 2)}, {_p(normal)}')
     if tails.why_not:
         return _plain(ProcessType.UNDETERMINED, tails.why_not)
     visible = detectable_kurtosis(shape.n)

@@ -103,9 +103,9 @@ def load_of(recording: Recording, t: FloatArray, v: FloatArray, u: FloatArray | 
         0.0 if u is None else _explained(t[some], v[some], u[some]))
     if not gain > 0.5 * _LAGS.size * math.log(v.size):
         return u
-    notes.append(f'The measured current predicts the voltage better than throttle (by {gain:.3g} '
-                 f'nats), so it is used as the load, as a share of {full:.3g} A. Read "throttle" '
-                 'in the results and in the model as this share.')
+    notes.append('The measured current predicts the voltage better than throttle (by '
+                 f'{number(gain)} nats), so it is used as the load, as a share of {full:.3g} A. '
+                 'Read "throttle" in the results and in the model as this share.')
     return np.asarray(load)
 
 

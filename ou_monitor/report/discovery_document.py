@@ -89,9 +89,10 @@ def _gain_words(finding: Finding) -> str:
     if not gain > Z95 * finding.gain_se or not math.isfinite(size):
         return gain_words(gain, finding.gain_se)
     errors = ('shrink by ' if shrink > 0.0 else 'grow by ') + f'{number(100.0 * abs(shrink), 2)} %'
+    smaller, better = ('+' * (x > 0.0) + number(1e3 * x) for x in (gain - size, size))
     return (f'On samples not used for the fit, one-step errors {errors} (rms; '
-            f'{1e3 * (gain - size):+.3g} mnat per sample) and their size is predicted '
-            f'{"better" if size >= 0.0 else "worse"} ({1e3 * size:+.3g}): '
+            f'{smaller} mnat per sample) and their size is predicted '
+            f'{"better" if size >= 0.0 else "worse"} ({better}): '
             f'{number(1e3 * gain)} +- {number(1e3 * finding.gain_se, 2)} mnat in all.')
 
 
