@@ -245,3 +245,7 @@ def test_numbers_outside_their_bands_are_named_beside_the_verdict():
                   lowest=replace(low, measured=low.high + 1.0))
     said = ' '.join(_answer(far))
     assert 'Outside their own bands' in said and 'lowest voltage' in said.split('Outside')[1]
+    assert 'chance allows this' in said
+    many = replace(far, falls=tuple(replace(one, measured=one.high + 1.0) for one in far.falls),
+                   mean=replace(far.mean, measured=far.mean.high + 1.0))
+    assert 'more than chance explains' in ' '.join(_answer(many))
