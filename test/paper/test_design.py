@@ -68,6 +68,9 @@ def test_changes_that_already_meet_the_target_are_not_offered():
     result = design(PowerNetwork(), 0.1, **QUESTION, flown=(0.05, 0.02, 0.01))
     assert result.verdict is DesignVerdict.ENOUGH
     assert answer(result).endswith('What would help: throttle limit 5.00 %.')
+    # The budget of the flight lies above this throttle: nothing is missing.
+    enough = design(PowerNetwork(), 0.1, **QUESTION, flown=(0.2, 0.02, 0.01))
+    assert 'But right after' not in answer(enough) and 'Neither' not in answer(enough)
 
 
 def test_a_fixed_esr_may_leave_no_capacitance():
