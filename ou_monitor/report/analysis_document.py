@@ -106,7 +106,7 @@ def _budget(analysis: Analysis) -> str:
             + ('(the default for a 5 V rail) ' if analysis.brownout_default else '')
             + f'within {curves.horizon:g} s')
     if math.isnan(curves.budget):
-        return f'unknown: {curves.budget_reason} The risk is that {what}.'
+        return f'unknown: {curves.budget_reason}'
     if not curves.budget:
         return f'no throttle, {_why_none(analysis)}: the risk {what} is {curves.risk[0]:.2g}'
     words = (f'{100.0 * curves.budget:.0f} % throttle if held: the risk {what} stays under '
