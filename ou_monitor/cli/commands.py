@@ -23,7 +23,7 @@ class Option:
 
 
 class WithoutOut(argparse.Action):
-    """A flag that needs no OUT; an optional positional could not follow an option."""
+    """A flag that makes OUT optional; if it always were, it could not follow an option."""
 
     def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
                  values: Any, option_string: str | None = None) -> None:
@@ -149,7 +149,7 @@ CSV = (
            help='unit of the time in a CSV (default: detected)'),
     Option('--throttle-unit', metavar='{1,%,us,LOW:HIGH}', type=ends,
            help='unit of the throttle in a CSV: 0..1, percent, a pulse of 1000 to 2000 us, or '
-           'its ends, such as 364:1684 or (with =) =-1024:1024 (default: detected)'),
+           'its ends, such as 364:1684 or --throttle-unit=-1024:1024 (default: detected)'),
     Option('--sample-interval', metavar='S', type=POSITIVE,
            help='time from row to row of a CSV, s, in place of a column'),
     Option('--delimiter', metavar='C',
@@ -302,7 +302,7 @@ _CONVERT = Command(
      Option('out', metavar='OUT', type=path_argument,
             help='bag to write: NAME.mcap for one file, NAME for a rosbag2 folder'),
      Option('--list', action=WithoutOut, nargs=0, default=False,
-            help='list the series, * those taken by default, and write nothing (without OUT)'),
+            help='list the series (*: taken by default) and write nothing; OUT is not needed'),
      Option('--voltage', metavar='NAME',
             help='voltage (default: the battery, if there is one)'),
      Option('--throttle', metavar='NAME',

@@ -176,7 +176,7 @@ def _in_doubt(samples: Samples, whole: Composite, names: Sequence[str], out: Seq
 
 
 def _other(fitter: Fitter, whole: Composite, names: Sequence[str]) -> list[int]:
-    """Return the states that no longer fit their name."""
+    """Return the causes with states of their own that no longer fit their name."""
     view = fitter.view(whole)
     return [k for k, kind in enumerate(kinds_of(names)) if kind.ROLE is Role.BLOCK
             and not whole.terms[position(whole, names, k)].holds(view)]

@@ -175,7 +175,7 @@ def _round(fitter: Fitter, search: Search, bank: NullBank, given: Sequence[str],
         if first and steady:
             return steady
     trials.sort(key=lambda trial: -trial.evidence)
-    # Time is measured: in a tie a trend precedes a latent cause.
+    # In a tie measured causes come first; a trend is one, because time is measured.
     return sorted(trials, key=lambda trial: not (
         catalogue()[trial.name].MEASURED and trial.evidence > trials[0].evidence - decision.TIE))
 
@@ -432,9 +432,9 @@ def outside_range(samples: Samples, terms: Sequence[Term], share: float = 0.5) -
     Return by how much the level of simulations leaves the recorded range, V: a quantile of them.
 
     The level is a running median of five samples, which single bad samples do not change.  Seeds
-    are fixed.  With heavy tails of index a, the extreme of one of two recordings of one process is
-    more than twice the other's in one of 1 + 2^a pairs.  So with a = 2, one in five simulations of
-    a right model leaves the range and its margin, but the median of them does in fewer than 1 %.
+    are fixed.  With heavy tails of index a, the extreme of a simulation of the right model is more
+    than twice that of the recording with probability 1/(1 + 2^a).  So with a = 2, one in five
+    simulations leaves the range and its margin, but the median of them does in fewer than 1 %.
     """
     rng, model = np.random.default_rng(0), SupplyModel(tuple(terms))
 

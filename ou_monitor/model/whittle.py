@@ -163,7 +163,7 @@ class CrossSpectrum:
         return max(self._cross.shape)
 
     def ou(self, a: FloatArray) -> FloatArray:
-        """Return the expected ordinates of an OU of variance 1; a: alpha D, shape (k, 1)."""
+        """Return the expected ordinates of an OU of variance 1; a: alpha dt, shape (k, 1)."""
         # The inverse covariance is (1 - phi)^2 + phi L, whose eigenvectors are the cosines, plus
         # phi (1 - phi) at both ends, which needs Woodbury's formula.
         phi, gap = np.exp(-a), -np.expm1(-a)

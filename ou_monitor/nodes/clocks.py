@@ -113,7 +113,7 @@ class SendClock:
     Turn source timestamps of single samples into stamps.
 
     `in_bursts`: no steady source is detectable, and the times are unusable; `settled`:
-    how often a steady source was found after that.
+    how often this has ended.
     """
 
     def __init__(self) -> None:
@@ -147,7 +147,7 @@ class SendClock:
         return self._last
 
     def _take_gap(self, gap: float) -> None:
-        """Detect bursts too far apart, s, to identify their source."""
+        """Declare the times unusable after two bursts followed by gaps (gap in s)."""
         times = self._times
         lump = len(times) >= LUMP and times[-1] - times[0] < SHORT * gap
         self._lumps = self._lumps + 1 if lump else 0

@@ -76,7 +76,7 @@ def run(name: str, work: Callable[[], int], args: list[str] | None = None) -> in
 
 
 def loaded() -> None:
-    """From here on only record signals: there is a node, or something else to clean up."""
+    """No longer let a signal end the process at once: now there is something to clean up."""
     _loading.clear()
 
 
@@ -194,7 +194,7 @@ def spin(make: Callable[[], Any]) -> int:
     executor.add_node(node)
     manager = ServiceManager()
     if manager.interval:
-        # By a timer of the node: an executor that serves no timers hangs.
+        # By a timer of the node, so that it stops when the executor serves no more timers.
         node.every(manager.interval, lambda: manager.tell('WATCHDOG=1'))
     # Freeze loaded objects: a garbage collection over them blocks for 40 ms, and delays the end of
     # the process by 0.2 s.

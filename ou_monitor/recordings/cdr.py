@@ -301,7 +301,7 @@ def gather(data: bytes, at: IntArray, kind: str) -> npt.NDArray[Any]:
 
 
 class FieldColumn(NamedTuple):
-    """A field of many messages, and a second one of each."""
+    """The values of a field in many messages, and of a second field, if wanted."""
 
     log_time: TimeArray  # Log times, ns; shape (m,)
     # Stamps of the messages (of the LAST sample of a block), s; the log time where a message has

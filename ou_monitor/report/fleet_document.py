@@ -28,11 +28,11 @@ _TITLES = {'resistance': 'Resistance', 'sag': 'Sag at full throttle',
 _UNITS = {'resistance': 'mOhm', 'sag': 'mV', 'sigma': 'V/\u221as', 'alpha': '1/s'}
 # Maximum significant drifts drawn; if there are none, this number of the most likely ones.
 _DRAWN, _LIKELY = 8, 2
-# Minimum trends in the table (further ones need p below `DRIFT_RATE`), and maximum.
+# Trends listed at any p (further ones need p below `DRIFT_RATE`), and maximum in all.
 _LEAST, _MOST = 6, 30
 # Maximum recordings in the table of the lowest voltages; rows and sentences on a terminal.
 _WORST, _SHOWN = 12, 10
-# Maximum sentences and recordings listed; the table has all of them.
+# Maximum sentences and recordings listed; JSON and the Parquet table have all of them.
 _SENTENCES, _RECORDINGS = 40, 500
 # Maximum ratio of mean voltages of one pack: 4.35 V per cell if full, 2.8 V if empty under load.
 _ONE_PACK = 1.6
@@ -64,7 +64,7 @@ def fleet_document(fleet: Fleet, command: str = '') -> Document:
         Facts(facts(fleet)),
         Section('What stands out', [
             Notes.of(odd[:_SENTENCES], Severity.WARNING, _SHOWN),
-            *([Text(f'and {len(odd) - _SENTENCES} more: see the table.')]
+            *([Text(f'and {len(odd) - _SENTENCES} more: --json lists all.')]
               if len(odd) > _SENTENCES else [])] if odd else [
                   Text('Nothing, at the false-alarm rates stated below.')]),
         Section('Packs: resistance and sag', _packs(fleet)),
@@ -252,7 +252,7 @@ def _thousandths(name: str) -> float:
 
 
 def _a_cell(judged: Judgement, name: str, vehicle: str) -> str:
-    """Return ' per cell' if the values of a vehicle are."""
+    """Return ' per cell' if the values of a vehicle are per cell."""
     one = judged.vehicles[name]
     return ' per cell' if vehicle in one.names and one.cells[one.names.index(vehicle)] else ''
 

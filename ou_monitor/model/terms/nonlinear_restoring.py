@@ -169,7 +169,7 @@ def _climbed(density: Callable[[FloatArray], FloatArray], b: FloatArray, error: 
 
 # Minimum cube in square^2/alpha: from 1/4 on, the force has only one zero.
 _HOLDS = 0.26
-# Slope of the force times the step: maximum, minimum, and maximum within a part of the step;
+# Slope of the force times the step: maximum, minimum, and value above which the step is split;
 # maximum number of parts.
 _STIFF, _FLAT, _TURN, _PARTS = 20.0, 1e-9, 0.4, 6
 # Maximum rounds of scoring, and minimum gain of a round to start another, nats.

@@ -149,7 +149,7 @@ def _scores(z: FloatArray, before: FloatArray, levels: FloatArray, size: int) ->
     padded[:z.size] = z
     z = padded.reshape(count, size, 1)
     # Levels with a noticeable probability in some segment.
-    some = before.max(axis=0) > _BELIEVED
+    some = before.max(axis=0) > _NOTICED
     before, levels = before[:, some], levels[some]
     std = np.exp(levels)
     log_density = -levels - 0.5 * (z / std) ** 2
@@ -172,7 +172,7 @@ _WANDERS = 2.0
 _STATIONARY: FloatArray = comb(_LEVELS - 1, np.arange(_LEVELS)) / 2.0 ** (_LEVELS - 1)
 # Evaluations of a first fit and of a refit; probability below which a level is ignored.
 _EVALUATIONS = 60, 30
-_BELIEVED = 1e-9
+_NOTICED = 1e-9
 
 
 @lru_cache(maxsize=8)

@@ -1,5 +1,5 @@
 """
-From the samples of a window to OU parameters.
+Fit OU parameters, noise and mean to the samples of a window.
 
 While throttle moves, or when the voltage drifts, sag, its curvature and its lag are regressed out
 of the mean, within the restricted likelihood (REML: Harville, J. Am. Stat. Assoc. 72 (1977) 320).

@@ -1,7 +1,7 @@
 """
-The readings of a sliding window: kept, thinned where the source is fast, with lagged throttle.
+The readings of a sliding window: store them, average those of a fast source, lag the throttle.
 
-Limits: if the step of a source changes by a third or more, it restarts with another block size.
+Limits: if a source changes its step by a third or more, the window restarts with other blocks.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ UNEVEN = 0.5
 NEW_RATE = 1.3
 # Number of stamps kept from batch to batch for that median.
 MEMORY = 32
-# Maximum samples per block: 10 MHz; stamps that are closer are invalid.
+# Maximum samples per block, for sources up to 10 MHz; stamps that are closer are invalid.
 MOST_BLOCK = 1000.0
 
 
@@ -54,7 +54,7 @@ class Kept:
         """Add readings; keep those of the last `reach` seconds, but no more than `most`."""
         count = columns.shape[1]
         if self._size + count > self._store.shape[1]:
-            # One more, to know that the window is shorter than the data.
+            # One more, to show that there are data before the window.
             first = max(0, int(np.searchsorted(
                 self.columns[0], columns[0, -1] - reach)) - 1, self._size + count - most - 1)
             old = self.columns[:, first:]

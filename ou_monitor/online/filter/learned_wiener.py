@@ -122,7 +122,7 @@ def noise_of(key: int, decay: float, slope: bool) -> FloatArray:
     return np.asarray(p[np.ix_(outputs, outputs)])
 
 
-# Time between new weights, of the transition to them, and of the memory, s; chosen
+# Time between new weights, also time constant of the transition to them; memory, s; both chosen
 # on bf3s, roma, jd and gecko (benchmarks/learned.py).
 _HOP, _MEMORY = 0.01, 5.0
 # Weight of the prior, which is no signal, s.

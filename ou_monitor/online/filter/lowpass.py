@@ -52,7 +52,7 @@ _SAME = 0.01
 _SAME_LEVEL = 1.5
 # Relative change of the gain below which it has settled, and above which the lag is computed
 # again.
-_SETTLED, _TOLD = 1e-9, 1e-3
+_SETTLED, _LAG_CHANGES = 1e-9, 1e-3
 # Maximum number of step lengths whose models are kept.
 _MODELS = 64
 # Magnitude up to which squares and products cannot overflow.
@@ -95,7 +95,7 @@ class VoltageKalman:
         self._models: dict[int, KalmanStep] = {}
         self._key: int | None = None
         self._moving = True
-        self._gain, self._told = [0.0, 0.0], [NAN, NAN]
+        self._gain, self._lag_gain = [0.0, 0.0], [NAN, NAN]
 
     def configure(self, settings: FilterSettings) -> None:
         """Change settings; keep the estimate."""
@@ -167,10 +167,10 @@ class VoltageKalman:
         even = self._model(round(math.log(interval) / _SAME), interval)
         if even is not step:
             gain, _ = self._gain_over(even, white)
-        if any(not abs(a - b) <= _TOLD * abs(a) for a, b in
-               zip(gain.tolist(), self._told, strict=True)):
-            self._told = gain.tolist()
-            self._tell(even.phi, gain, interval)
+        if any(not abs(a - b) <= _LAG_CHANGES * abs(a) for a, b in
+               zip(gain.tolist(), self._lag_gain, strict=True)):
+            self._lag_gain = gain.tolist()
+            self._update_lag(even.phi, gain, interval)
 
     def _gain_over(self, step: KalmanStep, white: float) -> tuple[FloatArray, FloatArray]:
         p = np.diag(step.still) if self._cov is None else (
@@ -180,7 +180,7 @@ class VoltageKalman:
         gain = seen / total if total > 0.0 else np.zeros_like(seen)
         return gain, p - np.outer(gain, seen)
 
-    def _tell(self, phi: FloatArray, gain: FloatArray, interval: float) -> None:
+    def _update_lag(self, phi: FloatArray, gain: FloatArray, interval: float) -> None:
         """Compute the present lag, and the share of the input that limits it."""
         s = self._settings
         back = cmath.exp(-2j * math.pi * s.lag_frequency * interval)

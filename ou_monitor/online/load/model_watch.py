@@ -1,7 +1,7 @@
 """
 Compare this flight with the saved model of its supply: ratios of sag, resistance and noise.
 
-Limits first: a cold pack looks like an old one; a full 5S pack for a 6S one is not detected at
+Limits: a cold pack looks like an old one; a full 5S pack in place of a 6S one is not detected at
 once; steady throttle allows no comparison.
 """
 
@@ -186,7 +186,7 @@ def judge(ratio: float, se: float, date: str) -> tuple[ModelVerdict, str]:
     found = f'Sag {100.0 * abs(more):.0f} % ({sizes[0]:.0f} to {sizes[1]:.0f})'
     # Most errors are factors, so the error of the logarithm hardly depends on ageing.
     if more > _LEAST and math.log(ratio) > _ERRORS * se / ratio:
-        return ModelVerdict.WEAKER, f'{found} above {model}: weak pack or cold.'
+        return ModelVerdict.WEAKER, f'{found} above {model}: weak or cold pack.'
     if ratio + _ERRORS * se < _OTHER:
         return ModelVerdict.OTHER_PACK, f'{found} below {model}: another pack, or another load.'
     return ModelVerdict.AS_MODEL, ''

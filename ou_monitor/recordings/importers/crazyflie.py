@@ -77,8 +77,8 @@ def read(path: Path, request: Request) -> Log:
                           'wrong values cannot be detected.', Defect.DAMAGED_FILE))
     # Up to four bytes may be a damaged or truncated checksum.
     if end - read_to > (0 if sound else 4):
-        notes.append(f'{counted(end - read_to, "byte")} from byte {read_to} on were not read: no '
-                     'record of this log.')
+        notes.append(f'{counted(end - read_to, "byte")} from byte {read_to} on were not read: '
+                     'they are not records of this log.')
     series: list[Series] = []
     inertial: list[Motion] = []
     for key, event in events.items():

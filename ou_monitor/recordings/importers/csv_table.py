@@ -347,7 +347,7 @@ def _time_of(path: Path, form: Form, wanted: CsvColumns) -> _Column:
 
 
 def _finest(form: Form, first: int) -> int:
-    """Return a time that tells the rows apart if the chosen one, in whole seconds, does not."""
+    """Return a finer time if the chosen one, in whole seconds, does not tell the rows apart."""
     named = [k for k in range(min(form.width, len(form.names)))
              if re.search('time|zeit', form.names[k].lower()) and not re.search(
                  'step|lap|interval', form.names[k].lower()) and _of_kind(form, k, True)]

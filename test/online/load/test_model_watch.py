@@ -48,7 +48,7 @@ def test_a_pack_that_has_aged_is_found_within_a_minute(age, verdict):
     low, high = map(float, report.fields['model_sag_ratio_95'].split())
     assert low < age < high
     weaker = verdict is ModelVerdict.WEAKER
-    words = f'above the model of {GECKO.date}: weak pack or cold'
+    words = f'above the model of {GECKO.date}: weak or cold pack'
     assert GECKO.date and (words in report.summary) is weaker
     assert bool(found.words) is weaker and (report.level >= Level.WARN or not weaker)
 
