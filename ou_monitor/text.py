@@ -101,4 +101,5 @@ def outside_words(name: str, start: float | None, end: float | None, length: flo
 
 def part_words(start: float | None, end: float | None) -> str:
     """Return the note on a part."""
-    return f'Only the part {span_words(start, end)} of the recording was read.'
+    return (f'Only the part {span_words(start, end)} of the recording was read; times in the '
+            'report count from its start.')

@@ -55,8 +55,9 @@ def quality_list(recording: Recording, throttles: Sequence[float], estimates: Se
     for throttle, estimate in zip(throttles, estimates):
         for item in _of_estimate(estimate, known):
             found.setdefault(item, []).append(throttle)
+    for item in more:
+        found.setdefault((item.name, item.severity, item.text), []).extend(item.throttles)
     items = [QualityItem(*key, tuple(where)) for key, where in found.items()]
-    items += more
     items += [_of_reader(note) for note in recording.notes]
     items = _of_units(recording) + items + _of_stamps(recording) + _of_samples(recording)
     return tuple(sorted(items, key=lambda item: -item.severity))

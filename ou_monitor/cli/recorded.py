@@ -114,7 +114,7 @@ def _unsaved(finding: Finding) -> str:
         return f"no model to save: '{finding.recording}' was not fitted. {finding.sentence}"
     if finding.load == 'current':
         return ('no model saved: its load is the measured current, and a model file is for '
-                'throttle')
+                'throttle (--current-column none uses throttle as the load)')
     return ''
 
 

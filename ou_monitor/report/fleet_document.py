@@ -133,7 +133,8 @@ def _growth(judged: Judgement, trend: Trend) -> str:
                    for flight in (trend.first, trend.last))
     return (f'{trend.quantity} {change(trend.slope)} per flight (95 % {change(trend.low)} to '
             f'{change(trend.high)}), {first} to {last} {_UNITS[trend.quantity]}'
-            f'{_a_cell(judged, trend.quantity, trend.vehicle)}')
+            f'{_a_cell(judged, trend.quantity, trend.vehicle)}'
+            + ' at full throttle' * (trend.quantity == 'sag'))
 
 
 def _analysed(fleet: Fleet) -> str:

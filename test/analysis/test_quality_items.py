@@ -5,7 +5,7 @@ import math
 import pickle
 
 import numpy as np
-from ou_monitor.analysis.quality import quality_list
+from ou_monitor.analysis.quality import quality_list, QualityItem
 from ou_monitor.records import (
     Defect, defect_of, Estimate, Flag, led, Note, Recording, Severity, Status)
 from ou_monitor.timeline import in_order, readings_of
@@ -122,3 +122,10 @@ def test_the_samples_show_the_step_of_the_adc():
     late[:100] = np.nan
     assert names(listed(Recording(simulated.t, simulated.voltage, late))) == {
         'THROTTLE_UNKNOWN': Severity.INFO}
+
+
+def test_the_same_doubt_of_two_levels_is_one_item():
+    """Also if it is not of an estimate."""
+    twice = [QualityItem('LINES', Severity.INFO, 'Same.', (u,)) for u in (0.1, 0.4)]
+    (item,) = quality_list(recording(1, ((0.1, 0.3),)), [0.1], [GOOD], twice)
+    assert item.throttles == (0.1, 0.4)
