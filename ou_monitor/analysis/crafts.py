@@ -25,8 +25,8 @@ _AT, _NEAR = 0.5, 0.15
 # Maximum factor from the median that is usual.
 _USUAL = 2.0
 # A lithium cell at rest, V: highest after charging (LiHV 4.35 V, and 0.1 V for the sensor), lowest
-# without damage, and lowest at the beginning of a flight.
-HIGHEST_CELL, LOWEST_CELL, _BEGINS = 4.45, 2.0, 3.0
+# without damage (a lead-acid cell has 2.1 V), and lowest at the beginning of a flight.
+HIGHEST_CELL, LOWEST_CELL, _BEGINS = 4.45, 2.5, 3.0
 # Voltage of an empty lithium cell under load, V (vbat_min_cell_voltage of Betaflight, and the
 # default of design).
 CELL_LIMIT = 3.3
@@ -136,7 +136,7 @@ def check_cells(full: float, cells: int) -> None:
     if math.isfinite(full) and not LOWEST_CELL <= full / cells <= HIGHEST_CELL:
         raise InputError(
             f'--cells {cells}: {full:.4g} V at rest would be {full / cells:.3g} V per cell: it is '
-            f'likely {cell_count(full) or round(full / 3.7) or 1} cells')
+            f'likely {cell_count(full) or round(full / 3.7) or 1} cells (lithium)')
 
 
 def cells_of(recording: Recording, given: int = 0) -> tuple[int, str]:

@@ -110,7 +110,8 @@ def test_impossible_cells_are_refused_with_the_likely_number(tmp_path, capsys):
     one = flown(n=600)
     path.write_text('time_s,voltage_v,throttle\n' + ''.join(
         f'{a:.3f},{b:.4f},{c:.4f}\n' for a, b, c in zip(one.t, one.voltage, one.throttle)))
-    for cells in ('3', '9'):
+    # Seven cells would be lead-acid, 2.3 V each.
+    for cells in ('3', '7', '9'):
         assert main(['analyze', str(path), '--cells', cells]) == 2
         assert 'it is likely 4 cells' in capsys.readouterr().err
     assert main(['analyze', str(path), '--cells', '4', '--json', '-']) == 0
