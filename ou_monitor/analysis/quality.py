@@ -53,8 +53,8 @@ def quality_list(recording: Recording, throttles: Sequence[float], estimates: Se
     """Return all cautions, worst first (known: the facts have alpha)."""
     found: dict[tuple[str, Severity, str], list[float]] = {}
     for throttle, estimate in zip(throttles, estimates):
-        for item in _of_estimate(estimate, known):
-            found.setdefault(item, []).append(throttle)
+        for doubt in _of_estimate(estimate, known):
+            found.setdefault(doubt, []).append(throttle)
     for item in more:
         found.setdefault((item.name, item.severity, item.text), []).extend(item.throttles)
     items = [QualityItem(*key, tuple(where)) for key, where in found.items()]
