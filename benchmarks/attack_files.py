@@ -361,7 +361,7 @@ def mutated_sheet(sound: bytes, rng: np.random.Generator) -> tuple[str, bytes]:
 
 def numbers(line: str) -> list[float]:
     """Return the numbers in a line of a CSV."""
-    cells = (cell.strip(' "') for cell in re.split('[,;\t]', line))
+    cells = (cell.strip(' "').removesuffix('V') for cell in re.split('[,;\t]', line))
     return [float(cell) for cell in cells if _NUMBER.fullmatch(cell)]
 
 
@@ -371,6 +371,8 @@ def verdict_of_sheet(data: bytes, found: Recording) -> str:
     code = wide if wide == 'utf-16' or data[1:2] == b'\0' else 'utf-8-sig'
     lines = [line for line in re.split('\r\n|\n|\r', data.decode(code, 'replace'))
              if line.strip() and not line.lstrip().startswith('#')]
+    while lines[1:] and lines[0] == lines[1] and not numbers(lines[0]):
+        lines = lines[1:]  # The header stands twice.
     lines = lines[not any("'column 1'" in note for note in found.notes):]
     stand: dict[float, list[list[float]]] = {}
     everything = {math.nan}
