@@ -126,8 +126,7 @@ def _despite(analysis: Analysis) -> str:
     recording, curves = analysis.recording, analysis.by_throttle
     k = int(np.argmin(recording.voltage))
     # The voltage may follow throttle late.
-    top = recording.throttle[(recording.t > recording.t[k] - 0.5) & (
-        recording.t <= recording.t[k])].max()
+    top = recording.throttle[np.searchsorted(recording.t, recording.t[k] - 0.5):k + 1].max()
     if recording.voltage[k] >= curves.voltage or not top <= curves.budget + 0.01:
         return ''
     return f'; yet the voltage was below {curves.voltage:g} V at {100.0 * top:.0f} % throttle'
