@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
         return 0
     if args.output is None:
         if args.save_model is None:
-            raise InputError('--output PATH.mcap is needed: where the recording goes')
+            raise InputError('--output is missing: name the bag to write, such as flight.mcap')
         if args.json is not None:
             raise InputError('--json describes the simulated bag: it needs --output PATH.mcap')
     if args.save_model is not None:

@@ -16,8 +16,8 @@ g = exp(-s) phi(y) / Phi(-y), the backward equation P_s = P_xx - x P_x becomes
     R_lambda = R_ww + R_w^2 + (w (1 - 2 T) + b sqrt(T) - 2 g) R_w - b sqrt(T) g,
 
 which is solved once for all barriers by linearly implicit steps (BDF2) and kept
-as a table with cubic splines.  Because R is a logarithm, small probabilities are
-accurate relatively too.
+as a table with cubic splines.  Because R is a logarithm, the relative error of
+small probabilities is small too.
 
 Limits: errors are within 0.15 % of P for barriers -3..30, starts above -10 and P
 down to 1e-12 (compared with finer grids).  Beyond the table, values come from a

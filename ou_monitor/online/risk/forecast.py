@@ -3,17 +3,17 @@ Brown-out risk by the method that predicts this flight best, and the risk if thr
 
 Methods: `first_passage` (the OU in the window, at the present throttle), `load` (half the response
 to the pilot's future throttle, half the excursions), and `excursions` (the drops of this flight,
-used alone if the load is unknown).  First passage and the other method are averaged with weights
-from their predictions of completed horizons' lowest voltages (Bayes, with forgetting).  Each law
-is mixed with a wider one by the share of horizons in which it was wrong: first passage with the
-excursions, the risk for a given throttle with a law as wide as the excursions, but at most
-`_WIDEST` times its own width (excursions include punches, which say nothing about idling).
+used alone if the load is unknown).  First passage and the other method are averaged, weighted by
+how well each predicted the lowest voltages of completed horizons (Bayes, with forgetting).  Each
+law is mixed with a wider one, whose weight is the share of horizons in which the law was wrong:
+first passage with the excursions; the risk for a given throttle with a law as wide as the
+excursions, but at most `_WIDEST` times its own width (excursions include punches, which say
+nothing about idling).
 
 The law learned in flight, from completed horizons: (lowest - start) / s = b0 + b1 (mu - start) / s
 + k e, with mean mu and deviation s of `lowest`, by least squares with forgetting; e has Student's
-t distribution with five degrees of freedom.  The share of horizons in which a law was wrong is
-counted by the rule of succession, with the probability of each horizon as its weight.  Overlapping
-horizons count as step / horizon each.
+t distribution with five degrees of freedom.  A horizon counts as wrong with the probability that
+the law was wrong in it (rule of succession); overlapping horizons count as step / horizon each.
 
 Limits: "below" refers to the median of three samples, except in first passage; nothing is known in
 the first second; all throttles share one bias and one gain; values between two horizons are
@@ -406,7 +406,7 @@ class Forecast:
         return self._kept[horizon]
 
     def _learned(self, horizon: float) -> tuple[LowestLaw, float, float, float]:
-        """Return the law, both shares, and the evidence for a horizon."""
+        """Return the law, both shares of wrong horizons, and the evidence for a horizon."""
         if horizon not in self._laws:
             values = np.sum([share * rung.values for rung, share in zip(
                 self._rungs, _shares(horizon)) if share > _LEAST_SHARE], axis=0)
@@ -456,7 +456,7 @@ class Forecast:
 
     def risk_if(self, throttle: npt.ArrayLike, dwell: float, voltage: float, horizon: float
                 ) -> FloatArray:
-        """Return the risk, (k,), if throttle goes there for `dwell`, s; NaN: load unknown."""
+        """Return the risk, (k,), of each throttle held for `dwell`, s; NaN: load unknown."""
         u = np.clip(np.atleast_1d(np.asarray(throttle, dtype=np.float64)), 0.0, 1.0)
         state = self._state()
         _, deviation, _ = self._flight(horizon)
