@@ -81,7 +81,7 @@ def find_levels(t: FloatArray, throttle: FloatArray,
     centres = _modes(t, throttle, width)
     while centres:
         found = _split(t, throttle, centres, width, False)
-        held = [_held(t, level) for level in found]
+        held = [_is_long_enough(t, level) for level in found]
         if all(held):
             return _most(t, found)
         if not any(held):
@@ -111,7 +111,7 @@ def _time(t: FloatArray, level: LoadLevel) -> float:
     return sum(float(t[s.stop - 1] - t[s.start]) for s in level.segments)
 
 
-def _held(t: FloatArray, level: LoadLevel) -> bool:
+def _is_long_enough(t: FloatArray, level: LoadLevel) -> bool:
     """Return whether a level has a long segment, or a shorter one and enough time in all."""
     whole = float(t[-1] - t[0])
     longest = max((float(t[s.stop - 1] - t[s.start]) for s in level.segments), default=0.0)
@@ -188,7 +188,7 @@ def _modes(t: FloatArray, throttle: FloatArray, width: float) -> list[float]:
         held = float(time_at[left:right].sum())
         if held < least or not held > 0.0:
             return [low + _GRID * k for k in sorted(found)]
-        if all(_apart(fine, peak, other, reach) for other in found):
+        if all(_are_separate(fine, peak, other, reach) for other in found):
             found.append(peak)
         time_at[left:right] = 0.0
 
@@ -198,7 +198,7 @@ def _triangle(reach: int) -> FloatArray:
     return 1.0 - np.abs(np.arange(-reach, reach + 1)) / (reach + 1.0)
 
 
-def _apart(density: FloatArray, peak: int, other: int, reach: int) -> bool:
+def _are_separate(density: FloatArray, peak: int, other: int, reach: int) -> bool:
     """Return whether a second peak is a separate level, not a shoulder of the other."""
     if abs(peak - other) > 2 * reach:
         return True

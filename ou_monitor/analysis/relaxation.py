@@ -463,7 +463,7 @@ def judge_cause(relaxation: Relaxation, alpha: AlphaTest) -> ReleaseCause:
     """Compare a relaxation with the noise and with an AC-coupled instrument."""
     if not relaxation.detected:
         return ReleaseCause('undetermined', NAN, NAN, NAN, NAN, 'undetermined', NAN, NAN, NAN,
-                            _nothing(relaxation))
+                            _why_none(relaxation))
     noise, ratio, low, high, p = _against_noise(relaxation, alpha)
     instrument, step, step_se = _against_instrument(relaxation)
     corner = 1.0 / (2.0 * math.pi * relaxation.tau)
@@ -487,7 +487,7 @@ def judge_cause(relaxation: Relaxation, alpha: AlphaTest) -> ReleaseCause:
                         f'{of_noise[0].upper()}{of_noise[1:]}; {of_instrument}.')
 
 
-def _nothing(relaxation: Relaxation) -> str:
+def _why_none(relaxation: Relaxation) -> str:
     what = 'falls' if relaxation.kind == 'release' else 'rises'
     if not relaxation.releases:
         return f'Throttle never {what} from one load level to another and stays there.'

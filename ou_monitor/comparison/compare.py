@@ -47,7 +47,7 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
     notes = list(recording.notes)
     samples, offset = _samples(recording, notes)
     duration = float(samples.t[-1])
-    begin = _begin(samples, fit_until, fitted=model is None)
+    begin = _start_index(samples, fit_until, fitted=model is None)
     if model is None:
         fitted = fit_flight(samples.part(slice(0, begin)), lambda share: report(0.6 * share))
         drawn: Drawn = fitted
@@ -62,7 +62,7 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
     lsb = samples.lsb
     yardstick = Yardstick(own, lsb, levels)
     rng = np.random.default_rng(seed)
-    aligned = None if drawn.alone else _first(own)
+    aligned = None if drawn.alone else _for_alignment(own)
     shifts = np.zeros(seeds)
     stride = max(1, -(-own.t.size // _POINTS))
     measured: list[Measures] = []
@@ -115,7 +115,7 @@ def _samples(recording: Recording, notes: list[str]) -> tuple[Readings, float]:
     return Readings(t - t[0], v, u, current_at(recording, t)), float(t[0])
 
 
-def _begin(samples: Readings, fit_until: float | None, fitted: bool) -> int:
+def _start_index(samples: Readings, fit_until: float | None, fitted: bool) -> int:
     duration = float(samples.t[-1])
     until = (0.5 * duration if fitted else 0.0) if fit_until is None else fit_until
     if not 0.0 <= until < duration or (fitted and not until > 0.0):
@@ -157,7 +157,7 @@ def _check_throttle(model: SupplyModel, samples: Readings) -> None:
                          'none')
 
 
-def _first(own: Readings) -> slice:
+def _for_alignment(own: Readings) -> slice:
     """Return the samples used for alignment: the first seconds, at least ten samples."""
     return slice(0, max(10, int(np.searchsorted(own.t, own.t[0] + _ALIGNED, side='right'))))
 

@@ -333,7 +333,7 @@ def differences(yardstick: Yardstick, own: Measures, others: Sequence[Measures],
             f'{number(b.measured, 4)} V')),
         Difference('level', own.mean, of(lambda m: m.mean), volts, lambda b: (
             f'the voltage is on average {number(1e3 * abs(b.median - b.measured), 2)} mV too '
-            f'{_too(b, "high", "low")}'))]
+            f'{_more_or_less(b, "high", "low")}'))]
     for k, level in enumerate(yardstick.levels):
         rate = own.falls[k]
         # Poisson error of the count.
@@ -380,7 +380,7 @@ def _span(b: Band, digits: int) -> str:
     return f'{number(b.low, digits)} to {number(b.high, digits)}'
 
 
-def _too(b: Band, more: str, less: str) -> str:
+def _more_or_less(b: Band, more: str, less: str) -> str:
     return more if b.median > b.measured else less
 
 

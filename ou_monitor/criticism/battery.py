@@ -298,17 +298,17 @@ def throttle_paths(throttle: FloatArray, keep: float) -> Iterator[tuple[str, Flo
         return
     u = (throttle - throttle.mean()) / spread
     cubic = np.vander(u, 4)
-    yield from _left('growing effect of throttle', u * time, np.column_stack((cubic, time)), keep)
+    yield from _extra('growing effect of throttle', u * time, np.column_stack((cubic, time)), keep)
     for low, high in _RELAYS:
         below, above = np.quantile(u, (low, high))
         state = np.where(u > above, 1.0, np.where(u < below, -1.0, 0.0))
         last = np.maximum.accumulate(np.where(state != 0.0, np.arange(u.size), 0))
-        yield from _left(f'loop of throttle {100 * low:g} to {100 * high:g} %', state[last],
-                         cubic, keep)
+        yield from _extra(f'loop of throttle {100 * low:g} to {100 * high:g} %', state[last],
+                          cubic, keep)
 
 
-def _left(name: str, wanted: FloatArray, known: FloatArray, keep: float
-          ) -> Iterator[tuple[str, FloatArray]]:
+def _extra(name: str, wanted: FloatArray, known: FloatArray, keep: float
+           ) -> Iterator[tuple[str, FloatArray]]:
     """Yield a regressor less its fit by others, whitened, if enough of its power is left."""
     less = wanted - known @ np.linalg.lstsq(known, wanted, rcond=None)[0]
     if float(less @ less) > _LEAST * float(wanted @ wanted):

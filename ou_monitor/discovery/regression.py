@@ -78,9 +78,9 @@ def mean_response(samples: Samples, composite: Composite, view: View,
                   start: Sequence[Term] = ()) -> MeanResponse:
     """Choose the terms of the mean; the other terms of the model stay as they are."""
     own = [term for term in composite.terms if _measured(term)]
-    pool = [*(term for term in start if not _there(term, own)), *own]
+    pool = [*(term for term in start if not _is_among(term, own)), *own]
     # With only a rough noise model, a growing sag would take the place of other terms.
-    pool += [term for term in _candidates(view) if not _there(term, pool)
+    pool += [term for term in _candidates(view) if not _is_among(term, pool)
              and not (start and isinstance(term, LoadSag) and term.growth)]
     if not pool:
         return MeanResponse((), (), ())
@@ -92,7 +92,7 @@ def _measured(term: Term) -> bool:
     return term.ROLE is Role.MEAN and term.MEASURED
 
 
-def _there(term: Term, others: Sequence[Term]) -> bool:
+def _is_among(term: Term, others: Sequence[Term]) -> bool:
     """Return whether a term, or one that is nearly the same, is among others."""
     for other in others:
         if type(other) is not type(term) or other.LINEAR != term.LINEAR:
@@ -220,8 +220,8 @@ class _Regression:
         """Return the evidence, and the cost of each held-out block, nats."""
         if chosen not in self._known:
             at = np.concatenate([[1], *(self._at[k] for k in chosen)]).astype(int)
-            lost = np.array([_lost(self._all - block, block, at) for block in self._blocks])
-            inside = _lost(self._all, self._all, at)
+            lost = np.array([_loss(self._all - block, block, at) for block in self._blocks])
+            inside = _loss(self._all, self._all, at)
             search = sum(self._pool[k].SEARCH for k in chosen)
             value = -max(inside + self._price * at.size, float(lost.sum())) - search
             self._known[chosen] = value, lost
@@ -255,7 +255,7 @@ class _Regression:
         return tuple(dict.fromkeys(self._pool[j].NAME for j in self._as_good(chosen, k)))
 
 
-def _lost(fitted: FloatArray, scored: FloatArray, at: npt.NDArray[np.int64]) -> float:
+def _loss(fitted: FloatArray, scored: FloatArray, at: npt.NDArray[np.int64]) -> float:
     """Fit some blocks; return half the sum of squared residuals on other blocks."""
     gram = fitted[np.ix_(at, at)]
     # The columns are scaled; the ridge keeps equal columns from a division by zero.

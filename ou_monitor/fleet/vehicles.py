@@ -71,13 +71,13 @@ def assign(stated: Mapping[Path, str], pattern: re.Pattern[str] | None = None
             found[path] = Vehicle(folders[path.parent], FOLDER)
     notes = [_rule(found)]
     if differing:
-        notes.append(f'{_these(differing)}: metadata and --vehicle-from name different '
+        notes.append(f'{_quoted(differing)}: metadata and --vehicle-from name different '
                      'vehicles; the metadata are used.')
     if unmatched:
-        notes.append(f'{_these(unmatched)}: --vehicle-from finds no vehicle in the path; these '
+        notes.append(f'{_quoted(unmatched)}: --vehicle-from finds no vehicle in the path; these '
                      'recordings are not compared.')
     if mixed:
-        notes.append(f'{_these(mixed)}: the metadata name no vehicle, though those of other '
+        notes.append(f'{_quoted(mixed)}: the metadata name no vehicle, though those of other '
                      'recordings in the folder do; these recordings are not compared. '
                      '--vehicle-from can name their vehicle by the path.')
     both = {v.name for v in found.values() if v.named_by == METADATA} & {
@@ -123,7 +123,7 @@ def _rule(found: Mapping[Path, Vehicle]) -> str:
     return 'Vehicles: ' + ('; '.join(parts) if parts else 'none identified') + '.'
 
 
-def _these(paths: Sequence[Path]) -> str:
+def _quoted(paths: Sequence[Path]) -> str:
     return some((f"'{path}'" for path in paths), _SHOWN)
 
 

@@ -170,7 +170,7 @@ class _Steady:
             right = self._gain[None, :, None] * part[:, None, :]
             right[0] += self._loop @ state
             loops = np.broadcast_to(self._loop[:, :, None], (d, d, m - 1))
-            band = _band(_one(d, m), -loops)
+            band = _band(_identity(d, m), -loops)
             states = dtbtrs(band, right.reshape(m * d, -1), uplo='L', diag='U')[0].reshape(
                 m, d, -1)
             before = np.concatenate((state[None], states[:-1]))
@@ -184,7 +184,7 @@ def _elements(a: FloatArray) -> FloatArray:
     return np.ascontiguousarray(a.transpose(1, 2, 0))
 
 
-def _one(d: int, n: int) -> FloatArray:
+def _identity(d: int, n: int) -> FloatArray:
     """Return n unit matrices, shape (d, d, n)."""
     one: FloatArray = np.broadcast_to(np.eye(d)[:, :, None], (d, d, n))
     return one

@@ -209,7 +209,7 @@ class EstimatorNode(MonitorNode):
             self._take_voltages(voltage)
         pushing = time.thread_time()
         self._stream.flush()
-        self._balance(time.thread_time() - pushing)
+        self._thin_if_costly(time.thread_time() - pushing)
 
     def _merge(self, voltage: Arrivals | None, throttle: Arrivals) -> Arrivals | None:
         """Place throttle messages among voltages, by arrival; return the voltages left."""
@@ -255,7 +255,7 @@ class EstimatorNode(MonitorNode):
             end if own else self._stamper.source_time(end, smooth)
             for end, own in zip(column.stamp.tolist(), column.stamped.tolist())])
 
-    def _balance(self, pushed: float) -> None:
+    def _thin_if_costly(self, pushed: float) -> None:
         """Thin the samples if taking them costs too much (pushed: s of CPU)."""
         self._load += pushed
         now = self.steady_now()

@@ -70,7 +70,7 @@ def answer(analysis: Analysis) -> list[str]:
     curves, names = analysis.by_throttle, {item.name for item in analysis.quality}
     first, *others = answers(analysis.overview) or ['The recording holds no samples.']
     safe = [] if math.isnan(curves.budget) else [
-        f'Safe up to {100.0 * curves.budget:.0f} % throttle{_despite(analysis)}.'
+        f'Safe up to {100.0 * curves.budget:.0f} % throttle{_fall_within_budget(analysis)}.'
         if curves.budget > 0.0 else
         f'No throttle keeps the risk below {100.0 * curves.limit:g} % {_why_none(analysis)}: at '
         f'idle it is {percent(curves.risk[0])}.']
@@ -118,10 +118,10 @@ def _budget(analysis: Analysis) -> str:
         words += f'; at {100.0 * u:.0f} % it is {percent(p)}'
     elif curves.budget < 1.0:
         words += '; higher throttle was not flown'
-    return words + _despite(analysis)
+    return words + _fall_within_budget(analysis)
 
 
-def _despite(analysis: Analysis) -> str:
+def _fall_within_budget(analysis: Analysis) -> str:
     """Return the fall below the limit at a throttle within the budget, in words; empty: none."""
     recording, curves = analysis.recording, analysis.by_throttle
     k = int(np.argmin(recording.voltage))

@@ -140,11 +140,11 @@ class Publishers:
             # The only publisher restarts after a silence: all others are gone.
             del self._tracks[1:]
         if publishers <= 1 and len(self._tracks) <= 1:
-            self._alone(whole, times, arrived)
+            self._take_only(whole, times, arrived)
             return kept
         for k, (number, time, at) in enumerate(
                 zip(whole.tolist(), times.tolist(), arrived.tolist())):
-            kept[k] = self._one(number, time, at, publishers)
+            kept[k] = self._take_one(number, time, at, publishers)
         self._give_up(publishers)
         return kept
 
@@ -160,8 +160,8 @@ class Publishers:
         if self._tracks[last].arrived - self._tracks[0].arrived > GIVE_UP:
             self._tracks[0] = self._tracks.pop(last)
 
-    def _alone(self, numbers: npt.NDArray[np.int64], times: FloatArray, arrived: FloatArray
-               ) -> None:
+    def _take_only(self, numbers: npt.NDArray[np.int64], times: FloatArray, arrived: FloatArray
+                   ) -> None:
         """Register messages of the only publisher; numbers that start again are a new one."""
         if not self._tracks:
             self._tracks = [_Track(int(numbers[0]), float(times[0]), float(arrived[0]))]
@@ -175,7 +175,7 @@ class Publishers:
             self._tracks[0] = _Track(int(numbers[-1]), float(times[-1]), float(arrived[-1]),
                                      track.interval)
 
-    def _one(self, number: int, time: float, arrived: float, publishers: int) -> bool:
+    def _take_one(self, number: int, time: float, arrived: float, publishers: int) -> bool:
         """Assign one message to a publisher; return whether it is the followed one."""
         off = [track.off(number, time) for track in self._tracks]
         best = min(range(len(off)), key=off.__getitem__, default=-1)

@@ -8,7 +8,7 @@ from ou_monitor.criticism.composite import fit_composite, view_of
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import decision, regression
 from ou_monitor.discovery.regression import (
-    _candidates, _nearby, _Regression, _there, FOLDS, mean_response)
+    _candidates, _is_among, _nearby, _Regression, FOLDS, mean_response)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
@@ -34,9 +34,9 @@ def response(tau, delay=0.0):
 def test_time_constants_are_compared_by_their_ratio(one, other, near, there):
     """By the ratio of time constants, whichever is longer, at one delay."""
     assert _nearby(one, other) is near
-    assert _there(one, [other]) is there
-    assert _there(one, [LoadSag(0.1, 0.0), other]) is there
-    assert not _there(one, [])
+    assert _is_among(one, [other]) is there
+    assert _is_among(one, [LoadSag(0.1, 0.0), other]) is there
+    assert not _is_among(one, [])
 
 
 @pytest.mark.parametrize('throttle', [None, np.linspace(0.0, 1.0, 400)])

@@ -388,7 +388,7 @@ class RegimeSwitching(Term):
             plain = log_normal(view.z) - 0.5 * np.log(view.variance / relaxed.variance)
 
             def value(x: FloatArray) -> float:
-                if not _inside(x, view):
+                if not _is_inside(x, view):
                     return -math.inf
                 chain = chain_of(scores.part(part), x, once)[0]
                 return log_likelihood(*chain) - float(plain[part].sum())
@@ -471,7 +471,7 @@ class RegimeSwitching(Term):
         within = scores.part(part).following(starts[0], at_once, states)
 
         def value(x: FloatArray) -> float:
-            if not _inside(x, view):
+            if not _is_inside(x, view):
                 return -math.inf
             return log_likelihood(*chain_of(within, x, at_once, states)[0])
 
@@ -593,7 +593,7 @@ def _fastest(view: View) -> float:
     return math.log(min(_FASTEST, view.rate / 20.0))
 
 
-def _inside(x: FloatArray, view: View) -> bool:
+def _is_inside(x: FloatArray, view: View) -> bool:
     """Return whether coordinates are within their ranges."""
     return bool(max(x[0], x[1]) <= _fastest(view) and min(x[0], x[1]) >= -12.0
                 and abs(x[3]) <= 3.0 and abs(x[4]) <= 2.0)

@@ -293,11 +293,11 @@ def solve_tridiagonal(diag: FloatArray, off: FloatArray, right: FloatArray
         left[:k] -= ahead * beside[:k]
         inner = inverse - back * left
         inner[:k] -= ahead * right_of
-        x, own, beside = _woven(x, odd), _woven(own, inner), _woven(left, right_of)
+        x, own, beside = _interleave(x, odd), _interleave(own, inner), _interleave(left, right_of)
     return log_det, x, own, beside
 
 
-def _woven(even: FloatArray, odd: FloatArray) -> FloatArray:
+def _interleave(even: FloatArray, odd: FloatArray) -> FloatArray:
     """Return an array whose last axis alternates between two arrays."""
     both = np.empty((*even.shape[:-1], even.shape[-1] + odd.shape[-1]))
     both[..., 0::2], both[..., 1::2] = even, odd
@@ -334,7 +334,7 @@ class Maximum:
 def maximise(likelihood: _Likelihood, used: int, before: Maximum | None = None) -> Maximum:
     """Fit rate, noise and mean, of `used` regressors (before: fit of a nearly equal window)."""
     low, high = likelihood.low, likelihood.high
-    place, at, curved = _least(
+    place, at, curved = _minimised(
         lambda p: likelihood.at(p.item(0), p.item(1), used),
         likelihood.start(used) if before is None else np.clip(before.place, low, high),
         None if before is None else before.curved, low, high)
@@ -346,8 +346,8 @@ def maximise(likelihood: _Likelihood, used: int, before: Maximum | None = None) 
                    at.beta, at.cov, -at.value, edge, a, share, at.gram, place, curved)
 
 
-def _least(f: Callable[[FloatArray], _Point], here: FloatArray, curved: FloatArray | None,
-           low: FloatArray, high: FloatArray) -> tuple[FloatArray, _Point, FloatArray | None]:
+def _minimised(f: Callable[[FloatArray], _Point], here: FloatArray, curved: FloatArray | None,
+               low: FloatArray, high: FloatArray) -> tuple[FloatArray, _Point, FloatArray | None]:
     """Return where f is least within a box, its point, and the curvature (Newton, BFGS)."""
     at = f(here)
     left = _MOST_POINTS

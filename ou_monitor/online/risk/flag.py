@@ -107,7 +107,7 @@ class FloorWatch:
         steps = np.diff(t, prepend=self._newest)
         # The comparison is false for NaN too, so a missing stamp counts as a late one.
         late = ~(steps > 0.0)
-        far = _FAR * self._together
+        far = _FAR * self._longest_gap
         at = t + self._shift
         if arrival is not None or late.any() or (steps[np.isfinite(steps)] > far).any():
             elapsed = np.cumsum(np.where(late, self._waits(arrival), np.minimum(steps, far)))
@@ -125,7 +125,7 @@ class FloorWatch:
         return at, v
 
     @property
-    def _together(self) -> float:
+    def _longest_gap(self) -> float:
         """Longest time, s, between two samples that are combined in a median."""
         return max(self.settings.stale_after, SLOW_MISSED * self.interval)
 
@@ -151,7 +151,7 @@ class FloorWatch:
         if not n:
             return
         span = float(times[-1]) - (before if known else float(times[0]))
-        most = 2.0 * self._usual if self._usual > 0.0 else self._together
+        most = 2.0 * self._usual if self._usual > 0.0 else self._longest_gap
         interval = min(max(span / n, 0.0), most)
         share = 1.0 if math.isnan(self._usual) else min(1.0, n / _USUAL)
         usual = 0.0 if math.isnan(self._usual) else self._usual
@@ -164,7 +164,7 @@ class FloorWatch:
         t, v = np.concatenate([self._t, t]), np.concatenate([self._v, v])
         ends = np.arange(old, t.size)
         begin = np.searchsorted(t, t[ends] - s.brownout_floor_time, 'right')
-        near = np.searchsorted(t, t[ends] - 2.0 * self._together, 'left')
+        near = np.searchsorted(t, t[ends] - 2.0 * self._longest_gap, 'left')
         begin = np.minimum(begin, np.maximum(ends - _FEWEST + 1, near))
         below = np.concatenate([[0], np.cumsum(v <= s.floor)])
         count = below[ends + 1] - below[begin]
@@ -289,7 +289,7 @@ class BrownoutFlag:
         for one in (risk, soon):
             if one < 0.0 or one > 1.0:
                 raise ValueError(f'a risk must lie within 0..1 or be NaN, got {one}')
-        self._go_to(t)
+        self._set_clock(t)
         low = self._floor.take(fresh if arriving is None else arriving)
         known = fresh and not math.isnan(risk)
         wanted, reason = self._wanted(risk, soon, tight, known, low)
@@ -305,8 +305,8 @@ class BrownoutFlag:
                                 self._floor.dips)
         return self._state
 
-    def _go_to(self, t: float) -> None:
-        """Set the clock; when it steps back everything remembered steps with it."""
+    def _set_clock(self, t: float) -> None:
+        """Set the clock; when it steps back, everything remembered steps with it."""
         self._now = t if math.isfinite(t) else NAN
         if math.isnan(self._now):
             return

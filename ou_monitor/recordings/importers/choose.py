@@ -243,7 +243,7 @@ def choose_extras(path: Path, log: Log, *, imus: Sequence[str] = (),
         notes += said
         if series.unit == UNKNOWN:
             notes.append(f'{name}: the log does not state its unit; written as it is logged.')
-        named[_free(topic_of(name), {*_TAKEN, *inertial, *named})] = series
+        named[_unused_topic(topic_of(name), {*_TAKEN, *inertial, *named})] = series
     return Extras(inertial, speeds, named, tuple(notes))
 
 
@@ -312,7 +312,7 @@ def topic_of(name: str) -> str:
                     ) or 'unnamed'
 
 
-def _free(topic: str, taken: set[str]) -> str:
+def _unused_topic(topic: str, taken: set[str]) -> str:
     """Return a topic that is not taken."""
     if topic in taken:
         topic = f'signal/{topic}'
