@@ -53,11 +53,11 @@ from scipy.special import chndtrinc
 LOWEST = 5.0
 # Longest and shortest segment, s; target number of segments.
 _LONGEST, _SHORTEST, _PIECES = 1.0, 0.1, 40
-FEWEST = 16
-LONGEST_LAG = 0.05
+FEWEST = 16  # Minimum number of segments
+LONGEST_LAG = 0.05  # Maximum lag that is searched, s
 # Minimum share of the common time that is used without a note.
-_MOST = 0.9
-_BLOCKS = 12
+_SHARE_USED = 0.9
+_BLOCKS = 12  # Blocks of the jackknife
 # Probability of detection at the limiting gain.
 POWER = 0.9
 
@@ -125,7 +125,7 @@ def estimate_coupling(
     elif not known:
         notes.append('Throttle is unknown: its effect on both series would count as coupling.')
     grid = on_grid(series)
-    if grid.duration < _MOST * grid.shared:
+    if grid.duration < _SHARE_USED * grid.shared:
         notes.append(f'Only {grid.duration:.3g} s of the {grid.shared:.3g} s covered by both were '
                      'used: the rest has gaps, or a series has another rate there; --from and '
                      '--to choose a part.')
@@ -350,7 +350,7 @@ def on_grid(series: dict[str, tuple[FloatArray, FloatArray]]) -> Grid:
         last = int(np.floor((stop - begin) * rate + 1e-9))
         if last - first >= _LEAST_SAMPLES:
             at = begin + np.arange(first, last + 1) / rate
-            runs.append(tuple(_at(at, t, x, r, rate) for (t, x), r in zip(clean, rates)))
+            runs.append(tuple(_sampled(at, t, x, r, rate) for (t, x), r in zip(clean, rates)))
     if not runs:
         ranges = ', '.join(f'{name} {t[0]:.6g}..{t[-1]:.6g} s'
                            for name, (t, _) in zip(series, clean))
@@ -382,7 +382,7 @@ def _shared(one: list[tuple[float, float]], other: list[tuple[float, float]],
     return found
 
 
-def _at(at: FloatArray, t: FloatArray, x: FloatArray, own: float, rate: float) -> FloatArray:
+def _sampled(at: FloatArray, t: FloatArray, x: FloatArray, own: float, rate: float) -> FloatArray:
     inside = slice(max(int(np.searchsorted(t, at[0] - 2.0 / own)) - 1, 0),
                    int(np.searchsorted(t, at[-1] + 2.0 / own)) + 1)
     t, x = t[inside], x[inside]
@@ -454,7 +454,7 @@ def measure_coherence(voltage: ComplexArray, signal: ComplexArray, causes: list[
                       level: float, rng: np.random.Generator) -> Coherence:
     """Test Fourier coefficients of shape (segments, bins), with the causes regressed out."""
     weight = 1.0 / local_size(signal)
-    # The weights contain the signal itself, which costs one of the independent powers.
+    # The signal is in its own weights, which costs one of the independent powers.
     share = 1.0 - 1.0 / _independent(signal.shape[1])
     whole = weight * signal
     basis = basis_of([weight * cause for cause in causes])

@@ -47,7 +47,7 @@ _MEAN_BLOCK = 5.0
 # impulses would determine the variance of a block.  With heavy tails (Student's t with 5 degrees),
 # it removes 1 in 10^4.
 _FAR = 10.0
-_LAGS_RAW, _LAGS_FITTED = 5, 10
+_LAGS_RAW, _LAGS_FITTED = 5, 10  # Lags tested, of samples and of innovations
 # Minimum effects that matter, in the unit of each test.
 LEAST = {'mean_drift': 0.25, 'variance_drift': 0.1, 'gaussian': 0.3, 'impulses': 0.5,
          'correlated': 0.0, 'one_relaxation': 0.1, 'second_relaxation': LEAST_SHARE}

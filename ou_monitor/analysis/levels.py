@@ -39,7 +39,7 @@ MIN_TIME = 0.25
 # Minimum length of the longest segment of a level, s: thirty relaxation times of the rail of the
 # paper.
 MIN_STAY = 0.5
-MAX_LEVELS = 20
+MAX_LEVELS = 20  # Maximum number of levels
 # A passage is shorter than this, s, and the means of its first and last quarter differ by more
 # than these shares of its range (a ramp has 0.75) and of the half width.
 _PASSAGE, _STEADY, _CROSSED = 3.0, 0.65, 0.75

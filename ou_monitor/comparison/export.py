@@ -38,7 +38,7 @@ _KEPT = {'px4': ('drift',), 'gazebo': ('drift', 'load_sag'), 'ardupilot': ('drif
 _EMPTY, _CRITICAL = 3.5, 3.3
 # Exponent of the current over throttle, for which the discharge of the model is valid.
 _POWER = 1.8
-_SEEDS = 20
+_SEEDS = 20  # Simulations of each model
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from scipy.signal import welch
 
 # Simulations of each model; their range misses about one point in twenty of the data.
 DRAWS = 40
-_BINS, _LEVELS, _LAGS, _BANDS = 60, 10, 40, 60
+_BINS, _LEVELS, _LAGS, _BANDS = 60, 10, 40, 60  # Points: density, throttle, lag, spectrum
 # Maximum number of distinct throttles for which each has its own bin.
 _DISTINCT = 12
 

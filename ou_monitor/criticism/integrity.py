@@ -190,7 +190,7 @@ def _as_logged(t: FloatArray, v: FloatArray, u: FloatArray | None) -> Samples:
 _SMALL, _LARGE = 0.02, 0.45
 # Correlation of neighbouring errors up to which they count as independent.
 _WHITE = 0.3
-_TINY = 1e-6
+_TINY = 1e-6  # Scatter that counts as none, in steps
 
 
 @dataclass(frozen=True, eq=False)

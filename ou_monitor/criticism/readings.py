@@ -35,7 +35,7 @@ _LARGEST, _SMALLEST = 1e30, 1e-30
 _MILLIVOLTS = 1000.0
 # Ranges of throttle as 0..1 with trim, as a percentage, and in microseconds of a servo pulse.
 _UNIT, _PERCENT, _PULSE = (-1.5, 1.5), (-1.0, 150.0), (700.0, 2400.0)
-_EDGE = 0.05
+_EDGE = 0.05  # Tolerance of the range 0..1
 # Maximum gap in a current, s; quantile of its size that counts as full load; lags of the mean
 # response to a load, s.
 _HOLE, _FULL, _LAGS = 1.0, 0.99, np.array([0.02, 0.2, 2.0])

@@ -26,7 +26,7 @@ from ou_monitor.text import printable
 _LOGS = ('', '.ulg', '.bin', '.log', '.bbl', '.bfl', '.txt', '.db3')
 # Endings shared by other files, which are skipped without a note.
 _COMMON = ('', '.log', '.txt')
-_BLOCK = 1 << 20
+_BLOCK = 1 << 20  # Bytes read at once for the digest
 # Maximum depth of the folders searched.
 _MOST_DEPTH = 50
 

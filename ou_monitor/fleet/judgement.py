@@ -56,7 +56,7 @@ _VAGUE = 0.5
 # Bend of Huber's function, in standard deviations (95 % efficiency); maximum rounds of the fit.
 _HUBER = 1.345
 _ROUNDS = 30
-_MOST_BINS = 60.0
+_MOST_BINS = 60.0  # Of a histogram
 # Maximum pieces of the curve, rows needed for each, and minimum distance of its knots.
 _PIECES, _ROWS, _APART = 8, 12, 0.03
 
@@ -362,7 +362,7 @@ def weighted_line(x: FloatArray, y: FloatArray, error: FloatArray) -> tuple[floa
 _MEDIAN = 0.6744897501960817
 # Minimum size of a group: in a smaller one, any member may be the outlier.
 LEAST = 4
-SIMULATIONS = 4000
+SIMULATIONS = 4000  # Simulated fleets
 # Maximum number of cells simulated at once; limits memory.
 _CELLS = 2_000_000
 # One-sided 90 % bound of a normal distribution, in standard deviations.

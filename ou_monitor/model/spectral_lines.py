@@ -42,10 +42,9 @@ FALSE_ALARM = 0.01
 # Lowest frequency, in periods of a piece: lower ones are affected by the removal of mean and
 # trend.
 FIRST = 4
-# Maximum length of a short piece, s, and maximum number of samples of a long one (memory and
-# time).
+# Maximum length of a short piece, s; maximum samples of a long one (for memory and time).
 _SHORT, _LONGEST = 4.0, 1 << 20
-_FEWEST = 128
+_FEWEST = 128  # Minimum number of samples of a piece
 # Minimum number of ordinates in which lines are searched for.
 _FEWEST_TESTED = 32
 # Neighbours: every second ordinate, because the window correlates adjacent ones.  Distance of the
@@ -54,6 +53,7 @@ _FEWEST_TESTED = 32
 _GUARD, _NEIGHBOURS, _MORE = 4, 64, 4
 # Number of bins on either side over which the window spreads a steady line.
 _LOBE = 2
+# Nodes and weights of quadrature over 0..1.
 _QUANTILES = 0.5 * (np.polynomial.legendre.leggauss(64)[0] + 1.0)
 _WEIGHTS = 0.5 * np.polynomial.legendre.leggauss(64)[1]
 # Maximum ratio of samples with missing ones filled in to samples given.

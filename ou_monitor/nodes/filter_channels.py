@@ -30,8 +30,8 @@ class Group:
     """Numbers of which a message contains either all or none."""
 
     fields: tuple[FieldPath, ...]  # One for each signal
-    # Their covariance, which is scaled with the noise; -1 as its first element means that the
-    # message does not have them, all 0 that it is unknown.
+    # Their covariance, which is scaled with the noise; if its first element is -1, the message
+    # does not have the numbers; if all are 0, the covariance is unknown.
     covariance: FieldPath | None = None
     # Whether a message without them is dropped; otherwise the filter takes 0, and they stay
     # unchanged in the message.
@@ -45,7 +45,7 @@ class Channels:
     names: tuple[str, ...]  # Signals, one low-pass each
     groups: tuple[Group, ...]  # Where they are in the message
     output: str = ''  # Type of the output; empty: the type of the input
-    # From a message and filtered values to an output; None: they replace the signals.
+    # Makes the output of a message and filtered values; None: the values replace the signals.
     make: Callable[[Any, Sequence[float]], Any] | None = None
 
     def take(self, message: Any) -> Sequence[float]:

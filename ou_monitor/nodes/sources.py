@@ -128,7 +128,7 @@ def _generic(quantity: str) -> list[Source]:
     """Return the generic msg_configs' entries for a quantity, one per type."""
     found: dict[str, Source] = {}
     if quantity != 'voltage':
-        # They are the same in all msg_configs, so no msg_config is named.
+        # Bare numbers are the same in all msg_configs, so none is named.
         for kind in (*_SCALARS, *(_ARRAYS if quantity == 'rpm' else ())):
             found[kind] = Source(quantity, quantity, FieldSpec(quantity, kind, 'data'), AUTO)
     for config in list_msg_configs().values():

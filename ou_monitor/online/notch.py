@@ -132,7 +132,7 @@ class NewestSpeeds:
 
 # Square roots of throttle that define a law: the middle of the range flown.
 LOW, HIGH = 0.4, 0.85
-_GRID = 48
+_GRID = 48  # Frequencies tried
 # Relative width of the notch by which laws are scored.
 _WIDTH = 0.5
 # Memory of frames, s: the speed at one throttle falls with the charge, in minutes.
@@ -392,7 +392,7 @@ _GAP, _KNOWN, _OTHER = 5.0, 64, 0.1
 _SPIN_UP, _FADE, _WIDEN, _MOVE = 0.03, 0.2, 0.05, 0.004
 # Time for which the last throttle is held, s.
 _HELD = 1.0
-_LAG_FREQUENCY = 10.0
+_LAG_FREQUENCY = 10.0  # Frequency at which the delay is stated, Hz
 
 _Maybe = npt.ArrayLike | None
 

@@ -34,7 +34,7 @@ _SLOW_STEP = LEAST_PATIENCE / SLOW_MISSED
 _SLOW_KEPT, _SLOW_FEWEST, _SLOW_SHARE = 5, 2, 0.5
 # Number of messages for the share of late ones, and minimum number for a decision.
 _LOOK, _FEWEST = 200, 20
-_IRREGULAR = 0.1
+_IRREGULAR = 0.1  # Share of late messages above which a source is irregular
 # A stamp this far behind the newest, s, starts a new time line (as in `stream.samples`).
 BACK = 0.1
 # Stamps of the filter's input are frozen after this time, s: 10 ticks of a clock of 10 ms.

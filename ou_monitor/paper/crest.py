@@ -25,7 +25,7 @@ from scipy.signal import lfilter
 
 # Screen lengths tried, ms; the paper gives none.
 SCREENS_MS = (10, 100, 500)
-TYPICAL_MS = 100
+TYPICAL_MS = 100  # Length for the statements and the plot, ms
 # Share of screens left out at either end.
 TAIL = 0.05
 # Oscilloscope samples per step of the simulation; segments in memory; screens of white noise.

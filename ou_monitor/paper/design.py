@@ -38,12 +38,12 @@ from ou_monitor.text import number
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
-CELL_BROWNOUT = 3.3
+CELL_BROWNOUT = 3.3  # Brown-out level of a LiPo cell, V
 # Regulated voltage, V -> (brown-out level, V, source).
 REGULATED_BROWNOUT = {
     5.0: (4.5, 'lower limit of the 5 V rail in PX4'),
     3.3: (2.88, 'STM32F405 brown-out reset level 3, falling, highest (ST DS8626)')}
-LEAST, MOST = 10e-6, 22e-3
+LEAST, MOST = 10e-6, 22e-3  # Range of capacitances, F
 # Capacitances tried before the root is refined, because the risk may not be monotonic.
 _GRID = 81
 # Lower limit of a rate of brown-outs, 1/s.

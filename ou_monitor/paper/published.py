@@ -236,8 +236,8 @@ VRMS_STEP = common_step([state.vrms for state in LOADED])
 # Fig. 5: ms and |U| in mV; the paper leaves out the last point.
 FIG_5_MS = (0.0, 10.0, 25.0, 35.0, 50.0)
 FIG_5_MV = (Printed('368'), Printed('200'), Printed('80'), Printed('40'), Printed('6'))
-FIG_5_USED = 4
-TRANSIENT_LOAD = 0.20
+FIG_5_USED = 4  # Points that the paper fits
+TRANSIENT_LOAD = 0.20  # Throttle before its release
 
 # Section 5 and Table 2.
 ALPHA = Printed('63.0')

@@ -471,8 +471,8 @@ class SwitchedSystem:
 
 # Tolerance of the average, as a share of the largest switched entry.
 BALANCE_TOLERANCE = 1e-9
-PRINTED_FACTOR = 1.0
-CORRECT_FACTOR = 2.0
+PRINTED_FACTOR = 1.0  # In B of equation (6), as printed
+CORRECT_FACTOR = 2.0  # As (4) needs it
 
 
 @dataclass(frozen=True, eq=False)

@@ -80,7 +80,7 @@ _BLOCK = 64 * 1024
 _MOST_RATIO = 256
 # Lowest limit of a chunk, bytes, and its largest share of the memory.
 _LEAST_LIMIT, _CHUNKS_AT_ONCE = 64 * 1024 * 1024, 8
-_VARIABLE = 'OU_MONITOR_MAX_CHUNK_MB'
+_VARIABLE = 'OU_MONITOR_MAX_CHUNK_MB'  # Environment variable that raises it
 
 
 class Damage(Exception):

@@ -70,10 +70,10 @@ def taken_words(flight: Flight, network: PowerNetwork, throttle: float, values: 
     sag, se = (float(np.interp(throttle, flight.throttle, one))
                for one in (flight.sag, flight.sag_se))
     return (f'From the flight: {flight.level:.4g} V open-circuit at its end, {network.cells} '
-            f'cells ({flight.full:.4g} V at most; --set cells=N), sag {sag:.3g} V (+- '
-            f'{2.0 * se:.2g} V, '
-            'included in the risks; the throttle limit is the throttle budget of analyze at this '
-            'risk) and noise '
+            f'cells (highest {flight.full:.4g} V; --set cells=N for others), sag {sag:.3g} V (+- '
+            f'{2.0 * se:.2g} V, which '
+            'the risks include; the throttle limit is the budget that analyze gives at this risk) '
+            'and noise '
             f'{1e3 * float(np.interp(throttle, flight.throttle, flight.noise)):.3g} mV rms at '
             f'{throttle:.0%} throttle, resistance '
             + (f'{1e3 * flight.resistance:.3g} mOhm.' if known else

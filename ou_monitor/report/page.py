@@ -35,7 +35,7 @@ from ou_monitor.report.svg import Curve, extremes, Plot
 
 # Maximum points of a plot that is embedded in full; with it, an hour at 1 kHz takes 1.5 MB.
 MOST = 150_000
-_EXACT = 4096
+_EXACT = 4096  # Points up to which nothing is rounded
 # Resolution of a long x column: grid steps per median step.
 _GRID = 1000
 _UNIT = re.compile(r'(10[\u207b\u00b2\u00b3\u00b9\u2070-\u2079]+ )?'

@@ -17,7 +17,7 @@ from ou_monitor.report.document import (
 from ou_monitor.report.svg import Plot, span
 from ou_monitor.text import percent
 
-_BINS = 40
+_BINS = 40  # Of the histogram of crest factors
 
 
 def reproduction_document(result: Reproduction, command: str = '') -> Document:

@@ -17,9 +17,9 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.records import FloatArray
 
-SERIES = 8
+SERIES = 8  # Colours
 
-_LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 30, 42
+_LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 30, 42  # Margins, pixels
 # Width of a character of the 12-pixel sans serif, rounded up.
 _LETTER = 7.0
 # Half the width of an error bar's cap, pixels.

@@ -150,7 +150,7 @@ class FlickerNoise(Term):
     IMITATES: ClassVar[tuple[str, ...]] = ('regime_switching', 'second_relaxation')
     MEANING: ClassVar[str] = '1/f noise: there is no single relaxation time.'
     REMEDY: ClassVar[str] = (
-        'Use alpha only for windows of this length, and compare only windows of equal length.')
+        'Use alpha only for windows as long as this one; compare only windows of equal length.')
     SEPARATED_BY: ClassVar[str] = 'a recording over two more decades of frequency'
 
     amplitude: float = parameter('V', 'square root of f times the PSD', 0.0)

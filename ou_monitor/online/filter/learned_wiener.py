@@ -211,7 +211,7 @@ class LearnedWiener:
         try:
             found = self._best(noise, misfit)
         except np.linalg.LinAlgError:
-            # Rounding after noise larger by many powers of ten: forget the means.
+            # Rounding has spoiled means of noise larger by powers of ten: forget them.
             self._sum, self._whiten = 0.0, None
             return
         if np.all(np.isfinite(found)):

@@ -58,10 +58,10 @@ GYROS = {'IMU': 0, 'GYR': 1, 'IMU2': None, 'IMU3': None}
 RATES, FORCES = ('GyrX', 'GyrY', 'GyrZ'), ('AccX', 'AccY', 'AccZ')
 # Units of the fields if the log does not state them (before 2018).
 KNOWN_UNITS = {**dict.fromkeys(RATES, 'rad/s'), **dict.fromkeys(FORCES, 'm/s^2')}
-SPEED = ('ESC', 'RPM')
-OUTPUTS = ('RCOU', 'RCO2', 'RCO3')
-ALSO = ('PARM', 'MSG', 'VER')
-INSTANCES = ('Inst', 'Instance', 'I')
+SPEED = ('ESC', 'RPM')  # Message and field of the motor speeds
+OUTPUTS = ('RCOU', 'RCO2', 'RCO3')  # Messages of the servo outputs
+ALSO = ('PARM', 'MSG', 'VER')  # Messages of parameters, texts and the version
+INSTANCES = ('Inst', 'Instance', 'I')  # Names of the field that numbers instances
 
 # SERVOn_FUNCTION: motors 1..8, motors 9..12, throttle, left and right throttle.
 MOTOR_FUNCTIONS = frozenset((*range(33, 41), *range(82, 86), 70, 73, 74))
