@@ -95,8 +95,8 @@ class Damping:
         return np.asarray(path - self.share * (path - lowpass(path, t, self.time)))
 
 
-# Errors are drawn from readings with noise of similar size: this share of all readings on either
-# side, and at least this number; tolerance for sizes that count as equal.
+# Errors are drawn from readings with noise of similar size: share of all readings taken on either
+# side, and minimum number; tolerance for sizes that count as equal.
 _ALIKE, _FEWEST, _ROUNDING = 0.02, 50, 1e-9
 # Minimum share of white noise in the variance, which the filter needs.
 _LEAST_WHITE = 1e-3
@@ -115,10 +115,10 @@ class FlightNoise:
     spacing: float  # Step between readings, s
 
     def draw(self, n: int, load: FloatArray | None, rng: np.random.Generator) -> FloatArray:
-        """Return n samples of noise, V, under that throttle or current."""
+        """Return n samples of noise, V, under a throttle or current."""
         wanted = np.log(self.sizes.of(load_signs(n, self.spacing, load)))
-        # Draw from readings of the same size (within rounding) and their neighbours, near the ends
-        # from equally many.
+        # Draw from readings of the same size (within rounding) and their neighbours, of which
+        # there are equally many near the ends.
         first = np.searchsorted(self.logs, wanted - _ROUNDING, side='left')
         last = np.searchsorted(self.logs, wanted + _ROUNDING, side='right')
         at = first + (rng.random(wanted.size) * (last - first)).astype(np.int64)
@@ -178,7 +178,7 @@ def _predicted(x: FloatArray, dt: float, white: float, parts: dict[float, float]
     if not rates.size:
         return x, white
     variances = np.array([parts[rate] for rate in rates])
-    # The gain is constant after that.
+    # After `SLOW_TIME` the gain is constant.
     n = min(x.size, max(3, math.ceil(SLOW_TIME / dt)))
     keep = np.exp(-rates * dt)
     f, q = (np.tile(np.diag(row), (n, 1, 1)) for row in (keep, variances * (1.0 - keep ** 2)))
@@ -319,7 +319,7 @@ def fit_flight(samples: Readings, progress: Callable[[float], None] | None = Non
 
 @dataclass(frozen=True, eq=False)
 class _Load:
-    """A load, its fit, and for each part the fit to the rest, and its errors in the part, V."""
+    """A load, its fit, and for each part a fit without it, and that fit's errors there, V."""
 
     fit: LoadFit
     current: FloatArray | None

@@ -1,5 +1,5 @@
 """
-Subscriptions: sources, types and publishers on the graph, and the time of every message.
+What a node subscribes to: find sources on the graph, fetch messages, and give each a time.
 
 Time is the message's own stamp, or else the middleware's source
 timestamp, under `use_sim_time` mapped to simulated time through `/clock`.
@@ -31,8 +31,8 @@ from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-# Best effort, because a reliable subscription receives nothing from best-effort publishers; depth
-# for 0.2 s at 10 kHz while the estimator fits.
+# Best effort, because a reliable subscription receives nothing from best-effort publishers; the
+# depth holds 0.2 s at 10 kHz while the estimator fits.
 INPUT_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000,
                        reliability=ReliabilityPolicy.BEST_EFFORT)
 # Smaller for blocks: 2000 blocks would take 80 MB.
@@ -318,7 +318,7 @@ class Console:
 
     def __init__(self, node: MonitorNode) -> None:
         self._node = node
-        self._waiting = self._muted = -math.inf
+        self._waiting = self._next_report = -math.inf
         self._critical = False
 
     def waiting(self, topic: str) -> None:
@@ -329,9 +329,9 @@ class Console:
         """
         now, topic = self._node.steady_now(), self._node.resolve_topic_name(topic)
         if self._node.count_publishers(topic):
-            self._mute(now, topic)
+            self._report_silence(now, topic)
             return
-        self._muted = -math.inf
+        self._next_report = -math.inf
         if now - self._waiting < AGAIN:
             return
         self._waiting = now
@@ -340,12 +340,12 @@ class Console:
         hint = f" (there is {', '.join(alike)})" if alike else ''
         self._node.get_logger().info(f'Waiting for a publisher on {topic}{hint}.')
 
-    def _mute(self, now: float, topic: str) -> None:
-        if self._muted == -math.inf:
-            self._muted = now + MUTE
-        if now < self._muted:
+    def _report_silence(self, now: float, topic: str) -> None:
+        if self._next_report == -math.inf:
+            self._next_report = now + MUTE
+        if now < self._next_report:
             return
-        self._muted = now + AGAIN
+        self._next_report = now + AGAIN
         self._node.get_logger().info(
             f'{topic} has a publisher, but no message has arrived: it sends none, or runs as '
             'another user, whose messages Fast DDS does not deliver (doc/deploy.md).')

@@ -205,7 +205,7 @@ def spin(make: Callable[[], Any]) -> int:
             node.context.try_shutdown()
     finally:
         manager.tell('STOPPING=1')
-        # A latch is already on disk; by default this signal ends the process.
+        # If ending hangs, this signal ends the process; a latch is already on disk.
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.setitimer(signal.ITIMER_REAL, END)
         executor.remove_node(node)

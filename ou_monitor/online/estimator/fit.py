@@ -35,8 +35,8 @@ _UNSEEN = 1e-5
 _STILL = 1e-12
 # Minimum correlation of adjacent samples, standard errors, for a fit.
 _CORRELATED = 4.0
-# alpha D above which adjacent samples carry no information on the relaxation; number of
-# relaxations in the window below which a drift may be chance.
+# alpha times the step above which adjacent samples carry no information on the relaxation; number
+# of relaxations in the window below which a drift may be chance.
 _FASTEST, _DOUBTFUL = 4.6, 25.0
 
 
@@ -396,8 +396,8 @@ MOST = 4096
 _APART = 1e-5
 # Samples averaged into one of a coarser grid, and minimum number of samples on that grid.
 _FACTOR, _FEWEST = 4, 100
-# An ADC step acts as white noise only if the OU crosses several codes within a sampling step:
-# D >= (0.7 step / sigma)^2 (doc/estimation.md).
+# An ADC step acts as white noise only if the OU crosses several codes between two samples, which
+# need a distance of (0.7 step / sigma)^2 or more, s (doc/estimation.md).
 _DITHER = 0.7
 # Correction of the bias of alpha, in 1/T, for the spectral likelihood and for the exact one.  The
 # exact restricted likelihood makes alpha too high by 2/T (Tang & Chen, J. Econometrics 149 (2009)

@@ -47,7 +47,7 @@ class Motion:
     name: str  # Name for the user
     t: FloatArray  # Stamps, s from the start of the log; shape (n,)
     vectors: dict[str, FloatArray]  # Field -> values, shape (n, 3) or (n, motors)
-    # Conversion of the values, poles included; kind of series.
+    # Conversion of the values, poles included; description.
     scale: str
     words: str
     rank: int | None = None  # The smallest rank is the default; None: only taken by name
@@ -222,13 +222,13 @@ def clean(series: Series) -> tuple[Series, tuple[str, ...]]:
     if series.quantity == THROTTLE:
         outside = int(((values < -0.01) | (values > 1.01)).sum())
         if outside:
-            notes.append(f'{counted(outside, "value")} outside 0..1 set to its end.')
+            notes.append(f'{counted(outside, "value")} outside 0..1 set to 0 or 1.')
         values = np.clip(values, 0.0, 1.0)
     return replace(series, t=series.t[which], values=values), tuple(notes)
 
 
 def near(t: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return which stamps are not in a small group more than an hour away from all others."""
+    """Return which stamps are in a large group without a pause of an hour; all if none is."""
     order = np.argsort(t, kind='stable')
     good = np.ones(t.size, dtype=bool)
     pauses = np.flatnonzero(np.diff(t[order]) > _FAR) + 1
