@@ -106,8 +106,8 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     if math.isfinite(low) or math.isfinite(high):
         drawn = (v <= low) | (v >= high)
         exact.append(_saturation(v, low, high))
-        notes.append(f'{int(drawn.sum())} {soft} were replaced by random draws of an OU beyond '
-                     'it, given their neighbours.')
+        notes.append(f'{int(drawn.sum())} {soft} were replaced by random draws beyond the '
+                     'range, from an OU through their neighbours.')
         v = redraw(v, low, high, step, np.random.default_rng(0))
     cell = _judge_step(step, _innovation_std(v), exact, notes)
     stamps = judge_stamps(t, v)

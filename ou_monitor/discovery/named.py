@@ -84,7 +84,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
                         latent=turn < _TURNS - 1,
                         progress=None if turn else lambda share: progress(0.1 + 0.9 * share))
             if fitter.evidence(search.composite) < refuted:
-                # These causes came in place of a better one that does not explain its statistics.
+                # These causes only stand in for a better one, which was withdrawn.
                 search = replace(less, stopped=search.stopped)
             found = _finished(fitter, search, bank)
             out = _withdrawn(fitter, found, begun)

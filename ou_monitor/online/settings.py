@@ -46,7 +46,7 @@ def _parameter(default: bool | int | float | str, description: str, low: float |
 
 
 def parameters_of(settings: type[Any], prefix: str = '') -> tuple[Parameter, ...]:
-    """Return the parameters of a class of settings; names of groups have a prefix or a dot."""
+    """Return the parameters of a class of settings; a group has a dotted prefix."""
     return tuple(Parameter(prefix + one.name.replace('brownout_', 'brownout.'), **one.metadata)
                  for one in fields(settings))
 
@@ -102,10 +102,10 @@ class MonitorSettings:
         0.0, 1.0)
     brownout_leave: float = _parameter(
         0.5, 'WARN or CRITICAL ends when the risk falls below this share of the value at which it '
-        'begins, 0.001..1, less than 1 (default: half, our choice).', 0.001, 1.0)
+        'begins, from 0.001 to below 1 (default: half, our choice).', 0.001, 1.0)
     brownout_hold: float = _parameter(
         1.0, 'Minimum duration of WARN and CRITICAL, also while the risk is unknown, s (default: '
-        '2 s doubled the time of the flag without a dip on five recorded quads).',
+        'with 2 s, the flag was set without a dip for twice as long on five recorded quads).',
         0.0, 3600.0)
     brownout_delay: float = _parameter(
         0.15, 'Time that a risk must last before WARN or CRITICAL begins, s (default: three '

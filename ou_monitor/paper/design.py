@@ -499,7 +499,7 @@ class Flight:
     var_inf: float  # Variance of the OU, V^2
 
 
-# Components that a flight shows; if one of them is given, its throttle budget does not apply.
+# Components that a flight shows; if one is given, the budget of the flight does not apply.
 SHOWN = frozenset(('battery_voltage', 'battery_resistance', 'current_max', 'current_exponent',
                    'switching_scale', 'flutter'))
 

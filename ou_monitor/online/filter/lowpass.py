@@ -196,7 +196,7 @@ class VoltageKalman:
 
 
 def step_model(known: Known, dt: float) -> KalmanStep:
-    """Return the model for a step of `dt`, s (dt in s)."""
+    """Return the model for a step (dt in s)."""
     levelled = known.level_se == known.level_se
     slow = 1.0 / LEVEL_TIME
     error = known.level_se if levelled else 0.0
@@ -309,14 +309,14 @@ class AdaptiveLowPass:
         With `shadow`, the one that would be in force; with `kalman`, that of a low-pass of equal
         lag.
         """
-        told = self._of_its_lag()
-        return self._within(told) if told == told else self._control.cutoff
+        by_lag = self._of_its_lag()
+        return self._within(by_lag) if by_lag == by_lag else self._control.cutoff
 
     @property
     def wanted(self) -> float:
         """Cutoff that the law requests, within fmin..fmax, Hz; NaN if unknown."""
-        told = self._of_its_lag()
-        return self._within(told) if told == told else self._control.wanted
+        by_lag = self._of_its_lag()
+        return self._within(by_lag) if by_lag == by_lag else self._control.wanted
 
     @property
     def highest(self) -> float:
@@ -333,10 +333,10 @@ class AdaptiveLowPass:
         if self._kalman is not None and self._known:
             if self._kalman.mixed:
                 return Bound.LAG if self._settings.max_lag else Bound.LOWEST
-            told = self._of_its_lag()
-            if told >= self._settings.fmax:
+            by_lag = self._of_its_lag()
+            if by_lag >= self._settings.fmax:
                 return Bound.HIGHEST
-            return Bound.NONE if told < self.highest * (1.0 - 1e-9) else Bound.RATE
+            return Bound.NONE if by_lag < self.highest * (1.0 - 1e-9) else Bound.RATE
         return self._control.bound
 
     @property
@@ -360,8 +360,8 @@ class AdaptiveLowPass:
         With the law `kalman`, that of the low-pass of equal lag; 1 with `shadow`, and until
         the sample rate is known.
         """
-        told = self._of_its_lag()
-        cutoff = told if told == told else self._control.cutoff
+        by_lag = self._of_its_lag()
+        cutoff = by_lag if by_lag == by_lag else self._control.cutoff
         angle = _TWO_PI * cutoff * self._interval.mean
         if self._settings.shadow or not angle > 0.0:
             return 1.0

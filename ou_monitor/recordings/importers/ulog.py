@@ -71,9 +71,9 @@ class _Watched(io.BufferedReader):
     """
     A file that records which bytes pyulog skips silently.
 
-    It also prevents two faults of pyulog: an endless loop, because it steps back by the stated
-    length of a message even if the file ended before; and a read of the rest of the file at each
-    byte of a damaged part.
+    It also prevents two faults of pyulog: an endless loop, because pyulog steps back by the stated
+    length of a message even if the file ended within it; and reading the rest of the file again
+    at each byte of a damaged part.
     """
 
     progress: Progress | None = None
@@ -109,7 +109,7 @@ class _Watched(io.BufferedReader):
         return data
 
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        """Move; count a step back beyond the last read from where pyulog assumes to be."""
+        """Move; a step back beyond the last read starts where pyulog believes to be."""
         if whence == io.SEEK_CUR and -offset > self.had:
             offset += self.missing
         return super().seek(offset, whence)
