@@ -99,11 +99,22 @@ class EvenGrid:
     rate: float  # Samples per second, Hz
 
 
+# Step, over the median, below which a sample may lie between those of the clock.
+_SHORT_STEP = 0.75
+
+
 def on_grid(t: FloatArray, values: FloatArray) -> EvenGrid:
     """Return samples on an even clock, with steps rounded to whole periods (t in s)."""
     step = np.diff(t)
     usual = float(np.median(step)) if step.size else math.inf
-    number = np.maximum(1.0, np.rint(step / usual))
+    ratio = step / usual
+    number = np.maximum(1.0, np.rint(ratio))
+    # Samples between those of the clock: their short steps add up to whole ones.
+    short = ratio < _SHORT_STEP
+    if (short[1:] & short[:-1]).any():
+        passed = np.cumsum(np.where(short, ratio, 0.0))
+        whole = np.rint(passed - np.maximum.accumulate(np.where(short, 0.0, passed)))
+        number = np.where(short, np.diff(whole, prepend=0.0), number)
     if number.sum() > _FILLED * t.size:
         # If most of the time is gaps, join the samples without them.
         number = np.ones(step.size)

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 from ou_monitor.model.ou import simulate
-from ou_monitor.model.spectral_lines import find_lines, tail
+from ou_monitor.model.spectral_lines import find_lines, fit_sinusoid, on_grid, tail
 import pytest
 from scipy import signal
 from scipy.signal import lfilter
@@ -137,3 +137,15 @@ def test_a_line_is_at_most_all_of_the_noise():
              *0.1 * rng.standard_normal((40, 300))]
     (line,) = find_lines(parts, 100.0).lines
     assert 0.9 < line.share <= 1.0
+
+
+def test_samples_between_those_of_the_clock_do_not_move_a_line():
+    """Thinned recordings keep samples around sudden changes: half steps, two for each."""
+    t = np.arange(20_000) / 1000.0
+    t = np.sort(np.append(t, t[500:19_000:370] + 0.0005))
+    grid = on_grid(t, np.sin(2.0 * np.pi * 120.0 * t))
+    assert grid.rate == pytest.approx(1000.0, rel=1e-4) and grid.values.size == 20_000
+    wave = fit_sinusoid(grid.values, grid.rate, 120.0, 0.5)
+    # A tenth of the resolution; counted as whole steps they would move it by 0.15 Hz.
+    assert abs(wave.frequency - 120.0) < 0.005
+    assert wave.amplitude == pytest.approx(1.0, abs=0.01)
