@@ -17,12 +17,12 @@ from ou_monitor.analysis.quality import QualityItem
 from ou_monitor.analysis.relaxation import Relaxation
 from ou_monitor.criticism.curves import outline
 from ou_monitor.online.settings import MonitorSettings
-from ou_monitor.records import FloatArray, NAN, OuFacts, Recording, Severity
+from ou_monitor.records import FloatArray, NAN, Recording, Severity
 from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text, UNKNOWN,
     worst_first)
 from ou_monitor.report.svg import Plot, span
-from ou_monitor.text import chance, counted, listed, number, percent, with_se
+from ou_monitor.text import chance, counted, listed, number, percent, with_se, Z95
 
 # Maximum changes of throttle drawn in one plot, and the length of the plot, relaxation times.
 _MOST_DRAWN, _DRAWN_TAUS = 6, 8.0
@@ -75,7 +75,7 @@ def answer(analysis: Analysis) -> list[str]:
         f'No throttle keeps the risk below {100.0 * curves.limit:g} % {_why_none(analysis)}: at '
         f'idle it is {percent(curves.risk[0])}.']
     return [first, *safe, *others, *craft_advice(analysis.craft),
-            *_numbers(analysis.overview.facts.ou), *_change(analysis),
+            *_numbers(analysis), *_change(analysis),
             *(words for name, words in _BEWARE.items() if name in names)]
 
 
@@ -157,14 +157,20 @@ def _origin(analysis: Analysis) -> list[tuple[str, str]]:
     return [('Read from', '; '.join([*found, f"config: {source['msg_config']}"]))] if found else []
 
 
-def _numbers(ou: OuFacts) -> list[str]:
+def _numbers(analysis: Analysis) -> list[str]:
+    ou = analysis.overview.facts.ou
     if ou.status != 'ok':
         return []
     low, high = ou.alpha_95
-    return [f'The noise (level and response to load removed) has sigma = {number(ou.sigma)} (95 % '
-            f'{number(ou.sigma_95[0])} to {number(ou.sigma_95[1])}) V/sqrt(s), relaxes in '
-            f'tau = {number(1e3 / ou.alpha)} (95 % {number(1e3 / high)} to {number(1e3 / low)}) '
-            f'ms, and has a standard deviation of {number(1e3 * math.sqrt(ou.var_inf))} mV.']
+    found = [f'The noise (level and response to load removed) has sigma = {number(ou.sigma)} '
+             f'(95 % {number(ou.sigma_95[0])} to {number(ou.sigma_95[1])}) V/sqrt(s), relaxes in '
+             f'tau = {number(1e3 / ou.alpha)} (95 % {number(1e3 / high)} to {number(1e3 / low)}) '
+             f'ms, and has a standard deviation of {number(1e3 * math.sqrt(ou.var_inf))} mV.']
+    steady = [level.estimate for level in analysis.levels if level.estimate.usable]
+    if steady and all(e.sigma * math.exp(Z95 * e.sigma_se) < ou.sigma_95[0] for e in steady):
+        found.append(f'At steady throttle sigma is at most {number(max(e.sigma for e in steady))} '
+                     'V/sqrt(s): the one above includes what follows changes of load.')
+    return found
 
 
 def _change(analysis: Analysis) -> list[str]:

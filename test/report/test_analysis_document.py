@@ -82,3 +82,16 @@ def test_a_safe_throttle_that_did_fall_below_the_limit_is_contradicted(analysis,
         assert ('yet the voltage was below' in words) == warned
     above = replace(safe, by_throttle=replace(safe.by_throttle, voltage=lowest - 0.01))
     assert 'yet the voltage' not in ' '.join(answer(above))
+
+
+@pytest.mark.parametrize('factor, lower', [(0.9, False), (2.0, True)])
+def test_a_sigma_above_that_of_every_level_is_explained(analysis, factor, lower):
+    """What follows a change of load counts as noise in the recording, not at steady throttle."""
+    most = max(level.estimate.sigma * np.exp(1.96 * level.estimate.sigma_se)
+               for level in analysis.levels)
+    seen = analysis.overview
+    ou = replace(seen.facts.ou, status='ok', alpha=60.0, alpha_95=(50.0, 70.0), var_inf=1e-3,
+                 sigma=1.1 * factor * most, sigma_95=(factor * most, 1.2 * factor * most))
+    said = ' '.join(answer(replace(analysis, overview=replace(
+        seen, facts=replace(seen.facts, ou=ou)))))
+    assert ('At steady throttle sigma is at most' in said) == lower
