@@ -40,8 +40,8 @@ from ou_monitor.timeline import readings_of
 
 Progress = Callable[[float], None]
 
-# Range of the median of a 5 V rail, V.
-RAIL = (4.0, 6.0)
+# Range of the median of a 5 V rail, V; lower is a lithium cell, or a rail in constant brown-out.
+RAIL = (4.5, 6.0)
 
 
 @dataclass(frozen=True, eq=False)
