@@ -62,12 +62,20 @@ def plain_words(statistic: str) -> str:
     return max(fits)[1] if fits else statistic
 
 
+# Longest list of numbers that is printed.
+_LISTED = 6
+
+
 def parameters(term: Term, se: Mapping[str, Any]) -> str:
     """Return the estimates of a term with units and errors, without undetermined ones."""
-    return '; '.join(
-        f'{name} = {with_error(value, se.get(name), positive=term.positive(name))}'
-        f'{_unit(term, name)}' for name, value in term.values().items()
-        if se.get(name) != math.inf and value != term.usual().get(name))
+    known = {name: value for name, value in term.values().items()
+             if se.get(name) != math.inf and value != term.usual().get(name)}
+    long = [name for name, value in known.items()
+            if isinstance(value, list) and len(value) > _LISTED]
+    found = [f'{name} = {with_error(value, se.get(name), positive=term.positive(name))}'
+             f'{_unit(term, name)}' for name, value in known.items() if name not in long]
+    return '; '.join([*found, *([f'{listed(long)} have {len(known[long[0]])} values each, see the '
+                                 'plot and --json'] if long else [])])
 
 
 def with_error(value: Any, error: Any, *, positive: bool = False) -> str:
