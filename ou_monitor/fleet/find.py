@@ -58,6 +58,8 @@ def find_recordings(given: Sequence[str], leave_out: Path | None = None) -> Foun
         path = Path(text)
         if not path.exists():
             raise InputError(f"there is no recording or folder '{text}': check the path")
+        if leave_out is not None and path.resolve() == leave_out.resolve():
+            raise InputError(f"--output is the folder of the recordings, '{text}': name another")
         if path.is_dir() and not _is_bag(path):
             search.walk(path)
         else:

@@ -191,6 +191,12 @@ def test_logs_are_read_as_analyze_reads_them(tmp_path):
     assert results['cut.bin']['error']
 
 
+def test_the_folder_of_the_recordings_is_no_output(tmp_path):
+    """It would be left out, and nothing found."""
+    with pytest.raises(InputError, match='--output is the folder of the recordings'):
+        find_recordings([str(tmp_path)], leave_out=tmp_path / '..' / tmp_path.name)
+
+
 def test_copies_are_found_by_content_not_by_name(tmp_path):
     """Equal bytes are equal, equal size is not; of three the oldest is the original."""
     young, old, other = (csv_file(tmp_path / name) for name in ('a.csv', 'b.csv', 'c.csv'))
