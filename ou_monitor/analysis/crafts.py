@@ -9,7 +9,7 @@ two of the median of the class, not that it is safe.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 import re
 from typing import Any
@@ -172,6 +172,8 @@ def craft_of(recording: Recording, facts: SupplyFacts, given: int = 0) -> Craft:
     if not kinds or not recording.has_throttle:
         return Craft(cells, source, full_voltage(recording), '', ())
     seen = bool(flown_near(recording, _AT, _NEAR)[0])
+    # Noise of changes that the load model does not follow is no lack of a capacitor.
+    calm = float(np.interp(_AT, facts.noise.throttle, facts.noise.steady_rms_v)) / cells
     # Values and standard errors; the error of the noise is negligible.
     values = {
         'sag': [float(np.interp(_AT, facts.sag.throttle, one)) if seen and facts.sag.known else NAN
@@ -185,8 +187,11 @@ def craft_of(recording: Recording, facts: SupplyFacts, given: int = 0) -> Craft:
             known = [row[1 + k] / row[0] for row in KNOWN[kind].values()
                      if math.isfinite(row[1 + k])]
             if known:
-                found.append(_measure(kind, name, value / cells, 2.0 * se / cells,
-                                      float(np.median(known))))
+                middle = float(np.median(known))
+                one = _measure(kind, name, value / cells, 2.0 * se / cells, middle)
+                found.append(replace(one, verdict='unknown', reason='', remedy='')
+                             if name == 'noise' and one.verdict == 'high' and calm < middle
+                             else one)
     return Craft(cells, source, full_voltage(recording), kinds[0] if len(kinds) == 1 else '',
                  tuple(found))
 

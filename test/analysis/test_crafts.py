@@ -69,6 +69,17 @@ def test_values_are_called_usual_high_or_low():
     assert {one.name: one.verdict for one in found.measures} == {'sag': 'usual', 'noise': 'high'}
 
 
+@pytest.mark.parametrize('steady, verdict', [(0.02, 'unknown'), (0.5, 'high')])
+def test_noise_of_changes_alone_is_not_called_high(steady, verdict):
+    """A load model that follows changes badly is no lack of a capacitor."""
+    recording = flown(noise=0.9)
+    facts = supply_facts(recording)
+    facts = replace(facts, noise=replace(facts.noise, steady_rms_v=(steady,) * 11))
+    found = [one for one in craft_of(recording, facts, 4).measures if one.name == 'noise']
+    assert [one.verdict for one in found] == [verdict]
+    assert bool(found[0].remedy) == (verdict == 'high')
+
+
 def test_twelve_volts_of_an_unknown_vehicle_may_be_a_robots():
     """Both classes are compared then; a flight controller's log, or given cells, decides."""
     small = flown(cells=3, sag=0.08, noise=0.012)
