@@ -440,8 +440,8 @@ class OuFacts:
     """
     The fitted relaxation (an OU beside white noise), or bounds on it.
 
-    `not_visible`: a relaxation slower than `tau_below_s`, but faster than the level, has a
-    variance below `var_inf_below` (95 %); a faster one may make up all of the noise.
+    `not_visible`: a relaxation slower than `tau_below_s`, but faster than the level wanders, has a
+    variance below `var_inf_below` (95 %); one faster than `tau_below_s` may be all of the noise.
     """
 
     status: str  # ok, not_visible, too_short or no_data

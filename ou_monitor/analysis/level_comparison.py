@@ -69,8 +69,8 @@ class AlphaTest:
         if not self.withheld:
             return ''
         names = ', '.join('all' if math.isnan(x) else f'{100.0 * x:.3g} %' for x in self.withheld)
-        return (f' Withheld: {names}, because this or another level shows more than one '
-                'relaxation, or both lines and impulses.')
+        return (f' Withheld: {names}, because a level shows more than one relaxation, or both '
+                'lines and impulses.')
 
     def _verdict(self) -> str:
         if self.levels < 2:

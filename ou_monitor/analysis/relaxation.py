@@ -14,8 +14,8 @@ enough.  If it is not, the first third of tau is left out, provided that the res
 delayed motors, or a rail much faster than the instrument, have settled by then.
 
 The relaxation may be that of the rail or of the instrument.  An AC-coupled input is a high-pass:
-it shows any step as a decay to the level before, at its own corner, which the noise shows too.  So
-a voltage that returns to the level before tells nothing about the rail, but one that settles at
+any step decays to the level before, at a rate that its corner sets and that the noise shows too.
+So a voltage that returns to the level before tells nothing about the rail, but one that settles at
 another level excludes the high-pass.
 
 Limits: throttle is a command that motors follow after 5 to 20 ms, which distorts the first
@@ -290,7 +290,7 @@ def fit_relaxation(recording: Recording, kind: str, steps: Sequence[LevelChange]
     if misfit_p < BADLY_FITTED:
         rest, once, p = _later(recording, steps, estimates, rms, _LATER * fit[0])
         _, twice, _ = _later(recording, steps, estimates, rms, 2.0 * _LATER * fit[0])
-        # If leaving out more changes tau again, the misfit is not limited to the beginning.
+        # If tau changes again when more is left out, the misfit is not limited to the beginning.
         if p > _WELL and len(rest) == len(used) and once[1] < twice[0] < once[2]:
             left_out, windows, fit, misfit_p = _LATER * fit[0], rest, once, p
     tau, low, high, scale, drop = fit

@@ -117,8 +117,8 @@ class FlightNoise:
     def draw(self, n: int, load: FloatArray | None, rng: np.random.Generator) -> FloatArray:
         """Return n samples of noise, V, under a throttle or current."""
         wanted = np.log(self.sizes.of(load_signs(n, self.spacing, load)))
-        # Draw from readings of the same size (within rounding) and their neighbours, of which
-        # there are equally many near the ends.
+        # Draw from readings of the same size (within rounding) and a number of neighbours that is
+        # the same near the ends.
         first = np.searchsorted(self.logs, wanted - _ROUNDING, side='left')
         last = np.searchsorted(self.logs, wanted + _ROUNDING, side='right')
         at = first + (rng.random(wanted.size) * (last - first)).astype(np.int64)
@@ -319,7 +319,7 @@ def fit_flight(samples: Readings, progress: Callable[[float], None] | None = Non
 
 @dataclass(frozen=True, eq=False)
 class _Load:
-    """A load, its fit, and for each part a fit without it, and that fit's errors there, V."""
+    """A load, its fit, and for each part the fit to the other parts and its errors there, V."""
 
     fit: LoadFit
     current: FloatArray | None
@@ -342,7 +342,7 @@ def _best(samples: Readings, report: Callable[[float], None]) -> _Load | None:
 
 
 def _loads(samples: Readings) -> list[FloatArray | None]:
-    """Return the loads to try that move: throttle (None), and current."""
+    """Return the loads to try, those that change: throttle (None), and current."""
     found: list[FloatArray | None] = []
     if samples.throttle is not None and np.ptp(samples.throttle) >= MOVES:
         found.append(None)
@@ -393,7 +393,7 @@ def damping(samples: Readings, path: FloatArray) -> Damping:
 
 def _sag_error(samples: Readings, load: _Load) -> float:
     """
-    Return the relative error of the sag over a time as long as two parts.
+    Return the relative error of the sag as a mean of two parts.
 
     In each held-out part, the voltage is regressed on the predicted path; parts that move more
     have more weight.  Temperature, wind and simplifications of the load model change the ratio.

@@ -16,14 +16,14 @@ from ou_monitor.records import FloatArray, Recording
 from ou_monitor.text import counted, number
 from ou_monitor.timeline import in_order
 
-# An outlier is farther from the median than this number of standard deviations, and than this
-# multiple of the distance of the next nearer sample.
+# An outlier is farther from the median than this number of standard deviations, and this many
+# times as far as the sample next in distance.
 _FAR, _GAP = 50.0, 5.0
 # Minimum repeats of an outlying value to be an error code; maximum share of such samples.
 _CODE, _MOST_CODES = 3, 0.2
 # Maximum single bad samples that are left out; for long recordings, one for each _EACH samples.
 _SINGLES, _EACH = 3, 100_000
-# Minimum number of other samples beside an error code whose share exceeds _MOST_CODES.
+# An error code may exceed the share _MOST_CODES beside at least this many other samples.
 _OTHERS = 100
 # Maximum values used for the spread.
 _EXAMINED = 200_000

@@ -100,8 +100,8 @@ def _straying(samples: Samples, state: Pruned) -> int | None:
     """
     Return the cause whose removal keeps simulations within the recorded range, if there is one.
 
-    One-step predictions hardly constrain the range of a process: with an intensity or an event
-    that fits them, simulations may still exceed the recorded range.  Responses of the mean are not
+    One-step predictions hardly constrain the range of a process: simulations of a term that
+    improves them may still exceed the recorded range.  Responses of the mean are not
     tested.
     """
     def far_of(model: Composite) -> float:
@@ -175,6 +175,6 @@ def refusal(samples: Samples, terms: Sequence[Term], gain: float, gain_se: float
         return f'The extended model cannot be simulated ({error})'
     if far > 0.0:
         by = 'without bound' if math.isinf(far) else f'by {far:.2g} V'
-        return ('Simulations of the extended model exceed the recorded range and a margin of '
-                f'half of it {by}')
+        return ('Simulations of the extended model exceed the recorded range, widened by half of '
+                f'it at both ends, {by}')
     return ''

@@ -277,7 +277,7 @@ class MonitorNode(Node):
         return made
 
     def _keep(self, made: Any) -> None:
-        """Record an object for `stop` to close; rclpy makes its own before the list exists."""
+        """Record an object for `stop` to close; rclpy makes others before the list exists."""
         if hasattr(self, '_made'):
             self._made.append(made)
 

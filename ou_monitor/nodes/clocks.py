@@ -10,7 +10,7 @@ source timestamps.
 A steady source can be late, but not early: the lower convex hull of source timestamp against
 message number is a straight line with the period as its slope, and many messages lie near it (this
 separates clock skew from delays: Zhang, Liu & Xia 2002, "Clock synchronization algorithms for
-network measurements").  The hull must span many pauses at any rate, because a burst of 400
+network measurements"). At any sampling rate the hull must span many pauses, because a burst of 400
 messages sent 10 us apart is a straight line too.
 
 Limits: a constant delay stays.  The times of an unsteady source are not changed; if its intervals
@@ -56,8 +56,8 @@ IN_BURSTS = (
     'The messages come in bursts without stamps, and no steady source was detected behind '
     'them, so nothing can be estimated: stamp them in the driver, or send blocks of samples '
     'with adc.sample_rate.')
-# The line follows the source with this time constant, s: 50 ms of delay, made up within 50 ms,
-# move it by 1.2 ms.
+# The line follows the source with this time constant, s: a delay that grows to 50 ms and vanishes
+# within 50 ms moves it by 1.2 ms.
 FOLLOW = 1.0
 # Minimum gap, as opposed to a delay, s; minimum step back of a clock, s.
 GAP, BACK = 0.25, 0.5

@@ -38,10 +38,10 @@ INPUT_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000,
 # Smaller for blocks: 2000 blocks would take 80 MB.
 BLOCK_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=200,
                        reliability=ReliabilityPolicy.BEST_EFFORT)
-# Maximum messages and bytes taken at a time: all that can wait, limited in bytes so that they need
-# at most about 50 ms and 50 MB to process.
+# Maximum messages and bytes taken at a time: as many as the queue holds; so many bytes take about
+# 50 ms and 50 MB of memory to process.
 MOST_TAKEN, MOST_BYTES = 2000, 2_000_000
-# Maximum wait of a message in the middleware, s: it keeps 2000.
+# Longest time for which a message may have waited in the middleware's queue of 2000, s.
 MOST_WAIT = 60.0
 # Period of reminders, and silence of a publisher before it is reported, s.
 AGAIN = 60.0

@@ -104,7 +104,7 @@ def test_levels_that_one_ou_does_not_describe_are_withheld():
     found = alpha_constancy(THROTTLES, four, [False, False, False, True])
     assert (found.verdict, found.levels, found.withheld) == ('constant', 3, (0.7,))
     assert found.sentence.endswith(
-        'Withheld: 70 %, because this or another level shows more than one relaxation, or both '
+        'Withheld: 70 %, because a level shows more than one relaxation, or both '
         'lines and impulses.')
     alone = alpha_constancy(THROTTLES, four, [False, True, True, True])
     assert alone.verdict == 'undetermined' and 'depends on load: only one load' in alone.sentence

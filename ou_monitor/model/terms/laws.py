@@ -1,4 +1,4 @@
-"""What terms that change the law of the innovations are fitted to, and common functions."""
+"""The data to which laws of the innovations are fitted (`View`), and common functions."""
 
 from __future__ import annotations
 

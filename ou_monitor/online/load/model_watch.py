@@ -42,7 +42,7 @@ _VAGUE = 0.15
 _OTHER = 0.7
 # Factor between level and the model's level, up or down, beyond which it is another pack.
 OTHER_LEVEL = 1.3
-# Level of a lithium cell at rest, V: at take-off, later, and at most (LiHV).
+# Level of a lithium cell at rest, V: least at take-off, least later, and most (LiHV).
 _TAKE_OFF, _EMPTY, _FULL = 3.4, 3.2, 4.4
 
 
@@ -154,8 +154,8 @@ def _warming(levels: FloatArray, left: FloatArray, squares: FloatArray) -> tuple
         return WARMING, WARMING_SE
     slope = float(levels @ left) / weight
     each = levels * (left - slope * levels * squares)
-    # The slope is also uncertain by errors of the form at both ends of the range of levels, which
-    # is sqrt(12) standard deviations wide.
+    # The model's form may err by _FORM at both ends of the range of levels, which is sqrt(12)
+    # standard deviations wide if they are uniform.
     variance = (float(each @ each) / weight + _FORM ** 2 * float(squares.sum()) / 6.0) / weight
     own, usual = 1.0 / variance, WARMING_SE ** -2
     return (slope * own + WARMING * usual) / (own + usual), (own + usual) ** -0.5
@@ -168,7 +168,7 @@ def other_pack(start: LoadStart, highest: float, level: float) -> str:
     if not _EMPTY <= start.volts / cells <= _FULL:
         other = not 1.0 / OTHER_LEVEL < level / start.volts < OTHER_LEVEL
     elif highest / cells < _TAKE_OFF:
-        # A pack that was fuller before has emptied.
+        # It never was full in this flight; a pack that was would only have emptied.
         return (f'The highest voltage at rest, {highest:.2f} V, is {highest / cells:.2f} V for '
                 f"each of the model's {cells:.0f} cells: another pack, or an empty one.")
     else:
@@ -194,7 +194,7 @@ def judge(ratio: float, se: float, date: str) -> tuple[ModelVerdict, str]:
 
 def compare(found: Contrast, start: LoadStart, ohm: float, ohm_se: float, other: str, date: str,
             discharge: float, discharge_se: float) -> ModelComparison:
-    """Compare this flight with an earlier model (ohm: now; other: why another pack, or empty)."""
+    """Compare this flight with an earlier model (ohm: now; other: as of `other_pack`)."""
     # Levels at which the two were measured: the sag of a pack falls as it empties and warms.
     apart = found.level - (start.level or start.volts / start.cells)
     as_found = math.exp(-start.warming * apart)

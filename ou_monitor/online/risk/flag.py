@@ -38,7 +38,7 @@ _BACK = 1.0
 _USUAL = 200
 # Maximum number of samples kept: the longest floor_time, 10 s, at 20 kHz.
 _MOST = 200_000
-# Maximum step forward, in units of `patience`: twice the span of three samples.  Without it,
+# Maximum step forward, over `_longest_gap`: twice the span of three samples.  Without it,
 # random stamps would move the time line until a float no longer resolves milliseconds.
 _FAR = 4.0
 
@@ -282,8 +282,8 @@ class BrownoutFlag:
 
         `risk`: within the horizon; `soon`: within the next second at the present throttle (omitted
         or NaN: as `risk`).  `tight`: the budget is below the throttle in use.  `fresh`: the
-        samples behind the risk are not too old.  `arriving`: samples still arrive, whatever their
-        stamps, so a last one at the floor still counts (by default as `fresh`).
+        samples behind the risk are not too old.  `arriving` (default: `fresh`): samples still
+        arrive, whatever their stamps, so a last one at the floor still counts.
         """
         soon = risk if soon is None or math.isnan(soon) else soon
         for one in (risk, soon):
