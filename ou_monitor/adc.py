@@ -221,7 +221,7 @@ class Scan:
 
 
 STAMP = 'in_timestamp'
-# Ratio to the typical interval above which samples are missing, because the buffer was full.
+# An interval above this multiple of the typical one means samples lost by a full buffer.
 HOLE = 1.5
 # Number of newest intervals whose median is the typical one.
 INTERVALS = 64

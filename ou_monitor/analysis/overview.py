@@ -20,7 +20,7 @@ from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.records import FloatArray, NAN, OuFacts, Recording
 from ou_monitor.text import counted, number, percent, volts, Z95
 
-# Minimum ratio of the noise at both ends of throttle that is reported as a change.
+# Minimum ratio between the noise at the two ends of throttle that is reported as a change.
 _GROWS = 1.25
 # Minimum noise, V; less is rounding.
 _NOTHING = 1e-9
@@ -228,7 +228,7 @@ def _noise_words(found: Overview) -> str:
 
 def other_scale(ou: OuFacts, alpha: float, ln_alpha_se: float, sigma: float, ln_sigma_se: float,
                 ) -> bool:
-    """Return whether the interval of alpha or sigma of another fit is apart from the facts'."""
+    """Return whether another fit's interval of alpha or sigma and the facts' are disjoint."""
     return ou.status == 'ok' and any(
         x * math.exp(Z95 * se) < low or x * math.exp(-Z95 * se) > high
         for x, se, (low, high) in ((alpha, ln_alpha_se, ou.alpha_95),

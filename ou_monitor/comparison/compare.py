@@ -23,8 +23,8 @@ from ou_monitor.model.supply import SupplyModel
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.text import counted, number
 
-# Minimum readings of a part, and its minimum duration, s; minimum simulations, with which 5 % of
-# good models are refused, and maximum.
+# Minimum readings and duration, s, of a part; minimum simulations (with so few, 5 % of good models
+# are refused) and maximum.
 _LEAST, _SHORTEST, _FEWEST_SEEDS, _MOST_SEEDS = 50, 0.2, 20, 10_000
 # Maximum points of the band on a page.
 _POINTS = 2000

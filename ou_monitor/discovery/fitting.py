@@ -32,7 +32,7 @@ _FULL, _PREVIEW, _FEW = 2, 8000, 4
 _WITHIN = 0.5
 # Maximum alternations between the fit and terms with parameters of their own (`APART`).
 _AGAIN = 3
-# Difference below which two fits to one spectrum, nats, and two scores, count as equal.
+# Fits to one spectrum (nats), and scores, that differ by less than this are equal.
 _ALIKE, _SAME = 0.1, 1e-6
 
 
@@ -129,8 +129,8 @@ class Fitter:
         Return kinds that improve a model: all are estimated, and the best few fitted in full.
 
         Kinds that failed before are tried again if score tests show more than at that time.  Kinds
-        whose fit takes seconds come last, and only if score tests still show them once the best
-        other kind is added, or if they imitate that kind.  statistics: function of a model.
+        whose fit takes seconds come last, and only if they imitate the best other kind or score
+        tests still show them after it is added.  statistics: function of a model.
         """
         values = statistics(composite)
         shown = {kind: decision.score_gain(kind, values) for kind in kinds}

@@ -1,5 +1,5 @@
 """
-Draw readings that the ADC limits: clipped ones, and those in codes wider than the rail's moves.
+Redraw readings that the ADC clips, or rounds to codes wider than the rail's moves.
 
 A path of the rail is drawn given all readings, then each limited reading given the path.  For a
 clipped reading, neighbouring samples, throttle and noise determine the distribution beyond the

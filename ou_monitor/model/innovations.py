@@ -43,8 +43,8 @@ class Filter:
     Gains and predictive variances of a model; filters any number of series of n samples.
 
     Beyond the model's samples, its matrices and gain are taken as constant.  `variance`, V^2,
-    shape (n,), is for the innovations; `shape`: number of samples with their own gain, and of
-    states.  ValueError when the precision is not positive definite.
+    shape (n,), is for the innovations; `shape`: numbers of samples with their own gain,
+    and of states.  ValueError when the precision is not positive definite.
     """
 
     def __init__(self, model: StateSpace, n: int | None = None) -> None:
@@ -194,7 +194,7 @@ Pattern = npt.NDArray[np.bool_]
 
 
 def _pattern(a: FloatArray) -> Pattern:
-    """Return which elements of matrices, shape (d, d, n), are not zero for all n."""
+    """Return which elements of matrices, shape (d, d, n), are nonzero for some n."""
     return np.asarray(a.any(axis=2))
 
 
@@ -217,7 +217,7 @@ def _times(a: FloatArray, b: FloatArray, left: Pattern, right: Pattern) -> Float
 
 def _symmetric(a: FloatArray, b: FloatArray, left: Pattern, right: Pattern, out: FloatArray
                ) -> None:
-    """Write the product of the transpose of a with b, which is symmetric, into `out` (zeros)."""
+    """Write the symmetric product a^T b into `out` (zeros)."""
     for k, i in np.argwhere(left).tolist():
         for j in np.flatnonzero(right[k, :i + 1]).tolist():
             out[i, j] += a[k, i] * b[k, j]

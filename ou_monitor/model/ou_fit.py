@@ -9,7 +9,7 @@ these regressors.
 The size of the noise depends on the load and its changes, and readings are weighted by it:
 otherwise the errors of the load model while the load moves would be taken for a fast OU.  The
 noise is white noise, the OU, and a random walk of the level, whose size has a prior and may be
-zero; without the walk, the rest of the level would be taken for a slow OU.  The fit maximises a
+zero; without it, what the hats miss of the level would pass for a slow OU.  The fit maximises a
 restricted likelihood in the frequency domain (`whittle.CrossSpectrum`).  Intervals are quantiles
 from importance sampling about all its maxima over the rate; the prior is flat in ln(alpha), and
 arcsine in the share of the OU.
@@ -21,7 +21,7 @@ changes, a load that neither throttle nor current shows, and noise with another 
 filtered sensor).
 
 On 1200 simulated rails under a quad's throttle (alpha 2 to 500 1/s, 50 to 1000 Hz, OU of 20 mV,
-white noise to 30 mV, windows of 20 s, above 300 Hz of 8 s) 93 % of the 95 % intervals contained
+white noise to 30 mV, windows of 20 s, or 8 s above 300 Hz) 93 % of the 95 % intervals contained
 alpha (most others lay above it), 93 % sigma, 92 % Var_inf; without white noise 90, 90 and 87 %.
 99 % of the bounds were correct.
 """
@@ -39,7 +39,7 @@ from ou_monitor.model.load import CELL
 from ou_monitor.model.whittle import CrossSpectrum
 from ou_monitor.records import determined, FloatArray, MOST_READINGS, OU_WINDOWS, OuFacts
 
-# Evidence against white noise alone from which a relaxation is visible, nats: more than white
+# Least evidence, nats, against white noise alone for a visible relaxation: more than white
 # noise showed in any window of 120 simulated recordings (test_ou_fit.py repeats a part).
 VISIBLE = 12.0
 # Distance of the level's knots, s; minimum number of parts.
@@ -52,14 +52,14 @@ _DELAYS, _DELAY_READINGS = 4, 8000
 _FAR = 20
 # Minimum range of a throttle that moves.
 _MOVED = 0.01
-# Minimum length of a gap, in usual steps: to restart at each lost message would cost more than the
-# error of the time line.  Minimum number of readings in a stretch.
+# Minimum length of a gap, in usual steps: restarting at each lost message would cost more
+# than the error of its time.  Minimum number of readings in a stretch.
 _GAP, _STRETCH = 5.0, 16
 # Minimum share of the readings in pieces of equal length.
 _HELD = 0.8
 # The shortest of OU_WINDOWS in which alpha is known within this factor is used, else the longest.
-# The search ends when alpha is precise, not when the relaxation is visible: in a short window,
-# visibility by chance depends on the estimate, and selecting by it would bias the estimate.
+# The search ends when alpha is precise, not when the relaxation is visible: in a short window
+# visibility depends on the estimate's error, so selecting by it would bias the estimate.
 PRECISE = 1.5
 # Minimum number of readings beyond the number of regressors.
 FEWEST = 40
@@ -73,7 +73,7 @@ _GRID, _LOGIT = (24, 16, 5), (-7.0, 12.0)
 # refine the walk.
 _ASIDE = np.linspace(-1.2, 1.2, 17)
 _REFINE = (1.2, 0.6, 0.3, 0.15)
-# Law of the noise's size: time constants, s, between whose lagged loads differences are taken;
+# Law of the noise's size: time constants, s, of the lagged loads whose differences are taken;
 # prior deviation of the coefficients; rounds of the fit.
 _CHANGES, _SIZE_SD, _SIZE_ROUNDS = (0.03, 0.2, 1.0), 0.5, 12
 # Maximum number of steps towards the maximum, and convergence tolerance of a step.
@@ -81,10 +81,10 @@ _LOOKS, _NEAR = 40, 0.05
 # Draws about the maxima in each round, and rounds; minimum share of the draws for a maximum.
 _DRAWS, _ROUNDS, _FEWEST_DRAWN = 1000, 4, 0.05
 # Minima of the cost over the rate: distance from the lowest, nats, up to which they are refined,
-# and up to which they count (with e^-6 of the likelihood one does not affect a 95 % interval).
+# and up to which they count (e^-6 of the likelihood does not affect a 95 % interval).
 _TRIED, _RIVAL = 10.0, 6.0
-# Standard deviation of ln(alpha), from the curvature at the maximum and widened by 1.2, from which
-# a window is imprecise: among 437 simulated windows, the 190 precise ones had at most 0.28.
+# A window is imprecise above this standard deviation of ln(alpha) (from the curvature at the
+# maximum, times 1.2): among 437 simulated windows, the 190 precise ones had at most 0.28.
 _IMPRECISE = 0.37
 # The level's usual walk, V per sqrt(s) and cell, and the prior deviation of its logarithm above
 # that: walks of .0015 to .015 fit the recordings (doc/load.md).
@@ -175,8 +175,8 @@ class Regression:
     places: npt.NDArray[np.intp]  # of the readings in stretches without gaps, shape (n,)
     voltage: FloatArray  # V, residual, shape (n,)
     size: FloatArray  # size of the noise over its rms, shape (n,)
-    # Orthonormal regressors, in units of the size, shape (p, n); without any each stretch has a
-    # mean of its own.
+    # Orthonormal regressors, in units of the size, shape (p, n); without any, each stretch has
+    # its own mean.
     basis: FloatArray
     lengths: list[int]  # of the stretches
     walk: float  # usual walk of the level, V per sqrt(s)
@@ -435,7 +435,7 @@ def fit_pieces(parts: Sequence[tuple[FloatArray, FloatArray]], dt: float, walk: 
     """Fit the noise to pieces (V, relative size of the noise), each with its own mean."""
     parts = [part for part in parts if part[0].size >= _STRETCH]
     total = sum(part[0].size for part in parts)
-    # Pieces of equal length: the longest, up to a hat, that contain most readings.
+    # Equal pieces: the longest, at most _HATS s, that contain most readings.
     n = max([_STRETCH, *(part[0].size for part in parts)])
     n = min(n, max(_STRETCH, round(_HATS / dt)))
     while n > _STRETCH and sum(part[0].size // n * n for part in parts) < _HELD * total:
@@ -523,7 +523,7 @@ def _rivals(cost: Callable[[FloatArray], FloatArray], points: FloatArray, value:
 
 def _moments(points: FloatArray, weight: FloatArray, more: FloatArray
              ) -> tuple[FloatArray, FloatArray]:
-    """Return the mean of weighted points, and a root of their covariance and more."""
+    """Return the mean of weighted points, and a root of their covariance + `more`."""
     weight = weight / max(float(weight.sum()), 1e-300)
     centre = weight @ points
     off = points - centre
@@ -547,7 +547,7 @@ def _log_density(points: FloatArray, part: float, centre: FloatArray, root: Floa
 
 
 def _curvature(cost: Callable[[FloatArray], FloatArray], centre: FloatArray) -> FloatArray:
-    """Return a root of the covariance from a cost's curvature, at most 2 in each direction."""
+    """Return a root of the covariance from a cost's curvature; deviations are at most 2."""
     step = 0.15 * np.eye(3)
     signs = ((1, 1, 1.0), (1, -1, -1.0), (-1, 1, -1.0), (-1, -1, 1.0))
     H = np.zeros((3, 3))
@@ -591,7 +591,7 @@ def _unseen(costs: Callable[[FloatArray], tuple[FloatArray, FloatArray]], low: F
             points = np.where(better, other, points)
             value, variance = (np.where(better[:, 0], x, y)
                                for x, y in ((cost, value), (size, variance)))
-    # At the best walk, interpolate the root of the loss: a parabola's root is linear.
+    # At the best walk, interpolate sqrt(loss), which is linear for a parabola.
     lost = (value - min(least, float(value.min()))).reshape(shape)
     fine = _finer(np.sqrt(np.maximum(lost, 0.0))) ** 2
     size, logit = (_finer(x.reshape(shape))

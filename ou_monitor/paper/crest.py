@@ -217,8 +217,8 @@ def jump_rows(found: list[JumpCrest], crests: Crests) -> list[Row]:
     inputs = over(published.HIGH.crest_range, published.LOW.crest_range)
     result = [Row(
         WHERE, 'Vpp/Vrms, 40 % over 5 %', '', Printed('> 1'), high / low, 'quotient from Table 1',
-        f'"From Gaussian noise to impulse disturbances with load" would raise it; it falls from '
-        f'{low:.1f} to {high:.1f}; the resolution of the readings allows a quotient of '
+        '"From Gaussian noise to impulse disturbances with load" would raise it, but it falls '
+        f'from {low:.1f} to {high:.1f}; the resolution of the readings allows a quotient of '
         f'{inputs[0]:.2f} to {inputs[1]:.2f}.', inputs=inputs, point=8)]
     for state in (published.LOW, published.MEDIUM):
         value, inputs = state.crest, state.crest_range
@@ -229,7 +229,7 @@ def jump_rows(found: list[JumpCrest], crests: Crests) -> list[Row]:
                 Printed(f'{value:.1f}'), best.mean,
                 f'OU with compound Poisson jumps that relax at alpha, best of '
                 f'{len(RATES) * len(SHARES)} kinds, Monte Carlo',
-                f'On average {best.mean:.1f} at best ({best.band[0]:.1f} to {best.band[1]:.1f}), '
+                f'Largest mean: {best.mean:.1f} ({best.band[0]:.1f} to {best.band[1]:.1f}), '
                 f'with {best.rate:g} jumps a second of {best.size(state.vrms.value):.0f} mV rms, '
                 f'{100 * best.share:.0f} % of the variance, excess kurtosis '
                 f'{best.kurtosis:.1f}; impulses too short to count in Vrms would need '

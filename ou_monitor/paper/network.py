@@ -23,10 +23,10 @@ the paper would need 0.4 F.  Exceptions:
 
 - Slow noise.  If the noise relaxes more slowly than the pole (a small C, or flutter), alpha is the
   rate of the noise and does not depend on C.
-- ESR.  With r fixed, fast noise of the current keeps a voltage variance of (R r / (R + r))^2 times
-  its own for any C, and the share of the pole falls; below 1 %, alpha jumps up to the next pole,
-  the rate of the noise.  With r C fixed (capacitors of one series in parallel), neither happens on
-  the bus.
+- ESR.  With r fixed, fast noise of the current leaves a voltage variance of (R r / (R + r))^2
+  times the current's for any C, and the share of the pole falls; below 1 %, alpha jumps up to the
+  next pole, the rate of the noise.  With r C fixed (capacitors of one series in parallel),
+  neither happens on the bus.
 - LC filter.  C shorts the battery resistance that damps L, so the resonance rises; if it is
   excited, Var_inf of either rail may rise with C.  With a constant-power regulator it may become
   an oscillation.
@@ -421,7 +421,7 @@ def _circuit(net: PowerNetwork, g: float) -> tuple[FloatArray, dict[str, FloatAr
         bus = source = (r * unit['bulk'] - r * esr * drawn) / (r + esr - r * esr * g)
         current = -g * source
     rate['bulk'] = (-bus / r - drawn - current) / net.bulk_capacitance
-    # `line` is the slow part of its input, which the regulator rejects.
+    # `line` is the slow part of the regulator's input, which it rejects.
     rate['line'] = 2.0 * math.pi * net.regulator_bandwidth * (source - unit['line'])
     passed = net.line_feedthrough * (source - unit['line'])
     ro, eso = net.regulator_resistance, net.output_esr

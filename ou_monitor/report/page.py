@@ -247,7 +247,7 @@ def _file(name: str) -> str:
 def _script() -> tuple[str, str]:
     """Return the script, and its hash as a source of the content security policy."""
     code = ''.join(_file(f'plots_{part}.js') for part in ('draw', 'input', 'live'))
-    # XML parsers read these marks as character data, scripts as comments.
+    # These marks are character data to XML parsers, comments to scripts.
     text = f"//<![CDATA[\n'use strict';\n{{\n{code}}}\n//]]>"
     digest = base64.b64encode(hashlib.sha256(text.encode('utf-8')).digest()).decode('ascii')
     return text, f"'sha256-{digest}'"

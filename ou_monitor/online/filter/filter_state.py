@@ -6,8 +6,8 @@ With w = 2 pi fc, input x, output y:
     order 1:  y' = w (x - y)
     order 2:  y' = w s,  s' = w (x - y - sqrt(2) s)     (Butterworth)
 
-A changing cutoff only stretches time (dtau = w dt), so with *any* sequence of
-cutoffs y is the response of one fixed filter to the input in stretched time.  So y
+A changing cutoff only stretches time (dtau = w dt), so for *any* sequence of
+cutoffs, y is the response of one fixed filter to the input in stretched time.  So y
 is continuous, and at most the largest input times the integral of the absolute
 impulse response: 1 for order 1, coth(pi / 2) = 1.0903 for order 2.
 

@@ -1,7 +1,7 @@
 """
 Group samples into blocks, and learn the delay of throttle and the noise from them.
 
-Blocks have equal throttle, at most about 50 per second.  Limits: an incomplete block is not
+A block has one throttle; at most about 50 a second.  Limits: an incomplete block is not
 returned, so a fast source is followed 20 ms late; of several throttle changes within 20 ms only
 the first three are resolved.
 
@@ -210,7 +210,7 @@ class LoadDelay:
         return bool(mean > -_SIGNIFICANT * math.sqrt(max(0.0, variance) / (self._pieces - 1.0)))
 
     def _choose(self, dt: float) -> bool:
-        # For a load of known sign, count only voltages that fall with it.
+        # With a load of known sign, count only voltages that fall as it rises.
         falls = self._xv if self._either else [min(one, 0.0) for one in self._xv]
         left = [1.0 - one * one / max(self._xx * other, 1e-300)
                 for one, other in zip(falls, self._vv)]
@@ -224,7 +224,7 @@ class LoadDelay:
         return True
 
 
-# Limit of standard scores: larger ones have less weight, and enter the noise as this limit.
+# Limit of standard scores: larger ones weigh less, and count as this limit in the noise.
 CLIP, _OUTLIER = 4.0, 16.0
 # Variance of a prediction, V^2, above which the filter has diverged, as after readings of
 # megavolts, and restarts.

@@ -29,7 +29,7 @@ SIZE_ERROR = 0.1
 # Minimum relative error of the noise: its scatter between simulated flights of one model.
 _NOISE_FORM = 0.15
 # Minimum relative error of the discharge per load: rms of ln of its ratio on 12 recorded pairs
-# (halves of gecko, nazgul and hiro, three flights of roma), whose packs were at other charges.
+# (halves of gecko, nazgul and hiro, three flights of roma), with packs at different charges.
 _DISCHARGE_FORM = 0.64
 # Lower limit of the noise, V.
 _LEAST_NOISE = 1e-6
@@ -38,7 +38,7 @@ _LEAST_NOISE = 1e-6
 _LEAST, _ERRORS = 0.10, 2.33
 # Relative error above which the ratio is not determined.
 _VAGUE = 0.15
-# Ratio of sag to the model's below which pack or load differs: warm packs have 0.75 or more.
+# Below this ratio of sag to the model's, pack or load differs: warm packs have 0.75 or more.
 _OTHER = 0.7
 # Factor between level and the model's level, up or down, beyond which it is another pack.
 OTHER_LEVEL = 1.3
@@ -168,7 +168,7 @@ def other_pack(start: LoadStart, highest: float, level: float) -> str:
     if not _EMPTY <= start.volts / cells <= _FULL:
         other = not 1.0 / OTHER_LEVEL < level / start.volts < OTHER_LEVEL
     elif highest / cells < _TAKE_OFF:
-        # It never was full in this flight; a pack that was would only have emptied.
+        # Never full in this flight; one that was full may merely have emptied.
         return (f'The highest voltage at rest, {highest:.2f} V, is {highest / cells:.2f} V for '
                 f"each of the model's {cells:.0f} cells: another pack, or an empty one.")
     else:
@@ -194,7 +194,7 @@ def judge(ratio: float, se: float, date: str) -> tuple[ModelVerdict, str]:
 
 def compare(found: Contrast, start: LoadStart, ohm: float, ohm_se: float, other: str, date: str,
             discharge: float, discharge_se: float) -> ModelComparison:
-    """Compare this flight with an earlier model (ohm: now; other: as of `other_pack`)."""
+    """Compare this flight with an earlier model (ohm: now; other: from `other_pack`)."""
     # Levels at which the two were measured: the sag of a pack falls as it empties and warms.
     apart = found.level - (start.level or start.volts / start.cells)
     as_found = math.exp(-start.warming * apart)

@@ -3,14 +3,14 @@ Crazyflie logs of the micro-SD deck, read without a library.
 
 Limits: the battery is read at 100 Hz or less, so a faster log repeats it.  The format has
 one checksum over the whole file: a mismatch does not locate the wrong bytes, and a
-note reports it.  The firmware's own events are read only by name.
+note reports it.  The firmware's own events are used only if named.
 
 As written by bitcraze/crazyflie-firmware (src/deck/drivers/src/usddeck.c; decoded by
 tools/usdlog/cfusdlog.py), little-endian: byte 0xBC, version and number of events (2 x uint16);
 for each event its number (uint16), name (ending in 0), number of variables (uint16), and each
 variable as ``group.name(type)`` (ending in 0), the type a letter of Python's `struct`; then
-records of the number of an event, a stamp (version 1: uint32, ms; 2: uint64, us) and its
-variables; at the end the CRC-32 of everything before.
+records: an event's number, a stamp (version 1: uint32, ms; 2: uint64, us), the variables; at the
+end the CRC-32 of everything before.
 """
 
 from __future__ import annotations
