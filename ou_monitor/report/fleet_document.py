@@ -128,12 +128,11 @@ def _flown(fleet: Fleet, trends: Sequence[Trend]) -> str:
 
 def _growth(judged: Judgement, trend: Trend) -> str:
     """Return by how much a quantity of a pack grows, from where to where."""
-    values = judged.values[trend.quantity]
-    first, last = (_plain(values, trend.line(np.array(float(flight))))
+    first, last = (_plain(judged.values[trend.quantity], trend.line(np.array(float(flight))))
                    for flight in (trend.first, trend.last))
     return (f'{trend.quantity} {change(trend.slope)} per flight (95 % {change(trend.low)} to '
             f'{change(trend.high)}), {first} to {last} {_UNITS[trend.quantity]}'
-            f'{_a_cell(judged, trend.quantity, trend.vehicle)}'
+            + _a_cell(judged, trend.quantity, trend.vehicle)
             + ' at full throttle' * (trend.quantity == 'sag'))
 
 
