@@ -9,7 +9,7 @@ from ou_monitor.report.document import (
 from ou_monitor.report.page import html
 from ou_monitor.report.svg import Plot
 from ou_monitor.report.terminal import terminal
-from ou_monitor.text import number
+from ou_monitor.text import number, percent
 from pages import parsed, self_contained
 import pytest
 
@@ -94,3 +94,10 @@ def test_a_page_has_typographic_signs():
 def test_numbers_keep_their_significant_digits(value, digits, text):
     """Significant digits, zeros kept, rounding across a decade."""
     assert number(value, digits) == text
+
+
+@pytest.mark.parametrize('share, text', [
+    (1.0, '100 %'), (0.996, '100 %'), (0.00056, '0.056 %'), (0.0134, '1.3 %'), (0.0, '0 %')])
+def test_shares_have_two_digits_and_no_exponent(share, text):
+    """What most lines of a report state: 1e+02 % is not read at a glance."""
+    assert percent(share) == text

@@ -376,3 +376,19 @@ def test_a_risk_that_falls_again_is_no_way_through(at):
 def test_above_the_limit_from_the_start():
     throttle, reason = budget(np.full(51, 0.3))
     assert throttle == 0.0 and 'idle' in reason
+
+
+def test_idling_is_not_charged_with_the_punches_of_the_flight():
+    """Idle is 1.4 V above the limit; the excursions of the flight alone would make it 0.004."""
+    t = np.arange(6000) / 100.0
+    u = np.where(t % 5.0 < 4.5, 0.3 + 0.05 * np.sin(t), 0.9)
+    v = 16.0 - 3.0 * u**1.8 + 0.02 * np.random.default_rng(5).standard_normal(t.size)
+    monitor = SupplyMonitor(MonitorSettings(brownout_voltage=14.5, brownout_horizon=2.0))
+    risks = []
+    for k in range(0, t.size, 20):
+        monitor.push(t[k:k + 20], v[k:k + 20], u[k:k + 20])
+        if t[k] > 30.0 and v[k + 19] > 15.0:
+            risks.append(monitor.risk_if(0.0, 2.0, 14.5, 2.0))
+    assert max(risks) < 0.001
+    # A punch, which the flight has shown, is not safe.
+    assert monitor.risk_if(0.9, 0.5, 14.5, 2.0) > 0.5
