@@ -37,9 +37,10 @@ from ou_monitor.text import plain_number
 TIME, VOLTAGE, THROTTLE = 'time_s', 'voltage_v', 'throttle'
 
 # Words of loggers for a missing number, or for one beyond the range.
-MISSING = frozenset(',nan,null,none,na,n/a,#n/a,-,--,x,∞,-∞,ol,-ol,ovl,overload'.split(','))
+MISSING = frozenset(',nan,null,none,na,n/a,#n/a,-,--,x,∞,-∞,ol,-ol,ovl,overload,unavailable,'
+                    'unknown'.split(','))
 # Added to the error about a cell with a decimal comma.
-_MARK = ': the decimal mark is a point'
+_MARK = ': the decimal mark is a point (--decimal)'
 # Maximum characters of a cell that are shown.
 _LONGEST = 40
 # Maximum characters of a line: a log of 1000 columns has lines of some 10 000.
@@ -81,6 +82,8 @@ _WITH_UNIT = re.compile(
     rf'(.*(?:time|zeit|stamp|elapsed)|t)(?: ?[\[({{/_ ] ?| in )({_LONG})[\])}}]?|'
     rf'(.*?) ?[\[({{] ?{_WORD} ?[\])}}]|(.+?) in {_WORD}|(.[^/]*?|.+? ) ?/ ?{_WORD}|'
     rf'(.+?)[ _]{_WORD}')
+# A unit before more words: 101 (VDC)- Battery.
+_BEFORE = re.compile(rf'(.*?)( ?[\[(]{_WORD}[\])]) ?[-:] ?(\w.*)', re.IGNORECASE)
 # Volts*100; current (10 mA).
 _MULTIPLE = re.compile(r'(.*?)(?: ?\* ?(10+)|([\[(] ?)(10+|0?\.0*1) ?([a-zµμ%]+ ?[\])]))',
                        re.IGNORECASE)
@@ -90,6 +93,8 @@ _GROUPED = re.compile(r'[-+]?\d{1,3}(?:,\d{3})+\.\d+')
 # A number with points between thousands, not a part of a date or a clock.
 _THOUSANDS = re.compile(r'(?<![\d.,:])\d{1,3}(?:\.\d{3})+(?![\d.:])')
 _AND_UNIT = re.compile(r'(\S*[\d.])\s*+([^\d\s.]{1,12}+(?: [AaDd][Cc])?)')  # 12.3 mV DC
+# A number whose decimal comma is within quotes, and does not separate thousands.
+_QUOTED = re.compile(r'"[-+]?\d+,(?!\d{3}(?!\d))\d+[^",]*"')
 # Lines above the data that state the time between rows, or its inverse.
 _NUMBER = r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?'
 # Possessive, so that the time is proportional to the length of a line of blanks.
@@ -163,7 +168,8 @@ def form_of(path: Path, wanted: CsvColumns) -> Form:
     best: tuple[float, Form] | None = None
     for delimiter in (',', ';', '\t', '|', ' ') if given is None else (given,):
         for mark in (wanted.decimal,) if wanted.decimal else ('.', ','):
-            if mark == delimiter or best and delimiter == ' ' and best[1].width > 1:
+            if mark == delimiter and not (wanted.decimal or _QUOTED.search(text)) or (
+                    best and delimiter == ' ' and best[1].width > 1):
                 continue
             found = _score_form(lines, encoding, delimiter, mark == ',', wanted)
             if found and (best is None or found[0] > best[0]):
@@ -205,6 +211,8 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool,
                 skipinitialspace=True)), [])])
         except csv.Error:
             rows.append([])
+    if comma and delimiter == ',':
+        rows = [list(map(_with_point, row)) for row in rows]
     # A quoted field may hold line breaks; the rest of it is not a row of the format.
     filled = [row for row in rows[skip:] if any(row)]
     widths = Counter(len(row) for row in filled[len(filled) // 3:])
@@ -269,11 +277,14 @@ def _prepared(lines: list[str], delimiter: str, comma: bool, stated_comma: bool)
             else line for line in lines]
     if stated_comma:
         lines = [_THOUSANDS.sub(lambda found: found[0].replace('.', ''), line) for line in lines]
-    if comma:
-        # A point becomes a comma, so that a thousands separator is not taken for a decimal mark.
-        lines = ['\0'.join(line.split('.')).replace(',', '.').replace('\0', ',')
-                 for line in lines]
+    if comma and delimiter != ',':
+        lines = [_with_point(line) for line in lines]
     return [' '.join(line.split()) + '\n' for line in lines] if delimiter == ' ' else lines
+
+
+def _with_point(text: str) -> str:
+    """Swap points and commas, so that a thousands separator is not taken for a decimal mark."""
+    return text.replace('.', '\0').replace(',', '.').replace('\0', ',')
 
 
 def number_of(cell: str) -> tuple[float, str]:
@@ -326,6 +337,8 @@ def swapped(cell: str) -> str:
 def unit_of(name: str) -> tuple[str, str]:
     """Split a name into its quantity and the unit it states, in lower case; '': none."""
     text = ' '.join(name.strip().strip('\'"').split())
+    if found := _BEFORE.fullmatch(text):
+        text = f'{found[1]} {found[4]}{found[2]}'
     if found := _MULTIPLE.fullmatch(text):
         text = found[1] + (found[3] or '') + (found[5] or '')
     if found := re.match(r'(milli(?:second)?s|micro(?:second)?s|[mun]s)(?![a-z])', text.lower()):
@@ -476,6 +489,8 @@ def _blocks(path: Path, file: TextIO, form: Form, width: int,
         before = reader.line_num
         try:
             rows = list(islice(reader, _BLOCK))
+            if form.comma and form.delimiter == ',':
+                rows = [list(map(_with_point, row)) for row in rows]
         except csv.Error as error:
             raise InputError(f'{path}:{form.skip + reader.line_num}: {error}: close each quote '
                              'in its line') from error
@@ -567,9 +582,9 @@ def _floats(cells: Sequence[str], where: Callable[[int], str], comma: bool, stat
             found.append(math.nan)
         else:
             if comma:
-                cell = cell.replace('.', '\0').replace(',', '.').replace('\0', ',')
+                cell = _with_point(cell)
             mark = _MARK if cell.count(',') == 1 and not comma else (
-                ': the decimal mark is a comma' * comma)
+                _MARK.replace('point', 'comma') * comma)
             wrong = f"{where(k)} holds '{shown(cell)}', not a number{mark}"
             if good is None or left_out is None:
                 raise InputError(wrong)

@@ -677,10 +677,13 @@ def _in_si(quantity: str, column: _Column, values: FloatArray, given: str | None
     known = np.abs(values[np.isfinite(values)])
     if quantity == logs.THROTTLE:
         unit = given or SHARE_WORDS.get(column.unit) or _PULSE_WORDS.get(column.unit)
-        words = ''
-        if unit is None:
-            unit = _throttle_unit(values[np.isfinite(values)], volts)
-            words = '' if unit == '1' else ', a guess: --throttle-unit'
+        guess = unit is None
+        unit = unit or _throttle_unit(values[np.isfinite(values)], volts)
+        # Percent below 0 are of a stick; a duty below 0 is of a motor in reverse.
+        if given is None and unit == '%' and np.mean(values < -MOST_THROTTLE) > WILD and not (
+                re.search('duty|pwm', column.name.lower())):
+            guess, unit = True, '-100:100'
+        words = ', a guess: --throttle-unit' if guess and unit != '1' else ''
         low, high = THROTTLE_UNITS.get(unit) or map(float, unit.split(':'))
         return (values - low) / (high - low), (
             '0..1' if unit == '1' else unit) + words

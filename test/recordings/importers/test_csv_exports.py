@@ -225,6 +225,16 @@ FORMS = {
         f'{k},{100 * V[k]:.1f},{100 * AMPS[k]:.0f},{1e3 * U[k]:.0f}')), 0.01, True, True),
     'uv': (table(['Time(ms),Pack(uV)'], lambda k: f'{10 * k},{1e6 * V[k]:.0f}'), 0.01, False,
            False),
+    # A unit within a name.
+    'benchvue': (table(['Name:,Load test,', 'Scan Interval:,0.01 s,', '', 'Scan Sweep Time (Sec),'
+                        'Scan Number,101 (VDC)- Pack,121 (ADC)- Load'], lambda k: (
+        f"{clock(k, '%m/%d/%Y %H:%M:%S.%f')},{k},{V[k]},{AMPS[k]}")), 0.01, False, True),
+    # The mark of decimals separates the cells, too: numbers with decimals are quoted.
+    'libreoffice_de': (table(['Zeit (s),Spannung (V),Strom (A),Gas'], lambda k: ','.join(
+        f'"{german(x)}"' if x % 1.0 else f'{x:.0f}' for x in (0.01 * k, V[k], AMPS[k], U[k]))),
+                       0.01, True, True),
+    'airdata_sticks': (table(['time(millisecond),voltage(v),rc_throttle(percent)'], lambda k: (
+        f'{10 * k},{V[k]},{200 * U[k] - 100:.1f}')), 0.01, True, False),
     # The column whose unit is known is the throttle.
     'airdata': (table(['time(millisecond),voltage(v),rc_throttle,rc_throttle(percent)'],
                       lambda k: f'{10 * k},{V[k]},{364 + 1320 * U[k]:.0f},{100 * U[k]:.1f}'),
@@ -393,6 +403,9 @@ def test_the_unit_of_a_throttle(tmp_path):
     found = read_recording(percent, columns=CsvColumns(throttle_unit='%', current='none'))
     assert found.throttle[0] == pytest.approx(0.01) and found.current is None
     assert not read_recording(path, columns=CsvColumns(throttle='none')).has_throttle
+    # A duty below 0 runs a motor in reverse.
+    duty = written(tmp_path, 't,U,duty [%]\n0,12,-50\n1,12,50\n', 'c.csv')
+    np.testing.assert_allclose(read_recording(duty).throttle, [-0.5, 0.5])
 
 
 def test_a_current_is_not_read_as_a_voltage(tmp_path):
@@ -429,6 +442,15 @@ def test_a_given_decimal_comma_makes_points_separate_thousands(tmp_path):
     recording = read_recording(written(tmp_path, text), columns=CsvColumns(decimal=','))
     np.testing.assert_allclose(recording.voltage, [24.674, 1024.6735])
     np.testing.assert_allclose(np.diff(recording.t), 0.125, atol=1e-6)
+
+
+def test_three_digits_behind_a_quoted_comma_may_be_thousands(tmp_path):
+    """In a CSV with commas between cells; refused unless the decimal mark is given."""
+    path = written(tmp_path, 't,U\n' + ''.join(f'{k},"16,52{k}"\n' for k in range(9)))
+    with pytest.raises(InputError, match='decimal mark is a point .--decimal'):
+        read_recording(path, columns=CsvColumns(voltage='U'))
+    found = read_recording(path, columns=CsvColumns(decimal=','))
+    np.testing.assert_allclose(found.voltage, 16.52 + 1e-3 * np.arange(9))
 
 
 def test_only_likely_voltages_are_listed_beside_the_chosen(tmp_path):
