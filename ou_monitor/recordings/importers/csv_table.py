@@ -1,7 +1,8 @@
 """
 Read a table of text, such as a CSV: time, voltage and, where present, throttle and current.
 
-Limits: a file is one flight; all rows have the same number of cells.  Columns and units are found
+Limits: a file is one flight; all rows have the same number of cells.  If rows hold a value and
+the name of its series, each series is read as a column of that name.  Columns and units are found
 by names and sizes and reported in one note; fields of `CsvColumns` override them.  A unit in a
 name or in a line of units is taken as stated; an unstated unit is guessed from the values.
 `time_s`, `voltage_v`, `throttle` and `current_a` are taken first and need no note.
@@ -113,6 +114,7 @@ class _Table(NamedTuple):
     """The data read from a file, in SI units."""
 
     form: Form
+    time: _Column  # Without a place if rows name their series
     t: FloatArray
     found: dict[str, tuple[_Column, FloatArray]]  # By quantity
     named: dict[str, FloatArray]  # Other requested columns, as written
@@ -181,7 +183,7 @@ def read(path: Path, request: Request) -> Log:
         series = [replace(one, t=t[order], values=one.values[order]) for one in series]
     if request.everything:
         known = {one.name for one in series} | {
-            table.form.names[place] for place in _time_of(path, table.form, CsvColumns()).place}
+            table.form.names[place] for place in table.time.place}
         others = [name for name in dict.fromkeys(header) if name not in known]
         if len(others) > MOST_COLUMNS:
             notes.append(f'{len(others) - MOST_COLUMNS} more columns are not listed.')
@@ -210,7 +212,9 @@ def holds_supply(path: Path) -> bool:
     try:
         nothing = CsvColumns()
         form = form_of(path, nothing)
-        _supply_of(path, form, nothing, _time_of(path, form, nothing), needed=True)
+        time = _time_of(path, form, nothing)
+        if not _series_of(path, form, nothing, time):
+            _supply_of(path, form, nothing, time, needed=True)
         return True
     except InputError:
         return False
@@ -223,8 +227,11 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
 
     left_out as in `numbers`.
     """
-    form = form_of(path, wanted)
-    time = _time_of(path, form, wanted)
+    raw = form = form_of(path, wanted)
+    time = clock = _time_of(path, form, wanted)
+    if series := _series_of(path, form, wanted, time):
+        form, label, value = series
+        more, time = form.names, time._replace(place=())
     found = _supply_of(path, form, wanted, time, needed)
     others = {name: form.names.index(name) for name in more if name in form.names}
     for name, place in others.items():
@@ -237,11 +244,24 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
     for place in (*time.place, *places):
         if form.names.count(form.names[place]) > 1:
             raise InputError(f"{path}:{form.line}: column '{form.names[place]}' occurs twice")
-    t, values = _read(path, form, time, places, left_out)
+    if series:
+        labels: list[str] = []
+        t, (mixed,) = _read(path, raw, clock, [value], left_out, {label: labels})
+        mine, *others_of = (np.array(labels) == form.names[place] for place in places)
+        _check_one_series(path, raw, t, raw.names[value], np.where(mine, mixed, np.nan))
+        values, stamps, t = [mixed[mine]], t, t[mine]
+        for rows in others_of:
+            # The last value of each series at the stamps of the voltage.
+            part = np.flatnonzero(rows)
+            part = part[np.argsort(stamps[part], kind='stable')]
+            values.append(np.append(mixed[part], np.nan)[
+                np.searchsorted(stamps[part], t, side='right') - 1])
+    else:
+        t, values = _read(path, form, time, places, left_out)
     volts = next(zip(found, values), (None, t))[1] if logs.VOLTAGE in found else t
     if time.place:
         _check_backwards(path, t, volts, time.name, found)
-    t, words = _stamps(path, t, form, wanted, time)
+    t, words = _stamps(path, t, raw, wanted, clock)
     units = {'voltage': wanted.unit, 'throttle': wanted.throttle_unit}
     scaled, guesses = {}, {_TIME_NAME: words}
     for (quantity, column), column_values in zip(found.items(), values):
@@ -255,10 +275,11 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
                 quantity, column, column_values, units.get(quantity), volts,
                 guesses.get(logs.VOLTAGE, ''))
         scaled[quantity] = column, si
-    if logs.VOLTAGE in scaled:
-        _check_one_series(path, form, t, *scaled[logs.VOLTAGE])
+    if logs.VOLTAGE in scaled and not series:
+        column, si = scaled[logs.VOLTAGE]
+        _check_one_series(path, form, t, column.name, si)
     note = _read_note(form, time, found, guesses, wanted.throttle is None)
-    return _Table(form, t, scaled, dict(zip(others, values[len(found):])), note)
+    return _Table(form, time, t, scaled, dict(zip(others, values[len(found):])), note)
 
 
 def _absent(path: Path, form: Form, name: str, option: str = '') -> str:
@@ -476,9 +497,32 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: _Column, needed
     return found
 
 
+def _series_of(path: Path, form: Form, wanted: CsvColumns, time: _Column,
+               ) -> tuple[Form, int, int] | None:
+    """Return the form of the series that rows name, and the columns of their names and values."""
+    named = _choose(form, logs.VOLTAGE, time.place)
+    if not form.line or not time.place or (
+            named if wanted.voltage is None else wanted.voltage in form.names):
+        return None
+    places = [k for k in range(min(form.width, len(form.names))) if k not in time.place]
+    value = [k for k in places if _of_kind(form, k, False) and re.fullmatch(
+        rf'(?=.)(?:{_VALUE_NAME}|state)', form.names[k].lower())] or named
+    for place in (k for k in places if value and not _of_kind(form, k, True)):
+        labels: list[str] = []
+        numbers(path, form, [], {place: labels}, [])
+        names = tuple(sorted({*labels} - {''}))
+        series = form._replace(names=names, width=len(names), rows=(), units=tuple(
+            unit_of(name)[1] or form.units[value[0]] for name in names))
+        if wanted.voltage in names or len(names) <= MOST_COLUMNS and _choose(
+                series, logs.VOLTAGE):
+            return series, place, value[0]
+    return None
+
+
 def _read(path: Path, form: Form, time: _Column, places: list[int],
-          left_out: list[str] | None = None) -> tuple[FloatArray, list[FloatArray]]:
-    """Return the time as written, days and clocks in s, and columns of numbers."""
+          left_out: list[str] | None = None, texts: dict[int, list[str]] | None = None,
+          ) -> tuple[FloatArray, list[FloatArray]]:
+    """Return the time as written, days and clocks in s, and columns; texts as in `numbers`."""
     sample = [row[time.place[0]] for row in form.rows
               if time.place and time.place[0] < len(row) and row[time.place[0]]]
     if not time.place:
@@ -490,14 +534,15 @@ def _read(path: Path, form: Form, time: _Column, places: list[int],
             time.name == form.stated), values
     if sample and not is_number(sample[0]) and is_clock(sample[0]):
         clocks: list[list[str]] = [[] for _ in time.place]
-        values = numbers(path, form, places, dict(zip(time.place, clocks)), left_out)
+        values = numbers(path, form, places, dict(zip(time.place, clocks)) | (texts or {}),
+                         left_out)
         cells = clocks[0]
         if len(clocks) > 1 and all(map(str.isdigit, clocks[1])):
             cells = [f'{clock}.{part:0>3}' for clock, part in zip(*clocks)]
         elif len(clocks) > 1:
             cells = [' '.join(pair) for pair in zip(*clocks)]
         return _clock(path, [swapped(cell) for cell in cells], time.name, left_out), values
-    t, *values = numbers(path, form, [*time.place, *places], left_out=left_out)
+    t, *values = numbers(path, form, [*time.place, *places], texts, left_out)
     if len(time.place) > 1:
         part, *values = values
         t = t + part * TIME_UNITS[time.unit]
@@ -572,8 +617,8 @@ def _check_backwards(path: Path, t: FloatArray, voltage: FloatArray, name: str,
                          'ever rises: are the two columns swapped?')
 
 
-def _check_one_series(path: Path, form: Form, t: FloatArray, column: _Column,
-                      values: FloatArray) -> None:
+def _check_one_series(path: Path, form: Form, t: FloatArray, column: str, values: FloatArray,
+                      ) -> None:
     """
     Raise InputError if a column of text names several series that share a column of values.
 
@@ -584,7 +629,7 @@ def _check_one_series(path: Path, form: Form, t: FloatArray, column: _Column,
     stamps = t[known]
     overlap = np.count_nonzero(
         stamps[1:] <= np.maximum.accumulate(stamps)[:-1]) > WILD * stamps.size
-    if not overlap and not re.fullmatch(_VALUE_NAME, column.name.lower()):
+    if not overlap and not re.fullmatch(_VALUE_NAME, column.lower()):
         return
     for place, label in enumerate(form.names[:form.width]):
         first = [row[place] for row in form.rows if place < len(row) and row[place]]
@@ -598,9 +643,9 @@ def _check_one_series(path: Path, form: Form, t: FloatArray, column: _Column,
         within = np.diff(stamps[order])[np.diff(which[order]) == 0]
         if np.mean(within <= 0.0) <= WILD and (overlap or np.mean(np.diff(which) != 0) > _BACK):
             raise InputError(
-                f"{path}: '{column.name}' holds several series, named in '{label}': "
-                f'{shown(some(map(printable, names), 3))}; pivot the table to one column for '
-                'each series')
+                f"{path}: '{column}' holds several series, named in '{label}': "
+                f'{shown(some(map(printable, names), 3))}; name one with '
+                '--voltage-column, or keep the rows of one')
 
 
 def _cells(path: Path, form: Form, place: int, size: int) -> list[str]:

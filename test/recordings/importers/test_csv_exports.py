@@ -235,6 +235,14 @@ FORMS = {
                        0.01, True, True),
     'airdata_sticks': (table(['time(millisecond),voltage(v),rc_throttle(percent)'], lambda k: (
         f'{10 * k},{V[k]},{200 * U[k] - 100:.1f}')), 0.01, True, False),
+    # Each row names the series of its value.
+    'influxdb': (table(['#datatype,string,long,dateTime:RFC3339,double,string',
+                        ',result,table,_time,_value,_field'], lambda k: '\n'.join(
+        f",,{n},{clock(k, '%Y-%m-%dT%H:%M:%S.%fZ')},{x},{name}" for n, (name, x) in enumerate(
+            (('current', AMPS[k]), ('throttle', U[k]), ('voltage', V[k]))))), 0.01, True, True),
+    'home_assistant': (table(
+        ['entity_id,state,last_changed', f'sensor.voltmeter,unavailable,{clock(-1)}'],
+        lambda k: f'sensor.voltmeter,{V[k]},{clock(k)}'), 0.01, False, False),
     # The column whose unit is known is the throttle.
     'airdata': (table(['time(millisecond),voltage(v),rc_throttle,rc_throttle(percent)'],
                       lambda k: f'{10 * k},{V[k]},{364 + 1320 * U[k]:.0f},{100 * U[k]:.1f}'),
@@ -417,18 +425,37 @@ def test_a_current_is_not_read_as_a_voltage(tmp_path):
 
 
 @pytest.mark.parametrize('order', ['one after another', 'equal stamps', 'in turn'])
-def test_several_series_in_one_column_are_refused(tmp_path, order):
+def test_series_that_rows_name_are_columns(tmp_path, order):
     """Foxglove, InfluxDB: a column of text names the series of each value."""
     late = 0.5 if order == 'in turn' else 0.0
     rows = [(k + late * place, name, size + 0.1 * (k % 7))
-            for place, (name, size) in enumerate((('pack/voltage', 12.0), ('pack/current', 3.0)))
+            for place, (name, size) in enumerate((('pack/current', 3.0), ('pack/voltage', 12.0),
+                                                  ('bus', 5.0)))
             for k in range(40)]
     if order != 'one after another':
         rows.sort()
-    text = 'time,topic,value\n' + ''.join(f'{t},{name},{value}\n' for t, name, value in rows)
+    path = written(tmp_path, 'time,topic,value\n' + ''.join(
+        f'{t},{name},{value}\n' for t, name, value in rows))
+    found = read_recording(path)
+    np.testing.assert_allclose(found.t, late + np.arange(40.0))
+    np.testing.assert_allclose(found.voltage, 12.0 + 0.1 * (np.arange(40) % 7))
+    np.testing.assert_allclose(found.current, found.voltage - 9.0)
+    assert holds_supply(path)
+    other = read_recording(path, columns=CsvColumns(voltage='bus', current='none'))
+    np.testing.assert_allclose(other.voltage, found.voltage - 7.0)
+    assert other.current is None
+    # The bag that `convert` writes, and a list of the series.
+    log = import_log(path, Request(everything=True))
+    assert {one.name for one in log.series} == {'pack/voltage', 'pack/current', 'bus'}
     with pytest.raises(InputError, match="'value' holds several series, named in 'topic': "
-                                         'pack/current, pack/voltage; pivot'):
-        read_recording(written(tmp_path, text), columns=CsvColumns(voltage='value'))
+                                         'bus, pack/current, pack/voltage; name one with --volt'):
+        read_recording(path, columns=CsvColumns(voltage='value'))
+    # Two packs with equal names of series.
+    lines = path.read_text().splitlines()
+    path.write_text('\n'.join([f'host,{lines[0]}', *(
+        f'{host},{line}' for line in lines[1:] for host in 'ab')]))
+    with pytest.raises(InputError, match="'value' holds several series, named in 'host': a, b"):
+        read_recording(path)
     # The mode of a flight is no series, nor is a lone topic.
     for names in ('pack', 'arm', 'fly'), ('pack', 'pack', 'pack'):
         text = 'time,mode,value\n' + ''.join(
