@@ -1,17 +1,12 @@
 """
 The node `adaptive_filter`: low-pass a topic, with a cutoff that follows the noise of the supply.
 
-Inputs (relative names): `input` (a type of `filter_channels.CHANNELS`, or any
-installed type with `input.field`), `sigma` (std_msgs/Float64), and `state`
-(the estimator's `~/state`, DiagnosticArray): while it is published it gives the
-error of sigma, alpha, throttle, level, and whether the estimate is usable.
-With `notch.count` above 0 also `throttle` and `rpm` (by msg_config or `rpm.type` and
-`rpm.field`) for the notches, which come before the low-pass; without `throttle` the
-throttle in `state` is used.
-Outputs: `~/output` (type, stamp and frame of the input; a derivative as
-geometry_msgs/AccelStamped or Vector3Stamped), `~/cutoff` (Hz) and `~/lag`
-(ms, phase delay at `lag_frequency`, notches included) as std_msgs/Float64 at `publish_rate`,
-`/diagnostics` at 1 Hz.
+doc/messages.md lists its topics.  `input` has a type of `filter_channels.CHANNELS`, or any
+installed type with `input.field`.  While the estimator's `state` is published, it gives the error
+of sigma, alpha, throttle, level, and whether the estimate is usable.  With `notch.count` above 0
+also `throttle` and `rpm` are followed, for the notches, which come before the low-pass; without
+`throttle` the throttle in `state` is used.  `~/output` has the type, stamp and frame of the input;
+a derivative is a geometry_msgs/AccelStamped or Vector3Stamped.
 
 Limits: of an Imu only the angular velocity is filtered, and with `input.acceleration` the
 linear acceleration; their covariances shrink as for white noise.  Of a BatteryState only
@@ -83,23 +78,13 @@ class SupplyInput:
         self._topic, self._state_topic = topics
         self._sigma = NAN
         self._state: dict[str, str] = {}
-        self._sigma_silence, self._state_silence = Silence(now), Silence(now)
+        self.sigma_silence, self.state_silence = Silence(now), Silence(now)
         self._error = NAN
         self._values = [NAN] * len(_FIELDS)
 
-    @property
-    def age(self) -> float | None:
-        """Seconds since the last sigma; None before the first."""
-        return self._sigma_silence.age
-
-    @property
-    def state_age(self) -> float | None:
-        """Seconds since the last state; None before the first."""
-        return self._state_silence.age
-
     def take_sigma(self, value: float) -> None:
         """Take a sigma, V/sqrt(s); a negative one counts as unknown."""
-        self._sigma_silence.record()
+        self.sigma_silence.record()
         self._sigma = value if value >= 0.0 and math.isfinite(value) else NAN
 
     def take_state(self, message: Any) -> None:
@@ -107,7 +92,7 @@ class SupplyInput:
         for status in message.status:
             values = {pair.key: pair.value for pair in status.values}
             if 'sigma_se' in values:
-                self._state_silence.record()
+                self.state_silence.record()
                 self._state = values
                 # Of ln sigma, as `AdaptiveLowPass` takes it.
                 error = _number(values, 'sigma_se')
@@ -123,7 +108,7 @@ class SupplyInput:
         throttle, as the sigma of an OU with relaxation `rate`, 1/s.  This sigma includes the ADC's
         white noise, so it is never below the supply's own.
         """
-        fresh = within(self._state_silence.age, stale_after)
+        fresh = within(self.state_silence.age, stale_after)
         error, (alpha, throttle, level, level_se, noise) = (
             (self._error, self._values) if fresh else (NAN, [NAN] * len(_FIELDS)))
         why = self._why(fresh, stale_after)
@@ -136,7 +121,7 @@ class SupplyInput:
 
     def why_no_throttle(self, stale_after: float) -> str:
         """Return why the throttle is unknown."""
-        age = self._state_silence.age
+        age = self.state_silence.age
         if age is None:
             return f'no message on {self._state_topic}'
         if not within(age, stale_after):
@@ -144,7 +129,7 @@ class SupplyInput:
         return f'the state on {self._state_topic} has no throttle'
 
     def _why(self, fresh: bool, stale_after: float) -> str:
-        age = self._sigma_silence.age
+        age = self.sigma_silence.age
         if age is None:
             return f'no message on {self._topic}'
         if not within(age, stale_after):
@@ -168,9 +153,6 @@ def _number(values: dict[str, str], key: str) -> float:
         return NAN
 
 
-QUANTITIES = ('throttle', 'rpm')
-
-
 class MotorInputs:
     """
     Newest throttle, and the motor speeds received since the last call.
@@ -181,18 +163,14 @@ class MotorInputs:
     def __init__(self, node: MonitorNode, values: Mapping[str, Any],
                  now: Callable[[], float]) -> None:
         self._node = node
-        self._silence = {quantity: Silence(now) for quantity in QUANTITIES}
+        self.silence = {quantity: Silence(now) for quantity in ('throttle', 'rpm')}
         self._throttle = NAN
         self._speeds: list[float] = []
-        self.sources = SourceFinder(node, QUANTITIES, values, self._open)
-
-    def age(self, quantity: str) -> float | None:
-        """Return the seconds since the last message; None before the first."""
-        return self._silence[quantity].age
+        self.sources = SourceFinder(node, tuple(self.silence), values, self._open)
 
     def throttle(self, stale_after: float) -> float:
         """Return the throttle, 0..1; NaN when the last is older than `stale_after`, s."""
-        return self._throttle if within(self._silence['throttle'].age, stale_after) else NAN
+        return self._throttle if within(self.silence['throttle'].age, stale_after) else NAN
 
     def take_speeds(self) -> list[float]:
         """Return the motor speeds received since the last call; empty: none."""
@@ -210,7 +188,7 @@ class MotorInputs:
                 self._throttle = values[0]
             else:
                 return
-            self._silence[source.quantity].record()
+            self.silence[source.quantity].record()
         self._node.create_subscription(
             message, source.topic, self._node.guarded(take), INPUT_QOS)
 
@@ -398,10 +376,11 @@ class AdaptiveFilterNode(MonitorNode):
             'notch_frequencies': ', '.join(f'{f:.4g}' for f in self._notch.frequencies),
             'notch_law_a': self._notch.law[0], 'notch_law_b': self._notch.law[1],
             'notch_problem': ' '.join(filter(None, self._motors.sources.problems.values())),
-            'throttle_age': self._motors.age('throttle'), 'rpm_age': self._motors.age('rpm'),
+            **{f'{name}_age': silence.age for name, silence in self._motors.silence.items()},
             'passed': self._passed, 'dropped': self._dropped,
             'repeated': counters.repeated, 'back': counters.back, 'gaps': counters.gaps,
-            'sigma_age': self._supply.age, 'state_age': self._supply.state_age,
+            'sigma_age': self._supply.sigma_silence.age,
+            'state_age': self._supply.state_silence.age,
             'stamps': self._input_clock.stamps.name,
             'placed_by_arrival': self._input_clock.by_arrival,
             'input_age': self._input_silence.age, 'callback_errors': self.faults}

@@ -7,7 +7,7 @@ Each name and default exists once, in a table. An exception in a callback does n
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 import functools
 import inspect
 import math
@@ -244,21 +244,15 @@ class MonitorNode(Node):
 
     def create_publisher(self, kind: Any, topic: str, qos: Any, **options: Any) -> Publisher:
         """Return a publisher; `qos_overrides` are honoured."""
-        overriding = self._overriding(topic)
-        with _readable_overrides(topic) if overriding else nullcontext():
-            made = super().create_publisher(kind, topic, qos, **overriding, **options)
-        self._keep(made)
-        return made
+        with self._overriding(topic) as overriding:
+            return self._kept(super().create_publisher(kind, topic, qos, **overriding, **options))
 
     def create_subscription(self, kind: Any, topic: str, callback: Any, qos: Any,
                             **options: Any) -> Subscription:
         """Return a subscription; `qos_overrides` are honoured."""
-        overriding = self._overriding(topic)
-        with _readable_overrides(topic) if overriding else nullcontext():
-            made = super().create_subscription(
-                kind, topic, callback, qos, **overriding, **options)
-        self._keep(made)
-        return made
+        with self._overriding(topic) as overriding:
+            return self._kept(super().create_subscription(
+                kind, topic, callback, qos, **overriding, **options))
 
     def serve(self, name: str, work: Callable[[], str]) -> None:
         """Offer a Trigger: `work` returns what was done, or raises `InputError` to refuse."""
@@ -272,21 +266,25 @@ class MonitorNode(Node):
 
     def create_service(self, kind: Any, name: str, callback: Any, **options: Any) -> Any:
         """Return a service."""
-        made = super().create_service(kind, name, callback, **options)
-        self._keep(made)
-        return made
+        return self._kept(super().create_service(kind, name, callback, **options))
 
-    def _keep(self, made: Any) -> None:
+    def _kept(self, made: Any) -> Any:
         """Record an object for `stop` to close; rclpy makes others before the list exists."""
         if hasattr(self, '_made'):
             self._made.append(made)
+        return made
 
-    def _overriding(self, topic: str) -> dict[str, Any]:
-        """Return the option that applies `qos_overrides` to a topic; empty if it has none."""
-        prefix = f'qos_overrides.{self.resolve_topic_name(topic)}.'
-        wanted = any(name.startswith(prefix) for name in getattr(self, '_parameter_overrides', ()))
-        return {'qos_overriding_options': QoSOverridingOptions.with_default_policies()
-                } if wanted else {}
+    @contextmanager
+    def _overriding(self, topic: str) -> Iterator[dict[str, Any]]:
+        """Give the option that applies a topic's `qos_overrides`; InputError if it cannot."""
+        prefix = f'{QOS}{self.resolve_topic_name(topic)}.'
+        if not any(name.startswith(prefix) for name in getattr(self, '_parameter_overrides', ())):
+            yield {}
+            return
+        try:
+            yield {'qos_overriding_options': QoSOverridingOptions.with_default_policies()}
+        except (InvalidQosOverridesError, RuntimeError, ValueError) as error:
+            raise InputError(f'qos_overrides of {topic}: {error}') from error
 
     def refuse_other_overrides(self, topics: Iterable[str]) -> None:
         """Refuse `qos_overrides` for topics other than these and those of every node."""
@@ -304,7 +302,8 @@ class MonitorNode(Node):
 
         The queue of the EventsExecutor has no bound, and messages in it delay every timer.
         """
-        polled = self.create_subscription(kind, topic, _never, qos, raw=True)
+        # rclpy requires a callback here too.
+        polled = self.create_subscription(kind, topic, lambda message: None, qos, raw=True)
         self._polled.append(polled)
         return polled
 
@@ -370,19 +369,6 @@ class MonitorNode(Node):
             self.apply(self.values())
 
 
-@contextmanager
-def _readable_overrides(topic: str) -> Iterator[None]:
-    """Turn errors in `qos_overrides` into an `InputError`."""
-    try:
-        yield
-    except (InvalidQosOverridesError, RuntimeError, ValueError) as error:
-        raise InputError(f'qos_overrides of {topic}: {error}') from error
-
-
-def _never(message: Any) -> None:
-    """Do nothing: rclpy requires a callback for a polled subscription too."""
-
-
 def _as_double(parameter: RosParameter) -> RosParameter:
     if parameter.type_ is not RosParameter.Type.INTEGER:
         return parameter
@@ -391,22 +377,18 @@ def _as_double(parameter: RosParameter) -> RosParameter:
 
 def _descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
     """Return what `ros2 param describe` shows."""
-    descriptor = ParameterDescriptor(
-        description=parameter.description, read_only=read_only,
-        additional_constraints=' | '.join((
-            *parameter.choices, *([f'{parameter.low:g}..{parameter.high:g}']
-                                  if parameter.mixed else []))),
-        dynamic_typing=parameter.mixed)
+    words = list(parameter.choices)
+    ends: dict[str, Any] = {}
     if parameter.mixed:
-        return descriptor
-    if parameter.low is not None and parameter.high is not None:
-        if isinstance(parameter.default, int):
-            descriptor.integer_range = [IntegerRange(
-                from_value=int(parameter.low), to_value=int(parameter.high), step=0)]
-        else:
-            descriptor.floating_point_range = [FloatingPointRange(
-                from_value=float(parameter.low), to_value=float(parameter.high), step=0.0)]
-    return descriptor
+        words.append(f'{parameter.low:g}..{parameter.high:g}')
+    elif parameter.low is not None and parameter.high is not None:
+        ends = {'integer_range': [IntegerRange(
+            from_value=int(parameter.low), to_value=int(parameter.high))]} if isinstance(
+                parameter.default, int) else {'floating_point_range': [FloatingPointRange(
+                    from_value=float(parameter.low), to_value=float(parameter.high))]}
+    return ParameterDescriptor(
+        description=parameter.description, read_only=read_only, dynamic_typing=parameter.mixed,
+        additional_constraints=' | '.join(words), **ends)
 
 
 def wait_until(instant: float, going: Callable[[], bool]) -> bool:

@@ -1,18 +1,12 @@
 """
 The node `estimator`: voltage and throttle -> OU estimate, brown-out risk and flag.
 
-Inputs: voltage and throttle, as a msg_config says (`voltage`, `throttle` by
-default), best effort.  Outputs at `publish_rate` of real time, reliable:
-`~/alpha`, `~/sigma`, `~/var_inf`, `~/brownout_risk`, `~/throttle_budget`
-(std_msgs/Float64, NaN when unknown), `~/brownout` (std_msgs/Bool, published
-only while it is known, so that it is never silently false), `~/state`
-(DiagnosticArray, every field of one estimate, stamped with the estimate's
-newest sample), and `/diagnostics` at 1 Hz.  alpha, sigma and Var_inf are estimated from `window`;
-windows of up to a minute are fitted in a thread.  Messages wait in the middleware, which keeps the
-newest 2000, and are fetched 50 times a second and read before each report, so that a flood of
-messages does not delay an output.  Services: `~/clear_brownout` (std_srvs/Trigger) drops a flag
-that is latched or held, unless `lock_parameters` is set; `~/save_model` writes what the flight has
-learned into `model_file`.  Hold, delay and latch run in real time, even under `use_sim_time`.
+doc/messages.md lists its topics, services and fields.  Inputs are best effort; outputs, at
+`publish_rate` of real time, are reliable.  Unknown numbers are NaN, and `~/brownout` is published
+only while it is known, so that it is never silently false.  Windows of up to a minute are fitted
+in a thread.  Messages wait in the middleware, which keeps the newest 2000, and are fetched 50
+times a second and read before each report, so that a flood of messages does not delay an output.
+Hold, delay and latch run in real time, even under `use_sim_time`.
 
 Limits: one voltage; an estimate older than `stale_after` is not published as
 a number, though `~/state` still shows its fields.

@@ -8,7 +8,7 @@ flag shows; of the filter's signals, each row has the extremes.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from functools import partial
 import math
 from threading import Lock
 import time
@@ -49,14 +49,16 @@ class LiveNode(Node):
         self._begin = time.monotonic()
         self._state: dict[str, str] = {}
         self._level, self._summary, self._state_arrival = 0, '', -math.inf
-        self._cutoff, self._lag = math.nan, math.nan
+        # Cutoff, Hz, and lag, ms, of the filter.
+        self._newest = {'cutoff': math.nan, 'lag': math.nan}
         self._limits: dict[str, float] = {}
         self._signals: dict[str, list[float]] = {'raw': [], 'filtered': []}
         self._open: dict[str, str] = {}
         self._estimator, self._filter = estimator, low_pass
         self.create_subscription(DiagnosticArray, f'{estimator}/state', self._take_state, 10)
-        self.create_subscription(Float64, f'{low_pass}/cutoff', self._take_cutoff, 10)
-        self.create_subscription(Float64, f'{low_pass}/lag', self._take_lag, 10)
+        for name in self._newest:
+            self.create_subscription(
+                Float64, f'{low_pass}/{name}', partial(self._take_number, name), 10)
         self._ask = self.create_client(GetParameters, f'{estimator}/get_parameters')
         self._answer: Any = None
         self.create_timer(PERIOD, self._add_row)
@@ -75,11 +77,8 @@ class LiveNode(Node):
         self._level, self._summary = status.level[0], status.message
         self._state_arrival = time.monotonic()
 
-    def _take_cutoff(self, message: Any) -> None:
-        self._cutoff = message.data
-
-    def _take_lag(self, message: Any) -> None:
-        self._lag = message.data
+    def _take_number(self, name: str, message: Any) -> None:
+        self._newest[name] = message.data
 
     def _find_signals(self) -> None:
         """Subscribe to the filter's signals once they exist; request the limit."""
@@ -110,19 +109,17 @@ class LiveNode(Node):
         if not kinds or self._open.get(name) == topic:
             return
         try:
-            take = channels_of(kinds[0], '').take
+            channels = channels_of(kinds[0], '')
             kind = message_class(kinds[0])
         except InputError:
             return
-        self._open[name] = topic
-        self.create_subscription(kind, topic, self._keeper(name, take), INPUT_QOS)
 
-    def _keeper(self, name: str, take: Callable[[Any], Any]) -> Callable[[Any], None]:
         def keep(message: Any) -> None:
-            values = take(message)
+            values = channels.take(message)
             if len(values) and math.isfinite(values[0]):
                 self._signals[name].append(float(values[0]))
-        return keep
+        self._open[name] = topic
+        self.create_subscription(kind, topic, keep, INPUT_QOS)
 
     # -- rows out
 
@@ -136,7 +133,7 @@ class LiveNode(Node):
             row.update({name: known(self._state.get(name)) for name in _NUMBERS})
             row.update({name: self._state.get(name, '') for name in _WORDS})
             row.update(level=self._level, summary=self._summary)
-        row.update(cutoff=known(self._cutoff), lag=known(self._lag))
+        row.update({name: known(value) for name, value in self._newest.items()})
         for name, values in self._signals.items():
             row[name] = [min(values), max(values)] if values else None
             values.clear()

@@ -167,7 +167,11 @@ class Player(Node):
         self._skipped: dict[str, str] = {}
         self._outputs: dict[str, Publisher] = {}
         for topic, kind in self._types.items():
-            self._advertise(topic, kind)
+            try:
+                self._outputs[topic] = self.create_publisher(message_class(kind), topic, DEPTH)
+            except (InputError, InvalidTopicNameException) as error:
+                self._skipped[topic] = one_line(f"topic '{topic}' is left out: {error}")
+                self.get_logger().warning(self._skipped[topic])
         if not self._outputs:
             raise InputError(f"nothing to play in '{options.bag}': " + (
                 '; '.join(self._skipped.values()) or 'it holds no messages'))
@@ -191,13 +195,6 @@ class Player(Node):
                 if topic in (self._options.topics or topics)
                 and not (topic == '/clock' and self._options.clock > 0.0)}
 
-    def _advertise(self, topic: str, kind: str) -> None:
-        try:
-            self._outputs[topic] = self.create_publisher(message_class(kind), topic, DEPTH)
-        except (InputError, InvalidTopicNameException) as error:
-            self._skipped[topic] = one_line(f"topic '{topic}' is left out: {error}")
-            self.get_logger().warning(self._skipped[topic])
-
     def going(self) -> bool:
         """Whether no signal has arrived."""
         return bool(self.context.ok())
@@ -214,8 +211,15 @@ class Player(Node):
             if not self._options.loop:
                 break
         summary = self._summary(time.monotonic() - began)
-        self._flush()
-        self._log(summary)
+        if self.going():
+            # Let reliable subscribers fetch what they missed before the publishers go.
+            for output in self._outputs.values():
+                output.wait_for_all_acked(FLUSH)
+        error = summary['spacing_error_s']
+        quality = ', '.join(f'{key} {value * 1e3:.3f} ms' for key, value in error.items())
+        print(f"played {summary['messages']} messages in {summary['duration_s']:.2f} s"
+              + (f'; spacing error {quality}' if quality else '')
+              + (f"; damage: {summary['damage']}" if summary['damage'] else ''), file=sys.stderr)
         return summary
 
     def _wait_for_subscriber(self) -> None:
@@ -229,11 +233,8 @@ class Player(Node):
             self.get_logger().warning(
                 f'no subscriber within {self._options.wait:g} s: playing anyway')
 
-    def _messages(self) -> Iterator[Message]:
-        return iter(self._bag.raw_messages(self._outputs))
-
     def _pass(self) -> None:
-        ahead = Prefetch(self._messages())
+        ahead = Prefetch(self._bag.raw_messages(self._outputs))
         try:
             ahead.fill()
             self._spacing.restart()
@@ -284,12 +285,6 @@ class Player(Node):
             if self.going():
                 raise
 
-    def _flush(self) -> None:
-        """Let reliable subscribers fetch what they missed before the publishers go."""
-        if self.going():
-            for output in self._outputs.values():
-                output.wait_for_all_acked(FLUSH)
-
     def _summary(self, duration: float) -> dict[str, Any]:
         return {
             'bag': str(self._options.bag), 'rate': self._options.rate, 'passes': self._passes,
@@ -300,13 +295,6 @@ class Player(Node):
             'span_s': max((self._span[1] - self._span[0]) * 1e-9, 0.0),
             'spacing_error_s': self._spacing.summary(),
             'ended_by': 'end' if self.going() else 'signal'}
-
-    def _log(self, summary: dict[str, Any]) -> None:
-        error = summary['spacing_error_s']
-        quality = ', '.join(f'{key} {value * 1e3:.3f} ms' for key, value in error.items())
-        print(f"played {summary['messages']} messages in {summary['duration_s']:.2f} s"
-              + (f'; spacing error {quality}' if quality else '')
-              + (f"; damage: {summary['damage']}" if summary['damage'] else ''), file=sys.stderr)
 
 
 class _Ticks:

@@ -124,7 +124,12 @@ def _run(name: str, work: Callable[[], int], args: list[str] | None, stopped: li
         InvalidHandle, NameValidationException, NotInitializedException, ParameterException)
     from rclpy.executors import ExternalShutdownException
     try:
-        _init(rclpy, binding, args)
+        _choose_queues()
+        try:
+            rclpy.init(args=args)
+        except (binding.RCLError, binding.RCLInvalidROSArgsError,
+                binding.UnknownROSArgsError) as error:
+            raise InputError(f'cannot read the ROS arguments: {one_line(error)}') from error
         return 0 if stopped else work()
     except (InputError, ParameterException, NameValidationException) as error:
         rclpy.logging.get_logger(name).fatal(one_line(error))
@@ -165,16 +170,6 @@ def _choose_queues() -> None:
     from ou_monitor.stream.config import msg_config_dir
     path = str(msg_config_dir().parent / 'config' / 'fastdds.xml')
     os.environ.update(dict.fromkeys(PROFILES, path))
-
-
-def _init(rclpy: Any, binding: Any, args: list[str] | None) -> None:
-    """Initialise rclpy; a command line or parameter file it cannot read is bad input."""
-    _choose_queues()
-    try:
-        rclpy.init(args=args)
-    except (binding.RCLError, binding.RCLInvalidROSArgsError,
-            binding.UnknownROSArgsError) as error:
-        raise InputError(f'cannot read the ROS arguments: {one_line(error)}') from error
 
 
 def spin(make: Callable[[], Any]) -> int:

@@ -106,14 +106,11 @@ def find_source(quantity: str, values: Mapping[str, Any]) -> Source | None:
     if values['msg_config'] == AUTO:
         offered = _generic(quantity)
     else:
-        config = load_msg_config(values['msg_config'])
-        spec = getattr(config, quantity)
-        offered = [] if spec is None else [
-            Source(quantity, spec.topic, spec, config.name, _install(config, spec),
-                   current=config.current if quantity == 'voltage' else None)]
+        offered = _of_config(load_msg_config(values['msg_config']), quantity)
     if kind:
+        usual = offered[0].topic if len(offered) == 1 else quantity
         offered = [s for s in offered if s.spec is not None and s.spec.type == kind] or [
-            _by_hand(quantity, topic or _topic_of(offered, quantity), kind, field)]
+            _by_hand(quantity, topic or usual, kind, field)]
     elif topic and not offered:
         raise InputError(
             f"msg_config '{values['msg_config']}' has no {quantity}: give {quantity}.type and "
@@ -132,21 +129,20 @@ def _generic(quantity: str) -> list[Source]:
         for kind in (*_SCALARS, *(_ARRAYS if quantity == 'rpm' else ())):
             found[kind] = Source(quantity, quantity, FieldSpec(quantity, kind, 'data'), AUTO)
     for config in list_msg_configs().values():
-        spec: FieldSpec | None = getattr(config, quantity)
-        if config.generic and spec is not None:
-            found.setdefault(
-                spec.type, Source(quantity, spec.topic, spec, config.name, _install(config, spec),
-                                  current=config.current if quantity == 'voltage' else None))
+        for source in _of_config(config, quantity) if config.generic else ():
+            if source.spec is not None:
+                found.setdefault(source.spec.type, source)
     return list(found.values())
 
 
-def _install(config: MsgConfig, spec: FieldSpec) -> str:
-    """Return how to install the package of a type, if the msg_config says it."""
-    return config.install if spec.type.partition('/')[0] == config.package else ''
-
-
-def _topic_of(offered: Sequence[Source], quantity: str) -> str:
-    return offered[0].topic if len(offered) == 1 else quantity
+def _of_config(config: MsgConfig, quantity: str) -> list[Source]:
+    """Return the source that a msg_config describes; empty if it does not have the quantity."""
+    spec: FieldSpec | None = getattr(config, quantity)
+    if spec is None:
+        return []
+    own = spec.type.partition('/')[0] == config.package
+    return [Source(quantity, spec.topic, spec, config.name, config.install if own else '',
+                   current=config.current if quantity == 'voltage' else None)]
 
 
 def _by_hand(quantity: str, topic: str, kind: str, field: str) -> Source:

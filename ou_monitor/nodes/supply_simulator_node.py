@@ -113,14 +113,11 @@ def _setter(message: Any, path: str, kind: str, stamp_factor: float = math.nan,
         def stamp(value: float) -> None:
             now.sec, now.nanosec = divmod(round(value * 1e9), 10**9)
         return stamp
-    if isinstance(now, int):
-        def convert(value: float) -> Any:
-            return round(value / stamp_factor if stamp_factor > 0.0 else value)
-    else:
-        def convert(value: float) -> Any:
-            return value / stamp_factor if stamp_factor > 0.0 else value
 
-    return lambda value: put(owner, (last,), convert(value))
+    def write(value: float) -> None:
+        scaled = value / stamp_factor if stamp_factor > 0.0 else value
+        put(owner, (last,), round(scaled) if isinstance(now, int) else scaled)
+    return write
 
 
 class SupplySimulatorNode(MonitorNode):
