@@ -160,82 +160,6 @@ def _append(kind: str, values: Any, block: bytearray, low: float = 0.0,
 
 # An unknown cell on a page.
 _DASH = '\u2013'
-# Hues of Okabe & Ito (2008), distinct with every common colour blindness; lighter in dark mode.
-_LIGHT = ('#0072b2', '#d55e00', '#009e73', '#cc79a7', '#b07d00', '#3a9bd9', '#6b4fa0', '#5f6b6d')
-_DARK = ('#5cb3f0', '#ff8a45', '#35cfa0', '#ea9cc9', '#e6b84a', '#9bd2f7', '#b59cf0', '#a9b4b6')
-
-_STYLE = """
-:root { color-scheme: light dark; --paper: #ffffff; --ink: #1c2326; --soft: #5d686c;
-  --rule: #dde3e5; --panel: #f5f7f8; --edge: #9aa6aa88; --warn: #9a4a00; LIGHT }
-@media (prefers-color-scheme: dark) { :root { --paper: #14191b; --ink: #e6eaeb;
-  --soft: #9aa6aa; --rule: #2e373a; --panel: #1c2326;
-  --edge: #00000099; --warn: #ffb070; DARK } }
-* { box-sizing: border-box; }
-body { margin: 0 auto; padding: 24px 20px 48px; max-width: 940px; background: var(--paper);
-  color: var(--ink); font: 15px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif;
-  overflow-wrap: break-word; }
-h1 { font-size: 22px; margin: 0 0 2px; }
-h2 { font-size: 17px; margin: 30px 0 8px; }
-p { margin: 6px 0; } .soft { color: var(--soft); }
-.headline { font-size: 17px; padding: 12px 16px; margin: 14px 0; background: var(--panel);
-  border-left: 4px solid var(--c0); border-radius: 3px; }
-.scroll { overflow-x: auto; margin: 0 0 14px; background-color: var(--paper);
-  background-image: linear-gradient(to right, var(--paper), var(--paper)),
-    linear-gradient(to right, var(--paper), var(--paper)),
-    linear-gradient(to right, var(--edge), transparent),
-    linear-gradient(to left, var(--edge), transparent);
-  background-position: left, right, left, right; background-repeat: no-repeat;
-  background-size: 24px 100%, 24px 100%, 12px 100%, 12px 100%;
-  background-attachment: local, local, scroll, scroll; }
-table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums;
-  font-size: 14px; }
-th { text-align: right; font-weight: 600; color: var(--soft); vertical-align: bottom;
-  border-bottom: 1px solid var(--soft); padding: 4px 10px 4px 0; }
-td { text-align: right; padding: 4px 10px 4px 0; border-bottom: 1px solid var(--rule);
-  white-space: nowrap; } td.left, th.left { text-align: left; }
-td small { color: var(--soft); display: inline-block; max-width: 250px; white-space: normal;
-  line-height: 1.3; }
-details.section { border-top: 1px solid var(--rule); margin: 10px 0; }
-details.section > summary { cursor: pointer; padding: 8px 0 4px; }
-details.section > summary h2 { display: inline; }
-dl.facts { display: grid; grid-template-columns: max-content 1fr; gap: 3px 16px; margin: 10px 0; }
-dl.facts dt { color: var(--soft); } dl.facts dd { margin: 0; overflow-wrap: anywhere; }
-@media (max-width: 560px) { dl.facts { grid-template-columns: 1fr; gap: 0; }
-  dl.facts dd { margin: 0 0 6px; }
-  body { padding: 16px 14px 32px; } .headline { font-size: 16px; padding: 10px 12px; }
-  table { font-size: 13px; } th, td { padding: 4px 7px 4px 0; }
-  td.left { white-space: normal; min-width: 92px; } }
-li { margin: 3px 0; overflow-wrap: anywhere; } li.warn::marker { color: var(--warn); }
-code { font: 13px/1.5 ui-monospace, Menlo, Consolas, monospace; background: var(--panel);
-  padding: 2px 5px; border-radius: 3px; overflow-wrap: anywhere; }
-figure { margin: 10px 0; } figcaption { font-size: 13px; color: var(--soft); }
-.pair { display: grid; grid-template-columns: repeat(auto-fit, minmax(340px, 1fr)); gap: 8px; }
-figure > svg { width: 100%; height: auto; display: block; }
-svg text { fill: var(--soft); font: 12px system-ui, -apple-system, "Segoe UI", sans-serif; }
-svg text.title { fill: var(--ink); font-weight: 600; font-size: 13px; }
-svg text.legend { fill: var(--ink); }
-svg .grid { stroke: var(--rule); stroke-width: 1; }
-svg .mark { stroke: var(--ink); stroke-width: 1; stroke-dasharray: 3 3; }
-svg .line { fill: none; stroke-width: 1.2; stroke-linejoin: round; }
-svg .thick { stroke-width: 2.2; } svg .dash { stroke-dasharray: 6 4; }
-svg .faint { opacity: .55; } svg .band { stroke: none; opacity: .22; }
-svg .panel { fill: var(--paper); opacity: .8; }
-svg .shade { stroke: none; opacity: .10; }
-@media print { body { max-width: none; } figure, tr, dl.facts, li { break-inside: avoid; }
-  h2 { break-after: avoid; } .scroll { overflow: visible; background: none; }
-  table { font-size: 12px; } th, td { padding: 3px 6px 3px 0; } td.left { white-space: normal; } }
-"""
-
-
-def _stylesheet() -> str:
-    def names(colours: Sequence[str]) -> str:
-        return ' '.join(f'--c{k}: {colour};' for k, colour in enumerate(colours))
-
-    series = ''.join(
-        f'svg .line.s{k} {{ stroke: var(--c{k}); }} '
-        f'svg .band.s{k}, svg .shade.s{k}, svg .dot.s{k} {{ fill: var(--c{k}); }}\n'
-        for k in range(len(_LIGHT)))
-    return _STYLE.replace('LIGHT', names(_LIGHT)).replace('DARK', names(_DARK)) + series
 
 
 @cache
@@ -286,20 +210,20 @@ def html(document: Document) -> str:
     text, source = _script() if 'class="plot-data"' in body else ('', "'none'")
     policy = (f"default-src 'none'; script-src {source}; style-src 'unsafe-inline'; "
               "base-uri 'none'; form-action 'none'")
-    style = _stylesheet() + (_file('plots.css') if text else '')
+    style = _file('page.css') + (_file('plots.css') if text else '')
     script = f'<script>{text}</script>\n' if text else ''
     return (f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"/>\n'
             f'<meta http-equiv="Content-Security-Policy" content="{policy}"/>\n'
             '<meta name="viewport" content="width=device-width, initial-scale=1"/>\n'
-            f'<title>{escape(document.title)}</title>\n<style>{style}</style></head>\n'
+            f'<title>{escape(document.title)}</title>\n<style>\n{style}</style></head>\n'
             f'<body>\n{_top(document)}{body}\n{script}</body></html>\n')
 
 
 def section(document: Document) -> str:
     """Return a document for inclusion in another page, with static plots."""
     # Nesting limits the CSS rules to this section.
-    style = _stylesheet().replace(':root', 'article').replace('body {', 'article {')
-    return (f'<div class="ou-monitor"><style>.ou-monitor {{{style}}}</style><article>\n'
+    style = _file('page.css').replace(':root', 'article').replace('body {', 'article {')
+    return (f'<div class="ou-monitor"><style>.ou-monitor {{\n{style}}}</style><article>\n'
             f'{_top(document)}{_joined(document.parts, live=False)}\n</article></div>\n')
 
 

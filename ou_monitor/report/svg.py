@@ -3,7 +3,7 @@ Plots as inline SVG, without a plotting library.
 
 `page.embed` puts the data beside the drawing, and the script of the page makes it interactive;
 print and browsers without scripts show this drawing.  Colours are CSS classes (``s0`` .. ``s7``
-for series), to which `page` gives colours for light and dark mode.
+for series); `page.css` gives their colours for light and dark mode.
 """
 
 from __future__ import annotations
