@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 import math
 import re
@@ -203,20 +203,27 @@ def finding_words(fleet: Fleet) -> list[str]:
         beside = 'the mean of the others' if few else 'the median of the vehicles'
         interval = '' if not few or reach is None else (
             f' (95 % {change(off - float(reach[k]))} to {change(off + float(reach[k]))})')
-        found.append(f'{one.names[k]}: {name} is {shown(values, one.value[k])}'
-                     f'{_a_cell(judged, name, one.names[k])}{_at(values, " at ")}, '
+        found.append(f'{one.names[k]}: {_compared(judged, name, one.names[k], one.value[k])}, '
                      f'{change(off)}{interval} from {beside}; fleet-wide p '
                      f'{chance(float(one.outliers.chance[k]))}.')
     for name, k in judged.odd_recordings():
         values, out = judged.values[name], judged.recordings[name]
-        away = change(float(values.value[k] - out.centre[k]))
-        found.append(f'{values.vehicles[k]}, {values.paths[k]}: {name} is '
-                     f'{shown(values, values.value[k])}{_a_cell(judged, name, values.vehicles[k])}'
-                     f'{_at(values, " at ")} '
-                     f'({_raw_value(values, k)}), '
-                     f'{away} from the other flights; fleet-wide p '
-                     f'{chance(float(out.chance[k]))}.')
+        vehicle, at = values.vehicles[k], values.throttle[k]
+        raw = f'{number(_thousandths(name) * float(values.measured[k]))} as measured' + (
+            f' at {100.0 * at:.0f} %' if math.isfinite(at) else '')
+        found.append(f'{vehicle}, {values.paths[k]}: '
+                     f'{_compared(judged, name, vehicle, values.value[k])} ({raw}), '
+                     f'{change(float(values.value[k] - out.centre[k]))} from the other flights; '
+                     f'fleet-wide p {chance(float(out.chance[k]))}.')
     return found
+
+
+def _compared(judged: Judgement, name: str, vehicle: str, value: float) -> str:
+    """Return a value of a vehicle as it is compared: at the common throttle."""
+    values = judged.values[name]
+    unit = _UNITS[name] if name in OF_PACK else QUANTITIES[name]
+    return (f'{name} is {_plain(values, value)} {unit}{_a_cell(judged, name, vehicle)}'
+            f'{_at(values)}')
 
 
 def failure_words(fleet: Fleet) -> list[str]:
@@ -236,12 +243,6 @@ def _prefix(row: Row) -> str:
     return '' if row['vehicle'] is None else f"{row['vehicle']}: "
 
 
-def shown(values: Values, value: float | FloatArray) -> str:
-    """Return one value in its unit, at the reference throttle."""
-    unit = QUANTITIES[values.name] if values.name not in OF_PACK else _UNITS[values.name]
-    return f'{_plain(values, value)} {unit}'
-
-
 def _plain(values: Values, value: float | FloatArray) -> str:
     """Return one value without its unit; resistance and sag in thousandths (mOhm, mV)."""
     return number(_thousandths(values.name) * float(values.shown(value)))
@@ -259,9 +260,14 @@ def _a_cell(judged: Judgement, name: str, vehicle: str) -> str:
 
 def _cells_of(fleet: Fleet, vehicle: str) -> str:
     """Return the cells of a vehicle, with a question mark if they are a guess."""
-    found = sorted({(row['cells'], '?' * (row['cells_from'] == 'guessed')) for row in fleet.rows
-                    if row['vehicle'] == vehicle and row['cells']})
-    return ', '.join(f'{cells}{mark}' for cells, mark in found) or UNKNOWN
+    return ', '.join(sorted({_cells(row) for row in fleet.rows if row['vehicle'] == vehicle
+                             and row['cells']}, key=lambda cells: int(cells.rstrip('?')))
+                     ) or UNKNOWN
+
+
+def _cells(row: Row) -> str:
+    return UNKNOWN if not row['cells'] else (
+        f"{row['cells']}{'?' * (row['cells_from'] == 'guessed')}")
 
 
 def _dates(fleet: Fleet, vehicle: str) -> str:
@@ -271,18 +277,12 @@ def _dates(fleet: Fleet, vehicle: str) -> str:
     return ' to '.join(days) or UNKNOWN
 
 
-def _at(values: Values, before: str) -> str:
-    """Return `before` and the throttle at which recordings are compared; empty without one."""
+def _at(values: Values) -> str:
+    """Return ' at' the throttle at which recordings are compared; empty without one."""
     if values.name in OF_PACK:
-        return f'{before}full throttle' if values.name == 'sag' else ''
+        return ' at full throttle' if values.name == 'sag' else ''
     at = values.curve.reference
-    return f'{before}{100.0 * at:.0f} % throttle' if math.isfinite(at) else ''
-
-
-def _raw_value(values: Values, k: int) -> str:
-    at = values.throttle[k]
-    return (f'{number(_thousandths(values.name) * float(values.measured[k]))} as measured'
-            + (f' at {100.0 * at:.0f} %' if math.isfinite(at) else ''))
+    return f' at {100.0 * at:.0f} % throttle' if math.isfinite(at) else ''
 
 
 def comparison_words(fleet: Fleet) -> list[str]:
@@ -423,22 +423,6 @@ def _slope(judged: Judgement, name: str, vehicle: str, *, interval: bool = False
     return UNKNOWN
 
 
-def quality_counts(fleet: Fleet) -> list[tuple[str, int]]:
-    """Return the counts of bad statuses, flags, verdicts and causes."""
-    counts: Counter[str] = Counter()
-    counted_paths: set[str] = set()
-    for row in fleet.rows:
-        if row['status'] is not None:
-            if row['status'] not in USABLE:
-                counts[f"level without estimate: {row['status']}"] += 1
-            counts.update(f'level with flag {flag}' for flag in row['flags'] or ())
-        if row['path'] not in counted_paths and row['verdict'] is not None:
-            counts[f"recording with verdict {row['verdict']}"] += 1
-            counts.update(f'recording with cause {cause}' for cause in set(row['causes'] or ()))
-        counted_paths.add(row['path'])
-    return counts.most_common()
-
-
 def as_data(fleet: Fleet) -> dict[str, Any]:
     """Return a fleet as plain data; NaN stands for unknown."""
     judged = fleet.judgement
@@ -556,25 +540,23 @@ def facts(fleet: Fleet) -> list[tuple[str, str]]:
             f'{counted(found.count, "dip")}, {number(found.below, 2)} s in all, in '
             f'{found.recordings} of {counted(len(rows), "recording")}') if found.count
             else 'never'))
-    sags = [row for row in rows if row['sag'] is not None]
-    if sags:
-        least, most = (choose(sags, key=lambda row: row['sag']) for choose in (min, max))
-        lines.append(('Sag', (f'{volts(least["sag"])}, {_name(least)}, to '
-                              if len(sags) > 1 else '')
-                      + f'{volts(most["sag"])} (+- {volts(2.0 * most["sag_se"])}), '
-                      f'{_name(most)}, at the highest throttle flown; known in {len(sags)} of '
-                      f'{counted(len(rows), "recording")}'))
-    else:
-        lines.append(('Sag', 'unknown in all: throttle is unknown, or did not move enough'))
-    known = [row for row in rows if row['resistance'] is not None]
-    if known:
-        least, most = (choose(known, key=lambda row: row['resistance']) for choose in (min, max))
-        lines.append(('Resistance', (f'{number(1e3 * least["resistance"])} mOhm, '
-                                     f'{_name(least)}, to ' if len(known) > 1 else '')
-                      + f'{number(1e3 * most["resistance"])} mOhm (+- '
-                      f'{number(2e3 * most["resistance_se"], 2)}), {_name(most)}; known in '
-                      f'{len(known)} of {counted(len(rows), "recording")}'))
-    return lines
+    lines.append(('Sag', _range(rows, 'sag', volts, volts, ', at the highest throttle flown')
+                  or 'unknown in all: throttle is unknown, or did not move enough'))
+    resistances = _range(rows, 'resistance', lambda ohm: f'{number(1e3 * ohm)} mOhm',
+                         lambda se: number(1e3 * se, 2))
+    return [*lines, ('Resistance', resistances)] if resistances else lines
+
+
+def _range(rows: Sequence[Row], name: str, shown: Callable[[float], str],
+           of_error: Callable[[float], str], where: str = '') -> str:
+    """Return the least and the most of a quantity, with their recordings; empty if unknown."""
+    known = [row for row in rows if row[name] is not None]
+    if not known:
+        return ''
+    least, most = (choose(known, key=lambda row: row[name]) for choose in (min, max))
+    return ((f'{shown(least[name])}, {_name(least)}, to ' if len(known) > 1 else '')
+            + f"{shown(most[name])} (+- {of_error(2.0 * most[f'{name}_se'])}), {_name(most)}"
+            f'{where}; known in {len(known)} of {counted(len(rows), "recording")}')
 
 
 def _name(row: Row) -> str:
@@ -593,20 +575,16 @@ def short_names(names: Sequence[str]) -> dict[str, str]:
 def lowest_table(fleet: Fleet, most: int = _WORST) -> Table:
     """Return the recordings with the lowest voltages."""
     names = short_names(fleet.vehicles)
-    return Table.of_known(LOWEST_HEADS, [_cells(row, names) for row in worst(fleet)[:most]],
-                          left=[0, 1], most=_SHOWN)
+    return Table.of_known(LOWEST_HEADS, [
+        [names.get(row['vehicle'], UNKNOWN), row['recording'], _cell(row['lowest'], 4),
+         _cell(row['lowest_at']), UNKNOWN if row['dips'] is None else f'{row["dips"]:g}',
+         _cell(row['below_s'], 2), _cell(row['resistance'], factor=1e3), _cell(row['sag']),
+         UNKNOWN if row['sag_throttle'] is None else f'{100.0 * row["sag_throttle"]:.0f} %']
+        for row in worst(fleet)[:most]], left=[0, 1], most=_SHOWN)
 
 
-def _cells(row: Row, names: dict[str, str]) -> list[str]:
-    def shown(value: float | None, digits: int = 3) -> str:
-        return UNKNOWN if value is None or math.isnan(value) else number(value, digits)
-
-    return [names.get(row['vehicle'], UNKNOWN), row['recording'], shown(row['lowest'], 4),
-            shown(row['lowest_at']), UNKNOWN if row['dips'] is None else f'{row["dips"]:g}',
-            shown(row['below_s'], 2),
-            UNKNOWN if row['resistance'] is None else number(1e3 * row['resistance']),
-            shown(row['sag']),
-            UNKNOWN if row['sag_throttle'] is None else f'{100.0 * row["sag_throttle"]:.0f} %']
+def _cell(value: float | None, digits: int = 3, factor: float = 1.0) -> str:
+    return UNKNOWN if value is None else number(factor * value, digits)
 
 
 def _lowest(fleet: Fleet, rows: list[Row]) -> Plot:
@@ -680,7 +658,7 @@ def _drift(fleet: Fleet) -> list[Part]:
 
 
 def _caption(trend: Trend, fleet: Fleet) -> str:
-    at = _at(fleet.judgement.values[trend.quantity], ' at ') or ' as measured'
+    at = _at(fleet.judgement.values[trend.quantity]) or ' as measured'
     return (f'{change(trend.slope)} per flight; fleet-wide p '
             f'{chance(trend.p_family)}. Values{at}, with 95 % intervals.')
 
@@ -743,10 +721,23 @@ def _over_throttle(fleet: Fleet) -> Plot | None:
 
 
 def _quality(fleet: Fleet) -> list[Part]:
-    counts = quality_counts(fleet)
+    """Return the counts of bad statuses, flags, verdicts and causes."""
+    counts: Counter[str] = Counter()
+    seen: set[str] = set()
+    for row in fleet.rows:
+        if row['status'] is not None:
+            if row['status'] not in USABLE:
+                counts[f"level without estimate: {row['status']}"] += 1
+            counts.update(f'level with flag {flag}' for flag in row['flags'] or ())
+        if row['path'] not in seen and row['verdict'] is not None:
+            counts[f"recording with verdict {row['verdict']}"] += 1
+            counts.update(f'recording with cause {cause}'
+                          for cause in dict.fromkeys(row['causes'] or ()))
+        seen.add(row['path'])
     if not counts:
         return [Text('Every level has an estimate, and no flag was raised.')]
-    return [Table(['what', 'how often'], [[text, str(n)] for text, n in counts], left=[0])]
+    return [Table(['what', 'how often'], [[text, str(n)] for text, n in counts.most_common()],
+                  left=[0])]
 
 
 def _recordings(fleet: Fleet) -> list[Part]:
@@ -754,7 +745,7 @@ def _recordings(fleet: Fleet) -> list[Part]:
     places: dict[str, dict[str, int]] = {
         name: {path: k for k, path in enumerate(values.paths)}
         for name, values in judged.values.items()}
-    firsts: dict[str, Mapping[str, Any]] = {}
+    firsts: dict[str, Row] = {}
     flags: dict[str, set[str]] = {}
     for row in fleet.rows:
         if row['error'] is not None or row['duplicate_of'] is not None:
@@ -763,14 +754,13 @@ def _recordings(fleet: Fleet) -> list[Part]:
         flags.setdefault(row['path'], set()).update(row['flags'] or ())
     rows, names = [], short_names(fleet.vehicles)
     for path, first in list(firsts.items())[:_RECORDINGS]:
-        measured = [_cell(values, judged.recordings[name].score, places[name].get(path))
+        measured = [_measured(values, judged.recordings[name].score, places[name].get(path))
                     for name, values in judged.values.items()]
+        start = f"{first['start']:%Y-%m-%d %H:%M UTC}" if first['start'] else ''
         rows.append([
             names.get(first['vehicle'], UNKNOWN), str(first['flight'] or UNKNOWN),
-            f"{first['recording']}\n{_date(first)}", UNKNOWN if not first['cells'] else
-            f"{first['cells']}{'?' * (first['cells_from'] == 'guessed')}",
-            number(first['duration_s'] or NAN),
-            UNKNOWN if first['lowest'] is None else number(first['lowest'], 4),
+            f"{first['recording']}\n{start}", _cells(first), _cell(first['duration_s'] or None),
+            _cell(first['lowest'], 4),
             UNKNOWN if first['dips'] is None else f"{first['dips']:g}", *measured,
             ', '.join(sorted(flags[path])) or UNKNOWN])
     heads = ['vehicle', 'flight', 'recording', 'cells', 's', 'lowest, V', 'dips', *[
@@ -785,11 +775,7 @@ def _recordings(fleet: Fleet) -> list[Part]:
         legend=True)]
 
 
-def _date(row: Mapping[str, Any]) -> str:
-    return '' if row['start'] is None else row['start'].strftime('%Y-%m-%d %H:%M UTC')
-
-
-def _cell(values: Values, score: FloatArray, k: int | None) -> str:
+def _measured(values: Values, score: FloatArray, k: int | None) -> str:
     if k is None:
         return UNKNOWN
     at = values.throttle[k]
