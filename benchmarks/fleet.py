@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import asdict
 import logging
 import os
 from pathlib import Path
@@ -87,7 +86,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         paths = make(Path(folder), args.recordings, args.seconds)
         size = sum(os.path.getsize(path) for path in paths)
-        tasks = [(path, asdict(Options())) for path in paths]
+        tasks = [(path, Options()) for path in paths]
         # Imports and compiled code are loaded before the clock starts.
         work(*tasks[0])
         one: list[tuple[float, float, float]] = []

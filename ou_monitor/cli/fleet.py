@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
 import hashlib
 import math
 import os
@@ -134,11 +133,10 @@ def _options(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
     limit = brownout_limit(args)
     check_ranges({'window': args.window, 'brownout_voltage': limit,
                   'brownout_horizon': args.brownout_horizon})
-    columns = columns_given(args)
     return Options(
         levels=args.levels, window=args.window,
         brownout_voltage=math.nan if limit is None else limit,
         brownout_horizon=args.brownout_horizon, cells=args.cells or 0,
         msg_config=config, voltage_topic=args.voltage_topic, throttle_topic=args.throttle_topic,
-        columns=None if columns is None else asdict(columns), partial=args.partial,
-        discover=args.discover, seed=args.seed), more
+        columns=columns_given(args), partial=args.partial, discover=args.discover,
+        seed=args.seed), more

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 import math
 from pathlib import Path
@@ -37,17 +36,17 @@ class Options:
     msg_config: str | None = None
     voltage_topic: str | None = None
     throttle_topic: str | None = None
-    columns: Mapping[str, Any] | None = None  # Fields of `CsvColumns`
+    columns: CsvColumns | None = None
     # Whether to read the intact part of damaged bags; CSVs are always read without bad lines.
     partial: bool = False
     discover: bool = False  # Whether to search for causes, which takes some seconds a recording
     seed: int = 0  # Seed of `discover`
 
 
-def work(path: str, options: Mapping[str, Any]) -> dict[str, Any]:
+def work(path: str, options: Options) -> dict[str, Any]:
     """Analyse one recording; the result reports any failure."""
     try:
-        return _analysed(path, Options(**options))
+        return _analysed(path, options)
     except InputError as error:
         why = str(error)
     except MemoryError:
@@ -62,8 +61,8 @@ def work(path: str, options: Mapping[str, Any]) -> dict[str, Any]:
 def _analysed(path: str, options: Options) -> dict[str, Any]:
     recording = read_recording(
         path, msg_config=options.msg_config, voltage_topic=options.voltage_topic,
-        throttle_topic=options.throttle_topic, partial=options.partial or is_csv(Path(path)),
-        columns=None if options.columns is None else CsvColumns(**options.columns))
+        throttle_topic=options.throttle_topic, columns=options.columns,
+        partial=options.partial or is_csv(Path(path)))
     if recording.n < 2:
         raise InputError(f'{recording.name} has {counted(recording.n, "usable sample")}: nothing '
                          'can be estimated from it')

@@ -154,7 +154,7 @@ def _work(missing: Sequence[FoundRecording], results: dict[Path, dict[str, Any]]
     order = sorted(missing, key=lambda source: (-source.size, source.path))
     tell = progress or (lambda share: None)
     tell(kept / (kept + len(order)))
-    tasks = [(str(source.path), asdict(options)) for source in order]
+    tasks = [(str(source.path), options) for source in order]
     for done, (k, result, why) in enumerate(pool.each(work, tasks)):
         if result is None:
             result = {'error': why, 'levels': []}

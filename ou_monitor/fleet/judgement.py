@@ -80,12 +80,6 @@ class CommonCurve:
         rise: FloatArray = np.nan_to_num(np.interp(u, self.knots, self.heights))
         return rise
 
-    def pieces(self, throttle: FloatArray) -> FloatArray:
-        """Return the derivative with respect to each slope at some throttles, shape (n, k - 1)."""
-        u = np.asarray(throttle, dtype=np.float64)
-        known = np.where(np.isfinite(u), u, self.reference)
-        return _pieces(known, self.knots)
-
 
 @dataclass(frozen=True, eq=False)
 class Values:
@@ -151,7 +145,8 @@ def values_of(rows: Sequence[Row], name: str) -> Values:
         of[ks] = number
     curve = _curve(y, u, [row['vehicle'] or '' for row in good], of)
     level = y - curve(u)
-    pieces = curve.pieces(u)
+    # Derivative of the curve with respect to each slope, shape (n, k - 1).
+    pieces = _pieces(np.where(np.isfinite(u), u, curve.reference), curve.knots)
     found, place = [], []
     for ks in by_path.values():
         weight = np.array([_number(good[k]['time_s']) for k in ks])
@@ -499,16 +494,16 @@ class Judgement:
 
     def odd_recordings(self) -> list[tuple[str, int]]:
         """Return (quantity, index) of the outlying recordings, largest score first."""
-        found = [(name, int(k)) for name, o in self.recordings.items()
-                 for k in np.flatnonzero(o.found)]
-        return sorted(found, key=lambda f: -abs(float(self.recordings[f[0]].score[f[1]])))
+        return _largest_first(self.recordings)
 
     def odd_vehicles(self) -> list[tuple[str, int]]:
         """Return (quantity, index) of the outlying vehicles, largest score first."""
-        found = [(name, int(k)) for name, v in self.vehicles.items()
-                 for k in np.flatnonzero(v.outliers.found)]
-        return sorted(found, key=lambda f: -abs(float(
-            self.vehicles[f[0]].outliers.score[f[1]])))
+        return _largest_first({name: v.outliers for name, v in self.vehicles.items()})
+
+
+def _largest_first(outliers_of: Mapping[str, Outliers]) -> list[tuple[str, int]]:
+    found = [(name, int(k)) for name, o in outliers_of.items() for k in np.flatnonzero(o.found)]
+    return sorted(found, key=lambda f: -abs(float(outliers_of[f[0]].score[f[1]])))
 
 
 def judge(rows: Sequence[Row], seed: int = 0) -> Judgement:

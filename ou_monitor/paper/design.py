@@ -163,10 +163,8 @@ def default_voltage(network: PowerNetwork, rail: str) -> tuple[float, str]:
 def with_capacitance(network: PowerNetwork, capacitance: float,
                      esr_follows: bool = True) -> PowerNetwork:
     """Return the network with another bulk capacitor (capacitance in F)."""
-    esr = network.bulk_esr
-    if esr_follows:
-        esr *= network.bulk_capacitance / capacitance
-    return replace(network, bulk_capacitance=capacitance, bulk_esr=esr)
+    ratio = network.bulk_capacitance / capacitance if esr_follows else 1.0
+    return replace(network, bulk_capacitance=capacitance, bulk_esr=ratio * network.bulk_esr)
 
 
 def row_of(rail: Rail, voltage: float, horizon: float, sag_error: float = 0.0) -> DesignRow:
@@ -252,22 +250,23 @@ def design(
         verdict = (DesignVerdict.ENOUGH if present.risk <= risk else
                    DesignVerdict.FOUND if least is not None else DesignVerdict.OUT_OF_RANGE)
     risks = [row.risk for row in rows]
-    return Design(
+    found = Design(
         network=network, rail=rail, throttle=throttle, voltage=voltage, horizon=horizon,
         target=risk, esr_follows=esr_follows, verdict=verdict, present=present, least=least,
         rows=tuple(rows), falls=all(b <= a * (1.0 + 1e-9) for a, b in zip(risks, risks[1:])),
         resistance=_resistance(network, throttle, voltage) if rail == 'bus' else math.nan,
-        levers=_levers(network, throttle, voltage, horizon, risk, rail, at, least, sag_error,
-                       flown),
-        sag_error=sag_error, flown_risk=math.nan if flown is None else flown[1])
+        levers=(), sag_error=sag_error, flown_risk=math.nan if flown is None else flown[1])
+    return replace(found, levers=_levers(found, at, flown))
 
 
-def _levers(network: PowerNetwork, throttle: float, voltage: float, horizon: float, target: float,
-            rail: str, at: Callable[[float], DesignRow], least: DesignRow | None,
-            sag_error: float, flown: tuple[float, float, float] | None) -> tuple[Lever, ...]:
+def _levers(found: Design, at: Callable[[float], DesignRow],
+            flown: tuple[float, float, float] | None) -> tuple[Lever, ...]:
+    network, throttle, target, least = found.network, found.throttle, found.target, found.least
+
     def risk(changed: PowerNetwork, u: float = throttle) -> float:
         try:
-            return row_of(rail_at(changed, u, rail), voltage, horizon, sag_error).risk
+            return row_of(rail_at(changed, u, found.rail), found.voltage, found.horizon,
+                          found.sag_error).risk
         except ValueError:
             # Unstable, or a load beyond the battery.
             return 1.0
@@ -378,17 +377,13 @@ def _network_answer(result: Design) -> str:
         return (f'No capacitance between {_uf(result.rows[0])} and {_uf(result.rows[-1])} brings '
                 f'the risk under {result.target:g}: with the largest it is still '
                 f'{probability(result.rows[-1].risk)}. {_others(result)}')
-    text = (f'No capacitor helps: the mean, {present.mean:.4g} V, is at or below '
-            f'{result.voltage:g} V. {_others(result)}')
-    if math.isfinite(result.resistance):
-        return (f'{text} The mean is above the level with less than '
-                f'{1e3 * result.resistance:.3g} mOhm.')
-    if result.rail == 'bus':
-        text += (' The level is at or above the open-circuit voltage: check cells and '
-                 'battery_voltage, or lower the level.')
-    else:
-        text += ' Raise regulator_voltage or lower the level.'
-    return text
+    cure = (f'The mean is above the level with less than {1e3 * result.resistance:.3g} mOhm.'
+            if math.isfinite(result.resistance) else
+            'The level is at or above the open-circuit voltage: check cells and battery_voltage, '
+            'or lower the level.' if result.rail == 'bus' else
+            'Raise regulator_voltage or lower the level.')
+    return (f'No capacitor helps: the mean, {present.mean:.4g} V, is at or below '
+            f'{result.voltage:g} V. {_others(result)} {cure}')
 
 
 def _others(result: Design) -> str:
@@ -459,13 +454,9 @@ def remarks(result: Design) -> list[str]:
         notes.append('More capacitance does not always lower the risk here (resonance or ESR): '
                      'choose a value from the table.')
     if result.network.filter_inductance > 0.0:
-        text = f'LC filter: corner {result.network.lc_corner:.4g} Hz'
-        if rail.resonance is None:
-            text += ', no resonance (all poles are real).'
-        else:
-            text += (f', resonance at {rail.resonance.frequency:.4g} Hz with Q '
-                     f'{rail.resonance.q:.3g}.')
-        notes.append(text)
+        notes.append(f'LC filter: corner {result.network.lc_corner:.4g} Hz, ' + (
+            'no resonance (all poles are real).' if rail.resonance is None else
+            f'resonance at {rail.resonance.frequency:.4g} Hz with Q {rail.resonance.q:.3g}.'))
     return notes
 
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 import math
 
 import numpy as np
 from ou_monitor.model.ou import simulate, stationary_variance
 from ou_monitor.model.passage import mean_first_passage
+from ou_monitor.paper.design import with_capacitance
 from ou_monitor.paper.network import PowerNetwork, Rail, rail_at
 from ou_monitor.paper.published import (
     ALPHA, BATTERY_CELLS, BATTERY_V, ESC_HZ, HIGH, IDLE, LOADED, LOW, MEDIUM, over, Printed,
@@ -233,8 +233,7 @@ def rc_rail(resistance: float, capacitance: float, density: float) -> tuple[floa
 
 def doubled(network: PowerNetwork) -> tuple[Rail, Rail]:
     """Return the bus at 40 % throttle, now and with a second capacitor in parallel."""
-    more = replace(network, bulk_capacitance=2.0 * network.bulk_capacitance,
-                   bulk_esr=0.5 * network.bulk_esr)
+    more = with_capacitance(network, 2.0 * network.bulk_capacitance)
     return rail_at(network, HIGH.load), rail_at(more, HIGH.load)
 
 

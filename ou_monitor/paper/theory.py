@@ -358,10 +358,6 @@ def check_classes(rates: FloatArray) -> None:
 Scaling = Literal['averaging', 'diffusion']
 
 
-def _no_values() -> FloatArray:
-    return np.empty(0)
-
-
 @dataclass(frozen=True, eq=False)
 class SwitchedSystem:
     """An affine system with a matrix and an offset for every state of the chain."""
@@ -369,10 +365,10 @@ class SwitchedSystem:
     generator: Generator  # The chain, n states
     matrices: FloatArray  # A_x, 1/s; shape (n, d, d)
     # a_x, unit of u per second; zeros when left out; shape (n, d).
-    offsets: FloatArray = field(default_factory=_no_values)
+    offsets: FloatArray = field(default_factory=lambda: np.empty(0))
     # D, 1/s: not switched, not sped up; zeros when left out; shape (d, d).
-    drift_matrix: FloatArray = field(default_factory=_no_values)
-    drift_offset: FloatArray = field(default_factory=_no_values)  # d, likewise; shape (d,)
+    drift_matrix: FloatArray = field(default_factory=lambda: np.empty(0))
+    drift_offset: FloatArray = field(default_factory=lambda: np.empty(0))  # d, likewise; (d,)
 
     def __post_init__(self) -> None:
         """Check the shapes and fill in the zeros."""
@@ -492,19 +488,16 @@ class LinearDiffusion:
 
 def require_balance(system: SwitchedSystem) -> None:
     """Refuse a system whose switched part does not have zero average."""
-    matrix, offset = system.switched_average()
-    cure = '; SwitchedSystem.balanced() moves the average to the unswitched drift'
-    worst = np.unravel_index(int(np.argmax(np.abs(matrix))), matrix.shape)
-    if abs(matrix[worst]) > BALANCE_TOLERANCE * float(np.abs(system.matrices).max()):
-        i, j = (int(k) for k in worst)
-        raise ValueError(
-            f'the balance condition does not hold: the averaged velocity of component {i} has '
-            f'{matrix[worst]:+.6g} 1/s times component {j}, not 0{cure}')
-    i = int(np.argmax(np.abs(offset)))
-    if abs(offset[i]) > BALANCE_TOLERANCE * float(np.abs(system.offsets).max()):
-        raise ValueError(
-            f'the balance condition does not hold: the averaged velocity of component {i} is '
-            f'{offset[i]:+.6g} per second at u = 0, not 0{cure}')
+    for average, switched in zip(system.switched_average(), (system.matrices, system.offsets)):
+        i, *j = np.unravel_index(int(np.argmax(np.abs(average))), average.shape)
+        worst = float(average[(i, *j)])
+        if abs(worst) > BALANCE_TOLERANCE * float(np.abs(switched).max()):
+            what = (f'has {worst:+.6g} 1/s times component {j[0]}' if j else
+                    f'is {worst:+.6g} per second at u = 0')
+            raise ValueError(
+                f'the balance condition does not hold: the averaged velocity of component {i} '
+                f'{what}, not 0; SwitchedSystem.balanced() moves the average to the unswitched '
+                'drift')
 
 
 def switching_drift(system: SwitchedSystem) -> AffineSystem:

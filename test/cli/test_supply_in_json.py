@@ -6,7 +6,7 @@ import math
 import numpy as np
 from ou_monitor import MonitorSettings, read_recording, SupplyMonitor
 from ou_monitor.cli.main import main
-from ou_monitor.fleet.analysis import work
+from ou_monitor.fleet.analysis import Options, work
 from project import REAL, ROOT
 import pytest
 
@@ -78,7 +78,7 @@ def test_commands_fleet_and_node_agree_on_the_facts(path, limit, part, tmp_path)
     supply = analysis['supply']
     compared = said('compare', table, limit, tmp_path, '--seeds', '5')
     assert compared is None or compared['supply'] == supply
-    row = work(str(table), {'brownout_voltage': limit})
+    row = work(str(table), Options(brownout_voltage=limit))
     assert row['supply'] == supply
     for column, wanted in (
             ('lowest', supply['lowest']['voltage_v']), ('lowest_at', supply['lowest']['time_s']),

@@ -1,6 +1,5 @@
 """The fleet's disk and processes: workers that die, saved results, search."""
 
-from dataclasses import asdict
 from datetime import datetime, timezone
 import errno
 import json
@@ -136,13 +135,13 @@ def test_work_never_raises(tmp_path, monkeypatch):
     """A bad file, a bug and a lack of memory are errors in the result."""
     bad = tmp_path / 'bad.csv'
     bad.write_text('time_s,voltage_v\n')
-    assert 'bad.csv' in work(str(bad), asdict(Options()))['error']
+    assert 'bad.csv' in work(str(bad), Options())['error']
     for error, words in ((ZeroDivisionError('x'), 'ZeroDivisionError: x'),
                          (MemoryError(), 'fewer workers')):
         def broken(*_: object, error=error, **__: object) -> None:
             raise error
         monkeypatch.setattr('ou_monitor.fleet.analysis.read_recording', broken)
-        assert words in work(str(bad), asdict(Options()))['error']
+        assert words in work(str(bad), Options())['error']
 
 
 def csv_file(path: Path, value: float = 1.0) -> Path:
@@ -185,7 +184,7 @@ def test_logs_are_read_as_analyze_reads_them(tmp_path):
     assert [source.path.name for source in found.sources] == [
         'LOG.TXT', 'cut.bin', 'log00']
     assert len(found.notes) == 1 and 'other.bin' in found.notes[0]
-    results = {source.path.name: work(str(source.path), asdict(Options()))
+    results = {source.path.name: work(str(source.path), Options())
                for source in found.sources}
     assert results['LOG.TXT']['samples'] == results['log00']['samples'] == read_recording(log).n
     assert results['cut.bin']['error']
@@ -331,6 +330,6 @@ def test_cells_that_a_recording_cannot_have_are_an_error(tmp_path):
     rng = np.random.default_rng(1)
     path.write_text('time_s,voltage_v\n' + ''.join(
         f'{a:.2f},{b:.3f}\n' for a, b in zip(t, 16.0 + 0.05 * rng.standard_normal(t.size))))
-    right, wrong = (work(str(path), asdict(Options(cells=cells))) for cells in (4, 9))
+    right, wrong = (work(str(path), Options(cells=cells)) for cells in (4, 9))
     assert (right['error'], right['cells'], right['cells_from']) == ('', 4, 'given')
     assert 'it is likely 4 cells' in wrong['error'] and not wrong['levels']
