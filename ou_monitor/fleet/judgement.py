@@ -460,7 +460,7 @@ OUTLIER_RATE = 0.05
 LEAST_VEHICLES = 6
 # Difference of ln resistance and ln sag that two good vehicles may have: the minimum error of
 # these facts (`LEAST_ERROR`), because it is common to all flights of a vehicle.
-_APART = math.log(1.0 + LEAST_ERROR)
+_ALIKE = math.log(1.0 + LEAST_ERROR)
 # Standard error of a median relative to the mean, for many normal values.
 _MEDIAN_ERROR = 1.2533141373155
 
@@ -560,7 +560,7 @@ def _few(found: Outliers, places: Sequence[int], flights: Sequence[FloatArray]) 
     Compare the mean of each of a few vehicles, with two flights or more, with the others' mean.
 
     A vehicle that stands out is left out when the rest are compared.  The null hypothesis is a
-    difference of at most `_APART`, either way.
+    difference of at most `_ALIKE`, either way.
     """
     from ou_monitor.analysis.level_tests import adjusted
     from scipy import stats
@@ -578,7 +578,7 @@ def _few(found: Outliers, places: Sequence[int], flights: Sequence[FloatArray]) 
         m, v = means[rest], variance[rest]
         others = (m.sum() - m) / (m.size - 1)
         se = np.sqrt(v + (v.sum() - v) / (m.size - 1) ** 2)
-        score, least = (m - others) / se, _APART / se
+        score, least = (m - others) / se, _ALIKE / se
         p = stats.t.sf(np.abs(score) - least, freedom) + stats.t.sf(np.abs(score) + least, freedom)
         chance = np.asarray(adjusted(p.tolist()))
         worst = int(p.argmin())

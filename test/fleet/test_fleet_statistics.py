@@ -28,6 +28,17 @@ def test_the_curve_over_throttle_is_taken_out():
     assert len(values.paths) == 72
 
 
+def test_a_bend_between_near_throttles_is_followed():
+    """Knots may be 0.03 of throttle apart: a rise within 0.1 is not spread over 0.2."""
+    rows = table(np.random.default_rng(3), 4, 12, scatter=0.02,
+                 levels=[(u, 30.0) for u in np.arange(0.1, 0.5, 0.05)])
+    for row in rows:
+        row['sigma'] = math.exp(np.interp(row['throttle'], (0.24, 0.31), (0.0, 2.0)))
+    curve = values_of(rows, 'sigma').curve
+    rise = np.diff(curve(np.array([0.2, 0.35])))[0]
+    assert rise == pytest.approx(2.0, abs=0.1)
+
+
 def test_the_curve_knows_its_error():
     """The error of the curve is its scatter over fleets; levels of one flight are not two."""
     rng = np.random.default_rng(11)
