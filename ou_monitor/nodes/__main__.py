@@ -25,7 +25,6 @@ class Executable:
     managed: bool = False  # Whether it takes --lifecycle
 
     def __call__(self) -> NoReturn:
-        """Run it."""
         lifecycle = self.managed and LIFECYCLE in sys.argv[1:]
         if lifecycle:
             sys.argv.remove(LIFECYCLE)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable
+from functools import partial
 import math
 from pathlib import Path
 import time
@@ -22,7 +23,7 @@ from typing import Any
 
 from ou_monitor.adc import Block, find_device, IioBuffer, PolledChannel
 from ou_monitor.errors import InputError
-from ou_monitor.nodes.base import MonitorNode, to_time, wait_until
+from ou_monitor.nodes.base import battery, MonitorNode, to_time, wait_until
 from ou_monitor.nodes.inputs import Silence
 from ou_monitor.online.settings import Parameter
 from ou_monitor.records import Level
@@ -66,7 +67,7 @@ class AdcNode(MonitorNode):
             polled = PolledChannel(folder, values['channel'])
             self.rate, channel = values['rate'] or polled.rate, polled.channel
             self._output = self.create_publisher(BatteryState, 'voltage', 10)
-            work = self._poller(polled)
+            work = partial(self._poll, polled)
         else:
             self._buffer = IioBuffer(
                 folder, Path(values['dev']) / folder.name, values['channel'], values['block'],
@@ -103,23 +104,18 @@ class AdcNode(MonitorNode):
         self._interval = block.interval
         self._silence.record()
 
-    def _poller(self, polled: PolledChannel) -> Callable[[], None]:
-        """Return the loop that polls a channel at its rate."""
-        def work() -> None:
-            nan = math.nan
-            message = BatteryState(
-                current=nan, charge=nan, capacity=nan, design_capacity=nan, percentage=nan,
-                temperature=nan, present=True, location=self._channel)
-            due = time.monotonic()
-            while wait_until(due, lambda: not self.ending.is_set()):
-                message.header.stamp = to_time(time.time())
-                message.voltage = polled.read() * self._gain + self._shift
-                self._output.publish(message)
-                self._samples += 1
-                self._silence.record()
-                # Missed polls are skipped.
-                due = max(due + 1.0 / self.rate, time.monotonic())
-        return work
+    def _poll(self, polled: PolledChannel) -> None:
+        """Publish samples at the polling rate until the end."""
+        message = battery(self._channel)
+        due = time.monotonic()
+        while wait_until(due, lambda: not self.ending.is_set()):
+            message.header.stamp = to_time(time.time())
+            message.voltage = polled.read() * self._gain + self._shift
+            self._output.publish(message)
+            self._samples += 1
+            self._silence.record()
+            # Missed polls are skipped.
+            due = max(due + 1.0 / self.rate, time.monotonic())
 
     def _diagnose(self) -> None:
         age = self._silence.age

@@ -31,6 +31,7 @@ from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverriding
 from rclpy.subscription import Subscription
 from rclpy.time import Time
 from rclpy.timer import Timer
+from sensor_msgs.msg import BatteryState
 from std_srvs.srv import Trigger
 
 QOS = 'qos_overrides.'
@@ -403,6 +404,13 @@ def wait_until(instant: float, going: Callable[[], bool]) -> bool:
     while time.monotonic() < instant:
         pass
     return True
+
+
+def battery(location: str = '') -> BatteryState:
+    """Return a message about a battery of which nothing but the voltage will be known."""
+    nan = math.nan
+    return BatteryState(current=nan, charge=nan, capacity=nan, design_capacity=nan, percentage=nan,
+                        temperature=nan, present=True, location=location)
 
 
 def to_time(stamp: float) -> object:

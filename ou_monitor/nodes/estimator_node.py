@@ -24,7 +24,6 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.model.load import LoadStart
 from ou_monitor.nodes.base import LOCK, MonitorNode, PUBLISH_RATE
 from ou_monitor.nodes.clocks import IN_BURSTS, SendClock
 from ou_monitor.nodes.inputs import (
@@ -32,7 +31,6 @@ from ou_monitor.nodes.inputs import (
     within)
 from ou_monitor.nodes.node_files import LatchFile, ModelChoice
 from ou_monitor.nodes.sources import Source, SOURCE_PARAMETERS
-from ou_monitor.online.load.model_watch import ModelComparison
 from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.online.risk.flag import FlagLevel
 from ou_monitor.online.settings import (
@@ -264,14 +262,11 @@ class EstimatorNode(MonitorNode):
             stream.thin //= 2
 
     def _watch_throttle(self) -> None:
+        # Three messages of a slow source.
+        limit = 3.0 * max(self._monitor.settings.stale_after, self._throttle_silence.interval)
         age = self._throttle_silence.age
-        limit = self._throttle_limit()
         if age is not None and age > limit and not math.isnan(self._stream.throttle):
             self._stream.lose_throttle()
-
-    def _throttle_limit(self) -> float:
-        """Return the timeout of the throttle, s: three messages of a slow source."""
-        return 3.0 * max(self._monitor.settings.stale_after, self._throttle_silence.interval)
 
     def _jumped(self, reason: str) -> None:
         self._source_clock = SourceClock()
@@ -299,8 +294,14 @@ class EstimatorNode(MonitorNode):
             raise InputError('There is no model_file.')
         if learned is None or not learned.noise > 0.0:
             raise InputError('Nothing to save: throttle moved too little to determine the sag.')
-        path = self._models.save(
-            learned, _entry(learned, loads.against(model.load)), self._meanwhile)
+        found = loads.against(model.load)
+        values = {'level_v': learned.volts, 'sag_ratio': found.sag_ratio,
+                  'sag_ratio_se': found.sag_ratio_se, 'resistance_ohm': learned.resistance,
+                  'noise_v': learned.noise}
+        path = self._models.save(learned, {
+            'date': time.strftime('%Y-%m-%d', time.gmtime()),
+            **{name: value if value > 0.0 else None for name, value in values.items()}},
+            self._meanwhile)
         self._monitor.set_model(self._models.use(path))
         return f'{path}: saved the load of this flight; {self._models.terms} are unchanged.'
 
@@ -413,14 +414,6 @@ class EstimatorNode(MonitorNode):
                   **self._watched.fields(),
                   'callback_errors': self.faults}
         return self.status(part, level, summary, fields, stamp, self._topic)
-
-
-def _entry(learned: LoadStart, found: ModelComparison) -> dict[str, object]:
-    values = {'level_v': learned.volts, 'sag_ratio': found.sag_ratio,
-              'sag_ratio_se': found.sag_ratio_se, 'resistance_ohm': learned.resistance,
-              'noise_v': learned.noise}
-    return {'date': time.strftime('%Y-%m-%d', time.gmtime())} | {
-        name: value if value > 0.0 else None for name, value in values.items()}
 
 
 def _settings(values: Mapping[str, Any]) -> MonitorSettings:

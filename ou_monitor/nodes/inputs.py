@@ -287,24 +287,18 @@ class SourceFinder:
                         raise
                     problem = f'{topic} is not used: {error}'
                 else:
-                    self._take(chosen, topic)
+                    assert chosen.spec is not None
+                    self.opened[quantity] = chosen
+                    self._node.get_logger().info(
+                        f'{quantity} from {topic}: {chosen.spec.type} field '
+                        f"'{chosen.spec.field}' (msg_config '{chosen.config}')")
             elif types:
                 problem = (f"{topic} carries {', '.join(types)}, which no generic msg_config "
                            f"describes ({', '.join(source.known_types)}): set {quantity}.type "
                            f'and {quantity}.field, or msg_config.')
-            self._note(quantity, problem)
-
-    def _take(self, source: Source, topic: str) -> None:
-        assert source.spec is not None
-        self.opened[source.quantity] = source
-        self._node.get_logger().info(
-            f"{source.quantity} from {topic}: {source.spec.type} field '{source.spec.field}' "
-            f"(msg_config '{source.config}')")
-
-    def _note(self, quantity: str, problem: str) -> None:
-        if problem and self.problems.get(quantity) != problem:
-            self._node.get_logger().warning(problem, throttle_duration_sec=10.0)
-        self.problems[quantity] = problem
+            if problem and self.problems.get(quantity) != problem:
+                self._node.get_logger().warning(problem, throttle_duration_sec=10.0)
+            self.problems[quantity] = problem
 
 
 def types_on(node: Node, topic: str) -> list[str]:
@@ -329,7 +323,13 @@ class Console:
         """
         now, topic = self._node.steady_now(), self._node.resolve_topic_name(topic)
         if self._node.count_publishers(topic):
-            self._report_silence(now, topic)
+            if self._next_report == -math.inf:
+                self._next_report = now + MUTE
+            if now >= self._next_report:
+                self._next_report = now + AGAIN
+                self._node.get_logger().info(
+                    f'{topic} has a publisher, but no message has arrived: it sends none, or runs '
+                    'as another user, whose messages Fast DDS does not deliver (doc/deploy.md).')
             return
         self._next_report = -math.inf
         if now - self._waiting < AGAIN:
@@ -339,16 +339,6 @@ class Console:
                  if topic in name and name != topic]
         hint = f" (there is {', '.join(alike)})" if alike else ''
         self._node.get_logger().info(f'Waiting for a publisher on {topic}{hint}.')
-
-    def _report_silence(self, now: float, topic: str) -> None:
-        if self._next_report == -math.inf:
-            self._next_report = now + MUTE
-        if now < self._next_report:
-            return
-        self._next_report = now + AGAIN
-        self._node.get_logger().info(
-            f'{topic} has a publisher, but no message has arrived: it sends none, or runs as '
-            'another user, whose messages Fast DDS does not deliver (doc/deploy.md).')
 
     def flag(self, state: FlagState) -> None:
         """Log when the flag becomes CRITICAL, and when it ends."""

@@ -54,19 +54,15 @@ def managed(kind: type[MonitorNode]) -> Callable[[str], MonitorNode]:
             return self._done('configured', tried)
 
         def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-            """Begin."""
             return self._done('activated', self.begin)
 
         def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-            """Stop; the window is discarded."""
             return self._done('deactivated', self.stop)
 
         def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-            """Stop, from any state."""
             return self._done('shut down', self.stop)
 
         def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-            """Return to the unconfigured state."""
             return self._done('reset', self.stop)
 
         def _done(self, what: str, work: Callable[[], Any]) -> TransitionCallbackReturn:

@@ -113,7 +113,6 @@ def make_server(app: Any, patience: float = PATIENCE) -> Any:
         """Closes connections beyond `CONNECTIONS`."""
 
         def handle_stream(self, stream: Any, address: Any) -> None:
-            """Take a connection."""
             if len(self._connections) >= CONNECTIONS:
                 stream.close()
             else:
@@ -135,7 +134,6 @@ def application(node: Any, token: str) -> Any:
         """Refuses requests without the token, or with a foreign host name (DNS rebinding)."""
 
         def prepare(self) -> None:
-            """Check the request."""
             if token:
                 given = self.get_query_argument('token', '')
                 if not hmac.compare_digest(given.encode(), token.encode()):
@@ -151,14 +149,11 @@ def application(node: Any, token: str) -> Any:
             self.set_header('Cache-Control', 'no-store')
 
     class Page(Guarded):
-        """The page."""
 
         def get(self) -> None:
-            """Send it."""
             self.finish(html)
 
     class Rows(Guarded):
-        """The stream of rows."""
 
         async def get(self) -> None:
             """Send rows as they come, after the last one the browser received."""

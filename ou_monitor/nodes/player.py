@@ -139,7 +139,6 @@ class Prefetch(Generic[Item]):
                 self._changed.notify_all()
 
     def __iter__(self) -> Iterator[Item]:
-        """Yield the items in order."""
         while True:
             if not self._items:
                 with self._changed:

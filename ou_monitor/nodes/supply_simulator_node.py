@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.nodes.base import MonitorNode
+from ou_monitor.nodes.base import battery, MonitorNode
 from ou_monitor.nodes.inputs import (
     NO_CLOCK, PolledInput, PublisherWatch, Silence, SourceFinder, within)
 from ou_monitor.nodes.sources import find_source, Source, SOURCE_PARAMETERS
@@ -79,13 +79,7 @@ class Sender:
         if spec.sample_rate is not None:
             raise InputError(f"msg_config '{source.config}' has blocks of samples, which are not "
                              'simulated live: ou-monitor simulate --type adc_block, and replay')
-        self.message = kind()
-        if spec.type == _USUAL['voltage']:
-            # Quantities that are not simulated are unknown.
-            for name in ('current', 'charge', 'capacity', 'design_capacity', 'percentage',
-                         'temperature'):
-                setattr(self.message, name, math.nan)
-            self.message.present = True
+        self.message = battery() if spec.type == _USUAL['voltage'] else kind()
         self._set = _setter(self.message, spec.field, spec.type)
         self._scale, self._offset = spec.sign * spec.unit_factor, spec.offset
         # Writes the stamp, if there is one.
