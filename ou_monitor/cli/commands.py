@@ -27,7 +27,6 @@ class WithoutOut(argparse.Action):
 
     def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
                  values: Any, option_string: str | None = None) -> None:
-        """Set the flag."""
         setattr(namespace, self.dest, True)
         for action in parser._actions:
             if action.dest == 'out':

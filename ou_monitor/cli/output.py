@@ -86,11 +86,9 @@ class Progress:
         self._live, self._drawn, self._told = False, 0.0, math.inf
 
     def __enter__(self) -> Progress:
-        """Return the bar."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Erase the bar, also after an error."""
         self.close()
 
 

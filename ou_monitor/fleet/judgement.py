@@ -1,32 +1,27 @@
 """
 The fleet table -> drifting vehicles, and outliers among recordings and vehicles.
 
+doc/fleet.md states the tests, their false-alarm rates and their limits; here is how they are
+computed.
+
 Common throttle: the logarithms of sigma and alpha follow one curve over throttle for all vehicles
 (straight between knots, by Huber's estimate, with a level for each vehicle).  Values are moved
-along this curve to the median throttle, with the error of the move.  Resistance and sag come from
-the `supply` facts, per cell where cells are known; the load model extrapolates the sag to full
-throttle (doc/load.md).  Limits: the curve assumes the same shape, and the same load at a throttle,
-on all vehicles; recordings without throttle are not moved.
+along this curve to the median throttle, with the error of the move; recordings without throttle
+are not moved.  Resistance and sag come from the `supply` facts, per cell where cells are known.
 
 Drift: a line through the logarithms over the number of the flight, weighted by their errors and a
-scatter between flights (Paule and Mandel); t test, with the scatter about the line as the scale,
-so that an error common to all flights does not count.  Holm's procedure limits the probability of
-any false alarm in the fleet.  Limits: the scatter between flights is assumed normal; consecutive
-flights with a common cause (a season, a battery) look like a drift.
+scatter between flights (Paule and Mandel), which is assumed normal; t test, with the scatter about
+the line as the scale, so that an error common to all flights does not count.
 
-Few vehicles (fewer than `LEAST_VEHICLES`): a t test compares the mean resistance and sag of each
-with the mean of the others, by the pooled scatter between flights.  The usual spread between good
-vehicles is unknown then, so the test is for a difference of more than a tenth.  A pack is compared
-only with packs of the same number of cells.
+Few vehicles (fewer than `LEAST_VEHICLES`): the pooled scatter between flights is the scale of the
+t test.  A pack is compared only with packs of the same number of cells.
 
 Outliers: the score of a value is its distance from the median of its group (or from the drift line
 of the group) divided by sqrt(s^2 + se^2), with its standard error se and the scatter s between
 recordings, a median absolute deviation.  The bound is a quantile of the largest score in simulated
 fleets without faults, with the same groups and errors and the same evaluation (and with s at its
-upper 90 % bound, which errs towards fewer false alarms).  Limits: the scatter between good
-recordings is assumed normal and equal on all vehicles; heavier tails give more alarms than
-stated; if many members of a group are off, its median is too; small groups have wide bounds
-(doc/fleet.md).
+upper 90 % bound, which errs towards fewer false alarms).  If many members of a group are off, its
+median is too.
 """
 
 from __future__ import annotations

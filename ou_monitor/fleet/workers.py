@@ -101,11 +101,9 @@ class Workers(ABC):
                     yield k, result, why
 
     def __enter__(self) -> Workers:
-        """Return itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Cancel the running tasks."""
         self.close()
 
 
