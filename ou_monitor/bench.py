@@ -20,7 +20,7 @@ from ou_monitor.errors import InputError
 from ou_monitor.records import as_numbers, as_seconds, Recording
 from ou_monitor.report.result import Result
 from ou_monitor.text import counted
-from ou_monitor.timeline import ordered, readings_of
+from ou_monitor.timeline import ordered, readings_of, supplied
 
 if TYPE_CHECKING:
     from ou_monitor.analysis.analyze import Analysis
@@ -402,7 +402,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
         raise ValueError('a PowerNetwork has all components already: with a recording, pass a '
                          'mapping of the components that the flight does not show')
     else:
-        flown, values = readings_of(_read(recording)), dict(network or {})
+        flown, values = supplied(readings_of(_read(recording))), dict(network or {})
         full, stated = full_voltage(flown), stated_limit(flown.source)
         cells = values.setdefault('cells', cells_of(flown)[0])
         if not cells:

@@ -308,6 +308,41 @@ def readings_of(recording: Recording) -> Recording:
         notes=(*recording.notes, note), held=recording.held + held)
 
 
+def supplied(recording: Recording) -> Recording:
+    """
+    Return a recording without the times at which its supply was off; a note tells them.
+
+    Off: below `OFF` of the usual voltage, with the readings up to `_ON` before and after.  A
+    signal that is often there, or that spends as long in between, is not a supply that was off.
+    """
+    t, v = recording.t, recording.voltage
+    usual = float(np.quantile(v, 0.8)) if v.size else 0.0
+    off = v < OFF * usual
+    if not usual > 0.0 or not off.any():
+        return recording
+    low = v < _ON * usual
+    edges = np.flatnonzero(np.diff(low, prepend=False, append=False))
+    begins, ends = edges[::2], edges[1::2]
+    gone = np.logical_or.reduceat(off, begins)
+    begins, ends = begins[gone], ends[gone]
+    between = int((low & ~off).sum())
+    if (begins.size > max(_OUTAGES, _FEW * v.size) or between > _BETWEEN * off.sum()
+            or (ends - begins).sum() > _MOST_OFF * v.size):
+        return recording
+    gone = np.zeros(v.size, dtype=np.bool_)
+    for begin, end in zip(begins.tolist(), ends.tolist()):
+        # From its full voltage, a decay takes half as long again as between the two limits.
+        first, last = begin + np.flatnonzero(off[begin:end])[[0, -1]]
+        gone[max(0, begin - (first - begin) // 2):end + (end - 1 - last) // 2] = True
+    count = int(gone.sum())
+    seconds = float((t[np.minimum(ends, t.size - 1)] - t[begins]).sum())
+    times = 'once' if begins.size == 1 else f'{begins.size} times'
+    return part_of(recording, ~gone, (
+        f'{counted(count)} left out: the supply was off {times} '
+        f'(near {float(np.median(v[off])):.2g} V), from {float(t[begins[0]] - t[0]):.4g} s on, '
+        f'{seconds:.3g} s in all. Lowest voltage and dips include them.'))
+
+
 def part_of(recording: Recording, which: Picked | npt.NDArray[np.bool_], *said: str,
             ) -> Recording:
     """Return the selected samples of a recording, with further notes."""
@@ -329,6 +364,12 @@ def ordered(recording: Recording) -> Recording:
     return recording
 
 
+# A supply is off below the first share of its usual voltage (4S replaced by 5 V of USB: 0.3), and
+# on again above the second.
+OFF, _ON = 0.2, 0.7
+# Maximum number of times off, or as a share of the samples; maximum share of samples; maximum
+# samples between the two limits for each sample below the first.
+_OUTAGES, _FEW, _MOST_OFF, _BETWEEN = 10, 0.01, 0.5, 1.0
 # Largest accepted magnitude of a voltage, V: far above any supply, with squares and cubes finite.
 MOST_VOLTAGE = 1.0e6
 # Largest accepted magnitude of a current, A: far above any supply.

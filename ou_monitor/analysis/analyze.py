@@ -36,7 +36,7 @@ from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, FloatArray, NAN, Recording
 from ou_monitor.text import Z95
-from ou_monitor.timeline import readings_of
+from ou_monitor.timeline import readings_of, supplied
 
 Progress = Callable[[float], None]
 
@@ -73,7 +73,8 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
     voltage refers (0: none), progress 0..1.
     """
     report: Progress = progress or (lambda share: None)
-    recording = readings_of(recording)
+    all_of_it = readings_of(recording)
+    recording = supplied(all_of_it)
     voltage = _default_voltage(recording) if brownout_voltage is None else brownout_voltage
     found = find_levels(recording.t, recording.throttle, levels)
     left = remainder(recording)
@@ -84,7 +85,7 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
         report(0.5 * (k + 1) / len(found))
     sliding = slide(recording, window, voltage, brownout_horizon,
                     lambda share: report(0.5 + 0.5 * share))
-    seen = overview(recording, None if math.isnan(voltage) else voltage, results, cells,
+    seen = overview(all_of_it, None if math.isnan(voltage) else voltage, results, cells,
                     left, sliding.monitor)
     judged = judge_levels(results, seen.load)
     throttles = [level.throttle for level in judged]

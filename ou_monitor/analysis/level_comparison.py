@@ -160,10 +160,22 @@ class SigmaChange:
         return not self.ratio_low <= 1.0 <= self.ratio_high
 
 
-def sigma_change(low: Estimate, high: Estimate) -> SigmaChange:
-    """Compare sigma of two levels that are usable."""
+def sigma_change(low: Estimate, high: Estimate, others: Sequence[Estimate] = ()) -> SigmaChange:
+    """
+    Compare sigma of two levels that are usable; its error includes the scatter of all levels.
+
+    Scatter about a line of ln sigma over throttle, beyond the errors of the levels, has another
+    cause than throttle, such as a load that throttle does not tell.
+    """
+    every = [low, *others, high]
+    scatter = 0.0
+    if others:
+        x, y = np.array([(e.throttle, math.log(e.sigma)) for e in every]).T
+        left = y - np.polyval(np.polyfit(x, y, 1), x)
+        scatter = max(0.0, float(left @ left) / (x.size - 2) - float(np.mean(
+            [e.sigma_se ** 2 for e in every])))
     ratio = high.sigma / low.sigma
-    ends = log_interval(ratio, math.hypot(low.sigma_se, high.sigma_se))
+    ends = log_interval(ratio, math.hypot(low.sigma_se, high.sigma_se, math.sqrt(2.0 * scatter)))
     return SigmaChange(ratio if determined(ratio, *ends) else NAN, *ends)
 
 

@@ -129,8 +129,7 @@ def answers(found: Overview) -> list[str]:
     elif fall := _fall(found):
         parts.append(f'The rail falls by {fall}; no sag over throttle is measurable.')
     elif known:
-        parts.append(f'No sag is measurable: at {100.0 * at:.0f} % throttle it is below '
-                     f'{volts(sag + 2.0 * se)}.')
+        parts.append(f'The sag at {100.0 * at:.0f} % throttle is below {volts(sag + 2.0 * se)}.')
     if found.line is not None and found.line.all_share > _LOUD:
         line = found.line
         what = (f'A line at {number(line.frequency, 4)} Hz makes' if line.lines == 1 else
@@ -159,6 +158,9 @@ def known_lines(found: Overview) -> list[tuple[str, str]]:
                       f'{number(2e3 * resistance.se_ohm, 2)}) within '
                       f'{max(_AT_ONCE, found.step):.2g} s'
                       + (f': {fall}' if (fall := _fall(found)) else '')))
+    elif found.drawn > 0.0:
+        lines.append(('Resistance', 'unknown: the current changes too little, or throttle tells '
+                      'what it does not, as if a load bypassed its sensor'))
     lines.append(('Relaxation', _ou_words(found.facts.ou)))
     if found.line is not None:
         line = found.line

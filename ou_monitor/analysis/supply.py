@@ -30,7 +30,7 @@ from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.online.risk.forecast import LOOK
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import FloatArray, NAN, OuFacts, plain_data, Recording
-from ou_monitor.timeline import ordered, readings_of
+from ou_monitor.timeline import ordered, readings_of, supplied
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 # Throttles at which sag and noise are given.
@@ -196,8 +196,8 @@ def facts_and_end(recording: Recording, limit: float | None = None, left: Remain
     """
     Return the facts, and load and report of the node at the end (no report without a limit).
 
-    limit in V; left: `remainder` of the recording; monitor: of `node_for`, fed with the recording;
-    both are computed if omitted.
+    limit in V; left: `remainder` of the recording; monitor: of `node_for`, fed with it; both
+    without the times off (`supplied`), and computed if omitted.
     """
     if limit is not None and not math.isfinite(limit):
         raise ValueError(f'the limit must be finite, got {limit} V')
@@ -213,15 +213,16 @@ def facts_and_end(recording: Recording, limit: float | None = None, left: Remain
             Noise(THROTTLES, unknown, unknown, nowhere), Resistance(NAN, NAN),
             OuFacts('no_data'), None), SupplyLoad(), None
     k = int(np.argmin(v))
-    noise = noise_of(recording, left)
-    load, budget, last = _at_the_end(recording, limit, monitor)
+    there = supplied(recording)
+    noise = noise_of(there, left)
+    load, budget, last = _at_the_end(there, limit, monitor)
     return SupplyFacts(
         Lowest(float(v[k]), float(t[k] - t[0]), float(u[k])),
         None if limit is None else _dips(t, v, u, limit, noise),
         Sag(load.known, noise.flown, THROTTLES, _tuple(load.sag(THROTTLES)),
             _tuple(load.sag_se(THROTTLES))),
         noise, Resistance(load.resistance, load.resistance_se),
-        known_ou(t, v, u, recording.current), budget), load, last
+        known_ou(there.t, there.voltage, there.throttle, there.current), budget), load, last
 
 
 def _tuple(values: FloatArray) -> tuple[float, ...]:

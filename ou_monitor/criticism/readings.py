@@ -14,7 +14,7 @@ from ou_monitor.model.load import lowpass
 from ou_monitor.model.load_fit import timing
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.text import counted, number
-from ou_monitor.timeline import in_order
+from ou_monitor.timeline import in_order, supplied
 
 # An outlier is farther from the median than this number of standard deviations, and this many
 # times as far as the sample next in distance.
@@ -46,6 +46,9 @@ _ROUNDINGS = 16.0
 def usable(recording: Recording, notes: list[str]
            ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
     """Return the readings of a recording, in order."""
+    before = len(recording.notes)
+    recording = supplied(recording)
+    notes += recording.notes[before:]
     t, v = recording.t, recording.voltage
     u: FloatArray | None = recording.throttle if recording.has_throttle else None
     which, said = in_order(t, v[:, None], float(np.finfo(np.float64).max))

@@ -25,7 +25,7 @@ from ou_monitor.online.trust import Doubt, InputTrust, patience, StampOrder
 from ou_monitor.records import (
     as_numbers, as_seconds, Counters, Estimate, Flag, Level, NAN, OuFacts, Status)
 from ou_monitor.timeline import (
-    as_column, as_columns, MOST_CURRENT, plausible, plausible_samples, TimeLine)
+    as_column, as_columns, Batch, MOST_CURRENT, OFF, plausible, plausible_samples, TimeLine)
 
 if TYPE_CHECKING:
     from ou_monitor.model.supply import SupplyModel
@@ -33,6 +33,10 @@ if TYPE_CHECKING:
 # Cautions that make the numbers doubtful; the others only inform.
 _DOUBTFUL = frozenset({Flag.SLOW_RATE, Flag.QUANTIZED, Flag.LOWPASS_UPSTREAM, Flag.SATURATED,
                        Flag.TREND, Flag.IRREGULAR})
+# A supply that is on has at least this voltage, V: one cell has 2.5 V, noise without one 0.5 V.
+_POWERED = 2.0
+# Time after which what is there instead counts as the supply, s.
+_ANOTHER = 60.0
 
 
 class SupplyMonitor:
@@ -85,8 +89,10 @@ class SupplyMonitor:
         self._odd, self._odd_at = 0, -math.inf
         self._begin()
 
-    def _begin(self) -> None:
-        self._line = TimeLine()
+    def _begin(self, line: TimeLine | None = None) -> None:
+        # Voltage of the supply, V, with a slow fall, and stamp at which it was last on, s.
+        self._level, self._on_at = NAN, NAN
+        self._line = line or TimeLine()
         self._estimator = SlidingEstimator(self._sliding, line=self._line)
         self._relaxation = RelaxationFits(background=self._background)
         self._load_filter, self._load = LoadFilter(), SupplyLoad()
@@ -173,13 +179,42 @@ class SupplyMonitor:
         try:
             columns = as_columns(stamps[part], volts[part], load, drawn)
             for batch in self._line.take(columns, self._sliding):
-                self._estimator.take(batch)
-                self._relaxation.take(batch)
-                if not batch.again:
-                    self._forecast.take(batch, came)
+                self._take(batch, came)
         except Exception as error:
             # Catch every error, because a monitor that stops here would report nothing.
             self.restart(error)
+
+    def _take(self, batch: Batch, came: float) -> None:
+        """Pass on readings, but none while the supply is off; begin anew when it comes."""
+        t, level = float(batch.t[-1]), self._level
+        if math.isnan(level) and batch.t.size > 3 and not batch.again:
+            # The first readings tell whether it is on.
+            self._take(Batch.of(batch.columns[:, :3], batch.restart), came)
+            self._take(Batch.of(batch.columns[:, 3:], False, before=float(batch.t[2])), came)
+            return
+        before = level
+        if level >= _POWERED:
+            on = batch.y >= OFF * level
+            if not on.any() and (batch.restart or t - self._on_at > _ANOTHER):
+                self._begin(self._line)
+            elif not on.all():
+                self._forecast.see(batch.y[~on])
+                if not on.any():
+                    return
+                batch = Batch.of(batch.columns[:, on], batch.restart, again=batch.again)
+            level *= math.exp(-max(t - self._on_at, 0.0) / _ANOTHER)
+        self._pass_on(batch, came)
+        now = self._forecast.voltage
+        if now >= _POWERED and before < OFF * now:
+            self._begin(self._line)
+            self._pass_on(Batch.of(batch.columns[:, batch.y >= OFF * now], True), came)
+        self._level, self._on_at = level if level > now else now, t
+
+    def _pass_on(self, batch: Batch, came: float) -> None:
+        self._estimator.take(batch)
+        self._relaxation.take(batch)
+        if not batch.again:
+            self._forecast.take(batch, came)
 
     def watch(self, voltage: npt.ArrayLike, arrival: npt.ArrayLike) -> None:
         """

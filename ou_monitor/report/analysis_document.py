@@ -22,7 +22,7 @@ from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text, UNKNOWN,
     worst_first)
 from ou_monitor.report.svg import Plot, span
-from ou_monitor.text import chance, counted, listed, number, percent, with_se, Z95
+from ou_monitor.text import chance, counted, listed, number, percent, with_se
 
 # Maximum changes of throttle drawn in one plot, and the length of the plot, relaxation times.
 _MOST_DRAWN, _DRAWN_TAUS = 6, 8.0
@@ -142,13 +142,18 @@ def _why_none(analysis: Analysis) -> str:
 
 def _origin(analysis: Analysis) -> list[tuple[str, str]]:
     """Return the topics or columns of voltage and throttle."""
-    source, found = analysis.recording.source, []
-    if 'voltage' in source:
-        return [('Read from', f"voltage: {source['voltage']}; throttle: "
-                 f"{source.get('throttle', 'none')}")]
+    recording = analysis.recording
+    source, found = recording.source, []
     if source and 'voltage_topic' not in source:
-        throttle = 'column throttle' if analysis.recording.has_throttle else 'none'
-        return [('Read from', f'voltage: column voltage_v; throttle: {throttle}')]
+        columns = {'voltage': 'column voltage_v'}
+        if recording.has_throttle:
+            columns['throttle'] = 'column throttle'
+        if recording.current is not None:
+            columns['current'] = 'column current_a'
+        names = {**dict.fromkeys(('voltage', 'throttle'), 'none'), **(
+            source if 'voltage' in source else columns)}
+        return [('Read from', '; '.join(f'{name}: {names[name]}' for name in (
+            'voltage', 'throttle', 'current') if name in names))]
     for name in ('voltage', 'throttle'):
         kind = source.get(f'{name}_type', '').split('/')[-1]
         if f'{name}_topic' in source:
@@ -167,9 +172,16 @@ def _numbers(analysis: Analysis) -> list[str]:
              f'tau = {number(1e3 / ou.alpha)} (95 % {number(1e3 / high)} to {number(1e3 / low)}) '
              f'ms, and has a standard deviation of {number(1e3 * math.sqrt(ou.var_inf))} mV.']
     steady = [level.estimate for level in analysis.levels if level.estimate.usable]
-    if steady and all(e.sigma * math.exp(Z95 * e.sigma_se) < ou.sigma_95[0] for e in steady):
-        found.append(f'At steady throttle sigma is at most {number(max(e.sigma for e in steady))} '
-                     'V/sqrt(s): the one above includes what follows changes of load.')
+    apart = []
+    if steady and all(e.interval('sigma')[1] < ou.sigma_95[0] for e in steady):
+        apart.append(f'sigma is at most {number(max(e.sigma for e in steady))} V/sqrt(s)')
+    ends = np.array([e.interval('alpha') for e in steady]).reshape(-1, 2)
+    if steady and ((ends[:, 1] < low).all() or (ends[:, 0] > high).all()):
+        taus = sorted(1e3 / e.alpha for e in steady)
+        apart.append(f'tau is {number(taus[0])} to {number(taus[-1])} ms')
+    if apart:
+        found.append(f'At steady throttle {listed(apart)}: the values above also describe what '
+                     'follows changes of load, or lines.')
     return found
 
 
@@ -178,7 +190,7 @@ def _change(analysis: Analysis) -> list[str]:
     if len(good) < 2:
         return []
     low, high = good[0], good[-1]
-    found = sigma_change(low.estimate, high.estimate)
+    found = sigma_change(low.estimate, high.estimate, [level.estimate for level in good[1:-1]])
     if math.isnan(found.ratio):
         return []
     verb = 'does not change measurably' if not found.differs else (

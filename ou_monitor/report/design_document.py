@@ -37,7 +37,12 @@ def design_document(result: Design, source: str, taken: str = '', command: str =
     subject = (f'{name} at throttle {result.throttle:g}: mean {present.mean:.4g} V (sag of the '
                f'bus {present.sag:.3g} V), brown-out at {result.voltage:g} V ({source}), allowed '
                f'risk {result.target:g} within {result.horizon:g} s')
-    return Document('Which capacitance', subject, [answer(result)], [
+    answers = [answer(result)]
+    if taken and result.least is not None:
+        answers.append(
+            'That holds for noise as fast as switching; a recording does not tell how fast its '
+            'noise is. No capacitor changes slower noise, or that of the sensor.')
+    return Document('Which capacitance', subject, answers, [
         lambda: [Figure(_risk(result))],
         Table(['C, uF', 'ESR, mOhm', 'alpha, 1/s', 'tau, us', 'sigma, V/sqrt(s)', 'Var_inf, V^2',
                'mean time', 'risk OU', 'crossing', ''], cells, left=[9]),

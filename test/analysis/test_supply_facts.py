@@ -6,11 +6,13 @@ import math
 
 import numpy as np
 from ou_monitor import read_recording, Recording, supply_facts
+from ou_monitor.analysis.analyze import analyze
 from ou_monitor.analysis.overview import overview
 from ou_monitor.analysis.supply import node_for
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.settings import MonitorSettings
+from ou_monitor.timeline import supplied
 from project import ROOT
 import pytest
 
@@ -37,6 +39,32 @@ def test_dips_are_runs():
     assert (found.dips.count, found.dips.limit_v) == (3, 9.5)
     assert (found.dips.seconds, found.dips.longest_s) == pytest.approx((0.11, 0.09))
     assert (found.lowest.voltage_v, found.lowest.time_s) == (8.0, 9.0)
+
+
+@pytest.mark.parametrize('begin, end', [(0, 100), (2000, 2400), (5900, 6000)])
+def test_a_supply_that_is_off_counts_for_lowest_and_dips_only(begin, end):
+    """Switched on late, a pack changed, a plug pulled: the rest is as without these readings."""
+    whole = flight(np.random.default_rng(4))
+    v = whole.voltage.copy()
+    v[begin:end] = 0.01 * np.random.default_rng(5).integers(0, 3, end - begin)
+    others = np.delete(np.arange(v.size), np.arange(begin, end))
+    off, on = (supply_facts(one, 13.0) for one in (
+        replace(whole, voltage=v),
+        Recording(whole.t[others], whole.voltage[others], whole.throttle[others])))
+    assert off.lowest.voltage_v == 0.0 and off.dips.count == 1
+    assert off.dips.seconds == pytest.approx((end - begin) / RATE)
+    assert (off.noise, off.sag, off.ou) == (on.noise, on.sag, on.ou)
+    found = analyze(replace(whole, voltage=v), brownout_voltage=13.0)
+    assert found.recording.n == others.size and found.overview.facts == off
+
+
+@pytest.mark.parametrize('v', [
+    np.tile([0.0, 12.0], 500).repeat(10), np.random.default_rng(6).standard_normal(10_000),
+    np.linspace(0.0, 12.0, 10_000)], ids=['switched', 'ac_coupled', 'ramp'])
+def test_a_signal_about_zero_is_no_supply_that_was_off(v):
+    """All readings are kept."""
+    whole = Recording(np.arange(v.size) / RATE, v, np.full(v.size, np.nan))
+    assert supplied(whole) is whole
 
 
 def test_noise_is_of_its_throttle():

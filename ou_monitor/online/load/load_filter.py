@@ -28,7 +28,7 @@ from ou_monitor.online.load.blocks import (
 from ou_monitor.online.load.model_watch import (
     compare, LoadContrasts, ModelComparison, OTHER_LEVEL, other_pack, SIZE_ERROR)
 from ou_monitor.online.load.supply_load import (
-    Basis, LAGS, LoadState, LoadStatus, POWER, static, SupplyLoad, TABLE)
+    Basis, LAGS, LoadState, LoadStatus, POWER, rising, static, SupplyLoad, TABLE)
 from ou_monitor.records import FloatArray, NAN
 from ou_monitor.timeline import MOST_CURRENT, MOST_THROTTLE, plausible
 
@@ -651,9 +651,9 @@ class LoadFilter:
         a, C = self._sag_law()
         H = static(TABLE)
         raw = H @ a
-        sag = np.maximum.accumulate(np.maximum(raw, 0.0))
-        # A correction of a negative or decreasing sag counts as an error too.
-        error = np.sqrt(np.maximum(np.einsum('ij,jk,ik->i', H, C, H), 0.0) + (sag - raw) ** 2)
+        sag = np.maximum.accumulate(H @ rising(a, C, H))
+        # The correction of a negative or decreasing sag counts as an error too.
+        error = np.sqrt(np.maximum(np.einsum('ij,jk,ik->i', H, C, H), (sag - raw) ** 2))
         low, high = self._flown_range()
         basis, level, rest = Basis.THROTTLE, self._level, self._rest
         resistance = resistance_se = NAN

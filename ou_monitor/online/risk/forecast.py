@@ -8,7 +8,7 @@ how well each predicted the lowest voltages of completed horizons (Bayes, with f
 law is mixed with a wider one, whose weight is the share of horizons in which the law was wrong:
 first passage with the excursions; the risk for a given throttle with a law as wide as the
 excursions, but at most `_WIDEST` times its own width (excursions include punches, which say
-nothing about idling).
+nothing about idling), or as wide as these horizons fell short of the law, in its deviations.
 
 The law learned in flight, from completed horizons: (lowest - start) / s = b0 + b1 (mu - start) / s
 + k e, with mean mu and deviation s of `lowest`, by least squares with forgetting; e has Student's
@@ -59,8 +59,12 @@ _PRECISION = (_BIAS ** -2, 0.0, _GAIN ** -2)
 MEMORY, _LARGEST, _HUBER = 120.0, 36.0, 3.0
 # Error of the model as a share of the drop.
 _SHARE = 0.1
-# Maximum widening of a law (chosen on gecko, nazgul, roma, bf3s, erle and cf_solo; 2 to 6 tried).
+# Maximum first widening of a law: chosen on gecko, nazgul, roma, bf3s, erle, cf_solo (2 to 6
+# tried).
 _WIDEST = 4.0
+# Horizons for which it counts, beside those that were missed in flight (chosen on gecko, frc_ol_1
+# and cf_solo; 1 and 4 tried).
+_FIRST = 4.0
 # Horizons that initially count as agreeing with the conditional law: chosen on these, hiro,
 # cf_pair, cf_bl00, frc_ol_1 and euc_1 (1, 4, 9 and 19 tried).
 _AGREE = 4.0
@@ -84,8 +88,11 @@ def below(level: float, mean: FloatArray, deviation: FloatArray) -> FloatArray:
     return np.asarray(np.where(t < 0.0, tail, 1.0 - tail))
 
 
-def _wider(spread: FloatArray, deviation: float) -> FloatArray:
-    return np.asarray(np.minimum(np.hypot(spread, deviation), _WIDEST * spread))
+def _wider(spread: FloatArray, deviation: float, misses: tuple[float, float]) -> FloatArray:
+    n, squares = misses
+    first = np.minimum(np.hypot(spread, deviation), _WIDEST * spread)
+    missed = np.sqrt((_FIRST * first * first + squares * spread * spread) / (_FIRST + n))
+    return np.asarray(np.maximum(first, missed))
 
 
 class LowestLaw:
@@ -148,19 +155,31 @@ class FarShare:
     def __init__(self, right: float) -> None:
         self._right, self._wrong = right, 1.0
         self._first = right
+        self._squares = 0.0
 
     @property
     def value(self) -> float:
         """Return the share."""
         return self._wrong / (self._wrong + self._right)
 
-    def add(self, law: float, far: float, weight: float, elapsed: float) -> float:
-        """Learn from the two densities, 1/V, of a lowest voltage; return that of the mixture."""
+    @property
+    def misses(self) -> tuple[float, float]:
+        """Return number and sum of squares of the misses that contradict, in deviations."""
+        return self._wrong - 1.0, self._squares
+
+    def add(self, law: float, far: float, weight: float, elapsed: float, miss: float = 0.0
+            ) -> float:
+        """
+        Learn from the two densities, 1/V, of a lowest voltage; return that of the mixture.
+
+        miss: how far that voltage is below the law's mean, in deviations of the law; else 0.
+        """
         keep = math.exp(-elapsed / MEMORY)
         share = self.value
         both = share * far + (1.0 - share) * law
         wrong = share * far / both if both > 0.0 else 1.0
         self._wrong = 1.0 + (self._wrong - 1.0) * keep + weight * wrong
+        self._squares = self._squares * keep + weight * wrong * miss * miss
         self._right = self._first + (self._right - self._first) * keep + weight * (1.0 - wrong)
         return both
 
@@ -229,7 +248,7 @@ class _Rung:
     def values(self) -> FloatArray:
         """Return all that is interpolated between horizons."""
         return np.append(self.calibrator.law.values, (
-            self.held.value, self.passage.value, self.evidence))
+            self.held.value, *self.held.misses, self.passage.value, self.evidence))
 
     def learn(self, look: _Look, low: float, peak: float, dwell: float, sampling: Sampling
               ) -> None:
@@ -249,8 +268,9 @@ class _Rung:
                 sampling)
             middle, spread = law.moments(mean, deviation, start)
             found = density(y, middle, spread)
-            wide = density(y, middle[:1], _wider(spread[:1], look.deviation))
-            self.held.add(float(found[0]), float(wide[0]), weight, elapsed)
+            wide = density(y, middle[:1], _wider(spread[:1], look.deviation, self.held.misses))
+            self.held.add(float(found[0]), float(wide[0]), weight, elapsed,
+                          max(float((middle[0] - low) / spread[0]), 0.0))
             other = _HALF * far + (1.0 - _HALF) * float(shares @ found[1:])
             self.calibrator.add(low, float(mean[0]), float(deviation[0]), start, weight, elapsed)
         self.evidence *= math.exp(-elapsed / MEMORY)
@@ -264,6 +284,11 @@ def _shares(horizon: float) -> list[float]:
     place = np.interp(math.log(horizon), _LN_RUNGS, np.arange(_LN_RUNGS.size))
     shares: list[float] = np.maximum(1.0 - np.abs(np.arange(_LN_RUNGS.size) - place), 0.0).tolist()
     return shares
+
+
+def _within(horizon: float) -> list[float]:
+    """Return a horizon and the shorter ones, down to a fifth, from which the flight learns."""
+    return [*(one for one in RUNGS if 0.2 * horizon <= one < horizon), horizon]
 
 
 class Forecast:
@@ -280,7 +305,8 @@ class Forecast:
         self.follow(Estimate(), 0.0)
         self._rungs = tuple(map(_Rung, RUNGS))
         self._learning = self._rungs if math.isnan(horizon) else tuple(
-            rung for rung, share in zip(self._rungs, _shares(horizon)) if share > _LEAST_SHARE)
+            rung for rung, share in zip(self._rungs, _shares(horizon))
+            if share > _LEAST_SHARE or rung.horizon in _within(horizon))
         self.new_time_line()
         self._known = False
         # Earliest arrival for the next update, s.
@@ -295,7 +321,7 @@ class Forecast:
         self._samples = 0
         self._begun = NAN
         self._next = -math.inf
-        self._laws: dict[float, tuple[LowestLaw, float, float, float]] = {}
+        self._laws: dict[float, tuple[LowestLaw, float, float, float, float, float]] = {}
         self._kept: dict[float, tuple[float, float, Flown]] = {}
         for rung in self._rungs:
             rung.looks.clear()
@@ -326,8 +352,12 @@ class Forecast:
         self._begun = t.item(0) if math.isnan(self._begun) else self._begun
         self._samples += t.size
         self._newest = t.item(-1)
-        self._last = np.concatenate((self._last, v))[-3:]
+        self.see(v)
         self._past.push(t, v, u)
+
+    def see(self, v: FloatArray) -> None:
+        """Take readings, V, for the present voltage only."""
+        self._last = np.concatenate((self._last, v))[-3:]
 
     @property
     def flown(self) -> tuple[float, float]:
@@ -405,7 +435,7 @@ class Forecast:
             self._kept[horizon] = *excursions(self._past, horizon), flown(self._past, horizon)
         return self._kept[horizon]
 
-    def _learned(self, horizon: float) -> tuple[LowestLaw, float, float, float]:
+    def _learned(self, horizon: float) -> tuple[LowestLaw, float, float, float, float, float]:
         """Return the law, both shares of wrong horizons, and the evidence for a horizon."""
         if horizon not in self._laws:
             values = np.sum([share * rung.values for rung, share in zip(
@@ -417,7 +447,7 @@ class Forecast:
         """Return P(below `voltage`, V, within `horizon`, s), including future throttle."""
         now = self.voltage
         state = self._state()
-        law, _, missed, evidence = self._learned(horizon)
+        law, _, _, _, missed, evidence = self._learned(horizon)
         mean, deviation, done = self._flight(horizon)
         level = np.array([voltage])
         far = NAN if math.isnan(deviation) or math.isnan(now) else float(
@@ -458,19 +488,23 @@ class Forecast:
                 ) -> FloatArray:
         """Return the risk, (k,), of each throttle held for `dwell`, s; NaN: load unknown."""
         u = np.clip(np.atleast_1d(np.asarray(throttle, dtype=np.float64)), 0.0, 1.0)
-        state = self._state()
-        _, deviation, _ = self._flight(horizon)
-        now = self.voltage
+        state, now = self._state(), self.voltage
         if now <= voltage:
             return np.ones(u.shape)
-        if state is None or math.isnan(deviation) or math.isnan(now):
-            return np.full(u.shape, NAN)
-        law, wrong, *_ = self._learned(horizon)
-        courses = held(u, dwell, state.throttle)
-        middle, spread = law.moments(*lowest(state, courses, horizon, self._sampling),
-                                     mean_now(state))
-        return np.asarray(wrong * below(voltage, middle, _wider(spread, deviation))
-                          + (1.0 - wrong) * below(voltage, middle, spread))
+        risk = np.zeros(u.shape)
+        # A fall within a shorter horizon is one within this horizon, and has been seen more often.
+        for within in _within(horizon):
+            _, deviation, _ = self._flight(within)
+            if state is None or math.isnan(deviation) or math.isnan(now):
+                return np.full(u.shape, NAN)
+            law, wrong, n, squares, *_ = self._learned(within)
+            courses = held(u, min(dwell, within), state.throttle)
+            middle, spread = law.moments(*lowest(state, courses, within, self._sampling),
+                                         mean_now(state))
+            wide = _wider(spread, deviation, (n, squares))
+            risk = np.maximum(risk, wrong * below(voltage, middle, wide)
+                              + (1.0 - wrong) * below(voltage, middle, spread))
+        return risk
 
     def _state(self) -> LoadState | None:
         """Return the state from which to predict; None if the load is unknown."""

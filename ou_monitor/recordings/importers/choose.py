@@ -91,14 +91,13 @@ def columns_of(path: Path, log: Log, chosen: Chosen) -> RawColumns:
     """Return the samples of a log, rounded as in the bag that `convert` writes."""
     volts = chosen.voltage
     t = _in_a_bag(volts.t)
-    held = {}
+    held, taken = {}, {VOLTAGE: volts.name}
     for one in (chosen.throttle, chosen.current):
         if one is not None:
             # A value holds until the next one.
             place = np.searchsorted(_in_a_bag(one.t), t, 'right')
             held[one.quantity] = np.append(np.nan, _single(one.values))[place]
-    taken = {VOLTAGE: volts.name} | (
-        {} if chosen.throttle is None else {THROTTLE: chosen.throttle.name})
+            taken[one.quantity] = one.name
     unknown = np.full(volts.n, np.nan)
     return RawColumns(
         t, _single(volts.values), held.get(THROTTLE, unknown), held.get(CURRENT, unknown),

@@ -300,3 +300,22 @@ def test_noise_counts_the_changes_of_throttle_as_flown():
         near = np.abs(u - throttle) < 0.05
         measured = float(np.sqrt(np.mean(noise[near] ** 2)))
         assert 1.0 / 1.3 < float(load.noise(throttle)) / measured < 1.3
+
+
+def test_a_sag_known_only_between_throttles_keeps_its_rise():
+    """
+    Flown at 45 to 80 %, where it rises by 0.14 V: a sag that rises everywhere rises so there.
+
+    The powers alone are negative below 70 % (as of a Crazyflie at hover).
+    """
+    t = np.arange(6000) / 100.0
+    u = 0.62 + 0.17 * np.sin(0.7 * t) * np.sin(0.05 * t)
+    sag = 0.05 + 0.9 * np.maximum(u - 0.45, 0.0)**1.8
+    v = 3.9 - sag - 0.001 * t + 0.002 * np.random.default_rng(3).standard_normal(t.size)
+    load_filter = LoadFilter()
+    load_filter.push(t, v, u)
+    load = load_filter.load()
+    rises = np.diff(load.sag(np.linspace(0.0, 1.0, 21)))
+    assert load.known and (rises > -1e-9).all()
+    low, high = np.interp((0.5, 0.75), u[np.argsort(u)], sag[np.argsort(u)])
+    assert float(load.sag(0.75) - load.sag(0.5)) == pytest.approx(high - low, rel=0.2)
