@@ -17,7 +17,8 @@ import codecs
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 import csv
-from functools import partial
+from datetime import date
+from functools import lru_cache, partial
 import io
 from itertools import chain, islice
 import math
@@ -107,12 +108,13 @@ _INTERVAL = re.compile(
     re.IGNORECASE)
 _PREFIX = {'n': 1e-9, 'u': 1e-6, 'µ': 1e-6, 'm': 1e-3, 'k': 1e3, 'M': 1e6, 'G': 1e9, '': 1.0}
 # Without a date, hours may count up to 99; time zones reach from -12:00 to +14:00.
-CLOCK = re.compile(
+_CLOCK = re.compile(
     r'\s*+(?:(\d{4})[-/.](\d\d?)[-/.](\d\d?)|(\d\d?)([./-])(\d\d?)[./-](\d{4}|\d\d))?+[T ,]*+'
     r'(?:(\d\d?):([0-5]\d)(?::([0-5]\d|60)(?:[.,:](\d{1,9}))?)?)?+\s*+'
     r'(Z|UTC|[-+](?:0\d|1[0-4]):?[0-5]\d)?+\s*+([AaPp][Mm])?+\s*+')
 # Minutes, seconds and a part of a second: 03:12.0 (Excel).
 _MINUTES = re.compile(r'\d\d?:[0-5]\d[.,]\d{1,9}')
+_DAY, _HOUR = 86400.0, 3600.0  # s
 _MONTHS = 'jan feb mar apr may jun jul aug sep oct nov dec'
 _MONTH = re.compile(rf"[- ]({_MONTHS.replace(' ', '|')})[a-z]*[- ]", re.IGNORECASE)
 # A serial monitor's time before the first cell: 10:15:23.123 -> 12.3
@@ -139,7 +141,6 @@ class Form(NamedTuple):
     units: tuple[str, ...]  # As stated, '' if not stated
     width: int  # Cells of a row
     rows: tuple[tuple[str, ...], ...]  # The first rows
-    start: float  # Start of numbered rows, s
     step: float  # From row to row, s; NaN: not stated
     stated: str  # Words that state the step
 
@@ -244,11 +245,11 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool,
         return None
     cells = [cell for row in rows[first:] for cell in row if cell]
     fit = sum(map(is_value, cells)) / max(len(cells), 1)
-    start, step, stated = _stated_step(lines[:max(first, 20)], rows[:first])
+    step, stated = _stated_step(lines[:max(first, 20)], rows[:first])
     first_rows = tuple(tuple(row) for row in rows[first:] if any(row))
     return fit * (1.0 if width > 1 else 0.4) + 0.01 * min(width, 20) / 20, Form(
         encoding, delimiter, comma, stated_comma, first, at, labels, ''.join(lines[:first]), names,
-        units, width, first_rows, start, step, stated)
+        units, width, first_rows, step, stated)
 
 
 def _unlabelled(row: list[str], labels: Sequence[str]) -> list[str]:
@@ -319,11 +320,16 @@ def is_clock(cell: str) -> bool:
     """Return whether a cell is a date, a time, or both."""
     return bool(cell[:1].isdigit() and (':' in cell or cell.count('-') > 1 or cell.count('.') > 1
                                         or cell.count('/') > 1 or cell.count(',') > 1)
-                and CLOCK.fullmatch(swapped(cell)))
+                and _CLOCK.fullmatch(_swapped(cell)))
 
 
-def swapped(cell: str) -> str:
-    """Return a clock in the form of `CLOCK`: days become hours, a month's name its number."""
+def has_day(cell: str) -> bool:
+    found = _CLOCK.fullmatch(_swapped(cell)) if is_clock(cell) else None
+    return found is not None and (found[1] or found[4]) is not None
+
+
+def _swapped(cell: str) -> str:
+    """Return a clock in the form of `_CLOCK`: days become hours, a month's name its number."""
     if found := _DAYS.match(cell):
         cell = f'{24 * int(found[1]) + int(found[2])}:{cell[found.end():]}'
     if found := _MONTH.search(cell):
@@ -417,15 +423,11 @@ def _are_units(row: list[str]) -> bool:
     return some > 1 and some >= others or some == 1 and not others
 
 
-def _stated_step(lines: list[str], above: list[list[str]]) -> tuple[float, float, str]:
-    """Return start and step of numbered rows, s, and the words that state the step."""
-    for names, row in zip(above, above[1:]):
-        low = [name.lower() for name in names]
-        if 'increment' in low and low.index('increment') < len(row) \
-                and is_number(row[low.index('increment')]):
-            at = low.index('start') if 'start' in low else -1
-            start = float(row[at]) if at >= 0 and is_number(row[at]) else 0.0
-            return start, float(row[low.index('increment')]), names[low.index('increment')]
+def _stated_step(lines: list[str], above: list[list[str]]) -> tuple[float, str]:
+    """Return the step of numbered rows, s, and the words that state it."""
+    for name, cell in chain.from_iterable(map(zip, above, above[1:])):
+        if name.lower() == 'increment' and is_number(cell):
+            return float(cell), name
     for line in lines:
         found = _INTERVAL.search(line)
         if found:
@@ -436,8 +438,8 @@ def _stated_step(lines: list[str], above: list[list[str]]) -> tuple[float, float
             if re.search('rate|frequency', words, re.IGNORECASE):
                 value = 1.0 / value if value else math.nan
             if value > 0.0:
-                return 0.0, value, ' '.join(words.split())
-    return 0.0, math.nan, ''
+                return value, ' '.join(words.split())
+    return math.nan, ''
 
 
 def numbers(path: Path, form: Form, places: Sequence[int],
@@ -613,3 +615,60 @@ def shown(text: str) -> str:
     """Return the part that fits in one line: an open quote makes the rest of a file one cell."""
     shown = text.strip()
     return shown if len(shown) <= _LONGEST else shown[:_LONGEST] + '...'
+
+
+@lru_cache(maxsize=64)
+def _days(year: int, month: int, day: int) -> int:
+    return date(year + (2000 if year < 100 else 0), month, day).toordinal() - 719163
+
+
+def clock_times(path: Path, cells: list[str], name: str, left_out: list[str] | None) -> FloatArray:
+    """Return dates and times in s since 1970; without a date since the first midnight."""
+    found = [None if not cell.strip() else _CLOCK.fullmatch(cell) for cell in map(_swapped, cells)]
+    bad = [f"{path}: column '{name}' holds '{shown(cells[k])}', not a date or a time"
+           for k, one in enumerate(found) if one is None and cells[k].strip()]
+    if bad and left_out is None:
+        raise InputError(bad[0])
+    if left_out is not None:
+        left_out += bad
+    try:
+        either = [_clock_seconds(found, first) for first in (True, False)]
+    except ValueError as error:
+        raise InputError(f"{path}: column '{name}': {error}") from error
+    spans = [float(np.nanmax(t) - np.nanmin(t)) if np.isfinite(t).any() else math.inf
+             for t in either]
+    # In 04/05 either may be the day: choose the shorter recording.
+    t = either[0] if spans[0] <= spans[1] else either[1]
+    if any(one is not None and not (one[1] or one[4]) for one in found):
+        # Minutes and seconds alone start anew each hour.
+        turn = _DAY if not np.nanmax(t, initial=0.0) < _HOUR else _HOUR
+        t = t + turn * np.concatenate(([0.0], np.cumsum(np.diff(t) < -0.5 * turn)))
+    return t
+
+
+def _clock_seconds(found: Sequence[re.Match[str] | None], day_first: bool) -> FloatArray:
+    seconds = array('d')
+    wrong = False
+    for one in found:
+        if one is None:
+            seconds.append(math.nan)
+            continue
+        year, month, day, a, mark, b, c, hour, minute, second, part, zone, half = one.groups()
+        days = 0
+        if year:
+            days = _days(int(year), int(month), int(day))
+        elif a:
+            x, y = (int(a), int(b)) if day_first or mark != '/' else (int(b), int(a))
+            wrong |= y > 12
+            days = _days(int(c), min(y, 12), x)
+        t = 60.0 * int(minute or 0) + int(second or 0) + (float(f'0.{part}') if part else 0.0)
+        hours = int(hour or 0)
+        if hours > 23 and (year or a):
+            raise ValueError('hour must be in 0..23')
+        if half:
+            hours = hours % 12 + 12 * (half.lower() == 'pm')
+        if zone and zone[0] in '+-':
+            shift = 3600 * int(zone[1:3]) + 60 * int(zone[-2:])
+            t -= math.copysign(shift, float(zone[0] + '1'))
+        seconds.append(_DAY * days + 3600.0 * hours + t)
+    return np.full(len(seconds), math.nan) if wrong else np.array(seconds, dtype=np.float64)

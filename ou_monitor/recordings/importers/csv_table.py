@@ -10,11 +10,8 @@ name or in a line of units is taken as stated; an unstated unit is guessed from 
 
 from __future__ import annotations
 
-from array import array
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from datetime import date
-from functools import lru_cache
 import math
 from pathlib import Path
 import re
@@ -24,9 +21,9 @@ import numpy as np
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.importers import log as logs
 from ou_monitor.recordings.importers.csv_form import (
-    AMPERE_WORDS, CHANNEL, CLOCK, factor_of, Form, form_of, is_clock, is_number, is_value, MISSING,
-    number_of, numbers, SCALES, SHARE_WORDS, shown, swapped, THROTTLE, TIME, TIME_WORDS, unit_of,
-    VOLT_WORDS, VOLTAGE)
+    AMPERE_WORDS, CHANNEL, clock_times, factor_of, Form, form_of, has_day, is_clock, is_number,
+    is_value, MISSING, number_of, numbers, SCALES, SHARE_WORDS, shown, THROTTLE, TIME, TIME_WORDS,
+    unit_of, VOLT_WORDS, VOLTAGE)
 from ou_monitor.recordings.importers.log import (
     ANY, CsvColumns, Log, one_flight, RawColumns, Request, Series)
 from ou_monitor.records import (
@@ -51,6 +48,11 @@ _USUAL_STEP, _USUAL_SPAN = 2.0, 43200.0
 _OF_1970, _TO_2100 = (25569.0, 719529.0), 47482.0
 # Rows from which repeated stamps are the resolution of a clock.
 _FEW_ROWS = 8
+# Rows per stamp from which they are spread; share by which the number of a stamp may differ;
+# stamps between which rows are even: a row more or less there is 1 % of ten rows per stamp.
+_LEAST_SHARED, _UNSTEADY, _EVEN = 1.5, 0.2, 10
+# Change by rounding; standard errors above which a mean change is significant.
+_ROUNDING, _SURE = 1e-6, 4.0
 # A voltage without a unit above this is in mV: no craft's pack has that many volts.
 _MOST_VOLTS = 1000.0
 
@@ -86,19 +88,20 @@ _PATTERNS = {
         r'(?:.*_)?(?:bus|input|supply|main|pack|total)_?current|i_?bus|curr',
         r'(?:i|curr(?:ent)?|amps?|strom|courant|corriente)(?:_(?:avg|average|mean))?(?:_?1)?'),
 }
-# Column that identifies a program -> units of its columns, not stated there.  Betaflight's
-# blackbox explorer writes the numbers of the log: us, 0.01 V and 0.01 A from version 4.0 on.
-_MAKERS: dict[str, dict[str, tuple[float, str]]] = {
-    'loopIteration': {'time': (1e-6, 'us'), 'vbatLatest': (0.01, '0.01 V'),
-                      'vbat': (0.01, '0.01 V'), 'amperageLatest': (0.01, '0.01 A'),
-                      'amperage': (0.01, '0.01 A'), 'rcCommand[3]': (0.0, 'us')}}
-# Fields of MAVLink's SYS_STATUS, BATTERY_STATUS and POWER_STATUS (common.xml): factor to V or A,
-# unit, and the number that stands for unknown.  All are whole numbers.
-_MAVLINK = {'voltage_battery': (1e-3, 'mV', 65535.0), 'voltages[0]': (1e-3, 'mV', 65535.0),
-            'vcc': (1e-3, 'mV', 0.0), 'vservo': (1e-3, 'mV', 0.0),
-            'current_battery': (1e-2, '10 mA', -1.0)}
+# Column that identifies a program, '' for any -> ends of the names of its columns, in lower case:
+# factor, unit and the number of an unknown value.  Betaflight's blackbox explorer writes the
+# numbers of the log: us, 0.01 V and 0.01 A from version 4.0 on; MAVLink those of SYS_STATUS,
+# BATTERY_STATUS and POWER_STATUS (common.xml).
+_RAW: dict[str, dict[str, tuple[float, str, float]]] = {
+    'loopIteration': {'time': (1e-6, 'us', math.nan), 'rccommand[3]': (0.0, 'us', math.nan), **{
+        f'{name}{end}': (0.01, unit, math.nan) for name, unit in (
+            ('vbat', '0.01 V'), ('amperage', '0.01 A')) for end in ('', 'latest')}},
+    '': {name: (scale, f'{unit} by MAVLink, {unknown:g} is unknown: --unit V for V and A', unknown)
+         for name, scale, unit, unknown in (
+             ('voltage_battery', 1e-3, 'mV', 65535.0), ('voltages[0]', 1e-3, 'mV', 65535.0),
+             ('vcc', 1e-3, 'mV', 0.0), ('vservo', 1e-3, 'mV', 0.0),
+             ('current_battery', 1e-2, '10 mA', -1.0))}}
 _CELLS = re.compile(r'(.*voltages\[)0\]', re.IGNORECASE)
-_DAY, _HOUR = 86400.0, 3600.0  # s
 
 
 class _Column(NamedTuple):
@@ -108,6 +111,7 @@ class _Column(NamedTuple):
     name: str
     unit: str  # As stated or given, '' if neither
     scale: float  # Factor that the maker states; 0: by the unit
+    unknown: float = math.nan  # Number of an unknown value
 
 
 class _Table(NamedTuple):
@@ -259,8 +263,9 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
     else:
         t, values = _read(path, form, time, places, left_out)
     volts = next(zip(found, values), (None, t))[1] if logs.VOLTAGE in found else t
-    if time.place:
-        _check_backwards(path, t, volts, time.name, found)
+    if time.place and (np.diff(t) < 0.0).sum() > _BACK * t.size and (np.diff(volts) > 0.0).all():
+        raise InputError(f"{path}: '{time.name}' runs backwards, and '{found[logs.VOLTAGE].name}' "
+                         'only ever rises: are the two columns swapped?')
     t, words = _stamps(path, t, raw, wanted, clock)
     units = {'voltage': wanted.unit, 'throttle': wanted.throttle_unit}
     scaled, guesses = {}, {_TIME_NAME: words}
@@ -270,16 +275,17 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
             column_values = column_values + sum(np.where(np.isfinite(cell) & (
                 cell != 65535.0), cell, 0.0) for cell in values[len(found) + len(others):])
         column_values = column_values * factor_of(column.name)
-        si, guesses[quantity] = _of_mavlink(
-            column, column_values, wanted.unit, guesses.get(logs.VOLTAGE, '')) or _in_si(
-                quantity, column, column_values, units.get(quantity), volts,
-                guesses.get(logs.VOLTAGE, ''))
+        si, guesses[quantity] = _in_si(quantity, column, column_values, units.get(quantity), volts,
+                                       guesses.get(logs.VOLTAGE, ''))
         scaled[quantity] = column, si
     if logs.VOLTAGE in scaled and not series:
         column, si = scaled[logs.VOLTAGE]
         _check_one_series(path, form, t, column.name, si)
+    spread = _spread(t, volts)
+    if spread is not t:
+        guesses[_TIME_NAME] += ', equal stamps spread evenly, a guess: --sample-interval'
     note = _read_note(form, time, found, guesses, wanted.throttle is None)
-    return _Table(form, time, t, scaled, dict(zip(others, values[len(found):])), note)
+    return _Table(form, time, spread, scaled, dict(zip(others, values[len(found):])), note)
 
 
 def _absent(path: Path, form: Form, name: str, option: str = '') -> str:
@@ -298,24 +304,20 @@ def _column_place(path: Path, form: Form, name: str, option: str) -> int:
 
 def _choose(form: Form, quantity: str, taken: Sequence[int] = ()) -> list[int]:
     """Return the candidate columns of a quantity, the first of the best pattern first."""
-    plain = [re.sub(r'\W+', '_', unit_of(name)[0].strip().lower()).strip('_') if name else None
-             for name in form.names[:form.width]]
-    plain = [name if name is None else name or 'time' if form.names[k].strip('_% ') else name
-             for k, name in enumerate(plain)]
+    plain = [re.sub(r'\W+', '_', unit_of(name)[0].strip().lower()).strip('_') or 'time' * bool(
+        form.units[k]) if name else None for k, name in enumerate(form.names[:form.width])]
     ends = [name if name is None else re.sub(r'\W+', '_', re.split(
         r'[/.:](?=[^/.:])(?![^\[(]*[\])]$)', form.names[k].strip().lower())[-1]).strip('_')
         for k, name in enumerate(plain)]
-    kinds: dict[str, dict[str, str]] = {
-        _TIME_NAME: TIME_WORDS, logs.VOLTAGE: VOLT_WORDS, logs.CURRENT: AMPERE_WORDS,
-        logs.THROTTLE: {**SHARE_WORDS, **_PULSE_WORDS}}
-    right = kinds.get(quantity, {})
+    right = {_TIME_NAME: TIME_WORDS, logs.VOLTAGE: VOLT_WORDS, logs.CURRENT: AMPERE_WORDS,
+             logs.THROTTLE: {**SHARE_WORDS, **_PULSE_WORDS}}[quantity]
     free = [k for k in range(len(plain)) if k not in taken and plain[k] is not None
             and _of_kind(form, k, quantity == _TIME_NAME)]
     for pattern in _PATTERNS[quantity]:
         found = list(dict.fromkeys(
             k for texts in ([form.names[k].strip() for k in range(len(plain))], plain, ends)
             for k in free if re.fullmatch(pattern, texts[k] or ' ')
-            and (not right or form.units[k] in right or not form.units[k])))
+            and (form.units[k] in right or not form.units[k])))
         if found:
             # Stated units decide between names: `v [V]` before `u`.
             return sorted(found, key=lambda k: form.units[k] not in right)
@@ -344,16 +346,17 @@ def _time_of(path: Path, form: Form, wanted: CsvColumns) -> _Column:
                             wanted.time_unit)
     numbered = bool(form.rows) and form.width > 1 and re.fullmatch(
         _INDEX_NAME, unit_of(form.names[0])[0].strip('# ').lower()) is not None
-    found = [] if numbered and math.isfinite(form.step) else (
-        _choose(form, _TIME_NAME) or _clock_columns(form))
+    found = [] if numbered and math.isfinite(form.step) else _choose(form, _TIME_NAME) or [
+        k for k in range(min(form.width, len(form.names))) if form.rows and all(
+            k < len(row) and ':' in row[k] and is_clock(row[k]) for row in form.rows)]
     if found:
         first = _finest(form, found[0])
         beside = [k for k in range(min(form.width, len(form.names))) if k != first and any(
-            k < len(row) and _has_day(row[k]) and ':' not in row[k] for row in form.rows[:3])]
+            k < len(row) and has_day(row[k]) and ':' not in row[k] for row in form.rows[:3])]
         cells = [row[first] for row in form.rows if first < len(row)]
         if parts := _parts_of_second(form, first):
             return parts
-        if beside and cells and ':' in cells[0] and not _has_day(cells[0]):
+        if beside and cells and ':' in cells[0] and not has_day(cells[0]):
             return _Column((beside[0], first),
                            f'{form.names[beside[0]]}, {form.names[first]}', 's', 0.0)
         return _unit_column(form, first, wanted.time_unit)
@@ -427,12 +430,6 @@ def _like_voltage(form: Form, places: list[int]) -> list[int]:
     return [places[k] for k in able] if least else []
 
 
-def _clock_columns(form: Form) -> list[int]:
-    """Return the columns that hold a time of the day in each of the first rows."""
-    return [k for k in range(min(form.width, len(form.names))) if form.rows and all(
-        k < len(row) and ':' in row[k] and is_clock(row[k]) for row in form.rows)]
-
-
 def _rises(form: Form, place: int) -> bool:
     """Return whether a column without a name never falls in the first rows."""
     cells = [row[place] for row in form.rows]
@@ -440,19 +437,16 @@ def _rises(form: Form, place: int) -> bool:
         (np.diff([number_of(cell)[0] for cell in cells]) >= 0.0).all())
 
 
-def _has_day(cell: str) -> bool:
-    found = CLOCK.fullmatch(swapped(cell)) if is_clock(cell) else None
-    return found is not None and (found[1] or found[4]) is not None
-
-
 def _unit_column(form: Form, place: int, unit: str | None) -> _Column:
-    name = form.names[place]
-    maker = next((units for column, units in _MAKERS.items() if column in form.names), {})
-    if unit is None and name in maker:
-        scale, words = (0.1, '0.1 V') if name == 'vbatLatest' and re.search(
-            r'Betaflight 3\.[1-9]|Cleanflight [2-9]', form.above) else maker[name]
-        return _Column((place,), name, words, scale)
-    return _Column((place,), name, unit or form.units[place], 0.0)
+    name, stated = form.names[place], form.units[place]
+    end = re.split('[./:]', name.strip().lower())[-1]
+    raw = next((units[end] for column, units in _RAW.items()
+                if column in ('', *form.names) and end in units), None)
+    if raw and raw[1].startswith(unit or '') and not (stated and unit is None):
+        if end == 'vbatlatest' and re.search(r'Betaflight 3\.[1-9]|Cleanflight [2-9]', form.above):
+            raw = 0.1, '0.1 V', math.nan
+        return _Column((place,), name, raw[1], raw[0], raw[2])
+    return _Column((place,), name, unit or stated, 0.0)
 
 
 def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: _Column, needed: bool,
@@ -530,8 +524,7 @@ def _read(path: Path, form: Form, time: _Column, places: list[int],
             raise InputError(f"{path}: '{time.name}' says rows {time.scale:g} s apart, outside "
                              f'{LEAST_STEP:g} to {LONGEST_STEP:g} s')
         values = numbers(path, form, places or [0], left_out=left_out)
-        return time.scale * np.arange(float(values[0].size)) + form.start * (
-            time.name == form.stated), values
+        return time.scale * np.arange(float(values[0].size)), values
     if sample and not is_number(sample[0]) and is_clock(sample[0]):
         clocks: list[list[str]] = [[] for _ in time.place]
         values = numbers(path, form, places, dict(zip(time.place, clocks)) | (texts or {}),
@@ -541,80 +534,12 @@ def _read(path: Path, form: Form, time: _Column, places: list[int],
             cells = [f'{clock}.{part:0>3}' for clock, part in zip(*clocks)]
         elif len(clocks) > 1:
             cells = [' '.join(pair) for pair in zip(*clocks)]
-        return _clock(path, [swapped(cell) for cell in cells], time.name, left_out), values
+        return clock_times(path, cells, time.name, left_out), values
     t, *values = numbers(path, form, [*time.place, *places], texts, left_out)
     if len(time.place) > 1:
         part, *values = values
         t = t + part * TIME_UNITS[time.unit]
     return t * factor_of(time.name), values
-
-
-@lru_cache(maxsize=64)
-def _days(year: int, month: int, day: int) -> int:
-    return date(year + (2000 if year < 100 else 0), month, day).toordinal() - 719163
-
-
-def _clock(path: Path, cells: list[str], name: str, left_out: list[str] | None) -> FloatArray:
-    """Return dates and times in s since 1970; without a date since the first midnight."""
-    found = [None if not cell.strip() else CLOCK.fullmatch(cell) for cell in cells]
-    bad = [f"{path}: column '{name}' holds '{shown(cells[k])}', not a date or a time"
-           for k, one in enumerate(found) if one is None and cells[k].strip()]
-    if bad and left_out is None:
-        raise InputError(bad[0])
-    if left_out is not None:
-        left_out += bad
-    try:
-        either = [_clock_seconds(found, first) for first in (True, False)]
-    except ValueError as error:
-        raise InputError(f"{path}: column '{name}': {error}") from error
-    spans = [float(np.nanmax(t) - np.nanmin(t)) if np.isfinite(t).any() else math.inf
-             for t in either]
-    # In 04/05 either may be the day: choose the shorter recording.
-    t = either[0] if spans[0] <= spans[1] else either[1]
-    if any(one is not None and not (one[1] or one[4]) for one in found):
-        # Minutes and seconds alone start anew each hour.
-        turn = _DAY if not np.nanmax(t, initial=0.0) < _HOUR else _HOUR
-        t = t + turn * np.concatenate(([0.0], np.cumsum(np.diff(t) < -0.5 * turn)))
-    return t
-
-
-def _clock_seconds(found: Sequence[re.Match[str] | None], day_first: bool) -> FloatArray:
-    seconds = array('d')
-    wrong = False
-    for one in found:
-        if one is None:
-            seconds.append(math.nan)
-            continue
-        year, month, day, a, mark, b, c, hour, minute, second, part, zone, half = one.groups()
-        days = 0
-        if year:
-            days = _days(int(year), int(month), int(day))
-        elif a:
-            x, y = (int(a), int(b)) if day_first or mark != '/' else (int(b), int(a))
-            wrong |= y > 12
-            days = _days(int(c), min(y, 12), x)
-        t = 60.0 * int(minute or 0) + int(second or 0) + (float(f'0.{part}') if part else 0.0)
-        hours = int(hour or 0)
-        if hours > 23 and (year or a):
-            raise ValueError('hour must be in 0..23')
-        if half:
-            hours = hours % 12 + 12 * (half.lower() == 'pm')
-        if zone and zone[0] in '+-':
-            shift = 3600 * int(zone[1:3]) + 60 * int(zone[-2:])
-            t -= math.copysign(shift, float(zone[0] + '1'))
-        seconds.append(_DAY * days + 3600.0 * hours + t)
-    return np.full(len(seconds), math.nan) if wrong else np.array(seconds, dtype=np.float64)
-
-
-def _check_backwards(path: Path, t: FloatArray, voltage: FloatArray, name: str,
-                     found: dict[str, _Column]) -> None:
-    """Raise InputError if time and voltage are likely swapped."""
-    step = np.diff(t)
-    step = step[np.isfinite(step)]
-    if step.size and logs.VOLTAGE in found and float(np.mean(step < 0.0)) > _BACK and (
-            np.diff(voltage) > 0.0).all():
-        raise InputError(f"{path}: '{name}' runs backwards, and '{found[logs.VOLTAGE].name}' only "
-                         'ever rises: are the two columns swapped?')
 
 
 def _check_one_series(path: Path, form: Form, t: FloatArray, column: str, values: FloatArray,
@@ -667,7 +592,8 @@ def _stamps(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: _Co
     if time.scale:
         return t * time.scale, time.unit
     known = t[np.isfinite(t)]
-    usual = float(np.median(np.abs(np.diff(known)))) if known.size > 1 else 0.0
+    steps = np.abs(np.diff(known))
+    usual = float(np.median(steps[steps > 0.0])) if steps.any() else 0.0
     if len(time.place) > 1:
         unit, words = 's', ''
     elif time.unit:
@@ -691,24 +617,37 @@ def _stamps(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: _Co
     return t, unit + words
 
 
-def _of_mavlink(column: _Column, values: FloatArray, given: str | None, beside: str,
-                ) -> tuple[FloatArray, str] | None:
+def _spread(t: FloatArray, volts: FloatArray) -> FloatArray:
     """
-    Return values of a field of MAVLink in V or A, and their unit; None if it is another.
+    Return stamps that steady numbers of rows share, spread evenly; others as they are.
 
-    given: the unit of the voltage; beside: the words of the voltage's unit, for a current.
+    The first row of a stamp is at the stamp, unless rows are missing before it.
     """
-    name = re.split(r'[./:]', column.name.strip().lower())[-1]
-    if name not in _MAVLINK or given == 'V' or column.unit and given is None or beside == 'V':
-        return None
-    scale, unit, unknown = _MAVLINK[name]
-    known = values[np.isfinite(values) & (values != unknown)]
-    # A tool that has converted them writes fractions; a supply has volts.
-    if (known != np.rint(known)).any() or unit == 'mV' and not (
-            known.size and float(np.median(known)) >= _MOST_VOLTS):
-        return None
-    return np.where(values == unknown, np.nan, values * scale), (
-        f'{unit} by MAVLink, {unknown:g} is unknown: --unit V for V and A')
+    known = np.flatnonzero(np.isfinite(t) & np.isfinite(volts))
+    stamps, change = t[known], np.diff(volts[known])
+    begin = np.flatnonzero(np.diff(stamps, prepend=-math.inf))
+    step, rows = np.diff(stamps[begin]), np.diff(begin)[1:]
+    if rows.size < 2 or _LEAST_SHARED * begin.size > known.size or (step < 0.0).any():
+        return t
+    usual, first = float(np.median(rows)), change[begin[1:] - 1]
+    # Repeated rows change between stamps only, and series in turn change there in one direction.
+    if np.mean(np.abs(rows - usual) > max(1.0, _UNSTEADY * usual)) > WILD or np.count_nonzero(
+            first) > (1.0 - WILD) * np.count_nonzero(change) or abs(
+                np.mean(first) - np.mean(change)) > _ROUNDING + np.std(first) * max(
+                    1.0, _SURE / math.sqrt(first.size)):
+        return t
+    row, even = np.arange(float(known.size)), stamps.copy()
+    pauses = np.flatnonzero(step > 1.5 * np.median(step)) + 1
+    for part in np.split(begin, pauses):
+        end = begin[begin > part[-1]].min(initial=known.size)
+        # The numbers of the first and the last stamp may be in part.
+        x = np.unique(np.append(part[1::_EVEN], part[-1]))
+        rate = np.ptp(stamps[x]) / np.ptp(x) if x.size > 1 else np.median(step) / usual
+        here = row[part[0]:end]
+        even[part[0]:end] = np.interp(here, x, stamps[x]) + rate * (
+            np.minimum(here - x[0], 0.0) + np.maximum(here - x[-1], 0.0))
+    return t if (np.diff(even) <= 0.0).any() else np.where(
+        np.isfinite(t), np.interp(np.arange(float(t.size)), known, even), t)
 
 
 def _in_si(quantity: str, column: _Column, values: FloatArray, given: str | None,
@@ -733,9 +672,10 @@ def _in_si(quantity: str, column: _Column, values: FloatArray, given: str | None
         return (values - low) / (high - low), (
             '0..1' if unit == '1' else unit) + words
     # A tool that has converted the numbers keeps the names: no supply is below 1 V.
-    if column.scale and beside != 'V' and (
+    if column.scale and 'V' not in (given, beside) and (
+            math.isnan(column.unknown) or (known == np.rint(known)).all()) and (
             quantity == logs.CURRENT or known.size and np.median(known) * column.scale >= 1.0):
-        return values * column.scale, column.unit
+        return np.where(values == column.unknown, np.nan, values * column.scale), column.unit
     if quantity == logs.CURRENT:
         whole = not column.unit and bool((known == np.rint(known)).all())
         small = whole and beside.startswith('mV,')
@@ -788,10 +728,11 @@ def _read_note(form: Form, time: _Column, found: dict[str, _Column], units: dict
     if search and logs.THROTTLE not in found:
         # Mention columns that may be a throttle under another name.
         used = {*time.place, *(column.place[0] for column in found.values())}
-        rest = [name for k, name in enumerate(form.names[:form.width]) if form.line
-                and k not in used and name not in others
+        rest = [name for k, name in enumerate(form.names[:form.width])
+                if k not in used and name not in others
                 and not re.fullmatch(_INDEX_NAME, name.strip('# ').lower())
-                and all(k < len(row) and is_number(row[k]) for row in form.rows[:2])]
+                and any(k < len(row) and is_number(row[k]) and row[k].lower() not in MISSING
+                        for row in form.rows)]
         also += f'; not read: {some(rest, 3)} (--throttle-column)' if rest else ''
     return (f"Read {', '.join(parts)}{also}; cells between {between}, decimal "
             f"{'comma' if form.comma else 'point'}"

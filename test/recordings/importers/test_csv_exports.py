@@ -31,9 +31,9 @@ def german(value):
     return f'{value}'.replace('.', ',')
 
 
-def clock(k, pattern='%Y-%m-%d %H:%M:%S.%f'):
-    """Return the time of a sample, 10 ms apart."""
-    return (BEGIN + timedelta(milliseconds=10 * k)).strftime(pattern)
+def clock(k, pattern='%Y-%m-%d %H:%M:%S.%f', step=0.01):
+    """Return the time of a sample."""
+    return (BEGIN + timedelta(seconds=step * k)).strftime(pattern)
 
 
 # Name -> content, time from row to row (s), whether throttle and current are in it.
@@ -284,6 +284,17 @@ FORMS = {
         f'{59.7 * (k < 30) + 0.01 * (k % 30):09.6f},{V[k]}')), 0.01, False, False),
     'rostopic_float': (table(['%time,field.data'], lambda k: (
         f'{1715846526000000000 + 10000000 * k},{V[k]}')), 0.01, False, False),
+    # Several rows per stamp of a clock of whole seconds; the first is in part.
+    'arduino_rtc': (table(['Time,Voltage(V),Current(A)'], lambda k: (
+        f"{clock(k + 3, '%H:%M:%S', 0.1)},{V[k]},{AMPS[k]}")), 0.1, False, True),
+    'unit_log': (table(['No.,Date,Time,Value,Unit'], lambda k: (
+        f"{k + 1},{clock(k, '%Y/%m/%d,%H:%M:%S', 0.5)},{V[k]},V")), 0.5, False, False),
+    'unix_seconds': (table(['unixtime,voltage,throttle'], lambda k: (
+        f'{1700000000 + (k + 13) // 20},{V[k]},{U[k]}')), 0.05, True, False),
+    # Rows are numbered; the name of the time has more words.
+    'hoboware': (table(['"Plot Title: pack"', '"#","Date Time, GMT+02:00","Volt, V (LGR S/N: 1)",'
+                        '"Host Connected (LGR S/N: 1)"'], lambda k: (
+        f"{k + 1},{clock(k, '%m/%d/%y %I:%M:%S %p', 5.0)},{V[k]},")), 5.0, False, False),
     # Units below the names; a few are unknown.
     'megasquirt': (table(['"MS3"', 'Time\tRPM\tMAP\tBatt V\tAFR', 's\tRPM\tkPa\tV\tAFR'],
                          lambda k: f'{0.01 * k:.3f}\t2100\t45\t{V[k]}\t14.7'), 0.01, False,
@@ -389,12 +400,40 @@ def test_labels_are_names_only_if_each_row_has_them(tmp_path):
         read_recording(written(tmp_path, rows))
 
 
-def test_a_cell_beyond_the_range_is_missing_and_a_coarse_clock_is_reported(tmp_path):
+def test_a_cell_beyond_the_range_is_missing(tmp_path):
     path = written(tmp_path, 't,U,I\n0,12,1\n1,OL,1\n2,13,∞\n3,14,1\n')
     np.testing.assert_allclose(read_recording(path).voltage, [12, 13, 14])
-    rows = ''.join(f'10:00:0{k // 50},12.5\n' for k in range(150))
-    found = read_recording(written(tmp_path, f'time,U\n{rows}'))
-    assert found.n == 3 and any('--sample-interval' in note for note in found.notes)
+
+
+@pytest.mark.parametrize('step, atol', [
+    (np.full(900, 0.104), 0.1), (np.where(np.arange(900) == 400, 33.3, 0.1), 0.1),
+    (np.random.default_rng(1).uniform(0.08, 0.12, 900), 0.3), (np.full(900, 1.0 / 101.0), 0.02)])
+def test_rows_that_share_a_stamp_are_spread(step, atol, tmp_path):
+    """A rate that is no multiple of the clock's, a pause, rows that come unevenly."""
+    t = 0.3 + np.cumsum(step)
+    volts = np.round(12.0 + 0.1 * np.random.default_rng(2).standard_normal(t.size), 2)
+    path = written(tmp_path, 'time,U,I\n' + ''.join(
+        f'{clock(int(k), "%H:%M:%S", 1.0)},{u},3\n' for k, u in zip(t, volts)))
+    found = read_recording(path)
+    assert found.n == t.size and 'equal stamps spread evenly, a guess' in found.notes[0]
+    late = (found.t - found.t[0]) - (t - t[0])
+    np.testing.assert_allclose(late, np.median(late), rtol=0.0, atol=atol)
+    log = import_log(path, Request())
+    np.testing.assert_allclose(log.series[0].t, found.t, rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize('stamps, volts', [
+    # Rows repeated, two packs in turn, and no steady number.
+    (np.arange(900) // 10, np.repeat(_RNG.normal(12.0, 0.1, 90), 10)),
+    (np.arange(900) // 2, 12.0 + 0.3 * (np.arange(900) % 2) + 0.02 * _RNG.standard_normal(900)),
+    (np.cumsum(_RNG.random(900) < 0.1), _RNG.normal(12.0, 0.1, 900))])
+def test_other_rows_that_share_a_stamp_are_dropped(stamps, volts, tmp_path):
+    path = written(tmp_path, 'time,U\n' + ''.join(
+        f'{clock(int(k), "%H:%M:%S", 1.0)},{u:.3f}\n' for k, u in zip(stamps, volts)))
+    found = read_recording(path)
+    assert found.n == np.unique(stamps).size and 'dropped: repeated stamp' in found.notes[-1]
+    assert any('--sample-interval' in note for note in found.notes) == (
+        stamps.size > 2 * np.unique(stamps).size)
 
 
 def test_the_unit_of_a_throttle(tmp_path):
@@ -518,8 +557,8 @@ def test_columns_without_names_are_not_mistaken(row, tmp_path):
 
 
 def test_a_column_that_may_be_the_throttle_is_named(tmp_path):
-    """Not lost in silence; nothing is said where it was found, or given as none."""
-    rows = 't,U,load\n' + ''.join(f'{k},12,{k / 9}\n' for k in range(9))
+    """Though in rows of its own; nothing is said where it was found, or given as none."""
+    rows = 't,U,load\n' + ''.join(f'{k},12,\n{k + 0.1},,{k / 9}\n' for k in range(9))
     path = written(tmp_path, rows)
     assert 'not read: load (--throttle-column)' in read_recording(path).notes[0]
     for name in ('load', 'none'):
