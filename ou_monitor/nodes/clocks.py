@@ -235,11 +235,6 @@ class SimClockMap:
         span = self._pairs[-1][0] - self._pairs[0][0] if self.ready else 0.0
         return max(STOPPED, MISSED * span / max(len(self._pairs) - 1, 1))
 
-    @property
-    def rate(self) -> float:
-        """Seconds of simulated time per second of the sender's clock."""
-        return self._rate
-
     def add(self, source: float, clock: float) -> bool:
         """Take one message of `/clock` (source in s, clock in s)."""
         stepped = False

@@ -132,7 +132,7 @@ class PolledInput:
     One field of the messages of a topic, fetched in batches on request.
 
     `spec` names the field and the stamp, `beside` a second field with one number per message.
-    `publishers` follows the senders; `unreadable` counts messages that could not be decoded.
+    `publishers` follows the senders.
     """
 
     def __init__(self, node: MonitorNode, kind: Any, topic: str, spec: FieldSpec,
@@ -141,17 +141,15 @@ class PolledInput:
         self.topic = node.resolve_topic_name(topic)
         self._input = node.create_polled(
             kind, topic, INPUT_QOS if spec.sample_rate is None else BLOCK_QOS)
-        self._reader = FieldReader(spec, definition_of(kind), self._broken, beside)
+        # Messages that cannot be decoded are left out.
+        self._reader = FieldReader(
+            spec, definition_of(kind), lambda index, why: None, beside)
         self.publishers = Publishers()
-        self.unreadable = 0
         # Fetched, not yet read: messages, when (wall and monotonic clock, s), and their total
         # size.
         self._fetched: list[tuple[bytes, dict[str, Any]]] = []
         self._when: list[tuple[float, float]] = []
         self._bytes = 0
-
-    def _broken(self, index: int, why: str) -> None:
-        self.unreadable += 1
 
     @property
     def full(self) -> bool:

@@ -248,15 +248,17 @@ class Player(Node):
             raise InputError(f"'{self._options.bag}' holds no message of "
                              + ', '.join(self._outputs))
         origin, rate = first[2], self._options.rate
-        start = time.monotonic()
-        ticks = _Ticks(start, self._options.clock)
+        start, frequency = time.monotonic(), self._options.clock
+        # Instants of /clock; past ones are skipped: the clock may be late but never piles up.
+        ticks, tick = 0, start if frequency > 0.0 else math.inf
         for topic, _, log_time, data in itertools.chain((first,), messages):
             due = start + (log_time - origin) * 1e-9 / rate
-            while ticks.due <= due:
-                if not wait_until(ticks.due, self.going):
+            while tick <= due:
+                if not wait_until(tick, self.going):
                     return
                 self._tick(origin, start)
-                ticks.advance()
+                ticks = max(ticks, math.floor((time.monotonic() - start) * frequency)) + 1
+                tick = start + ticks / frequency
             if not wait_until(due, self.going):
                 return
             done = time.monotonic()
@@ -294,17 +296,3 @@ class Player(Node):
             'span_s': max((self._span[1] - self._span[0]) * 1e-9, 0.0),
             'spacing_error_s': self._spacing.summary(),
             'ended_by': 'end' if self.going() else 'signal'}
-
-
-class _Ticks:
-    """Instants of /clock; past ones are skipped: the clock may be late but never piles up."""
-
-    def __init__(self, start: float, frequency: float) -> None:
-        self._start, self._frequency, self._n = start, frequency, 0
-        self.due = start if frequency > 0.0 else math.inf
-
-    def advance(self) -> None:
-        """Go to the next future instant."""
-        passed = math.floor((time.monotonic() - self._start) * self._frequency)
-        self._n = max(self._n, passed) + 1
-        self.due = self._start + self._n / self._frequency
