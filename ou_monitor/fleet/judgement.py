@@ -465,9 +465,7 @@ class VehicleValues:
     """One quantity of every vehicle: the medians of its recordings."""
 
     names: tuple[str, ...]  # Vehicles
-    # Medians on the scale of `Values.value`, and their standard errors; shape (v,).
-    value: FloatArray
-    error: FloatArray
+    value: FloatArray  # Medians on the scale of `Values.value`; shape (v,)
     outliers: Outliers  # How far each is from the fleet
     cells: tuple[int, ...]  # Cells by which the values of each are divided; 0: they are not
 
@@ -480,7 +478,6 @@ class Judgement:
     trends: tuple[Trend, ...]  # All that were tested, lowest p-value first
     recordings: dict[str, Outliers]  # Quantity -> each recording in its vehicle
     vehicles: dict[str, VehicleValues]  # Quantity -> each vehicle among the others
-    rate: float  # Probability of any false alarm in one comparison; in all, `OUTLIER_RATE`
 
     @property
     def drifting(self) -> tuple[Trend, ...]:
@@ -518,7 +515,7 @@ def judge(rows: Sequence[Row], seed: int = 0) -> Judgement:
                     0.5 * (t.first + t.last)))
         recordings[name] = outliers(one.value, one.error, one.vehicles, rate, trend, seed=seed)
         vehicles[name] = _vehicles(one, recordings[name], one.value - trend, rate, seed)
-    return Judgement(values, tested, recordings, vehicles, rate)
+    return Judgement(values, tested, recordings, vehicles)
 
 
 def _is_of_vehicle(values: Values, vehicle: str) -> npt.NDArray[np.bool_]:
@@ -547,7 +544,7 @@ def _vehicles(values: Values, within: Outliers, flat: FloatArray, rate: float, s
         places = [k for k, one in enumerate(cells) if one == kind and of[k].size > 1]
         if 1 < len(places) and cells.count(kind) < LEAST_VEHICLES:
             found = _few(found, places, [flat[of[k]] for k in places])
-    return VehicleValues(names, value, error, found, cells)
+    return VehicleValues(names, value, found, cells)
 
 
 def _few(found: Outliers, places: Sequence[int], flights: Sequence[FloatArray]) -> Outliers:

@@ -69,17 +69,13 @@ def assign(stated: Mapping[Path, str], pattern: re.Pattern[str] | None = None
             mixed.append(path)
         else:
             found[path] = Vehicle(folders[path.parent], FOLDER)
-    notes = [_rule(found)]
-    if differing:
-        notes.append(f'{_quoted(differing)}: metadata and --vehicle-from name different '
-                     'vehicles; the metadata are used.')
-    if unmatched:
-        notes.append(f'{_quoted(unmatched)}: --vehicle-from finds no vehicle in the path; these '
-                     'recordings are not compared.')
-    if mixed:
-        notes.append(f'{_quoted(mixed)}: the metadata name no vehicle, though those of other '
-                     'recordings in the folder do; these recordings are not compared. '
-                     '--vehicle-from can name their vehicle by the path.')
+    notes = [_rule(found), *(f'{_quoted(paths)}: {words}' for paths, words in (
+        (differing, 'metadata and --vehicle-from name different vehicles; the metadata are used.'),
+        (unmatched, '--vehicle-from finds no vehicle in the path; these recordings are not '
+         'compared.'),
+        (mixed, 'the metadata name no vehicle, though those of other recordings in the folder do; '
+         'these recordings are not compared. --vehicle-from can name their vehicle by the path.')
+    ) if paths)]
     both = {v.name for v in found.values() if v.named_by == METADATA} & {
         v.name for v in found.values() if v.named_by != METADATA and v.name}
     if both:

@@ -200,7 +200,6 @@ UNITS = {part.name: part.metadata['unit'] for part in fields(PowerNetwork) if pa
 class Load:
     """The load and the mean voltages at one throttle."""
 
-    throttle: float  # 0..1.
     current: float  # Mean current of the motors, A.
     # Random ESC current: rms, A, and rate of its exponential covariance, 1/s.
     switching_rms: float
@@ -211,10 +210,6 @@ class Load:
     regulated: float
     sag: float  # Battery voltage less the mean of the bus, V.
     input_conductance: float  # Incremental P/V^2 of the constant-power load, 1/Ohm, or 0.
-
-    def mean(self, rail: str) -> float:
-        """Return the mean of a rail, V."""
-        return {'bus': self.bus, 'regulated': self.regulated}[rail]
 
 
 def load_at(network: PowerNetwork, throttle: float) -> Load:
@@ -248,7 +243,7 @@ def load_at(network: PowerNetwork, throttle: float) -> Load:
     drawn = power / source
     bus = free - resistance * drawn
     return Load(
-        throttle=throttle, current=current, switching_rms=rms,
+        current=current, switching_rms=rms,
         switching_rate=network.esc_frequency / (duty * (1.0 - duty)),
         flutter_rms=network.flutter * current, bus=bus,
         regulated=network.regulator_voltage - network.regulator_resistance * network.mcu_current,
@@ -284,7 +279,7 @@ class Rail:
     @property
     def mean(self) -> float:
         """Mean voltage of the rail, V."""
-        return self.load.mean(self.name)
+        return self.load.bus if self.name == 'bus' else self.load.regulated
 
     @property
     def source_rates(self) -> FloatArray:

@@ -15,8 +15,8 @@ from ou_monitor.paper import published
 from ou_monitor.paper.crest import mean_and_error
 from ou_monitor.paper.published import Printed, Row
 from ou_monitor.paper.theory import (
-    CORRECT_FACTOR, diffusion_limit, Generator, matrix_model, PRINTED_FACTOR, SwitchedSystem,
-    switching_drift)
+    CORRECT_FACTOR, Generator, matrix_model, PRINTED_FACTOR, SwitchedSystem, switching_drift,
+    switching_intensity)
 from ou_monitor.records import FloatArray
 from scipy.integrate import quad
 
@@ -85,7 +85,7 @@ def spreading(rng: np.random.Generator, paths: int) -> Spreading:
     variance = np.mean(u ** 2, axis=0)
     error = np.std(u ** 2, axis=0) / math.sqrt(paths)
     return Spreading(t, variance, error, *(
-        float(diffusion_limit(system, factor).intensity([0.0])[0, 0])
+        float(switching_intensity(system, [0.0], factor)[0, 0])
         for factor in (CORRECT_FACTOR, PRINTED_FACTOR)))
 
 
@@ -109,7 +109,7 @@ def _intensity(rng: np.random.Generator, paths: int) -> list[Row]:
     for name, what, system in (
             ('telegraph', f'+-{SPEED:g} V/s, {RATE:g} 1/s each way', telegraph()),
             ('three states', 'a chain that is not reversible', three_states())):
-        printed = float(diffusion_limit(system, PRINTED_FACTOR).intensity([0.0])[0, 0])
+        printed = float(switching_intensity(system, [0.0], PRINTED_FACTOR)[0, 0])
         rate, error = variance_rate(system, rng, paths)
         found.append(Row(
             WHERE, f'B of (6), {name}', 'mV^2/s', Printed(f'{1e6 * printed:.4g}'), 1e6 * rate,
@@ -129,7 +129,7 @@ def _drift(rng: np.random.Generator, paths: int) -> list[Row]:
     rate, rate_se = 2.0 * math.log(mean) / span, 2.0 * error / mean / span
     # Contiguous: in NumPy 1.26 the last digit of a logarithm depends on the memory layout.
     log, log_se = mean_and_error(np.log(np.ascontiguousarray(u[:, 1])) / span)
-    intensity = float(diffusion_limit(system, PRINTED_FACTOR).intensity([1.0])[0, 0])
+    intensity = float(switching_intensity(system, [1.0], PRINTED_FACTOR)[0, 0])
     ito = drift - 0.5 * intensity
     # The limit omits a share GROWTH^2 / (4 RATE^2) of the drift.
     left = drift * (GROWTH / RATE) ** 2 / 4.0

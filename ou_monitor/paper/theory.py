@@ -20,7 +20,7 @@ the paper, both with a small eps; at eps = 1 the system is unchanged, and D and 
   of C(x(t)) grows at twice the integral of its autocovariance over positive lags
   (Korolyuk & Limnios, Stochastic Systems in Merging Phase Space, 2005, give it with the 2).
 
-Between two jumps a switched system is affine; so are its average, and drift and noise of
+Between two jumps a switched system is affine; so are its average and the drift of
 its diffusion limit.
 """
 
@@ -471,21 +471,6 @@ PRINTED_FACTOR = 1.0  # In B of equation (6), as printed
 CORRECT_FACTOR = 2.0  # As (4) needs it
 
 
-@dataclass(frozen=True, eq=False)
-class LinearDiffusion:
-    """du = (M u + m) dt + sum_k (G_k u + g_k) dW_k, in the sense of Ito."""
-
-    matrix: FloatArray  # M, 1/s; shape (d, d)
-    offset: FloatArray  # m, unit of u per second; shape (d,)
-    noise_matrices: FloatArray  # G_k, 1/sqrt(s); shape (r, d, d)
-    noise_offsets: FloatArray  # g_k, unit of u per sqrt(s); shape (r, d)
-
-    def intensity(self, u: npt.ArrayLike) -> FloatArray:
-        """Return B(u), shape (d, d): the rate at which the covariance grows at u."""
-        fields = self.noise_matrices @ check_state(u, self.offset.size) + self.noise_offsets
-        return np.asarray(fields.T @ fields)
-
-
 def require_balance(system: SwitchedSystem) -> None:
     """Refuse a system whose switched part does not have zero average."""
     for average, switched in zip(system.switched_average(), (system.matrices, system.offsets)):
@@ -511,19 +496,12 @@ def switching_drift(system: SwitchedSystem) -> AffineSystem:
         np.einsum('xij,xj->i', after, system.offsets))
 
 
-def diffusion_limit(system: SwitchedSystem, factor: float = CORRECT_FACTOR) -> LinearDiffusion:
-    """Return the limit diffusion of a balanced system."""
+def switching_intensity(system: SwitchedSystem, u: npt.ArrayLike,
+                        factor: float = CORRECT_FACTOR) -> FloatArray:
+    """Return B(u), equation (6) with a factor, of a balanced system, shape (d, d)."""
     if not 0.0 < factor < math.inf:
         raise ValueError(f'factor must be positive and finite, got {factor}')
-    correction = switching_drift(system)
-    half = system.generator.stationary[:, None] * system.generator.potential
-    # Positive semidefinite: a spectral density of the chain at frequency 0.
-    value, vector = np.linalg.eigh(0.5 * factor * (half + half.T))
-    used = value > 1e-12 * value.max()
-    root = vector[:, used] * np.sqrt(value[used])
-    matrices = np.einsum('xk,xij->kij', root, system.matrices)
-    offsets = root.T @ system.offsets
-    felt = matrices.any(axis=(1, 2)) | offsets.any(axis=1)
-    return LinearDiffusion(
-        system.drift_matrix + correction.matrix, system.drift_offset + correction.offset,
-        matrices[felt], offsets[felt])
+    require_balance(system)
+    weight = system.generator.stationary[:, None] * system.generator.potential
+    velocity = system.matrices @ check_state(u, system.matrices.shape[1]) + system.offsets
+    return np.asarray(0.5 * factor * velocity.T @ (weight + weight.T) @ velocity)

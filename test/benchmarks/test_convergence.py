@@ -6,7 +6,7 @@ import re
 from chains import moments_of_switched, PAPER, THREE
 from convergence import averaging_convergence, esc_chain, fit_order, main, SwitchedOU
 import numpy as np
-from ou_monitor.paper.theory import diffusion_limit, Generator, PRINTED_FACTOR
+from ou_monitor.paper.theory import Generator, PRINTED_FACTOR, switching_intensity
 from project import ROOT
 import pytest
 from scipy.integrate import quad
@@ -81,8 +81,8 @@ def test_variance_of_the_switched_rail_is_where_its_moments_settle(eps):
 def test_sigma_is_the_intensity_of_the_diffusion_limit():
     """The package's general limit gives the same for this rail."""
     rail = SwitchedOU(2.0, THREE, np.array([1.0, -2.0, 0.5]))
-    limit = diffusion_limit(rail.system())
-    assert limit.intensity([0.0])[0, 0] == pytest.approx(rail.sigma() ** 2, rel=1e-12)
+    assert switching_intensity(rail.system(), [0.0])[0, 0] == pytest.approx(
+        rail.sigma() ** 2, rel=1e-12)
 
 
 def test_sigma_of_the_rail_follows_from_the_switching():

@@ -4,7 +4,8 @@ from chains import moments_of_switched, THREE, vector_system
 from convergence import cycle
 import numpy as np
 from ou_monitor.paper.theory import (
-    diffusion_limit, Generator, PRINTED_FACTOR, SwitchedSystem, switching_drift)
+    CORRECT_FACTOR, Generator, PRINTED_FACTOR, SwitchedSystem, switching_drift,
+    switching_intensity)
 import pytest
 from scipy.integrate import quad_vec
 from scipy.linalg import expm
@@ -26,16 +27,13 @@ def test_intensity_and_drift_are_integrals_of_correlations():
         return np.einsum('xy,yij,xj->i', pi[:, None] * expm(THREE.q * t), SYSTEM.matrices,
                          velocity)
 
-    limit = diffusion_limit(SYSTEM)
-    assert limit.intensity(u) == pytest.approx(
+    assert switching_intensity(SYSTEM, u) == pytest.approx(
         quad_vec(intensity, 0.0, 30.0, epsabs=1e-11)[0], rel=1e-8)
     b = quad_vec(drift, 0.0, 30.0, epsabs=1e-11)[0]
     correction = switching_drift(SYSTEM)
     assert correction.matrix @ u + correction.offset == pytest.approx(b, rel=1e-8)
-    assert limit.matrix @ u + limit.offset == pytest.approx(
-        b + SYSTEM.drift_matrix @ u + SYSTEM.drift_offset, rel=1e-8)
-    assert diffusion_limit(SYSTEM, PRINTED_FACTOR).intensity(u) == pytest.approx(
-        limit.intensity(u) / 2.0, rel=1e-12)
+    assert switching_intensity(SYSTEM, u, PRINTED_FACTOR) == pytest.approx(
+        switching_intensity(SYSTEM, u) / 2.0, rel=1e-12)
 
 
 @pytest.mark.parametrize('matrices, offsets, message', [
@@ -46,8 +44,8 @@ def test_without_balance_the_limit_is_refused(matrices, offsets, message):
     """Refused with the component and the amount; `balanced` is named and mends it."""
     system = SwitchedSystem(Generator.telegraph(1.0, 1.0), matrices, offsets)
     with pytest.raises(ValueError, match=message + r'.*balanced\(\)'):
-        diffusion_limit(system)
-    diffusion_limit(system.balanced())
+        switching_intensity(system, [0.0])
+    switching_intensity(system.balanced(), [0.0])
 
 
 def test_the_order_of_the_jumps_matters_to_the_drift():
@@ -74,22 +72,27 @@ def test_exact_moments_tend_to_those_of_the_limit():
     u0 = np.array([0.5, 1.0])
 
     def of_limit(factor):
-        limit = diffusion_limit(SYSTEM, factor) if factor else diffusion_limit(SYSTEM)
-        column, one = limit.offset[:, None], np.eye(2)
+        drift = switching_drift(SYSTEM)
+        matrix, one = SYSTEM.drift_matrix + drift.matrix, np.eye(2)
+        column = (SYSTEM.drift_offset + drift.offset)[:, None]
         change = np.zeros((7, 7))
-        change[1:3, :1], change[1:3, 1:3] = column, limit.matrix
+        change[1:3, :1], change[1:3, 1:3] = column, matrix
         change[3:, 1:3] = np.kron(column, one) + np.kron(one, column)
-        change[3:, 3:] = np.kron(limit.matrix, one) + np.kron(one, limit.matrix)
-        # The intensity is a polynomial in u: its constant, linear and square parts.
-        for g, h in zip(limit.noise_matrices, limit.noise_offsets):
-            column = h[:, None]
-            change[3:, :1] += np.kron(column, column)
-            change[3:, 1:3] += np.kron(g, column) + np.kron(column, g)
-            change[3:, 3:] += np.kron(g, g)
+        change[3:, 3:] = np.kron(matrix, one) + np.kron(one, matrix)
+        # The intensity is a polynomial in u: constant, square and mixed parts by differences.
+        parts = {k: switching_intensity(SYSTEM, k, factor).ravel() for k in (
+            (0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0), (1.0, 1.0))}
+        constant, right, left, up, down, both = parts.values()
+        change[3:, 0] += constant
+        change[3:, 1] += 0.5 * (right - left)
+        change[3:, 2] += 0.5 * (up - down)
+        change[3:, 3] += 0.5 * (right + left) - constant
+        change[3:, 6] += 0.5 * (up + down) - constant
+        change[3:, 4] += both - right - up + constant
         found = expm(change) @ np.concatenate([[1.0], u0, np.outer(u0, u0).ravel()])
         return found[1:3], found[3:].reshape(2, 2) - np.outer(found[1:3], found[1:3])
 
-    mean, covariance = of_limit(None)
+    mean, covariance = of_limit(CORRECT_FACTOR)
     errors = []
     for eps in (0.01, 0.005, 0.0025):
         there = moments_of_switched(SYSTEM, 1.0, u0, eps, 'diffusion')
