@@ -171,11 +171,8 @@ def path_argument(text: str) -> Path:
 
 def check_paths(inputs: Mapping[str, str | Path | None],
                 outputs: Mapping[str, str | Path | None], force: bool = False) -> None:
-    """
-    Refuse paths that are empty, and outputs that would overwrite an input or each other.
-
-    Other existing files are overwritten only with `force`.
-    """
+    """Refuse paths that are empty, and outputs that would overwrite an input or each other."""
+    # Other existing files are overwritten only with `force`.
     for name, given in (*inputs.items(), *outputs.items()):
         if given is not None and not str(given):
             raise InputError(f'{name}: the path is empty')

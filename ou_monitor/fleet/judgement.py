@@ -229,11 +229,8 @@ def _curve(y: FloatArray, u: FloatArray, vehicles: Sequence[str], recordings: In
 
 def _jackknife(inner: FloatArray, rest: FloatArray, weight: FloatArray, of: IntArray,
                vehicle: IntArray) -> FloatArray:
-    """
-    Return the covariance of slopes by leaving out one recording (`of`) at a time.
-
-    Residuals within a recording are correlated, and the level of each vehicle is fitted too.
-    """
+    """Return the covariance of slopes by leaving out one recording (`of`) at a time."""
+    # Residuals within a recording are correlated, and the level of each vehicle is fitted too.
     # Derivative of Huber's function: 0 beyond its bend.
     pulls = (weight >= 1.0).astype(np.float64)
     bread = np.linalg.pinv((inner * pulls[:, None]).T @ inner, rcond=1e-9)
@@ -323,12 +320,9 @@ def _of_values(values: Values) -> list[Trend]:
 
 
 def weighted_line(x: FloatArray, y: FloatArray, error: FloatArray) -> tuple[float, float, float]:
-    """
-    Return slope and start of a weighted line, and the standard error of the slope.
-
-    The weights are 1 / (error^2 + s^2), with the scatter s that explains the residuals (0 if the
-    errors do); the residuals give the scale of the error, with n - 2 degrees of freedom.
-    """
+    """Return slope and start of a weighted line, and the standard error of the slope."""
+    # The weights are 1 / (error^2 + s^2), with the scatter s that explains the residuals (0 if the
+    # errors do); the residuals give the scale of the error, with n - 2 degrees of freedom.
     columns = np.column_stack((np.ones(x.size), x))
     variance = error ** 2
 
@@ -437,13 +431,10 @@ def _spread(scatter: FloatArray, error: FloatArray) -> FloatArray:
 
 
 def _scatter(rest: FloatArray, error: FloatArray, share: float = 0.5) -> FloatArray:
-    """
-    Return s of each row; shape (k, 1).
-
-    The median of |rest| / sqrt(s^2 + se^2) is `_MEDIAN`, as for a normal distribution, if s^2 is
-    the median of rest^2 / `_MEDIAN`^2 - se^2.  A share of 0.5 + z / (2 sqrt(n)) gives an upper
-    bound of one-sided level Phi(z).
-    """
+    """Return s of each row; shape (k, 1)."""
+    # The median of |rest| / sqrt(s^2 + se^2) is `_MEDIAN`, as for a normal distribution, if s^2 is
+    # the median of rest^2 / `_MEDIAN`^2 - se^2. A share of 0.5 + z / (2 sqrt(n)) gives an upper
+    # bound of one-sided level Phi(z).
     excess = (rest / _MEDIAN) ** 2 - error[None, :] ** 2
     return np.sqrt(np.maximum(np.quantile(excess, share, axis=1)[:, None], 0.0))
 

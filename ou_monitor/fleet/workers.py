@@ -167,12 +167,9 @@ def failure(error: Exception) -> str:
 
 @contextmanager
 def _environment_of_workers() -> Iterator[None]:
-    """
-    Start processes with one thread each and with Ctrl-C blocked.
-
-    A terminal sends Ctrl-C to all processes of the group; the main process ends its workers
-    itself, and their tracebacks would hide its message.
-    """
+    """Start processes with one thread each and with Ctrl-C blocked."""
+    # A terminal sends Ctrl-C to all processes of the group; the main process ends its workers
+    # itself, and their tracebacks would hide its message.
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(_ONE_THREAD)
     # A child inherits the mask; in this process, Ctrl-C is delayed until the child has started.

@@ -101,13 +101,10 @@ class SupplyInput:
                 return
 
     def now(self, stale_after: float, rate: float = NAN) -> KnownSupply:
-        """
-        Return the latest values that are not older than `stale_after`, s.
-
-        Without a sigma, derive it from the noise that the load does not explain at the present
-        throttle, as the sigma of an OU with relaxation `rate`, 1/s.  This sigma includes the ADC's
-        white noise, so it is never below the supply's own.
-        """
+        """Return the latest values that are not older than `stale_after`, s."""
+        # Without a sigma, derive it from the noise that the load does not explain at the present
+        # throttle, as the sigma of an OU with relaxation `rate`, 1/s. This sigma includes the
+        # ADC's white noise, so it is never below the supply's own.
         fresh = within(self.state_silence.age, stale_after)
         error, (alpha, throttle, level, level_se, noise) = (
             (self._error, self._values) if fresh else (NAN, [NAN] * len(_FIELDS)))

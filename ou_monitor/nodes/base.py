@@ -184,11 +184,8 @@ class MonitorNode(Node):
         self._publishing = self.every(1.0 / self.values()[PUBLISH_RATE.name], callback)
 
     def guarded(self, callback: Callable[..., Any]) -> Callable[..., Any]:
-        """
-        Return a callback whose exceptions are reported instead of raised.
-
-        An uncaught exception becomes a SystemError in the EventsExecutor.
-        """
+        """Return a callback whose exceptions are reported instead of raised."""
+        # An uncaught exception becomes a SystemError in the EventsExecutor.
         @functools.wraps(callback)
         def call(*args: Any) -> Any:
             try:
@@ -218,11 +215,8 @@ class MonitorNode(Node):
 
     def status(self, part: str, level: Level, summary: str, fields: Mapping[str, object],
                stamp: float, hardware_id: str) -> DiagnosticArray:
-        """
-        Return the status of a part of the node as a stamped message (stamp in s).
-
-        Floats keep all their digits.
-        """
+        """Return the status of a part of the node as a stamped message (stamp in s)."""
+        # Floats keep all their digits.
         message = DiagnosticArray()
         message.header.stamp = to_time(stamp)
         message.status = [DiagnosticStatus(
@@ -298,23 +292,16 @@ class MonitorNode(Node):
                                  f"are {', '.join(known)}")
 
     def create_polled(self, kind: Any, topic: str, qos: QoSProfile) -> Subscription:
-        """
-        Return a subscription whose messages wait in the middleware until they are taken.
-
-        The queue of the EventsExecutor has no bound, and messages in it delay every timer.
-        """
+        """Return a subscription whose messages wait in the middleware until they are taken."""
+        # The queue of the EventsExecutor has no bound, and messages in it delay every timer.
         # rclpy requires a callback here too.
         polled = self.create_subscription(kind, topic, lambda message: None, qos, raw=True)
         self._polled.append(polled)
         return polled
 
     def with_info(self, callback: Callable[[Any, Any], None]) -> Callable[..., Any]:
-        """
-        Return a subscription callback of (message, info), guarded, for every executor.
-
-        rclpy 7.1's EventsExecutor passes one tuple where the other
-        executors pass two arguments.
-        """
+        """Return a subscription callback of (message, info), guarded, for every executor."""
+        # rclpy 7.1's EventsExecutor passes one tuple where the other executors pass two arguments.
         inner = self.guarded(callback)
 
         def call(*args: Any) -> None:

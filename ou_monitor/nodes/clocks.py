@@ -89,11 +89,8 @@ def line_under(times: Sequence[float] | FloatArray) -> tuple[float, float]:
 
 
 def _hull_edge(numbers: list[int], times: list[float]) -> tuple[int, float]:
-    """
-    Return where the middle edge of the lower convex hull starts, and its slope.
-
-    The middle in time: a burst holds many messages but takes hardly any time.
-    """
+    """Return where the middle edge of the lower convex hull starts, and its slope."""
+    # The middle in time: a burst holds many messages but takes hardly any time.
     hull: list[tuple[int, float]] = []
     for k, time in zip(numbers, times):
         while len(hull) >= 2:

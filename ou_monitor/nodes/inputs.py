@@ -314,11 +314,8 @@ class Console:
         self._critical = False
 
     def waiting(self, topic: str) -> None:
-        """
-        Log why no message has arrived on a topic yet.
-
-        Without a publisher: at once, then once a minute; with a silent publisher: after a while.
-        """
+        """Log why no message has arrived on a topic yet."""
+        # Without a publisher: at once, then once a minute; with a silent publisher: after a while.
         now, topic = self._node.steady_now(), self._node.resolve_topic_name(topic)
         if self._node.count_publishers(topic):
             if self._next_report == -math.inf:

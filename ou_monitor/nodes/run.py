@@ -99,11 +99,8 @@ def run_node(name: str, about: str, work: Callable[[], int]) -> NoReturn:
 
 
 def end(status: int) -> NoReturn:
-    """
-    Close what needs closing, DDS included, and exit without unloading the interpreter.
-
-    Unloading takes 0.1 to 0.3 s, and waits for the threads that tabulate the risk.
-    """
+    """Close what needs closing, DDS included, and exit without unloading the interpreter."""
+    # Unloading takes 0.1 to 0.3 s, and waits for the threads that tabulate the risk.
     gc.collect()
     atexit._run_exitfuncs()
     sys.stdout.flush()
@@ -152,14 +149,11 @@ def _run(name: str, work: Callable[[], int], args: list[str] | None, stopped: li
 
 
 def _choose_queues() -> None:
-    """
-    Make Fast DDS use a queue that needs no CPU, unless the user has configured it.
-
-    By default a queue holds 512 messages of all topics together, and is given up with its content
-    if the process does not read for 1 s.  Other middlewares ignore these variables.  If discovery
-    is limited to this machine, the configuration is not changed: rmw_fastrtps would add transports
-    of its own, and a message might arrive through either.
-    """
+    """Make Fast DDS use a queue that needs no CPU, unless the user has configured it."""
+    # By default a queue holds 512 messages of all topics together, and is given up with its
+    # content if the process does not read for 1 s. Other middlewares ignore these variables. If
+    # discovery is limited to this machine, the configuration is not changed: rmw_fastrtps would
+    # add transports of its own, and a message might arrive through either.
     beside = (Path('DEFAULT_FASTRTPS_PROFILES.xml'), Path('DEFAULT_FASTDDS_PROFILES.xml'))
     local = (os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() in ('LOCALHOST', 'OFF')
              or os.environ.get('ROS_LOCALHOST_ONLY') == '1')
@@ -173,12 +167,9 @@ def _choose_queues() -> None:
 
 
 def spin(make: Callable[[], Any]) -> int:
-    """
-    Make one node and spin it until its context ends, then destroy it.
-
-    The EventsExecutor takes 10 000 messages/s where the SingleThreadedExecutor
-    loses most of them; it is used if this rclpy has it.
-    """
+    """Make one node and spin it until its context ends, then destroy it."""
+    # The EventsExecutor takes 10 000 messages/s where the SingleThreadedExecutor loses most of
+    # them; it is used if this rclpy has it.
     executor = make_executor()
     loaded()
     _making.set()

@@ -105,12 +105,10 @@ def _draw(rng: np.random.Generator, paths: int) -> dict[int, FloatArray]:
 
 
 def screen_for(crest_factor: float) -> float:
-    """
-    Return the screen length at which an OU shows a crest factor, s.
-
-    Half of the screens of this length go beyond crest/2 standard deviations on one side: passages
-    above a high level d are nearly a Poisson process of rate alpha d exp(-d^2/2) / sqrt(2 pi).
-    """
+    """Return the screen length at which an OU shows a crest factor, s."""
+    # Half of the screens of this length go beyond crest/2 standard deviations on one side:
+    # passages above a high level d are nearly a Poisson process of rate alpha d exp(-d^2/2) /
+    # sqrt(2 pi).
     d = 0.5 * crest_factor
     rate = published.ALPHA.value * d * math.exp(-0.5 * d * d) / math.sqrt(2.0 * math.pi)
     return math.log(2.0) / rate
@@ -165,12 +163,9 @@ class JumpCrest:
 
 
 def excess_kurtosis(rate: float, share: float) -> float:
-    """
-    Return the excess kurtosis of an OU with normal jumps of mean zero.
-
-    The fourth cumulant of the jumps is rate E J^4 / (4 alpha), and E J^4 is
-    3 (E J^2)^2, with E J^2 = 2 alpha share Var_inf / rate.
-    """
+    """Return the excess kurtosis of an OU with normal jumps of mean zero."""
+    # The fourth cumulant of the jumps is rate E J^4 / (4 alpha), and E J^4 is 3 (E J^2)^2, with
+    # E J^2 = 2 alpha share Var_inf / rate.
     return 3.0 * published.ALPHA.value * share * share / rate
 
 

@@ -213,13 +213,10 @@ class Load:
 
 
 def load_at(network: PowerNetwork, throttle: float) -> Load:
-    """
-    Return the load at a throttle.
-
-    An ESC draws the phase current I_m during the on-time of its PWM only, so its mean is
-    I = D I_m with the duty D = throttle.  As a telegraph process with f cycles per second it has
-    the variance I_m^2 D (1 - D) and a covariance that decays at f / (D (1 - D)).
-    """
+    """Return the load at a throttle."""
+    # An ESC draws the phase current I_m during the on-time of its PWM only, so its mean is
+    # I = D I_m with the duty D = throttle. As a telegraph process with f cycles per second it has
+    # the variance I_m^2 D (1 - D) and a covariance that decays at f / (D (1 - D)).
     if not 0.0 <= throttle <= 1.0:
         raise ValueError(f'throttle must be within 0..1, got {throttle}')
     current = network.current_at(throttle)
@@ -320,12 +317,8 @@ class Rail:
 
     @cached_property
     def alpha(self) -> float:
-        """
-        Relaxation rate, 1/s: the slowest pole that carries 1 % of Var_inf or more.
-
-        For a complex pair, the rate of its envelope; NaN without noise.
-
-        """
+        """Relaxation rate, 1/s: the slowest pole that carries 1 % of Var_inf or more."""
+        # For a complex pair, the rate of its envelope; NaN without noise.
         excited = np.flatnonzero(np.abs(self.shares) >= EXCITED)
         return float(-self.poles[excited[0]].real) if excited.size else math.nan
 

@@ -66,11 +66,8 @@ def multiplicative() -> SwitchedSystem:
 
 def variance_rate(system: SwitchedSystem, rng: np.random.Generator,
                   paths: int) -> tuple[float, float]:
-    """
-    Return the long-run growth rate of the variance of a balanced additive system.
-
-    (Var U(T) - Var U(S)) / (T - S), unbiased if S is longer than the memory of the chain.
-    """
+    """Return the long-run growth rate of the variance of a balanced additive system."""
+    # (Var U(T) - Var U(S)) / (T - S), unbiased if S is longer than the memory of the chain.
     memory = 1.0 / float(system.generator.leaving.min())
     t = memory * np.array([0.0, 10.0, 110.0])
     u = system.simulate(t, [0.0], rng, paths=paths)[:, :, 0]

@@ -101,11 +101,8 @@ def exponent(low: PrintedLoad, high: PrintedLoad) -> tuple[float, Range]:
 
 
 def sigma_half_width(state: PrintedLoad) -> float:
-    """
-    Return the uncertainty of sigma, V/sqrt(s).
-
-    Half a step of Vrms and half of the 95 % interval of alpha, in quadrature.
-    """
+    """Return the uncertainty of sigma, V/sqrt(s)."""
+    # Half a step of Vrms and half of the 95 % interval of alpha, in quadrature.
     reading = 0.5 * VRMS_STEP.size / state.vrms.value
     rate = 0.5 * PAPER_FIT.half_width / PAPER_FIT.alpha
     return state.sigma * math.hypot(reading, rate)

@@ -53,15 +53,10 @@ def augmented(matrix: npt.ArrayLike, offset: npt.ArrayLike) -> FloatArray:
 
 
 def flow(matrix: FloatArray, offset: FloatArray, tau: FloatArray, u: FloatArray) -> FloatArray:
-    """
-    Move m states along their affine systems, each for its own time.
-
-    Taylor series of the exponential acting on the state, in substeps of norm
-    at most 1, to the last digit; without eigenvectors, so that a defective matrix
-    is handled too. Very long steps use the matrix exponential.
-
-    matrix in 1/s, tau in s.
-    """
+    """Move m states along their affine systems (1/s), each for its own time tau, s."""
+    # Taylor series of the exponential acting on the state, in substeps of norm at most 1, to the
+    # last digit; without eigenvectors, so that a defective matrix is handled too. Very long steps
+    # use the matrix exponential.
     if not u.size:
         return u.copy()
     step = tau[:, None]
@@ -228,13 +223,9 @@ class Generator:
 
     @cached_property
     def stationary(self) -> FloatArray:
-        """
-        Return the stationary law pi, shape (n,).
-
-        Elimination without subtractions (Grassmann, Taksar & Heyman, Oper.
-        Res. 33 (1985) 1107): every entry has full relative precision, even for
-        rates of very different size.
-        """
+        """Return the stationary law pi, shape (n,)."""
+        # Elimination without subtractions (Grassmann, Taksar & Heyman, Oper. Res. 33 (1985) 1107):
+        # every entry has full relative precision, even for rates of very different size.
         p = self.q / np.abs(self.q).max()
         np.fill_diagonal(p, 0.0)
         for k in range(self.size - 1, 0, -1):
@@ -249,12 +240,9 @@ class Generator:
 
     @cached_property
     def potential(self) -> FloatArray:
-        """
-        Return R0 = integral_0^inf (exp(Q t) - Pi) dt, s, shape (n, n).
-
-        (s Pi - Q)^-1 - Pi / s is the same for every s > 0; s is the mean rate of
-        leaving, so that the matrix to invert is well scaled.
-        """
+        """Return R0 = integral_0^inf (exp(Q t) - Pi) dt, s, shape (n, n)."""
+        # (s Pi - Q)^-1 - Pi / s is the same for every s > 0; s is the mean rate of leaving, so
+        # that the matrix to invert is well scaled.
         rate = float(self.leaving.mean())
         # Pi: every row is the stationary law.
         projector = np.tile(self.stationary, (self.size, 1))
@@ -422,12 +410,9 @@ class SwitchedSystem:
         return AffineSystem(self.drift_matrix + matrix, self.drift_offset + offset)
 
     def balanced(self) -> SwitchedSystem:
-        """
-        Return the same system with the average moved to the unswitched part.
-
-        At eps = 1 nothing changes; the switched part meets the balance
-        condition, so the diffusion limit exists.
-        """
+        """Return the same system with the average moved to the unswitched part."""
+        # At eps = 1 nothing changes; the switched part meets the balance condition, so the
+        # diffusion limit exists.
         matrix, offset = self.switched_average()
         return replace(
             self, drift_matrix=self.drift_matrix + matrix, drift_offset=self.drift_offset + offset,

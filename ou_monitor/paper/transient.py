@@ -167,13 +167,9 @@ def slowest_rail() -> float:
 
 
 def simulate_fitted(rng: np.random.Generator, draws: int) -> FloatArray:
-    """
-    Release a load behind an AC-coupled oscilloscope and fit it as the paper does.
-
-    The rail is an OU whose noise is half a step of the oscilloscope (the most that is read as
-    "~0"); the points are taken 0, 10, 25 and 35 ms after the peak of the noiseless trace.  Result
-    in 1/s.
-    """
+    """Release a load behind an AC-coupled oscilloscope and fit it as the paper does, 1/s."""
+    # The rail is an OU whose noise is half a step of the oscilloscope (the most that is read as
+    # "~0"); the points are taken 0, 10, 25 and 35 ms after the peak of the noiseless trace.
     t = np.arange(round((_HOLD + _WATCH) * _RATE)) / _RATE
     throttle = np.where(t <= _HOLD, published.TRANSIENT_LOAD, 0.0)
     sag = 1e-3 * VALUE[0]
