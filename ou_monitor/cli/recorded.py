@@ -122,21 +122,19 @@ def model_text(finding: Finding, recording: Recording | None = None) -> str:
     """Return the extended model, with the state at take-off, as the text of a model file."""
     from ou_monitor.online.load.load_filter import LoadFilter
     from ou_monitor.recordings.model_file import as_yaml, ModelFile
+    from ou_monitor.records import plain_data
 
     if why := _unsaved(finding):
         raise InputError(why)
     assert finding.model is not None
 
-    def known(value: float) -> float | None:
-        return value if math.isfinite(value) else None
-
-    provenance = {
+    provenance = plain_data({
         'recording': finding.recording, 'date': datetime.now(timezone.utc).date().isoformat(),
         'ou_monitor': __version__, 'verdict': finding.verdict.value,
-        'heldout_score': known(finding.score), 'gain': known(finding.gain),
-        'gain_se': known(finding.gain_se), 'seed': finding.seed,
+        'heldout_score': finding.score, 'gain': finding.gain,
+        'gain_se': finding.gain_se, 'seed': finding.seed,
         # Rate at which `simulate` draws the model.
-        'rate_hz': float(f'{(finding.n - 1) / finding.duration:.6g}')}
+        'rate_hz': float(f'{(finding.n - 1) / finding.duration:.6g}')})
     loads = LoadFilter()
     if recording is not None:
         loads.push(recording.t, recording.voltage, recording.throttle, recording.current)

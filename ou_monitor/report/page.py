@@ -28,7 +28,7 @@ from typing import Any
 import zlib
 
 import numpy as np
-from ou_monitor.records import FloatArray, Severity
+from ou_monitor.records import FloatArray, plain_data, Severity
 from ou_monitor.report.document import (
     Code, Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text, UNKNOWN)
 from ou_monitor.report.svg import Curve, extremes, Plot
@@ -68,11 +68,11 @@ def embed(plot: Plot, most: int = MOST) -> str:
         'title': plot.title, 'x': _axis(plot.x_label, plot.x_range, plot.log_x),
         'y': _axis(plot.y_label, plot.y_range, plot.log_y),
         'width': plot.width, 'height': plot.height, 'curves': curves,
-        'shades': [[_known(a), _known(b), int(style[1:]), label]
+        'shades': [[a, b, int(style[1:]), label]
                    for a, b, style, label in plot.shades],
-        'marks': [[_known(x), label] for x, label in plot.marks], 'names': plot.names,
+        'marks': [[x, label] for x, label in plot.marks], 'names': plot.names,
         'block': base64.b64encode(zlib.compress(bytes(block), 6)).decode('ascii')}
-    text = json.dumps(found, allow_nan=False, separators=(',', ':'))
+    text = json.dumps(plain_data(found), allow_nan=False, separators=(',', ':'))
     # Without tags and entities, HTML and XML parsers read the same text.
     for sign in '<>&':
         text = text.replace(sign, f'\\u{ord(sign):04x}')
@@ -120,11 +120,7 @@ def _axis(label: str, ends: tuple[float, float], log: bool) -> dict[str, Any]:
     if not comma:
         name, unit = ('', label) if _UNIT.fullmatch(label) else (label, '')
     return {'label': label, 'name': name, 'unit': unit, 'log': log,
-            'low': _known(ends[0]), 'high': _known(ends[1])}
-
-
-def _known(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
+            'low': ends[0], 'high': ends[1]}
 
 
 def _abscissa(x: FloatArray, log: bool, block: bytearray) -> list[float | str]:

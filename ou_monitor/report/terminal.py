@@ -35,7 +35,8 @@ def _part(part: Part) -> str:
     if isinstance(part, Facts):
         return facts(part.pairs)
     if isinstance(part, Notes):
-        lines = [item(text if severity is Severity.INFO else f'{severity.name.lower()}: {text}')
+        lines = [paragraph(text if severity is Severity.INFO else
+                           f'{severity.name.lower()}: {text}', '- ')
                  for severity, text in part.notes[:part.most]]
         return '\n'.join(lines + _left_out_line(len(part.notes), part.most))
     if isinstance(part, Table):
@@ -56,11 +57,6 @@ def paragraph(text: str, begin: str = '') -> str:
     """Break a paragraph into lines, indented below `begin`; words and paths stay whole."""
     return fill(text, columns(), initial_indent=begin, subsequent_indent=' ' * len(begin),
                 break_long_words=False, break_on_hyphens=False)
-
-
-def item(text: str) -> str:
-    """Break one entry of a list into lines."""
-    return paragraph(text, '- ')
 
 
 def facts(pairs: Sequence[tuple[str, str]]) -> str:

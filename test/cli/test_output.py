@@ -219,7 +219,7 @@ def test_the_width_of_the_terminal_is_kept(monkeypatch, width):
     monkeypatch.setattr('sys.stdout', Screen())
     monkeypatch.setattr('shutil.get_terminal_size', lambda *_, **__: os.terminal_size((width, 24)))
     words = ' '.join(['word'] * 60)
-    for text in (terminal.paragraph(words), terminal.item(words),
+    for text in (terminal.paragraph(words), terminal.paragraph(words, '- '),
                  terminal.facts([('Sag', words), ('Noise', words)])):
         assert max(map(len, text.splitlines())) <= min(width, 100)
     heads = ['vehicle', *[f'column {k}' for k in range(8)]]
