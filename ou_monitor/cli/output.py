@@ -1,7 +1,7 @@
 """
 Output of commands: text and progress on the terminal, JSON and other files.
 
-Progress is a bar on a terminal, and a line every minute elsewhere.
+Progress is a bar with the time left on a terminal, and a line every minute elsewhere.
 """
 
 from __future__ import annotations
@@ -31,12 +31,7 @@ _LEAST = 0.02
 
 
 class Progress:
-    """
-    Progress of a command on standard error; `quiet`: no lines without a terminal.
-
-    A terminal shows a bar and the time left; elsewhere a line comes every minute, so shorter work
-    prints nothing.
-    """
+    """Progress of a command on standard error; `quiet`: no lines without a terminal."""
 
     def __init__(self, label: str, quiet: bool = False) -> None:
         self._label, self._quiet = label, quiet
@@ -281,11 +276,8 @@ def check_folder(path: Path) -> None:
 
 def deliver(args: argparse.Namespace, found: Result, command: str = '',
             report: str | Path | None = None, **files: object) -> None:
-    """
-    Write a command's result to the page, JSON file and terminal that its arguments name.
-
-    report: path of a page, already checked; an existing page is overwritten.
-    """
+    """Write a result to the page, JSON file and terminal that the arguments name."""
+    # `report` is the path of a page that has been checked: an existing page is overwritten.
     force = args.force or report is not None
     report = report or getattr(args, 'report', None)
     document = found.document(command)

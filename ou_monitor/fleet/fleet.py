@@ -46,14 +46,11 @@ def is_own(folder: Path) -> bool:
 
 
 class Parts:
-    """
-    The saved results in the folder of a fleet, which is created; InputError if that fails.
-
-    options: everything that the results depend on, including the package version; plain data.
-    """
+    """The saved results in the folder of a fleet, which is created; InputError if that fails."""
 
     def __init__(self, folder: Path, options: Mapping[str, Any]) -> None:
         self._folder = folder / FOLDER
+        # Everything that the results depend on, the package version included.
         self._options = json.dumps(dict(options), sort_keys=True)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)

@@ -151,11 +151,7 @@ def _number(values: dict[str, str], key: str) -> float:
 
 
 class MotorInputs:
-    """
-    Newest throttle, and the motor speeds received since the last call.
-
-    The parameters `sources.MOTOR_PARAMETERS` choose the topics; times are monotonic, s.
-    """
+    """Newest throttle, and the motor speeds since the last call; times are monotonic, s."""
 
     def __init__(self, node: MonitorNode, values: Mapping[str, Any],
                  now: Callable[[], float]) -> None:

@@ -106,14 +106,11 @@ def _hull_edge(numbers: list[int], times: list[float]) -> tuple[int, float]:
 
 
 class SendClock:
-    """
-    Turn source timestamps of single samples into stamps.
-
-    `in_bursts`: no steady source is detectable, and the times are unusable; `settled`:
-    how often this has ended.
-    """
+    """Turn source timestamps of single samples into stamps."""
 
     def __init__(self) -> None:
+        # Whether no steady source is detectable, so that the times are unusable; and how often
+        # this has ended.
         self.in_bursts = False
         self.settled = 0
         self._lumps = 0
@@ -208,12 +205,7 @@ STOPPED, MISSED = 1.0, 5.0
 
 
 class SimClockMap:
-    """
-    Straight line through the last pairs (source time, clock), by least squares.
-
-    Limits: undefined before two pairs have come, and `STOPPED` after the last one;
-    between pairs and shortly after the last the line is continued.
-    """
+    """Straight line through the last pairs (source time, clock), by least squares."""
 
     def __init__(self) -> None:
         self._pairs: deque[tuple[float, float]] = deque(maxlen=PAIRS)
@@ -265,6 +257,7 @@ class SimClockMap:
 
     def __call__(self, source: float) -> float:
         """Return the simulated time, s, at which a message was sent; NaN while undefined."""
+        # The line is continued between pairs and shortly after the last one.
         if not self.ready or source - self._pairs[-1][0] > self.patience:
             return math.nan
         return self._line(source)

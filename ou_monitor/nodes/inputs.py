@@ -128,12 +128,7 @@ class Arrivals:
 
 
 class PolledInput:
-    """
-    One field of the messages of a topic, fetched in batches on request.
-
-    `spec` names the field and the stamp, `beside` a second field with one number per message.
-    `publishers` follows the senders.
-    """
+    """One field of the messages of a topic (`beside`: and a number), fetched in batches."""
 
     def __init__(self, node: MonitorNode, kind: Any, topic: str, spec: FieldSpec,
                  beside: FieldSpec | None = None) -> None:
@@ -243,12 +238,7 @@ def within(age: float | None, limit: float) -> bool:
 
 
 class SourceFinder:
-    """
-    Sources of some quantities, each opened once a publisher offers a known type.
-
-    The parameters' values name them. `open_source` opens a source of a known type; its InputError
-    becomes a problem. `problems` says why a quantity is not used; '' if it is.
-    """
+    """Sources of some quantities, each opened once a publisher offers a known type."""
 
     def __init__(self, node: MonitorNode, quantities: tuple[str, ...], values: Mapping[str, Any],
                  open_source: Callable[[Source], None]) -> None:
@@ -257,6 +247,7 @@ class SourceFinder:
         self.sources = {quantity: source for quantity in quantities
                         if (source := find_source(quantity, values)) is not None}
         self.opened: dict[str, Source] = {}
+        # Why a quantity is not used, such as an InputError of `open_source`; '' if it is.
         self.problems: dict[str, str] = {}
 
     @property

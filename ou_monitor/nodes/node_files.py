@@ -55,11 +55,7 @@ class ModelChoice:
         self._reader = ThreadPoolExecutor(1, 'model_file')
 
     def check(self, path: str, meanwhile: Callable[[], object] = lambda: None) -> None:
-        """
-        Read the file unless it is in force; `ValueError` says why it cannot be used.
-
-        Calls `meanwhile` every `PAUSE` while reading.
-        """
+        """Read the file unless it is in force; `ValueError` says why it cannot be used."""
         if not path or path == self._used[0]:
             self._checked = self._used if path else ('', None, b'')
             return
@@ -99,12 +95,7 @@ class ModelChoice:
 
     def save(self, load: LoadStart, entry: Mapping[str, object],
              meanwhile: Callable[[], object] = lambda: None) -> str:
-        """
-        Write what a flight has learned into the file in force; return its path.
-
-        The entry, with its `date`, goes to the end of the file's history.  `InputError` says why
-        it is not written.
-        """
+        """Write what a flight has learned, and an entry of the history; return the file's path."""
         path, file, known = self._used
         if file is None:
             raise InputError('There is no model_file in force.')
@@ -207,18 +198,15 @@ RETRY = 1.0
 
 
 class LatchFile:
-    """
-    Keeps the flag of one node in a file, or in a file named after the node in a folder.
-
-    `problem` says in one line why the file cannot be used now; empty: the last request is on
-    disk.  `refused`: the file found at the start must not be changed, and its content is unknown.
-    """
+    """Keeps the flag of one node in a file, or in a file named after the node in a folder."""
 
     def __init__(self, path: str | Path, node: str) -> None:
         self.path = Path(path).expanduser()
         if self.path.is_dir():
             self.path /= node.strip('/').replace('/', '_') + '.latch.json'
+        # Why the file cannot be used now, one line; empty: the last request is on disk.
         self.problem = ''
+        # Whether the file found at the start must not be changed; its content is unknown.
         self.refused = False
         self._node = node
         # Open handle of the file, which holds its lock.

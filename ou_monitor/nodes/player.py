@@ -50,13 +50,10 @@ SWITCH = 0.0002
 
 
 class SpacingError:
-    """
-    How far the spacing of events was from the intended one, in whole microseconds.
-
-    A histogram, so that days of replay take no more memory than minutes.
-    """
+    """How far the spacing of events was from the intended one, in whole microseconds."""
 
     def __init__(self) -> None:
+        # A histogram, so that days of replay take no more memory than minutes.
         self._counts: Counter[int] = Counter()
         self._last: tuple[float, float] | None = None
 

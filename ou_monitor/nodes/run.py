@@ -222,18 +222,14 @@ def make_executor() -> Any:
 
 
 class ServiceManager:
-    """
-    The service manager that has started this process, if any.
-
-    `interval`, s, is the period of the watchdog message, half of the manager's
-    timeout; 0: none.
-    """
+    """The service manager that has started this process, if any."""
 
     def __init__(self) -> None:
         self._address = os.environ.get('NOTIFY_SOCKET', '')
         # A watchdog set for another process is ignored.
         ours = os.environ.get('WATCHDOG_PID', str(os.getpid())) == str(os.getpid())
         span = os.environ.get('WATCHDOG_USEC', '') if self._address and ours else ''
+        # Period of the watchdog message, half of the manager's timeout, s; 0: none.
         self.interval = 0.5e-6 * int(span) if span.isdigit() else 0.0
 
     def tell(self, state: str) -> None:

@@ -142,11 +142,8 @@ def peak_of(rail: float) -> float:
 
 
 def fitted_through_coupling(time: FloatArray) -> tuple[FloatArray, float]:
-    """
-    Return the typical rail behind the coupling, scaled to the points of the paper's fit.
-
-    time in s from the peak of the curve; returns mV, and the largest relative misfit.
-    """
+    """Return the typical rail behind the coupling, mV, and its largest relative misfit."""
+    # Scaled to the points of the paper's fit; times count from the peak of the curve, s.
     peak = peak_of(TYPICAL_RAIL)
     misfit = np.log(VALUE[USED] / through_coupling(peak + TIME[USED], TYPICAL_RAIL))
     scale = math.exp(float(misfit.mean()))
