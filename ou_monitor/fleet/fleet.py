@@ -100,6 +100,10 @@ class Fleet:
         """Return the vehicles with a name, in order."""
         return sorted({row['vehicle'] for row in self.rows if row['vehicle'] is not None})
 
+    def recordings_of(self, vehicle: str) -> list[Row]:
+        """Return one row for each recording of a vehicle."""
+        return list({row['path']: row for row in self.rows if row['vehicle'] == vehicle}.values())
+
     @property
     def failed(self) -> list[Row]:
         """Return the rows that have an error."""

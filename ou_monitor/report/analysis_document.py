@@ -48,7 +48,9 @@ def analysis_document(analysis: Analysis, command: str = '') -> Document:
     subject = (f'{recording.name or "recording"}: {recording.n} samples in '
                f'{recording.duration:.4g} s ({number(rate)} Hz)')
     parts: list[Part] = [
-        lambda: [Figure(_voltage(analysis))], Facts([*facts(analysis), *_origin(analysis)]),
+        lambda: [Figure(_with_segments(voltage_plot(recording, analysis.overview.limit),
+                                       analysis))],
+        Facts([*facts(analysis), *_origin(analysis)]),
         Section('What to know before using these numbers', [notes(analysis)]),
         lambda: _over_time(analysis),
         Section('Over throttle', [_by_throttle(analysis), lambda: _curves(analysis),
@@ -320,13 +322,10 @@ def _interval(level: LevelResult, name: str) -> str:
 
 def _process(analysis: Analysis) -> list[Part]:
     """Return the tests that decide the type of process of each level, and the reasons."""
-    rows = []
-    for level in analysis.levels:
-        cells = []
-        for test in level.shape.tests:
-            strength = f'\n{number(test.effect, 2)}' if math.isfinite(test.effect) else ''
-            cells.append(chance(test.p_adjusted) + (' *' if test.rejects else '') + strength)
-        rows.append([level.label, *cells])
+    rows = [[level.label, *(
+        chance(test.p_adjusted) + ' *' * test.rejects
+        + (f'\n{number(test.effect, 2)}' if math.isfinite(test.effect) else '')
+        for test in level.shape.tests)] for level in analysis.levels]
     groups: dict[tuple[str, str], list[LevelResult]] = {}
     for level in analysis.levels:
         if level.n:
@@ -380,9 +379,9 @@ def _relaxation_sentence(analysis: Analysis, k: int) -> str:
     fit, cause = analysis.relaxations[k], analysis.causes[k]
     if not fit.detected:
         return cause.sentence
-    count, caveat = len(fit.releases), f'{fit.caveat} ' if fit.caveat else ''
-    what = {'release': 'fall', 'load': 'rise'}[fit.kind]
-    return (f'After {counted(count, what)} of throttle the voltage relaxes in '
+    caveat = f'{fit.caveat} ' if fit.caveat else ''
+    what = counted(len(fit.releases), 'fall' if fit.kind == 'release' else 'rise')
+    return (f'After {what} of throttle the voltage relaxes in '
             f'tau = {number(1e3 * fit.tau)} (95 % {number(1e3 * fit.tau_low)} to '
             f'{number(1e3 * fit.tau_high)}) ms. {caveat}{cause.sentence}')
 
@@ -409,7 +408,6 @@ def _relaxation_plot(analysis: Analysis, fit: Relaxation) -> list[Part]:
 def _changes(analysis: Analysis, fit: Relaxation) -> Table:
     start = float(analysis.recording.t[0])
     side = 'overshoot, mV' if fit.kind == 'release' else 'undershoot, mV'
-
     rows = [[number(change.t - start, 4),
              f'{100.0 * change.throttle_before:.3g} to {100.0 * change.throttle_after:.3g} %',
              with_se(change.level_before, change.level_before_se, 4),
@@ -418,11 +416,6 @@ def _changes(analysis: Analysis, fit: Relaxation) -> Table:
              number(1e3 * change.beyond), chance(change.beyond_p)] for change in fit.clear]
     return Table(['at, s', 'throttle', 'before, V', 'after, V', 'A, mV', side, 'p (noise only)'],
                  rows, left=[1], most=_MOST_CHANGES)
-
-
-def _voltage(analysis: Analysis) -> Plot:
-    plot = voltage_plot(analysis.recording, analysis.overview.limit)
-    return _with_segments(plot, analysis) if analysis.recording.has_throttle else plot
 
 
 def voltage_plot(recording: Recording, limit: float) -> Plot:
@@ -444,8 +437,9 @@ def _since_start(recording: Recording, t: FloatArray) -> FloatArray:
 
 
 def _with_segments(plot: Plot, analysis: Analysis) -> Plot:
-    t = _since_start(analysis.recording, analysis.recording.t)
-    for k, level in enumerate(_drawn(analysis)):
+    recording = analysis.recording
+    t = _since_start(recording, recording.t)
+    for k, level in enumerate(_drawn(analysis) if recording.has_throttle else ()):
         for s in level.segments:
             plot.shade(float(t[s.start]), float(t[s.stop - 1]), k, level.label)
     return plot

@@ -120,7 +120,8 @@ def _ageing(fleet: Fleet) -> str:
 
 def _flown(fleet: Fleet, trends: Sequence[Trend]) -> str:
     """Return flights, dates and cells of an ageing pack."""
-    dates, cells = (of(fleet, trends[0].vehicle) for of in (_dates, _cells_of))
+    mine = fleet.recordings_of(trends[0].vehicle)
+    dates, cells = _dates(mine), _cells_of(mine)
     words = [counted(max(t.flights for t in trends), 'flight'), '' if dates == UNKNOWN else dates,
              f'{cells[:-1]} cells, a guess' if cells.endswith('?') else '']
     return f' ({"; ".join(word for word in words if word)})'
@@ -258,11 +259,10 @@ def _a_cell(judged: Judgement, name: str, vehicle: str) -> str:
     return ' per cell' if vehicle in one.names and one.cells[one.names.index(vehicle)] else ''
 
 
-def _cells_of(fleet: Fleet, vehicle: str) -> str:
+def _cells_of(rows: Sequence[Row]) -> str:
     """Return the cells of a vehicle, with a question mark if they are a guess."""
-    return ', '.join(sorted({_cells(row) for row in fleet.rows if row['vehicle'] == vehicle
-                             and row['cells']}, key=lambda cells: int(cells.rstrip('?')))
-                     ) or UNKNOWN
+    return ', '.join(sorted({_cells(row) for row in rows if row['cells']},
+                            key=lambda cells: (int(cells.rstrip('?')), cells))) or UNKNOWN
 
 
 def _cells(row: Row) -> str:
@@ -270,9 +270,9 @@ def _cells(row: Row) -> str:
         f"{row['cells']}{'?' * (row['cells_from'] == 'guessed')}")
 
 
-def _dates(fleet: Fleet, vehicle: str) -> str:
+def _dates(rows: Sequence[Row]) -> str:
     """Return the dates of the first and the last flight of a vehicle."""
-    found = [row['start'] for row in fleet.rows if row['vehicle'] == vehicle and row['start']]
+    found = [row['start'] for row in rows if row['start']]
     days = sorted({f'{date:%Y-%m-%d}' for date in (min(found), max(found))}) if found else []
     return ' to '.join(days) or UNKNOWN
 
@@ -339,23 +339,20 @@ def pack_table(fleet: Fleet) -> Table:
     """Return the table of packs: resistance and sag of each vehicle, with their drift."""
     judged = fleet.judgement
     short = short_names(fleet.vehicles)
-    rows = [[short[vehicle], str(_flights(fleet, vehicle)), _dates(fleet, vehicle),
-             _cells_of(fleet, vehicle), *(cell for name in OF_PACK for cell in (
-                 _of_pack(fleet, name, vehicle), _slope(judged, name, vehicle, interval=True)))]
-            for vehicle in fleet.vehicles
-            if any(_known(fleet, name, vehicle) for name in OF_PACK)]
+    rows = []
+    for vehicle in fleet.vehicles:
+        mine = fleet.recordings_of(vehicle)
+        if any(row[name] is not None for row in mine for name in OF_PACK):
+            rows.append([short[vehicle], _flights(mine), _dates(mine), _cells_of(mine)])
+            for name in OF_PACK:
+                rows[-1] += [_of_pack(mine, name, _star(judged, name, vehicle)),
+                             _slope(judged, name, vehicle, interval=True)]
     return Table.of_known(PACK_HEADS, rows, left=[0, 2], most=2 * _SHOWN)
 
 
-def _known(fleet: Fleet, name: str, vehicle: str) -> list[Row]:
-    """Return one row for each recording of a vehicle in which a quantity is known."""
-    return list({row['path']: row for row in fleet.rows
-                 if row['vehicle'] == vehicle and row[name] is not None}.values())
-
-
-def _of_pack(fleet: Fleet, name: str, vehicle: str) -> str:
+def _of_pack(rows: Sequence[Row], name: str, star: str) -> str:
     """Return the median of a quantity of a pack as measured, with its throttle."""
-    mine = _known(fleet, name, vehicle)
+    mine = [row for row in rows if row[name] is not None]
     if not mine:
         return UNKNOWN
     whole = not all(row['cells'] for row in mine)
@@ -363,8 +360,7 @@ def _of_pack(fleet: Fleet, name: str, vehicle: str) -> str:
     at = {row['sag_throttle'] for row in mine} if name == 'sag' else set()
     ends = [f'{100.0 * u:.0f}' for u in sorted({min(at), max(at)})] if at else []
     where = f'\nat {" to ".join(ends)} %' if ends else ''
-    return (f'{number(1e3 * value)}{_star(fleet.judgement, name, vehicle)}{" (pack)" * whole}'
-            + where)
+    return f'{number(1e3 * value)}{star}{" (pack)" * whole}{where}'
 
 
 def _star(judged: Judgement, name: str, vehicle: str) -> str:
@@ -384,21 +380,21 @@ def _packs(fleet: Fleet) -> list[Part]:
         legend=True)]
 
 
-def _flights(fleet: Fleet, vehicle: str) -> int:
-    return len({row['path'] for row in fleet.rows if row['vehicle'] == vehicle
-                and row['flight'] is not None})
+def _flights(rows: Sequence[Row]) -> str:
+    return str(sum(row['flight'] is not None for row in rows))
 
 
 def vehicle_table(fleet: Fleet) -> Table:
     """Return the table of vehicles."""
     judged = fleet.judgement
-    found, seen = [], one_each(fleet)
+    found = []
     shown_as = short_names(fleet.vehicles)
     for vehicle in fleet.vehicles:
-        mine = [row for row in seen if row['vehicle'] == vehicle]
-        dips = dips_of(mine)
-        cells = [shown_as[vehicle], str(_flights(fleet, vehicle)),
-                 number(min((row['lowest'] for row in mine), default=NAN), 4),
+        mine = fleet.recordings_of(vehicle)
+        seen = [row for row in mine if row['lowest'] is not None]
+        dips = dips_of(seen)
+        cells = [shown_as[vehicle], _flights(mine),
+                 number(min((row['lowest'] for row in seen), default=NAN), 4),
                  UNKNOWN if dips is None else str(dips.count)]
         for name in ('sigma', 'alpha'):
             cells += [_median(judged, name, vehicle), _slope(judged, name, vehicle)]
@@ -442,7 +438,7 @@ def as_data(fleet: Fleet) -> dict[str, Any]:
         'brownout_voltage': fleet.limit,
         'vehicles': [{
             'vehicle': vehicle,
-            'cells': _cells_of(fleet, vehicle),
+            'cells': _cells_of(fleet.recordings_of(vehicle)),
             **{name + ('_a_cell' if _a_cell(judged, name, vehicle) else ''): _vehicle_value(
                 judged, name, vehicle) for name in QUANTITIES}}
             for vehicle in fleet.vehicles],
