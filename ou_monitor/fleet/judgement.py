@@ -539,12 +539,8 @@ def _vehicles(values: Values, within: Outliers, flat: FloatArray, rate: float, s
 
 
 def _few(found: Outliers, places: Sequence[int], flights: Sequence[FloatArray]) -> Outliers:
-    """
-    Compare the mean of each of a few vehicles, with two flights or more, with the others' mean.
-
-    A vehicle that stands out is left out when the rest are compared.  The null hypothesis is a
-    difference of at most `_ALIKE`, either way.
-    """
+    """Compare the mean of each of a few vehicles (two flights or more) with the others' mean."""
+    # The null hypothesis is a difference of at most `_ALIKE`, either way.
     from ou_monitor.analysis.level_tests import adjusted
     from scipy import stats
 

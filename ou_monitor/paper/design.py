@@ -496,11 +496,7 @@ SHOWN = frozenset(('battery_voltage', 'battery_resistance', 'current_max', 'curr
 
 
 def network_of(flight: Flight, throttle: float, given: dict[str, Any]) -> PowerNetwork:
-    """
-    Return the network of a flight; values `given` override measured ones.
-
-    Raises ValueError where level, sag or noise at the throttle are unknown.
-    """
+    """Return the network of a flight, with values `given` in place of measured ones."""
     low, high = flight.flown
     u, sag = np.asarray(flight.throttle), np.asarray(flight.sag)
     at = float(np.interp(throttle, u, sag))

@@ -344,16 +344,13 @@ class Rail:
                              0.5 / float(-pole.real / abs(pole)))
 
     def crossing_rate(self, voltage: float) -> float:
-        """
-        Return the rate, 1/s, at which the rail falls below a voltage, V, far from its mean.
-
-        It is for the full Gaussian process, not only its OU, and is the larger of two rates.  For
-        rough paths it is q/(2 Var) d/sqrt(2 pi) exp(-d^2/2) (Pickands, Trans. AMS 145 (1969) 51),
-        for smooth paths sqrt(v/Var)/(2 pi) exp(-d^2/2) (Rice, Bell Syst. Tech. J. 24 (1945) 46).
-        d: distance to the voltage in standard deviations; q: quadratic variation per second; v:
-        variance of the smooth part of the slope.  For an OU, the first is the rate of its mean
-        first passage.
-        """
+        """Return the rate, 1/s, at which the rail falls below a voltage, V, far from its mean."""
+        # It is for the full Gaussian process, not only its OU, and is the larger of two rates. For
+        # rough paths it is q/(2 Var) d/sqrt(2 pi) exp(-d^2/2) (Pickands, Trans. AMS 145 (1969)
+        # 51), for smooth paths sqrt(v/Var)/(2 pi) exp(-d^2/2) (Rice, Bell Syst. Tech. J. 24 (1945)
+        # 46). d: distance to the voltage in standard deviations; q: quadratic variation per
+        # second; v: variance of the smooth part of the slope. For an OU, the first is the rate of
+        # its mean first passage.
         if self.mean <= voltage:
             return math.inf
         if self.var_inf == 0.0:

@@ -284,14 +284,9 @@ class Generator:
     def segments(
         self, edges: FloatArray, state: IntArray, rng: np.random.Generator,
     ) -> Iterator[tuple[int, IntArray | slice, IntArray, FloatArray]]:
-        """
-        Advance an ensemble of paths from jump to jump, stopping at every edge.
-
-        Yields index of the interval, paths that leave a state (at an edge: all paths), these
-        states, and the time spent in them since the last yield.
-
-        edges in s.
-        """
+        """Advance an ensemble of paths from jump to jump, stopping at every edge, s."""
+        # Yields index of the interval, paths that leave a state (at an edge: all paths), these
+        # states, and the time spent in them since the last yield, s.
         rates, everyone = self.leaving, slice(None)
         hold = rng.standard_exponential(state.size) / rates[state]
         for k, width in enumerate(np.diff(edges)):
