@@ -238,7 +238,10 @@ class ClusterWorkers(Workers):
     def _connect(self, address: str, check: Callable[[], str]) -> Any:
         from distributed import Client
 
-        _quiet()
+        # Silence Dask's messages about workers: the table reports failures.
+        for name in ('distributed', 'distributed.core', 'distributed.client',
+                     'distributed.batched', 'tornado', 'asyncio'):
+            logging.getLogger(name).setLevel(logging.CRITICAL + 1)
         try:
             client = self._stack.enter_context(Client(address, timeout=_PATIENCE))
         # Dask raises a TypeError if there is no certificate.
@@ -308,10 +311,3 @@ class ClusterWorkers(Workers):
     def close(self) -> None:
         """Release the workers."""
         self._stack.close()
-
-
-def _quiet() -> None:
-    """Silence Dask's messages about workers: the table reports failures."""
-    for name in ('distributed', 'distributed.core', 'distributed.client', 'distributed.batched',
-                 'tornado', 'asyncio'):
-        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
