@@ -27,7 +27,7 @@ from ou_monitor.nodes.base import MonitorNode, PUBLISH_RATE
 from ou_monitor.nodes.filter_channels import CHANNELS, Channels, channels_of, IMU
 from ou_monitor.nodes.inputs import (
     Console, decode, INPUT_QOS, NO_CLOCK, Silence, SourceFinder, Stamper, types_on, within)
-from ou_monitor.nodes.sources import message_class, MOTOR_PARAMETERS, Source
+from ou_monitor.nodes.sources import AUTO, message_class, MOTOR_PARAMETERS, Source
 from ou_monitor.online.filter.cutoff_control import Bound
 from ou_monitor.online.filter.lowpass import AdaptiveLowPass, FilterCounters
 from ou_monitor.online.notch import AdaptiveNotch
@@ -37,7 +37,6 @@ from ou_monitor.online.trust import InputClock, SLOW_MISSED, SourceInterval, Sta
 from ou_monitor.records import Level, NAN, Status
 from std_msgs.msg import Float64
 
-AUTO = 'auto'
 # Fixed at run time: the mode decides the unit of the output.
 _MODE = next(p for p in FILTER_PARAMETERS if p.name == 'mode')
 INPUT_PARAMETERS = (

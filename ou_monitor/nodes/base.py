@@ -6,7 +6,7 @@ Each name and default exists once, in a table. An exception in a callback does n
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 import functools
 import inspect
@@ -47,6 +47,9 @@ LOCK = Parameter(
 SPIN = 0.0001
 # Maximum single sleep, s: limits the delay in noticing a signal.
 NAP = 0.05
+# Maximum time for which a second thread may hold the interpreter, s: with Python's default of 5 ms
+# each call of the executor, or each message of a replay, may wait that long.
+SWITCH = 2e-4
 # Time for which the diagnostics report an exception of a callback, s.
 TELL = 10.0
 PUBLISH_RATE = Parameter('publish_rate', 10.0, 'How often the outputs are published, Hz.',
@@ -87,7 +90,9 @@ class MonitorNode(Node):
         self._changeable = {parameter.name for parameter in self.RUN_TIME}
         self._fixed = {parameter.name for parameter in self.FIXED}
         declared = [*self.RUN_TIME, *self.FIXED, LOCK]
-        self._widen_overrides(declared)
+        self._floats = {p.name for p in declared if isinstance(p.default, float) or p.mixed}
+        overrides = self._parameter_overrides
+        overrides.update({p.name: p for p in self._widen(list(overrides.values()))})
         for parameter in declared:
             self.declare_parameter(parameter.name, parameter.default, _descriptor(
                 parameter, read_only=not managed and parameter.name not in self._changeable))
@@ -316,14 +321,8 @@ class MonitorNode(Node):
         """Return the node's clock, s (simulated time when `use_sim_time`)."""
         return float(self.get_clock().now().nanoseconds) * 1e-9
 
-    def _widen_overrides(self, declared: Sequence[Parameter]) -> None:
-        """Read `-p window:=2` as 2.0: YAML writes whole numbers without a point."""
-        self._floats = {p.name for p in declared if isinstance(p.default, float) or p.mixed}
-        overrides = self._parameter_overrides
-        for name in self._floats & overrides.keys():
-            overrides[name] = _as_double(overrides[name])
-
     def _widen(self, parameters: list[RosParameter]) -> list[RosParameter]:
+        """Read 2 as 2.0 where a parameter is a float: YAML writes such numbers without a point."""
         return [_as_double(p) if p.name in self._floats else p for p in parameters]
 
     def _warn_misspelt(self) -> None:

@@ -24,7 +24,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.nodes.base import LOCK, MonitorNode, PUBLISH_RATE
+from ou_monitor.nodes.base import LOCK, MonitorNode, PUBLISH_RATE, SWITCH
 from ou_monitor.nodes.clocks import IN_BURSTS, SendClock
 from ou_monitor.nodes.inputs import (
     Arrivals, Console, NO_CLOCK, PolledInput, PublisherWatch, Silence, SourceFinder, Stamper,
@@ -50,9 +50,6 @@ HAND_OVER = 0.25
 SHARE = 0.25
 # An estimate that takes longer than this, s of CPU, is not made for every report.
 HEAVY = 0.02
-# Maximum time for which the fitting thread may hold the interpreter, s: with Python's default of
-# 5 ms each call of the executor would wait that long.
-SWITCH = 2e-4
 # Maximum thinning: one sample in this many is kept.
 MOST_THIN = 1024
 # Maximum throttle messages placed among the voltages at each hand-over, evenly chosen.

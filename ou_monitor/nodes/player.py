@@ -20,7 +20,7 @@ import time
 from typing import Any, Generic, TypeVar
 
 from ou_monitor.errors import InputError, nearest
-from ou_monitor.nodes.base import wait_until
+from ou_monitor.nodes.base import SWITCH, wait_until
 from ou_monitor.nodes.run import one_line
 from ou_monitor.nodes.sources import message_class
 from ou_monitor.recordings.bag import BagReader
@@ -44,9 +44,6 @@ Message = tuple[str, str, int, bytes]
 Item = TypeVar('Item')
 # Maximum messages held: about 20 s at 10 kHz, some 50 MB.
 AHEAD = 200_000
-# Maximum time for which the reading thread may hold the interpreter, s; Python's default of 5 ms
-# would show in the spacing.
-SWITCH = 0.0002
 
 
 class SpacingError:

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.nodes.base import battery, MonitorNode
+from ou_monitor.nodes.base import battery, MonitorNode, NAP
 from ou_monitor.nodes.inputs import (
     NO_CLOCK, PolledInput, PublisherWatch, Silence, SourceFinder, within)
 from ou_monitor.nodes.sources import find_source, Source, SOURCE_PARAMETERS
@@ -62,8 +62,8 @@ _MOST_THROTTLE = 2.0
 # If the clock and the next sample differ by more than this, s, the clock was set, and samples
 # continue from its time.  A machine under load pauses for up to a second.
 _JUMP = 5.0
-# Maximum sleep, s, and period of checking simulated time, s.
-_NAP, _LOOK = 0.05, 0.002
+# Period of checking simulated time, s.
+_LOOK = 0.002
 
 
 class Sender:
@@ -213,13 +213,9 @@ class SupplySimulatorNode(MonitorNode):
             if good.size:
                 self._throttle = min(max(float(found.column.values[good[-1]]), 0.0), 1.0)
                 self._throttle_silence.record()
-        if self._is_idle:
+        if not within(self._throttle_silence.age, _HOLD):
             self._throttle = 0.0
         return self._throttle
-
-    @property
-    def _is_idle(self) -> bool:
-        return not within(self._throttle_silence.age, _HOLD)
 
     # -- the thread
 
@@ -231,7 +227,7 @@ class SupplySimulatorNode(MonitorNode):
         """Draw the next samples and publish each when it is due."""
         now = self.stamp_now()
         if now <= 0.0 or self.problem:
-            time.sleep(_NAP)
+            time.sleep(NAP)
             return
         with self._lock:
             run = self._run_now
@@ -279,7 +275,7 @@ class SupplySimulatorNode(MonitorNode):
             left = due - (self.stamp_now() if simulated else time.time())
             if left <= 0.0 or left > _JUMP + 1.0 / self._rate:
                 return True
-            time.sleep(_LOOK if simulated else min(left, _NAP))
+            time.sleep(_LOOK if simulated else min(left, NAP))
         return False
 
     # -- diagnostics
@@ -289,7 +285,8 @@ class SupplySimulatorNode(MonitorNode):
         topic = '' if self._throttle_source is None else self.resolve_topic_name(
             self._throttle_source.topic)
         voltage = self.resolve_topic_name(self._voltage.source.topic)
-        if self._played is None and self._needs_throttle and self._is_idle:
+        idle = not within(self._throttle_silence.age, _HOLD)
+        if self._played is None and self._needs_throttle and idle:
             notes.append(f'No throttle {f"on {topic}" if topic else "in this msg_config"}'
                          f'{self._throttle_silence.words}: the craft idles.')
         notes += [*filter(None, self._sources.problems.values()), *self._watched.notes(topic)]
