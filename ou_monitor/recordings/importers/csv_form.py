@@ -408,9 +408,8 @@ def _header(rows: list[list[str]], lines: list[str], first: int, width: int, del
 
 def _unit_beside(names: Sequence[str], rows: list[list[str]], place: int) -> str:
     """Return the unit in the next column, such as Volt DC, if that is named so."""
-    beside = names[place + 1].lower() if place + 1 < len(names) else ''
-    words = rows[0][place + 1].lower().split() if beside in (
-        'unit', 'units', 'einheit') and rows and len(rows[0]) > place + 1 else []
+    words = ' '.join(rows[0][place + 1:][:1]).lower().split() if rows and ''.join(
+        names[place + 1:][:1]).lower() in ('unit', 'units', 'einheit') else []
     return words[0] if words and words[0] in WORDS else ''
 
 

@@ -282,7 +282,7 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
         column, si = scaled[logs.VOLTAGE]
         _check_one_series(path, form, t, column.name, si)
     spread = _spread(t, volts)
-    if spread is not t:
+    if not np.array_equal(spread, t, equal_nan=True):
         guesses[_TIME_NAME] += ', equal stamps spread evenly, a guess: --sample-interval'
     note = _read_note(form, time, found, guesses, wanted.throttle is None)
     return _Table(form, time, spread, scaled, dict(zip(others, values[len(found):])), note)
@@ -506,7 +506,7 @@ def _series_of(path: Path, form: Form, wanted: CsvColumns, time: _Column,
         numbers(path, form, [], {place: labels}, [])
         names = tuple(sorted({*labels} - {''}))
         series = form._replace(names=names, width=len(names), rows=(), units=tuple(
-            unit_of(name)[1] or form.units[value[0]] for name in names))
+            unit_of(name)[1] or unit_of(form.names[value[0]])[1] for name in names))
         if wanted.voltage in names or len(names) <= MOST_COLUMNS and _choose(
                 series, logs.VOLTAGE):
             return series, place, value[0]
@@ -585,9 +585,8 @@ def _stamps(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: _Co
     """Return the time in s, and its unit in words."""
     if not time.place:
         return t, f'{time.scale:g} s'
-    if form.rows and time.place[0] < len(form.rows[0]) \
-            and not is_number(form.rows[0][time.place[0]]) \
-            and is_clock(form.rows[0][time.place[0]]):
+    cell = ''.join(form.rows[0][time.place[0]:][:1]) if form.rows else ''
+    if not is_number(cell) and is_clock(cell):
         return t, 'dates and times'
     if time.scale:
         return t * time.scale, time.unit
@@ -625,8 +624,10 @@ def _spread(t: FloatArray, volts: FloatArray) -> FloatArray:
     """
     known = np.flatnonzero(np.isfinite(t) & np.isfinite(volts))
     stamps, change = t[known], np.diff(volts[known])
-    begin = np.flatnonzero(np.diff(stamps, prepend=-math.inf))
+    begin = np.flatnonzero(np.diff(stamps, prepend=math.inf))
     step, rows = np.diff(stamps[begin]), np.diff(begin)[1:]
+    if step.size and (step < 0.0).all():
+        return _spread(t[::-1], volts[::-1])[::-1]
     if rows.size < 2 or _LEAST_SHARED * begin.size > known.size or (step < 0.0).any():
         return t
     usual, first = float(np.median(rows)), change[begin[1:] - 1]

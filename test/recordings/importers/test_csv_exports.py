@@ -420,6 +420,12 @@ def test_rows_that_share_a_stamp_are_spread(step, atol, tmp_path):
     np.testing.assert_allclose(late, np.median(late), rtol=0.0, atol=atol)
     log = import_log(path, Request())
     np.testing.assert_allclose(log.series[0].t, found.t, rtol=0.0, atol=1e-6)
+    # The newest row first.
+    first, *rows = path.read_text().splitlines(keepends=True)
+    path.write_text(first + ''.join(rows[::-1]))
+    again = read_recording(path)
+    np.testing.assert_allclose(again.t, found.t)
+    np.testing.assert_allclose(again.voltage, found.voltage)
 
 
 @pytest.mark.parametrize('stamps, volts', [
@@ -495,6 +501,11 @@ def test_series_that_rows_name_are_columns(tmp_path, order):
         f'{host},{line}' for line in lines[1:] for host in 'ab')]))
     with pytest.raises(InputError, match="'value' holds several series, named in 'host': a, b"):
         read_recording(path)
+    # The unit of the first row is not that of other series.
+    path.write_text('time,topic,value,unit\n' + ''.join(
+        f'{k},battery,12.{k % 7},V\n{k},throttle,{k % 9 * 10},%\n' for k in range(40)))
+    found = read_recording(path, columns=CsvColumns(voltage='battery'))
+    np.testing.assert_allclose(found.throttle, np.arange(40) % 9 / 10)
     # The mode of a flight is no series, nor is a lone topic.
     for names in ('pack', 'arm', 'fly'), ('pack', 'pack', 'pack'):
         text = 'time,mode,value\n' + ''.join(
