@@ -287,7 +287,7 @@ def _shares(horizon: float) -> list[float]:
 
 
 def _within(horizon: float) -> list[float]:
-    """Return a horizon and the shorter ones, down to a fifth, from which the flight learns."""
+    """Return a horizon and the shorter ones, down to a third, from which the flight learns."""
     return [*(one for one in RUNGS if 0.2 * horizon <= one < horizon), horizon]
 
 
