@@ -8,12 +8,11 @@ their periodogram are independent and exponential.  A second OU, slower or faste
 factor, raises the ordinates in a known pattern.  The part of it that the fit absorbs (alpha,
 sigma, white noise) is projected out, and the rest is compared with the ordinates.  For small
 deviations this score test is the most powerful one; correlations at single lags would miss a
-second OU ten times slower, which is correlated over hundreds of samples.  An AC-coupled instrument
-subtracts what a second OU with the rate of its corner would add,
+second OU ten times slower, which is correlated over hundreds of samples.
 
-    S r^2 / (w^2 + r^2) = (S - S_r) a^2 r^2 / (a^2 - r^2) up to factors,  S = 1 / (a^2 + w^2),
-
-so the same score with the opposite sign tests for it.
+An AC-coupled instrument is a high-pass: the ordinates below its corner are too small.  Their sum
+has a gamma law, which holds for a few ordinates too, unlike the lower tail of the score; and it
+counts only if more than half of their power is missing, because a regression takes some.
 
 Limits: only the rates in `FACTORS`, one at a time; a corner at the rate of the OU itself is
 absorbed by the fit; linear drifts are removed; samples are taken as evenly spaced.
@@ -40,6 +39,8 @@ LEAST_SHARE = 0.1
 FACTORS = (1.0 / 30.0, 1.0 / 10.0, 1.0 / 3.0, 3.0, 10.0)
 # Minimum ordinates of a test, and minimum samples of a segment.
 _FEWEST, _SHORTEST = 64, 64
+# A high-pass removes 79 % of the power below its corner: mean ordinate minus 1 that shows one.
+_MISSING = -0.5
 # Relative difference up to which steps count as equal.
 ALIKE = 0.3
 # Minimum measurement noise, for a regular filter, as a share of the variance of a step.
@@ -105,6 +106,8 @@ def other_pole(parts: Sequence[FloatArray], rate: float, alpha: float, var_inf: 
     # The ordinates at 0 and at half the rate have a different distribution.
     frequency = join([f[1:-1] if f[-1] == 0.5 * rate else f[1:] for f, _ in both])
     power = join([p[1:-1] if f[-1] == 0.5 * rate else p[1:] for f, p in both])
+    # The removal of a trend takes part of the first ordinate, as a high-pass would.
+    first = np.isin(frequency, [f[1] for f, _ in both])[frequency > above]
     frequency, power = frequency[frequency > above], power[frequency > above]
     if frequency.size < _FEWEST:
         return OtherPole()
@@ -119,6 +122,9 @@ def other_pole(parts: Sequence[FloatArray], rate: float, alpha: float, var_inf: 
         np.ones(omega.size), var_inf * slope / fitted, 1.0 / fitted)))[0]
     more, share, less = 1.0, NAN, 1.0
     for factor in FACTORS:
+        slow = power[(omega < factor * step) & ~first]
+        if factor < 1.0 and slow.sum() < _MISSING * slow.size:
+            less = min(less, float(stats.gamma.cdf(slow.size + slow.sum(), slow.size)))
         pattern = var_inf * _shape(omega, factor * step) / fitted
         full = float(pattern @ pattern)
         pattern = pattern - absorbed @ (absorbed.T @ pattern)
@@ -131,8 +137,6 @@ def other_pole(parts: Sequence[FloatArray], rate: float, alpha: float, var_inf: 
         p = float(law.sf(score / math.sqrt(left)))
         if p < more:
             more, share = p, score / left
-        if factor < 1.0:
-            less = min(less, float(law.cdf(score / math.sqrt(left))))
     slower = sum(factor < 1.0 for factor in FACTORS)
     return OtherPole(min(1.0, len(FACTORS) * more), share, min(1.0, slower * less))
 

@@ -43,6 +43,15 @@ def test_one_relaxation_is_left_alone():
     assert sum(pole.coupling_p < 0.01 for pole in found) <= 7
 
 
+@pytest.mark.parametrize('sizes', [[355], [600] * 10])
+def test_few_slow_ordinates_are_no_high_pass(sizes):
+    """1000 levels of short parts of white innovations: at most 20 below 1 % (chance 2e-3)."""
+    rng = np.random.default_rng(1)
+    found = [other_pole([rng.standard_normal(n) for n in sizes], 50.0, 10.0, 2e-4, 1.6e-5)
+             for _ in range(1000)]
+    assert sum(pole.coupling_p < 0.01 for pole in found) <= 20
+
+
 def detected(level):
     """Whether one of the tests of a level sees more than one relaxation."""
     return (level.wanders or level.shape['mean_drift'].rejects
