@@ -47,8 +47,9 @@ INPUT_PARAMETERS = (
     Parameter('input.acceleration', False,
               'Filter the linear acceleration of an IMU beside its angular velocity.'))
 OWN_TOPICS = ('input', 'sigma', 'state', '~/output', '~/cutoff', '~/lag')
-# Fields of the state that the filter uses unchanged.
-_FIELDS = ('alpha', 'throttle', 'u0', 'u0_se', 'load_noise')
+# Fields of the state that the filter uses.
+_FIELDS = ('sigma_se', 'alpha', 'throttle', 'u0', 'u0_se', 'load_noise')
+_UNKNOWN = [NAN] * len(_FIELDS)
 # A sigma whose window exceeds the sliding one by this ratio comes from a fit.
 _LONGER = 1.1
 _USABLE = (Status.OK.name, Status.SHORT_WINDOW.name)
@@ -78,8 +79,7 @@ class SupplyInput:
         self._sigma = NAN
         self._state: dict[str, str] = {}
         self.sigma_silence, self.state_silence = Silence(now), Silence(now)
-        self._error = NAN
-        self._values = [NAN] * len(_FIELDS)
+        self._values = _UNKNOWN
 
     def take_sigma(self, value: float) -> None:
         """Take a sigma, V/sqrt(s); a negative one counts as unknown."""
@@ -93,10 +93,9 @@ class SupplyInput:
             if 'sigma_se' in values:
                 self.state_silence.record()
                 self._state = values
-                # Of ln sigma, as `AdaptiveLowPass` takes it.
-                error = _number(values, 'sigma_se')
-                self._error = error if error >= 0.0 else NAN
-                self._values = [_number(values, key) for key in _FIELDS]
+                # The error is of ln sigma, as `AdaptiveLowPass` takes it.
+                error, *others = (_number(values, key) for key in _FIELDS)
+                self._values = [error if error >= 0.0 else NAN, *others]
                 return
 
     def now(self, stale_after: float, rate: float = NAN) -> KnownSupply:
@@ -105,8 +104,7 @@ class SupplyInput:
         # throttle, as the sigma of an OU with relaxation `rate`, 1/s. This sigma includes the
         # ADC's white noise, so it is never below the supply's own.
         fresh = within(self.state_silence.age, stale_after)
-        error, (alpha, throttle, level, level_se, noise) = (
-            (self._error, self._values) if fresh else (NAN, [NAN] * len(_FIELDS)))
+        error, alpha, throttle, level, level_se, noise = self._values if fresh else _UNKNOWN
         why = self._why(fresh, stale_after)
         if why and noise > 0.0 and rate > 0.0:
             return KnownSupply(noise * math.sqrt(2.0 * rate), throttle=throttle, source='load')

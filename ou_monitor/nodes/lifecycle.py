@@ -1,14 +1,9 @@
 """
 Nodes that a manager configures, activates and deactivates (managed nodes, design.ros2.org).
 
-| state | what is there |
-|---|---|
-| unconfigured, inactive | parameters and the life-cycle services only |
-| active | the whole plain node |
-
-Configuring checks what the parameters name (message types, model file), so that activating does
-not fail because of them; an active node starts without data.  A failure is logged, and the node
-stays in its former state.  A latched flag survives all transitions in its file, `state_file`.
+Only an active node is the whole plain node; before, it has parameters and the life-cycle services.
+A failure is logged, and the node stays in its former state.  A latched flag survives all
+transitions in its file, `state_file`.  doc/deploy.md says what configuring checks.
 """
 
 from __future__ import annotations

@@ -2,9 +2,7 @@
 The node `supply_simulator`: publish the voltage of a saved model under throttle.
 
 A thread simulates samples under the newest throttle and publishes each when the node's clock
-(also simulated time) reaches its time, in the format of `msg_config`: by default
-sensor_msgs/BatteryState on `voltage`.  Throttle comes from its topic, or is played and published
-(`throttle.play`).  `~/reset` (std_srvs/Trigger) restarts the simulation; `/diagnostics` at 1 Hz.
+reaches its time.  doc/simulation.md describes topics, parameters and `~/reset`.
 
 Limits: one voltage, no current.  Above 200 Hz samples are drawn in pieces of 20 ms, so throttle
 acts up to 20 ms later, and the stamped messages of a piece are sent together.

@@ -27,13 +27,6 @@ class Text:
 
 
 @dataclass(frozen=True)
-class Code:
-    """A command, for a page."""
-
-    text: str
-
-
-@dataclass(frozen=True)
 class Facts:
     """Facts: names and values."""
 
@@ -106,7 +99,7 @@ class Section:
 
 
 # A function returns parts that only a page shows; the terminal does not compute them.
-Part = Union[Text, Code, Facts, Notes, Table, Figure, Pair, Section,
+Part = Union[Text, Facts, Notes, Table, Figure, Pair, Section,
              Callable[[], 'Sequence[Part]']]
 
 

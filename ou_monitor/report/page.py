@@ -30,7 +30,7 @@ import zlib
 import numpy as np
 from ou_monitor.records import FloatArray, plain_data, Severity
 from ou_monitor.report.document import (
-    Code, Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text, UNKNOWN)
+    Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text, UNKNOWN)
 from ou_monitor.report.svg import Curve, extremes, Plot
 
 # Maximum points of a plot that is embedded in full; with it, an hour at 1 kHz takes 1.5 MB.
@@ -200,9 +200,10 @@ def _head(text: str) -> str:
 
 def html(document: Document) -> str:
     """Return a document as a whole page, which loads nothing else."""
-    again = [Section('To repeat this', [Code(document.command)], folded=True)
-             ] if document.command else []
-    body = _joined([*document.parts, *again])
+    body = _joined(document.parts)
+    if document.command:
+        again = f'<p><code>{escape(document.command)}</code></p>'
+        body += '\n' * bool(body) + _folded('<h2>To repeat this</h2>', again)
     text, source = _script() if 'class="plot-data"' in body else ('', "'none'")
     policy = (f"default-src 'none'; script-src {source}; style-src 'unsafe-inline'; "
               "base-uri 'none'; form-action 'none'")
@@ -236,8 +237,6 @@ def _part(part: Part, live: bool = True) -> str:
     """Return one part of a document; live: with the data of its plots."""
     if isinstance(part, Text):
         return '' if not part.text else f'<p{_SOFT if part.legend else ""}>{_set(part.text)}</p>'
-    if isinstance(part, Code):
-        return f'<p><code>{escape(part.text)}</code></p>'
     if isinstance(part, Facts):
         return '' if not part.pairs else '<dl class="facts">' + ''.join(
             f'<dt>{_set(name)}</dt><dd>{_set(words)}</dd>' for name, words in part.pairs) + '</dl>'
@@ -262,9 +261,13 @@ def _part(part: Part, live: bool = True) -> str:
         inside, heading = _joined(part.parts, live), f'<h2>{_set(part.heading)}</h2>'
         if not inside:
             return ''
-        return (f'<details class="section"><summary>{heading}</summary>\n{inside}\n</details>'
-                if part.folded else f'<section>{heading}\n{inside}\n</section>')
+        return _folded(heading, inside) if part.folded else (
+            f'<section>{heading}\n{inside}\n</section>')
     return _joined(part(), live)
+
+
+def _folded(heading: str, inside: str) -> str:
+    return f'<details class="section"><summary>{heading}</summary>\n{inside}\n</details>'
 
 
 def _table(part: Table) -> str:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from ou_monitor.records import Severity
 from ou_monitor.report.document import (
-    Code, Document, Facts, Figure, Notes, Pair, Section, Table, Text, worst_first)
+    Document, Facts, Figure, Notes, Pair, Section, Table, Text, worst_first)
 from ou_monitor.report.page import html
 from ou_monitor.report.svg import Plot
 from ou_monitor.report.terminal import terminal
@@ -30,20 +30,20 @@ def document(*parts, **more):
 def test_every_part_is_on_the_page_escaped():
     """Markup in any text is shown, not obeyed."""
     page = html(Document(EVIL, EVIL, [EVIL], [
-        Text(EVIL), Code(EVIL), Facts([(EVIL, EVIL)]), Notes.of([EVIL], Severity.WARNING),
+        Text(EVIL), Facts([(EVIL, EVIL)]), Notes.of([EVIL], Severity.WARNING),
         Table([EVIL], [[EVIL + '\n' + EVIL]]), Pair([Figure(plot(), EVIL)]),
         Section(EVIL, [Text(EVIL)], folded=True), lambda: [Text(EVIL)]], EVIL))
     tree = self_contained(page)
     assert '<script>alert' not in page
-    assert sum(EVIL in (e.text or '') for e in tree.iter()) >= 14
+    assert sum(EVIL in (e.text or '') for e in tree.iter()) >= 13
 
 
 def test_a_terminal_draws_nothing_for_a_page_only():
-    """Functions, figures, legends and commands; a section of nothing else has no heading."""
+    """Functions, figures and legends; a section of nothing else has no heading."""
     def drawn():
         pytest.fail('a terminal draws nothing')
 
-    only = (drawn, Figure(plot()), Text('legend', legend=True), Code('again'))
+    only = (drawn, Figure(plot()), Text('legend', legend=True))
     text = terminal(document(*only, Section('Plots', only), Section('Both', [Text('said')])))
     assert text == 'a.csv\n\nOne. Two.\n\nBoth:\nsaid'
 
