@@ -17,7 +17,7 @@ import math
 import sys
 import threading
 import time
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.nodes.base import SWITCH, wait_until
@@ -41,7 +41,6 @@ FLUSH = Duration(seconds=1)
 RCLError = rclpy_implementation.RCLError
 
 Message = tuple[str, str, int, bytes]
-Item = TypeVar('Item')
 # Maximum messages held: about 20 s at 10 kHz, some 50 MB.
 AHEAD = 200_000
 
@@ -86,13 +85,13 @@ class SpacingError:
         return {'p50': self.quantile(0.5), 'p99': self.quantile(0.99), 'max': self.quantile(1.0)}
 
 
-class Prefetch(Generic[Item]):
+class Prefetch:
     """Iterate over a source that a thread reads ahead, up to `ahead` items; raise its errors."""
 
-    def __init__(self, source: Iterable[Item], ahead: int = AHEAD) -> None:
+    def __init__(self, source: Iterable[Message], ahead: int = AHEAD) -> None:
         self._source = source
         self._ahead = ahead
-        self._items: deque[Item] = deque()
+        self._items: deque[Message] = deque()
         self._changed = threading.Condition()
         self._finished = self._closed = False
         self._error: BaseException | None = None
@@ -132,7 +131,7 @@ class Prefetch(Generic[Item]):
                 self._finished = True
                 self._changed.notify_all()
 
-    def __iter__(self) -> Iterator[Item]:
+    def __iter__(self) -> Iterator[Message]:
         while True:
             if not self._items:
                 with self._changed:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 import math
 import re
 from typing import Any
@@ -395,7 +394,7 @@ def vehicle_table(fleet: Fleet) -> Table:
         dips = dips_of(seen)
         cells = [shown_as[vehicle], _flights(mine),
                  number(min((row['lowest'] for row in seen), default=NAN), 4),
-                 UNKNOWN if dips is None else str(dips.count)]
+                 UNKNOWN if dips is None else str(dips[0])]
         for name in ('sigma', 'alpha'):
             cells += [_median(judged, name, vehicle), _slope(judged, name, vehicle)]
         found.append(cells)
@@ -458,28 +457,18 @@ def _vehicle_value(judged: Judgement, name: str, vehicle: str) -> float:
             if vehicle in one.names else NAN)
 
 
-@dataclass(frozen=True)
-class DipCount:
-    """Dips of a vehicle or of the whole fleet."""
-
-    count: int = 0  # Number of dips below the limit
-    below: float = 0.0  # Time below it, s
-    recordings: int = 0  # Recordings with dips
-
-
 def one_each(fleet: Fleet) -> list[Row]:
     """Return one row for each analysed recording with a known lowest voltage."""
     rows = {row['path']: row for row in fleet.rows if row['lowest'] is not None}
     return list(rows.values())
 
 
-def dips_of(rows: Sequence[Row]) -> DipCount | None:
-    """Return the dips of recordings; None without a limit."""
+def dips_of(rows: Sequence[Row]) -> tuple[int, float, int] | None:
+    """Return number of dips, seconds below the limit, recordings with dips; None without one."""
     known = [row for row in rows if row['dips'] is not None]
-    if not known:
-        return None
-    return DipCount(sum(int(row['dips']) for row in known), sum(row['below_s'] for row in known),
-                    sum(row['dips'] > 0 for row in known))
+    return None if not known else (
+        sum(int(row['dips']) for row in known), sum(row['below_s'] for row in known),
+        sum(row['dips'] > 0 for row in known))
 
 
 def worst(fleet: Fleet) -> list[Row]:
@@ -497,14 +486,14 @@ def sentences(fleet: Fleet) -> list[str]:
     found = dips_of(rows)
     if found is None:
         text = f'The lowest voltage was {lowest}'
-    elif not found.count:
+    elif not found[0]:
         text = f'No recording fell below {fleet.limit:g} V: the lowest was {lowest}'
     else:
-        most = worst(fleet)[0]
-        where = f'in {found.recordings} of {counted(len(rows), "recording")}'
-        if found.recordings > 1 and most['dips'] > 1:
+        most, (count, _, recordings) = worst(fleet)[0], found
+        where = f'in {recordings} of {counted(len(rows), "recording")}'
+        if recordings > 1 and most['dips'] > 1:
             where += f', most in {_name(most)}, {most["dips"]}'
-        text = (f'{counted(found.count, "dip")} below {fleet.limit:g} V {where}: the lowest was '
+        text = (f'{counted(count, "dip")} below {fleet.limit:g} V {where}: the lowest was '
                 f'{lowest}')
     sags = [row for row in rows if row['sag'] is not None]
     if not sags:
@@ -532,10 +521,10 @@ def facts(fleet: Fleet) -> list[tuple[str, str]]:
               lowest + ('' if u is None else f', at {100.0 * u:.0f} % throttle'))]
     found = dips_of(rows)
     if found is not None:
+        count, below, recordings = found
         lines.append((f'Below {fleet.limit:g} V', (
-            f'{counted(found.count, "dip")}, {number(found.below, 2)} s in all, in '
-            f'{found.recordings} of {counted(len(rows), "recording")}') if found.count
-            else 'never'))
+            f'{counted(count, "dip")}, {number(below, 2)} s in all, in {recordings} of '
+            f'{counted(len(rows), "recording")}') if count else 'never'))
     lines.append(('Sag', _range(rows, 'sag', volts, volts, ', at the highest throttle flown')
                   or 'unknown in all: throttle is unknown, or did not move enough'))
     resistances = _range(rows, 'resistance', lambda ohm: f'{number(1e3 * ohm)} mOhm',
