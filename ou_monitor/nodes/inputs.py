@@ -128,7 +128,7 @@ class Arrivals:
 
 
 class PolledInput:
-    """One field of the messages of a topic (`beside`: and a number), fetched in batches."""
+    """One field of a topic's messages, and with `beside` a number of each, in batches."""
 
     def __init__(self, node: MonitorNode, kind: Any, topic: str, spec: FieldSpec,
                  beside: FieldSpec | None = None) -> None:
