@@ -310,13 +310,18 @@ def readings_of(recording: Recording) -> Recording:
 
 def supplied(recording: Recording) -> Recording:
     """
-    Return a recording without the times at which its supply was off; a note tells them.
+    Return a recording without wild readings and the times at which its supply was off, noted.
 
     Off: below `OFF` of the usual voltage, with the readings up to `_ON` before and after.  A
     signal that is often there, or that spends as long in between, is not a supply that was off.
     """
+    usual = float(np.quantile(recording.voltage, 0.8)) if recording.n else 0.0
+    wild = recording.voltage > WILD_FACTOR * usual
+    if usual > 0.0 and wild.any() and wild.sum() <= _FEW * recording.n:
+        recording = part_of(recording, ~wild, (
+            f'{counted(int(wild.sum()))} left out: up to {float(recording.voltage.max()):.4g} V, '
+            f'where {usual:.3g} V is usual.'))
     t, v = recording.t, recording.voltage
-    usual = float(np.quantile(v, 0.8)) if v.size else 0.0
     off = v < OFF * usual
     if not usual > 0.0 or not off.any():
         return recording
@@ -367,6 +372,8 @@ def ordered(recording: Recording) -> Recording:
 # A supply is off below the first share of its usual voltage (4S replaced by 5 V of USB: 0.3), and
 # on again above the second.
 OFF, _ON = 0.2, 0.7
+# A reading above this number of usual voltages is an error (6S after 5 V of USB: 5).
+WILD_FACTOR = 20.0
 # Maximum number of times off, or as a share of the samples; maximum share of samples; maximum
 # samples between the two limits for each sample below the first.
 _OUTAGES, _FEW, _MOST_OFF, _BETWEEN = 10, 0.01, 0.5, 1.0

@@ -25,7 +25,8 @@ from ou_monitor.online.trust import Doubt, InputTrust, patience, StampOrder
 from ou_monitor.records import (
     as_numbers, as_seconds, Counters, Estimate, Flag, Level, NAN, OuFacts, Status)
 from ou_monitor.timeline import (
-    as_column, as_columns, Batch, MOST_CURRENT, OFF, plausible, plausible_samples, TimeLine)
+    as_column, as_columns, Batch, MOST_CURRENT, OFF, plausible, plausible_samples, TimeLine,
+    WILD_FACTOR)
 
 if TYPE_CHECKING:
     from ou_monitor.model.supply import SupplyModel
@@ -194,7 +195,7 @@ class SupplyMonitor:
             return
         before = level
         if level >= _POWERED:
-            on = batch.y >= OFF * level
+            on = (batch.y >= OFF * level) & (batch.y <= WILD_FACTOR * level)
             if not on.any() and (batch.restart or t - self._on_at > _ANOTHER):
                 self._begin(self._line)
             elif not on.all():
@@ -517,7 +518,8 @@ class SupplyMonitor:
             words = outcome.basis.replace('_', ' ')
             known += f' (from {words}; main cause: {outcome.cause})' if outcome.cause else \
                 f' (from {words})'
-        supply = f'; supply {e.voltage:.3f} V' if math.isfinite(e.voltage) else ''
+        now = self._forecast.voltage
+        supply = f'; supply {now:.3f} V' if math.isfinite(now) else ''
         return (f'Risk of falling below {s.brownout_voltage:g} V within {s.brownout_horizon:g} s: '
                 f'{known}, critical from {s.brownout_critical:g} within 1 s{load}{supply}; '
                 f'{flag.level.name} for {flag.age:.1f} s: {flag.reason}.')

@@ -58,6 +58,16 @@ def test_a_supply_that_is_off_counts_for_lowest_and_dips_only(begin, end):
     assert found.recording.n == others.size and found.overview.facts == off
 
 
+def test_error_codes_change_no_fact():
+    """A reading of 65535 V, now and then."""
+    whole = flight(np.random.default_rng(4))
+    v = whole.voltage.copy()
+    v[[700, 701, 3000]] = 65535.0
+    others = np.delete(np.arange(v.size), [700, 701, 3000])
+    assert supply_facts(replace(whole, voltage=v), 13.0) == supply_facts(
+        Recording(whole.t[others], whole.voltage[others], whole.throttle[others]), 13.0)
+
+
 @pytest.mark.parametrize('v', [
     np.tile([0.0, 12.0], 500).repeat(10), np.random.default_rng(6).standard_normal(10_000),
     np.linspace(0.0, 12.0, 10_000)], ids=['switched', 'ac_coupled', 'ramp'])
