@@ -30,6 +30,7 @@ from ou_monitor.analysis.relaxation import (
     find_steps, fit_relaxation, judge_cause, Relaxation, ReleaseCause)
 from ou_monitor.analysis.supply import fed, flown_near, node_for, remainder, THROTTLES
 from ou_monitor.criticism.innovations import FAMILY_WISE
+from ou_monitor.criticism.readings import two_levels
 from ou_monitor.model.spectral_lines import FALSE_ALARM
 from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.online.monitor import SupplyMonitor
@@ -131,7 +132,9 @@ def _left_out(recording: Recording, found: tuple[LoadLevel, ...]) -> tuple[str, 
     if not recording.n:
         return ('The recording holds no samples.',)
     if not recording.has_throttle:
-        return ('The recording has no throttle: it is taken as one load level.',)
+        switches = two_levels(recording.voltage) if recording.current is None else ''
+        return ('The recording has no throttle: it is taken as one load level.',
+                *([switches] if switches else []))
     if any(math.isnan(level.throttle) for level in found):
         return ('No throttle was held long enough for a load level: the whole recording is one '
                 'level, with throttle as a regressor; --levels can name levels.',)
@@ -142,7 +145,7 @@ def _left_out(recording: Recording, found: tuple[LoadLevel, ...]) -> tuple[str, 
     notes = []
     unknown = int(np.isnan(recording.throttle).sum())
     if unknown:
-        notes.append(f'{unknown} samples before the first throttle belong to no load level.')
+        notes.append(f'{unknown} samples without throttle belong to no load level.')
     if settling > 0.0:
         notes.append(f'The levels leave out {settling:.3g} s in which the voltage settled after '
                      'changes of throttle.')

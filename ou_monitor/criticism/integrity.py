@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.adc import (
     find_knee, find_rails, find_step, redraw, usual_change, without_repeats)
-from ou_monitor.criticism.readings import load_of, usable, why_nothing
+from ou_monitor.criticism.readings import load_of, two_levels, usable, why_nothing
 from ou_monitor.criticism.samples import (
     choose_samples, events_between, lines_between, Samples, without_tones)
 from ou_monitor.model.terms.catalogue import catalogue
@@ -70,6 +70,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     logged = (t, v, u)
     t, v, u, held = without_repeats(t, v, u)
     throttle, u = u, load_of(recording, t, v, u, notes)
+    notes += [two_levels(v)] if u is None and two_levels(v) else []
     current_is_load = u is not throttle
     if period > 1.0 or recording.held or held > 1.0:
         fresh = (v.size - 1) / float(t[-1] - t[0])

@@ -39,6 +39,9 @@ _EDGE = 0.05  # Tolerance of the range 0..1
 # Maximum gap in a current, s; quantile of its size that counts as full load; lags of the mean
 # response to a load, s.
 _HOLE, _FULL, _LAGS = 1.0, 0.99, np.array([0.02, 0.2, 2.0])
+# Two levels of a voltage: minimum distance, in standard deviations about them and in ADC steps;
+# minimum switches between them, samples for each, and share of the samples at each level.
+_APART, _STEPS, _SWITCHES, _DWELL, _SHARE = 5.0, 4.0, 3, 20, 0.05
 # Maximum second difference of a voltage that counts as a straight line, in rounding errors.
 _ROUNDINGS = 16.0
 
@@ -208,6 +211,29 @@ def _range(v: FloatArray) -> str:
 
 def _short(value: float) -> str:
     return f'{value:.6g}'
+
+
+def two_levels(v: FloatArray) -> str:
+    """Return the note for a voltage without a load that switches between two levels, or ''."""
+    ordered = np.sort(v[np.isfinite(v)])
+    sums, count = np.cumsum(ordered)[:-1], np.arange(1.0, ordered.size)
+    # Otsu's split of the values.
+    low, high = sums / count, (ordered.sum() - sums) / (ordered.size - count)
+    between = count * (ordered.size - count) * (high - low) ** 2
+    k = int(np.argmax(between)) if between.any() else 0
+    if not _SHARE < k / max(v.size, 1) < 1.0 - _SHARE:
+        return ''
+    apart, steps = float(high[k] - low[k]), np.diff(ordered)
+    within = math.sqrt(max(0.0, float(ordered.var() - between[k] / ordered.size ** 2)))
+    # What lies between the levels is on its way.
+    there = v[np.abs(v - 0.5 * (low[k] + high[k])) > 0.25 * apart] > ordered[k]
+    switches = int(np.count_nonzero(np.diff(there)))
+    least = max(_APART * within, _STEPS * float(steps[steps > 0.0].min()))
+    if not (least < apart and _SWITCHES <= switches < v.size / _DWELL):
+        return ''
+    return (f'The voltage switches between two levels, {number(float(low[k]), 4)} and '
+            f'{number(float(high[k]), 4)} V: a column of the load (--current-column or '
+            '--throttle-column) would explain it; without one, it counts as noise and lines.')
 
 
 def why_nothing(v: FloatArray) -> str:

@@ -278,8 +278,8 @@ def _notes(state: Integrity, named: Named, model: Composite, dropped: Sequence[s
     for name in dict.fromkeys(dropped):
         notes.append(f"'{name}' fitted, but did not explain its statistics: withdrawn."
                      if name in named.dropped else
-                     f"'{name}' fitted, but did not improve predictions of held-out samples: "
-                     'left out.')
+                     f"'{name}' fitted, but did not improve predictions of held-out samples, "
+                     'or its size is not determined: left out.')
     if uncovered:
         notes.append(left_out_note(uncovered, samples.n - uncovered))
     duration = float(samples.t[-1] - samples.t[0])

@@ -16,9 +16,10 @@ import numpy.typing as npt
 from ou_monitor.criticism.composite import Composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import decision
-from ou_monitor.discovery.fitting import is_trend
+from ou_monitor.discovery.fitting import is_trend, standard_errors
 from ou_monitor.discovery.gain import cause_gain, held_out, HeldOut, without
 from ou_monitor.discovery.search import outside_range, position
+from ou_monitor.discovery.words import is_vague
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.term import Term
 from ou_monitor.records import NAN
@@ -62,6 +63,7 @@ def prune_by_gain(samples: Samples, model: Composite, names: Sequence[str], plai
     for turn in range(_ROUNDS):
         state.worth = []
         try:
+            _leave_out_vague(samples, state)
             _measure(samples, state, plain, scored, lambda share: progress(
                 1.0 - 0.5 ** turn * (1.0 - 0.5 * share)))
         except KeyboardInterrupt:
@@ -79,6 +81,23 @@ def prune_by_gain(samples: Samples, model: Composite, names: Sequence[str], plai
             return state
         _leave_out(state, worst)
     return state
+
+
+def _leave_out_vague(samples: Samples, state: Pruned) -> None:
+    """Remove causes whose size is not determined, and lines whose frequency or width is not."""
+    for k in reversed(range(len(state.names))):
+        at = position(state.full.model, state.names, k)
+        term = state.full.model.terms[at]
+        errors = standard_errors(samples, state.full.model, slice(0, samples.n))[at]
+        line = term.FAMILY == 'line'
+        sizes = [is_vague(value, errors.get(name)) for name, value in term.values().items()
+                 if term.positive(name) and (line or term.unit(name) in ('V', 'V/sqrt(s)'))]
+        less = without(samples, state.full.model, at) if any(sizes) and (
+            line or all(sizes)) else None
+        if less is not None:
+            state.worth = [Worth(less=held_out(samples, less))] * len(state.names)
+            _leave_out(state, k)
+    state.worth = []
 
 
 def _leave_out(state: Pruned, worst: int) -> None:

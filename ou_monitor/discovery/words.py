@@ -82,7 +82,7 @@ def with_error(value: Any, error: Any, *, positive: bool = False) -> str:
     """
     Return a number, or a list of numbers, with its standard error if known.
 
-    A positive number is "not determined" if its error exceeds `LARGEST_LOG_SE`, as in `Estimate`.
+    A positive number may be "not determined", see `is_vague`.
     """
     if isinstance(value, list):
         errors = error if isinstance(error, list) else [None] * len(value)
@@ -91,11 +91,17 @@ def with_error(value: Any, error: Any, *, positive: bool = False) -> str:
     if error == math.inf:
         return 'beyond what the recording shows'
     if isinstance(error, float) and math.isfinite(error) and error > 0.0:
-        if positive and 0.0 < LARGEST_LOG_SE * value < error:
+        if positive and is_vague(value, error):
             return 'not determined'
         digits = min(max(2 + math.floor(math.log10(max(abs(value) / error, 1.0))), 2), 6)
         return f'{number(value, digits)} +- {number(error, 2)}'
     return number(value, 4)
+
+
+def is_vague(value: Any, error: Any) -> bool:
+    """Return whether the error of a positive number exceeds `LARGEST_LOG_SE`, as in `Estimate`."""
+    return (isinstance(value, float) and isinstance(error, float)
+            and 0.0 < LARGEST_LOG_SE * value < error)
 
 
 def _unit(term: Term, name: str) -> str:

@@ -1,10 +1,13 @@
 """Invalid readings (codes, single bad samples, units of throttle): left out, with a note."""
 
+from dataclasses import replace
 import math
 import warnings
 
 import numpy as np
-from ou_monitor.criticism.readings import find_bad, usable, why_nothing
+from ou_monitor.analysis.analyze import analyze
+from ou_monitor.criticism.integrity import examine
+from ou_monitor.criticism.readings import find_bad, two_levels, usable, why_nothing
 from ou_monitor.discovery.discover import discover
 from ou_monitor.discovery.finding import Verdict
 from ou_monitor.model.ou import simulate
@@ -124,3 +127,24 @@ def test_throttle_in_other_units_gives_the_same_sag():
     assert 'percent' in note
     said = discover(Recording(T, rail(), 65535.0 * np.linspace(0.0, 1.0, N), 'counts')).notes
     assert any('Throttle is not usable: load_dependent_alpha' in note for note in said)
+
+
+@pytest.mark.parametrize('apart, moves, found', [
+    (0.1, lambda k: k % 1600 < 800, True), (0.1, lambda k: k % 800 < 60, True),
+    # Too close; once only; rare pulses; a change with each sample; a slope; a sine; ADC codes.
+    (0.03, lambda k: k % 1600 < 800, False), (0.1, lambda k: k < 4000, False),
+    (0.1, lambda k: k % 800 < 20, False), (0.1, lambda k: k % 2, False),
+    (0.1, lambda k: k / 8000, False), (0.1, lambda k: np.sin(0.01 * k), False),
+    (0.0, lambda k: k, False)])
+def test_a_switched_voltage_without_a_load_is_noted(apart, moves, found):
+    """Noise of 10 mV about one or two levels."""
+    k = np.arange(8000)
+    v = 12.0 + apart * moves(k) + simulate(1e-3 * k, 200.0, 0.2, np.random.default_rng(1))
+    assert bool(two_levels(v)) is found
+    assert two_levels(np.round(v, 1)) == two_levels(v[:1]) == two_levels(v[:0]) == ''
+    if found:
+        recording = Recording(1e-3 * k, v, np.full(k.size, np.nan), 'bench')
+        assert two_levels(v) in analyze(recording).notes
+        assert two_levels(v) in examine(recording).notes
+        load = replace(recording, throttle=moves(k).astype(float))
+        assert two_levels(v) not in (*analyze(load).notes, *examine(load).notes)

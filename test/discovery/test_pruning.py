@@ -61,6 +61,7 @@ def run(monkeypatch, values, names):
     """Return what is left, with (gain, chance) of each cause in each round; error 0.01."""
     rounds = iter(values)
     monkeypatch.setattr(pruning, 'held_out', lambda samples, model: scored_model(*names))
+    monkeypatch.setattr(pruning, '_leave_out_vague', lambda samples, state: None)
     monkeypatch.setattr(pruning, '_straying', lambda samples, state: None)
     monkeypatch.setattr(pruning, '_as_trend', lambda *given: False)
 
@@ -73,6 +74,25 @@ def run(monkeypatch, values, names):
 
     monkeypatch.setattr(pruning, '_measure', measure)
     return prune_by_gain(None, None, names, None, None, lambda share: None)
+
+
+@pytest.mark.parametrize('name, errors, left_out', [
+    ('tone', {'amplitude': 0.1}, True), ('tone', {'amplitude': 0.001, 'frequency': 1e3}, True),
+    ('tone', {'amplitude': 0.001, 'frequency': 0.1, 'phase': 9.0}, False),
+    ('second_relaxation', {'sigma': 1.0}, True), ('second_relaxation', {'alpha': 99.0}, False),
+    ('drift', {'rate': 9.0}, False)])
+def test_a_cause_of_undetermined_size_is_left_out(name, errors, left_out, monkeypatch):
+    """Its size, or the frequency of a line, has an error beyond the largest; others stay."""
+    state = state_of('measurement_noise', name)
+    monkeypatch.setattr(pruning, 'standard_errors', lambda samples, model, part: [
+        {}, {'std': 0.001}, errors])
+    monkeypatch.setattr(pruning, 'without', lambda samples, model, at: SimpleNamespace(
+        terms=model.terms[:at] + model.terms[at + 1:]))
+    monkeypatch.setattr(pruning, 'held_out', lambda samples, model: SimpleNamespace(model=model))
+    pruning._leave_out_vague(SimpleNamespace(n=9), state)
+    assert state.out == [name] * left_out and state.worth == []
+    assert state.names == ['measurement_noise', name][:2 - left_out]
+    assert len(state.full.model.terms) == 1 + len(state.names)
 
 
 def test_the_worst_goes_first_and_the_others_are_measured_again(monkeypatch):
