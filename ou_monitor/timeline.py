@@ -319,7 +319,7 @@ def supplied(recording: Recording) -> Recording:
     wild = recording.voltage > WILD_FACTOR * usual
     if usual > 0.0 and wild.any() and wild.sum() <= _FEW * recording.n:
         recording = part_of(recording, ~wild, (
-            f'{counted(int(wild.sum()))} left out: up to {float(recording.voltage.max()):.4g} V, '
+            f'{counted(int(wild.sum()))} left out: up to {float(recording.voltage.max()):.6g} V, '
             f'where {usual:.3g} V is usual.'))
     t, v = recording.t, recording.voltage
     off = v < OFF * usual
