@@ -262,6 +262,8 @@ def coupling(recording: Given, signal: str | Series | Pairs, *,
         name = signal.name if name == 'signal' else name
         unit = '' if signal.unit == UNKNOWN else signal.unit
         signal = signal.t, signal.values
+    if len(signal) != 2 or not np.ndim(signal[0]):
+        raise InputError('the signal must be stamps and values, (t, values)')
     t, values = as_seconds(signal[0]), as_numbers(signal[1])
     limit, cells = _limit(recording, brownout_voltage, cells)
     try:

@@ -211,6 +211,9 @@ def test_the_limit_of_a_log_holds_in_python_too(monkeypatch):
     log = Recording(t, 15.5 + 0.01 * np.sin(9.0 * t), np.full(t.size, 0.4), 'log',
                     {'log_cells': '4', 'log_cell_minimum': '3.5'})
     assert coupling(log, (t, np.cos(t * 40.0))).supply.dips.limit_v == 14.0
+    for bare in (t, t[:2], t.tolist()):
+        with pytest.raises(InputError, match=r'\(t, values\)'):
+            coupling(log, bare)
     assert analyze(log).supply.dips.limit_v == 14.0
     assert analyze(log, cells=4).supply.dips.limit_v == pytest.approx(13.2)
     assert analyze(log, brownout_voltage=15.0).supply.dips.limit_v == 15.0

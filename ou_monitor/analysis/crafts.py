@@ -27,6 +27,8 @@ _USUAL = 2.0
 # A lithium cell at rest, V: highest after charging (LiHV 4.35 V, and 0.1 V for the sensor), lowest
 # without damage (a lead-acid cell has 2.1 V), and lowest at the beginning of a flight.
 HIGHEST_CELL, LOWEST_CELL, _BEGINS = 4.45, 2.5, 3.0
+# Cells of usual packs of LiFePO4, and the plateau of such a cell at rest, V.
+_IRON_CELLS, _IRON = (4, 8, 12, 16), (3.2, 3.45)
 # Voltage of an empty lithium cell under load, V (vbat_min_cell_voltage of Betaflight, and the
 # default of design).
 CELL_LIMIT = 3.3
@@ -218,7 +220,9 @@ def craft_line(craft: Craft) -> str:
                 + ('' if one.verdict == 'usual' else f' (usual: {low} to {high})'))
     if not found:
         return ''
-    source = {'log': ' (from the log)', 'guessed': ' (from the voltage)'}.get(craft.cells_from, '')
+    iron = next((n for n in _IRON_CELLS if _IRON[0] <= craft.full_v / n <= _IRON[1]), 0)
+    source = {'log': ' (from the log)', 'guessed': ' of LiPo (from the voltage)' + (
+        f' or {iron} of LiFePO4' if iron > craft.cells else '')}.get(craft.cells_from, '')
     return f'{counted(craft.cells, "cell")}{source}, ' + '; or '.join(
         f'class "{kind}": {"; ".join(words)}' for kind, words in found.items())
 

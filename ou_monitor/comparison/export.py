@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 import json
 import math
+import re
 
 import numpy as np
 from ou_monitor.comparison.compare import compare
@@ -62,6 +63,7 @@ class _Numbers:
     share: float  # Usual load, as a share of the load at full throttle
     sag: float  # Sag at full throttle, V
     usual_sag: float  # Sag under the usual load, V
+    stated: float = math.nan  # Capacity that the recording states, Ah
 
 
 def export(model: SupplyModel, target: str, *, throttle: FloatArray, rate: float,
@@ -76,7 +78,7 @@ def export(model: SupplyModel, target: str, *, throttle: FloatArray, rate: float
         data = {'model': [{'term': t.NAME, 'params': t.values()} for t in model.terms],
                 'load': None if model.load is None else model.load.values()}
         return Export(json.dumps(data, indent=1, allow_nan=False), (), model)
-    n = _numbers(model, throttle)
+    n = replace(_numbers(model, throttle), stated=_stated(recording))
     known = not math.isnan(full_current)
     if known and not 0.0 < full_current < math.inf:
         raise InputError(f'--full-current must be above 0 A, got {full_current:g}')
@@ -95,6 +97,9 @@ def export(model: SupplyModel, target: str, *, throttle: FloatArray, rate: float
     notes += [f'load_sag is as at the start: in the model, it grows by {t.growth:.3g} V/s at '
               'full throttle' for t in model.terms
               if target != 'px4' and isinstance(t, LoadSag) and t.growth]
+    if target != 'px4' and math.isnan(n.stated):
+        notes.append(f'the capacity, {_capacity(n, full_current):.3g} Ah, is estimated from the '
+                     'fall of the voltage: replace it by what the pack states')
     if recording is not None:
         notes += _cost(model, left, recording)
     return Export(text, tuple(notes), left)
@@ -122,6 +127,13 @@ def _numbers(model: SupplyModel, throttle: FloatArray) -> _Numbers:
                     sag(np.ones(1)), sag(throttle))
 
 
+def _stated(recording: Recording | None) -> float:
+    """Return the capacity that the log of a recording states, Ah; otherwise NaN."""
+    source = {} if recording is None else recording.source
+    text = source.get('capacity_mah', source.get('log_capacity_mah', ''))
+    return float(text) / 1e3 if re.fullmatch('[1-9][0-9]{0,6}', text) else math.nan
+
+
 def _px4(n: _Numbers, full_current: float) -> str:
     return '\n'.join((
         f'# {SOURCES["px4"]}', f'param set BAT1_N_CELLS {n.cells}',
@@ -134,6 +146,8 @@ def _px4(n: _Numbers, full_current: float) -> str:
 
 def _capacity(n: _Numbers, full_current: float) -> float:
     """Return the capacity of the pack, Ah."""
+    if math.isfinite(n.stated):
+        return n.stated
     if not (math.isfinite(n.charge) and math.isfinite(n.drain)) or not n.charge > 0.0:
         raise InputError('the model does not say how fast throttle empties the pack (load): '
                          'no capacity can be given')

@@ -182,7 +182,9 @@ def _numbers(analysis: Analysis) -> list[str]:
         taus = sorted(1e3 / e.alpha for e in steady)
         apart.append(f'tau is {number(taus[0])} to {number(taus[-1])} ms')
     if apart:
-        found.append(f'At steady throttle {listed(apart)}: the values above also describe what '
+        where = ('At steady throttle' if analysis.recording.has_throttle else
+                 'Over the whole recording')
+        found.append(f'{where} {listed(apart)}: the values above also describe what '
                      'follows changes of load, or lines.')
     return found
 

@@ -42,6 +42,17 @@ def test_given_cells_override_the_log_and_the_log_the_guess():
         assert stated_limit({'log_cells': cells, 'log_cell_minimum': low}) is None
 
 
+@pytest.mark.parametrize('volts, other', [
+    (13.2, '4 of LiFePO4'), (26.6, '8 of LiFePO4'), (12.6, ''), (16.5, ''), (25.2, '')])
+def test_cells_of_the_other_chemistry(volts, other):
+    """Where a usual pack of LiFePO4 rests at that voltage."""
+    one = flown(cells=1)
+    one = replace(one, voltage=volts - 0.1 * one.throttle + 0.01 * (one.voltage - 4.1))
+    said = craft_line(craft_of(one, supply_facts(one)))
+    assert 'of LiPo (from the voltage)' in said and ('LiFePO4' in said) == bool(other)
+    assert other in said and 'LiPo' not in craft_line(craft_of(one, supply_facts(one), 6))
+
+
 def test_values_are_called_usual_high_or_low():
     """Against the median of a class, a cell; a reason and a remedy where it is not usual."""
     middle = {name: np.nanmedian([row[k] / row[0] for row in KNOWN[QUAD].values()])

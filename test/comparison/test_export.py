@@ -12,6 +12,7 @@ from ou_monitor.errors import InputError
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
+from ou_monitor.records import Recording
 from ou_monitor.recordings.model_file import read_model
 from ou_monitor.recordings.read import read_recording
 import pytest
@@ -67,6 +68,20 @@ def test_ardupilot_has_charge_and_resistance():
     assert 60.0 * resistance == pytest.approx(sag.linear + sag.square, rel=1e-3)
     with pytest.raises(InputError, match='--full-current'):
         export(GECKO, 'ardupilot', throttle=HOVER, rate=100.0)
+
+
+@pytest.mark.parametrize('source, stated', [
+    ({'capacity_mah': '3700'}, True), ({'log_capacity_mah': '3700'}, True),
+    ({'capacity_mah': 'much'}, False), ({}, False)])
+def test_a_stated_capacity_is_kept(source, stated):
+    """Otherwise a note says that it is an estimate."""
+    t = np.arange(2000) / 100.0
+    flown = Recording(t, GECKO.simulate(t, np.random.default_rng(1), HOVER), HOVER, 'x',
+                      source=source)
+    found = export(GECKO, 'ardupilot', throttle=HOVER, rate=100.0, full_current=60.0,
+                   recording=flown)
+    assert (parameters(found.text)['BATT_CAPACITY'] == 3700.0) is stated
+    assert any('capacity' in note for note in found.notes) is not stated
 
 
 @pytest.mark.parametrize('target', ['gazebo', 'ardupilot'])

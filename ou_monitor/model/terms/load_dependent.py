@@ -291,11 +291,11 @@ class LoadDependentNoise(Term):
     APART: ClassVar[int] = by_parameters(0, lambda term: len(term.at) - len(set(term.number)))
     CHANGES: ClassVar[type[Term] | None] = MeasurementNoise
     MEANING: ClassVar[str] = (
-        'The white noise of the readings grows with throttle or its changes: the ADC samples the '
-        'ripple of the ESCs.')
+        'The white noise of the readings grows with throttle or its changes: ripple of the ESCs, '
+        'or a rail that relaxes faster than the sampling, which looks the same.')
     REMEDY: ClassVar[str] = (
-        'Add capacitance at the ESCs or a filter before the ADC; give readings at high throttle '
-        'less weight.')
+        'Sample faster to tell them apart; against ripple, add capacitance at the ESCs or a '
+        'filter before the ADC. Give readings at high throttle less weight.')
     SEPARATED_BY: ClassVar[str] = (
         'the same flight at several times the sampling rate: white noise stays uncorrelated')
 

@@ -27,9 +27,12 @@ class MeasurementNoise(Term):
     FREE: ClassVar[tuple[str, ...]] = ('std',)
     SIGNS: ClassVar[tuple[str, ...]] = ('-autocorrelation', '+band')
     MAY_LEAVE: ClassVar[float] = 0.3
-    MEANING: ClassVar[str] = 'The sensor adds white noise to the voltage of the rail.'
+    MEANING: ClassVar[str] = (
+        'The readings have white noise: of the sensor, or of a rail that relaxes faster than the '
+        'sampling, which looks the same.')
     REMEDY: ClassVar[str] = (
-        'Average in the ADC or use a finer range; alpha and sigma fitted without it are too high.')
+        'Sample faster to tell them apart; if it is the sensor, average in the ADC or use a finer '
+        'range. Alpha and sigma fitted without it are too high.')
     SEPARATED_BY: ClassVar[str] = (
         'the same rail at several times the sampling rate, or the input of the ADC shorted')
 

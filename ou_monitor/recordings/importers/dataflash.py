@@ -251,15 +251,18 @@ def _lost_text(log: Any) -> list[str]:
 
 
 def _cells(parameters: dict[str, float]) -> dict[str, str]:
-    """Return the number of cells, from MOT_BAT_VOLT_MAX, and the lowest voltage of a cell."""
-    full = parameters.get('MOT_BAT_VOLT_MAX', 0.0)
+    """Return the capacity, the cells, from MOT_BAT_VOLT_MAX, and a cell's lowest voltage."""
+    full, capacity = (parameters.get(name, 0.0) for name in ('MOT_BAT_VOLT_MAX', 'BATT_CAPACITY'))
+    # The default, 3300, says nothing about the pack.
+    facts = {'capacity_mah': f'{capacity:.0f}'} if capacity > 0.0 and capacity != 3300.0 else {}
     if not full > 3.0:
-        return {}
+        return facts
     cells = round(full / 4.2)
     low = next((parameters[name] / cells for name in (
         'BATT_CRT_VOLT', 'BATT_LOW_VOLT', 'FS_BATT_VOLTAGE') if parameters.get(name, 0.0) > 0.0),
         0.0)
-    return {'cells': f'{cells}', **({'cell_minimum': f'{low:.4g}'} if 2.0 < low < 4.0 else {})}
+    return {**facts, 'cells': f'{cells}',
+            **({'cell_minimum': f'{low:.4g}'} if 2.0 < low < 4.0 else {})}
 
 
 def _facts(banner: list[str]) -> dict[str, str]:

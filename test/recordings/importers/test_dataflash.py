@@ -6,6 +6,7 @@ from made_logs import copter, Dataflash, load, named, outcomes_of_flipped_bytes
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.choose import choose
+from ou_monitor.recordings.importers.dataflash import _cells
 import pytest
 
 
@@ -180,3 +181,13 @@ def test_throttle_of_copters_until_2015(tmp_path, kind, columns, name):
     throttle = choose(path, found).throttle
     assert throttle.name == name
     np.testing.assert_allclose(throttle.values, (350 + np.arange(50)) / 1000.0)
+
+
+@pytest.mark.parametrize('stated, found', [
+    ({'BATT_CAPACITY': 3700.0}, {'capacity_mah': '3700'}), ({'BATT_CAPACITY': 3300.0}, {}),
+    ({'BATT_CAPACITY': 0.0}, {}), ({'MOT_BAT_VOLT_MAX': 16.8}, {'cells': '4'}),
+    ({'MOT_BAT_VOLT_MAX': 16.8, 'BATT_CAPACITY': 1500.0},
+     {'capacity_mah': '1500', 'cells': '4'})])
+def test_the_pack_of_the_parameters(stated, found):
+    """The default capacity, 3300 mAh, is no statement."""
+    assert _cells(stated) == found
