@@ -61,6 +61,10 @@ class Scale:
             self.low, self.high, count)
 
 
+# A logarithmic axis shorter than this factor has even ticks.
+_SHORT = 10.0 ** 0.7
+
+
 def linear_ticks(low: float, high: float, count: int = 6) -> list[float]:
     """Return multiples of 1, 2 or 5 times a power of ten."""
     rough = (high - low) / max(count, 1)
@@ -74,7 +78,7 @@ def log_ticks(low: float, high: float) -> list[float]:
     """Return powers of ten, and their multiples of 2 and 5 if the axis is short."""
     first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
     decades = math.log10(high / low)
-    if decades < 0.7:
+    if high < low * _SHORT:
         return linear_ticks(low, high, 5)
     marks = (1.0, 2.0, 5.0) if decades < 2.5 else (1.0,)
     stride = max(1, math.ceil(decades / 8.0))
@@ -306,7 +310,7 @@ class Plot:
         named = short(self.names, (right - _LEFT) / max(len(self.names), 1))
         for ticks, scale, across in ((places if named else x.ticks(7), x, True),
                                      (y.ticks(5), y, False)):
-            uneven = scale.log or len(ticks) < 2
+            uneven = len(ticks) < 2 or scale.log and scale.high >= scale.low * _SHORT
             for value in ticks:
                 step = abs(value) if uneven else ticks[1] - ticks[0]
                 text = named[round(value) - 1] if across and named else tick_text(

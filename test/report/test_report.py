@@ -54,6 +54,15 @@ def test_ticks_have_the_decimals_of_their_step(value, step, text):
     assert tick_text(value, step) == text
 
 
+@pytest.mark.parametrize('low, high', [(0.19, 0.27), (0.2, 0.9), (0.1, 30.0)])
+def test_no_two_ticks_of_an_axis_have_the_same_text(low, high):
+    """A logarithmic axis, short or long."""
+    plot = Plot('', 'x', 'y', log_y=True)
+    drawing = plot.line(np.array([0.0, 1.0]), np.array([low, high]), 'one', 0).svg()
+    texts = re.findall(r'class="tick"[^>]*text-anchor="end"[^>]*>([^<]+)<', drawing)
+    assert len(texts) > 1 and len(set(texts)) == len(texts)
+
+
 def test_scale_maps_ends_to_pixels():
     """Linear and logarithmic; what a log axis cannot show is NaN."""
     assert list(Scale(0.0, 10.0, 60.0, 160.0)(np.array([0.0, 5.0, 10.0]))) == [60.0, 110.0, 160.0]
