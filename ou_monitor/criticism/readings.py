@@ -1,5 +1,5 @@
 """
-Clean the readings of a recording: drop error codes and bad samples, convert throttle to 0..1.
+Clean the readings of a recording: drop error codes, bad samples and implausible throttle.
 
 Each correction adds a note.
 """
@@ -33,9 +33,8 @@ _ODD, _ODD_SHARE = 3, 1e-3
 _LARGEST, _SMALLEST = 1e30, 1e-30
 # Median above which volts may be millivolts.
 _MILLIVOLTS = 1000.0
-# Ranges of throttle as 0..1 with trim, as a percentage, and in microseconds of a servo pulse.
-_UNIT, _PERCENT, _PULSE = (-1.5, 1.5), (-1.0, 150.0), (700.0, 2400.0)
-_EDGE = 0.05  # Tolerance of the range 0..1
+# Largest throttle, with trim, and tolerance of the range 0..1; the readers refuse other units.
+_MOST, _EDGE = 1.5, 0.05
 # Maximum gap in a current, s; quantile of its size that counts as full load; lags of the mean
 # response to a load, s.
 _HOLE, _FULL, _LAGS = 1.0, 0.99, np.array([0.02, 0.2, 2.0])
@@ -67,7 +66,7 @@ def usable(recording: Recording, notes: list[str]
                      'millivolts or counts of the ADC, every result in V is wrong by that factor; '
                      'give it in volts.')
     if u is not None:
-        u = _held(t, _as_share(u, notes), notes) if np.isfinite(u).any() else None
+        u = _held(t, _within(u, notes), notes) if np.isfinite(u).any() else None
     return t, v, u
 
 
@@ -257,37 +256,19 @@ def why_nothing(v: FloatArray) -> str:
     return ''
 
 
-def _as_share(u: FloatArray, notes: list[str]) -> FloatArray:
-    """Return throttle as 0..1, NaN where implausible; note the unit."""
-    known = u[np.isfinite(u)]
-    # A few wild values must not decide the unit.
-    low, high = _quantiles(known[::max(1, known.size // _EXAMINED)], 0.005, 0.995)
-    within = _UNIT
-    if _UNIT[0] <= low and high <= _UNIT[1]:
-        if low < -_EDGE or high > 1.0 + _EDGE:
-            notes.append(f'Throttle lies within {number(low)} to {number(high)}, not 0 to 1: used '
-                         'as it is.')
-    elif _PULSE[0] <= low and high <= _PULSE[1]:
-        u = (u - 1000.0) / 1000.0
-        notes.append(f'Throttle lies within {number(low, 4)} to {number(high, 4)}: taken as '
-                     'pulses in microseconds, throttle = (value - 1000) / 1000. All results, and '
-                     'the model file, are for throttle 0 to 1.')
-        within = ((_PULSE[0] - 1000.0) / 1000.0, (_PULSE[1] - 1000.0) / 1000.0)
-    elif _PERCENT[0] <= low and high <= _PERCENT[1]:
-        u = u / 100.0
-        notes.append(f'Throttle lies within {number(low)} to {number(high)}: taken as percent, '
-                     'throttle = value / 100. All results, and the model file, are for throttle '
-                     '0 to 1.')
-    else:
-        notes.append(f'Throttle lies within {number(low)} to {number(high)}, an unknown unit: '
-                     'not used. Give it as 0 to 1.')
-        return np.full(u.size, np.nan)
+def _within(u: FloatArray, notes: list[str]) -> FloatArray:
+    """Return throttle, NaN where it is far outside 0..1, and note values outside."""
     with np.errstate(invalid='ignore'):
-        wild = np.isfinite(u) & ((u < within[0]) | (u > within[1]))
+        wild = np.abs(u) > _MOST
     if wild.any():
         notes.append(f'Throttle is far outside its range at {counted(int(wild.sum()), "sample")}: '
                      'taken as unknown there.')
         u = np.where(wild, np.nan, u)
+    known = u[np.isfinite(u)]
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    if low < -_EDGE or high > 1.0 + _EDGE:
+        notes.append(f'Throttle lies within {number(low)} to {number(high)}, not 0 to 1: used '
+                     'as it is.')
     return u
 
 

@@ -85,43 +85,22 @@ def throttle(u, t=None):
 
 @pytest.mark.parametrize('low, high, word', [
     (0.0, 1.0, ''), (-0.05, 1.05, ''), (-0.06, 1.0, 'not 0 to 1'), (0.0, 1.06, 'not 0 to 1'),
-    (-1.5, 1.5, 'not 0 to 1'), (0.0, 1.6, 'percent'), (-1.0, 150.0, 'percent'),
-    (0.0, 151.0, 'unknown unit'), (-1.6, 1.0, 'unknown unit'), (700.0, 2400.0, 'microseconds'),
-    (699.0, 2000.0, 'unknown unit'), (1000.0, 2401.0, 'unknown unit')])
-def test_the_unit_of_throttle_follows_from_its_range(low, high, word):
+    (-1.5, 1.5, 'not 0 to 1')])
+def test_throttle_outside_its_range_is_noted(low, high, word):
     raw = np.linspace(low, high, 101)
-    raw[:3], raw[-3:] = low, high
     u, notes = throttle(raw)
     assert (word in notes) if word else notes == ''
-    expected = {'percent': raw / 100.0, 'microseconds': (raw - 1000.0) / 1000.0}.get(word, raw)
-    if word == 'unknown unit':
-        assert u is None
-    else:
-        np.testing.assert_allclose(u, expected)
+    np.testing.assert_array_equal(u, raw)
 
 
-@pytest.mark.parametrize('wild, word', [(4, '4 samples'), (6, 'unknown unit')])
-def test_half_a_percent_of_wild_values_is_no_unit(wild, word):
-    raw = np.linspace(0.0, 1.0, 1001)
-    raw[500:500 + wild] = 1e4
-    u, notes = throttle(raw)
-    assert word in notes
-    if word != 'unknown unit':
-        assert (u[500:500 + wild] == raw[499]).all()
-
-
-@pytest.mark.parametrize('unit, inside, outside', [
-    (lambda x: x, (-1.4, 1.4), (-1.6, 1.6)), (lambda x: 1000.0 + 1000.0 * x, (-0.29, 1.39),
-                                              (-0.31, 1.41)),
-    (lambda x: 100.0 * x, (-1.4, 1.4), (-1.6, 1.6))])
-def test_throttle_beyond_its_range_is_unknown(unit, inside, outside):
+@pytest.mark.parametrize('values, holes', [((-1.4, 1.4), 0), ((-1.6, 1.6), 2), ((1e4, -9.0), 2)])
+def test_throttle_beyond_its_range_is_unknown(values, holes):
     share = np.linspace(0.0, 1.0, 1001)
-    for values, holes in ((inside, 0), (outside, 2)):
-        some = share.copy()
-        some[[400, 700]] = values
-        u, notes = throttle(unit(some))
-        assert ('far outside its range at 2 samples' in notes) == bool(holes)
-        np.testing.assert_allclose(u[[400, 700]], share[[399, 699]] if holes else values)
+    some = share.copy()
+    some[[400, 700]] = values
+    u, notes = throttle(some)
+    assert ('far outside its range at 2 samples' in notes) == bool(holes)
+    np.testing.assert_allclose(u[[400, 700]], share[[399, 699]] if holes else values)
 
 
 def test_holes_of_throttle_are_held_and_measured():
