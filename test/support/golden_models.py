@@ -115,7 +115,7 @@ def _recordings():
         'squeezed': (t, np.minimum(v, 5.0) + 0.005 * np.log1p(np.maximum(v - 5.0, 0.0) / 0.005),
                      u), 'held': (t, np.repeat(v[::4], 4), u),
         'jittered': (np.sort(t + 2e-4 * noise), v, u), 'lost': (t[lost], v[lost], u[lost]),
-        'glitched': (t, glitched, 100.0 * u), 'still': (t, v, 0.0 * u + 0.4),
+        'glitched': (t, glitched, u), 'still': (t, v, 0.0 * u + 0.4),
         'none': (t, v, np.full(t.size, math.nan)), 'fast': (long_t, long_v, 0.0 * long_v)}
 
 
