@@ -16,7 +16,8 @@ import math
 import numpy as np
 from ou_monitor.analysis.levels import GAP_STEPS
 from ou_monitor.online.estimator.quality import examine
-from ou_monitor.records import defect_of, Estimate, Flag, Recording, Severity, Status
+from ou_monitor.records import (
+    clock_unit, defect_of, Estimate, Flag, Recording, Severity, Status)
 from ou_monitor.text import counted, Z95
 from ou_monitor.timeline import TAIL
 
@@ -98,7 +99,8 @@ def _of_units(recording: Recording) -> list[QualityItem]:
             'The voltage is negative throughout, so lowest voltage, sag and risk have no meaning: '
             'swap the leads of the sensor, or change the sign.')))
     step = float(np.median(np.diff(recording.t))) if recording.n > 1 else 0.0
-    if step > _LONG_STEP or (step > _SLOW and recording.duration > _LONG_FLIGHT):
+    slow = step > _LONG_STEP or (step > _SLOW and recording.duration > _LONG_FLIGHT)
+    if slow and not clock_unit(recording.t[0]):
         items.append(QualityItem('TIME_UNIT', Severity.WARNING, (
             f'The samples are {step:.3g} s apart, over {recording.duration / 3600.0:.3g} hours: '
             'is the time in ms or us? If so, all rates and times are wrong by a factor of 1000 or '

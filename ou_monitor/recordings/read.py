@@ -22,7 +22,7 @@ from ou_monitor.recordings.importers.csv_table import read_column, read_csv
 from ou_monitor.recordings.importers.formats import import_log, is_csv, is_log
 from ou_monitor.recordings.importers.log import (
     CsvColumns, Log, RawColumns, Request, Series, SIGNAL)
-from ou_monitor.records import defect_of, Recording
+from ou_monitor.records import clock_unit, defect_of, Recording
 from ou_monitor.text import outside_words, part_words
 from ou_monitor.timeline import (
     check_throttle, in_order, MOST_CURRENT, MOST_THROTTLE, MOST_VOLTAGE, part_of, plausible,
@@ -166,9 +166,9 @@ def tidy(raw: RawColumns) -> Recording:
     notes, t = [*raw.notes, *said], t[which]
     if not t.size:
         raise InputError(_unusable(name, notes))
-    # Cheap test first: with this median spacing, the mean is at least half of it.
-    if t.size > 2 and t[-1] - t[0] >= 0.5 * _SPARSE * (t.size - 1) - 1.0 and (
-            spacing := float(np.median(np.diff(t)))) >= _SPARSE:
+    # Dates are in s.  Cheap test first: with this median spacing, the mean is at least half of it.
+    if (t.size > 2 and t[-1] - t[0] >= 0.5 * _SPARSE * (t.size - 1) - 1.0 and not clock_unit(t[0])
+            and (spacing := float(np.median(np.diff(t)))) >= _SPARSE):
         notes.append(f'The samples are {spacing:.4g} s apart: is the time in ms, us or ns? '
                      'Give --time-unit for a CSV.')
     current = None if raw.current is None else plausible(raw.current[which], MOST_CURRENT)

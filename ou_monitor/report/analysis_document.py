@@ -147,13 +147,7 @@ def _origin(analysis: Analysis) -> list[tuple[str, str]]:
     recording = analysis.recording
     source, found = recording.source, []
     if source and 'voltage_topic' not in source:
-        columns = {'voltage': 'column voltage_v'}
-        if recording.has_throttle:
-            columns['throttle'] = 'column throttle'
-        if recording.current is not None:
-            columns['current'] = 'column current_a'
-        names = {**dict.fromkeys(('voltage', 'throttle'), 'none'), **(
-            source if 'voltage' in source else columns)}
+        names = {**dict.fromkeys(('voltage', 'throttle'), 'none'), **source}
         return [('Read from', '; '.join(f'{name}: {names[name]}' for name in (
             'voltage', 'throttle', 'current') if name in names))]
     for name in ('voltage', 'throttle'):

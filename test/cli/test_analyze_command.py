@@ -71,8 +71,8 @@ def test_it_says_where_voltage_and_throttle_came_from(flight, tmp_path, capsys):
     rng = np.random.default_rng(1)
     write_csv(alone, np.arange(600) / 100.0, 5.0 + 0.01 * rng.normal(size=600))
     for path, words in (
-            (flight, r'voltage: column voltage_v; throttle: column throttle'),
-            (alone, r'voltage: column voltage_v; throttle: none'),
+            (flight, r'voltage: voltage_v; throttle: throttle'),
+            (alone, r'voltage: voltage_v; throttle: none'),
             (ROOT / 'bags' / 'transient', r'voltage: /\S+ \(\w+\.\w+\); throttle: /\S+ '
              r'\(Float32\.data\); config: \w+')):
         assert main(['analyze', str(path)]) == 0

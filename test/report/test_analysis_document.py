@@ -25,10 +25,14 @@ def test_headline_warns_of_what_changes_its_own_numbers():
     assert not any('Beware' in one for one in answer(analyze(simulated)))
     sentence = answer(analyze(replace(simulated, voltage=1e3 * simulated.voltage)))[-1]
     assert sentence == ('Beware: the voltages seem to be millivolts or counts, not volts.')
-    found = analyze(replace(simulated, t=1e3 * simulated.t[::20], voltage=simulated.voltage[::20],
-                            throttle=simulated.throttle[::20], current=None))
+    slow = replace(simulated, t=1e3 * simulated.t[::20], voltage=simulated.voltage[::20],
+                   throttle=simulated.throttle[::20], current=None)
+    found = analyze(slow)
     assert answer(found)[-1] == 'Beware: the time seems to be in ms or us, not in s.'
     assert 'TIME_UNIT' in {item.name for item in found.quality}
+    # Dates since 1970 are in s.
+    dated = analyze(replace(slow, t=1.7e9 + slow.t))
+    assert 'TIME_UNIT' not in {item.name for item in dated.quality}
 
 
 def test_the_same_caution_of_two_levels_is_said_once(analysis):

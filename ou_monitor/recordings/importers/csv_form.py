@@ -78,7 +78,7 @@ SCALES = {**TIME_UNITS, 'min': 60.0, 'h': 3600.0, 'd': 86400.0, 'V': 1.0, 'dV': 
           'uA': 1e-6, '%': 0.01}
 # A quantity with one of these words at the end of its name, preferably in brackets.  Repetitions
 # after the quantity are bounded, so that the time is proportional to the length of a name.
-_WORD = '|'.join(sorted(WORDS.keys() - _LONG.split('|'), key=len, reverse=True)).join('()')
+_WORD = rf"({'|'.join(sorted(WORDS.keys() - _LONG.split('|'), key=len, reverse=True))})(?: dc)?"
 _WITH_UNIT = re.compile(
     rf'(.*(?:time|zeit|stamp|elapsed)|t)(?: ?[\[({{/_ ] ?| in )({_LONG})[\])}}]?|'
     rf'(.*?) ?[\[({{] ?{_WORD} ?[\])}}]|(.+?) in {_WORD}|(.[^/]*?|.+? ) ?/ ?{_WORD}|'
@@ -349,8 +349,9 @@ def unit_of(name: str) -> tuple[str, str]:
         text = found[1] + (found[3] or '') + (found[5] or '')
     if found := re.match(r'(milli(?:second)?s|micro(?:second)?s|[mun]s)(?![a-z])', text.lower()):
         return text, found[1]
-    found = _WITH_UNIT.fullmatch(text.lower()) or re.fullmatch(r'(CH\d+)(V|A)', text)
-    if found is None or CHANNEL.fullmatch(text):
+    found = None if CHANNEL.fullmatch(text) else _WITH_UNIT.fullmatch(
+        text.lower()) or re.fullmatch(r'(CH\d+)(V|A)|(?=(\w+))(m?[VA]) DC', text)
+    if found is None:
         return text, ''
     quantity, unit = (part for part in found.groups() if part is not None)
     return quantity, unit.lower()

@@ -86,7 +86,8 @@ _PATTERNS = {
         r'current_a', r'amperage(?:_?latest)?|current_in|i_?bat(?:t|tery)?|'
         r'batt?(?:ery)?_?\d?_?(?:i|curr(?:ent)?|amps?)|current_?batt?(?:ery)?|'
         r'(?:.*_)?(?:bus|input|supply|main|pack|total)_?current|i_?bus|curr',
-        r'(?:i|curr(?:ent)?|amps?|strom|courant|corriente)(?:_(?:avg|average|mean))?(?:_?1)?'),
+        r'(?:i|curr(?:ent)?|amps?|strom|courant|corriente)(?:_(?:avg|average|mean))?(?:_?1)?|'
+        r'(?!.*(?:max|min|limit)).*_batt?(?:ery)?_current'),
 }
 # Column that identifies a program, '' for any -> ends of the names of its columns, in lower case:
 # factor, unit and the number of an unknown value.  Betaflight's blackbox explorer writes the
@@ -142,10 +143,8 @@ def read_csv(path: Path, columns: CsvColumns | None = None, *, partial: bool = F
     nothing = np.full(t.shape, np.nan)
     name = printable(path.name)
     held = {quantity: values for quantity, (_, values) in table.found.items()}
-    source = {'file': name, 'format': 'csv'}
-    if column.name != VOLTAGE:
-        source |= {quantity: printable(one.name) for quantity, (one, _) in table.found.items()
-                   if quantity != logs.CURRENT}
+    source = {'file': name, 'format': 'csv', **{
+        quantity: printable(one.name) for quantity, (one, _) in table.found.items()}}
     current = held.get(logs.CURRENT, nothing)
     if 2 * np.isfinite(current[np.isfinite(volts)]).sum() < np.isfinite(volts).sum():
         # Measured beside the voltage, not with it.
