@@ -84,16 +84,14 @@ def prune_by_gain(samples: Samples, model: Composite, names: Sequence[str], plai
 
 
 def _leave_out_vague(samples: Samples, state: Pruned) -> None:
-    """Remove causes whose size is not determined, and lines whose frequency or width is not."""
+    """Remove causes of which no size is determined."""
     for k in reversed(range(len(state.names))):
         at = position(state.full.model, state.names, k)
         term = state.full.model.terms[at]
         errors = standard_errors(samples, state.full.model, slice(0, samples.n))[at]
-        line = term.FAMILY == 'line'
         sizes = [is_vague(value, errors.get(name)) for name, value in term.values().items()
-                 if term.positive(name) and (line or term.unit(name) in ('V', 'V/sqrt(s)'))]
-        less = without(samples, state.full.model, at) if any(sizes) and (
-            line or all(sizes)) else None
+                 if term.positive(name) and term.unit(name) in ('V', 'V/sqrt(s)')]
+        less = without(samples, state.full.model, at) if sizes and all(sizes) else None
         if less is not None:
             state.worth = [Worth(less=held_out(samples, less))] * len(state.names)
             _leave_out(state, k)
