@@ -206,9 +206,10 @@ class SupplyMonitor:
             level *= math.exp(-max(t - self._on_at, 0.0) / _ANOTHER)
         self._pass_on(batch, came)
         now = self._forecast.voltage
-        if now >= _POWERED and before < OFF * now:
+        on = batch.y >= OFF * now
+        if now >= _POWERED and before < OFF * now and on.any():
             self._begin(self._line)
-            self._pass_on(Batch.of(batch.columns[:, batch.y >= OFF * now], True), came)
+            self._pass_on(Batch.of(batch.columns[:, on], True), came)
         self._level, self._on_at = level if level > now else now, t
 
     def _pass_on(self, batch: Batch, came: float) -> None:

@@ -207,6 +207,18 @@ def test_what_is_read_while_the_supply_is_off_teaches_nothing(at, off, size):
     assert float(load.noise(0.5)) == pytest.approx(0.02, rel=0.2)
 
 
+@given(st.lists(st.sampled_from([0.0, 0.05, 0.5, 2.1, 3.0, 12.0, 16.0, 400.0, -5.0, math.nan]),
+                min_size=1, max_size=40), st.integers(1, 5))
+@hypothesis_settings(max_examples=200, deadline=None)
+def test_no_voltages_stop_the_monitor(voltages, size):
+    """Whatever is plugged, pulled or misread."""
+    monitor = SupplyMonitor(MonitorSettings(brownout_voltage=10.0))
+    for begin in range(0, len(voltages), size):
+        part = voltages[begin:begin + size]
+        monitor.push(0.01 * (begin + np.arange(len(part))), part, 0.3)
+    assert monitor.report(0.0).restarts == 0
+
+
 def test_samples_that_nobody_can_place_reach_the_floor():
     monitor = SupplyMonitor(MonitorSettings(brownout_hold=0.0))
     monitor.watch([5.0, math.nan, 4.2, 4.2, 1e30, 4.2], 0.01 * np.arange(6))
