@@ -245,7 +245,8 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
     law = NoiseSize(load_signs(t.size, dt, u, i)[:, places])
     # First all readings have equal weights, then weights by the size of their noise.
     left = v
-    for again in range(3 if law.follows and v.size else 1):
+    basis = np.empty((0, v.size))
+    for again in range(0 if not v.size else 3 if law.follows else 1):
         if again:
             size = law.fit(_innovations(left))
         basis, left = _basis(rows / size), v / size
