@@ -19,6 +19,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import errno
+import math
 import os
 from pathlib import Path
 import re
@@ -124,6 +125,12 @@ def find_attribute(folder: Path, channel: str, what: str) -> Path | None:
                  if (folder / name).exists()), None)
 
 
+def channel_number(folder: Path, channel: str, what: str, missing: float) -> float:
+    """Return the number in an attribute of a channel."""
+    path = find_attribute(folder, channel, what)
+    return missing if path is None else number_of(path)
+
+
 # Polling rate where the driver does not state its own, Hz.
 USUAL_RATE = 10.0
 
@@ -143,10 +150,8 @@ class PolledChannel:
         self._path = known[self.channel]
         self._scale, self._offset = 1.0, 0.0
         if self._path.name.endswith('_raw'):
-            scale, offset = (find_attribute(folder, self.channel, what)
-                             for what in ('scale', 'offset'))
-            self._scale = 1.0 if scale is None else number_of(scale)
-            self._offset = 0.0 if offset is None else number_of(offset)
+            self._scale = channel_number(folder, self.channel, 'scale', 1.0)
+            self._offset = channel_number(folder, self.channel, 'offset', 0.0)
         interval = folder / 'update_interval'
         spacing = number_of(interval) if interval.exists() else 0.0
         self.rate = 1e3 / spacing if spacing > 0.0 else USUAL_RATE
@@ -172,16 +177,6 @@ class Element:
     bits: int
     storage: int
     shift: int
-
-    def integers(self, raw: npt.NDArray[np.unsignedinteger]) -> npt.NDArray[np.int64]:
-        """Return the numbers in stored words."""
-        stored = raw.astype(np.uint64) >> np.uint64(self.shift)
-        unused = np.uint64(64 - self.bits)
-        # Shift to the top and back: extends the sign, or masks the bits above.
-        top = stored << unused
-        if self.signed:
-            return top.view(np.int64) >> np.int64(unused)
-        return (top >> unused).astype(np.int64)
 
 
 def parse_element(name: str, index: int, kind: str) -> Element:
@@ -213,7 +208,14 @@ class Scan:
 
     def integers(self, data: bytes, name: str) -> npt.NDArray[np.int64]:
         """Return the numbers of one element in whole scans."""
-        return self._elements[name].integers(np.frombuffer(data, self._dtype)[name])
+        element = self._elements[name]
+        stored = np.frombuffer(data, self._dtype)[name].astype(np.uint64)
+        unused = np.uint64(64 - element.bits)
+        # Shift to the top and back: extends the sign, or masks the bits above.
+        top = (stored >> np.uint64(element.shift)) << unused
+        if element.signed:
+            return top.view(np.int64) >> np.int64(unused)
+        return (top >> unused).astype(np.int64)
 
     def volts(self, data: bytes, name: str, scale: float, offset: float) -> FloatArray:
         """Return one element of whole scans in V (scale in mV, as the kernel gives it)."""
@@ -270,18 +272,16 @@ class IioBuffer:
         write_attribute(folder / 'buffer/enable', 0)
         if trigger:
             write_attribute(folder / 'trigger/current_trigger', trigger)
-        own = find_attribute(folder, self.channel, 'sampling_frequency')
         if rate > 0.0:
+            own = find_attribute(folder, self.channel, 'sampling_frequency')
             write_attribute(own or folder / 'in_voltage_sampling_frequency', f'{rate:g}')
-        self.rate = float('nan') if own is None else number_of(own)
+        self.rate = channel_number(folder, self.channel, 'sampling_frequency', math.nan)
         self.block = block or (max(round(0.01 * self.rate), 1) if self.rate > 0.0 else 1)
-        scale, offset = (find_attribute(folder, self.channel, what)
-                         for what in ('scale', 'offset'))
-        if scale is None:
+        if find_attribute(folder, self.channel, 'scale') is None:
             raise InputError(f'{folder.name} does not say what a count of {self.channel} is '
                              f'(no {self.channel}_scale)')
-        self._scale = number_of(scale)
-        self._offset = 0.0 if offset is None else number_of(offset)
+        self._scale = channel_number(folder, self.channel, 'scale', math.nan)
+        self._offset = channel_number(folder, self.channel, 'offset', 0.0)
         self._elements = self._enable()
         self._scan = Scan(self._elements)
         self._clock = self._stamp_clock()
@@ -359,7 +359,7 @@ class IioBuffer:
     def _decode(self, data: bytes, now: float) -> Iterator[Block]:
         volts = self._scan.volts(data, self.channel, self._scale, self._offset)
         if self._clock is None:
-            yield Block(now, volts, float('nan'))
+            yield Block(now, volts, math.nan)
             return
         # Integers: nanoseconds since 1970 exceed the precision of a float.
         apart = 0 if self._clock == time.CLOCK_REALTIME else (
@@ -371,7 +371,7 @@ class IioBuffer:
         steps = np.diff(kernel, prepend=before)
         self._intervals += steps[1 if self._newest is None else 0:].tolist()
         self._newest = int(kernel[-1])
-        typical = float(np.median(self._intervals)) if self._intervals else float('nan')
+        typical = float(np.median(self._intervals)) if self._intervals else math.nan
         holes = np.flatnonzero(steps > HOLE * typical)
         self.holes += holes.size
         # A hole before the first sample does not split the block.

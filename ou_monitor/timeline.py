@@ -23,6 +23,7 @@ are fewer than four samples per reading and the ADC step exceeds 1.3 times the u
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, replace
 import math
 
@@ -30,7 +31,7 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.records import (
-    as_numbers, Counters, Defect, FloatArray, LEAST_STEP, LONGEST_STEP, MOST_STAMP, NAN, Note,
+    as_numbers, Counters, Defect, FloatArray, LEAST_STEP, LONGEST_STEP, NAN, Note,
     Recording)
 from ou_monitor.text import counted
 
@@ -247,16 +248,11 @@ class Repeats:
         return fresh
 
 
-def reading_period(y: FloatArray) -> float:
-    """Return the samples per reading of a voltage, V."""
-    first = max(0, (y.size - _MIDDLE) // 2)
-    return refresh_period(y[first:first + _MIDDLE])
-
-
 def reading_places(y: FloatArray) -> tuple[Picked, float]:
     """Return the places of new readings in a voltage, V, and samples per reading (1: all)."""
     repeats = Repeats()
-    repeats.period = reading_period(y)
+    first = max(0, (y.size - _MIDDLE) // 2)
+    repeats.period = refresh_period(y[first:first + _MIDDLE])
     if repeats.period <= 1.0:
         return slice(None), 1.0
     return np.flatnonzero(repeats.fresh(np.stack([np.empty(y.size), y]))), repeats.period
@@ -302,10 +298,7 @@ def readings_of(recording: Recording) -> Recording:
     logged = (recording.n - 1) / recording.duration
     note = (f'The voltage was read at {(t.size - 1) / float(t[-1] - t[0]):.4g} Hz and logged at '
             f'{logged:.4g} Hz: {held} repeats were left out.')
-    return replace(
-        recording, t=t, voltage=recording.voltage[places], throttle=recording.throttle[places],
-        current=None if recording.current is None else recording.current[places],
-        notes=(*recording.notes, note), held=recording.held + held)
+    return replace(part_of(recording, places, note), t=t, held=recording.held + held)
 
 
 def supplied(recording: Recording) -> Recording:
@@ -430,13 +423,6 @@ def hold(values: FloatArray) -> FloatArray:
     return np.where(place < 0, NAN, values[place]) if values.size else values
 
 
-def plausible_samples(t: FloatArray, voltage: FloatArray, throttle: FloatArray | None
-                      ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-    """Return samples with NaN for implausible values (t in s, V, throttle 0..1)."""
-    return (plausible(t, MOST_STAMP), plausible(voltage, MOST_VOLTAGE),
-            None if throttle is None else plausible(throttle, MOST_THROTTLE))
-
-
 class TimeLine:
     """Buffer, order and counters of the samples of one source."""
 
@@ -444,12 +430,9 @@ class TimeLine:
         # Columns t, V, throttle and current of each push since the last `work_off`.
         self._parts: list[FloatArray] = []
         self._fill = 0
-        self._counts: dict[str, int] = {}
-        self.newest = -math.inf
+        self._counts: Counter[str] = Counter()
         self._repeats = Repeats()
-        # Last raw samples (t, V, throttle, current); new ones since the last search for repeats.
-        self._tail = np.empty((4, 0))
-        self._unseen, self._looked = 0, False
+        self.forget()
 
     @property
     def counters(self) -> Counters:
@@ -473,9 +456,7 @@ class TimeLine:
 
     def count(self, **more: int) -> None:
         """Add to the counters."""
-        counts = self._counts
-        for name, number in more.items():
-            counts[name] = counts.get(name, 0) + number
+        self._counts.update(more)
 
     def forget(self) -> None:
         """Start a new time line with the next sample; keep the period of repeats."""
@@ -484,6 +465,7 @@ class TimeLine:
 
     def _begin_anew(self) -> None:
         self._repeats.forget()
+        # Last raw samples (t, V, throttle, current); new ones since the last search for repeats.
         self._tail = np.empty((4, 0))
         self._unseen, self._looked = 0, False
 

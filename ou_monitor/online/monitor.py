@@ -23,10 +23,10 @@ from ou_monitor.online.risk.forecast import Ahead, Forecast, LOOK, look_ahead
 from ou_monitor.online.settings import AUTO, MonitorSettings
 from ou_monitor.online.trust import Doubt, InputTrust, patience, StampOrder
 from ou_monitor.records import (
-    as_numbers, as_seconds, Counters, Estimate, Flag, Level, NAN, OuFacts, Status)
+    as_numbers, as_seconds, Counters, Estimate, Flag, Level, MOST_STAMP, NAN, OuFacts, Status)
 from ou_monitor.timeline import (
-    as_column, as_columns, Batch, MOST_CURRENT, OFF, plausible, plausible_samples, TimeLine,
-    WILD_FACTOR)
+    as_column, as_columns, Batch, MOST_CURRENT, MOST_THROTTLE, MOST_VOLTAGE, OFF, plausible,
+    TimeLine, WILD_FACTOR)
 
 if TYPE_CHECKING:
     from ou_monitor.model.supply import SupplyModel
@@ -164,10 +164,11 @@ class SupplyMonitor:
             When the shapes differ.
 
         """
-        stamps, volts = np.atleast_1d(as_seconds(t)), as_column(voltage)
-        load = None if throttle is None else np.broadcast_to(as_numbers(throttle), volts.shape)
+        stamps = plausible(np.atleast_1d(as_seconds(t)), MOST_STAMP)
+        volts = plausible(as_column(voltage), MOST_VOLTAGE)
+        load = None if throttle is None else plausible(
+            np.broadcast_to(as_numbers(throttle), volts.shape), MOST_THROTTLE)
         times = None if arrival is None else np.atleast_1d(as_seconds(arrival))
-        stamps, volts, load = plausible_samples(stamps, volts, load)
         self._trust.push(stamps, volts, load, times)
         self._flag.push(stamps, volts, times, self._trust.interval)
         part = slice(-self._phase % thin, None, thin)
@@ -224,11 +225,10 @@ class SupplyMonitor:
 
         Voltage in V and arrival in s, shape (n,), as for `push`.
         """
-        volts = np.atleast_1d(np.asarray(voltage, dtype=np.float64))
-        unknown, volts, _ = plausible_samples(np.full_like(volts, NAN), volts, None)
+        volts = plausible(np.atleast_1d(np.asarray(voltage, dtype=np.float64)), MOST_VOLTAGE)
         times = np.atleast_1d(np.asarray(arrival, dtype=np.float64))
         self._trust.push_readings(times, volts)
-        self._flag.push(unknown, volts, times, self._trust.interval)
+        self._flag.push(np.full_like(volts, NAN), volts, times, self._trust.interval)
 
     def restart(self, error: BaseException) -> None:
         """Restart after an error, which the next reports name; the flag keeps its state."""

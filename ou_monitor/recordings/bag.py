@@ -54,13 +54,9 @@ def _qos() -> list[dict[str, Any]]:
         'liveliness_lease_duration': dict(_FOR_EVER), 'avoid_ros_namespace_conventions': False}]
 
 
+@one_line()
 def read_metadata(folder: Path) -> BagFiles:
     """Return the MCAP files and the metadata of a rosbag2 directory."""
-    with one_line():
-        return _metadata(folder)
-
-
-def _metadata(folder: Path) -> BagFiles:
     path = folder / FILE
     where = path_words(path)
     content = read_yaml(path, 'the metadata', most_bytes=MOST_BYTES, most_nodes=MOST_NODES)

@@ -20,7 +20,8 @@ from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.bag import BagReader, batches
 from ou_monitor.recordings.cdr import (
     Field, FieldColumn, join, short_name, TimeArray, value_path)
-from ou_monitor.recordings.importers.log import RawColumns, Series, SIGNAL, UNKNOWN
+from ou_monitor.recordings.importers.log import (
+    RawColumns, Series, SIGNAL, UNKNOWN, unusable_words)
 from ou_monitor.recordings.standard_types import FLOAT32, FLOAT64, IMU
 from ou_monitor.records import Defect, defect_of, FloatArray, Note
 from ou_monitor.stream.config import FieldSpec, list_msg_configs, load_msg_config, MsgConfig
@@ -234,9 +235,9 @@ def read_bag(
                           Defect.DAMAGED_FILE))
     name = printable(bag.path.name)
     if not supply.t:
-        why = ' '.join(note for note in notes if defect_of(note).drops)
-        if (start is None and end is None) or why:
-            raise InputError(f'{name} holds no usable sample' + (f': {why}' if why else ''))
+        whole = start is None and end is None
+        if whole or any(defect_of(note).drops for note in notes):
+            raise InputError(unusable_words(name, notes))
         raise InputError(outside_words(name, start, end, (bag.end_ns - bag.start_ns) * 1e-9))
     return supply.columns(name, _source(bag, choice, name), notes)
 

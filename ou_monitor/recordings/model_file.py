@@ -9,6 +9,7 @@ Written by `discover`, read by `simulate` and by the estimator node.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import chain, repeat
 import math
 from pathlib import Path
 import re
@@ -33,7 +34,6 @@ _EXPONENT = re.compile(r'[-+]?\d+(\.\d*)?[eE][-+]?\d{1,3}')
 class ModelFile:
     """Content of a model file."""
 
-    # The terms.
     model: SupplyModel
     # Standard errors by parameter, one dict a term, empty if unknown; in the parameter's unit.
     se: tuple[dict[str, Any], ...] = ()
@@ -41,15 +41,14 @@ class ModelFile:
     provenance: dict[str, Any] = field(default_factory=dict)
 
 
+@one_line()
 def read_model(path: str | Path) -> ModelFile:
     """
     Read a model file: a regular file of at most 1 MB.
 
     The largest takes 2 to 5 s: a node reads it in a thread, not in a callback.
     """
-    data = read_yaml(path, 'the model file')
-    with one_line():
-        return parse_model(data, path_words(path))
+    return parse_model(read_yaml(path, 'the model file'), path_words(path))
 
 
 def parse_model(data: Any, where: str) -> ModelFile:
@@ -139,14 +138,10 @@ def _error(name: str, value: Any) -> Any:
 
 def as_yaml(file: ModelFile) -> str:
     """Return the text of a model file; `parse_model` gives the same model back."""
-    entries = []
-    for k, term in enumerate(file.model.terms):
-        entry: dict[str, Any] = {'term': term.NAME, 'params': plain_data(term.values())}
-        se = file.se[k] if k < len(file.se) else {}
-        if se:
-            entry['se'] = plain_data(se)
-        entries.append(entry)
-    data: dict[str, Any] = {'model': entries}
+    data: dict[str, Any] = {'model': [
+        {'term': term.NAME, 'params': plain_data(term.values())}
+        | ({'se': plain_data(se)} if se else {})
+        for term, se in zip(file.model.terms, chain(file.se, repeat({})))]}
     if file.model.load is not None:
         data['load'] = file.model.load.values()
     if file.provenance:

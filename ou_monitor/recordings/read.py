@@ -8,11 +8,11 @@ bag; if the voltage has the other kind of stamps, the signal is shifted by the t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 import math
 from pathlib import Path
-from typing import TypedDict, Unpack
+from typing import Any
 
 import numpy as np
 from ou_monitor.errors import InputError
@@ -21,12 +21,12 @@ from ou_monitor.recordings.importers.choose import (
 from ou_monitor.recordings.importers.csv_table import read_column, read_csv
 from ou_monitor.recordings.importers.formats import import_log, is_csv, is_log
 from ou_monitor.recordings.importers.log import (
-    CsvColumns, Log, RawColumns, Request, Series, SIGNAL)
-from ou_monitor.records import clock_unit, defect_of, Recording
+    CsvColumns, Log, RawColumns, Request, Series, SIGNAL, unusable_words)
+from ou_monitor.records import clock_unit, MOST_STAMP, Recording
 from ou_monitor.text import outside_words, part_words
 from ou_monitor.timeline import (
     check_throttle, in_order, MOST_CURRENT, MOST_THROTTLE, MOST_VOLTAGE, part_of, plausible,
-    plausible_samples, readings_of)
+    readings_of)
 
 # Spacing, s, from which another unit of time is more likely than a slow logger.
 _SPARSE = 5.0
@@ -82,44 +82,30 @@ def read_recording(
 
     """
     return readings_of(_read(
-        Path(path), ReadOptions(
-            msg_config=msg_config, voltage_topic=voltage_topic, throttle_topic=throttle_topic,
-            partial=partial, start=start, end=end, flight=flight, columns=columns,
-            progress=progress))[0])
+        Path(path), msg_config=msg_config, voltage_topic=voltage_topic,
+        throttle_topic=throttle_topic, partial=partial, start=start, end=end, flight=flight,
+        columns=columns, progress=progress)[0])
 
 
-class ReadOptions(TypedDict, total=False):
-    """Options of `read_recording`."""
-
-    msg_config: str | Path | None
-    voltage_topic: str | None
-    throttle_topic: str | None
-    partial: bool
-    start: float | None
-    end: float | None
-    flight: int | None
-    columns: CsvColumns | None
-    progress: Callable[[float], None] | None
-
-
-def _read(path: Path, options: ReadOptions, signal: str | None = None,
-          ) -> tuple[Recording, Log | None]:
+def _read(
+    path: Path, signal: str | None = None, *, msg_config: str | Path | None = None,
+    voltage_topic: str | None = None, throttle_topic: str | None = None, partial: bool = False,
+    start: float | None = None, end: float | None = None, flight: int | None = None,
+    columns: CsvColumns | None = None, progress: Callable[[float], None] | None = None,
+) -> tuple[Recording, Log | None]:
     """Read a recording with the repeats of its logger, and a log with a signal by name."""
-    start, end, columns = (options.get('start'), options.get('end'), options.get('columns'))
-    flight = options.get('flight')
     _check_part(start, end)
     csv, log = is_csv(path), is_log(path)
-    for option in ('msg_config', 'voltage_topic', 'throttle_topic'):
-        if (csv or log) and options.get(option) is not None:
-            raise InputError(f"{path} is a {'CSV' if csv else 'log'}: "
-                             f"--{option.replace('_', '-')} is for bags")
+    for option, value in (('msg-config', msg_config), ('voltage-topic', voltage_topic),
+                          ('throttle-topic', throttle_topic)):
+        if (csv or log) and value is not None:
+            raise InputError(f"{path} is a {'CSV' if csv else 'log'}: --{option} is for bags")
     if csv:
         if flight is not None:
             raise InputError(f'{path} is a CSV: --flight is for logs')
-        return _cut(tidy(read_csv(
-            path, columns, partial=options.get('partial', False))), start, end), None
+        return _cut(tidy(read_csv(path, columns, partial=partial)), start, end), None
     if log:
-        recording, whole = _of_log(path, signal, columns, flight, options.get('progress'))
+        recording, whole = _of_log(path, signal, columns, flight, progress)
         return _cut(recording, start, end), whole
     if flight is not None or columns is not None:
         raise InputError(f'{path} is a bag: --flight is for logs, names and units of columns are '
@@ -128,10 +114,8 @@ def _read(path: Path, options: ReadOptions, signal: str | None = None,
     from ou_monitor.recordings.bag_samples import read_bag
 
     return tidy(read_bag(
-        path, partial=options.get('partial', False),
-        msg_config=options.get('msg_config'), voltage_topic=options.get('voltage_topic'),
-        throttle_topic=options.get('throttle_topic'), start=start, end=end,
-        progress=options.get('progress'))), None
+        path, partial=partial, msg_config=msg_config, voltage_topic=voltage_topic,
+        throttle_topic=throttle_topic, start=start, end=end, progress=progress)), None
 
 
 def _of_log(path: Path, signal: str | None, columns: CsvColumns | None, flight: int | None,
@@ -157,7 +141,7 @@ def tidy(raw: RawColumns) -> Recording:
     """Return a `Recording` in order, each stamp once, with notes on dropped samples."""
     name = raw.name
     check_throttle(name, raw.throttle, raw.voltage)
-    t, _, _ = plausible_samples(raw.t, raw.voltage, None)
+    t = plausible(raw.t, MOST_STAMP)
     throttle = plausible(raw.throttle, MOST_THROTTLE)
     if not np.isfinite(t).any() and (stamps := raw.t[np.isfinite(raw.t)]).size:
         raise InputError(f'{name}: stamps of {stamps[0]:.4g} s are implausible: is the time in '
@@ -165,7 +149,7 @@ def tidy(raw: RawColumns) -> Recording:
     which, said = in_order(t, raw.voltage[:, None], MOST_VOLTAGE, ' V')
     notes, t = [*raw.notes, *said], t[which]
     if not t.size:
-        raise InputError(_unusable(name, notes))
+        raise InputError(unusable_words(name, notes))
     # Dates are in s.  Cheap test first: with this median spacing, the mean is at least half of it.
     if (t.size > 2 and t[-1] - t[0] >= 0.5 * _SPARSE * (t.size - 1) - 1.0 and not clock_unit(t[0])
             and (spacing := float(np.median(np.diff(t)))) >= _SPARSE):
@@ -174,11 +158,6 @@ def tidy(raw: RawColumns) -> Recording:
     current = None if raw.current is None else plausible(raw.current[which], MOST_CURRENT)
     return Recording(t, raw.voltage[which], throttle[which], name, raw.source, tuple(notes),
                      None if current is None or np.isnan(current).all() else current)
-
-
-def _unusable(name: str, notes: Sequence[str]) -> str:
-    why = ' '.join(note for note in notes if defect_of(note).drops)
-    return f'{name} holds no usable sample' + (f': {why}' if why else '')
 
 
 def _check_part(start: float | None, end: float | None) -> None:
@@ -202,14 +181,17 @@ def _cut(recording: Recording, start: float | None, end: float | None) -> Record
     return part_of(recording, part, part_words(start, end))
 
 
-def read_beside(path: str | Path, signal: str, **options: Unpack[ReadOptions],
-                ) -> tuple[Recording, Series]:
-    """Read a recording with the repeats of its logger, and one whole scalar beside it."""
+def read_beside(path: str | Path, signal: str, *, partial: bool = False,
+                columns: CsvColumns | None = None, **options: Any) -> tuple[Recording, Series]:
+    """
+    Read a recording with the repeats of its logger, and one whole scalar beside it.
+
+    For the options see `read_recording`.
+    """
     path = Path(path)
-    recording, log = _read(path, options, signal)
+    recording, log = _read(path, signal, partial=partial, columns=columns, **options)
     if log is None:
-        return recording, read_signal(path, signal, partial=options.get('partial', False),
-                                      columns=options.get('columns'))
+        return recording, read_signal(path, signal, partial=partial, columns=columns)
     series, said = signal_of(path, log, signal)
     return replace(recording, notes=(*recording.notes, *said)), series
 

@@ -146,24 +146,22 @@ def _files(directory: Path | str | None) -> list[Path]:
     return sorted(folder.glob('*.yaml'))
 
 
+@one_line()
 def _load(path: Path) -> MsgConfig:
-    content = read_yaml(path, 'msg config')
     where = path_words(path)
-    with one_line():
-        top = _checked(content, MsgConfig, where)
-        throttle, current, rpm = (top.get(key) for key in ('throttle', 'current', 'rpm'))
-        if current is not None:
-            # The current comes from the messages of the voltage, with their stamps.
-            shared = ('topic', 'type', 'stamp_field', 'stamp_factor')
-            current = {**{key: top['voltage'][key] for key in shared if key in top['voltage']},
-                       'nan': 'unknown', **current}
-        return MsgConfig(
-            name=path.stem, description=' '.join(top['description'].split()),
-            package=top['package'], install=' '.join(top['install'].split()),
-            generic=top['generic'], voltage=_field_spec(top['voltage'], f'{where}: voltage'),
-            throttle=None if throttle is None else _field_spec(throttle, f'{where}: throttle'),
-            current=None if current is None else _field_spec(current, f'{where}: current'),
-            rpm=None if rpm is None else _field_spec(rpm, f'{where}: rpm', parse_each_path))
+    top = dict(_checked(read_yaml(path, 'msg config'), MsgConfig, where))
+    if top.get('current') is not None:
+        # The current comes from the messages of the voltage, with their stamps.
+        shared = ('topic', 'type', 'stamp_field', 'stamp_factor')
+        top['current'] = {key: top['voltage'][key] for key in shared if key in top['voltage']} | {
+            'nan': 'unknown'} | top['current']
+    for key in ('voltage', 'throttle', 'current', 'rpm'):
+        if top.get(key) is not None:
+            top[key] = _field_spec(top[key], f'{where}: {key}',
+                                   parse_each_path if key == 'rpm' else parse_field_path)
+    for key in ('description', 'install'):
+        top[key] = ' '.join(top[key].split())
+    return MsgConfig(name=path.stem, **top)
 
 
 def _checked(content: Any, record: type, where: str) -> dict[str, Any]:
@@ -210,12 +208,10 @@ def _field_spec(content: Any, where: str,
         raise InputError(f"{where}: topic '{spec.topic}' is not a valid topic name")
     if spec.sign not in (1, -1):
         raise InputError(f'{where}: sign must be 1 or -1, found {spec.sign}')
-    if spec.nan not in NAN_RULES:
-        raise InputError(
-            f"{where}: unknown nan rule '{spec.nan}': {nearest(spec.nan, NAN_RULES)}")
-    if spec.zero not in ZERO_RULES:
-        raise InputError(
-            f"{where}: unknown zero rule '{spec.zero}': {nearest(spec.zero, ZERO_RULES)}")
+    for key, rules in (('nan', NAN_RULES), ('zero', ZERO_RULES)):
+        rule = getattr(spec, key)
+        if rule not in rules:
+            raise InputError(f"{where}: unknown {key} rule '{rule}': {nearest(rule, rules)}")
     if spec.sample_rate is not None and spec.sample_rate <= 0.0:
         raise InputError(
             f'{where}: sample_rate must be above 0 Hz, found {spec.sample_rate}')

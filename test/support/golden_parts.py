@@ -13,7 +13,8 @@ from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.online.risk.flag import BrownoutFlag
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.online.trust import patience, StampWatch
-from ou_monitor.timeline import plausible_samples
+from ou_monitor.records import MOST_STAMP
+from ou_monitor.timeline import MOST_THROTTLE, MOST_VOLTAGE, plausible
 from scipy.signal import lfilter
 from term_examples import EXAMPLES, OU, term
 
@@ -80,8 +81,9 @@ def stamps():
     settings = MonitorSettings(stale_after=0.8)
     found.append(table([patience(settings, rate, n) for rate in (0.0, 10.0, 500.0, 1500.0)
                         for n in (19, 20, 5000)]))
-    found.append(table(plausible_samples(np.array([1.0, 1e9, 1e19, np.nan]), np.array(
-        [5.0, 1e6, 1.0001e6, -1e7]), np.array([2.0, 2.01, -2.0, np.nan]))))
+    found.append(table([plausible(np.array(values), most) for values, most in (
+        ([1.0, 1e9, 1e19, np.nan], MOST_STAMP), ([5.0, 1e6, 1.0001e6, -1e7], MOST_VOLTAGE),
+        ([2.0, 2.01, -2.0, np.nan], MOST_THROTTLE))]))
     return found
 
 

@@ -24,7 +24,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
-from ou_monitor.records import clock_unit, Defect, FloatArray, Note
+from ou_monitor.records import clock_unit, Defect, defect_of, FloatArray, Note
 from ou_monitor.text import counted, printable
 from ou_monitor.timeline import in_order, Picked
 
@@ -156,6 +156,12 @@ class RawColumns:
     name: str  # Name of the file, printable
     source: dict[str, str]  # Origin: file, format, chosen series, firmware
     notes: tuple[str, ...] = ()  # Dropped or unreadable parts, one sentence each
+
+
+def unusable_words(name: str, notes: Iterable[str]) -> str:
+    """Return the text of the error for a file without usable samples, with what was dropped."""
+    why = ' '.join(note for note in notes if defect_of(note).drops)
+    return f'{name} holds no usable sample' + (f': {why}' if why else '')
 
 
 @dataclass(frozen=True)
