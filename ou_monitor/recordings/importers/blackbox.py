@@ -41,7 +41,6 @@ _PAUSE = 10.0
 _PART = 16
 
 GYRO, UNFILTERED, DEBUG, ACCELEROMETER = 'gyroADC', 'gyroUnfilt', 'debug', 'accSmooth'
-ERPM = 'eRPM'
 # debug_mode GYRO_SCALED of Betaflight 4.0 to 4.5: the gyro before its filters, deg/s.
 _GYRO_SCALED, _FIRST, _LAST = 6, (4, 0, 0), (4, 6, 0)
 # A scale below this is in rad/us, as Baseflight had it, not in deg/s.
@@ -49,6 +48,8 @@ _BASEFLIGHT = 1e-3
 
 Fields = dict[str, FloatArray]
 Headers = dict[str, Any]
+# Field without its index -> SI per unit, unit, words.
+Units = dict[str, tuple[float, str, str]]
 
 _FIRMWARE = re.compile(r'(Betaflight|Cleanflight|INAV|EmuFlight)\s+(\d+)\.(\d+)\.?(\d*)', re.I)
 
@@ -113,11 +114,10 @@ def read(path: Path, request: Request) -> Log:
         notes.insert(0, f'The file holds {len(held)} flights ({lengths}); this is flight '
                      f'{wanted}, the largest: --flight N chooses another.')
     series = [*_battery(t, columns, headers, notes), *_throttles(t, columns, headers)]
-    known = {one.name for one in series}
-    shows_gyro = _shows_gyro(headers, *_version(headers))
-    series += _signals(t, columns, headers, known, debug_gyro=shows_gyro)
-    inertial, speeds = _motion(t, columns, headers, notes, debug_gyro=shows_gyro,
-                               poles=request.poles)
+    units = _units(headers)
+    series += _signals(t, columns, units, {one.name for one in series})
+    inertial = [*_gyros(t, columns, headers, units, notes)]
+    speeds = _speeds(t, columns, headers, notes, request.poles)
     return log_of('blackbox', series, facts, notes, (name for name in names if name != 'time'),
                   inertial, speeds)
 
@@ -302,39 +302,47 @@ def _high_resolution(headers: Headers) -> float:
     return 10.0 if _number(headers, 'blackbox_high_resolution') else 1.0
 
 
-def _motion(t: FloatArray, columns: Fields, headers: Headers, notes: list[str], *,
-            debug_gyro: bool, poles: int | None,
-            ) -> tuple[tuple[Motion, ...], Motion | None]:
-    """Return gyros with the accelerometer, and motor speeds (t in s)."""
-    acc = three_axes(columns, [f'{ACCELEROMETER}[{axis}]' for axis in range(3)])
-    one_g = _number(headers, 'acc_1G')
-    if acc is not None and not one_g:
+def _units(headers: Headers) -> Units:
+    """Return the units of fields, as far as the header states them."""
+    units = {'setpoint': (DEGREE / _high_resolution(headers), 'rad/s', 'rate command'),
+             'BaroAlt': (0.01, 'm', 'altitude by the barometer')}
+    gyro, one_g = _gyro_scale(headers), _number(headers, 'acc_1G')
+    if gyro is not None:
+        units |= dict.fromkeys((GYRO, UNFILTERED), (gyro, 'rad/s', 'gyro'))
+    if one_g:
+        units[ACCELEROMETER] = GRAVITY / one_g, 'm/s^2', 'accelerometer'
+    firmware, version = _version(headers)
+    if firmware == 'betaflight' and _FIRST <= version < _LAST and (
+            headers.get('debug_mode') == _GYRO_SCALED):
+        units[DEBUG] = DEGREE, 'rad/s', 'gyro before the filters'
+    return units
+
+
+def _gyros(t: FloatArray, columns: Fields, headers: Headers, units: Units, notes: list[str],
+           ) -> Iterator[Motion]:
+    """Yield the gyros that the log holds, with the accelerometer (t in s)."""
+    forces = _three(columns, ACCELEROMETER)
+    words = 'no accelerometer'
+    if forces is not None and ACCELEROMETER in units:
+        forces *= units[ACCELEROMETER][0]
+        words = f'accSmooth {GRAVITY:g} / {_number(headers, "acc_1G"):g}'
+    elif forces is not None:
         notes.append('accSmooth was left out of /imu: the header does not state acc_1G.')
-        acc = None
-    scaled = None if acc is None else acc * (GRAVITY / one_g)
-    words = f'accSmooth {GRAVITY:g} / {one_g:g}' if scaled is not None else 'no accelerometer'
-    inertial = []
-    gyro = _gyro_scale(headers)
-    for name, scale, rank, what in (
-            (GYRO, gyro, 0, "gyro after the autopilot's filters"),
-            (UNFILTERED, gyro, 1, 'gyro before the filters'),
-            (DEBUG, DEGREE if debug_gyro else None, 2,
-             'gyro before the filters (debug_mode GYRO_SCALED)')):
-        values = three_axes(columns, [f'{name}[{axis}]' for axis in range(3)])
-        if values is None or (name == DEBUG and not debug_gyro):
-            continue
-        if scale is None:
+        forces = None
+    for rank, (name, what) in enumerate((
+            (GYRO, "gyro after the autopilot's filters"), (UNFILTERED, 'gyro before the filters'),
+            (DEBUG, 'gyro before the filters (debug_mode GYRO_SCALED)'))):
+        rates = _three(columns, name)
+        if rates is not None and name in units:
+            scale = units[name][0]
+            yield from gyro_of(name, t, rates * scale, forces, f'{name} {scale:.6g}, {words}',
+                               what, rank)
+        elif rates is not None and name != DEBUG:
             notes.append(f'{name} was left out of /imu: the header does not state gyro_scale.')
-            continue
-        inertial.append(gyro_of(name, t, values * scale, scaled, f'{name} {scale:.6g}, {words}',
-                                what, rank))
-    return tuple(inertial), _speeds(t, columns, headers, notes, poles)
 
 
-def _shows_gyro(headers: Headers, firmware: str, version: tuple[int, int, int]) -> bool:
-    """Whether the debug fields hold the gyro before its filters."""
-    return (firmware == 'betaflight' and _FIRST <= version < _LAST
-            and headers.get('debug_mode') == _GYRO_SCALED)
+def _three(columns: Fields, name: str) -> FloatArray | None:
+    return three_axes(columns, [f'{name}[{axis}]' for axis in range(3)], 1.0)
 
 
 def _gyro_scale(headers: Headers) -> float | None:
@@ -353,33 +361,21 @@ def _gyro_scale(headers: Headers) -> float | None:
     return scale * DEGREE / _high_resolution(headers)
 
 
-def _signals(t: FloatArray, columns: Fields, headers: Headers, known: set[str], *,
-             debug_gyro: bool) -> Iterator[Series]:
+def _signals(t: FloatArray, columns: Fields, units: Units, known: set[str]) -> Iterator[Series]:
     """Yield the remaining fields, in SI where their unit is known (t in s)."""
-    gyro, one_g = _gyro_scale(headers), _number(headers, 'acc_1G')
-    rates = DEGREE / _high_resolution(headers)
     for name, values in columns.items():
-        stem = name.partition('[')[0]
-        if name == 'time' or name in known:
-            continue
-        scale, unit, words = 1.0, UNKNOWN, 'as logged'
-        if stem in (GYRO, UNFILTERED) and gyro is not None:
-            scale, unit, words = gyro, 'rad/s', 'gyro'
-        elif stem == DEBUG and debug_gyro and not name.endswith('[3]'):
-            scale, unit, words = DEGREE, 'rad/s', 'gyro before the filters'
-        elif stem == ACCELEROMETER and one_g:
-            scale, unit, words = GRAVITY / one_g, 'm/s^2', 'accelerometer'
-        elif stem == 'setpoint':
-            scale, unit, words = rates, 'rad/s', 'rate command'
-        elif stem == 'BaroAlt':
-            scale, unit, words = 0.01, 'm', 'altitude by the barometer'
-        yield Series(name, SIGNAL, t, values * scale, f'{scale:.6g}', words, own_unit=unit)
+        if name != 'time' and name not in known:
+            # Only the first three debug fields hold the gyro.
+            found = None if name == f'{DEBUG}[3]' else units.get(name.partition('[')[0])
+            scale, unit, words = found or (1.0, UNKNOWN, 'as logged')
+            yield Series(name, SIGNAL, t, values * scale, f'{scale:.6g}', words, own_unit=unit)
 
 
 def _speeds(t: FloatArray, columns: Fields, headers: Headers, notes: list[str],
             poles: int | None) -> Motion | None:
-    fields = sorted((name for name in columns if name.startswith(f'{ERPM}[')), key=_place)
-    if not fields:
+    places = sorted(int(found[1]) for name in columns
+                    if (found := re.fullmatch(r'eRPM\[(\d+)\]', name)))
+    if not places:
         return None
     stated = _number(headers, 'motor_poles')
     count = poles or int(stated)
@@ -389,20 +385,14 @@ def _speeds(t: FloatArray, columns: Fields, headers: Headers, notes: list[str],
         return None
     # eRPM is logged in hundreds; each pair of poles makes one electrical turn per turn.
     scale = 100.0 * RPM * 2.0 / count
-    values = np.column_stack([columns[name] for name in fields]) * scale
+    values = np.column_stack([columns[f'eRPM[{k}]'] for k in places]) * scale
     origin = '--poles' if poles else 'the header'
     return Motion('', t, {VELOCITY: values}, f'eRPM {scale:.6g}',
                   f'rotor speed, {count} poles by {origin}',
-                  motors=tuple(f'motor_{_place(name)}' for name in fields))
-
-
-def _place(name: str) -> int:
-    digits = name.partition('[')[2].rstrip(']')
-    return int(digits) if digits.isdigit() else 0
+                  motors=tuple(f'motor_{k}' for k in places))
 
 
 def _number(headers: Headers, key: str) -> float:
     """Return a positive number of the header; 0 if missing."""
     value = headers.get(key)
-    good = isinstance(value, (int, float)) and math.isfinite(value) and value > 0
-    return float(value) if good and value is not None else 0.0
+    return float(value) if isinstance(value, (int, float)) and 0.0 < value < math.inf else 0.0

@@ -166,11 +166,9 @@ def _series(prefix: str, t: FloatArray, columns: dict[str, FloatArray]) -> Itera
 
 def _inertial(prefix: str, t: FloatArray, columns: dict[str, FloatArray]) -> Iterator[Motion]:
     """Yield the gyro with the accelerometer."""
-    rates, forces = (three_axes(columns, [f'{group}.{axis}' for axis in 'xyz'])
-                     for group in (_GYRO, _FORCE))
-    if rates is not None:
-        yield gyro_of(f'{prefix}{_GYRO}', t, rates * DEGREE,
-                      None if forces is None else forces * GRAVITY,
-                      f'{_GYRO} {DEGREE:.6g}' + ('' if forces is None else
-                                                 f', {_FORCE} {GRAVITY:g}'),
-                      "gyro after the autopilot's filters", None if prefix else 0)
+    rates, forces = (three_axes(columns, [f'{group}.{axis}' for axis in 'xyz'], factor)
+                     for group, factor in ((_GYRO, DEGREE), (_FORCE, GRAVITY)))
+    return gyro_of(
+        f'{prefix}{_GYRO}', t, rates, forces,
+        f'{_GYRO} {DEGREE:.6g}' + ('' if forces is None else f', {_FORCE} {GRAVITY:g}'),
+        "gyro after the autopilot's filters", None if prefix else 0)

@@ -20,7 +20,7 @@ import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import (
     CURRENT, FRD_TO_FLU, gyro_of, Log, log_of, Motion, one_flight, quiet, quiet_process, Request,
-    RPM, Series, SIGNAL, started, three_axes, THROTTLE, UNKNOWN, VELOCITY, VOLTAGE)
+    RPM, Series, SIGNAL, started, three_axes, THROTTLE, TURNED, UNKNOWN, VELOCITY, VOLTAGE)
 from ou_monitor.records import FloatArray
 from ou_monitor.stream.files import open_regular
 from ou_monitor.text import counted
@@ -89,8 +89,8 @@ def read(path: Path, request: Request) -> Log:
             parameters: dict[str, float] = dict(log.params)
             # Unix time of boot by GPS; 0: unknown.
             boot = float(getattr(log.clock, 'timebase', 0.0) or 0.0)
-            whole = {kind: _whole_numbers(log, kind) for kind, _ in table}
-            units = {kind: _units(log, kind) for kind, _ in table}
+            # Damage may repeat a name: the first format counts.
+            forms = {one.name: one for one in reversed([*log.formats.values()])}
             names = tuple(f'{one.name}.{field}' for one in log.formats.values()
                           for field in _numbers(one))
         finally:
@@ -99,11 +99,11 @@ def read(path: Path, request: Request) -> Log:
         notes.append(f'{counted(bad, "message")} could not be read and were left out.')
     series: list[Series] = []
     for (kind, instance), columns in table.items():
-        series += _plain(_name(kind, instance), kind, columns, whole[kind])
+        series += _plain(_name(kind, instance), columns, forms[kind])
     series += _outputs(table, parameters)
     known = {one.name for one in series}
     for (kind, instance), columns in table.items():
-        series += _others(_name(kind, instance), columns, units[kind], known)
+        series += _others(_name(kind, instance), columns, forms[kind], known)
     if not series:
         raise InputError(f'{path} holds none of the messages that carry a voltage or a throttle '
                          f'({", ".join(dict.fromkeys(row[0] for row in PLAIN))})'
@@ -189,37 +189,21 @@ def _collect(log: Any, request: Request) -> tuple[Table, list[str], int]:
             for key, columns in sorted(table.items())}, banner, bad
 
 
-def _whole_numbers(log: Any, kind: str) -> frozenset[str]:
-    """Return the fields of a message that are integers without a multiplier of their own."""
-    form = next(one for one in log.formats.values() if one.name == kind)
-    return frozenset(name for name, letter in zip(form.columns, form.format)
-                     if letter in 'bBhHiI')
-
-
 def _numbers(form: Any) -> list[str]:
     """Return the fields of a message that hold a number over time."""
     return [name for name, letter in zip(form.columns, form.format)
             if letter not in 'nNZa' and name not in ('TimeUS', 'TimeMS', *INSTANCES)]
 
 
-def _units(log: Any, kind: str) -> dict[str, str]:
-    """Return the units that the log states (since 2018)."""
-    form = next(one for one in log.formats.values() if one.name == kind)
-    stated = zip(form.columns, form.units or ())
-    return {name: unit.replace('/s/s', '/s^2') for name, unit in stated if unit}
-
-
 def _lost_binary(log: Any) -> list[str]:
     """Return a note on the bytes of a binary log that belong to no message."""
     size = int(log.data_len)
-    read_bytes, end = 0, 0
+    lost, end = size, 0
     for kind, offsets in enumerate(log.offsets):
         length = log.formats[kind].len if kind in log.formats else 0
-        for at in offsets:
-            if at + length <= size:
-                read_bytes += length
-                end = max(end, at + length)
-    lost = size - read_bytes
+        ends = [at + length for at in offsets if at + length <= size]
+        lost -= length * len(ends)
+        end = max([end, *ends])
     tail = bytes(log.data_map[end:size])
     # The last page of flash is padded with its erased value.
     if tail.strip(b'\xff') == b'' or tail.strip(b'\0') == b'':
@@ -277,9 +261,12 @@ def _facts(banner: list[str]) -> dict[str, str]:
     return facts
 
 
-def _plain(name: str, kind: str, columns: Columns, whole: frozenset[str]) -> Iterator[Series]:
+def _plain(name: str, columns: Columns, form: Any) -> Iterator[Series]:
+    """Yield the fields of a message that `PLAIN` lists."""
+    # Integers without a multiplier of their own.
+    whole = {field for field, letter in zip(form.columns, form.format) if letter in 'bBhHiI'}
     for source, field, quantity, rank, words in PLAIN:
-        if source != kind or field not in columns:
+        if source != form.name or field not in columns:
             continue
         values, scale = columns[field], 1.0
         if quantity == THROTTLE:
@@ -293,29 +280,28 @@ def _plain(name: str, kind: str, columns: Columns, whole: frozenset[str]) -> Ite
             quantity != THROTTLE and one.silent) else one
 
 
-def _others(name: str, columns: Columns, units: dict[str, str], known: set[str],
-            ) -> Iterator[Series]:
+def _others(name: str, columns: Columns, form: Any, known: set[str]) -> Iterator[Series]:
     """Yield the fields that no other series uses, as logged."""
+    # Logs state units since 2018.
+    units = KNOWN_UNITS | {field: unit.replace('/s/s', '/s^2') for field, unit in zip(
+        form.columns, form.units or ()) if unit}
     for field, values in columns.items():
         if field != 't' and f'{name}.{field}' not in known:
-            unit = units.get(field) or KNOWN_UNITS.get(field, UNKNOWN)
             yield Series(f'{name}.{field}', SIGNAL, columns['t'], values, '1', 'as logged',
-                         group=name, own_unit=unit)
+                         group=name, own_unit=units.get(field, UNKNOWN))
 
 
 def _gyros(table: Table) -> Iterator[Motion]:
     """Yield each gyro, with the accelerometer of its message, along front, left and up."""
     first: set[str] = set()
     for (kind, instance), columns in table.items():
-        rates, forces = three_axes(columns, RATES), three_axes(columns, FORCES)
+        rates, forces = (three_axes(columns, fields, FRD_TO_FLU) for fields in (RATES, FORCES))
         if kind not in GYROS or rates is None:
             continue
-        rank = None if kind in first else GYROS[kind]
+        yield from gyro_of(_name(kind, instance), columns['t'], rates, forces, TURNED,
+                           'gyro' if forces is None else 'gyro and accelerometer',
+                           None if kind in first else GYROS[kind])
         first.add(kind)
-        yield gyro_of(_name(kind, instance), columns['t'], rates * FRD_TO_FLU,
-                      None if forces is None else forces * FRD_TO_FLU,
-                      'front, right, down turned to front, left, up',
-                      'gyro and accelerometer' if forces is not None else 'gyro', rank)
 
 
 def _speeds(table: Table) -> Motion | None:

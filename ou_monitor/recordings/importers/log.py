@@ -28,8 +28,9 @@ from ou_monitor.records import clock_unit, Defect, defect_of, FloatArray, Note
 from ou_monitor.text import counted, printable
 from ou_monitor.timeline import in_order, Picked
 
-# Front, right, down -> front, left, up.
+# Front, right, down -> front, left, up; in words.
 FRD_TO_FLU = np.array([1.0, -1.0, -1.0])
+TURNED = 'front, right, down turned to front, left, up'
 DEGREE = math.pi / 180.0
 GRAVITY = 9.80665  # m/s^2, the scale of accelerometers
 RPM = 2.0 * math.pi / 60.0
@@ -61,11 +62,12 @@ class Motion:
                 for field, values in self.vectors.items() for k, column in enumerate(values.T)}
 
 
-def gyro_of(name: str, t: FloatArray, rates: FloatArray, forces: FloatArray | None, scale: str,
-            words: str, rank: int | None = None) -> Motion:
-    """Return a gyro, with its accelerometer unless that is None; see `Motion`."""
-    return Motion(name, t, {RATE: rates, **({} if forces is None else {FORCE: forces})}, scale,
-                  words, rank)
+def gyro_of(name: str, t: FloatArray, rates: FloatArray | None, forces: FloatArray | None,
+            scale: str, words: str, rank: int | None = None) -> Iterator[Motion]:
+    """Yield a gyro, unless it is None, with its accelerometer, unless that is; see `Motion`."""
+    if rates is not None:
+        yield Motion(name, t, {RATE: rates, **({} if forces is None else {FORCE: forces})},
+                     scale, words, rank)
 
 
 VOLTAGE, THROTTLE, CURRENT = 'voltage', 'throttle', 'current'
@@ -296,11 +298,12 @@ def started(unix: float) -> dict[str, str]:
         timespec='seconds')} if clock_unit(unix) == 's' else {}
 
 
-def three_axes(columns: Mapping[str, Any], names: Sequence[str]) -> FloatArray | None:
-    """Return columns side by side, shape (n, 3); None when one is missing."""
-    if not all(name in columns for name in names):
+def three_axes(columns: Mapping[str, FloatArray], names: Sequence[str],
+               factor: FloatArray | float) -> FloatArray | None:
+    """Return columns times a factor side by side, shape (n, 3); None if any is missing."""
+    if not names or not all(name in columns for name in names):
         return None
-    return np.column_stack([np.asarray(columns[name], dtype=np.float64) for name in names])
+    return np.column_stack([columns[name] for name in names]) * factor
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from ou_monitor.recordings.importers.log import (
     CURRENT, FRD_TO_FLU, gyro_of, Log, log_of, Motion, one_flight, Progress, quiet, Request, RPM,
-    Series, SIGNAL, started, three_axes, THROTTLE, UNKNOWN, VELOCITY, VOLTAGE)
+    Series, SIGNAL, started, three_axes, THROTTLE, TURNED, UNKNOWN, VELOCITY, VOLTAGE)
 from ou_monitor.records import Defect, FloatArray, Note
 from ou_monitor.text import counted
 from pyulog import ULog
@@ -32,12 +32,13 @@ TOPICS = ('battery_status', CLOCK, 'system_power', 'power_monitor', 'esc_status'
           'actuator_motors', 'vehicle_thrust_setpoint', 'actuator_controls_0', 'actuator_outputs',
           'manual_control_setpoint', 'sensor_combined', 'vehicle_angular_velocity', 'sensor_gyro')
 
-# Topic, field of the gyro, field of the accelerometer, rank, words.  Axes are front, right,
-# down; an element is named [k] or by its axis.
+# Topic, fields of the gyro and of the accelerometer (front, right, down), rank, words.
 GYROS = (
-    ('sensor_combined', 'gyro_rad', 'accelerometer_m_s2', 0, 'gyro and accelerometer'),
-    ('vehicle_angular_velocity', 'xyz', '', 1, "gyro after the autopilot's filters"),
-    ('sensor_gyro', '', '', 2, 'one gyro, along the axes of its board'),
+    ('sensor_combined', [f'gyro_rad[{k}]' for k in range(3)],
+     [f'accelerometer_m_s2[{k}]' for k in range(3)], 0, 'gyro and accelerometer'),
+    ('vehicle_angular_velocity', [f'xyz[{k}]' for k in range(3)], (), 1,
+     "gyro after the autopilot's filters"),
+    ('sensor_gyro', 'xyz', (), 2, 'one gyro, along the axes of its board'),
 )
 # Endings of names of fields that state a unit.
 ENDINGS = (('_m_s2', 'm/s^2'), ('_rad', 'rad/s'), ('_m_s', 'm/s'), ('_v', 'V'), ('_a', 'A'),
@@ -189,19 +190,9 @@ def _others(name: str, topic: str, t: FloatArray, columns: Columns, known: set[s
 def _gyros(name: str, topic: str, t: FloatArray, columns: Columns) -> Iterator[Motion]:
     """Yield gyro and accelerometer of a topic along front, left and up."""
     for source, gyro, acc, rank, words in GYROS:
-        if source != topic:
-            continue
-        rates = three_axes(columns, _axes(gyro))
-        forces = three_axes(columns, _axes(acc)) if acc else None
-        if rates is not None:
-            yield gyro_of(name, t, rates * FRD_TO_FLU,
-                          None if forces is None else forces * FRD_TO_FLU,
-                          'front, right, down turned to front, left, up', words, rank)
-
-
-def _axes(stem: str) -> list[str]:
-    """Return the fields of three axes."""
-    return [f'{stem}[{axis}]' for axis in range(3)] if stem else ['x', 'y', 'z']
+        if source == topic:
+            rates, forces = (three_axes(columns, fields, FRD_TO_FLU) for fields in (gyro, acc))
+            yield from gyro_of(name, t, rates, forces, TURNED, words, rank)
 
 
 def _speeds(topic: str, t: FloatArray, columns: Columns) -> Motion | None:

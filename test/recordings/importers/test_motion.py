@@ -197,7 +197,7 @@ def test_bad_rows_gaps_and_jumps_of_rate():
     t = np.concatenate([np.arange(100) * 0.001, 0.5 + np.arange(100) * 0.004])
     gyro = np.ones((200, 3))
     gyro[5, 1], t[50] = np.nan, 0.02
-    one, notes = clean_motion(gyro_of('g', t, gyro, None, '1', ''))
+    one, notes = clean_motion(next(gyro_of('g', t, gyro, None, '1', '')))
     assert one.t.size == 198 and FORCE not in one.vectors and (np.diff(one.t) > 0.0).all()
     assert any('1 sample dropped: not a finite' in note for note in notes)
     notes = pace_notes(one.t)
