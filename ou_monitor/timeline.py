@@ -301,12 +301,13 @@ def readings_of(recording: Recording) -> Recording:
     return replace(part_of(recording, places, note), t=t, held=recording.held + held)
 
 
-def supplied(recording: Recording) -> Recording:
+def supplied(recording: Recording, at_ends: bool = False) -> Recording:
     """
     Return a recording without wild readings and the times at which its supply was off, noted.
 
     Off: below `OFF` of the usual voltage, with the readings up to `_ON` before and after.  A
     signal that is often there, or that spends as long in between, is not a supply that was off.
+    at_ends: keep the times within the recording.
     """
     usual = float(np.quantile(recording.voltage, 0.8)) if recording.n else 0.0
     wild = recording.voltage > WILD_FACTOR * usual
@@ -327,6 +328,11 @@ def supplied(recording: Recording) -> Recording:
     if (begins.size > max(_OUTAGES, _FEW * v.size) or between > _BETWEEN * off.sum()
             or (ends - begins).sum() > _MOST_OFF * v.size):
         return recording
+    if at_ends:
+        outer = (begins == 0) | (ends == v.size)
+        begins, ends = begins[outer], ends[outer]
+    if not begins.size:
+        return recording
     gone = np.zeros(v.size, dtype=np.bool_)
     for begin, end in zip(begins.tolist(), ends.tolist()):
         # From its full voltage, a decay takes half as long again as between the two limits.
@@ -338,7 +344,8 @@ def supplied(recording: Recording) -> Recording:
     return part_of(recording, ~gone, (
         f'{counted(count)} left out: the supply was off {times} '
         f'(near {float(np.median(v[off])):.2g} V), from {float(t[begins[0]] - t[0]):.4g} s on, '
-        f'{seconds:.3g} s in all. Lowest voltage and dips include them.'))
+        f'{seconds:.3g} s in all. Lowest voltage and dips include that, except at the ends of the '
+        'recording.'))
 
 
 def part_of(recording: Recording, which: Picked | npt.NDArray[np.bool_], *said: str,

@@ -256,7 +256,7 @@ def by_throttle(recording: Recording, found: Overview, voltage: float, horizon: 
     risk = np.full(grid.size, NAN)
     if last is not None and last.risk_curve:
         # RISK_CURVE has the same throttles; keep one beyond the highest flown, to interpolate.
-        risk = np.where(grid < found.highest + 0.1, last.risk_curve, NAN)
+        risk = np.where(grid >= found.highest + 0.1, NAN, last.risk_curve)
     return ByThrottle(
         grid, flown_near(recording, grid), middle, middle - reach, middle + reach,
         np.array(found.facts.noise.rms_v), risk, NAN if last is None else last.budget,

@@ -192,7 +192,7 @@ def craft_of(recording: Recording, facts: SupplyFacts, given: int = 0) -> Craft:
                 middle = float(np.median(known))
                 one = _measure(kind, name, value / cells, 2.0 * se / cells, middle)
                 found.append(replace(one, verdict='unknown', reason='', remedy='')
-                             if name == 'noise' and one.verdict == 'high' and calm < middle
+                             if name == 'noise' and one.verdict == 'high' and not calm >= middle
                              else one)
     return Craft(cells, source, full_voltage(recording), kinds[0] if len(kinds) == 1 else '',
                  tuple(found))

@@ -212,12 +212,14 @@ def facts_and_end(recording: Recording, limit: float | None = None, left: Remain
             Sag(False, nowhere, THROTTLES, unknown, unknown),
             Noise(THROTTLES, unknown, unknown, nowhere), Resistance(NAN, NAN),
             OuFacts('no_data'), None), SupplyLoad(), None
+    began = float(t[0])
+    there, outer = supplied(recording), supplied(recording, at_ends=True)
+    t, v, u = outer.t, outer.voltage, outer.throttle
     k = int(np.argmin(v))
-    there = supplied(recording)
     noise = noise_of(there, left)
     load, budget, last = _at_the_end(there, limit, monitor)
     return SupplyFacts(
-        Lowest(float(v[k]), float(t[k] - t[0]), float(u[k])),
+        Lowest(float(v[k]), float(t[k]) - began, float(u[k])),
         None if limit is None else _dips(t, v, u, limit, noise),
         Sag(load.known, noise.flown, THROTTLES, _tuple(load.sag(THROTTLES)),
             _tuple(load.sag_se(THROTTLES))),
@@ -295,8 +297,10 @@ def _dips(t: FloatArray, v: FloatArray, u: FloatArray, limit: float, noise: Nois
 
 def rise_that_ends(v: FloatArray, u: FloatArray, noise: Noise) -> FloatArray:
     """Return the hysteresis of a dip, V, at each reading: ADC step or steady noise."""
-    steady = np.nan_to_num(np.interp(np.nan_to_num(u), THROTTLES, noise.steady_rms_v))
-    return np.asarray(np.maximum(find_step(v), steady))
+    rms, throttle = np.array(noise.steady_rms_v), np.array(THROTTLES)
+    known = np.isfinite(rms)
+    steady = np.interp(np.nan_to_num(u), throttle[known], rms[known]) if known.any() else 0.0
+    return np.asarray(np.maximum(find_step(v), np.full(u.shape, steady)))
 
 
 def dip_begins(v: FloatArray, limit: float, rise: FloatArray) -> npt.NDArray[np.intp]:
@@ -358,7 +362,7 @@ def noise_of(recording: Recording, left: Remainder | None = None) -> Noise:
     still = _still(recording.t, u)
     enough = _enough(recording)
     return Noise(THROTTLES, _over_throttle(u[seen], square[seen], enough),
-                 _over_throttle(u[seen & still], square[seen & still], enough), flown)
+                 _over_throttle(u[seen & still], square[seen & still], enough, NAN), flown)
 
 
 def _still(t: FloatArray, u: FloatArray) -> npt.NDArray[np.bool_]:
@@ -387,12 +391,14 @@ def _enough(recording: Recording) -> float:
     return max(_IN_BAND, share * recording.n)
 
 
-def _over_throttle(u: FloatArray, square: FloatArray, enough: float) -> tuple[float, ...]:
-    """Return rms, V, at THROTTLES: measured, else interpolated; constant beyond those measured."""
+def _over_throttle(u: FloatArray, square: FloatArray, enough: float,
+                   beyond: float | None = None) -> tuple[float, ...]:
+    """Return rms, V, at THROTTLES: measured, else interpolated; beyond those measured constant."""
     at, rms = [], []
     for throttle in THROTTLES:
         near = np.abs(u - throttle) <= _BAND
         if near.sum() >= enough:
             at.append(float(throttle))
             rms.append(math.sqrt(float(square[near].mean())))
-    return _tuple(np.interp(THROTTLES, at, rms)) if at else (NAN,) * len(THROTTLES)
+    return _tuple(np.interp(THROTTLES, at, rms, left=beyond, right=beyond)) if at else (
+        (NAN,) * len(THROTTLES))

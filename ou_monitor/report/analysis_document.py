@@ -174,7 +174,8 @@ def _numbers(analysis: Analysis) -> list[str]:
     ends = np.array([e.interval('alpha') for e in steady]).reshape(-1, 2)
     if steady and ((ends[:, 1] < low).all() or (ends[:, 0] > high).all()):
         taus = sorted(1e3 / e.alpha for e in steady)
-        apart.append(f'tau is {number(taus[0])} to {number(taus[-1])} ms')
+        apart.append(f'tau is {number(taus[0])}'
+                     + (f' to {number(taus[-1])} ms' if len(taus) > 1 else ' ms'))
     if apart:
         where = ('At steady throttle' if analysis.recording.has_throttle else
                  'Over the whole recording')

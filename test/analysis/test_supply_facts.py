@@ -42,7 +42,7 @@ def test_dips_are_runs():
 
 
 @pytest.mark.parametrize('begin, end', [(0, 100), (2000, 2400), (5900, 6000)])
-def test_a_supply_that_is_off_counts_for_lowest_and_dips_only(begin, end):
+def test_a_supply_that_is_off_counts_within_the_recording_for_lowest_and_dips_only(begin, end):
     """Switched on late, a pack changed, a plug pulled: the rest is as without these readings."""
     whole = flight(np.random.default_rng(4))
     v = whole.voltage.copy()
@@ -51,11 +51,16 @@ def test_a_supply_that_is_off_counts_for_lowest_and_dips_only(begin, end):
     off, on = (supply_facts(one, 13.0) for one in (
         replace(whole, voltage=v),
         Recording(whole.t[others], whole.voltage[others], whole.throttle[others])))
-    assert off.lowest.voltage_v == 0.0 and off.dips.count == 1
-    assert off.dips.seconds == pytest.approx((end - begin) / RATE)
-    assert (off.noise, off.sag, off.ou) == (on.noise, on.sag, on.ou)
+    if 0 < begin and end < v.size:
+        assert off.lowest.voltage_v == 0.0 and off.dips.count == 1
+        assert off.dips.seconds == pytest.approx((end - begin) / RATE)
+    else:
+        assert off.lowest.voltage_v == on.lowest.voltage_v and off.dips == on.dips
+        lowest = whole.t[whole.voltage == off.lowest.voltage_v][0]
+        assert off.lowest.time_s == pytest.approx(lowest)
+    assert repr((off.noise, off.sag, off.ou)) == repr((on.noise, on.sag, on.ou))
     found = analyze(replace(whole, voltage=v), brownout_voltage=13.0)
-    assert found.recording.n == others.size and found.overview.facts == off
+    assert found.recording.n == others.size and repr(found.overview.facts) == repr(off)
 
 
 def test_error_codes_change_no_fact():
@@ -64,8 +69,8 @@ def test_error_codes_change_no_fact():
     v = whole.voltage.copy()
     v[[700, 701, 3000]] = 65535.0
     others = np.delete(np.arange(v.size), [700, 701, 3000])
-    assert supply_facts(replace(whole, voltage=v), 13.0) == supply_facts(
-        Recording(whole.t[others], whole.voltage[others], whole.throttle[others]), 13.0)
+    assert repr(supply_facts(replace(whole, voltage=v), 13.0)) == repr(supply_facts(
+        Recording(whole.t[others], whole.voltage[others], whole.throttle[others]), 13.0))
 
 
 @pytest.mark.parametrize('v', [
@@ -87,7 +92,9 @@ def test_noise_is_of_its_throttle():
     found = supply_facts(flight(np.random.default_rng(4))).noise
     for u, rms, steady in zip(found.throttle, found.rms_v, found.steady_rms_v):
         truth = 0.01 + 0.02 * np.clip(u, *found.flown)
-        assert (rms, steady) == pytest.approx((truth, truth), rel=0.15)
+        assert rms == pytest.approx(truth, rel=0.15)
+        assert steady == pytest.approx(truth, rel=0.15) or math.isnan(steady) and not (
+            found.flown[0] < u < found.flown[1])
 
 
 def test_noise_is_measured_where_throttle_was_flown_and_only_there():
