@@ -16,6 +16,7 @@ from ou_monitor.analysis.overview import answers, known_lines
 from ou_monitor.analysis.quality import QualityItem
 from ou_monitor.analysis.relaxation import Relaxation
 from ou_monitor.criticism.curves import outline
+from ou_monitor.online.risk.courses import KEPT
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import FloatArray, NAN, Recording, Severity
 from ou_monitor.report.document import (
@@ -119,7 +120,8 @@ def _budget(analysis: Analysis) -> str:
         u, p = beyond[0]
         words += f'; at {100.0 * u:.0f} % it is {percent(p)}'
     elif curves.budget < 1.0:
-        words += '; higher throttle was not flown'
+        words += '; higher throttle was not flown' + (
+            f' in the last {KEPT / 60.0:g} minutes' if analysis.recording.duration > KEPT else '')
     return words + _fall_within_budget(analysis)
 
 
