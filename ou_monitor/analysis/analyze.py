@@ -20,12 +20,13 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.analysis.crafts import Craft, craft_of
 from ou_monitor.analysis.level_comparison import alpha_constancy, AlphaTest, LEVEL
-from ou_monitor.analysis.level_result import fit_all, fit_level, judge_levels, LevelResult
+from ou_monitor.analysis.level_result import (
+    fit_all, fit_level, judge_levels, LevelResult, ProcessType)
 from ou_monitor.analysis.level_tests import EFFECT, LEAST
 from ou_monitor.analysis.levels import find_levels, LoadLevel
 from ou_monitor.analysis.overview import Overview, overview
 from ou_monitor.analysis.quality import (
-    coupling_items, line_item, quality_list, QualityItem, second_items)
+    line_item, noise_items, quality_list, QualityItem)
 from ou_monitor.analysis.relaxation import (
     find_steps, fit_relaxation, judge_cause, Relaxation, ReleaseCause)
 from ou_monitor.analysis.supply import fed, flown_near, node_for, remainder, THROTTLES
@@ -102,8 +103,12 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
         recording, judged, relaxations, tuple(judge_cause(r, alpha) for r in relaxations), alpha,
         by_throttle(recording, seen, voltage, brownout_horizon), sliding,
         quality_list(recording, throttles, estimates,
-                     lines + second_items([level.throttle for level in judged if level.wanders])
-                     + coupling_items([level.throttle for level in judged if level.coupled]),
+                     [*lines, *(item for name, at in (
+                         ('SECOND_RELAXATION', [one for one in judged if one.wanders]),
+                         ('AC_COUPLING', [one for one in judged if one.coupled]),
+                         ('IMPULSES', [one for one in judged if one.estimate.usable
+                                       and one.verdict.within is ProcessType.IMPULSES]))
+                         for item in noise_items(name, [one.throttle for one in at]))],
                      seen.facts.ou.status == 'ok'),
         brownout_voltage is None, recording.notes + _left_out(recording, found), seen,
         craft_of(recording, seen.facts, cells))

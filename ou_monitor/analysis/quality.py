@@ -183,18 +183,22 @@ def line_item(throttle: float, without: Estimate, with_lines: Estimate | None) -
                        (throttle,))
 
 
-def second_items(throttles: Sequence[float]) -> list[QualityItem]:
-    """Return the caution for levels with a second relaxation (throttles 0..1)."""
-    return [QualityItem('SECOND_RELAXATION', Severity.WARNING, (
+# Cautions about the noise of a level: name and sentence.
+_NOISE = {
+    'SECOND_RELAXATION': (
         'The noise shows a second relaxation, slower or faster than the fitted one: alpha, tau '
         'and Var_inf describe a mixture, and their intervals are valid for neither; other levels '
-        'may have it too. `ou-monitor discover` fits both.'), tuple(throttles))
-        ] if throttles else []
-
-
-def coupling_items(throttles: Sequence[float]) -> list[QualityItem]:
-    """Return the caution for levels behind an AC-coupled instrument (throttles 0..1)."""
-    return [QualityItem('AC_COUPLING', Severity.WARNING, (
+        'may have it too. `ou-monitor discover` fits both.'),
+    'AC_COUPLING': (
         'Slow noise is missing, as behind an AC-coupled instrument: alpha, tau and Var_inf '
         'describe rail and instrument together; repeat with a DC-coupled instrument. '
-        '`ou-monitor discover` fits both.'), tuple(throttles))] if throttles else []
+        '`ou-monitor discover` fits both.'),
+    'IMPULSES': (
+        'The noise has impulses: alpha, sigma and Var_inf include them, and their intervals are '
+        'too narrow. `ou-monitor discover` tells impulses from noise.')}
+
+
+def noise_items(name: str, throttles: Sequence[float]) -> list[QualityItem]:
+    """Return the caution of this name for levels at these throttles, 0..1, if any."""
+    return [QualityItem(name, Severity.WARNING, _NOISE[name], tuple(throttles))
+            ] if throttles else []

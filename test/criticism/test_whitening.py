@@ -3,8 +3,9 @@
 import numpy as np
 from ou_monitor.analysis.analyze import analyze
 from ou_monitor.analysis.level_result import ProcessType
-from ou_monitor.analysis.quality import coupling_items, second_items
+from ou_monitor.analysis.quality import noise_items
 from ou_monitor.criticism.innovations import FAMILY_WISE, other_pole
+from ou_monitor.model.ou import simulate
 from ou_monitor.records import Recording
 import pytest
 from scipy.signal import lfilter
@@ -91,7 +92,7 @@ def test_too_few_samples_are_not_tested():
 
 
 def test_without_an_ac_coupling_there_is_no_note():
-    assert second_items([]) == coupling_items([]) == [] and FAMILY_WISE == 0.01
+    assert noise_items('AC_COUPLING', []) == [] and FAMILY_WISE == 0.01
 
 
 @pytest.mark.parametrize('corner', [6.0, 15.0])
@@ -119,3 +120,14 @@ def test_power_that_is_missing_is_a_high_pass_where_it_is_slow(slow, coupled):
     spectrum *= np.where(np.abs(np.log(np.maximum(omega, 1e-9) / slow)) < 0.7, 0.3, 1.0)
     pole = other_pole([np.fft.irfft(spectrum, n)], RATE, ALPHA, 4e-4, 0.0)
     assert (pole.coupling_p < FAMILY_WISE) is coupled
+
+
+def test_impulses_are_said_beside_the_fit_that_includes_them():
+    """Spikes of 0.5 V every two seconds on a rail of 10 mV; not without them."""
+    rng = np.random.default_rng(8)
+    t = np.arange(20_000) * 1e-3
+    v = simulate(t, 90.0, 0.13, rng, u0=5.0)
+    for spikes in (False, True):
+        w = v - 0.5 * spikes * (np.arange(t.size) % 2000 < 4)
+        names = {item.name for item in analyze(Recording(t, w)).quality}
+        assert ('IMPULSES' in names) == spikes
