@@ -68,12 +68,8 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
             window: float = 2.0, brownout_voltage: float | None = None,
             brownout_horizon: float = 5.0, cells: int = 0,
             progress: Progress | None = None) -> Analysis:
-    """
-    Analyse a recording load level by load level.
-
-    window in s, brownout_voltage in V, brownout_horizon in s, cells in series, to which the
-    voltage refers (0: none), progress 0..1.
-    """
+    """Analyse a recording load level by load level (window and horizon in s, voltage in V)."""
+    # cells: in series, to which the voltage refers; 0: none.
     report: Progress = progress or (lambda share: None)
     all_of_it = readings_of(recording)
     recording = supplied(all_of_it)
@@ -188,11 +184,7 @@ class Sliding:
 def slide(recording: Recording, window: float, brownout_voltage: float = NAN,
           brownout_horizon: float = 5.0,
           progress: Callable[[float], None] | None = None) -> Sliding:
-    """
-    Run the node's monitor, or without a limit its estimator, over a recording.
-
-    window in s, brownout_voltage in V, brownout_horizon in s, progress 0..1.
-    """
+    """Run the node's monitor, or without a limit its estimator, over a recording (s, V, s)."""
     if not (math.isfinite(brownout_horizon) and brownout_horizon > 0.0):
         raise ValueError(f'the horizon must be a positive number of seconds, got '
                          f'{brownout_horizon}')

@@ -228,11 +228,8 @@ def craft_line(craft: Craft) -> str:
 
 
 def craft_advice(craft: Craft) -> list[str]:
-    """
-    Return a sentence for each measure that is high: the likely reason and a remedy.
-
-    There are none if the number of cells is a guess, because it may not be a pack at all.
-    """
+    """Return a sentence for each measure that is high: the likely reason and a remedy."""
+    # If the number of cells is a guess, it may not be a pack at all.
     if craft.cells_from == 'guessed':
         return []
     return [f'The {one.name} is {_USUAL * one.value / one.usual[1]:.1f} times the median of '

@@ -132,12 +132,9 @@ def alpha_constancy(throttles: Sequence[float], estimates: Sequence[Estimate],
 
 
 def at_common_alpha(logs: FloatArray, errors: FloatArray) -> FloatArray:
-    """
-    Return relative errors of alpha or Var_inf at the common alpha (logs: ln of alpha, 1/s).
-
-    The error is proportional to sqrt(2 / (alpha T)), so it is too small for an alpha that is high
-    by chance.
-    """
+    """Return relative errors of alpha or Var_inf at the common alpha (logs: ln of alpha, 1/s)."""
+    # The error is proportional to sqrt(2 / (alpha T)), so it is too small for an alpha that is
+    # high by chance.
     found = errors
     for _ in range(20):
         weight = 1.0 / found ** 2
@@ -161,12 +158,9 @@ class SigmaChange:
 
 
 def sigma_change(low: Estimate, high: Estimate, others: Sequence[Estimate] = ()) -> SigmaChange:
-    """
-    Compare sigma of two levels that are usable; its error includes the scatter of all levels.
-
-    Scatter about a line of ln sigma over throttle, beyond the errors of the levels, has another
-    cause than throttle, such as a load that throttle does not tell.
-    """
+    """Compare sigma of two usable levels; its error includes the scatter of all levels."""
+    # Scatter about a line of ln sigma over throttle, beyond the errors of the levels, has another
+    # cause than throttle, such as a load that throttle does not tell.
     every = [low, *others, high]
     scatter = 0.0
     if others:

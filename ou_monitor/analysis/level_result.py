@@ -218,12 +218,8 @@ class LevelSpectrum:
 
 def level_spectrum(recording: Recording, segments: Sequence[Stay],
                    estimate: Estimate) -> LevelSpectrum:
-    """
-    Return the PSD of a level (Welch, Hann), averaged over its segments.
-
-    Limits: samples are taken as evenly spaced; if they are not, frequencies near the Nyquist
-    frequency are smeared.
-    """
+    """Return the PSD of a level (Welch, Hann), averaged over its segments."""
+    # Samples are taken as evenly spaced; if not, it is smeared near the Nyquist frequency.
     longest = max((s.stop - s.start for s in segments), default=0)
     rate = segment_rate(recording, segments)
     if longest < _MIN_LENGTH or not rate > 0.0:
@@ -261,14 +257,9 @@ def _pieces(segments: Sequence[Stay], length: int) -> int:
 
 def ou_spectrum(frequency: FloatArray, alpha: float, sigma: float, rate: float,
                 noise_std: float = 0.0) -> FloatArray:
-    """
-    Return the one-sided PSD of a *sampled* OU in white noise.
-
-    The Lorentzian 2 sigma^2 / (alpha^2 + (2 pi f)^2) with its aliases is the spectrum of an AR(1)
-    with the coefficient exp(-alpha/rate).
-
-    frequency in Hz, rate in Hz, noise_std in V.
-    """
+    """Return the one-sided PSD of a *sampled* OU in white noise (frequency and rate in Hz, V)."""
+    # The Lorentzian 2 sigma^2 / (alpha^2 + (2 pi f)^2) with its aliases is the spectrum of an
+    # AR(1) with the coefficient exp(-alpha/rate).
     phi = math.exp(-alpha / rate)
     var_inf = sigma * sigma / (2.0 * alpha)
     omega = 2.0 * math.pi * frequency / rate
@@ -300,11 +291,7 @@ class LevelSag:
 
 
 def mean_variance(time: float, n: int, estimate: Estimate, rms: float) -> float:
-    """
-    Return the variance of the mean of a segment of OU in white noise.
-
-    time in s, rms in V, result in V^2.
-    """
+    """Return the variance of the mean of a segment of OU in white noise, V^2 (s, rms in V)."""
     if not estimate.usable:
         return rms * rms / max(n, 1)
     at = max(estimate.alpha * time, 1e-9)

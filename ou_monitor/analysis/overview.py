@@ -81,12 +81,8 @@ class Overview:
 def overview(recording: Recording, limit: float | None = None,
              levels: Sequence[LevelResult] = (), cells: int = 0,
              left: Remainder | None = None, monitor: SupplyMonitor | None = None) -> Overview:
-    """
-    Return the facts.
-
-    limit in V, for `cells` in series; levels: the source of lines; left and monitor as in
-    `facts_and_end`.
-    """
+    """Return the facts (limit in V for `cells` in series; left, monitor: see `facts_and_end`)."""
+    # levels: the source of lines.
     facts, load, end = facts_and_end(recording, limit, left, monitor)
     known = recording.throttle[np.isfinite(recording.throttle)]
     near = np.flatnonzero(flown_near(recording, THROTTLES)).tolist() or [0]

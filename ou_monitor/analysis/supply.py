@@ -193,12 +193,9 @@ def supply_facts(recording: Recording, limit: float | None = None) -> SupplyFact
 def facts_and_end(recording: Recording, limit: float | None = None, left: Remainder | None = None,
                   monitor: SupplyMonitor | None = None,
                   ) -> tuple[SupplyFacts, SupplyLoad, MonitorReport | None]:
-    """
-    Return the facts, and load and report of the node at the end (no report without a limit).
-
-    limit in V; left: `remainder` of the recording; monitor: of `node_for`, fed with it; both
-    without the times off (`supplied`), and computed if omitted.
-    """
+    """Return the facts, and the node's load and, with a limit, V, its report at the end."""
+    # left: `remainder` of the recording; monitor: of `node_for`, fed with it; both without the
+    # times off (`supplied`), and computed if omitted.
     if limit is not None and not math.isfinite(limit):
         raise ValueError(f'the limit must be finite, got {limit} V')
     if left is None and recording.n > 1:
@@ -245,11 +242,7 @@ def node_for(recording: Recording, settings: MonitorSettings,
 
 def fed(recording: Recording, window: float, push: Callable[[slice], None],
         ) -> Iterator[tuple[float, bool]]:
-    """
-    Push a recording part by part.
-
-    After each part it yields the time, s, and whether this is one of `_POINTS`.
-    """
+    """Push a recording part by part; yield the time, s, and whether it is one of `_POINTS`."""
     t, duration, done = recording.t, recording.duration, 0
     step = max(0.25 * window, duration / _POINTS)
     each = max(1, min(math.ceil(step / _STEP), _MOST // _POINTS))

@@ -68,12 +68,9 @@ class _Numbers:
 
 def export(model: SupplyModel, target: str, *, throttle: FloatArray, rate: float,
            full_current: float = math.nan, recording: Recording | None = None) -> Export:
-    """
-    Return a model for another simulator (throttle at rate, Hz; full_current in A).
-
-    The throttle determines the usual load, and the effect of each term is measured over it.  With
-    the recording, the notes say how much of it the model and the exported part explain.
-    """
+    """Return a model for another simulator (throttle at rate, Hz; full_current in A)."""
+    # The throttle determines the usual load, and the effect of each term is measured over it.
+    # With the recording, the notes say how much of it the model and the exported part explain.
     if target == 'json':
         data = {'model': [{'term': t.NAME, 'params': t.values()} for t in model.terms],
                 'load': None if model.load is None else model.load.values()}

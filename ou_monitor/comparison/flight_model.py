@@ -77,14 +77,10 @@ class Drawn(Protocol):
 
 @dataclass(frozen=True)
 class Damping:
-    """
-    The share of fast changes of a path that the voltage does not follow.
+    """The share of fast changes of a path that the voltage does not follow."""
 
-    Throttle jitters, is not synchronous with the voltage, and is not a current.  So the voltage
-    follows its fast changes only in part; without damping they would count twice, in the path and
-    in the noise.
-    """
-
+    # Throttle jitters, is not synchronous with the voltage, and is not a current; without damping,
+    # its fast changes would count twice, in the path and in the noise.
     share: float = 0.0  # Share of the fast part that is missing, 0..1
     time: float = 0.02  # Time constant below which changes are fast, s
 
@@ -136,11 +132,7 @@ class FlightNoise:
 
 def fit_noise(samples: Readings, left: FloatArray, load: FloatArray | None, slow: float
               ) -> FlightNoise:
-    """
-    Fit the noise to residuals, V, under a throttle or current.
-
-    slow: variance, V^2, of the process with `SLOW_TIME` that the residuals also contain.
-    """
+    """Fit the noise to residuals, V, under a load, beside a process of `SLOW_TIME` (slow: V^2)."""
     dt, lsb = samples.spacing, samples.lsb
     left = left - left.mean()
     ou = fit_pieces([(left[part], np.ones(part.stop - part.start))
@@ -169,11 +161,7 @@ def fit_noise(samples: Readings, left: FloatArray, load: FloatArray | None, slow
 
 def _predicted(x: FloatArray, dt: float, white: float, parts: dict[float, float]
                ) -> tuple[FloatArray, float]:
-    """
-    Return the one-step prediction errors of readings, V, and their variance, V^2.
-
-    x in V, spacing dt in s, white in V^2; parts: variances of OUs, V^2, by rates, 1/s.
-    """
+    """Return one-step errors, V, and their variance, V^2, beside OUs (1/s: V^2) in white noise."""
     rates = np.array([rate for rate, variance in parts.items() if variance > 0.0])
     if not rates.size:
         return x, white
@@ -392,12 +380,9 @@ def damping(samples: Readings, path: FloatArray) -> Damping:
 
 
 def _sag_error(samples: Readings, load: _Load) -> float:
-    """
-    Return the relative error of the sag as a mean of two parts.
-
-    In each held-out part, the voltage is regressed on the predicted path; parts that move more
-    have more weight.  Temperature, wind and simplifications of the load model change the ratio.
-    """
+    """Return the relative error of the sag as a mean of two parts."""
+    # In each held-out part, the voltage is regressed on the predicted path; parts that move more
+    # have more weight.  Temperature, wind and simplifications of the load model change the ratio.
     squares, weights = [], []
     for (fit, errors), part in zip(load.parts, _parts(samples)):
         path = _path(samples, fit, load.current)[part]

@@ -187,13 +187,10 @@ class Measures:
 
 
 class Yardstick:
-    """
-    Levels, frequency bands and rises, chosen from the recording, by which voltages are compared.
-
-    lsb: step of the ADC, V, or 0; limits: levels, V, in addition to the two low ones.
-    """
+    """Levels, frequency bands and rises of a recording, by which voltages are compared."""
 
     def __init__(self, samples: Readings, lsb: float, limits: tuple[float, ...] = ()) -> None:
+        # lsb: step of the ADC, V, or 0; limits: levels, V, in addition to the two low ones.
         v, t = samples.voltage, samples.t
         self._t = t
         self.minutes = float(t[-1] - t[0]) / 60.0
@@ -390,11 +387,8 @@ def _fall(v: float) -> str:
 
 def judge(found: Sequence[Difference], explained: float, moved: bool
           ) -> tuple[float, Likeness, str, str]:
-    """
-    Return p-value, verdict, the largest difference in words, and its kind.
-
-    explained: share of the variance explained by the mean path; moved: whether throttle moved.
-    """
+    """Return p-value, verdict, the largest difference in words, and its kind."""
+    # explained: share of the variance explained by the mean path; moved: whether throttle moved.
     scores = np.array([one.scores() for one in found])
     largest = scores.max(axis=0)
     p = float(np.mean(largest >= largest[0]))

@@ -136,11 +136,8 @@ def find_rails(voltage: FloatArray, step: float, noise: float,
 
 def _noisy(voltage: FloatArray, step: float, throttle: FloatArray | None
            ) -> npt.NDArray[np.bool_]:
-    """
-    Return the samples at throttles whose noise spans several codes.
-
-    A quiet rail at idle may stay within the top code without clipping.
-    """
+    """Return the samples at throttles whose noise spans several codes."""
+    # A quiet rail at idle may stay within the top code without clipping.
     if throttle is None or not step > 0.0:
         return np.ones(voltage.size, dtype=bool)
     edges = np.unique(np.quantile(throttle, np.arange(1, _LOADS) / _LOADS))
@@ -157,11 +154,8 @@ def _idle(throttle: FloatArray) -> npt.NDArray[np.bool_]:
 
 
 def _limit(x: FloatArray, step: float, noisy: npt.NDArray[np.bool_]) -> float:
-    """
-    Return the top reading if it is more frequent than its neighbours predict; otherwise inf.
-
-    If a stage before the ADC clips, later noise may raise some readings by a code or two.
-    """
+    """Return the top reading if it is more frequent than its neighbours predict; otherwise inf."""
+    # If a stage before the ADC clips, later noise may raise some readings by a code or two.
     top = float(x.max())
     tie = _FLOAT32 * abs(top)
     width = step if step > 0.0 else tie
@@ -198,11 +192,7 @@ def _limit(x: FloatArray, step: float, noisy: npt.NDArray[np.bool_]) -> float:
 
 def redraw(voltage: FloatArray, low: float, high: float, step: float,
            rng: np.random.Generator) -> FloatArray:
-    """
-    Return the voltage with clipped samples drawn beyond their limit.
-
-    voltage in V, low, high in V, step in V.
-    """
+    """Return the voltage with clipped samples drawn beyond their limits (all in V)."""
     v = voltage.astype(np.float64)
     top, bottom = voltage >= high, voltage <= low
     sites = np.flatnonzero(top | bottom)
@@ -261,12 +251,9 @@ def find_knee(voltage: FloatArray, noise: float, side: float,
 
 
 def _is_limit(x: FloatArray, knee: float) -> bool:
-    """
-    Return whether noise is compressed above the knee only, and repeatedly.
-
-    A rail that is quiet without load also stays near its top, but it is quiet just below the knee
-    too, and only during one long time.
-    """
+    """Return whether noise is compressed above the knee only, and repeatedly."""
+    # A rail that is quiet without load also stays near its top, but it is quiet just below the
+    # knee too, and only during one long time.
     step = np.diff(x)
     near = (x[:-1] < knee) & (x[:-1] > knee - 3.0 * float(np.std(step)))
     # With a limit, falls from just below the knee are not compressed.
@@ -352,12 +339,9 @@ def _code(v: FloatArray) -> float:
 
 
 def _ties_of_codes(moved: FloatArray, code: float) -> tuple[float, float]:
-    """
-    Return the number of ties expected from changes by one and two codes, and its standard error.
-
-    The log density of a change is nearly a parabola about zero, even with a ramp, a line or a load
-    added, because both signs are about equally likely.
-    """
+    """Return the ties expected from changes by one and two codes, and their standard error."""
+    # The log density of a change is nearly a parabola about zero, even with a ramp, a line or a
+    # load added, because both signs are about equally likely.
     size = np.abs(moved)
     one, two = (max(0.5 * float((np.abs(size - k * code) < 0.5 * code).sum()), 0.5)
                 for k in (1.0, 2.0))
@@ -366,12 +350,9 @@ def _ties_of_codes(moved: FloatArray, code: float) -> tuple[float, float]:
 
 
 def _stuck(v: FloatArray) -> npt.NDArray[np.bool_]:
-    """
-    Return which samples (from the second on) belong to runs of repeats too long for chance.
-
-    A calm rail enters and leaves a run with a change of about one code.  A lost link stops between
-    ordinary changes, and the voltage has moved further when the link is back.
-    """
+    """Return which samples (from the second on) belong to runs of repeats too long for chance."""
+    # A calm rail enters and leaves a run with a change of about one code.  A lost link stops
+    # between ordinary changes, and the voltage has moved further when the link is back.
     step = np.diff(v)
     none = np.zeros(step.size, dtype=np.bool_)
     equal = (step == 0.0) & (v[1:] > v.min()) & (v[1:] < v.max())
@@ -410,13 +391,10 @@ def _stuck(v: FloatArray) -> npt.NDArray[np.bool_]:
 
 
 def _ties_without_holds(v: FloatArray, inner: npt.NDArray[np.bool_]) -> float:
-    """
-    Return the share of ties between neighbours that is expected without holds.
-
-    Values k samples apart are equal by chance of their codes, or with probability h^k if a share h
-    of the samples is held.  By chance, neighbours are equal more often, by the ratio of the rms
-    differences at lags k and 1: sqrt(k) in a diffusion, less in white noise.
-    """
+    """Return the share of ties between neighbours that is expected without holds."""
+    # Values k samples apart are equal by chance of their codes, or with probability h^k if a share
+    # h of the samples is held.  By chance, neighbours are equal more often, by the ratio of the
+    # rms differences at lags k and 1: sqrt(k) in a diffusion, less in white noise.
     near = float(np.mean((v[1:] - v[:-1]) ** 2))
     shares = []
     for k in _APART:

@@ -270,22 +270,15 @@ def score(a: FloatArray, b: FloatArray) -> float:
 
 
 def sigma_score(square: FloatArray, throttle: FloatArray) -> float:
-    """
-    Return the score of a slope of ln sigma over throttle (0..1).
-
-    square: squared innovations.  `analyze` instead compares sigma between levels of constant
-    throttle (`ou_monitor.analysis.level_comparison`).
-    """
+    """Return the score of a slope of ln sigma over throttle, from squared innovations."""
+    # `analyze` compares sigma between levels of constant throttle instead.
     return score(square, throttle)
 
 
 def alpha_score(w: FloatArray, state: FloatArray, throttle: FloatArray) -> float:
-    """
-    Return the score of a slope of ln alpha over throttle (0..1), orthogonal to the score of alpha.
-
-    w: innovations; state: the standardised deviation before each.  `analyze` instead tests whether
-    levels of constant throttle have the same alpha (`ou_monitor.analysis.level_comparison`).
-    """
+    """Return the score of a slope of ln alpha over throttle, orthogonal to the score of alpha."""
+    # w: innovations; state: the standardised deviation before each.  `analyze` instead tests
+    # whether levels of constant throttle have the same alpha.
     u = throttle - throttle.mean()
     return score(w, state * u - float((state * state * u).mean()) * state)
 
@@ -404,12 +397,9 @@ def simulate_bank(given: Covariates, phi: float, rng: np.random.Generator, size:
 
 def simulate_bank_of(samples: Samples, composite: Composite, rng: np.random.Generator,
                      size: int = SIZE) -> NullBank:
-    """
-    Simulate the bank of a model with more terms than the `ou`.
-
-    Needed if the step of the ADC is as large as the noise: then errors of the right model are
-    neither normal nor independent.
-    """
+    """Simulate the bank of a model with more terms than the `ou`."""
+    # Needed if the step of the ADC is as large as the noise: then errors of the right model are
+    # neither normal nor independent.
     model, rows, given = SupplyModel(composite.terms), [], covariates_of(samples, composite)
     for _ in range(size):
         y = model.simulate(samples.t, rng, samples.throttle)

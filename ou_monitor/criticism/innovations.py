@@ -68,11 +68,7 @@ def steps_before(t: FloatArray) -> FloatArray:
 
 def ou_filter(t: FloatArray, alpha: float, var_inf: float, noise_var: float,
               first: float = NAN) -> Filter:
-    """
-    Return the filter of a sampled OU in white noise.
-
-    t in s; first: variance of the OU at the first sample, V^2 (default Var_inf).
-    """
+    """Return the filter of an OU in white noise at t, s (first: its variance at t[0], V^2)."""
     dt = steps_before(t)[1:]
     q = np.append(var_inf if math.isnan(first) else first,
                   -var_inf * np.expm1(-2.0 * alpha * dt))
@@ -83,11 +79,7 @@ def ou_filter(t: FloatArray, alpha: float, var_inf: float, noise_var: float,
 
 def innovations(t: FloatArray, deviation: FloatArray, alpha: float, var_inf: float,
                 noise_var: float) -> FloatArray:
-    """
-    Return the standardised one-step innovations of a sampled OU in white noise.
-
-    t in s, deviation in V.
-    """
+    """Return the standardised one-step innovations of a sampled OU in white noise (s, V)."""
     if deviation.size < 2 or not math.isfinite(alpha):
         return deviation / math.sqrt(var_inf + noise_var)
     run = ou_filter(t, alpha, var_inf, noise_var)

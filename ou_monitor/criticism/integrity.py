@@ -204,11 +204,7 @@ class Stamps:
 
 
 def judge_stamps(t: FloatArray, voltage: FloatArray) -> Stamps:
-    """
-    Replace stamps by an even grid if their scatter is negligible or wrong.
-
-    t in s, voltage in V.
-    """
+    """Replace stamps, s, by an even grid if their scatter is negligible or wrong."""
     step = np.diff(t)
     usual = float(np.median(step))
     # First assume no gaps, because steps that scatter by half their length look like gaps.
@@ -243,12 +239,9 @@ def judge_stamps(t: FloatArray, voltage: FloatArray) -> Stamps:
 
 
 def _wrong(step: FloatArray, number: FloatArray, voltage: FloatArray) -> bool:
-    """
-    Return whether increments do not follow the steps, so that the stamps are wrong.
-
-    The likelihood ratio must exceed the penalty of a parameter, as for causes.  White noise of the
-    sensor, which does not depend on the steps, is allowed for.
-    """
+    """Return whether increments do not follow the steps, so that the stamps are wrong."""
+    # The likelihood ratio must exceed the penalty of a parameter, as for causes.  White noise of
+    # the sensor, which does not depend on the steps, is allowed for.
     change = np.diff(voltage)
     change = change - np.median(change)
     limit = 4.0 * float(np.median(np.abs(change))) / 0.6745

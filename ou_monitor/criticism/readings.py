@@ -89,12 +89,9 @@ def current_at(recording: Recording, t: FloatArray) -> FloatArray | None:
 
 def load_of(recording: Recording, t: FloatArray, v: FloatArray, u: FloatArray | None,
             notes: list[str]) -> FloatArray | None:
-    """
-    Return the load: throttle, or the measured current if it predicts the voltage better.
-
-    The current is scaled by its 99 % quantile, and shifted by the delay of the voltage; t in s, v
-    in V.
-    """
+    """Return the load: throttle, or the measured current if it predicts the voltage better."""
+    # t in s, v in V.  The current is scaled by its 99 % quantile, and shifted by the delay of the
+    # voltage.
     current = current_at(recording, t)
     if current is None or not float(np.ptp(current)) > 0.0:
         return u

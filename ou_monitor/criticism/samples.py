@@ -105,13 +105,10 @@ class Samples:
         return self.cell * self.cell / 12.0
 
     def spread(self, codes: FloatArray, cell: float, rng: np.random.Generator) -> Samples:
-        """
-        Return the samples with codes, V, spread evenly within their cells (cell in V; 0: as is).
-
-        The mean log density of a value spread within a cell is at most the log of the code's
-        probability over the width (Jensen; Theis et al., ICLR 2016).  So, where codes repeat, a
-        narrow distribution cannot gain without limit, as it does with the density at the code.
-        """
+        """Return samples with codes, V, spread evenly within their cells, V (0: as they are)."""
+        # The mean log density of a value spread within a cell is at most the log of the code's
+        # probability over the width (Jensen; Theis et al., ICLR 2016).  So, where codes repeat, a
+        # narrow distribution cannot gain without limit, as it does with the density at the code.
         if not cell > 0.0:
             return replace(self, voltage=codes)
         drawn = codes + cell * (rng.random(self.n) - 0.5)
@@ -185,13 +182,8 @@ def choose_samples(voltage: FloatArray, rate: float) -> tuple[slice, str]:
 
 def events_between(voltage: FloatArray, throttle: FloatArray | None, rate: float, which: slice
                    ) -> npt.NDArray[np.int64]:
-    """
-    Return further samples to keep: around sudden changes.
-
-    A jump that is clear between neighbours may be lost in the noise of k steps.
-
-    voltage in V, rate in Hz.
-    """
+    """Return further samples to keep: around sudden changes (voltage in V, rate in Hz)."""
+    # A jump that is clear between neighbours may be lost in the noise of k steps.
     first, stop, k = which.start, min(which.stop, voltage.size), which.step or 1
     none = np.zeros(0, dtype=np.int64)
     change = np.diff(voltage[first:stop])
@@ -220,11 +212,8 @@ def events_between(voltage: FloatArray, throttle: FloatArray | None, rate: float
 
 
 def lines_between(t: FloatArray, voltage: FloatArray, which: slice) -> list[Tone]:
-    """
-    Find steady lines in all samples above the Nyquist frequency of the samples used.
-
-    In the samples used they would be aliased, and mostly hidden by noise.
-    """
+    """Find steady lines in all samples above the Nyquist frequency of the samples used."""
+    # In the samples used they would be aliased, and mostly hidden by noise.
     k = which.step or 1
     part = slice(which.start, min(which.stop, voltage.size))
     t, v = t[part], voltage[part]
@@ -297,12 +286,9 @@ def _widest(voltage: FloatArray, factor: int) -> int:
 
 
 def _variogram(v: FloatArray, lag: int, coarse: bool) -> float:
-    """
-    Return the variogram at a lag, V^2, up to a factor.
-
-    Computed from the smaller half of the differences; load steps, which would hide how fast the
-    rail itself relaxes, are in the larger half.  Coarse codes need all differences.
-    """
+    """Return the variogram at a lag, V^2, up to a factor."""
+    # Computed from the smaller half of the differences; load steps, which would hide how fast the
+    # rail itself relaxes, are in the larger half.  Coarse codes need all differences.
     d = np.square(v[lag:] - v[:-lag])
     if coarse:
         return 0.5 * float(d.mean())

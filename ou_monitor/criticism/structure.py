@@ -81,11 +81,8 @@ def fit_gaussian(samples: Samples, terms: Sequence[Term], part: slice,
                  events: Events | None = None, offset: FloatArray | None = None,
                  whole_mean: bool = False, rough: bool = False, begun: bool = False
                  ) -> GaussianFit:
-    """
-    Fit the Gaussian part by maximum likelihood on a part of the recording (offset in V).
-
-    begun: whether the parameters were already fitted to the whole part.
-    """
+    """Fit the Gaussian part by maximum likelihood on a part of the recording (offset in V)."""
+    # begun: whether the parameters were already fitted to the whole part.
     voltage = samples.voltage if offset is None else samples.voltage - offset
     chosen = samples.part(part, voltage)
     inside = None if events is None else events.part(part)
@@ -114,12 +111,9 @@ def evaluate(samples: Samples, terms: Sequence[Term], events: Events | None = No
 def whitened(samples: Samples, terms: Sequence[Term], more: Sequence[Term],
              events: Events | None = None, offset: FloatArray | None = None, *,
              own: bool = False) -> FloatArray:
-    """
-    Return voltage, level and columns of the mean, whitened by the noise of a model.
-
-    The columns are those of `more`, and with `own` also those of the model.  Without `own`, terms
-    of the model that are not `MEASURED` are subtracted from the voltage.  offset in V.
-    """
+    """Return voltage, level and columns of the mean, whitened by the noise of a model."""
+    # The columns are those of `more`, and with `own` also those of the model.  Without `own`,
+    # terms of the model that are not `MEASURED` are subtracted from the voltage.  offset in V.
     run = _filter(samples, terms, events)
     kept = terms if own else [term for term in terms if term.ROLE is not Role.MEAN]
     columns = columns_of(samples, (*kept, *more), run.segment)
@@ -261,13 +255,10 @@ def _coupled(term: ACCoupling, s: Segment, phi: FloatArray, q: FloatArray
 
 def _beside_lines(samples: Samples, terms: tuple[Term, ...], events: Events | None, rough: bool,
                   begun: bool) -> GaussianFit:
-    """
-    Fit by scoring; more than `_MANY` lines are first subtracted, given the initial noise.
-
-    The estimates of noise and of coefficients of the mean are uncorrelated, and a line depends
-    only on the noise at its own frequency.  So the other terms are fitted to the rest, then all
-    coefficients together.
-    """
+    """Fit by scoring; more than `_MANY` lines are first subtracted, given the initial noise."""
+    # The estimates of noise and of coefficients of the mean are uncorrelated, and a line depends
+    # only on the noise at its own frequency.  So the other terms are fitted to the rest, then all
+    # coefficients together.
     lines = [k for k, term in enumerate(terms) if isinstance(term, Tone)
              and term.ROLE is Role.MEAN]
     if len(lines) <= _MANY:
@@ -360,12 +351,9 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
 
 def _scored(samples: Samples, terms: tuple[Term, ...], events: Events | None, base: GaussianFit,
             free: Sequence[tuple[int, str]]) -> tuple[FloatArray, FloatArray, float]:
-    """
-    Return scores, shape (n, free), expected information, and processor time, s.
-
-    The information assumes normal errors with the predicted variances.  With heavy tails, the
-    outer product of the scores would shorten each step in proportion to the kurtosis.
-    """
+    """Return scores, shape (n, free), expected information, and processor time, s."""
+    # The information assumes normal errors with the predicted variances.  With heavy tails, the
+    # outer product of the scores would shorten each step in proportion to the kurtosis.
     v, cost = base.variance, 0.0
     z = base.innovation / np.sqrt(v)
     means, spreads = np.empty((2, samples.n, len(free)))

@@ -56,13 +56,10 @@ BESIDE_SHARE = 0.3
 
 def kinds_to_try(kinds: Iterable[Kind], model: Sequence[Kind], given: Collection[str],
                  throttle: bool, first: bool) -> list[Kind]:
-    """
-    Return the kinds to add to a model: those that come first (`first`), or else the others.
-
-    Measured inputs come first, because latent causes imitate them, and white noise, because every
-    sensor has it.  The regression chooses responses of the mean, except that a trend is also tried
-    together with latent causes, which imitate it.
-    """
+    """Return the kinds to add to a model: those that come first (`first`), or else the others."""
+    # Measured inputs come first, because latent causes imitate them, and white noise, because
+    # every sensor has it.  The regression chooses responses of the mean, except that a trend is
+    # also tried together with latent causes, which imitate it.
     return [kind for kind in kinds
             if kind.NAME not in ('ou', *given) and kind.ROLE is not Role.EXACT
             and comes_first(kind) is first and (not is_response(kind) or kind.FAMILY == 'slow')
@@ -83,11 +80,8 @@ def imitate(one: Kind, other: Kind) -> bool:
 
 
 def score_gain(kind: Kind, values: Statistics) -> float:
-    """
-    Return the gain of a kind by score tests, nats: half the square of its largest sign.
-
-    A score test is for one size and span; the fitted kind may gain several times as much.
-    """
+    """Return the gain of a kind by score tests, nats: half the square of its largest sign."""
+    # A score test is for one size and span; the fitted kind may gain several times as much.
     return 0.5 * max((value ** 2 for name, value in values.items() for sign in kind.SIGNS
                       if is_sign(sign, name, value)), default=0.0)
 
@@ -100,11 +94,8 @@ def affordable(kind: Kind, cost: float) -> bool:
 # Which trial is accepted, and what comes with it.
 
 def least_evidence(kind: Kind, largest: float, again: bool = False) -> float:
-    """
-    Return the minimum evidence of a response of the mean, nats (largest: evidence of all).
-
-    again: whether the model has a term of this kind, so that another may only correct its form.
-    """
+    """Return the minimum evidence of a response of the mean, nats (largest: evidence of all)."""
+    # If the model has a term of this kind (again), another may only correct its form.
     share = max(kind.LEAST_SHARE, FORM if again else 0.0)
     return max(ACCEPT, share * largest)
 
@@ -120,12 +111,9 @@ def is_latent(kind: Kind) -> bool:
 
 
 def is_shared(gains: npt.ArrayLike, errors: float = 1.0) -> bool:
-    """
-    Return whether the total gain of the parts of a recording exceeds its standard error, nats.
-
-    If only one part gains, the standard error of the sum equals that gain; for an effect that
-    gains g nats evenly, it is sqrt(2 g).
-    """
+    """Return whether the total gain of a recording's parts exceeds its standard error, nats."""
+    # If only one part gains, the standard error of the sum equals that gain; for an effect that
+    # gains g nats evenly, it is sqrt(2 g).
     parts = np.asarray(gains, dtype=np.float64)
     error = math.sqrt(parts.size) * float(parts.std(ddof=1))
     # Margin for rounding: a single part is exactly at the limit and must not pass.
@@ -144,11 +132,7 @@ def is_plainer(one: Kind, other: Kind) -> bool:
 
 
 def only_to_changes(responses: Iterable[Kind]) -> bool:
-    """
-    Return whether a mean responds to throttle by transients alone.
-
-    This is so behind an AC coupling, which removes steady currents.
-    """
+    """Return whether a mean responds to throttle by transients alone, as behind an AC coupling."""
     names = {kind.NAME for kind in responses}
     return LoadTransient.NAME in names and LoadSag.NAME not in names
 
@@ -159,11 +143,8 @@ def relaxes(rate: float, duration: float) -> bool:
 
 
 def improves_predictions(gain: float, error: float, chance: float) -> bool:
-    """
-    Return whether a cause improves predictions of held-out blocks (gain, error in nats).
-
-    If the gain is unknown, the p-value of the fit decides.
-    """
+    """Return whether a cause improves predictions of held-out blocks (gain, error in nats)."""
+    # If the gain is unknown, the p-value of the fit decides.
     return chance <= CHANCE and not gain < -error
 
 
@@ -177,15 +158,12 @@ def failing(before: Statistics, after: Statistics) -> list[str]:
 
 def withdrawn(before: Statistics, after: Statistics, accepted: Sequence[Kind],
               asked: Mapping[str, Statistics] = MappingProxyType({})) -> list[int]:
-    """
-    Return which accepted causes do not explain their statistics.
-
-    The form of measured causes is never exact, so with them some statistic always fails on a real
-    flight.  Then a latent cause is tested by its own signs only, relative to their values with the
-    measured causes alone (`before`) or just before its acceptance (`asked`, by name), since a
-    larger effect may have hidden them.  Without measured causes, latent ones are tested by all
-    statistics, because the effect may not be in the catalogue.
-    """
+    """Return which accepted causes do not explain their statistics."""
+    # The form of measured causes is never exact, so with them some statistic always fails on a
+    # real flight.  Then a latent cause is tested by its own signs only, relative to their values
+    # with the measured causes alone (`before`) or just before its acceptance (`asked`, by name),
+    # since a larger effect may have hidden them.  Without measured causes, latent ones are tested
+    # by all statistics, because the effect may not be in the catalogue.
     beside = not all(map(is_latent, accepted))
     left = failing(before, after)
 

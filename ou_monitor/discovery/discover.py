@@ -219,14 +219,11 @@ def _plain(samples: Samples, state: Integrity) -> HeldOut:
 def _causes(samples: Samples, state: Integrity, left: Pruned, se: tuple[dict[str, Any], ...],
             plain: HeldOut, scored: npt.NDArray[np.bool_], rivals: Mapping[str, list[str]]
             ) -> tuple[Cause, ...]:
-    """
-    Return all causes: exact findings first, then those of the search.
-
-    The gain of a cause is how much the model loses without it, fitted again.  If there are many
-    causes of one kind (harmonics of a line), they are left out together and share one gain.
-    Repeats, clipping and wrong stamps, which are corrected in the samples, also share one gain:
-    what the plain OU loses if it is fitted to the samples as logged.
-    """
+    """Return all causes: exact findings first, then those of the search."""
+    # The gain of a cause is how much the model loses without it, fitted again.  If there are many
+    # causes of one kind (harmonics of a line), they are left out together and share one gain.
+    # Repeats, clipping and wrong stamps, which are corrected in the samples, also share one gain:
+    # what the plain OU loses if it is fitted to the samples as logged.
     found: list[Cause] = []
     model = left.full.model
     for term in state.exact:
@@ -310,11 +307,8 @@ def judge(remaining: Sequence[Criticism], causes: int, doubts: Sequence[str] = (
 
 def doubts(terms: Sequence[Term], crossing: CrossingRate, duration: float, step: float,
            larger: bool = False) -> tuple[str, ...]:
-    """
-    Return objections to a model besides its statistics, in words (times in s).
-
-    larger: whether its one-step errors are larger than those of the plain OU.
-    """
+    """Return objections to a model besides its statistics, in words (times in s)."""
+    # larger: whether its one-step errors are larger than those of the plain OU.
     found = ['its one-step errors are larger than those of the plain OU'] if larger else []
     if crossing.worse:
         found.append(f'it falls through {number(crossing.level, 4)} V '

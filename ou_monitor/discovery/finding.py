@@ -163,15 +163,7 @@ class Finding:
         return throttle_effects(self.samples, self.simulated.terms, self.crossing.level)
 
     def as_data(self) -> dict[str, Any]:
-        """
-        Return the finding for JSON.
-
-        Returns
-        -------
-        dict
-            The keys of doc/discovery.md; wherever there are `params`, there are `se` and `units`.
-
-        """
+        """Return the finding for JSON (doc/discovery.md); beside `params` lie `se` and `units`."""
         baseline = self.baseline
         found: dict[str, Any] = plain_data({
             'recording': self.recording, 'load': self.load, 'n': self.n,

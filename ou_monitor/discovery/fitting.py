@@ -125,13 +125,10 @@ class Fitter:
 
     def trials(self, composite: Composite, kinds: Sequence[type[Term]],
                statistics: Callable[[Composite], Mapping[str, float]]) -> list[Trial]:
-        """
-        Return kinds that improve a model: all are estimated, and the best few fitted in full.
-
-        Kinds that failed before are tried again if score tests show more than at that time.  Kinds
-        whose fit takes seconds come last, and only if they imitate the best other kind or score
-        tests still show them after it is added.  statistics: function of a model.
-        """
+        """Return kinds that improve a model: all are estimated, the best few fitted in full."""
+        # Kinds that failed before are tried again if score tests show more than at that time.
+        # Kinds whose fit takes seconds come last, and only if they imitate the best other kind or
+        # score tests still show them after it is added.
         values = statistics(composite)
         shown = {kind: decision.score_gain(kind, values) for kind in kinds}
         tried = [kind for kind in kinds if not kind.SLOW_FIT
@@ -215,11 +212,8 @@ class Fitter:
 
     def best_start(self, composite: Composite, kind: type[Term], view: View, least: float = 0.0,
                    starts: Sequence[Term] | None = None) -> Composite | None:
-        """
-        Return the best fit with one more term of a kind.
-
-        least: nats that its spectrum must gain; starts: by default, the candidates of the kind.
-        """
+        """Return the best fit with one more term of a kind (starts: its candidates by default)."""
+        # least: nats that its spectrum must gain.
         if kind.ROLE is Role.LAW:
             found = self.fit([*composite.terms, kind], composite)
             return found if found is not None and found.terms[-1].holds(view) else None
@@ -291,11 +285,8 @@ def _joined(composite: Composite) -> Term:
 
 
 def _by_scores(samples: Samples, starts: list[Term], view: View) -> list[Term]:
-    """
-    Return starts by their gain in the scores; lines only if they may be worth their penalty.
-
-    Slow terms are partly absorbed by the `ou`, so their scores are small.
-    """
+    """Return starts by their gain in the scores; lines only if they may be worth their penalty."""
+    # Slow terms are partly absorbed by the `ou`, so their scores are small.
     s = samples.segment(1.0, 0.0)
     scale = np.sqrt(view.variance)
     price = 0.5 * math.log(samples.train.stop)
@@ -318,12 +309,9 @@ def _by_scores(samples: Samples, starts: list[Term], view: View) -> list[Term]:
 
 def from_spectrum(samples: Samples, composite: Composite, starts: Sequence[Term]
                   ) -> tuple[tuple[Term, ...], float]:
-    """
-    Return the terms of a model and further ones, fitted to the spectrum of its scores.
-
-    starts: the terms of `composite` without its laws, with the initial `ou`, and further terms at
-    the end.  The second result is the gain of the fit, nats.
-    """
+    """Return terms fitted to the spectrum of a model's scores, and the gain of the fit, nats."""
+    # starts: the terms of `composite` without its laws, with the initial `ou`, and further terms
+    # at the end.
     ordinates = Ordinates.of(composite.z[samples.train])
     spectrum = _Spectrum(samples, composite.gaussian.terms, ordinates.omega)
     free = [(k, name) for k, term in enumerate(starts) if k == 0 or term.ROLE in (

@@ -71,11 +71,8 @@ def if_known(gain: float, error: float) -> tuple[float, float]:
 
 def without(samples: Samples, model: Composite, *indices: int, plain: Composite | None = None
             ) -> Composite | None:
-    """
-    Return the model fitted again to everything without some of its terms; None if that fails.
-
-    If it is worse than the plain fit, it has not converged, and is repeated from another start.
-    """
+    """Return the model fitted to everything without some of its terms; None if that fails."""
+    # If it is worse than the plain fit, it has not converged, and is repeated from another start.
     kept = [term for k, term in enumerate(model.terms) if k not in indices]
     # Terms that modify a removed term are removed too.
     names = {term.NAME for term in kept}
@@ -143,12 +140,9 @@ def why_unknown(new: HeldOut, old: HeldOut, scored: npt.NDArray[np.bool_],
 
 def cause_gain(full: HeldOut, less: HeldOut, scored: npt.NDArray[np.bool_]
                ) -> tuple[float, float, float]:
-    """
-    Return the gain of the larger of two models, its error, nats per sample, and a p-value.
-
-    The p-value is twice the smaller of two p-values: of the likelihood ratio on everything,
-    corrected for the search, and of the gain on held-out samples.
-    """
+    """Return the gain of the larger of two models, its error, nats per sample, and a p-value."""
+    # The p-value is twice the smaller of two p-values: of the likelihood ratio on everything,
+    # corrected for the search, and of the gain on held-out samples.
     gain, error = gain_of(full, less, scored)
     ratio = 2.0 * float((full.model.density - less.model.density).sum())
     tail = float(chi2.logsf(max(ratio, 0.0), max(full.model.free - less.model.free, 1)))
@@ -296,14 +290,11 @@ def held_out(samples: Samples, model: Composite) -> HeldOut:
 
 def errors_grow(new: FloatArray, old: FloatArray, variance: FloatArray, errors: float = Z95
                 ) -> bool:
-    """
-    Return whether one-step errors (rms) grew by more than `errors` standard errors.
-
-    If the new model is right, its errors, with these variances, V^2, are independent of their
-    difference from the old ones, which gives the standard error of the increase.  A likelihood may
-    rise although errors grow: to explain a few bursts as noise may cost less likelihood than it
-    gains elsewhere.
-    """
+    """Return whether one-step errors (rms) grew by more than `errors` standard errors."""
+    # If the new model is right, its errors, with these variances, V^2, are independent of their
+    # difference from the old ones, which gives the standard error of the increase.  A likelihood
+    # may rise although errors grow: to explain a few bursts as noise may cost less likelihood than
+    # it gains elsewhere.
     difference = old - new
     error = 2.0 * math.sqrt(float(np.sum(variance * difference**2)))
     return float(np.sum(new**2 - old**2)) > errors * error

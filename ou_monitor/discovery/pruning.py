@@ -54,11 +54,8 @@ class Pruned:
 
 def prune_by_gain(samples: Samples, model: Composite, names: Sequence[str], plain: HeldOut,
                   scored: npt.NDArray[np.bool_], progress: Callable[[float], None]) -> Pruned:
-    """
-    Remove the causes that do not improve held-out predictions, the worst first.
-
-    Interrupted (Ctrl-C), it returns the current model; gains not yet measured are unknown.
-    """
+    """Remove the causes that do not improve held-out predictions, the worst first."""
+    # Interrupted (Ctrl-C), it returns the current model; gains not yet measured are unknown.
     state = Pruned(held_out(samples, model), list(names))
     for turn in range(_ROUNDS):
         state.worth = []
@@ -114,13 +111,9 @@ def _leave_out(state: Pruned, worst: int) -> None:
 
 
 def _straying(samples: Samples, state: Pruned) -> int | None:
-    """
-    Return the cause whose removal keeps simulations within the recorded range, if there is one.
-
-    One-step predictions hardly constrain the range of a process: simulations of a term that
-    improves them may still exceed the recorded range.  Responses of the mean are not
-    tested.
-    """
+    """Return the cause, if any, whose removal keeps simulations within the recorded range."""
+    # One-step predictions hardly constrain the range of a process: simulations of a term that
+    # improves them may still exceed the recorded range.  Responses of the mean are not tested.
     def far_of(model: Composite) -> float:
         try:
             return outside_range(samples, model.terms)
@@ -146,11 +139,8 @@ def _as_trend(samples: Samples, state: Pruned, k: int) -> bool:
 
 def _measure(samples: Samples, state: Pruned, plain: HeldOut, scored: npt.NDArray[np.bool_],
              progress: Callable[[float], None]) -> None:
-    """
-    Measure the gain of each cause, or of all causes of one kind if there are many.
-
-    If the rest predicts worse than the plain OU, the gain is relative to the plain OU.
-    """
+    """Measure the gain of each cause, or of all causes of one kind if there are many."""
+    # If the rest predicts worse than the plain OU, the gain is relative to the plain OU.
     found: dict[tuple[int, ...], Worth] = {}
     for k in range(len(state.names)):
         group = group_of(state.full.model, state.names, k)
@@ -177,11 +167,8 @@ def group_of(model: Composite, names: Sequence[str], k: int) -> tuple[int, ...]:
 
 def refusal(samples: Samples, terms: Sequence[Term], gain: float, gain_se: float,
             larger: bool = False) -> str:
-    """
-    Return why a model is refused, in words; otherwise empty.
-
-    gain, gain_se in nats per sample; larger: whether its one-step errors are significantly larger.
-    """
+    """Return why a model is refused, in words; otherwise empty (gains in nats per sample)."""
+    # larger: whether its one-step errors are significantly larger.
     if math.isfinite(gain) and not decision.improves_predictions(gain, gain_se, 0.0):
         return 'The extended model predicts worse than the plain OU'
     if larger:

@@ -53,11 +53,7 @@ def _process(samples: Samples, terms: Sequence[Term]) -> tuple[FloatArray, Float
 
 def redrawn(samples: Samples, model: Composite, ends: Saturation,
             clipped: npt.NDArray[np.bool_], rng: np.random.Generator) -> Samples:
-    """
-    Return samples with clipped readings, shape (n,), drawn again beyond their limits.
-
-    The model provides mean, `ou` and white noise.
-    """
+    """Return samples with clipped readings, shape (n,), drawn again beyond their limits."""
     phi, added, white = _process(samples, model.gaussian.terms)
     white = np.maximum(white, _LEAST_WHITE * added)
     at = np.flatnonzero(clipped)
@@ -77,12 +73,9 @@ def redrawn(samples: Samples, model: Composite, ends: Saturation,
 def _path_at(y: FloatArray, at: npt.NDArray[np.int64], side: FloatArray, end: FloatArray,
              phi: FloatArray, added: FloatArray, white: FloatArray, rng: np.random.Generator
              ) -> FloatArray:
-    """
-    Draw the path at clipped readings, given their limits and the other readings, V.
-
-    Each clipped reading is replaced by a pseudo-reading with its own mean and white noise, which
-    gives the path the same moments as the limit (expectation propagation, Minka 2001).
-    """
+    """Draw the path at clipped readings, given their limits and the other readings, V."""
+    # Each clipped reading is replaced by a pseudo-reading with its own mean and white noise, which
+    # gives the path the same moments as the limit (expectation propagation, Minka 2001).
     white = white.copy()
     own = white[at]
     y[at], white[at] = end, _NOTHING * own
@@ -150,11 +143,7 @@ class _Path:
 
 
 def within_codes(samples: Samples, model: Composite, rng: np.random.Generator) -> Samples:
-    """
-    Return samples drawn within their codes, or unchanged if rounding is white noise.
-
-    The model provides mean, `ou` and white noise.
-    """
+    """Return samples drawn within their codes, or unchanged if rounding is white noise."""
     terms = [term for term in model.gaussian.terms if term.NAME != 'quantization']
     phi, added, white = _process(samples, terms)
     white -= samples.blur

@@ -157,12 +157,9 @@ def kinds_of(names: Sequence[str]) -> list[type[Term]]:
 
 def _round(fitter: Fitter, search: Search, bank: NullBank, given: Sequence[str], latent: bool
            ) -> list[Trial]:
-    """
-    Return the trials of a round that may be accepted, best first.
-
-    A measured input comes before latent causes if it gains throughout the recording: a few
-    outliers that coincide with one throttle by chance imitate a response.
-    """
+    """Return the trials of a round that may be accepted, best first."""
+    # A measured input comes before latent causes if it gains throughout the recording: a few
+    # outliers that coincide with one throttle by chance imitate a response.
     trials: list[Trial] = []
     for first in (True, False)[:1 + latent]:
         kinds = decision.kinds_to_try(
@@ -306,12 +303,9 @@ _SLOW = 1.0
 
 
 def under_load(fitter: Fitter, search: Search) -> None:
-    """
-    Start from the load model: response to throttle, and noise that follows it, together.
-
-    They make up nearly all of the variance of a flight; added one by one, each would also absorb
-    the effects of the others.  Afterwards each must be worth its own penalty.
-    """
+    """Start from the load model: response to throttle, and noise that follows it, together."""
+    # They make up nearly all of the variance of a flight; added one by one, each would also absorb
+    # the effects of the others.  Afterwards each must be worth its own penalty.
     load, plain = load_terms(fitter.samples), search.composite
     noisy = whole_load(fitter, plain, load)
     if noisy is None:
@@ -387,13 +381,10 @@ def whole_load(fitter: Fitter, plain: Composite, load: Sequence[Term]) -> Compos
 
 
 def _noise_beside(fitter: Fitter, composite: Composite, on_sigma: bool) -> Composite:
-    """
-    Return a model with the noise of a recording under load.
-
-    on_sigma: whether sigma may follow the law of the white noise.  Before the response to throttle
-    is chosen it must not: noise with memory imitates one.  It must not either if simulations then
-    leave the recorded range, which one-step predictions hardly constrain.
-    """
+    """Return a model with the noise of a recording under load."""
+    # on_sigma: whether sigma may follow the law of the white noise.  Before the response to
+    # throttle is chosen it must not: noise with memory imitates one.  It must not either if
+    # simulations then leave the recorded range, which one-step predictions hardly constrain.
     best = composite
     ou = composite.terms[0]
     assert isinstance(ou, OU)
@@ -428,14 +419,12 @@ _DRAWS = 16
 
 
 def outside_range(samples: Samples, terms: Sequence[Term], share: float = 0.5) -> float:
-    """
-    Return by how much the level of simulations leaves the recorded range, V: a quantile of them.
-
-    The level is a running median of five samples, which single bad samples do not change.  Seeds
-    are fixed.  With heavy tails of index a, the extreme of a simulation of the right model is more
-    than twice that of the recording with probability 1/(1 + 2^a).  So with a = 2, one in five
-    simulations leaves the range and its margin, but the median of them does in fewer than 1 %.
-    """
+    """Return by how much simulated levels leave the recorded range, V: a quantile of them."""
+    # The level is a running median of five samples, which single bad samples do not change.  Seeds
+    # are fixed.  With heavy tails of index a, the extreme of a simulation of the right model is
+    # more than twice that of the recording with probability 1/(1 + 2^a).  So with a = 2, one in
+    # five simulations leaves the range and its margin, but the median of them does in fewer than 1
+    # %.
     rng, model = np.random.default_rng(0), SupplyModel(tuple(terms))
 
     def level(voltage: FloatArray) -> FloatArray:

@@ -79,11 +79,8 @@ def parameters(term: Term, se: Mapping[str, Any]) -> str:
 
 
 def with_error(value: Any, error: Any, *, positive: bool = False) -> str:
-    """
-    Return a number, or a list of numbers, with its standard error if known.
-
-    A positive number may be "not determined", see `is_vague`.
-    """
+    """Return a number, or a list of numbers, with its standard error if known."""
+    # A positive number may be "not determined", see `is_vague`.
     if isinstance(value, list):
         errors = error if isinstance(error, list) else [None] * len(value)
         return '[' + ', '.join(with_error(
@@ -112,11 +109,7 @@ def _unit(term: Term, name: str) -> str:
 def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
             alternatives: Sequence[str], exact: bool, why: str = '', together: int = 1,
             chance: float = math.nan) -> str:
-    """
-    Return an explanation of a cause: meaning, estimate, gain and remedy.
-
-    gain, gain_se in nats.
-    """
+    """Return an explanation of a cause: meaning, estimate, gain (nats) and remedy."""
     parts = [term.MEANING, f'Estimate: {parameters(term, se)}.']
     if exact:
         parts.append('The samples themselves show it, without a model.')
@@ -142,11 +135,8 @@ def left_out_note(count: int, scored: int) -> str:
 
 
 def coupling_note(alpha: float, duration: float) -> str:
-    """
-    Return for which rails an AC coupling is ruled out (alpha in 1/s, duration in s).
-
-    Evidence for one grows as 0.24 alpha T nats with the rate alpha of the rail behind it.
-    """
+    """Return for which rails an AC coupling is ruled out (alpha in 1/s, duration in s)."""
+    # Evidence for one grows as 0.24 alpha T nats with the rate alpha of the rail behind it.
     slowest = 6.0 / (0.24 * duration)
     corner = alpha / (2.0 * math.pi)
     return (f'An AC-coupled instrument with a corner at {number(corner)} Hz would show '
@@ -246,11 +236,7 @@ def why_named(gain: float, gain_se: float, chance: float) -> str:
 
 
 def overlap_words(causes: Sequence[Cause], gain: float) -> str:
-    """
-    Explain why single gains exceed the gain of the whole model; empty if none does.
-
-    gain in nats.
-    """
+    """Explain why single gains exceed the gain of the whole model, nats; empty if none does."""
     larger = list(dict.fromkeys(
         c.name for c in causes if c.measurable and c.gain > max(gain, 0.0) + Z95 * c.gain_se))
     if not larger:

@@ -49,14 +49,11 @@ def theta_at(a: float, m: int, share: float) -> float:
 
 
 def log_covariance(a: float, theta: float, m: int, n: int) -> tuple[float, float, float]:
-    """
-    Return the variances of ln(alpha), ln(sigma) and ln(Var_inf) from n blocks.
-
-    The covariance of (phi, theta) is (1 - phi theta)/(phi - theta)^2 / n times
-    [[(1-phi^2)(1-phi theta), (1-phi^2)(1-theta^2)], [., (1-theta^2)(1-phi
-    theta)]], and the variance of ln q is 2/n (Box & Jenkins, Time Series
-    Analysis, 7.2.6); the delta method gives those of the logarithms.
-    """
+    """Return the variances of ln(alpha), ln(sigma) and ln(Var_inf) from n blocks."""
+    # The covariance of (phi, theta) is (1 - phi theta)/(phi - theta)^2 / n times [[(1-phi^2)(1-phi
+    # theta), (1-phi^2)(1-theta^2)], [., (1-theta^2)(1-phi theta)]], and the variance of ln q is
+    # 2/n (Box & Jenkins, Time Series Analysis, 7.2.6); the delta method gives those of the
+    # logarithms.
     phi = math.exp(-a)
     one, other = -math.expm1(-2.0 * a), 1.0 - theta * theta
     cross, apart = 1.0 - phi * theta, phi - theta

@@ -39,16 +39,12 @@ class StateSpace:
 
 
 class Filter:
-    """
-    Gains and predictive variances of a model; filters any number of series of n samples.
-
-    Beyond the model's samples, its matrices and gain are taken as constant.  `variance`, V^2,
-    shape (n,), is for the innovations; `shape`: numbers of samples with their own gain,
-    and of states.  ValueError when the precision is not positive definite.
-    """
+    """Gains of a model; filters series.  ValueError: the precision is not positive definite."""
 
     def __init__(self, model: StateSpace, n: int | None = None) -> None:
+        # Beyond the model's samples, its matrices and gain are taken as constant.
         self._n = model.f.shape[0] if n is None else n
+        # Samples with their own gain, and states; variance of the innovations, V^2, shape (n,).
         self.shape = (model.f.shape[0], model.f.shape[1])
         self.variance: FloatArray = self._solve(model)
         if self._n > model.f.shape[0]:

@@ -247,13 +247,11 @@ def _numbers(value: Any) -> Any:
 
 
 def usual_coefficients() -> tuple[FloatArray, FloatArray, float]:
-    """
-    Return mean and covariance of the coefficients, and mean sag, per volt of pack: the prior.
-
-    The coefficients are S b with a log-normal S, median 0.12.  In b, the share that lags by 60 ms
-    is beta(0.5, 1), the coefficients of u and u^3 are normal(0, 0.2), and the others log-normal.
-    The first, of x, is 1 minus that share minus 0.7 times the sum of the two normal ones.
-    """
+    """Return mean and covariance of the coefficients, and mean sag, per volt: the prior."""
+    # The coefficients are S b with a log-normal S, median 0.12.  In b, the share that lags by 60
+    # ms is beta(0.5, 1), the coefficients of u and u^3 are normal(0, 0.2), and the others
+    # log-normal. The first, of x, is 1 minus that share minus 0.7 times the sum of the two normal
+    # ones.
     def lognormal(median: float, deviation: float) -> tuple[float, float]:
         mean = median * math.exp(0.5 * deviation ** 2)
         return mean, mean ** 2 * math.expm1(deviation ** 2)

@@ -245,14 +245,10 @@ def level_evidence(t: FloatArray, voltage: FloatArray) -> float:
 def fit_load(t: FloatArray, voltage: FloatArray, throttle: FloatArray | None,
              current: FloatArray | None = None, *, stands: bool = False,
              left_out: tuple[float, float] | None = None, near: LoadFit | None = None) -> LoadFit:
-    """
-    Fit the load model; if current, A, is given, it is the load instead of throttle.
-
-    t in s, voltage in V, throttle in 0..1; all finite, stamps rising.  The level follows a lithium
-    pack, or is constant (`stands`).  Voltage between the stamps left_out, s, is not used. `near`,
-    a similar fit (such as that of all the voltage), provides the start, and the cells, scale and
-    delay, which are not fitted.
-    """
+    """Fit the load model to finite samples (s, V, 0..1), or with a current, A, as the load."""
+    # The level follows a lithium pack, or is constant (`stands`).  Voltage between the stamps
+    # left_out, s, is not used.  `near`, a similar fit (such as that of all the voltage), provides
+    # the start, and the cells, scale and delay, which are not fitted.
     if t.size < _LEAST:
         raise ValueError(f'a fit of the load needs {_LEAST} samples, got {t.size}')
     if not (np.isfinite(voltage).all() and (np.diff(t) > 0.0).all()):

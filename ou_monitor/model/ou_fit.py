@@ -331,12 +331,9 @@ class _Likelihood:
             np.vstack([part.basis, part.voltage / part.size]), part.lengths)
 
     def at(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """
-        Return minus the log-likelihood, and the variance, V^2, of OU and white noise together.
-
-        Points of shape (k, 3): ln(alpha dt), logit(share of the OU), and ln of the variance of a
-        step of the level over that of the noise.
-        """
+        """Return minus the log-likelihood, and the variance of OU plus white noise, V^2."""
+        # Points of shape (k, 3): ln(alpha dt), logit(share of the OU), and ln of the variance of a
+        # step of the level over that of the noise.
         half = points.shape[0] // 2
         if half and points.shape[0] * self._cross.size > _AT_ONCE:
             value, variance = zip(self.at(points[:half]), self.at(points[half:]))

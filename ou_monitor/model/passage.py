@@ -220,12 +220,9 @@ def spline_at(coefficients: FloatArray, at: FloatArray) -> FloatArray:
 
 
 def _solve(b: FloatArray, fine_w: int, fine_s: int) -> FloatArray:
-    """
-    Return R by linearly implicit BDF2 steps, shape (barriers, w, lambda).
-
-    Differences use three uneven nodes and are exact for parabolas, such as R is for large w; the
-    value at the last w is extrapolated by the parabola through the three nodes before it.
-    """
+    """Return R by linearly implicit BDF2 steps, shape (barriers, w, lambda)."""
+    # Differences use three uneven nodes and are exact for parabolas, such as R is for large w; the
+    # value at the last w is extrapolated by the parabola through the three nodes before it.
     w = _W_SCALE * np.sinh(_DV / fine_w * np.arange((_W_NODES - 1) * fine_w + 1))
     first, second = (weights[..., None] for weights in _differences(w))
     step = _DL / fine_s
@@ -257,11 +254,8 @@ def _solve(b: FloatArray, fine_w: int, fine_s: int) -> FloatArray:
 
 
 def tridiagonal(bands: FloatArray, right: FloatArray, far: FloatArray) -> FloatArray:
-    """
-    Return x of the inner nodes, 0 before them and x[-1] = far . x[-4:-1] after them.
-
-    bands: below, on and above the diagonal, shape (3, n, systems); right: (n, systems).
-    """
+    """Return x of the inner nodes, 0 before them and x[-1] = far . x[-4:-1] after them."""
+    # bands: below, on and above the diagonal, shape (3, n, systems); right: (n, systems).
     low, main, high = bands
     p, q = np.empty_like(right), np.empty_like(right)
     # The last row contains x[-1], that is, its three neighbours; eliminate the farthest first.
@@ -298,14 +292,11 @@ def _parabola(w: FloatArray, at: float) -> FloatArray:
 
 
 def _log_rate(b: FloatArray) -> FloatArray:
-    """
-    Return ln nu, nu the smallest zero of the parabolic cylinder function D_nu(-b), 1/tau.
-
-    For 0 < b <= 8 from the power series of the Hermite function, in which all terms
-    but the first are positive: nu = 2 Gamma(1 - nu/2) / sum over n >= 1 of
-    Gamma((n - nu)/2) (sqrt(2) b)^n / n!.  For larger b, nu is the inverse of the mean
-    time, an asymptotic series; for b <= 0, the lowest energy above a wall.
-    """
+    """Return ln nu, nu the smallest zero of the parabolic cylinder function D_nu(-b), 1/tau."""
+    # For 0 < b <= 8 from the power series of the Hermite function, in which all terms but the
+    # first are positive: nu = 2 Gamma(1 - nu/2) / sum over n >= 1 of Gamma((n - nu)/2) (sqrt(2)
+    # b)^n / n!. For larger b, nu is the inverse of the mean time, an asymptotic series; for b <=
+    # 0, the lowest energy above a wall.
     result = np.empty(b.size)
     n = range(1, 260)
 
@@ -330,12 +321,10 @@ def _log_rate(b: FloatArray) -> FloatArray:
 
 
 def _lowest_energy(barrier: float) -> float:
-    """
-    Return the least nu of -f'' + (x^2/4 - 1/2) f = nu f, with f zero at the barrier and far below.
-
-    f is exp(-x^2/4) times the solution of the backward equation; by collocation at Chebyshev
-    points (Trefethen, Spectral Methods in MATLAB, 2000, program 6).
-    """
+    """Return the least nu of -f'' + (x^2/4 - 1/2) f = nu f."""
+    # f is zero at the barrier and far below.  It is exp(-x^2/4) times the solution of the backward
+    # equation; by collocation at Chebyshev points (Trefethen, Spectral Methods in MATLAB, 2000,
+    # program 6).
     order, length = 64, 14.0
     x = np.cos(math.pi * np.arange(order + 1) / order)
     c = np.ones(order + 1)

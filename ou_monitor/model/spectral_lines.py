@@ -128,12 +128,8 @@ def on_grid(t: FloatArray, values: FloatArray) -> EvenGrid:
 def find_lines(parts: Sequence[FloatArray], rate: float, *, false_alarm: float = FALSE_ALARM,
                levels: int = 1, white: Sequence[FloatArray] = (), lowest: float = 0.0
                ) -> LineSearch:
-    """
-    Look for lines in segments of evenly spaced samples, strongest first.
-
-    parts in V, rate and lowest in Hz; white: their innovations, whose flat spectrum is searched
-    if the parts are not white.
-    """
+    """Look for lines in segments of even samples, V (rate and lowest in Hz), strongest first."""
+    # white: their innovations, whose flat spectrum is searched if the parts are not white.
     # The mean is removed first: a detrended constant consists of rounding errors.
     parts, white = ([part - part.mean() for part in some if part.size]
                     for some in (parts, white or parts))

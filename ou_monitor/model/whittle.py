@@ -101,17 +101,14 @@ def cosines(x: FloatArray) -> FloatArray:
 
 
 class CrossSpectrum:
-    """
-    Cross spectra of regressors and a voltage, and the likelihood of a noise spectrum.
+    """Cross spectra of regressors and a voltage, and the likelihood of a noise spectrum."""
 
-    rows: regressors, and the voltage as the last row, shape (q, n), in stretches of `lengths`
-    evenly spaced readings; without regressors (q = 1) each stretch has its own mean.
-
-    The ordinates come from the cosine transform, which continues the window as a mirror image; so
-    different values at its ends cause no leakage, unlike in a Fourier transform.
-    """
+    # The ordinates come from the cosine transform, which continues the window as a mirror image;
+    # so different values at its ends cause no leakage, unlike in a Fourier transform.
 
     def __init__(self, rows: FloatArray, lengths: Sequence[int]) -> None:
+        # rows: regressors, and the voltage as the last row, shape (q, n), in stretches of evenly
+        # spaced readings; without regressors (q = 1) each stretch has its own mean.
         q, n = rows.shape
         self.free = n - (q - 1 or len(lengths))
         # Lost messages may cause hundreds of stretches; those of similar lengths share their bins.
@@ -173,12 +170,9 @@ class CrossSpectrum:
 
     def cost(self, S: FloatArray, used: int | None = None
              ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """
-        Return minus the log-likelihood of spectra, shape (k, bins), restricted and profiled.
-
-        used: number of regressors to use.  The second result is the factor on the spectrum, and
-        the third are the products x' K^-1 z of all rows, shape (k, q, q).
-        """
+        """Return minus the log-likelihood of spectra, shape (k, bins), restricted and profiled."""
+        # used: number of regressors to use.  The second result is the factor on the spectrum, and
+        # the third are the products x' K^-1 z of all rows, shape (k, q, q).
         gram = ((1.0 / S) @ self._cross).reshape(-1, self._q, self._q)
         # Keep it definite despite rounding.
         gram[:, range(self._q), range(self._q)] *= 1.0 + 1e-10

@@ -303,12 +303,9 @@ class NotchChoice:
         self.chosen: list[Candidate | None] = [None] * channels
 
     def usual(self, power: FloatArray, passed: float) -> tuple[FloatArray, float]:
-        """
-        Return a low-passed frame relative to the loudest recent one, shape (channels, K).
-
-        A louder frame reduces the weight of earlier ones by the second result; quiet frames count
-        again once loud ones are forgotten.
-        """
+        """Return a low-passed frame over the loudest recent one, (channels, K), and a factor."""
+        # A louder frame reduces the weight of earlier ones by that factor; quiet frames count
+        # again once loud ones are forgotten.
         before = self._loudest * np.exp(-passed / _LEVEL)
         self._loudest = np.maximum(power[:, self._used] @ self._low[1], before)
         lost = (before / np.maximum(self._loudest, _TINY))**_BY_AMPLITUDE
@@ -324,12 +321,8 @@ class NotchChoice:
 
     def take(self, power: FloatArray, throttle: float, motors: FloatArray,
              passed: float) -> None:
-        """
-        Take a frame.
-
-        power: shape (channels, K); throttle: frequency by the law, Hz, NaN if unknown; motors:
-        their frequencies, Hz; passed: time since the last frame, s.
-        """
+        """Take a frame: power, shape (channels, K), `passed` s after the last one."""
+        # throttle: frequency by the law, Hz, NaN if unknown; motors: their frequencies, Hz.
         power = power[:, self._used]
         none = power @ self._low.T
         mean = motors.mean(keepdims=True) if motors.size else motors
@@ -691,17 +684,14 @@ HIGHEST = 0.45
 
 
 class Notch:
-    """
-    One notch of one channel, which starts as if its first sample x had lasted for ever.
-
-    `width`: bandwidth over frequency; `share`: depth, 0 (off) to 1.
-    """
+    """One notch of one channel, which starts as if its first sample x had lasted for ever."""
 
     __slots__ = ('_g', '_ratio', '_s1', '_s2', 'share', 'width')
 
     def __init__(self, x: float) -> None:
         self._s1, self._s2 = 0.0, x
         self._ratio = self._g = 0.0
+        # Bandwidth over frequency; depth, 0 (off) to 1.
         self.width, self.share = 1.0, 0.0
 
     @property

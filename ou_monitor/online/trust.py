@@ -174,14 +174,11 @@ class StampWatch:
 
 
 class InputClock:
-    """
-    Time of messages that must all be used: their stamps, or their arrival if stamps are invalid.
-
-    `stamps`: quality of the stamps; `by_arrival`: number of messages placed by their arrival.
-    """
+    """Time of messages that must all be used: their stamps, or their arrival if those fail."""
 
     def __init__(self) -> None:
         self.stamps = StampOrder.GOOD
+        # Number of messages placed by their arrival.
         self.by_arrival = 0
         self._watch = StampWatch()
         # Arrival and time of the last message, and what is added to stamps, s.

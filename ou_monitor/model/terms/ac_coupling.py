@@ -106,13 +106,8 @@ class ACCoupling(Term):
 
 def bridge(alpha: FloatArray, rate: float, step: FloatArray
            ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """
-    Return start, end and spread of one step of a low-passed OU, given the OU at both ends.
-
-    l_k = exp(-rate step) l_{k-1} + start x_{k-1} + end x_k + sigma sqrt(spread) z.
-
-    alpha in 1/s, rate in 1/s, step in s, result in s.
-    """
+    """Return start, end and spread of one step of a low-passed OU, given the OU at both ends."""
+    # l_k = exp(-rate step) l_{k-1} + start x_{k-1} + end x_k + sigma sqrt(spread) z; 1/s and s.
     a = np.where(np.abs(alpha / rate - 1.0) < _APART, rate * (1.0 + _APART), alpha)
     share = rate / (rate - a)
     xx = -np.expm1(-2.0 * a * step) / (2.0 * a)

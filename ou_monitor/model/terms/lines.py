@@ -33,14 +33,9 @@ def wandering(linewidth: float, rng: np.random.Generator) -> Callable[[FloatArra
 
 def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float,
              lag: float = 0.0) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """
-    Return two states that rotate, decay and are driven by noise, as `Term.block`.
-
-    The first has the autocovariance std^2 exp(-damping t) (cos + lag sin), with the angle
-    turned in t.
-
-    damping in 1/s, step in s, std in V, result in V^2.
-    """
+    """Return two states that rotate, decay and are driven by noise, as `Term.block` (1/s, V)."""
+    # The first has the autocovariance std^2 exp(-damping t) (cos + lag sin), with the angle turned
+    # in t.
     shrink = np.exp(-damping * step)
     f, q = np.empty((step.size, 2, 2)), np.zeros((step.size, 2, 2))
     along, across = shrink * np.cos(turn), shrink * np.sin(turn)
@@ -69,12 +64,9 @@ CONSTANT, RINGING = 0.85, 0.7
 
 
 def power_spread(view: View, frequency: float, linewidth: float) -> float:
-    """
-    Return the interquartile range over the median of the powers of a line's segments (line in Hz).
-
-    It is 0 for a line of constant amplitude, and ln 3 / ln 2 = 1.58 for ringing driven by noise,
-    whose powers are exponential; outliers hardly change it.  NaN: too few segments.
-    """
+    """Return the interquartile range over the median of the powers of a line's segments (Hz)."""
+    # It is 0 for a line of constant amplitude, and ln 3 / ln 2 = 1.58 for ringing driven by noise,
+    # whose powers are exponential; outliers hardly change it.  NaN: too few segments.
     length = int(view.rate / (_FINE * max(linewidth, 1.0 / float(view.at[-1]))))
     v, at = view.residual, view.at
     count = v.size // max(length, 1)

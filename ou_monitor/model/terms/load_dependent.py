@@ -239,12 +239,9 @@ SUM = len(INPUTS)
 
 def _curve(square: FloatArray, x: FloatArray, shares: FloatArray, log: FloatArray | None
            ) -> tuple[FloatArray, FloatArray] | None:
-    """
-    Return knots in x and ln of the scores' std there, relative to the first; None if constant.
-
-    square: squared scores, shape (n,); shares: quantiles between the bins of x; log: a rough
-    estimate of ln of the scores' std, shape (n,), if there is one.
-    """
+    """Return knots in x and ln of the scores' std over the first there; None if constant."""
+    # square: squared scores, shape (n,); shares: quantiles between the bins of x; log: a rough
+    # estimate of ln of the scores' std, shape (n,), if there is one.
     edges = np.unique(np.quantile(x, shares))
     if edges.size < 3:
         return None

@@ -115,12 +115,9 @@ class NonlinearRestoring(Term):
 
 def _linearised(x: FloatArray, span: FloatArray, linear: float, square: float, cube: float,
                 variance: float) -> tuple[FloatArray, FloatArray]:
-    """
-    Return how far each deviation moves in a step, V, and its variance over `variance`.
-
-    Within a part of the step, the force is linearised about the deviation at its beginning,
-    with the mean effect of its curvature (Shoji & Ozaki, Stoch. Anal. Appl. 16 (1998) 733).
-    """
+    """Return how far each deviation moves in a step, V, and its variance over `variance`."""
+    # Within a part of the step, the force is linearised about the deviation at its beginning, with
+    # the mean effect of its curvature (Shoji & Ozaki, Stoch. Anal. Appl. 16 (1998) 733).
     # Beyond the extremum of a softening force, the force stays constant.
     tops = np.roots([3.0 * cube, 2.0 * square, linear])
     tops = tops[np.isreal(tops)].real

@@ -365,12 +365,9 @@ _LEAST_JITTER = 1e-12
 
 def _errors(z: FloatArray, state: FloatArray, phi: float, x: FloatArray
             ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """
-    Return predicted law of the previous error, densities, stds and shifts of pairs, and prior.
-
-    A shift is the change of the score that the error of the step causes, per standard deviation of
-    the rail from its mean.
-    """
+    """Return predicted law of the last error, densities, stds and shifts of pairs, and prior."""
+    # A shift is the change of the score that the error of the step causes, per standard deviation
+    # of the rail from its mean.
     nodes = np.linspace(-2.4, 2.4, _LEVELS)
     law = np.exp(-0.5 * nodes * nodes)
     law /= law.sum()

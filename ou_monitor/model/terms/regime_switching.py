@@ -192,12 +192,9 @@ def relaxing(view: View, faster: float) -> View:
 
 def calm_levels(view: View, part: slice, spread: float, rates: FloatArray
                 ) -> tuple[FloatArray, float, View] | None:
-    """
-    Return a start for levels in white noise, and a view that shows them; None without noise.
-
-    An `ou` that was fitted to the levels follows them, so starts with less noise are tried.
-    Heights are tried up to twice the spread, V, where two levels explain all of it.
-    """
+    """Return a start for levels in white noise, and a view that shows them; None without noise."""
+    # An `ou` that was fitted to the levels follows them, so starts with less noise are tried.
+    # Heights are tried up to twice the spread, V, where two levels explain all of it.
     if bool((Scores.of(view).trust == 1.0).all()):
         return None
     best: tuple[float, FloatArray, View] | None = None
@@ -237,12 +234,9 @@ def _filtered(view: View, keep: float, trust: float, variance: float) -> View:
 
 
 def without_levels(view: View, levels: FloatArray) -> View:
-    """
-    Return the view for an OU that is fitted to the voltage without the levels, V.
-
-    The OU has white noise if it then predicts the voltage without levels better; the parameters
-    come from covariances at lags up to 2.
-    """
+    """Return the view for an OU that is fitted to the voltage without the levels, V."""
+    # The OU has white noise if it then predicts the voltage without levels better; the parameters
+    # come from covariances at lags up to 2.
     r = (view.residual - levels)[view.train]
     r = r - r.mean()
     near, next_, far = (float(r[k:] @ r[:r.size - k]) / r.size for k in range(3))
@@ -518,12 +512,9 @@ def _counted(before: FloatArray, step: float) -> FloatArray:
 
 
 def _slow_levels(view: View) -> tuple[FloatArray | None, float, int]:
-    """
-    Return a start for levels much slower than the noise, its evidence, and the number of states.
-
-    Means over half a relaxation time are modelled as levels plus first-order noise.  The noise's
-    correlation is fitted too, because the samples' correlation includes the levels.
-    """
+    """Return a start for levels much slower than the noise, its evidence, and their number."""
+    # Means over half a relaxation time are modelled as levels plus first-order noise.  The noise's
+    # correlation is fitted too, because the samples' correlation includes the levels.
     r = view.residual[view.train]
     a = -math.log(min(max(float(np.median(view.phi[view.train])), 1e-6), 1.0 - 1e-6))
     size = max(1, round(0.5 / a))

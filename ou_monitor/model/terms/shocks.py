@@ -336,14 +336,11 @@ class HeavyTails(Term):
 
 
 class _Mixture:
-    """
-    Scores that are the sum of a Student-t part and a normal part.
-
-    A Student-t is a normal distribution whose variance is inverse-gamma distributed; the integral
-    over the variance is a sum over close points of its logarithm.
-    """
+    """Scores that are the sum of a Student-t part and a normal part."""
 
     def __init__(self, square: FloatArray, share: FloatArray, dof: float, scale: float) -> None:
+        # A Student-t is a normal distribution whose variance is inverse-gamma distributed; the
+        # integral over the variance is a sum over close points of its logarithm.
         if dof <= 2.0:
             self._log = np.full(square.size, -math.inf)
             return

@@ -267,13 +267,10 @@ def _bridge(pole: float, rate: float, step: FloatArray
 
 
 def _sum(low: float, high: float, octaves: float) -> tuple[FloatArray, FloatArray]:
-    """
-    Return relaxation rates, 1/s, and variances whose one-sided PSD is nearly 1/f, V^2/Hz.
-
-    The integral of 4 a / (a^2 + w^2) d(ln a) over all rates a is 1/f.  It is computed between the
-    ends by the midpoint rule, and below and above them (in a and in 1/a) by two-point
-    Gauss-Legendre quadrature.
-    """
+    """Return relaxation rates, 1/s, and variances whose one-sided PSD is nearly 1/f, V^2/Hz."""
+    # The integral of 4 a / (a^2 + w^2) d(ln a) over all rates a is 1/f.  It is computed between
+    # the ends by the midpoint rule, and below and above them (in a and in 1/a) by two-point
+    # Gauss-Legendre quadrature.
     count = max(1, math.ceil(math.log2(high / low) / octaves))
     width = math.log(high / low) / count
     inner = low * np.exp(width * (np.arange(count) + 0.5))

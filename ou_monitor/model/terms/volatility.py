@@ -117,13 +117,9 @@ def _segments(view: View) -> tuple[int, FloatArray, FloatArray]:
 
 
 def _start(view: View) -> FloatArray:
-    """
-    Return std, rate and mean of ln sigma, found by moments, in the coordinates of `_grid`.
-
-    The logarithm of the mean of m squares is 2 ln sigma plus an error that is
-    independent from segment to segment, so the covariances at two lags give the
-    variance and the rate.
-    """
+    """Return std, rate and mean of ln sigma, found by moments, in the coordinates of `_grid`."""
+    # The logarithm of the mean of m squares is 2 ln sigma plus an error that is independent from
+    # segment to segment, so the covariances at two lags give the variance and the rate.
     size, squares, sizes = _segments(view)
     log = 0.5 * np.log(np.maximum(squares / sizes, 1e-12))[:max(view.train.stop // size, 2)]
     c = log - log.mean()
@@ -177,14 +173,10 @@ _NOTICED = 1e-9
 
 @lru_cache(maxsize=8)
 def _rouwenhorst(keep: float) -> FloatArray:
-    """
-    Return the transition probabilities between levels, shape (levels, levels).
-
-    The conditional mean and variance are those of the OU even if it is so slow
-    that its steps are much smaller than the spacing of the levels (Rouwenhorst
-    1995; Kopecky & Suen, Rev. Econ. Dyn. 13 (2010) 701).
-
-    """
+    """Return the transition probabilities between levels, shape (levels, levels)."""
+    # The conditional mean and variance are those of the OU even if it is so slow that its steps
+    # are much smaller than the spacing of the levels (Rouwenhorst 1995; Kopecky & Suen, Rev. Econ.
+    # Dyn. 13 (2010) 701).
     stay, go = 0.5 * (1.0 + keep), 0.5 * (1.0 - keep)
     chances = np.array([[stay, go], [go, stay]])
     for n in range(3, _LEVELS + 1):

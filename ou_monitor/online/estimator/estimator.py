@@ -315,12 +315,9 @@ class SlidingEstimator:
 
 
 def _smoothness(ratio: float, a: float, m: int) -> float:
-    """
-    Return how much more neighbouring increments are correlated than in an OU.
-
-    From D_1 = E(z_j - z_{j-1})^2 and D_2 = E(z_j - z_{j-2})^2, less the means
-    squared, their correlation is D_2 / (2 D_1) - 1; the ratio is D_2 / D_1.
-    """
+    """Return how much more neighbouring increments are correlated than in an OU."""
+    # ratio: D_2 / D_1.  From D_1 = E(z_j - z_{j-1})^2 and D_2 = E(z_j - z_{j-2})^2, less the means
+    # squared, their correlation is D_2 / (2 D_1) - 1.
     gamma0, gamma1 = arma.block_autocovariance(a, m)
     of_ou = (gamma0 - gamma1 * math.exp(-a)) / (2.0 * (gamma0 - gamma1)) - 1.0
     return 0.5 * ratio - 1.0 - of_ou

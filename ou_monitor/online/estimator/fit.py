@@ -413,14 +413,10 @@ _EXACT = 1e-14
 def fit_window(t: FloatArray, y: FloatArray, load: FloatArray, m: int, adc: float,
                stamps: Callable[[float], bool], before: Maximum | None,
                ) -> tuple[Fitted, Maximum | None]:
-    """
-    Fit the OU, the noise and the mean.
-
-    t in s, y in V; load: variables of shape (c, n), none while throttle is constant; m: raw
-    samples averaged in each; adc: ADC step, V; stamps: function of alpha times the mean step that
-    tells whether the exact likelihood is needed (inf: for any alpha); before: the second value
-    returned for a nearly identical window.
-    """
+    """Fit the OU, the noise and the mean (t in s, y in V, load of shape (c, n), adc step in V)."""
+    # load: empty while throttle is constant; m: raw samples averaged in each; stamps: function of
+    # alpha times the mean step that tells whether the exact likelihood is needed (inf: for any
+    # alpha); before: the second value returned for a nearly identical window.
     level = np.append(y.mean(), load.mean(axis=1))
     centred = load - level[1:, None]
     basis = independent(centred @ centred.T / t.size)

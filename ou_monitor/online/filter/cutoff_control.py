@@ -40,12 +40,10 @@ class Bound(enum.Enum):
 
 
 class SampleInterval:
-    """
-    Mean time between samples, s, over about 100 of them; 0 before the second sample.
+    """Mean time between samples, s, over about 100 of them; 0 before the second sample."""
 
-    Intervals over five times the mean are gaps and left out, unless a third of all are gaps. Five
-    intervals in a row that are off by a factor of five are a new rate and restart the mean.
-    """
+    # Intervals over five times the mean are gaps and left out, unless a third of all are gaps.
+    # Five intervals in a row that are off by a factor of five are a new rate.
 
     __slots__ = ('_long', '_n', '_short', 'mean')
 
@@ -79,17 +77,10 @@ class SampleInterval:
 
 
 def time_constant(settings: FilterSettings, error: float) -> float:
-    """
-    Return the time constant of the cutoff for a relative error of sigma.
-
-    A random walk of intensity q, measured with an error e
-    over a correlation time T, is tracked best (steady Kalman filter) with the
-    time constant e sqrt(T) / q.  So the time constant is proportional to the error, and equal to
-    `smoothing` at `smoothing_error`, within a factor of `smoothing_range` (Betaflight moves its
-    notches 1 to 10 times as fast).
-
-    result in s.
-    """
+    """Return the time constant of the cutoff, s, for a relative error of sigma."""
+    # A random walk of intensity q, measured with an error e over a correlation time T, is tracked
+    # best (steady Kalman filter) with the time constant e sqrt(T) / q, which is proportional to e.
+    # Betaflight moves its notches 1 to 10 times as fast.
     if error != error:
         return settings.smoothing
     most = settings.smoothing_range

@@ -120,17 +120,10 @@ _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
 def squared_error(order: int, w: float, signal: tuple[float, float],
                   noise: tuple[float, float], n0: float, poles: int = 1) -> float:
-    """
-    Return the mean square error of a low-pass with a cutoff of `w`.
-
-    Lost signal, by 1 - H: for an OU of intensity a and rate b,
-    a^2 / (2 (w + b)) for order 1 and a^2 (3 w + sqrt2 b)
-    / (2 sqrt2 (w^2 + sqrt2 w b + b^2)) for order 2; for two poles see
-    `_lost_of_two_poles`.  Noise that passes: V of `cutoff_laws` from the
-    supply; n0 w / 2 or n0 w / (2 sqrt2) from white noise.
-
-    w in 1/s, signal in 1/s.
-    """
+    """Return the mean square error of a low-pass with a cutoff of `w`, 1/s (rates in 1/s)."""
+    # Lost signal, by 1 - H: for an OU of intensity a and rate b, a^2 / (2 (w + b)) for order 1 and
+    # a^2 (3 w + sqrt2 b) / (2 sqrt2 (w^2 + sqrt2 w b + b^2)) for order 2.  Noise that passes: V of
+    # the supply, as above; n0 w / 2 or n0 w / (2 sqrt2) from white noise.
     a, b = signal
     c, d = noise
     if poles == 2:
@@ -146,18 +139,12 @@ def squared_error(order: int, w: float, signal: tuple[float, float],
 
 
 def _lost_of_two_poles(order: int, w: float, b: float) -> float:
-    r"""
-    Return the variance that a low-pass removes from a two-pole signal of variance 1.
-
-    The signal has the spectrum 2 sqrt2 b^3 / |s^2 + sqrt2 b s + b^2|^2 at s = i w'.
-    The integral of |c / d|^2 is in the table of Newton, Gould & Kaiser
-    (Analytical Design of Linear Feedback Controls, 1957, appendix E):
-
-        order 1   c = s,               d = (s + w) (s^2 + sqrt2 b s + b^2)
-        order 2   c = s^2 + sqrt2 w s, d = (s^2 + sqrt2 w s + w^2) (s^2 + sqrt2 b s + b^2)
-
-    In units of b: u = w / b.
-    """
+    """Return the variance that a low-pass removes from a two-pole signal of variance 1."""
+    # The signal has the spectrum 2 sqrt2 b^3 / |s^2 + sqrt2 b s + b^2|^2 at s = i w'.  The
+    # integral of |c / d|^2 is in the table of Newton, Gould & Kaiser (Analytical Design of Linear
+    # Feedback Controls, 1957, appendix E); in units of b:
+    #   order 1   c = s,               d = (s + w) (s^2 + sqrt2 b s + b^2)
+    #   order 2   c = s^2 + sqrt2 w s, d = (s^2 + sqrt2 w s + w^2) (s^2 + sqrt2 b s + b^2)
     u = w / b
     if order == 1:
         # d = s^3 + (u + sqrt2) s^2 + (1 + sqrt2 u) s + u; I = 1 / (2 (d1 d2 - d0)).
@@ -169,16 +156,10 @@ def _lost_of_two_poles(order: int, w: float, b: float) -> float:
 
 
 def sampled_error(w: float, dt: float, alpha: float, var: float, white: float) -> float:
-    """
-    Return the mean square error of the sampled low-pass of order 1 for an OU in white noise.
-
-    With q = exp(-w dt), b = 1 - (1 - q) / (w dt) and a = 1 - q - b the filter is
-    y_k = q y_(k-1) + b x_k + a x_(k-1).  White noise passes with the variance
-    (a^2 + b^2 + 2 a b q) / (1 - q^2); the lost signal is the response to an
-    AR(1) process of (b - 1, a + q) over the same pole.
-
-    w in 1/s, dt in s.
-    """
+    """Return the mean square error of the sampled low-pass of order 1 for an OU in white noise."""
+    # The filter is y_k = q y_(k-1) + b x_k + a x_(k-1) (w in 1/s, dt in s).  White noise passes
+    # with the variance (a^2 + b^2 + 2 a b q) / (1 - q^2); the lost signal is the response to an
+    # AR(1) process of (b - 1, a + q) over the same pole.
     angle = w * dt
     lost = -math.expm1(-angle)
     q, phi = math.exp(-angle), math.exp(-alpha * dt)
@@ -253,16 +234,9 @@ def threshold_law(settings: FilterSettings, sigma: float, alpha: float,
 
 def constant_noise_law(settings: FilterSettings, sigma: float, alpha: float,
                        interval: float) -> float:
-    """
-    Return the cutoff at which the rms of the output noise is the wanted one.
-
-    With `coupling`, the noise is that of the supply, and `cutoff_for_noise`
-    solves coupling sigma sqrt(V) = noise_wanted (by default the output noise
-    at `sigma_ref` and fmax).
-
-    Otherwise the noise is white with a variance proportional to sigma^2, and
-    the output noise is kept at its value for `sigma_ref` and fmax: `relative_cutoff`.
-    """
+    """Return the cutoff at which the rms of the output noise is the wanted one."""
+    # Without `coupling` the noise is white, with a variance proportional to sigma^2.  By default
+    # its rms in the output is kept as at `sigma_ref` and fmax.
     if settings.coupling:
         wanted = settings.noise_wanted or settings.coupling * settings.sigma_ref * math.sqrt(
             supply_noise(settings.mode, settings.order, settings.fmax, alpha))
@@ -328,21 +302,13 @@ def cutoff_for_noise(mode: str, order: int, rms: float, intensity: float,
 
 
 def wiener_law(settings: FilterSettings, sigma: float, alpha: float, interval: float) -> float:
-    """
-    Return the cutoff of least mean square error.
-
-    Without `signal_bandwidth` the signal is the voltage itself, in white noise
-    of density n0.  The Kalman-Bucy filter of an OU process has one pole: from
-    its Riccati equation 0 = sigma^2 - 2 alpha P - P^2 / n0 it lies at
-    alpha + P / n0 = sqrt(alpha^2 + sigma^2 / n0).  The best low-pass of gain 1 is
-    slightly off it, and a sampled one more so: if the interval is known, order 1
-    minimises `sampled_error`.  A second-order Butterworth
-    has the error 3 sigma^2 / (2 sqrt2 w) + n0 w / (2 sqrt2) for w >> alpha, least
-    at w = sqrt(3) sigma / sqrt(n0): the law for order 2 is
-    sqrt(alpha^2 + 3 sigma^2 / n0).
-
-    With `signal_bandwidth`, `squared_error` is minimised.
-    """
+    """Return the cutoff of least mean square error."""
+    # Without `signal_bandwidth` the signal is the voltage itself, in white noise of density n0.
+    # The Kalman-Bucy filter of an OU process has one pole: from its Riccati equation 0 = sigma^2 -
+    # 2 alpha P - P^2 / n0 it lies at alpha + P / n0 = sqrt(alpha^2 + sigma^2 / n0).  The best
+    # low-pass of gain 1 is slightly off it, and a sampled one more so.  A second-order Butterworth
+    # has the error 3 sigma^2 / (2 sqrt2 w) + n0 w / (2 sqrt2) for w >> alpha, least at w = sqrt(3)
+    # sigma / sqrt(n0): the law for order 2 is sqrt(alpha^2 + 3 sigma^2 / n0).
     s = settings
     if s.signal_bandwidth:
         return least_error(s, sigma, alpha)

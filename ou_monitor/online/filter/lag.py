@@ -34,14 +34,9 @@ def most_lag(order: int) -> float:
 
 
 def cutoff_for_lag(order: int, lag: float, frequency: float) -> float:
-    """
-    Return the cutoff whose lag at `frequency` is `lag`: the inverse of `phase_lag`.
-
-    Order 1: fc = f / tan(lag).  Order 2: with c = cot(lag), r^2 + sqrt(2) c r
-    - 1 = 0, so fc = f / r = f (c + sqrt(c^2 + 2)) / sqrt(2).
-
-    frequency in Hz, result in Hz.
-    """
+    """Return the cutoff, Hz, whose lag at a frequency, Hz, is `lag`: inverse of `phase_lag`."""
+    # Order 1: fc = f / tan(lag).  Order 2: with c = cot(lag), r^2 + sqrt(2) c r - 1 = 0, so fc = f
+    # / r = f (c + sqrt(c^2 + 2)) / sqrt(2).
     if not 0.0 < lag < most_lag(order):
         raise ValueError(
             f'a low-pass of order {order} lags by more than 0 and less than '
@@ -54,12 +49,9 @@ def cutoff_for_lag(order: int, lag: float, frequency: float) -> float:
 
 
 def share_for_lag(response: complex, raw: complex, most: float) -> float:
-    """
-    Return the share of the unfiltered signal that reduces a lag to a limit.
-
-    A mixture (1 - m) H + m R has the lag p where (1 - m) H e^(ip) + m R e^(ip)
-    has the imaginary part 0.
-    """
+    """Return the share of the unfiltered signal that reduces a lag to a limit, rad."""
+    # A mixture (1 - m) H + m R has the lag p where (1 - m) H e^(ip) + m R e^(ip) has the imaginary
+    # part 0.
     if -cmath.phase(response) <= most:
         return 0.0
     turned, straight = (one * cmath.exp(1j * most) for one in (response, raw))

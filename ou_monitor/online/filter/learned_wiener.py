@@ -95,11 +95,8 @@ def response_of(interval: float, frequency: float, slope: bool) -> Complexes:
 
 @lru_cache(maxsize=_STEPS)
 def noise_of(key: int, decay: float, slope: bool) -> FloatArray:
-    """
-    Return the covariance of the outputs for noise of variance 1, shape (5, 5).
-
-    key of the interval, s; decay of the noise's correlation, 1/s, infinite for white noise.
-    """
+    """Return the outputs' covariance, shape (5, 5), for noise of variance 1 and decay, 1/s."""
+    # key of the interval, s; the decay is infinite for white noise.
     interval, step = math.exp(_SAME * key), step_of(key)
     size = step.shape[0]
     phi = math.exp(-decay * interval)
@@ -141,16 +138,13 @@ _RAW = np.eye(COUNT)[-1]
 
 
 class LearnedWiener:
-    """
-    The best linear combination of a few low-passes, starting at a first sample x.
-
-    `y` is the signal, or its slope in mode derivative (unit/s); `lag` that of the output at
-    `lag_frequency`, degrees, NaN if unknown; `mixed` the share of unfiltered input in it.
-    """
+    """The best linear combination of a few low-passes, starting at a first sample x."""
 
     def __init__(self, settings: FilterSettings, x: float) -> None:
         self._settings = settings
         self._slope = settings.mode == 'derivative'
+        # Signal, or its slope (unit/s); its lag at `lag_frequency`, degrees, NaN if unknown; the
+        # share of unfiltered input in it.
         self.y = 0.0 if self._slope else x
         self.lag, self.mixed = NAN, 0.0
         self._x = x

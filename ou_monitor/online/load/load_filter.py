@@ -157,13 +157,10 @@ class CurrentFilter:
 
     @property
     def _bypassed(self) -> float:
-        """
-        Return the relative error of the resistance by loads that bypass the current sensor.
-
-        It is the change of the resistance with throttle as a further regressor, times the share
-        of the rest of the voltage that throttle explains.  Both are taken after a band-pass,
-        because throttle also explains what a slow sensor misses, and charge lowers the level.
-        """
+        """Return the relative error of the resistance by loads that bypass the current sensor."""
+        # It is the change of the resistance with throttle as a further regressor, times the share
+        # of the rest of the voltage that throttle explains.  Both are taken after a band-pass,
+        # because throttle also explains what a slow sensor misses, and charge lowers the level.
         (xx, xi, xv), (_, ii, iv), (_, _, vv) = self._beside.tolist()
         # Voltage and throttle without current.
         rest, moved, both = (vv - iv * iv / ii, xx - xi * xi / ii, xv - xi * iv / ii
@@ -333,12 +330,10 @@ class FastLevel:
 
 
 class LoadFilter:
-    """
-    Level, sag and noise of a supply, sample by sample.
+    """Level, sag and noise of a supply, sample by sample."""
 
-    States: level, V; discharge per load, 1/s; coefficients, V, of x, u, u^3, x after three
-    lags, and inrush, with x = u^1.8.  White noise has ln variance b.(1, ripple(u), sqrt|du|).
-    """
+    # States: level, V; discharge per load, 1/s; coefficients, V, of x, u, u^3, x after three
+    # lags, and inrush, with x = u^1.8.  White noise: see `LoadNoise`.
 
     def __init__(self) -> None:
         self._start: LoadStart | None = None
@@ -357,12 +352,7 @@ class LoadFilter:
     def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike,
              throttle: npt.ArrayLike | None = None,
              current: npt.ArrayLike | None = None) -> None:
-        """
-        Add samples in order, s, V, 0..1, A, of one time line.
-
-        Throttle that is NaN or beyond 2 is unknown, and so is a current beyond 1e6 A: the last one
-        holds for a second.
-        """
+        """Add samples in order, s, V, 0..1, A; an unknown load is held for a second."""
         # Several times as fast as `broadcast_arrays`, for parts of a few samples.
         columns = np.full((4, np.size(t)), NAN)
         for row, given in zip(columns, (t, voltage, throttle, current)):
