@@ -47,7 +47,7 @@ def _convert(args: argparse.Namespace, log: Any) -> int:
              **{f'log_{key}': value for key, value in log.facts.items()}}
     with Progress('writing', args.json == output.STDOUT) as progress, \
             output.replacing(args.out, args.force):
-        topics, moved = write_log(chosen, args.out, about, kind=args.type, extras=extras,
+        topics, moved = write_log(chosen, extras, args.out, about, kind=args.type,
                                   progress=progress)
     notes = (*log.notes, *chosen.notes, *extras.notes, *moved)
     volts = chosen.voltage
@@ -67,18 +67,11 @@ def _convert(args: argparse.Namespace, log: Any) -> int:
 
 
 def _topic_contents(chosen: Any, extras: Any) -> dict[str, dict[str, Any]]:
-    found = {'/voltage': chosen.voltage, '/throttle': chosen.throttle,
-             '/current': chosen.current, **{f'/{k}': one for k, one in extras.signals.items()}}
-    rows = {topic: {'field': one.name, 'scale': one.scale, 'what': one.words, 'unit': one.unit,
-                    'n': one.n} for topic, one in found.items() if one is not None}
-    for topic, one in extras.inertial.items():
-        rows[f'/{topic}'] = {'field': one.name, 'scale': one.scale, 'what': one.words,
-                             'unit': 'rad/s, m/s^2', 'n': int(one.t.size)}
-    if extras.speeds is not None:
-        rows['/motor_speed'] = {
-            'field': ', '.join(extras.speeds.motors), 'scale': extras.speeds.scale,
-            'what': extras.speeds.words, 'unit': 'rad/s', 'n': int(extras.speeds.t.size)}
-    return rows
+    found = {'voltage': chosen.voltage, 'throttle': chosen.throttle, 'current': chosen.current,
+             **extras.signals, **extras.inertial, 'motor_speed': extras.speeds}
+    return {f'/{topic}': {'field': one.name, 'scale': one.scale, 'what': one.words,
+                          'unit': one.unit, 'n': int(one.t.size)}
+            for topic, one in found.items() if one is not None}
 
 
 def _list(args: argparse.Namespace, log: Any) -> int:

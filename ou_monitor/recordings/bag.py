@@ -367,7 +367,7 @@ class BagWriter:
             self._file = self._mcap.open('xb')
         except OSError as error:
             raise self._write_error(error) from error
-        self._topics: dict[str, str] = {}
+        self.topics: dict[str, str] = {}
         self._channels: dict[str, int] = {}
         self._counts: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
@@ -388,14 +388,14 @@ class BagWriter:
     ) -> str:
         """Add a topic (sample_rate in Hz)."""
         topic = '/' + name.lstrip('/')
-        if topic in self._topics:
+        if topic in self.topics:
             raise ValueError(f"topic '{topic}' was added before")
         text = SCHEMAS.get(type) if schema is None else schema
         if text is None:
             raise ValueError(f'no definition of type {type}: give its ros2msg text as schema')
         if type not in self._schemas:
             self._schemas[type] = self._writer.register_schema(type, 'ros2msg', text.encode())
-        self._topics[topic] = type
+        self.topics[topic] = type
         metadata = {'offered_qos_profiles': yaml.safe_dump(_qos(), sort_keys=False),
                     'topic_type_hash': TYPE_HASHES.get(type, '')}
         if sample_rate is not None:
@@ -431,7 +431,7 @@ class BagWriter:
             finish()
             self._file.close()
             if self._folder is not None:
-                write_metadata(self._folder, self._mcap.name, self._topics, self._counts,
+                write_metadata(self._folder, self._mcap.name, self.topics, self._counts,
                                self._start_ns or 0, self._end_ns, self._about)
         except OSError as error:
             self._remove()

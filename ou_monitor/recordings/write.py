@@ -12,7 +12,6 @@ series std_msgs/Float64; the metadata of each topic have its unit.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
 import heapq
 import math
 from pathlib import Path
@@ -78,13 +77,12 @@ def write_recording(
     if isinstance(rec, Recording) and rec.n == 0:
         raise InputError(f"'{rec.name}' holds no sample: there is nothing to write")
     kind, count, first = TYPES[type], 0, 0
-    topics: dict[str, str] = {}
     notes: tuple[str, ...] = ()
     # Samples of an incomplete block; throttle and period of the last message.
     rest: tuple[Stamps, FloatArray] = np.empty(0, np.int64), np.empty(0)
     held, period = math.nan, -1
     with BagWriter(path) as bag:
-        topics[bag.add_topic('voltage', kind, sample_rate=sample_rate if blocks else None)] = kind
+        bag.add_topic('voltage', kind, sample_rate=sample_rate if blocks else None)
         for piece in _pieces(rec):
             stamps = as_nanoseconds(piece.t, piece.name) + start_ns
             if not count:
@@ -104,8 +102,8 @@ def write_recording(
             count += piece.n
             streams = [_timed(VOLTAGE, encode(kind, stamps[:whole], volts[:whole], block))]
             if values.size:
-                if '/throttle' not in topics:
-                    topics[bag.add_topic('throttle', FLOAT32)] = FLOAT32
+                if '/throttle' not in bag.topics:
+                    bag.add_topic('throttle', FLOAT32)
                 # One sample a period is written even if unchanged.
                 periods = times // THROTTLE_PERIOD_NS
                 sent = (np.diff(values, prepend=np.float32(held)) != 0.0) | (
@@ -116,7 +114,7 @@ def write_recording(
                 bag.write(('/throttle', '/voltage')[topic], t, data)
         for t, data in encode(kind, *rest, block):
             bag.write('/voltage', t, data)
-    return topics, notes
+    return bag.topics, notes
 
 
 def _pieces(rec: Recording | Iterable[Recording]) -> Iterator[Recording]:
@@ -165,57 +163,59 @@ def check_steady(name: str, since_first: npt.NDArray[np.int64], before: int,
             'need: use another type')
 
 
-@dataclass(frozen=True, eq=False)
-class _Stream:
-    """One topic: its stamps (s), how to encode a part of its samples, and its origin."""
-
-    topic: str
-    kind: str
-    t: FloatArray
-    encode: Callable[[Stamps, slice], Iterable[tuple[int, bytes]]]
-    origin: dict[str, str]
-
-
 def write_log(
-    chosen: Chosen, path: Path, about: Mapping[str, str], *, kind: str = 'battery_state',
-    extras: Extras | None = None, progress: Callable[[float], None] | None = None,
+    chosen: Chosen, extras: Extras, path: Path, about: Mapping[str, str], *,
+    kind: str = 'battery_state', progress: Callable[[float], None] | None = None,
 ) -> tuple[dict[str, str], tuple[str, ...]]:
     """Write a bag (progress 0..1)."""
     # At equal times the voltage comes last, after the values that hold for it.
-    streams = [_of_series(name, FLOAT32, series) for name, series in (
-        ('throttle', chosen.throttle), ('current', chosen.current)) if series is not None]
-    if extras is not None:
-        streams += [_of_motion(name, one) for name, one in extras.inertial.items()]
-        if extras.speeds is not None:
-            streams.append(_of_motion(SPEEDS, extras.speeds))
-        streams += [_of_series(name, FLOAT64, one) for name, one in extras.signals.items()]
-    streams.append(_of_series('voltage', TYPES[kind], chosen.voltage))
-    first = min(float(stream.t[0]) for stream in streams)
+    held: dict[str, Series | Motion | None] = {
+        'throttle': chosen.throttle, 'current': chosen.current, **extras.inertial,
+        SPEEDS: extras.speeds, **extras.signals, 'voltage': chosen.voltage}
+    streams = {topic: one for topic, one in held.items() if one is not None}
+    kinds = {'throttle': FLOAT32, 'current': FLOAT32, **dict.fromkeys(extras.inertial, IMU),
+             SPEEDS: JOINT_STATE, **dict.fromkeys(extras.signals, FLOAT64), 'voltage': TYPES[kind]}
+    first = min(float(one.t[0]) for one in streams.values())
     shift = max(0, -round(first * 1e9))
-    total = sum(stream.t.size for stream in streams)
-    topics: dict[str, str] = {}
+    total = sum(one.t.size for one in streams.values())
     # Refused before anything is written to disk.
-    stamps = [as_nanoseconds(stream.t, stream.origin[f'{stream.topic}_field']) + shift
-              for stream in streams]
+    stamps = {topic: as_nanoseconds(one.t, one.name) + shift for topic, one in streams.items()}
     if kind == 'adc_block':
-        check_steady(chosen.voltage.name, stamps[-1] - stamps[-1][0], 0, BLOCK_RATE)
-    for stream, own in zip(streams, stamps):
-        _check_header(stream.kind, stream.origin[f'{stream.topic}_field'], own)
-    whole = {**about}
-    for stream in streams:
-        whole |= stream.origin
+        check_steady(chosen.voltage.name, stamps['voltage'] - stamps['voltage'][0], 0, BLOCK_RATE)
+    whole, origins = {**about}, {}
+    for topic, one in streams.items():
+        _check_header(kinds[topic], one.name, stamps[topic])
+        origins[topic] = {f'{topic}_field': one.name, f'{topic}_unit': one.unit,
+                          f'{topic}_scale': one.scale, f'{topic}_what': one.words}
+        whole |= origins[topic]
     with BagWriter(path, about=whole) as bag:
         # Topics in the order of the table of contents: the voltage first.
-        for stream in reversed(streams):
-            rate = BLOCK_RATE if stream.kind == FLOAT32_ARRAY else None
-            topics[bag.add_topic(stream.topic, stream.kind, sample_rate=rate,
-                                 origin={**about, **stream.origin})] = stream.kind
-        parts = [_messages(k, own, stream) for k, (own, stream) in enumerate(zip(stamps, streams))]
+        for topic in reversed(streams):
+            rate = BLOCK_RATE if kinds[topic] == FLOAT32_ARRAY else None
+            bag.add_topic(topic, kinds[topic], sample_rate=rate,
+                          origin={**about, **origins[topic]})
+        names = [f'/{topic}' for topic in streams]
+        parts = [_messages(k, kinds[topic], stamps[topic], one)
+                 for k, (topic, one) in enumerate(streams.items())]
         for done, (t, k, data) in enumerate(heapq.merge(*parts)):
-            bag.write('/' + streams[k].topic, t, data)
+            bag.write(names[k], t, data)
             if progress is not None and done % SLICE == 0:
                 progress(done / total)
-    return topics, _moved(shift)
+    return bag.topics, _moved(shift)
+
+
+def _messages(place: int, kind: str, stamps: Stamps, one: Series | Motion) -> Iterator[Timed]:
+    """Yield the messages of one topic."""
+    for first in range(0, stamps.size, SLICE):
+        part = slice(first, first + SLICE)
+        now = stamps[part]
+        if isinstance(one, Series):
+            yield from _timed(place, encode(kind, now, one.values[part]))
+        else:
+            vectors = {field: values[part] for field, values in one.vectors.items()}
+            yield from _timed(place, zip(now.tolist(), encode_joints(
+                now, one.motors, vectors[VELOCITY]) if one.motors else encode_imu(now, vectors),
+                strict=True))
 
 
 def encode(kind: str, stamps: Stamps, values: FloatArray, block: int = BLOCK,
@@ -230,32 +230,3 @@ def encode(kind: str, stamps: Stamps, values: FloatArray, block: int = BLOCK,
         return
     yield from zip(stamps.tolist(), encode_battery(stamps, values) if kind == BATTERY_STATE
                    else encode_scalars(kind, values), strict=True)
-
-
-def _origin(topic: str, name: str, unit: str, scale: str, words: str) -> dict[str, str]:
-    """Return the origin of a topic, by keys of its own."""
-    return {f'{topic}_field': name, f'{topic}_unit': unit, f'{topic}_scale': scale,
-            f'{topic}_what': words}
-
-
-def _of_series(topic: str, kind: str, series: Series) -> _Stream:
-    return _Stream(topic, kind, series.t,
-                   lambda stamps, part: encode(kind, stamps, series.values[part]),
-                   _origin(topic, series.name, series.unit, series.scale, series.words))
-
-
-def _of_motion(topic: str, one: Motion) -> _Stream:
-    def messages(stamps: Stamps, part: slice) -> Iterable[tuple[int, bytes]]:
-        held = {field: values[part] for field, values in one.vectors.items()}
-        return zip(stamps.tolist(), encode_joints(stamps, one.motors, held[VELOCITY])
-                   if one.motors else encode_imu(stamps, held), strict=True)
-    return _Stream(
-        topic, JOINT_STATE if one.motors else IMU, one.t, messages,
-        _origin(topic, ', '.join(one.motors) or one.name,
-                'rad/s' if one.motors else 'rad/s, m/s^2', one.scale, one.words))
-
-
-def _messages(place: int, stamps: Stamps, stream: _Stream) -> Iterator[Timed]:
-    for first in range(0, stamps.size, SLICE):
-        part = slice(first, first + SLICE)
-        yield from _timed(place, stream.encode(stamps[part], part))

@@ -28,7 +28,7 @@ from orangebox.types import FrameType
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import (
     CURRENT, DEGREE, GRAVITY, gyro_of, Log, log_of, Motion, quiet, Request, RPM, Series,
-    SIGNAL, three_axes, THROTTLE, UNKNOWN, VELOCITY, VOLTAGE)
+    SIGNAL, speeds_of, three_axes, THROTTLE, UNKNOWN, VOLTAGE)
 from ou_monitor.records import FloatArray
 from ou_monitor.text import counted
 
@@ -385,11 +385,9 @@ def _speeds(t: FloatArray, columns: Fields, headers: Headers, notes: list[str],
         return None
     # eRPM is logged in hundreds; each pair of poles makes one electrical turn per turn.
     scale = 100.0 * RPM * 2.0 / count
-    values = np.column_stack([columns[f'eRPM[{k}]'] for k in places]) * scale
     origin = '--poles' if poles else 'the header'
-    return Motion('', t, {VELOCITY: values}, f'eRPM {scale:.6g}',
-                  f'rotor speed, {count} poles by {origin}',
-                  motors=tuple(f'motor_{k}' for k in places))
+    return speeds_of(t, [columns[f'eRPM[{k}]'] for k in places], scale, 'eRPM',
+                     f'rotor speed, {count} poles by {origin}', places)
 
 
 def _number(headers: Headers, key: str) -> float:

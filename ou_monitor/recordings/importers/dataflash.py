@@ -20,7 +20,7 @@ import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import (
     CURRENT, FRD_TO_FLU, gyro_of, Log, log_of, Motion, one_flight, quiet, quiet_process, Request,
-    RPM, Series, SIGNAL, started, three_axes, THROTTLE, TURNED, UNKNOWN, VELOCITY, VOLTAGE)
+    RPM, Series, SIGNAL, speeds_of, started, three_axes, THROTTLE, TURNED, UNKNOWN, VOLTAGE)
 from ou_monitor.records import FloatArray
 from ou_monitor.stream.files import open_regular
 from ou_monitor.text import counted
@@ -316,10 +316,9 @@ def _speeds(table: Table) -> Motion | None:
     for columns in found.values():
         # ESCs report in turn: the last report holds.
         last = np.maximum(np.searchsorted(columns['t'], t, 'right') - 1, 0)
-        values.append(columns[field][last] * RPM)
-    return Motion('', t, {VELOCITY: np.column_stack(values)}, f'rpm {RPM:.6g}',
-                  'speed reported by the ESC, the last report held',
-                  motors=tuple(f'motor_{instance or 0}' for instance in found))
+        values.append(columns[field][last])
+    return speeds_of(t, values, RPM, 'rpm', 'speed reported by the ESC, the last report held',
+                     [instance or 0 for instance in found])
 
 
 def _throttle_scale(values: FloatArray) -> float:

@@ -56,6 +56,11 @@ class Motion:
     motors: tuple[str, ...] = ()
 
     @property
+    def unit(self) -> str:
+        """Return the units of the values."""
+        return 'rad/s' if self.motors else 'rad/s, m/s^2'
+
+    @property
     def columns(self) -> dict[str, FloatArray]:
         """Return path in the message -> values, shape (n,)."""
         return {f'{field}[{k}]' if self.motors else f"{field}.{'xyz'[k]}": column
@@ -68,6 +73,14 @@ def gyro_of(name: str, t: FloatArray, rates: FloatArray | None, forces: FloatArr
     if rates is not None:
         yield Motion(name, t, {RATE: rates, **({} if forces is None else {FORCE: forces})},
                      scale, words, rank)
+
+
+def speeds_of(t: FloatArray, rpm: Sequence[FloatArray], factor: float, scale: str, words: str,
+              numbers: Iterable[object]) -> Motion:
+    """Return the speeds of motors by their numbers (factor to rad/s); see `Motion`."""
+    motors = tuple(f'motor_{number}' for number in numbers)
+    return Motion(', '.join(motors), t, {VELOCITY: np.column_stack(rpm) * factor},
+                  f'{scale} {factor:.6g}', words, motors=motors)
 
 
 VOLTAGE, THROTTLE, CURRENT = 'voltage', 'throttle', 'current'

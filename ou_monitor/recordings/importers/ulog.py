@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from ou_monitor.recordings.importers.log import (
     CURRENT, FRD_TO_FLU, gyro_of, Log, log_of, Motion, one_flight, Progress, quiet, Request, RPM,
-    Series, SIGNAL, started, three_axes, THROTTLE, TURNED, UNKNOWN, VELOCITY, VOLTAGE)
+    Series, SIGNAL, speeds_of, started, three_axes, THROTTLE, TURNED, UNKNOWN, VOLTAGE)
 from ou_monitor.records import Defect, FloatArray, Note
 from ou_monitor.text import counted
 from pyulog import ULog
@@ -197,14 +197,11 @@ def _gyros(name: str, topic: str, t: FloatArray, columns: Columns) -> Iterator[M
 
 def _speeds(topic: str, t: FloatArray, columns: Columns) -> Motion | None:
     """Return the speeds reported by ESCs, or None."""
-    fields = [f'esc[{k}].esc_rpm' for k in range(16) if f'esc[{k}].esc_rpm' in columns]
-    fields = [name for name in fields if np.any(columns[name])]
-    if topic != 'esc_status' or not fields:
+    found = {k: np.abs(columns[f'esc[{k}].esc_rpm']) for k in range(16)
+             if np.any(columns.get(f'esc[{k}].esc_rpm', 0.0))}
+    if topic != 'esc_status' or not found:
         return None
-    values = np.column_stack([columns[name] for name in fields])
-    return Motion(
-        '', t, {VELOCITY: np.abs(values) * RPM}, f'rpm {RPM:.6g}', 'speed reported by the ESC',
-        motors=tuple(f'motor_{name[4:name.index("]")]}' for name in fields))
+    return speeds_of(t, [*found.values()], RPM, 'rpm', 'speed reported by the ESC', found)
 
 
 def _facts(ulog: Any) -> dict[str, str]:
