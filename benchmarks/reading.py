@@ -137,8 +137,8 @@ def ours(path: Path, case: Case) -> Columns:
     """Read with this package, to the same arrays as the others."""
     bag = BagReader(path)
     choice = choose(path, bag.topics, msg_config=case.config)
-    assert choice.throttle is not None
-    found = list(batches(bag, {VOLTAGE: choice.voltage, THROTTLE: choice.throttle}))
+    found = list(batches(bag, {VOLTAGE: choice.specs['voltage'],
+                               THROTTLE: choice.specs['throttle']}))
     columns = {topic: join([batch[topic] for batch in found if topic in batch])
                for topic in (VOLTAGE, THROTTLE)}
     return {topic: (column.stamp, column.values) for topic, column in columns.items()}

@@ -431,11 +431,40 @@ class BagWriter:
             finish()
             self._file.close()
             if self._folder is not None:
-                write_metadata(self._folder, self._mcap.name, self.topics, self._counts,
-                               self._start_ns or 0, self._end_ns, self._about)
+                text = yaml.safe_dump(self._metadata(), sort_keys=False, default_flow_style=False)
+                (self._folder / FILE).write_text(text, encoding='utf-8')
         except OSError as error:
             self._remove()
             raise self._write_error(error) from error
+
+    def _metadata(self) -> dict[str, Any]:
+        """Return the content of metadata.yaml (version 9)."""
+        start_ns = self._start_ns or 0
+        duration = {'nanoseconds': self._end_ns - start_ns}
+        start = {'nanoseconds_since_epoch': start_ns}
+        count = sum(self._counts.values())
+        return {_ROOT: {
+            'version': 9,
+            'storage_identifier': 'mcap',
+            'duration': dict(duration),
+            'starting_time': dict(start),
+            'message_count': count,
+            'topics_with_message_count': [{
+                'topic_metadata': {
+                    'name': name, 'type': kind, 'serialization_format': 'cdr',
+                    'offered_qos_profiles': _qos(),
+                    'type_description_hash': TYPE_HASHES.get(kind, ''),
+                },
+                'message_count': self._counts[name],
+            } for name, kind in self.topics.items()],
+            'compression_format': '',
+            'compression_mode': '',
+            'relative_file_paths': [self._mcap.name],
+            'files': [{'path': self._mcap.name, 'starting_time': start, 'duration': duration,
+                       'message_count': count}],
+            'custom_data': self._about or None,
+            'ros_distro': 'jazzy',
+        }}
 
     def _remove(self) -> None:
         """Remove the files that this object has written."""
@@ -461,37 +490,3 @@ class BagWriter:
 
 def _as_text(value: str) -> str:
     return value.encode('utf-8', 'backslashreplace').decode()
-
-
-def write_metadata(folder: Path, file: str, topics: Mapping[str, str], counts: Mapping[str, int],
-                   start_ns: int, end_ns: int, custom: Mapping[str, str]) -> None:
-    """Write metadata.yaml (version 9) of a directory with one MCAP file."""
-    count = sum(counts.values())
-    content = {_ROOT: {
-        'version': 9,
-        'storage_identifier': 'mcap',
-        'duration': {'nanoseconds': end_ns - start_ns},
-        'starting_time': {'nanoseconds_since_epoch': start_ns},
-        'message_count': count,
-        'topics_with_message_count': [{
-            'topic_metadata': {
-                'name': name, 'type': kind, 'serialization_format': 'cdr',
-                'offered_qos_profiles': _qos(),
-                'type_description_hash': TYPE_HASHES.get(kind, ''),
-            },
-            'message_count': counts[name],
-        } for name, kind in topics.items()],
-        'compression_format': '',
-        'compression_mode': '',
-        'relative_file_paths': [file],
-        'files': [{
-            'path': file,
-            'starting_time': {'nanoseconds_since_epoch': start_ns},
-            'duration': {'nanoseconds': end_ns - start_ns},
-            'message_count': count,
-        }],
-        'custom_data': dict(custom) if custom else None,
-        'ros_distro': 'jazzy',
-    }}
-    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=False)
-    (folder / FILE).write_text(text, encoding='utf-8')

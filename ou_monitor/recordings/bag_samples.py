@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,7 +20,7 @@ from ou_monitor.recordings.bag import BagReader, batches
 from ou_monitor.recordings.cdr import (
     Field, FieldColumn, join, short_name, TimeArray, value_path)
 from ou_monitor.recordings.importers.log import (
-    RawColumns, Series, SIGNAL, UNKNOWN, unusable_words)
+    CURRENT, RawColumns, Series, SIGNAL, THROTTLE, UNKNOWN, unusable_words, VOLTAGE)
 from ou_monitor.recordings.standard_types import FLOAT32, FLOAT64, IMU
 from ou_monitor.records import Defect, defect_of, FloatArray, Note
 from ou_monitor.stream.config import FieldSpec, list_msg_configs, load_msg_config, MsgConfig
@@ -35,10 +34,8 @@ class TopicChoice:
     """The fields to read from a bag."""
 
     config: MsgConfig  # The source
-    # With the topics of this bag; None if there is no throttle or current.
-    voltage: FieldSpec
-    throttle: FieldSpec | None
-    current: FieldSpec | None
+    # VOLTAGE, and THROTTLE and CURRENT if there are, -> their fields, with the topics of this bag.
+    specs: dict[str, FieldSpec]
     notes: tuple[str, ...]  # Notes on unexpected choices, one sentence each
 
 
@@ -54,27 +51,32 @@ def choose(
         config = load_msg_config(msg_config)
     else:
         config = _detect(path, topics, voltage_topic)
-    if voltage_topic is not None:
-        topic = _absolute(voltage_topic)
-        if topics[topic] != config.voltage.type:
-            raise InputError(
-                f"{path}: topic '{topic}' is {topics[topic]}, but msg config '{config.name}' "
-                f'expects {config.voltage.type}: choose another with --msg-config')
-    else:
+    wanted = _absolute(config.voltage.topic if voltage_topic is None else voltage_topic)
+    if voltage_topic is None:
         found = _by_name(config.voltage, topics) or _only_of_type(config, topics)
-        if not found:
-            raise InputError(_topic_error(path, config, topics))
-        if len(found) > 1:
-            raise InputError(f'{path}: several topics fit: {some(found)}; choose with '
-                             '--voltage-topic')
-        topic = found[0]
+    else:
+        found = [wanted] if topics[wanted] == config.voltage.type else []
+    if not found and wanted in topics:
+        raise InputError(f"{path}: topic '{wanted}' is {topics[wanted]}, but msg config "
+                         f"'{config.name}' expects {config.voltage.type}: choose another with "
+                         '--msg-config')
+    if not found:
+        raise InputError(f"{path}: msg config '{config.name}' needs topic '{wanted}' "
+                         f'({config.voltage.type}), which is not in the bag; topics: '
+                         f'{listed(topics)}')
+    if len(found) > 1:
+        raise InputError(f'{path}: several topics fit: {some(found)}; choose with '
+                         '--voltage-topic')
+    topic = found[0]
     throttle, notes = _throttle(path, config, topics, topic, throttle_topic)
     others = [name for name in _by_suffix(config.voltage, topics) if name != topic]
     if voltage_topic is None and others:
         notes = (*notes, f'{topic} was taken for the voltage; {some(others)} would fit too: '
                          'choose with --voltage-topic.')
-    return TopicChoice(config, replace(config.voltage, topic=topic), throttle,
-                       _current(config, topics, topic), notes)
+    specs = {VOLTAGE: replace(config.voltage, topic=topic), THROTTLE: throttle,
+             CURRENT: _current(config, topics, topic)}
+    return TopicChoice(config, {name: spec for name, spec in specs.items() if spec is not None},
+                       notes)
 
 
 def listed(topics: Mapping[str, str]) -> str:
@@ -129,16 +131,6 @@ def _detect(path: Path, topics: Mapping[str, str], voltage_topic: str | None) ->
         f"--msg-config one of {', '.join(c.name for c in configs)}, or a YAML file of your own")
 
 
-def _topic_error(path: Path, config: MsgConfig, topics: Mapping[str, str]) -> str:
-    wanted = _absolute(config.voltage.topic)
-    kind = topics.get(wanted)
-    if kind is not None:
-        return (f"{path}: topic '{wanted}' is {kind}, but msg config '{config.name}' expects "
-                f'{config.voltage.type}: choose another with --msg-config')
-    return (f"{path}: msg config '{config.name}' needs topic '{wanted}' "
-            f'({config.voltage.type}), which is not in the bag; topics: {listed(topics)}')
-
-
 def _current(config: MsgConfig, topics: Mapping[str, str], voltage: str) -> FieldSpec | None:
     """Return the field of the current: a topic `current` beside the voltage, or as configured."""
     beside = voltage.rsplit('/', 1)[0] + '/current'
@@ -187,7 +179,6 @@ def _throttle(
     return None, (f'The throttle is unknown: {why}; name one with --throttle-topic.',)
 
 
-VOLTAGE, THROTTLE, CURRENT = 'voltage', 'throttle', 'current'
 # Types with a single number, whose field need not be named.
 _SCALARS = (FLOAT32, FLOAT64)
 
@@ -201,7 +192,17 @@ def read_bag(
     bag = BagReader(path, partial=partial)
     choice = choose(bag.path, bag.topics, msg_config=msg_config, voltage_topic=voltage_topic,
                     throttle_topic=throttle_topic)
-    specs = _specs(bag, choice)
+    specs = dict(choice.specs)
+    stated = bag.sample_rates.get(specs[VOLTAGE].topic)
+    if specs[VOLTAGE].sample_rate is not None and stated is not None:
+        # The rate stated in the bag overrides the config's.
+        specs[VOLTAGE] = replace(specs[VOLTAGE], sample_rate=stated)
+    if CURRENT in specs:
+        try:
+            value_path(specs[CURRENT], bag.definitions(specs[CURRENT].type))
+        except InputError:
+            # Older types of a battery have no current.
+            del specs[CURRENT]
     notes = [*bag.notes, *choice.notes]
     if bag.damage is not None:
         notes.append(Note(f'The bag is damaged; its intact part was read: {bag.damage}.',
@@ -242,34 +243,14 @@ def read_bag(
     return supply.columns(name, _source(bag, choice, name), notes)
 
 
-def _specs(bag: BagReader, choice: TopicChoice) -> dict[str, FieldSpec]:
-    """Return the fields to read, by name."""
-    spec = choice.voltage
-    stated = bag.sample_rates.get(spec.topic)
-    if spec.sample_rate is not None and stated is not None:
-        # The rate stated in the bag overrides the config's.
-        spec = replace(spec, sample_rate=stated)
-    specs = {VOLTAGE: spec}
-    if choice.throttle is not None:
-        specs[THROTTLE] = choice.throttle
-    if choice.current is not None:
-        # Older types of a battery have no current.
-        with suppress(InputError):
-            value_path(choice.current, bag.definitions(choice.current.type))
-            specs[CURRENT] = choice.current
-    return specs
-
-
 def _source(bag: BagReader, choice: TopicChoice, name: str) -> dict[str, str]:
     """Return topics, types, files and metadata of the bag."""
-    source = {
-        **bag.about, 'file': name, 'format': 'mcap', 'msg_config': choice.config.name,
-        'voltage_topic': choice.voltage.topic, 'voltage_type': choice.voltage.type,
-        'voltage_field': choice.voltage.field, **bag.origins.get(choice.voltage.topic, {})}
-    if choice.throttle is not None:
-        source |= {'throttle_topic': choice.throttle.topic, 'throttle_type': choice.throttle.type,
-                   'throttle_field': choice.throttle.field,
-                   **bag.origins.get(choice.throttle.topic, {})}
+    source = {**bag.about, 'file': name, 'format': 'mcap', 'msg_config': choice.config.name}
+    for which in (VOLTAGE, THROTTLE):
+        spec = choice.specs.get(which)
+        if spec is not None:
+            source |= {f'{which}_topic': spec.topic, f'{which}_type': spec.type,
+                       f'{which}_field': spec.field, **bag.origins.get(spec.topic, {})}
     # `ou-monitor convert` stores the log's own vehicle apart from the user's.
     vehicle = source.get('vehicle') or source.get('log_vehicle')
     return {**source, 'vehicle': vehicle} if vehicle else source
