@@ -24,7 +24,7 @@ from ou_monitor.recordings.importers.log import (
 from ou_monitor.recordings.standard_types import FLOAT32, FLOAT64, IMU
 from ou_monitor.records import Defect, defect_of, FloatArray, Note
 from ou_monitor.stream.config import FieldSpec, list_msg_configs, load_msg_config, MsgConfig
-from ou_monitor.stream.samples import BlockClock, ThrottleHold
+from ou_monitor.stream.samples import BlockClock, clock_of, ThrottleHold
 from ou_monitor.text import counted, outside_words, part_words, printable, some
 from ou_monitor.timeline import check_throttle
 
@@ -267,7 +267,7 @@ class _Load:
 
     def __init__(self, spec: FieldSpec, sample_rate: float | None) -> None:
         self._spec = spec
-        self._clock = _clock(spec)
+        self._clock = clock_of(spec)
         self.hold = ThrottleHold(sample_rate)
         # Messages since the last voltage.
         self.waiting: list[FieldColumn] = []
@@ -305,7 +305,7 @@ class _Supply:
 
     def __init__(self, specs: Mapping[str, FieldSpec]) -> None:
         volts = specs[VOLTAGE]
-        self._clock = _clock(volts)
+        self._clock = clock_of(volts)
         # These grow in place: parts and the whole together would take twice the memory.
         self.t, self._voltage, self._current = array('d'), array('d'), array('d')
         self.loads = {name: _Load(spec, volts.sample_rate) for name, spec in specs.items()
@@ -356,10 +356,6 @@ class _Supply:
             found[THROTTLE] = np.full(t.size, np.nan)
         return RawColumns(t, np.frombuffer(self._voltage), found[THROTTLE],
                           found.get(CURRENT), name, source, tuple(notes))
-
-
-def _clock(spec: FieldSpec) -> BlockClock | None:
-    return None if spec.sample_rate is None else BlockClock(spec.sample_rate)
 
 
 def _stamps(clock: BlockClock | None, column: FieldColumn) -> FloatArray:

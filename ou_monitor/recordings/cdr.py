@@ -200,7 +200,7 @@ class Layout:
                 continue
             size = self._word() if field.size is None else field.size
             if field.type in PRIMITIVES:
-                self._numbers(field.type, size, here)
+                self._numbers(field.type, here, size)
                 continue
             self._step(size)
             for k in range(size):
@@ -219,25 +219,24 @@ class Layout:
                 self._data[begin:begin + length - 1].decode()
                 self.texts.append((begin, length - 1))
         elif kind in PRIMITIVES:
-            width = np.dtype(PRIMITIVES[kind]).itemsize
-            begin = self._take(width, width)
-            if path in self._wanted:
-                self.places[path] = Place(begin, self._order + PRIMITIVES[kind])
+            self._numbers(kind, path)
         else:
             self._message(kind, path, depth + 1)
 
-    def _numbers(self, kind: str, size: int, path: FieldPath) -> None:
+    def _numbers(self, kind: str, path: FieldPath, size: int | None = None) -> None:
+        """Skip a number, or the `size` numbers of an array."""
         item = self._order + PRIMITIVES[kind]
         width = np.dtype(item).itemsize
         # An empty array is not aligned.
-        begin = self._take(size * width, width if size else 1)
+        begin = self._take(width if size is None else size * width, 1 if size == 0 else width)
+        if path in self._wanted:
+            self.places[path] = Place(begin, item, size)
+        if not size:
+            return
         for wanted in self._wanted:
-            if wanted == path:
-                self.places[wanted] = Place(begin, item, size)
-            elif len(wanted) == len(path) + 1 and wanted[:-1] == path:
-                k = wanted[-1]
-                if isinstance(k, int) and k < size:
-                    self.places[wanted] = Place(begin + k * width, item)
+            k = wanted[-1]
+            if wanted[:-1] == path and isinstance(k, int) and k < size:
+                self.places[wanted] = Place(begin + k * width, item)
 
     def _word(self) -> int:
         begin = self._take(4, 4)
@@ -283,10 +282,8 @@ class MessageTable:
 
     def rows(self, picked: IntArray, length: int) -> Rows:
         """Return messages of one length in bytes as rows."""
-        if not length:
-            return np.empty((picked.size, 0), np.uint8)
-        return gather(self.data, self.begin[picked], f'V{length}').view(np.uint8).reshape(
-            -1, length)
+        found = gather(self.data, self.begin[picked], f'V{length}') if length else np.empty(0)
+        return found.view(np.uint8).reshape(picked.size, length)
 
 
 def gather(data: bytes, at: IntArray, kind: str) -> npt.NDArray[Any]:

@@ -87,13 +87,6 @@ class Damage(Exception):
     """A part of the file is damaged."""
 
 
-class Break(NamedTuple):
-    """Damage: its first byte, and the reason."""
-
-    offset: int
-    why: str
-
-
 class Span(NamedTuple):
     """A part of the file with messages that is read at once."""
 
@@ -169,7 +162,8 @@ class McapFile:
         self.topics: dict[int, Topic] = {}
         self.counts: dict[int, int] = {}
         self.spans: list[Span] = []
-        self.breaks: list[Break] = []
+        # First byte and reason of each damage, in order.
+        self.breaks: list[tuple[int, str]] = []
         self.about: dict[str, str] = {}
         self.notes: list[str] = []
         self.start_ns = self.end_ns = 0
@@ -183,7 +177,13 @@ class McapFile:
             self._size = file.seek(0, os.SEEK_END)
             self._limit = _chunk_limit(self._size)
             self._limit_of_all = max(16 * self._limit, _MOST_RATIO * self._size)
-            self._check_magic(file)
+            if self._size == 0:
+                raise InputError(f'{self.path} is empty (0 bytes)')
+            file.seek(0)
+            head = file.read(64)
+            if not head.startswith(MAGIC):
+                raise InputError(f'{self.path} is not an MCAP file: '
+                                 f'{kind_of_foreign(head, self.path)}')
             self._summary = self._read_summary(file)
             # With `partial` the summary is not trusted.
             if partial or not self._use_summary(file):
@@ -205,28 +205,18 @@ class McapFile:
         """Return a description of the damage; '' for an intact file."""
         if not self.breaks:
             return ''
-        first, rest = self.breaks[0], len(self.breaks) - 1
-        newest = max((span.end_ns for span in self.spans if span.offset <= first.offset),
-                     default=None)
-        words = f'at byte {first.offset}: {first.why} (' + (
+        (first, why), rest = self.breaks[0], len(self.breaks) - 1
+        newest = max((span.end_ns for span in self.spans if span.offset <= first), default=None)
+        words = f'at byte {first}: {why} (' + (
             'before the first message' if newest is None else
             moment(newest, self.origin_ns)) + ')'
         if rest + 1 >= _MOST_BREAKS:
             return f'{words}; and at {rest} more places, where the search was given up'
         return words + (f'; and at {counted(rest, "more place")}, the last at byte '
-                        f'{self.breaks[-1].offset}' if rest else '')
+                        f'{self.breaks[-1][0]}' if rest else '')
 
     def _break(self, offset: int, why: object) -> None:
-        bisect.insort(self.breaks, Break(offset, str(why)))
-
-    def _check_magic(self, file: BinaryIO) -> None:
-        if self._size == 0:
-            raise InputError(f'{self.path} is empty (0 bytes)')
-        file.seek(0)
-        head = file.read(64)
-        if not head.startswith(MAGIC):
-            raise InputError(
-                f'{self.path} is not an MCAP file: {kind_of_foreign(head, self.path)}')
+        bisect.insort(self.breaks, (offset, str(why)))
 
     def _read_summary(self, file: BinaryIO) -> Any:
         """Return the summary section, or None where it is missing or damaged."""
@@ -595,12 +585,13 @@ class _Strict(ReadDataStream):
 def _parse(kind: Any, content: bytes) -> Any:
     """Return a record as the library reads it."""
     stream = _Strict(io.BytesIO(content))
+    what = f'a {kind.__name__.lower()} record cannot be read'
     try:
         found = kind.read(stream)
     except Exception as error:
-        raise Damage(f'a {kind.__name__.lower()} record cannot be read ({error!r})') from error
+        raise Damage(f'{what} ({error!r})') from error
     if stream.count < len(content):
-        raise Damage(f'a {kind.__name__.lower()} record cannot be read: it ends before its record')
+        raise Damage(f'{what}: it ends before its record')
     return found
 
 

@@ -25,6 +25,13 @@ import numpy.typing as npt
 from ou_monitor.recordings.cdr import DEFAULTS, Definitions, Field, Layout, short_name
 from ou_monitor.stream.config import FieldPath, parse_field_path
 
+IMU = 'sensor_msgs/msg/Imu'
+JOINT_STATE = 'sensor_msgs/msg/JointState'
+FLOAT32 = 'std_msgs/msg/Float32'
+FLOAT64 = 'std_msgs/msg/Float64'
+FLOAT32_ARRAY = 'std_msgs/msg/Float32MultiArray'
+BATTERY_STATE = 'sensor_msgs/msg/BatteryState'
+
 _SEPARATOR = 80 * '='
 
 # rosbag2 prints this line between a definition and the definitions it uses.
@@ -39,11 +46,17 @@ int32 sec
 uint32 nanosec
 """
 
+
+def _constants(kind: str, *names: str) -> str:
+    """Return the constants of a BatteryState, numbered from 0."""
+    return ''.join(f'uint8 POWER_SUPPLY_{kind}_{name}={k}\n' for k, name in enumerate(names))
+
+
 # package/msg/Type -> its definition and the definitions it uses.
 SCHEMAS: dict[str, str] = {
-    'std_msgs/msg/Float32': 'float32 data\n',
-    'std_msgs/msg/Float64': 'float64 data\n',
-    'std_msgs/msg/Float32MultiArray': f"""\
+    FLOAT32: 'float32 data\n',
+    FLOAT64: 'float64 data\n',
+    FLOAT32_ARRAY: f"""\
 std_msgs/MultiArrayLayout layout
 float32[] data
 {_SEPARATOR}
@@ -56,30 +69,12 @@ string label
 uint32 size
 uint32 stride
 """,
-    'sensor_msgs/msg/BatteryState': """\
-uint8 POWER_SUPPLY_STATUS_UNKNOWN=0
-uint8 POWER_SUPPLY_STATUS_CHARGING=1
-uint8 POWER_SUPPLY_STATUS_DISCHARGING=2
-uint8 POWER_SUPPLY_STATUS_NOT_CHARGING=3
-uint8 POWER_SUPPLY_STATUS_FULL=4
-uint8 POWER_SUPPLY_HEALTH_UNKNOWN=0
-uint8 POWER_SUPPLY_HEALTH_GOOD=1
-uint8 POWER_SUPPLY_HEALTH_OVERHEAT=2
-uint8 POWER_SUPPLY_HEALTH_DEAD=3
-uint8 POWER_SUPPLY_HEALTH_OVERVOLTAGE=4
-uint8 POWER_SUPPLY_HEALTH_UNSPEC_FAILURE=5
-uint8 POWER_SUPPLY_HEALTH_COLD=6
-uint8 POWER_SUPPLY_HEALTH_WATCHDOG_TIMER_EXPIRE=7
-uint8 POWER_SUPPLY_HEALTH_SAFETY_TIMER_EXPIRE=8
-uint8 POWER_SUPPLY_TECHNOLOGY_UNKNOWN=0
-uint8 POWER_SUPPLY_TECHNOLOGY_NIMH=1
-uint8 POWER_SUPPLY_TECHNOLOGY_LION=2
-uint8 POWER_SUPPLY_TECHNOLOGY_LIPO=3
-uint8 POWER_SUPPLY_TECHNOLOGY_LIFE=4
-uint8 POWER_SUPPLY_TECHNOLOGY_NICD=5
-uint8 POWER_SUPPLY_TECHNOLOGY_LIMN=6
-uint8 POWER_SUPPLY_TECHNOLOGY_TERNARY=7
-uint8 POWER_SUPPLY_TECHNOLOGY_VRLA=8
+    BATTERY_STATE: _constants(
+        'STATUS', 'UNKNOWN', 'CHARGING', 'DISCHARGING', 'NOT_CHARGING', 'FULL') + _constants(
+        'HEALTH', 'UNKNOWN', 'GOOD', 'OVERHEAT', 'DEAD', 'OVERVOLTAGE', 'UNSPEC_FAILURE', 'COLD',
+        'WATCHDOG_TIMER_EXPIRE', 'SAFETY_TIMER_EXPIRE') + _constants(
+        'TECHNOLOGY', 'UNKNOWN', 'NIMH', 'LION', 'LIPO', 'LIFE', 'NICD', 'LIMN', 'TERNARY',
+        'VRLA') + """\
 std_msgs/Header header
 float32 voltage
 float32 temperature
@@ -97,7 +92,7 @@ float32[] cell_temperature
 string location
 string serial_number
 """ + _STD_HEADER,
-    'sensor_msgs/msg/Imu': f"""\
+    IMU: f"""\
 std_msgs/Header header
 geometry_msgs/Quaternion orientation
 float64[9] orientation_covariance
@@ -117,7 +112,7 @@ float64 x
 float64 y
 float64 z
 """,
-    'sensor_msgs/msg/JointState': """\
+    JOINT_STATE: """\
 std_msgs/Header header
 string[] name
 float64[] position
@@ -128,27 +123,13 @@ float64[] effort
 
 # package/msg/Type -> its RIHS01 hash.
 TYPE_HASHES: dict[str, str] = {
-    'std_msgs/msg/Float32':
-        'RIHS01_7170d3d8f841f7be3172ce5f4f59f3a4d7f63b0447e8b33327601ad64d83d6e2',
-    'std_msgs/msg/Float64':
-        'RIHS01_705ba9c3d1a09df43737eb67095534de36fd426c0587779bda2bc51fe790182a',
-    'std_msgs/msg/Float32MultiArray':
-        'RIHS01_0599f6f85b4bfca379873a0b4375a0aca022156bd2d7021275d116ed1fa8bfe0',
-    'sensor_msgs/msg/BatteryState':
-        'RIHS01_4bee5dfce981c98faa6828b868307a0a73f992ed0789f374ee96c8f840e69741',
-    'sensor_msgs/msg/Imu':
-        'RIHS01_7d9a00ff131080897a5ec7e26e315954b8eae3353c3f995c55faf71574000b5b',
-    'sensor_msgs/msg/JointState':
-        'RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e',
+    FLOAT32: 'RIHS01_7170d3d8f841f7be3172ce5f4f59f3a4d7f63b0447e8b33327601ad64d83d6e2',
+    FLOAT64: 'RIHS01_705ba9c3d1a09df43737eb67095534de36fd426c0587779bda2bc51fe790182a',
+    FLOAT32_ARRAY: 'RIHS01_0599f6f85b4bfca379873a0b4375a0aca022156bd2d7021275d116ed1fa8bfe0',
+    BATTERY_STATE: 'RIHS01_4bee5dfce981c98faa6828b868307a0a73f992ed0789f374ee96c8f840e69741',
+    IMU: 'RIHS01_7d9a00ff131080897a5ec7e26e315954b8eae3353c3f995c55faf71574000b5b',
+    JOINT_STATE: 'RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e',
 }
-
-
-IMU = 'sensor_msgs/msg/Imu'
-JOINT_STATE = 'sensor_msgs/msg/JointState'
-FLOAT32 = 'std_msgs/msg/Float32'
-FLOAT64 = 'std_msgs/msg/Float64'
-FLOAT32_ARRAY = 'std_msgs/msg/Float32MultiArray'
-BATTERY_STATE = 'sensor_msgs/msg/BatteryState'
 
 
 def parse_definition(kind: str, text: str) -> Definitions:

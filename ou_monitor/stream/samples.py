@@ -66,12 +66,8 @@ class SourceClock:
         newest = int(np.argmax(stamps))
         delay = float(received[newest] - stamps[newest])
         least = float(np.min(received - stamps))
-        if self.name == 'ros' and -AHEAD <= delay <= MOST_DELAY:
-            pass
-        elif -AHEAD <= least <= BEHIND:
-            self.name = 'ros'
-        else:
-            self.name = 'foreign'
+        still = self.name == 'ros' and -AHEAD <= delay <= MOST_DELAY
+        self.name = 'ros' if still or -AHEAD <= least <= BEHIND else 'foreign'
         self._delay = max(delay, 0.0) if self.name == 'ros' else 0.0
         self._arrived = arrived
 
@@ -263,6 +259,11 @@ class BlockClock:
         return 0.0, 1 - n, self._dt
 
 
+def clock_of(spec: FieldSpec) -> BlockClock | None:
+    """Return the time line of a field of blocks; None for single values."""
+    return None if spec.sample_rate is None else BlockClock(spec.sample_rate)
+
+
 # Difference of voltage and throttle stamps, s, above which they are from different clocks (an
 # autopilot's boot time and a wall clock differ by years).
 APART = 5.0
@@ -388,14 +389,13 @@ class SampleStream:
 
     def open_voltage(self, spec: FieldSpec) -> None:
         """Set the field of the voltage's messages."""
-        self._block = None if spec.sample_rate is None else BlockClock(spec.sample_rate)
+        self._block = clock_of(spec)
         self._hold = ThrottleHold(spec.sample_rate)
 
     def open_throttle(self, spec: FieldSpec) -> None:
         """Set the field of the throttle's messages."""
         self._drop = spec.nan == 'drop'
-        self._throttle_block = (
-            None if spec.sample_rate is None else BlockClock(spec.sample_rate))
+        self._throttle_block = clock_of(spec)
 
     @property
     def throttle(self) -> float:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import codecs
 from collections.abc import Callable
-from contextlib import redirect_stderr
+from contextlib import redirect_stderr, suppress
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -142,14 +142,10 @@ _TABLES = ('.csv', '.tsv', '.tab', '.txt', '.dat', '.asc', '.log', '.lvm', '.msl
 
 def _begins_as(path: Path) -> Format | None:
     """Return the format of a file by its first bytes; None if unknown or unreadable."""
-    if not path.is_file():
-        return None
-    try:
-        with open_regular(path) as file:
-            return format_of(file.read(HEAD))
-    except OSError:
-        # The reader reports why it cannot be read.
-        return None
+    # The reader reports why it cannot be read.
+    with suppress(InputError):
+        return detect(path) if path.is_file() else None
+    return None
 
 
 def is_csv(path: Path) -> bool:
