@@ -136,11 +136,7 @@ USUAL_RATE = 10.0
 
 
 class PolledChannel:
-    """
-    One channel ('in1', 'in_voltage0'; empty: the only one) of a hwmon or IIO device.
-
-    `rate` is the driver's conversion rate, Hz, or 10 if unknown.
-    """
+    """One channel ('in1', 'in_voltage0'; empty: the only one) of a hwmon or IIO device."""
 
     def __init__(self, folder: Path, channel: str = '') -> None:
         ends = {'_input': 'in[0-9]*_input', '_raw': 'in_voltage*_raw'}
@@ -154,6 +150,7 @@ class PolledChannel:
             self._offset = channel_number(folder, self.channel, 'offset', 0.0)
         interval = folder / 'update_interval'
         spacing = number_of(interval) if interval.exists() else 0.0
+        # The driver's conversion rate, Hz.
         self.rate = 1e3 / spacing if spacing > 0.0 else USUAL_RATE
         self.read()
 

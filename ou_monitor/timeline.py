@@ -570,12 +570,12 @@ def in_order(t: FloatArray, rows: FloatArray, most: float, unit: str = '',
     stamps = t[good]
     if (steps := int(np.count_nonzero(stamps[1:] < stamps[:-1]))):
         notes.append(Note(_late_words(steps, stamps), Defect.UNORDERED))
-    line = TimeLine()
-    batches = line.order(as_columns(stamps, np.flatnonzero(good).astype(np.float64)), math.inf)
-    if line.counters.late:
-        notes.append(Note(f'{counted(line.counters.late)} dropped: repeated stamp; '
+    places = np.flatnonzero(good)[np.argsort(stamps, kind='stable')]
+    first = np.diff(t[places], prepend=-math.inf) > 0.0
+    if not first.all():
+        notes.append(Note(f'{counted(int((~first).sum()))} dropped: repeated stamp; '
                           'the first of each was kept.', Defect.REPEATED_STAMPS))
-    return (batches[0].y if batches else np.empty(0)).astype(np.intp), notes
+    return places[first], notes
 
 
 def _late_words(steps: int, t: FloatArray) -> str:

@@ -207,20 +207,20 @@ class BagReader:
                 self.counts[topic.name] = (
                     self.counts.get(topic.name, 0) + file.counts.get(key, 0))
 
-    def _spans(self, wanted: set[str]) -> list[tuple[Span, McapFile]]:
-        """Return where topics are, in the order of the first log times."""
+    def tables(self, topics: Iterable[str], end_ns: int | None = None) -> Iterator[Part]:
+        """Yield the places of messages, chunk by chunk, up to `end_ns`, ns, or the end."""
+        wanted = set(topics)
+        for topic in sorted(wanted):
+            if topic not in self.topics:
+                raise InputError(f"{self.path}: no topic '{topic}': "
+                                 f'{nearest(topic, self.topics)}')
         spans: list[tuple[Span, McapFile]] = []
         for file in self._files:
             channels = file.channels_of(wanted).keys()
             spans += [(span, file) for span in file.spans
-                      if span.channels is None or span.channels & channels]
-        return sorted(spans, key=lambda pair: pair[0].start_ns)
-
-    def tables(self, topics: Iterable[str], end_ns: int | None = None) -> Iterator[Part]:
-        """Yield the places of messages, chunk by chunk, up to `end_ns`, ns, or the end."""
-        wanted = self._wanted(topics)
-        spans = [(span, file) for span, file in self._spans(wanted)
-                 if end_ns is None or span.start_ns < end_ns]
+                      if (span.channels is None or span.channels & channels)
+                      and (end_ns is None or span.start_ns < end_ns)]
+        spans.sort(key=lambda pair: pair[0].start_ns)
         total = sum(span.length for span, _ in spans)
         read = place = 0
         while place < len(spans):
@@ -262,14 +262,6 @@ class BagReader:
             raise InputError(f'{self.path}: a message of type {kind} cannot be decoded: its '
                              f'definition cannot be read ({type(error).__name__}: '
                              f'{printable(error, 200)})') from error
-
-    def _wanted(self, topics: Iterable[str]) -> set[str]:
-        wanted = set(topics)
-        for topic in sorted(wanted):
-            if topic not in self.topics:
-                raise InputError(f"{self.path}: no topic '{topic}': "
-                                 f'{nearest(topic, self.topics)}')
-        return wanted
 
 
 def _same_fields(schema: Any, other: Any) -> bool:

@@ -43,11 +43,7 @@ class ModelFile:
 
 @one_line()
 def read_model(path: str | Path) -> ModelFile:
-    """
-    Read a model file: a regular file of at most 1 MB.
-
-    The largest takes 2 to 5 s: a node reads it in a thread, not in a callback.
-    """
+    """Read a model file of at most 1 MB: 2 to 5 s for the largest, so a node needs a thread."""
     return parse_model(read_yaml(path, 'the model file'), path_words(path))
 
 

@@ -60,7 +60,7 @@ THROTTLE, VOLTAGE = 0, 1
 def write_recording(
     rec: Recording | Iterable[Recording], path: str | Path, *,
     type: str = 'battery_state',  # noqa: A002
-    start_ns: int = 0, sample_rate: float = 10000.0, block: int = 100,
+    start_ns: int = 0, sample_rate: float = BLOCK_RATE,
 ) -> tuple[dict[str, str], tuple[str, ...]]:
     """
     Write topics `/voltage` and, if throttle is known, `/throttle`.
@@ -97,10 +97,10 @@ def write_recording(
             if blocks:
                 check_steady(piece.name, stamps - first, count, sample_rate)
                 stamps, volts = np.append(rest[0], stamps), np.append(rest[1], volts)
-                whole = stamps.size - stamps.size % block
+                whole = stamps.size - stamps.size % BLOCK
                 rest = stamps[whole:], volts[whole:]
             count += piece.n
-            streams = [_timed(VOLTAGE, encode(kind, stamps[:whole], volts[:whole], block))]
+            streams = [_timed(VOLTAGE, encode(kind, stamps[:whole], volts[:whole]))]
             if values.size:
                 if '/throttle' not in bag.topics:
                     bag.add_topic('throttle', FLOAT32)
@@ -112,7 +112,7 @@ def write_recording(
                 streams.append(_timed(THROTTLE, encode(FLOAT32, times[sent], values[sent])))
             for t, topic, data in heapq.merge(*streams):
                 bag.write(('/throttle', '/voltage')[topic], t, data)
-        for t, data in encode(kind, *rest, block):
+        for t, data in encode(kind, *rest):
             bag.write('/voltage', t, data)
     return bag.topics, notes
 
@@ -218,13 +218,12 @@ def _messages(place: int, kind: str, stamps: Stamps, one: Series | Motion) -> It
                 strict=True))
 
 
-def encode(kind: str, stamps: Stamps, values: FloatArray, block: int = BLOCK,
-           ) -> Iterator[tuple[int, bytes]]:
+def encode(kind: str, stamps: Stamps, values: FloatArray) -> Iterator[tuple[int, bytes]]:
     """Yield messages of numbers with their log times, ns (a block's: its last sample's)."""
     if kind == FLOAT32_ARRAY:
-        whole = stamps.size - stamps.size % block
-        yield from zip(stamps[block - 1:whole:block].tolist(),
-                       encode_blocks(values[:whole].reshape(-1, block)), strict=True)
+        whole = stamps.size - stamps.size % BLOCK
+        yield from zip(stamps[BLOCK - 1:whole:BLOCK].tolist(),
+                       encode_blocks(values[:whole].reshape(-1, BLOCK)), strict=True)
         if whole < stamps.size:
             yield int(stamps[-1]), encode_blocks(values[None, whole:])[0]
         return

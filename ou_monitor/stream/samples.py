@@ -58,11 +58,7 @@ class SourceClock:
         self._arrived = -math.inf
 
     def take(self, stamps: FloatArray, received: FloatArray, arrived: float) -> None:
-        """
-        Register samples: stamps and times of reception on the node's clock, s.
-
-        arrived: arrival of the last one on the monotonic clock, s.
-        """
+        """Register samples, s: `arrived` of the last one is on the monotonic clock."""
         newest = int(np.argmax(stamps))
         delay = float(received[newest] - stamps[newest])
         least = float(np.min(received - stamps))
@@ -439,15 +435,13 @@ class SampleStream:
         # Stamps of late blocks stay on the time line; only its restart makes them go back.
         before = np.concatenate(([self._newest], ends[:-1]))
         back = np.flatnonzero(firsts < before - BACK)
+        # The last of several backward steps in one call counts.
+        begin = int(back[-1]) if back.size else 0
+        at = int(counts[:begin].sum())
         if back.size:
-            # The last of several backward steps in one call counts.
-            begin = int(back[-1])
-            at = int(counts[:begin].sum())
             self._add(ends[:begin], own[:begin], *(column[:at] for column in columns))
             self._begin_anew(f'stamps went back by {before[begin] - firsts[begin]:.3g} s')
-            self._add(ends[begin:], own[begin:], *(column[at:] for column in columns))
-        else:
-            self._add(ends, own, *columns)
+        self._add(ends[begin:], own[begin:], *(column[at:] for column in columns))
         return held
 
     def _add(self, ends: FloatArray, own: BoolArray, stamps: FloatArray, values: FloatArray,

@@ -38,9 +38,7 @@ class Format(NamedTuple):
     words: str  # What it is, with its usual ending
     fits: Callable[[bytes], bool]  # Whether a file with these first bytes has this format
     module: str  # Name of the module that reads it, beside this one; empty: not a log
-    # Package needed beyond the core, and the extra of pyproject.toml that installs it.
-    package: str = ''
-    extra: str = ''
+    package: str = ''  # Package needed beyond the core; an extra of the module's name installs it
 
 
 def _is_text(head: bytes) -> bool:
@@ -62,15 +60,14 @@ BAG, CSV = 'mcap', 'csv'
 # The first that fits is taken.
 FORMATS = (
     Format(BAG, 'MCAP bag (.mcap)', lambda head: head.startswith(MAGIC), ''),
-    Format('ulog', 'PX4 ULog (.ulg)', lambda head: head.startswith(ULOG), 'ulog', 'pyulog',
-           'ulog'),
+    Format('ulog', 'PX4 ULog (.ulg)', lambda head: head.startswith(ULOG), 'ulog', 'pyulog'),
     Format('dataflash', 'ArduPilot dataflash (.bin)', lambda head: head.startswith(DATAFLASH),
-           'dataflash', 'pymavlink', 'dataflash'),
+           'dataflash', 'pymavlink'),
     Format('dataflash_text', 'ArduPilot dataflash as text (.log)',
            lambda head: _is_text(head) and (head.startswith(b'FMT,') or b'\nFMT,' in head),
-           'dataflash', 'pymavlink', 'dataflash'),
+           'dataflash', 'pymavlink'),
     Format('blackbox', 'Betaflight or INAV blackbox (.bbl, .bfl)',
-           lambda head: head.startswith(BLACKBOX), 'blackbox', 'orangebox', 'blackbox'),
+           lambda head: head.startswith(BLACKBOX), 'blackbox', 'orangebox'),
     Format('crazyflie', 'Crazyflie micro-SD log', _is_crazyflie, 'crazyflie'),
     Format(CSV, 'CSV (.csv, .txt, .tsv)', _is_text, 'csv_table'),
 )
@@ -176,7 +173,7 @@ def import_log(path: Path, request: Request) -> Log:
             raise
         raise InputError(
             f"'{path}' is {form.words}: reading it needs {form.package}: "
-            f'{how_to_install(form.extra)}') from error
+            f'{how_to_install(form.module)}') from error
     if request.progress is not None:
         request = replace(request, progress=_terminal_progress(request.progress))
     # Broken bytes give numbers that no cast accepts, and fields of any shape.
