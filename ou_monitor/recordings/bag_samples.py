@@ -384,7 +384,7 @@ def read_bag_signal(path: Path, signal: str, partial: bool) -> Series:
 
 def _split(path: Path, signal: str, topics: Mapping[str, str]) -> tuple[str, str]:
     """Return the topic and the field that a signal names."""
-    wanted = '/' + signal.lstrip('/')
+    wanted = _absolute(signal)
     if topics.get(wanted) in _SCALARS:
         return wanted, 'data'
     topic, _, field = wanted.rpartition('/')

@@ -65,26 +65,25 @@ def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | 
             held := [one for one in _series_of(log, CURRENT) if not one.silent]):
         notes.append('No current clearly belongs to this voltage: ' + _names_of(held)
                      + f'; none taken ({option.format(CURRENT)} NAME).')
-    chosen: list[Series | None] = []
+    usable: dict[str, Series] = {}
     dropped: dict[str, list[str]] = {}
     for one in (volts, first, second):
-        if one is None:
-            chosen.append(None)
-            continue
-        mended, why = clean(one)
-        for sentence in why:
-            dropped.setdefault(sentence, []).append(one.name)
-        if not mended.n:
-            notes.append(f'{one.name} has no usable sample.')
-        chosen.append(mended if mended.n else None)
+        if one is not None:
+            mended, why = clean(one)
+            for sentence in why:
+                dropped.setdefault(sentence, []).append(one.name)
+            if mended.n:
+                usable[one.quantity] = mended
+            else:
+                notes.append(f'{one.name} has no usable sample.')
     # A note common to several series, such as columns of one table, appears once.
     notes = [note for sentence, names in dropped.items()
              for note in led(', '.join(names), [sentence])] + notes
-    if chosen[0] is None:
+    if VOLTAGE not in usable:
         raise InputError(f'{path}: {volts.name} has no usable sample'
                          + ''.join(f' ({note})' for note in notes))
     notes += _alternatives(log, (volts, first), option)
-    return Chosen(chosen[0], chosen[1], chosen[2], tuple(notes))
+    return Chosen(usable[VOLTAGE], usable.get(THROTTLE), usable.get(CURRENT), tuple(notes))
 
 
 def columns_of(path: Path, log: Log, chosen: Chosen) -> RawColumns:
@@ -325,17 +324,16 @@ def _inertial(path: Path, log: Log, names: Sequence[str]) -> list[Motion]:
     if not names:
         return default_inertial(log)
     found = []
+    known = [one.name for one in log.inertial]
     for name in dict.fromkeys(names):
         if name == NONE:
             if len(names) > 1:
                 raise InputError("--imu: 'none' cannot be combined with a gyro")
             return []
-        held = [one for one in log.inertial if one.name == name]
-        if not held:
-            known = [one.name for one in log.inertial]
+        if name not in known:
             raise InputError(f"{path} has no gyro '{name}': "
                              + (nearest(name, known) if known else 'it holds none'))
-        found += held
+        found += [one for one in log.inertial if one.name == name]
     return found
 
 

@@ -302,18 +302,18 @@ def _outputs(name: str, t: FloatArray, columns: Columns) -> Iterator[Series]:
     count = int(np.max(columns['noutputs'])) if 'noutputs' in columns else len(output)
     for k, values in enumerate(output[:count]):
         low, high = float(values.min()), float(values.max())
+        share, scale = values, '1'
         if 800.0 <= low and high <= 2200.0:
-            yield Series(f'{name}.output[{k}]', THROTTLE, t, (values - 1000.0) / 1000.0,
-                         '(x - 1000 us) / 1000 us', 'one output, motor or servo', None, name)
-        elif 0.0 <= low and 0.0 < high <= 1.0:
-            yield Series(f'{name}.output[{k}]', THROTTLE, t, values, '1',
-                         'one output, motor or servo', None, name)
+            share, scale = (values - 1000.0) / 1000.0, '(x - 1000 us) / 1000 us'
+        elif not (0.0 <= low and 0.0 < high <= 1.0):
+            continue
+        yield Series(f'{name}.output[{k}]', THROTTLE, t, share, scale,
+                     'one output, motor or servo', None, name)
 
 
 def _escs(name: str, t: FloatArray, columns: Columns) -> Iterator[Series]:
     for field in columns:
-        quantity = (VOLTAGE if field.endswith('.esc_voltage')
-                    else CURRENT if field.endswith('.esc_current') else None)
+        quantity = {'esc_voltage': VOLTAGE, 'esc_current': CURRENT}.get(field.split('.')[-1])
         if quantity is not None:
             one = Series(f'{name}.{field}', quantity, t, columns[field], '1', 'at the ESC', None,
                          f'{name}.{field.split(".")[0]}')
