@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import bisect
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path, PurePosixPath
 from types import TracebackType
 from typing import Any, NamedTuple
@@ -331,7 +331,7 @@ _TOGETHER = 2 * 1024 * 1024
 CHUNK_SIZE = 128 * 1024  # bytes
 
 
-class BagWriter:
+class BagWriter(AbstractContextManager['BagWriter']):
     """
     Writes a bag: an .mcap file when the path ends in .mcap, else a rosbag2 directory.
 
@@ -464,10 +464,6 @@ class BagWriter:
         with suppress(OSError):
             self._file.close()
         remove_bag([self._mcap], self._folder)
-
-    def __enter__(self) -> BagWriter:
-        """Return itself."""
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None,

@@ -151,12 +151,10 @@ def _throttle(
     if throttle_topic is not None:
         topic = _absolute(throttle_topic)
         # Read a topic named by the user as any shipped config reads its type.
-        specs = [spec] + [c.throttle for c in list_msg_configs().values()]
-        for one in specs:
+        for one in (spec, *(c.throttle for c in list_msg_configs().values()),
+                    FieldSpec(topic, FLOAT64, 'data')):
             if one is not None and one.type == topics[topic]:
                 return replace(one, topic=topic), ()
-        if topics[topic] == FLOAT64:
-            return FieldSpec(topic, topics[topic], 'data'), ()
         raise InputError(f"{path}: throttle topic '{topic}' is {topics[topic]}, which no msg "
                          'config reads: name one in a YAML file of your own')
     if spec is None:

@@ -74,7 +74,7 @@ def test_missing_flight_is_refused(tmp_path):
             import_log(path, Request(flight=2))
 
 
-@pytest.mark.parametrize('name', [one.name for one in FORMATS if one.extra])
+@pytest.mark.parametrize('name', [one.name for one in FORMATS if one.package])
 def test_a_missing_extra_is_named(tmp_path, name):
     """Without its package a format is one line; nothing else needs the package."""
     form = next(one for one in FORMATS if one.name == name)
@@ -90,7 +90,7 @@ def test_a_missing_extra_is_named(tmp_path, name):
                           text=True, timeout=120)
     assert done.returncode == 2, done.stderr
     assert done.stderr.count('\n') == 1
-    assert f"pip install '.[{form.extra}]'" in done.stderr
+    assert f"pip install '.[{form.module}]'" in done.stderr
     assert form.package in done.stderr
 
 
@@ -98,7 +98,7 @@ def test_the_extras_are_in_the_metadata():
     """Each extra named to users installs the package that it names, and 'logs' all of them."""
     extras = metadata()['optional-dependencies']
     for form in FORMATS:
-        if form.extra:
-            assert any(form.package in one for one in extras[form.extra])
+        if form.package:
+            assert any(form.package in one for one in extras[form.module])
     (every,) = map(Requirement, extras['logs'])
-    assert every.extras == {form.extra for form in FORMATS if form.extra}
+    assert every.extras == {form.module for form in FORMATS if form.package}
