@@ -115,7 +115,7 @@ def _budget(analysis: Analysis) -> str:
     words = (f'{100.0 * curves.budget:.0f} % throttle if held: the risk {what} stays under '
              f'{100.0 * curves.limit:g} %')
     beyond = [(u, p) for u, p in zip(curves.throttle, curves.risk)
-              if u > curves.budget and p >= max(0.05, 2.0 * curves.limit)]
+              if u > curves.budget and p >= 2.0 * curves.limit]
     if beyond:
         u, p = beyond[0]
         words += f'; at {100.0 * u:.0f} % it is {percent(p)}'

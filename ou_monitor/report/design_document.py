@@ -84,4 +84,6 @@ def taken_words(flight: Flight, network: PowerNetwork, throttle: float, values: 
             + (f'{1e3 * flight.resistance:.3g} mOhm.' if known else
                f'{1e3 * network.battery_resistance:.3g} mOhm as given or assumed: the current is '
                'scaled to the sag.')
+            + ('' if math.isfinite(flight.alpha) else ' It shows no relaxation: alpha of slow '
+               f'noise is assumed to be {number(network.flutter_rate)} 1/s.')
             + ' A flight shows neither bulk capacitor nor ESR: --set bulk_capacitance=470uF.')

@@ -1,5 +1,7 @@
 """A second relaxation or an AC coupling: found in the innovations if it is there, only then."""
 
+import math
+
 import numpy as np
 from ou_monitor.analysis.analyze import analyze
 from ou_monitor.analysis.level_result import ProcessType
@@ -131,3 +133,14 @@ def test_impulses_are_said_beside_the_fit_that_includes_them():
         w = v - 0.5 * spikes * (np.arange(t.size) % 2000 < 4)
         names = {item.name for item in analyze(Recording(t, w)).quality}
         assert ('IMPULSES' in names) == spikes
+
+
+@pytest.mark.parametrize('alpha, slow', [(0.8, True), (10.0, False)])
+def test_a_relaxation_as_slow_as_the_level_is_warned_of(alpha, slow):
+    """Five minutes at 10 Hz; the fit of 0.8 1/s is too high by a factor of 2."""
+    t = np.arange(3000) * 0.1
+    rng = np.random.default_rng(8)
+    v = simulate(t, alpha, 0.02 * math.sqrt(2.0 * alpha), rng, u0=12.0)
+    names = {item.name for item in analyze(Recording(
+        t, v + 0.005 * rng.standard_normal(t.size), np.full(t.size, 0.5))).quality}
+    assert ('SLOW_RELAXATION' in names) == slow

@@ -148,9 +148,11 @@ class Glitches(Term):
     IMITATES: ClassVar[tuple[str, ...]] = ('clock_jitter', 'heavy_tails', 'jumps')
     SEVERAL: ClassVar[bool] = True
     MEANING: ClassVar[str] = (
-        'Single bad readings that the rail does not follow: bus errors or pick-up at the ADC.')
+        'Readings, single or a few, that the rail does not relax from: bus errors, pick-up at the '
+        'ADC, or real dips of a few samples.')
     REMEDY: ClassVar[str] = (
-        'Reject outliers ahead of the estimator; check the cables and the ground of the ADC.')
+        'Before outliers are rejected, a faster or second ADC must show that they are no dips; '
+        'check the cables and the ground of the ADC.')
     SEPARATED_BY: ClassVar[str] = 'two ADCs on one rail: a glitch shows in only one'
 
     probability: float = parameter('', 'share of samples that are bad', 0.0, 1.0)
