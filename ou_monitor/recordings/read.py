@@ -183,11 +183,7 @@ def _cut(recording: Recording, start: float | None, end: float | None) -> Record
 
 def read_beside(path: str | Path, signal: str, *, partial: bool = False,
                 columns: CsvColumns | None = None, **options: Any) -> tuple[Recording, Series]:
-    """
-    Read a recording with the repeats of its logger, and one whole scalar beside it.
-
-    For the options see `read_recording`.
-    """
+    """Read as `read_recording` does, with the logger's repeats, and a whole scalar beside it."""
     path = Path(path)
     recording, log = _read(path, signal, partial=partial, columns=columns, **options)
     if log is None:

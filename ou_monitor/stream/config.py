@@ -122,28 +122,24 @@ def msg_config_dir() -> Path:
         'or name a YAML file by its path')
 
 
-def list_msg_configs(directory: Path | str | None = None) -> dict[str, MsgConfig]:
-    """Return every msg config of a folder by name."""
-    return {path.stem: _load(path) for path in _files(directory)}
+def list_msg_configs() -> dict[str, MsgConfig]:
+    """Return every shipped msg config by name."""
+    return {name: _load(path) for name, path in _files().items()}
 
 
-def load_msg_config(name_or_path: Path | str, directory: Path | str | None = None) -> MsgConfig:
+def load_msg_config(name_or_path: Path | str) -> MsgConfig:
     """Return one msg config."""
     path = Path(name_or_path)
     if path.suffix in ('.yaml', '.yml') or len(path.parts) > 1:
         return _load(path)
-    known = {file.stem: file for file in _files(directory)}
-    name = str(name_or_path)
+    known, name = _files(), str(name_or_path)
     if name not in known:
         raise InputError(f"no msg config '{name}': {nearest(name, known)}")
     return _load(known[name])
 
 
-def _files(directory: Path | str | None) -> list[Path]:
-    folder = msg_config_dir() if directory is None else Path(directory)
-    if not folder.is_dir():
-        raise InputError(f'no folder of msg configs {folder}')
-    return sorted(folder.glob('*.yaml'))
+def _files() -> dict[str, Path]:
+    return {path.stem: path for path in sorted(msg_config_dir().glob('*.yaml'))}
 
 
 @one_line()

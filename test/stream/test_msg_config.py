@@ -118,17 +118,6 @@ def test_unknown_name_and_missing_file(tmp_path):
         load_msg_config('batery_state')
     with pytest.raises(InputError, match='nowhere.yaml'):
         load_msg_config(tmp_path / 'nowhere.yaml')
-    with pytest.raises(InputError, match='no folder'):
-        list_msg_configs(tmp_path / 'nowhere')
-
-
-def test_an_own_folder_of_msg_configs_is_read(tmp_path):
-    """Names are looked up in the folder given."""
-    written(tmp_path)
-    assert list(list_msg_configs(tmp_path)) == ['rail']
-    assert load_msg_config('rail', tmp_path).voltage.topic == '/rail'
-    with pytest.raises(InputError, match="'rail'"):
-        load_msg_config('rails', tmp_path)
 
 
 @pytest.mark.parametrize('layout', [

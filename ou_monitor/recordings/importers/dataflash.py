@@ -330,33 +330,29 @@ def _throttle_scale(values: FloatArray) -> float:
 
 def _outputs(table: Table, parameters: dict[str, float]) -> Iterator[Series]:
     """Yield the mean of the motors, which the parameters name, and each output."""
-    found: dict[int, tuple[FloatArray, FloatArray]] = {}
+    found: dict[int, tuple[Series, bool]] = {}
     for (kind, _), columns in table.items():
-        if kind in OUTPUTS:
-            found |= {int(name[1:]): (columns['t'], values)
-                      for name, values in columns.items() if name != 't'}
-            yield from _motors(kind, columns, parameters)
-    for number, (t, values) in sorted(found.items()):
-        low, high = _span(number, parameters)
-        one = Series(f'RCOU.C{number}', THROTTLE, t, (values - low) / (high - low),
-                     f'(x - {low:g} us) / {high - low:g} us', 'one output, motor or servo')
-        if values.any():
+        if kind not in OUTPUTS:
+            continue
+        shares: dict[str, FloatArray] = {}
+        # The first column holds the stamps.
+        for name in [*columns][1:]:
+            number = int(name[1:])
+            low, high = _span(number, parameters)
+            one = Series(f'RCOU.C{number}', THROTTLE, columns['t'],
+                         (columns[name] - low) / (high - low),
+                         f'(x - {low:g} us) / {high - low:g} us', 'one output, motor or servo')
+            found[number] = one, bool(columns[name].any())
+            if int(parameters.get(f'SERVO{number}_FUNCTION', 0)) in MOTOR_FUNCTIONS:
+                shares[name] = one.values
+        if shares:
+            yield Series(f'{kind}.motors', THROTTLE, columns['t'],
+                         np.mean([*shares.values()], axis=0),
+                         f"mean of {', '.join(shares)}, each from its lowest to its highest pulse",
+                         f'mean of {len(shares)} motors', 2)
+    for _, (one, used) in sorted(found.items()):
+        if used:
             yield one
-
-
-def _motors(kind: str, columns: Columns, parameters: dict[str, float]) -> Iterator[Series]:
-    numbers = [int(name[1:]) for name in columns if name != 't' and int(
-        parameters.get(f'SERVO{name[1:]}_FUNCTION', 0)) in MOTOR_FUNCTIONS]
-    if not numbers:
-        return
-    shares = []
-    for number in numbers:
-        low, high = _span(number, parameters)
-        shares.append((columns[f'C{number}'] - low) / (high - low))
-    yield Series(f'{kind}.motors', THROTTLE, columns['t'], np.mean(shares, axis=0),
-                 'mean of ' + ', '.join(f'C{number}' for number in numbers)
-                 + ', each from its lowest to its highest pulse',
-                 f'mean of {len(numbers)} motors', 2)
 
 
 def _span(number: int, parameters: dict[str, float]) -> tuple[float, float]:
