@@ -157,7 +157,6 @@ class BagReader:
     def __init__(self, path: Path | str, *, partial: bool = False) -> None:
         """Index the bag; messages are read later, and files are closed between reads."""
         self.path = Path(path)
-        self.partial = partial
         paths, about, missing = find_files(self.path, partial)
         self._files = [McapFile(file, partial) for file in paths]
         # The metadata of the directory wins: people edit it.

@@ -220,7 +220,7 @@ def read_bag(
     beside = {VOLTAGE: specs.pop(CURRENT)} if own else {}
     supply = _Supply(specs)
     for batch in batches(bag, specs, end_ns=last, progress=progress, beside=beside,
-                         broken=leave_out if bag.partial else None):
+                         broken=leave_out if partial else None):
         for name, column in batch.items():
             before, column = column.split(column.place(first))
             if last is not None:

@@ -27,7 +27,7 @@ from orangebox.reader import Reader
 from orangebox.types import FrameType
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import (
-    CURRENT, DEGREE, GRAVITY, gyro_of, Log, log_of, Motion, quiet, Request, RPM, Series,
+    CURRENT, DEGREE, GRAVITY, gyro_of, Log, log_of, Motion, Request, RPM, Series,
     SIGNAL, speeds_of, three_axes, THROTTLE, UNKNOWN, VOLTAGE)
 from ou_monitor.records import FloatArray
 from ou_monitor.text import counted
@@ -54,44 +54,36 @@ Units = dict[str, tuple[float, str, str]]
 _FIRMWARE = re.compile(r'(Betaflight|Cleanflight|INAV|EmuFlight)\s+(\d+)\.(\d+)\.?(\d*)', re.I)
 
 
-def _sizes(path: Path) -> list[int]:
-    """Return the bytes of each flight in a file, without decoding them."""
-    with quiet(path, 'orangebox'):
-        pointers = Reader(str(path), None, True).log_pointers
-    ends = [*pointers[1:], path.stat().st_size]
-    return [end - begin for begin, end in zip(pointers, ends)]
-
-
 def read(path: Path, request: Request) -> Log:
     """Read one flight of a blackbox file, by default the largest."""
-    held = _sizes(path)
+    pointers = Reader(str(path), None, True).log_pointers
+    # Bytes of each flight, without decoding them.
+    held = np.diff([*pointers, path.stat().st_size]).tolist()
     wanted = request.flight or (held.index(max(held)) + 1 if held else 1)
     notes = []
     if not 1 <= wanted <= len(held):
         raise InputError(f'{path} has no flight {wanted}: it holds {len(held)}')
-    with quiet(path, 'orangebox'):
-        parser = Parser.load(str(path), wanted, True)
-        headers = parser.headers
-        main = parser.reader.field_defs
-        if FrameType.INTRA not in main or FrameType.INTER not in main:
-            raise InputError(f'{path}: the header of flight {wanted} does not say which fields '
-                             'are logged: it is damaged')
-        names = [one.name for one in main[FrameType.INTRA]]
-        fields = _wanted(names, request)
-        if 'time' not in names:
-            raise InputError(f'{path}: flight {wanted} has no field time: it is damaged')
-        table, dropped = _frames(parser, [names.index(name) for name in fields], request)
-        end, size = parser.reader.tell(), len(parser.reader)
-        closed = bool(parser._end_of_log)
-        rest = parser.reader._frame_data[end:].removeprefix(b'End of log\0')
-        broken = int(parser._ctx.invalid_frame_count)
+    parser = Parser.load(str(path), wanted, True)
+    headers = parser.headers
+    main = parser.reader.field_defs
+    if FrameType.INTRA not in main or FrameType.INTER not in main:
+        raise InputError(f'{path}: the header of flight {wanted} does not say which fields '
+                         'are logged: it is damaged')
+    names = [one.name for one in main[FrameType.INTRA]]
+    fields = _wanted(names, request)
+    if 'time' not in names:
+        raise InputError(f'{path}: flight {wanted} has no field time: it is damaged')
+    table, dropped = _frames(parser, [names.index(name) for name in fields], request)
+    end, size = parser.reader.tell(), len(parser.reader)
+    rest = parser.reader._frame_data[end:].removeprefix(b'End of log\0')
+    broken = int(parser._ctx.invalid_frame_count)
     if dropped:
         notes.append(f'At least {counted(dropped, "frame")} dropped: no sound key frame before '
                      'them.')
     if broken:
         notes.append(f'{counted(broken, "piece")} unknown to orangebox left out: broken bytes, or '
                      'events of newer firmware.')
-    if not closed:
+    if not parser._end_of_log:
         notes.append(f'Flight {wanted} has no end mark, so it was probably cut off; '
                      f'{end} of {size} bytes of frames were read.')
     elif rest.strip(b'\xff\0'):

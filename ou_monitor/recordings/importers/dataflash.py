@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import (
-    CURRENT, FRD_TO_FLU, gyro_of, Log, log_of, Motion, one_flight, quiet, quiet_process, Request,
+    CURRENT, FRD_TO_FLU, gyro_of, Log, log_of, Motion, one_flight, quiet_process, Request,
     RPM, Series, SIGNAL, speeds_of, started, three_axes, THROTTLE, TURNED, UNKNOWN, VOLTAGE)
 from ou_monitor.records import FloatArray
 from ou_monitor.stream.files import open_regular
@@ -77,7 +77,7 @@ def read(path: Path, request: Request) -> Log:
     one_flight(path, request)
     with open_regular(path) as file:
         text = not file.read(2).startswith(b'\xa3\x95')
-    with quiet(path, 'pymavlink'), _plain_text(path, text) as (name, mended):
+    with _plain_text(path, text) as (name, mended):
         reader = DFReader.DFReader_text if text else DFReader.DFReader_binary
         # Created before it is set up: if that fails, pymavlink leaves its files open.
         log: Any = reader.__new__(reader)

@@ -253,17 +253,13 @@ def _series(name: str, topic: str, t: FloatArray, columns: Columns) -> Iterator[
         one = Series(f'{name}.{field}', quantity, t, values, '1', words, rank, name)
         yield replace(one, words=f'{words}, not connected', rank=None) if (
             quantity != THROTTLE and (one.silent or not there)) else one
-    if topic == 'actuator_motors':
-        yield from _motors(name, t, columns)
-    elif topic == 'vehicle_thrust_setpoint':
-        yield from _thrust(name, t, columns)
-    elif topic == 'manual_control_setpoint' and 'throttle' in columns:
+    if topic == 'manual_control_setpoint' and 'throttle' in columns:
         yield Series(f'{name}.throttle', THROTTLE, t, (columns['throttle'] + 1.0) / 2.0,
                      '(x + 1) / 2', 'stick', 4, name)
-    elif topic == 'actuator_outputs':
-        yield from _outputs(name, t, columns)
-    elif topic == 'esc_status':
-        yield from _escs(name, t, columns)
+    more = {'actuator_motors': _motors, 'vehicle_thrust_setpoint': _thrust,
+            'actuator_outputs': _outputs, 'esc_status': _escs}
+    if topic in more:
+        yield from more[topic](name, t, columns)
 
 
 def _stack(columns: Columns, stem: str) -> FloatArray:
