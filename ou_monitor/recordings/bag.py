@@ -167,13 +167,12 @@ class BagReader:
         self.end_ns = max((file.end_ns for file in held), default=0)
         for file in self._files:
             file.origin_ns = self.start_ns
-        damages = [f'{file.path.name} is damaged {file.damage}'
-                   for file in self._files if file.damage]
-        if damages and not partial:
-            broken = next(file for file in self._files if file.damage)
-            raise InputError(f'{broken.path} is damaged {broken.damage}; use --partial to read '
-                             'the intact part')
-        self.damage = '; '.join(([missing] if missing else []) + damages) or None
+        broken = [file for file in self._files if file.damage]
+        if broken and not partial:
+            raise InputError(f'{broken[0].path} is damaged {broken[0].damage}; use --partial to '
+                             'read the intact part')
+        self.damage = '; '.join([*([missing] if missing else []), *(
+            f'{file.path.name} is damaged {file.damage}' for file in broken)]) or None
         self.topics: dict[str, str] = {}
         self.counts: dict[str, int] = {}
         self.sample_rates: dict[str, float] = {}

@@ -132,8 +132,7 @@ def _chunk_limit(size: int) -> int:
         except (ValueError, OverflowError):
             raise InputError(f'{_VARIABLE} must be a number of MB, got '
                              f"'{printable(text, 40)}'") from None
-    return min(max(_LEAST_LIMIT, _MOST_RATIO * size),
-               max(_LEAST_LIMIT, usable_memory() // _CHUNKS_AT_ONCE))
+    return max(_LEAST_LIMIT, min(_MOST_RATIO * size, usable_memory() // _CHUNKS_AT_ONCE))
 
 
 def _over_limit(what: str, length: int, limit: int) -> str:
