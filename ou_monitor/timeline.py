@@ -436,7 +436,7 @@ class TimeLine:
     def __init__(self) -> None:
         # Columns t, V, throttle and current of each push since the last `work_off`.
         self._parts: list[FloatArray] = []
-        self._fill = 0
+        self.waiting = 0  # Samples in them
         self._counts: Counter[str] = Counter()
         self._repeats = Repeats()
         self.forget()
@@ -447,11 +447,6 @@ class TimeLine:
         return Counters(**self._counts)
 
     @property
-    def waiting(self) -> int:
-        """Return the number of samples in the buffer."""
-        return self._fill
-
-    @property
     def period(self) -> float:
         """Return the samples per reading; 1 without repeats."""
         return self._repeats.period
@@ -459,7 +454,7 @@ class TimeLine:
     def put(self, t: FloatArray, y: FloatArray, u: FloatArray | float | None) -> None:
         """Keep samples, copied, for the next `work_off`."""
         self._parts.append(as_columns(t, y, u))
-        self._fill += t.size
+        self.waiting += t.size
 
     def count(self, **more: int) -> None:
         """Add to the counters."""
@@ -478,7 +473,7 @@ class TimeLine:
 
     def work_off(self, pause: float) -> list[Batch]:
         """Empty the buffer; return its readings in order (pause in s)."""
-        parts, self._parts, self._fill = self._parts, [], 0
+        parts, self._parts, self.waiting = self._parts, [], 0
         return self.take(np.concatenate(parts, axis=1), pause)
 
     def take(self, columns: FloatArray, pause: float) -> list[Batch]:

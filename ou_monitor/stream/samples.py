@@ -341,10 +341,6 @@ class ThrottleHold:
         self._places, self._values = [np.array([-math.inf])], [np.array([value])]
         self._latest, self._newest, self._own = -math.inf, -math.inf, False
 
-    def __len__(self) -> int:
-        """Return the number of values kept."""
-        return int(self.held()[0].size)
-
 
 # Backward step of a stamp, s, above which the clock or the bag went back.  Messages of a publisher
 # arrive in order; interleaved publishers differ by milliseconds.

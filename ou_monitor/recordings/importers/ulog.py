@@ -28,9 +28,6 @@ from pyulog import ULog
 Columns = dict[str, FloatArray]
 
 CLOCK, UTC = 'vehicle_gps_position', 'time_utc_usec'
-TOPICS = ('battery_status', CLOCK, 'system_power', 'power_monitor', 'esc_status',
-          'actuator_motors', 'vehicle_thrust_setpoint', 'actuator_controls_0', 'actuator_outputs',
-          'manual_control_setpoint', 'sensor_combined', 'vehicle_angular_velocity', 'sensor_gyro')
 
 # Topic, fields of the gyro and of the accelerometer (front, right, down), rank, words.
 GYROS = (
@@ -59,6 +56,8 @@ PLAIN = (
     ('actuator_controls_0', 'control[3]', THROTTLE, 3, 'thrust command to the mixer'),
     ('manual_control_setpoint', 'z', THROTTLE, 4, 'stick'),
 )
+TOPICS = (CLOCK, 'esc_status', 'actuator_motors', 'vehicle_thrust_setpoint', 'actuator_outputs',
+          *(row[0] for row in (*PLAIN, *GYROS)))
 
 
 # Bytes before the content of a message: its length and its kind.
