@@ -445,11 +445,6 @@ class Coherence:
         return math.sqrt(far / per_gain) if per_gain > 0.0 else math.inf
 
 
-def effective_segments(count: int) -> float:
-    """Return the equivalent number of segments without overlap."""
-    return count / (1.0 + 2.0 * OVERLAP * (count - 1) / count)
-
-
 def measure_coherence(voltage: ComplexArray, signal: ComplexArray, causes: list[ComplexArray],
                       level: float, rng: np.random.Generator) -> Coherence:
     """Test Fourier coefficients of shape (segments, bins), with the causes regressed out."""
@@ -459,7 +454,9 @@ def measure_coherence(voltage: ComplexArray, signal: ComplexArray, causes: list[
     whole = weight * signal
     basis = basis_of([weight * cause for cause in causes])
     v, x = without(weight * voltage, basis), without(whole, basis)
-    segments = effective_segments(len(signal))
+    # The equivalent number of segments without overlap.
+    count = len(signal)
+    segments = count / (1.0 + 2.0 * OVERLAP * (count - 1) / count)
     spare = segments - 1.0 - len(causes)
     vv, xx = (np.abs(v)**2).sum(0), (np.abs(x)**2).sum(0)
     response = (np.conj(v) * x).sum(0) / np.where(vv > 0.0, vv, 1.0)

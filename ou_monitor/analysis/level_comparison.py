@@ -9,8 +9,8 @@ errors do not include this.  Limits: only levels with a usable fit count; weak s
 in the fit; a test that does not reject proves nothing, so the detectable ratio is reported too.
 
 The tests have the significance level `LEVEL`, like the printed intervals.  Each level is fitted by
-itself here; `discover` fits one model to a whole recording, and uses `alpha_score` and
-`sigma_score` (`ou_monitor.criticism.battery`) to decide whether they depend on throttle.
+itself here; `discover` fits one model to a whole recording, and uses statistics of its innovations
+(`ou_monitor.criticism.battery`) to decide whether they depend on throttle.
 """
 
 from __future__ import annotations
@@ -125,7 +125,9 @@ def alpha_constancy(throttles: Sequence[float], estimates: Sequence[Estimate],
     size = float(weight @ along ** 2)
     ratio = exp_or_inf(float(weight @ (along * logs)) / size)
     low, high = log_interval(ratio, 1.0 / math.sqrt(size))
-    detectable = exp_or_inf(math.sqrt(_noncentrality(freedom) / size))
+    # At this noncentrality, chi^2 rejects with probability `POWER`.
+    far = float(chndtrinc(stats.chi2.isf(LEVEL, freedom), freedom, 1.0 - POWER))
+    detectable = exp_or_inf(math.sqrt(far / size))
     verdict = 'differs' if p < LEVEL else 'constant' if detectable <= NARROW else 'undetermined'
     return AlphaTest(verdict, len(good), *common, statistic, p, detectable,
                      ratio if determined(ratio, low, high) else NAN, low, high, withheld)
@@ -171,8 +173,3 @@ def sigma_change(low: Estimate, high: Estimate, others: Sequence[Estimate] = ())
     ratio = high.sigma / low.sigma
     ends = log_interval(ratio, math.hypot(low.sigma_se, high.sigma_se, math.sqrt(2.0 * scatter)))
     return SigmaChange(ratio if determined(ratio, *ends) else NAN, *ends)
-
-
-def _noncentrality(freedom: int) -> float:
-    """Return the noncentrality at which chi^2 rejects with probability `POWER`."""
-    return float(chndtrinc(stats.chi2.isf(LEVEL, freedom), freedom, 1.0 - POWER))

@@ -59,7 +59,9 @@ def quality_list(recording: Recording, throttles: Sequence[float], estimates: Se
     for item in more:
         found.setdefault((item.name, item.severity, item.text), []).extend(item.throttles)
     items = [QualityItem(*key, tuple(where)) for key, where in found.items()]
-    items += [_of_reader(note) for note in recording.notes]
+    for note in recording.notes:
+        defect = defect_of(note)
+        items.append(QualityItem(defect.name, defect.severity, note))
     items = _of_units(recording) + items + _of_stamps(recording) + _of_samples(recording)
     return tuple(sorted(items, key=lambda item: -item.severity))
 
@@ -78,11 +80,6 @@ def _of_estimate(e: Estimate, known: bool) -> list[tuple[str, Severity, str]]:
     items += [(flag.name, Severity.INFO if flag in _INFORMS else Severity.WARNING, flag.value)
               for flag in e.flags]
     return items
-
-
-def _of_reader(note: str) -> QualityItem:
-    defect = defect_of(note)
-    return QualityItem(defect.name, defect.severity, note)
 
 
 def _of_units(recording: Recording) -> list[QualityItem]:

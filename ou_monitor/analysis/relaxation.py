@@ -122,7 +122,8 @@ class Window:
             self.sd = np.sqrt(self.var_inf + self.noise_var + louder)
         e = self.whitened(np.column_stack([self.voltage, np.ones(self.n)]))
         self._one = e[:, 1]
-        self._y = e[:, 0] - _project(self._one, e[:, 0])
+        y = e[:, 0]
+        self._y: FloatArray = y - self._one * float(self._one @ y) / float(self._one @ self._one)
         self.rss_flat = float(self._y @ self._y)
 
     def whitened(self, columns: FloatArray) -> FloatArray:
@@ -134,17 +135,20 @@ class Window:
 
     def rss(self, taus: FloatArray) -> FloatArray:
         """Return the residual sum of squares for each tau, level and amplitude fitted."""
-        basis = self.whitened(np.exp(-self.since[:, None] / taus[None, :]))
-        basis -= np.outer(self._one, self._one @ basis) / float(self._one @ self._one)
+        basis = self._decays(taus)
         size = np.maximum((basis ** 2).sum(axis=0), 1e-300)
         found: FloatArray = self.rss_flat - (self._y @ basis) ** 2 / size
         return found
 
+    def _decays(self, taus: FloatArray) -> FloatArray:
+        """Return exponentials, whitened, without the level; shape (n, taus)."""
+        basis = self.whitened(np.exp(-self.since[:, None] / taus[None, :]))
+        basis -= np.outer(self._one, self._one @ basis) / float(self._one @ self._one)
+        return basis
+
     def more(self, tau: float) -> tuple[float, int]:
         """Return the reduction of the sum of squares by further exponentials, and their number."""
-        times = tau * np.array((1.0, *_BESIDE))
-        basis = self.whitened(np.exp(-self.since[:, None] / times[None, :]))
-        basis -= np.outer(self._one, self._one @ basis) / float(self._one @ self._one)
+        basis = self._decays(tau * np.array((1.0, *_BESIDE)))
         basis /= np.maximum(np.sqrt((basis ** 2).sum(axis=0)), 1e-300)
         found, _, rank, _ = np.linalg.lstsq(basis, self._y, rcond=1e-6)
         rest = self._y - basis @ found
@@ -164,10 +168,6 @@ class Window:
         jacobian = np.column_stack([x[:, 1:], bend])
         errors = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian) * scale))
         return float(found[0]), float(errors[0]), float(found[1]), float(errors[1])
-
-
-def _project(direction: FloatArray, y: FloatArray) -> FloatArray:
-    return np.asarray(direction * float(direction @ y) / float(direction @ direction))
 
 
 # Minimum samples of a change, and points of the grids of tau.

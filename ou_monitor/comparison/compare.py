@@ -58,7 +58,9 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
     lsb = samples.lsb
     yardstick = Yardstick(own, lsb, levels)
     rng = np.random.default_rng(seed)
-    aligned = None if drawn.alone else _for_alignment(own)
+    # A model from a file has the level of another flight.
+    aligned = None if model is None else slice(0, max(10, int(np.searchsorted(
+        own.t, own.t[0] + _ALIGNED, side='right'))))
     shifts = np.zeros(seeds)
     stride = max(1, -(-own.t.size // _POINTS))
     measured: list[Measures] = []
@@ -88,8 +90,8 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
         notes.append(f'{strays} of {seeds} simulations leave the range of the recording by more '
                      'than half of it.')
     path = fitted.path(samples)[part] if model is None else total / seeds
-    return _agreement(recording, samples, own, yardstick, drawn, measured, path, traces, first,
-                      notes, (0.0, float(own.t[0]) if model is None else 0.0), seeds, offset,
+    return _agreement(recording, own, yardstick, drawn, measured, path, traces, first, notes,
+                      (0.0, float(own.t[0]) if model is None else 0.0), seeds, offset,
                       (float(own.t[0]), duration))
 
 
@@ -153,15 +155,9 @@ def _check_throttle(model: SupplyModel, samples: Readings) -> None:
                          'none')
 
 
-def _for_alignment(own: Readings) -> slice:
-    """Return the samples used for alignment: the first seconds, at least ten samples."""
-    return slice(0, max(10, int(np.searchsorted(own.t, own.t[0] + _ALIGNED, side='right'))))
-
-
-def _agreement(recording: Recording, samples: Readings, own: Readings, yardstick: Yardstick,
-               drawn: Drawn, measured: list[Measures], path: FloatArray,
-               traces: np.ndarray, first: FloatArray, notes: list[str],
-               fitted: tuple[float, float], seeds: int, offset: float,
+def _agreement(recording: Recording, own: Readings, yardstick: Yardstick, drawn: Drawn,
+               measured: list[Measures], path: FloatArray, traces: np.ndarray, first: FloatArray,
+               notes: list[str], fitted: tuple[float, float], seeds: int, offset: float,
                simulated: tuple[float, float]) -> Agreement:
     real = yardstick.measure(own.voltage)
     spread = float(np.ptp(own.voltage))

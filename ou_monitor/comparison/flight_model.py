@@ -67,10 +67,6 @@ class Drawn(Protocol):
     def names(self) -> list[str]:
         """Return the names of its terms."""
 
-    @property
-    def alone(self) -> bool:
-        """Return whether its level is valid, so that it needs no alignment with the recording."""
-
     def draw(self, samples: Readings, rng: np.random.Generator) -> FloatArray:
         """Return one simulated voltage, V, before the ADC."""
 
@@ -199,11 +195,6 @@ class FlightModel:
         return [*found, 'measurement_noise',
                 *(['load_dependent_noise'] if self.noise.sizes.follows else [])]
 
-    @property
-    def alone(self) -> bool:
-        """Return True: the level is valid."""
-        return True
-
     def path(self, samples: Readings) -> FloatArray:
         """Return the mean voltage, V."""
         if self.load is None:
@@ -250,11 +241,6 @@ class FiledModel:
         """Return the names of its terms."""
         return [term.NAME for term in self.model.terms]
 
-    @property
-    def alone(self) -> bool:
-        """Return False: the level is from another flight."""
-        return False
-
     def draw(self, samples: Readings, rng: np.random.Generator) -> FloatArray:
         """Return one simulated voltage, V."""
         analogue = SupplyModel(tuple(
@@ -277,9 +263,8 @@ _FAST = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64)
 _DRAWN = 16
 
 
-def fit_flight(samples: Readings, progress: Callable[[float], None] | None = None) -> FlightModel:
-    """Fit a model to samples: at least 100, over several seconds."""
-    report = progress or (lambda share: None)
+def fit_flight(samples: Readings, report: Callable[[float], None]) -> FlightModel:
+    """Fit a model to samples: at least 100, over several seconds (report: progress, 0..1)."""
     mean = float(samples.voltage.mean())
     best = _best(samples, lambda share: report(0.4 * share))
     if best is not None:

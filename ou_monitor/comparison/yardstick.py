@@ -206,7 +206,8 @@ class Yardstick:
         self.rises = _rises(t, samples.throttle)
         self.after = np.linspace(-_BEFORE, _AFTER, _POINTS)
         reach = 0.5 * (float(v.max()) - float(v.min())) + 10.0 * lsb
-        self._edges = np.linspace(v.min() - reach, v.max() + reach, _BINS)
+        # Of the distribution, V.
+        self.edges = np.linspace(v.min() - reach, v.max() + reach, _BINS)
 
     def measure(self, v: FloatArray) -> Measures:
         """Measure a voltage at the stamps of the part, V."""
@@ -217,7 +218,7 @@ class Yardstick:
         return Measures(
             float(v.mean()), np.array([part.mean() for part in np.array_split(v, 3)]),
             float(v.min()), np.array(falls), power, self._response(v),
-            np.searchsorted(np.sort(v), self._edges, side='right') / v.size)
+            np.searchsorted(np.sort(v), self.edges, side='right') / v.size)
 
     def _response(self, v: FloatArray) -> FloatArray:
         if self.rises.size < _FEWEST:
@@ -225,11 +226,6 @@ class Yardstick:
         around = np.interp(self.rises[:, None] + self.after, self._t, v)
         responses = around - around[:, self.after < 0.0].mean(axis=1, keepdims=True)
         return np.asarray(responses.mean(axis=0), dtype=np.float64)
-
-    @property
-    def edges(self) -> FloatArray:
-        """Return the edges of the distribution, V."""
-        return self._edges
 
 
 def between_codes(level: float, lsb: float) -> float:
@@ -310,12 +306,6 @@ def band(measured: float, simulated: FloatArray) -> Band:
     return Band(measured, low, median, high)
 
 
-def response_times(yardstick: Yardstick) -> tuple[int, int]:
-    """Return the indices of the response at the beginning of a rise, and `RECOVERED` later."""
-    at = np.searchsorted(yardstick.after, [0.0, RECOVERED])
-    return int(at[0]), int(at[1])
-
-
 def differences(yardstick: Yardstick, own: Measures, others: Sequence[Measures],
                 spread: float) -> list[Difference]:
     """Return all numbers that are judged; spread is the range of the measured voltage, V."""
@@ -330,7 +320,7 @@ def differences(yardstick: Yardstick, own: Measures, others: Sequence[Measures],
             f'{number(b.measured, 4)} V')),
         Difference('level', own.mean, of(lambda m: m.mean), volts, lambda b: (
             f'the voltage is on average {number(1e3 * abs(b.median - b.measured), 2)} mV too '
-            f'{_more_or_less(b, "high", "low")}'))]
+            f'{"high" if b.median > b.measured else "low"}'))]
     for k, level in enumerate(yardstick.levels):
         rate = own.falls[k]
         # Poisson error of the count.
@@ -341,7 +331,7 @@ def differences(yardstick: Yardstick, own: Measures, others: Sequence[Measures],
                 f'the voltage falls through {number(level, 4)} V {number(b.median, 2)} times a '
                 f'minute ({_span(b, 2)}), measured {number(b.measured, 2)}')))
     if own.response.size:
-        begin, later = response_times(yardstick)
+        begin, later = np.searchsorted(yardstick.after, [0.0, RECOVERED]).tolist()
         found += [
             Difference('answer', float(own.response[begin:].min()),
                        of(lambda m: float(m.response[begin:].min())), volts, lambda b: (
@@ -375,10 +365,6 @@ def distance(one: Measures, pooled: FloatArray) -> float:
 
 def _span(b: Band, digits: int) -> str:
     return f'{number(b.low, digits)} to {number(b.high, digits)}'
-
-
-def _more_or_less(b: Band, more: str, less: str) -> str:
-    return more if b.median > b.measured else less
 
 
 def _fall(v: float) -> str:

@@ -206,7 +206,8 @@ def _inputs(w: FloatArray, square: FloatArray, given: Covariates) -> Iterator[tu
             yield f'throttle change over {span:g} s', score(w, recent)
             if span in (0.05, 2.0):
                 yield f'throttle direction over {span:g} s', score(w, np.abs(recent))
-    yield 'variance throttle', sigma_score(square, u)
+    # `analyze` compares sigma, and alpha, between levels of constant throttle instead.
+    yield 'variance throttle', score(square, u)
     yield 'variance throttle squared', score(square, centre * centre - slope * centre)
     keep = math.exp(-1.0 / max(0.05 * given.rate, 1.0))
     yield 'variance change of throttle', score(
@@ -227,7 +228,9 @@ def _state(w: FloatArray, square: FloatArray, given: Covariates) -> Iterator[tup
     yield 'pairs after a large one', float(pairs.sum()) / math.sqrt(
         max(float((w[large] ** 2).sum()), 9.0))
     if given.throttle is not None:
-        yield 'state throttle', alpha_score(w, x, given.throttle)
+        # A slope of ln alpha over throttle, orthogonal to the score of alpha.
+        u = given.throttle - given.throttle.mean()
+        yield 'state throttle', score(w, x * u - float((x * x * u).mean()) * x)
 
 
 def _beyond_second_order(w: FloatArray, given: Covariates) -> Iterator[tuple[str, float]]:
@@ -267,20 +270,6 @@ def score(a: FloatArray, b: FloatArray) -> float:
     a, b = a - a.mean(), b - b.mean()
     norm = math.sqrt(float(a @ a) * float(b @ b))
     return math.sqrt(a.size) * float(a @ b) / norm if norm > 0.0 else 0.0
-
-
-def sigma_score(square: FloatArray, throttle: FloatArray) -> float:
-    """Return the score of a slope of ln sigma over throttle, from squared innovations."""
-    # `analyze` compares sigma between levels of constant throttle instead.
-    return score(square, throttle)
-
-
-def alpha_score(w: FloatArray, state: FloatArray, throttle: FloatArray) -> float:
-    """Return the score of a slope of ln alpha over throttle, orthogonal to the score of alpha."""
-    # w: innovations; state: the standardised deviation before each.  `analyze` instead tests
-    # whether levels of constant throttle have the same alpha.
-    u = throttle - throttle.mean()
-    return score(w, state * u - float((state * state * u).mean()) * state)
 
 
 def throttle_paths(throttle: FloatArray, keep: float) -> Iterator[tuple[str, FloatArray]]:

@@ -130,9 +130,8 @@ def view_of(samples: Samples, gaussian: GaussianFit, z: FloatArray, part: slice)
     residual = samples.voltage - gaussian.mean
     s = driven(samples, gaussian.terms)
     white = white_noise(samples, gaussian.terms, s)
-    added = s.sigma * s.sigma * -np.expm1(-2.0 * s.alpha * s.step) / (2.0 * s.alpha)
     return View(z=z, variance=gaussian.variance, phi=gaussian.phi,
                 state=np.concatenate(([0.0], residual[:-1])), residual=residual,
                 at=samples.t - samples.t[0], step=samples.step, throttle=samples.throttle,
                 train=part, trust=np.clip(1.0 - white / gaussian.variance, 0.0, 1.0),
-                driven=np.clip(added / gaussian.variance, 0.0, 1.0))
+                driven=np.clip(s.added / gaussian.variance, 0.0, 1.0))

@@ -67,7 +67,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     # A recording made in Python may still contain the steady repeats of a logger.
     places, period = reading_places(v)
     t, v, u = reading_times(t[places], period), v[places], None if u is None else u[places]
-    logged = (t, v, u)
+    logged = Samples(t[:_EXAMINED], v[:_EXAMINED], None)
     t, v, u, held = without_repeats(t, v, u)
     throttle, u = u, load_of(recording, t, v, u, notes)
     notes += [two_levels(v)] if u is None and two_levels(v) else []
@@ -121,7 +121,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
         notes.append(f'{between.size} samples around sudden changes were kept as well.')
     samples = samples.spread(samples.voltage, cell, np.random.default_rng(0))
     report(1.0)
-    raw = _as_logged(*logged) if held > 1.0 or any(
+    raw = logged if held > 1.0 or any(
         term.NAME in ('saturation', 'clock_jitter') for term in exact) else None
     return Integrity(samples, tuple(exact), tuple(notes), raw=raw, current=current_is_load,
                      drawn=drawn)
@@ -179,11 +179,6 @@ def _useful(u: FloatArray | None, recorded: bool, notes: list[str]) -> FloatArra
     why = 'constant' if u is not None else 'not usable' if recorded else 'not recorded'
     notes.append(f'Throttle is {why}: {", ".join(names)} cannot be tested.')
     return None
-
-
-def _as_logged(t: FloatArray, v: FloatArray, u: FloatArray | None) -> Samples:
-    part = slice(0, min(v.size, _EXAMINED))
-    return Samples(t[part], v[part], None)
 
 
 # Scatter of stamps about a grid, as a share of a step: below the first it is ignored, above the

@@ -9,7 +9,7 @@ middle is used instead.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 import math
 
@@ -61,6 +61,11 @@ class Samples:
     # ADC codes as logged, V, if `voltage` is spread evenly within their cells; shape (n,).
     codes: FloatArray | None = None
     cell: float = 0.0  # Width of a cell, V; 0 without spreading
+    # Caches: columns by term; the last mean, V, by terms with their coefficients; the last design
+    # (voltage, level, columns) by terms.
+    _known: dict[Term, FloatArray] = field(default_factory=dict, init=False)
+    means: dict[tuple[object, ...], FloatArray] = field(default_factory=dict, init=False)
+    designs: dict[tuple[Term, ...], FloatArray] = field(default_factory=dict, init=False)
 
     @property
     def n(self) -> int:
@@ -122,21 +127,6 @@ class Samples:
             codes = codes.copy()
             codes[at] += self.cell * np.rint((voltage - codes[at]) / self.cell)
         return replace(self, voltage=v, longer=self.longer or self, codes=codes)
-
-    @cached_property
-    def _known(self) -> dict[Term, FloatArray]:
-        """Return a cache of columns by term."""
-        return {}
-
-    @cached_property
-    def means(self) -> dict[tuple[object, ...], FloatArray]:
-        """Return a cache of the last mean, V, by terms with their coefficients."""
-        return {}
-
-    @cached_property
-    def designs(self) -> dict[tuple[Term, ...], FloatArray]:
-        """Return a cache of the last design (voltage, level, columns) by terms."""
-        return {}
 
     @cached_property
     def step(self) -> FloatArray:

@@ -105,7 +105,7 @@ def evaluate(samples: Samples, terms: Sequence[Term], events: Events | None = No
     # The law predicts the event at a sample itself, except during the fit of the Gaussian part.
     variance = run.full if inside else run.plain
     return GaussianFit(tuple(terms), tuple(se), mean, e, variance, _log_density(e, variance),
-                       run.phi, run.cost)
+                       run.segment.phi, run.cost)
 
 
 def whitened(samples: Samples, terms: Sequence[Term], more: Sequence[Term],
@@ -142,11 +142,6 @@ class _Run:
     full: FloatArray  # The same with it; shape (n,)
     cost: float  # Processor time, s
 
-    @property
-    def phi(self) -> FloatArray:
-        phi: FloatArray = np.exp(-self.segment.alpha * self.segment.step)
-        return phi
-
 
 def _filter(samples: Samples, terms: Sequence[Term], events: Events | None) -> _Run:
     if events is not None and _states(terms) >= _MANY and not events.error.any():
@@ -154,9 +149,8 @@ def _filter(samples: Samples, terms: Sequence[Term], events: Events | None) -> _
         # constant gains, which saves most of the time.
         s, space, _ = state_space(samples, terms, None)
         run = Filter(space, samples.n)
-        q = s.sigma * s.sigma * -np.expm1(-2.0 * s.alpha * s.step) / (2.0 * s.alpha)
-        return _Run(s, run, run.variance, run.variance + (events.power - 1.0) * q + events.push
-                    + (events.white - 1.0) * white_noise(samples, terms, s),
+        return _Run(s, run, run.variance, run.variance + (events.power - 1.0) * s.added
+                    + events.push + (events.white - 1.0) * white_noise(samples, terms, s),
                     _cost(space, samples.n))
     s, space, own = state_space(samples, terms, events)
     run = Filter(space, samples.n)
@@ -183,8 +177,7 @@ def state_space(samples: Samples, terms: Sequence[Term], events: Events | None
             for term in terms):
         s = _first(s, _SETTLES)
     n = s.t.size
-    phi = np.exp(-s.alpha * s.step)
-    q = s.sigma * s.sigma * -np.expm1(-2.0 * s.alpha * s.step) / (2.0 * s.alpha)
+    phi, q = s.phi, s.added
     floor = NO_NOISE * q[1:].mean()
     blocks = [(phi[:, None, None], q[:, None, None], np.ones(1))]
     for term in terms:
@@ -392,7 +385,7 @@ def _with_mean(samples: Samples, terms: tuple[Term, ...], events: Events | None)
     beta = solved(through[:, 1:], through[:, 0])
     e = (through[:, 0] - through[:, 1:] @ beta) / weight
     return GaussianFit(with_mean(terms, beta), (), design[:, 1:] @ beta, e, variance,
-                       _log_density(e, variance), run.phi,
+                       _log_density(e, variance), run.segment.phi,
                        run.cost + 1e-8 * samples.n * beta.size)
 
 
@@ -444,8 +437,7 @@ def mean_of(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray:
 
 def owners(terms: Sequence[Term]) -> list[Term | None]:
     """Return the term of each column of the mean; None for the level."""
-    return [None, *(term for term in terms if term.ROLE is Role.MEAN and term.NAME != 'ou'
-                    for _ in term.LINEAR)]
+    return [None, *(term for term in _means(terms) for _ in term.LINEAR)]
 
 
 def solved(columns: FloatArray, y: FloatArray) -> FloatArray:

@@ -17,6 +17,7 @@ from ou_monitor.criticism.composite import Composite, fit_composite, LAW_COST, v
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import coefficients, driven, evaluate, state_space, white_noise
 from ou_monitor.discovery import decision
+from ou_monitor.discovery.gain import all_moved
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.ou import OU
@@ -77,14 +78,19 @@ class Fitter:
     def fit(self, terms: Sequence[Term | type[Term]], known: Composite | None,
             rough: bool = False, begun: bool = False) -> Composite | None:
         """Return a fit to the first part, its mean fitted to everything; None if it fails."""
+        found = self._tried(terms, self.samples.train, known, whole_mean=True, rough=rough,
+                            begun=begun, first=self.law_fit)
+        return found if found is None or rough else self._apart(found, self.samples.train)
+
+    def _tried(self, *model: Any, **options: Any) -> Composite | None:
+        """Return `fit_composite` of the samples, and count its cost; None if it fails."""
         try:
-            found = fit_composite(self.samples, terms, self.samples.train, known,
-                                  whole_mean=True, rough=rough, begun=begun, first=self.law_fit)
+            found = fit_composite(self.samples, *model, **options)
         except (ValueError, ArithmeticError, np.linalg.LinAlgError):
             # Parameters out of range, or an overflow.
             return None
         self.cost += 0.0 if found is None else found.cost
-        return found if found is None or rough else self._apart(found, self.samples.train)
+        return found
 
     def _apart(self, found: Composite, part: slice) -> Composite:
         """Return a model with the `APART` parameters of its terms estimated again."""
@@ -93,12 +99,7 @@ class Fitter:
                 break
             view = view_of(self.samples, found.gaussian, found.z, part)
             terms = [term.apart(view) if term.APART else term for term in found.terms]
-            try:
-                again = fit_composite(self.samples, terms, part, found, whole_mean=True,
-                                      rough=True)
-            except (ValueError, ArithmeticError, np.linalg.LinAlgError):
-                break
-            self.cost += 0.0 if again is None else again.cost
+            again = self._tried(terms, part, found, whole_mean=True, rough=True)
             if again is None or not self.evidence(again) > self.evidence(found) + _ALIKE:
                 break
             found = again
@@ -106,12 +107,8 @@ class Fitter:
 
     def whole(self, model: Composite) -> Composite:
         """Return a model fitted to everything, or unchanged if that fails."""
-        try:
-            # Its laws were already fitted to all samples.
-            again = fit_composite(self.samples, model.terms, slice(0, self.samples.n), model)
-        except (ValueError, ArithmeticError, np.linalg.LinAlgError):
-            return model
-        self.cost += 0.0 if again is None else again.cost
+        # Its laws were already fitted to all samples.
+        again = self._tried(model.terms, slice(0, self.samples.n), model)
         if again is None or not math.isfinite(float(again.density.sum())):
             return model
         return self._apart(again, slice(0, self.samples.n))
@@ -318,19 +315,9 @@ def from_spectrum(samples: Samples, composite: Composite, starts: Sequence[Term]
         Role.BLOCK, Role.NOISE) for name in term.free()]
     before = spectrum.of(composite.gaussian.terms)
 
-    def terms_at(x: FloatArray) -> tuple[Term, ...]:
-        found = list(starts)
-        for (k, name), by in zip(free, x.tolist(), strict=True):
-            try:
-                found[k] = found[k].moved(name, by)
-            except ValueError:
-                # Out of range.
-                continue
-        return tuple(found)
-
-    x, gain = ordinates.climb(lambda x: np.log(spectrum.of(terms_at(x)) / before),
-                              np.zeros(len(free)))
-    return terms_at(x), gain
+    x, gain = ordinates.climb(
+        lambda x: np.log(spectrum.of(all_moved(starts, free, x)) / before), np.zeros(len(free)))
+    return all_moved(starts, free, x), gain
 
 
 class _Spectrum:

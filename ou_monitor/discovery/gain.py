@@ -275,7 +275,8 @@ def held_out(samples: Samples, model: Composite) -> HeldOut:
             continue
         step = np.clip(-inverse @ score[b].sum(axis=0), -_FAR, _FAR)
         try:
-            there = evaluate(data, with_mean(_moved(terms, free, step), beta), events, inside=True)
+            there = evaluate(data, with_mean(all_moved(terms, free, step), beta), events,
+                             inside=True)
         except ValueError:
             # No valid model without the block.
             known[b] = False
@@ -312,8 +313,8 @@ def _stepped(term: Term, name: str) -> tuple[Term, float]:
     return term, _STEP
 
 
-def _moved(terms: tuple[Term, ...], free: list[tuple[int, str]], step: FloatArray
-           ) -> tuple[Term, ...]:
+def all_moved(terms: Sequence[Term], free: Sequence[tuple[int, str]], step: FloatArray
+              ) -> tuple[Term, ...]:
     """Return terms with parameters moved, but not beyond their ranges."""
     found = list(terms)
     for (k, name), by in zip(free, step.tolist(), strict=True):

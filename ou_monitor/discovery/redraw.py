@@ -46,9 +46,7 @@ _NONE, _LEAST = 1e-300, 1e-9
 def _process(samples: Samples, terms: Sequence[Term]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return phi, variance of the noise in each step, V^2, and of the white noise, V^2."""
     s = driven(samples, terms)
-    phi = np.exp(-s.alpha * s.step)
-    added = s.sigma * s.sigma * -np.expm1(-2.0 * s.alpha * s.step) / (2.0 * s.alpha)
-    return phi, added, white_noise(samples, terms, s)
+    return s.phi, s.added, white_noise(samples, terms, s)
 
 
 def redrawn(samples: Samples, model: Composite, ends: Saturation,

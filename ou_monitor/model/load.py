@@ -116,12 +116,11 @@ class LoadModel:
     delay: float = 0.0  # Delay of the load behind the voltage, s
     stands: float = NAN  # Constant level, V; NaN: a lithium pack that discharges
 
-    def sag(self, throttle: npt.ArrayLike, cell: float = CELL) -> FloatArray:
-        """Return the sag, V, at constant throttle, of cold cells at that voltage, V."""
+    def sag(self, throttle: npt.ArrayLike) -> FloatArray:
+        """Return the sag, V, at constant throttle, of cold cells at 3.8 V."""
         if self.full_current:
             raise ValueError('the load of this model is a current, not throttle')
-        x = np.asarray(throttle, dtype=np.float64) ** self.power * (cell / CELL) ** (
-            self.power - 1.0)
+        x = np.asarray(throttle, dtype=np.float64) ** self.power
         return np.asarray(
             self.size * CELL * self.cells * (1.0 + self.fast_share + self.slow_share) * x)
 

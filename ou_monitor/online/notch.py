@@ -73,9 +73,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.online.filter.cutoff_control import SampleInterval
-from ou_monitor.online.filter.lowpass import FilterCounters
+from ou_monitor.online.filter.lowpass import FilterCounters, LARGEST, LATEST, SHORTEST
 from ou_monitor.online.settings import NotchSettings
-from ou_monitor.records import FloatArray
+from ou_monitor.records import FloatArray, NAN
 
 # A speed that has changed this often is frozen if it then stays constant for this many mean times
 # between changes, and for this time, s: no motor in flight holds its speed to the last digit.
@@ -374,9 +374,6 @@ class NotchChoice:
                 self.chosen[c] = None
 
 
-NAN = math.nan
-# Beyond these limits a state could overflow, see `lowpass`.
-_LARGEST, _LATEST, _SHORTEST = 1e150, 1e18, 1e-12
 # Minimum gap in intervals; number of samples that determine the interval; relative change of it
 # that is a new rate.
 _GAP, _KNOWN, _OTHER = 5.0, 64, 0.1
@@ -559,7 +556,7 @@ class AdaptiveNotch:
         if self._out and len(values) != len(self._out):
             raise ValueError(f'the number of channels changed from {len(self._out)} to '
                              f'{len(values)}: make a new notch for another signal')
-        if not abs(t) < _LATEST or not all(abs(x) < _LARGEST for x in values):
+        if not abs(t) < LATEST or not all(abs(x) < LARGEST for x in values):
             self.counters.non_finite += 1
             return self._out or [NAN] * len(values)
         if self._t is None:
@@ -569,7 +566,7 @@ class AdaptiveNotch:
             self._listen(t, 0.0, throttle, rpm)
             return self._out
         dt = t - self._t
-        if dt < _SHORTEST:
+        if dt < SHORTEST:
             if dt < 0.0:
                 self._t = t
                 self.counters.back += 1

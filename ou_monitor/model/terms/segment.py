@@ -55,6 +55,17 @@ class Segment:
     # Transformations of the normal draws of the white noise, in order.
     shape: list[Callable[[FloatArray], FloatArray]] = field(default_factory=list)
 
+    @property
+    def phi(self) -> FloatArray:
+        """Return the share of the OU deviation that a step leaves; shape (n,)."""
+        return np.asarray(np.exp(-self.alpha * self.step), dtype=np.float64)
+
+    @property
+    def added(self) -> FloatArray:
+        """Return the variance of the OU noise in each step, V^2; shape (n,)."""
+        decayed = -np.expm1(-2.0 * self.alpha * self.step)
+        return np.asarray(self.sigma * self.sigma * decayed / (2.0 * self.alpha))
+
 
 Effect = Callable[[Segment], None]
 

@@ -186,14 +186,11 @@ def _level(fit: Fitted, throttle: float, moves: bool) -> tuple[float, float]:
     if not moves or math.isnan(throttle):
         return float(fit.level[0]), NAN
     shift = (load_at(throttle) - fit.level[1:5]) @ fit.beta[:4]
-    return float(fit.level[0] + shift), slope_at(throttle, fit.beta)
+    # d(mean)/d(throttle), at a steady throttle.
+    slope = fit.beta[0] + 2.0 * throttle * fit.beta[1] + fit.beta[2] + fit.beta[3]
+    return float(fit.level[0] + shift), float(slope)
 
 
 def load_at(throttle: float) -> FloatArray:
     """Return the load variables of a throttle that has long been steady."""
     return np.array([throttle, throttle * throttle, throttle, throttle])
-
-
-def slope_at(throttle: float, beta: FloatArray) -> float:
-    """Return d(mean)/d(throttle), V per unit throttle, at a steady throttle."""
-    return float(beta[0] + 2.0 * throttle * beta[1] + beta[2] + beta[3])

@@ -137,13 +137,14 @@ class CutoffControl:
             self._aim = self._moving = self._cutoff = settings.fallback
 
     def update(self, wanted: float, error: float, dt: float, interval: float) -> float:
-        """Take the law's cutoff, Hz; return the cutoff in force, Hz (dt, interval in s)."""
+        """Take the law's cutoff, Hz; return the one in force (dt, interval in s; 0: unknown)."""
         self._choose(wanted)
         if not self._started:
             self._started, self._moving = True, self._aim
         elif self._moving != self._aim and dt > 0.0:
             self._approach(time_constant(self._settings, error), dt)
-        self._limit(interval)
+        most = OF_RATE / interval if interval > 0.0 else math.inf
+        self._cutoff = self._clip(min(self._moving, most))
         return self._cutoff
 
     def _choose(self, wanted: float) -> None:
@@ -170,11 +171,6 @@ class CutoffControl:
         off += math.copysign(most, step) if self._slewing else step
         # Stop within the tolerance instead of approaching the target for ever.
         self._moving = self._aim * math.exp(off) if abs(off) >= ARRIVED else self._aim
-
-    def _limit(self, interval: float) -> None:
-        """Apply the moving cutoff (interval in s; 0: unknown)."""
-        most = OF_RATE / interval if interval > 0.0 else math.inf
-        self._cutoff = self._clip(min(self._moving, most))
 
     def _clip(self, cutoff: float) -> float:
         """Return a cutoff within fmin..fmax, Hz; NaN stays."""

@@ -224,7 +224,7 @@ def _alike(one: float, other: float) -> bool:
 
 _TWO_PI = 2.0 * math.pi
 # Signals and stamps beyond this, and steps below it, overflow in the filter.
-_LARGEST, _LATEST, _SHORTEST = 1e150, 1e18, 1e-12
+LARGEST, LATEST, SHORTEST = 1e150, 1e18, 1e-12
 # Minimum gap in mean intervals, and minimum number of samples in the mean to count one.
 _GAP, _KNOWN = 5.0, 10
 # Number of samples that are converted to Python floats at a time; limits memory.
@@ -466,7 +466,7 @@ class AdaptiveLowPass:
              alpha: float = NAN, throttle: float = NAN, level: float = NAN,
              level_se: float = NAN) -> float:
         """Filter one sample like `filter`, but faster; NaN for unknown inputs."""
-        if not (abs(x) < _LARGEST and abs(t) < _LATEST):
+        if not (abs(x) < LARGEST and abs(t) < LATEST):
             self.counters.non_finite += 1
             return self._out
         error = sigma_se if sigma_se >= 0.0 else NAN
@@ -481,7 +481,7 @@ class AdaptiveLowPass:
             self._t, self._x = t, x
             return self._out
         dt = t - self._t
-        if dt < _SHORTEST:
+        if dt < SHORTEST:
             self._stay(t, x, dt)
             return self._out
         self.counters.samples += 1
@@ -489,7 +489,7 @@ class AdaptiveLowPass:
             self.counters.gaps += 1
         interval = self._interval.add(dt)
         if self._settings.law == 'kalman':
-            about = (level if abs(level) < _LARGEST else NAN, level_se)
+            about = (level if abs(level) < LARGEST else NAN, level_se)
             self._run_kalman(dt, interval, x, sigma, error, alpha, about)
         cutoff = self._control.update(
             self._ask(sigma, alpha, throttle, interval), error, dt, interval)
@@ -526,7 +526,7 @@ class AdaptiveLowPass:
         if self._known:
             self._sigma = sigma
             self._kalman = (
-                VoltageKalman(self._settings, x, level if abs(level) < _LARGEST else NAN)
+                VoltageKalman(self._settings, x, level if abs(level) < LARGEST else NAN)
                 if self._settings.of_voltage else LearnedWiener(self._settings, x))
 
     def _run_kalman(self, dt: float, interval: float, x: float, sigma: float, error: float,

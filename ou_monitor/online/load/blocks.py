@@ -248,7 +248,7 @@ class LoadNoise:
     def __init__(self, volts: float, b: tuple[float, float, float] | None = None) -> None:
         # Prior: 0.4 % of the voltage, with the usual effect of ripple and changes of throttle; or
         # the noise of another flight, within a factor of 1.4.
-        self.b = [math.log((0.004 * volts) ** 2), 2.0, 4.0] if b is None else list(b)
+        self.b = (math.log((0.004 * volts) ** 2), 2.0, 4.0) if b is None else b
         x, y, z = (4.0, 4.0, 9.0) if b is None else (0.5, 0.5, 1.0)
         self._covariance = [[x, 0.0, 0.0], [0.0, y, 0.0], [0.0, 0.0, z]]
         # Mean square of the standard scores, and correlation of neighbours.
@@ -279,11 +279,6 @@ class LoadNoise:
     def ripple_se(self) -> float:
         """Return the standard error of b[1], the coefficient of ripple."""
         return math.sqrt(max(self._covariance[1][1], 0.0))
-
-    @property
-    def of_blocks(self) -> tuple[float, float, float]:
-        """Return b of the mean of a block."""
-        return self.b[0], self.b[1], self.b[2]
 
     def see(self, voltage: float) -> None:
         """Update the ADC step from the means of blocks, V."""
@@ -324,7 +319,8 @@ class LoadNoise:
         # The square of a standard normal has the variance 2.
         total = own + 2.0 / share ** 2
         step = min((square - 1.0) / share / total, 0.7 / own)
-        self.b = [b + one * step for b, one in zip(self.b, g)]
+        x, y, z = (b + one * step for b, one in zip(self.b, g))
+        self.b = x, y, z
         C = [[c - one * other / total for c, other in zip(row, g)] for row, one in zip(C, g)]
         most = min(1.0, 9.0 / max(C[0][0], C[1][1], C[2][2]))
         self._covariance = [[most * one for one in row] for row in C]

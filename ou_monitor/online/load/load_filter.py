@@ -746,7 +746,7 @@ class LoadFilter:
         return LoadStart(
             self._cells, float(self._m[0]), tuple((size * self._m[2:]).tolist()),
             tuple(tuple(row) for row in P.tolist()), max(0.0, float(self._m[1])),
-            self._noise.of_blocks, load.flown, self._delay.delay, ohm, ohm_se,
+            self._noise.b, load.flown, self._delay.delay, ohm, ohm_se,
             noise, noise_se, size_se, level, found.warming, found.warming_se)
 
     def against(self, start: LoadStart | None, date: str = '') -> ModelComparison:
