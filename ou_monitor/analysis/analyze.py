@@ -272,8 +272,7 @@ def by_throttle(recording: Recording, found: Overview, voltage: float, horizon: 
 
 def as_data(analysis: Analysis) -> dict[str, Any]:
     """Return an analysis as plain data; NaN stands for unknown."""
-    recording = analysis.recording
-    sliding = analysis.sliding
+    recording, sliding, curves = analysis.recording, analysis.sliding, analysis.by_throttle
     duration = recording.duration
     return {
         'recording': recording.name,
@@ -290,8 +289,16 @@ def as_data(analysis: Analysis) -> dict[str, Any]:
         'transients': [_relaxation(fit, cause)
                        for fit, cause in zip(analysis.relaxations, analysis.causes)],
         'alpha_constant': _alpha(analysis),
-        'by_throttle': _by_throttle(analysis),
-        'brownout': _brownout(analysis),
+        'by_throttle': {
+            'throttle': curves.throttle, 'known': curves.known,
+            'sag': curves.sag, 'sag_low': curves.sag_low, 'sag_high': curves.sag_high,
+            'noise': curves.noise,
+            'brownout_risk': curves.risk},
+        'brownout': {
+            'voltage': curves.voltage, 'horizon_s': curves.horizon,
+            'voltage_source': 'default' if analysis.brownout_default else 'given',
+            'throttle_budget': curves.budget, 'budget_limit': curves.limit,
+            'budget_reason': curves.budget_reason, 't': curves.time},
         'sliding': {
             'window_s': sliding.window,
             't': sliding.t,
@@ -405,21 +412,3 @@ def _alpha(analysis: Analysis) -> dict[str, Any]:
         'ratio': test.ratio, 'ratio_ci95': [test.ratio_low, test.ratio_high],
         'detectable_ratio': test.detectable_ratio, 'withheld': list(test.withheld),
         'sentence': test.sentence}
-
-
-def _by_throttle(analysis: Analysis) -> dict[str, Any]:
-    curves = analysis.by_throttle
-    return {
-        'throttle': curves.throttle, 'known': curves.known,
-        'sag': curves.sag, 'sag_low': curves.sag_low, 'sag_high': curves.sag_high,
-        'noise': curves.noise,
-        'brownout_risk': curves.risk}
-
-
-def _brownout(analysis: Analysis) -> dict[str, Any]:
-    curves = analysis.by_throttle
-    return {
-        'voltage': curves.voltage, 'horizon_s': curves.horizon,
-        'voltage_source': 'default' if analysis.brownout_default else 'given',
-        'throttle_budget': curves.budget, 'budget_limit': curves.limit,
-        'budget_reason': curves.budget_reason, 't': curves.time}

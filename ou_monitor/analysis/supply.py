@@ -200,7 +200,6 @@ def facts_and_end(recording: Recording, limit: float | None = None, left: Remain
         raise ValueError(f'the limit must be finite, got {limit} V')
     if left is None and recording.n > 1:
         recording = readings_of(recording)
-    t, v, u = recording.t, recording.voltage, recording.throttle
     if not recording.n:
         unknown = (NAN,) * len(THROTTLES)
         nowhere = (NAN, NAN)
@@ -209,7 +208,7 @@ def facts_and_end(recording: Recording, limit: float | None = None, left: Remain
             Sag(False, nowhere, THROTTLES, unknown, unknown),
             Noise(THROTTLES, unknown, unknown, nowhere), Resistance(NAN, NAN),
             OuFacts('no_data'), None), SupplyLoad(), None
-    began = float(t[0])
+    began = float(recording.t[0])
     there, outer = supplied(recording), supplied(recording, at_ends=True)
     t, v, u = outer.t, outer.voltage, outer.throttle
     k = int(np.argmin(v))

@@ -178,7 +178,6 @@ class Measures:
     """Measures of one voltage."""
 
     mean: float  # V
-    thirds: FloatArray  # Means of the thirds, V; shape (3,)
     lowest: float  # V
     falls: FloatArray  # Dips below each level per minute; shape (levels,)
     power: FloatArray  # Power in each band, V^2; shape (bands,)
@@ -216,8 +215,7 @@ class Yardstick:
         at = np.clip(np.searchsorted(self.bands, f, side='right') - 1, -1, _BANDS - 1)
         power = np.array([density[at == k].sum() for k in range(_BANDS)]) * (f[1] - f[0])
         return Measures(
-            float(v.mean()), np.array([part.mean() for part in np.array_split(v, 3)]),
-            float(v.min()), np.array(falls), power, self._response(v),
+            float(v.mean()), float(v.min()), np.array(falls), power, self._response(v),
             np.searchsorted(np.sort(v), self.edges, side='right') / v.size)
 
     def _response(self, v: FloatArray) -> FloatArray:

@@ -82,8 +82,13 @@ def imitate(one: Kind, other: Kind) -> bool:
 def score_gain(kind: Kind, values: Statistics) -> float:
     """Return the gain of a kind by score tests, nats: half the square of its largest sign."""
     # A score test is for one size and span; the fitted kind may gain several times as much.
-    return 0.5 * max((value ** 2 for name, value in values.items() for sign in kind.SIGNS
-                      if is_sign(sign, name, value)), default=0.0)
+    return 0.5 * max((value ** 2 for name, value in values.items() if _shows(kind, name, value)),
+                     default=0.0)
+
+
+def _shows(kind: Kind, name: str, value: float) -> bool:
+    """Return whether a statistic is a sign of a kind."""
+    return any(is_sign(sign, name, value) for sign in kind.SIGNS)
 
 
 def affordable(kind: Kind, cost: float) -> bool:
@@ -169,21 +174,19 @@ def withdrawn(before: Statistics, after: Statistics, accepted: Sequence[Kind],
 
     def largest(kind: Kind) -> float:
         return max((abs(value) for values in (before, asked.get(kind.NAME, {}))
-                    for name, value in values.items()
-                    if any(is_sign(sign, name, value) for sign in kind.SIGNS)), default=0.0)
+                    for name, value in values.items() if _shows(kind, name, value)), default=0.0)
 
     def fails(kind: Kind) -> bool:
         most = largest(kind)
         if beside:
-            own = {name for name, value in before.items()
-                   if any(is_sign(sign, name, value) for sign in kind.SIGNS)}
+            own = {name for name, value in before.items() if _shows(kind, name, value)}
             share = max(kind.MAY_LEAVE, BESIDE_SHARE)
             return any(abs(after.get(name, 0.0)) > max(FAILS, share * most) for name in own)
         if not kind.MAY_LEAVE:
             return bool(left)
         if kind.REFUTED_BY and any(name.startswith(kind.REFUTED_BY) for name in left):
             return True
-        return any(is_sign(sign, name, after[name]) and abs(after[name]) > kind.MAY_LEAVE * most
-                   for name in left for sign in kind.SIGNS)
+        return any(_shows(kind, name, after[name]) and abs(after[name]) > kind.MAY_LEAVE * most
+                   for name in left)
 
     return [k for k, kind in enumerate(accepted) if is_latent(kind) and fails(kind)]

@@ -51,12 +51,9 @@ class LoadDependentSigma(Term):
         """Return whether the curve is a single step."""
         return len(self.throttle) == 2 and self.throttle[1] - self.throttle[0] < 3.0 * _EDGE
 
-    def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
-        def effect(s: Segment) -> None:
-            s.sigma *= np.exp(np.interp(s.throttle, self.throttle, self.log_factor))
-
-        return effect
+    def change(self, s: Segment) -> None:
+        """Multiply sigma."""
+        s.sigma *= np.exp(np.interp(s.throttle, self.throttle, self.log_factor))
 
     def free(self) -> tuple[str, ...]:
         """Return all knots but the first, where sigma equals that of the OU."""
@@ -195,12 +192,9 @@ class LoadDependentAlpha(Term):
 
     slope: float = parameter('', 'ln of the factor at full throttle')
 
-    def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
-        def effect(s: Segment) -> None:
-            s.alpha *= np.exp(self.slope * s.throttle)
-
-        return effect
+    def change(self, s: Segment) -> None:
+        """Multiply alpha."""
+        s.alpha *= np.exp(self.slope * s.throttle)
 
     def moved(self, name: str, by: float) -> LoadDependentAlpha:
         """Return the term with its slope moved."""

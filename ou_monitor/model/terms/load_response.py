@@ -50,13 +50,10 @@ class LoadSag(Term):
     square: float = parameter('V', 'drop at full throttle, quadratic part')
     growth: float = parameter('V/s', 'growth of the linear part', default=0.0)
 
-    def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
-        def effect(s: Segment) -> None:
-            linear = self.linear + self.growth * (s.at - s.origin)
-            s.level -= (linear + self.square * s.throttle) * s.throttle
-
-        return effect
+    def change(self, s: Segment) -> None:
+        """Lower the level."""
+        linear = self.linear + self.growth * (s.at - s.origin)
+        s.level -= (linear + self.square * s.throttle) * s.throttle
 
     def at(self, t: float) -> LoadSag:
         """Return the sag t seconds after the first sample, without growth."""

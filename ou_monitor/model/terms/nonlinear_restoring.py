@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 from ou_monitor.model.terms.laws import log_normal, View
-from ou_monitor.model.terms.segment import Effect, Segment, Stage
+from ou_monitor.model.terms.segment import Segment, Stage
 from ou_monitor.model.terms.term import LawFit, parameter, Role, Term
 from ou_monitor.records import FloatArray
 
@@ -40,12 +40,9 @@ class NonlinearRestoring(Term):
             raise ValueError(f'{self.NAME}: square needs a cube above 0, else the voltage runs '
                              'away')
 
-    def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
-        def effect(s: Segment) -> None:
-            s.bend = (s.bend[0] + self.square, s.bend[1] + self.cube)
-
-        return effect
+    def change(self, s: Segment) -> None:
+        """Bend the force."""
+        s.bend = (s.bend[0] + self.square, s.bend[1] + self.cube)
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:

@@ -197,12 +197,9 @@ class Quantization(Term):
 
     step: float = parameter('V', 'resolution, one code', 0.0, above=True)
 
-    def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
-        def effect(s: Segment) -> None:
-            s.voltage = self.step * np.rint(s.voltage / self.step)
-
-        return effect
+    def change(self, s: Segment) -> None:
+        """Round the readings."""
+        s.voltage = self.step * np.rint(s.voltage / self.step)
 
     def variance(self) -> float:
         """Return the variance of the rounding, V^2."""
@@ -231,12 +228,9 @@ class Saturation(Term):
             raise ValueError(f'{self.NAME}: low must be below high, got {self.low:g} V and '
                              f'{self.high:g} V')
 
-    def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
-        def effect(s: Segment) -> None:
-            np.clip(s.voltage, self.low, self.high, out=s.voltage)
-
-        return effect
+    def change(self, s: Segment) -> None:
+        """Clip the readings."""
+        np.clip(s.voltage, self.low, self.high, out=s.voltage)
 
 
 @dataclass(frozen=True)

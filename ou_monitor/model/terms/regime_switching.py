@@ -556,8 +556,7 @@ def _slow_levels(view: View) -> tuple[FloatArray | None, float, int]:
             top -= _THIRD * (states - 2)
             if best is None or top > best[0]:
                 best = top, x, states
-    if best is None:
-        return None, 0.0, 2
+    assert best is not None
     unit = math.sqrt(float(np.median(view.variance)))
     x = best[1]
     return np.array([x[0], x[1], x[2] * spread / unit, 0.0, 0.0]), best[0] - least, best[2]

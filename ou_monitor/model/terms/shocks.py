@@ -324,7 +324,7 @@ class HeavyTails(Term):
         square, shares, count = _cells(view.z[view.train], share[view.train])
 
         def value(x: FloatArray) -> float:
-            return float(count @ _Mixture(square, shares, math.exp(x[0]), math.exp(x[1])).log())
+            return float(count @ _Mixture(square, shares, math.exp(x[0]), math.exp(x[1])).log)
 
         x, _ = climb(value, [math.log(5.0), 0.0])
         dof, scale = math.exp(x[0]), math.exp(x[1])
@@ -333,7 +333,7 @@ class HeavyTails(Term):
         law = _Mixture(view.z * view.z, share, dof, scale)
         scores = np.copysign(normal_scores(law.beyond()), view.z)
         return LawFit(cls(dof), {'dof': dof * float(curvature_se(value, x)[0])}, scores,
-                      law.log() - log_normal(view.z), 2,
+                      law.log - log_normal(view.z), 2,
                       power=law.power() if float(np.median(share)) > _ALONE else None)
 
 
@@ -342,9 +342,10 @@ class _Mixture:
 
     def __init__(self, square: FloatArray, share: FloatArray, dof: float, scale: float) -> None:
         # A Student-t is a normal distribution whose variance is inverse-gamma distributed; the
-        # integral over the variance is a sum over close points of its logarithm.
+        # integral over the variance is a sum over close points of its logarithm.  `log`: log
+        # densities of the scores.
         if dof <= 2.0:
-            self._log = np.full(square.size, -math.inf)
+            self.log: FloatArray = np.full(square.size, -math.inf)
             return
         half = 0.5 * dof
         ends = np.log(gammaincinv(half, _OUTSIDE)), np.log(gammainccinv(half, _OUTSIDE))
@@ -361,11 +362,7 @@ class _Mixture:
             np.log(2.0 * math.pi * self._variance) + square[:, None] / self._variance)
         top = log.max(axis=1)
         self._density = np.exp(log - top[:, None])
-        self._log = top + np.log(self._density.sum(axis=1))
-
-    def log(self) -> FloatArray:
-        """Return log densities."""
-        return self._log
+        self.log = top + np.log(self._density.sum(axis=1))
 
     def beyond(self) -> FloatArray:
         """Return the probability of a more extreme score on the same side."""

@@ -38,13 +38,10 @@ class Drift(Term):
     rate: float = parameter('V/s', 'slope at the first sample')
     curvature: float = parameter('V/s^2', 'coefficient of t^2')
 
-    def start(self, rng: np.random.Generator) -> Effect:
-        """Begin a simulation."""
-        def effect(s: Segment) -> None:
-            t = s.at - s.origin
-            s.level += (self.rate + self.curvature * t) * t
-
-        return effect
+    def change(self, s: Segment) -> None:
+        """Move the level."""
+        t = s.at - s.origin
+        s.level += (self.rate + self.curvature * t) * t
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:

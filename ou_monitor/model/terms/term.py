@@ -157,6 +157,10 @@ class Term:
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Return a function that applies the term to one `Segment` after another, in order."""
+        return self.change
+
+    def change(self, s: Segment) -> None:
+        """Apply a term that draws nothing and keeps no state from segment to segment."""
         raise NotImplementedError
 
     @classmethod

@@ -102,19 +102,14 @@ _SMOOTH, _SMOOTH_SCORE = 0.05, 5.0
 
 
 def log_errors(fit: Fitted, duration: float) -> tuple[float, float, float]:
-    """
-    Return the standard errors of ln(alpha), ln(sigma), ln(Var_inf).
-
-    If no noise was found, theta is at its bound or near it, and the
-    information overstates the error of sigma.  Within `_NEAR` standard errors
-    of the bound, the error is therefore reduced as for a normal distribution
-    cut on one side (0.68 of the variance; theta makes up most of sigma's).
-
-    duration in s.
-    """
+    """Return the standard errors of ln(alpha), ln(sigma), ln(Var_inf) (duration in s)."""
     # At least a thousandth, to avoid a division by zero.
     relaxations = max(fit.alpha * duration - fit.high + _AS_FITTED, 1e-3)
     wider = 1.0 + (_WIDER + _MUCH_WIDER / relaxations) / relaxations
+    # If no noise was found, theta is at its bound or near it, and the information overstates the
+    # error of sigma.  Within `_NEAR` standard errors of the bound, the error is therefore reduced
+    # as for a normal distribution cut on one side (0.68 of the variance; theta makes up most of
+    # sigma's).
     near = math.exp(-0.5 * math.pow(min(fit.noise_score / _NEAR, 1e3), 2))
     return (_root(fit.log_var[0]) * wider, _root(fit.log_var[1]) * math.sqrt(1.0 - 0.32 * near),
             _root(fit.log_var[2]) * wider)

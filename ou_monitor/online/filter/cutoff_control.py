@@ -93,14 +93,10 @@ class CutoffControl:
     def __init__(self, settings: FilterSettings) -> None:
         self._settings = settings
         self._lowest = settings.lowest
-        self._aim = self._moving = self._cutoff = settings.fallback
+        # Target, approach to it, and cutoff in force, Hz.
+        self._aim = self._moving = self.cutoff = settings.fallback
         self._wanted = math.nan
         self._started = self._follow_exactly = self._slewing = False
-
-    @property
-    def cutoff(self) -> float:
-        """Cutoff in force, Hz."""
-        return self._cutoff
 
     @property
     def wanted(self) -> float:
@@ -111,8 +107,8 @@ class CutoffControl:
     def bound(self) -> Bound:
         """Return what determines the cutoff in force."""
         s = self._settings
-        if self._cutoff < self._moving:
-            if self._cutoff > self._lowest:
+        if self.cutoff < self._moving:
+            if self.cutoff > self._lowest:
                 return Bound.RATE
             return Bound.LAG if s.max_lag else Bound.LOWEST
         if self._moving != self._aim:
@@ -131,10 +127,10 @@ class CutoffControl:
         self._lowest = settings.lowest
         self._moving = self._clip(self._moving)
         self._aim = self._clip(self._aim)
-        self._cutoff = self._clip(min(self._cutoff, self._moving))
+        self.cutoff = self._clip(min(self.cutoff, self._moving))
         self._follow_exactly = True
         if not self._started:
-            self._aim = self._moving = self._cutoff = settings.fallback
+            self._aim = self._moving = self.cutoff = settings.fallback
 
     def update(self, wanted: float, error: float, dt: float, interval: float) -> float:
         """Take the law's cutoff, Hz; return the one in force (dt, interval in s; 0: unknown)."""
@@ -144,8 +140,8 @@ class CutoffControl:
         elif self._moving != self._aim and dt > 0.0:
             self._approach(time_constant(self._settings, error), dt)
         most = OF_RATE / interval if interval > 0.0 else math.inf
-        self._cutoff = self._clip(min(self._moving, most))
-        return self._cutoff
+        self.cutoff = self._clip(min(self._moving, most))
+        return self.cutoff
 
     def _choose(self, wanted: float) -> None:
         """Set the target to the wanted cutoff if that is outside the dead band of the old one."""

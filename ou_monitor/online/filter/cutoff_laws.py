@@ -249,21 +249,17 @@ def constant_noise_law(settings: FilterSettings, sigma: float, alpha: float,
 
 
 def relative_cutoff(mode: str, order: int, fmax: float, times: float, interval: float) -> float:
-    """
-    Return the cutoff, Hz, at which white noise `times` as large has the same rms as at fmax.
-
-    For the sampled filter see `held_cutoff`; interval in s, 0: continuous.  Far below the sample
-    rate, white noise of two-sided density N has the variance N w / 2 (order 1) or
-    N w / (2 sqrt 2) (order 2) after a low-pass: rms ~ sqrt(fc), so fc = fmax / times^2 for both.
-    Derivative, order 2: N int w'^2 |H|^2 dw' / 2 pi = N w^3 / (2 sqrt 2), so rms ~ fc^(3/2) and
-    fc = fmax / times^(2/3).  Derivative, order 1: the integral is finite only because of the
-    sample rate; independent samples of variance v give v w^2, so fc = fmax / times.
-    """
-    # Range of the table of white noise.
+    """Return the cutoff, Hz, at which white noise `times` as large has the same rms as at fmax."""
+    # interval in s, 0: continuous.  Range of the table of white noise.
     if interval > 0.0 and 1e-6 < TWO_PI * fmax * interval < 1e2 and times < 1e3:
         return held_cutoff(mode, order, fmax, times, interval)
+    # Far below the sample rate, white noise of two-sided density N has the variance N w / 2 (order
+    # 1) or N w / (2 sqrt 2) (order 2) after a low-pass: rms ~ sqrt(fc), so fc = fmax / times^2.
     if mode == 'lowpass':
         return fmax / (times * times)
+    # Derivative, order 2: N int w'^2 |H|^2 dw' / 2 pi = N w^3 / (2 sqrt 2), so rms ~ fc^(3/2) and
+    # fc = fmax / times^(2/3).  Order 1: the integral is finite only because of the sample rate;
+    # independent samples of variance v give v w^2, so fc = fmax / times.
     return float(fmax * times ** (-2.0 / 3.0)) if order == 2 else fmax / times
 
 

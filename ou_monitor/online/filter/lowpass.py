@@ -482,7 +482,12 @@ class AdaptiveLowPass:
             return self._out
         dt = t - self._t
         if dt < SHORTEST:
-            self._stay(t, x, dt)
+            if dt < 0.0:
+                # The next slope begins at the earlier stamp.
+                self._t, self._x = t, x
+                self.counters.back += 1
+            else:
+                self.counters.repeated += 1
             return self._out
         self.counters.samples += 1
         if dt > _GAP * self._interval.mean and self.counters.samples > _KNOWN:
@@ -504,15 +509,6 @@ class AdaptiveLowPass:
             self._offset *= math.exp(-angle)
             self._out += self._offset
         return self._out
-
-    def _stay(self, t: float, x: float, dt: float) -> None:
-        """Process a sample with a repeated or backward stamp."""
-        if dt < 0.0:
-            # The next slope begins at the earlier stamp.
-            self._t, self._x = t, x
-            self.counters.back += 1
-        else:
-            self.counters.repeated += 1
 
     def _source(self) -> float:
         """Return the output without the transition after a switch of `shadow`."""
