@@ -547,6 +547,8 @@ def look_ahead(forecast: Forecast, load: SupplyLoad, settings: MonitorSettings, 
         why = '' if load.status is LoadStatus.NO_DATA else load.status.value if (
             not load.known) else 'Less than a second has been flown.'
         return Ahead(outcome, NAN, why, soon=soon)
+    # Less throttle falls no deeper; just after a large one, the law says so of idle.
+    risks = np.minimum.accumulate(risks[::-1])[::-1]
     budget, reason = throttle_budget(risks, forecast.flown[1], s.budget_limit)
     # The comparison is false for NaN.
     return Ahead(outcome, budget, reason, tuple(risks[::5].tolist()), soon, budget < forecast.used)

@@ -406,6 +406,19 @@ def test_the_risk_does_not_fall_with_the_horizon():
     assert risks == sorted(risks) and risks[0] > 0.5
 
 
+def test_the_risk_curve_rises_with_throttle():
+    """At full throttle a step down is an extrapolation, of which idle must not seem riskier."""
+    rng = np.random.default_rng(2)
+    t = np.arange(9000) / 200.0
+    u = np.repeat(rng.uniform(0.05, 0.8, 30), 300)
+    v = 5.0 - 0.2 * u**1.8 + (0.01 + 0.05 * u) * rng.standard_normal(t.size)
+    monitor = SupplyMonitor(MonitorSettings(brownout_voltage=4.6, brownout_horizon=5.0))
+    for k in range(0, t.size, 100):
+        monitor.push(t[k:k + 100], v[k:k + 100], u[k:k + 100])
+        curve = monitor.report(0.0).risk_curve
+        assert list(curve) == sorted(curve)
+
+
 def test_idling_is_not_charged_with_the_punches_of_the_flight():
     """Idle is 1.4 V above the limit; the excursions of the flight alone would make it 0.004."""
     t = np.arange(6000) / 100.0
