@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 from ou_monitor import SlidingEstimator
-from ou_monitor.online.estimator.window import Thinner
+from ou_monitor.online.estimator.estimator import Thinner
 from ou_monitor.records import Flag, Status
 from ou_monitor.timeline import TimeLine
 import pytest
