@@ -81,15 +81,9 @@ def ripple(throttle: Number) -> Number:
 def lowpass(x: FloatArray, t: FloatArray, tau: float, start: float | None = None) -> FloatArray:
     """Return x after a first-order low-pass of tau, s; exact for x held over each step."""
     # Imported here, because the nodes do not need it: SciPy takes 35 MB.
-    from scipy.linalg import solve_banded
-    keep = np.exp(-np.diff(t) / tau)
-    bands = np.ones((2, x.size))
-    bands[1, :-1] = -keep
-    bands[1, -1] = 0.0
-    right = np.empty(x.size)
-    right[0] = x[0] if start is None else start
-    right[1:] = (1.0 - keep) * x[1:]
-    return np.asarray(solve_banded((1, 0), bands, right, check_finite=False), dtype=np.float64)
+    from ou_monitor.model.ou import first_order
+    keep = np.exp(-np.diff(t, prepend=t[0]) / tau)
+    return first_order(keep, (1.0 - keep) * x, float(x[0]) if start is None else start)
 
 
 @dataclass(frozen=True)

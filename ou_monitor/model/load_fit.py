@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.load import CELL, cells_in_series, charge_at, LoadModel, lowpass
+from ou_monitor.model.ou import first_order
 from ou_monitor.records import determined, FloatArray, log_interval, NAN
-from scipy.linalg import solve_banded
 from scipy.optimize import least_squares
 
 # Prior centre and deviation of each parameter (of its logarithm unless it is in _LINEAR): usual
@@ -160,26 +160,22 @@ class _Noise:
     def whiten(self, residuals: FloatArray, slow: float | None = None,
                ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return standardised innovations, their variances, V^2, and the innovations, V."""
-        variance, bands, passed = self._predictor(self.slow if slow is None else slow)
-        right = np.zeros(residuals.size)
-        right[1:] = passed * residuals[:-1]
-        innovations = residuals - solve_banded((1, 0), bands, right, check_finite=False)
+        variance, kept, passed = self._predictor(self.slow if slow is None else slow)
+        innovations = residuals - first_order(
+            kept, np.append(0.0, passed * residuals[:-1]), 0.0)
         return innovations / np.sqrt(variance), variance, innovations
 
     def _predictor(self, q: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return variances of innovations, V^2, and the coefficients of the recursion."""
         if self._found is None or self._found[0] != (self.white, q):
-            n = self._keep.size + 1
-            keep, values, p, white = self._keep.tolist(), [], q, self.white
-            for a in keep:
+            values, p, white = [], q, self.white
+            for a in self._keep.tolist():
                 values.append(p + white)
                 p = a * a * p * white / (p + white) + q * (1.0 - a * a)
             variance = np.array([*values, p + white])
             gain = 1.0 - white / variance
-            bands = np.ones((2, n))
-            bands[1, :-1] = -self._keep * (1.0 - gain[:-1])
-            bands[1, -1] = 0.0
-            self._found = (white, q), (variance, bands, self._keep * gain[:-1])
+            kept = np.append(0.0, self._keep * (1.0 - gain[:-1]))
+            self._found = (white, q), (variance, kept, self._keep * gain[:-1])
         return self._found[1]
 
     def evidence(self, residuals: FloatArray) -> float:

@@ -12,7 +12,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.records import FloatArray
-from scipy.linalg import solve_banded
+from scipy.linalg.lapack import dtbtrs
+from scipy.signal import lfilter
 
 
 def stationary_variance(alpha: float, sigma: float) -> float:
@@ -54,7 +55,32 @@ def simulate(
         if first is None:
             first = math.sqrt(stationary_variance(alpha, float(intensity[0]))) * noise[0]
         kicks = np.append(first, noise[1:] * intensity[1:] * np.sqrt(unit_q))
-        bands = np.ones((2, n))
-        bands[1] = np.append(-phi, 0.0)
-        x = solve_banded((1, 0), bands, kicks, check_finite=False)
+        x = first_order(np.append(0.0, phi), kicks, 0.0)
     return x + np.asarray(u0, dtype=np.float64)
+
+
+def first_order(phi: FloatArray, e: FloatArray, before: float) -> FloatArray:
+    """Return x with x_k = phi_k x_{k-1} + e_k; before: the value before the first."""
+    n = e.size
+    if not n:
+        return np.empty(0)
+    if steady(phi[1:]):
+        x: FloatArray = lfilter([1.0], [1.0, -phi[-1]], e, zi=[phi[0] * before])[0]
+        return x
+    # A lower bidiagonal system with a unit diagonal, in the memory order of LAPACK, which avoids
+    # a slow copy.
+    band = np.empty((2, n), order='F')
+    band[0] = 1.0
+    np.negative(phi[1:], out=band[1, :-1])
+    band[1, -1] = 0.0
+    right = np.array(e[:, None], order='F')
+    right[0] += phi[0] * before
+    solved: FloatArray = dtbtrs(band, right, uplo='L', diag='U', overwrite_b=True)[0][:, 0]
+    return solved
+
+
+def steady(values: FloatArray) -> bool:
+    """Return whether all values are equal."""
+    # Compare the last value first: if values vary, it mostly differs.
+    return not values.size or values.strides == (0,) or bool(
+        values[0] == values[-1] and (values == values[0]).all())

@@ -8,8 +8,9 @@ import math
 from typing import ClassVar
 
 import numpy as np
+from ou_monitor.model.ou import first_order
 from ou_monitor.model.terms.laws import View
-from ou_monitor.model.terms.segment import Effect, first_order, Segment, Stage
+from ou_monitor.model.terms.segment import Effect, Segment, Stage
 from ou_monitor.model.terms.term import parameter, Role, Term
 from ou_monitor.records import FloatArray
 

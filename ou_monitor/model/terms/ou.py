@@ -8,7 +8,8 @@ from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.model.terms.segment import Effect, first_order, Segment, Stage, steady
+from ou_monitor.model.ou import first_order, steady
+from ou_monitor.model.terms.segment import Effect, Segment, Stage
 from ou_monitor.model.terms.term import parameter, Term
 from ou_monitor.records import FloatArray
 

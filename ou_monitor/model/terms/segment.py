@@ -1,5 +1,5 @@
 """
-Segments of simulated samples, and first-order recursions along them.
+Segments of simulated samples.
 
 Segments pass through the terms of a model in the order of their `Stage`.
 """
@@ -12,8 +12,6 @@ import enum
 
 import numpy as np
 from ou_monitor.records import FloatArray
-from scipy.linalg.lapack import dtbtrs
-from scipy.signal import lfilter
 
 
 class Stage(enum.IntEnum):
@@ -68,30 +66,3 @@ class Segment:
 
 
 Effect = Callable[[Segment], None]
-
-
-def first_order(phi: FloatArray, e: FloatArray, before: float) -> FloatArray:
-    """Return x with x_k = phi_k x_{k-1} + e_k; before: the value before the first."""
-    n = e.size
-    if not n:
-        return np.empty(0)
-    if steady(phi[1:]):
-        x: FloatArray = lfilter([1.0], [1.0, -phi[-1]], e, zi=[phi[0] * before])[0]
-        return x
-    # A lower bidiagonal system with a unit diagonal, in the memory order of LAPACK, which avoids
-    # a slow copy.
-    band = np.empty((2, n), order='F')
-    band[0] = 1.0
-    np.negative(phi[1:], out=band[1, :-1])
-    band[1, -1] = 0.0
-    right = np.array(e[:, None], order='F')
-    right[0] += phi[0] * before
-    solved: FloatArray = dtbtrs(band, right, uplo='L', diag='U', overwrite_b=True)[0][:, 0]
-    return solved
-
-
-def steady(values: FloatArray) -> bool:
-    """Return whether all values are equal."""
-    # Compare the last value first: if values vary, it mostly differs.
-    return not values.size or values.strides == (0,) or bool(
-        values[0] == values[-1] and (values == values[0]).all())

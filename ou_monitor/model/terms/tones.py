@@ -8,11 +8,12 @@ import math
 from typing import ClassVar
 
 import numpy as np
+from ou_monitor.model.ou import first_order
 from ou_monitor.model.spectral_lines import find_lines, fit_sinusoid, Line, on_grid
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.lines import (
     broad_peaks, CONSTANT, order_lines, power_spread, RINGING, rotation, wandering)
-from ou_monitor.model.terms.segment import Effect, first_order, Segment, Stage
+from ou_monitor.model.terms.segment import Effect, Segment, Stage
 from ou_monitor.model.terms.term import by_parameters, parameter, Role, Term
 from ou_monitor.records import FloatArray
 
