@@ -36,7 +36,7 @@ from typing import Any
 
 import numpy as np
 from ou_monitor.analysis.level_tests import examine_level, holm, Shape, TestResult
-from ou_monitor.analysis.levels import LoadLevel, Stay
+from ou_monitor.analysis.levels import LevelSegment, LoadLevel
 from ou_monitor.analysis.supply import Remainder
 from ou_monitor.criticism.curves import bin_width, even_on_log
 from ou_monitor.criticism.innovations import FAMILY_WISE, innovations
@@ -216,7 +216,7 @@ class LevelSpectrum:
     fitted: FloatArray = field(default_factory=_empty)
 
 
-def level_spectrum(recording: Recording, segments: Sequence[Stay],
+def level_spectrum(recording: Recording, segments: Sequence[LevelSegment],
                    estimate: Estimate) -> LevelSpectrum:
     """Return the PSD of a level (Welch, Hann), averaged over its segments."""
     # Samples are taken as evenly spaced; if not, it is smeared near the Nyquist frequency.
@@ -243,14 +243,14 @@ def level_spectrum(recording: Recording, segments: Sequence[Stay],
     return LevelSpectrum(frequency, density, fitted)
 
 
-def segment_rate(recording: Recording, segments: Sequence[Stay]) -> float:
+def segment_rate(recording: Recording, segments: Sequence[LevelSegment]) -> float:
     """Return the mean rate of the samples within segments, Hz; 0 if they have no duration."""
     steps = sum(s.stop - s.start - 1 for s in segments)
     time = float(sum(recording.t[s.stop - 1] - recording.t[s.start] for s in segments))
     return steps / time if time > 0.0 else 0.0
 
 
-def _pieces(segments: Sequence[Stay], length: int) -> int:
+def _pieces(segments: Sequence[LevelSegment], length: int) -> int:
     """Return the number of half-overlapping pieces of a length in the segments."""
     return sum(max(0, 2 * (s.stop - s.start) // length - 1) for s in segments)
 
@@ -301,7 +301,7 @@ def mean_variance(time: float, n: int, estimate: Estimate, rms: float) -> float:
     return of_ou + noise * noise / max(n, 1)
 
 
-def fit_parts(recording: Recording, left: Remainder, segments: Sequence[Stay],
+def fit_parts(recording: Recording, left: Remainder, segments: Sequence[LevelSegment],
               throttle: float = NAN) -> tuple[OuFacts, Estimate]:
     """Fit segments of a recording, and return the fit as facts and as the node's record."""
     n = sum(s.stop - s.start for s in segments)
@@ -337,7 +337,7 @@ class LevelResult:
     """Results of one load level."""
 
     throttle: float  # 0..1; NaN if the level is the whole recording
-    segments: tuple[Stay, ...]  # Segments used
+    segments: tuple[LevelSegment, ...]  # Segments used
     time: float  # Time in them, s
     n: int  # Samples in them
     mean: float  # Mean voltage, V
@@ -445,14 +445,15 @@ def fit_all(recording: Recording, left: Remainder, levels: Sequence[LoadLevel]) 
                                        for part in _known(s, left.voltage)])[1]
 
 
-def _known(segment: Stay, voltage: FloatArray) -> list[Stay]:
+def _known(segment: LevelSegment, voltage: FloatArray) -> list[LevelSegment]:
     """Return the parts of a segment without gaps, for which the remainder is known."""
     known = np.isfinite(voltage[segment.start:segment.stop])
     turns = np.flatnonzero(np.diff(known, prepend=False, append=False)) + segment.start
-    return [Stay(a, b) for a, b in zip(turns[::2].tolist(), turns[1::2].tolist()) if b - a > 1]
+    return [LevelSegment(a, b)
+            for a, b in zip(turns[::2].tolist(), turns[1::2].tolist()) if b - a > 1]
 
 
-def _parts(recording: Recording, segments: Sequence[Stay]
+def _parts(recording: Recording, segments: Sequence[LevelSegment]
            ) -> list[tuple[FloatArray, FloatArray]]:
     return [(recording.t[s.start:s.stop], recording.voltage[s.start:s.stop]) for s in segments]
 
@@ -471,7 +472,7 @@ def _grid_rate(grids: Sequence[EvenGrid]) -> float:
     return steps / time if time > 0.0 else 0.0
 
 
-def _without_lines(recording: Recording, segments: Sequence[Stay], rate: float,
+def _without_lines(recording: Recording, segments: Sequence[LevelSegment], rate: float,
                    lines: LineSearch) -> Recording:
     """Return the recording without the spectral lines of a level, in its segments."""
     voltage = recording.voltage.copy()

@@ -53,7 +53,7 @@ _VALLEY = 0.7
 
 
 @dataclass(frozen=True)
-class Stay:
+class LevelSegment:
     """A segment of samples: indices ``start <= k < stop`` of the recording."""
 
     start: int
@@ -65,7 +65,7 @@ class LoadLevel:
     """One throttle and where in the recording it was held."""
 
     throttle: float  # Throttle of the level, 0..1; NaN if it is the whole recording
-    segments: tuple[Stay, ...]  # Segments at this throttle, without settling
+    segments: tuple[LevelSegment, ...]  # Segments at this throttle, without settling
     settling: float = 0.0  # Time left out after changes of throttle, s
 
 
@@ -77,7 +77,7 @@ def find_levels(t: FloatArray, throttle: FloatArray,
     width = half_width(t, throttle)
     if given is not None:
         return _split(t, throttle, _checked(given), width, True)
-    whole = (LoadLevel(NAN, tuple(_cut(Stay(0, t.size), _gaps(t)))),)
+    whole = (LoadLevel(NAN, tuple(_cut(LevelSegment(0, t.size), _gaps(t)))),)
     centres = _modes(t, throttle, width)
     while centres:
         found = _split(t, throttle, centres, width, False)
@@ -130,8 +130,8 @@ def _split(t: FloatArray, throttle: FloatArray, centres: list[float], width: flo
            named: bool) -> tuple[LoadLevel, ...]:
     """Return levels with their segments; levels given by the user (`named`) keep passages."""
     broken = _gaps(t)
-    runs: list[list[Stay]] = [[] for _ in centres]
-    for run, k in stays(throttle, centres, width):
+    runs: list[list[LevelSegment]] = [[] for _ in centres]
+    for run, k in level_segments(throttle, centres, width):
         runs[k] += _cut(run, broken)
     found = []
     for centre, inner, mine in zip(centres, _inner(centres, width), runs):
@@ -207,8 +207,8 @@ def _are_separate(density: FloatArray, peak: int, other: int, reach: int) -> boo
         between.min() < _VALLEY * min(density[peak], density[other]))
 
 
-def stays(throttle: FloatArray, centres: Sequence[float], width: float
-          ) -> list[tuple[Stay, int]]:
+def level_segments(throttle: FloatArray, centres: Sequence[float], width: float
+                   ) -> list[tuple[LevelSegment, int]]:
     """Return the segments of throttle at levels, each with the index of its level."""
     if not centres:
         return []
@@ -225,19 +225,19 @@ def stays(throttle: FloatArray, centres: Sequence[float], width: float
     at = np.where((away <= inner).any(axis=1), away.argmin(axis=1), -1).tolist()
     near = (away <= outer).tolist()
     starts = np.flatnonzero(np.diff(zone, prepend=-1))
-    found: list[tuple[Stay, int]] = []
+    found: list[tuple[LevelSegment, int]] = []
     here, begin, last = -1, 0, 0
     for start, stop, where in zip(starts.tolist(), [*starts[1:].tolist(), throttle.size],
                                   zone[starts].tolist()):
         if here >= 0 and not near[where][here]:
-            found.append((Stay(begin, last), here))
+            found.append((LevelSegment(begin, last), here))
             here = -1
         if here < 0 and at[where] >= 0:
             here, begin = at[where], start
         if here >= 0 and at[where] == here:
             last = stop
     if here >= 0:
-        found.append((Stay(begin, last), here))
+        found.append((LevelSegment(begin, last), here))
     return found
 
 
@@ -252,14 +252,14 @@ def _inner(centres: Sequence[float], width: float) -> FloatArray:
     return np.minimum(width, 0.5 * _nearest(centres)) + 1e-9
 
 
-def _cut(run: Stay, broken: BoolArray) -> list[Stay]:
+def _cut(run: LevelSegment, broken: BoolArray) -> list[LevelSegment]:
     """Return the pieces of a segment between pauses."""
     cuts = run.start + 1 + np.flatnonzero(broken[run.start + 1:run.stop])
     ends = [run.start, *cuts.tolist(), run.stop]
-    return [Stay(a, b) for a, b in zip(ends, ends[1:])]
+    return [LevelSegment(a, b) for a, b in zip(ends, ends[1:])]
 
 
-def _passage(t: FloatArray, throttle: FloatArray, run: Stay, width: float) -> bool:
+def _passage(t: FloatArray, throttle: FloatArray, run: LevelSegment, width: float) -> bool:
     """Return whether throttle only passes through."""
     if t[run.stop - 1] - t[run.start] >= _PASSAGE:
         return False
@@ -269,8 +269,8 @@ def _passage(t: FloatArray, throttle: FloatArray, run: Stay, width: float) -> bo
     return moved > max(_CROSSED * width, _STEADY * float(np.ptp(inside)))
 
 
-def _settle(t: FloatArray, runs: Sequence[Stay], away: BoolArray,
-            broken: BoolArray) -> tuple[tuple[Stay, ...], float]:
+def _settle(t: FloatArray, runs: Sequence[LevelSegment], away: BoolArray,
+            broken: BoolArray) -> tuple[tuple[LevelSegment, ...], float]:
     """Leave out the settling time after changes of throttle larger than jitter."""
     kept, lost = [], 0.0
     for run in runs:
@@ -283,5 +283,5 @@ def _settle(t: FloatArray, runs: Sequence[Stay], away: BoolArray,
         start = min(max(start, run.start), run.stop)
         lost += float(t[min(start, run.stop - 1)] - t[run.start])
         if start < run.stop - 1:
-            kept.append(Stay(start, run.stop))
+            kept.append(LevelSegment(start, run.stop))
     return tuple(kept), lost

@@ -33,7 +33,7 @@ import math
 import numpy as np
 from ou_monitor.analysis.level_comparison import AlphaTest, LEVEL
 from ou_monitor.analysis.level_result import mean_variance
-from ou_monitor.analysis.levels import HALF_WIDTH, half_width, stays
+from ou_monitor.analysis.levels import HALF_WIDTH, half_width, level_segments
 from ou_monitor.criticism.innovations import ou_filter
 from ou_monitor.records import determined, Estimate, FloatArray, log_interval, NAN, Recording
 from ou_monitor.text import number, p_words, volts, Z95
@@ -73,7 +73,7 @@ def find_steps(recording: Recording, throttles: Sequence[float]) -> tuple[LevelC
     if not np.isfinite(throttles).all():
         return ()
     width = half_width(t, throttle)
-    runs = [(run.start, run.stop, k) for run, k in stays(throttle, throttles, width)
+    runs = [(run.start, run.stop, k) for run, k in level_segments(throttle, throttles, width)
             if t[run.stop - 1] - t[run.start] >= SHORTEST_STAY]
     found = []
     for (begin, leave, before), (start, stop, after) in zip(runs, runs[1:]):

@@ -136,7 +136,7 @@ def _fit_notes(model: FlightModel, samples: Readings) -> list[str]:
             found.append('The simulated load is current, which explains the voltage better than '
                          'throttle.' if samples.throttle is not None else
                          'The simulated load is current.')
-        if math.isfinite(model.load.model.stands):
+        if math.isfinite(model.load.model.constant_level):
             found.append('No discharge is visible, so the level is constant.')
         return found
     if samples.current is None and samples.throttle is None:

@@ -191,7 +191,7 @@ class FlightModel:
         found = ['ou']
         if self.load is not None:
             found += ['load_sag', 'load_transient',
-                      *(['drift'] if math.isnan(self.load.model.stands) else [])]
+                      *(['drift'] if math.isnan(self.load.model.constant_level) else [])]
         return [*found, 'measurement_noise',
                 *(['load_dependent_noise'] if self.noise.sizes.follows else [])]
 
@@ -270,7 +270,7 @@ def fit_flight(samples: Readings, report: Callable[[float], None]) -> FlightMode
     if best is not None:
         parts = []
         for j, part in enumerate(_parts(samples)):
-            fit = _fit(samples, best.current, best.stands, part, best.fit)
+            fit = _fit(samples, best.current, best.constant_level, part, best.fit)
             parts.append((fit, samples.voltage[part] - _path(samples, fit, best.current)[part]))
             report(0.4 + 0.5 * (j + 1.0) / _PARTS)
         best = replace(best, parts=tuple(parts))
@@ -296,7 +296,7 @@ class _Load:
 
     fit: LoadFit
     current: FloatArray | None
-    stands: bool
+    constant_level: bool
     parts: tuple[tuple[LoadFit, FloatArray], ...] = ()
 
 
@@ -305,11 +305,11 @@ def _best(samples: Readings, report: Callable[[float], None]) -> _Load | None:
     found: _Load | None = None
     most = level_evidence(samples.t, samples.voltage)
     # The simpler ones first: throttle before current, a constant level before a discharge.
-    tried = [(current, stands) for current in _loads(samples) for stands in (True, False)]
-    for k, (current, stands) in enumerate(tried):
-        fit = _fit(samples, current, stands)
+    tried = [(current, constant) for current in _loads(samples) for constant in (True, False)]
+    for k, (current, constant) in enumerate(tried):
+        fit = _fit(samples, current, constant)
         if fit.evidence > most + _CLEAR:
-            found, most = _Load(fit, current, stands), fit.evidence
+            found, most = _Load(fit, current, constant), fit.evidence
         report((k + 1.0) / len(tried))
     return found
 
@@ -329,7 +329,7 @@ def _parts(samples: Readings) -> list[slice]:
     return [slice(int(a), int(b)) for a, b in zip(edges, edges[1:])]
 
 
-def _fit(samples: Readings, current: FloatArray | None, stands: bool,
+def _fit(samples: Readings, current: FloatArray | None, constant_level: bool,
          without: slice | None = None, near: LoadFit | None = None) -> LoadFit:
     """Fit the load; with very many samples, to means of neighbours."""
     width = -(-samples.t.size // _MOST)
@@ -343,7 +343,8 @@ def _fit(samples: Readings, current: FloatArray | None, stands: bool,
     return fit_load(
         mean(samples.t), mean(samples.voltage),
         None if samples.throttle is None else mean(samples.throttle),
-        None if current is None else mean(current), stands=stands, left_out=left_out, near=near)
+        None if current is None else mean(current), constant_level=constant_level,
+        left_out=left_out, near=near)
 
 
 def _path(samples: Readings, fit: LoadFit, current: FloatArray | None) -> FloatArray:

@@ -162,18 +162,18 @@ def failing(before: Statistics, after: Statistics) -> list[str]:
 
 
 def withdrawn(before: Statistics, after: Statistics, accepted: Sequence[Kind],
-              asked: Mapping[str, Statistics] = MappingProxyType({})) -> list[int]:
+              before_accepted: Mapping[str, Statistics] = MappingProxyType({})) -> list[int]:
     """Return which accepted causes do not explain their statistics."""
     # The form of measured causes is never exact, so with them some statistic always fails on a
     # real flight.  Then a latent cause is tested by its own signs only, relative to their values
-    # with the measured causes alone (`before`) or just before its acceptance (`asked`, by name),
-    # since a larger effect may have hidden them.  Without measured causes, latent ones are tested
-    # by all statistics, because the effect may not be in the catalogue.
+    # with the measured causes alone (`before`) or just before its acceptance (`before_accepted`,
+    # by name), since a larger effect may have hidden them.  Without measured causes, latent ones
+    # are tested by all statistics, because the effect may not be in the catalogue.
     beside = not all(map(is_latent, accepted))
     left = failing(before, after)
 
     def largest(kind: Kind) -> float:
-        return max((abs(value) for values in (before, asked.get(kind.NAME, {}))
+        return max((abs(value) for values in (before, before_accepted.get(kind.NAME, {}))
                     for name, value in values.items() if _shows(kind, name, value)), default=0.0)
 
     def fails(kind: Kind) -> bool:

@@ -191,7 +191,7 @@ class Finding:
                     'baseline_se': self.crossing.baseline_se,
                     'extended_se': self.crossing.extended_se, 'unit': '1/min'}},
             'remaining': [_discrepancy(c, c.after, c.p_after) for c in self.remaining],
-            'felt': self.throttle_effects.as_data(), 'refused': self.refused or None,
+            'throttle_effects': self.throttle_effects.as_data(), 'refused': self.refused or None,
             'notes': list(self.notes)})
         return found
 

@@ -133,7 +133,8 @@ def _finished(fitter: Fitter, search: Search, bank: NullBank) -> _Result:
 def _withdrawn(fitter: Fitter, found: _Result, begun: _Result) -> list[int]:
     """Return the causes that do not explain their statistics, or no longer fit their name."""
     names = found.search.accepted
-    out = decision.withdrawn(begun.after, found.after, kinds_of(names), found.search.asked)
+    out = decision.withdrawn(begun.after, found.after, kinds_of(names),
+                             found.search.before_accepted)
     # Noise terms of the load model stay.
     out = [k for k in out if names[k] not in begun.search.accepted]
     return sorted({*_in_doubt(fitter.samples, found.whole, names, out),

@@ -63,13 +63,13 @@ class Search:
     rivals: dict[str, list[str]] = field(default_factory=dict)
     log: list[str] = field(default_factory=list)  # Trials and their results, one line each
     # For each latent cause, the statistics before it was accepted.
-    asked: dict[str, Mapping[str, float]] = field(default_factory=dict)
+    before_accepted: dict[str, Mapping[str, float]] = field(default_factory=dict)
     stopped: bool = False  # Whether the search ended because it took too long
 
     def copy(self) -> Search:
         """Return an independent copy of the search."""
         return replace(self, accepted=list(self.accepted), rivals=dict(self.rivals),
-                       log=list(self.log), asked=dict(self.asked))
+                       log=list(self.log), before_accepted=dict(self.before_accepted))
 
 
 def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
@@ -86,7 +86,7 @@ def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
             break
         best = trials[0]
         if decision.is_latent(catalogue()[best.name]):
-            search.asked[best.name] = criticise(fitter.samples, search.composite, bank)
+            search.before_accepted[best.name] = criticise(fitter.samples, search.composite, bank)
         _accept(search, best, trials)
         if best.composite.gaussian.cost < _SOON:
             choose_response(fitter, search, ())

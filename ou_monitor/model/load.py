@@ -108,7 +108,7 @@ class LoadModel:
     # Current at full load, A, negative if discharge is negative; 0: the load is throttle.
     full_current: float = 0.0
     delay: float = 0.0  # Delay of the load behind the voltage, s
-    stands: float = NAN  # Constant level, V; NaN: a lithium pack that discharges
+    constant_level: float = NAN  # Constant level, V; NaN: a lithium pack that discharges
 
     def sag(self, throttle: npt.ArrayLike) -> FloatArray:
         """Return the sag, V, at constant throttle, of cold cells at 3.8 V."""
@@ -135,11 +135,11 @@ class LoadModel:
         if not self.full_current:
             # A propeller draws less at a lower voltage: I ~ u (u V)^(p - 1).
             x = lagged ** self.power
-            if math.isnan(self.stands):
+            if math.isnan(self.constant_level):
                 level = open_circuit(np.clip(self.charge - np.cumsum(x * dt) / full, 0.0, 1.0))
                 x = x * (level / CELL) ** (self.power - 1.0)
-        rest: FloatArray | float = self.stands
-        if math.isnan(self.stands):
+        rest: FloatArray | float = self.constant_level
+        if math.isnan(self.constant_level):
             # Ohmic heat warms the pack, and a warm pack has less resistance.
             total = self.size * (1.0 + self.fast_share + self.slow_share)
             x = x * np.exp(-_HEATING * np.cumsum(total * x * x * dt / full))

@@ -35,7 +35,7 @@ _LINEAR = {'charge': (0.0, 1.05), 'before': (0.0, 1.5)}
 _OF_CURRENT = {'size': 2.0, 'fast_share': 0.7, 'slow_share': 0.7, 'endurance': 1.0}
 _CENTRE = {'endurance': math.log(2000.0)}
 # Prior deviation of a constant level, which replaces the charge, V per cell.
-_STANDS = 0.2
+_LEVEL_SD = 0.2
 # Delay of the load: maximum in steps and in s; it is used if the residuals fall below this ratio.
 # Time constants of its fit, s: slower trends are removed; the load also enters with this lag.
 _SHIFTS, _LATEST, _PAYS, _SLOWER, _LATE = 10, 0.2, 0.95, 1.0, 0.06
@@ -95,7 +95,8 @@ class LoadFit:
 def _theta(model: LoadModel) -> FloatArray:
     """Return the parameters as fitted; a constant level, V per cell, replaces the charge."""
     return np.array([
-        model.stands / model.cells if name == 'charge' and math.isfinite(model.stands)
+        model.constant_level / model.cells
+        if name == 'charge' and math.isfinite(model.constant_level)
         else getattr(model, name) if name in _LINEAR
         else math.log(getattr(model, name)) for name in _NAMES])
 
@@ -103,8 +104,8 @@ def _theta(model: LoadModel) -> FloatArray:
 def _moved(model: LoadModel, theta: FloatArray) -> LoadModel:
     values: dict[str, Any] = {name: float(x) if name in _LINEAR else math.exp(x)
                               for name, x in zip(_NAMES, theta)}
-    if math.isfinite(model.stands):
-        values['stands'] = values.pop('charge') * model.cells
+    if math.isfinite(model.constant_level):
+        values['constant_level'] = values.pop('charge') * model.cells
     return replace(model, **values)
 
 
@@ -116,12 +117,12 @@ def _bounds(model: LoadModel) -> tuple[FloatArray, FloatArray, FloatArray, Float
     deviation = np.array([wide.get(name, _PRIOR[name][1]) for name in _NAMES])
     level = _NAMES.index('charge')
     centre[level] = _theta(model)[level]
-    stands = math.isfinite(model.stands)
-    if stands:
-        deviation[level] = _STANDS
+    constant_level = math.isfinite(model.constant_level)
+    if constant_level:
+        deviation[level] = _LEVEL_SD
     low, high = centre - _REACH * deviation, centre + _REACH * deviation
     for name, (least, most) in _LINEAR.items():
-        if not (stands and name == 'charge'):
+        if not (constant_level and name == 'charge'):
             low[_NAMES.index(name)], high[_NAMES.index(name)] = least, most
     return low, high, centre, deviation
 
@@ -197,7 +198,7 @@ class _Noise:
 
 
 def _template(t: FloatArray, voltage: FloatArray, throttle: FloatArray | None,
-              current: FloatArray | None, stands: bool) -> LoadModel:
+              current: FloatArray | None, constant_level: bool) -> LoadModel:
     """Return the parts of a model that are not fitted: cells, and the load's scale and delay."""
     load = throttle if current is None else current
     if load is None:
@@ -213,7 +214,7 @@ def _template(t: FloatArray, voltage: FloatArray, throttle: FloatArray | None,
         full = sign * max(float(np.quantile(np.abs(current), 0.99)), 1e-9)
         mean = max(1e-3, float(np.maximum(current / full, 0.0).mean()))
     return LoadModel(cells_in_series(float(np.quantile(voltage, 0.99))), mean, full_current=full,
-                     delay=delay, stands=0.0 if stands else NAN)
+                     delay=delay, constant_level=0.0 if constant_level else NAN)
 
 
 def _bins(t: FloatArray) -> tuple[Callable[[FloatArray], FloatArray], npt.NDArray[np.intp]]:
@@ -235,16 +236,16 @@ def level_evidence(t: FloatArray, voltage: FloatArray) -> float:
         one = noise.whiten(np.ones(left.size))[0]
         left = left - float(one @ noise.whiten(left)[0]) / float(one @ one)
     # Laplace, with one parameter, at the centre of its prior.
-    return noise.evidence(left) - 0.5 * math.log(float(one @ one) * (_STANDS * cells) ** 2)
+    return noise.evidence(left) - 0.5 * math.log(float(one @ one) * (_LEVEL_SD * cells) ** 2)
 
 
 def fit_load(t: FloatArray, voltage: FloatArray, throttle: FloatArray | None,
-             current: FloatArray | None = None, *, stands: bool = False,
+             current: FloatArray | None = None, *, constant_level: bool = False,
              left_out: tuple[float, float] | None = None, near: LoadFit | None = None) -> LoadFit:
     """Fit the load model to finite samples (s, V, 0..1), or with a current, A, as the load."""
-    # The level follows a lithium pack, or is constant (`stands`).  Voltage between the stamps
-    # left_out, s, is not used.  `near`, a similar fit (such as that of all the voltage), provides
-    # the start, and the cells, scale and delay, which are not fitted.
+    # The level is constant (`constant_level`) or follows a lithium pack.  Voltage between the
+    # stamps left_out, s, is not used.  `near`, a similar fit (such as that of all the voltage),
+    # provides the start, and the cells, scale and delay, which are not fitted.
     if t.size < _LEAST:
         raise ValueError(f'a fit of the load needs {_LEAST} samples, got {t.size}')
     if not (np.isfinite(voltage).all() and (np.diff(t) > 0.0).all()):
@@ -253,10 +254,11 @@ def fit_load(t: FloatArray, voltage: FloatArray, throttle: FloatArray | None,
         (t < left_out[0]) | (t > left_out[1]))
     if not seen.any():
         raise ValueError('no voltage is left for the fit')
-    model = _template(t, voltage, throttle, current, stands) if near is None else near.model
+    model = near.model if near is not None else _template(
+        t, voltage, throttle, current, constant_level)
     top = float(np.quantile(voltage[seen], 0.98))
-    centred = replace(model, stands=top) if math.isfinite(model.stands) else replace(
-        model, charge=charge_at(top / model.cells))
+    centred = (replace(model, constant_level=top) if math.isfinite(model.constant_level) else
+               replace(model, charge=charge_at(top / model.cells)))
     low, high, centre, deviation = _bounds(centred)
     mean, starts = _bins(t)
     used = seen[starts]

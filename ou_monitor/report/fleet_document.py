@@ -444,7 +444,8 @@ def as_data(fleet: Fleet) -> dict[str, Any]:
         'drift': [{
             'vehicle': t.vehicle, 'quantity': t.quantity, 'flights': t.flights,
             'slope': t.slope, 'ci95': [t.low, t.high], 'p_value': t.p_value,
-            'p_family': t.p_family, 'stands': t.p_family <= DRIFT_RATE} for t in judged.trends],
+            'p_family': t.p_family, 'significant': t.p_family <= DRIFT_RATE}
+            for t in judged.trends],
         'outliers': odd,
         'rows': [{name: value.isoformat() if name == 'start' and value is not None else value
                   for name, value in row.items()} for row in fleet.rows],

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from ou_monitor.analysis.level_comparison import alpha_constancy, sigma_change
 from ou_monitor.analysis.level_result import fit_parts
-from ou_monitor.analysis.levels import Stay
+from ou_monitor.analysis.levels import LevelSegment
 from ou_monitor.criticism.battery import covariates_of, statistics
 from ou_monitor.criticism.composite import fit_composite, view_of
 from ou_monitor.criticism.innovations import FAMILY_WISE, innovations, other_pole
@@ -132,7 +132,7 @@ def over_throttle(*terms, seed):
     samples, composite = fitted(*terms, throttle=throttle, seed=seed)
     found = statistics(composite.z, covariates_of(samples, composite))
     recording = Recording(samples.t, samples.voltage, throttle, 'levels')
-    low, high = (fit_parts(recording, bare(recording), [Stay(*ends)])[1]
+    low, high = (fit_parts(recording, bare(recording), [LevelSegment(*ends)])[1]
                  for ends in ((0, N // 2), (N // 2, N)))
     alpha, sigma = alpha_constancy((0.2, 0.6), (low, high)), sigma_change(low, high)
     reach = math.log(sigma.ratio_high / sigma.ratio)

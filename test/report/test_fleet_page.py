@@ -71,7 +71,7 @@ def test_stars_mark_significant_values_only(odd):
 def test_plain_data_agrees(odd):
     """The JSON names the same drift and the same outliers."""
     data = as_data(odd)
-    assert [(d['vehicle'], d['quantity']) for d in data['drift'] if d['stands']] == [
+    assert [(d['vehicle'], d['quantity']) for d in data['drift'] if d['significant']] == [
         ('<b>uav2</b> & co', 'sigma')]
     assert {(o['what'], o['vehicle'], o['path']) for o in data['outliers']} == {
         ('vehicle', 'uav4', None), ('recording', 'uav6', '/f/uav6/3')}

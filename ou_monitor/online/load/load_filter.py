@@ -420,12 +420,12 @@ class LoadFilter:
                 self._open(block.voltage, u)
             else:
                 du = abs(u - self._throttle)
-                legs = [(block.t, u)]
+                pieces = [(block.t, u)]
                 if u != self._throttle and self._last > self._t:
                     # The last throttle was held to the end of its block.
-                    legs.insert(0, (self._last, self._throttle))
+                    pieces.insert(0, (self._last, self._throttle))
                 self._throttle = u
-                self._predict(legs)
+                self._predict(pieces)
                 self._correct(block, du)
         if self._current is not None:
             self._current.take(block, self._cells, fresh=fresh)
@@ -544,16 +544,16 @@ class LoadFilter:
         place = int((level / self._cells - _LOWEST) * _PER_VOLT + 0.5)
         return self._cells * float(_SLOPE_AT[min(len(_SLOPE_AT) - 1, max(0, place))])
 
-    def _predict(self, legs: list[tuple[float, float]]) -> None:
+    def _predict(self, pieces: list[tuple[float, float]]) -> None:
         """Predict to the last of some stamps, s, with the throttle before each."""
         m, P, used = self._m, self._P, 0.0
-        dt = legs[-1][0] - self._t
+        dt = pieces[-1][0] - self._t
         if math.isnan(self._throttle):
-            self._t = legs[-1][0]
+            self._t = pieces[-1][0]
             P[0, 0] += (_WALK * self._cells) ** 2 * dt
             return
         self._flown *= 1.0 - min(dt / _FLOWN_MEMORY, 1.0)
-        for t, u in legs:
+        for t, u in pieces:
             used += self._advance(t - self._t, u) * (t - self._t)
             self._flown[0, int(u * _BINS + 0.5)] += t - self._t
             self._t = t
