@@ -73,20 +73,22 @@ _PATTERNS = {
         r'v_?bat(?:t|tery)?(?:_?latest|_?filtered|_?voltage|_?v)?|batt?(?:ery)?_?(?:v|volt|volts|'
         r'voltage)|pack_?voltage|(?:input|inp|bus|supply|rail|main|link)_?(?:v|volt|voltage)'
         r'|v_?bus|rxbt|vfas|voltage_?(?:battery|batt?|raw)|bat_?spannung|akku_?spannung|pm_vbat',
-        r'u|v|volts?|voltage|spannung|tension|tensione|voltaje|[UVuv]\(.*\)',
+        r'u|v|volts?|voltage|spannung|tension|tensione|voltaje|[UVuv]\(.*\)|'
+        r'[uv](?:rms|dc|mean|mn)?_?1?',
         r'volt(?:age)?_?filtered(?:_v)?',
         r'(?!.*(?:axis|cell|temp|limit|zelle|motor|servo|rssi|phase|cpu|mcu|5v|sag)).*(?:volt|'
         r'spannung|vbat).*'),
     logs.THROTTLE: (
         r'throttle', r'thr(?:ottle)?_?(?:out|cmd|command|pct|percent)?|ga[sz]|'
-        r'acelerador|duty(?:_cycle)?|tho?o|tastgrad|tastverh.*',
+        r'acelerador|duty(?:_cycle)?|tho?o|tps|tastgrad|tastverh.*',
         r'rc_?command_3', r'pwm|thrust|gas_?(?:kanal|stellung|hebel)|esc(?:_signal)?|'
         r'(?!.*(?:limit|trim|max|min)).*throttle.*'),
     logs.CURRENT: (
         r'current_a', r'amperage(?:_?latest)?|current_in|i_?bat(?:t|tery)?|'
         r'batt?(?:ery)?_?\d?_?(?:i|curr(?:ent)?|amps?)|current_?batt?(?:ery)?|'
         r'(?:.*_)?(?:bus|input|supply|main|pack|total)_?current|i_?bus|curr',
-        r'(?:i|curr(?:ent)?|amps?|strom|courant|corriente)(?:_(?:avg|average|mean))?(?:_?1)?|'
+        r'(?:i(?:rms|dc|mn)?|curr(?:ent)?|amps?|strom|courant|corriente)'
+        r'(?:_?(?:avg|average|mean))?(?:_?1)?|'
         r'(?!.*(?:max|min|limit)).*_batt?(?:ery)?_current'),
 }
 # Column that identifies a program, '' for any -> ends of the names of its columns, in lower case:
@@ -691,11 +693,16 @@ def _in_si(quantity: str, column: _Column, values: FloatArray, given: str | None
 def _throttle_unit(values: FloatArray, volts: FloatArray) -> str:
     """Return the unit suggested by the sizes of a throttle; '1' by default."""
     known = np.abs(values)
+    if not known.size:
+        return '1'
+    low, high = (float(np.quantile(known, q)) for q in (WILD, 1.0 - 0.1 * WILD))
+    if low >= 0.8 and 1.1 < high <= 2.2:
+        # Pulses in ms.
+        return '1:2'
     beyond = known[known > MOST_THROTTLE]
     # With a voltage within 0 to 1 it may be the voltage: `check_throttle` reports it.
     if beyond.size <= WILD * known.size or float(np.nanmax(np.abs(volts), initial=0.0)) <= 1.0:
         return '1'
-    low, high = (float(np.quantile(known, q)) for q in (WILD, 1.0 - 0.1 * WILD))
     if high <= 110.0:
         return '%'
     if low >= 800.0 and high <= 2200.0:

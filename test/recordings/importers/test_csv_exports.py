@@ -464,9 +464,20 @@ def test_the_unit_of_a_throttle(tmp_path):
     found = read_recording(percent, columns=CsvColumns(throttle_unit='%', current='none'))
     assert found.throttle[0] == pytest.approx(0.01) and found.current is None
     assert not read_recording(path, columns=CsvColumns(throttle='none')).has_throttle
+    # Pulses in ms.
+    pulses = written(tmp_path, 't,U,Throttle\n0,12,1.1\n1,12,1.9\n', 'd.csv')
+    np.testing.assert_allclose(read_recording(pulses).throttle, [0.1, 0.9])
     # A duty below 0 runs a motor in reverse.
     duty = written(tmp_path, 't,U,duty [%]\n0,12,-50\n1,12,50\n', 'c.csv')
     np.testing.assert_allclose(read_recording(duty).throttle, [-0.5, 0.5])
+
+
+def test_columns_of_a_power_meter(tmp_path):
+    """Names such as Urms-1 and Irms-1 are of one channel; power is not read."""
+    found = read_recording(written(
+        tmp_path, 'Store No.,Time,Urms-1,Irms-1,P-1\n1,0.0,12.5,3.5,43\n2,0.1,12.4,4.5,55\n'))
+    assert found.voltage.tolist() == [12.5, pytest.approx(12.4)]
+    assert found.current is not None and found.current.tolist() == [3.5, 4.5]
 
 
 def test_a_current_is_not_read_as_a_voltage(tmp_path):
