@@ -38,10 +38,11 @@ from ou_monitor.text import plain_number
 TIME, VOLTAGE, THROTTLE = 'time_s', 'voltage_v', 'throttle'
 
 # Words of loggers for a missing number, or for one beyond the range.
-MISSING = frozenset(',nan,null,none,na,n/a,#n/a,-,--,x,∞,-∞,ol,-ol,ovl,overload,unavailable,'
-                    'unknown'.split(','))
-# Added to the error about a cell with a decimal comma.
-_MARK = ': the decimal mark is a point (--decimal)'
+MISSING = frozenset(',nan,null,none,na,n/a,#n/a,-,--,---,----,x,∞,-∞,ol,-ol,ovl,overload,'
+                    'unavailable,unknown,1.#qnan,-1.#qnan,-1.#ind,1.#inf,-1.#inf'.split(','))
+# Added to the error about a cell with a decimal comma, and to errors of single lines.
+_MARK = ': the decimal mark is a point (with --decimal . a comma separates thousands)'
+_PARTIAL = '; --partial leaves bad lines out'
 # Maximum characters of a cell that are shown.
 _LONGEST = 40
 # Maximum characters of a line: a log of 1000 columns has lines of some 10 000.
@@ -86,13 +87,15 @@ _WITH_UNIT = re.compile(
 # A unit before more words: 101 (VDC)- Battery.
 _BEFORE = re.compile(rf'(.*?)( ?[\[(]{_WORD}[\])]) ?[-:] ?(\w.*)', re.IGNORECASE)
 # Volts*100; current (10 mA).
-_MULTIPLE = re.compile(r'(.*?)(?: ?\* ?(10+)|([\[(] ?)(10+|0?\.0*1) ?([a-zµμ%]+ ?[\])]))',
-                       re.IGNORECASE)
+_MULTIPLE = re.compile(
+    r'(.*?)(?: ?\* ?(10+)|([\[(] ?)(?:x ?)?(10+|0?\.0*1) ?([a-zµμ%]+ ?[\])]))', re.IGNORECASE)
 _NAMES = re.compile(r'[^\s\[(]+(?: ?[\[(][^\])]*[\])])?')
 # A number with commas between thousands, and decimals.
 _GROUPED = re.compile(r'[-+]?\d{1,3}(?:,\d{3})+\.\d+')
-# A number with points between thousands, not a part of a date or a clock.
-_THOUSANDS = re.compile(r'(?<![\d.,:])\d{1,3}(?:\.\d{3})+(?![\d.:])')
+# A number with points or commas between thousands, not a part of a date or a clock.
+_OF_POINT, _OF_COMMA = (re.compile(rf'(?<![\d.,:])\d{{1,3}}(?:{mark}\d{{3}})+(?![\d{mark}:])')
+                        for mark in (r'\.', ','))
+_OF_QUOTED = re.compile(r'"[-+]?\d{1,3}(?:,\d{3})+(?:\.\d+)?"')
 _AND_UNIT = re.compile(r'(\S*[\d.])\s*+([^\d\s.]{1,12}+(?: [AaDd][Cc])?)')  # 12.3 mV DC
 # A number whose decimal comma is within quotes, and does not separate thousands.
 _QUOTED = re.compile(r'"[-+]?\d+,(?!\d{3}(?!\d))\d+[^",]*"')
@@ -132,7 +135,7 @@ class Form(NamedTuple):
     encoding: str
     delimiter: str
     comma: bool  # Whether the decimal mark is a comma
-    stated_comma: bool  # Whether that was given: then a point separates thousands
+    mark: str  # The decimal mark that was given: then the other one separates thousands
     skip: int  # Lines above the first row of numbers
     line: int  # Number of the line with the names; 0: there is none
     labels: tuple[str, ...]  # Words before the numbers of each column, '' if none
@@ -202,13 +205,13 @@ def _encoding(path: Path, head: bytes) -> str:
 def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool,
                 wanted: CsvColumns) -> tuple[float, Form] | None:
     """Return how well a delimiter and a decimal mark fit, and the form; None if they do not."""
-    skip, stated_comma = wanted.skip_rows or 0, wanted.decimal == ','
+    skip, given = wanted.skip_rows or 0, wanted.decimal or ''
     rows: list[list[str]] = []
     for line in lines:
         plain = '' if line.lstrip().startswith('#') else line
         try:
             rows.append([cell.strip() for cell in next(iter(csv.reader(
-                _prepared([plain], delimiter, comma, stated_comma), delimiter=delimiter,
+                _prepared([plain], delimiter, comma, given), delimiter=delimiter,
                 skipinitialspace=True)), [])])
         except csv.Error:
             rows.append([])
@@ -248,7 +251,7 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool,
     step, stated = _stated_step(lines[:max(first, 20)], rows[:first])
     first_rows = tuple(tuple(row) for row in rows[first:] if any(row))
     return fit * (1.0 if width > 1 else 0.4) + 0.01 * min(width, 20) / 20, Form(
-        encoding, delimiter, comma, stated_comma, first, at, labels, ''.join(lines[:first]), names,
+        encoding, delimiter, comma, given, first, at, labels, ''.join(lines[:first]), names,
         units, width, first_rows, step, stated)
 
 
@@ -270,14 +273,16 @@ def _after_names(rows: list[list[str]], skip: int, first: int, width: int, place
     return next((k for k in numeric if k > names and not _are_units(rows[k])), first)
 
 
-def _prepared(lines: list[str], delimiter: str, comma: bool, stated_comma: bool) -> list[str]:
+def _prepared(lines: list[str], delimiter: str, comma: bool, mark: str) -> list[str]:
     """Return lines with decimal points, and single blanks if blanks separate the cells."""
     if lines and _RECEIVED.match(lines[0]):
         lines = [f'{found[1]}{delimiter}{rest}' if (found := _RECEIVED.match(line)) and (
             delimiter in (rest := line[found.end():]).strip() or ' ' not in rest.strip())
             else line for line in lines]
-    if stated_comma:
-        lines = [_THOUSANDS.sub(lambda found: found[0].replace('.', ''), line) for line in lines]
+    if mark:
+        groups, between = (_OF_POINT, '.') if mark == ',' else (
+            _OF_QUOTED if delimiter == ',' else _OF_COMMA, ',')
+        lines = [groups.sub(lambda found: found[0].replace(between, ''), line) for line in lines]
     if comma and delimiter != ',':
         lines = [_with_point(line) for line in lines]
     return [' '.join(line.split()) + '\n' for line in lines] if delimiter == ' ' else lines
@@ -527,7 +532,7 @@ def _lines(path: Path, file: TextIO, form: Form) -> Iterator[list[str]]:
 def _without_comments(lines: list[str], form: Form, text: str) -> list[str]:
     if '#' in text:
         lines = ['\n' if line.lstrip().startswith('#') else line for line in lines]
-    return _prepared(lines, form.delimiter, form.comma, form.stated_comma)
+    return _prepared(lines, form.delimiter, form.comma, form.mark)
 
 
 def _line(before: int, rows: list[list[str]], k: int) -> int:
@@ -547,7 +552,7 @@ def _fitting(path: Path, rows: list[list[str]], width: int, last: int, form: For
             wrong = (f'{path}:{_line(begin, rows, k)}: the line ends before column '
                      f"'{form.names[last]}'")
         if wrong and left_out is None:
-            raise InputError(wrong)
+            raise InputError(wrong + _PARTIAL)
         if wrong or blank:
             # It stays in the block, so that line numbers can be counted.
             row.clear()
@@ -585,11 +590,11 @@ def _floats(cells: Sequence[str], where: Callable[[int], str], comma: bool, stat
         else:
             if comma:
                 cell = _with_point(cell)
-            mark = _MARK if cell.count(',') == 1 and not comma else (
-                _MARK.replace('point', 'comma') * comma)
+            mark = ': the decimal mark is a comma (--decimal)' if comma else (
+                _MARK * (cell.count(',') == 1))
             wrong = f"{where(k)} holds '{shown(cell)}', not a number{mark}"
             if good is None or left_out is None:
-                raise InputError(wrong)
+                raise InputError(wrong + _PARTIAL * (not mark))
             if good[k]:
                 left_out.append(wrong)
             good[k] = False

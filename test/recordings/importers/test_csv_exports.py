@@ -472,6 +472,24 @@ def test_the_unit_of_a_throttle(tmp_path):
     np.testing.assert_allclose(read_recording(duty).throttle, [-0.5, 0.5])
 
 
+def test_a_stated_mark_makes_the_other_one_separate_thousands(tmp_path):
+    """Integers in groups are ambiguous without --decimal; with it, quoted groups are numbers."""
+    path = written(tmp_path, '"Time (ms)","U (mV)"\n' + ''.join(
+        f'"{10 * k:,}","{12_000.5 + k:,.1f}"\n' for k in range(200)))
+    with pytest.raises(InputError, match="'1,000', not a number.*--decimal"):
+        read_recording(path)
+    found = read_recording(path, columns=CsvColumns(decimal='.'))
+    assert found.t[-1] == pytest.approx(1.99) and found.voltage[-1] == pytest.approx(12.1995)
+
+
+def test_words_of_loggers_for_a_missing_number(tmp_path):
+    """They are counted, not refused; a factor in the unit of a column is applied."""
+    words = ['OL', '----', '1.#QNAN', '-1.#IND']
+    found = read_recording(written(tmp_path, 'time,VBAT (x10 mV)\n' + ''.join(
+        f'{k},{word}\n' for k, word in enumerate(['1200', *words, '1210']))))
+    assert found.voltage.tolist() == [12.0, pytest.approx(12.1)]
+
+
 def test_columns_of_a_power_meter(tmp_path):
     """Names such as Urms-1 and Irms-1 are of one channel; power is not read."""
     found = read_recording(written(
@@ -543,7 +561,7 @@ def test_a_given_decimal_comma_makes_points_separate_thousands(tmp_path):
 def test_three_digits_behind_a_quoted_comma_may_be_thousands(tmp_path):
     """In a CSV with commas between cells; refused unless the decimal mark is given."""
     path = written(tmp_path, 't,U\n' + ''.join(f'{k},"16,52{k}"\n' for k in range(9)))
-    with pytest.raises(InputError, match='decimal mark is a point .--decimal'):
+    with pytest.raises(InputError, match='decimal mark is a point .with --decimal'):
         read_recording(path, columns=CsvColumns(voltage='U'))
     found = read_recording(path, columns=CsvColumns(decimal=','))
     np.testing.assert_allclose(found.voltage, 16.52 + 1e-3 * np.arange(9))
