@@ -114,9 +114,9 @@ def choose_channel(folder: Path, known: Sequence[str], channel: str) -> str:
         return channel
     if not channel and len(known) == 1:
         return known[0]
-    asked = f"no channel '{channel}'" if channel else f'{len(known)} voltage channels'
+    wanted = f"no channel '{channel}'" if channel else f'{len(known)} voltage channels'
     names = ', '.join(known) or 'none'
-    raise InputError(f'{folder.name} has {asked}: give channel:= one of {names}')
+    raise InputError(f'{folder.name} has {wanted}: give channel:= one of {names}')
 
 
 def find_attribute(folder: Path, channel: str, what: str) -> Path | None:

@@ -303,11 +303,11 @@ def readings_of(recording: Recording) -> Recording:
 
 def supplied(recording: Recording, at_ends: bool = False) -> Recording:
     """
-    Return a recording without wild readings and the times at which its supply was off, noted.
+    Return a recording without wild readings and without the times when its supply was off.
 
-    Off: below `OFF` of the usual voltage, with the readings up to `_ON` before and after.  A
-    signal that is often there, or that spends as long in between, is not a supply that was off.
-    at_ends: keep the times within the recording.
+    Notes state both.  Off: below `OFF` of the usual voltage, with the readings up to `_ON` before
+    and after.  A signal that is low too often, or mostly between `OFF` and `_ON`, is not a supply
+    that was off.  at_ends: leave out only the start and the end of the recording.
     """
     usual = float(np.quantile(recording.voltage, 0.8)) if recording.n else 0.0
     wild = recording.voltage > WILD_FACTOR * usual

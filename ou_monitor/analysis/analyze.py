@@ -2,7 +2,7 @@
 A recording -> Tables 1 and 2 of the paper, with intervals, tests and curves over throttle.
 
 The recording also goes through `SupplyMonitor`, as in flight, so that node and command agree on
-the same data, even if throttle never stands still.  The limits of the monitor apply; the risk is
+the same data, even if throttle is never constant.  The limits of the monitor apply; the risk is
 for the state at the end of the recording.  Throttles not flown are NaN.
 
 `as_data` returns the JSON of `analyze`; see doc/analysis.md.
@@ -64,8 +64,8 @@ class Analysis:
     craft: Craft  # Cells, and a comparison with known crafts
 
 
-# Rate of a relaxation, 1/s, over the lowest frequency that the level leaves, Hz: slower ones come
-# out too fast (simulated OUs of 0.4 to 3 1/s at 10 Hz).
+# Rate of a relaxation, 1/s, over the lowest frequency that the level leaves, Hz: for slower ones
+# the fitted rate is too high (simulated OUs of 0.4 to 3 1/s at 10 Hz).
 _SLOWEST = 4.0 * math.pi
 
 

@@ -174,7 +174,7 @@ def craft_of(recording: Recording, facts: SupplyFacts, given: int = 0) -> Craft:
     if not kinds or not recording.has_throttle:
         return Craft(cells, source, full_voltage(recording), '', ())
     seen = bool(flown_near(recording, _AT, _NEAR)[0])
-    # Noise of changes that the load model does not follow is no lack of a capacitor.
+    # Noise from changes that the load model does not follow does not mean a missing capacitor.
     calm = float(np.interp(_AT, facts.noise.throttle, facts.noise.steady_rms_v)) / cells
     # Values and standard errors; the error of the noise is negligible.
     values = {

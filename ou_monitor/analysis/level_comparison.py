@@ -162,7 +162,7 @@ class SigmaChange:
 def sigma_change(low: Estimate, high: Estimate, others: Sequence[Estimate] = ()) -> SigmaChange:
     """Compare sigma of two usable levels; its error includes the scatter of all levels."""
     # Scatter about a line of ln sigma over throttle, beyond the errors of the levels, has another
-    # cause than throttle, such as a load that throttle does not tell.
+    # cause than throttle, such as a load that throttle does not show.
     every = [low, *others, high]
     scatter = 0.0
     if others:

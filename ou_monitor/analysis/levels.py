@@ -26,7 +26,7 @@ HALF_WIDTH = 0.02
 # With more jitter: half width in standard deviations of the jitter, and its maximum.
 _SPREADS, _WIDEST = 2.5, 0.03
 # Length of blocks in which the jitter is measured, s, and the quantile of blocks that is used:
-# sticks often stand still at idle and jitter only in flight.
+# sticks often do not move at idle and jitter only in flight.
 _LOOK, _QUIETER = 1.0, 0.75
 # Time left out after a change of throttle by more than two half widths, s: six relaxation times of
 # the rail of the paper (15.9 ms), after which 0.2 % of a step is left.

@@ -155,8 +155,8 @@ def known_lines(found: Overview) -> list[tuple[str, str]]:
                       f'{max(_AT_ONCE, found.step):.2g} s'
                       + (f': {fall}' if (fall := _fall(found)) else '')))
     elif found.drawn > 0.0:
-        lines.append(('Resistance', 'unknown: the current changes too little, or throttle tells '
-                      'what it does not, as if a load bypassed its sensor'))
+        lines.append(('Resistance', 'unknown: the current changes too little, or a load seems '
+                      'to bypass its sensor'))
     lines.append(('Relaxation', _ou_words(found.facts.ou)))
     if found.line is not None:
         line = found.line

@@ -1,7 +1,7 @@
 """
 Relaxation of the voltage after a change of load, as in Fig. 5 of the paper, with intervals.
 
-Once throttle stands still, U(t) = U0 + A exp(-t/tau) in the noise of that level: OU and white
+Once throttle is constant, U(t) = U0 + A exp(-t/tau) in the noise of that level: OU and white
 noise, whose exact covariance weights the samples (generalised least squares, through the one-step
 innovations).  tau is common to all changes of one kind; U0 and A differ for each.  The interval of
 tau comes from the profile likelihood.
@@ -42,7 +42,7 @@ from scipy import stats
 
 # Maximum duration of a change of level, s; a slower one leaves nothing to relax.
 LONGEST_RAMP = 1.0
-# Minimum time at a level, s; shorter stays are passages.
+# Minimum time at a level, s; in less, throttle only passes through it.
 SHORTEST_STAY = 0.1
 # Tolerance of throttle after a change, as a share of the change.
 _STILL = 0.1
@@ -61,8 +61,8 @@ class LevelChange:
     before: int
     after: int
     leave: int  # Index of the first sample that is no longer at the level before
-    enter: int  # Index of the sample from which throttle stands still at the level after
-    # First sample of the stay before; end of the samples with constant throttle after.
+    enter: int  # Index of the sample from which throttle is constant at the level after
+    # First sample at the level before; end of the samples with constant throttle after.
     begin: int
     stop: int
 
@@ -192,18 +192,18 @@ _LATER, _WELL = 1.0 / 3.0, 0.05
 class Release:
     """One change of load."""
 
-    t: float  # Time when throttle stood still, s, clock of the recording
+    t: float  # Time when throttle was constant again, s, clock of the recording
     # Levels, 0..1.
     throttle_before: float
     throttle_after: float
-    # Mean voltage at the end of the stay before and its standard error, V; NaN if it was too
+    # Mean voltage at the end of the level before and its standard error, V; NaN if it was too
     # short.
     level_before: float
     level_before_se: float
     # U0, the voltage after settling, V.
     level: float
     level_se: float
-    # A, the deviation from U0 when throttle stands still, V; negative after a release.
+    # A, the deviation from U0 when throttle is constant again, V; negative after a release.
     amplitude: float
     amplitude_se: float
     beyond: float  # Overshoot beyond U0 after a release, undershoot after a load, V
@@ -314,7 +314,7 @@ def fit_relaxation(recording: Recording, kind: str, steps: Sequence[LevelChange]
 
 def _watched(recording: Recording, steps: Sequence[LevelChange], estimates: Sequence[Estimate],
              rms: Sequence[float], later: float) -> tuple[list[LevelChange], list[Window]]:
-    """Return the changes with enough samples from `later` s after throttle stands still."""
+    """Return the changes with enough samples from `later` s after throttle is constant again."""
     used, windows = [], []
     for step in steps:
         begin = int(np.searchsorted(recording.t, recording.t[step.enter] + later))
@@ -417,7 +417,7 @@ def _crossing(x: FloatArray, fall: FloatArray) -> float:
 
 def _level_before(recording: Recording, step: LevelChange, estimate: Estimate, rms: float
                   ) -> tuple[float, float]:
-    """Return the mean voltage at the end of the stay before, and its standard error."""
+    """Return the mean voltage at the end of the level before, and its standard error."""
     t = recording.t
     last = float(t[step.leave - 1])
     first = max(last - _BEFORE_S, float(t[step.begin]) + _SETTLED_S)

@@ -7,8 +7,8 @@ a level are counted as dips are in `supply_facts`, with hysteresis.
 The score of a number is its distance from the median, in half-widths of a band that is estimated
 from the simulations and the recording; the half-width is at least a difference that a pilot would
 not notice.  The largest weighted score is ranked among those of the simulations.  Of recordings
-that follow the model, this rank reports at most 2 % to differ; the level, which must lie in its
-band, reports 5 %.
+that follow the model, at most 2 % are called different by this rank, and 5 % because their level
+is outside its band.
 """
 
 from __future__ import annotations

@@ -330,7 +330,7 @@ def _ties(v: FloatArray) -> bool:
     smooth, error = _ties_of_codes(moved, code)
     return (equal - expected > _CLEARLY * math.sqrt(max(expected, 1.0))
             and equal - smooth > _CLEARLY * math.hypot(math.sqrt(max(smooth, 1.0)), error)
-            and equal > count * _alike_again(v, inner))
+            and equal > count * _recurring_share(v, inner))
 
 
 def _code(v: FloatArray) -> float:
@@ -404,7 +404,7 @@ def _ties_without_holds(v: FloatArray, inner: npt.NDArray[np.bool_]) -> float:
     return min(shares)
 
 
-def _alike_again(v: FloatArray, inner: npt.NDArray[np.bool_]) -> float:
-    """Return the largest share of values that return after one period."""
+def _recurring_share(v: FloatArray, inner: npt.NDArray[np.bool_]) -> float:
+    """Return the largest share of values that recur after one period of a line."""
     return max((float(np.mean(v[k:][inner[k - 1:]] == v[:-k][inner[k - 1:]]))
                 for k in _PERIODS if k < v.size // 2), default=0.0)

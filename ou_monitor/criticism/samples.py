@@ -83,7 +83,7 @@ class Samples:
         return slice(round(TRAIN * self.n), self.n)
 
     def part(self, part: slice, voltage: FloatArray | None = None) -> Samples:
-        """Return a part, or all with another voltage."""
+        """Return a part of the samples, with another voltage if one is given."""
         v = self.voltage if voltage is None else voltage
         return Samples(self.t[part], v[part],
                        None if self.throttle is None else self.throttle[part],

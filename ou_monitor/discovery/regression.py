@@ -137,7 +137,7 @@ class _Regression:
         through[:, 1:] /= np.maximum(np.sqrt(np.mean(through[:, 1:]**2, axis=0)), 1e-300)
         self._blocks = np.array([part.T @ part for part in np.array_split(through, FOLDS)])
         self._all = self._blocks.sum(axis=0)
-        self._price = 0.5 * math.log(samples.n)
+        self._penalty = 0.5 * math.log(samples.n)
         self._known: dict[tuple[int, ...], tuple[float, FloatArray]] = {}
 
     def search(self, start: Sequence[int]) -> MeanResponse:
@@ -223,7 +223,7 @@ class _Regression:
             lost = np.array([_loss(self._all - block, block, at) for block in self._blocks])
             inside = _loss(self._all, self._all, at)
             search = sum(self._pool[k].SEARCH for k in chosen)
-            value = -max(inside + self._price * at.size, float(lost.sum())) - search
+            value = -max(inside + self._penalty * at.size, float(lost.sum())) - search
             self._known[chosen] = value, lost
         return self._known[chosen]
 

@@ -167,7 +167,7 @@ def _round(fitter: Fitter, search: Search, bank: NullBank, given: Sequence[str],
             fitter.samples.throttle is not None, first)
         trials += [trial for trial in fitter.trials(
             search.composite, kinds, lambda model: criticise(fitter.samples, model, bank))
-                   if trial.evidence > _price(fitter, search.composite, trial.name)]
+                   if trial.evidence > _needed(fitter, search.composite, trial.name)]
         steady = [trial for trial in trials if _is_steady(trial, search)]
         if first and steady:
             return steady
@@ -182,7 +182,7 @@ def _is_steady(trial: Trial, search: Search) -> bool:
     return decision.is_shared([float(part.sum()) for part in np.array_split(gains, BLOCKS)], Z95)
 
 
-def _price(fitter: Fitter, beside: Composite, name: str, least: float = decision.ACCEPT) -> float:
+def _needed(fitter: Fitter, beside: Composite, name: str, least: float = decision.ACCEPT) -> float:
     """Return the minimum evidence of a cause beside a model, nats."""
     other = _CURVES.get(name, '')
     if not beside.has(other):
@@ -207,10 +207,10 @@ def _more_lines(fitter: Fitter, search: Search) -> bool:
     composite, samples = search.composite, fitter.samples
     view = fitter.view(composite)
     # Penalty for amplitude, phase, and the search for the frequency.
-    price = math.log(samples.train.stop) + Tone.SEARCH
+    penalty = math.log(samples.train.stop) + Tone.SEARCH
     # A line of the scores, with variance 1, gains n rms^2 / 2 nats.
     lines = [Tone.at(line, view) for line in lines_of(view)[:_MOST_LINES]
-             if 0.5 * samples.n * line.rms ** 2 > price + decision.ACCEPT]
+             if 0.5 * samples.n * line.rms ** 2 > penalty + decision.ACCEPT]
     fit = fitter.join(composite, lines, rough=True) if lines else None
     if fit is None or (fitter.evidence(fit) - fitter.evidence(composite)
                        < decision.ACCEPT * len(lines)):
@@ -241,7 +241,7 @@ def _moved(fitter: Fitter, search: Search) -> bool:
         less = _without(fitter, search.composite, name)
         if less is None:
             continue
-        needed = _price(fitter, less, name, decision.TIE)
+        needed = _needed(fitter, less, name, decision.TIE)
         if value - fitter.evidence(less) < needed + _ROUGH:
             less = _in_full(fitter, less)
         if fitter.holds(less):

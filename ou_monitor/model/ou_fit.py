@@ -2,17 +2,17 @@
 Fit an Ornstein-Uhlenbeck process and white noise to a voltage, together with level and load.
 
 `known_ou` fits the shortest window in which alpha is known well.  `regress` removes a flexible
-level (linear hats every 5 s), throttle and measured current from the voltage; both loads enter
-without lag and after several lags with free initial states.  `fit_ou` fits the noise jointly with
-these regressors.
+level (linear hat functions every 5 s), throttle and measured current from the voltage; both loads
+enter without lag and after several lags with free initial states.  `fit_ou` fits the noise jointly
+with these regressors.
 
 The size of the noise depends on the load and its changes, and readings are weighted by it:
 otherwise the errors of the load model while the load moves would be taken for a fast OU.  The
 noise is white noise, the OU, and a random walk of the level, whose size has a prior and may be
-zero; without it, what the hats miss of the level would pass for a slow OU.  The fit maximises a
-restricted likelihood in the frequency domain (`whittle.CrossSpectrum`).  Intervals are quantiles
-from importance sampling about all its maxima over the rate; the prior is flat in ln(alpha), and
-arcsine in the share of the OU.
+zero; without it, changes of the level that the hats miss would be fitted as a slow OU.  The fit
+maximises a restricted likelihood in the frequency domain (`whittle.CrossSpectrum`).  Intervals are
+quantiles from importance sampling about all its maxima over the rate; the prior is flat in
+ln(alpha), and arcsine in the share of the OU.
 
 Limits: samples are taken as evenly spaced within a stretch without gaps; a relaxation slower than
 2.5 s (a sixth of a window below 15 s) counts as level; OU and white noise change in proportion,

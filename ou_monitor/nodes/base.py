@@ -42,8 +42,8 @@ LOCK = Parameter(
     'lock_parameters', False,
     'Whether to refuse what can disarm the node at run time: changes of any parameter except '
     'publish_rate, and the services ~/clear_brownout and ~/save_model.')
-# Busy wait before an instant, s: about the usual lateness of sleep; a 1 kHz bag then costs a tenth
-# of a core.
+# Busy wait at the end of a sleep, s: as long as sleep is usually late; a 1 kHz bag then costs a
+# tenth of a core.
 SPIN = 0.0001
 # Maximum single sleep, s: limits the delay in noticing a signal.
 NAP = 0.05

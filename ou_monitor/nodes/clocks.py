@@ -154,7 +154,7 @@ class SendClock:
         return GAP if math.isnan(self._period) else max(GAP, 5.0 * self._period)
 
     def _judge(self) -> None:
-        """Learn the period; drop it when none of the messages examined shows it."""
+        """Learn the period; forget it if the messages examined no longer show one."""
         times = self._times
         looked = np.array(times)
         end = float(looked[-1])

@@ -342,7 +342,7 @@ class EstimatorNode(MonitorNode):
             summary = ' '.join((summary, *notes))
             level = max(level, Level.WARN) if level is not Level.STALE else level
         if self._latch is not None and self._latch.problem:
-            # The owner relies on the latch, whatever the input does.
+            # Report a failing latch file even if the input is bad: the user relies on the latch.
             level, summary = Level.ERROR, f'{summary} {self._latch.problem}.'
         return report, level, summary
 

@@ -151,7 +151,7 @@ def _field_channel(kind: str, field: str) -> Channels:
     """Return one field of any installed type, tried on an empty message."""
     message = message_class(kind)()
     steps = value_path(FieldSpec('input', kind, field), definition_of(message_class(kind)))
-    # None stands for an element that does not exist yet.
+    # None: an element that does not exist yet.
     value = walk(message, steps)
     if value is not None and not isinstance(value, float):
         raise InputError(

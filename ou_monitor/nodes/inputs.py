@@ -38,7 +38,7 @@ INPUT_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000,
 # Smaller for blocks: 2000 blocks would take 80 MB.
 BLOCK_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=200,
                        reliability=ReliabilityPolicy.BEST_EFFORT)
-# Maximum messages and bytes taken at a time: as many as the queue holds; so many bytes take about
+# Maximum messages and bytes taken at a time: as many as the queue holds; these bytes take about
 # 50 ms and 50 MB of memory to process.
 MOST_TAKEN, MOST_BYTES = 2000, 2_000_000
 # Longest time for which a message may have waited in the middleware's queue of 2000, s.
@@ -128,7 +128,7 @@ class Arrivals:
 
 
 class PolledInput:
-    """One field of a topic's messages, and with `beside` a number of each, in batches."""
+    """One field of a topic's messages, in batches; `beside`: a second number of each message."""
 
     def __init__(self, node: MonitorNode, kind: Any, topic: str, spec: FieldSpec,
                  beside: FieldSpec | None = None) -> None:

@@ -1,7 +1,7 @@
 """
 Nodes that a manager configures, activates and deactivates (managed nodes, design.ros2.org).
 
-Only an active node is the whole plain node; before, it has parameters and the life-cycle services.
+Only an active node does its work; before activation it has parameters and lifecycle services only.
 A failure is logged, and the node stays in its former state.  A latched flag survives all
 transitions in its file, `state_file`.  doc/deploy.md says what configuring checks.
 """
@@ -29,12 +29,12 @@ def managed(kind: type[MonitorNode]) -> Callable[[str], MonitorNode]:
             kind.__init__(self, name, managed=True)  # type: ignore[call-arg]
             LifecycleNodeMixin.__init__(self)
             change = self._service_change_state
-            asked = change.callback
+            original = change.callback
 
             def answer(request: Any, response: Any) -> Any:
                 # rclpy 7.1 raises if a state has no such transition, which would end the node.
                 try:
-                    return asked(request, response)
+                    return original(request, response)
                 except Exception as error:
                     self.get_logger().error(f'no such transition now: {one_line(error)}')
                     response.success = False

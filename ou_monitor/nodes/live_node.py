@@ -59,7 +59,7 @@ class LiveNode(Node):
         for name in self._newest:
             self.create_subscription(
                 Float64, f'{low_pass}/{name}', partial(self._take_number, name), 10)
-        self._ask = self.create_client(GetParameters, f'{estimator}/get_parameters')
+        self._client = self.create_client(GetParameters, f'{estimator}/get_parameters')
         self._answer: Any = None
         self.create_timer(PERIOD, self._add_row)
         self.create_timer(_LOOK, self._find_signals)
@@ -86,8 +86,8 @@ class LiveNode(Node):
             values = self._answer.result().values
             self._limits = {name: value.double_value for name, value in zip(_SHOWN, values)}
             self._answer = None
-        if self._answer is None and self._ask.service_is_ready():
-            self._answer = self._ask.call_async(GetParameters.Request(names=list(_SHOWN)))
+        if self._answer is None and self._client.service_is_ready():
+            self._answer = self._client.call_async(GetParameters.Request(names=list(_SHOWN)))
         self._listen('filtered', f'{self._filter}/output')
         source = self._input()
         if source:

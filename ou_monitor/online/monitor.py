@@ -190,7 +190,7 @@ class SupplyMonitor:
         """Pass on readings, but none while the supply is off; begin anew when it comes."""
         t, level = float(batch.t[-1]), self._level
         if math.isnan(level) and batch.t.size > 3 and not batch.again:
-            # The first readings tell whether it is on.
+            # The first readings decide whether it is on.
             self._take(Batch.of(batch.columns[:, :3], batch.restart), came)
             self._take(Batch.of(batch.columns[:, 3:], False, before=float(batch.t[2])), came)
             return
@@ -326,18 +326,18 @@ class SupplyMonitor:
                 self._counted = self._counters()
                 self._begin()
                 e = self._estimate()
-            told, ou, ou_age = self._relaxation.in_force(e) if (
+            shown, ou, ou_age = self._relaxation.in_force(e) if (
                 self._settings.window == AUTO) else (e, of_estimate(e), 0.0)
             if doubt in (Doubt.STAMPS, Doubt.OTHER):
-                told = untimed(told)
-                ou = of_estimate(told)
+                shown = untimed(shown)
+                ou = of_estimate(shown)
             self._stamps, self._doubt = stamps, doubt
             fresh = (silent <= limit and e.status is not Status.NO_DATA and doubt is Doubt.NONE)
             if again or not fresh:
                 self._load = self._load_filter.load()
                 # Use the better sigma of a longer window only if the short one shows an OU too;
                 # otherwise the load model is more accurate.
-                self._forecast.follow(*((told, ou.window_s, ou_age) if e.usable and told.usable
+                self._forecast.follow(*((shown, ou.window_s, ou_age) if e.usable and shown.usable
                                         else (e, e.duration)))
                 self._ahead = look_ahead(
                     self._forecast, self._load, self._settings, alone=alone) if (
@@ -349,9 +349,9 @@ class SupplyMonitor:
             limit, stamps, fresh = self._settings.stale_after, StampOrder.GOOD, False
             doubt, why = Doubt.NONE, ''
             self._ahead = Ahead()
-            told, ou, ou_age = e, of_estimate(e), 0.0
+            shown, ou, ou_age = e, of_estimate(e), 0.0
         # The risk is always based on the sliding estimate of the last seconds.
-        self._newest, e = e, told
+        self._newest, e = e, shown
         ahead = self._ahead
         risk = ahead.outcome.risk
         self._faulty = self._faulty and not e.usable
@@ -395,10 +395,10 @@ class SupplyMonitor:
             When the voltage is not finite, or the horizon not positive.
 
         """
-        asked = self._asked(voltage, horizon)
+        wanted = self._checked(voltage, horizon)
         if not self._trusted:
             return NAN
-        return self._forecast.risk(*asked).risk
+        return self._forecast.risk(*wanted).risk
 
     def risk_if(self, throttle: float, dwell: float, voltage: float | None = None,
                 horizon: float | None = None) -> float:
@@ -425,7 +425,7 @@ class SupplyMonitor:
             When the throttle lies outside 0..1 or the dwell is negative, and as `risk` does.
 
         """
-        level, ahead = self._asked(voltage, horizon)
+        level, ahead = self._checked(voltage, horizon)
         if not (math.isfinite(throttle) and 0.0 <= throttle <= 1.0):
             raise ValueError(f'throttle must lie within 0..1, got {throttle}')
         if not (math.isfinite(dwell) and dwell >= 0.0):
@@ -439,7 +439,7 @@ class SupplyMonitor:
         """Whether the readings are trusted, regardless of the limit."""
         return self._trust.doubt(self._stamps, math.inf)[0] is Doubt.NONE
 
-    def _asked(self, voltage: float | None, horizon: float | None) -> tuple[float, float]:
+    def _checked(self, voltage: float | None, horizon: float | None) -> tuple[float, float]:
         level = self._settings.brownout_voltage if voltage is None else voltage
         ahead = self._settings.brownout_horizon if horizon is None else horizon
         if not math.isfinite(level):

@@ -428,7 +428,7 @@ class AdaptiveNotch:
         self._law: MotorLaw | None = None
         self._choice: NotchChoice | None = None
         # Square root of throttle after the lag of the motors, and time of the last throttle.
-        self._root, self._asked, self._received = NAN, NAN, -math.inf
+        self._root, self._newest_root, self._received = NAN, NAN, -math.inf
         self._motors: list[float] = []
         self._sources: set[str] = set()
 
@@ -599,12 +599,12 @@ class AdaptiveNotch:
 
     def _listen(self, t: float, dt: float, throttle: float, rpm: Sequence[float]) -> None:
         if throttle == throttle:
-            self._asked, self._received = math.sqrt(min(max(throttle, 0.0), 1.0)), t
+            self._newest_root, self._received = math.sqrt(min(max(throttle, 0.0), 1.0)), t
         elif not t - self._received <= _HELD:
-            self._root = self._asked = NAN
-        if self._asked == self._asked:
-            off = self._asked - self._root if self._root == self._root else NAN
-            self._root = self._asked if off != off else (
+            self._root = self._newest_root = NAN
+        if self._newest_root == self._newest_root:
+            off = self._newest_root - self._root if self._root == self._root else NAN
+            self._root = self._newest_root if off != off else (
                 self._root - off * math.expm1(-dt / _SPIN_UP))
         if len(rpm):
             self._speeds.take(t, rpm)

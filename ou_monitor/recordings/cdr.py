@@ -308,7 +308,7 @@ class FieldColumn(NamedTuple):
     counts: IntArray  # Values in each message: 1, unless the field is a block; shape (m,)
     # Values in SI units; NaN where missing or not finite; shape (counts.sum(),).
     values: FloatArray
-    # The second field in SI units; NaN where missing, not finite or not asked for; shape (m,).
+    # The second field in SI units; NaN where missing, not finite or not requested; shape (m,).
     beside: FloatArray
 
     @property

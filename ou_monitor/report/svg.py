@@ -161,7 +161,7 @@ class Plot:
     """
     One plot with two axes; sizes are in pixels, and screen readers read the title.
 
-    The legend stands beside the title, else in a row below it, else in the upper right of the
+    The legend is beside the title, else in a row below it, else in the upper right of the
     axes.  legend_low: in the lower left instead.  legend_row: never beside the title, so that
     plots side by side have axes of equal size.
     """

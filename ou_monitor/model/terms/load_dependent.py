@@ -27,9 +27,9 @@ class LoadDependentSigma(Term):
     ROLE: ClassVar[Role] = Role.DRIVE
     SIGNS: ClassVar[tuple[str, ...]] = ('variance throttle',)
     MEASURED: ClassVar[bool] = True
-    # Price of the search for a step's position.
+    # Penalty of the search for a step's position.
     SEARCH: ClassVar[float] = by_parameters(
-        0.0, lambda term: _STEP_PRICE if term.steps() else 0.0)
+        0.0, lambda term: _STEP_COST if term.steps() else 0.0)
     LIVE: ClassVar[bool] = True
     MEANING: ClassVar[str] = 'The noise grows or shrinks with throttle.'
     REMEDY: ClassVar[str] = (
@@ -81,27 +81,27 @@ class LoadDependentSigma(Term):
         if high - low < _APART:
             return ()
         bins = _binned(view.z[view.train] ** 2, u, np.linspace(low, high, _BINS + 1))
-        price = 0.5 * math.log(u.size)
+        penalty = 0.5 * math.log(u.size)
         forms = []
         inner = np.unique(np.quantile(u, np.linspace(0.05, 0.95, 91)))
         ends = _ends(view.throttle)
         steps = np.column_stack((inner - _EDGE, inner + _EDGE))
-        line, bent = _to_bins(bins, ends[None]), _greedy(bins, ends, price + _KNOT_PRICE, _APART)
+        line, bent = _to_bins(bins, ends[None]), _greedy(bins, ends, penalty + _KNOT_COST, _APART)
         for knots, factors, misfit in (
                 (ends, line[0][0], float(line[1][0])), bent,
                 *zip(steps, *_to_bins(bins, steps), strict=True)):
-            found = _STEP_PRICE if knots[-1] - knots[0] < 3.0 * _EDGE else (
-                _KNOT_PRICE * (knots.size - 2))
-            forms.append((misfit + price * knots.size + found, knots, factors))
+            found = _STEP_COST if knots[-1] - knots[0] < 3.0 * _EDGE else (
+                _KNOT_COST * (knots.size - 2))
+            forms.append((misfit + penalty * knots.size + found, knots, factors))
         forms.sort(key=lambda form: form[0])
         return [cls(tuple(knots.tolist()), tuple((factors - factors[0]).tolist()))
                 for _, knots, factors in forms[:2]]
 
 
-# Price of the search for the edge of a step, nats: ln of the edges tried.
-_STEP_PRICE = 4.5
-# Price of the search for a knot, nats; number of bins, minimum scores in a bin, maximum knots.
-_KNOT_PRICE = 3.5
+# Penalty of the search for the edge of a step, nats: ln of the edges tried.
+_STEP_COST = 4.5
+# Penalty of the search for a knot, nats; number of bins, minimum scores in a bin, maximum knots.
+_KNOT_COST = 3.5
 _BINS, _IN_BIN, _MOST_KNOTS = 40, 20, 9
 # Largest logarithm of a factor; nothing else limits it where white noise hides the rail.
 _MOST = 4.0
@@ -155,9 +155,9 @@ def _to_bins(bins: Bins, knots: FloatArray) -> tuple[FloatArray, FloatArray]:
     return factors, 0.5 * (left * left) @ weight
 
 
-def _greedy(bins: Bins, knots: FloatArray, price: float, apart: float
+def _greedy(bins: Bins, knots: FloatArray, penalty: float, apart: float
             ) -> tuple[FloatArray, FloatArray, float]:
-    """Add the best knot while it gains `price`; return knots, factors and misfit, nats."""
+    """Add the best knot while it gains `penalty`; return knots, factors and misfit, nats."""
     factors, misfit = _to_bins(bins, knots[None])
     found = knots, factors[0], float(misfit[0])
     while found[0].size < _MOST_KNOTS:
@@ -167,7 +167,7 @@ def _greedy(bins: Bins, knots: FloatArray, price: float, apart: float
             break
         factors, misfit = _to_bins(bins, np.array(tried))
         best = int(np.argmin(misfit))
-        if found[2] - misfit[best] < price:
+        if found[2] - misfit[best] < penalty:
             break
         found = tried[best], factors[best], float(misfit[best])
     return found
@@ -218,8 +218,8 @@ _FAST, _SLOW = 0.03, 0.2
 # last 30 and 200 ms; and decaying sums of its rises and of its falls.
 INPUTS = (('throttle', 0.0), ('fast', _FAST), ('step', 0.0), ('slow', _SLOW), *(
     (what, span) for span in (0.1, 0.5, 2.5) for what in ('rises', 'falls')))
-# Price of choosing an input, nats: ln of their number.
-_INPUT_PRICE = math.log(len(INPUTS))
+# Penalty of choosing an input, nats: ln of their number.
+_INPUT_COST = math.log(len(INPUTS))
 # Minimum share of white noise in the one-step errors; below it, it cannot be separated.
 _LEAST_WHITE = 0.05
 # Quantiles between the bins of an input, dense at the top because most changes are zero.
@@ -250,12 +250,12 @@ def _curve(square: FloatArray, x: FloatArray, shares: FloatArray, log: FloatArra
         count = count / max(0.5 * float(np.mean(alike**2) / np.mean(alike)**2) - 0.5, 1.0)
     flat = 0.0 if centre.size < 2 else float(np.sum(
         count * (values - np.average(values, weights=count)) ** 2))
-    price = 0.5 * math.log(x.size)
-    if flat < price + _INPUT_PRICE:
+    penalty = 0.5 * math.log(x.size)
+    if flat < penalty + _INPUT_COST:
         return None
     knots, factors, misfit = _greedy((centre, values, count), centre[[0, -1]],
-                                     price + _KNOT_PRICE, _SPACING * float(np.ptp(centre)))
-    if flat - misfit < price * (knots.size - 1) + _KNOT_PRICE * (knots.size - 2) + _INPUT_PRICE:
+                                     penalty + _KNOT_COST, _SPACING * float(np.ptp(centre)))
+    if flat - misfit < penalty * (knots.size - 1) + _KNOT_COST * (knots.size - 2) + _INPUT_COST:
         return None
     return knots, np.clip(factors - factors[0], -_MOST, _MOST)
 
@@ -277,9 +277,9 @@ class LoadDependentNoise(Term):
     ROLE: ClassVar[Role] = Role.DRIVE
     SIGNS: ClassVar[tuple[str, ...]] = ('variance throttle', 'variance change')
     MEASURED: ClassVar[bool] = True
-    # Price of the search for inputs and knots.
+    # Penalty of the search for inputs and knots.
     SEARCH: ClassVar[float] = by_parameters(0.0, lambda term: sum(
-        _KNOT_PRICE * (values.size - 2) + _INPUT_PRICE for _, values in term.curves().values()))
+        _KNOT_COST * (values.size - 2) + _INPUT_COST for _, values in term.curves().values()))
     APART: ClassVar[int] = by_parameters(0, lambda term: len(term.at) - len(set(term.number)))
     CHANGES: ClassVar[type[Term] | None] = MeasurementNoise
     MEANING: ClassVar[str] = (

@@ -14,7 +14,7 @@ from ou_monitor.model.terms.segment import Effect, Segment, Stage
 from ou_monitor.model.terms.term import by_parameters, NEXT_TO_ZERO, parameter, Role, Term
 
 
-# Evidence needed for a growth beyond the price of its parameter, nats: as much as for a cause.
+# Evidence needed for a growth beyond the penalty of its parameter, nats: as much as for a cause.
 # Without it, a growth was found in 5 of 72 simulated flights with a steady sag; with it, in none.
 _GROWS = 6.0
 

@@ -49,9 +49,9 @@ class NonlinearRestoring(Term):
         """Regress the innovations on the square, the cube, or both, of the previous deviation."""
         found = [fit for powers in ((2,), (3,), (2, 3))
                  if (fit := cls._regressed(view, powers)) is not None]
-        price = 0.5 * math.log(view.train.stop)
+        penalty = 0.5 * math.log(view.train.stop)
         return max(found, default=None,
-                   key=lambda fit: float(fit.gain[view.train].sum()) - price * fit.free)
+                   key=lambda fit: float(fit.gain[view.train].sum()) - penalty * fit.free)
 
     @classmethod
     def _regressed(cls, view: View, powers: tuple[int, ...]) -> LawFit | None:

@@ -262,8 +262,8 @@ def bad_samples(view: View, share: float, spread: float, lengths: FloatArray
             run += power * z[first + j]
             weight += power * power
             before += z[first + j] ** 2
-        price = width * size - math.log(share * lengths[width - 1])
-        gain = 0.5 * (before - run * run / weight) - price
+        penalty = width * size - math.log(share * lengths[width - 1])
+        gain = 0.5 * (before - run * run / weight) - penalty
         good = np.flatnonzero(gain > 0.0)
         begins.append(first[good])
         ends.append(first[good] + width)

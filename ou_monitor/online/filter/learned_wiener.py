@@ -221,9 +221,9 @@ class LearnedWiener:
         shares, turn = np.linalg.eigh(inverse @ (self._power + floor) @ inverse.T)
         # Factor on a share: 1 plus its relative sampling error.
         unsure = 1.0 + math.sqrt(2.0 * self._squares) / self._sum
-        believed = min(max(float(shares[0]) * unsure, _LEAST), self._most)
-        grown = (root @ turn) * np.sqrt(np.maximum(shares - believed * unsure, 0.0))
-        root = np.linalg.cholesky(believed * (noise + floor))
+        scale = min(max(float(shares[0]) * unsure, _LEAST), self._most)
+        grown = (root @ turn) * np.sqrt(np.maximum(shares - scale * unsure, 0.0))
+        root = np.linalg.cholesky(scale * (noise + floor))
         inverse = np.linalg.inv(root)
         part = inverse @ grown
         shares, turn = np.linalg.eigh(part @ part.T)

@@ -291,10 +291,10 @@ class AdaptiveLowPass:
         self._x = 0.0
         self._raw = self._offset = 0.0
         self._out = NAN
-        self._asked: tuple[float, ...] | None = None
+        self._law_inputs: tuple[float, ...] | None = None
         self._wanted = NAN
         # Mean interval at the last evaluation of the law, s.
-        self._interval_asked = 0.0
+        self._law_interval = 0.0
 
     @property
     def settings(self) -> FilterSettings:
@@ -389,7 +389,7 @@ class AdaptiveLowPass:
         other = settings.of_voltage != self._settings.of_voltage
         self._settings = settings
         self._control.configure(settings)
-        self._asked = None
+        self._law_inputs = None
         if settings.law != 'kalman' or other:
             self._kalman, self._before, self._known = None, None, False
         elif self._kalman is not None:
@@ -476,7 +476,7 @@ class AdaptiveLowPass:
             if self._settings.law == 'kalman':
                 # The lag is unknown before the first step.
                 self._start_kalman(x, sigma, level)
-            self._control.update(self._ask(sigma, alpha, throttle, 0.0), error, 0.0, 0.0)
+            self._control.update(self._law_cutoff(sigma, alpha, throttle, 0.0), error, 0.0, 0.0)
             self._state.y = self._raw = self._out = 0.0 if derivative else x
             self._t, self._x = t, x
             return self._out
@@ -497,7 +497,7 @@ class AdaptiveLowPass:
             about = (level if abs(level) < LARGEST else NAN, level_se)
             self._run_kalman(dt, interval, x, sigma, error, alpha, about)
         cutoff = self._control.update(
-            self._ask(sigma, alpha, throttle, interval), error, dt, interval)
+            self._law_cutoff(sigma, alpha, throttle, interval), error, dt, interval)
         angle = _TWO_PI * cutoff * dt
         start, end = self._x, x
         if derivative:
@@ -550,20 +550,20 @@ class AdaptiveLowPass:
             self._offset += self._state.y - self._kalman.y if known else (
                 self._kalman.y - self._state.y)
 
-    def _ask(self, sigma: float, alpha: float, throttle: float, interval: float) -> float:
+    def _law_cutoff(self, sigma: float, alpha: float, throttle: float, interval: float) -> float:
         """Return the wanted cutoff of the law, evaluated again only if an input has changed."""
         s = self._settings
         if s.law == 'kalman':
             return self._of_its_lag()
         # Jitter of the stamps needs no new search.
-        if abs(interval - self._interval_asked) > _MOVED * self._interval_asked:
-            self._interval_asked = interval
+        if abs(interval - self._law_interval) > _MOVED * self._law_interval:
+            self._law_interval = interval
         # Replace NaN, which never equals itself.
-        asked = (*(one if one == one else math.inf for one in (sigma, alpha, throttle)),
-                 self._interval_asked)
-        if asked != self._asked:
-            self._wanted = wanted_cutoff(s, sigma, alpha, throttle, self._interval_asked)
-            self._asked = asked
+        inputs = (*(one if one == one else math.inf for one in (sigma, alpha, throttle)),
+                 self._law_interval)
+        if inputs != self._law_inputs:
+            self._wanted = wanted_cutoff(s, sigma, alpha, throttle, self._law_interval)
+            self._law_inputs = inputs
         return self._wanted
 
     def _of_its_lag(self) -> float:

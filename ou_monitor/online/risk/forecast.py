@@ -5,10 +5,10 @@ Methods: `first_passage` (the OU in the window, at the present throttle), `load`
 to the pilot's future throttle, half the excursions), and `excursions` (the drops of this flight,
 used alone if the load is unknown).  First passage and the other method are averaged, weighted by
 how well each predicted the lowest voltages of completed horizons (Bayes, with forgetting).  Each
-law is mixed with a wider one, whose weight is the share of horizons in which the law was wrong:
-first passage with the excursions; the risk for a given throttle with a law as wide as the
-excursions, but at most `_WIDEST` times its own width (excursions include punches, which say
-nothing about idling), or as wide as these horizons fell short of the law, in its deviations.
+law is mixed with a wider one, whose weight is the share of horizons in which the law was wrong.
+For first passage the wider law is the excursions.  For a given throttle it is as wide as the
+excursions, but at most `_WIDEST` times the law (excursions include punches, which say nothing
+about idling), or wider if the voltage in those horizons was farther below the law's mean.
 
 The law learned in flight, from completed horizons: (lowest - start) / s = b0 + b1 (mu - start) / s
 + k e, with mean mu and deviation s of `lowest`, by least squares with forgetting; e has Student's
@@ -59,14 +59,14 @@ _PRECISION = (_BIAS ** -2, 0.0, _GAIN ** -2)
 MEMORY, _LARGEST, _HUBER = 120.0, 36.0, 3.0
 # Error of the model as a share of the drop.
 _SHARE = 0.1
-# Maximum first widening of a law: chosen on gecko, nazgul, roma, bf3s, erle, cf_solo (2 to 6
+# Maximum initial widening of a law: chosen on gecko, nazgul, roma, bf3s, erle, cf_solo (2 to 6
 # tried).
 _WIDEST = 4.0
-# Horizons for which it counts, beside those that were missed in flight (chosen on gecko, frc_ol_1
-# and cf_solo; 1 and 4 tried).
+# Weight of the initial width, in horizons, when it is averaged with the misses of this flight
+# (chosen on gecko, frc_ol_1 and cf_solo; 1 and 4 tried).
 _FIRST = 4.0
-# Horizons that initially count as agreeing with the conditional law: chosen on these, hiro,
-# cf_pair, cf_bl00, frc_ol_1 and euc_1 (1, 4, 9 and 19 tried).
+# Horizons that initially count as agreeing with the law for a given throttle: chosen on the
+# recordings of `_WIDEST`, hiro, cf_pair, cf_bl00, frc_ol_1 and euc_1 (1, 4, 9 and 19 tried).
 _AGREE = 4.0
 
 
@@ -492,7 +492,7 @@ class Forecast:
         if now <= voltage:
             return np.ones(u.shape)
         risk = np.zeros(u.shape)
-        # A fall within a shorter horizon is one within this horizon, and has been seen more often.
+        # A fall within a shorter horizon is also within this one; shorter ones have more data.
         for within in _within(horizon):
             _, deviation, _ = self._flight(within)
             if state is None or math.isnan(deviation) or math.isnan(now):
@@ -547,7 +547,7 @@ def look_ahead(forecast: Forecast, load: SupplyLoad, settings: MonitorSettings, 
         why = '' if load.status is LoadStatus.NO_DATA else load.status.value if (
             not load.known) else 'Less than a second has been flown.'
         return Ahead(outcome, NAN, why, soon=soon)
-    # Less throttle falls no deeper; just after a large one, the law says so of idle.
+    # Less throttle is never riskier, but just after high throttle the law rates idle as riskier.
     risks = np.minimum.accumulate(risks[::-1])[::-1]
     budget, reason = throttle_budget(risks, forecast.flown[1], s.budget_limit)
     # The comparison is false for NaN.

@@ -139,7 +139,7 @@ def _frames(parser: Any, places: list[int], request: Request) -> tuple[FloatArra
             for frame in parser.frames():
                 if context.invalid_frame_count != invalid:
                     invalid, sound = context.invalid_frame_count, False
-                # A key frame stands alone; the others add to the one before them.
+                # A key frame is complete; the others are differences from the frame before.
                 sound = sound or frame.type == FrameType.INTRA
                 if sound:
                     rows.append(pick(frame.data))

@@ -213,7 +213,7 @@ class Extras:
 
 def choose_extras(path: Path, log: Log, *, imus: Sequence[str] = (),
                   signals: Sequence[str] = ()) -> Extras:
-    """Choose the default gyro or the one asked for, and the series named."""
+    """Choose the requested or the default gyro, and the named series."""
     notes: list[str] = []
     inertial: dict[str, Motion] = {}
     for one in _inertial(path, log, imus):
