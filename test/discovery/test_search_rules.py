@@ -214,8 +214,8 @@ def test_a_second_curve_must_add_a_tenth_of_the_first(name, price):
     """It must bring a tenth of what the other one explains."""
     # A rough fit of the table is a nat worse.
     fitter = Table({('measurement_noise',): 401.0})
-    assert rules._price(fitter, Model([BASE, NOISE, SIGMA], 500.0), name) == pytest.approx(price)
-    assert rules._price(fitter, Model([BASE], 0.0), 'load_dependent_noise') == decision.ACCEPT
+    assert rules._needed(fitter, Model([BASE, NOISE, SIGMA], 500.0), name) == pytest.approx(price)
+    assert rules._needed(fitter, Model([BASE], 0.0), 'load_dependent_noise') == decision.ACCEPT
 
 
 def test_an_accepted_trial_is_recorded_with_its_rivals():
