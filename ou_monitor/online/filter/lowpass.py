@@ -560,7 +560,7 @@ class AdaptiveLowPass:
             self._law_interval = interval
         # Replace NaN, which never equals itself.
         inputs = (*(one if one == one else math.inf for one in (sigma, alpha, throttle)),
-                 self._law_interval)
+                  self._law_interval)
         if inputs != self._law_inputs:
             self._wanted = wanted_cutoff(s, sigma, alpha, throttle, self._law_interval)
             self._law_inputs = inputs
