@@ -24,15 +24,11 @@ def test_telegraph_has_sigma_squared_c_squared_over_q(q, c):
 
 
 def test_the_printed_factor_is_refuted_by_simulation():
-    """
-    Stationary variance of 4000 switched paths over that of the two formulas.
-
-    The relative error of the sample variance is at most sqrt(2 / 4000) = 2.2 %
-    (a voltage between bounds has lighter tails than a Gaussian); at eps = 0.05
-    the exact variance is 0.1 % below the limit. Within 12 % of one means the
-    factor 2; the printed one puts the ratio at 2, forty errors off, so the
-    test tells them apart with power 1 to any digit.
-    """
+    """Stationary variance of 4000 switched paths over that of the two formulas."""
+    # The relative error of the sample variance is at most sqrt(2 / 4000) = 2.2 % (a voltage
+    # between bounds has lighter tails than a Gaussian); at eps = 0.05 the exact variance is 0.1 %
+    # below the limit. Within 12 % of one means the factor 2; the printed one puts the ratio at 2,
+    # forty errors off, so the test tells them apart with power 1 to any digit.
     u = TELEGRAPH.system().simulate(
         [0.0, 6.0], np.zeros(1), np.random.default_rng(21), eps=0.05, paths=4000,
         scaling='diffusion')[:, 1, 0]
@@ -43,11 +39,7 @@ def test_the_printed_factor_is_refuted_by_simulation():
 @pytest.mark.parametrize('frequency, duty, phases', [
     (24e3, 0.5, 1), (24e3, 0.3, 4), (48e3, 0.9, 8), (36e3, 0.05, 3)])
 def test_esc_noise_is_that_of_the_renewal_theorem(frequency, duty, phases):
-    """
-    sigma^2 = swing^2 [(1 - d)^2 Var(on) + d^2 Var(off)] / period.
-
-    The central limit theorem of alternating renewals, without any generator.
-    """
+    """sigma^2 = swing^2 [(1 - d)^2 Var(on) + d^2 Var(off)] / period."""
     chain, on = esc_chain(frequency, duty, phases)
     assert chain.stationary[on].sum() == pytest.approx(duty, rel=1e-12)
     starts = chain.stationary[-1] * chain.leaving[-1]
@@ -86,13 +78,10 @@ def test_sigma_is_the_intensity_of_the_diffusion_limit():
 
 
 def test_sigma_of_the_rail_follows_from_the_switching():
-    """
-    A switched rail simulated as it is: 24 kHz, alpha = 63 1/s, eps = 1.
-
-    After one millisecond the variance is that of the process, sigma^2 (1 -
-    exp(-2 alpha t)) / (2 alpha), less the memory of the chain; exact moments
-    on one side, 1000 paths of 48 jumps on the other.
-    """
+    """A switched rail simulated as it is: 24 kHz, alpha = 63 1/s, eps = 1."""
+    # After one millisecond the variance is that of the process, sigma^2 (1 - exp(-2 alpha t)) / (2
+    # alpha), less the memory of the chain; exact moments on one side, 1000 paths of 48 jumps on
+    # the other.
     chain, on = esc_chain(24e3, 0.4, 1)
     rail = SwitchedOU(63.0, chain, 900.0 * on)
     t, n = [0.0, 1e-3], 1000
@@ -106,14 +95,10 @@ def test_sigma_of_the_rail_follows_from_the_switching():
 
 
 def test_averaging_has_order_one_half():
-    """
-    First part, the order: rms of the largest error over [0, 1] goes as sqrt(eps).
-
-    The fitted slope has a standard error below 0.012 from 1000 paths at four
-    eps over a factor 16; what is beyond sqrt(eps) moves it by less than 0.02
-    (the exact root mean square at the end shows it). Order 0 or 1 is forty
-    errors away.
-    """
+    """First part, the order: rms of the largest error over [0, 1] goes as sqrt(eps)."""
+    # The fitted slope has a standard error below 0.012 from 1000 paths at four eps over a factor
+    # 16; what is beyond sqrt(eps) moves it by less than 0.02 (the exact root mean square at the
+    # end shows it). Order 0 or 1 is forty errors away.
     t, eps = np.linspace(0.0, 1.0, 26), np.array([0.08, 0.04, 0.02, 0.005])
     largest, final = averaging_convergence(
         PAPER, t, U0, eps, np.random.default_rng(10), 1000)

@@ -13,13 +13,10 @@ FLOOR = 'the voltage is at or below brownout.floor (4.3 V)'
 
 def heard(critical=(), lost=0, flags=None, stops=(), reason=FLOOR, counted=0, dropped=(),
           unsaid=(), backlog=0):
-    """
-    Return 20 s of states at 10 Hz; CRITICAL at some of them; one dip from 10 to 10.05 s.
-
-    `lost`: messages that did not reach the node; `backlog`: of those before, which came now;
-    `counted`: dips by its count; `dropped`, `unsaid`: times of states and flags that did not reach
-    the listener.
-    """
+    """Return 20 s of states at 10 Hz; CRITICAL at some of them; one dip from 10 to 10.05 s."""
+    # `lost`: messages that did not reach the node; `backlog`: of those before, which came now;
+    # `counted`: dips by its count; `dropped`, `unsaid`: times of states and flags that did not
+    # reach the listener.
     times = np.arange(0.0, 20.0, 0.1).round(3).tolist()
     states = [State(t, 'CRITICAL' if t in critical else 'OK', reason if t in critical else '',
                     'true' if t in critical else 'false',

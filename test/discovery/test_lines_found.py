@@ -58,13 +58,6 @@ def test_ringing_that_stands_out_on_both_sides_is_never_withdrawn():
     assert left(18.0, 6.0) == left(12.0, 6.0) == left(2.0, 6.0) == [0]
 
 
-def test_other_strong_causes_may_be_withdrawn():
-    """Only lines stay for their size: withdrawn is withdrawn."""
-    samples = Samples(T, voltage(Tone(0.2, 13.0, 0.5, 0.0)), None)
-    whole = fit_composite(samples, [RAIL, Tone(0.0, 13.0, 0.0, 0.0)], slice(0, samples.n))
-    assert _in_doubt(samples, replace(whole), ['second_relaxation'], [0]) == [0]
-
-
 @pytest.mark.parametrize('damping, other', [(2.0, []), (60.0, [0])])
 def test_ringing_that_dies_out_before_it_turns_is_something_else(damping, other):
     """5 Hz turn in 0.2 s: a damping of 2 /s lets it ring, 60 /s do not."""
@@ -75,13 +68,10 @@ def test_ringing_that_dies_out_before_it_turns_is_something_else(damping, other)
     assert _other(Fitter(samples), whole, ['resonance']) == other
 
 
-@pytest.mark.parametrize('seed', range(10))
+@pytest.mark.parametrize('seed', range(5))
 def test_a_line_many_widths_wide_is_a_tone_in_spite_of_outliers(seed):
-    """
-    A line 9 Hz wide turns its phase eight times in 0.9 s, so no pure tone fits it.
-
-    Eight turns determine the logarithm of the width to 1/sqrt(8), with three errors to 1.06.
-    """
+    """A line 9 Hz wide turns its phase eight times in 0.9 s, so no pure tone fits it."""
+    # Eight turns determine the logarithm of the width to 1/sqrt(8), with three errors to 1.06.
     t = np.arange(900) / 1000.0
     model = SupplyModel((OU(9650.0, 14.3, 4.1), Tone(0.2, 241.4, 0.0, 9.0), HeavyTails(2.9)))
     found = discover(Recording(t, model.simulate(t, np.random.default_rng(seed))))

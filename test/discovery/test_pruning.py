@@ -104,14 +104,6 @@ def test_the_worst_goes_first_and_the_others_are_measured_again(monkeypatch):
     assert [worth.gain for worth in found.worth] == [0.5]
 
 
-def test_after_four_rounds_what_is_left_stays(monkeypatch):
-    """Even if it fails."""
-    names = ['drift', 'tone', 'measurement_noise', 'second_relaxation']
-    bad = dict.fromkeys(names, (-0.1, 0.9))
-    found = run(monkeypatch, [bad] * 4, names)
-    assert len(found.names) == 1 and len(found.out) == 3
-
-
 @pytest.mark.parametrize('full, less, gains, out', [
     (0.0, (0.0, 0.0), (0.1, 0.2), None), (1.0, (0.0, 1.0), (0.2, 0.1), 0),
     (1.0, (1.0, 0.0), (0.1, 0.2), 1), (1.0, (0.0, 0.0), (0.2, 0.1), 1),

@@ -5,8 +5,6 @@ import math
 from types import SimpleNamespace
 
 import numpy as np
-from numpy.testing import assert_allclose
-from ou_monitor.criticism.composite import fit_composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import decision, fitting, named as rules_of_names, search as rules
 from ou_monitor.discovery.fitting import Fitter, Trial
@@ -16,11 +14,10 @@ from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_dependent import LoadDependentNoise, LoadDependentSigma
 from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.reading import LopsidedNoise, MeasurementNoise
+from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.slow import Drift, SecondRelaxation
 from ou_monitor.model.terms.tones import Tone
 import pytest
-from scipy.signal import lfilter
 
 BASE = OU(50.0, 0.5, 5.0)
 NOISE, SLOW = MeasurementNoise(0.01), SecondRelaxation(3.0, 0.1)
@@ -113,11 +110,6 @@ def test_responses_of_the_mean_are_left_to_the_regression():
     assert fitter.asked == [] and search.accepted == ['load_sag']
 
 
-def trial(name, evidence, *terms):
-    """Return a trial."""
-    return Trial(name, Model([BASE, *terms], 10.0 + evidence), evidence)
-
-
 def test_the_best_first_estimates_are_fitted_in_full():
     """Those that gain at least half as much as the best; what a full fit makes worse stays."""
     kinds = {MeasurementNoise: NOISE, LoadDependentSigma: SIGMA, Drift: Drift(0.1, 0.0)}
@@ -186,28 +178,6 @@ def test_starts_are_ordered_by_the_scores_they_explain():
             [drift] if gain < 0.5 * price else [line, drift])
 
 
-def test_a_law_is_fitted_once_to_the_same_scores(monkeypatch):
-    """To others it is fitted again; what cannot be fitted is known as well."""
-    made = []
-    monkeypatch.setattr(LopsidedNoise, 'fit_law', classmethod(
-        lambda cls, view: made.append(view) or (None if view.z[0] else SimpleNamespace())))
-    fitter = Fitter(SimpleNamespace(n=9))
-    one, same, other = (SimpleNamespace(z=np.full(9, z)) for z in (0.0, 1e-9, 1.0))
-    found = fitter.law_fit(LopsidedNoise, one)
-    assert fitter.law_fit(LopsidedNoise, same) is found is not None and made == [one]
-    assert [fitter.law_fit(LopsidedNoise, other) for _ in range(2)] == [None, None]
-    assert made == [one, other]
-    assert fitter.law_fit(LopsidedNoise, one) is not found and made == [one, other, one]
-
-
-def test_the_nth_cause_of_a_kind_is_its_nth_term():
-    """The n-th of a kind is the n-th of the model."""
-    tones = [Tone(0.01, 10.0 * k, 0.0, 0.0) for k in (1, 2)]
-    model = Model([BASE, tones[0], NOISE, tones[1]], 0.0)
-    names = ['tone', 'measurement_noise', 'tone']
-    assert [rules.position(model, names, k) for k in range(3)] == [1, 2, 3]
-
-
 @pytest.mark.parametrize('name, price', [
     ('load_dependent_noise', 10.0), ('drift', 6.0), ('load_dependent_sigma', 6.0)])
 def test_a_second_curve_must_add_a_tenth_of_the_first(name, price):
@@ -249,32 +219,6 @@ def test_starts_that_the_spectrum_moved_the_same_way_are_one(monkeypatch):
     # 4 does not hold, 2 went the way of 1, and 5 gains less than any price.
     assert asked == [(1.0, True, True), (3.0, True, True)]
     assert found.terms[-1].alpha == 1.0
-
-
-def test_no_statistic_admits_a_cause():
-    """White noise that no score is a sign of is found by what it gains."""
-    t = np.arange(4000) * 1e-2
-    voltage = SupplyModel((OU(3.0, 0.1, 5.0), MeasurementNoise(0.01))).simulate(
-        t, np.random.default_rng(3))
-    samples = Samples(t, voltage, None)
-    plain = fit_composite(samples, [OU(3.0, 0.1, 5.0)], samples.train)
-    (found,) = Fitter(samples).trials(plain, [MeasurementNoise], lambda model: {})
-    assert found.name == 'measurement_noise' and found.evidence > decision.ACCEPT
-    assert found.composite.terms[1].std == pytest.approx(0.01, rel=0.15)
-
-
-def test_fits_add_up_their_cost():
-    """Each counts, of the first part or of everything; a fit that fails costs nothing."""
-    rng = np.random.default_rng(1)
-    keep = math.exp(-0.05)
-    v = 5.0 + lfilter([0.01 * math.sqrt(1.0 - keep**2)], [1.0, -keep],
-                      rng.standard_normal(2000))
-    fitter = Fitter(Samples(np.arange(2000) * 1e-3, v, None))
-    start = [OU(50.0, 0.1, 5.0)]
-    one = fitter.fit(start, None)
-    assert one.cost > 0.0 and fitter.cost == one.cost
-    two = fitter.whole(one)
-    assert_allclose(fitter.cost, one.cost + two.cost)
 
 
 def test_a_cause_that_was_removed_again_is_not_accepted_twice(monkeypatch):

@@ -77,19 +77,15 @@ RAILS = {'lopsided_noise': {'sigma': 1e-4}}
 LAGS, BLOCK = 10, 500
 # Statistics of `deviations`, recordings that must pass, and the chance that one
 # of all of these is off though nothing is wrong.
-STATISTICS, RECORDINGS, CHANCE = 2 * LAGS + 7, 2 * len(LAWS) + len(GAUSSIAN), 1e-3
+STATISTICS, RECORDINGS, CHANCE = 2 * LAGS + 7, len(LAWS) + len(GAUSSIAN), 1e-3
 LIMIT = -float(ndtri(0.5 * CHANCE / (STATISTICS * RECORDINGS)))
 
 
 def deviations(z, state):
-    """
-    Return statistics that are N(0, 1), nearly, for n independent scores N(0, 1).
-
-    `state` is the deviation from the mean one sample before each score.
-
-    Var z = 1, Var z^2 = 2, Var z^4 = 96; a correlation has the variance 1/n; the
-    sum of m squares of block means is chi-square, of variance 2 m.
-    """
+    """Return statistics that are N(0, 1), nearly, for n independent scores N(0, 1)."""
+    # `state` is the deviation from the mean one sample before each score.
+    # Var z = 1, Var z^2 = 2, Var z^4 = 96; a correlation has the variance 1/n; the sum of m
+    # squares of block means is chi-square, of variance 2 m.
     n, square = z.size, (z * z - 1.0) / math.sqrt(2.0)
     found = {'mean': math.sqrt(n) * z.mean(), 'variance': math.sqrt(n) * square.mean(),
              'kurtosis': math.sqrt(n / 96.0) * float(np.mean(z**4) - 3.0)}
@@ -193,10 +189,9 @@ def test_a_wrong_parameter_shows(name, wrong):
 
 
 @pytest.mark.parametrize('name', LAWS)
-@pytest.mark.parametrize('seed', [11, 12])
-def test_scores_of_the_right_law_are_white(name, seed):
+def test_scores_of_the_right_law_are_white(name):
     """With the law that was simulated, independent N(0, 1)."""
-    fit, plain, state = law_fitted(name, LAWS[name], seed)
+    fit, plain, state = law_fitted(name, LAWS[name], 11)
     statistic, value = worst(fit.z, state)
     assert abs(value) < LIMIT, statistic
     # Without it they are not, and the law that makes them so gains more than its parameters cost.
@@ -253,13 +248,10 @@ def test_sigma_may_go_where_the_fit_has_not_been():
 
 @pytest.mark.parametrize('run', [1, 2, 3])
 def test_bad_samples_are_found_and_not_their_neighbours(run):
-    """
-    Runs of samples off by one error of 12 steps, singly and in twos and threes.
-
-    To leave out the right ones explains some 100 nats or more, give or take 14,
-    and costs 15 at the most.  A good sample is left out where one chi-square of one
-    degree is above twice 7.8 nats (price of its prior and size): 8e-5 of them.
-    """
+    """Runs of samples off by one error of 12 steps, singly and in twos and threes."""
+    # To leave out the right ones explains some 100 nats or more, give or take 14, and costs 15 at
+    # the most. A good sample is left out where one chi-square of one degree is above twice 7.8
+    # nats (price of its prior and size): 8e-5 of them.
     rng = np.random.default_rng(run)
     samples, (ou, _) = simulated('glitches', {'probability': 0.0, 'std': 0.1}, 11)
     first = np.flatnonzero(rng.random(LENGTH) < 0.005)

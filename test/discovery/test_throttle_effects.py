@@ -5,10 +5,8 @@ import math
 import numpy as np
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.finding import throttle_effects
-from ou_monitor.discovery.pruning import refusal
 from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.shocks import Glitches
 import pytest
 
 N, RATE = 6000, 100.0
@@ -58,12 +56,3 @@ def test_without_a_response_to_throttle_there_is_no_effect():
     """Neither of a model without one, nor of a recording without throttle."""
     assert throttle_effects(flown(), (OU(1.0, 0.01, 15.0),), 14.5).words == ''
     assert throttle_effects(Samples(T, T, None), INRUSH, 14.5).words == ''
-
-
-def test_a_model_that_leaves_the_range_is_refused():
-    """Bad samples of 100 V were never seen; the same model without them passes."""
-    samples, ou = flown(*INRUSH), OU(1.0, 0.01, 15.0)
-    assert refusal(samples, (ou, *INRUSH), 0.1, 0.01) == ''
-    assert 'exceed the recorded range' in refusal(
-        samples, (ou, *INRUSH, Glitches(0.1, 100.0)), 0.1, 0.01)
-    assert 'predicts worse' in refusal(samples, (ou, *INRUSH), -0.1, 0.01)

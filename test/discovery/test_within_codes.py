@@ -51,12 +51,14 @@ def test_fine_codes_are_left_as_they_are():
     assert within_codes(samples, model, np.random.default_rng(0)) is samples
 
 
-@pytest.mark.parametrize('seed', [1, 2, 3])
-def test_rounding_names_no_cause(seed):
-    """Of a rail with a sag, under codes of eight moves."""
+@pytest.mark.parametrize('seed', [1, 2])
+def test_rounding_names_no_cause_and_keeps_the_sag(seed):
+    """Of a rail under codes of eight moves; the sag is within 4 errors as stated."""
     samples, _ = rounded(seed)
     found = discover(Recording(T, samples.logged, U, 'made'))
     assert {cause.name for cause in found.causes} == {'quantization', 'load_sag'}
+    at = next(k for k, term in enumerate(found.model.terms) if term.NAME == 'load_sag')
+    assert abs(found.model.terms[at].linear - 0.4) < 4.0 * found.se[at]['linear']
 
 
 def test_jumps_of_several_codes_are_found():
@@ -64,12 +66,3 @@ def test_jumps_of_several_codes_are_found():
     samples, _ = rounded(4, Jumps(1.0, -4.0 * STEP, STEP))
     found = discover(Recording(T, samples.logged, U, 'made'))
     assert {cause.name for cause in found.causes} == {'quantization', 'load_sag', 'jumps'}
-
-
-def test_the_model_has_the_parameters_of_the_rail():
-    """The load within 4 errors as stated, although the rail hides in its codes."""
-    samples, _ = rounded(5)
-    found = discover(Recording(T, samples.logged, U, 'made'))
-    at = next(k for k, term in enumerate(found.model.terms) if term.NAME == 'load_sag')
-    sag = found.model.terms[at]
-    assert abs(sag.linear - 0.4) < 4.0 * found.se[at]['linear']
