@@ -13,11 +13,8 @@ NARROWEST, WIDEST = 0.08, 2.0
 
 
 def bound(narrowest, highest):
-    """
-    Return how much larger than the input one notch can ever come out, whatever its sequence.
-
-    narrowest: least bandwidth over frequency; highest: most frequency over sample rate.
-    """
+    """Return how much larger than the input one notch can ever come out, whatever its sequence."""
+    # narrowest: least bandwidth over frequency; highest: most frequency over sample rate.
     g = math.tan(math.pi * highest)
     e = 2.0 * narrowest / (4.0 + narrowest * narrowest)
     p = np.array([[1.0, e], [e, 1.0]])

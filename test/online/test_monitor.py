@@ -36,13 +36,6 @@ def test_good_input_is_ok():
     assert float(report.fields['alpha']) == report.estimate.alpha
 
 
-def test_only_nan_is_said():
-    monitor = SupplyMonitor()
-    monitor.push([0.0, 0.1], [math.nan, math.inf])
-    report = monitor.report(0.0)
-    assert report.level is Level.STALE and '2 samples were NaN' in report.summary
-
-
 def test_slow_input_warns_and_has_a_rough_risk():
     monitor = SupplyMonitor()
     monitor.push(np.arange(3.0), [5.0, 5.1, 4.9])
@@ -60,25 +53,6 @@ def test_risk_levels_follow_the_parameters():
     warned = filled(brownout_voltage=4.83, brownout_warn=0.1,
                     brownout_critical=1.0, brownout_delay=0.0).report(0.0)
     assert warned.brownout is (warned.risk >= 1.0) and warned.level is not Level.OK
-
-
-def test_a_parameter_change_keeps_the_samples():
-    monitor = filled()
-    before = monitor.report(0.0).estimate
-    monitor.configure(MonitorSettings(brownout_voltage=4.0))
-    assert monitor.report(0.0).estimate == before
-    monitor.configure(MonitorSettings(window=1.0))
-    assert monitor.report(0.0).estimate.n == 1001
-    monitor.configure(MonitorSettings(window=5.0))
-    assert monitor.report(0.0).estimate.n == 1001
-
-
-def test_reset_is_counted_and_said():
-    monitor = filled()
-    monitor.reset('the clock jumped back by 3 s')
-    report = monitor.report(0.0)
-    assert report.estimate.counters.resets == 1 and 'jumped back' in report.summary
-    assert report.level is Level.STALE
 
 
 def test_distrusted_stamps_leave_the_floor():
@@ -129,19 +103,6 @@ def test_summary_says_why():
     assert report.fields['brownout_reason'] == report.flag.reason
 
 
-def test_held_after_a_dip():
-    """The rail is well again, the flag is still held, and says so; then it is not."""
-    # What has just gone down by 0.6 V may do so again, but below what warns.
-    feed = Feed(brownout_hold=5.0, window=1.0, brownout_warn=0.05, brownout_floor=4.3,
-                brownout_delay=0.0)
-    assert feed.feed(4.4).level is Level.ERROR
-    held = feed.feed(5.0, 3.0)
-    assert held.risk < 0.05 and held.level is Level.ERROR and held.brownout is True
-    assert 'held for brownout.hold (5 s)' in held.summary
-    well = feed.feed(5.0, 3.0)
-    assert well.level is Level.OK and well.brownout is False
-
-
 def test_a_reset_keeps_the_flag_and_forgets_the_samples():
     """Another time line: what was low there is not low here, but the hold goes on."""
     feed = Feed(brownout_hold=2.0, window=1.0)
@@ -164,13 +125,6 @@ def test_a_reset_forgets_what_the_floor_has_seen():
     assert monitor.report(0.0).brownout is None
 
 
-def test_floor_of_a_silent_source_does_not_decide():
-    monitor = SupplyMonitor(MonitorSettings(brownout_hold=0.0))
-    monitor.push([0.0, 0.001, 0.002], [4.2] * 3)
-    assert monitor.report(0.9).brownout is True
-    assert monitor.report(1.1).brownout is None
-
-
 def test_a_dip_is_told_though_the_source_is_silent_since():
     """A rail that dies takes its sensor with it, perhaps between two reports: told once."""
     monitor = SupplyMonitor(MonitorSettings(brownout_hold=0.0))
@@ -184,7 +138,7 @@ def test_a_dip_is_told_though_the_source_is_silent_since():
 
 
 @pytest.mark.parametrize('at, off', [(0.0, 30.0), (30.0, 3.0)], ids=['plugged', 'changed'])
-@pytest.mark.parametrize('size', [1, 20, 20_000])
+@pytest.mark.parametrize('size', [20, 20_000])
 def test_what_is_read_while_the_supply_is_off_teaches_nothing(at, off, size):
     """Started on USB before the pack is plugged, or a pack changed: the load is the flight's."""
     rng, rate = np.random.default_rng(1), 50
@@ -225,16 +179,6 @@ def test_samples_that_nobody_can_place_reach_the_floor():
     report = monitor.report(None, 1.0)
     assert report.brownout is True and report.estimate.counters.pushed == 0
     assert monitor.report(None, 1.1).brownout is None
-
-
-def test_floor_without_an_estimate():
-    """Five samples: no fit yet, and the risk knows only the newest ones."""
-    monitor = SupplyMonitor()
-    monitor.push([0.0, 0.001, 0.002, 0.003, 0.004], [4.2, 4.2, 4.2, 4.6, 4.6])
-    report = monitor.report(0.0)
-    assert math.isnan(report.risk) and not report.estimate.usable
-    assert report.level is Level.ERROR and report.brownout is True
-    assert 'brownout.floor (4.5 V)' in report.summary and 'within 5 s: unknown' in report.summary
 
 
 def test_silence_keeps_a_flag_that_is_set_for_the_hold():
@@ -381,31 +325,17 @@ def test_a_reset_of_time_keeps_the_sag(flight):
     assert float(after.sag(0.5)) == pytest.approx(float(before.sag(0.5)), rel=0.2)
 
 
-def test_what_needs_no_alpha_is_told_first(flight):
-    """Sag with its error, then why alpha is unknown; every number is a field."""
+def test_the_fields_have_the_numbers_of_the_load(flight):
     monitor = SupplyMonitor()
     monitor.push(*flight)
     report = monitor.report(0.0)
     sag, error = float(report.load.sag(1.0)), float(report.load.sag_se(1.0))
-    assert report.summary.startswith(f'Sag {sag:.1f} V at full throttle \u00b1 {error:.1f}, level')
-    assert report.summary.endswith(
-        'The relaxation is not visible at 50 Hz: only a higher rate can show it.')
     fields = report.fields
     assert fields['load_status'] == 'KNOWN' and fields['load_basis'] == 'THROTTLE'
     assert float(fields['sag']) == sag and float(fields['sag_se']) == error
     assert float(fields['load_level']) == report.load.level
     assert float(fields['load_noise']) == float(report.load.noise(report.estimate.throttle))
     assert fields['load_resistance'] == 'nan' and fields['load_delay'] == '0.0'
-
-
-def test_what_is_known_without_throttle_is_told():
-    """Level and noise first, then why the sag is not known."""
-    t = np.arange(0.0, 10.0, 0.02)
-    monitor = SupplyMonitor()
-    monitor.push(t, 16.0 + 0.05 * np.random.default_rng(1).standard_normal(t.size))
-    summary = monitor.report(0.0).summary
-    assert summary.startswith('Level 16.0') and 'Throttle is unknown' in summary
-    assert float(monitor.report(0.0).fields['load_noise']) == pytest.approx(0.05, rel=0.15)
 
 
 def test_fields_are_numbers_whatever_leg_they_stand_on(flight):

@@ -170,12 +170,3 @@ def test_the_account_adds_up(samples, block, throttle):
     assert c.non_finite == sum(kind in ('nan t', 'inf y') for kind, _ in samples)
     assert min(astuple(c)) >= 0
     assert e.n <= c.used
-
-
-def test_estimates_are_kept_until_something_is_pushed():
-    estimator = SlidingEstimator(2.0)
-    estimator.push(T, Y)
-    e = estimator.estimate()
-    assert estimator.estimate() is e
-    estimator.push(T[-1] + DT, 5.0)
-    assert estimator.estimate() is not e

@@ -46,13 +46,10 @@ def test_what_waits_for_the_rate_is_that_of_the_window(window, step, n):
 
 
 def test_trends_are_few_where_there_is_none_and_seen_where_there_is():
-    """
-    Measured: 5 % of random walks, 0.7 % of windows of six relaxations.
-
-    The limits are those, plus three standard errors of 400 windows.  A drift of 8
-    standard deviations is seen in 92 of 100 windows of 25 relaxations, less three
-    errors, and in 60 of 100 of 13, give or take three errors of 300.
-    """
+    """Measured: 5 % of random walks, 0.7 % of windows of six relaxations."""
+    # The limits are those, plus three standard errors of 400 windows. A drift of 8 standard
+    # deviations is seen in 92 of 100 windows of 25 relaxations, less three errors, and in 60 of
+    # 100 of 13, give or take three errors of 300.
     rng = np.random.default_rng(9)
     walks = LEVEL + np.cumsum(0.01 * rng.standard_normal((400, 200)), axis=1)
     drift = 8.0 * SIGMA / math.sqrt(2.0 * ALPHA)

@@ -21,11 +21,8 @@ def numbers(e):
 
 @pytest.mark.parametrize('moving', [False, True])
 def test_estimates_on_the_way_change_nothing(moving):
-    """
-    With 60 estimates on the way searches start warm.
-
-    Each stops where a step gains less than 1e-9 nats, 1e-4 standard errors.
-    """
+    """With 60 estimates on the way searches start warm."""
+    # Each stops where a step gains less than 1e-9 nats, 1e-4 standard errors.
     once, often = SlidingEstimator(2.0), SlidingEstimator(2.0)
     y = Y - 0.6 * U if moving else Y
     once.push(T, y, U if moving else None)
@@ -63,12 +60,9 @@ def test_the_window_is_as_long_as_asked(seconds):
 @settings(deadline=None, max_examples=25)
 @given(st.floats(0.01, 100.0), st.floats(-100.0, 100.0), st.floats(0.1, 10.0), st.booleans())
 def test_units_and_shifts(scale, shift, slower, moving):
-    """
-    Other volts, another level, another origin and unit of time.
-
-    Doubles at a level of 100 V leave 1e-12 of sums of squares, the search its
-    1e-4 standard errors (see above).
-    """
+    """Other volts, another level, another origin and unit of time."""
+    # Doubles at a level of 100 V leave 1e-12 of sums of squares, the search its 1e-4 standard
+    # errors (see above).
     n = 1500
     t, y = T[:n], Y[:n]
     u = None
@@ -109,11 +103,7 @@ def test_window_change_keeps_samples():
 
 
 def test_no_drift_and_bounded_memory():
-    """
-    Ten million samples at a level of 12 V, then against an estimator that is new.
-
-    Memory is what the window and one batch need.
-    """
+    """Ten million samples at a level of 12 V, then against an estimator that is new."""
     rng = np.random.default_rng(52)
     y = 12.0 + 0.05 * paths(rng, 1, 10_000)[0]
     t = stamps(10_000)

@@ -32,11 +32,8 @@ def exact(t, y, x):
 @given(st.integers(0, 10 ** 6), st.floats(-1.0, 5.0), st.floats(-6.0, 4.0),
        st.integers(1, 3))
 def test_value_is_that_of_dense_matrices(seed, log_alpha, log_share, p):
-    """
-    Any parameters, any stamps, any regressors: value, scale, beta, its covariance.
-
-    The dense matrix has condition up to 1e6 here, so 1e-8 is what doubles leave.
-    """
+    """Any parameters, any stamps, any regressors: value, scale, beta, its covariance."""
+    # The dense matrix has condition up to 1e6 here, so 1e-8 is what doubles leave.
     t, y, x = made(seed, n=60)
     x = x[:, :p]
     likelihood = likelihood_of(t, y, x)
@@ -90,12 +87,9 @@ def test_optimum_is_that_of_dense_matrices(seed, noise):
 
 
 def test_value_is_that_of_a_kalman_filter():
-    """
-    Integrate the level out of the Kalman filter's likelihood, numerically.
-
-    Restricted likelihood is the integral over a flat prior of the level; the
-    Gaussian integrand is summed exactly enough with 41 points over +-8 sd.
-    """
+    """Integrate the level out of the Kalman filter's likelihood, numerically."""
+    # Restricted likelihood is the integral over a flat prior of the level; the Gaussian integrand
+    # is summed exactly enough with 41 points over +-8 sd.
     t, y, x = made(3)
     fit = exact(t, y, x[:, :1])
     sd = math.sqrt(fit.beta_cov[0, 0])

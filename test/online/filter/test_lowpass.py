@@ -14,29 +14,11 @@ NAN = math.nan
 BOUND = {1: 1.0, 2: 1.0 / math.tanh(0.5 * math.pi)}
 
 
-def fixed(order, fc, **more):
-    """Return a filter whose cutoff cannot move from fc."""
-    return AdaptiveLowPass(order=order, law='threshold', fmin=fc * 0.999999, fmax=fc,
-                           fallback=fc, smoothing=0.0, sigma_ref=1.0, **more)
-
-
 def warm(seed=0, **options):
     """Return a filter after 100 samples of noise at 1 kHz, and its last output."""
     f = AdaptiveLowPass(**options)
     x = np.random.default_rng(seed).standard_normal(100)
     return f, float(f.filter(np.arange(100) * 1e-3, x, 0.5)[-1])
-
-
-@pytest.mark.parametrize('mode', ['lowpass', 'derivative'])
-@pytest.mark.parametrize('order', [1, 2])
-def test_irregular_steps_equal_fine_steps(order, mode):
-    """A line over one long step is the same as over many short ones."""
-    coarse, fine = fixed(order, 40.0, mode=mode), fixed(order, 40.0, mode=mode)
-    for f in (coarse, fine):
-        f.filter(0.0, 1.0, 0.0)
-    t = np.arange(1, 101) * 1e-4
-    assert coarse.filter(0.010, -0.3, 0.0) == pytest.approx(
-        fine.filter(t, 1.0 - 130.0 * t, 0.0)[-1], rel=1e-9)
 
 
 @pytest.mark.parametrize('order', [1, 2])
@@ -50,12 +32,9 @@ def test_a_ramp_has_its_slope(order):
 @pytest.mark.parametrize('mode', ['lowpass', 'derivative'])
 @pytest.mark.parametrize('order', [1, 2])
 def test_the_cutoff_may_jump_at_every_sample(order, mode):
-    """
-    Sigma alternates so that the cutoff goes between 20 and 150 Hz; the output does not jump.
-
-    Over a step of 1 us, 2 pi fc dt is below 1e-3: the output moves by less than
-    that times what separates it from its input, whatever the cutoff was before.
-    """
+    """Sigma alternates so that the cutoff goes between 20 and 150 Hz; the output does not jump."""
+    # Over a step of 1 us, 2 pi fc dt is below 1e-3: the output moves by less than that times what
+    # separates it from its input, whatever the cutoff was before.
     f = AdaptiveLowPass(mode=mode, order=order, smoothing=0.0, slew=0.0, dead_band=0.0)
     rng = np.random.default_rng(3)
     t, x = 0.0, 0.0
@@ -340,22 +319,3 @@ def test_a_relaxation_rate_is_used_within_the_range_of_the_parameter(alpha, used
     assert (got.tolist() == at_default.tolist()) is not used
     if used:
         assert got.tolist() == AdaptiveLowPass(**options, alpha=alpha).filter(t, x, 0.3).tolist()
-
-
-@pytest.mark.parametrize('options, good', [
-    ({'fmin': 0.001, 'fmax': 0.0015, 'fallback': 0.001}, True),
-    ({'fmin': 0.00099, 'fmax': 1.0, 'fallback': 1.0}, False),
-    ({'fmin': 9e5, 'fmax': 1e6, 'fallback': 1e6}, True),
-    ({'fmin': 9e5, 'fmax': 1.001e6, 'fallback': 1e6}, False),
-    ({'lag_frequency': 0.001}, True), ({'lag_frequency': 0.00099}, False),
-    ({'lag_frequency': 1e6}, True), ({'lag_frequency': 1.001e6}, False),
-    ({'alpha': 1e-6}, True), ({'alpha': 0.99e-6}, False),
-    ({'alpha': 1e9}, True), ({'alpha': 1.001e9}, False),
-    ({'sigma_ref': 1e-9}, True), ({'sigma_ref': 0.99e-9}, False)])
-def test_frequencies_and_rates_may_be_within_their_ranges(options, good):
-    """1 mHz to 1 MHz; 1e-6 to 1e9 1/s; fmin below fmax."""
-    if good:
-        assert AdaptiveLowPass(**options).settings == FilterSettings(**options)
-    else:
-        with pytest.raises(ValueError, match=next(iter(options)) + '|fmax'):
-            AdaptiveLowPass(**options)

@@ -126,19 +126,3 @@ def test_any_number_on_the_topics_gives_a_finite_output(samples):
         y = f.step(t, x, sigma, NAN, alpha, NAN, level, level_se)
         assert math.isfinite(y)
         assert 0.0 < f.cutoff < math.inf and not f.phase_lag > 180.0
-
-
-def test_a_change_of_parameters_holds_from_the_next_sample_on():
-    """The estimate goes on; gain and steps are those of the new white noise."""
-    t, x = 1e-3 * np.arange(600), recording()[1]
-    sigma = np.full(600, 0.6)
-    changed, other = made(), made()
-    for one in (changed, other):
-        one.filter(t[:300], x[:300], sigma[:300], alpha=63.0, level=5.0)
-    changed.configure(n0=(5.0 * WHITE) ** 2 / 1000.0)
-    y = changed.filter(t[300:], x[300:], sigma[300:], alpha=63.0, level=5.0)
-    before = other.filter(t[300:], x[300:], sigma[300:], alpha=63.0, level=5.0)
-    # The new filter from the same state: it forgets where it was within some samples.
-    new = made(n0=(5.0 * WHITE) ** 2 / 1000.0).filter(t, x, sigma, alpha=63.0, level=5.0)[300:]
-    assert np.abs(y - before)[100:].max() > 0.05
-    assert y[100:] == pytest.approx(list(new[100:]), abs=1e-6)

@@ -243,11 +243,7 @@ options = st.fixed_dictionaries({
 @given(options, events)
 @hypothesis_settings(max_examples=200, deadline=None)
 def test_whatever_happens_it_is_never_silently_fine(changes, happened):
-    """
-    Never OK, and never false, while the risk is unknown; CRITICAL while it must be.
-
-    Time steps back and forth, data stop, the voltage passes the floor, it is cleared.
-    """
+    """Never OK, and never false, while the risk is unknown; CRITICAL while it must be."""
     flag = made(**changes)
     t, known = 0.0, -math.inf
     for step, risk, fresh, voltage, clear in happened:

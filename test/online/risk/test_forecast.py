@@ -167,12 +167,9 @@ def _flown():
 
 
 def test_flying_at_the_budget_dips_as_often_as_told():
-    """
-    400 flights from the same pack at a budget of 10 %, held for the horizon.
-
-    0.05 of throttle is 0.1 V, more than two deviations of the noise: less than 10 % dip below the
-    budget, more above it.
-    """
+    """400 flights from the same pack at a budget of 10 %, held for the horizon."""
+    # 0.05 of throttle is 0.1 V, more than two deviations of the noise: less than 10 % dip below
+    # the budget, more above it.
     u, v, pack = flight('telegraph')
     rng = np.random.default_rng(3)
     monitor, _ = monitor_of(brownout_voltage=14.75, brownout_budget_limit=0.1,
@@ -379,11 +376,8 @@ def test_above_the_limit_from_the_start():
 
 
 def test_dips_that_throttle_does_not_tell_are_counted():
-    """
-    Beside full throttle something else takes 4 V for 0.1 s every 6 s.
-
-    Of the horizons of 2 s up to a third fall below 9 V (said: 0.045; without these misses 3e-5).
-    """
+    """Beside full throttle something else takes 4 V for 0.1 s every 6 s."""
+    # Of the horizons of 2 s up to a third fall below 9 V (said: 0.045; without these misses 3e-5).
     t = np.arange(5900) / 50.0
     u = np.where(t % 10.0 < 3.0, 0.0, 1.0)
     v = 14.0 - 2.0 * u + 0.03 * np.random.default_rng(5).standard_normal(t.size)
