@@ -5,13 +5,10 @@ import pytest
 
 
 def pytest_collection_modifyitems(items):
-    """
-    Let a test of real processes run once more where it fails.
-
-    On a machine that has too much to do the middleware loses messages, and a process is late: 1
-    of 7413 tests in one of three runs of the suite.  What failed once is listed as RERUN at the
-    end: look at it, it was a fault of ours one time in two.
-    """
+    """Let a test of real processes run once more where it fails."""
+    # On a machine that has too much to do the middleware loses messages, and a process is late: 1
+    # of 7413 tests in one of three runs of the suite. What failed once is listed as RERUN at the
+    # end: look at it, it was a fault of ours one time in two.
     for item in items:
         if ({'world', 'shared_world'} & set(getattr(item, 'fixturenames', ()))
                 and item.get_closest_marker('flaky') is None):

@@ -209,16 +209,6 @@ def test_current_of_the_battery_gives_a_resistance(world):
     assert rig.field('load_status') == 'NO_THROTTLE'
 
 
-def test_slow_input_is_said_to_be_too_slow(world):
-    """PX4's 1 Hz cannot carry alpha = 63 1/s: a warning, not a number."""
-    rig = Rig(world, 'slow', '-p', 'window:=60.0')
-    rig.connect(BatteryState)
-    rig.feed(ou_path(60, 1.0, seed=8), dt=1.0)
-    wait_until(lambda: rig.count('n') >= 55)
-    wait_until(lambda: rig.status.level == WARN)
-    assert 'at 1 Hz: only a higher rate' in rig.status.message
-
-
 def test_a_type_nobody_knows_is_named(world):
     """And so is what to do; the right type is taken when it comes."""
     rig = Rig(world, 'odd')

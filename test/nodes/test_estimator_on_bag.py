@@ -2,7 +2,6 @@
 
 from itertools import dropwhile
 import math
-import statistics
 
 from diagnostic_msgs.msg import DiagnosticArray
 from live import BAGS, seconds, values_of, wait_until
@@ -19,11 +18,6 @@ BAG = BAGS / 'load_40'
 TRUTH = yaml.safe_load((BAG / 'truth.yaml').read_text())['parameters']
 WINDOW = 2.0
 NUMBERS = ('alpha', 'sigma', 'var_inf', 'brownout_risk')
-# 20 s of bag are at most 10 independent windows; a normal error beyond 4.5 se in one of them has
-# a probability of 7e-5 for each parameter.
-SIGMAS = 4.5
-
-
 @pytest.fixture(scope='module')
 def run(shared_world):
     """Play the bag once; give what was heard."""
@@ -82,32 +76,6 @@ def test_inputs_are_best_effort(run):
         ReliabilityPolicy.BEST_EFFORT]
 
 
-@pytest.mark.parametrize('name', ['alpha', 'sigma', 'var_inf'])
-def test_values_are_the_truth(states, name):
-    """Each estimate within 4.5 of its own standard errors, and those are small."""
-    errors = [math.log(float(f[name]) / TRUTH[name]) / float(f[name + '_se']) for _, f in states]
-    assert max(map(abs, errors)) < SIGMAS
-    # Floor: sqrt(2 / (alpha T)) = 12.6 % for alpha and var_inf, 1.6 % for sigma; a wrong factor
-    # of two in var_inf, or of sqrt(2) in sigma, is seen in the mean over 20 s.
-    mean = statistics.fmean(math.log(float(f[name]) / TRUTH[name]) for _, f in states)
-    assert abs(mean) < (0.03 if name == 'sigma' else 0.25)
-
-
-def test_standard_errors_have_power(states):
-    """An estimator that says `I do not know` would pass the test before."""
-    fields = states[-1][1]
-    # Twice the floor of the samples used: a machine that is slow thins them.
-    floor = 1.0 / math.sqrt(2.0 * float(fields['n']))
-    assert float(fields['sigma_se']) < 2.0 * floor and float(fields['alpha_se']) < 0.2
-
-
-def test_u0_is_the_mean_level(states):
-    """U0 within 4.5 standard errors of the mean of an OU over the window."""
-    spread = math.sqrt(2.0 * TRUTH['var_inf'] / (TRUTH['alpha'] * WINDOW))
-    for _, fields in states:
-        assert abs(float(fields['u0']) - TRUTH['u0']) < SIGMAS * spread
-
-
 def test_all_fields_are_of_one_instant(states, run):
     """All fields of a state belong together, and the plain topics say the same numbers."""
     sent = {name: {m.data for m in run[name]} for name in NUMBERS}
@@ -138,6 +106,8 @@ def test_the_same_numbers_as_offline(states):
         # Searches that start from different estimates before end this near each other.
         assert float(fields['alpha']) == pytest.approx(e.alpha, rel=1e-4)
         assert float(fields['sigma']) == pytest.approx(e.sigma, rel=1e-4)
+        assert float(fields['u0']) == pytest.approx(e.u0, abs=0.1 * e.u0_se)
+        assert float(fields['sigma_se']) == pytest.approx(e.sigma_se, rel=1e-2)
         compared += 1
     # Best effort may lose a message, on a busy machine in most windows, but not in all.
     assert compared > len(states) / 5

@@ -57,10 +57,10 @@ def test_arguments_that_rclpy_ignores_are_refused(world, name):
     assert not process.err
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM], ids=['SIGINT', 'SIGTERM'])
-def test_a_signal_during_the_start_ends_with_status_0(world, number):
+def test_a_signal_during_the_start_ends_with_status_0(world):
     """While it imports, while it makes its node: status 0 all the same."""
-    for delay in (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8):
+    for delay, number in zip((0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8),
+                             4 * (signal.SIGINT, signal.SIGTERM)):
         process = world.start('estimator')
         # Before `main` Python's own handlers are in force; then SIGTERM, number 15, is caught.
         state = Path(f'/proc/{process.popen.pid}/status')
@@ -104,6 +104,7 @@ def test_a_signal_while_it_ends_is_only_noted(tmp_path):
 @pytest.mark.parametrize('name, arguments, words', [
     ('estimator', ['-p', 'window:=long'], "window: unknown 'long'"),
     ('estimator', ['-p', 'window:=.nan'], 'window must be a finite number or auto'),
+    ('estimator', ['-p', 'model_file:=/no/such/model.yaml'], 'cannot read the model file'),
     ('estimator', ['-p', 'brownout.warn:=0.5'], 'must be less than brownout.critical'),
     ('estimator', ['-p', 'msg_config:=std_flaot64'], "did you mean 'std_float64'?"),
     ('estimator', ['-p', 'msg_config:=px4'], 'clone https://github.com/PX4/px4_msgs'),

@@ -148,24 +148,6 @@ def test_the_lag_is_published(rig):
     assert f'{lag:.3g} degrees ({lag / 3.6:.3g} ms) at 10 Hz' in rig.status.message
 
 
-def test_the_bound_is_told_in_words(rig):
-    """The limits, and fmin that follows from a lag."""
-    def told(words, sigma):
-        def there():
-            drive(rig, sigma, 0.1)
-            return rig.status.level == b'\x00' and words in values_of(rig.status)['decided_by']
-        wait_until(there, what=f'{words}: {rig.status.message}')
-    told('fmax', 0.1)
-    assert rig.probe.set_parameter(NODE, 'slew', 4.0).successful
-    told('the slew limit, on the way to the 20 Hz wanted', 100.0)
-    assert rig.probe.set_parameter(NODE, 'slew', 0.0).successful
-    told('fmin', 100.0)
-    assert rig.probe.set_parameter(NODE, 'max_lag', 45.0).successful
-    cutoff_becomes(rig, 19.3185, 100.0)
-    told('fmin, 19.32 Hz by max_lag (45 degrees at 10 Hz)', 100.0)
-    assert rig.probe.set_parameter(NODE, 'max_lag', 0.0).successful
-
-
 def state_of(**values):
     """Return a state as the estimator publishes it."""
     return DiagnosticArray(status=[DiagnosticStatus(values=[
@@ -351,14 +333,13 @@ def test_the_law_kalman_goes_where_the_offline_filter_goes(rig):
     assert rig.probe.set_parameter(NODE, 'law', 'constant_noise').successful
 
 
-@pytest.mark.parametrize('step', [0.0, -0.002, -0.5])
-def test_stamps_that_are_no_time_do_not_hold_the_output(rig, step):
-    """Frozen or steadily backward: the output follows the input by arrival, and that is said."""
-    aim = 5.0 - 40.0 * step
+def test_stamps_that_are_no_time_do_not_hold_the_output(rig):
+    """Steadily backward: the output follows the input by arrival, and that is said."""
+    aim = 5.0
 
     def there():
         for _ in range(20):
-            rig.send((aim, 0.0, 0.0), dt=step)
+            rig.send((aim, 0.0, 0.0), dt=-0.002)
             time.sleep(0.002)
         return rig.output[-1].angular_velocity.x == pytest.approx(aim, abs=1e-3)
     wait_until(lambda: there() and values_of(rig.status)['stamps'] != 'GOOD', what='by arrival')

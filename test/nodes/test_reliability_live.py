@@ -302,19 +302,15 @@ def test_messages_wait_for_a_stopped_node(
 
 
 @pytest.mark.flaky(reruns=1)
-@pytest.mark.parametrize('rate', [5000.0, 20000.0])
-def test_overload_mutes_nothing(world, rate):
-    """
-    A flood, and a node that is stopped two thirds of the time.
-
-    States keep coming, two dips of 50 ms are flagged, losses are counted, memory is bounded, and
-    SIGINT ends it.  The longest silence allowed: 2 s, and what this machine itself pauses.
-    """
+def test_overload_mutes_nothing(world):
+    """A flood of 20 kHz, and a node that is stopped two thirds of the time."""
+    # States keep coming, two dips of 50 ms are flagged, losses are counted, memory is bounded, and
+    # SIGINT ends it. The longest silence allowed: 2 s, and what this machine itself pauses.
     rig = Rig(world, 'load', '-p', 'brownout.hold:=1.0')
     pid = rig.process.popen.pid
     starved = Starved(pid)
     env = {**os.environ, 'ROS_DOMAIN_ID': str(world.domain)}
-    flood = subprocess.Popen([sys.executable, FLOOD, str(rate), '0.05'], env=env)
+    flood = subprocess.Popen([sys.executable, FLOOD, '20000.0', '0.05'], env=env)
     try:
         wait_until(lambda: int(rig.field('messages')) > 1000, what='messages')
         starved.start()
@@ -345,6 +341,6 @@ def test_overload_mutes_nothing(world, rate):
         took = time.monotonic() - ended
         flood.kill()
         flood.wait()
-    print(f'{rate:g} Hz: silence {silence:.2f} s, {taken} taken, {lost} lost, '
+    print(f'silence {silence:.2f} s, {taken} taken, {lost} lost, '
           f'{rss / 1e6:.0f} MB, end {took:.2f} s')
     assert status == 0 and took < 10.0 + 10.0 * starved.longest

@@ -77,20 +77,6 @@ def test_the_form_is_that_of_sros2():
         'estimator', 'adaptive_filter', 'adc', 'replay', 'live', 'operator')]
 
 
-@pytest.mark.parametrize('change', [
-    lambda root: root.attrib.pop('version'),
-    lambda root: root.find('.//profile').attrib.pop('ns'),
-    lambda root: root.find('.//topics').set('publish', 'MAYBE'),
-    lambda root: root.find('.//topics').append(ElementTree.Element('service')),
-    lambda root: root.find('.//services').clear(),
-])
-def test_a_wrong_form_is_detected(change):
-    """The check above can fail."""
-    root = policy()
-    change(root)
-    assert complaints(root)
-
-
 def opened(probe, node: str) -> dict[str, set[str]]:
     """Return the full names that a node has opened."""
     from rclpy.node import NodeNameNonExistentError
