@@ -19,11 +19,6 @@ def test_a_description_loads(block, tmp_path):
     assert found.voltage.topic and found.throttle is not None and found.throttle.topic
 
 
-def test_there_are_two_descriptions():
-    """Of PX4's motors and of a Crazyflie."""
-    assert len(BLOCKS) == 2
-
-
 class Port:
     """A serial port with what a flight controller sends."""
 

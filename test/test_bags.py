@@ -93,15 +93,11 @@ def test_every_message_type_has_a_bag():
 
 
 def check_ou(x, dt, alpha, sigma, noise=0.0):
-    """
-    Check deviations against their law within 4 standard errors.
-
-    With n samples over T: the variance has relative SE sqrt(2 / (alpha T)), the
-    mean SE sigma / (alpha sqrt(T)), and the mean squared increment relative SE
-    sqrt(2 / n) (increments are nearly white for alpha dt << 1; white noise
-    adds 2 noise^2 to it, and its own correlation at lag 1 raises the SE by
-    less than sqrt(1.5)).
-    """
+    """Check deviations against their law within 4 standard errors."""
+    # With n samples over T: the variance has relative SE sqrt(2 / (alpha T)), the mean SE sigma /
+    # (alpha sqrt(T)), and the mean squared increment relative SE sqrt(2 / n) (increments are
+    # nearly white for alpha dt << 1; white noise adds 2 noise^2 to it, and its own correlation at
+    # lag 1 raises the SE by less than sqrt(1.5)).
     n, duration = x.size, x.size * dt
     var_inf = sigma**2 / (2.0 * alpha)
     spread = 4.0 * math.sqrt(2.0 / (alpha * duration))

@@ -82,7 +82,3 @@ def test_no_machine_paths():
     found = [f'{path.relative_to(ROOT)}: {match.group().decode()}' for path in files
              if path.suffix != '.mcap' and (match := MACHINE_PATH.search(path.read_bytes()))]
     assert not found, '\n'.join(found)
-
-
-def test_python_is_supported():
-    assert sys.version_info[:2] in ((3, 11), (3, 12))

@@ -22,7 +22,6 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from project import metadata, project_files, ROOT
 import pytest
-import yaml
 
 PYPROJECT = tomllib.loads((ROOT / 'pyproject.toml').read_text(encoding='utf-8'))
 EXECUTABLES = [
@@ -404,8 +403,3 @@ def test_extras_have_the_bounds_of_the_test_list():
     assert all({s.operator for s in specifier} == {'>=', '<'} for specifier in found.values())
     for name in set(found) & set(listed):
         assert found[name] == listed[name], name
-
-
-def test_parameter_files_are_yaml():
-    files = sorted((ROOT / 'config').glob('*.yaml'))
-    assert files and all(isinstance(yaml.safe_load(path.read_text()), dict) for path in files)

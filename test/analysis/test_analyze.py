@@ -18,15 +18,11 @@ TRUTH = ((0.1, 0.3156), (0.4, 0.632))
 
 
 def test_two_levels_are_recovered():
-    """
-    Throttle, mean, sigma, alpha and Var_inf of both, within 4 standard errors.
-
-    With T = 10 s: ln alpha and ln Var_inf scatter by sqrt(2/(alpha T)) =
-    5.6 %, the mean by sqrt(2 Var_inf/(alpha T)), ln sigma by about
-    1/sqrt(2n) = 0.7 % (n = 10000) where white noise is known, and twice that
-    where it is not.  The two sigmas are a factor 2 apart: mixing levels would
-    be seen.
-    """
+    """Throttle, mean, sigma, alpha and Var_inf of both, within 4 standard errors."""
+    # With T = 10 s: ln alpha and ln Var_inf scatter by sqrt(2/(alpha T)) = 5.6 %, the mean by
+    # sqrt(2 Var_inf/(alpha T)), ln sigma by about 1/sqrt(2n) = 0.7 % (n = 10000) where white noise
+    # is known, and twice that where it is not. The two sigmas are a factor 2 apart: mixing levels
+    # would be seen.
     found = analyze(recording(1, TRUTH)).levels
     assert [level.throttle for level in found] == pytest.approx([0.1, 0.4])
     for level, (throttle, sigma) in zip(found, TRUTH):

@@ -35,11 +35,8 @@ def test_false_alarms_are_five_percent():
 
 
 def test_the_detectable_ratio_is_detected_nine_times_in_ten():
-    """
-    ln(alpha) straight over throttle, by that ratio: 270 +- 5.2 of 300.
-
-    Within 5 standard deviations, for the errors at a common alpha are themselves estimates.
-    """
+    """ln(alpha) straight over throttle, by that ratio: 270 +- 5.2 of 300."""
+    # Within 5 standard deviations, for the errors at a common alpha are themselves estimates.
     rng = np.random.default_rng(2)
     ratio = alpha_constancy(THROTTLES, [estimate(ALPHA, 0.1)] * 4).detectable_ratio
     steps = (np.array(THROTTLES) - 0.4) / 0.6
@@ -83,12 +80,9 @@ def test_less_than_two_levels_decide_nothing(estimates):
 
 
 def test_fitted_levels_of_one_alpha_do_not_differ():
-    """
-    60 recordings of three levels, fitted: at most 9 alarms at 5 %.
-
-    A binomial of 60 and 0.05 exceeds 9 with probability 1e-3; errors a third too small would
-    make it 20 %.
-    """
+    """60 recordings of three levels, fitted: at most 9 alarms at 5 %."""
+    # A binomial of 60 and 0.05 exceeds 9 with probability 1e-3; errors a third too small would
+    # make it 20 %.
     alarms = 0
     for seed in range(60):
         simulated = recording(7000 + seed, ((0.1, 0.2), (0.3, 0.4), (0.6, 0.6)), seconds=2.0)
@@ -114,11 +108,8 @@ def test_levels_that_one_ou_does_not_describe_are_withheld():
 
 
 def test_a_tone_is_not_taken_for_another_alpha():
-    """
-    Alpha 63 1/s at both levels, a tone of 3 mV rms at 180 Hz: never 'differs'.
-
-    Sigma goes from 0.1 to 0.3, so the tone bends the alpha of the quiet level more.
-    """
+    """Alpha 63 1/s at both levels, a tone of 3 mV rms at 180 Hz: never 'differs'."""
+    # Sigma goes from 0.1 to 0.3, so the tone bends the alpha of the quiet level more.
     for seed in range(3):
         simulated = recording(seed, ((0.0, 0.1), (0.2, 0.3)), seconds=5.0)
         white = np.random.default_rng(seed).normal(0.0, 0.001, simulated.n)
@@ -132,12 +123,9 @@ def test_a_tone_is_not_taken_for_another_alpha():
 
 
 def test_scatter_between_levels_is_no_growth_of_sigma():
-    """
-    Levels with a scatter of 0.3 in ln sigma, known to 2 % each, beside a growth by 8.
-
-    Of 400 drawings 8.5 % differ without growth (the scatter has 6 degrees of freedom) and 99 %
-    with it; the bounds are three standard deviations away.
-    """
+    """Levels with a scatter of 0.3 in ln sigma, known to 2 % each, beside a growth by 8."""
+    # Of 400 drawings 8.5 % differ without growth (the scatter has 6 degrees of freedom) and 99 %
+    # with it; the bounds are three standard deviations away.
     rng, u, found = np.random.default_rng(1), np.linspace(0.1, 0.8, 8), []
     for grows in (0.0, 3.0):
         for _ in range(200):

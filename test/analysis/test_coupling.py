@@ -18,13 +18,9 @@ def noise(rng, n, alpha, deviation):
 
 
 def flight(rng, gain=0.0, lag=0, common=0.0, square=0.0, seconds=SECONDS):
-    """
-    Return stamps, voltage, signal, throttle.
-
-    The intensity of both noises grows with throttle, as on a vehicle: that is
-    no coupling.  `common` and `square` let throttle move both, each through a
-    lag of its own.
-    """
+    """Return stamps, voltage, signal, throttle."""
+    # The intensity of both noises grows with throttle, as on a vehicle: that is no coupling.
+    # `common` and `square` let throttle move both, each through a lag of its own.
     n = int(seconds * RATE)
     t = np.arange(n) / RATE
     throttle = np.repeat(rng.uniform(0.1, 0.9, round(2 * seconds)), int(RATE / 2))

@@ -38,12 +38,9 @@ def examined(voltage, estimate=None, t=T):
 
 
 def test_innovations_are_standard_and_independent():
-    """
-    Of an OU in white noise, and of one sampled unevenly.
-
-    Variance 1 +- sqrt(2/n) and lag-1 correlation 0 +- 1/sqrt(n), n = 20000 and 5000; 4 standard
-    errors.  Without the gain of the noise the correlation would be -0.2.
-    """
+    """Of an OU in white noise, and of one sampled unevenly."""
+    # Variance 1 +- sqrt(2/n) and lag-1 correlation 0 +- 1/sqrt(n), n = 20000 and 5000; 4 standard
+    # errors. Without the gain of the noise the correlation would be -0.2.
     rng = np.random.default_rng(1)
     t = np.arange(20000) / 1000.0
     noisy = simulate(t, ALPHA, SIGMA, rng) + rng.normal(0.0, 0.01, t.size)
@@ -56,11 +53,8 @@ def test_innovations_are_standard_and_independent():
 
 
 def test_false_alarms_of_a_whole_recording():
-    """
-    Of 200 levels of OU in noise, fitted, at most 7 have any test but 'correlated' reject.
-
-    Holm keeps a level at 1 %: a binomial of 200 and 0.01 exceeds 7 with probability 1e-3.
-    """
+    """Of 200 levels of OU in noise, fitted, at most 7 have any test but 'correlated' reject."""
+    # Holm keeps a level at 1 %: a binomial of 200 and 0.01 exceeds 7 with probability 1e-3.
     alarms = 0
     for seed in range(200):
         rng = np.random.default_rng(5000 + seed)
@@ -75,11 +69,8 @@ NAMES = ('mean_drift', 'variance_drift', 'gaussian', 'impulses', 'one_relaxation
 
 
 def test_p_values_are_not_too_small():
-    """
-    At most 15 % of 200 p-values of each test lie below 0.1.
-
-    A binomial of 200 and 0.1 exceeds 30 with probability 1 %; five tests, fixed seeds.
-    """
+    """At most 15 % of 200 p-values of each test lie below 0.1."""
+    # A binomial of 200 and 0.1 exceeds 30 with probability 1 %; five tests, fixed seeds.
     shapes = [examine_level([(T, ou(seed))], truth()) for seed in range(200)]
     for name in NAMES:
         p = np.array([shape[name].p_value for shape in shapes])
@@ -125,11 +116,8 @@ def test_each_effect_is_seen_in_ten_of_ten(name):
 
 
 def test_heavy_tails_are_no_change_of_intensity():
-    """
-    Student's t of 5 degrees: Layard's test stays calm, as Bartlett's would not.
-
-    At most 3 of 40 at 1 % (binomial: 7e-4).
-    """
+    """Student's t of 5 degrees: Layard's test stays calm, as Bartlett's would not."""
+    # At most 3 of 40 at 1 % (binomial: 7e-4).
     calm = 0
     for seed in range(40):
         z = np.random.default_rng(seed).standard_t(5, T.size)

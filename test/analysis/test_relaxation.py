@@ -23,11 +23,8 @@ KNOWN = AlphaTest('constant', 2, ALPHA, 0.05)
 
 
 def steps_of(seed, tau=0.03, sag=0.4, changes=3, high_pass=False, rate=1000.0, ramp=0.0):
-    """
-    Return 0 -> 40 -> 0 % several times, one second each; the sag follows with tau.
-
-    With `high_pass` the sag is seen through one of that time constant: no level stays.
-    """
+    """Return 0 -> 40 -> 0 % several times, one second each; the sag follows with tau."""
+    # With `high_pass` the sag is seen through one of that time constant: no level stays.
     t = np.arange(int((2 * changes + 1) * rate)) / rate
     phase = np.mod(t, 2.0)
     throttle = np.where(phase >= 1.0, 0.4, 0.0)
@@ -78,11 +75,8 @@ def test_no_steps_without_levels():
 
 
 def test_the_fit_is_that_of_dense_generalised_least_squares():
-    """
-    Residual sum, level, amplitude and errors of one change, from the covariance matrix.
-
-    With tau held where the fast fit has it; 500 samples.
-    """
+    """Residual sum, level, amplitude and errors of one change, from the covariance matrix."""
+    # With tau held where the fast fit has it; 500 samples.
     simulated = steps_of(2, changes=1)
     fit = fitted(simulated)
     (change,) = fit.releases
@@ -114,11 +108,8 @@ def test_the_fit_is_that_of_dense_generalised_least_squares():
 @pytest.mark.parametrize('options', [{}, {'high_pass': True}, {'ramp': 0.05},
                                      {'sag': -0.4}], ids=str)
 def test_intervals_of_tau_hold(options):
-    """
-    Of 40 recordings at least 33 intervals hold 30 ms: step, ramp, high-pass, either sign.
-
-    A binomial of 40 and 0.95 falls below 33 with probability 4e-4.
-    """
+    """Of 40 recordings at least 33 intervals hold 30 ms: step, ramp, high-pass, either sign."""
+    # A binomial of 40 and 0.95 falls below 33 with probability 4e-4.
     fits = [fitted(steps_of(seed, **options)) for seed in range(40)]
     assert sum(fit.tau_low < 0.03 < fit.tau_high for fit in fits) >= 33
     # And they are narrow enough to tell tau from twice or half of it; a ramp leaves less.
@@ -255,13 +246,9 @@ def test_a_rail_much_faster_than_the_instrument_is_left_out():
 
 
 def test_a_step_that_is_not_one_exponential_is_said_so():
-    """
-    A rail of 10 ms behind a high-pass of 16 ms: the words warn of tau.
-
-    Of twelve at least seven (17 of 20 were measured; binomial: 5e-3 below seven); the others say
-    what they left out.
-    Of 40 plain sags of 0.4 V one may be called badly fitted (p = 1e-3 each).
-    """
+    """A rail of 10 ms behind a high-pass of 16 ms: the words warn of tau."""
+    # Of twelve at least seven (17 of 20 were measured; binomial: 5e-3 below seven); the others say
+    # what they left out. Of 40 plain sags of 0.4 V one may be called badly fitted (p = 1e-3 each).
     fits = [behind_a_high_pass(seed, 0.01) for seed in range(12)]
     assert all(fit.caveat for fit in fits)
     bad = [fit for fit in fits if fit.badly_fitted]

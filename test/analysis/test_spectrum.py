@@ -17,14 +17,10 @@ def test_the_curve_holds_the_whole_variance():
 
 
 def test_measured_and_true_spectrum_agree():
-    """
-    The mean of their ratio is 1.
-
-    About 40 points a decade over two decades; each averages >= 8 pieces
-    (relative error below 1/sqrt(8) = 35 %), and most points average several
-    bins; the mean of 60 or more is known to 35 % / sqrt(60) = 5 %.
-    A two-sided or badly scaled density is off by 2.
-    """
+    """The mean of their ratio is 1."""
+    # About 40 points a decade over two decades; each averages >= 8 pieces (relative error below
+    # 1/sqrt(8) = 35 %), and most points average several bins; the mean of 60 or more is known to
+    # 35 % / sqrt(60) = 5 %. A two-sided or badly scaled density is off by 2.
     simulated = recording(1, ((0.1, 0.3),), seconds=60.0)
     (level,) = analyze(simulated).levels
     found = level_spectrum(simulated, level.segments, level.estimate)

@@ -83,12 +83,9 @@ def test_a_signal_about_zero_is_no_supply_that_was_off(v):
 
 
 def test_noise_is_of_its_throttle():
-    """
-    Within 15 % of the truth at each throttle flown, steady or not; beyond as at the edge.
-
-    A band holds a step of throttle of 300 readings or more: its rms has an error of 4 %, and the
-    noise changes by 7 % across it.
-    """
+    """Within 15 % of the truth at each throttle flown, steady or not; beyond as at the edge."""
+    # A band holds a step of throttle of 300 readings or more: its rms has an error of 4 %, and the
+    # noise changes by 7 % across it.
     found = supply_facts(flight(np.random.default_rng(4))).noise
     for u, rms, steady in zip(found.throttle, found.rms_v, found.steady_rms_v):
         truth = 0.01 + 0.02 * np.clip(u, *found.flown)

@@ -1,7 +1,6 @@
 """`ou-monitor coupling`: columns and topics in; table and JSON out; one line for bad input."""
 
 import json
-import re
 
 from command_line import failure
 from made_bags import encode
@@ -130,15 +129,6 @@ def test_no_coupling_is_reported_with_the_detectable_gain(table, capsys):
     assert 'would have been' in ' '.join(text.split())
     assert text.index('No supply noise') < text.index('Chance') < text.index('Lowest voltage')
     assert max(map(len, text.splitlines())) <= 100
-
-
-def test_a_coupling_is_reported_with_interval_and_lag(table, capsys):
-    """Gain, interval, lag."""
-    assert main(['coupling', str(table), '--signal', 'gyro_x', '--band', '10,60']) == 0
-    text = capsys.readouterr().out
-    assert re.search(r'gyro_x from 10 to 60 Hz is supply noise: 2\d\.\d per V\.', text)
-    assert 'p < 0.001' in text and not re.search(r'\de-\d', text)
-    assert text.splitlines()[-1].startswith('No file was written')
 
 
 def test_the_page_says_what_the_text_says(table, tmp_path, capsys):

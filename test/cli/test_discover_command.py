@@ -21,9 +21,7 @@ from ou_monitor.model.terms.tones import Tone
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.recordings.model_file import read_model
 from ou_monitor.recordings.read import read_recording
-from ou_monitor.report.discovery_document import answer, discovery_document
-from ou_monitor.report.page import html as page_of
-from ou_monitor.report.terminal import terminal
+from ou_monitor.report.discovery_document import answer
 from project import ROOT
 import pytest
 
@@ -113,13 +111,6 @@ def test_too_short_still_writes_all_but_the_model(tmp_path, capsys):
     assert strict(out)['verdict'] == 'insufficient_data' and err.count('\n') == 1
 
 
-def tables(html):
-    """Return the rows of the first table of a page, as text."""
-    tree = ElementTree.fromstring(html.replace('<!DOCTYPE html>\n', ''))
-    return [[' '.join(cell.itertext()) for cell in row]
-            for row in next(tree.iter('table')).iter('tr')]
-
-
 def made(*causes):
     """Return a finding of causes: term, gain, its error, p."""
     terms = tuple(term for term, *_ in causes)
@@ -132,28 +123,6 @@ def made(*causes):
             for term, gain, se, p in causes),
         model=model, se=({},) * len(model.terms), samples=samples,
         simulated=SupplyModel((OU(60.0, 0.3, 5.0),)))
-
-
-def test_unknown_and_worse_gains_are_stated():
-    """No nan, no '- +- -'; unknown is not 'none'; significantly negative is 'worse'."""
-    nan = float('nan')
-    finding = made((LoadSag(0.6, 0.0), nan, nan, nan), (Tone(0.01, 9.0, 0.0, 0.0), -0.01, 0.002,
-                                                        1e-9),
-                   (Drift(0.1, 0.0), 0.001, 0.002, 0.5))
-    said = discovery_document(finding)
-    text, html = terminal(said), page_of(said)
-    for shown in (text, html):
-        assert not re.search(r'\bnan\b|- \+- -|\u2013 \u00b1 \u2013', shown)
-        words = ' '.join(re.sub('<[^>]*>', ' ', shown).split())
-        assert words.count('worse on held-out samples') == 1
-        assert 'Worse on samples not used' in words
-        assert 'Gain not measurable here; named because it explains' in words
-        assert 'Gain not distinguishable from 0' in words
-    # Its name, and what a pilot calls it.
-    rows = {row[0]: row for row in tables(html)}
-    assert rows['load_sag'][:4] == ['load_sag', 'sag', 'load', 'not known']
-    assert rows['load_sag'][4] == 'not known'
-    assert re.search(r'load_sag +sag +load +not known +not known', text)
 
 
 @pytest.mark.parametrize('words, part', [

@@ -2,12 +2,9 @@
 
 from argparse import Namespace
 
-import numpy as np
-from ou_monitor.analysis.overview import known_lines, overview
 from ou_monitor.cli.arguments import brownout_limit
 from ou_monitor.cli.main import main
 from ou_monitor.errors import InputError
-from ou_monitor.records import Recording
 import pytest
 
 
@@ -31,13 +28,3 @@ def test_an_invalid_number_of_cells_is_one_line(cells, capsys):
     """One line."""
     assert main(['analyze', 'x.csv', '--cells', cells]) == 2
     assert f"'{cells}' is not a number of cells, 1 to 28" in capsys.readouterr().err
-
-
-def test_the_limit_is_shown_per_cell():
-    """Beside its dips."""
-    t = np.arange(200) * 0.01
-    voltage = np.where(t == t[50], 13.0, 15.0)
-    made = Recording(t, voltage, np.full(t.size, np.nan), 'made')
-    assert dict(known_lines(overview(made, 13.2, cells=4)))['Below 13.2 V'].endswith(
-        '; 3.3 V per cell')
-    assert 'per cell' not in dict(known_lines(overview(made, 13.2)))['Below 13.2 V']

@@ -9,11 +9,7 @@ import pytest
 
 
 def test_table_json_and_report_agree(tmp_path, capsys, monkeypatch):
-    """
-    One run writes all three, and they agree; test_bench.py has a second with the same seed.
-
-    With fewer simulated screens than a user gets; the verdicts asserted do not rest on them.
-    """
+    """One run writes all three, and they agree; test_bench.py has a second with the same seed."""
     monkeypatch.setattr(module, 'CREST_PATHS', 200)
     monkeypatch.setattr(module, 'JUMP_SECONDS', 10.0)
     report, data = tmp_path / 'r.html', tmp_path / 'r.json'

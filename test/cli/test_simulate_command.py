@@ -251,12 +251,8 @@ def test_an_error_half_way_leaves_nothing(tmp_path, name, model, words, capsys):
 @pytest.mark.parametrize('number, status', [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 @pytest.mark.parametrize('name', ['a.mcap', 'a'])
 def test_a_signal_brings_the_old_bag_back(tmp_path, name, number, status):
-    """
-    Ended while it writes: no traceback, no new bag, and the old one in its place.
-
-    An hour at 20 kHz lasts far longer than the test; the signal goes out once
-    the bag has grown.
-    """
+    """Ended while it writes: no traceback, no new bag, and the old one in its place."""
+    # An hour at 20 kHz lasts far longer than the test; the signal goes out once the bag has grown.
     path = tmp_path / name
     assert main(['simulate', '--preset', 'idle', '--duration', '1', '--output', str(path)]) == 0
     old = {p: p.stat().st_mtime_ns for p in tmp_path.rglob('*')}

@@ -1,6 +1,7 @@
 """Lists of the project's files, for tests that read or copy all of them; recordings of others."""
 
 from functools import cache
+import math
 import os
 from pathlib import Path
 import subprocess
@@ -41,3 +42,18 @@ def project_files() -> list[Path]:
         return [ROOT / name for name in names if name and (ROOT / name).is_file()]
     return [path for path in ROOT.rglob('*')
             if path.is_file() and not GENERATED & set(path.relative_to(ROOT).parts)]
+
+
+def differences(found: Any, wanted: Any, relative: float, absolute: float,
+                where: str = '') -> list[str]:
+    """Return the places at which two tables differ by more than the tolerances."""
+    if isinstance(wanted, dict) and isinstance(found, dict) and found.keys() == wanted.keys():
+        return [line for key in wanted for line in differences(
+            found[key], wanted[key], relative, absolute, f'{where}/{key}')]
+    if isinstance(wanted, list) and isinstance(found, list) and len(found) == len(wanted):
+        return [line for k, (a, b) in enumerate(zip(found, wanted))
+                for line in differences(a, b, relative, absolute, f'{where}[{k}]')]
+    number = all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in (found, wanted))
+    same = (math.isclose(found, wanted, rel_tol=relative, abs_tol=absolute) if number
+            else found == wanted)
+    return [] if same else [f'{where}: {found}, not {wanted}']
