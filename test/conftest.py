@@ -31,11 +31,8 @@ def pytest_configure(config):
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    """
-    Run each file on one worker of pytest-xdist, and all ROS tests on the same one.
-
-    Groups of xdist itself are ignored from pytest 9.2 on (pytest-xdist issue 1386).
-    """
+    """Run each file on one worker of pytest-xdist, and all ROS tests on the same one."""
+    # Groups of xdist itself are ignored from pytest 9.2 on (pytest-xdist issue 1386).
     from xdist.scheduler import LoadScopeScheduling
 
     class ByFile(LoadScopeScheduling):

@@ -45,12 +45,9 @@ def test_a_recording_of_the_model_looks_like_it():
 
 
 def test_alignment_on_two_seconds_leaves_an_error_of_the_level():
-    """
-    A voltage that wanders for seconds: the level taken from the first two has an error.
-
-    A level without its error made 85 % of such drawings differ with p < 0.05; of 10, more than
-    3 come once in 1000 tests.
-    """
+    """A voltage that wanders for seconds: the level taken from the first two has an error."""
+    # A level without its error made 85 % of such drawings differ with p < 0.05; of 10, more than 3
+    # come once in 1000 tests.
     t = np.arange(800) / 20.0
     slow = SupplyModel((OU(1.0, 0.05, LEVEL),))
     found = [compare(Recording(t, slow.simulate(t, np.random.default_rng(seed)),

@@ -120,12 +120,9 @@ def test_the_verdict_follows_from_path_and_level():
 
 
 def test_a_recording_is_the_farthest_as_often_as_each_simulation():
-    """
-    Four numbers of a recording and of 20 simulations, all of one law: p is uniform.
-
-    Of 600, 28.6 are expected to be the farthest (standard deviation 5.2), and 30 to lie outside
-    a band of 50 simulations.
-    """
+    """Four numbers of a recording and of 20 simulations, all of one law: p is uniform."""
+    # Of 600, 28.6 are expected to be the farthest (standard deviation 5.2), and 30 to lie outside
+    # a band of 50 simulations.
     rng, farthest, outside = np.random.default_rng(3), 0, 0
     for _ in range(600):
         x = rng.standard_normal((4, 21))

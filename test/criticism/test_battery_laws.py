@@ -25,12 +25,9 @@ def correlation(a, b):
 
 
 def test_a_flat_spectrum_has_every_band_at_its_expectation():
-    """
-    A single pulse: every ordinate is 1, and the cube root of a mean of 1 is 1.
-
-    What remains of Wilson and Hilferty's score is its bias term, 3 sqrt(m) / (9 m).  The edges
-    of 8 bands of 256 ordinates are powers of two.
-    """
+    """A single pulse: every ordinate is 1, and the cube root of a mean of 1 is 1."""
+    # What remains of Wilson and Hilferty's score is its bias term, 3 sqrt(m) / (9 m). The edges of
+    # 8 bands of 256 ordinates are powers of two.
     pulse = np.zeros(512)
     pulse[100] = 1.0
     found = {name: value for name, value in plain(pulse).items() if name.startswith('band')}

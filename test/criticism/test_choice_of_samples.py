@@ -20,11 +20,8 @@ def rail(n, keep, seed):
 
 @pytest.mark.parametrize('code', (0.0, 3.0))
 def test_coarse_codes_do_not_hide_a_fast_relaxation(code):
-    """
-    A relaxation of 16 samples among 8e5, of which every 10th would be too few.
-
-    Codes of three standard deviations: most differences are 0, and so is the smaller half.
-    """
+    """A relaxation of 16 samples among 8e5, of which every 10th would be too few."""
+    # Codes of three standard deviations: most differences are 0, and so is the smaller half.
     v = rail(8 * MOST + 80_000, math.exp(-1.0 / 16.0), 1)
     if code:
         v = code * np.rint(v / code)
@@ -81,12 +78,9 @@ def test_changes_within_20_ms_of_a_throttle_step_belong_to_the_load(move, late, 
 
 @pytest.mark.parametrize('phase', (0.4, 2.5, -1.7))
 def test_a_line_between_the_samples_used_leaves_nothing(phase):
-    """
-    A line of 310 Hz of samples at 1 kHz of which every 5th is used, after 3 s.
-
-    Its two amplitudes are known to sqrt(2 / n) of the spectrum's level there.  A phase or gain
-    of the whitening left in the line would leave more than a tenth of its amplitude.
-    """
+    """A line of 310 Hz of samples at 1 kHz of which every 5th is used, after 3 s."""
+    # Its two amplitudes are known to sqrt(2 / n) of the spectrum's level there. A phase or gain of
+    # the whitening left in the line would leave more than a tenth of its amplitude.
     n, keep, amplitude = 50_000, 0.9, 0.3
     t = 3.0 + np.arange(n) * 1e-3
     noise = rail(n, keep, 2)

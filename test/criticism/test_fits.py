@@ -53,11 +53,8 @@ RAIL = OU(20.0, 0.3, 5.0)
 @pytest.mark.parametrize('law', [
     RegimeSwitching(1.5, 1.0, 0.0, 3.0, 1.0, 2.0), Volatility(0.8, 3.0)])
 def test_simulations_of_the_fit_spread_as_far_as_the_data(law):
-    """
-    Sigma and the spread of simulations, where sigma of all would be twice as large.
-
-    In 30 s the share of each state is known to a fifth, the mean of ln sigma to 0.8 sqrt(2/90).
-    """
+    """Sigma and the spread of simulations, where sigma of all would be twice as large."""
+    # In 30 s the share of each state is known to a fifth, the mean of ln sigma to 0.8 sqrt(2/90).
     voltage = SupplyModel((RAIL, law)).simulate(T, np.random.default_rng(2), None)
     samples, whole = Samples(T, voltage, None), slice(0, N)
     plain = fit_composite(samples, [RAIL], whole)
@@ -94,11 +91,7 @@ def begun(std, seed):
 
 
 def test_a_start_of_a_second_relaxation_is_near_the_truth():
-    """
-    36 s hold 90 relaxations of it: rate and variance are known to about 15 %.
-
-    Shares of its spectrum that the rail hides make that twice as much.
-    """
+    """36 s hold 90 relaxations of it: rate and variance are known to about 15 %."""
     for seed in (1, 2):
         (ou, slow), gain = begun(0.03, seed)
         assert abs(math.log(slow.alpha / SLOW)) < 0.9

@@ -180,11 +180,8 @@ def test_throttle_that_does_not_move_is_left_out_with_a_note(u, word):
 
 @pytest.mark.parametrize('alpha', [63.0, 6300.0])
 def test_too_many_samples_keep_their_relaxation(alpha):
-    """
-    100 kHz: a slow rail is thinned, a fast one cut; alpha stays to be seen.
-
-    The lag-1 correlation has a standard error of sqrt((1 - r^2) / n).
-    """
+    """100 kHz: a slow rail is thinned, a fast one cut; alpha stays to be seen."""
+    # The lag-1 correlation has a standard error of sqrt((1 - r^2) / n).
     n = 1_000_000
     t, v = rail(11, n, 1e5, alpha)
     which, note = choose_samples(v, 1e5)
@@ -220,12 +217,9 @@ def test_long_recordings_bound_memory():
 
 
 def test_a_line_faster_than_the_samples_used_is_found_in_all():
-    """
-    Half a million samples at 100 kHz of which every 7th is used: a line at 31 kHz.
-
-    Whitened, it gains n amplitude^2 |1 - phi exp(-iw)|^2 / (4 step^2) = 60 nats; phase
-    and amplitude then have standard errors of sqrt(1 / 120) and that share of the amplitude.
-    """
+    """Half a million samples at 100 kHz of which every 7th is used: a line at 31 kHz."""
+    # Whitened, it gains n amplitude^2 |1 - phi exp(-iw)|^2 / (4 step^2) = 60 nats; phase and
+    # amplitude then have standard errors of sqrt(1 / 120) and that share of the amplitude.
     n, rate = 500_000, 1e5
     t, v = rail(12, n, rate)
     step = np.diff(v).std()
@@ -266,12 +260,9 @@ def test_events_that_only_neighbours_show_are_kept():
 @pytest.mark.parametrize('times, named', [(0.25, False), (0.297, False), (0.303, True),
                                           (1.0, True), (2.0, True)])
 def test_a_step_is_held_against_the_noise_without_its_own_rounding(times, named):
-    """
-    Rounding adds step^2 / 12 to a sample, so step^2 / 6 to the square of an innovation.
-
-    A noise of 1 mV that was rounded is 1 mV again: steps count from 0.3 mV on, and the note
-    gives them in units of that noise.
-    """
+    """Rounding adds step^2 / 12 to a sample, so step^2 / 6 to the square of an innovation."""
+    # A noise of 1 mV that was rounded is 1 mV again: steps count from 0.3 mV on, and the note
+    # gives them in units of that noise.
     exact, notes = [], []
     _judge_step(1e-3 * times, 1e-3 * math.sqrt(1.0 + times**2 / 6.0), exact, notes)
     assert [term.NAME for term in exact] == ['quantization'] * named

@@ -34,11 +34,8 @@ def test_uneven_samples_are_compared_on_a_grid_to_their_end():
 @pytest.mark.parametrize('side', (1.0, -1.0))
 @pytest.mark.parametrize('step', (0.0, 0.02))
 def test_samples_beyond_a_limit_are_drawn_from_the_bridge(side, step):
-    """
-    Clipped at one deviation: variance and lag-1 correlation of the AR(1) come back.
-
-    Their standard errors by Bartlett, of n / 8 independent ones, and the rest by what is known.
-    """
+    """Clipped at one deviation: variance and lag-1 correlation of the AR(1) come back."""
+    # Their standard errors by Bartlett, of n / 8 independent ones, and the rest by what is known.
     n, keep = 40_000, 0.8
     rng = np.random.default_rng(4)
     x = np.zeros(n)

@@ -29,12 +29,9 @@ def simulated(tone, seed, seconds=20.0, frequency=120.3):
 
 
 def test_a_steady_tone_goes_and_the_rest_stays():
-    """
-    Of 20 mV rms less than 0.7 mV is left: the noise in the bins of the line.
-
-    The noise has 3.3e-7 V^2/Hz at 120 Hz; the largest of three bins of 0.25 Hz has some 1.8 times
-    the mean: 0.39 mV, in each of five pieces with an error of a third.
-    """
+    """Of 20 mV rms less than 0.7 mV is left: the noise in the bins of the line."""
+    # The noise has 3.3e-7 V^2/Hz at 120 Hz; the largest of three bins of 0.25 Hz has some 1.8
+    # times the mean: 0.39 mV, in each of five pieces with an error of a third.
     noisy, clean = simulated(0.02, 1), simulated(0.0, 1)
     search = find_lines([noisy.voltage], RATE, white=[
         lfilter([1.0, -np.exp(-ALPHA / RATE)], [1.0], noisy.voltage - noisy.voltage.mean())])
@@ -45,12 +42,9 @@ def test_a_steady_tone_goes_and_the_rest_stays():
 
 
 def test_a_faint_tone_does_not_bias_alpha_and_sigma():
-    """
-    4 mV beside 27 mV: 20 recordings, each interval holds the truth as often as it says.
-
-    Of 20 at 95 % fewer than 16 have a probability of 0.003; with the line in, 20 of 20 of sigma
-    were too high.
-    """
+    """4 mV beside 27 mV: 20 recordings, each interval holds the truth as often as it says."""
+    # Of 20 at 95 % fewer than 16 have a probability of 0.003; with the line in, 20 of 20 of sigma
+    # were too high.
     holds = {'alpha': 0, 'sigma': 0}
     for seed in range(20):
         level = as_one_level(simulated(0.004, seed))

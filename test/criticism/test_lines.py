@@ -25,11 +25,8 @@ def tone(frequency, rms, n=3000, phase=0.3):
 
 @pytest.mark.parametrize('pieces, neighbours', [(1, 64), (5, 16)])
 def test_the_tail_is_that_of_simulated_ratios(pieces, neighbours):
-    """
-    Share of ratios beyond where the tail says 5 % and 0.5 %.
-
-    40000 draws: standard errors 0.11 % and 0.035 %; 4 of them.
-    """
+    """Share of ratios beyond where the tail says 5 % and 0.5 %."""
+    # 40000 draws: standard errors 0.11 % and 0.035 %; 4 of them.
     rng = np.random.default_rng(1)
     others = np.sort(rng.gamma(pieces, size=(40000, neighbours)), axis=1)
     p = tail(rng.gamma(pieces, size=40000) / others[:, neighbours // 2], pieces, neighbours)
@@ -40,12 +37,9 @@ def test_the_tail_is_that_of_simulated_ratios(pieces, neighbours):
 
 @pytest.mark.parametrize('cut', [1, 3])
 def test_false_alarms_are_as_stated(cut):
-    """
-    OU in white noise, whole or in three segments, at a stated rate of 20 %.
-
-    200 recordings: 40 +- 5.7 at most; 57 is 3 standard deviations up, and 17 as far down as 4,
-    for the union bound takes some.
-    """
+    """OU in white noise, whole or in three segments, at a stated rate of 20 %."""
+    # 200 recordings: 40 +- 5.7 at most; 57 is 3 standard deviations up, and 17 as far down as 4,
+    # for the union bound takes some.
     alarms = 0
     for seed in range(200):
         rng = np.random.default_rng(seed)
@@ -57,12 +51,9 @@ def test_false_alarms_are_as_stated(cut):
 
 
 def test_a_line_of_the_stated_size_is_found_nine_times_in_ten():
-    """
-    At any frequency and phase; the size is for the worst place between two bins.
-
-    80 trials at 90 %: fewer than 63 has probability 1e-3.  Half that size is found in less than
-    half of them.
-    """
+    """At any frequency and phase; the size is for the worst place between two bins."""
+    # 80 trials at 90 %: fewer than 63 has probability 1e-3. Half that size is found in less than
+    # half of them.
     found = {1.0: 0, 0.5: 0}
     rng = np.random.default_rng(2)
     for seed in range(80):
@@ -77,12 +68,9 @@ def test_a_line_of_the_stated_size_is_found_nine_times_in_ten():
 
 
 def test_intervals_of_the_amplitude_hold():
-    """
-    60 tones, five times what can be seen: at least 50 intervals hold the truth.
-
-    A binomial of 60 and 0.95 falls below 50 with probability 1e-4.  The frequency is right to a
-    tenth of a bin, the share is that of the variance.
-    """
+    """60 tones, five times what can be seen: at least 50 intervals hold the truth."""
+    # A binomial of 60 and 0.95 falls below 50 with probability 1e-4. The frequency is right to a
+    # tenth of a bin, the share is that of the variance.
     inside = 0
     rng = np.random.default_rng(3)
     for seed in range(60):

@@ -13,11 +13,8 @@ import pytest
 
 
 def test_a_score_by_a_spread_of_few_draws_has_heavy_tails():
-    """
-    Of 4 million scores divided as `_summary` does: the share beyond 3.5.
-
-    To four standard errors; the normal law would be 10 of them off.
-    """
+    """Of 4 million scores divided as `_summary` does: the share beyond 3.5."""
+    # To four standard errors; the normal law would be 10 of them off.
     rng = np.random.default_rng(1)
     weight = SIZE / (SIZE + _PRIOR)
     drawn = weight * rng.chisquare(SIZE - 1, 40_000) / (SIZE - 1) + 1.0 - weight

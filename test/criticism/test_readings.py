@@ -44,11 +44,8 @@ ALL = ('last', 'first', 'middle', 'in the part kept', 'two', 'codes', 'codes at 
 
 @pytest.mark.parametrize('what', ALL)
 def test_bad_samples_become_a_note_and_no_cause(what):
-    """
-    A plain rail stays one; the note counts them and says what they read.
-
-    At 1 % the rail itself might alarm: this seed does not (of 0 to 13, one does).
-    """
+    """A plain rail stays one; the note counts them and says what they read."""
+    # At 1 % the rail itself might alarm: this seed does not (of 0 to 13, one does).
     v, bad = with_bad(what)
     kept = usable(Recording(T, v, np.full(N, math.nan)), [])[0]
     assert np.array_equal(kept, T[~bad])

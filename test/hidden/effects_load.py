@@ -13,13 +13,10 @@ BOTH = ('load_sag', 'load_transient')
 
 
 def _battery(bench: Bench, gain: float) -> tuple[float, float, dict[str, float]]:
-    """
-    Draw a battery and motors; return ohm, ampere at full throttle, and the parameters.
-
-    The sag at full throttle is 0.15..0.4 V on a rail of ordinary noise, less on a quiet one and
-    more on a noisy one: as the square root, which is half way between equal volts and equal
-    evidence.
-    """
+    """Draw a battery and motors; return ohm, ampere at full throttle, and the parameters."""
+    # The sag at full throttle is 0.15..0.4 V on a rail of ordinary noise, less on a quiet one and
+    # more on a noisy one: as the square root, which is half way between equal volts and equal
+    # evidence.
     sag = gain * bench.draw.uniform(0.15, 0.4) * math.sqrt(
         bench.reference_innovation / TYPICAL_INNOVATION)
     ohm = float(np.exp(bench.draw.uniform(math.log(4e-3), math.log(30e-3))))
@@ -245,12 +242,9 @@ def _rate(bench: Bench, curve: np.ndarray) -> dict[str, object]:
 
 
 def _alpha_ratio(bench: Bench, gain: float) -> float:
-    """
-    Draw the ratio of alpha at full load to that at the lowest; up or down.
-
-    1.8..2.4, and up to 4 on a slow rail, of which a minute holds few relaxations: a relative
-    change c(t) of the rate gains T alpha <c^2>/4 nats.
-    """
+    """Draw the ratio of alpha at full load to that at the lowest; up or down."""
+    # 1.8..2.4, and up to 4 on a slow rail, of which a minute holds few relaxations: a relative
+    # change c(t) of the rate gains T alpha <c^2>/4 nats.
     ratio, sense = float(bench.draw.uniform(1.8, 2.4)), float(bench.draw.choice([-1.0, 1.0]))
     while ratio < 4.0:
         curve = 1 + (ratio**sense - 1) * bench.load
@@ -284,12 +278,9 @@ def alpha_step(bench: Bench, gain: float) -> dict[str, object]:
 
 
 def _slope(bench: Bench, gain: float) -> tuple[float, dict[str, object]]:
-    """
-    Draw a rate of discharge, V/s.
-
-    1..5 mV/s, but not below seven nor above forty standard errors of a slope fitted to a minute
-    of this rail, which is sigma/alpha sqrt(12/T^3).
-    """
+    """Draw a rate of discharge, V/s."""
+    # 1..5 mV/s, but not below seven nor above forty standard errors of a slope fitted to a minute
+    # of this rail, which is sigma/alpha sqrt(12/T^3).
     error = bench.sigma0 / bench.alpha0 * math.sqrt(12 / REFERENCE_TIME**3)
     slope = float(np.clip(bench.draw.uniform(1e-3, 5e-3), 7 * error, 40 * error)) * gain
     cell = bench.draw.uniform(0.7, 0.9)       # V lost by a lithium cell from full to empty

@@ -157,12 +157,9 @@ def jumps_exponential(bench: Bench, gain: float) -> dict[str, object]:
 
 
 def _regimes(bench: Bench, dwell: list[float], shape: float = 1.0) -> np.ndarray:
-    """
-    Draw the path of a switch on the fine grid, shape (n_fine,) of ints.
-
-    Dwell times have the given means (s) and a gamma law of the given shape, 1 being Markov; the
-    next state is any other, all alike.
-    """
+    """Draw the path of a switch on the fine grid, shape (n_fine,) of ints."""
+    # Dwell times have the given means (s) and a gamma law of the given shape, 1 being Markov; the
+    # next state is any other, all alike.
     state = int(bench.path.integers(len(dwell)))
     pieces, total = [], 0
     while total < bench.n_fine:
@@ -229,23 +226,17 @@ def regimes_output(bench: Bench, gain: float) -> dict[str, object]:
 
 
 def _change(bench: Bench, gain: float) -> float:
-    """
-    Draw by how much the restoring force differs from the linear one at two deviations.
-
-    0.4..0.8, but not so small on a slow rail, of which a minute holds few relaxations.
-    """
+    """Draw by how much the restoring force differs from the linear one at two deviations."""
+    # 0.4..0.8, but not so small on a slow rail, of which a minute holds few relaxations.
     least = max(0.4, math.sqrt(8 / bench.alpha0))
     return min(bench.draw.uniform(least, 0.8) * gain, 0.85)
 
 
 @effect('nonlinear_restoring')
 def restoring(bench: Bench, gain: float) -> dict[str, object]:
-    """
-    Make the source's current a nonlinear function of its voltage, in one of two ways.
-
-    A source that limits its current: i = I tanh(x/(I R)), softer on both sides. Or one behind an
-    OR-ing diode: i = I (exp(-x/V) - 1), stiffer when the rail is low.
-    """
+    """Make the source's current a nonlinear function of its voltage, in one of two ways."""
+    # A source that limits its current: i = I tanh(x/(I R)), softer on both sides. Or one behind an
+    # OR-ing diode: i = I (exp(-x/V) - 1), stiffer when the rail is low.
     change, two = _change(bench, gain), 2 * bench.stationary
     if bench.draw.random() < 0.5:
         change = min(change, 0.65)

@@ -131,11 +131,8 @@ def saturation_soft(bench: Bench, gain: float) -> dict[str, object]:
 
 @effect('ac_coupling')
 def ac_coupling(bench: Bench, gain: float) -> dict[str, object]:
-    """
-    Read a rail of 1..5 1/s through a series capacitor, corner 5..12 Hz.
-
-    Strength scales the rail's own rate, to which the evidence is proportional.
-    """
+    """Read a rail of 1..5 1/s through a series capacitor, corner 5..12 Hz."""
+    # Strength scales the rail's own rate, to which the evidence is proportional.
     alpha = bench.draw.uniform(1.6, 5.0) * gain
     # The same innovation as the rail that was drawn, so that only the relaxation is slower.
     phi2 = math.exp(-2 * alpha / bench.rate)
@@ -199,11 +196,8 @@ def glitches_triple(bench: Bench, gain: float) -> dict[str, object]:
 
 
 def _latency(bench: Bench, gain: float) -> tuple[np.ndarray, dict[str, object]]:
-    """
-    Draw delays, s, inside nine tenths of each sample's own slot: a symmetric beta law.
-
-    So conversions stay in order, and no two have the same time on the fine grid.
-    """
+    """Draw delays, s, inside nine tenths of each sample's own slot: a symmetric beta law."""
+    # So conversions stay in order, and no two have the same time on the fine grid.
     spread, slot = min(bench.draw.uniform(0.22, 0.35) * gain, 0.35), 0.9
     shape = 0.5 * (slot**2 / (4 * spread**2) - 1)
     late = slot * (bench.path.beta(shape, shape, bench.n) - 0.5)

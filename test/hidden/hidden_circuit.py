@@ -99,12 +99,9 @@ class Bench:
         return fine[self.lead::self.substeps]
 
     def nats(self, signal: np.ndarray, *known: np.ndarray) -> float:
-        """
-        Return the log-likelihood that knowing an additive signal gains, nats.
-
-        Signals are in V on the fine grid; linear effects of `known` signals, and a constant, are
-        removed first.
-        """
+        """Return the log-likelihood that knowing an additive signal gains, nats."""
+        # Signals are in V on the fine grid; linear effects of `known` signals, and a constant, are
+        # removed first.
         def whitened(fine: np.ndarray) -> np.ndarray:
             at = self.samples(fine)
             return at[1:] - self.phi * at[:-1]
@@ -215,11 +212,8 @@ class Bench:
 
 def make_bench(duration: float, rate: float, substeps: int,
                rng: np.random.Generator) -> Bench:
-    """
-    Draw a plain rail and a flight: length in s, rate in Hz, fine steps a sample.
-
-    Relaxation 20..120 1/s, innovation of 5..30 mV at 1 kHz, level 3.3..25 V.
-    """
+    """Draw a plain rail and a flight: length in s, rate in Hz, fine steps a sample."""
+    # Relaxation 20..120 1/s, innovation of 5..30 mV at 1 kHz, level 3.3..25 V.
     flight, draw, path = (np.random.default_rng(rng.integers(2**63)) for _ in range(3))
 
     def log_uniform(low: float, high: float) -> float:

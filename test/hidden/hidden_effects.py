@@ -149,16 +149,13 @@ def _plain(value: object) -> object:
 def draw(kind: str, rng: np.random.Generator, *,
          cause: str | tuple[str, str] | None = None, duration: float = 60.0,
          rate: float = 1000.0, strength: float = 1.0, substeps: int | None = None) -> Hidden:
-    """
-    Draw a recording of one of KINDS: rail, flight, effect and noise are drawn from `rng`.
-
-    `cause` selects the effect (otherwise any): a cause; for 'pair' two of them; for 'variant' and
-    'unknown' a name from `variants` or `unknowns`, or the cause or shape in it.  Length in s, rate
-    in Hz.  Strength 1 is moderate: the right likelihood almost always finds it in a minute at 1
-    kHz.  It scales amplitudes, the logarithms of ratios, and the inverse of degrees of freedom; in
-    addition the strength of each effect varies by 30 % either way.  `substeps` are fine steps per
-    sample, by default as many as the effects need.
-    """
+    """Draw a recording of one of KINDS: rail, flight, effect and noise are drawn from `rng`."""
+    # `cause` selects the effect (otherwise any): a cause; for 'pair' two of them; for 'variant'
+    # and 'unknown' a name from `variants` or `unknowns`, or the cause or shape in it. Length in s,
+    # rate in Hz. Strength 1 is moderate: the right likelihood almost always finds it in a minute
+    # at 1 kHz. It scales amplitudes, the logarithms of ratios, and the inverse of degrees of
+    # freedom; in addition the strength of each effect varies by 30 % either way. `substeps` are
+    # fine steps per sample, by default as many as the effects need.
     if not (duration > 0 and rate > 0 and strength > 0):
         raise ValueError(f'duration {duration} s, rate {rate} 1/s and strength {strength} '
                          'must be positive')

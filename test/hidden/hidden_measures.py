@@ -69,11 +69,8 @@ def local_std(e: np.ndarray, block: int) -> np.ndarray:
 
 
 def signs(h: Hidden) -> dict[str, float]:
-    """
-    Return z-scores that are about N(0,1) on a plain rail, and large with a hidden effect.
-
-    They know the true alpha and innovation; all but 'line' and the bands are plain averages.
-    """
+    """Return z-scores that are about N(0,1) on a plain rail, and large with a hidden effect."""
+    # They know the true alpha and innovation; all but 'line' and the bands are plain averages.
     e = whitened(h)
     n = e.size
     square = np.minimum(e**2, 16.0)

@@ -16,13 +16,10 @@ RATES = (1e-7, 1e-4, 9.9e-4, 1.01e-3, 0.02, 0.3, 4.0)
 @pytest.mark.parametrize('m', BLOCKS)
 @pytest.mark.parametrize('a', RATES)
 def test_block_autocovariances_are_the_double_sums(a, m):
-    """
-    Both closed forms, and their difference, which is what theta lives on.
-
-    gamma0 and gamma1 agree to a few roundings; their difference is a times
-    smaller, and where the closed form is used (a >= 1e-3) it loses eps/a^2.
-    Below, the reference itself loses eps/a in the difference.
-    """
+    """Both closed forms, and their difference, which is what theta lives on."""
+    # gamma0 and gamma1 agree to a few roundings; their difference is a times smaller, and where
+    # the closed form is used (a >= 1e-3) it loses eps/a^2. Below, the reference itself loses eps/a
+    # in the difference.
     expected = block_autocovariances(a, m, 2)
     got = arma.block_autocovariance(a, m)
     assert got == pytest.approx(expected, rel=1e-9)
@@ -68,13 +65,9 @@ def test_theta_of_long_blocks_tends_to_that_of_a_random_walk():
 @pytest.mark.parametrize('m', [1, 4])
 @pytest.mark.parametrize('a, share', [(0.2, 0.15), (0.6, 0.6), (0.1, 0.02)])
 def test_log_covariance_is_the_dense_expected_information(a, share, m):
-    """
-    The information of 2n samples less that of n, over n, is free of the ends.
-
-    Parameters of the dense matrix are ln(alpha), ln(sigma^2) and the noise;
-    with steps of 1e-4 the differences are exact to 1e-7, and the ends have
-    fallen to exp(-2 n a) = 1e-13 or less.
-    """
+    """The information of 2n samples less that of n, over n, is free of the ends."""
+    # Parameters of the dense matrix are ln(alpha), ln(sigma^2) and the noise; with steps of 1e-4
+    # the differences are exact to 1e-7, and the ends have fallen to exp(-2 n a) = 1e-13 or less.
     n = 150
     gammas = {}
 

@@ -93,12 +93,9 @@ def relaxations(n, rates, noise, *, uneven=False, seed=1):
 @pytest.mark.parametrize('noise', [0.1, 1e-6])
 @pytest.mark.parametrize('uneven', [False, True])
 def test_the_filter_equals_the_kalman_recursion(rates, noise, uneven):
-    """
-    Same innovations and variances, whatever the steps.
-
-    Almost no noise costs digits: the precision of a sample is then some 1e6
-    of that of a step, and of 16 digits ten are left.
-    """
+    """Same innovations and variances, whatever the steps."""
+    # Almost no noise costs digits: the precision of a sample is then some 1e6 of that of a step,
+    # and of 16 digits ten are left.
     model = relaxations(400, rates, noise, uneven=uneven)
     y = np.random.default_rng(2).standard_normal(400)
     run = Filter(model)
@@ -180,11 +177,7 @@ def test_ordinates_of_a_random_walk_are_exact():
 @pytest.mark.parametrize('m', [1, 4])
 @pytest.mark.parametrize('a, share', [(0.02, 0.0), (0.06, 0.1), (0.3, 1.0)])
 def test_the_likelihood_is_nearly_that_of_dense_matrices(m, a, share):
-    """
-    Between two points it rises by as many nats, to 0.2.
-
-    A Fourier transform of the same window misses by several: it leaks.
-    """
+    """Between two points it rises by as many nats, to 0.2."""
     rng = np.random.default_rng(1)
     n, step = 400, 0.01
     t = np.arange(m * n) * step / m

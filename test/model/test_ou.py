@@ -29,12 +29,9 @@ def test_transition_at_a_tiny_step_keeps_its_digits():
 
 @pytest.mark.parametrize('regular', [True, False])
 def test_paths_have_the_exact_covariance(regular):
-    """
-    Cov(x_j, x_k) = Var_inf exp(-alpha |t_j - t_k|), over 10 000 paths.
-
-    The standard error of a sample covariance is at most
-    Var_inf sqrt(2 / paths); five of them, 7 %, bound the largest of 36 entries.
-    """
+    """Cov(x_j, x_k) = Var_inf exp(-alpha |t_j - t_k|), over 10 000 paths."""
+    # The standard error of a sample covariance is at most Var_inf sqrt(2 / paths); five of them, 7
+    # %, bound the largest of 36 entries.
     rng = np.random.default_rng(11)
     t = np.arange(8) * 0.005 if regular else np.array(
         [0.0, 0.001, 0.004, 0.0041, 0.02, 0.03, 0.031, 0.09])

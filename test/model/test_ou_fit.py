@@ -26,12 +26,9 @@ def rail(rng, rate, alpha, deviation, white, seconds=30.0, sag=1.5):
 
 
 def test_intervals_cover_the_truth():
-    """
-    Of 40 rails 95 % intervals of alpha, sigma and Var_inf cover each at least 34.
-
-    Binomial: fewer than 34 of 40 at a coverage of 95 % has a chance of 1.4 % for 35 and 0.3 %
-    here; at 75 % (an interval of 60 % of the width) it is 92 %.
-    """
+    """Of 40 rails 95 % intervals of alpha, sigma and Var_inf cover each at least 34."""
+    # Binomial: fewer than 34 of 40 at a coverage of 95 % has a chance of 1.4 % for 35 and 0.3 %
+    # here; at 75 % (an interval of 60 % of the width) it is 92 %.
     inside = dict.fromkeys(('alpha', 'sigma', 'var_inf'), 0)
     for seed in range(40):
         rng = np.random.default_rng(seed)
@@ -67,11 +64,8 @@ def test_the_answer_to_a_switched_load_leaves_nothing():
 
 
 def test_buried_relaxations_lie_within_the_bounds():
-    """
-    Of 20 rails with an OU a fifth as large as white noise, 17 lie within the bounds.
-
-    95 % each; fewer than 17 of 20 has a chance of 1.6 %.
-    """
+    """Of 20 rails with an OU a fifth as large as white noise, 17 lie within the bounds."""
+    # 95 % each; fewer than 17 of 20 has a chance of 1.6 %.
     inside = 0
     for seed in range(20):
         t, v, u = rail(np.random.default_rng(seed), 100.0, 20.0, 0.002, 0.01, 8.0)
@@ -82,11 +76,8 @@ def test_buried_relaxations_lie_within_the_bounds():
 
 
 def test_slow_relaxations_lie_within_the_bounds():
-    """
-    Of 16 rails with a slow OU beside fast readings, the intervals or bounds hold 13.
-
-    95 % each; fewer than 13 of 16 has a chance of 0.7 %.
-    """
+    """Of 16 rails with a slow OU beside fast readings, the intervals or bounds hold 13."""
+    # 95 % each; fewer than 13 of 16 has a chance of 0.7 %.
     inside = 0
     for seed in range(16):
         rng = np.random.default_rng(seed)
@@ -99,12 +90,9 @@ def test_slow_relaxations_lie_within_the_bounds():
 
 
 def test_throttle_does_not_excuse_a_slow_relaxation():
-    """
-    Of 16 rails with readings much faster than the OU, intervals of sigma hold 13.
-
-    95 %; fewer than 13 of 16 has a chance of 0.7 %.  A law of the noise's size fitted to the OU
-    itself, whose few independent values follow throttle by chance, held 9.
-    """
+    """Of 16 rails with readings much faster than the OU, intervals of sigma hold 13."""
+    # 95 %; fewer than 13 of 16 has a chance of 0.7 %. A law of the noise's size fitted to the OU
+    # itself, whose few independent values follow throttle by chance, held 9.
     inside = 0
     for seed in range(16):
         rng = np.random.default_rng(seed)
@@ -117,11 +105,8 @@ def test_throttle_does_not_excuse_a_slow_relaxation():
 
 
 def test_intervals_hold_if_noise_grows_with_throttle_changes():
-    """
-    Of 16 rails whose white noise is as large again while throttle moves, intervals hold 13.
-
-    95 %; fewer than 13 of 16 has a chance of 0.7 %.
-    """
+    """Of 16 rails whose white noise is as large again while throttle moves, intervals hold 13."""
+    # 95 %; fewer than 13 of 16 has a chance of 0.7 %.
     inside = 0
     for seed in range(16):
         rng = np.random.default_rng(seed)
@@ -160,11 +145,8 @@ def test_gaps_and_short_stretches_change_little():
 
 
 def test_lost_messages_cost_little_memory():
-    """
-    2 % of 1 kHz lost, one by one: the same answer.
-
-    At most 150 MB: it runs in the node.
-    """
+    """2 % of 1 kHz lost, one by one: the same answer."""
+    # At most 150 MB: it runs in the node.
     rng = np.random.default_rng(3)
     t, v, u = rail(rng, 1000.0, 20.0, 0.05, 0.01)
     keep = rng.random(t.size) > 0.02
@@ -197,12 +179,9 @@ def test_a_constant_signal_has_no_noise():
 
 @pytest.mark.parametrize('seed', [5, 7])
 def test_two_nearly_equally_likely_rates_both_count(seed):
-    """
-    An OU of 2 1/s is one, or the level's walk beside one of 40 1/s: both maxima count.
-
-    With these seeds, of 0 to 11, they are within some nats; with one maximum alone seed 5 gave 4.2
-    1/s, 95 % 3.3 to 5.8.
-    """
+    """An OU of 2 1/s is one, or the level's walk beside one of 40 1/s: both maxima count."""
+    # With these seeds, of 0 to 11, they are within some nats; with one maximum alone seed 5 gave
+    # 4.2 1/s, 95 % 3.3 to 5.8.
     rng, t = np.random.default_rng(seed), np.arange(6000) / 100.0
     slow, fast = (simulate(t, alpha, deviation * np.sqrt(2.0 * alpha), rng)
                   for alpha, deviation in ((2.0, 0.0045), (40.0, 0.0012)))

@@ -36,12 +36,9 @@ def test_additive_along_the_way():
 
 
 def test_mean_passage_time_agrees_with_simulated_paths():
-    """
-    Mean over 4 000 paths of step 2e-3 tau, barrier moved for discreteness.
-
-    Sampled paths see the barrier shifted by 0.5826 sqrt(2 dt) (Broadie,
-    Glasserman & Kou 1997); what is left is far below the Monte Carlo error.
-    """
+    """Mean over 4 000 paths of step 2e-3 tau, barrier moved for discreteness."""
+    # Sampled paths see the barrier shifted by 0.5826 sqrt(2 dt) (Broadie, Glasserman & Kou 1997);
+    # what is left is far below the Monte Carlo error.
     rng = np.random.default_rng(2)
     dt, paths = 2e-3, 4000
     phi, q = math.exp(-dt), math.sqrt(-math.expm1(-2.0 * dt))
@@ -100,11 +97,8 @@ def test_mean_time_is_that_of_siegert(start, barrier):
 
 
 def log_cylinder(p, z):
-    """
-    Return ln D_-p(z) for p > 0, from its integral (DLMF 12.5.1).
-
-    For p > 1; scipy's pbdv, good for small p, is off by 0.3 % at p = 60 here and there.
-    """
+    """Return ln D_-p(z) for p > 0, from its integral (DLMF 12.5.1)."""
+    # For p > 1; scipy's pbdv, good for small p, is off by 0.3 % at p = 60 here and there.
     if p <= 1.0:
         return math.log(pbdv(-p, z)[0])
 

@@ -137,11 +137,8 @@ def test_throttle_may_be_unknown_if_no_term_needs_it():
 @pytest.mark.parametrize('name', ['jumps', 'clock_jitter', 'ac_coupling', 'load_transient',
                                   'heavy_tails'])
 def test_memory_does_not_grow(name):
-    """
-    Forty segments of 20 000 samples take no more than the first three.
-
-    One array of a segment is 160 kB; all samples would be 6 MB.
-    """
+    """Forty segments of 20 000 samples take no more than the first three."""
+    # One array of a segment is 160 kB; all samples would be 6 MB.
     run = Simulation(supply(term(name, **EXAMPLES[name])), np.random.default_rng(0))
     n, load = 20_000, np.full(20_000, 0.3)
     base = np.arange(n) / 1000.0

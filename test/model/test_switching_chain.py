@@ -46,12 +46,7 @@ def drawn(height, at_once, seed):
 
 @pytest.mark.parametrize('height, at_once', [(0.4, 1.0), (1.0, 0.0)])
 def test_scores_of_the_true_levels_are_standard_normal(height, at_once):
-    """
-    Variance within 4 errors, sqrt(2/n); no correlation of neighbours, 1/sqrt(n).
-
-    A rail on its way to a level hides for long which one: there the mean of the states leaves
-    more, and only the likelihood is asked.
-    """
+    """Variance within 4 errors, sqrt(2/n); no correlation of neighbours, 1/sqrt(n)."""
     voltage, _ = drawn(height, at_once, 3)
     view = filtered(voltage, DRIVE)
     x = np.array([math.log(UP), math.log(DOWN), height / math.sqrt(view.variance[0]), 0.0, 0.0])

@@ -58,11 +58,7 @@ def test_power_along_throttle_is_that_of_every_line(rate, lengths):
 
 
 def test_the_view_of_a_faster_rail_has_its_residuals():
-    """
-    Residuals less phi^2 times the state before, over what noise of that phi makes of a step.
-
-    Its spread is that of the middle half of the errors, at a usual step.
-    """
+    """Residuals less phi^2 times the state before, over what noise of that phi makes of a step."""
     rng = np.random.default_rng(9)
     phi = np.tile([0.9, 0.8, 0.9], 400)
     state, z, variance = rng.standard_normal(1200), rng.standard_normal(1200), np.tile(

@@ -16,13 +16,10 @@ def jumps(rate=50.0, mean=-0.05, std=0.03):
 
 @pytest.mark.parametrize('dt', [2e-3, 0.05])
 def test_jumps_have_the_moments_of_shot_noise(dt):
-    """
-    Mean rate m/alpha, variance rate (m^2 + s^2)/(2 alpha), covariance exp(-alpha lag).
-
-    The fourth cumulant is rate E J^4/(4 alpha).  A run of n samples is worth
-    n tanh(alpha dt/2) for its mean and n tanh(alpha dt) for its variance.  At
-    steps of 50 ms, 3 relaxations, a jump within a step has relaxed since it came.
-    """
+    """Mean rate m/alpha, variance rate (m^2 + s^2)/(2 alpha), covariance exp(-alpha lag)."""
+    # The fourth cumulant is rate E J^4/(4 alpha). A run of n samples is worth n tanh(alpha dt/2)
+    # for its mean and n tanh(alpha dt) for its variance. At steps of 50 ms, 3 relaxations, a jump
+    # within a step has relaxed since it came.
     n = round(3500.0 / dt) if dt < 0.01 else 70_000
     x = still(jumps()).simulate(np.arange(n) * dt, np.random.default_rng(1))
     x = x[round(0.5 / dt):]
@@ -41,11 +38,8 @@ def test_jumps_have_the_moments_of_shot_noise(dt):
 
 
 def test_jumps_are_a_poisson_process():
-    """
-    Seen at 20 kHz: numbers, exponential waits, normal sizes, decay in between.
-
-    N jumps: their rate to 1/sqrt(N).
-    """
+    """Seen at 20 kHz: numbers, exponential waits, normal sizes, decay in between."""
+    # N jumps: their rate to 1/sqrt(N).
     dt, n = 5e-5, 1_000_000
     x = still(jumps()).simulate(np.arange(n) * dt, np.random.default_rng(2))
     e = x[1:] - math.exp(-ALPHA * dt) * x[:-1]
@@ -62,11 +56,8 @@ def test_jumps_are_a_poisson_process():
 
 @pytest.mark.parametrize('dof', [3.0, 5.0, 12.0])
 def test_innovations_are_student_t(dof):
-    """
-    Innovations are Student-t of the stated degrees, scaled to the variance of the ou.
-
-    100 000 of them tell 15 % more or fewer degrees up to 5, and 60 % at 12.
-    """
+    """Innovations are Student-t of the stated degrees, scaled to the variance of the ou."""
+    # 100 000 of them tell 15 % more or fewer degrees up to 5, and 60 % at 12.
     n, dt = 100_000, 1e-3
     x = supply(term('heavy_tails', dof=dof), u0=0.0).simulate(
         np.arange(n) * dt, np.random.default_rng(4))
@@ -99,11 +90,8 @@ SHARE = UP / (UP + DOWN)
 
 
 def test_switching_of_the_level():
-    """
-    Share of the second state, and covariance level^2 p (1 - p) exp(-(up + down) lag).
-
-    Sampled every 100 ms, 8 relaxations of the chain; 8 and 25 ms give the lags.
-    """
+    """Share of the second state, and covariance level^2 p (1 - p) exp(-(up + down) lag)."""
+    # Sampled every 100 ms, 8 relaxations of the chain; 8 and 25 ms give the lags.
     n, level = 60_000, 0.3
     state = term('regime_switching', rate_up=UP, rate_down=DOWN, level=level, sigma_ratio=1.0,
                  at_once=1.0, states=2.0)
@@ -132,11 +120,8 @@ def test_rates_of_switching():
 
 
 def test_a_level_that_comes_at_the_rate_alpha():
-    """
-    A telegraph behind a low-pass: variance level^2 p (1 - p) alpha/(alpha + up + down).
-
-    Whatever the steps: groups of samples 1 and 30 ms apart, independent of each other.
-    """
+    """A telegraph behind a low-pass: variance level^2 p (1 - p) alpha/(alpha + up + down)."""
+    # Whatever the steps: groups of samples 1 and 30 ms apart, independent of each other.
     level = 0.3
     slow = term('regime_switching', rate_up=UP, rate_down=DOWN, level=level, sigma_ratio=1.0,
                 at_once=0.0, states=2.0)
@@ -149,12 +134,9 @@ def test_a_level_that_comes_at_the_rate_alpha():
 
 
 def test_three_states_keep_detailed_balance():
-    """
-    Shares of the states, by detailed balance of up and down; each adds its level once.
-
-    With q = up/down: 0 is left at 2 up, 1 at up + down, 2 at 2 down.  Samples 6 relaxations of
-    the chain apart correlate by exp(-6): half a percent of a variance.
-    """
+    """Shares of the states, by detailed balance of up and down; each adds its level once."""
+    # With q = up/down: 0 is left at 2 up, 1 at up + down, 2 at 2 down. Samples 6 relaxations of
+    # the chain apart correlate by exp(-6): half a percent of a variance.
     up, down, count = 20.0, 30.0, 60_000
     three = term('regime_switching', rate_up=up, rate_down=down, level=0.5, sigma_ratio=1.0,
                  at_once=1.0, states=3.0)
@@ -168,14 +150,10 @@ def test_three_states_keep_detailed_balance():
 
 @pytest.mark.parametrize('dt', [1e-3, 0.02, 0.06])
 def test_switching_of_sigma_within_a_step(dt):
-    """
-    Variance of innovations given the state at the end of the step, in closed form.
-
-    Looking back a time u from a sample in state s, the chain is in the second
-    state with p + (s - p) exp(-(up + down) u); noise of that time counts with
-    2 alpha exp(-2 alpha u).  A level of 100 V shows the state.  Steps of 60 ms
-    are 5 stays in the second state long.
-    """
+    """Variance of innovations given the state at the end of the step, in closed form."""
+    # Looking back a time u from a sample in state s, the chain is in the second state with p + (s
+    # - p) exp(-(up + down) u); noise of that time counts with 2 alpha exp(-2 alpha u). A level of
+    # 100 V shows the state. Steps of 60 ms are 5 stays in the second state long.
     n, ratio = 200_000, 3.0
     x = supply(term('regime_switching', rate_up=UP, rate_down=DOWN, level=100.0,
                     sigma_ratio=ratio, at_once=1.0, states=2.0), u0=0.0).simulate(

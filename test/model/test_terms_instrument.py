@@ -11,12 +11,9 @@ VAR = SIGMA ** 2 / (2.0 * ALPHA)
 
 
 def covariance(alpha, rate, lag, var=VAR):
-    """
-    Return the autocovariance of a high-passed OU, V^2.
-
-    The PSD ~ w^2 / ((w^2 + alpha^2) (w^2 + rate^2)) in partial fractions; for
-    equal rates its limit.
-    """
+    """Return the autocovariance of a high-passed OU, V^2."""
+    # The PSD ~ w^2 / ((w^2 + alpha^2) (w^2 + rate^2)) in partial fractions; for equal rates its
+    # limit.
     if abs(alpha / rate - 1.0) < 1e-3:
         return 0.5 * var * (1.0 - alpha * lag) * math.exp(-alpha * lag)
     return var * alpha / (alpha ** 2 - rate ** 2) * (
@@ -25,12 +22,9 @@ def covariance(alpha, rate, lag, var=VAR):
 
 @pytest.mark.parametrize('corner', [0.5, 5.0, 10.026, 10.03, 100.0, 1000.0])
 def test_the_covariance_is_exact_at_any_spacing(corner):
-    """
-    Variance Var alpha/(alpha + rate) and its autocovariance, steps from fine to very coarse.
-
-    At steps of a relaxation or more the rail between samples is not a straight
-    line: only the exact bridge has this law.  10.027 Hz is alpha itself.
-    """
+    """Variance Var alpha/(alpha + rate) and its autocovariance, steps from fine to very coarse."""
+    # At steps of a relaxation or more the rail between samples is not a straight line: only the
+    # exact bridge has this law. 10.027 Hz is alpha itself.
     rate = 2.0 * math.pi * corner
     offsets = np.array([0.0, 0.3, 1.3, 3.3]) / math.sqrt(ALPHA * rate)
     gap = 15.0 / min(ALPHA, rate)
@@ -43,11 +37,8 @@ def test_the_covariance_is_exact_at_any_spacing(corner):
 @pytest.mark.parametrize('dt', [1e-4, 1e-2, 2e-2])
 @pytest.mark.parametrize('corner', [10.026761414789407, 4.0])
 def test_covariance_at_even_stamps(corner, dt):
-    """
-    Also in a run, where errors would add up; rate dt is 0.0025 to 1.3.
-
-    Standard error of a sample covariance: (1/n) sum_j (c_j^2 + c_{j+k} c_{j-k}).
-    """
+    """Also in a run, where errors would add up; rate dt is 0.0025 to 1.3."""
+    # Standard error of a sample covariance: (1/n) sum_j (c_j^2 + c_{j+k} c_{j-k}).
     rate = 2.0 * math.pi * corner
     n = 1_000_000 if dt < 1e-3 else 100_000
     x = supply(term('ac_coupling', corner=corner, offset=0.0)).simulate(
@@ -75,12 +66,9 @@ def test_first_sample_is_stationary():
 
 @pytest.mark.parametrize('corner', [2.0, 10.027, 50.0])
 def test_a_step_of_the_level_decays_at_the_corner(corner):
-    """
-    A step of the level decays as exp(-rate t); constant levels are gone from the start.
-
-    The level is taken as a straight line between samples: the step is a ramp of
-    one sample, whose answer at its end is (1 - exp(-rate dt)) / (rate dt).
-    """
+    """A step of the level decays as exp(-rate t); constant levels are gone from the start."""
+    # The level is taken as a straight line between samples: the step is a ramp of one sample,
+    # whose answer at its end is (1 - exp(-rate dt)) / (rate dt).
     dt, k = 1e-4, 50
     rate = 2.0 * math.pi * corner
     throttle = np.where(np.arange(3000) < k, 0.1, 0.6)
@@ -105,12 +93,9 @@ def test_noise_after_the_instrument_is_not_high_passed():
 
 
 def test_coupling_takes_a_slow_second_pole_away():
-    """
-    A second relaxation passes the same high-pass: at fine steps, variances add up.
-
-    Steps of 0.5 ms; the second pole is 20 times slower than the corner, so what
-    is left of it is var a/(a + rate).
-    """
+    """A second relaxation passes the same high-pass: at fine steps, variances add up."""
+    # Steps of 0.5 ms; the second pole is 20 times slower than the corner, so what is left of it is
+    # var a/(a + rate).
     n, dt, corner = 400_000, 5e-4, 10.0
     rate = 2.0 * math.pi * corner
     model = still(term('second_relaxation', alpha=3.0, sigma=1.0),

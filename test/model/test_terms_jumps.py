@@ -17,13 +17,10 @@ def jumping(seed, share=0.01, mean=-0.06, spread=0.03, unit=1.1, n=40_000):
 
 
 def test_the_mixture_of_jumps_is_that_of_the_largest_likelihood():
-    """
-    Climbing on from where EM ended gains nothing; the truth is within four errors.
-
-    n = 40 000 with 400 jumps: mean and spread are known to spread / sqrt(400) and
-    spread / sqrt(800), widened by the noise in each (a third of the spread), the scale of the
-    rest to 1 / sqrt(2 n).
-    """
+    """Climbing on from where EM ended gains nothing; the truth is within four errors."""
+    # n = 40 000 with 400 jumps: mean and spread are known to spread / sqrt(400) and spread /
+    # sqrt(800), widened by the noise in each (a third of the spread), the scale of the rest to 1 /
+    # sqrt(2 n).
     z, var = jumping(1)
     share, mean, spread, unit = _mixture(z, var)
 

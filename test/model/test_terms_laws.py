@@ -45,11 +45,7 @@ def test_a_mixture_has_the_weighted_chance():
 
 @pytest.mark.parametrize('seed', range(20))
 def test_best_runs_are_the_best_of_all_choices(seed):
-    """
-    Seven runs, all 128 choices of them: the largest sum of gains of runs that are apart.
-
-    A run needs the innovation at its end, so the next begins behind that.
-    """
+    """Seven runs, all 128 choices of them: the largest sum of gains of runs that are apart."""
     rng = np.random.default_rng(seed)
     begin = rng.integers(0, 20, 7)
     end, gain = begin + rng.integers(1, 6, 7), rng.random(7)

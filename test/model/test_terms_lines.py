@@ -25,11 +25,8 @@ def test_resonance_has_its_damped_covariance(frequency, damping, std, tilt):
 
 
 def test_resonance_at_even_stamps():
-    """
-    Lags of a run at 1 kHz, also of half and whole periods.
-
-    A sample covariance at lag k has the variance (1/n) sum_j (c_j^2 + c_{j+k} c_{j-k}).
-    """
+    """Lags of a run at 1 kHz, also of half and whole periods."""
+    # A sample covariance at lag k has the variance (1/n) sum_j (c_j^2 + c_{j+k} c_{j-k}).
     n, dt = 400_000, 1e-3
     x = still(term('resonance', frequency=50.0, damping=20.0, std=0.05, tilt=0.0)).simulate(
         np.arange(n) * dt, np.random.default_rng(2))
@@ -92,12 +89,9 @@ def test_throttle_tone_has_no_jump_of_phase():
 
 @pytest.mark.parametrize('low, high', [(10.0, 100.0), (0.5, 200.0), (1e-3, 1e4), (3.0, 5.0)])
 def test_flicker_poles_make_one_over_f(low, high):
-    """
-    The one-sided PSD of the sum is amplitude^2/f within 2 %, at the ends as between.
-
-    An OU of variance v and rate a has the one-sided PSD 4 v a / (a^2 + (2 pi f)^2):
-    its integral over f > 0 is v.
-    """
+    """The one-sided PSD of the sum is amplitude^2/f within 2 %, at the ends as between."""
+    # An OU of variance v and rate a has the one-sided PSD 4 v a / (a^2 + (2 pi f)^2): its integral
+    # over f > 0 is v.
     noise = term('flicker_noise', amplitude=0.3, low=low, high=high)
     poles, std = np.broadcast_arrays(noise.poles(), noise.pole_std())
     f = np.geomspace(low, high, 400)
@@ -111,15 +105,11 @@ def test_flicker_poles_make_one_over_f(low, high):
 
 
 def test_flicker_samples_have_that_spectrum():
-    """
-    Octaves of a run at 4 kHz against amplitude^2/f between 10 and 80 Hz.
-
-    Half-overlapped Hann segments of n_seg samples out of n average about
-    1.9 n/n_seg periodograms' worth of 0.95 each; neighbouring bins share
-    information, 1.5 bins of noise bandwidth: the relative error of a mean over
-    m bins is sqrt(1.5 n_seg / (1.8 m n)).  What aliases from above 3.9 kHz adds
-    (80/4000)^2 at most.
-    """
+    """Octaves of a run at 4 kHz against amplitude^2/f between 10 and 80 Hz."""
+    # Half-overlapped Hann segments of n_seg samples out of n average about 1.9 n/n_seg
+    # periodograms' worth of 0.95 each; neighbouring bins share information, 1.5 bins of noise
+    # bandwidth: the relative error of a mean over m bins is sqrt(1.5 n_seg / (1.8 m n)). What
+    # aliases from above 3.9 kHz adds (80/4000)^2 at most.
     n, rate, seg = 2 ** 20, 4000.0, 2 ** 14
     x = still(term('flicker_noise', amplitude=0.3, low=10.0, high=80.0)).simulate(
         np.arange(n) / rate, np.random.default_rng(5))
@@ -133,12 +123,10 @@ def test_flicker_samples_have_that_spectrum():
 
 
 def test_the_powers_of_ringing_spread_and_those_of_a_line_do_not():
-    """
-    A wandering phase at one amplitude, and noise that rings, both 4 Hz wide at 90 Hz.
-
-    Of 32 powers, hardly dependent, the interquartile range over the median is near 0 for a line;
-    for ringing it is ln 3 / ln 2 = 1.58, with a standard error of 0.41: 10 of 400 are below 0.85.
-    """
+    """A wandering phase at one amplitude, and noise that rings, both 4 Hz wide at 90 Hz."""
+    # Of 32 powers, hardly dependent, the interquartile range over the median is near 0 for a line;
+    # for ringing it is ln 3 / ln 2 = 1.58, with a standard error of 0.41: 10 of 400 are below
+    # 0.85.
     n, rate, width = 2000, 1000.0, 4.0
     at = np.arange(n) / rate
 

@@ -33,12 +33,7 @@ def test_sag_follows_throttle_at_once(start):
 
 @pytest.mark.parametrize('gain, tau', [(0.4, 0.03), (-0.2, 0.005), (0.1, 2.0)])
 def test_transient_of_a_step(gain, tau):
-    """
-    A step from 20 to 70 % shows as 0.5 gain exp(-t/tau) and nothing before.
-
-    Throttle holds from the stamp before to its own, so t counts from the stamp
-    before the first sample of the new throttle.
-    """
+    """A step from 20 to 70 % shows as 0.5 gain exp(-t/tau) and nothing before."""
     found = level(term('load_transient', gain=gain, tau=tau, delay=0.0),
                   throttle=step_at(100, 0.2, 0.7))
     since = T - T[99]
@@ -58,12 +53,7 @@ def test_transient_of_uneven_stamps():
 @pytest.mark.parametrize('delay, later', [(0.02, 20), (0.001, 1), (0.1, 100), (0.0205, 21)])
 @pytest.mark.parametrize('start', [0.0, 0.3, 1000.1])
 def test_transient_comes_after_its_delay(delay, later, start):
-    """
-    The answer is that without delay, later by the samples that the delay lasts.
-
-    A delay of half a sample more shows one sample later.  Whole samples are
-    whole whatever the rounding of the stamps.
-    """
+    """The answer is that without delay, later by the samples that the delay lasts."""
     t = start + np.arange(400) / 1000.0
     throttle = step_at(100) * 0.5 + 0.1
     prompt = level(term('load_transient', gain=0.4, tau=0.03, delay=0.0), throttle=throttle, t=t)

@@ -12,11 +12,8 @@ VAR = 0.632 ** 2 / 126.0
 
 @pytest.mark.parametrize('alpha, sigma', [(63.0, 0.632), (4.0, 2.0), (900.0, 0.05)])
 def test_ou_at_uneven_stamps(alpha, sigma):
-    """
-    Mean u0 and covariance sigma^2/(2 alpha) exp(-alpha lag), steps of 0.1 to 60 relaxations.
-
-    60 000 independent groups: a variance to sqrt(2/60 000) = 0.6 %, so that 5 % is seen.
-    """
+    """Mean u0 and covariance sigma^2/(2 alpha) exp(-alpha lag), steps of 0.1 to 60 relaxations."""
+    # 60 000 independent groups: a variance to sqrt(2/60 000) = 0.6 %, so that 5 % is seen.
     offsets = np.array([0.0, 0.1, 0.5, 1.5]) / alpha
     groups = clusters(supply(alpha=alpha, sigma=sigma), offsets, 60.0 / alpha, 60_000, 1) - U0
     var = sigma ** 2 / (2.0 * alpha)
@@ -27,12 +24,9 @@ def test_ou_at_uneven_stamps(alpha, sigma):
 
 @pytest.mark.parametrize('dt', [1e-4, 0.01, 0.05])
 def test_ou_at_even_stamps(dt):
-    """
-    It is AR(1): coefficient and variance of the innovations, which are independent.
-
-    n = 400 000: the variance to sqrt(2/n) = 0.22 %, so that 2 % is seen; the
-    coefficient to sqrt((1 - phi^2)/n).
-    """
+    """It is AR(1): coefficient and variance of the innovations, which are independent."""
+    # n = 400 000: the variance to sqrt(2/n) = 0.22 %, so that 2 % is seen; the coefficient to
+    # sqrt((1 - phi^2)/n).
     n = 400_000
     phi = math.exp(-ALPHA * dt)
     x = supply().simulate(np.arange(n) * dt, np.random.default_rng(2)) - U0
@@ -59,11 +53,8 @@ def test_second_relaxation_adds_its_own_covariance():
 @pytest.mark.parametrize('throttle, log_factor', [
     (0.0, 0.3), (0.1, 0.3), (0.2, 0.4), (0.4, 0.7), (0.7, 0.55), (1.0, 0.4)])
 def test_sigma_follows_throttle(throttle, log_factor):
-    """
-    Ln sigma on straight lines between knots, level outside; alpha as it was.
-
-    The factors are read off the knots (0.1, 0.3), (0.3, 0.5), (0.4, 0.7), (1, 0.4) by hand.
-    """
+    """Ln sigma on straight lines between knots, level outside; alpha as it was."""
+    # The factors are read off the knots (0.1, 0.3), (0.3, 0.5), (0.4, 0.7), (1, 0.4) by hand.
     model = supply(term('load_dependent_sigma', throttle=[0.1, 0.3, 0.4, 1.0],
                         log_factor=[0.3, 0.5, 0.7, 0.4]))
     offsets = np.array([0.0, 0.01])
@@ -84,11 +75,7 @@ def test_alpha_follows_throttle(throttle, rate):
 
 
 def test_throttle_acts_on_the_step_before_its_stamp():
-    """
-    From the sample where throttle is 1, innovations have the new intensity.
-
-    Every second step is loud: sigma times e, at once and not a sample later.
-    """
+    """From the sample where throttle is 1, innovations have the new intensity."""
     n, dt = 200_000, 0.01
     load = (np.arange(n) % 2).astype(float)
     x = supply(term('load_dependent_sigma', throttle=[0.0, 1.0], log_factor=[0.0, 1.0])).simulate(
@@ -102,13 +89,10 @@ def test_throttle_acts_on_the_step_before_its_stamp():
 
 
 def test_the_log_of_sigma_is_an_ou():
-    """
-    Ln sigma is an OU of the stated std and rate.
-
-    The ou relaxes in 1 us here, so a sample is sigma times a fresh normal z,
-    and ln x^2 = ln Var + 2 L + ln z^2: mean ln Var - gamma - ln 2, lagged
-    covariance 4 std^2 exp(-rate lag); exp(2 L) has mean exp(2 std^2).
-    """
+    """Ln sigma is an OU of the stated std and rate."""
+    # The ou relaxes in 1 us here, so a sample is sigma times a fresh normal z, and ln x^2 = ln Var
+    # + 2 L + ln z^2: mean ln Var - gamma - ln 2, lagged covariance 4 std^2 exp(-rate lag); exp(2
+    # L) has mean exp(2 std^2).
     std, rate, count = 0.7, 8.0, 200_000
     offsets = np.array([0.0, 0.02, 0.06])
     model = supply(term('volatility', std=std, rate=rate), alpha=1e6, sigma=1.0, u0=0.0)
@@ -128,12 +112,9 @@ def test_the_log_of_sigma_is_an_ou():
 @pytest.mark.parametrize('square, cube, sigma', [
     (0.0, 4000.0, 2.0), (300.0, 3000.0, 2.0), (-300.0, 3000.0, 2.0), (0.0, 1e6, 2.0)])
 def test_nonlinear_restoring_has_the_density_of_its_potential(square, cube, sigma):
-    """
-    Density ~ exp(-2 V/sigma^2), V the integral of alpha x + square x^2 + cube x^3.
-
-    Samples 4 relaxations apart are worth n tanh(2) = 0.96 n at least, as this
-    force pulls harder than the linear one nearly everywhere.
-    """
+    """Density ~ exp(-2 V/sigma^2), V the integral of alpha x + square x^2 + cube x^3."""
+    # Samples 4 relaxations apart are worth n tanh(2) = 0.96 n at least, as this force pulls harder
+    # than the linear one nearly everywhere.
     def weight(x):
         return math.exp(-(ALPHA * x * x + square * x ** 3 / 1.5 + 0.5 * cube * x ** 4)
                         / sigma ** 2)
@@ -174,11 +155,8 @@ def decay_error(dt, square=0.0, cube=6000.0):
 
 @pytest.mark.parametrize('square, cube', [(0.0, 6000.0), (700.0, 1e-6), (-90.0, 1e-6)])
 def test_nonlinear_restoring_is_of_second_order(square, cube):
-    """
-    Without noise the closed form is met, four times nearer at half the step.
-
-    Order 1 would give 2; the bound is 3, and steps are well below the cut.
-    """
+    """Without noise the closed form is met, four times nearer at half the step."""
+    # Order 1 would give 2; the bound is 3, and steps are well below the cut.
     errors = [decay_error(dt, square, cube) for dt in (4e-4, 2e-4, 1e-4)]
     assert errors[0] < 1e-5
     assert 3.0 < errors[0] / errors[1] < 5.5 and 3.0 < errors[1] / errors[2] < 5.5

@@ -36,11 +36,8 @@ def test_measurement_noise_is_white_and_normal():
 
 @pytest.mark.parametrize('std', [0.05, 0.5])
 def test_readings_are_whole_steps(std):
-    """
-    Whole steps from 0 V, within half a step; errors of step^2/12 where noise covers steps.
-
-    The square of a uniform error has the standard deviation step^2 / sqrt(180).
-    """
+    """Whole steps from 0 V, within half a step; errors of step^2/12 where noise covers steps."""
+    # The square of a uniform error has the standard deviation step^2 / sqrt(180).
     step = 0.0317
     raw = drawn(term('measurement_noise', std=std))
     coded = drawn(term('measurement_noise', std=std), term('quantization', step=step))
@@ -78,11 +75,8 @@ def test_noise_comes_before_clipping_and_clipping_before_codes():
 @pytest.mark.parametrize('start', [0.0, 12.345, 1.7e9])
 @pytest.mark.parametrize('rate', [1000, 500, 250, 400, 270, 999, 1])
 def test_a_value_holds_until_the_source_has_the_next(rate, start):
-    """
-    A value holds until the source has the next one, counted in whole numbers here.
-
-    At 1 kHz, sample k is in turn k rate // 1000; it shows the first sample of its turn.
-    """
+    """A value holds until the source has the next one, counted in whole numbers here."""
+    # At 1 kHz, sample k is in turn k rate // 1000; it shows the first sample of its turn.
     k = np.arange(20_000)
     fresh = np.diff(k * rate // 1000, prepend=-1) > 0
     first = np.maximum.accumulate(np.where(fresh, k, 0))
@@ -93,11 +87,7 @@ def test_a_value_holds_until_the_source_has_the_next(rate, start):
 
 
 def test_glitches_hit_their_share_and_no_other_sample():
-    """
-    The stated share of samples has a normal error; the others are untouched.
-
-    None of them enters the dynamics: without them the samples are those of the ou.
-    """
+    """The stated share of samples has a normal error; the others are untouched."""
     error = drawn(term('glitches', probability=0.04, std=0.3)) - drawn()
     bad = error != 0.0
     agrees(bad.mean(), 0.04, math.sqrt(0.04 * 0.96 / N), 0.07)
@@ -138,12 +128,9 @@ def test_clock_errors_never_swap_samples():
 
 
 def test_samples_are_taken_at_the_wrong_time():
-    """
-    At the true instants the samples are an exact ou; at the stamps they are not.
-
-    A stamp in the data is k dt, the sample of k dt + error.  Innovations over the
-    true steps have variance 1 and no memory, over the stated ones they are wider.
-    """
+    """At the true instants the samples are an exact ou; at the stamps they are not."""
+    # A stamp in the data is k dt, the sample of k dt + error. Innovations over the true steps have
+    # variance 1 and no memory, over the stated ones they are wider.
     jitter = term('clock_jitter', std=2.5e-4)
     x = drawn(jitter) - U0
     at = T + clock_errors(2.5e-4, T)

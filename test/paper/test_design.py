@@ -140,12 +140,7 @@ def test_slow_noise_is_noted():
        st.floats(0.05, 0.95), st.floats(1.05, 10.0), st.floats(1.8, 12.0), st.booleans())
 def test_without_filter_capacitance_lowers_the_risk(
         resistance, capacitance, esr, frequency, throttle, factor, distance, follows):
-    """
-    For levels beyond sqrt(3) standard deviations, where d exp(-d^2/2) / Var falls with Var.
-
-    The crossing rate once the network is slower than the noise; that of the OU
-    when alpha stays or falls, as it always does when the ESR follows.
-    """
+    """For levels beyond sqrt(3) standard deviations, where d exp(-d^2/2) / Var falls with Var."""
     network = PowerNetwork(battery_resistance=resistance, bulk_capacitance=capacitance,
                            bulk_esr=esr, current_max=50.0, esc_frequency=frequency)
     here = rail_at(network, throttle)

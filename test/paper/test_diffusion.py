@@ -63,12 +63,9 @@ def test_the_order_of_the_jumps_matters_to_the_drift():
 
 
 def test_exact_moments_tend_to_those_of_the_limit():
-    """
-    Multiplicative, not reversible: mean and covariance after 1 s, with order 1 in eps.
-
-    The second moments of the limit follow from its drift and its intensity; with the printed
-    factor the covariance keeps an error of 30 % and more.
-    """
+    """Multiplicative, not reversible: mean and covariance after 1 s, with order 1 in eps."""
+    # The second moments of the limit follow from its drift and its intensity; with the printed
+    # factor the covariance keeps an error of 30 % and more.
     u0 = np.array([0.5, 1.0])
 
     def of_limit(factor):

@@ -109,14 +109,11 @@ def test_ensembles_have_the_transition_law():
 
 
 def test_monte_carlo_decides_for_the_factor_two():
-    """
-    Var of the integral of +-1 telegraph noise over its length is 1/q, not 1/(2q).
-
-    Exact: (1/q) (1 - (1 - exp(-2 q T)) / (2 q T)). A variance from n nearly
-    Gaussian samples has the relative error sqrt(2 / n): 2.2 % for n = 4000.
-    Five of these are allowed, a false alarm in 2 million. Without the factor 2
-    the ratio would be 2, forty errors away: power 1 to any digit.
-    """
+    """Var of the integral of +-1 telegraph noise over its length is 1/q, not 1/(2q)."""
+    # Exact: (1/q) (1 - (1 - exp(-2 q T)) / (2 q T)). A variance from n nearly Gaussian samples has
+    # the relative error sqrt(2 / n): 2.2 % for n = 4000. Five of these are allowed, a false alarm
+    # in 2 million. Without the factor 2 the ratio would be 2, forty errors away: power 1 to any
+    # digit.
     q, horizon, n = 1.5, 30.0, 4000
     chain, rng = Generator.telegraph(q, q), np.random.default_rng(7)
     value = np.array([-1.0, 1.0])

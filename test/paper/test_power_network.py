@@ -45,11 +45,8 @@ def test_rc_has_the_textbook_pole_and_variance():
 
 
 def test_rc_in_white_noise_is_the_ou_of_the_theory():
-    """
-    Var_inf -> S R / (2 C) and sigma -> sqrt(S) / C, S two-sided.
-
-    The noise is white up to a/lambda, here 2e-5; alpha is 62.5 1/s at 0.4 F.
-    """
+    """Var_inf -> S R / (2 C) and sigma -> sqrt(S) / C, S two-sided."""
+    # The noise is white up to a/lambda, here 2e-5; alpha is 62.5 1/s at 0.4 F.
     rail = rail_at(replace(RC, bulk_capacitance=0.4, esc_frequency=1e6), 0.4)
     density = 2.0 * rail.load.switching_rms**2 / rail.load.switching_rate
     assert rail.alpha == pytest.approx(62.5, rel=1e-9)
@@ -143,13 +140,10 @@ def test_equal_poles_are_handled():
 
 
 def test_esc_current_is_that_of_a_telegraph():
-    """
-    Mean, variance and rate against 60 000 drawn cycles of one ESC.
-
-    The mean on-share of n cycles of two exponential times has the standard
-    error D (1 - D) sqrt(2/n); the covariance at one relaxation time over a
-    grid of m independent points at most v sqrt(2/m).
-    """
+    """Mean, variance and rate against 60 000 drawn cycles of one ESC."""
+    # The mean on-share of n cycles of two exponential times has the standard error D (1 - D)
+    # sqrt(2/n); the covariance at one relaxation time over a grid of m independent points at most
+    # v sqrt(2/m).
     network = PowerNetwork(escs=1)
     load = load_at(network, 0.3)
     rng = np.random.default_rng(4)
@@ -278,12 +272,8 @@ def test_a_load_beyond_the_battery_is_refused():
 
 
 def test_crossing_rate_of_a_rough_rail_is_that_of_its_ou():
-    """
-    With hardly a capacitor the bus is R times the current, an OU.
-
-    At d standard deviations the passage rate differs from its limit by a
-    factor 1 - 1/d^2.
-    """
+    """With hardly a capacitor the bus is R times the current, an OU."""
+    # At d standard deviations the passage rate differs from its limit by a factor 1 - 1/d^2.
     rail = rail_at(replace(RC, bulk_capacitance=1e-12, bulk_esr=10.0), 0.4)
     d = 8.0
     level = rail.mean - d * math.sqrt(rail.var_inf)
@@ -292,12 +282,9 @@ def test_crossing_rate_of_a_rough_rail_is_that_of_its_ou():
 
 
 def test_crossing_rate_of_a_smooth_rail_is_counted():
-    """
-    Rice's rate against the downcrossings in 4000 paths without ESR.
-
-    1333 passages are expected.  Over 20 seeds their number had 1.3 times the
-    variance of a Poisson count, and 1.5 % were missed between the steps.
-    """
+    """Rice's rate against the downcrossings in 4000 paths without ESR."""
+    # 1333 passages are expected. Over 20 seeds their number had 1.3 times the variance of a
+    # Poisson count, and 1.5 % were missed between the steps.
     rail = rail_at(RC, 0.4)
     d, dt, paths, steps = 2.0, 5e-7, 4000, 300
     transition = expm(rail.a * dt)

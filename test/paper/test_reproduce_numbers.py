@@ -47,12 +47,9 @@ def test_step_of_readings_drawn_with_a_known_one():
 
 
 def test_chance_of_a_step_is_about_right():
-    """
-    Random readings have a step as large as that of Vrms about as often as said.
-
-    The formula is a bound on a union, so the count lies between a fifth and
-    twice of it; 5000 triples.
-    """
+    """Random readings have a step as large as that of Vrms about as often as said."""
+    # The formula is a bound on a union, so the count lies between a fifth and twice of it; 5000
+    # triples.
     rng = np.random.default_rng(3)
     claimed = published.VRMS_STEP.chance
     hits = 0
@@ -176,12 +173,9 @@ def test_coupling_hides_the_rail():
 
 
 def test_coupling_by_simulation(fig5):
-    """
-    The mean of 30 noisy recordings against the noiseless fit; and the claim is refused.
-
-    ln|U| at 40 mV with 4.7 mV of noise scatters by 12 % and, by Jensen, falls by 0.7 %:
-    alpha moves by 0.2 1/s, well within 4 standard errors.
-    """
+    """The mean of 30 noisy recordings against the noiseless fit; and the claim is refused."""
+    # ln|U| at 40 mV with 4.7 mV of noise scatters by 12 % and, by Jensen, falls by 0.7 %: alpha
+    # moves by 0.2 1/s, well within 4 standard errors.
     row = fig5['alpha fitted, rail of 1000 1/s']
     assert abs(row.recomputed - transient.fitted_rate(1000.0)) < 4.0 * row.error + 0.2
     assert row.error < 1.5
@@ -222,11 +216,8 @@ def test_the_probability_agrees_in_three_ways(delta, var):
 
 
 def test_probability_by_simulation():
-    """
-    The count is within 4 standard errors, which a variance 3 % off would not be.
-
-    200000 samples at 50 mV and 40 %: an error of 0.3 % of P; d ln P / d ln var is 0.64 there.
-    """
+    """The count is within 4 standard errors, which a variance 3 % off would not be."""
+    # 200000 samples at 50 mV and 40 %: an error of 0.3 % of P; d ln P / d ln var is 0.64 there.
     rows = by_quantity(tables.probabilities(np.random.default_rng(5), draws=200_000))
     row = rows['P(|U| > 50 mV), 40 %']
     exact, off = (2.0 * norm.sf(0.05 / (0.0563 * math.sqrt(f))) for f in (1.0, 1.03))
@@ -237,12 +228,9 @@ def test_probability_by_simulation():
 
 
 def test_falls_agree_with_simulated_paths():
-    """
-    Mean time from the mean to 100 mV below, against simulated paths at 40 %.
-
-    2000 paths in steps of 0.2 ms, up to the last passage; a discrete path passes as if the
-    level were 0.58 sigma sqrt(dt) = 5.2 mV further away.
-    """
+    """Mean time from the mean to 100 mV below, against simulated paths at 40 %."""
+    # 2000 paths in steps of 0.2 ms, up to the last passage; a discrete path passes as if the level
+    # were 0.58 sigma sqrt(dt) = 5.2 mV further away.
     rng, dt, s = np.random.default_rng(6), 2e-4, 0.0563
     phi = math.exp(-63.0 * dt)
     level = 0.1 - 0.5826 * s * math.sqrt(2.0 * 63.0 * dt)

@@ -25,12 +25,9 @@ def crests():
 
 
 def long_run_rate(q, c):
-    """
-    Return the long-run variance rate by integrating the autocovariance.
-
-    2 integral_0^inf sum pi c exp(Qt) c dt with the equation p' = p Q solved
-    numerically; no potential, no formula (6).
-    """
+    """Return the long-run variance rate by integrating the autocovariance."""
+    # 2 integral_0^inf sum pi c exp(Qt) c dt with the equation p' = p Q solved numerically; no
+    # potential, no formula (6).
     values, vectors = np.linalg.eig(q.T)
     pi = np.real(vectors[:, np.argmin(np.abs(values))])
     pi /= pi.sum()
@@ -47,11 +44,8 @@ def long_run_rate(q, c):
 @pytest.mark.parametrize('name, system', [
     ('telegraph', switching.telegraph()), ('three states', switching.three_states())])
 def test_intensity_is_twice_the_printed_one(formulas, name, system):
-    """
-    Within 4 standard errors of an evaluation without potentials; the printed one refused.
-
-    4000 paths give an error of 2.5 %: the missing factor is 20 standard errors away.
-    """
+    """Within 4 standard errors of an evaluation without potentials; the printed one refused."""
+    # 4000 paths give an error of 2.5 %: the missing factor is 20 standard errors away.
     row = formulas[f'B of (6), {name}']
     exact = 1e6 * long_run_rate(np.array(system.generator.q), system.offsets[:, 0])
     assert row.printed.value == pytest.approx(0.5 * exact, rel=1e-3)
@@ -104,12 +98,9 @@ def test_spreading_follows_the_closed_form():
 
 
 def test_crest_factors_are_those_of_1_mhz(crests):
-    """
-    Against paths drawn sample by sample at 1 MHz, without bridges: mean and 95 % quantile.
-
-    10000 screens of 10 ms: the mean to 0.007.  What 1 MHz leaves unseen is 0.04 there, ten
-    times as much is what lies between the points of the simulation.
-    """
+    """Against paths drawn sample by sample at 1 MHz, without bridges: mean and 95 % quantile."""
+    # 10000 screens of 10 ms: the mean to 0.007. What 1 MHz leaves unseen is 0.04 there, ten times
+    # as much is what lies between the points of the simulation.
     rng, phi = np.random.default_rng(14), math.exp(-63e-6)
     direct = []
     for _ in range(100):
@@ -169,11 +160,8 @@ def test_screen_that_a_crest_factor_takes():
 
 
 def test_jumps_have_the_kurtosis_said():
-    """
-    Moments of the simulated process against 3 alpha share^2 / rate.
-
-    Drawn here in closed form: each of the jumps of the last 12 tau, relaxed.
-    """
+    """Moments of the simulated process against 3 alpha share^2 / rate."""
+    # Drawn here in closed form: each of the jumps of the last 12 tau, relaxed.
     rng, alpha, rate, share = np.random.default_rng(16), 63.0, 20.0, 0.75
     draws, span = 200_000, 12.0 / alpha
     count = rng.poisson(rate * span, draws)

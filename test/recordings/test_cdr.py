@@ -99,12 +99,9 @@ def assert_same(found, expected):
 
 
 def assert_both_ways(spec, text, messages, broken=False):
-    """
-    Compare the two ways.
-
-    Of a broken message the library takes texts that go on beyond it, and of a type without a
-    number there an empty array: both are refused here.
-    """
+    """Compare the two ways."""
+    # Of a broken message the library takes texts that go on beyond it, and of a type without a
+    # number there an empty array: both are refused here.
     table = table_of(messages)
     found = in_bulk(spec, text, table)
     expected = one_by_one(spec, text, messages, table)

@@ -107,11 +107,8 @@ def test_drawings_have_finite_coordinates(tree):
 
 
 def test_screens_are_in_steps_and_near_their_vrms(result):
-    """
-    Each sample a multiple of 6.25 mV; rms within the scatter of a 100 ms screen.
-
-    About 100 ms / (2 tau) = 3 independent values: the rms about zero scatters by some 35 %.
-    """
+    """Each sample a multiple of 6.25 mV; rms within the scatter of a 100 ms screen."""
+    # About 100 ms / (2 tau) = 3 independent values: the rms about zero scatters by some 35 %.
     for screen in result.screens:
         steps = screen.u / 6.2503e-3
         assert abs(steps - steps.round()).max() < 0.01
@@ -121,11 +118,8 @@ def test_screens_are_in_steps_and_near_their_vrms(result):
 
 
 def test_spectra_follow_the_lorentzian(result):
-    """
-    At 100 Hz to 10 kHz within 25 %, and halved by the coupling at its corner.
-
-    Bins there average 7 segments and several lines, so each scatters by 12 % at most.
-    """
+    """At 100 Hz to 10 kHz within 25 %, and halved by the coupling at its corner."""
+    # Bins there average 7 segments and several lines, so each scatters by 12 % at most.
     for found in result.spectra:
         use = (found.frequency > 100.0) & (found.frequency < 1e4)
         sigma = 1e-3 * found.state.vrms.value * (2.0 * 63.0) ** 0.5

@@ -32,11 +32,8 @@ def test_the_presets_and_profiles_have_these_names():
 
 @pytest.mark.parametrize('name', sorted(VRMS))
 def test_presets_have_the_rms_of_the_paper(name):
-    """
-    Vrms = sigma / sqrt(2 alpha) within the last digit printed; throttle as labelled.
-
-    Table 2 prints 4 digits of sigma and 3 of Var_inf.
-    """
+    """Vrms = sigma / sqrt(2 alpha) within the last digit printed; throttle as labelled."""
+    # Table 2 prints 4 digits of sigma and 3 of Var_inf.
     throttle, vrms = VRMS[name]
     ou = PRESETS[name].model.ou
     assert float(PRESETS[name].throttle) == throttle
@@ -54,12 +51,9 @@ def test_idle_reads_zero():
 
 @pytest.mark.parametrize('name', sorted(VRMS))
 def test_forty_seconds_show_the_table(name):
-    """
-    Vrms and Var_inf of 40 s, within 4 standard errors.
-
-    The variance of an OU over T has the relative error sqrt(2/(alpha T)) = 2.8 %,
-    Vrms half of it; the mean is that of the rail to Vrms sqrt(2/(alpha T)).
-    """
+    """Vrms and Var_inf of 40 s, within 4 standard errors."""
+    # The variance of an OU over T has the relative error sqrt(2/(alpha T)) = 2.8 %, Vrms half of
+    # it; the mean is that of the rail to Vrms sqrt(2/(alpha T)).
     t, voltage, throttle = drawn(name, 40.0)
     assert t.size == 40_000 and set(throttle) == {float(np.float32(VRMS[name][0]))}
     error = math.sqrt(2.0 / (63.0 * 40.0))
@@ -85,12 +79,9 @@ def test_loads_follow_the_four_states():
 
 
 def test_transient_is_that_of_the_figure():
-    """
-    Release of 20 %: 368 mV at once, then exp(-63 t), as the paper fits it.
-
-    Averages of 40 releases, noise of 9.4 mV: to 1.5 mV.  The printed points at 10
-    and 25 ms, 200 and 80 mV, are within 5 mV of that exponential.
-    """
+    """Release of 20 %: 368 mV at once, then exp(-63 t), as the paper fits it."""
+    # Averages of 40 releases, noise of 9.4 mV: to 1.5 mV. The printed points at 10 and 25 ms, 200
+    # and 80 mV, are within 5 mV of that exponential.
     t, voltage, throttle = drawn('transient', 400.0, seed=3)
     assert float(throttle.max()) == pytest.approx(0.2, rel=1e-6)
     # A throttle holds from the stamp before: the decay counts from there.
@@ -105,11 +96,8 @@ def test_transient_is_that_of_the_figure():
 
 
 def test_flight_sags_and_is_noisy():
-    """
-    Mean at hover against that at idle: sag 0.3 V at full throttle; white noise of 2 mV.
-
-    Differences at 20 kHz are of the noise: 2 std^2, and sigma^2 dt of the rail.
-    """
+    """Mean at hover against that at idle: sag 0.3 V at full throttle; white noise of 2 mV."""
+    # Differences at 20 kHz are of the noise: 2 std^2, and sigma^2 dt of the rail.
     t, voltage, throttle = drawn('flight', 40.0, seed=4)
     hover, idle = np.isclose(throttle, 0.4), (throttle == 0.0) & (t < 2.0)
     assert hover.sum() > 10_000

@@ -19,11 +19,8 @@ OPEN = ('unexplained', 'partly_explained')
 
 def hide(kind: str, effect: str, seed: int, number: int, *, duration: float, rate: float,
          strength: float) -> Hidden:
-    """
-    Hide an effect; all but its name comes from the seed and the number of this effect.
-
-    Kind and effect as for `draw`: for a pair two names joined by '+', for 'none' ''.
-    """
+    """Hide an effect; all but its name comes from the seed and the number of this effect."""
+    # Kind and effect as for `draw`: for a pair two names joined by '+', for 'none' ''.
     word = int.from_bytes(sha256(f'{kind} {effect}'.encode()).digest()[:8], 'big')
     cause = tuple(effect.split('+')) if kind == 'pair' else effect or None
     return draw(kind, np.random.default_rng([seed, number, word]), cause=cause,
@@ -52,12 +49,9 @@ class Outcome:
 
     @property
     def in_set(self) -> bool:
-        """
-        Whether all true names were reported, and no false ones.
-
-        A true name is reported if it is named or is an alternative of a name; a name is false
-        unless it or one of its alternatives matches a true name that no other name matches.
-        """
+        """Whether all true names were reported, and no false ones."""
+        # A true name is reported if it is named or is an alternative of a name; a name is false
+        # unless it or one of its alternatives matches a true name that no other name matches.
         return bool(self.verdict) and any(
             set(way) <= self.reported and _each_stands(list(self.named.items()), set(way))
             for way in self.accepted)
@@ -113,11 +107,8 @@ def from_data(data: Mapping[str, Any]) -> Outcome:
 
 
 def outcome(hidden: Hidden, verdict: str = '', causes: Iterable[Any] = ()) -> Outcome:
-    """
-    Return the outcome for a recording; without a verdict if the program failed.
-
-    A cause that is named twice counts once.
-    """
+    """Return the outcome for a recording; without a verdict if the program failed."""
+    # A cause that is named twice counts once.
     named: dict[str, tuple[str, ...]] = {}
     for cause in causes:
         named[cause.name] = tuple(dict.fromkeys((*named.get(cause.name, ()),

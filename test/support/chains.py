@@ -39,11 +39,8 @@ def drawn(chain, edges, paths, rng):
 
 
 def moments_of_switched(system, t, u0, eps, scaling='averaging'):
-    """
-    Return exact mean and covariance at t, s, without simulation.
-
-    E[1_x], E[u 1_x] and E[u u' 1_x] together obey a linear equation.
-    """
+    """Return exact mean and covariance at t, s, without simulation."""
+    # E[1_x], E[u 1_x] and E[u u' 1_x] together obey a linear equation.
     at_eps = system.scaled(eps, scaling)
     n, d = at_eps.offsets.shape
     one = np.eye(d)

@@ -7,11 +7,8 @@ from scipy.linalg import cho_factor, cho_solve
 
 
 def block_autocovariances(a, m, count):
-    """
-    Return autocovariances of OU block means at lags 0..count-1, by double sums.
-
-    The double sum runs over the distance of both samples; result in units of sigma^2 D.
-    """
+    """Return autocovariances of OU block means at lags 0..count-1, by double sums."""
+    # The double sum runs over the distance of both samples; result in units of sigma^2 D.
     distance = np.arange(1 - m, m)
     weight = (m - np.abs(distance)) / m ** 2
     lags = np.arange(count)[:, None]

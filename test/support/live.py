@@ -68,12 +68,9 @@ _UNUSED = [*range(1, 10), 100, 101]
 
 @contextmanager
 def unused_domain() -> Iterator[int]:
-    """
-    Give a ROS domain in which no killed program has left a queue in shared memory.
-
-    A node reuses such a queue with the size that its creator chose.  Queues that the test's own
-    programs leave in the domain are removed.
-    """
+    """Give a ROS domain in which no killed program has left a queue in shared memory."""
+    # A node reuses such a queue with the size that its creator chose. Queues that the test's own
+    # programs leave in the domain are removed.
     while _UNUSED:
         domain = _UNUSED.pop(0)
         if not any(port.exists() for port in queues(domain)):
@@ -257,12 +254,9 @@ class Probe:
         return self.node.create_publisher(kind, topic, qos)
 
     def call(self, kind: Any, service: str, request: Any) -> Any:
-        """
-        Return the answer of a service.
-
-        If a client has discovered a service before the service has discovered the client, the
-        middleware drops the answer after .1 s; so the call is repeated.
-        """
+        """Return the answer of a service."""
+        # If a client has discovered a service before the service has discovered the client, the
+        # middleware drops the answer after .1 s; so the call is repeated.
         if service not in self._clients:
             self._clients[service] = self.node.create_client(kind, service)
         client = self._clients[service]
@@ -318,12 +312,9 @@ class World:
         return self._probes[-1]
 
     def close(self) -> None:
-        """
-        Stop everything; a traceback in any process is a failure, whatever the test checked.
-
-        A killed process leaves its queues in shared memory, in which later processes of the domain
-        may lose messages.
-        """
+        """Stop everything; a traceback in any process is a failure, whatever the test checked."""
+        # A killed process leaves its queues in shared memory, in which later processes of the
+        # domain may lose messages.
         for process in self._processes:
             process.ask_to_end()
         until = time.monotonic() + _END

@@ -19,11 +19,8 @@ def attributes(folder: Path, **values: object) -> None:
 
 
 def iio_device(root: Path, rate: float = 10_000.0, clock: str = 'realtime') -> tuple[Path, Path]:
-    """
-    Make an IIO device of two channels and a timestamp; return its sysfs folder and its FIFO.
-
-    Only channel 0 is enabled, as if another program had done so.
-    """
+    """Make an IIO device of two channels and a timestamp; return its sysfs folder and its FIFO."""
+    # Only channel 0 is enabled, as if another program had done so.
     folder = root / 'sys/bus/iio/devices/iio:device0'
     attributes(
         folder, name='ads1015', sampling_frequency=rate, in_voltage_scale=SCALE,

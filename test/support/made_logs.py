@@ -66,12 +66,9 @@ def ulog_info(key, value):
 
 
 def ulog(topics, start_us=0, info=None, extra=b''):
-    """
-    Return a ULog as a list of pieces, cut at message boundaries.
-
-    `topics` is a list of (name, instance, [(type, field)], rows), the first field
-    of each being the timestamp in us; rows are sorted into one stream by it.
-    """
+    """Return a ULog as a list of pieces, cut at message boundaries."""
+    # `topics` is a list of (name, instance, [(type, field)], rows), the first field of each being
+    # the timestamp in us; rows are sorted into one stream by it.
     codes = {'uint64_t': 'Q', 'float': 'f', 'uint8_t': 'B', 'bool': '?', 'uint32_t': 'I'}
     pieces = [b'ULog\x01\x12\x35\x01' + struct.pack('<Q', start_us),
               ulog_message('B', bytes(40))]
@@ -258,12 +255,9 @@ FIXED = 0xFFFF
 
 
 def crazyflie(events, records, version=2):
-    """
-    Return a log as pieces: the header, one record each, the checksum.
-
-    `events` is a list of (number, name, ['group.name(type)']), `records` of (number, stamp in ms
-    of version 1 and us of version 2, values).
-    """
+    """Return a log as pieces: the header, one record each, the checksum."""
+    # `events` is a list of (number, name, ['group.name(type)']), `records` of (number, stamp in ms
+    # of version 1 and us of version 2, values).
     head = struct.pack('<BHH', 0xBC, version, len(events))
     layouts = {}
     for number, name, variables in events:

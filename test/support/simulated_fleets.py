@@ -15,12 +15,9 @@ def table(rng: np.random.Generator, vehicles: int, flights: int, *, scatter: flo
           drift: dict | None = None, odd_flights: dict | None = None,
           odd_vehicles: dict | None = None, levels=LEVELS, ageing: dict | None = None,
           ohms: dict | None = None) -> list[dict]:
-    """
-    Return a fleet table with a row per level; effects are on ln sigma.
-
-    ageing: vehicle -> growth of ln resistance and ln sag per flight; ohms: vehicle -> their
-    offset.
-    """
+    """Return a fleet table with a row per level; effects are on ln sigma."""
+    # ageing: vehicle -> growth of ln resistance and ln sag per flight; ohms: vehicle -> their
+    # offset.
     rows = []
     for v in range(vehicles):
         vehicle = 0.15 * rng.standard_normal() + (odd_vehicles or {}).get(v, 0.0)

@@ -74,12 +74,9 @@ def clusters(model, offsets, gap, count, seed, throttle=None):
 
 
 def agrees(found, truth, error, change=0.05):
-    """
-    Return whether an estimate is within 4 standard errors of the truth.
-
-    First checks the power: a truth changed by the share `change` must be 6 standard errors away,
-    so that it is rejected in 97.7 of 100 cases.  An infinite `change` requires no power.
-    """
+    """Return whether an estimate is within 4 standard errors of the truth."""
+    # First checks the power: a truth changed by the share `change` must be 6 standard errors away,
+    # so that it is rejected in 97.7 of 100 cases. An infinite `change` requires no power.
     if math.isfinite(change):
         assert 6.0 * error <= change * abs(truth), f'no power: {6 * error / abs(truth):.3f}'
     assert abs(found - truth) < 4.0 * error, (
@@ -87,13 +84,10 @@ def agrees(found, truth, error, change=0.05):
 
 
 def has_covariance(groups, offsets, cov, change=0.05):
-    """
-    Check all second moments of independent groups of a zero-mean process.
-
-    `cov` is the autocovariance as a function of the lag.  The standard error of
-    the mean of M products is their standard deviation / sqrt(M).  Moments that are small against
-    the variance have the same error but too little power; they must only be within 4 errors.
-    """
+    """Check all second moments of independent groups of a zero-mean process."""
+    # `cov` is the autocovariance as a function of the lag. The standard error of the mean of M
+    # products is their standard deviation / sqrt(M). Moments that are small against the variance
+    # have the same error but too little power; they must only be within 4 errors.
     for j, early in enumerate(offsets):
         for k in range(j, len(offsets)):
             product = groups[:, j] * groups[:, k]

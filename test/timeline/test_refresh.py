@@ -37,11 +37,8 @@ def lowpassed(y, corner):
 
 @pytest.mark.parametrize('factor', FACTORS + RATIOS)
 def test_repeats_are_counted_and_noted(factor):
-    """
-    Twenty sources of each: the period is right to one sample in the whole.
-
-    1024 samples, as many as the estimator looks at; 20 changes for a factor of 50.
-    """
+    """Twenty sources of each: the period is right to one sample in the whole."""
+    # 1024 samples, as many as the estimator looks at; 20 changes for a factor of 50.
     rng = np.random.default_rng(1)
     for kind in (np.float64, np.float32):
         for _ in range(20):
@@ -110,11 +107,8 @@ COARSE = {
 
 @pytest.mark.parametrize('name', COARSE)
 def test_coarse_adcs_are_not_repeats(name):
-    """
-    Steps of 0.5 to 3 increments, 200 windows each: never, of 1000.
-
-    None in 1000 holds the rate below 0.5 % at 99 % confidence (exp(-0.005 1000)).
-    """
+    """Steps of 0.5 to 3 increments, 200 windows each: never, of 1000."""
+    # None in 1000 holds the rate below 0.5 % at 99 % confidence (exp(-0.005 1000)).
     rng = np.random.default_rng(5)
     for steps in (0.5, 1.0, 1.5, 2.0, 3.0):
         code = steps * INCREMENT
@@ -164,11 +158,7 @@ def dropped_to(y, period, sizes=()):
 
 
 def test_refreshes_stay_where_they_were():
-    """
-    Also those that happen to equal the one before; the last is known half a period later.
-
-    Since when the first had been there is not known: it is left out.
-    """
+    """Also those that happen to equal the one before; the last is known half a period later."""
     source = [1.0, 2.0, 2.0, 3.0, 1.0, 1.0, 1.0, 5.0]
     assert dropped_to(np.repeat(source, 4), 4.0) == [4 * k for k in range(1, 8)]
     assert dropped_to(np.repeat([1.0, 2.0, 3.0, 4.0], [2, 3, 2, 3]), 2.5) == [2, 5, 7]
@@ -205,14 +195,11 @@ def test_steps_and_throttle_of_refreshes():
 
 @pytest.mark.parametrize('factor', FACTORS + RATIOS[:2])
 def test_dropping_leaves_no_bias(factor):
-    """
-    Logger and source against the source alone, and against the truth.
-
-    Paired with the fit of the source itself, a refresh is late by half a logged sample on
-    average, the same for all: what is left is one sample more or less in 2000, 0.05 %.  Against
-    the truth: an error of 3.5 Monte Carlo errors is chance once in 2000, and the bias of windows
-    of 2 s is 1 % at most (doc/estimation.md).
-    """
+    """Logger and source against the source alone, and against the truth."""
+    # Paired with the fit of the source itself, a refresh is late by half a logged sample on
+    # average, the same for all: what is left is one sample more or less in 2000, 0.05 %. Against
+    # the truth: an error of 3.5 Monte Carlo errors is chance once in 2000, and the bias of windows
+    # of 2 s is 1 % at most (doc/estimation.md).
     rng = np.random.default_rng(7)
     n = 2000
     found, alone = [], []

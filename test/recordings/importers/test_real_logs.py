@@ -16,13 +16,9 @@ RAW = REAL / 'raw'
 
 
 def test_a_blackbox_log_equals_its_published_table(tmp_path):
-    """
-    The 200 Hz table of the flight follows from its raw log of 500 Hz.
-
-    The table was made by others with another parser: its stamps are smoothed, so
-    they agree to the spacing of the log (2 ms) but for a constant; its throttle is
-    the mean of the motors.
-    """
+    """The 200 Hz table of the flight follows from its raw log of 500 Hz."""
+    # The table was made by others with another parser: its stamps are smoothed, so they agree to
+    # the spacing of the log (2 ms) but for a constant; its throttle is the mean of the motors.
     out = tmp_path / 'gecko'
     assert main(['convert', str(RAW / 'ie_btfl_002.bbl'), str(out)]) == 0
     table = np.loadtxt(REAL / 'bf_gecko_a.csv', delimiter=',', skiprows=1)
