@@ -40,8 +40,8 @@ def design_document(result: Design, source: str, taken: str = '', command: str =
     answers = [answer(result)]
     if taken and result.least is not None:
         answers.append(
-            'That holds for noise as fast as switching; a recording does not tell how fast its '
-            'noise is. No capacitor changes slower noise, or that of the sensor.')
+            'That holds for noise as fast as switching; a recording does not show how fast its '
+            'noise is. No capacitor reduces slower noise, or noise of the sensor.')
     return Document('Which capacitance', subject, answers, [
         lambda: [Figure(_risk(result))],
         Table(['C, uF', 'ESR, mOhm', 'alpha, 1/s', 'tau, us', 'sigma, V/sqrt(s)', 'Var_inf, V^2',

@@ -57,7 +57,7 @@ class Result:
                  data: Callable[[], Mapping[str, Any]], rows: str | Callable[[], Rows],
                  supply: SupplyFacts | Callable[[], SupplyFacts] | None = None) -> None:
         """
-        Keep the record, and functions that compute the rest when asked.
+        Keep the record, and functions that compute the rest on demand.
 
         rows: a function, or the name of a list in the data.  A supply given as a function is left
         out of the JSON.  Use module-level functions: closures cannot be pickled.

@@ -148,10 +148,10 @@ class Glitches(Term):
     IMITATES: ClassVar[tuple[str, ...]] = ('clock_jitter', 'heavy_tails', 'jumps')
     SEVERAL: ClassVar[bool] = True
     MEANING: ClassVar[str] = (
-        'Readings, single or a few, that the rail does not relax from: bus errors, pick-up at the '
-        'ADC, or real dips of a few samples.')
+        'Outlying single readings, or a few in a row, without relaxation after them: bus errors, '
+        'pick-up at the ADC, or real dips of a few samples.')
     REMEDY: ClassVar[str] = (
-        'Before outliers are rejected, a faster or second ADC must show that they are no dips; '
+        'Before you reject them, check with a faster or a second ADC that they are not real dips; '
         'check the cables and the ground of the ADC.')
     SEPARATED_BY: ClassVar[str] = 'two ADCs on one rail: a glitch shows in only one'
 

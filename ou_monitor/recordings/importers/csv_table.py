@@ -149,7 +149,7 @@ def read_csv(path: Path, columns: CsvColumns | None = None, *, partial: bool = F
         quantity: printable(one.name) for quantity, (one, _) in table.found.items()}}
     current = held.get(logs.CURRENT, nothing)
     if 2 * np.isfinite(current[np.isfinite(volts)]).sum() < np.isfinite(volts).sum():
-        # Measured beside the voltage, not with it.
+        # Most rows with a voltage have no current: hold the last current.
         current = hold(current)
     filled = np.ones(volts.shape, dtype=bool)
     if np.isnan(volts).any():
