@@ -35,15 +35,12 @@ from ou_monitor.criticism.readings import two_levels
 from ou_monitor.model.spectral_lines import FALSE_ALARM
 from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.online.monitor import SupplyMonitor
-from ou_monitor.online.settings import MonitorSettings
+from ou_monitor.online.settings import DEFAULT_LIMIT, MonitorSettings, RAIL
 from ou_monitor.records import Estimate, FloatArray, NAN, Recording
 from ou_monitor.text import Z95
 from ou_monitor.timeline import readings_of, supplied
 
 Progress = Callable[[float], None]
-
-# Range of the median of a 5 V rail, V; lower is a lithium cell, or a rail in constant brown-out.
-RAIL = (4.5, 6.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +119,7 @@ def _default_voltage(recording: Recording) -> float:
     """Return the default of the node, V, for a 5 V rail; NaN for other supplies."""
     low, high = RAIL
     middle = float(np.median(recording.voltage)) if recording.n else NAN
-    return MonitorSettings().brownout_voltage if low <= middle <= high else NAN
+    return DEFAULT_LIMIT if low <= middle <= high else NAN
 
 
 def _relaxations(recording: Recording, levels: Sequence[LevelResult]) -> tuple[Relaxation, ...]:

@@ -20,7 +20,7 @@ from ou_monitor.online.load.model_watch import ModelComparison
 from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.online.risk.flag import BrownoutFlag, FlagLevel, FlagState
 from ou_monitor.online.risk.forecast import Ahead, Forecast, LOOK, look_ahead
-from ou_monitor.online.settings import AUTO, MonitorSettings
+from ou_monitor.online.settings import AUTO, DEFAULT_LIMIT, MonitorSettings, RAIL
 from ou_monitor.online.trust import Doubt, InputTrust, patience, StampOrder
 from ou_monitor.records import (
     as_numbers, as_seconds, Counters, Estimate, Flag, Level, MOST_STAMP, NAN, OuFacts, Status)
@@ -365,8 +365,9 @@ class SupplyMonitor:
         left_out = () if self._model is None else self._model.left_out
         model = None if self._model is None else self._load_filter.against(
             self._model.load, self._model.date)
-        if model is not None and model.words and fresh and level < Level.ERROR:
-            level, summary = Level.WARN, f'{summary} {model.words}'
+        cautions = [words for words in (self._of_default(), model.words if model else '') if words]
+        if cautions and fresh and level < Level.ERROR:
+            level, summary = Level.WARN, ' '.join((summary, *cautions))
         return MonitorReport(
             e, risk, ahead.budget, ahead.budget_reason, left_out, flag, level, summary, silent,
             limit, stamps, doubt, fresh, self._thinned, self._restarts, self._fault, self._load,
@@ -509,6 +510,13 @@ class SupplyMonitor:
         if doubts:
             return Level.WARN, ' '.join(doubts)
         return Level.OK, e.status.value
+
+    def _of_default(self) -> str:
+        """Return a caution if the default limit is in force, and the supply is no 5 V rail."""
+        limit, now = self._settings.brownout_voltage, self._forecast.voltage
+        return (f'The limit is the default of {limit:g} V, for a 5 V rail, and the supply is at '
+                f'{now:.3g} V: set brownout.voltage.') if (
+                    limit == DEFAULT_LIMIT and now > RAIL[1]) else ''
 
     def _of_risk(self, e: Estimate, risk: float, flag: FlagState) -> str:
         s = self._settings

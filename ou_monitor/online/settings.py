@@ -69,6 +69,11 @@ def _documented(settings: type[_Settings]) -> type[_Settings]:
     return settings
 
 
+# The default limit, V, and the range of the median of a 5 V rail, for which it is: lower is a
+# lithium cell, or a rail in constant brown-out.
+DEFAULT_LIMIT, RAIL = 4.5, (4.5, 6.0)
+
+
 @_documented
 @dataclass(frozen=True)
 class MonitorSettings:
@@ -92,8 +97,8 @@ class MonitorSettings:
         'intervals, but at least 0.3 s), a slow one more (2.5 intervals).',
         0.01, 3600.0)
     brownout_voltage: float = _parameter(
-        4.5, 'Lowest permitted supply voltage, V (default: the lower limit of PX4 for a 5 V '
-        'rail).', 0.0, 1000.0)
+        DEFAULT_LIMIT, 'Lowest permitted supply voltage, V (default: the lower limit of PX4 for a '
+        '5 V rail).', 0.0, 1000.0)
     brownout_horizon: float = _parameter(
         5.0, 'Time ahead for which the risk is computed, s.', 0.001, 3600.0)
     brownout_warn: float = _parameter(0.1, 'Risk at which the diagnostics warn, 0..1.', 0.0, 1.0)

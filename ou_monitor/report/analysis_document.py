@@ -17,7 +17,7 @@ from ou_monitor.analysis.quality import QualityItem
 from ou_monitor.analysis.relaxation import Relaxation
 from ou_monitor.criticism.curves import outline
 from ou_monitor.online.risk.courses import KEPT
-from ou_monitor.online.settings import MonitorSettings
+from ou_monitor.online.settings import DEFAULT_LIMIT
 from ou_monitor.records import FloatArray, NAN, Recording, Severity
 from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text, UNKNOWN,
@@ -103,7 +103,7 @@ def _budget(analysis: Analysis) -> str:
             return (f'unknown: no limit; --cells {craft.cells} ({source}) sets it to '
                     f'{CELL_LIMIT * craft.cells:g} V, --brownout-voltage to any other')
         return ('unknown: no limit; --brownout-voltage or --cells sets one (the default of '
-                f'{MonitorSettings().brownout_voltage:g} V is for a 5 V rail, and this supply is '
+                f'{DEFAULT_LIMIT:g} V is for a 5 V rail, and this supply is '
                 f'at {number(middle)} V)')
     what = (f'of falling below {curves.voltage:g} V '
             + ('(the default for a 5 V rail) ' if analysis.brownout_default else '')

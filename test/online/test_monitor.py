@@ -346,3 +346,15 @@ def test_fields_are_numbers_whatever_leg_they_stand_on(flight):
     assert report.risk_basis == 'load' and 0.0 < report.budget <= 1.0
     assert float(report.fields['throttle_budget']) == report.budget
     assert not [name for name, text in report.fields.items() if 'np.' in text]
+
+
+@pytest.mark.parametrize('limit, supply, warned', [
+    (4.5, 15.8, True), (4.5, 5.0, False), (13.2, 15.8, False)])
+def test_the_default_limit_on_another_supply_is_a_warning(limit, supply, warned):
+    """A pack of four cells is never near 4.5 V: OK would say that it is safe."""
+    t = 0.01 * np.arange(1000)
+    monitor = SupplyMonitor(MonitorSettings(brownout_voltage=limit))
+    monitor.push(t, supply + simulate(t, 60.0, 0.1, np.random.default_rng(3)))
+    report = monitor.report(age=0.0)
+    assert ('set brownout.voltage' in report.summary) is warned
+    assert report.level is (Level.WARN if warned else Level.OK)
