@@ -153,6 +153,14 @@ def _idle(throttle: FloatArray) -> npt.NDArray[np.bool_]:
     return np.asarray(throttle <= throttle.min() + _STILL)
 
 
+def _rises(below: FloatArray, codes: int, step: float) -> bool:
+    """Return whether more readings are just above the fullest of the top codes than below it."""
+    # Noise after a limit lowers as many readings as it raises.
+    count = [int((np.abs(below - k * step) < 0.5 * step).sum()) for k in range(codes + 1)]
+    full = max(range(codes), key=lambda k: count[k])
+    return full > 0 and count[full - 1] > count[full + 1]
+
+
 def _limit(x: FloatArray, step: float, noisy: npt.NDArray[np.bool_]) -> float:
     """Return the top reading if it is more frequent than its neighbours predict; otherwise inf."""
     # If a stage before the ADC clips, later noise may raise some readings by a code or two.
@@ -176,8 +184,10 @@ def _limit(x: FloatArray, step: float, noisy: npt.NDArray[np.bool_]) -> float:
             next_ones = [float((np.abs(below[noisy] - (codes - 1 + k) * step)
                                 < 0.5 * step).sum()) for k in (1, 2, 3)]
             expected = codes * max(next_ones)
-            if codes > 1 and next_ones[0] > max(next_ones[1:]) + _CLEAR * math.sqrt(next_ones[0]):
-                # The flank of a peak: the rail is at rest.
+            if codes > 1 and (
+                    next_ones[0] > max(next_ones[1:]) + _CLEAR * math.sqrt(next_ones[0])
+                    or _rises(below[noisy], codes, step)):
+                # A peak: the rail is at rest.
                 continue
         else:
             # Expect the same density as for the nearest samples below.

@@ -124,3 +124,14 @@ def test_events_add_to_the_joint_normal_law():
     # What an event adds at its own sample is not in the variance there.
     own = (power - 1.0) / power * (added - push) + push + error + (white - 1.0) * std**2
     assert_allclose(found.variance, np.diag(known)**2 - own, rtol=1e-3)
+
+
+def test_a_rail_at_rest_is_not_clipped():
+    """Readings of a robot (regbot_19): more are just above the fullest code than below it."""
+    counts = {12.35: 3, 12.34: 134, 12.33: 182, 12.32: 58, 12.31: 23, 12.30: 35, 12.29: 63}
+    voltage = np.random.default_rng(1).permutation(np.repeat([*counts], [*counts.values()]))
+    assert find_rails(voltage, 0.01, 0.0095) == (-math.inf, math.inf)
+    # Noise after a limit lowers as many readings as it raises.
+    counts |= {12.34: 30, 12.33: 400, 12.32: 60}
+    clipped = np.random.default_rng(1).permutation(np.repeat([*counts], [*counts.values()]))
+    assert find_rails(clipped, 0.01, 0.0095) == (-math.inf, 12.33)
