@@ -21,7 +21,8 @@ from ou_monitor.model.terms.tones import Tone
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.recordings.model_file import read_model
 from ou_monitor.recordings.read import read_recording
-from ou_monitor.report.discovery_document import answer
+from ou_monitor.report.discovery_document import answer, discovery_document
+from ou_monitor.report.terminal import terminal
 from project import ROOT
 import pytest
 
@@ -165,6 +166,8 @@ def test_the_headline_names_the_strongest_and_what_all_are_worth():
         (LoadSag(0.6, 0.0), 0.2, 0.01, 0.0), (Drift(0.1, 0.0), nan, nan, nan),
         *[(Tone(0.01, f, 0.0, 0.0), 0.3, 0.01, 0.0) for f in (11.0, 23.0)]),
         gain=math.log(2.0), gain_se=0.1, shrink=0.2)
+    said = ' '.join(terminal(discovery_document(finding)).split())
+    assert 'Gain not measurable here; named because it explains' in said
     strongest, worth, passes = answer(finding)
     assert re.findall(r'\((\w+)\)', strongest) == ['tone', 'load_sag', 'drift']
     assert re.findall(r'\d+', worth) == ['20', '223', '470', '693', '100']
