@@ -129,15 +129,6 @@ def test_kinds_that_do_not_apply_are_not_tried(changes, missing):
     assert missing not in tried(**changes)
 
 
-def test_a_kind_that_recurs_is_tried_again():
-    class Again(Cheap):
-        NAME = 'again'
-        RECURS = True
-
-    assert tried([Again], kinds=[Again]) == ['again']
-    assert tried([Cheap], kinds=[Cheap]) == []
-
-
 @pytest.mark.parametrize('kind, values, nats', [
     (Cheap, {'band 3': 3.0}, 4.5), (Cheap, {'band 3': -3.0}, 0.0), (Cheap, {'line': -3.0}, 4.5),
     (Cheap, {'band 3': 3.0, 'line': 4.0, 'time': 20.0}, 8.0), (Cheap, {'order line': 9.0}, 0.0),
@@ -169,11 +160,6 @@ def test_slow_kinds_are_tried_only_while_time_is_left(kind, cost, may):
     assert decision.affordable(kind, cost) is may
 
 
-def test_rivals_are_those_within_a_tie_of_the_best():
-    evidence = [('a', 13.1), ('best', 10.0), ('b', 7.1), ('c', 6.9)]
-    assert decision.rivals_of('best', evidence) == ['a', 'b']
-
-
 @pytest.mark.parametrize('before, after, fails', [
     ({'a': 0.0}, {'a': 4.79}, False), ({'a': 0.0}, {'a': -4.81}, True),
     ({'a': 100.0}, {'a': 6.9}, False), ({'a': 100.0}, {'a': 7.1}, True)])
@@ -195,14 +181,6 @@ def test_a_statistic_fails_beyond_its_band_and_share(before, after, fails):
     ({'band 1': 60.0}, {'bursts within 1 s': 9.0}, [Ringing, White], [0])])
 def test_unexplained_statistics_withdraw_their_causes(before, after, accepted, out):
     assert decision.withdrawn(before, after, accepted) == out
-
-
-@pytest.mark.parametrize('left, withdrawn', [(-44.0, False), (-46.0, True), (46.0, False)])
-def test_an_ac_coupling_may_leave_three_quarters_of_the_slow_power_missing(left, withdrawn):
-    """An instrument may have two corners; slow power in excess is none of its signs."""
-    kinds = [catalogue()['ac_coupling']]
-    found = decision.withdrawn({'band 0': -60.0}, {'band 0': left}, kinds)
-    assert found == ([0] if withdrawn else [])
 
 
 @pytest.mark.parametrize('gain, error, chance, earns', [
@@ -236,12 +214,6 @@ def test_a_latent_cause_is_tested_by_its_own_signs_only(measured, before, asked,
 def test_a_tie_goes_to_the_cause_with_less_search(one, other, plainer):
     """Within a family: of a sag and a lag that do as well, the sag."""
     assert decision.is_plainer(catalogue()[one], catalogue()[other]) is plainer
-
-
-@pytest.mark.parametrize('rate, duration, shown', [
-    (1.0, 19.9, False), (1.0, 20.1, True), (10.0, 2.1, True), (0.1, 100.0, False)])
-def test_a_rate_needs_twenty_relaxation_times(rate, duration, shown):
-    assert decision.relaxes(rate, duration) is shown
 
 
 @pytest.mark.parametrize('names, changes', [

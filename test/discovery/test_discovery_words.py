@@ -3,10 +3,10 @@
 from dataclasses import replace
 import math
 
-from ou_monitor.discovery.finding import Cause, Criticism, ThrottleEffects, Verdict
+from ou_monitor.discovery.finding import Cause, Criticism, Verdict
 from ou_monitor.discovery.words import (
     cause_rows, coupling_note, explain, gain_remark, gain_text, gain_words, overlap_words,
-    plain_words, remaining_words, verdict_sentence, why_named, with_error)
+    plain_words, verdict_sentence, why_named, with_error)
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.tones import Tone
@@ -62,25 +62,6 @@ def test_a_positive_parameter_is_shown_if_known_to_a_factor_of_10(error, text):
     (0.9e-3, '< 0.001'), (1.1e-3, '0.0011'), (0.25, '0.25')])
 def test_p_values_are_written_with_one_rule(chance, text):
     assert cause_rows([replace(SAG, p_value=chance)])[0].chance == text
-
-
-def test_causes_share_a_row_where_gain_and_chance_are_the_same():
-    other = replace(SAG, term=LoadSag(0.2, 0.1), alternatives=('drift', 'load_transient'))
-    row, = cause_rows([replace(SAG, alternatives=('drift',)), other])
-    assert row.alternatives == ('drift', 'load_transient') and row.label == 'load_sag x2'
-    assert len(cause_rows([SAG, replace(other, gain=0.021)])) == 2
-    assert len(cause_rows([SAG, replace(other, p_value=0.5)])) == 2
-
-
-def test_at_most_four_remaining_discrepancies_are_named():
-    """And says how many more; each thing once."""
-    def left(*names):
-        return remaining_words([left_over(name) for name in names])
-    five = left('skewness', 'kurtosis', 'throttle', 'clustering', 'time')
-    assert five.endswith('(1 more)') and 'time' not in five
-    assert '(2 more)' in left('skewness', 'kurtosis', 'throttle', 'clustering', 'time', 'bursts')
-    four = left('skewness', 'kurtosis', 'throttle', 'throttle change over 2 s', 'clustering')
-    assert 'more' not in four
 
 
 @pytest.mark.parametrize('gain, whole, said', [
@@ -177,12 +158,3 @@ def test_a_cause_without_a_gain_is_named_for_the_whole_recording(gain, error, ch
 def test_a_gain_has_its_error_or_says_that_it_is_unknown(gain, error, text):
     """In thousandths of a nat."""
     assert gain_text(gain, error) == text
-
-
-@pytest.mark.parametrize('dips, made, words', [
-    (1, 1, 'Throttle caused the only dip'), (1, 0, 'Throttle did not cause the only dip'),
-    (2, 1, 'Throttle caused 1 of the 2 dips')])
-def test_the_dips_that_throttle_caused_are_counted(dips, made, words):
-    """One dip needs no count."""
-    effects = ThrottleEffects(0.2, 0.8, 1.5, 0.1, level=13.2, dips=dips, made=made)
-    assert f'{words} below 13.20 V.' in effects.words

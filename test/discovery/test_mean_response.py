@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 from ou_monitor.criticism.composite import fit_composite, view_of
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.discovery import decision, regression
+from ou_monitor.discovery import regression
 from ou_monitor.discovery.regression import (
     _candidates, _is_among, _nearby, _Regression, FOLDS, mean_response)
 from ou_monitor.model.supply import SupplyModel
@@ -121,16 +121,6 @@ def test_the_search_finds_the_true_terms_from_any_start(driven, start, monkeypat
     worse = tuple(sorted((0, other)))
     if found._value(chosen) > found._value(worse) + 0.1:
         assert found._best_exchange(worse, found._value(worse)) == chosen
-
-
-def test_another_cause_that_does_as_well_is_a_rival(driven, monkeypatch):
-    """Within a tie of the evidence, in the place of the one."""
-    pool, columns, voltage = driven
-    found, _ = made([pool[0], pool[4]], [columns[0], columns[0]], voltage, monkeypatch)
-    near = abs(found._value((0,)) - found._value((1,)))
-    assert near < decision.TIE and found._rivals((0,), 0) == ('drift',)
-    found, _ = made([pool[0], pool[4]], [columns[0], columns[4]], voltage, monkeypatch)
-    assert found._rivals((0,), 0) == ()
 
 
 def test_a_steady_sag_gets_no_growth():

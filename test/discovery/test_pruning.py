@@ -2,8 +2,6 @@
 
 from types import SimpleNamespace
 
-import numpy as np
-from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import pruning
 from ou_monitor.discovery.pruning import Pruned, prune_by_gain, group_of, MANY, refusal, Worth
 from ou_monitor.model.terms.ou import OU
@@ -129,19 +127,6 @@ def test_a_model_that_cannot_be_simulated_strays_without_bound(monkeypatch):
     monkeypatch.setattr(pruning, 'outside_range', far)
     assert pruning._straying(None, state_of('drift', 'tone')) == 1
     assert pruning._straying(None, state_of('drift')) is None
-
-
-def test_the_excess_of_simulations_is_measured_beyond_the_margin():
-    """Nothing where the model is that of the samples; its level by 2 V, less the margin."""
-    rng = np.random.default_rng(3)
-    t = 1e-3 * np.arange(3000)
-    v = 5.0 + 0.05 * rng.standard_normal(t.size)
-    samples = Samples(t, v, None)
-    assert pruning.outside_range(samples, [OU(60.0, 0.5, 5.0)]) == 0.0
-    away = pruning.outside_range(samples, [OU(60.0, 0.5, 7.0)])
-    seen = v.max() - v.min()
-    assert away == pytest.approx(7.0 - v.max() - 0.5 * seen, abs=0.25)
-    assert pruning.outside_range(samples, [OU(60.0, 0.5, 7.0)]) == away
 
 
 @pytest.mark.parametrize('gain, far, said', [

@@ -102,14 +102,6 @@ def test_a_term_that_modifies_a_removed_one_is_removed_too():
     assert search.accepted == [] and search.composite.terms == (BASE,)
 
 
-def test_responses_of_the_mean_are_left_to_the_regression():
-    """Nothing is fitted for them."""
-    search = Search(Model([BASE, LoadSag(0.1, 0.0)], 20.0), ['load_sag'])
-    fitter = Table({})
-    rules.backward(fitter, search)
-    assert fitter.asked == [] and search.accepted == ['load_sag']
-
-
 def test_the_best_first_estimates_are_fitted_in_full():
     """Those that gain at least half as much as the best; what a full fit makes worse stays."""
     kinds = {MeasurementNoise: NOISE, LoadDependentSigma: SIGMA, Drift: Drift(0.1, 0.0)}

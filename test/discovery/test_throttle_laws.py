@@ -99,12 +99,6 @@ def test_two_curves_stay_where_each_explains_a_tenth_of_the_other(both, left):
     assert compared(worth, 'ns')[1] == left
 
 
-def test_ripple_needs_white_noise():
-    """Without it the law of the white noise is no rival of sigma."""
-    worth = {letters: value for letters, value in ALONE.items() if 'n' not in letters}
-    assert compared(worth, 's', white=False)[1] == 's'
-
-
 def test_constant_white_noise_does_not_follow_throttle():
     """Sigma that follows throttle beside constant white noise is named, its rivals are not."""
     rng = np.random.default_rng(6)
