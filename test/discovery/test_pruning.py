@@ -145,3 +145,11 @@ def test_a_model_is_refused_for_its_gain_or_its_simulations(gain, far, said, mon
     assert said in text and bool(text) is bool(said)
     if gain > 0.0:
         assert 'errors' in refusal(None, (BASE,), gain, 0.01, larger=True)
+
+
+def test_after_four_rounds_what_is_left_stays(monkeypatch):
+    """Even if it fails."""
+    names = ['drift', 'tone', 'measurement_noise', 'second_relaxation']
+    bad = dict.fromkeys(names, (-0.1, 0.9))
+    found = run(monkeypatch, [bad] * 4, names)
+    assert len(found.names) == 1 and len(found.out) == 3

@@ -14,7 +14,7 @@ from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_dependent import LoadDependentNoise, LoadDependentSigma
 from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.reading import MeasurementNoise
+from ou_monitor.model.terms.reading import LopsidedNoise, MeasurementNoise
 from ou_monitor.model.terms.slow import Drift, SecondRelaxation
 from ou_monitor.model.terms.tones import Tone
 import pytest
@@ -278,3 +278,28 @@ def test_a_cause_in_place_of_a_better_one_that_was_withdrawn_is_not_named(
     start.gaussian.phi = np.ones(3)
     found = rules_of_names.named_causes(SimpleNamespace(t=np.arange(3.0)), start, None, (), print)
     assert list(found.names) == named and found.dropped == (NOISE.NAME,)
+
+
+def test_fits_add_up_their_cost():
+    """Each counts, of the first part or of everything; a fit that fails costs nothing."""
+    start, t = [OU(50.0, 0.1, 5.0)], np.arange(2000) * 1e-3
+    v = SupplyModel(tuple(start)).simulate(t, np.random.default_rng(1))
+    fitter = Fitter(Samples(t, v, None))
+    one = fitter.fit(start, None)
+    assert one.cost > 0.0 and fitter.cost == one.cost
+    two = fitter.whole(one)
+    assert fitter.cost == pytest.approx(one.cost + two.cost)
+
+
+def test_a_law_is_fitted_once_to_the_same_scores(monkeypatch):
+    """To others it is fitted again; what cannot be fitted is known as well."""
+    made = []
+    monkeypatch.setattr(LopsidedNoise, 'fit_law', classmethod(
+        lambda cls, view: made.append(view) or (None if view.z[0] else SimpleNamespace())))
+    fitter = Fitter(SimpleNamespace(n=9))
+    one, same, other = (SimpleNamespace(z=np.full(9, z)) for z in (0.0, 1e-9, 1.0))
+    found = fitter.law_fit(LopsidedNoise, one)
+    assert fitter.law_fit(LopsidedNoise, same) is found is not None and made == [one]
+    assert [fitter.law_fit(LopsidedNoise, other) for _ in range(2)] == [None, None]
+    assert made == [one, other]
+    assert fitter.law_fit(LopsidedNoise, one) is not found and made == [one, other, one]
