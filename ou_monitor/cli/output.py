@@ -182,7 +182,7 @@ def check_paths(inputs: Mapping[str, str | Path | None],
             if _same(target, earlier):
                 raise InputError(f"{other} and {name} are both '{target}': give each its own "
                                  'name')
-            inner, outer = sorted((target.resolve(), earlier.resolve()),
+            inner, outer = sorted((_real(target), _real(earlier)),
                                   key=lambda path: -len(path.parts))
             if outer in inner.parents and (
                     not outer.is_dir() or (outer / 'metadata.yaml').exists()):
@@ -241,20 +241,25 @@ def _is_device(path: Path) -> bool:
     return path.exists() and not path.is_file() and not path.is_dir()
 
 
+def _real(path: Path) -> Path:
+    """Return a path without links; a loop of links, which `resolve` refuses, stays as it is."""
+    return Path(os.path.realpath(path))
+
+
 def _same(first: Path, second: Path) -> bool:
     """Return whether two paths are one file, also through links."""
-    if first.resolve() == second.resolve():
+    if _real(first) == _real(second):
         return True
     return first.exists() and second.exists() and first.samefile(second)
 
 
 def _overwrites(target: Path, source: Path) -> bool:
     """Return whether writing the target would harm the source: a file, or a bag's folder."""
-    if _same(target, source) or target.is_dir() and target.resolve() in source.resolve().parents:
+    if _same(target, source) or target.is_dir() and _real(target) in _real(source).parents:
         return True
-    if not source.is_dir() or source.resolve() not in target.resolve().parents:
+    if not source.is_dir() or _real(source) not in _real(target).parents:
         return False
-    name = target.resolve().name.lower()
+    name = _real(target).name.lower()
     return name == 'metadata.yaml' or name.endswith(_STORAGE)
 
 

@@ -246,3 +246,13 @@ def test_the_last_lines_repeat_the_answer_and_name_the_files(capsys):
     first, second = capsys.readouterr().out.strip('\n').split('\n\n')
     assert first.splitlines() == ['It fell to 13 V.', 'It sags by 2 V.', 'Report: a.html']
     assert second.splitlines()[-1].startswith('No file was written: --report')
+
+
+def test_a_link_that_loops_is_replaced_only_with_force(tmp_path):
+    """It names no file of anybody; without --force it is refused in one line."""
+    loop = tmp_path / 'page.html'
+    loop.symlink_to(loop)
+    inputs = {'RECORDING': str(tmp_path / 'flight.csv')}
+    with pytest.raises(InputError, match='exists already'):
+        output.check_paths(inputs, {'--report': loop})
+    output.check_paths(inputs, {'--report': loop}, force=True)
