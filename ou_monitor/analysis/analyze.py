@@ -32,7 +32,7 @@ from ou_monitor.analysis.relaxation import (
 from ou_monitor.analysis.supply import fed, flown_near, node_for, remainder, THROTTLES
 from ou_monitor.criticism.innovations import FAMILY_WISE
 from ou_monitor.criticism.readings import two_levels
-from ou_monitor.model.spectral_lines import FALSE_ALARM
+from ou_monitor.model.sinusoid import FALSE_ALARM
 from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.settings import DEFAULT_LIMIT, MonitorSettings, RAIL

@@ -169,8 +169,8 @@ def line_item(throttle: float, without: Estimate, with_lines: Estimate | None) -
     if without.usable and with_lines.usable:
         moved = any(abs(math.log(getattr(with_lines, name) / getattr(without, name)))
                     > Z95 * getattr(without, name + '_se') for name in ('alpha', 'sigma'))
-        text = (f'{taken}; with them, as in the node, alpha would be {with_lines.alpha:.3g} '
-                f'1/s and sigma {with_lines.sigma:.3g} V/sqrt(s).')
+        text = (f'{taken}; with them, as in the window of the node, alpha would be '
+                f'{with_lines.alpha:.3g} 1/s and sigma {with_lines.sigma:.3g} V/sqrt(s).')
     else:
         moved = without.usable or with_lines.usable
         left = ', and the remainder cannot be fitted' if not without.usable else (

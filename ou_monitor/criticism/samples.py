@@ -16,7 +16,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.innovations import steps_before
-from ou_monitor.model.spectral_lines import find_lines, fit_sinusoid, Sinusoid
+from ou_monitor.model.sinusoid import fit_sinusoid, Sinusoid
+from ou_monitor.model.spectral_lines import find_lines
 from ou_monitor.model.terms.segment import Segment
 from ou_monitor.model.terms.term import Term
 from ou_monitor.model.terms.tones import Tone

@@ -1,7 +1,8 @@
 """
 Fit an Ornstein-Uhlenbeck process and white noise to a voltage, together with level and load.
 
-`known_ou` fits the shortest window in which alpha is known well.  `regress` removes a flexible
+`known_ou` fits the shortest window in which alpha is known well, without the window's spectral
+lines: a tone as large as the OU may double alpha.  `regress` removes a flexible
 level (linear hat functions every 5 s), throttle and measured current from the voltage; both loads
 enter without lag and after several lags with free initial states.  `fit_ou` fits the noise jointly
 with these regressors.
@@ -36,6 +37,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.load import CELL
+from ou_monitor.model.sinusoid import tones
 from ou_monitor.model.whittle import CrossSpectrum
 from ou_monitor.records import determined, FloatArray, MOST_READINGS, OU_WINDOWS, OuFacts
 
@@ -98,6 +100,8 @@ _DROP = 3.0
 _QUARTER = 0.25
 # Relative size below which a regressor counts as spanned by the others.
 _SPANNED = 1e-5
+# Minimum number of a line's periods between knots of the level, which absorbs slower ones.
+_PERIODS = 10.0
 # Exponent of the load over throttle.
 _POWER = 1.8
 
@@ -469,16 +473,30 @@ def known_ou(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray |
         begin = int(np.searchsorted(t, t[-1] - window))
         if t.size - begin < FEWEST:
             continue
-        part = regress(t[begin:], v[begin:], None if u is None else u[begin:],
-                       None if i is None else i[begin:])
+        near, cut = t[begin:], v[begin:].copy()
+        throttle, drawn = (None if x is None else x[begin:] for x in (u, i))
+        part = regress(near, cut, throttle, drawn)
         if part.free < FEWEST:
             continue
+        lines = _tones(part)
+        if lines.any():
+            cut[part.places] -= lines
+            part = regress(near, cut, throttle, drawn)
         last = part, window
         if window < longest:
             found = fit_ou(part, window, precise=True)
             if found.status == 'ok' and found.alpha_95[1] < PRECISE ** 2 * found.alpha_95[0]:
                 return found
     return fit_ou(*last) if last else OuFacts('too_short', span)
+
+
+def _tones(part: Regression) -> FloatArray:
+    """Return the tones in the residual, V; shape (n,)."""
+    edges, lowest = np.cumsum(part.lengths)[:-1], 0.5 * _PERIODS / part.slowest
+    white = _innovations(part.voltage / part.size)
+    return np.concatenate([
+        tones(one, other, 1.0 / part.dt, lowest)
+        for one, other in zip(np.split(part.voltage, edges), np.split(white, edges))])
 
 
 def _pair(ends: Sequence[float]) -> tuple[float, float]:

@@ -31,35 +31,22 @@ import math
 
 import numpy as np
 import numpy.typing as npt
+from ou_monitor.model.sinusoid import (
+    FALSE_ALARM, FEWEST_SAMPLES, FEWEST_TESTED, FIRST, fit_sinusoid, groups, LOBE, local_median,
+    neighbours, SHORT)
 from ou_monitor.records import FloatArray, NAN
 from ou_monitor.text import Z95
 from scipy.optimize import brentq
 from scipy.signal import welch
 from scipy.special import betaincinv, chndtrinc, gammaincc, gammaincinv
 
-# Probability that a recording without lines has one reported at any of its levels.
-FALSE_ALARM = 0.01
-# Lowest frequency, in periods of a piece: lower ones are affected by the removal of mean and
-# trend.
-FIRST = 4
-# Maximum length of a short piece, s; maximum samples of a long one (for memory and time).
-_SHORT, _LONGEST = 4.0, 1 << 20
-_FEWEST = 128  # Minimum number of samples of a piece
-# Minimum number of ordinates in which lines are searched for.
-_FEWEST_TESTED = 32
-# Neighbours: every second ordinate, because the window correlates adjacent ones.  Distance of the
-# nearest, in bins; their number; maximum factor on that number in long pieces, whose bins are
-# narrower.
-_GUARD, _NEIGHBOURS, _MORE = 4, 64, 4
-# Number of bins on either side over which the window spreads a steady line.
-_LOBE = 2
+# Maximum samples of a long piece (for memory and time).
+_LONGEST = 1 << 20
 # Nodes and weights of quadrature over 0..1.
 _QUANTILES = 0.5 * (np.polynomial.legendre.leggauss(64)[0] + 1.0)
 _WEIGHTS = 0.5 * np.polynomial.legendre.leggauss(64)[1]
 # Maximum ratio of samples with missing ones filled in to samples given.
 _FILLED = 4.0
-# Parts of a piece whose phases are compared, and frequencies tried for each bin of the piece.
-_PHASES, _TRIED = 64, 32
 
 
 @dataclass(frozen=True)
@@ -100,7 +87,7 @@ class EvenGrid:
 
 
 # Step, over the median, below which a sample may lie between those of the clock.
-_SHORT_STEP = 0.75
+SHORT_STEP = 0.75
 
 
 def on_grid(t: FloatArray, values: FloatArray) -> EvenGrid:
@@ -110,7 +97,7 @@ def on_grid(t: FloatArray, values: FloatArray) -> EvenGrid:
     ratio = step / usual
     number = np.maximum(1.0, np.rint(ratio))
     # Samples between those of the clock: their short steps add up to whole ones.
-    short = ratio < _SHORT_STEP
+    short = ratio < SHORT_STEP
     if (short[1:] & short[:-1]).any():
         passed = np.cumsum(np.where(short, ratio, 0.0))
         whole = np.rint(passed - np.maximum.accumulate(np.where(short, 0.0, passed)))
@@ -134,12 +121,12 @@ def find_lines(parts: Sequence[FloatArray], rate: float, *, false_alarm: float =
     parts, white = ([part - part.mean() for part in some if part.size]
                     for some in (parts, white or parts))
     sizes = [part.size for part in parts]
-    short = _piece_length(sizes, max(_FEWEST, int(_SHORT * rate)))
+    short = _piece_length(sizes, max(FEWEST_SAMPLES, int(SHORT * rate)))
     if not (short and rate > 0.0):
-        return LineSearch(why_not=f'no segment holds {_FEWEST} samples')
+        return LineSearch(why_not=f'no segment holds {FEWEST_SAMPLES} samples')
     tested = {length: np.arange(max(FIRST, math.ceil(lowest * length / rate)), length // 2 - 1)
               for length in (short, _piece_length(sizes, _LONGEST))}
-    if tested[short].size < _FEWEST_TESTED:
+    if tested[short].size < FEWEST_TESTED:
         return LineSearch(why_not=f'too few frequencies lie above {lowest:g} Hz')
     count = sum(where.size for where in tested.values())
     found: list[Line] = []
@@ -151,7 +138,7 @@ def find_lines(parts: Sequence[FloatArray], rate: float, *, false_alarm: float =
         # pieces, unless only the long ones show it clearly.
         for line in lines:
             same = [other for other in found if abs(line.frequency - other.frequency)
-                    < 2 * _LOBE * other.resolution]
+                    < 2 * LOBE * other.resolution]
             if all(other.p_value > max(line.p_value, FALSE_ALARM / (levels * count))
                    for other in same):
                 found = [other for other in found if other not in same] + [line]
@@ -170,8 +157,8 @@ def _search(parts: Sequence[FloatArray], whites: Sequence[FloatArray], rate: flo
         part, rate, nperseg=length, noverlap=0, detrend='linear')[1]
         for part in some if part.size >= length) / pieces for some in (parts, whites))
     df, k = rate / length, float(pieces)
-    near = _neighbours(where.size, length / (_SHORT * rate))
-    middle = _local_median(white, where, near)
+    near = neighbours(where.size, length / (SHORT * rate))
+    middle = local_median(white, where, near)
     ratio = white[where] / np.maximum(middle, 1e-300)
     limit = threshold(k, near, chance)
     hits = np.flatnonzero(ratio > limit)
@@ -184,7 +171,7 @@ def _search(parts: Sequence[FloatArray], whites: Sequence[FloatArray], rate: flo
     held = [part for part in parts if part.size >= length]
     total = float(sum(part @ part for part in held) / sum(part.size for part in held))
     lines = [_measure(raw, background, white[where], middle, where, group, p, df, total, k)
-             for group in _groups(hits)]
+             for group in groups(hits)]
     return lines, _detectable(float(np.median(background)), df, k, limit)
 
 
@@ -214,11 +201,11 @@ def threshold(pieces: float, neighbours: int, level: float) -> float:
 def _piece_length(sizes: Sequence[int], most: int) -> int:
     """Return the length of pieces, up to a maximum, at which a line is detected best."""
     longest = max(sizes, default=0)
-    if longest < _FEWEST:
+    if longest < FEWEST_SAMPLES:
         return 0
     top = min(longest, most)
     best, score = top, 0.0
-    for length in {top, *(size for size in sizes if _FEWEST <= size < top)}:
+    for length in {top, *(size for size in sizes if FEWEST_SAMPLES <= size < top)}:
         # The power of a line grows with the number of pieces, and the scatter of noise with the
         # root of that number.
         gained = length * math.sqrt(sum(size // length for size in sizes))
@@ -227,55 +214,14 @@ def _piece_length(sizes: Sequence[int], most: int) -> int:
     return best
 
 
-def _neighbours(ordinates: int, share: float) -> int:
-    """Return the number of neighbours: even, and the same band in Hz for long pieces."""
-    there = max(2, (ordinates - 2 * _GUARD) // 4 * 2)
-    return min(there, _NEIGHBOURS * min(_MORE, max(1, int(share))))
-
-
-def _local_median(density: FloatArray, where: np.ndarray, near: int) -> FloatArray:
-    """Return the upper median of the nearest neighbours on either side, shape of `where`."""
-    n = where.size
-    # If there are many neighbours, several ordinates share them.
-    hop = max(1, near // _NEIGHBOURS)
-    centres = np.minimum(np.arange(0, n, hop) + hop // 2, n - 1)
-    guard = _GUARD + hop // 2
-    side = np.arange(guard, guard + near, 2)
-    both = np.concatenate((-side[::-1], side))
-    found = np.empty(centres.size)
-    inside = (centres >= side[-1]) & (centres < n - side[-1])
-    inner = np.flatnonzero(inside)
-    for part in np.array_split(inner, max(1, inner.size * near // (1 << 18))):
-        values = density[where[0] + centres[part, None] + both[None, :]]
-        found[part] = np.partition(values, near // 2, axis=1)[:, near // 2]
-    # Near an end, one side has too few: use the nearest on the other.
-    reach = np.arange(guard, guard + 4 * near, 2)
-    offsets = np.concatenate((-reach[::-1], reach))
-    edges = np.flatnonzero(~inside)
-    index = centres[edges, None] + offsets[None, :]
-    there = (index >= 0) & (index < n)
-    distance = np.where(there, np.abs(offsets)[None, :], np.iinfo(np.int64).max)
-    chosen = np.argpartition(distance, near - 1, axis=1)[:, :near]
-    values = density[where[0] + np.take_along_axis(np.where(there, index, 0), chosen, 1)]
-    found[edges] = np.partition(values, near // 2, axis=1)[:, near // 2]
-    return np.repeat(found, hop)[:n]
-
-
-def _groups(hits: np.ndarray) -> list[np.ndarray]:
-    """Join ordinates of one line."""
-    if not hits.size:
-        return []
-    return list(np.split(hits, np.flatnonzero(np.diff(hits) > 2 * _LOBE) + 1))
-
-
 def _measure(raw: FloatArray, background: FloatArray, white: FloatArray, middle: FloatArray,
              where: np.ndarray, group: np.ndarray, p: FloatArray, df: float, total: float, k: float
              ) -> Line:
     """Return frequency and power of the line that a group of ordinates belongs to."""
-    low, high = max(0, group[0] - _LOBE), min(where.size, group[-1] + _LOBE + 1)
-    if group.size <= 2 * _LOBE + 1:
+    low, high = max(0, group[0] - LOBE), min(where.size, group[-1] + LOBE + 1)
+    if group.size <= 2 * LOBE + 1:
         peak = int(group[np.argmax(white[group])])
-        low, high = max(0, peak - _LOBE), min(where.size, peak + _LOBE + 1)
+        low, high = max(0, peak - LOBE), min(where.size, peak + LOBE + 1)
     density, noise = raw[where[low:high]], background[low:high]
     # The mean of a gamma variable, in units of its median.
     excess = np.maximum(white[low:high] - k / float(gammaincinv(k, 0.5)) * middle[low:high], 0.0)
@@ -307,44 +253,3 @@ def without_lines(voltage: FloatArray, rate: float, lines: Sequence[Line]) -> Fl
             piece - fit_sinusoid(piece, rate, line.frequency, line.resolution).sampled(
                 np.arange(piece.size) / rate) for piece in np.array_split(voltage, pieces)])
     return voltage
-
-
-@dataclass(frozen=True)
-class Sinusoid:
-    """A line within a piece."""
-
-    amplitude: float  # Peak, V
-    frequency: float  # Hz
-    phase: float  # Of its sine at the first sample, rad
-
-    def sampled(self, t: FloatArray) -> FloatArray:
-        """Return its voltage, V, at times since the first sample, s."""
-        wave: FloatArray = self.amplitude * np.sin(
-            2.0 * math.pi * (t * self.frequency % 1.0) + self.phase)
-        return wave
-
-
-def fit_sinusoid(piece: FloatArray, rate: float, frequency: float, reach: float) -> Sinusoid:
-    """Return the strongest sinusoid near a frequency (piece in V; rate, reach in Hz)."""
-    v = piece - piece.mean()
-    size = max(1, v.size // _PHASES)
-    count = v.size // size
-    # Each part of the piece as one complex number, in a rotating frame.
-    turns = frequency / rate
-    sums = v[:count * size].reshape(count, size) @ _turning(turns, size)
-    sums *= _turning(turns * size, count)
-    shifts = np.fft.fftfreq(_TRIED * count, size / rate)
-    power = np.abs(np.fft.fft(np.hanning(count + 2)[1:-1] * sums, shifts.size))
-    power[(np.abs(shifts) > reach) | (frequency + shifts <= 0.0)
-          | (frequency + shifts >= 0.5 * rate)] = 0.0
-    best = frequency + float(shifts[np.argmax(power)])
-    wave = _turning(best / rate, v.size)
-    waves = np.column_stack((-wave.imag, wave.real))
-    sine, cosine = np.linalg.solve(waves.T @ waves, waves.T @ v).tolist()
-    return Sinusoid(math.hypot(sine, cosine), best, math.atan2(cosine, sine))
-
-
-def _turning(turns: float, count: int) -> npt.NDArray[np.complex128]:
-    """Return a unit vector that rotates backwards by a number of turns per sample."""
-    found: npt.NDArray[np.complex128] = np.exp(-2j * math.pi * (turns * np.arange(count) % 1.0))
-    return found

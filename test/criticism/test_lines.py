@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 from ou_monitor.model.ou import simulate
-from ou_monitor.model.spectral_lines import find_lines, fit_sinusoid, on_grid, tail
+from ou_monitor.model.sinusoid import fit_sinusoid, tones
+from ou_monitor.model.spectral_lines import find_lines, on_grid, tail
 import pytest
 from scipy import signal
 from scipy.signal import lfilter
@@ -137,3 +138,13 @@ def test_samples_between_those_of_the_clock_do_not_move_a_line():
     # A tenth of the resolution; counted as whole steps they would move it by 0.15 Hz.
     assert abs(wave.frequency - 120.0) < 0.005
     assert wave.amplitude == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_tones_are_summed_and_noise_is_left_alone(seed):
+    """Two tones, one of them for half of the time, within 10 % of their rms; none in noise."""
+    v = noise(seed, 8000)
+    assert not tones(v, v, RATE).any()
+    added = tone(57.3, 0.01, 8000) + tone(211.7, 0.02, 8000) * (np.arange(8000) >= 4000)
+    error = tones(v + added, v + added, RATE) - added
+    assert np.sqrt(np.mean(error ** 2)) < 0.1 * np.sqrt(np.mean(added ** 2))

@@ -18,7 +18,8 @@ from ou_monitor.criticism.innovations import FAMILY_WISE, innovations, other_pol
 from ou_monitor.criticism.integrity import examine
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate
-from ou_monitor.model.spectral_lines import FALSE_ALARM, find_lines, on_grid
+from ou_monitor.model.sinusoid import FALSE_ALARM
+from ou_monitor.model.spectral_lines import find_lines, on_grid
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ac_coupling import ACCoupling
 from ou_monitor.model.terms.load_dependent import LoadDependentAlpha, LoadDependentSigma

@@ -9,7 +9,8 @@ from typing import ClassVar
 
 import numpy as np
 from ou_monitor.model.ou import first_order
-from ou_monitor.model.spectral_lines import find_lines, fit_sinusoid, Line, on_grid
+from ou_monitor.model.sinusoid import fit_sinusoid
+from ou_monitor.model.spectral_lines import find_lines, Line, on_grid
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.lines import (
     broad_peaks, CONSTANT, order_lines, power_spread, RINGING, rotation, wandering)

@@ -1,0 +1,154 @@
+"""
+Sinusoids in a voltage: fitted, and, where they are clear, detected and summed.
+
+`tones` is for the node, which must not load SciPy; `spectral_lines` searches with more power, in
+averaged periodograms.  An ordinate of the periodogram of noise is exponential.  Divided by the
+median of its neighbours, of rank j among N, it exceeds r with probability
+prod_(i=1..j) 1 / (1 + r / (N - i + 1)), because the spacings of ordered exponential variables are
+independent and exponential (Renyi 1953): the test needs no model of the spectrum.
+
+Limits: those of `spectral_lines`; each piece of a few seconds is tested alone, so a weak tone that
+only the average of pieces shows is missed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+import numpy.typing as npt
+from ou_monitor.records import FloatArray
+
+# Probability that a recording without lines has one reported at any of its levels.
+FALSE_ALARM = 0.01
+# Maximum length of a short piece, s: tones of motors and converters drift.
+SHORT = 4.0
+# Lowest frequency, in periods of a piece: lower ones are affected by the removal of mean and
+# trend.
+FIRST = 4
+# Neighbours: every second ordinate, because the window correlates adjacent ones.  Distance of the
+# nearest, in bins; their number.
+GUARD, NEIGHBOURS = 4, 64
+# Maximum factor on that number in long pieces, whose bins are narrower.
+_MORE = 4
+# Number of bins on either side over which the window spreads a steady line.
+LOBE = 2
+# Minimum number of samples of a piece, and of ordinates in which lines are searched for.
+FEWEST_SAMPLES, FEWEST_TESTED = 128, 32
+# Parts of a piece whose phases are compared, and frequencies tried for each bin of the piece.
+_PHASES, _TRIED = 64, 32
+
+
+@dataclass(frozen=True)
+class Sinusoid:
+    """A line within a piece."""
+
+    amplitude: float  # Peak, V
+    frequency: float  # Hz
+    phase: float  # Of its sine at the first sample, rad
+
+    def sampled(self, t: FloatArray) -> FloatArray:
+        """Return its voltage, V, at times since the first sample, s."""
+        wave: FloatArray = self.amplitude * np.sin(
+            2.0 * math.pi * (t * self.frequency % 1.0) + self.phase)
+        return wave
+
+
+def fit_sinusoid(piece: FloatArray, rate: float, frequency: float, reach: float) -> Sinusoid:
+    """Return the strongest sinusoid near a frequency (piece in V; rate, reach in Hz)."""
+    v = piece - piece.mean()
+    size = max(1, v.size // _PHASES)
+    count = v.size // size
+    # Each part of the piece as one complex number, in a rotating frame.
+    turns = frequency / rate
+    sums = v[:count * size].reshape(count, size) @ _turning(turns, size)
+    sums *= _turning(turns * size, count)
+    shifts = np.fft.fftfreq(_TRIED * count, size / rate)
+    power = np.abs(np.fft.fft(np.hanning(count + 2)[1:-1] * sums, shifts.size))
+    power[(np.abs(shifts) > reach) | (frequency + shifts <= 0.0)
+          | (frequency + shifts >= 0.5 * rate)] = 0.0
+    top = int(np.argmax(power))
+    # A parabola through the highest three: half a step would leave 3 % of the amplitude.
+    before, here, after = (float(power[k % power.size]) for k in (top - 1, top, top + 1))
+    bent = before - 2.0 * here + after
+    off = 0.5 * (before - after) / bent if before and after and bent < 0.0 else 0.0
+    best = frequency + float(shifts[top] + off * shifts[1])
+    wave = _turning(best / rate, v.size)
+    waves = np.column_stack((-wave.imag, wave.real))
+    sine, cosine = np.linalg.solve(waves.T @ waves, waves.T @ v).tolist()
+    return Sinusoid(math.hypot(sine, cosine), best, math.atan2(cosine, sine))
+
+
+def _turning(turns: float, count: int) -> npt.NDArray[np.complex128]:
+    """Return a unit vector that rotates backwards by a number of turns per sample."""
+    found: npt.NDArray[np.complex128] = np.exp(-2j * math.pi * (turns * np.arange(count) % 1.0))
+    return found
+
+
+def local_median(density: FloatArray, where: np.ndarray, near: int) -> FloatArray:
+    """Return the upper median of the nearest neighbours on either side, shape of `where`."""
+    n = where.size
+    # If there are many neighbours, several ordinates share them.
+    hop = max(1, near // NEIGHBOURS)
+    centres = np.minimum(np.arange(0, n, hop) + hop // 2, n - 1)
+    guard = GUARD + hop // 2
+    side = np.arange(guard, guard + near, 2)
+    both = np.concatenate((-side[::-1], side))
+    found = np.empty(centres.size)
+    inside = (centres >= side[-1]) & (centres < n - side[-1])
+    inner = np.flatnonzero(inside)
+    for part in np.array_split(inner, max(1, inner.size * near // (1 << 18))):
+        values = density[where[0] + centres[part, None] + both[None, :]]
+        found[part] = np.partition(values, near // 2, axis=1)[:, near // 2]
+    # Near an end, one side has too few: use the nearest on the other.
+    reach = np.arange(guard, guard + 4 * near, 2)
+    offsets = np.concatenate((-reach[::-1], reach))
+    edges = np.flatnonzero(~inside)
+    index = centres[edges, None] + offsets[None, :]
+    there = (index >= 0) & (index < n)
+    distance = np.where(there, np.abs(offsets)[None, :], np.iinfo(np.int64).max)
+    chosen = np.argpartition(distance, near - 1, axis=1)[:, :near]
+    values = density[where[0] + np.take_along_axis(np.where(there, index, 0), chosen, 1)]
+    found[edges] = np.partition(values, near // 2, axis=1)[:, near // 2]
+    return np.repeat(found, hop)[:n]
+
+
+def groups(hits: np.ndarray) -> list[np.ndarray]:
+    """Join ordinates of one line."""
+    if not hits.size:
+        return []
+    return list(np.split(hits, np.flatnonzero(np.diff(hits) > 2 * LOBE) + 1))
+
+
+def tones(v: FloatArray, white: FloatArray, rate: float, lowest: float = 0.0) -> FloatArray:
+    """Return the sum of the clear tones in even samples, V (rate and lowest in Hz); shape (n,)."""
+    # white: their innovations, whose flatter spectrum is tested.
+    found, pieces = np.zeros(v.size), math.ceil(v.size / (SHORT * rate))
+    for where in np.array_split(np.arange(v.size), max(1, pieces)):
+        n = where.size
+        tested = np.arange(max(FIRST, math.ceil(lowest * n / rate)), n // 2 - 1)
+        if n < FEWEST_SAMPLES or tested.size < FEWEST_TESTED:
+            continue
+        e = white[where]
+        power = np.abs(np.fft.rfft((e - e.mean()) * np.hanning(n))) ** 2
+        near = neighbours(tested.size)
+        ratio = power[tested] / np.maximum(local_median(power, tested, near), 1e-300)
+        ranks = near - np.arange(near // 2 + 1)
+        log_p = -np.log1p(ratio[:, None] / ranks).sum(axis=1)
+        hits = np.flatnonzero(log_p < math.log(FALSE_ALARM / (pieces * tested.size)))
+        peaks = [int(group[np.argmax(ratio[group])]) for group in groups(hits)]
+        left = v[where] - v[where].mean()
+        for peak in sorted(peaks, key=lambda k: -ratio[k]):
+            wave = fit_sinusoid(left, rate, tested[peak] * rate / n, rate / n)
+            left = left - wave.sampled(np.arange(n) / rate)
+        if peaks:
+            found[where] = v[where] - v[where].mean() - left
+    return found
+
+
+def neighbours(ordinates: int, share: float = 1.0) -> int:
+    """Return the number of neighbours: even, and the same band in Hz for long pieces."""
+    # share: length of a piece over that of a short one.
+    there = max(2, (ordinates - 2 * GUARD) // 4 * 2)
+    return min(there, NEIGHBOURS * min(_MORE, max(1, int(share))))
