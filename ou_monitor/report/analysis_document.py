@@ -39,7 +39,7 @@ _TESTS = {'mean_drift': 'mean moves', 'variance_drift': 'intensity moves',
 # Warnings that change the meaning of every number.
 _BEWARE = {
     'VOLTAGE_UNIT': 'Beware: the voltages seem to be millivolts or counts, not volts.',
-    'TIME_UNIT': 'Beware: the time seems to be in ms or us, not in s.'}
+    'TIME_UNIT': 'Beware: the time seems to be in a smaller unit.'}
 
 
 def analysis_document(analysis: Analysis, command: str = '') -> Document:

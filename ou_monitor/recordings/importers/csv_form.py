@@ -82,6 +82,7 @@ SCALES = {**TIME_UNITS, 'min': 60.0, 'h': 3600.0, 'd': 86400.0, 'V': 1.0, 'dV': 
 _WORD = rf"({'|'.join(sorted(WORDS.keys() - _LONG.split('|'), key=len, reverse=True))})(?: dc)?"
 _WITH_UNIT = re.compile(
     rf'(.*(?:time|zeit|stamp|elapsed)|t)(?: ?[\[({{/_ ] ?| in )({_LONG})[\])}}]?|'
+    r'(.*(?:time|stamp))([mun]s)|'  # ArduPilot's TimeUS
     rf'(.*?) ?[\[({{] ?{_WORD} ?[\])}}]|(.+?) in {_WORD}|(.[^/]*?|.+? ) ?/ ?{_WORD}|'
     rf'(.+?)[ _]{_WORD}')
 # A unit before more words: 101 (VDC)- Battery.

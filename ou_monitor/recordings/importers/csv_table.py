@@ -81,7 +81,8 @@ _PATTERNS = {
     logs.THROTTLE: (
         r'throttle', r'thr(?:ottle)?_?(?:out|cmd|command|pct|percent)?|ga[sz]|'
         r'acelerador|duty(?:_cycle)?|tho?o|tps|tastgrad|tastverh.*',
-        r'rc_?command_3', r'pwm|thrust|gas_?(?:kanal|stellung|hebel)|esc(?:_signal)?|'
+        r'rc_?command_3|rc_?out?(?:_?ch?_?3)?|servo3_raw',
+        r'pwm|rc_?out?_?ch?_?1|thrust|gas_?(?:kanal|stellung|hebel)|esc(?:_signal)?|'
         r'(?!.*(?:limit|trim|max|min)).*throttle.*'),
     logs.CURRENT: (
         r'current_a', r'amperage(?:_?latest)?|current_in|i_?bat(?:t|tery)?|'
@@ -670,6 +671,9 @@ def _in_si(quantity: str, column: _Column, values: FloatArray, given: str | None
                 re.search('duty|pwm', column.name.lower())):
             guess, unit = True, '-100:100'
         words = ', a guess: --throttle-unit' if guess and unit != '1' else ''
+        if unit == 'us':
+            # An output without pulses.
+            values = np.where(values == 0.0, THROTTLE_UNITS[unit][0], values)
         low, high = THROTTLE_UNITS.get(unit) or map(float, unit.split(':'))
         return (values - low) / (high - low), (
             '0..1' if unit == '1' else unit) + words
@@ -705,7 +709,7 @@ def _throttle_unit(values: FloatArray, volts: FloatArray) -> str:
         return '1'
     if high <= 110.0:
         return '%'
-    if low >= 800.0 and high <= 2200.0:
+    if np.quantile(known[known > 0.0], WILD) >= 800.0 and high <= 2200.0:
         return 'us'
     if float(np.mean(values < -MOST_THROTTLE)) > WILD:
         return next((f'{-end}:{end}' for end in _STICKS if high <= end), '1')

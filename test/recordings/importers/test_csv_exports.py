@@ -107,6 +107,10 @@ FORMS = {
         ['loopIteration, time (us), axisP[0], rcCommand[3], vbatLatest (V), amperageLatest (A)'],
         lambda k: f'{k}, {5000 + 500 * k}, 1, {1000 + 1000 * U[k]:.0f}, {V[k]}, {AMPS[k]}'),
         500e-6, True, True),
+    # Steps of 2 ms in us.
+    'ardupilot': (table(['TimeUS\tRCOU.C1\tRCOU.C3\tVolt\tCurr'], lambda k: (
+        f'{2000 * k}\t1500\t{1000 + 1000 * U[k]:.0f}\t{V[k]}\t{AMPS[k]}')), 0.002,
+        True, True),
     'vesc_tool': (table(
         ['ms_today;input_voltage;temp_mos_max;temp_motor;current_motor;current_in;d_axis_current;'
          'erpm;duty_cycle;fault_code;d_axis_voltage;ms_today_setup;roll;'],
@@ -455,6 +459,9 @@ def test_the_unit_of_a_throttle(tmp_path):
     rows = 't,U,gas,I\n' + ''.join(f'{k},12,{g},3\n' for k, g in enumerate((1100, 1500, 1900)))
     path = written(tmp_path, rows)
     np.testing.assert_allclose(read_recording(path).throttle, [0.1, 0.5, 0.9])
+    # An output is without pulses until it is armed.
+    armed = written(tmp_path, rows.replace('gas', 'RCOut').replace('1100', '0'), 'e.csv')
+    np.testing.assert_allclose(read_recording(armed).throttle, [0.0, 0.5, 0.9])
     # The thrust of a Crazyflie may have decimals.
     thrust = written(tmp_path, rows.replace('1100', '0').replace('1500', '6553.5').replace(
         '1900', '58981.5'), 'a.csv')
