@@ -500,7 +500,7 @@ class Recording:
     t: FloatArray
     voltage: FloatArray
     throttle: FloatArray = field(default_factory=lambda: np.array(NAN))
-    name: str = ''
+    name: str = 'recording'
     source: dict[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     current: FloatArray | None = None

@@ -361,7 +361,7 @@ def ordered(recording: Recording) -> Recording:
     """Return a recording in the order of its stamps, each once; notes count dropped samples."""
     which, said = in_order(recording.t, recording.voltage[:, None], MOST_VOLTAGE, ' V')
     recording = part_of(recording, which, *said) if said else recording
-    check_throttle(recording.name or 'the recording', recording.throttle, recording.voltage)
+    check_throttle(recording.name, recording.throttle, recording.voltage)
     if recording.n > 1 and not LEAST_STEP <= (
             step := float(np.median(np.diff(recording.t)))) <= LONGEST_STEP:
         raise InputError(f"the samples of '{recording.name}' are {step:.4g} s apart: are the "

@@ -217,10 +217,12 @@ def replacing(bag: Path | None, force: bool) -> Iterator[None]:
     from ou_monitor.recordings.bag import read_metadata, remove_bag
 
     if bag.is_dir() and not bag.is_symlink():
-        files = read_metadata(bag).paths
-        if {*bag.iterdir()} != {bag / 'metadata.yaml', *files}:
-            raise InputError(f"'{bag}' is a folder that holds more than one bag: it is not "
-                             'overwritten')
+        files: list[Path] = []
+        with suppress(InputError):
+            files = read_metadata(bag).paths
+        if not files or {*bag.iterdir()} != {bag / 'metadata.yaml', *files}:
+            raise InputError(f"'{bag}' is a folder that holds no bag, or more than a bag: it is "
+                             'not overwritten')
     elif not bag.is_symlink() and not bag.is_file():
         raise InputError(f"'{bag}' is neither a file nor a folder: it is not overwritten")
     aside = bag.with_name(f'.{bag.name}.{os.getpid()}.old')

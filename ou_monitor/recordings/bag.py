@@ -93,7 +93,7 @@ def find_files(path: Path, partial: bool) -> BagFiles:
         path = path.parent
     if not path.exists():
         raise InputError(f'{path} is a broken link' if path.is_symlink()
-                         else f'there is no bag {path}: check the path')
+                         else f'there is no recording {path}: check the path')
     if not path.is_dir():
         return BagFiles([path], {}, '')
     if (path / FILE).exists():

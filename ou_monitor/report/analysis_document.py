@@ -46,7 +46,7 @@ def analysis_document(analysis: Analysis, command: str = '') -> Document:
     """Return the report of an analysis."""
     recording = analysis.recording
     rate = (recording.n - 1) / recording.duration if recording.duration > 0.0 else NAN
-    subject = (f'{recording.name or "recording"}: {recording.n} samples in '
+    subject = (f'{recording.name}: {recording.n} samples in '
                f'{recording.duration:.4g} s ({number(rate)} Hz)')
     parts: list[Part] = [
         lambda: [Figure(_with_segments(voltage_plot(recording, analysis.overview.limit),

@@ -16,7 +16,7 @@ def coupling_document(found: Coupling, recording: Recording, signal: tuple[Float
                       name: str, unit: str, seen: Overview, command: str = '') -> Document:
     """Return the report of a coupling; `signal` holds stamps, s, and values."""
     grid, per = found.grid, f'{unit} per V'.lstrip()
-    subject = (f'{recording.name or "recording"}, {name}: {grid.duration:.4g} s covered by both, '
+    subject = (f'{recording.name}, {name}: {grid.duration:.4g} s covered by both, '
                f'{found.segments:.0f} segments'
                + (', throttle removed' if found.partial else ''))
     lost = [f'{counted(n)} of the {what} dropped.' for n, what in

@@ -22,5 +22,11 @@ def simulation_document(run: Run, output: str | Path | None = None, command: str
             lambda: [Figure(voltage_plot(run.recording, NAN)),
                      Figure(Plot('Throttle', 'time, s', 'throttle', height=160).line(
                          run.recording.t, run.recording.throttle, '', 2))],
-            Facts([(term.NAME, ', '.join(f'{name} {value}' for name, value in
+            Facts([(term.NAME, ', '.join(f'{name} {_words(value)}' for name, value in
                                          term.values().items())) for term in terms])], command)
+
+
+def _words(value: object) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(map(_words, value))}]"
+    return f'{value:.4g}' if isinstance(value, float) else str(value)

@@ -161,7 +161,7 @@ def test_a_folder_that_is_not_one_bag_stays(tmp_path, foreign, whole):
     if not whole:
         (bag / 'metadata.yaml').unlink()
     there = {path: path.read_text() for path in bag.iterdir()}
-    with pytest.raises(InputError, match='more than one bag|cannot read the metadata'):
+    with pytest.raises(InputError, match='more than a bag'):
         with output.replacing(bag, force=True):
             pytest.fail('nothing of a user is taken away')
     assert {path: path.read_text() for path in bag.iterdir()} == there

@@ -204,6 +204,7 @@ def test_a_time_without_a_unit(begin, unit, tmp_path):
     ('3.0,1x.2,0.3', "line 302: column 'voltage_v' holds '1x.2', not a number"),
     ('3.0', "line 302: the line ends before column 'throttle'"),
     ('3.0,5.0,0.3,7,8', 'line 302: 5 cells'), ('?,5.0,0.3', "line 302: column 'time_s'"),
+    ('3.0,5\0.0,0.3', r"line 302: column 'voltage_v' holds '5\x00.0'"),
     ('?,y,z', "1 bad line left out, such as line 302: column 'time_s'")])
 def test_one_bad_line_costs_one_line(line, words, tmp_path):
     """With --partial; without it the file is refused, and so is one with many of them."""

@@ -270,7 +270,7 @@ def complaint(path, **options):
 
 def test_missing_and_empty_paths_are_refused(tmp_path):
     """A missing file, an empty file and an empty folder."""
-    assert 'there is no bag' in complaint(tmp_path / 'no.mcap')
+    assert 'there is no recording' in complaint(tmp_path / 'no.mcap')
     (tmp_path / 'empty.mcap').touch()
     assert 'empty (0 bytes)' in complaint(tmp_path / 'empty.mcap')
     (tmp_path / 'folder' / 'bag').mkdir(parents=True)

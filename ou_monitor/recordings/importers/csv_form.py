@@ -29,7 +29,7 @@ from typing import NamedTuple, TextIO
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
-from ou_monitor.recordings.importers.formats import kind_of_foreign
+from ou_monitor.recordings.importers.formats import is_text, kind_of_foreign
 from ou_monitor.recordings.importers.log import CsvColumns
 from ou_monitor.records import FloatArray, TIME_UNITS
 from ou_monitor.stream.files import open_regular
@@ -193,7 +193,7 @@ def _encoding(path: Path, head: bytes) -> str:
     if head[1:2] == b'\0' != head[:1] and head[3:4] == b'\0':
         return 'utf-16-le'
     kind = kind_of_foreign(head, path)
-    if b'\0' in head or kind.startswith('it is') and kind != 'it is text':
+    if b'\0' in head and not is_text(head) or kind.startswith('it is') and kind != 'it is text':
         raise InputError(f'{path} is not text: {kind}')
     try:
         codecs.getincrementaldecoder('utf-8')().decode(head)

@@ -138,7 +138,7 @@ def read_csv(path: Path, columns: CsvColumns | None = None, *, partial: bool = F
     if left_out:
         if len(left_out) > WILD * table.t.size:
             raise InputError(f'{left_out[0]} ({len(left_out)} such lines, too many to leave out)')
-        first = left_out[0].removeprefix(str(path)).lstrip(': ')
+        first = printable(left_out[0].removeprefix(str(path)).lstrip(': '))
         said.append(Note(
             f'{counted(len(left_out), "bad line")} left out, such as '
             f'{"line " * first[0].isdigit()}{first}.', Defect.DAMAGED_FILE))

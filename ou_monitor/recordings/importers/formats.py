@@ -29,6 +29,8 @@ MAGIC = b'\x89MCAP0\r\n'
 ULOG = b'ULog\x01\x12\x35'
 DATAFLASH = b'\xa3\x95\x80'
 BLACKBOX = b'H Product:Blackbox flight data recorder'
+# Maximum share of NUL bytes in damaged text; tables of binary numbers have more.
+_NULS = 0.05
 
 
 class Format(NamedTuple):
@@ -41,13 +43,14 @@ class Format(NamedTuple):
     package: str = ''  # Package needed beyond the core; an extra of the module's name installs it
 
 
-def _is_text(head: bytes) -> bool:
+def is_text(head: bytes) -> bool:
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         # "Unicode text" of spreadsheets, whose cells use only the first 256 characters.
         head = head[2:].replace(b'\0', b'')
-    # Text that is not UTF-8 passes, so that its reader can name the invalid byte.
-    return bool(head) and (head[0] < 0x80 or head.startswith(codecs.BOM_UTF8)) and all(
-        byte >= 0x20 or byte in b'\t\n\r\f' for byte in head)
+    # Text that is not UTF-8 and damaged cells pass, so that the reader can name their line.
+    return bool(head) and (head[0] < 0x80 or head.startswith(codecs.BOM_UTF8)) and head.count(
+        b'\0') <= _NULS * len(head) and all(
+            byte >= 0x20 or byte in b'\0\t\n\r\f' for byte in head)
 
 
 def _is_crazyflie(head: bytes) -> bool:
@@ -64,12 +67,12 @@ FORMATS = (
     Format('dataflash', 'ArduPilot dataflash (.bin)', lambda head: head.startswith(DATAFLASH),
            'dataflash', 'pymavlink'),
     Format('dataflash_text', 'ArduPilot dataflash as text (.log)',
-           lambda head: _is_text(head) and (head.startswith(b'FMT,') or b'\nFMT,' in head),
+           lambda head: is_text(head) and (head.startswith(b'FMT,') or b'\nFMT,' in head),
            'dataflash', 'pymavlink'),
     Format('blackbox', 'Betaflight or INAV blackbox (.bbl, .bfl)',
            lambda head: head.startswith(BLACKBOX), 'blackbox', 'orangebox'),
     Format('crazyflie', 'Crazyflie micro-SD log', _is_crazyflie, 'crazyflie'),
-    Format(CSV, 'CSV (.csv, .txt, .tsv)', _is_text, 'csv_table'),
+    Format(CSV, 'CSV (.csv, .txt, .tsv)', is_text, 'csv_table'),
 )
 
 
