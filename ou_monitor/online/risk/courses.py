@@ -182,6 +182,8 @@ class Past:
         self.table: FloatArray = np.empty((4, 0))
         self._start = self._end = NAN
         self._tail: FloatArray = np.empty(0)
+        # Samples of the last block.
+        self._last = 0
 
     @property
     def end(self) -> float:
@@ -219,6 +221,10 @@ class Past:
             last = self.table[:, at[0]]
             rows[0, 0] = min(rows[0, 0], last[0])
             rows[3, 0] = max(rows[3, 0], last[3])
+            earlier = self._last / (self._last + count[0])
+            rows[2, 0] += earlier * (last[2] - rows[2, 0])
+            count[0] += self._last
+        self._last = int(count[-1])
         new = np.full((4, max(at[-1] + 1 - old, 0)), NAN)
         table = np.concatenate((self.table, new), axis=1)
         table[:, at] = rows

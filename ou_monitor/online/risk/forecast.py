@@ -352,6 +352,7 @@ class Forecast:
         self._begun = t.item(0) if math.isnan(self._begun) else self._begun
         self._samples += t.size
         self._newest = t.item(-1)
+        self._kept.clear()
         self.see(v)
         self._past.push(t, v, u)
 
@@ -403,7 +404,6 @@ class Forecast:
 
     def _look(self) -> None:
         """Complete horizons, and start new ones."""
-        self._kept.clear()
         self._laws.clear()
         self._known = self._loads.known
         if self._samples > 1:
@@ -430,7 +430,7 @@ class Forecast:
                 None if state is None else pilot(done, state.throttle, rung.horizon), passage))
 
     def _flight(self, horizon: float) -> tuple[float, float, Flown]:
-        """Return excursions and courses of the flight, computed once between two updates."""
+        """Return excursions and courses of the flight, computed once for the newest samples."""
         if horizon not in self._kept:
             self._kept[horizon] = *excursions(self._past, horizon), flown(self._past, horizon)
         return self._kept[horizon]

@@ -198,6 +198,15 @@ def test_asking_changes_nothing_and_is_quick():
         monitor.risk_if(0.3, 1.0, voltage, horizon)
     assert (monitor.risk(14.8, 1.0), monitor.risk_if(0.8, 0.5, 14.8, 1.0)) == first
     assert monitor.report(0.0).risk == report.risk == monitor.risk()
+    # Nor do reports between two samples.
+    u, v, _ = flight('telegraph')
+    often, once = monitor_of()[0], monitor_of()[0]
+    for k in range(FLOWN, FLOWN + 30):
+        often.push(k * DT, v[k], u[k])
+        often.report(0.0)
+    part = slice(FLOWN, FLOWN + 30)
+    once.push(np.arange(FLOWN, FLOWN + 30) * DT, v[part], u[part])
+    assert once.report(0.0).budget == pytest.approx(often.report(0.0).budget, rel=1e-9)
     assert report.risk_curve[0] < report.risk_curve[-1]
     assert report.fields['risk_basis'] == 'load' and '1.0:' in report.fields['risk_curve']
 

@@ -38,6 +38,17 @@ def test_what_a_horizon_became():
     assert past.outcome(59.0, 2.0) is None
 
 
+def test_parts_of_samples_change_nothing():
+    u = np.random.default_rng(1).uniform(0.0, 1.0, 600)
+    whole, parts, single = Past(), Past(), Past()
+    for past, step in ((whole, 600), (parts, 7), (single, 1)):
+        for k in range(0, 600, step):
+            part = slice(k, k + step)
+            past.push(np.arange(600)[part] / RATE, 16.0 - u[part], u[part])
+    np.testing.assert_allclose(parts.table, whole.table, rtol=1e-12)
+    np.testing.assert_allclose(single.table, whole.table, rtol=1e-12)
+
+
 def test_slow_sources_are_held_and_silence_is_not():
     past = Past()
     past.push(np.arange(10.0), np.arange(10.0) + 10.0, np.full(10, 0.5))
