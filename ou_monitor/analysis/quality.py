@@ -100,8 +100,8 @@ def _of_units(recording: Recording) -> list[QualityItem]:
     if slow and not clock_unit(recording.t[0]):
         items.append(QualityItem('TIME_UNIT', Severity.WARNING, (
             f'The samples are {step:.3g} s apart, over {recording.duration / 3600.0:.3g} hours: '
-            'is its unit smaller than the one it was read in? If so, all rates and times are wrong '
-            'by a factor of 1000 or 1e6; --time-unit states the unit of a CSV.')))
+            'is the unit of time smaller? If so, all rates and times are wrong by a factor of '
+            '1000 or 1e6; --time-unit states the unit of a CSV.')))
     known = recording.throttle[np.isfinite(recording.throttle)]
     low, high = np.quantile(known, (_RARE, 1.0 - _RARE)) if known.size else (0.0, 1.0)
     if low < -_TRIM or high > 1.0 + _TRIM:
