@@ -117,7 +117,7 @@ def notches(gyro: gyros.Gyro, f: np.ndarray, width: float, share: np.ndarray,
         one.width = width
         lags = np.empty(-(-gyro.t.size // 20))
         for i, k in enumerate(range(0, gyro.t.size, 20)):
-            one.ratio, one.share = float(ratios[k, j]), float(part[k])
+            one.ratio, one.depth = float(ratios[k, j]), float(part[k])
             lags[i] = phase_lag([one], LAG_AT / gyro.rate) / (2.0 * math.pi * LAG_AT)
         lag += np.repeat(lags, 20)[:gyro.t.size, None]
     return out, lag

@@ -22,7 +22,7 @@ from ou_monitor.discovery.gain import (
     why_unknown, without)
 from ou_monitor.discovery.named import INTERRUPTED, Named, named_causes
 from ou_monitor.discovery.pruning import prune_by_gain, Pruned, refusal
-from ou_monitor.discovery.redraw import redrawn, within_codes
+from ou_monitor.discovery.redraw import redraw_clipped, redraw_within_codes
 from ou_monitor.discovery.regression import load_terms
 from ou_monitor.discovery.search import position, Progress, Search, under_load, whole_load
 from ou_monitor.discovery.words import (
@@ -157,7 +157,7 @@ def _unclipped(samples: Samples, state: Integrity, start: Composite
     rng = np.random.default_rng(0)
     for _ in range(_REDRAWN):
         model = whole_load(Fitter(samples), start, load_terms(samples)) or start
-        samples = redrawn(samples, model, ends, state.drawn, rng)
+        samples = redraw_clipped(samples, model, ends, state.drawn, rng)
         start = _start(samples, state)
     return samples, start
 
@@ -171,7 +171,7 @@ def _uncoded(samples: Samples, state: Integrity, start: Composite) -> tuple[Samp
         search = Search(start)
         under_load(Fitter(inside), search)
         model = search.composite
-        drawn = within_codes(samples, model, rng)
+        drawn = redraw_within_codes(samples, model, rng)
         if drawn is samples:
             break
         inside, start = drawn, _start(drawn, state)

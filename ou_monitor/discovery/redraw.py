@@ -1,14 +1,12 @@
 """
 Redraw readings that the ADC clips, or rounds to codes wider than the rail's moves.
 
-A path of the rail is drawn given all readings, then each limited reading given the path.  For a
-clipped reading, neighbouring samples, throttle and noise determine the distribution beyond the
-limit.
+A path of the rail is drawn given all readings, then each affected reading given the path.
 
-Rounding errors of wide codes are neither normal nor white, and a likelihood that takes them for
-white noise finds heavy tails and switching.  If the model is right, readings drawn within their
-codes follow it exactly.  On average, a further cause gains at most as much in the readings as in
-the probability of the codes (Jensen's inequality).
+Rounding errors of wide codes are neither normal nor white; taken for white noise, they look like
+heavy tails or switching.  Under the right model, readings redrawn within their codes follow it
+exactly.  A further cause gains on average at most as much from redrawn readings as from the
+probability of the codes (Jensen's inequality).
 """
 
 from __future__ import annotations
@@ -31,15 +29,15 @@ from scipy.special import log_ndtr, ndtr, ndtri
 _LEAST_WHITE = 0.1
 # Sweeps of expectation propagation; factor on the white noise of a reading without information.
 _SWEEPS, _NOTHING = 8, 1e6
-# Step of the ADC, in moves of the rail between readings, up to which rounding passes for white
-# noise.  Rounding errors of neighbours correlate by exp(-2 (pi / step)^2): 11 % here, 73 % at 8.
-# In simulations, steps of 2.3 to 4 moves gave no false name (8 recordings each), steps of 8.3 in 9
-# of 20 recordings.
+# Maximum ADC step, in moves of the rail between readings, whose rounding counts as white noise.
+# Rounding errors of neighbours correlate by exp(-2 (pi / step)^2): 11 % here, 73 % at 8.  In
+# simulations, steps of 2.3 to 4 moves gave no false name (8 recordings each), steps of 8.3 in 9 of
+# 20 recordings.
 _COARSE = 3.0
-# Grid of the rail across a code: points in each move (with two, sums are exact to 1e-9), minimum
-# and maximum points; range of the white noise beyond a code, in standard deviations.
+# Grid across a code: points per move of the rail (with two, sums are exact to 1e-9), minimum and
+# maximum points; margin beyond the code, in standard deviations of the white noise.
 _EACH, _FEWEST, _MOST, _BEYOND = 2.0, 16, 128, 3.0
-# Lower limits of a probability, and of the white noise in codes, which only avoid 0/0.
+# Minimum probability, and white noise in codes: they only avoid 0/0.
 _NONE, _LEAST = 1e-300, 1e-9
 
 
@@ -49,9 +47,9 @@ def _process(samples: Samples, terms: Sequence[Term]) -> tuple[FloatArray, Float
     return s.phi, s.added, white_noise(samples, terms, s)
 
 
-def redrawn(samples: Samples, model: Composite, ends: Saturation,
-            clipped: npt.NDArray[np.bool_], rng: np.random.Generator) -> Samples:
-    """Return samples with clipped readings, shape (n,), drawn again beyond their limits."""
+def redraw_clipped(samples: Samples, model: Composite, ends: Saturation,
+                   clipped: npt.NDArray[np.bool_], rng: np.random.Generator) -> Samples:
+    """Return samples whose clipped readings, shape (n,), are redrawn beyond the limits."""
     phi, added, white = _process(samples, model.gaussian.terms)
     white = np.maximum(white, _LEAST_WHITE * added)
     at = np.flatnonzero(clipped)
@@ -72,15 +70,15 @@ def _path_at(y: FloatArray, at: npt.NDArray[np.int64], side: FloatArray, end: Fl
              phi: FloatArray, added: FloatArray, white: FloatArray, rng: np.random.Generator
              ) -> FloatArray:
     """Draw the path at clipped readings, given their limits and the other readings, V."""
-    # Each clipped reading is replaced by a pseudo-reading with its own mean and white noise, which
-    # gives the path the same moments as the limit (expectation propagation, Minka 2001).
+    # Expectation propagation (Minka 2001): a clipped reading is replaced by a pseudo-reading whose
+    # mean and white noise give the path the same moments as the limit does.
     white = white.copy()
     own = white[at]
     y[at], white[at] = end, _NOTHING * own
     for _ in range(_SWEEPS):
         path = _Path(phi, added, white)
-        mean, variance = path.drawn(y)[at], path.variance()[at]
-        # Without its own pseudo-reading (cavity distribution).
+        mean, variance = path.draw(y)[at], path.variance()[at]
+        # Cavity distribution, without its own pseudo-reading.
         less = np.maximum(1.0 / variance - 1.0 / white[at], 1.0 / (_NOTHING * own))
         mean = (mean / variance - y[at] / white[at]) / less
         variance = 1.0 / less
@@ -90,11 +88,11 @@ def _path_at(y: FloatArray, at: npt.NDArray[np.int64], side: FloatArray, end: Fl
         bend = np.clip(slope * (slope + z), 1.0 / _NOTHING, 1.0)
         y[at] = mean + side * slope * wide / bend
         white[at] = wide * wide / bend - variance
-    return _Path(phi, added, white).drawn(y, rng)[at]
+    return _Path(phi, added, white).draw(y, rng)[at]
 
 
 class _Path:
-    """Paths of an OU in white noise, given readings less their mean, V."""
+    """Paths of an OU, given readings with white noise; mean subtracted, V."""
 
     def __init__(self, phi: FloatArray, added: FloatArray, white: FloatArray) -> None:
         before, known = np.empty(phi.size), np.empty(phi.size)
@@ -122,7 +120,7 @@ class _Path:
             out.append(last)
         return np.asarray(out[::-1])
 
-    def drawn(self, y: FloatArray, rng: np.random.Generator | None = None) -> FloatArray:
+    def draw(self, y: FloatArray, rng: np.random.Generator | None = None) -> FloatArray:
         """Return a random path, or without `rng` the mean of all paths."""
         means, last = [], 0.0
         for keep, gain, value in zip(self._phi, self._gain, y.tolist(), strict=True):
@@ -140,8 +138,8 @@ class _Path:
         return np.asarray(out[::-1])
 
 
-def within_codes(samples: Samples, model: Composite, rng: np.random.Generator) -> Samples:
-    """Return samples drawn within their codes, or unchanged if rounding is white noise."""
+def redraw_within_codes(samples: Samples, model: Composite, rng: np.random.Generator) -> Samples:
+    """Return samples redrawn within their codes, or unchanged if rounding is white noise."""
     terms = [term for term in model.gaussian.terms if term.NAME != 'quantization']
     phi, added, white = _process(samples, terms)
     white -= samples.blur
@@ -167,7 +165,7 @@ def _path_within(low: FloatArray, cell: float, noise: FloatArray, phi: FloatArra
     least = np.maximum(noise, _LEAST * cell)[:, None]
     edge = (places * move[:, None] - low[:, None]) / least
     likely = np.maximum(ndtr(edge) - ndtr(edge - cell / least), _NONE)
-    # The grid is in moves of each sample; for the first, in stationary standard deviations.
+    # The grid is in moves of the sample; for the first, in stationary standard deviations.
     keep = phi[1:] * move[:-1] / move[1:]
     known = likely
     known[0] *= np.exp(-0.5 * np.square(places[0]))

@@ -1,30 +1,28 @@
 """
 Fit an Ornstein-Uhlenbeck process and white noise to a voltage, together with level and load.
 
-`known_ou` fits the shortest window in which alpha is known well, without the window's spectral
-lines: a tone as large as the OU may double alpha.  `regress` removes a flexible
-level (linear hat functions every 5 s), throttle and measured current from the voltage; both loads
-enter without lag and after several lags with free initial states.  `fit_ou` fits the noise jointly
-with these regressors.
+1. `known_ou` selects the shortest window that determines alpha well, and removes its spectral
+   lines: a tone as large as the OU may double alpha.
+2. `regress` removes a flexible level (linear hat functions every 5 s), throttle and measured
+   current; both loads enter directly and through several lags with free initial states.
+3. `fit_ou` fits the noise jointly with these regressors, by restricted likelihood in the frequency
+   domain (`whittle.CrossSpectrum`).  Intervals are quantiles from importance sampling about all
+   maxima over the rate; the prior is flat in ln(alpha), and arcsine in the OU's share.
 
-The size of the noise depends on the load and its changes, and readings are weighted by it:
-otherwise the errors of the load model while the load moves would be taken for a fast OU.  The
-noise is white noise, the OU, and a random walk of the level, whose size has a prior and may be
-zero; without it, changes of the level that the hats miss would be fitted as a slow OU.  The fit
-maximises a restricted likelihood in the frequency domain (`whittle.CrossSpectrum`).  Intervals are
-quantiles from importance sampling about all its maxima over the rate; the prior is flat in
-ln(alpha), and arcsine in the share of the OU.
+The noise is white noise, the OU, and a random walk of the level.  Its size follows the load and
+its changes, and readings are weighted by it; otherwise errors of the load model would be fitted as
+a fast OU.  The walk, whose size has a prior and may be zero, absorbs changes of the level that the
+hats miss and that would be fitted as a slow OU.
 
-Limits: samples are taken as evenly spaced within a stretch without gaps; a relaxation slower than
-2.5 s (a sixth of a window below 15 s) counts as level; OU and white noise change in proportion,
-and results are for their mean size.  These are taken for the OU: repeats or rounding of slow
-changes, a load that neither throttle nor current shows, and noise with another spectrum (a
-filtered sensor).
+Limits: samples are taken as evenly spaced between gaps; a relaxation slower than 2.5 s (a sixth of
+a window below 15 s) counts as level; OU and white noise change in proportion, and results are for
+their mean size.  Fitted as OU, although they are not: repeats or rounding of slow changes, a load
+that neither throttle nor current shows, and noise with another spectrum (a filtered sensor).
 
-On 1200 simulated rails under a quad's throttle (alpha 2 to 500 1/s, 50 to 1000 Hz, OU of 20 mV,
-white noise to 30 mV, windows of 20 s, or 8 s above 300 Hz) 93 % of the 95 % intervals contained
-alpha (most others lay above it), 93 % sigma, 92 % Var_inf; without white noise 90, 90 and 87 %.
-99 % of the bounds were correct.
+Coverage of the 95 % intervals on 1200 simulated rails under a quad's throttle (alpha 2 to 500 1/s,
+50 to 1000 Hz, OU of 20 mV, white noise to 30 mV, windows of 20 s, or 8 s above 300 Hz): alpha 93 %
+(most misses lay above it), sigma 93 %, Var_inf 92 %; without white noise 90, 90 and 87 %.  99 % of
+the bounds were correct.
 """
 
 from __future__ import annotations
@@ -41,8 +39,8 @@ from ou_monitor.model.sinusoid import tones
 from ou_monitor.model.whittle import CrossSpectrum
 from ou_monitor.records import determined, FloatArray, MOST_READINGS, OU_WINDOWS, OuFacts
 
-# Least evidence, nats, against white noise alone for a visible relaxation: more than white
-# noise showed in any window of 120 simulated recordings (test_ou_fit.py repeats a part).
+# Minimum evidence for a relaxation over white noise alone, nats: more than white noise reached in
+# any window of 120 simulated recordings (test_ou_fit.py repeats a part).
 VISIBLE = 12.0
 # Distance of the level's knots, s; minimum number of parts.
 _HATS, _PARTS = 5.0, 3
@@ -54,25 +52,25 @@ _DELAYS, _DELAY_READINGS = 4, 8000
 _FAR = 20
 # Minimum range of a throttle that moves.
 _MOVED = 0.01
-# Minimum length of a gap, in usual steps: restarting at each lost message would cost more
-# than the error of its time.  Minimum number of readings in a stretch.
+# Minimum gap, in usual steps (restarting at each lost message would cost more than the error of
+# its time); minimum number of readings between gaps.
 _GAP, _STRETCH = 5.0, 16
-# Minimum share of the readings in pieces of equal length.
+# Minimum share of the readings that equal pieces must contain.
 _HELD = 0.8
-# The shortest of OU_WINDOWS in which alpha is known within this factor is used, else the longest.
-# The search ends when alpha is precise, not when the relaxation is visible: in a short window
-# visibility depends on the estimate's error, so selecting by it would bias the estimate.
+# The shortest of OU_WINDOWS that determines alpha within this factor is used, else the longest.
+# Selecting by the visibility of the relaxation instead would bias alpha, because in a short window
+# visibility depends on the error of alpha.
 PRECISE = 1.5
 # Minimum number of readings beyond the number of regressors.
 FEWEST = 40
 # Maximum number of elements in an array of the likelihood: 16 MB of complex numbers.
 _AT_ONCE = 1 << 20
-# Points of the likelihood's first grid in ln(alpha), logit(share) and ln(walk); ends of the logit.
-# The share reaches that close to 1 because white noise of 1e-3 of the variance is half of the
-# spectrum at the highest frequency, if alpha dt = 0.004.
+# Points of the first grid in ln(alpha), logit(share of the OU) and ln(walk); ends of the logit.
+# The upper end is close to share 1: if alpha dt = 0.004, white noise of 1e-3 of the variance is
+# half of the spectrum at the highest frequency.
 _GRID, _LOGIT = (24, 16, 5), (-7.0, 12.0)
-# For the bounds: further distances in logit(share) from the best point of the grid, and steps that
-# refine the walk.
+# For the bounds: further points in logit(share) about the best of the grid, and steps that refine
+# the walk.
 _ASIDE = np.linspace(-1.2, 1.2, 17)
 _REFINE = (1.2, 0.6, 0.3, 0.15)
 # Law of the noise's size: time constants, s, of the lagged loads whose differences are taken;
@@ -82,25 +80,25 @@ _CHANGES, _SIZE_SD, _SIZE_ROUNDS = (0.03, 0.2, 1.0), 0.5, 12
 _LOOKS, _NEAR = 40, 0.05
 # Draws about the maxima in each round, and rounds; minimum share of the draws for a maximum.
 _DRAWS, _ROUNDS, _FEWEST_DRAWN = 1000, 4, 0.05
-# Minima of the cost over the rate: distance from the lowest, nats, up to which they are refined,
-# and up to which they count (e^-6 of the likelihood does not affect a 95 % interval).
-_TRIED, _RIVAL = 10.0, 6.0
+# Other minima of the cost over the rate: maximum cost above the lowest, nats, to be refined, and
+# to count (e^-6 of the likelihood does not affect a 95 % interval).
+_REFINED, _RIVAL = 10.0, 6.0
 # A window is imprecise above this standard deviation of ln(alpha) (from the curvature at the
 # maximum, times 1.2): among 437 simulated windows, the 190 precise ones had at most 0.28.
 _IMPRECISE = 0.37
-# The level's usual walk, V per sqrt(s) and cell, and the prior deviation of its logarithm above
-# that: walks of .0015 to .015 fit the recordings (doc/load.md).
+# Usual walk of the level, V per sqrt(s) and cell, and prior deviation of its logarithm above that:
+# walks of .0015 to .015 fit the recordings (doc/load.md).
 _WALK, _WALK_SD = 0.004, 0.8
-# Largest alpha dt tried: beyond, neighbouring readings are uncorrelated.
+# Maximum alpha dt: beyond, neighbouring readings are uncorrelated.
 _FASTEST = 5.0
-# How far the profile log-likelihood at the edge of a 95 % region of rate and share lies below the
-# maximum, nats: chi^2 with 2 degrees of freedom.
+# Loss of profile log-likelihood at the edge of a 95 % region of rate and share, nats: chi^2 with 2
+# degrees of freedom.
 _DROP = 3.0
 # Largest share of the variance that an OU slower than `tau_below_s` may have.
 _QUARTER = 0.25
-# Relative size below which a regressor counts as spanned by the others.
+# Relative size below which a regressor counts as dependent on the others.
 _SPANNED = 1e-5
-# Minimum number of a line's periods between knots of the level, which absorbs slower ones.
+# Minimum periods of a line between knots of the level, which absorbs slower lines.
 _PERIODS = 10.0
 # Exponent of the load over throttle.
 _POWER = 1.8
@@ -112,7 +110,7 @@ def usual_walk(v: FloatArray) -> float:
 
 
 def stretches(t: FloatArray) -> list[slice]:
-    """Return the stretches without a gap; a few lost messages do not count."""
+    """Return the stretches between gaps; a few lost messages are no gap."""
     steps = np.diff(t)
     gaps = np.flatnonzero(steps > _GAP * np.median(steps))
     edges = [0, *(gaps + 1).tolist(), t.size]
@@ -142,7 +140,7 @@ def _filled(t: FloatArray, x: FloatArray | None) -> FloatArray | None:
 
 
 def _basis(rows: FloatArray) -> FloatArray:
-    """Return an orthonormal basis of rows, given in order of importance."""
+    """Return an orthonormal basis of rows; later rows that depend on earlier ones are dropped."""
     size = np.sqrt(np.mean(rows * rows, axis=1))
     rows = rows[size > 0.0] / size[size > 0.0, None]
     R = np.linalg.qr(rows.T, mode='r')
@@ -151,8 +149,8 @@ def _basis(rows: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.inv(np.linalg.qr(R[:, kept], mode='r')).T @ rows[kept])
 
 
-def _beside(basis: FloatArray, rows: FloatArray) -> FloatArray:
-    """Return an orthonormal basis of rows, orthogonal to a given one."""
+def _orthogonal_basis(rows: FloatArray, basis: FloatArray) -> FloatArray:
+    """Return an orthonormal basis of rows after projection orthogonal to `basis`."""
     size = np.sqrt(np.mean(rows * rows, axis=1))
     rows = rows[size > 0.0] / size[size > 0.0, None]
     # Twice, because of rounding.
@@ -162,7 +160,7 @@ def _beside(basis: FloatArray, rows: FloatArray) -> FloatArray:
     return _basis(rows) if rows.size else rows
 
 
-def _moved(x: FloatArray, late: int) -> FloatArray:
+def _shifted(x: FloatArray, late: int) -> FloatArray:
     """Return `x` shifted by `late` samples; the end values are held."""
     if not late:
         return x
@@ -179,8 +177,7 @@ class Regression:
     places: npt.NDArray[np.intp]  # of the readings in stretches without gaps, shape (n,)
     voltage: FloatArray  # V, residual, shape (n,)
     size: FloatArray  # size of the noise over its rms, shape (n,)
-    # Orthonormal regressors, in units of the size, shape (p, n); without any, each stretch has
-    # its own mean.
+    # Orthonormal regressors over the size, shape (p, n); if empty, each stretch has its own mean.
     basis: FloatArray
     lengths: list[int]  # of the stretches
     walk: float  # usual walk of the level, V per sqrt(s)
@@ -222,13 +219,13 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
         rest = v[last] - (held @ v[last]) @ held
         for late in sorted(range(-most, most + 1), key=abs):
             # The earlier half only lets the lags settle.
-            loads = regressors(_moved(x[-2 * _DELAY_READINGS:], late))[:5]
-            Q = _beside(held, np.stack([c[last] for c in loads]))
+            loads = regressors(_shifted(x[-2 * _DELAY_READINGS:], late))[:5]
+            Q = _orthogonal_basis(np.stack([c[last] for c in loads]), held)
             left[late] = float(rest @ rest - np.sum((Q @ rest) ** 2))
         least = min(left, key=left.__getitem__)
         # A delay must improve the fit clearly; otherwise noise would choose it.
         late = least if left[least] < left[0] * (1.0 - 10.0 / rest.size) else 0
-        found: list[FloatArray] = regressors(_moved(x, late))
+        found: list[FloatArray] = regressors(_shifted(x, late))
         return found
 
     walk = usual_walk(v)
@@ -247,7 +244,7 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
     rows, v = np.stack([c[places] for c in columns]), v[places]
     size = np.ones(v.size)
     law = NoiseSize(load_signs(t.size, dt, u, i)[:, places])
-    # First all readings have equal weights, then weights by the size of their noise.
+    # Start with equal weights, then weight by the size of the noise.
     left = v
     basis = np.empty((0, v.size))
     for again in range(0 if not v.size else 3 if law.follows else 1):
@@ -264,7 +261,7 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
 
 def _innovations(x: FloatArray) -> FloatArray:
     """Return the innovations of an AR(1)."""
-    # The law assumes independent values; fitted to a slow OU, it would follow chance.
+    # `NoiseSize` assumes independent values; fitted to a slow OU, it would follow chance.
     power = float(x @ x)
     phi = float(x[1:] @ x[:-1]) / power if power > 0.0 else 0.0
     return x - phi * np.append(x[:1], x[:-1])
@@ -312,7 +309,7 @@ class NoiseSize:
         prior = np.append(0.0, np.full(len(X) - 1, 2.0 / _SIZE_SD ** 2))
         beta, H = np.zeros(len(X)), X @ X.T + np.diag(prior)
         for _ in range(_SIZE_ROUNDS):
-            # A score of the Gamma law of squares.
+            # Score of the Gamma likelihood of the squares.
             score = X @ (square * np.exp(-np.clip(beta @ X, -6.0, 6.0)) - 1.0) - prior * beta
             beta = beta + np.clip(np.linalg.solve(H, score), -1.0, 1.0)
         log = np.clip(beta @ X, -6.0, 6.0)
@@ -322,7 +319,7 @@ class NoiseSize:
         return np.asarray(np.sqrt(variance / variance.mean()))
 
     def of(self, signs: FloatArray) -> FloatArray:
-        """Return the sizes, V, of the last fit for such signs."""
+        """Return the sizes, V, for signs by the last fit."""
         X = np.vstack([np.ones(signs.shape[1]), self._laws(signs) - self._mean])
         return np.asarray(self._rms * np.exp(0.5 * np.clip(self._beta @ X, *self._ends)))
 
@@ -356,7 +353,7 @@ def _points(*axes: FloatArray) -> FloatArray:
 
 
 def fit_ou(part: Regression, span: float, *, precise: bool = False) -> OuFacts:
-    """Fit the noise to a window of `span` s; `precise` stops early if alpha is imprecise."""
+    """Fit the noise to a window of `span` s; with `precise`, give up if alpha is imprecise."""
     dt = part.dt
     total = float(part.voltage @ part.voltage)
     if not total > 1e-18 * part.voltage.size:
@@ -386,7 +383,7 @@ def fit_ou(part: Regression, span: float, *, precise: bool = False) -> OuFacts:
     peaks = [_minimum(cost, points[np.argmin(value)], step)]
     least = min(peaks[0][1], white)
     if white - least < VISIBLE:
-        return OuFacts('not_visible', span) if precise else _unseen(
+        return OuFacts('not_visible', span) if precise else _bounds(
             costs, low, high, least, dt, span)
     roots = [_curvature(cost, np.clip(peaks[0][0], low, high))]
     if precise and math.sqrt(float(roots[0][0] @ roots[0][0])) > _IMPRECISE:
@@ -396,8 +393,8 @@ def fit_ou(part: Regression, span: float, *, precise: bool = False) -> OuFacts:
         roots.append(_curvature(cost, np.clip(rival[0], low, high)))
     if precise and len(peaks) > 1:
         return OuFacts('not_visible', span)
-    # Draw from a wide distribution about each maximum and weight by likelihood; in later rounds,
-    # distributions have the moments of the last points.
+    # Importance sampling from a wide distribution about each maximum; in later rounds, from
+    # distributions with the moments of the last points.
     nearest = np.abs(points[:, :1] - [peak[0] for peak, _ in peaks]).argmin(axis=1)
     laws = [(1.0 / len(peaks), *_moments(
         np.vstack([np.clip(peak, low, high), points[nearest == k]]),
@@ -429,7 +426,7 @@ def fit_ou(part: Regression, span: float, *, precise: bool = False) -> OuFacts:
                     float(var_inf), _pair(var_inf_95))
     return found if all(determined(middle, *around) for middle, around in (
         (found.alpha, found.alpha_95), (found.sigma, found.sigma_95),
-        (found.var_inf, found.var_inf_95))) else _unseen(
+        (found.var_inf, found.var_inf_95))) else _bounds(
             costs, low, high, least, dt, span)
 
 
@@ -437,7 +434,7 @@ def fit_pieces(parts: Sequence[tuple[FloatArray, FloatArray]], dt: float, walk: 
     """Fit the noise to pieces (V, relative size of the noise), each with its own mean."""
     parts = [part for part in parts if part[0].size >= _STRETCH]
     total = sum(part[0].size for part in parts)
-    # Equal pieces: the longest, at most _HATS s, that contain most readings.
+    # Equal pieces: the longest, up to _HATS s, that contain enough readings.
     n = max([_STRETCH, *(part[0].size for part in parts)])
     n = min(n, max(_STRETCH, round(_HATS / dt)))
     while n > _STRETCH and sum(part[0].size // n * n for part in parts) < _HELD * total:
@@ -526,7 +523,7 @@ def _rivals(cost: Callable[[FloatArray], FloatArray], points: FloatArray, value:
     by_rate = value.reshape(_GRID[0], -1)
     profile = np.pad(by_rate.min(axis=1), 1, constant_values=math.inf)
     dips = np.flatnonzero((profile[1:-1] <= profile[:-2]) & (profile[1:-1] < profile[2:])
-                          & (profile[1:-1] < peak[1] + _TRIED))
+                          & (profile[1:-1] < peak[1] + _REFINED))
     found = [peak]
     for k in (dips * by_rate.shape[1] + by_rate[dips].argmin(axis=1)).tolist():
         if abs(points[k, 0] - peak[0][0]) > 2.0 * step[0]:
@@ -586,9 +583,9 @@ def _quantiles(log: FloatArray, weight: FloatArray, extra: float) -> FloatArray:
     return np.interp((0.5, 0.025, 0.975), mass, log[order])
 
 
-def _unseen(costs: Callable[[FloatArray], tuple[FloatArray, FloatArray]], low: FloatArray,
+def _bounds(costs: Callable[[FloatArray], tuple[FloatArray, FloatArray]], low: FloatArray,
             high: FloatArray, least: float, dt: float, span: float) -> OuFacts:
-    """Return tau and Var_inf such that no slower OU has a larger variance."""
+    """Return bounds: an OU slower than `tau_below_s` has a variance below `var_inf_below`."""
     axes = [np.linspace(*ends) for ends in zip(low, high, _GRID)]
     first = costs(_points(*axes))[0].reshape(_GRID).reshape(_GRID[0], -1).argmin(axis=1)
     best, walk = np.unravel_index(first, _GRID[1:])
@@ -624,7 +621,7 @@ def _unseen(costs: Callable[[FloatArray], tuple[FloatArray, FloatArray]], low: F
 
 
 def _finer(values: FloatArray) -> FloatArray:
-    """Return values on a grid with 8 times the points each way, by linear interpolation."""
+    """Return values on a grid 8 times as fine in both directions, by linear interpolation."""
     for _ in range(2):
         at = np.linspace(0.0, values.shape[0] - 1.0, 8 * values.shape[0])
         low = np.minimum(at.astype(np.intp), values.shape[0] - 2)

@@ -3,9 +3,9 @@ First passage of the OU to a level: mean time, and probability within a time spa
 
 A continuous OU path has no finite crossing rate, so risk is stated as first passage.
 
-The unit OU is dX = -X ds + sqrt(2) dW: levels are in units of the stationary
-standard deviation, positive towards the barrier, and times in units of
-tau = 1/alpha.  This is for the continuous path; `sampled_passage` is for samples.
+The unit OU is dX = -X ds + sqrt(2) dW: levels in stationary standard deviations,
+positive towards the barrier, times in tau = 1/alpha.  This is for the continuous
+path; `sampled_passage` is for samples.
 
 Numerical method.  With T = 1 - exp(-2 s) and w = (b - x) / sqrt(T) the
 probability is written as P = 2 Phi(-w exp(-s)) exp(R).  The first factor is
@@ -20,9 +20,9 @@ as a table with cubic splines.  Because R is a logarithm, the relative error of
 small probabilities is small too.
 
 Limits: errors are within 0.15 % of P for barriers -3..30, starts above -10 and P
-down to 1e-12 (compared with finer grids).  Beyond the table, values come from a
-scaled problem (constant pull towards the mean near the barrier), and are
-plausible rather than accurate.
+down to 1e-12 (compared with finer grids).  Outside the table, values are
+approximate: the problem is scaled into it, as if the pull towards the mean were
+constant near the barrier.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _PAD = 5
 
 T = TypeVar('T')
 _LOG_TWO_PI = math.log(2.0 * math.pi)
-# Level above which the mean time, more than 1e150 tau, counts as never.
+# Barrier above which the mean time, more than 1e150 tau, counts as infinite.
 _NEVER = 26.0
 
 
@@ -85,7 +85,7 @@ def log_normal_below(x: npt.ArrayLike) -> FloatArray:
 
 
 def mean_first_passage(start: float, barrier: float) -> float:
-    """Return the mean time of a unit OU to a barrier (Siegert, Phys. Rev. 81 (1951) 617)."""
+    """Return a unit OU's mean time to a barrier (Siegert, Phys. Rev. 81 (1951) 617)."""
     if start >= barrier:
         return 0.0
     if barrier > _NEVER:
@@ -120,7 +120,7 @@ def passage_probability(start: npt.ArrayLike, barrier: npt.ArrayLike, span: npt.
 
 @dataclass(frozen=True, eq=False)
 class PassageTable:
-    """The table, made once."""
+    """Spline table of R."""
 
     coefficients: FloatArray  # Spline coefficients of R; shape (barriers, w, lambda)
     # Spline coefficients of the logarithm of the long-run rate of passages, 1/tau; shape
@@ -128,7 +128,7 @@ class PassageTable:
     log_rate: FloatArray
 
     def probability(self, x: FloatArray, b: FloatArray, s: FloatArray) -> FloatArray:
-        """Return probabilities where start < barrier and span > 0, all finite but the span."""
+        """Return probabilities for start < barrier and span > 0; only the span may be infinite."""
         with np.errstate(under='ignore', over='ignore'):
             # Near a far barrier, and within a short span, the pull is constant: then
             # only b sqrt(s) and (b - x) / sqrt(s) matter.
@@ -156,7 +156,7 @@ class PassageTable:
 
 
 def prepare() -> PassageTable:
-    """Return the table, made in tenths of a second by the first call, in any thread."""
+    """Return the table; the first call, in any thread, takes tenths of a second."""
     global _table
     if _table is None:
         with _lock:
@@ -178,7 +178,7 @@ _DL = float(_LAMBDA[1] - _LAMBDA[0])
 
 def _build() -> PassageTable:
     b = _B_SCALE * np.sinh(_U)
-    # Errors are proportional to squared steps, so combining two solutions removes the leading one.
+    # Richardson extrapolation: errors are proportional to squared steps.
     table = (4.0 * _solve(b, _FINE_W, _FINE_S) - _solve(b, _FINE_W // 2, _FINE_S // 2)) / 3.0
     return PassageTable(spline(table), spline(_log_rate(b)))
 
@@ -221,14 +221,13 @@ def spline_at(coefficients: FloatArray, at: FloatArray) -> FloatArray:
 
 def _solve(b: FloatArray, fine_w: int, fine_s: int) -> FloatArray:
     """Return R by linearly implicit BDF2 steps, shape (barriers, w, lambda)."""
-    # Differences use three uneven nodes and are exact for parabolas, such as R is for large w; the
-    # value at the last w is extrapolated by the parabola through the three nodes before it.
+    # For large w, R is a parabola: differences over three uneven nodes are exact for it, and the
+    # last node is extrapolated from the three before it.
     w = _W_SCALE * np.sinh(_DV / fine_w * np.arange((_W_NODES - 1) * fine_w + 1))
     first, second = (weights[..., None] for weights in _differences(w))
     step = _DL / fine_s
     lead = math.ceil(_LEAD / step)
     inner = w[1:-1, None]
-    # Extrapolation to the last node by the parabola through the three before it.
     far = _parabola(w[-4:-1], w[-1])
     # Start from the limit of short spans, R = -b sqrt(T) w / 2.
     r = -0.5 * b * math.exp(_LAMBDA[0] - lead * step) * w[:, None]
@@ -254,11 +253,11 @@ def _solve(b: FloatArray, fine_w: int, fine_s: int) -> FloatArray:
 
 
 def tridiagonal(bands: FloatArray, right: FloatArray, far: FloatArray) -> FloatArray:
-    """Return x of the inner nodes, 0 before them and x[-1] = far . x[-4:-1] after them."""
+    """Solve for x at the inner nodes, with x[0] = 0 and x[-1] = far . x[-4:-1]."""
     # bands: below, on and above the diagonal, shape (3, n, systems); right: (n, systems).
     low, main, high = bands
     p, q = np.empty_like(right), np.empty_like(right)
-    # The last row contains x[-1], that is, its three neighbours; eliminate the farthest first.
+    # Replace x[-1] in the last row by its three neighbours; eliminate the farthest first.
     last = high[-1] * far[:, None]
     main[-1] += last[2]
     low[-1] += last[1]
@@ -292,11 +291,11 @@ def _parabola(w: FloatArray, at: float) -> FloatArray:
 
 
 def _log_rate(b: FloatArray) -> FloatArray:
-    """Return ln nu, nu the smallest zero of the parabolic cylinder function D_nu(-b), 1/tau."""
-    # For 0 < b <= 8 from the power series of the Hermite function, in which all terms but the
-    # first are positive: nu = 2 Gamma(1 - nu/2) / sum over n >= 1 of Gamma((n - nu)/2) (sqrt(2)
-    # b)^n / n!. For larger b, nu is the inverse of the mean time, an asymptotic series; for b <=
-    # 0, the lowest energy above a wall.
+    """Return ln of the long-run passage rate, 1/tau: the smallest nu with D_nu(-b) = 0."""
+    # D is the parabolic cylinder function.  For 0 < b <= 8 by the power series of the Hermite
+    # function, whose terms but the first are positive: nu = 2 Gamma(1 - nu/2) / sum over n >= 1
+    # of Gamma((n - nu)/2) (sqrt(2) b)^n / n!.  For larger b, by the asymptotic series of the mean
+    # time, 1/nu; for b <= 0, as the lowest energy above a wall.
     result = np.empty(b.size)
     n = range(1, 260)
 
@@ -322,8 +321,8 @@ def _log_rate(b: FloatArray) -> FloatArray:
 
 def _lowest_energy(barrier: float) -> float:
     """Return the least nu of -f'' + (x^2/4 - 1/2) f = nu f."""
-    # f is zero at the barrier and far below.  It is exp(-x^2/4) times the solution of the backward
-    # equation; by collocation at Chebyshev points (Trefethen, Spectral Methods in MATLAB, 2000,
+    # f is zero at the barrier and far below, and exp(-x^2/4) times the solution of the backward
+    # equation.  Collocation at Chebyshev points (Trefethen, Spectral Methods in MATLAB, 2000,
     # program 6).
     order, length = 64, 14.0
     x = np.cos(math.pi * np.arange(order + 1) / order)

@@ -1,40 +1,31 @@
 """
-Notches that follow the motors, by speed or else by throttle, and are off if they do not help.
+Notches that follow the motors, by their speeds or else by throttle, and are off if useless.
 
-samples -> frames -> spectrum -> law (throttle to frequency) and choice (which notches, or none)
--> frequency, width and share of each notch, sample by sample -> output.
+samples -> spectra of frames -> law (throttle to frequency) and choice (which notches, or none)
+-> frequency, width and depth of each notch, sample by sample -> output.
 
-Frequencies of the motors: from their speeds if known, else from throttle by a learned law.
+**Law** for unknown motor speeds: f = a + b sqrt(u), learned from the noise.  The thrust of a motor
+in hover is proportional to its speed squared, so f is proportional to the square root of throttle
+u if the controller's throttle is a thrust, with an offset otherwise.  The candidates are all pairs
+of a frequency at `LOW` and one at `HIGH`; the score of each is the share of the past noise (old
+frames are forgotten) that a notch on its frequency would have removed.  The highest score wins.
+A median of the peaks would follow the most frequent peak; this law follows the loudest.
 
-The law is f = a + b sqrt(u), learned from the noise itself.  The thrust of a motor in hover is
-proportional to its speed squared, so f grows with the square root of throttle if the controller's
-throttle is a thrust, and with an offset otherwise.  Each pair of a frequency at `LOW` and one at
-`HIGH` is a law.  Each frame gives the share of its noise that a notch at each frequency would
-remove; the score of a law is the share of all noise so far that it would have removed, with old
-frames forgotten.  The best law is in force.  A median of the data would follow the most frequent
-peak; this law follows the loud peaks, which have to be removed.  No future data are used.
+**Choice** of notches in each channel: least noise in a D term at equal lag.  The noise of a
+candidate is the power of the derivative above `fmin` after its notches and a low-pass of order 2,
+whose cutoff is raised until both together lag as much as the low-pass alone.  It is averaged over
+frames before the law learns from them, for this low-pass, a slower and a faster one.  A channel
+uses the best candidate if it leaves less than `_ON` of the rms without notches, and is not worse
+with any of the low-passes; it changes to another that is better by a tenth in power.  It switches
+off if `_OFF` or more remains, or any low-pass becomes worse.
 
-Limits of the law: lines aliased at half the sample rate fall with throttle and are not followed;
-speeds of single motors are not resolved.
+Limits: only lines that follow the motors are removed, and motor speeds or throttle are needed.
+The law does not resolve speeds of single motors.  Lines above half the sample rate are aliased,
+fall with throttle, and are not followed.  A change of the vehicle is learned within half a minute.
+A frame with a gap of more than five intervals is dropped; smaller unevenness is interpolated.
 
-Choice of the notches: the least noise in a D term at equal lag, by the signal's own spectrum.
-
-The noise of a candidate is the power of the derivative above `fmin` after its notches and a
-low-pass of order 2, whose cutoff is raised so that both together lag as much as the low-pass
-alone. Its running means, over frames that the law had not yet learned from, show what each
-candidate would have achieved, also with a slower and a faster low-pass; "no notch" is a
-candidate.  A channel uses the best candidate if it leaves less than `_ON` of the rms without
-notches, and is not worse with any of the low-passes.  It changes to one that is better by a tenth
-in power, and switches off if `_OFF` or more remains or any low-pass becomes worse.
-
-Limits: only lines that follow the motors are removed.  Motor speeds or throttle are needed.  Lines
-above half the sample rate are aliased and not followed.  A change of the vehicle is learned within
-half a minute.  The choice depends on the past.  A frame with a gap of more than five intervals is
-dropped; smaller unevenness is interpolated.
-
-The notches themselves: state-variable filters whose coefficients may move.
-
-One notch, with w = 2 pi f and k = bandwidth / f:
+**Filters**: state-variable filters whose coefficients may change.  With w = 2 pi f and
+k = bandwidth / f, one notch of depth m is
 
     s1' = w (x - s2 - k s1),  s2' = w s1,  y = x - m k s1
 
@@ -43,24 +34,23 @@ by the trapezoidal rule with g = tan(pi f dt), so that the zero lies on f exactl
 
     v1 = (g (x - s2) + s1) / (1 + g (g + k)),  v2 = s2 + g v1,  s <- 2 v - s.
 
+A step of the coefficients moves y within the sample, so the caller moves them smoothly.
+
 **Stable under any sequence of f, k and m.**  With A = [[-k, -1], [1, 0]] and
 P = [[1, e], [e, 1]],
 
     -(A^T P + P A) = [[2 k - 2 e, k e], [k e, 2 e]]
 
-is positive definite for each k with 4 k > e (4 + k^2): one e < 4 K / (4 + K^2), K = least k,
-serves all k in K..2, so that s^T P s is a Lyapunov function of all of them.  The rule has
-s+ - s = 2 g (A v + b x) and s+ + s = 2 v, so that
+is positive definite if 4 k > e (4 + k^2).  Any e < 4 K / (4 + K^2), with the least k, K, suits
+all k in K..2, so V(s) = s^T P s is a Lyapunov function of all of them.  The rule gives
+s+ - s = 2 g (A v + b x) and s+ + s = 2 v, so
 
     V(s+) - V(s) = 2 g (v^T (A^T P + P A) v + 2 x b^T P v),
 
-which is below 0 wherever |v| > 2 |P b| X / q (q: least eigenvalue of the form above, X: bound
-of the input); and |v| >= (|s| - g X) / |I - g A|, so that a large state has a large v while
-g is bounded, as it is by `HIGHEST` (test_biquads.py states the bound in numbers; adversarial
-sequences reach a tenth of it).  m stays within 0..1 and is outside the loop.
-
-Limits: a step of the coefficients moves y by the change of v1 within the sample, so the caller
-moves them smoothly.
+which is negative if |v| > 2 |P b| X / q, with the least eigenvalue q of the form above and a
+bound X of the input.  A large state implies a large v, because |v| >= (|s| - g X) / |I - g A| and
+`HIGHEST` bounds g.  So the state is bounded (test_biquads.py computes the bound; adversarial
+sequences reach a tenth of it).  m, in 0..1, is outside the loop.
 """
 
 from __future__ import annotations
@@ -77,8 +67,8 @@ from ou_monitor.online.filter.lowpass import FilterCounters, LARGEST, LATEST, SH
 from ou_monitor.online.settings import NotchSettings
 from ou_monitor.records import FloatArray, NAN
 
-# A speed that has changed this often is frozen if it then stays constant for this many mean times
-# between changes, and for this time, s: no motor in flight holds its speed to the last digit.
+# Speeds count as frozen if, after this many changes, they stay constant for this many mean times
+# between changes and for this time, s: no motor in flight holds its speed to the last digit.
 _CHANGES, _FROZEN, _STUCK = 20, 50.0, 1.0
 
 
@@ -130,20 +120,20 @@ class NewestSpeeds:
         return [sum(known[a:b]) / (b - a) for a, b in zip(edges, edges[1:])]
 
 
-# Square roots of throttle that define a law: the middle of the range flown.
+# Square roots of throttle at which a law is defined: the middle of the usual range.
 LOW, HIGH = 0.4, 0.85
-_GRID = 48  # Frequencies tried
+_GRID = 48  # Number of frequencies
 # Relative width of the notch by which laws are scored.
 _WIDTH = 0.5
 # Memory of frames, s: the speed at one throttle falls with the charge, in minutes.
 _LAW_MEMORY = 30.0
-# Prior of the laws: share of noise that f ~ sqrt(u) removes, number of frames that the prior
-# counts as, and its spread in a / f(HIGH).
+# Prior of the laws: share of noise removed by f ~ sqrt(u), weight of the prior in frames, and its
+# standard deviation in a / f(HIGH).
 _PRIOR, _FRAMES, _SPREAD = 0.1, 8.0, 0.3
 
 
 class MotorLaw:
-    """All laws, and the one in force: `a` and `b`, Hz, NaN while unknown."""
+    """Candidate laws, and the best of them: `a` and `b`, Hz, NaN while unknown."""
 
     def __init__(self, frequencies: FloatArray, fmin: float, rate: float) -> None:
         highest = HIGHEST * rate
@@ -169,7 +159,7 @@ class MotorLaw:
 
     def learn(self, power: FloatArray, root: float, passed: float,
               lost: float) -> None:
-        """Take a frame: power per bin, s since the last frame, and a factor on earlier frames."""
+        """Take a frame: power per bin, s since the last frame, factor on the earlier scores."""
         keep = float(np.exp(-passed / _LAW_MEMORY))
         removed = self._removed @ power
         f = self._a + self._b * root
@@ -195,11 +185,10 @@ class MotorLaw:
         self.a = low - self.b * LOW
 
 
-# Frames of a quarter of a second, in which throttle changes little: a resolution of 4 Hz; each
-# sample is in four frames.
+# Length and distance of frames, s: throttle changes little within one, and it resolves 4 Hz.
 FRAME, HOP = 0.25, 0.0625
 _SMALLEST, _LONGEST = 16, 4096  # Samples in a frame
-_MISSING, _UNEVEN = 5.0, 0.3  # In intervals: gap that restarts, deviation that is interpolated
+_MISSING, _UNEVEN = 5.0, 0.3  # Gap that restarts a frame, deviation that is resampled; intervals
 
 
 class NotchFrames:
@@ -241,14 +230,15 @@ class NotchFrames:
         return power, rows[:, channels:].mean(axis=0)
 
 
-# Bandwidths over frequency tried for one notch and for one notch per motor.
+# Candidate bandwidths over frequency.
 WIDTHS: FloatArray = np.array([1.0, 0.66, 0.45, 0.3, 0.2, 0.13, 0.085])
 # Cutoffs of the low-passes after the notches, over `cutoff`; maximum share of the sample rate.
 _BEHIND, _FASTEST = (0.5, 1.0, 1.5), 0.25
-_ON, _OFF, _HARM, _BETTER = 0.9, 0.97, 0.99, 0.9  # See above; _HARM: "worse", share of the rms
+# Remaining share of the rms: to switch on, to switch off, "worse"; of the power: to change.
+_ON, _OFF, _HARM, _BETTER = 0.9, 0.97, 0.99, 0.9
 # Memory of the noise and of the loudest frame, s; frames before the first decision.
 _MEMORY, _LEVEL, _FEWEST = 5.0, 2.0, 6
-# Minimum share of the lag that a low-pass keeps, in a frame (one ten times as fast hardly filters)
+# Minimum share of the lag left to the low-pass, in a frame (one ten times as fast hardly filters)
 # and in the mean of frames.
 _LEAST, _LEAST_MEAN = 0.1, 0.4
 # Frames are weighted by amplitude: by power, a single crash would dominate.
@@ -260,14 +250,14 @@ class Family(NamedTuple):
     """Kind of notches, of any width."""
 
     source: str  # 'rpm' or 'throttle'
-    many: bool  # Whether each motor has its own notch
+    each: bool  # Whether each motor has its own notch
     times: int  # Number of equal notches in series
 
 
 class Candidate(NamedTuple):
     """Notches that may be chosen."""
 
-    family: Family  # Which
+    family: Family
     width: float  # Bandwidth over frequency
 
 
@@ -296,21 +286,21 @@ class NotchChoice:
         self.families = families(count)
         shape = (len(self.families), WIDTHS.size, channels, len(_BEHIND))
         self._noise: FloatArray = np.zeros(shape)
-        self._none: FloatArray = np.zeros((shape[0], 1, *shape[2:]))
+        self._without: FloatArray = np.zeros((shape[0], 1, *shape[2:]))
         self._left: FloatArray = np.ones((*shape[:2], len(_BEHIND)))
         self._frames = [0] * len(self.families)
         self._loudest: FloatArray = np.zeros(channels)
         self.chosen: list[Candidate | None] = [None] * channels
 
-    def usual(self, power: FloatArray, passed: float) -> tuple[FloatArray, float]:
-        """Return a low-passed frame over the loudest recent one, (channels, K), and a factor."""
-        # A louder frame reduces the weight of earlier ones by that factor; quiet frames count
-        # again once loud ones are forgotten.
+    def normalise(self, power: FloatArray, passed: float) -> tuple[FloatArray, float]:
+        """Return a frame over the loudest recent power, and the factor on earlier frames."""
+        # A louder frame reduces the weight of earlier ones; quiet frames count again once loud
+        # ones are forgotten.
         before = self._loudest * np.exp(-passed / _LEVEL)
         self._loudest = np.maximum(power[:, self._used] @ self._low[1], before)
         lost = (before / np.maximum(self._loudest, _TINY))**_BY_AMPLITUDE
         self._noise *= lost[:, None]
-        self._none *= lost[:, None]
+        self._without *= lost[:, None]
         return power / np.maximum(self._loudest, _TINY)[:, None], float(np.mean(lost))
 
     def low_passed(self, power: FloatArray) -> FloatArray:
@@ -328,7 +318,7 @@ class NotchChoice:
         mean = motors.mean(keepdims=True) if motors.size else motors
         for j, family in enumerate(self.families):
             f = (np.array([throttle]) if family.source == 'throttle' else
-                 motors if family.many else mean)
+                 motors if family.each else mean)
             f = f[(f >= self._fmin) & (f <= HIGHEST * self._rate)]
             if not f.size:
                 continue
@@ -339,7 +329,7 @@ class NotchChoice:
             self._frames[j] += 1
             weight = max(1.0 / self._frames[j], passed / _MEMORY)
             self._noise[j] += weight * (noise - self._noise[j])
-            self._none[j] += weight * (none - self._none[j])
+            self._without[j] += weight * (none - self._without[j])
             self._left[j] += weight * (left - self._left[j])
 
     def _cascade(self, f: FloatArray, times: int) -> tuple[FloatArray, FloatArray]:
@@ -354,7 +344,7 @@ class NotchChoice:
         """Choose for each channel among the candidates whose source is known now."""
         known = np.array([one.source in sources and frames >= _FEWEST for one, frames in
                           zip(self.families, self._frames, strict=True)])
-        left = self._noise / np.maximum(self._none, _TINY)
+        left = self._noise / np.maximum(self._without, _TINY)
         harms: npt.NDArray[np.bool_] = (np.max(left, axis=3) > _HARM**2) | (
             np.min(self._left, axis=2) < _LEAST_MEAN)[..., None]
         gain = np.where(known[:, None, None], np.mean(left, axis=3), np.inf)
@@ -366,7 +356,7 @@ class NotchChoice:
             if old is not None:
                 k = self.families.index(old.family)
                 now = float(able[k, int(np.argmin(np.abs(WIDTHS - old.width)))])
-            # If a source is lost, the other continues with its choice.
+            # If the source of the old candidate is lost, the other takes over.
             limit = _ON if old is None else _OFF
             if best < limit**2 and best < _BETTER * now:
                 self.chosen[c] = found
@@ -374,17 +364,17 @@ class NotchChoice:
                 self.chosen[c] = None
 
 
-# Minimum gap in intervals; number of samples that determine the interval; relative change of it
-# that is a new rate.
+# Minimum gap, in intervals; samples that determine the interval; its relative change that counts
+# as a new rate.
 _GAP, _KNOWN, _OTHER = 5.0, 64, 0.1
-# Time constant, s, of motors after a step of throttle (25 ms on a 5 inch propeller), and of
-# changes of a notch's share, width and frequency.
+# Time constants, s: motors after a step of throttle (25 ms on a 5 inch propeller); changes of a
+# notch's depth, width and frequency.
 _SPIN_UP, _FADE, _WIDEN, _MOVE = 0.03, 0.2, 0.05, 0.004
 # Time for which the last throttle is held, s.
 _HELD = 1.0
 _LAG_FREQUENCY = 10.0  # Frequency at which the delay is stated, Hz
 
-_Maybe = npt.ArrayLike | None
+_Optional = npt.ArrayLike | None
 
 
 class AdaptiveNotch:
@@ -440,13 +430,13 @@ class AdaptiveNotch:
     @property
     def active(self) -> bool:
         """Whether any notch is in force in any channel."""
-        return any(one.share > 0.0 for bank in self._banks for one in bank)
+        return any(one.depth > 0.0 for bank in self._banks for one in bank)
 
     @property
     def frequencies(self) -> FloatArray:
         """Frequencies of the notches in the channel with the most of them, Hz; empty: none."""
         rate = self.rate
-        each = [[one.ratio * rate for one in bank if one.share > 0.0] for bank in self._banks]
+        each = [[one.ratio * rate for one in bank if one.depth > 0.0] for bank in self._banks]
         return np.array(max(each, key=len, default=[]), dtype=np.float64)
 
     @property
@@ -499,7 +489,7 @@ class AdaptiveNotch:
             self._frames = self._law = self._choice = None
 
     def filter(self, t: npt.ArrayLike, x: npt.ArrayLike,  # noqa: A003
-               throttle: _Maybe = None, rpm: _Maybe = None) -> FloatArray | float:
+               throttle: _Optional = None, rpm: _Optional = None) -> FloatArray | float:
         """
         Filter samples; the state is carried over from call to call.
 
@@ -563,7 +553,7 @@ class AdaptiveNotch:
             self.counters.samples += 1
             self._banks = [[Notch(x) for _ in range(4)] for x in values]
             self._t, self._out = t, list(values)
-            self._listen(t, 0.0, throttle, rpm)
+            self._take_inputs(t, 0.0, throttle, rpm)
             return self._out
         dt = t - self._t
         if dt < SHORTEST:
@@ -575,19 +565,19 @@ class AdaptiveNotch:
             return self._out
         self.counters.samples += 1
         gap = dt > _GAP * self._interval.mean and self.counters.samples > _KNOWN
-        self._time(dt)
+        self._follow_interval(dt)
         self._t = t
-        self._listen(t, dt, throttle, rpm)
-        self._watch(t, values, dt)
+        self._take_inputs(t, dt, throttle, rpm)
+        self._analyse(t, values, dt)
         if gap:
             self.counters.gaps += 1
             for bank, x in zip(self._banks, values, strict=True):
                 for one in bank:
                     one.restart(x)
-        self._out = [self._filtered(c, x, dt) for c, x in enumerate(values)]
+        self._out = [self._filter_channel(c, x, dt) for c, x in enumerate(values)]
         return self._out
 
-    def _time(self, dt: float) -> None:
+    def _follow_interval(self, dt: float) -> None:
         """Follow the interval; restart at a new rate."""
         mean = self._interval.add(dt)
         if self._frames is None:
@@ -597,7 +587,7 @@ class AdaptiveNotch:
             self._interval, self._since = SampleInterval(), 0
             self._interval.add(dt)
 
-    def _listen(self, t: float, dt: float, throttle: float, rpm: Sequence[float]) -> None:
+    def _take_inputs(self, t: float, dt: float, throttle: float, rpm: Sequence[float]) -> None:
         if throttle == throttle:
             self._newest_root, self._received = math.sqrt(min(max(throttle, 0.0), 1.0)), t
         elif not t - self._received <= _HELD:
@@ -612,7 +602,7 @@ class AdaptiveNotch:
         self._motors = [one for one in self._speeds.now(t, self._settings.count)
                         if self._settings.fmin <= one <= highest]
 
-    def _watch(self, t: float, values: Sequence[float], dt: float) -> None:
+    def _analyse(self, t: float, values: Sequence[float], dt: float) -> None:
         s, channels = self._settings, len(values)
         if self._frames is None:
             if not s.count or self._since < _KNOWN or HIGHEST / self._interval.mean < 1.2 * s.fmin:
@@ -630,7 +620,7 @@ class AdaptiveNotch:
             power, rest = self._frames.take(channels)
             passed = self._frames.hop * self._frames.interval
             root, motors = float(rest[0]), rest[1:]
-            power, lost = self._choice.usual(power, passed)
+            power, lost = self._choice.normalise(power, passed)
             # Score the law before it learns.
             self._choice.take(power, self._law.frequency(root), motors[np.isfinite(motors)],
                               passed)
@@ -640,21 +630,21 @@ class AdaptiveNotch:
             self._sources = sources
             self._choice.decide(sources)
 
-    def _wanted(self, chosen: Candidate | None) -> list[float]:
+    def _targets(self, chosen: Candidate | None) -> list[float]:
         """Return the present frequencies of a candidate, Hz; NaN: none."""
         if chosen is None or self._law is None:
             return []
         if chosen.family.source == 'throttle':
             return [self._law.frequency(self._root)] * chosen.family.times
-        if chosen.family.many or not self._motors:
+        if chosen.family.each or not self._motors:
             return self._motors
         return [sum(self._motors) / len(self._motors)] * chosen.family.times
 
-    def _filtered(self, c: int, x: float, dt: float) -> float:
+    def _filter_channel(self, c: int, x: float, dt: float) -> float:
         chosen = None if self._choice is None else self._choice.chosen[c]
-        wanted = self._wanted(chosen)
+        wanted = self._targets(chosen)
         bank = self._banks[c]
-        if not wanted and not any(one.share for one in bank):
+        if not wanted and not any(one.depth for one in bank):
             for one in bank:
                 one.advance(x)
             return x
@@ -664,14 +654,14 @@ class AdaptiveNotch:
             f = wanted[k] if k < len(wanted) else NAN
             ratio = f * interval
             if chosen is not None and f >= lowest and ratio <= HIGHEST:
-                if one.share == 0.0:
+                if one.depth == 0.0:
                     one.ratio, one.width = ratio, chosen.width
                 elif abs(ratio - one.ratio) > 1e-5 * ratio:
                     one.ratio += (ratio - one.ratio) * moved
                 one.width -= (chosen.width - one.width) * math.expm1(-dt / _WIDEN)
-                one.share = min(one.share + step, 1.0)
-            elif one.share > 0.0:
-                one.share = max(one.share - step, 0.0)
+                one.depth = min(one.depth + step, 1.0)
+            elif one.depth > 0.0:
+                one.depth = max(one.depth - step, 0.0)
             x = one.advance(x)
         return x
 
@@ -681,15 +671,15 @@ HIGHEST = 0.45
 
 
 class Notch:
-    """One notch of one channel, which starts as if its first sample x had lasted for ever."""
+    """One notch of one channel; it starts as if the input had always been x."""
 
-    __slots__ = ('_g', '_ratio', '_s1', '_s2', 'share', 'width')
+    __slots__ = ('_g', '_ratio', '_s1', '_s2', 'depth', 'width')
 
     def __init__(self, x: float) -> None:
         self._s1, self._s2 = 0.0, x
         self._ratio = self._g = 0.0
         # Bandwidth over frequency; depth, 0 (off) to 1.
-        self.width, self.share = 1.0, 0.0
+        self.width, self.depth = 1.0, 0.0
 
     @property
     def ratio(self) -> float:
@@ -703,7 +693,7 @@ class Notch:
             self._g = math.tan(math.pi * self._ratio)
 
     def restart(self, x: float) -> None:
-        """Restart as if the input had always been this sample."""
+        """Restart as if the input had always been x."""
         self._s1, self._s2 = 0.0, x
 
     def advance(self, x: float) -> float:
@@ -713,7 +703,7 @@ class Notch:
         v2 = self._s2 + g * v1
         self._s1 = 2.0 * v1 - self._s1
         self._s2 = 2.0 * v2 - self._s2
-        return x - self.share * k * v1
+        return x - self.depth * k * v1
 
     def response(self, ratio: float) -> complex:
         """Return the response to a frequency over the sample rate, with constant coefficients."""
@@ -721,7 +711,7 @@ class Notch:
             return 1.0 + 0.0j
         p = 1j * math.tan(math.pi * ratio) / self._g
         k = self.width
-        return 1.0 - self.share * k * p / (p * p + k * p + 1.0)
+        return 1.0 - self.depth * k * p / (p * p + k * p + 1.0)
 
 
 def phase_lag(notches: Iterable[Notch], ratio: float) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 from ou_monitor import discover, Recording
 from ou_monitor.criticism.composite import fit_composite
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.discovery.redraw import redrawn
+from ou_monitor.discovery.redraw import redraw_clipped
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_dependent import LoadDependentSigma
 from ou_monitor.model.terms.load_response import LoadSag
@@ -35,7 +35,7 @@ def test_drawn_readings_have_the_mean_of_the_clipped_ones(seed):
     seen = Samples(t, np.maximum(v, low), u)
     model = fit_composite(Samples(t, v, u), TERMS, slice(0, N))
     ends = Saturation(low, 100.0)
-    drawn = redrawn(seen, model, ends, clipped, np.random.default_rng(seed))
+    drawn = redraw_clipped(seen, model, ends, clipped, np.random.default_rng(seed))
     assert (drawn.voltage[~clipped] == v[~clipped]).all()
     assert (drawn.voltage[clipped] <= low).all()
     off = drawn.voltage[clipped] - v[clipped]
@@ -52,8 +52,8 @@ def test_codes_stay_codes():
     samples = Samples(t, v, u).spread(codes, cell, np.random.default_rng(0))
     clipped = codes <= codes.min()
     model = fit_composite(samples, TERMS, slice(0, N))
-    drawn = redrawn(samples, model, Saturation(float(codes.min()), 100.0), clipped,
-                    np.random.default_rng(0))
+    drawn = redraw_clipped(samples, model, Saturation(float(codes.min()), 100.0), clipped,
+                           np.random.default_rng(0))
     assert (np.abs(drawn.voltage - drawn.logged) < 0.5001 * cell).all()
     assert np.abs(drawn.logged / cell - np.rint(drawn.logged / cell)).max() < 1e-6
     assert (drawn.logged[clipped] < 15.2 + 0.5 * cell).all()

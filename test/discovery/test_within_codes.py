@@ -7,7 +7,7 @@ from ou_monitor import discover, Recording
 from ou_monitor.criticism.composite import Composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate
-from ou_monitor.discovery.redraw import within_codes
+from ou_monitor.discovery.redraw import redraw_within_codes
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
@@ -37,7 +37,7 @@ def rounded(seed, *terms):
 def test_scores_of_what_is_drawn_are_normal_and_white(seed, noise):
     """Within 4 errors of normal scores; places half a move apart add 1/48 of its variance."""
     samples, model = rounded(seed, *noise)
-    drawn = within_codes(samples, model, np.random.default_rng(seed))
+    drawn = redraw_within_codes(samples, model, np.random.default_rng(seed))
     assert (np.abs(drawn.voltage - drawn.logged) <= 0.5001 * STEP).all() and drawn.cell == 0.0
     z = evaluate(drawn, model.terms).z
     assert abs(float(np.mean(z * z)) - 1.0) < 4.0 * math.sqrt(2.0 / N) + 2.0 / 48.0
@@ -48,7 +48,7 @@ def test_scores_of_what_is_drawn_are_normal_and_white(seed, noise):
 def test_fine_codes_are_left_as_they_are():
     """A code of three moves is rounded to white noise."""
     samples, model = rounded(0, MeasurementNoise(2.5 * STEP / 6.0))
-    assert within_codes(samples, model, np.random.default_rng(0)) is samples
+    assert redraw_within_codes(samples, model, np.random.default_rng(0)) is samples
 
 
 @pytest.mark.parametrize('seed', [1, 2])

@@ -35,7 +35,7 @@ def bound(narrowest, highest):
 
 def notch(ratio, width, share=1.0, x=0.0):
     one = Notch(x)
-    one.ratio, one.width, one.share = ratio, width, share
+    one.ratio, one.width, one.depth = ratio, width, share
     return one
 
 

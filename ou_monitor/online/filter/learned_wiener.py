@@ -1,35 +1,36 @@
 """
-The law `kalman` for a signal in supply noise: the best filter, learned in flight.
+The law `kalman` for a signal in supply noise: a Wiener filter, learned in flight.
 
-The signal is unknown.  The outputs z of four low-passes, and the input (`step_of`), are signal
-plus noise, z = z_s + z_n.  The noise is known: `coupling` times the supply's noise, an OU with
-sigma and alpha, and white noise n0.  Of all linear combinations of z
+The vector z holds the outputs of four low-passes, and the input: an unknown signal plus noise,
+z = z_s + z_n.  The noise is known: `coupling` times the supply's noise, an OU with sigma and
+alpha, plus white noise n0.  With the covariances C_s of the signal and C_n of the noise, and c_s,
+the last column of C_s, the weights
 
     w = (C_s + C_n)^-1 c_s,    C_s = C_z - C_n,
 
-has the least mean square error to the last of z_s, the signal or its slope: the multichannel
-Wiener filter (Doclo & Moonen 2002, IEEE Trans. Signal Process. 50, 2230).  C_z is a mean of z z^T
-over `_MEMORY`; a hop of 10 ms has weight 1 / noise^2, as the variance of z z^T grows with noise^2.
-C_s is the part of C_z - C_n that exceeds its sampling error, in each direction.
+give the linear combination w^T z with the least mean square error, as an estimate of the last
+element of z_s (the signal, or its slope): the multichannel Wiener filter (Doclo & Moonen 2002,
+IEEE Trans. Signal Process. 50, 2230).  C_z is a mean of z z^T with the time constant `_MEMORY`.
+Each hop of 10 ms has the weight 1 / noise^2 (noise: power), because the variance of z z^T grows
+with noise^2.  C_s keeps only what exceeds the sampling error of C_z - C_n, in each direction.
 
-- If the stated noise is too large, so that the power of the signal would be negative, the noise is
-  reduced accordingly.  For a slope, whose power is finite, some direction has almost no signal; if
-  the stated noise is too small, it is increased to the power found there.
-- A hop that does not fit C_s + C_n (its largest normalised square lies above the 99.9 % quantile
-  of chi squared) opens the filter at once: C_s grows in proportion, as in a manoeuvre after calm.
+- Wrong noise: if the stated noise is so large that the power of the signal would be negative, it
+  is reduced.  If it is too small, that shows only in a slope, whose power is finite: some
+  direction contains almost no signal, and the noise is increased to the power found there.
+- Manoeuvre after calm: if a hop does not fit C_s + C_n (largest normalised square above the 99.9 %
+  quantile of chi squared), C_s is scaled up in proportion, which opens the filter at once.
+- If the lag of the combination exceeds its limit, just enough of the input is mixed in to meet it
+  (`lag.share_for_lag`).
 
-The lag is that of the combination.  If it exceeds the limit, just enough of the input is mixed in
-to keep the limit (`lag.share_for_lag`).
+A step of the low-passes (`filter_state`) is z' = F z + a start + b end, exact for an input that is
+linear between samples; for a derivative the input is the difference quotient.
 
-The low-passes are those of `filter_state`: a step is z' = F z + a start + b end, exact for an
-input that is linear between samples; for a derivative the input is the difference quotient.
+C_n for noise with autocorrelation phi^k: with the noise p' = phi p + e as a further state, the
+covariance solves P = A P A^T + q g g^T, which is summed by doubling, A -> A A.
 
-The covariance of all outputs for noise with r(k) = phi^k: with the noise p' = phi p + e as a state
-beside z it solves P = A P A^T + q g g^T, which is summed by doubling, A -> A A.
-
-Limits: for a signal, the excess of noise over its stated value passes as signal.  The gain at
-frequency 0 is below 1.  Motions slower than 2 Hz, or faster than 128 Hz, are filtered no better
-than by these low-passes.  Intervals within 1 % of each other count as equal.
+Limits: for a signal, noise above its stated value passes as signal.  The gain at frequency 0 is
+below 1.  Motions slower than 2 Hz or faster than 128 Hz are filtered no better than by these
+low-passes.  Intervals within 1 % of each other count as equal.
 """
 
 from __future__ import annotations
@@ -53,20 +54,20 @@ CUTOFFS = (2.0, 8.0, 32.0, 128.0)
 COUNT = len(CUTOFFS) + 1
 _TWO_PI = 2.0 * math.pi
 _ORDER, _SAME = 2, 0.01
-# Maximum number of steps whose matrices are kept.
+# Maximum number of steps whose matrices are cached.
 _STEPS = 64
-# Share of a state that counts as 0.
+# Convergence tolerance of the sum over powers of A.
 _GONE = 1e-18
 
 
 def _key(x: float) -> int:
-    """Return the same number for values within 1 % of each other."""
+    """Return the number of a bin of width 1 % on the log scale."""
     return round(math.log(x) / _SAME)
 
 
 @lru_cache(maxsize=_STEPS)
 def step_of(key: int) -> FloatArray:
-    """Return F, a and b of all low-passes over a step (key of s), side by side, shape (8, 10)."""
+    """Return [F a b] of all low-passes for a step (`_key` of s), shape (8, 10)."""
     dt = math.exp(_SAME * key)
     size = 2 * len(CUTOFFS)
     found = np.zeros((size, size + 2))
@@ -83,7 +84,7 @@ def step_of(key: int) -> FloatArray:
 
 
 def response_of(interval: float, frequency: float, slope: bool) -> Complexes:
-    """Return the response of each output to a wave, shape (5,) (interval in s, Hz)."""
+    """Return the frequency response of each output, shape (5,) (interval in s, Hz)."""
     step = step_of(_key(interval))
     back = np.exp(-1j * _TWO_PI * frequency * interval)
     raw = (1.0 - back) / interval if slope else 1.0 + 0.0j
@@ -95,8 +96,8 @@ def response_of(interval: float, frequency: float, slope: bool) -> Complexes:
 
 @lru_cache(maxsize=_STEPS)
 def noise_of(key: int, decay: float, slope: bool) -> FloatArray:
-    """Return the outputs' covariance, shape (5, 5), for noise of variance 1 and decay, 1/s."""
-    # key of the interval, s; the decay is infinite for white noise.
+    """Return the covariance of z, shape (5, 5), for noise of variance 1 and rate decay, 1/s."""
+    # key: of the interval, s; decay: infinite for white noise.
     interval, step = math.exp(_SAME * key), step_of(key)
     size = step.shape[0]
     phi = math.exp(-decay * interval)
@@ -119,10 +120,10 @@ def noise_of(key: int, decay: float, slope: bool) -> FloatArray:
     return np.asarray(p[np.ix_(outputs, outputs)])
 
 
-# Time between new weights, also time constant of the transition to them; memory, s; both chosen
-# on bf3s, roma, jd and gecko (benchmarks/learned.py).
+# Time between updates of the weights, also time constant of the transition; memory, s; both
+# chosen on bf3s, roma, jd and gecko (benchmarks/learned.py).
 _HOP, _MEMORY = 0.01, 5.0
-# Weight of the prior, which is no signal, s.
+# Weight of the prior (no signal), s.
 _BEFORE = 1.0
 # 99.9 % quantile of chi squared with 5 degrees of freedom.
 _MISFIT = 20.515
@@ -130,9 +131,9 @@ _MISFIT = 20.515
 _ROWS = 256
 # Regularisation: noise added to each output, as a share of its noise and of its power.
 _FLOOR, _FLOOR_OF_ALL, _TINY = 1e-9, 1e-12, 1e-200
-# Minimum share of the stated noise that is used; values above the largest are not learned from.
+# Minimum factor on the stated noise; maximum value that is learned from.
 _LEAST, _LARGEST = 1e-3, 1e60
-# Maximum step in intervals; longer steps count as this one.
+# Maximum weight of a step, in intervals.
 _GAP = 5.0
 _RAW = np.eye(COUNT)[-1]
 
@@ -143,8 +144,8 @@ class LearnedWiener:
     def __init__(self, settings: FilterSettings, x: float) -> None:
         self._settings = settings
         self._slope = settings.mode == 'derivative'
-        # Signal, or its slope (unit/s); its lag at `lag_frequency`, degrees, NaN if unknown; the
-        # share of unfiltered input in it.
+        # Estimate of the signal, or of its slope (unit/s); its lag at `lag_frequency`, degrees,
+        # NaN if unknown; share of unfiltered input in it.
         self.y = 0.0 if self._slope else x
         self.lag, self.mixed = NAN, 0.0
         self._x = x
@@ -160,7 +161,7 @@ class LearnedWiener:
         self._power = self._noise = np.zeros((COUNT, COUNT))
         self._sum = self._squares = self._level = 0.0
         self._whiten: FloatArray | None = None
-        # Maximum share of the stated noise that is used.
+        # Maximum factor on the stated noise.
         self._most = _LARGEST if self._slope else 1.0
 
     def __copy__(self) -> LearnedWiener:
@@ -205,14 +206,14 @@ class LearnedWiener:
         try:
             found = self._best(noise, misfit)
         except np.linalg.LinAlgError:
-            # Rounding has spoiled means of noise larger by powers of ten: forget them.
+            # The means are of noise many powers of ten larger, and too inaccurate: forget them.
             self._sum, self._whiten = 0.0, None
             return
         if np.all(np.isfinite(found)):
             self._limit(found, interval)
 
     def _best(self, noise: FloatArray, misfit: float) -> FloatArray:
-        """Return the weights of least error with the present noise."""
+        """Return the optimal weights for the present noise."""
         # Regularisation of the power and of the noise.
         floor = np.diag(_FLOOR * np.diag(self._noise + noise)
                         + _FLOOR_OF_ALL * np.diag(self._power) + _TINY)
@@ -249,7 +250,7 @@ class LearnedWiener:
         return found
 
     def _misfit(self, rows: FloatArray) -> float:
-        """Return the factor by which the signal exceeds its model; 1: none."""
+        """Return the factor by which the hop exceeds the model; 1: it fits."""
         if self._whiten is None:
             return 1.0
         squares = np.sum((rows @ self._whiten)**2, axis=1)
