@@ -26,18 +26,17 @@ from ou_monitor.model.terms.term import LawFit, Role, Term
 from ou_monitor.model.whittle import Ordinates
 from ou_monitor.records import FloatArray, NAN
 
-# Number of starting points that are fitted, of samples used to select them, and of kinds that get
-# a full fit.
+# Maximum starting points that are fitted, samples to select them, and kinds with a full fit.
 _FULL, _PREVIEW, _FEW = 2, 8000, 4
 # First estimates below this share of the best are dropped: a full fit at most doubles an estimate.
 _WITHIN = 0.5
-# Maximum alternations between the fit and terms with parameters of their own (`APART`).
+# Maximum alternations between the fit and the `APART` parameters of its terms.
 _AGAIN = 3
-# Fits to one spectrum (nats), and scores, that differ by less than this are equal.
+# Tolerances within which fits to one spectrum, nats, and scores are equal.
 _ALIKE, _SAME = 0.1, 1e-6
 
 
-# First estimate of the gain of a kind, nats, the kind, and a start (None for a law).
+# First estimate: gain, nats, kind, and start (None for a law).
 _FirstEstimate = tuple[float, type[Term], Composite | None]
 
 
@@ -78,12 +77,12 @@ class Fitter:
     def fit(self, terms: Sequence[Term | type[Term]], known: Composite | None,
             rough: bool = False, begun: bool = False) -> Composite | None:
         """Return a fit to the first part, its mean fitted to everything; None if it fails."""
-        found = self._tried(terms, self.samples.train, known, whole_mean=True, rough=rough,
-                            begun=begun, first=self.law_fit)
-        return found if found is None or rough else self._apart(found, self.samples.train)
+        found = self._fit(terms, self.samples.train, known, whole_mean=True, rough=rough,
+                          begun=begun, first=self.law_fit)
+        return found if found is None or rough else self._fit_apart(found, self.samples.train)
 
-    def _tried(self, *model: Any, **options: Any) -> Composite | None:
-        """Return `fit_composite` of the samples, and count its cost; None if it fails."""
+    def _fit(self, *model: Any, **options: Any) -> Composite | None:
+        """Run `fit_composite` and count its cost; None if it fails."""
         try:
             found = fit_composite(self.samples, *model, **options)
         except (ValueError, ArithmeticError, np.linalg.LinAlgError):
@@ -92,14 +91,14 @@ class Fitter:
         self.cost += 0.0 if found is None else found.cost
         return found
 
-    def _apart(self, found: Composite, part: slice) -> Composite:
-        """Return a model with the `APART` parameters of its terms estimated again."""
+    def _fit_apart(self, found: Composite, part: slice) -> Composite:
+        """Alternate between the `APART` parameters of terms and all others while it gains."""
         for _ in range(_AGAIN):
             if not any(term.APART for term in found.terms):
                 break
             view = view_of(self.samples, found.gaussian, found.z, part)
             terms = [term.apart(view) if term.APART else term for term in found.terms]
-            again = self._tried(terms, part, found, whole_mean=True, rough=True)
+            again = self._fit(terms, part, found, whole_mean=True, rough=True)
             if again is None or not self.evidence(again) > self.evidence(found) + _ALIKE:
                 break
             found = again
@@ -108,10 +107,10 @@ class Fitter:
     def whole(self, model: Composite) -> Composite:
         """Return a model fitted to everything, or unchanged if that fails."""
         # Its laws were already fitted to all samples.
-        again = self._tried(model.terms, slice(0, self.samples.n), model)
+        again = self._fit(model.terms, slice(0, self.samples.n), model)
         if again is None or not math.isfinite(float(again.density.sum())):
             return model
-        return self._apart(again, slice(0, self.samples.n))
+        return self._fit_apart(again, slice(0, self.samples.n))
 
     def join(self, composite: Composite, starts: Sequence[Term], rough: bool) -> Composite | None:
         """Return the fit with more terms, inserted before the laws."""
@@ -123,9 +122,9 @@ class Fitter:
     def trials(self, composite: Composite, kinds: Sequence[type[Term]],
                statistics: Callable[[Composite], Mapping[str, float]]) -> list[Trial]:
         """Return kinds that improve a model: all are estimated, the best few fitted in full."""
-        # Kinds that failed before are tried again if score tests show more than at that time.
-        # Kinds whose fit takes seconds come last, and only if they imitate the best other kind or
-        # score tests still show them after it is added.
+        # Kinds that failed before are tried again if score tests now show more than then.  Slow
+        # kinds come last, and only if they imitate the best other kind or score tests still show
+        # them after it is added.
         values = statistics(composite)
         shown = {kind: decision.score_gain(kind, values) for kind in kinds}
         tried = [kind for kind in kinds if not kind.SLOW_FIT
@@ -144,7 +143,7 @@ class Fitter:
         if slow:
             estimates += self._first_estimates(composite, slow, _WITHIN * top)
             found = self._in_full(composite, estimates, found)
-            # A BROAD kind below `least` was not estimated in full, so it has not failed.
+            # BROAD kinds below `least` were not estimated in full, so they have not failed.
             tried += [kind for kind in slow if not top or not kind.BROAD]
         gained = {estimate[1] for estimate in estimates}
         self.failed |= {kind.NAME: shown[kind] for kind in tried if kind not in gained}
@@ -152,7 +151,7 @@ class Fitter:
 
     def _first_estimates(self, composite: Composite, kinds: Sequence[type[Term]], least: float
                          ) -> list[_FirstEstimate]:
-        """Return the estimated gains of kinds, if they are large enough, nats."""
+        """Return the first estimates of kinds that gain enough (least: for BROAD kinds, nats)."""
         view, before = self.view(composite), self.evidence(composite)
         found = []
         for kind in kinds:
@@ -161,7 +160,7 @@ class Fitter:
             else:
                 start = self.best_start(composite, kind, view, least)
                 gain = -math.inf if start is None else self.evidence(start) - before
-            # Keep kinds that gain less than others, because they may later be the best.
+            # Keep kinds that gain less than others: a full fit may reverse the order.
             if gain > (least if kind.BROAD else 0.0):
                 found.append((gain, kind, start))
         return found
@@ -172,7 +171,7 @@ class Fitter:
         found, names = list(known), {trial.name for trial in known}
         best = sorted(estimates, key=lambda estimate: -estimate[0])[:_FEW]
         for gain, kind, start in best:
-            # Compare with full fits, in which a law may lose all of its first estimate.
+            # Compare with full fits, because a law may lose all of its first estimate in one.
             top = max((trial.evidence for trial in found), default=0.0)
             if gain < _WITHIN * top or kind.NAME in names:
                 continue
@@ -241,19 +240,19 @@ class Fitter:
         laws = [term for term in composite.terms if term.ROLE is Role.LAW]
         moved = [from_spectrum(self.samples, composite, [start.beside(ou), *others, start])
                  for start in starts]
-        # A start whose spectrum gains less than its penalty does not gain more in the samples.
-        moved = sorted((way for way in moved if way[0][-1].holds(view)
-                        and way[1] > max(decision.ACCEPT, least)), key=lambda way: -way[1])
+        # If the spectrum gains less than the penalty, the samples do not gain more.
+        moved = sorted((fit for fit in moved if fit[0][-1].holds(view)
+                        and fit[1] > max(decision.ACCEPT, least)), key=lambda fit: -fit[1])
         # Starts with the same gain have converged to one fit.
-        ways = [way for k, way in enumerate(moved)
-                if not any(way[1] > other[1] - _ALIKE for other in moved[:k])]
+        distinct = [fit for k, fit in enumerate(moved)
+                    if not any(fit[1] > other[1] - _ALIKE for other in moved[:k])]
         fits = [self.fit([*terms, *laws], composite, rough=True, begun=True)
-                for terms, _ in ways[:_FULL]]
+                for terms, _ in distinct[:_FULL]]
         return max((fit for fit in fits if fit is not None and _joined(fit).holds(view)),
                    default=None, key=self.evidence)
 
     def _by_likelihood(self, composite: Composite, starts: list[Term]) -> list[Term]:
-        """Return starts by their likelihood without a fit, on a part of the samples."""
+        """Sort starts by their likelihood without a fit, on a part of the samples."""
         few = self.samples.part(slice(0, min(self.samples.train.stop, _PREVIEW)))
         structural = [term for term in composite.terms if term.ROLE is not Role.LAW]
 
@@ -282,8 +281,8 @@ def _joined(composite: Composite) -> Term:
 
 
 def _by_scores(samples: Samples, starts: list[Term], view: View) -> list[Term]:
-    """Return starts by their gain in the scores; lines only if they may be worth their penalty."""
-    # Slow terms are partly absorbed by the `ou`, so their scores are small.
+    """Sort starts by their gain in the scores; drop lines whose gain is far below the penalty."""
+    # Other terms stay: the `ou` partly absorbs slow ones, so their gain in the scores is small.
     s = samples.segment(1.0, 0.0)
     scale = np.sqrt(view.variance)
     price = 0.5 * math.log(samples.train.stop)
@@ -307,8 +306,7 @@ def _by_scores(samples: Samples, starts: list[Term], view: View) -> list[Term]:
 def from_spectrum(samples: Samples, composite: Composite, starts: Sequence[Term]
                   ) -> tuple[tuple[Term, ...], float]:
     """Return terms fitted to the spectrum of a model's scores, and the gain of the fit, nats."""
-    # starts: the terms of `composite` without its laws, with the initial `ou`, and further terms
-    # at the end.
+    # starts: the initial `ou`, the other terms of `composite` without its laws, then new terms.
     ordinates = Ordinates.of(composite.z[samples.train])
     spectrum = _Spectrum(samples, composite.gaussian.terms, ordinates.omega)
     free = [(k, name) for k, term in enumerate(starts) if k == 0 or term.ROLE in (

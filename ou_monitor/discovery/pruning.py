@@ -1,8 +1,8 @@
 """
 Remove causes that do not improve predictions of held-out blocks, and check the model.
 
-A cause is removed if the rest, fitted again, predicts held-out blocks equally well.  Then the
-others are tested again, because one of them may take over its effect.
+A cause is removed if the rest, refitted, predicts held-out blocks equally well.  The others are
+then tested again, because one of them may take over its effect.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Pruned:
     full: HeldOut  # The model
     names: list[str]  # Its causes, in the order of acceptance
     worth: list[Worth] = field(default_factory=list)  # One for each
-    out: list[str] = field(default_factory=list)  # Causes that were left out
+    out: list[str] = field(default_factory=list)  # Removed causes
 
 
 def prune_by_gain(samples: Samples, model: Composite, names: Sequence[str], plain: HeldOut,
@@ -69,7 +69,7 @@ def prune_by_gain(samples: Samples, model: Composite, names: Sequence[str], plai
             return state
         failing = [k for k, worth in enumerate(state.worth) if worth.less is not None
                    and not decision.improves_predictions(worth.gain, worth.error, worth.chance)
-                   and not _as_trend(samples, state, k)]
+                   and not _absorbs_trend(samples, state, k)]
         if turn == _ROUNDS - 1:
             return state
         worst = (min(failing, key=lambda k: (-state.worth[k].chance, state.worth[k].gain))
@@ -81,14 +81,14 @@ def prune_by_gain(samples: Samples, model: Composite, names: Sequence[str], plai
 
 
 def _leave_out_vague(samples: Samples, state: Pruned) -> None:
-    """Remove causes of which no size is determined."""
+    """Remove causes whose amplitudes are all undetermined."""
     for k in reversed(range(len(state.names))):
         at = position(state.full.model, state.names, k)
         term = state.full.model.terms[at]
         errors = standard_errors(samples, state.full.model, slice(0, samples.n))[at]
-        sizes = [is_vague(value, errors.get(name)) for name, value in term.values().items()
+        vague = [is_vague(value, errors.get(name)) for name, value in term.values().items()
                  if term.positive(name) and term.unit(name) in ('V', 'V/sqrt(s)')]
-        less = without(samples, state.full.model, at) if sizes and all(sizes) else None
+        less = without(samples, state.full.model, at) if vague and all(vague) else None
         if less is not None:
             state.worth = [Worth(less=held_out(samples, less))] * len(state.names)
             _leave_out(state, k)
@@ -112,8 +112,8 @@ def _leave_out(state: Pruned, worst: int) -> None:
 
 def _straying(samples: Samples, state: Pruned) -> int | None:
     """Return the cause, if any, whose removal keeps simulations within the recorded range."""
-    # One-step predictions hardly constrain the range of a process: simulations of a term that
-    # improves them may still exceed the recorded range.  Responses of the mean are not tested.
+    # A term may improve one-step predictions although its simulations exceed the recorded range.
+    # Responses of the mean are not tested.
     def far_of(model: Composite) -> float:
         try:
             return outside_range(samples, model.terms)
@@ -125,13 +125,13 @@ def _straying(samples: Samples, state: Pruned) -> int | None:
         return None
     other = {k: far_of(worth.less.model) for k, worth in enumerate(state.worth)
              if worth.less is not None and not decision.is_response(catalogue()[state.names[k]])}
-    # The cheapest single cause; combinations are not tried.
+    # The single cause with the least gain; combinations are not tried.
     return min((k for k, stays in other.items() if not stays > 0.0), default=None,
                key=lambda k: state.worth[k].gain)
 
 
-def _as_trend(samples: Samples, state: Pruned, k: int) -> bool:
-    """Return whether the `ou` would become a trend if this response of the mean were removed."""
+def _absorbs_trend(samples: Samples, state: Pruned, k: int) -> bool:
+    """Return whether `ou` would become a trend without this response of the mean."""
     less = state.worth[k].less
     return (decision.is_response(catalogue()[state.names[k]]) and less is not None
             and is_trend(samples, less.model) and not is_trend(samples, state.full.model))

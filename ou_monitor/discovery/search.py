@@ -2,11 +2,11 @@
 The search for the causes that a recording shows.
 
 It begins with the response of the mean to throttle and time, and with the noise under load: on
-real flights they make up nearly all of the variance and hide everything else.  Then, in each
-round, every candidate of the catalogue is fitted together with the model so far, and the one with
-most evidence is accepted; causes that are no longer worth their penalty are removed, and a law of
-throttle is exchanged for another that fits better.  Measured inputs come before latent causes,
-which can imitate them; causes that tie are named as alternatives.
+real flights they make up nearly all of the variance and hide everything else.  In each round,
+every candidate of the catalogue is then added to the model and fitted, and the one with most
+evidence is accepted.  Causes no longer worth their penalty are removed, and laws of throttle are
+exchanged for better ones.  Measured inputs come before latent causes, which can imitate them;
+causes that tie become alternatives.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ Progress = Callable[[float], None]
 
 # Laws of throttle, which have similar effects on one-step errors and may be exchanged.
 LAWS: tuple[type[Term], ...] = (LoadDependentSigma, LoadDependentNoise, LoadDependentAlpha)
-# Intensities that follow throttle: a second one may only be correcting the form of the first.
+# Laws of intensity over throttle: a second one may only correct the form of the first.
 _CURVES = {LoadDependentSigma.NAME: LoadDependentNoise.NAME,
            LoadDependentNoise.NAME: LoadDependentSigma.NAME}
 # Maximum loss of a fit with few rounds, nats.
 _ROUGH = 20.0
-# Maximum time of a fit, s; with slower fits the mean is not chosen again after each cause.
+# Maximum time of a fit, s, to choose the mean again after each cause.
 _SOON = 1.0
 # Maximum rounds that add lines to a tone (three motors or converters, each with harmonics), and
 # maximum lines added in one.
@@ -104,7 +104,7 @@ def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
 def backward(fitter: Fitter, search: Search) -> None:
     """Remove or exchange causes, the best change first, until none gains."""
     for _ in range(2 * decision.MOST):
-        if not _moved(fitter, search):
+        if not _make_best_move(fitter, search):
             return
 
 
@@ -158,8 +158,8 @@ def kinds_of(names: Sequence[str]) -> list[type[Term]]:
 def _round(fitter: Fitter, search: Search, bank: NullBank, given: Sequence[str], latent: bool
            ) -> list[Trial]:
     """Return the trials of a round that may be accepted, best first."""
-    # A measured input comes before latent causes if it gains throughout the recording: a few
-    # outliers that coincide with one throttle by chance imitate a response.
+    # A measured input comes before latent causes only if it gains throughout the recording: a few
+    # outliers at one throttle imitate a response.
     trials: list[Trial] = []
     for first in (True, False)[:1 + latent]:
         kinds = decision.kinds_to_try(
@@ -182,13 +182,13 @@ def _is_steady(trial: Trial, search: Search) -> bool:
     return decision.is_shared([float(part.sum()) for part in np.array_split(gains, BLOCKS)], Z95)
 
 
-def _needed(fitter: Fitter, beside: Composite, name: str, least: float = decision.ACCEPT) -> float:
-    """Return the minimum evidence of a cause beside a model, nats."""
+def _needed(fitter: Fitter, model: Composite, name: str, least: float = decision.ACCEPT) -> float:
+    """Return the minimum evidence for adding a cause to a model, nats."""
     other = _CURVES.get(name, '')
-    if not beside.has(other):
+    if not model.has(other):
         return least
-    less = _without(fitter, beside, other)
-    worth = fitter.evidence(beside) - (0.0 if less is None else fitter.evidence(less))
+    less = _without(fitter, model, other)
+    worth = fitter.evidence(model) - (0.0 if less is None else fitter.evidence(less))
     return max(least, decision.CURVE * worth)
 
 
@@ -226,12 +226,12 @@ class _Move:
     """A model without a cause, or with another one in its place."""
 
     name: str  # Name of the cause
-    instead: str  # Name of its replacement; empty: none
+    replacement: str  # Name of the other one; empty: none
     model: Composite
     gain: float  # Evidence above the required minimum, nats
 
 
-def _moved(fitter: Fitter, search: Search) -> bool:
+def _make_best_move(fitter: Fitter, search: Search) -> bool:
     """Make the best removal or exchange of one cause; return whether there was one."""
     value, moves = fitter.evidence(search.composite), []
     names = dict.fromkeys(name for name in search.accepted
@@ -246,7 +246,7 @@ def _moved(fitter: Fitter, search: Search) -> bool:
             less = _in_full(fitter, less)
         if fitter.holds(less):
             moves.append(_Move(name, '', less, needed - value + fitter.evidence(less)))
-        for kind in _instead(less, name):
+        for kind in _replacements(less, name):
             found = fitter.best_start(less, kind, fitter.view(less))
             if found is None or fitter.evidence(found) < value - _ROUGH or not fitter.holds(found):
                 continue
@@ -260,14 +260,15 @@ def _moved(fitter: Fitter, search: Search) -> bool:
             search.rivals[name] = others
         return False
     at = len(search.accepted) - 1 - search.accepted[::-1].index(best.name)
-    search.accepted[at:at + 1] = [best.instead] if best.instead else []
+    search.accepted[at:at + 1] = [best.replacement] if best.replacement else []
     search.accepted = [name for name in search.accepted if best.model.has(name)]
-    search.log.append(f'{best.instead or "nothing"} in place of {best.name}: {best.gain:.1f} nats')
+    search.log.append(f'{best.replacement or "nothing"} in place of {best.name}: '
+                      f'{best.gain:.1f} nats')
     search.composite = best.model
     return True
 
 
-def _instead(less: Composite, name: str) -> list[type[Term]]:
+def _replacements(less: Composite, name: str) -> list[type[Term]]:
     """Return possible replacements of a law of throttle: another one, or other knots."""
     return [kind for kind in LAWS if kind.NAME in catalogue() and not less.has(kind.NAME)
             and (kind.CHANGES is None or less.has(kind.CHANGES.NAME))
@@ -290,9 +291,9 @@ def _in_full(fitter: Fitter, found: Composite) -> Composite:
     return full if full is not None and fitter.evidence(full) > fitter.evidence(found) else found
 
 
-def _leaves(fitter: Fitter, model: Composite) -> bool:
-    """Return whether sigma follows a law of noise, and a simulation leaves the recorded range."""
-    # No simulation may leave it (share 1), because the model is still Gaussian.
+def _leaves_range(fitter: Fitter, model: Composite) -> bool:
+    """Return whether sigma follows the law of noise and a simulation leaves the recorded range."""
+    # All simulations must stay within it (share 1), because the model is still Gaussian.
     follows = any(isinstance(term, LoadDependentNoise) and term.on_sigma for term in model.terms)
     return follows and outside_range(fitter.samples, model.terms, 1.0) > 0.0
 
@@ -304,8 +305,8 @@ _SLOW = 1.0
 
 def under_load(fitter: Fitter, search: Search) -> None:
     """Start from the load model: response to throttle, and noise that follows it, together."""
-    # They make up nearly all of the variance of a flight; added one by one, each would also absorb
-    # the effects of the others.  Afterwards each must be worth its own penalty.
+    # Added one by one, each would absorb effects of the others.  Afterwards each must be worth its
+    # own penalty.
     load, plain = load_terms(fitter.samples), search.composite
     noisy = whole_load(fitter, plain, load)
     if noisy is None:
@@ -382,14 +383,14 @@ def whole_load(fitter: Fitter, plain: Composite, load: Sequence[Term]) -> Compos
 
 def _noise_beside(fitter: Fitter, composite: Composite, on_sigma: bool) -> Composite:
     """Return a model with the noise of a recording under load."""
-    # on_sigma: whether sigma may follow the law of the white noise.  Before the response to
-    # throttle is chosen it must not: noise with memory imitates one.  It must not either if
-    # simulations then leave the recorded range, which one-step predictions hardly constrain.
+    # on_sigma: whether sigma may follow the law of the white noise.  Not before the response to
+    # throttle is chosen, because noise with memory imitates one, and not if simulations then leave
+    # the recorded range, which one-step predictions hardly constrain.
     best = composite
     ou = composite.terms[0]
     assert isinstance(ou, OU)
     error = math.sqrt(float(np.median(composite.gaussian.variance)))
-    # Two starts: a slow residual of the load, smaller than the white noise, and all noise as `ou`.
+    # Two starts: all noise as `ou`; a slow residual of the load, smaller than the white noise.
     slow = replace(ou, alpha=_SLOW, sigma=0.3 * error * math.sqrt(2.0 * _SLOW))
     while True:
         view = fitter.view(best)
@@ -406,7 +407,8 @@ def _noise_beside(fitter: Fitter, composite: Composite, on_sigma: bool) -> Compo
                 for law in groups if kind is LoadDependentNoise else [()]:
                     tried.append(fitter.fit([slow, *best.terms[1:], white, *law], best,
                                             rough=True))
-        top = max((found for found in tried if found is not None and not _leaves(fitter, found)),
+        top = max((found for found in tried
+                   if found is not None and not _leaves_range(fitter, found)),
                   default=None, key=fitter.evidence)
         gain = -math.inf if top is None else fitter.evidence(top) - fitter.evidence(best)
         if top is None or gain < decision.ACCEPT:
@@ -419,12 +421,11 @@ _DRAWS = 16
 
 
 def outside_range(samples: Samples, terms: Sequence[Term], share: float = 0.5) -> float:
-    """Return by how much simulated levels leave the recorded range, V: a quantile of them."""
-    # The level is a running median of five samples, which single bad samples do not change.  Seeds
-    # are fixed.  With heavy tails of index a, the extreme of a simulation of the right model is
-    # more than twice that of the recording with probability 1/(1 + 2^a).  So with a = 2, one in
-    # five simulations leaves the range and its margin, but the median of them does in fewer than 1
-    # %.
+    """Return by how much simulated levels leave the recorded range, V: a quantile over draws."""
+    # The level is a running median of five samples, which ignores single bad samples.  With heavy
+    # tails of index a, the extreme of a simulation of the right model is more than twice the
+    # recorded one with probability 1/(1 + 2^a).  So with a = 2, one in five simulations leaves the
+    # range and its margin, but their median does so in fewer than 1 % of recordings.
     rng, model = np.random.default_rng(0), SupplyModel(tuple(terms))
 
     def level(voltage: FloatArray) -> FloatArray:

@@ -61,7 +61,7 @@ def run(monkeypatch, values, names):
     monkeypatch.setattr(pruning, 'held_out', lambda samples, model: scored_model(*names))
     monkeypatch.setattr(pruning, '_leave_out_vague', lambda samples, state: None)
     monkeypatch.setattr(pruning, '_straying', lambda samples, state: None)
-    monkeypatch.setattr(pruning, '_as_trend', lambda *given: False)
+    monkeypatch.setattr(pruning, '_absorbs_trend', lambda *given: False)
 
     def measure(samples, state, plain, scored, progress):
         table = next(rounds)

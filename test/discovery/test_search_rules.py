@@ -238,7 +238,7 @@ def test_sigma_follows_only_if_all_simulations_stay_in_the_recorded_range(on_sig
     fitter = Fitter(Samples(t, SupplyModel(terms).simulate(t, np.random.default_rng(1), u), u))
     model = SimpleNamespace(terms=(*terms[:2], LoadDependentNoise(
         law.number, law.at, law.log_factor, on_sigma)))
-    assert rules._leaves(fitter, model) is leaves
+    assert rules._leaves_range(fitter, model) is leaves
 
 
 @pytest.mark.parametrize('rate, other, drift', [(0.05, 45.0, True), (45.0, 0.05, True),
