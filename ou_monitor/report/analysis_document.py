@@ -172,18 +172,20 @@ def _numbers(analysis: Analysis) -> list[str]:
     steady = [level.estimate for level in analysis.levels if level.estimate.usable]
     apart = []
     if steady and all(e.interval('sigma')[1] < ou.sigma_95[0] for e in steady):
-        apart.append(f'sigma is at most {number(max(e.sigma for e in steady))} V/sqrt(s)')
+        apart.append(f'sigma is {_range([e.sigma for e in steady])} V/sqrt(s)')
     ends = np.array([e.interval('alpha') for e in steady]).reshape(-1, 2)
     if steady and ((ends[:, 1] < low).all() or (ends[:, 0] > high).all()):
-        taus = sorted(1e3 / e.alpha for e in steady)
-        apart.append(f'tau is {number(taus[0])}'
-                     + (f' to {number(taus[-1])} ms' if len(taus) > 1 else ' ms'))
+        apart.append(f'tau is {_range([1e3 / e.alpha for e in steady])} ms')
     if apart:
         where = ('At steady throttle' if analysis.recording.has_throttle else
                  'Over the whole recording')
         found.append(f'{where} {listed(apart)}: the values above also describe what '
                      'follows changes of load, or lines.')
     return found
+
+
+def _range(values: Sequence[float]) -> str:
+    return ' to '.join(dict.fromkeys(number(x) for x in (min(values), max(values))))
 
 
 def _change(analysis: Analysis) -> list[str]:
