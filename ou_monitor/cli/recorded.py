@@ -62,15 +62,14 @@ def discover(args: argparse.Namespace) -> int:
     """Run `discover`: what the simulation gets wrong, why, and the gain."""
     given = _bench_arguments(args, 'seed')
     recording, finding = _read_and_run(args, 'discovering', bench.discover, given)
-    why = _unsaved(finding.record)
+    why = finding.unsaved
     if finding.refused and not (why or args.force):
-        why = (f'no model saved: {finding.refused[0].lower()}{finding.refused[1:]}; --force saves '
-               'it anyway')
+        why = f'{finding.refused}; --force saves it anyway'
     output.deliver(args, finding, _command(args, given), model=None if why else args.save_model)
     if args.save_model is not None:
         # Last, so that a refused model does not stop the other files from being written.
         if why:
-            raise InputError(why)
+            raise InputError(_unsaved(why))
         output.write_text(model_text(finding.record, recording), args.save_model, args.force)
     return 0
 
@@ -108,14 +107,8 @@ def _command(args: argparse.Namespace, names: Iterable[str]) -> str:
     return shlex.join(['ou-monitor', args.command, args.recording, *repeated(args, *names)])
 
 
-def _unsaved(finding: Finding) -> str:
-    """Return why the extended model cannot be saved; empty if it can."""
-    if finding.model is None:
-        return f"no model to save: '{finding.recording}' was not fitted. {finding.sentence}"
-    if finding.load == 'current':
-        return ('no model saved: its load is the measured current, and a model file is for '
-                'throttle (--current-column none uses throttle as the load)')
-    return ''
+def _unsaved(why: str) -> str:
+    return f'no model saved: {why[0].lower()}{why[1:]}'
 
 
 def model_text(finding: Finding, recording: Recording | None = None) -> str:
@@ -124,8 +117,8 @@ def model_text(finding: Finding, recording: Recording | None = None) -> str:
     from ou_monitor.recordings.model_file import as_yaml, ModelFile
     from ou_monitor.records import plain_data
 
-    if why := _unsaved(finding):
-        raise InputError(why)
+    if finding.unsaved:
+        raise InputError(_unsaved(finding.unsaved))
     assert finding.model is not None
 
     provenance = plain_data({

@@ -140,6 +140,15 @@ class Finding:
         return self.gain + math.log1p(-self.shrink) if self.shrink < 1.0 else NAN
 
     @property
+    def unsaved(self) -> str:
+        """Return why a model file cannot hold the extended model; empty if it can."""
+        if self.model is None:
+            return f"'{self.recording}' was not fitted. {self.sentence}"
+        return '' if self.load == 'throttle' else (
+            'Its load is the measured current, and a model file is for throttle (--current-column '
+            'none uses throttle as the load)')
+
+    @property
     def closer(self) -> bool:
         """Whether errors and falls of the extended model are no worse than the plain OU's."""
         return bool(self.causes) and not self.larger and not self.crossing.worse
@@ -191,7 +200,7 @@ class Finding:
                     'baseline_se': self.crossing.baseline_se,
                     'extended_se': self.crossing.extended_se, 'unit': '1/min'}},
             'remaining': [_discrepancy(c, c.after, c.p_after) for c in self.remaining],
-            'throttle_effects': self.throttle_effects.as_data(), 'refused': self.refused or None,
+            'throttle_effects': self.throttle_effects.as_data(), 'refused': self.unsaved or self.refused or None,
             'notes': list(self.notes)})
         return found
 

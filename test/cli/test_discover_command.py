@@ -1,6 +1,7 @@
 """`ou-monitor discover`: CSV in; summary, JSON, model, page out; one line for bad input."""
 
 from dataclasses import replace
+import json
 import math
 import re
 from xml.etree import ElementTree
@@ -198,6 +199,8 @@ def test_a_model_that_is_not_saved_is_not_announced(tmp_path, capsys):
         f'{a:.3f},{16.0 - 0.03 * i + 0.01 * e:.4f},{i:.2f}\n'
         for a, i, e in zip(t, amps, rng.standard_normal(t.size))))
     model = tmp_path / 'm.yaml'
-    assert main(['discover', str(path), '--save-model', str(model)]) == 2
+    data = tmp_path / 'a.json'
+    assert main(['discover', str(path), '--save-model', str(model), '--json', str(data)]) == 2
     out, err = capsys.readouterr()
+    assert 'measured current' in json.loads(data.read_text())['refused']
     assert 'no model saved' in err and str(model) not in out and not model.exists()
