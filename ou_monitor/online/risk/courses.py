@@ -42,9 +42,10 @@ from ou_monitor.records import FloatArray, NAN
 
 # The first group after a rise, in time constants of the inrush.
 _RISE = 2.0
-# Share of a throttle rise that counts for the inrush: pilots ramp in about 0.2 s, and the inrush
-# of a ramp is that of a step times time constant / ramp length.
-_SHARE_OF_RISE = INRUSH_TIME / 0.2
+# Length of a rise, s; share of it that counts for the inrush: the inrush of a ramp is that of a
+# step times time constant / length.
+_RAMP = 0.2
+_SHARE_OF_RISE = INRUSH_TIME / _RAMP
 
 
 def _integral(y: FloatArray, x: FloatArray) -> float:
@@ -150,7 +151,8 @@ def lowest(state: LoadState, courses: Courses, horizon: float, sampling: Samplin
     u = np.stack([peak, peak, courses.rest], axis=1)
     up = np.maximum(0.0, peak - state.throttle) * _SHARE_OF_RISE
     inrush = np.zeros_like(u)
-    inrush[:, 0] = up
+    # A median of three shows it if two samples are within the ramp.
+    inrush[:, 0] = up * min(max(_RAMP / dt - 1.0, 0.0), 1.0)
     rows = _groups(state, u, tau, inrush)
     activity = np.full_like(u, sampling.activity)
     activity[:, 0] = np.maximum(np.sqrt(up), sampling.activity)

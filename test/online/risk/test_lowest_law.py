@@ -48,6 +48,19 @@ def test_throttle_that_stays():
     assert mean_now(state()) == pytest.approx(16.0 - 1.5 * 0.4 ** 1.8)
 
 
+@pytest.mark.parametrize('interval, share', [(0.02, 1.0), (0.1, 1.0), (0.16, 0.25), (1.0, 0.0)])
+def test_a_slow_sensor_misses_the_inrush(interval, share):
+    """A coefficient of 10 +- 30 V that no reading shows; two of three are within 0.2 s or not."""
+    coefficients, error = COEFFICIENTS.copy(), np.zeros((9, 9))
+    coefficients[8], error[8, 8] = 10.0, 900.0
+    quiet = {'log_variance': (2.0 * math.log(1e-6), 0.0, 0.0)}
+    mean, deviation = lowest(state(mean=coefficients, covariance=error, **quiet),
+                             held(0.9, 5.0, 0.4), 5.0, Sampling(interval, 0.0))
+    plain, _ = lowest(state(**quiet), held(0.9, 5.0, 0.4), 5.0, Sampling(interval, 0.0))
+    assert plain - mean == pytest.approx(share * 0.5 * 0.02 / 0.2 * 10.0, abs=1e-5)
+    assert deviation == pytest.approx(share * 0.5 * 0.02 / 0.2 * 30.0, abs=1e-5)
+
+
 def test_a_peak_and_its_lag():
     """Throttle after a lag of 2 s, the mean of its way to the peak; the noise is far smaller."""
     coefficients = COEFFICIENTS.copy()
