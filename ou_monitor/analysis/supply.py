@@ -50,7 +50,7 @@ _LATE = 0.06
 # Maximum range of a steady throttle, and the time over which it is taken, s.
 _STEADY, _STEADY_TIME = 0.02, 0.2
 # Half width of the band of throttle about each of THROTTLES; minimum readings in it.
-_BAND, _IN_BAND = 0.05, 10
+BAND, _IN_BAND = 0.05, 10
 # Minimum time of these readings, s, and as a share of a short recording.
 _IN_TIME, _IN_SHARE = 0.5, 0.02
 
@@ -369,7 +369,7 @@ def _still(t: FloatArray, u: FloatArray) -> npt.NDArray[np.bool_]:
     return np.asarray(span <= _STEADY)
 
 
-def flown_near(recording: Recording, throttle: npt.ArrayLike, reach: float = _BAND,
+def flown_near(recording: Recording, throttle: npt.ArrayLike, reach: float = BAND,
                ) -> npt.NDArray[np.bool_]:
     """Return whether there are enough readings within `reach` of throttles, shape (k,)."""
     enough = _enough(recording)
@@ -388,7 +388,7 @@ def _over_throttle(u: FloatArray, square: FloatArray, enough: float,
     """Return rms, V, at THROTTLES: measured, else interpolated; beyond those measured constant."""
     at, rms = [], []
     for throttle in THROTTLES:
-        near = np.abs(u - throttle) <= _BAND
+        near = np.abs(u - throttle) <= BAND
         if near.sum() >= enough:
             at.append(float(throttle))
             rms.append(math.sqrt(float(square[near].mean())))

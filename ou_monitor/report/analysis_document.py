@@ -15,6 +15,7 @@ from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.overview import answers, known_lines
 from ou_monitor.analysis.quality import QualityItem
 from ou_monitor.analysis.relaxation import Relaxation
+from ou_monitor.analysis.supply import BAND
 from ou_monitor.criticism.curves import outline
 from ou_monitor.online.risk.courses import KEPT
 from ou_monitor.online.settings import DEFAULT_LIMIT
@@ -226,11 +227,13 @@ def _by_throttle(analysis: Analysis) -> Part:
     def millivolts(value: float) -> str:
         return number(1e3 * value) if not abs(value) < 5e-7 else '0'
 
-    rows = []
+    rows, throttle = [], analysis.recording.throttle
     for u, flown, fall, se, rms, still in zip(sag.throttle, curves.known, sag.sag_v, sag.se_v,
                                               noise.rms_v, noise.steady_rms_v):
+        briefly = analysis.recording.duration * float(np.mean(np.abs(throttle - u) <= BAND))
         rows.append([
-            f'{100.0 * u:.0f} %' + ('' if flown else '\nnot flown'),
+            f'{100.0 * u:.0f} %' + ('' if flown else f'\nonly {number(briefly, 2)} s' if briefly
+                                    else '\nnot flown'),
             f'{millivolts(fall)} +- {millivolts(2.0 * se)}' if math.isfinite(fall) else UNKNOWN,
             millivolts(rms) if flown else UNKNOWN, millivolts(still) if flown else UNKNOWN,
             chance(curves.at(u, 'risk'))])
