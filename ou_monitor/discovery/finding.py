@@ -200,8 +200,8 @@ class Finding:
                     'baseline_se': self.crossing.baseline_se,
                     'extended_se': self.crossing.extended_se, 'unit': '1/min'}},
             'remaining': [_discrepancy(c, c.after, c.p_after) for c in self.remaining],
-            'throttle_effects': self.throttle_effects.as_data(), 'refused': self.unsaved or self.refused or None,
-            'notes': list(self.notes)})
+            'throttle_effects': self.throttle_effects.as_data(),
+            'refused': self.unsaved or self.refused or None, 'notes': list(self.notes)})
         return found
 
     def _extended(self) -> dict[str, Any]:

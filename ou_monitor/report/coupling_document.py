@@ -41,8 +41,8 @@ def coupling_document(found: Coupling, recording: Recording, signal: tuple[Float
 def _answer(found: Coupling, name: str, per: str) -> str:
     band = f'{number(found.frequency[0], 2)} to {number(found.frequency[-1], 2)} Hz'
     if found.signal_leads:
-        return (f'{name} leads the voltage by {number(-1e3 * found.lag)} ms from {band}: it drives '
-                'the load, so what they share is not supply noise.')
+        return (f'{name} leads the voltage by {number(-1e3 * found.lag)} ms from {band}: it '
+                'drives the load, so what they share is not supply noise.')
     if found.seen:
         return (f'{number(100.0 * found.noise_share, 2)} % of {name} from {band} is supply '
                 f'noise: {number(found.gain)} {per}.')
@@ -57,15 +57,15 @@ def _facts(found: Coupling, per: str) -> list[tuple[str, str]]:
         lines = [('Gain', f'{number(found.gain, 4)} {per} (95 %: {number(low, 4)} to '
                   f'{number(high, 4)})'),
                  ('Lag', f'the signal is {number(1e3 * abs(found.lag))} ms (+- '
-                  f"{number(2e3 * found.lag_se, 2)} ms) {'ahead of' if found.lag < 0.0 else 'behind'}"
-                  ' the voltage')]
+                  f'{number(2e3 * found.lag_se, 2)} ms) '
+                  f"{'ahead of' if found.lag < 0.0 else 'behind'} the voltage")]
     else:
         lines = [('Detectable', f'a gain of {number(found.limit, 4)} {per}, in '
                   f'{100.0 * POWER:.0f} % of such recordings')]
     advice = f'coupling: {number(abs(found.gain))}' if found.seen and not found.signal_leads else (
         'adapting the cutoff to sigma does not help this signal')
-    return [*lines, ('For the filter', advice), ('Chance', f'{p_words(found.p_value)}; detected if below '
-                     f'{chance(found.level)}'),
+    return [*lines, ('For the filter', advice),
+            ('Chance', f'{p_words(found.p_value)}; detected if below {chance(found.level)}'),
             ('Largest coherence', f'{number(found.coherence[peak])} (squared) at '
              f'{number(found.frequency[peak])} Hz; by chance up to {number(found.threshold)}')]
 
