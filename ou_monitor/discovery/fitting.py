@@ -155,7 +155,7 @@ class Fitter:
         view, before = self.view(composite), self.evidence(composite)
         found = []
         for kind in kinds:
-            if kind.ROLE is Role.LAW:
+            if kind.ROLE is Role.LAW and not self._finds_events(kind, view):
                 gain, start = self._law_gain(kind, view), None
             else:
                 start = self.best_start(composite, kind, view, least)
@@ -179,7 +179,7 @@ class Fitter:
                             start or composite)
             if start is not None and (full is None or self.evidence(full) < self.evidence(start)):
                 full = start
-            if full is not None and (full.terms[-1] if start is None else _joined(full)
+            if full is not None and (full.terms[-1] if kind.ROLE is Role.LAW else _joined(full)
                                      ).holds(self.view(composite)):
                 with_it = kind.CHANGES is not None and not composite.has(kind.CHANGES.NAME)
                 found.append(Trial(
@@ -191,17 +191,23 @@ class Fitter:
         """Return a law fitted to a view, cached by the scores."""
         last = self.law_fits.get(kind)
         if last is None or not np.allclose(last[0], view.z, rtol=0.0, atol=_SAME):
-            last = self.law_fits[kind] = view.z, kind.fit_law(view)
+            try:
+                last = view.z, kind.fit_law(view)
+            except (ValueError, ArithmeticError, np.linalg.LinAlgError):
+                last = view.z, None
+            self.law_fits[kind] = last
         return last[1]
+
+    def _finds_events(self, kind: type[Term], view: View) -> bool:
+        """Return whether a law finds events, which have widened the Gaussian part until now."""
+        found = None if kind.SLOW_FIT else self.law_fit(kind, view)
+        return found is not None and (found.push is not None or found.error is not None)
 
     def _law_gain(self, kind: type[Term], view: View) -> float:
         """Return the evidence for a law of scores, nats."""
         if kind.SLOW_FIT:
             self.cost += LAW_COST * self.samples.n
-        try:
-            fit = self.law_fit(kind, view)
-        except (ValueError, ArithmeticError, np.linalg.LinAlgError):
-            return -math.inf
+        fit = self.law_fit(kind, view)
         return -math.inf if fit is None else (
             float(fit.gain.sum()) - fit.term.SEARCH
             - 0.5 * fit.free * math.log(self.samples.train.stop))
@@ -211,7 +217,7 @@ class Fitter:
         """Return the best fit with one more term of a kind (starts: its candidates by default)."""
         # least: nats that its spectrum must gain.
         if kind.ROLE is Role.LAW:
-            found = self.fit([*composite.terms, kind], composite)
+            found = self.fit([*composite.terms, kind], composite, rough=True)
             return found if found is not None and found.terms[-1].holds(view) else None
         starts = list(kind.candidates(view)) if starts is None else list(starts)
         if kind.BROAD and not any(term.ROLE is Role.BLOCK and term.NEEDS_THROTTLE

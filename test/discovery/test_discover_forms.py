@@ -16,6 +16,7 @@ from ou_monitor.model.terms.nonlinear_restoring import NonlinearRestoring
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import ClockJitter, MeasurementNoise
 from ou_monitor.model.terms.regime_switching import RegimeSwitching
+from ou_monitor.model.terms.shocks import Glitches
 import pytest
 from scipy.signal import lfilter
 
@@ -50,6 +51,17 @@ def test_a_line_that_sweeps_40_bins_in_a_segment_is_found():
     # What 20 s can tell: a turn in the whole recording is 0.05 Hz.
     assert abs(slope) == pytest.approx(300.0, abs=1.0)
     assert math.copysign(idle, idle * slope) == pytest.approx(30.0, abs=0.5)
+
+
+@pytest.mark.parametrize('share, size', [(0.003, 30.0), (0.02, 10.0), (0.05, 50.0)])
+def test_bad_samples_are_named_although_they_are_most_of_the_variance(share, size):
+    """White noise first takes up their variance; size in errors of a step."""
+    std = size * 0.3 * math.sqrt(1.0 / 500.0)
+    t = np.arange(10000) / 500.0
+    model = SupplyModel((OU(30.0, 0.3, 14.0), MeasurementNoise(0.002), Glitches(share, std)))
+    voltage = model.simulate(t, np.random.default_rng(6))
+    names = [cause.name for cause in discover(Recording(t, voltage, np.nan)).causes]
+    assert set(names) - {'measurement_noise'} == {'glitches'}
 
 
 def test_a_lagged_sag_under_jittering_throttle_is_found():

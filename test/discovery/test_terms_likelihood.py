@@ -11,7 +11,7 @@ from importlib import import_module
 import math
 
 import numpy as np
-from ou_monitor.criticism.composite import view_of
+from ou_monitor.criticism.composite import fit_composite, view_of
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate, Events
 from ou_monitor.model.supply import SupplyModel
@@ -274,6 +274,22 @@ def test_bad_samples_are_found_and_not_their_neighbours(run):
     assert not found[beside].any()
     expected = 8e-5 * LENGTH
     assert found[~bad].sum() < expected + 5.0 * math.sqrt(expected)
+
+
+@pytest.mark.parametrize('share', [0.001, 0.01, 0.05])
+def test_share_and_size_of_bad_samples_beside_white_noise(share):
+    """Errors of 30 steps; the fit begins with the noise that they have widened."""
+    # Of such errors 12 % are below 4.5 steps, and are missed, so the share is 12 % too low, and
+    # the size 6 % too high.
+    size = 30.0 * STEP
+    samples, terms = simulated('glitches', {'probability': share, 'std': size}, 5)
+    before = fit_composite(samples, [terms[0], MeasurementNoise(0.1 * size)], samples.train)
+    fit = fit_composite(samples, [*before.terms, catalogue()['glitches']], samples.train, before)
+    found, error = fit.terms[-1], math.sqrt(1.0 / (share * samples.train.stop))
+    assert abs(found.probability / (0.88 * share) - 1.0) < 4.0 * error + 0.05
+    assert abs(found.std / (1.06 * size) - 1.0) < 3.0 * error + 0.05
+    assert abs(fit.terms[0].sigma / 0.632 - 1.0) < 0.03
+    assert fit.score(samples) > before.score(samples)
 
 
 @pytest.mark.parametrize('dof', [3.0, 5.0])

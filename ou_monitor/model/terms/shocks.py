@@ -16,6 +16,8 @@ from ou_monitor.records import FloatArray
 from scipy.special import gammainccinv, gammaincinv, ndtr
 
 
+# Minimum of a sum of squares that divides.
+_TINY = 1e-280
 # Maximum number of events in one segment; limits time and memory.
 _MOST = 5_000_000
 # Share of samples with a jump above which jumps are not rare events.
@@ -171,11 +173,13 @@ class Glitches(Term):
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
         """Find runs of up to three samples that contradict their neighbours on both sides."""
-        # Bad samples have widened the fitted noise, so the scale is a median.  It comes from a
-        # filter without measurement errors, in which a sample affects only the next one.
-        plain = (view.residual - view.phi * view.state) / np.sqrt(view.variance)
+        # The errors come from a filter without measurement errors, in which a sample affects only
+        # the next one, and so do their variances.  Bad samples have widened the fitted noise, so
+        # the scale is a median.
+        own = view.variance * (view.driven + (1.0 - view.trust) * (1.0 + view.phi ** 2))
+        plain = (view.residual - view.phi * view.state) / np.sqrt(own)
         unit = float(np.median(np.abs(plain))) / 0.6745
-        scaled = replace(view, z=plain / unit, variance=view.variance * unit * unit)
+        scaled = replace(view, z=plain / unit, variance=own * unit * unit)
         floor = float(np.median(scaled.variance))
         share, spread = 1e-3, 6.0 * math.sqrt(floor)
         lengths = np.array([1.0, share, share * share])
@@ -269,6 +273,26 @@ def bad_samples(view: View, share: float, spread: float, lengths: FloatArray
         ends.append(first[good] + width)
         gains.append(gain[good])
     return _best_runs(np.concatenate(begins), np.concatenate(ends), np.concatenate(gains), n)
+
+
+def outlying(voltage: FloatArray) -> npt.NDArray[np.bool_]:
+    """Return the readings, V, that contradict the AR(1) through their neighbours."""
+    bad = np.zeros(voltage.size, dtype=np.bool_)
+    # The second turn estimates the AR(1) without the outliers of the first.
+    for _ in range(2):
+        c = voltage - voltage[~bad].mean()
+        pairs = ~bad[1:] & ~bad[:-1]
+        phi = float((c[1:] * c[:-1])[pairs].sum()) / max(float((c[:-1] ** 2)[pairs].sum()), _TINY)
+        e = c - phi * np.concatenate((c[:1], c[:-1]))
+        scale = float(np.median(np.abs(e))) / 0.6745
+        if not scale > 0.0:
+            return bad
+        one = np.ones(c.size)
+        fit = Glitches.fit_law(View(
+            e / scale, scale * scale * one, phi * one, np.concatenate((c[:1], c[:-1])), c,
+            np.cumsum(one), one, None, slice(0, c.size)))
+        bad = bad if fit is None or fit.error is None else fit.error > 0.0
+    return bad
 
 
 def _best_runs(begin: npt.NDArray[np.int64], end: npt.NDArray[np.int64], gain: FloatArray, n: int
