@@ -20,12 +20,11 @@ from ou_monitor.text import Z95
 FloatArray = npt.NDArray[np.float64]
 
 NAN = float('nan')
-# Largest factor between a positive parameter and an end of its 95 % interval: beyond it the
-# parameter is unknown.
+# Maximum factor between a known positive parameter and an end of its 95 % interval.
 LARGEST_FACTOR = 10.0
 # The corresponding standard error of the parameter's logarithm.
 LARGEST_LOG_SE = math.log(LARGEST_FACTOR) / Z95
-# Exponent beyond which a factor counts as infinite: exp(709.78) is the largest float.
+# Maximum exponent of a finite factor: exp(709.78) is the largest float.
 _INFINITE = 709.0
 # Units of a time, in s.
 TIME_UNITS = {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9}
@@ -69,7 +68,7 @@ def as_numbers(values: npt.ArrayLike) -> FloatArray:
 
 
 def clock_unit(stamp: float) -> str:
-    """Return the unit in which a stamp since 1970 is a date of 2000 to 2100; '': there is none."""
+    """Return the unit in which a stamp since 1970 is a date of 2000 to 2100; '': none."""
     return next((unit for unit, scale in TIME_UNITS.items()
                  if _CLOCKS[0] <= stamp * scale <= _CLOCKS[1]), '')
 
@@ -226,7 +225,7 @@ def defect_of(note: str) -> Defect:
     return note.defect if isinstance(note, Note) else Defect.READER
 
 
-def led(name: str, notes: Iterable[str]) -> list[str]:
+def prefixed(name: str, notes: Iterable[str]) -> list[str]:
     """Return notes with a name before each."""
     return [Note(f'{name}: {note}', defect_of(note)) for note in notes]
 
@@ -441,7 +440,7 @@ class OuFacts:
     The fitted relaxation (an OU beside white noise), or bounds on it.
 
     `not_visible`: a relaxation slower than `tau_below_s`, but faster than the level wanders, has a
-    variance below `var_inf_below` (95 %); one faster than `tau_below_s` may be all of the noise.
+    variance below `var_inf_below` (95 %); a faster one may make up all of the noise.
     """
 
     status: str  # ok, not_visible, too_short or no_data

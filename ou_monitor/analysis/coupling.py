@@ -3,9 +3,9 @@ How much of a signal, such as a gyro axis, is noise of the supply.
 
 Limits: white noise of the voltage sensor lowers the gain by its share of the voltage in the band.
 Effects of throttle are regressed out if they are linear in throttle and its square, with a lag
-shorter than a segment.  Motor rotation disturbs both gyro and supply; only its narrow line reveals
-this common cause.  A signal that *leads* the voltage is its cause, through the motors.  These two
-cases are reported, but not corrected.
+shorter than a segment.  Reported but not corrected: motor rotation, which disturbs both gyro and
+supply and shows as a narrow line; a signal that *leads* the voltage, which it drives through the
+motors.
 
 Method: Fourier coefficients of half-overlapping Hann segments.  `measure_coherence` tests for
 coupling.  If there is any, the signal is regressed on voltage, throttle and its square.  Segments
@@ -18,18 +18,18 @@ The usable band ends at a quarter of the slowest rate; above, the spline attenua
 3 %.  Limits: aliases of the original sampling stay, and a stamp error of e seconds gives a phase
 error of 2 pi f e.
 
-`measure_coherence` tests whether two series are coherent, at a stated level for any spectra.
-Limits: both signs of the series must be equally likely.  A line with the same frequency and phase
-in both is detected although it is not coupling (`narrow`).  Effects of throttle on both must be
-regressed out.
+`measure_coherence` tests whether two series are coherent, at a stated level for any spectra.  Two
+tests must both reject:
 
-A manoeuvre changes the shape of the gyro spectrum, so one weight for each segment is not enough:
-each bin of each segment is divided by the rms of the signal over the bins around it.  If the
-signal is then white Gaussian, the squared partial coherence of a bin exceeds c by chance with
-probability (1 - c)^(K - 1 - p), for any voltage, with K segments and p causes regressed out
-(Halliday et al., 1995).  Moving lines and bursts are not whitened by that, so the same statistics
-are also computed with random signs of the signal for blocks of neighbouring segments, which keep
-all sizes (Freedman and Lane, 1983).  A coherence is significant only if both tests reject.
+- Each bin of each segment is divided by the rms of the signal over the bins around it, because a
+  manoeuvre changes the shape of the gyro spectrum.  If the signal is then white Gaussian, the
+  squared partial coherence of a bin exceeds c by chance with probability (1 - c)^(K - 1 - p), for
+  any voltage, with K segments and p causes regressed out (Halliday et al., 1995).
+- Moving lines and bursts are not whitened by that, so the same statistics are computed with random
+  signs of the signal for blocks of neighbouring segments (Freedman and Lane, 1983).
+
+Limits: both signs of the series must be equally likely.  A line with the same frequency and phase
+in both is detected although it is not coupling (`narrow`).
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ LONGEST_LAG = 0.05  # Maximum lag that is searched, s
 # Minimum share of the common time that is used without a note.
 _SHARE_USED = 0.9
 _BLOCKS = 12  # Blocks of the jackknife
-# Probability of detection at the limiting gain.
+# Probability of detection at the limit of the gain.
 POWER = 0.9
 
 
@@ -430,7 +430,7 @@ class Coherence:
     # Power of the voltage over the power of the unexplained signal, 1 / gain^2; shape (m,).
     ratio: FloatArray
     threshold: float  # Coherence that the largest bin must exceed
-    # Effective number of segments; the same less the fitted parameters.
+    # Effective number of segments; that number less the fitted parameters.
     segments: float
     spare: float
     narrow: bool  # Only a few bins are coherent, and the others contradict their gain
@@ -449,7 +449,7 @@ def measure_coherence(voltage: ComplexArray, signal: ComplexArray, causes: list[
                       level: float, rng: np.random.Generator) -> Coherence:
     """Test Fourier coefficients of shape (segments, bins), with the causes regressed out."""
     weight = 1.0 / local_size(signal)
-    # The signal is in its own weights, which costs one of the independent powers.
+    # Each bin is a part of its own weight; `share` corrects the bias.
     share = 1.0 - 1.0 / _independent(signal.shape[1])
     whole = weight * signal
     basis = basis_of([weight * cause for cause in causes])

@@ -36,8 +36,8 @@ class Progress:
     def __init__(self, label: str, quiet: bool = False) -> None:
         self._label, self._quiet = label, quiet
         self._live = sys.stderr.isatty()
-        self._drawn = 0.0
-        self._told = time.monotonic()
+        # Times of the last bar and of the last line.
+        self._drawn_at, self._printed_at = 0.0, time.monotonic()
         # Time and value of the first share, which may include results of an earlier run.
         self._first: tuple[float, float] | None = None
 
@@ -46,13 +46,13 @@ class Progress:
         now = time.monotonic()
         self._first = self._first or (now, share)
         if not self._live:
-            if now - self._told >= _EVERY and share < 1.0 and not self._quiet:
-                self._told = now
+            if now - self._printed_at >= _EVERY and share < 1.0 and not self._quiet:
+                self._printed_at = now
                 self._write(f'{self._label}: {share:.0%} done{self._remaining_time(share, now)}\n')
             return
-        if now - self._drawn < 0.1 and share < 1.0:
+        if now - self._drawn_at < 0.1 and share < 1.0:
             return
-        self._drawn = now
+        self._drawn_at = now
         left = self._remaining_time(share, now)
         width = min(40, shutil.get_terminal_size().columns - len(self._label) - 12 - len(left))
         full = int(width * min(max(share, 0.0), 1.0))
@@ -76,9 +76,9 @@ class Progress:
 
     def close(self) -> None:
         """Erase the bar."""
-        if self._live and self._drawn:
+        if self._live and self._drawn_at:
             self._write('\r\x1b[K')
-        self._live, self._drawn, self._told = False, 0.0, math.inf
+        self._live, self._drawn_at, self._printed_at = False, 0.0, math.inf
 
     def __enter__(self) -> Progress:
         return self

@@ -12,12 +12,12 @@ import math
 
 import numpy as np
 from ou_monitor.comparison.flight_model import (
-    Drawn, FiledModel, fit_flight, FlightModel, MOVES, Readings)
+    FiledModel, fit_flight, FlightModel, MOVES, Readings, Simulator)
 from ou_monitor.comparison.yardstick import (
     Agreement, band, differences, distance, judge, Measures, SpectrumBand, Traces, Yardstick)
 from ou_monitor.criticism.adc import without_repeats
 from ou_monitor.criticism.curves import stray
-from ou_monitor.criticism.readings import current_at, usable, why_nothing
+from ou_monitor.criticism.readings import current_at, usable, why_no_model
 from ou_monitor.errors import InputError
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.records import FloatArray, Recording
@@ -46,11 +46,11 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
     begin = _start_index(samples, fit_until, fitted=model is None)
     if model is None:
         fitted = fit_flight(samples.part(slice(0, begin)), lambda share: report(0.6 * share))
-        drawn: Drawn = fitted
+        simulator: Simulator = fitted
         notes += _fit_notes(fitted, samples)
     else:
         _check_throttle(model, samples)
-        drawn = FiledModel(model)
+        simulator = FiledModel(model)
         notes.append('The errors of the parameters in the model file are not simulated: the '
                      'bands include only the noise.')
     part = slice(begin, samples.t.size)
@@ -68,7 +68,7 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
     total, first = np.zeros(own.t.size), own.voltage
     strays = 0
     for k in range(seeds):
-        v = drawn.draw(samples, rng)[part]
+        v = simulator.draw(samples, rng)[part]
         if not np.isfinite(v).all():
             raise InputError('the model diverges over this throttle: its voltage is not finite')
         if aligned is not None:
@@ -90,7 +90,7 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
         notes.append(f'{strays} of {seeds} simulations leave the range of the recording by more '
                      'than half of it.')
     path = fitted.path(samples)[part] if model is None else total / seeds
-    return _agreement(recording, own, yardstick, drawn, measured, path, traces, first, notes,
+    return _agreement(recording, own, yardstick, simulator, measured, path, traces, first, notes,
                       (0.0, float(own.t[0]) if model is None else 0.0), seeds, offset,
                       (float(own.t[0]), duration))
 
@@ -101,7 +101,7 @@ def _samples(recording: Recording, notes: list[str]) -> tuple[Readings, float]:
     if v.size < 2 * _LEAST:
         raise InputError(f"'{recording.name}' holds {counted(v.size, 'usable sample')}; a "
                          f'comparison needs at least {2 * _LEAST}')
-    reason = why_nothing(v)
+    reason = why_no_model(v)
     if reason:
         raise InputError(f"'{recording.name}': {reason}")
     t, v, u, period = without_repeats(t, v, u)
@@ -155,7 +155,7 @@ def _check_throttle(model: SupplyModel, samples: Readings) -> None:
                          'none')
 
 
-def _agreement(recording: Recording, own: Readings, yardstick: Yardstick, drawn: Drawn,
+def _agreement(recording: Recording, own: Readings, yardstick: Yardstick, simulator: Simulator,
                measured: list[Measures], path: FloatArray, traces: np.ndarray, first: FloatArray,
                notes: list[str], fitted: tuple[float, float], seeds: int, offset: float,
                simulated: tuple[float, float]) -> Agreement:
@@ -176,7 +176,7 @@ def _agreement(recording: Recording, own: Readings, yardstick: Yardstick, drawn:
     response_low, response_high = (empty, empty) if not responses.size else np.percentile(
         responses, [2.5, 97.5], axis=0)
     return Agreement(
-        recording.name, fitted, simulated, tuple(drawn.names),
+        recording.name, fitted, simulated, tuple(simulator.names),
         explained, math.sqrt(float(np.mean(error ** 2))), float(error.mean()),
         tuple(float(part.mean()) for part in np.array_split(error, 3)),  # type: ignore[arg-type]
         band(real.lowest, np.array([m.lowest for m in measured])),

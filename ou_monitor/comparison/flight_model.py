@@ -60,7 +60,7 @@ class Readings:
         return find_step(self.voltage)
 
 
-class Drawn(Protocol):
+class Simulator(Protocol):
     """A model that can be simulated over the stamps, throttle and current of a recording."""
 
     @property

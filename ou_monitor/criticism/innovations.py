@@ -4,15 +4,18 @@ One-step innovations of an OU in white noise, and a test of their spectrum for a
 `analyze` applies it to the residual of a load level, `discover` to a whole recording.
 
 Under the right model the innovations are independent and standard normal, and the ordinates of
-their periodogram are independent and exponential.  A second OU, slower or faster by a known
-factor, raises the ordinates in a known pattern.  The part of it that the fit absorbs (alpha,
-sigma, white noise) is projected out, and the rest is compared with the ordinates.  For small
-deviations this score test is the most powerful one; correlations at single lags would miss a
-second OU ten times slower, which is correlated over hundreds of samples.
+their periodogram are independent and exponential.
 
-An AC-coupled instrument is a high-pass: the ordinates below its corner are too small.  Their sum
-has a gamma law, which holds for a few ordinates too, unlike the lower tail of the score; and it
-counts only if more than half of their power is missing, because a regression takes some.
+Second OU, slower or faster by a known factor: it raises the ordinates in a known pattern.  The
+part of the pattern that the fit absorbs (alpha, sigma, white noise) is projected out, and the rest
+is compared with the ordinates.  For small deviations this score test is the most powerful one;
+correlations at single lags would miss a second OU ten times slower, which is correlated over
+hundreds of samples.
+
+AC-coupled instrument, a high-pass: the ordinates below its corner are too small.  Their sum is
+tested by the gamma distribution, which holds for few ordinates, unlike the lower tail of the
+score.  It counts only if more than half of their power is missing, because a regression removes
+some.
 
 Limits: only the rates in `FACTORS`, one at a time; a corner at the rate of the OU itself is
 absorbed by the fit; linear drifts are removed; samples are taken as evenly spaced.
@@ -33,13 +36,13 @@ from scipy.signal import periodogram
 # Probability that any test rejects a right model: in `analyze` over all levels of a recording, in
 # `discover` over the whole recording.  One in a hundred, as for lines.
 FAMILY_WISE = 0.01
-# Variance of a second relaxation, over Var_inf, from which it matters.
+# Minimum variance of a second relaxation that matters, over Var_inf.
 LEAST_SHARE = 0.1
 # Rates of the other pole that are tested, over the rate of the first.
 FACTORS = (1.0 / 30.0, 1.0 / 10.0, 1.0 / 3.0, 3.0, 10.0)
 # Minimum ordinates of a test, and minimum samples of a segment.
 _FEWEST, _SHORTEST = 64, 64
-# A high-pass removes 79 % of the power below its corner: mean ordinate minus 1 that shows one.
+# Maximum mean ordinate, minus 1, below the corner of a high-pass, which removes 79 % there.
 _MISSING = -0.5
 # Relative difference up to which steps count as equal.
 ALIKE = 0.3
@@ -60,8 +63,8 @@ def steps_before(t: FloatArray) -> FloatArray:
     """Return the time before each sample, s; infinite before the first."""
     step = np.diff(t, prepend=-np.inf)
     usual = float(np.median(step[1:]))
-    # Small deviations change a prediction by much less than its error, and even steps save most
-    # of the time.
+    # Small deviations change a prediction by much less than its error; equal steps save most of
+    # the time.
     step[np.abs(step - usual) < ALIKE * usual] = usual
     return step
 

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.adc import (
     find_knee, find_rails, find_step, redraw, usual_change, without_repeats)
-from ou_monitor.criticism.readings import load_of, two_levels, usable, why_nothing
+from ou_monitor.criticism.readings import load_of, two_levels, usable, why_no_model
 from ou_monitor.criticism.samples import (
     choose_samples, events_between, lines_between, Samples, without_tones)
 from ou_monitor.model.terms.catalogue import catalogue
@@ -59,7 +59,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     if v.size < LEAST:
         return Integrity(None, (), tuple(notes), f'It holds {counted(v.size, "usable sample")}; '
                          f'at least {LEAST} are needed.')
-    reason = why_nothing(v)
+    reason = why_no_model(v)
     if reason:
         return Integrity(None, (), tuple(notes), reason)
     report(0.2)

@@ -16,30 +16,30 @@ from ou_monitor.records import FloatArray, Recording
 from ou_monitor.text import counted, number
 from ou_monitor.timeline import in_order, supplied
 
-# An outlier is farther from the median than this number of standard deviations, and this many
-# times as far as the sample next in distance.
+# Minimum distance of an outlier from the median: in standard deviations, and in distances of the
+# next sample.
 _FAR, _GAP = 50.0, 5.0
 # Minimum repeats of an outlying value to be an error code; maximum share of such samples.
 _CODE, _MOST_CODES = 3, 0.2
 # Maximum single bad samples that are left out; for long recordings, one for each _EACH samples.
 _SINGLES, _EACH = 3, 100_000
-# An error code may exceed the share _MOST_CODES beside at least this many other samples.
+# Minimum other samples beside an error code whose share exceeds _MOST_CODES.
 _OTHERS = 100
 # Maximum values used for the spread.
 _EXAMINED = 200_000
 # A voltage counts as constant if at most this number, or this share, of samples differ.
 _ODD, _ODD_SHARE = 3, 1e-3
-# Limits of a voltage and of its range, V, for which fourth powers neither overflow nor vanish.
+# Maximum voltage and minimum range, V: fourth powers neither overflow nor vanish.
 _LARGEST, _SMALLEST = 1e30, 1e-30
 # Median above which volts may be millivolts.
 _MILLIVOLTS = 1000.0
 # Largest throttle, with trim, and tolerance of the range 0..1; the readers refuse other units.
 _MOST, _EDGE = 1.5, 0.05
-# Maximum gap in a current, s; quantile of its size that counts as full load; lags of the mean
-# response to a load, s.
+# Maximum gap in a current, s; quantile of its size taken as full load; lags of the mean response
+# to a load, s.
 _HOLE, _FULL, _LAGS = 1.0, 0.99, np.array([0.02, 0.2, 2.0])
 # Two levels of a voltage: minimum distance, in standard deviations about them and in ADC steps;
-# minimum switches between them, samples for each, and share of the samples at each level.
+# minimum switches, samples per switch, and share of the samples at each level.
 _APART, _STEPS, _SWITCHES, _DWELL, _SHARE = 5.0, 4.0, 3, 20, 0.05
 # Maximum second difference of a voltage that counts as a straight line, in rounding errors.
 _ROUNDINGS = 16.0
@@ -66,7 +66,7 @@ def usable(recording: Recording, notes: list[str]
                      'millivolts or counts of the ADC, every result in V is wrong by that factor; '
                      'give it in volts.')
     if u is not None:
-        u = _held(t, _within(u, notes), notes) if np.isfinite(u).any() else None
+        u = _fill_gaps(t, _drop_implausible(u, notes), notes) if np.isfinite(u).any() else None
     return t, v, u
 
 
@@ -101,8 +101,8 @@ def load_of(recording: Recording, t: FloatArray, v: FloatArray, u: FloatArray | 
     if not full:
         return u
     load = np.interp(t + late, t, current) / full
-    gain = _explained(t[some], v[some], load[some]) - (
-        0.0 if u is None else _explained(t[some], v[some], u[some]))
+    gain = _gain(t[some], v[some], load[some]) - (
+        0.0 if u is None else _gain(t[some], v[some], u[some]))
     if not gain > 0.5 * _LAGS.size * math.log(v.size):
         return u
     notes.append('The measured current predicts the voltage better than throttle (by '
@@ -111,8 +111,8 @@ def load_of(recording: Recording, t: FloatArray, v: FloatArray, u: FloatArray | 
     return np.asarray(load)
 
 
-def _explained(t: FloatArray, v: FloatArray, load: FloatArray) -> float:
-    """Return the log likelihood gain from a load, its square and its lags, nats."""
+def _gain(t: FloatArray, v: FloatArray, load: FloatArray) -> float:
+    """Return the gain in log-likelihood from a load, its square and its lags, nats."""
     lags = [lowpass(load, t, tau) for tau in _LAGS[_LAGS > float(np.median(np.diff(t)))].tolist()]
     columns = np.diff(np.stack([load, load * load, *lags]))
     change = np.diff(v)
@@ -132,7 +132,7 @@ def find_bad(v: FloatArray) -> npt.NDArray[np.bool_]:
     some = v[::max(1, v.size // _EXAMINED)]
     if some.size < 2:
         return bad
-    off = _resting(some)
+    off = _off_value(some)
     if off is not None:
         bad[v == off] = True
         bad[~bad] = find_bad(v[~bad])
@@ -164,8 +164,8 @@ def find_bad(v: FloatArray) -> npt.NDArray[np.bool_]:
     return bad
 
 
-def _resting(v: FloatArray) -> float | None:
-    """Return a value that many samples have and that is far from all others, if any."""
+def _off_value(v: FloatArray) -> float | None:
+    """Return the value, if any, that many samples have and that is far from all others."""
     values, count = np.unique(v, return_counts=True)
     value = float(values[count.argmax()])
     others = v[v != value]
@@ -221,7 +221,7 @@ def two_levels(v: FloatArray) -> str:
         return ''
     apart, steps = float(high[k] - low[k]), np.diff(ordered)
     within = math.sqrt(max(0.0, float(ordered.var() - between[k] / ordered.size ** 2)))
-    # What lies between the levels is on its way.
+    # Without transitions between the levels.
     there = v[np.abs(v - 0.5 * (low[k] + high[k])) > 0.25 * apart] > ordered[k]
     switches = int(np.count_nonzero(np.diff(there)))
     least = max(_APART * within, _STEPS * float(steps[steps > 0.0].min()))
@@ -232,7 +232,7 @@ def two_levels(v: FloatArray) -> str:
             '--throttle-column) would explain it; without one, it counts as noise and lines.')
 
 
-def why_nothing(v: FloatArray) -> str:
+def why_no_model(v: FloatArray) -> str:
     """Return why no model can be fitted to voltages, V; empty if one can."""
     if float(v.min()) == float(v.max()):
         return ('The voltage does not change at all: the sensor is stuck, or its step is larger '
@@ -253,8 +253,8 @@ def why_nothing(v: FloatArray) -> str:
     return ''
 
 
-def _within(u: FloatArray, notes: list[str]) -> FloatArray:
-    """Return throttle, NaN where it is far outside 0..1, and note values outside."""
+def _drop_implausible(u: FloatArray, notes: list[str]) -> FloatArray:
+    """Return throttle, NaN where far outside 0..1; note values outside."""
     with np.errstate(invalid='ignore'):
         wild = np.abs(u) > _MOST
     if wild.any():
@@ -269,7 +269,7 @@ def _within(u: FloatArray, notes: list[str]) -> FloatArray:
     return u
 
 
-def _held(t: FloatArray, u: FloatArray, notes: list[str]) -> FloatArray | None:
+def _fill_gaps(t: FloatArray, u: FloatArray, notes: list[str]) -> FloatArray | None:
     """Return throttle with the last value held over gaps; note their size."""
     there = np.isfinite(u)
     known = np.flatnonzero(there)

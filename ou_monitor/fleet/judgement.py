@@ -5,9 +5,9 @@ doc/fleet.md states the tests, their false-alarm rates and their limits; here is
 computed.
 
 Common throttle: the logarithms of sigma and alpha follow one curve over throttle for all vehicles
-(straight between knots, by Huber's estimate, with a level for each vehicle).  Values are moved
-along this curve to the median throttle, with the error of the move; recordings without throttle
-are not moved.  Resistance and sag come from the `supply` facts, per cell where cells are known.
+(straight between knots, fitted by Huber's estimate, with a level for each vehicle).  Values are
+moved along it to the median throttle, with the error of the move; without throttle they stay.
+Resistance and sag come from the `supply` facts, per cell where cells are known.
 
 Drift: a line through the logarithms over the number of the flight, weighted by their errors and a
 scatter between flights (Paule and Mandel), which is assumed normal; t test, with the scatter about
@@ -16,12 +16,11 @@ the line as the scale, so that an error common to all flights does not count.
 Few vehicles (fewer than `LEAST_VEHICLES`): the pooled scatter between flights is the scale of the
 t test.  A pack is compared only with packs of the same number of cells.
 
-Outliers: the score of a value is its distance from the median of its group (or from the drift line
-of the group) divided by sqrt(s^2 + se^2), with its standard error se and the scatter s between
-recordings, a median absolute deviation.  The bound is a quantile of the largest score in simulated
-fleets without faults, with the same groups and errors and the same evaluation (and with s at its
-upper 90 % bound, which errs towards fewer false alarms).  If many members of a group are off, its
-median is too.
+Outliers: the score of a value is its distance from the median (or the drift line) of its group
+divided by sqrt(s^2 + se^2), with its standard error se and the scatter s between recordings, a
+median absolute deviation.  The bound is a quantile of the largest score in simulated fleets
+without faults, with the same groups, errors and evaluation, and with the upper 90 % bound of s,
+which errs towards fewer false alarms.  If many members of a group are off, its median is too.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ USABLE = ('OK', 'SHORT_WINDOW')
 QUANTITIES = {'resistance': 'Ohm', 'sag': 'V', 'sigma': 'V/sqrt(s)', 'alpha': '1/s'}
 OF_PACK = {'resistance': ('resistance', 'resistance_se', 'resistance', ''),
            'sag': ('sag_full', 'sag_full_se', 'sag', 'sag_throttle')}
-# Maximum relative error of a pack's value that is compared; with a larger one it is unknown.
+# Maximum relative error of a pack's value; with a larger one it is unknown.
 _VAGUE = 0.5
 # Bend of Huber's function, in standard deviations (95 % efficiency); maximum rounds of the fit.
 _HUBER = 1.345
@@ -61,7 +60,7 @@ class CommonCurve:
     """The common curve over throttle of the logarithm of a quantity: straight between knots."""
 
     reference: float  # Throttle at which recordings are compared; NaN without throttle
-    # Throttles, and the difference there to the logarithm at the reference; empty: flat.
+    # Throttles, and the logarithm there less that at the reference; empty: flat.
     knots: tuple[float, ...] = ()
     heights: tuple[float, ...] = ()
     # Covariance of the slopes between k knots, for independent recordings; shape (k - 1, k - 1).
@@ -249,7 +248,7 @@ def _jackknife(inner: FloatArray, rest: FloatArray, weight: FloatArray, of: IntA
 
 
 def _knots(u: FloatArray) -> list[float]:
-    """Return knots at even shares of the rows, not too close to each other; increasing."""
+    """Return increasing knots at even quantiles of throttle, not too close to each other."""
     pieces = min(max(u.size // _ROWS, 1), _PIECES)
     wanted = np.quantile(u, np.linspace(0.0, 1.0, pieces + 1)).tolist()
     knots = wanted[:1]
@@ -333,7 +332,7 @@ def weighted_line(x: FloatArray, y: FloatArray, error: FloatArray) -> tuple[floa
         return found, root, float(rest @ rest) / (x.size - 2)
 
     low, high = 0.0, max(float(np.ptp(y)) ** 2, 1e-24)
-    # The scale falls as the scatter grows; 60 halvings are more than a double resolves.
+    # The scale falls as the scatter grows; 60 halvings exhaust a double's precision.
     for _ in range(60 if fit(0.0)[2] > 1.0 else 0):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if fit(middle)[2] > 1.0 else (low, middle)
@@ -398,7 +397,7 @@ def outliers(value: FloatArray, error: FloatArray, groups: Sequence[str], rate: 
     centre[good] = middle[0] + (0.0 if trend is None else trend[good])
     rng = np.random.default_rng(seed)
     size = max(1, min(simulations, _CELLS // se.size))
-    # If errors are as large as s, its estimate may be zero and scores too large: simulate with the
+    # If errors are as large as s, its estimate may be 0, and scores too large: simulate with the
     # upper bound of s.
     share = min(0.5 + 0.5 * _UPPER / math.sqrt(se.size), 0.95)
     most = float(_scatter(rest, se, share)[0, 0])
@@ -444,9 +443,9 @@ DRIFT_RATE = 0.05
 OUTLIER_RATE = 0.05
 # Minimum number of vehicles to judge one by the spread of the others.
 LEAST_VEHICLES = 6
-# Difference of ln resistance and ln sag that two good vehicles may have: the minimum error of
-# these facts (`LEAST_ERROR`), because it is common to all flights of a vehicle.
-_ALIKE = math.log(1.0 + LEAST_ERROR)
+# Maximum difference of ln resistance or ln sag between two good vehicles: the systematic error of
+# these facts (`LEAST_ERROR`), common to all flights of a vehicle.
+_TOLERANCE = math.log(1.0 + LEAST_ERROR)
 # Standard error of a median relative to the mean, for many normal values.
 _MEDIAN_ERROR = 1.2533141373155
 
@@ -540,7 +539,7 @@ def _vehicles(values: Values, within: Outliers, flat: FloatArray, rate: float, s
 
 def _few(found: Outliers, places: Sequence[int], flights: Sequence[FloatArray]) -> Outliers:
     """Compare the mean of each of a few vehicles (two flights or more) with the others' mean."""
-    # The null hypothesis is a difference of at most `_ALIKE`, either way.
+    # The null hypothesis is a difference of at most `_TOLERANCE`, either way.
     from ou_monitor.analysis.level_tests import adjusted
     from scipy import stats
 
@@ -552,12 +551,12 @@ def _few(found: Outliers, places: Sequence[int], flights: Sequence[FloatArray]) 
     variance = squares / freedom / np.array([one.size for one in flights])
     reach = np.full(found.score.size, NAN) if found.reach is None else found.reach
     rest = list(range(len(means)))
-    # One that stands out would move the mean with which the others are compared.
+    # An outlier would move the mean with which the others are compared, so it is removed.
     while len(rest) > 1:
         m, v = means[rest], variance[rest]
         others = (m.sum() - m) / (m.size - 1)
         se = np.sqrt(v + (v.sum() - v) / (m.size - 1) ** 2)
-        score, least = (m - others) / se, _ALIKE / se
+        score, least = (m - others) / se, _TOLERANCE / se
         p = stats.t.sf(np.abs(score) - least, freedom) + stats.t.sf(np.abs(score) + least, freedom)
         chance = np.asarray(adjusted(p.tolist()))
         worst = int(p.argmin())

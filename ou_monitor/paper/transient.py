@@ -132,18 +132,18 @@ def local_rates() -> FloatArray:
 
 
 def through_coupling(time: FloatArray, rail: float) -> FloatArray:
-    """Return the unit step of a rail of this rate, 1/s, behind the high-pass (time in s)."""
+    """Return the response of a rail, 1/s, to a unit step, behind the high-pass (time in s)."""
     return np.asarray(rail / (rail - CORNER) * (np.exp(-CORNER * time) - np.exp(-rail * time)))
 
 
 def peak_of(rail: float) -> float:
-    """Return when `through_coupling` peaks, s, for a rail of this rate, 1/s."""
+    """Return the time of the peak of `through_coupling`, s."""
     return math.log(rail / CORNER) / (rail - CORNER)
 
 
 def fitted_through_coupling(time: FloatArray) -> tuple[FloatArray, float]:
     """Return the typical rail behind the coupling, mV, and its largest relative misfit."""
-    # Scaled to the points of the paper's fit; times count from the peak of the curve, s.
+    # Scaled to the points that the paper fits; time, s, counts from the peak of the curve.
     peak = peak_of(TYPICAL_RAIL)
     misfit = np.log(VALUE[USED] / through_coupling(peak + TIME[USED], TYPICAL_RAIL))
     scale = math.exp(float(misfit.mean()))
@@ -152,21 +152,21 @@ def fitted_through_coupling(time: FloatArray) -> tuple[FloatArray, float]:
 
 
 def fitted_rate(rail: float) -> float:
-    """Return the rate, 1/s, that the fit of the paper gives for a step behind the high-pass."""
+    """Return the rate, 1/s, that the paper's fit gives for a rail behind the high-pass."""
     used = TIME[USED]
     return fit_log_line(used, through_coupling(peak_of(rail) + used, rail)).alpha
 
 
 def slowest_rail() -> float:
-    """Return the lowest rate of a rail that Fig. 5 allows behind a 10 Hz coupling, 1/s."""
+    """Return the lowest rate of a rail behind a 10 Hz coupling that agrees with Fig. 5, 1/s."""
     least = PAPER_FIT.alpha - PAPER_FIT.half_width
     return float(brentq(lambda rail: fitted_rate(rail) - least, 70.0, 1e5))
 
 
 def simulate_fitted(rng: np.random.Generator, draws: int) -> FloatArray:
-    """Release a load behind an AC-coupled oscilloscope and fit it as the paper does, 1/s."""
-    # The rail is an OU whose noise is half a step of the oscilloscope (the most that is read as
-    # "~0"); the points are taken 0, 10, 25 and 35 ms after the peak of the noiseless trace.
+    """Return rates of simulated load releases behind the coupling, by the paper's fit, 1/s."""
+    # One row per rail.  Each is an OU whose noise is half a step of the oscilloscope (the most
+    # that is read as "~0"); points are 0, 10, 25 and 35 ms after the peak of the noiseless trace.
     t = np.arange(round((_HOLD + _WATCH) * _RATE)) / _RATE
     throttle = np.where(t <= _HOLD, published.TRANSIENT_LOAD, 0.0)
     sag = 1e-3 * VALUE[0]

@@ -127,7 +127,7 @@ def _spectrum(result: Reproduction) -> list[Part]:
 
 
 def _crest_and_factor(result: Reproduction) -> list[Part]:
-    """Return the crest factors, and the variance that decides about (6)."""
+    """Return the plots of the crest factors, and of the variance that tests equation (6)."""
     crests = Plot('Vpp/Vrms of one OU', 'Vpp/Vrms', 'density', width=450, height=300)
     edges = np.linspace(2.5, 10.0, 1 + _BINS)
     for k, (ms, values) in enumerate(sorted(result.crests.by_screen.items())):

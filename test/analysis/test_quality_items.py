@@ -7,7 +7,7 @@ import pickle
 import numpy as np
 from ou_monitor.analysis.quality import quality_list, QualityItem
 from ou_monitor.records import (
-    Defect, defect_of, Estimate, Flag, led, Note, Recording, Severity, Status)
+    Defect, defect_of, Estimate, Flag, Note, prefixed, Recording, Severity, Status)
 from ou_monitor.timeline import in_order, readings_of
 import pytest
 from simulated_recordings import recording
@@ -57,7 +57,7 @@ def test_the_rate_or_length_of_a_recording_is_no_fault(status):
 def test_a_note_is_judged_by_what_it_is_about(defect):
     """Not by its words, also led by a name; a bare sentence is good to know."""
     text = 'The damaged bag has gaps.'
-    for note in (Note(text, defect), *led('vbat', [Note(text, defect)])):
+    for note in (Note(text, defect), *prefixed('vbat', [Note(text, defect)])):
         simulated = replace(recording(1, ((0.1, 0.3),)), notes=(note,))
         (item,) = listed(simulated)
         assert (item.name, item.severity, item.text) == (defect.name, defect.severity, note)

@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 from ou_monitor.analysis.analyze import analyze
 from ou_monitor.criticism.integrity import examine
-from ou_monitor.criticism.readings import find_bad, two_levels, usable, why_nothing
+from ou_monitor.criticism.readings import find_bad, two_levels, usable, why_no_model
 from ou_monitor.discovery.discover import discover
 from ou_monitor.discovery.finding import Verdict
 from ou_monitor.model.ou import simulate
@@ -95,7 +95,7 @@ def test_a_voltage_that_cannot_be_fitted_gives_a_reason_and_no_warning(what):
         warnings.simplefilter('error')
         found = discover(Recording(T, v, np.full(N, math.nan), what))
     assert found.verdict is Verdict.INSUFFICIENT_DATA and part in found.sentence
-    assert why_nothing(rail()) == ''
+    assert why_no_model(rail()) == ''
 
 
 def test_a_recording_that_starts_with_a_stuck_sensor_is_still_looked_at():

@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from ou_monitor.criticism.readings import find_bad, usable, why_nothing
+from ou_monitor.criticism.readings import find_bad, usable, why_no_model
 from ou_monitor.records import Recording
 from ou_monitor.text import counted
 import pytest
@@ -144,20 +144,20 @@ def test_voltages_above_a_thousand_may_be_millivolts(level, said):
 def test_a_voltage_in_which_few_samples_differ_is_constant(n, odd, stuck):
     v = np.full(n, 5.0)
     v[1:1 + odd] = 5.1 + 0.01 * np.arange(odd)
-    assert why_nothing(v).startswith('All but') == stuck
+    assert why_no_model(v).startswith('All but') == stuck
 
 
 def test_voltages_that_no_sensor_measures_are_refused():
     """Beyond 1e30 V, below 1e-30 V; a straight line to 16 roundings."""
     rng = np.random.default_rng(2)
     noise = rng.standard_normal(200)
-    assert 'reaches' in why_nothing(1.01e30 * noise / np.abs(noise).max())
-    assert why_nothing(0.99e30 * noise / np.abs(noise).max()) == ''
-    assert 'moves by' in why_nothing(0.99e-30 * noise / np.ptp(noise))
-    assert why_nothing(1.01e-30 * noise / np.ptp(noise)) == ''
+    assert 'reaches' in why_no_model(1.01e30 * noise / np.abs(noise).max())
+    assert why_no_model(0.99e30 * noise / np.abs(noise).max()) == ''
+    assert 'moves by' in why_no_model(0.99e-30 * noise / np.ptp(noise))
+    assert why_no_model(1.01e-30 * noise / np.ptp(noise)) == ''
     line = 4.0 + np.arange(200) / 64.0
     bend = line.copy()
     bend[100] += 2.0 ** -48
-    assert 'straight line' in why_nothing(bend)
+    assert 'straight line' in why_no_model(bend)
     bend[100] += 2.0 ** -46
-    assert why_nothing(bend) == ''
+    assert why_no_model(bend) == ''

@@ -72,7 +72,7 @@ class ACCoupling(Term):
             x_old = np.concatenate(([x_before], s.x[:-1]))
             level_old = np.concatenate(([level_before], level[:-1]))
             e = start * x_old + end * s.x + s.sigma * np.sqrt(spread * s.power) * draws
-            # A straight line from level_old to level.
+            # Response to a straight line from level_old to level.
             mean = np.where(step > 0.0, -np.expm1(-rate * step) / np.where(
                 step > 0.0, rate * step, 1.0), 1.0)
             e += (mean - decay) * level_old + (1.0 - mean) * level
@@ -86,7 +86,7 @@ class ACCoupling(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return the corner of the fitted relaxation, and a quarter of it."""
+        """Return couplings whose corner is the fitted relaxation rate, and a quarter of it."""
         rate = -math.log(max(float(np.median(view.phi[1:])), 1e-300)) * view.rate / (2.0 * math.pi)
         return [cls(rate, 0.0), cls(0.25 * rate, 0.0)]
 

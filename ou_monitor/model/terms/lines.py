@@ -1,4 +1,4 @@
-"""Common functions of lines: their states, and detection of broad and moving lines in scores."""
+"""Common functions of spectral lines: states, and detection of broad and moving lines."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from scipy.signal import welch
 _MOST = 3
 
 
-def wandering(linewidth: float, rng: np.random.Generator) -> Callable[[FloatArray], FloatArray]:
+def phase_noise(linewidth: float, rng: np.random.Generator
+                ) -> Callable[[FloatArray], FloatArray]:
     """Return a function of the steps, s, that draws the phase noise of a line (width in Hz)."""
     last = 0.0
 
@@ -34,8 +35,7 @@ def wandering(linewidth: float, rng: np.random.Generator) -> Callable[[FloatArra
 def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float,
              lag: float = 0.0) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return two states that rotate, decay and are driven by noise, as `Term.block` (1/s, V)."""
-    # The first has the autocovariance std^2 exp(-damping t) (cos + lag sin), with the angle turned
-    # in t.
+    # Autocovariance of the first: std^2 exp(-damping t) (cos a + lag sin a), a the angle in t.
     shrink = np.exp(-damping * step)
     f, q = np.empty((step.size, 2, 2)), np.zeros((step.size, 2, 2))
     along, across = shrink * np.cos(turn), shrink * np.sin(turn)
@@ -56,17 +56,16 @@ def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float,
 
 # Segments per 1 / linewidth, and minimum number of segments.
 _FINE, _ENOUGH = 4.0, 12
-# Spread of the powers below which a line may have a constant amplitude, and above which it may be
-# ringing; between them, evidence decides.  Of 60 simulated lines and 60 ringings with outliers, in
-# 14 segments each, 60 and 10 were below the first, and 2 and 54 above the second (in 33 segments:
-# 60 and 2, 0 and 60).
+# Maximum `power_spread` of a line of constant amplitude, minimum of ringing; between the two,
+# evidence decides.  Simulated with outliers in 14 segments, 60 of 60 lines and 10 of 60 ringings
+# were below the maximum, 2 and 54 above the minimum (in 33 segments: 60 and 2, 0 and 60).
 CONSTANT, RINGING = 0.85, 0.7
 
 
 def power_spread(view: View, frequency: float, linewidth: float) -> float:
-    """Return the interquartile range over the median of the powers of a line's segments (Hz)."""
-    # It is 0 for a line of constant amplitude, and ln 3 / ln 2 = 1.58 for ringing driven by noise,
-    # whose powers are exponential; outliers hardly change it.  NaN: too few segments.
+    """Return the interquartile range over the median of the power of a line by segment (Hz)."""
+    # 0 for a line of constant amplitude; ln 3 / ln 2 = 1.58 for ringing driven by noise, whose
+    # powers are exponential; NaN with too few segments.  Outliers hardly change it.
     length = int(view.rate / (_FINE * max(linewidth, 1.0 / float(view.at[-1]))))
     v, at = view.residual, view.at
     count = v.size // max(length, 1)
@@ -79,14 +78,14 @@ def power_spread(view: View, frequency: float, linewidth: float) -> float:
 
 
 def prominence(z: FloatArray, rate: float, frequency: float, width: float) -> float:
-    """Return by how many standard errors a peak, Hz, exceeds both sides; -inf: no side."""
+    """Return by how many standard errors a peak, Hz, exceeds both sides; -inf if one is empty."""
     power = np.abs(np.fft.rfft(z - z.mean()))[1:] ** 2
     away = (np.fft.rfftfreq(z.size, 1.0 / rate)[1:] - frequency) / width
     inside = power[np.abs(away) <= 0.5]
     sides = [power[(sign * away > 1.0) & (sign * away < 2.5)] for sign in (-1.0, 1.0)]
     if not inside.size or not all(side.size for side in sides):
         return -math.inf
-    # A mean of n exponential variables is known to one part in sqrt(n).
+    # The relative error of a mean of n exponential variables is 1 / sqrt(n).
     return min(math.log(inside.mean() / side.mean()) / math.sqrt(1 / inside.size + 1 / side.size)
                for side in sides)
 
@@ -121,7 +120,7 @@ def order_lines(view: View) -> list[tuple[float, float]]:
 
 
 def order_power(z: FloatArray, u: FloatArray, rate: float) -> tuple[float, float]:
-    """Return the power of the strongest line that follows throttle (rate in Hz)."""
+    """Return the rise of the strongest line that follows throttle, and the number tested."""
     top, trials = 0.0, 0.0
     for length in _lengths(rate):
         best = _hough(z, u, rate, length)
@@ -131,11 +130,10 @@ def order_power(z: FloatArray, u: FloatArray, rate: float) -> tuple[float, float
     return top, trials
 
 
-# Effective share of independent lines among those examined; neighbours share most of their bins.
-# From simulation: with it, 1 of 120 flights of white noise exceeded the 95 % point.
+# Share of independent lines among those examined (neighbours share most bins): with it, 1 of 120
+# simulated flights of white noise exceeded the 95 % point.
 _INDEPENDENT = 0.02
-# Maximum slope examined, in sampling rates: from idle to full throttle a line may fold once and
-# return.
+# Maximum slope, in sampling rates: from idle to full throttle a line may fold once and return.
 _REACH = 1.0
 # Ratio of the long segments to the short ones, which show lines while throttle moves fast.
 _SHORTER = 8
@@ -152,10 +150,11 @@ def _lengths(rate: float) -> tuple[int, ...]:
 class _Line:
     """A line that follows throttle."""
 
-    rise: float
+    rise: float  # Minus ln of the probability of its power by chance (bound)
+    # Frequency at no throttle, and its change up to full throttle, Hz.
     idle: float
     slope: float
-    length: int
+    length: int  # Samples in a segment
 
 
 def _hough(z: FloatArray, u: FloatArray, rate: float, length: int) -> list[_Line]:
@@ -165,7 +164,7 @@ def _hough(z: FloatArray, u: FloatArray, rate: float, length: int) -> list[_Line
         return []
     shape = z[:count * length].reshape(count, length)
     power = np.abs(np.fft.rfft(shape * np.hanning(length), 2 * length, axis=1)) ** 2
-    # Power that is present at a frequency in every segment does not follow throttle.
+    # Normalise each bin: a line at a fixed frequency does not follow throttle.
     power = (power / power.mean(axis=0)).astype(np.float32)
     load = u[:count * length].reshape(count, length).mean(axis=1)
     width = rate / (2.0 * length)

@@ -67,8 +67,8 @@ class LoadSag(Term):
                      for square in (0.0, NEXT_TO_ZERO))
 
 
-# Difference below which stamps are equal, s: the resolution of a bag.
-_HAIR = 1e-9
+# Tolerance of stamps, s: the resolution of a bag.
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -117,12 +117,12 @@ class LoadTransient(Term):
             nonlocal slow, times, values
             throttle = s.throttle
             if self.delay > 0.0:
-                # Throttle `delay` ago; before the first sample, that of the first sample.
+                # Throttle `delay` ago; before the start, the first throttle.
                 times = np.concatenate((times, s.at))
                 values = np.concatenate((values, throttle))
-                # Tolerance for rounding where the delay is a whole number of steps.
-                hair = _HAIR + 2.0 * np.spacing(np.abs(s.at))
-                then = np.searchsorted(times, s.at - self.delay + hair, side='right') - 1
+                # Rounding matters where the delay is a whole number of steps.
+                rounding = _ROUNDING + 2.0 * np.spacing(np.abs(s.at))
+                then = np.searchsorted(times, s.at - self.delay + rounding, side='right') - 1
                 throttle = values[np.maximum(then, 0)]
                 keep = max(int(then[-1]), 0)
                 times, values = times[keep:], values[keep:]
@@ -151,15 +151,14 @@ class LoadTransient(Term):
         late = np.unique(np.rint(np.geomspace(step, latest, _DELAYS) / step)) * step
         inrush = [cls(0.0, lag.tau, 0.0, NEXT_TO_ZERO) for lag in lags if lag.tau < _INRUSH]
         return [*lags, *inrush, *(
-            cls(0.0, _FOR_GOOD * 4.0 * longest, float(delay)) for delay in late)]
+            cls(0.0, _LASTING * 4.0 * longest, float(delay)) for delay in late)]
 
 
-# Shortest visible time constant, in steps of the recording: one seventh of the response is left at
-# the next sample.
+# Shortest visible time constant, in steps: one seventh of the response remains at the next sample.
 SHORTEST = 0.5
 # Longest time that motors take to speed up, s.
 _INRUSH = 0.2
 # Number of delays to try, and the longest, s.
 _DELAYS, _LATEST = 12, 0.1
 # Time constant, in durations of the recording, for a response that never decays.
-_FOR_GOOD = 100.0
+_LASTING = 100.0

@@ -48,14 +48,14 @@ class NonlinearRestoring(Term):
     def fit_law(cls, view: View) -> LawFit | None:
         """Regress the innovations on the square, the cube, or both, of the previous deviation."""
         found = [fit for powers in ((2,), (3,), (2, 3))
-                 if (fit := cls._regressed(view, powers)) is not None]
+                 if (fit := cls._fit_powers(view, powers)) is not None]
         penalty = 0.5 * math.log(view.train.stop)
         return max(found, default=None,
                    key=lambda fit: float(fit.gain[view.train].sum()) - penalty * fit.free)
 
     @classmethod
-    def _regressed(cls, view: View, powers: tuple[int, ...]) -> LawFit | None:
-        """Return the fit with some powers and the linear force."""
+    def _fit_powers(cls, view: View, powers: tuple[int, ...]) -> LawFit | None:
+        """Fit the linear force and some powers."""
         train = view.train
         span = np.where(np.isfinite(view.step), view.step, 0.0)
         s, x = np.sqrt(view.variance), view.state
@@ -86,10 +86,10 @@ class NonlinearRestoring(Term):
             return scores, log_normal(scores) - 0.5 * np.log(spread)
 
         level = [0.0, 1.0]
-        # The regression takes the force as constant within a step.  With coefficients far from the
-        # data, or the data of a stuck sensor, the voltage runs away.
+        # The start is a regression with a constant force within each step.  Bad coefficients, or a
+        # stuck sensor, make the voltage overflow.
         with np.errstate(over='ignore', invalid='ignore'):
-            b = _climbed(lambda b: scored(b, train)[1], inverse @ (inside.T @ view.z[train]),
+            b = _maximise(lambda b: scored(b, train)[1], inverse @ (inside.T @ view.z[train]),
                          error)
             if not alpha > b[0]:
                 return None
@@ -101,7 +101,7 @@ class NonlinearRestoring(Term):
         errors = dict(zip(powers, error[1:].tolist(), strict=True))
         square, cube = by.get(2, 0.0), by.get(3, 0.0)
         if cube < 0.0:
-            # The force would push the voltage away, which no term can represent.
+            # The force would push the voltage away without limit.
             return None
         # The cube must be large enough to keep the square from pushing the voltage away.
         cube = max(cube, _HOLDS * square * square / alpha)
@@ -112,10 +112,10 @@ class NonlinearRestoring(Term):
 
 def _linearised(x: FloatArray, span: FloatArray, linear: float, square: float, cube: float,
                 variance: float) -> tuple[FloatArray, FloatArray]:
-    """Return how far each deviation moves in a step, V, and its variance over `variance`."""
-    # Within a part of the step, the force is linearised about the deviation at its beginning, with
-    # the mean effect of its curvature (Shoji & Ozaki, Stoch. Anal. Appl. 16 (1998) 733).
-    # Beyond the extremum of a softening force, the force stays constant.
+    """Return the mean move of each deviation in a step, V, and its variance over `variance`."""
+    # In each part of the step, the force is linearised about the deviation at its beginning, with
+    # the mean effect of its curvature (Shoji & Ozaki, Stoch. Anal. Appl. 16 (1998) 733).  Beyond
+    # the extremum of a softening force, the force stays constant.
     tops = np.roots([3.0 * cube, 2.0 * square, linear])
     tops = tops[np.isreal(tops)].real
     low = np.max(tops, initial=-np.inf, where=tops < 0.0)
@@ -140,8 +140,8 @@ def _linearised(x: FloatArray, span: FloatArray, linear: float, square: float, c
     return at - x, spread / variance
 
 
-def _climbed(density: Callable[[FloatArray], FloatArray], b: FloatArray, error: FloatArray
-             ) -> FloatArray:
+def _maximise(density: Callable[[FloatArray], FloatArray], b: FloatArray, error: FloatArray
+               ) -> FloatArray:
     """Maximise the likelihood from b by Fisher scoring with numerical derivatives."""
     now = density(b)
     for _ in range(_ROUNDS):

@@ -115,16 +115,16 @@ class LopsidedNoise(Term):
     def fit_law(cls, view: View) -> LawFit | None:
         """Fit the scores if they are mostly white noise, with a free scale."""
         white = 1.0 - np.broadcast_to(view.trust, view.z.shape)[view.train]
-        found, paid = cls._climbed(view)
+        found, paid = cls._best_fit(view)
         # Heavy tails without asymmetry are left to other causes.
         return found if float(white.mean()) > _MOSTLY and paid else None
 
     def refit_law(self, view: View) -> LawFit:
         """Fit again unconditionally: the evidence decides whether the cause stays."""
-        return self._climbed(view)[0]
+        return self._best_fit(view)[0]
 
     @classmethod
-    def _climbed(cls, view: View) -> tuple[LawFit, bool]:
+    def _best_fit(cls, view: View) -> tuple[LawFit, bool]:
         """Return the fit, and whether its asymmetry gains more than a parameter costs."""
         z = view.z
         edges = np.unique(np.quantile(z[view.train], np.linspace(0.0, 1.0, _CELLS + 1)))
@@ -304,14 +304,14 @@ class ClockJitter(Term):
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
         """Fit hidden errors of the stamps: a longer step contains more noise."""
-        return cls._climbed(view, [math.log(0.2), 0.0], 40)
+        return cls._best_fit(view, [math.log(0.2), 0.0], 40)
 
     def refit_law(self, view: View) -> LawFit | None:
         """Fit again, starting from these parameters."""
-        return self._climbed(view, [math.log(min(max(self.std * view.rate, 0.02), 0.44)), 0.0], 20)
+        return self._best_fit(view, [math.log(min(max(self.std * view.rate, 0.02), 0.44)), 0.0], 20)
 
     @classmethod
-    def _climbed(cls, view: View, start: list[float], most: int) -> LawFit | None:
+    def _best_fit(cls, view: View, start: list[float], most: int) -> LawFit | None:
         """Return the fit near a start."""
         step = 1.0 / view.rate
         z = view.z[view.train]

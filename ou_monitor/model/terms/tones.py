@@ -13,7 +13,7 @@ from ou_monitor.model.sinusoid import fit_sinusoid
 from ou_monitor.model.spectral_lines import find_lines, Line, on_grid
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.lines import (
-    broad_peaks, CONSTANT, order_lines, power_spread, RINGING, rotation, wandering)
+    broad_peaks, CONSTANT, order_lines, phase_noise, power_spread, RINGING, rotation)
 from ou_monitor.model.terms.segment import Effect, Segment, Stage
 from ou_monitor.model.terms.term import by_parameters, parameter, Role, Term
 from ou_monitor.records import FloatArray
@@ -53,7 +53,7 @@ class Tone(Term):
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
-        wander = wandering(self.linewidth, rng)
+        wander = phase_noise(self.linewidth, rng)
 
         def effect(s: Segment) -> None:
             phase = 2.0 * math.pi * ((s.at - s.origin) * self.frequency % 1.0) + self.phase
@@ -255,7 +255,7 @@ class ThrottleTone(Term):
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
         turns = 0.0
-        wander = wandering(self.linewidth, rng)
+        wander = phase_noise(self.linewidth, rng)
 
         def effect(s: Segment) -> None:
             nonlocal turns

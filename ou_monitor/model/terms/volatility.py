@@ -53,11 +53,11 @@ class Volatility(Term):
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
         """Fit an OU of ln sigma, constant within short segments."""
-        return cls._climbed(view, _start(view), known=False)
+        return cls._best_fit(view, _start(view), known=False)
 
     def refit_law(self, view: View) -> LawFit | None:
         """Fit again, starting from these parameters."""
-        return self._climbed(view, np.array([
+        return self._best_fit(view, np.array([
             math.log(max(self.std, 1e-3)), math.log(self.rate), _start(view)[2]]), known=True)
 
     def holds(self, view: View) -> bool:
@@ -65,7 +65,7 @@ class Volatility(Term):
         return self.rate * float(view.at[-1]) > _WANDERS
 
     @classmethod
-    def _climbed(cls, view: View, start: FloatArray, known: bool) -> LawFit | None:
+    def _best_fit(cls, view: View, start: FloatArray, known: bool) -> LawFit | None:
         """Return the fit near a start."""
         size, squares, sizes = _segments(view)
         span = size / view.rate

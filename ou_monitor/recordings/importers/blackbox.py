@@ -1,10 +1,9 @@
 """
 Betaflight and INAV blackbox, read by orangebox.
 
-Limits: the ADC is read more slowly than the log is written, so most voltages are
-repeats.  Frames predicted from damaged ones are
-left out up to the next key frame.  orangebox is under GPL-3; importers of other formats do not
-load it.  Betaflight's axes (x forwards, y left, z up) match `base_link`.
+Limits: the ADC is read more slowly than the log is written, so most voltages are repeats.  After a
+damaged frame, frames are left out up to the next key frame.  orangebox is under GPL-3; importers
+of other formats do not load it.  Betaflight's axes (x forwards, y left, z up) match `base_link`.
 
 Scales come from Betaflight's viewer (flightlog_parser, flightlog_fields_presenter) and from
 the header: `gyro_scale`, `acc_1G`, `motor_poles`, `blackbox_high_resolution`.

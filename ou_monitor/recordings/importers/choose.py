@@ -20,7 +20,7 @@ from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.importers.log import (
     ANY, clean, CURRENT, FORCE, Log, Motion, RATE, RawColumns, Series, SIGNAL, sound, THROTTLE,
     UNKNOWN, VELOCITY, VOLTAGE)
-from ou_monitor.records import Defect, FloatArray, led, Note
+from ou_monitor.records import Defect, FloatArray, Note, prefixed
 from ou_monitor.text import counted, printable
 from ou_monitor.timeline import check_throttle
 
@@ -78,7 +78,7 @@ def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | 
                 notes.append(f'{one.name} has no usable sample.')
     # A note common to several series, such as columns of one table, appears once.
     notes = [note for sentence, names in dropped.items()
-             for note in led(', '.join(names), [sentence])] + notes
+             for note in prefixed(', '.join(names), [sentence])] + notes
     if VOLTAGE not in usable:
         raise InputError(f'{path}: {volts.name} has no usable sample'
                          + ''.join(f' ({note})' for note in notes))
@@ -218,7 +218,7 @@ def choose_extras(path: Path, log: Log, *, imus: Sequence[str] = (),
     inertial: dict[str, Motion] = {}
     for one in _inertial(path, log, imus):
         kept, said = clean_motion(one)
-        notes += led(one.name, (*said, *pace_notes(kept.t)))
+        notes += prefixed(one.name, (*said, *pace_notes(kept.t)))
         if not kept.t.size:
             notes.append(f'{one.name} has no usable sample.')
             continue
@@ -233,7 +233,7 @@ def choose_extras(path: Path, log: Log, *, imus: Sequence[str] = (),
     speeds = log.speeds
     if speeds is not None:
         speeds, said = clean_motion(speeds)
-        notes += led(SPEEDS, said)
+        notes += prefixed(SPEEDS, said)
         speeds = speeds if speeds.t.size else None
     named: dict[str, Series] = {}
     for name in dict.fromkeys(signals):
@@ -276,7 +276,7 @@ def _cleaned(path: Path, name: str, series: Series) -> tuple[Series, tuple[str, 
     if not series.n:
         raise InputError(f'{path}: {name} has no usable sample'
                          + ''.join(f' ({sentence})' for sentence in said))
-    return series, tuple(led(name, (*said, *pace_notes(series.t))))
+    return series, tuple(prefixed(name, (*said, *pace_notes(series.t))))
 
 
 def _of_topic(path: Path, log: Log, signal: str) -> Series | None:

@@ -77,8 +77,8 @@ WORDS = {**TIME_WORDS, **VOLT_WORDS, **AMPERE_WORDS, **SHARE_WORDS}
 SCALES = {**TIME_UNITS, 'min': 60.0, 'h': 3600.0, 'd': 86400.0, 'V': 1.0, 'dV': 0.1, 'cV': 0.01,
           'mV': 1e-3, 'kV': 1e3, 'uV': 1e-6, 'A': 1.0, 'dA': 0.1, 'cA': 0.01, 'mA': 1e-3,
           'uA': 1e-6, '%': 0.01}
-# A quantity with one of these words at the end of its name, preferably in brackets.  Repetitions
-# after the quantity are bounded, so that the time is proportional to the length of a name.
+# A name that ends with one of these words, preferably in brackets.  Repetitions after the quantity
+# are bounded, so that the time is proportional to the length of a name.
 _WORD = rf"({'|'.join(sorted(WORDS.keys() - _LONG.split('|'), key=len, reverse=True))})(?: dc)?"
 _WITH_UNIT = re.compile(
     rf'(.*(?:time|zeit|stamp|elapsed)|t)(?: ?[\[({{/_ ] ?| in )({_LONG})[\])}}]?|'
@@ -136,7 +136,7 @@ class Form(NamedTuple):
     encoding: str
     delimiter: str
     comma: bool  # Whether the decimal mark is a comma
-    mark: str  # The decimal mark that was given: then the other one separates thousands
+    mark: str  # Decimal mark given by the user: the other one separates thousands; '': not given
     skip: int  # Lines above the first row of numbers
     line: int  # Number of the line with the names; 0: there is none
     labels: tuple[str, ...]  # Words before the numbers of each column, '' if none
@@ -245,7 +245,7 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool,
     names, units, at = _header(rows, lines, first, width, delimiter, skip, labels)
     if not at and any(len(row) > 2 and all(row) and not any(map(is_value, row))
                       for row in rows[skip:first]):
-        # Names of other columns: rows have lost or gained cells.
+        # The names do not fit the columns: rows have lost or gained cells.
         return None
     cells = [cell for row in rows[first:] for cell in row if cell]
     fit = sum(map(is_value, cells)) / max(len(cells), 1)
