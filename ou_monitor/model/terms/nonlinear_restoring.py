@@ -90,7 +90,7 @@ class NonlinearRestoring(Term):
         # stuck sensor, make the voltage overflow.
         with np.errstate(over='ignore', invalid='ignore'):
             b = _maximise(lambda b: scored(b, train)[1], inverse @ (inside.T @ view.z[train]),
-                         error)
+                          error)
             if not alpha > b[0]:
                 return None
             scored(b, train)
@@ -141,7 +141,7 @@ def _linearised(x: FloatArray, span: FloatArray, linear: float, square: float, c
 
 
 def _maximise(density: Callable[[FloatArray], FloatArray], b: FloatArray, error: FloatArray
-               ) -> FloatArray:
+              ) -> FloatArray:
     """Maximise the likelihood from b by Fisher scoring with numerical derivatives."""
     now = density(b)
     for _ in range(_ROUNDS):

@@ -308,7 +308,8 @@ class ClockJitter(Term):
 
     def refit_law(self, view: View) -> LawFit | None:
         """Fit again, starting from these parameters."""
-        return self._best_fit(view, [math.log(min(max(self.std * view.rate, 0.02), 0.44)), 0.0], 20)
+        return self._best_fit(
+            view, [math.log(min(max(self.std * view.rate, 0.02), 0.44)), 0.0], 20)
 
     @classmethod
     def _best_fit(cls, view: View, start: list[float], most: int) -> LawFit | None:
