@@ -21,7 +21,7 @@ from ou_monitor.criticism.samples import (
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.reading import ClockJitter, HeldSamples, Quantization, Saturation
 from ou_monitor.model.terms.term import Term
-from ou_monitor.records import FloatArray, Recording
+from ou_monitor.records import FloatArray, NAN, Recording
 from ou_monitor.text import counted, percent
 from ou_monitor.timeline import on_grid, reading_places, reading_times
 
@@ -46,7 +46,7 @@ class Integrity:
     # Samples as logged, repeats included, for the score of the plain model; None if they equal
     # `samples`.
     raw: Samples | None = None
-    current: bool = False  # Whether the load is the measured current instead of throttle
+    full: float = NAN  # Current that is a load of 1, A; NaN if the load is throttle
     # Samples that were drawn, not measured, and so are not scored; shape (samples.n,).
     drawn: npt.NDArray[np.bool_] | None = None
 
@@ -69,9 +69,8 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     t, v, u = reading_times(t[places], period), v[places], None if u is None else u[places]
     logged = Samples(t[:_EXAMINED], v[:_EXAMINED], None)
     t, v, u, held = without_repeats(t, v, u)
-    throttle, u = u, load_of(recording, t, v, u, notes)
+    u, full = load_of(recording, t, v, u, notes)
     notes += [two_levels(v)] if u is None and two_levels(v) else []
-    current_is_load = u is not throttle
     if period > 1.0 or recording.held or held > 1.0:
         fresh = (v.size - 1) / float(t[-1] - t[0])
         exact.append(HeldSamples(fresh))
@@ -115,7 +114,8 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     notes += stamps.notes
     if stamps.error > 0.0:
         exact.append(ClockJitter(stamps.error))
-    samples = Samples(stamps.t, v, _useful(u, recording.has_throttle or current_is_load, notes))
+    recorded = recording.has_throttle or math.isfinite(full)
+    samples = Samples(stamps.t, v, _useful(u, recorded, notes))
     if between.size and drawn is None and stamps.error == 0.0:
         samples = _joined(samples, *events)
         notes.append(f'{between.size} samples around sudden changes were kept as well.')
@@ -123,7 +123,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     report(1.0)
     raw = logged if held > 1.0 or any(
         term.NAME in ('saturation', 'clock_jitter') for term in exact) else None
-    return Integrity(samples, tuple(exact), tuple(notes), raw=raw, current=current_is_load,
+    return Integrity(samples, tuple(exact), tuple(notes), raw=raw, full=full,
                      drawn=drawn)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.load import lowpass
 from ou_monitor.model.load_fit import timing
-from ou_monitor.records import FloatArray, Recording
+from ou_monitor.records import FloatArray, NAN, Recording
 from ou_monitor.text import counted, number
 from ou_monitor.timeline import in_order, supplied
 
@@ -88,27 +88,27 @@ def current_at(recording: Recording, t: FloatArray) -> FloatArray | None:
 
 
 def load_of(recording: Recording, t: FloatArray, v: FloatArray, u: FloatArray | None,
-            notes: list[str]) -> FloatArray | None:
-    """Return the load: throttle, or the measured current if it predicts the voltage better."""
-    # t in s, v in V.  The current is scaled by its 99 % quantile, and shifted by the delay of the
-    # voltage.
+            notes: list[str]) -> tuple[FloatArray | None, float]:
+    """Return the load, and the current that is a load of 1, A; NaN if the load is throttle."""
+    # t in s, v in V.  The current is the load if it predicts the voltage better.  It is divided by
+    # its 99 % quantile, and shifted by the delay of the voltage.
     current = current_at(recording, t)
     if current is None or not float(np.ptp(current)) > 0.0:
-        return u
+        return u, NAN
     some = slice(None, None, -(-v.size // _EXAMINED))
     late, sign = timing(t[some], v[some], current[some])
     full = sign * float(np.quantile(np.abs(current), _FULL))
     if not full:
-        return u
+        return u, NAN
     load = np.interp(t + late, t, current) / full
     gain = _gain(t[some], v[some], load[some]) - (
         0.0 if u is None else _gain(t[some], v[some], u[some]))
     if not gain > 0.5 * _LAGS.size * math.log(v.size):
-        return u
-    notes.append('The measured current predicts the voltage better than throttle (by '
-                 f'{number(gain)} nats), so it is used as the load, as a share of {full:.3g} A. '
-                 'Read "throttle" in the results and in the model as this share.')
-    return np.asarray(load)
+        return u, NAN
+    notes.append('The load is the measured current, which predicts the voltage better than '
+                 f'throttle (by {number(gain)} nats). Parameters are for a current of 1 '
+                 f'= {number(full)} A.')
+    return np.asarray(load), full
 
 
 def _gain(t: FloatArray, v: FloatArray, load: FloatArray) -> float:

@@ -15,7 +15,8 @@ from ou_monitor.criticism.integrity import examine, Integrity
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate, fit_gaussian
 from ou_monitor.discovery.decision import relaxes
-from ou_monitor.discovery.finding import Cause, Criticism, CrossingRate, Finding, Verdict
+from ou_monitor.discovery.finding import (
+    Cause, Criticism, CrossingRate, Finding, throttle_effects, ThrottleEffects, Verdict)
 from ou_monitor.discovery.fitting import Fitter, standard_errors, with_reach
 from ou_monitor.discovery.gain import (
     covered, crossing_rates, errors_grew, gain_of, guess, held_out, HeldOut, mean_score, shrink_of,
@@ -26,7 +27,7 @@ from ou_monitor.discovery.redraw import redraw_clipped, redraw_within_codes
 from ou_monitor.discovery.regression import load_terms
 from ou_monitor.discovery.search import position, Progress, Search, under_load, whole_load
 from ou_monitor.discovery.words import (
-    coupling_found, coupling_note, explain, left_out_note, NO_OTHER, no_relaxation_note,
+    by_load, coupling_found, coupling_note, explain, left_out_note, NO_OTHER, no_relaxation_note,
     VAGUE, verdict_sentence)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import blamed, catalogue, left_out, withdraw
@@ -100,7 +101,9 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
     se = tuple(with_reach(term, found, samples) for term, found in zip(
         whole.terms, standard_errors(samples, whole, slice(0, samples.n)), strict=True))
     done(0.95)
-    causes = _causes(samples, state, left, se, plain, scored, named.rivals)
+    load = 'current' if math.isfinite(state.full) else 'throttle'
+    causes = tuple(replace(cause, explanation=by_load(cause.explanation, load)) for cause in
+                   _causes(samples, state, left, se, plain, scored, named.rivals))
     gain, gain_se = gain_of(left.full, plain, scored)
     unknown = why_unknown(left.full, plain, scored, bool(uncovered))
     why = unknown or ('' if math.isfinite(gain) else VAGUE)
@@ -114,22 +117,26 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
     baseline = plain.model.terms[0]
     assert isinstance(baseline, OU)
     crossing = crossing_rates(samples, (baseline,), () if unknown else whole.terms, rng, scored)
+    effects = throttle_effects(samples, whole.terms, crossing.level, state.full)
     against = doubts(whole.terms, crossing, recording.duration,
-                     float(np.median(samples.step[1:])), larger) if causes else ()
+                     float(np.median(samples.step[1:])), larger, effects) if causes else ()
     verdict = judge(remaining, len(causes), against)
     done(1.0)
     return Finding(
         recording=recording.name, n=recording.n, duration=recording.duration, verdict=verdict,
-        sentence=verdict_sentence(verdict, causes, remaining, gain, gain_se, named.dropped, why,
-                                  uncovered, refused, named.failure == INTERRUPTED, against),
+        sentence=by_load(verdict_sentence(
+            verdict, causes, remaining, gain, gain_se, named.dropped, why, uncovered, refused,
+            named.failure == INTERRUPTED, against), load),
         baseline=baseline, baseline_score=mean_score(plain.density, scored & plain.known),
         criticism=criticism, causes=causes, model=SupplyModel((*whole.terms, *undone)),
         se=(*se, *(with_reach(term, {}, samples) for term in undone)),
         score=mean_score(left.full.density, scored & left.full.known),
         gain=gain, gain_se=gain_se, shrink=shrink_of(left.full, plain, scored), larger=larger,
-        crossing=crossing, notes=_notes(state, named, whole, dropped, samples, uncovered),
+        crossing=crossing, throttle_effects=effects,
+        notes=(*state.notes, *(by_load(note, load) for note in _notes(
+            named, whole, dropped, samples, uncovered))),
         samples=samples, simulated=SupplyModel(whole.terms), refused=refused,
-        load='current' if state.current else 'throttle', seed=seed)
+        full=state.full, seed=seed)
 
 
 def _insufficient(recording: Recording, state: Integrity, reason: str, seed: int) -> Finding:
@@ -268,10 +275,10 @@ def _criticism(before: Mapping[str, float], after: Mapping[str, float]) -> tuple
         for name, value in before.items())
 
 
-def _notes(state: Integrity, named: Named, model: Composite, dropped: Sequence[str],
-           samples: Samples, uncovered: int) -> tuple[str, ...]:
-    """Return notes: corrections of the samples, withdrawn causes, and undecided questions."""
-    notes = [*state.notes, *([named.failure] if named.failure else [])]
+def _notes(named: Named, model: Composite, dropped: Sequence[str], samples: Samples,
+           uncovered: int) -> tuple[str, ...]:
+    """Return notes: withdrawn causes, and undecided questions."""
+    notes = [named.failure] if named.failure else []
     for name in dict.fromkeys(dropped):
         notes.append(f"'{name}' fitted, but did not explain its statistics: withdrawn."
                      if name in named.dropped else
@@ -306,7 +313,8 @@ def judge(remaining: Sequence[Criticism], causes: int, doubts: Sequence[str] = (
 
 
 def doubts(terms: Sequence[Term], crossing: CrossingRate, duration: float, step: float,
-           larger: bool = False) -> tuple[str, ...]:
+           larger: bool = False, effects: ThrottleEffects = ThrottleEffects()
+           ) -> tuple[str, ...]:
     """Return objections to a model besides its statistics, in words (times in s)."""
     # larger: whether its one-step errors are larger than those of the plain OU.
     found = ['its one-step errors are larger than those of the plain OU'] if larger else []
@@ -315,6 +323,9 @@ def doubts(terms: Sequence[Term], crossing: CrossingRate, duration: float, step:
                      f'{number(crossing.extended)} times a minute; the recording does so '
                      f'{number(crossing.observed)} times, and the plain OU '
                      f'{number(crossing.baseline)} times')
+    if not effects.fits:
+        found.append(f'its voltage falls by {number(effects.explained, 2)} V from low to high '
+                     f'throttle; the readings do by {number(effects.measured, 2)} V')
     ends = [f'{name} of {term.NAME}' for term in terms for name in _at_ends(term, duration, step)]
     if ends:
         found.append(f'{listed(ends)} {"are" if ends[1:] else "is"} at the end of the range')

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 import enum
-from functools import cached_property
 import math
 from typing import Any
 
@@ -126,13 +125,19 @@ class Finding:
     shrink: float = NAN
     larger: bool = False  # Whether these errors are significantly larger than the plain OU's
     crossing: CrossingRate = field(default_factory=CrossingRate)  # Falls through a low level
+    throttle_effects: ThrottleEffects = field(default_factory=lambda: ThrottleEffects())
     notes: tuple[str, ...] = ()  # What was dropped, left out or cannot be decided
     samples: Samples | None = None  # Samples that were fitted
     # The extended model of `samples`; it lacks effects removed from them, such as repeats.
     simulated: SupplyModel | None = None
     refused: str = ''  # Why the extended model is refused, in words; otherwise empty
-    load: str = 'throttle'  # The load: 'throttle', or 'current' if that predicts better
+    full: float = NAN  # Current that is a load of 1, A; NaN if the load is throttle
     seed: int = 0  # Random seed
+
+    @property
+    def load(self) -> str:
+        """Return the load: 'throttle', or 'current' if that predicts the voltage better."""
+        return 'current' if math.isfinite(self.full) else 'throttle'
 
     @property
     def size_gain(self) -> float:
@@ -164,18 +169,12 @@ class Finding:
         """Return the statistics outside the band under the extended model, worst first."""
         return tuple(sorted((c for c in self.criticism if c.is_off), key=lambda c: -abs(c.after)))
 
-    @cached_property
-    def throttle_effects(self) -> ThrottleEffects:
-        """Return what the extended model predicts for punch-outs and dips."""
-        if self.samples is None or self.simulated is None:
-            return ThrottleEffects()
-        return throttle_effects(self.samples, self.simulated.terms, self.crossing.level)
-
     def as_data(self) -> dict[str, Any]:
         """Return the finding for JSON (doc/discovery.md); beside `params` lie `se` and `units`."""
         baseline = self.baseline
         found: dict[str, Any] = plain_data({
-            'recording': self.recording, 'load': self.load, 'n': self.n,
+            'recording': self.recording, 'load': self.load, 'full_load_a': self.full,
+            'n': self.n,
             'duration_s': self.duration,
             'verdict': self.verdict.value, 'sentence': self.sentence,
             'baseline': {
@@ -233,6 +232,8 @@ _FLOWN, _BEFORE, _AFTER, _MOST = (0.01, 0.99), 1.0, 5.0, 6000
 _BACK, _COUNTS = 0.9, 0.1
 # Minimum time between two dips, s, and range in which the predicted minimum of a dip is sought, s.
 _APART, _NEAR = 0.2, 0.05
+# Relative error of a fall under load above which the model does not reproduce it.
+_WRONG = 0.5
 # Share of a dip's depth above which throttle has caused it.
 _MADE = 0.5
 
@@ -241,9 +242,15 @@ _MADE = 0.5
 class ThrottleEffects:
     """Effects of throttle: a punch-out halfway through the recording, and the recorded dips."""
 
-    # Throttle before and after the punch-out.
+    # Load before and after the punch-out.
     low: float = NAN
     high: float = NAN
+    # Median fall from readings at the lower load to those at the higher, V: as measured, and of
+    # the mean of the model.
+    measured: float = NAN
+    explained: float = NAN
+    error: float = NAN  # Standard error of their difference, V
+    full: float = NAN  # Current that is a load of 1, A; NaN if the load is throttle
     # Maximum fall of the mean, V, and its time after the punch-out, s.
     dip: float = NAN
     after: float = NAN
@@ -258,7 +265,8 @@ class ThrottleEffects:
     def as_data(self) -> dict[str, Any]:
         """Return the fields for JSON."""
         return {
-            'punch_out': {'from': self.low, 'to': self.high, 'dip_v': self.dip,
+            'punch_out': {'from': self.low, 'to': self.high, 'measured_v': self.measured,
+                          'explained_v': self.explained, 'dip_v': self.dip,
                           'dip_after_s': self.after, 'recovered_v': self.recovered,
                           'recovered_within_s': self.within},
             'dips': {'level_v': self.level, 'count': self.dips, 'made_by_throttle': self.made}}
@@ -268,21 +276,38 @@ class ThrottleEffects:
         """Return the effects in words; empty if throttle has none."""
         if not self.dip > 0.0:
             return ''
-        found = (f'A punch-out from throttle {number(self.low, 2)} to {number(self.high, 2)} '
-                 f'lowers the voltage by {number(self.dip, 2)} V')
-        if self.recovered > 0.0:
-            found += (f' after {number(1e3 * self.after, 2)} ms, of which '
-                      f'{number(self.recovered, 2)} V recover within {number(self.within, 2)} s')
-        found += '.'
+        load, unit = ('current', ' A') if math.isfinite(self.full) else ('throttle', '')
+        low, high = (number(self.full * end if unit else end, 2) + unit
+                     for end in (self.low, self.high))
+        found = (f'The median voltage at {load} {high} is {number(self.measured, 2)} V below that '
+                 f'at {low}')
+        if not self.fits:
+            found += f', but {number(self.explained, 2)} V by the model: trust the readings.'
+        else:
+            found += (f'; by the model, a step from {low} to {high} lowers it by '
+                      f'{number(self.dip, 2)} V')
+            if self.recovered > 0.0:
+                found += (f' after {number(1e3 * self.after, 2)} ms, of which '
+                          f'{number(self.recovered, 2)} V recover within '
+                          f'{number(self.within, 2)} s')
+            found += '.'
         if self.dips:
             made = (f'caused {self.made} of the {self.dips} dips' if self.dips > 1 else
                     f'{"caused" if self.made else "did not cause"} the only dip')
-            found += f' Throttle {made} below {number(self.level, 4)} V.'
+            found += (f' {"The current" if unit else "Throttle"} {made} below '
+                      f'{number(self.level, 4)} V.')
         return found
 
+    @property
+    def fits(self) -> bool:
+        """Whether the model explains most of the measured fall, and not much more."""
+        off = abs(self.explained - self.measured)
+        return not (off > _WRONG * abs(self.measured) and off > Z95 * self.error)
 
-def throttle_effects(samples: Samples, terms: Sequence[Term], level: float) -> ThrottleEffects:
-    """Return what a model predicts for punch-outs and for dips below a level, V."""
+
+def throttle_effects(samples: Samples, terms: Sequence[Term], level: float, full: float = NAN
+                     ) -> ThrottleEffects:
+    """Return what a model predicts for punch-outs and for dips below a level, V (full in A)."""
     responses = [term for term in terms if term.ROLE is Role.MEAN and term.MEASURED]
     u = samples.throttle
     if u is None or not any(term.NEEDS_THROTTLE for term in responses):
@@ -303,9 +328,16 @@ def throttle_effects(samples: Samples, terms: Sequence[Term], level: float) -> T
     if not recovered > _COUNTS * dip:
         recovered = 0.0
     within = step * int(np.argmax(back >= _BACK * recovered)) if recovered else NAN
-    dips, made = _dips(samples, _path(samples, responses), level)
-    return ThrottleEffects(low, high, dip, step * (deepest + 1), recovered, within, level, dips,
-                           made)
+    mean = _path(samples, responses)
+    v, ends = samples.logged, (u <= low, u >= high)
+    measured, explained = (float(np.median(y[ends[0]]) - np.median(y[ends[1]]))
+                           for y in (v, mean))
+    # Readings of one stay at a load are not independent.
+    stays = [1 + int((end[1:] & ~end[:-1])[1:].sum()) for end in ends]
+    error = float(np.std(v - mean)) * math.sqrt(sum(1.0 / count for count in stays))
+    dips, made = _dips(samples, mean, level)
+    return ThrottleEffects(low, high, measured, explained, error, full, dip, step * (deepest + 1),
+                           recovered, within, level, dips, made)
 
 
 def _path(samples: Samples, responses: Sequence[Term]) -> FloatArray:

@@ -379,6 +379,12 @@ def plain(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
+def by_load(text: str, load: str) -> str:
+    """Return a text about throttle with the name of the load instead."""
+    return re.sub(r'\b([Tt])hrottle\b', lambda found: (
+        load.capitalize() if found[1] == 'T' else load), text)
+
+
 def both_names(name: str) -> str:
     """Return the plain name of a cause, followed by its name in code."""
     return f'{PLAIN_NAMES[name]} ({name})' if name in PLAIN_NAMES else name

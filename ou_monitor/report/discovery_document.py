@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from html import escape
 import math
 
@@ -12,7 +12,7 @@ from ou_monitor.analysis.overview import known_lines, other_scale, Overview
 from ou_monitor.criticism.curves import compare_curves, Comparison
 from ou_monitor.discovery.finding import Finding, Verdict
 from ou_monitor.discovery.words import (
-    both_names, cause_rows, gain_words, MNAT, overlap_words, plain, plain_model_words,
+    both_names, by_load, cause_rows, gain_words, MNAT, overlap_words, plain, plain_model_words,
     PLAIN_NAMES, plain_words, with_error)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.report.document import (
@@ -38,8 +38,10 @@ def discovery_document(finding: Finding, seen: Overview | None = None, command: 
     """Return the report of a discovery; `seen` holds the facts of the recording."""
     samples, baseline = finding.samples, finding.baseline
     used = '' if samples is None or samples.n == finding.n else f', {samples.n} used'
+    load = ('' if finding.load == 'throttle' else
+            f'; load: the measured current, 1 = {number(finding.full)} A')
     subject = (f'{finding.recording or "recording"}: {finding.n} samples in '
-               f'{number(finding.duration, 4)} s{used}')
+               f'{number(finding.duration, 4)} s{used}{load}')
     known = [] if seen is None else known_lines(seen)
     if seen is not None and baseline is not None and other_scale(
             seen.facts.ou, baseline.alpha, 0.0, baseline.sigma, 0.0):
@@ -47,7 +49,7 @@ def discovery_document(finding: Finding, seen: Overview | None = None, command: 
     parts: list[Part] = [
         lambda: [] if samples is None else [Figure(_voltage(finding), (
             f'Band: range of {_DRAWS} simulations of the {_model_name(finding)} at each moment, '
-            'with the throttle of the recording.') if finding.simulated else '')],
+            f'with the {finding.load} of the recording.') if finding.simulated else '')],
         Facts(known)]
     if baseline is not None:
         after = ' before and after' if finding.causes else ''
@@ -67,7 +69,8 @@ def answer(finding: Finding) -> list[str]:
     if not finding.causes:
         return [plain(finding.sentence)]
     order = sorted(finding.causes, key=lambda c: -c.gain if math.isfinite(c.gain) else math.inf)
-    names = [both_names(name) for name in dict.fromkeys(cause.name for cause in order)]
+    names = [by_load(both_names(name), finding.load)
+             for name in dict.fromkeys(cause.name for cause in order)]
     more = len(names) - _FIRST
     others = [f'{more} more'] if more > 0 else []
     worse = [*(['one-step errors are larger'] if finding.larger else []),
@@ -129,8 +132,9 @@ def _causes(finding: Finding) -> list[Part]:
         for remark in dict.fromkeys(row.remark for row in found if row.remark)]
     return [
         Table(['cause', 'what it is', 'family', 'gain,\nmnat/sample', 'p', 'alternatives'],
-              [[row.label, PLAIN_NAMES.get(row.name, row.name), row.family, row.gain, row.chance,
-                ', '.join(row.alternatives) or '-'] for row in found], left=[0, 1, 2, 5]),
+              [[row.label, by_load(PLAIN_NAMES.get(row.name, row.name), finding.load),
+                row.family, row.gain, row.chance, ', '.join(row.alternatives) or '-']
+               for row in found], left=[0, 1, 2, 5]),
         Notes.of([*remarks, overlap_words(finding.causes, finding.gain),
                   *(f'{row.label}: {row.explanation}' for row in found)]),
         Text(f'{MNAT} Gain: the loss of held-out score when the cause is left out and the rest is '
@@ -161,7 +165,8 @@ def _gain(finding: Finding) -> list[Part]:
 
 def _statistics(finding: Finding) -> list[Part]:
     worst = sorted(finding.criticism, key=lambda c: -max(abs(c.before), abs(c.after)))
-    rows = [(c.statistic, c.low, c.high, c.before, c.after) for c in worst[:_ROWS]]
+    rows = [(by_load(c.statistic, finding.load), c.low, c.high, c.before, c.after)
+            for c in worst[:_ROWS]]
     text = (f'{len(finding.discrepancies)} of {len(finding.criticism)} statistics of the '
             'one-step errors lie outside the band for the plain OU'
             + (f', {len(finding.remaining)} for the extended model. ' if finding.causes else '. '))
@@ -179,11 +184,13 @@ def _comparisons(finding: Finding) -> list[Part]:
     named = ('plain OU', 'extended model') if finding.causes else ('plain OU',)
     compared = compare_curves(samples, [plain, extended] if finding.causes else [plain],
                               np.random.default_rng(finding.seed))
-    drawn = [Figure(_plot(curve, k, name))
+    drawn = [Figure(_plot(replace(curve, title=by_load(curve.title, finding.load),
+                                  x_label=by_load(curve.x_label, finding.load)), k, name))
              for curve in compared for k, name in enumerate(named)]
     return [*Pair.two_by_two(drawn), Text(
         'Line or dots: the data. Band or bars: the range of 40 simulations with the stamps and '
-        'throttle of the data; with a correct model about one point in twenty lies outside.',
+        f'{finding.load} of the data; with a correct model about one point in twenty lies '
+        'outside.',
         legend=True)]
 
 
@@ -215,8 +222,10 @@ def _plot(curve: Comparison, k: int, name: str) -> Plot:
 def _discrepancies(finding: Finding) -> Part:
     if not finding.remaining:
         return Text(f'Nothing: no statistic of the {_model_name(finding)} lies outside the band.')
-    rows = [[c.statistic, *([number(c.before)] if finding.causes else []), number(c.after),
-             f'[{number(c.low)}, {number(c.high)}]', plain_words(c.statistic)]
+    rows = [[by_load(c.statistic, finding.load),
+             *([number(c.before)] if finding.causes else []), number(c.after),
+             f'[{number(c.low)}, {number(c.high)}]',
+             by_load(plain_words(c.statistic), finding.load)]
             for c in finding.remaining]
     return Table(['statistic', *(['plain OU'] if finding.causes else []), 'score',
                   'band', 'in words'], rows, left=[0, len(rows[0]) - 1], most=_SHOWN)
@@ -231,7 +240,8 @@ def _parameters(finding: Finding) -> list[Part]:
             value = list(value) if isinstance(value, tuple) else value
             rows.append([term.NAME, spec.name,
                          with_error(value, se.get(spec.name), positive=term.positive(spec.name)),
-                         spec.metadata['unit'] or '-', spec.metadata['text']])
+                         spec.metadata['unit'] or '-',
+                         by_load(spec.metadata['text'], finding.load)])
     about = ('Extended model: all terms fitted together on the whole recording. Its alpha and '
              'sigma describe the relaxation and noise not explained by the causes; alpha and '
              'sigma of the plain OU above include the causes.'

@@ -1,5 +1,8 @@
 """The load of a recording: throttle, or the measured current if it explains more."""
 
+import math
+import re
+
 import numpy as np
 from ou_monitor import discover, Recording
 from ou_monitor.cli.recorded import model_text
@@ -8,6 +11,8 @@ from ou_monitor.errors import InputError
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
+from ou_monitor.report.discovery_document import discovery_document
+from ou_monitor.report.terminal import terminal
 import pytest
 from scipy.signal import lfilter
 
@@ -36,7 +41,11 @@ def test_the_measured_current_is_the_load_where_it_says_more():
     found = discover(recording)
     assert found.as_data()['load'] == 'current'
     assert [cause.name for cause in found.causes] == ['load_sag']
-    assert any('current predicts the voltage better' in note for note in found.notes)
+    assert found.full == pytest.approx(np.quantile(current, 0.99), rel=0.01)
+    assert any('load is the measured current' in note for note in found.notes)
+    shown = ' '.join(terminal(discovery_document(found)).split())
+    assert 'throttle' not in shown.replace('better than throttle', '')
+    assert re.search(r'at current [0-9.]+ A is .* V below', shown)
     with pytest.raises(InputError, match='current'):
         model_text(found, recording)
     alone = discover(Recording(T, v, u, 'made'))
@@ -50,8 +59,9 @@ def test_a_current_is_taken_with_its_sign_and_its_delay(sign, late):
     load = flown(5)
     read = sign * 30.0 * np.roll(load, late)
     notes = []
-    found = load_of(Recording(T, sagged(load), flown(4), '', current=read), T, sagged(load),
-                    flown(4), notes)
+    found, full = load_of(Recording(T, sagged(load), flown(4), '', current=read), T, sagged(load),
+                          flown(4), notes)
+    assert full == pytest.approx(sign * 30.0 * np.quantile(load, 0.99))
     assert np.corrcoef(found[10:-10], load[10:-10])[0, 1] > 0.99 and len(notes) == 1
 
 
@@ -62,4 +72,5 @@ def test_throttle_stays_the_load_where_current_is_noise_or_unknown():
     noise = 30.0 * np.random.default_rng(1).random(N)
     gap = np.where((T > 10.0) & (T < 20.0), np.nan, 30.0 * u)
     for current in (None, noise, gap, np.full(N, 3.0), np.full(N, np.nan)):
-        assert load_of(Recording(T, v, u, '', current=current), T, v, u, []) is u
+        load, full = load_of(Recording(T, v, u, '', current=current), T, v, u, [])
+        assert load is u and math.isnan(full)
