@@ -21,13 +21,15 @@ from ou_monitor.criticism.readings import current_at, usable, why_no_model
 from ou_monitor.errors import InputError
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.records import FloatArray, Recording
-from ou_monitor.text import counted, number
+from ou_monitor.text import counted, number, percent
 
 # Minimum readings and duration, s, of a part; minimum simulations (with so few, 5 % of good models
 # are refused) and maximum.
 _LEAST, _SHORTEST, _FEWEST_SEEDS, _MOST_SEEDS = 50, 0.2, 20, 10_000
 # Maximum points of the band on a page.
 _POINTS = 2000
+# Least probability of the other kind of level that is reported.
+_UNSURE = 0.05
 # Time at the beginning over which a model from a file is aligned with the recording, s.
 _ALIGNED = 2.0
 
@@ -138,6 +140,10 @@ def _fit_notes(model: FlightModel, samples: Readings) -> list[str]:
                          'The simulated load is current.')
         if math.isfinite(model.load.model.constant_level):
             found.append('No discharge is visible, so the level is constant.')
+        if model.doubt > _UNSURE:
+            falls = math.isnan(model.load.model.constant_level)
+            found.append(f'Whether the level {"stands" if falls else "falls"} is open: it does in '
+                         f'{percent(model.doubt)} of the simulations.')
         return found
     if samples.current is None and samples.throttle is None:
         return ['Throttle is not recorded: only level and noise are simulated.']

@@ -29,6 +29,7 @@ from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.reading import Quantization
 from ou_monitor.records import FloatArray
 from scipy.signal import lfilter
+from scipy.special import expit
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,6 +177,9 @@ class FlightModel:
     """Load model, slow process, OU and white noise, as fitted to a part of a recording."""
 
     load: LoadFit | None  # The response to the load; None if there is only a level
+    # The same with the other kind of level, constant or discharging, and its probability.
+    other: LoadFit | None
+    doubt: float
     # Level, V, without a load model, and its standard error.
     level: float
     level_se: float
@@ -199,8 +203,11 @@ class FlightModel:
         """Return the mean voltage, V."""
         if self.load is None:
             return np.full(samples.t.size, self.level)
-        return self.damping.of(
-            self.load.model.path(samples.t, samples.throttle, samples.current), samples.t)
+        path = self.load.model.path(samples.t, samples.throttle, samples.current)
+        if self.other is not None:
+            path = path + self.doubt * (self.other.model.path(
+                samples.t, samples.throttle, samples.current) - path)
+        return self.damping.of(path, samples.t)
 
     def draw(self, samples: Readings, rng: np.random.Generator) -> FloatArray:
         """Return one simulated voltage, V; the errors of the parameters are drawn too."""
@@ -209,13 +216,14 @@ class FlightModel:
         if self.load is None:
             voltage = np.full(n, self.level + self.level_se * rng.standard_normal())
         else:
-            load = self.load.draw(rng)
+            other = None if rng.random() >= self.doubt else self.other
+            load = (other or self.load).draw(rng)
             path = load.path(samples.t, samples.throttle, samples.current)
             size = load.size * math.exp(self.sag_error * float(rng.standard_normal()))
-            other = replace(load, size=size).path(
+            resized = replace(load, size=size).path(
                 samples.t, samples.throttle, samples.current)
             # The mean over the fitted part is known, so with a larger sag the level is higher.
-            path = other - float((other - path)[samples.t <= self.until].mean())
+            path = resized - float((resized - path)[samples.t <= self.until].mean())
             voltage = self.damping.of(path, samples.t)
             slow = self.spread * self.load.slow_std ** 2
         if slow > 0.0:
@@ -286,7 +294,8 @@ def fit_flight(samples: Readings, report: Callable[[float], None]) -> FlightMode
     spread, sag_error = (1.0, 0.0) if best is None else (
         _spread(samples, best), _sag_error(samples, best))
     return FlightModel(
-        load, mean, noise.mean_error(duration), damped, spread, sag_error, noise,
+        load, None if best is None else best.other, 0.0 if best is None else best.doubt,
+        mean, noise.mean_error(duration), damped, spread, sag_error, noise,
         float(samples.t[-1]))
 
 
@@ -297,20 +306,26 @@ class _Load:
     fit: LoadFit
     current: FloatArray | None
     constant_level: bool
+    other: LoadFit  # With the other kind of level
+    doubt: float  # Its probability
     parts: tuple[tuple[LoadFit, FloatArray], ...] = ()
 
 
 def _best(samples: Readings, report: Callable[[float], None]) -> _Load | None:
-    """Return the load and kind of level with most evidence; None if no load has any."""
+    """Return the load with most evidence, with both kinds of level; None if none has any."""
     found: _Load | None = None
     most = level_evidence(samples.t, samples.voltage)
-    # The simpler ones first: throttle before current, a constant level before a discharge.
-    tried = [(current, constant) for current in _loads(samples) for constant in (True, False)]
-    for k, (current, constant) in enumerate(tried):
-        fit = _fit(samples, current, constant)
-        if fit.evidence > most + _CLEAR:
-            found, most = _Load(fit, current, constant), fit.evidence
-        report((k + 1.0) / len(tried))
+    # The simpler one first: throttle before current.
+    loads = _loads(samples)
+    for k, current in enumerate(loads):
+        constant, falling = (_fit(samples, current, kind) for kind in (True, False))
+        ahead = falling.evidence - constant.evidence
+        evidence = float(np.logaddexp(falling.evidence, constant.evidence)) - math.log(2.0)
+        if evidence > most + _CLEAR:
+            fit, other = (falling, constant) if ahead > 0.0 else (constant, falling)
+            found, most = _Load(fit, current, ahead <= 0.0, other,
+                                float(expit(-abs(ahead)))), evidence
+        report((k + 1.0) / len(loads))
     return found
 
 

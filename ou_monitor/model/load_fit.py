@@ -27,7 +27,7 @@ _PRIOR = {
     'fast_share': (math.log(0.2), 0.3), 'fast_time': (math.log(1.0), 0.7),
     'slow_share': (math.log(0.3), 0.3), 'slow_time': (math.log(20.0), 0.3),
     'inrush': (math.log(0.5), 1.0), 'lag': (math.log(0.01), 0.7),
-    'endurance': (math.log(350.0), 0.4), 'charge': (0.7, 0.3), 'before': (0.3, 0.4),
+    'endurance': (math.log(450.0), 0.6), 'charge': (0.7, 0.3), 'before': (0.3, 0.4),
 }
 _NAMES = tuple(_PRIOR)
 _LINEAR = {'charge': (0.0, 1.05), 'before': (0.0, 1.5)}
