@@ -11,14 +11,14 @@ Node, estimator and offline reading share these rules:
 
 Repeats: a voltage read at 100 Hz and logged at 1 kHz appears ten times, and the repeats would look
 like increments of zero.  They are recognised by the gaps between changes, all multiples of one
-period, which need not be whole (3, 3, 4).  A coarse ADC also makes ties, but at irregular
-distances.  A ramp, square wave or ripple through a coarse ADC changes at regular distances, but
-always by one code, and two neighbouring gaps always have the same sum.
+period, which need not be whole (3, 3, 4).  A coarse ADC also repeats values, but changes at
+irregular distances, or (ramp, square wave, ripple) always by one code and with a constant sum of
+two neighbouring gaps.
 
-Limits: repeats are recognised from 64 samples on and need at least two samples per reading; until
-then they count as readings, and `Batch.again` marks the restart without them.  They are not
-recognised if readings jitter by more than a tenth of a period (standard deviation), or if there
-are fewer than four samples per reading and the ADC step exceeds 1.3 times the usual increment.
+Limits: repeats need at least two samples per reading, and are recognised after 64 samples.  The
+first samples are then passed on again without repeats (`Batch.again`).  Repeats are not recognised
+if readings jitter by more than a tenth of a period (standard deviation), or if there are fewer
+than four samples per reading and the ADC step exceeds 1.3 times the usual increment.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ _WIDEST = 0.35
 _EVIDENCE = 20.0
 # Minimum share of changes whose size differs from the most common size.
 _SIZES = 0.1
-# Minimum share of regular gaps that keeps a period found earlier.
+# To keep a period found earlier: minimum share of regular gaps.
 _KEEP = 0.8
-# Minimum number of gaps before that period can be given up.
+# To give it up: minimum number of gaps.
 _FEWEST = 8
 # Relative difference below which two step sizes are equal (float32 rounding).
 _SAME = 1e-3
@@ -120,7 +120,7 @@ def refresh_period(y: FloatArray, known: float = 1.0) -> float:
     usual = float(np.median(gaps))
     if usual < 2.0:
         return 1.0
-    # If few readings change the ADC code, gaps span several periods: do not try longer gaps.
+    # Long gaps span several periods, because few readings change a coarse ADC code.
     evidence, period = 0.0, 1.0
     for first in np.unique(gaps[gaps <= 1.5 * usual])[:_TRIED].tolist():
         about = _period(gaps, float(gaps[np.abs(gaps - first) <= max(1.0, 0.1 * first)].mean()))
@@ -161,7 +161,7 @@ def _period(gaps: FloatArray, near: float) -> float:
 
 
 def _excess(gaps: FloatArray, period: float) -> FloatArray:
-    """Return gaps less the nearest whole number, at least one, of periods."""
+    """Return gaps less the nearest multiple (at least one) of the period."""
     excess: FloatArray = gaps - period * np.maximum(1.0, np.rint(gaps / period))
     return excess
 
@@ -194,9 +194,9 @@ class Repeats:
     """
     Drops repeats from a stream, in batches of any size; `period`: samples per refresh.
 
-    A refresh may return the same value as the one before.  In a run longer than a period it is
-    placed where it is due, because to keep only changes would bias the noise.  It is passed on
-    half a period later.
+    A refresh may return the previous value; to drop it as a repeat would bias the noise.  So in a
+    run longer than a period, a refresh is assumed where it is due, and passed on half a period
+    later.
     """
 
     def __init__(self) -> None:
@@ -335,7 +335,7 @@ def supplied(recording: Recording, at_ends: bool = False) -> Recording:
         return recording
     gone = np.zeros(v.size, dtype=np.bool_)
     for begin, end in zip(begins.tolist(), ends.tolist()):
-        # From its full voltage, a decay takes half as long again as between the two limits.
+        # Include the decay from full voltage: about half the time between the two limits.
         first, last = begin + np.flatnonzero(off[begin:end])[[0, -1]]
         gone[max(0, begin - (first - begin) // 2):end + (end - 1 - last) // 2] = True
     count = int(gone.sum())
@@ -369,13 +369,13 @@ def ordered(recording: Recording) -> Recording:
     return recording
 
 
-# A supply is off below the first share of its usual voltage (4S replaced by 5 V of USB: 0.3), and
-# on again above the second.
+# Shares of the usual voltage below which a supply is off (4S replaced by 5 V of USB: 0.3), and
+# above which it is on again.
 OFF, _ON = 0.2, 0.7
-# A reading above this number of usual voltages is an error (6S after 5 V of USB: 5).
+# Maximum reading, in usual voltages (6S after 5 V of USB: 5).
 WILD_FACTOR = 20.0
-# Maximum number of times off, or as a share of the samples; maximum share of samples; maximum
-# samples between the two limits for each sample below the first.
+# Maximum number of outages, also as a share of the samples; maximum share of samples off; maximum
+# ratio of samples between the two limits to samples below the lower one.
 _OUTAGES, _FEW, _MOST_OFF, _BETWEEN = 10, 0.01, 0.5, 1.0
 # Largest accepted magnitude of a voltage, V: far above any supply, with squares and cubes finite.
 MOST_VOLTAGE = 1.0e6
@@ -434,7 +434,7 @@ class TimeLine:
     """Buffer, order and counters of the samples of one source."""
 
     def __init__(self) -> None:
-        # Columns t, V, throttle and current of each push since the last `work_off`.
+        # Columns t, V, throttle and current of each push since the last `flush`.
         self._parts: list[FloatArray] = []
         self.waiting = 0  # Samples in them
         self._counts: Counter[str] = Counter()
@@ -452,7 +452,7 @@ class TimeLine:
         return self._repeats.period
 
     def put(self, t: FloatArray, y: FloatArray, u: FloatArray | float | None) -> None:
-        """Keep samples, copied, for the next `work_off`."""
+        """Keep samples, copied, for the next `flush`."""
         self._parts.append(as_columns(t, y, u))
         self.waiting += t.size
 
@@ -467,11 +467,11 @@ class TimeLine:
 
     def _begin_anew(self) -> None:
         self._repeats.forget()
-        # Last raw samples (t, V, throttle, current); new ones since the last search for repeats.
+        # Last raw samples (t, V, throttle, current); number since the last search for repeats.
         self._tail = np.empty((4, 0))
-        self._unseen, self._looked = 0, False
+        self._since_search, self._searched = 0, False
 
-    def work_off(self, pause: float) -> list[Batch]:
+    def flush(self, pause: float) -> list[Batch]:
         """Empty the buffer; return its readings in order (pause in s)."""
         parts, self._parts, self.waiting = self._parts, [], 0
         return self.take(np.concatenate(parts, axis=1), pause)
@@ -488,7 +488,7 @@ class TimeLine:
             self.count(non_finite=int(np.count_nonzero(~good)))
             columns = columns[:, good]
         batches: list[Batch] = []
-        # One jump of time at a time, because the newest stamp starts anew at each.
+        # Split at each jump of time, where the newest stamp starts anew.
         while columns.size:
             t = columns[0]
             restart = math.isfinite(self.newest) and abs(t[0] - self.newest) > pause
@@ -521,11 +521,11 @@ class TimeLine:
         if batch.restart:
             self._begin_anew()
         whole = np.concatenate([self._tail, batch.columns], axis=1)
-        self._unseen += batch.t.size
+        self._since_search += batch.t.size
         self._tail = whole[:, -TAIL:].copy()
         before = self._repeats.period
-        if self._unseen >= (_LOOK if self._looked else _ENOUGH):
-            self._unseen, self._looked = 0, True
+        if self._since_search >= (_LOOK if self._searched else _ENOUGH):
+            self._since_search, self._searched = 0, True
             self._repeats.period = self._refresh(before)
         if self._repeats.period == 1.0:
             if before > 1.0:

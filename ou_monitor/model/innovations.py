@@ -42,7 +42,7 @@ class Filter:
     """Gains of a model; filters series.  ValueError: the precision is not positive definite."""
 
     def __init__(self, model: StateSpace, n: int | None = None) -> None:
-        # Beyond the model's samples, its matrices and gain are taken as constant.
+        # After the samples of the model, its matrices and the gain are constant.
         self._n = model.f.shape[0] if n is None else n
         # Samples with their own gain, and states; variance of the innovations, V^2, shape (n,).
         self.shape = (model.f.shape[0], model.f.shape[1])
@@ -122,9 +122,9 @@ class Filter:
         return e, state
 
 
-# Condition number of the eigenvectors above which the modes are not filtered one by one.
-_APART = 1e10
-# Samples filtered at once if the modes are not filtered one by one.
+# Maximum condition number of the eigenvectors for filtering the modes one by one.
+_DISTINCT = 1e10
+# Samples filtered at once otherwise.
 _CHUNK = 4096
 
 
@@ -134,7 +134,7 @@ class _Steady:
     def __init__(self, loop: FloatArray, gain: FloatArray, look: FloatArray) -> None:
         self._loop, self._gain, self._look = loop, gain, look
         self._roots, vectors = np.linalg.eig(loop)
-        self._modal = bool(np.linalg.cond(vectors) < _APART)
+        self._modal = bool(np.linalg.cond(vectors) < _DISTINCT)
         if self._modal:
             self._into = np.linalg.inv(vectors)
             self._drive = self._into @ gain

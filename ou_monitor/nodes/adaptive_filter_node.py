@@ -1,18 +1,21 @@
 """
 The node `adaptive_filter`: low-pass a topic, with a cutoff that follows the noise of the supply.
 
-doc/messages.md lists its topics.  `input` has a type of `filter_channels.CHANNELS`, or any
-installed type with `input.field`.  While the estimator's `state` is published, it gives the error
-of sigma, alpha, throttle, level, and whether the estimate is usable.  With `notch.count` above 0
-also `throttle` and `rpm` are followed, for the notches, which come before the low-pass; without
-`throttle` the throttle in `state` is used.  `~/output` has the type, stamp and frame of the input;
-a derivative is a geometry_msgs/AccelStamped or Vector3Stamped.
+doc/messages.md lists its topics:
 
-Limits: of an Imu only the angular velocity is filtered, and with `input.acceleration` the
-linear acceleration; their covariances shrink as for white noise.  Of a BatteryState only
-the voltage is filtered, unless `input.field` names another field.  All other fields stay
-unchanged.  Messages with a non-finite signal are counted and dropped.  If stamps repeat or
-go back, the arrival times are used, and the diagnostics report it.
+- `input`: a type of `filter_channels.CHANNELS`, or with `input.field` any installed type;
+- `state` of the estimator, if published: sigma's error, alpha, throttle, level, and whether the
+  estimate is usable;
+- `throttle` and `rpm`, if `notch.count` is above 0: for the notches, which come before the
+  low-pass; without `throttle`, the throttle in `state` is used;
+- `~/output`: type, stamp and frame of the input; a derivative is a geometry_msgs/AccelStamped or
+  Vector3Stamped.
+
+Limits: of an Imu only the angular velocity is filtered, and with `input.acceleration` the linear
+acceleration; their covariances shrink as for white noise.  Of a BatteryState only the voltage is
+filtered, unless `input.field` names another field.  Other fields stay unchanged.  Messages with a
+non-finite signal are counted and dropped.  If stamps repeat or go back, the arrival times are
+used, and the diagnostics report it.
 """
 
 from __future__ import annotations
@@ -200,7 +203,7 @@ class AdaptiveFilterNode(MonitorNode):
         self._filters: list[AdaptiveLowPass] = []
         values = self.values()
         # Used until the filters exist.
-        self._idle = AdaptiveLowPass(**_of_filter(values))
+        self._idle = AdaptiveLowPass(**_filter_options(values))
         self._notch = AdaptiveNotch(**notch_options(values))
         self._motors = MotorInputs(self, values, self.steady_now)
         self._supply = SupplyInput(self.steady_now, (
@@ -234,18 +237,19 @@ class AdaptiveFilterNode(MonitorNode):
 
     def check(self, values: Mapping[str, Any]) -> None:
         """Raise `ValueError` when the parameters contradict each other or the signal."""
-        settings = FilterSettings(**_of_filter(values))
+        settings = FilterSettings(**_filter_options(values))
         NotchSettings.from_options(notch_options(values))
-        if self._channels is not None and _not_a_voltage(self._type, settings):
+        if self._channels is not None and _lacks_voltage(self._type, settings):
+            needed = _signal_parameter(settings)
             raise ValueError(
-                f'law {settings.law} without {_of_signal(settings)} is for a voltage, but '
-                f'{self._topic} is {self._type}: set {_of_signal(settings)} first')
+                f'law {settings.law} without {needed} is for a voltage, but {self._topic} is '
+                f'{self._type}: set {needed} first')
 
     def apply(self, values: Mapping[str, Any]) -> None:
         """Bring checked parameters into force; the output does not move."""
         super().apply(values)
         for channel in (self._idle, *self._filters):
-            channel.configure(**_of_filter(values))
+            channel.configure(**_filter_options(values))
         self._notch.configure(**notch_options(values))
 
     @property
@@ -276,7 +280,7 @@ class AdaptiveFilterNode(MonitorNode):
         channels = self._channels_of(kind)
         message = message_class(kind)
         self._type, self._channels = kind, channels
-        self._filters = [AdaptiveLowPass(**_of_filter(self.values()))
+        self._filters = [AdaptiveLowPass(**_filter_options(self.values()))
                          for _ in channels.names]
         self._output = self.create_publisher(
             message_class(channels.output or kind), '~/output', 10)
@@ -337,7 +341,7 @@ class AdaptiveFilterNode(MonitorNode):
                                 self.low_pass.settings.alpha)
 
     def _jumped(self, reason: str) -> None:
-        """Do nothing: a step back in time has length 0, so the output stays."""
+        """Keep the output: a step back in time counts as a step of length 0."""
         self.get_logger().info(f'{reason}: the filter continues from its output')
 
     # -- reporting
@@ -415,10 +419,11 @@ class AdaptiveFilterNode(MonitorNode):
             return Level.WARN, NO_CLOCK
         if self._input_clock.stamps is not StampOrder.GOOD:
             return Level.WARN, f'{self._topic}: {self._input_clock.stamps.by_arrival}'
-        if _not_a_voltage(self._type, s):
+        if _lacks_voltage(self._type, s):
+            needed = _signal_parameter(s)
             return Level.WARN, (
-                f'Law {s.law} without {_of_signal(s)} assumes that {self._topic} is the voltage, '
-                f'but it is {self._type}: set {_of_signal(s)}.')
+                f'Law {s.law} without {needed} assumes that {self._topic} is the voltage, '
+                f'but it is {self._type}: set {needed}.')
         missing = math.isnan(supply.throttle if s.law == 'throttle' else supply.sigma)
         if missing:
             return Level.WARN, (
@@ -434,9 +439,9 @@ class AdaptiveFilterNode(MonitorNode):
         return Level.OK, (
             f'{shadow}Cutoff {self.low_pass.cutoff:.4g} Hz by law {s.law} at {of}; decided by '
             f'{self._decided_by(supply)}; lag {360.0 * s.lag_frequency * self._delay:.3g} degrees '
-            f'({1e3 * self._delay:.3g} ms) at {s.lag_frequency:g} Hz{self._of_notches()}.')
+            f'({1e3 * self._delay:.3g} ms) at {s.lag_frequency:g} Hz{self._notch_words()}.')
 
-    def _of_notches(self) -> str:
+    def _notch_words(self) -> str:
         notch = self._notch
         if not notch.settings.count:
             return ''
@@ -446,16 +451,16 @@ class AdaptiveFilterNode(MonitorNode):
         return f'; notches at {at} Hz by {notch.source}'
 
 
-def _of_filter(values: Mapping[str, Any]) -> dict[str, Any]:
+def _filter_options(values: Mapping[str, Any]) -> dict[str, Any]:
     return {p.name: values[p.name] for p in FILTER_PARAMETERS}
 
 
-def _not_a_voltage(kind: str, settings: FilterSettings) -> bool:
+def _lacks_voltage(kind: str, settings: FilterSettings) -> bool:
     """Return whether the law needs the voltage itself but the signal is another."""
     own = {'kalman': settings.of_voltage, 'wiener': not settings.signal_bandwidth}
     return kind == 'sensor_msgs/msg/Imu' and own.get(settings.law, False)
 
 
-def _of_signal(settings: FilterSettings) -> str:
-    """Return the parameter that is set if the signal is not the voltage."""
+def _signal_parameter(settings: FilterSettings) -> str:
+    """Return the parameter that must be set if the signal is not the voltage."""
     return 'coupling' if settings.law == 'kalman' else 'signal_bandwidth'

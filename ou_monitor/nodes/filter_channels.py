@@ -18,8 +18,8 @@ from ou_monitor.recordings.cdr import value_path
 from ou_monitor.stream.config import FieldPath, FieldSpec, put, walk
 
 IMU = 'sensor_msgs/msg/Imu'
-# Types of derivatives: of an angular velocity; of another signal with a stamp (in x), and without
-# a stamp.
+# Output types of derivatives: of an angular velocity; of another signal with a stamp (in x); of
+# one without.
 ACCEL, VECTOR, PLAIN = ('geometry_msgs/msg/AccelStamped', 'geometry_msgs/msg/Vector3Stamped',
                         'std_msgs/msg/Float64')
 _NONE = (math.nan, math.nan, math.nan)

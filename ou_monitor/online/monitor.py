@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 # Cautions that make the numbers doubtful; the others only inform.
 _DOUBTFUL = frozenset({Flag.SLOW_RATE, Flag.QUANTIZED, Flag.LOWPASS_UPSTREAM, Flag.SATURATED,
                        Flag.TREND, Flag.IRREGULAR})
-# A supply that is on has at least this voltage, V: one cell has 2.5 V, noise without one 0.5 V.
+# Minimum voltage of a supply that is on, V: one cell has 2.5 V, noise without a supply 0.5 V.
 _POWERED = 2.0
-# Time after which what is there instead counts as the supply, s.
+# Time after which a much lower or higher voltage counts as another supply, s.
 _ANOTHER = 60.0
 
 
@@ -86,12 +86,12 @@ class SupplyMonitor:
         self._thinned = self._phase = 0
         # Sum of the counts of earlier estimators.
         self._counted = Counters()
-        # Number of late and unusable samples so far, and the stamp when it last rose.
+        # Number of late and unusable samples so far, and stamp of its last increase.
         self._odd, self._odd_at = 0, -math.inf
         self._begin()
 
     def _begin(self, line: TimeLine | None = None) -> None:
-        # Voltage of the supply, V, with a slow fall, and stamp at which it was last on, s.
+        # Voltage of the supply, V, slowly decaying while off, and stamp when it was last on, s.
         self._level, self._on_at = NAN, NAN
         self._line = line or TimeLine()
         self._estimator = SlidingEstimator(self._sliding, line=self._line)
@@ -187,7 +187,7 @@ class SupplyMonitor:
             self.restart(error)
 
     def _take(self, batch: Batch, came: float) -> None:
-        """Pass on readings, but none while the supply is off; begin anew when it comes."""
+        """Pass on readings while the supply is on; begin anew when it is switched on."""
         t, level = float(batch.t[-1]), self._level
         if math.isnan(level) and batch.t.size > 3 and not batch.again:
             # The first readings decide whether it is on.
@@ -322,7 +322,7 @@ class SupplyMonitor:
             stamps = self._trust.stamps(limit, 1.0 / e.rate if e.rate > 0.0 else NAN)
             doubt, why = self._trust.doubt(stamps, self._settings.brownout_voltage)
             if self._doubt is Doubt.UNIT is not doubt:
-                # Forget what was learned in the other unit.
+                # The unit has changed: forget what was learned in the other one.
                 self._counted = self._counters()
                 self._begin()
                 e = self._estimate()
@@ -350,7 +350,7 @@ class SupplyMonitor:
             doubt, why = Doubt.NONE, ''
             self._ahead = Ahead()
             shown, ou, ou_age = e, of_estimate(e), 0.0
-        # The risk is always based on the sliding estimate of the last seconds.
+        # The risk always uses the sliding estimate of the last seconds.
         self._newest, e = e, shown
         ahead = self._ahead
         risk = ahead.outcome.risk
@@ -358,14 +358,15 @@ class SupplyMonitor:
         arriving = here <= max(self._settings.stale_after, limit)
         flag = self._flag.update(e.t + silent if now is None else now, risk, ahead.soon,
                                  ahead.tight, fresh=fresh, arriving=arriving)
-        silence = '' if fresh else why if arriving and why else self._silence(
+        silence = '' if fresh else why if arriving and why else self._silence_words(
             age, e, limit, late=silent - here > limit)
         wrong = doubt if silence and silence == why else Doubt.NONE
         level, summary = self._judge(e, risk, flag, silence, wrong)
         left_out = () if self._model is None else self._model.left_out
         model = None if self._model is None else self._load_filter.against(
             self._model.load, self._model.date)
-        cautions = [words for words in (self._of_default(), model.words if model else '') if words]
+        cautions = [words for words in (
+            self._default_limit_words(), model.words if model else '') if words]
         if cautions and fresh and level < Level.ERROR:
             level, summary = Level.WARN, ' '.join((summary, *cautions))
         return MonitorReport(
@@ -463,7 +464,7 @@ class SupplyMonitor:
             return e
         return replace(e, flags=flags, counters=counters)
 
-    def _silence(self, age: float | None, e: Estimate, limit: float, late: bool) -> str:
+    def _silence_words(self, age: float | None, e: Estimate, limit: float, late: bool) -> str:
         if age is not None and age > limit:
             why = f'stale_after = {self._settings.stale_after:g} s'
             if limit != self._settings.stale_after:
@@ -489,15 +490,15 @@ class SupplyMonitor:
                 f'The estimator failed and was restarted ({self._restarts} times so far); it has '
                 f'no estimate yet: {self._fault}.{still}')
         if silence and critical and flag.low:
-            return Level.ERROR, f'{self._of_risk(e, risk, flag)} {silence}'
+            return Level.ERROR, f'{self._risk_words(e, risk, flag)} {silence}'
         if silence:
             still = f' The brown-out flag is still set: {flag.reason}.' if critical else ''
             wrong = doubt in (Doubt.UNIT, Doubt.LIMIT)
             return (Level.ERROR if wrong else Level.STALE), silence + still
         if critical:
-            return Level.ERROR, self._of_risk(e, risk, flag)
+            return Level.ERROR, self._risk_words(e, risk, flag)
         if flag.level is FlagLevel.WARN and flag.brownout is not None:
-            return Level.WARN, self._of_risk(e, risk, flag)
+            return Level.WARN, self._risk_words(e, risk, flag)
         if not e.usable:
             rate = f' Input: {e.n} samples at {e.rate:.3g} Hz.' if e.rate > 0.0 else ''
             if without_alpha := self._load.words(e):
@@ -505,20 +506,20 @@ class SupplyMonitor:
                 return Level.OK if good else Level.WARN, without_alpha
             return Level.WARN, e.status.value + rate
         if flag.level is not FlagLevel.OK:
-            return Level.WARN, self._of_risk(e, risk, flag)
+            return Level.WARN, self._risk_words(e, risk, flag)
         doubts = [caution.value for caution in e.flags if caution in _DOUBTFUL]
         if doubts:
             return Level.WARN, ' '.join(doubts)
         return Level.OK, e.status.value
 
-    def _of_default(self) -> str:
+    def _default_limit_words(self) -> str:
         """Return a caution if the default limit is in force, and the supply is no 5 V rail."""
         limit, now = self._settings.brownout_voltage, self._forecast.voltage
         return (f'The limit is the default of {limit:g} V, for a 5 V rail, and the supply is at '
                 f'{now:.3g} V: set brownout.voltage.') if (
                     limit == DEFAULT_LIMIT and now > RAIL[1]) else ''
 
-    def _of_risk(self, e: Estimate, risk: float, flag: FlagState) -> str:
+    def _risk_words(self, e: Estimate, risk: float, flag: FlagState) -> str:
         s = self._settings
         load = f'; throttle {e.throttle:.2f}' if math.isfinite(e.throttle) else ''
         known = 'unknown' if math.isnan(risk) else f'{risk:.2g}'

@@ -140,14 +140,14 @@ class SlidingEstimator:
     @window.setter
     def window(self, value: float) -> None:
         """Change the length; keep samples within the new length."""
-        self._work_off()
+        self._flush()
         self._window = _positive('window', value, 's')
         self._slide()
         self._cached = None
 
     def reset(self) -> None:
         """Clear the window; keep the counters."""
-        self._work_off()
+        self._flush()
         self._line.forget()
         self._line.count(resets=1)
         self._forget()
@@ -187,14 +187,14 @@ class SlidingEstimator:
         for begin in range(0, stamps.size, BATCH):
             part = slice(begin, begin + BATCH)
             if self._line.waiting + stamps[part].size > BATCH:
-                self._work_off()
+                self._flush()
             self._line.put(stamps[part], volts[part],
                            load[part] if load is not None and load.ndim else load)
 
     def estimate(self) -> Estimate:
         """Return the estimate for the window that ends at the newest sample."""
         if self._cached is None or self._cached.counters != self._line.counters:
-            self._work_off()
+            self._flush()
             self._cached = self._estimate()
         return self._cached
 
@@ -203,11 +203,11 @@ class SlidingEstimator:
         """Return the samples processed so far, by outcome."""
         return self._line.counters
 
-    def _work_off(self) -> None:
+    def _flush(self) -> None:
         """Move the pushed samples into the window."""
         if not self._line.waiting:
             return
-        for batch in self._line.work_off(self._window):
+        for batch in self._line.flush(self._window):
             self.take(batch)
 
     def take(self, batch: Batch) -> None:

@@ -79,7 +79,7 @@ def read(path: Path, request: Request) -> Log:
         text = not file.read(2).startswith(b'\xa3\x95')
     with _plain_text(path, text) as (name, mended):
         reader = DFReader.DFReader_text if text else DFReader.DFReader_binary
-        # Created before it is set up: if that fails, pymavlink leaves its files open.
+        # Created without `__init__`, so that its files can be closed if `__init__` fails.
         log: Any = reader.__new__(reader)
         try:
             with quiet_process():

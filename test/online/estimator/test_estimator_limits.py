@@ -73,7 +73,7 @@ def batches(t, y=None, window=1.0, intake=None, u=None):
     intake = intake or TimeLine()
     t = np.asarray(t, dtype=float)
     intake.put(t, np.zeros(t.size) if y is None else np.asarray(y, dtype=float), u)
-    return intake.work_off(window), intake
+    return intake.flush(window), intake
 
 
 def taken(thinner, t, y=None, u=None, window=1e9):
@@ -89,7 +89,7 @@ def test_throttle_does_not_leak_into_the_next_batch():
     assert got[0].columns[2].tolist() == [0.7, 0.7]
     intake.put(np.array([0.2]), np.zeros(1), 0.1)
     intake.put(np.array([0.3]), np.zeros(1), None)
-    u = intake.work_off(1.0)[0].columns[2]
+    u = intake.flush(1.0)[0].columns[2]
     assert u[0] == 0.1 and math.isnan(u[1])
     got, _ = batches([0.4], intake=intake)
     assert np.isnan(got[0].columns[2]).all()
@@ -107,7 +107,7 @@ def test_any_array_of_doubles_is_copied():
         intake.put(np.empty(0), np.empty(0), np.empty(0))
         intake.put(0.1 * plain, y, y)
         intake.put(0.1 * plain + 1.0, np.broadcast_to(2.0, 4), np.broadcast_to(0.5, 4))
-        batch = intake.work_off(2.0)[0]
+        batch = intake.flush(2.0)[0]
         assert batch.y.tolist() == [1.0, 2.0, 3.0, 4.0, 2.0, 2.0, 2.0, 2.0]
         assert batch.columns[2].tolist() == [1.0, 2.0, 3.0, 4.0, 0.5, 0.5, 0.5, 0.5]
 
