@@ -192,7 +192,8 @@ def _agreement(recording: Recording, own: Readings, yardstick: Yardstick, simula
             float(real.power[k]), np.array([m.power[k] for m in measured])))
             for k, (a, b) in enumerate(zip(yardstick.bands, yardstick.bands[1:]))),
         dips[0] if dips else None, dips[1] if dips else None, int(yardstick.rises.size),
-        distance(real, pooled), seeds, p, verdict, words, farthest, tuple(notes),
+        band(distance(real, pooled), np.array([distance(m, pooled) for m in measured])),
+        seeds, p, verdict, words, farthest, tuple(notes),
         Traces(own.t + offset, own.voltage,
                np.full(own.t.size, np.nan) if own.throttle is None else own.throttle, first,
                own.t[::stride] + offset, low, high, yardstick.after if responses.size else empty,

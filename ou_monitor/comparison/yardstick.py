@@ -114,7 +114,8 @@ class Agreement:
     dip: Band | None
     recovery: Band | None
     rises: int  # Rises of throttle
-    ks_distance: float  # Largest difference of the two distributions
+    # Largest difference of the distribution from that of all simulations.
+    apart: Band
     seeds: int  # Simulations
     p_value: float  # Share of simulations, recording included, with a score as large
     verdict: Likeness
@@ -122,6 +123,11 @@ class Agreement:
     farthest: str  # Kind of that difference: lowest, falls, level, answer, spectrum, ks or path
     notes: tuple[str, ...]  # What was left out or assumed
     traces: Traces  # For a page
+
+    @property
+    def ks_distance(self) -> float:
+        """Return the largest difference of the two distributions."""
+        return self.apart.measured
 
     @property
     def worst(self) -> str:
@@ -136,6 +142,7 @@ class Agreement:
                  *((f'falls through {level:.4g} V, 1/min', falls)
                    for level, falls in zip(self.levels, self.falls)),
                  *((name, one) for name, one in response if one is not None),
+                 ('KS distance', self.apart),
                  *((f'power {one.low_hz:.3g} to {one.high_hz:.3g} Hz, V^2', one.power)
                    for one in self.spectrum)]
         return [{'measure': name, **one.as_data(), 'inside': one.inside} for name, one in bands]
