@@ -473,9 +473,14 @@ def dips_of(rows: Sequence[Row]) -> tuple[int, float, int] | None:
 
 
 def worst(fleet: Fleet) -> list[Row]:
-    """Return the recordings by number of dips, most first, then by lowest voltage."""
+    """Return the recordings by number of dips, most first, then by lowest voltage per cell."""
     return sorted(one_each(fleet),
-                  key=lambda row: (-(row['dips'] or 0), row['lowest'], row['path']))
+                  key=lambda row: (-(row['dips'] or 0), _of_a_cell(row), row['path']))
+
+
+def _of_a_cell(row: Row) -> float:
+    """Return the lowest voltage per cell, V; of the supply if the cells are unknown."""
+    return float(row['lowest']) / (row['cells'] or 1)
 
 
 def sentences(fleet: Fleet) -> list[str]:
@@ -505,10 +510,12 @@ def sentences(fleet: Fleet) -> list[str]:
 
 
 def _lowest_of(rows: Sequence[Row]) -> tuple[Row, str]:
-    """Return the recording with the lowest voltage, and where and when in words."""
-    low = min(rows, key=lambda row: row['lowest'])
-    return low, (f'{number(low["lowest"], 4)} V at {number(low["lowest_at"])} s of '
-                 f'{_name(low)}')
+    """Return the recording with the lowest voltage per cell, and where and when in words."""
+    low = min(rows, key=_of_a_cell)
+    found = f'{number(low["lowest"], 4)} V'
+    if low['cells'] and len({row['cells'] for row in rows}) > 1:
+        found = f'{number(_of_a_cell(low), 4)} V per cell ({found}, {_cells(low)} cells)'
+    return low, f'{found} at {number(low["lowest_at"])} s of {_name(low)}'
 
 
 def facts(fleet: Fleet) -> list[tuple[str, str]]:

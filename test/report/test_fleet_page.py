@@ -169,6 +169,14 @@ def test_without_a_limit_no_dip_is_counted():
         'No recording fell below 14 V: the lowest was 14.20 V')
 
 
+def test_packs_of_other_cells_are_compared_per_cell():
+    """3.9 V of one cell are more than 13.2 V of four."""
+    mixed = fleet([seen('a', 'quad', 13.2, None, cells=4), seen('b', 'micro', 3.9, None, cells=1)])
+    assert [row['path'] for row in worst(mixed)] == ['a', 'b']
+    assert fleet_document(mixed).headline.startswith(
+        'The lowest voltage was 3.300 V per cell (13.20 V, 4 cells) at 12.0 s of a (quad).')
+
+
 def test_tables_show_values_as_measured():
     """Recordings of one load each keep their order, as in `analyze`, however they are compared."""
     truth = {0.0: 0.05, 0.05: 0.10, 0.1: 0.32, 0.4: 0.63}

@@ -28,7 +28,7 @@ from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import (
     CURRENT, DEGREE, GRAVITY, gyro_of, Log, log_of, Motion, Request, RPM, Series,
     SIGNAL, speeds_of, three_axes, THROTTLE, UNKNOWN, VOLTAGE)
-from ou_monitor.records import FloatArray
+from ou_monitor.records import Defect, FloatArray, Note
 from ou_monitor.text import counted
 
 # The clock counts us in 32 bits.
@@ -83,8 +83,8 @@ def read(path: Path, request: Request) -> Log:
         notes.append(f'{counted(broken, "piece")} unknown to orangebox left out: broken bytes, or '
                      'events of newer firmware.')
     if not parser._end_of_log:
-        notes.append(f'Flight {wanted} has no end mark, so it was probably cut off; '
-                     f'{end} of {size} bytes of frames were read.')
+        notes.append(Note(f'Flight {wanted} has no end mark, so it was probably cut off; '
+                          f'{end} of {size} bytes of frames were read.', Defect.DAMAGED_FILE))
     elif rest.strip(b'\xff\0'):
         # Bytes of erased flash and padding of cards do not count.
         notes.append(f'{len(rest)} of {size} bytes after the end mark of flight {wanted} were '

@@ -21,7 +21,7 @@ from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.log import (
     CURRENT, FRD_TO_FLU, gyro_of, Log, log_of, Motion, one_flight, quiet_process, Request,
     RPM, Series, SIGNAL, speeds_of, started, three_axes, THROTTLE, TURNED, UNKNOWN, VOLTAGE)
-from ou_monitor.records import FloatArray
+from ou_monitor.records import Defect, FloatArray, Note
 from ou_monitor.stream.files import open_regular
 from ou_monitor.text import counted
 from pymavlink import DFReader
@@ -213,8 +213,8 @@ def _lost_binary(log: Any) -> list[str]:
         return []
     where = (f'cut off at byte {end}' if lost == len(tail) else
              f'damaged, its last whole message ends at byte {end}')
-    return [f'{lost} of {size} bytes belong to no message, so the log is {where}; '
-            'the messages around that were read.']
+    return [Note(f'{lost} of {size} bytes belong to no message, so the log is {where}; '
+                 'the messages around that were read.', Defect.DAMAGED_FILE)]
 
 
 def _lost_text(log: Any) -> list[str]:
@@ -230,7 +230,8 @@ def _lost_text(log: Any) -> list[str]:
     if lost:
         notes.append(f'Left out: {counted(lost, "line")} in no format of this log.')
     if not text.endswith('\n'):
-        notes.append(f'The last line does not end: the log was cut off at byte {size}.')
+        notes.append(Note(f'The last line does not end: the log was cut off at byte {size}.',
+                          Defect.DAMAGED_FILE))
     return notes
 
 

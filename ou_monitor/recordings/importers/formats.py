@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from ou_monitor.errors import how_to_install, InputError
 from ou_monitor.recordings.importers.log import Log, Progress, quiet, Request
+from ou_monitor.records import defect_of, Note
 from ou_monitor.stream.files import open_regular, plain_texts
 from ou_monitor.text import printable
 
@@ -187,7 +188,8 @@ def import_log(path: Path, request: Request) -> Log:
         log, series=tuple(replace(one, name=printable(one.name, 200), words=printable(one.words),
                                   scale=printable(one.scale), own_unit=printable(one.own_unit))
                           for one in log.series),
-        facts=plain_texts(log.facts), notes=tuple(map(printable, log.notes)),
+        facts=plain_texts(log.facts), notes=tuple(
+            Note(printable(note), defect_of(note)) for note in log.notes),
         inertial=tuple(replace(one, name=printable(one.name, 200)) for one in log.inertial),
         names=tuple(printable(name, 200) for name in log.names))
 

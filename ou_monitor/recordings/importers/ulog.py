@@ -125,8 +125,8 @@ def read(path: Path, request: Request) -> Log:
             ulog = ULog(file, None if request.everything else _topics(request.names))
     notes: list[str] = []
     if file.cut_at is not None:
-        notes.append(f'The log was cut off within its last message, at byte {file.cut_at} of '
-                     f'{size}; all before that was read.')
+        notes.append(Note(f'The log was cut off within its last message, at byte {file.cut_at} '
+                          f'of {size}; all before that was read.', Defect.DAMAGED_FILE))
     elif file.end < size:
         notes.append(Note(f'Only {file.end} of {size} bytes were read: the log is damaged.',
                           Defect.DAMAGED_FILE))

@@ -9,6 +9,7 @@ from ou_monitor.recordings.importers.choose import choose
 from ou_monitor.recordings.importers.formats import import_log
 from ou_monitor.recordings.importers.log import Request
 from ou_monitor.recordings.read import read_recording
+from ou_monitor.records import Defect, defect_of
 import pytest
 
 TIME, STICK, VOLTS, AMPERES = 1, 2, 3, 4
@@ -146,6 +147,8 @@ def test_a_truncated_log_is_read_up_to_its_end(tmp_path):
         assert held - 1 <= voltage.n <= held
         np.testing.assert_allclose(voltage.values, rows[:voltage.n, VOLTS] / 100)
         assert any('no end mark' in note for note in log.notes)
+    notes = read_recording(path).notes
+    assert 'no end mark' in next(n for n in notes if defect_of(n) is Defect.DAMAGED_FILE)
 
 
 def test_cut_within_the_header(tmp_path):
