@@ -40,8 +40,8 @@ MIN_TIME = 0.25
 # paper.
 MIN_STAY = 0.5
 MAX_LEVELS = 20  # Maximum number of levels
-# A passage is shorter than this, s, and the means of its first and last quarter differ by more
-# than these shares of its range (a ramp has 0.75) and of the half width.
+# A passage: maximum duration, s; minimum difference between the means of its first and last
+# quarter, as a share of its range (a ramp has 0.75) and of the half width.
 _PASSAGE, _STEADY, _CROSSED = 3.0, 0.65, 0.75
 # Minimum pause that splits a segment, in median steps.
 GAP_STEPS = 20.0

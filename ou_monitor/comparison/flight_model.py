@@ -129,7 +129,7 @@ class FlightNoise:
 
 def fit_noise(samples: Readings, left: FloatArray, load: FloatArray | None, slow: float
               ) -> FlightNoise:
-    """Fit the noise to residuals, V, under a load, beside a process of `SLOW_TIME` (slow: V^2)."""
+    """Fit the noise to residuals, V, under a load (slow: variance of the slow process, V^2)."""
     dt, lsb = samples.spacing, samples.lsb
     left = left - left.mean()
     ou = fit_pieces([(left[part], np.ones(part.stop - part.start))
@@ -158,7 +158,7 @@ def fit_noise(samples: Readings, left: FloatArray, load: FloatArray | None, slow
 
 def _predicted(x: FloatArray, dt: float, white: float, parts: dict[float, float]
                ) -> tuple[FloatArray, float]:
-    """Return one-step errors, V, and their variance, V^2, beside OUs (1/s: V^2) in white noise."""
+    """Return one-step errors, V, and their variance, V^2, for a sum of OUs (rate: variance)."""
     rates = np.array([rate for rate, variance in parts.items() if variance > 0.0])
     if not rates.size:
         return x, white

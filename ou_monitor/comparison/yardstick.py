@@ -288,8 +288,8 @@ class Difference:
 
     def scores(self) -> FloatArray:
         """Return the weighted scores: of the recording, then of each simulation."""
-        # On a scale to which the recording contributes as each simulation does; otherwise it would
-        # be the farthest too often.
+        # The scale includes the recording like each simulation; otherwise it would be the farthest
+        # too often.
         off = np.append(self.measured, self.simulated)
         off -= np.median(off)
         up, down = (Z95 * math.sqrt(float(np.mean(side ** 2))) if side.size else 0.0

@@ -27,7 +27,7 @@ _MOST = 200_000
 _FLOAT32 = 2.5e-7
 # Minimum share of the samples on the grid of codes, and their maximum distance from it, steps.
 _SHARE, _NEAR = 0.99, 0.1
-# Minimum step of the ADC in steps of the last printed digit (below two, every value is near some
+# Minimum step of the ADC, in units of the last printed digit (below two, every value is near a
 # code); minimum number of gaps between codes; numbers of decimals tried.
 _SPARSE, _FEWEST_CODES = 2.0, 4
 _DECIMALS = range(7)
@@ -155,8 +155,8 @@ def _idle(throttle: FloatArray) -> npt.NDArray[np.bool_]:
 
 
 def _rises(below: FloatArray, codes: int, step: float) -> bool:
-    """Return whether more readings are just above the fullest of the top codes than below it."""
-    # Noise after a limit lowers as many readings as it raises.
+    """Return whether the code above the most frequent top code is fuller than the code below."""
+    # Noise after clipping lowers as many readings as it raises.
     count = [int((np.abs(below - k * step) < 0.5 * step).sum()) for k in range(codes + 1)]
     full = max(range(codes), key=lambda k: count[k])
     return full > 0 and count[full - 1] > count[full + 1]

@@ -217,7 +217,7 @@ def _plain(samples: Samples, state: Integrity) -> HeldOut:
         return found
     logged = fit_gaussian(state.raw, [guess(state.raw)], slice(0, state.raw.n)).terms
     gaussian = evaluate(samples, logged)
-    # The cost of holding out a block is taken from the same fit without repeats.
+    # The loss by holding out a block is taken from the fit without repeats.
     density = gaussian.density + found.density - plain.density
     return HeldOut(replace(plain, terms=logged, gaussian=gaussian, density=density), density,
                    found.known & np.isfinite(density), gaussian.innovation)

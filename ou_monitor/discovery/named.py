@@ -84,7 +84,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
                         latent=turn < _TURNS - 1,
                         progress=None if turn else lambda share: progress(0.1 + 0.9 * share))
             if fitter.evidence(search.composite) < refuted:
-                # These causes only stand in for a better one, which was withdrawn.
+                # These causes are worse than the withdrawn ones that they replace.
                 search = replace(less, stopped=search.stopped)
             found = _finished(fitter, search, bank)
             out = _withdrawn(fitter, found, begun)
@@ -138,7 +138,7 @@ def _withdrawn(fitter: Fitter, found: _Result, begun: _Result) -> list[int]:
     # Noise terms of the load model stay.
     out = [k for k in out if names[k] not in begun.search.accepted]
     return sorted({*_in_doubt(fitter.samples, found.whole, names, out),
-                   *_other(fitter, found.whole, names)})
+                   *_mislabelled(fitter, found.whole, names)})
 
 
 def _with_trends(samples: Samples, whole: Composite, rivals: Mapping[str, list[str]]
@@ -176,7 +176,7 @@ def _in_doubt(samples: Samples, whole: Composite, names: Sequence[str], out: Seq
     return [k for k in out if not is_sure(k)]
 
 
-def _other(fitter: Fitter, whole: Composite, names: Sequence[str]) -> list[int]:
+def _mislabelled(fitter: Fitter, whole: Composite, names: Sequence[str]) -> list[int]:
     """Return the causes with states of their own that no longer fit their name."""
     view = fitter.view(whole)
     return [k for k, kind in enumerate(kinds_of(names)) if kind.ROLE is Role.BLOCK

@@ -69,7 +69,7 @@ def _documented(settings: type[_Settings]) -> type[_Settings]:
     return settings
 
 
-# The default limit, V, and the range of the median of a 5 V rail, for which it is: lower is a
+# The default limit, V, is for a 5 V rail, whose median voltage lies in this range, V: lower is a
 # lithium cell, or a rail in constant brown-out.
 DEFAULT_LIMIT, RAIL = 4.5, (4.5, 6.0)
 

@@ -103,7 +103,7 @@ def _by_suffix(spec: FieldSpec, topics: Mapping[str, str]) -> list[str]:
 
 
 def _only_of_type(config: MsgConfig, topics: Mapping[str, str]) -> list[str]:
-    """Return the topics of the voltage's type, without the one whose name is the throttle's."""
+    """Return the topics with the voltage's type, except the topic named as the throttle."""
     taken = set() if config.throttle is None else set(_by_name(config.throttle, topics))
     return sorted(name for name, kind in topics.items()
                   if kind == config.voltage.type and name not in taken)

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from ou_monitor.online.monitor import SupplyMonitor
 
 
-# Largest lead (unsynchronized clocks) and lag (queues) of a stamp that counts as taken from the
-# receiver's clock, s.
+# Maximum lead (unsynchronized clocks) and lag (queues) of a stamp of the receiver's clock, s;
+# beyond, it is of another clock.
 AHEAD, BEHIND = 0.25, 5.0
 # Largest delay once the clock is known, s: no queue holds ten minutes.
 MOST_DELAY = 600.0

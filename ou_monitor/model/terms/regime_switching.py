@@ -1,10 +1,11 @@
 """
 Markov switching of the mean or of sigma, unrelated to throttle.
 
-A filter without levels takes a change of level for noise at first, and follows it more slowly the
-more white noise there is.  How far it has followed depends on all earlier states, which are
-replaced by their mean given the samples so far (generalised pseudo-Bayesian filter of first order;
-Blom & Bar-Shalom, IEEE Trans. Autom. Control 33 (1988) 780).
+The filter of the Gaussian part does not know the levels: after a change of level its errors are
+large until it has followed, which takes longer with more white noise.  How far it has followed
+depends on all earlier states; they are replaced by their mean given the samples so far
+(generalised pseudo-Bayesian filter of first order; Blom & Bar-Shalom, IEEE Trans. Autom. Control
+33 (1988) 780).
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ _MEDIAN = 0.6745
 _ALL, NO_LEVEL = 0.98, 0.2
 # Minimum correlation of the residual for an OU beside the levels.
 _LEAST = 1e-3
-# Starts tried: share of the fitted noise that remains when levels are added; heights of levels
-# relative to the spread.
+# Starts: remaining share of the fitted noise when levels are added; heights of levels relative to
+# the spread.
 _CALMER, _HEIGHTS = (0.1, 0.01), (0.7, 1.2, 2.0)
 
 
@@ -260,7 +261,7 @@ def without_levels(view: View, levels: FloatArray) -> View:
 
 
 def _settled(keep: float, power: float, white: float) -> tuple[float, float]:
-    """Return a settled filter's variance of the OU before a sample, and the white noise's."""
+    """Return the settled predictive variance of the OU, and the variance of the white noise."""
     drive = power * (1.0 - keep * keep)
     b = white * (1.0 - keep * keep) - drive
     return 0.5 * (-b + math.sqrt(b * b + 4.0 * drive * white)), white
@@ -428,7 +429,7 @@ class RegimeSwitching(Term):
         if two.power is None:
             slow, ahead, states = _slow_levels(view)
             if slow is not None and ahead > max(float(two.gain[view.train].sum()), _SLOW_AHEAD):
-                # The view relaxes as levels and noise together do; the next fit separates them.
+                # The view mixes levels and noise in one relaxation; the next fit separates them.
                 return cls._finished(view, [slow], 0.0, 1, states) or two
         # Try three states that differ as the two do: in sigma, or in the level.
         starts = [np.array([0.0, 0.0, 0.0, ratio, -ratio]) for ratio in (0.45, 0.9)]

@@ -208,7 +208,7 @@ def _scored(view: View, bad: npt.NDArray[np.bool_], share: float, spread: float,
     """Return normal scores, gains in log density, and the number of parameters."""
     # States: good, and the first, second and third sample of a run with similar errors.
     e = view.z * np.sqrt(view.variance)
-    keep, rest = _alike(e, bad, view.train, spread)
+    keep, rest = _repetition(e, bad, view.train, spread)
     wide = np.sqrt(1.0 + spread * spread / view.variance)
     again = np.sqrt(1.0 + rest * rest / view.variance)
     mean = keep * np.concatenate(([0.0], e[:-1])) / np.sqrt(view.variance)
@@ -227,9 +227,9 @@ def _scored(view: View, bad: npt.NDArray[np.bool_], share: float, spread: float,
     return scores, both - calm, 2 if keep == 0.0 else 6
 
 
-def _alike(e: FloatArray, bad: npt.NDArray[np.bool_], train: slice, spread: float
-           ) -> tuple[float, float]:
-    """Return the regression of an error on the one before in its run, and its residual std, V."""
+def _repetition(e: FloatArray, bad: npt.NDArray[np.bool_], train: slice, spread: float
+                ) -> tuple[float, float]:
+    """Return slope and residual std, V, of errors regressed on the previous error of their run."""
     e, bad = e[train], bad[train]
     second = np.flatnonzero(bad[1:] & bad[:-1]) + 1
     if second.size < _PAIRS:
@@ -408,9 +408,9 @@ def _cells(z: FloatArray, share: FloatArray) -> tuple[FloatArray, FloatArray, Fl
     return (np.bincount(cell, z * z) / count, np.bincount(cell, share) / count, count)
 
 
-# Share of the variance from which the Student-t counts as the only noise, and each sample gets a
-# power.  If there is white noise, the powers would explain it too, and the next fit would find
-# none; without powers the variance is still right.
+# Minimum share of the Student-t in the variance to give each sample a power.  With white noise,
+# the powers would explain it too, and the next fit would find none; without powers the variance is
+# still right.
 _ALONE = 0.99
 # Points of the variance, and the probability outside them; bins of share, and number and width of
 # the bins of scores, in a fit.

@@ -64,8 +64,8 @@ _LAGS, _EVEN = 24, 0.5
 # Jitter of the stamps, in relaxation times, above which the exact stamps are used: the error of an
 # even grid is its square.
 _JITTER = 0.1
-# Share of the window by which rounded stamps may miss its edge.
-_HAIR = 1e-6
+# Tolerance of rounded stamps at the edge of the window, as a share of it.
+_ROUNDING = 1e-6
 # If the variance of increments is below this share of their mean square, the voltage is a ramp.
 _RAMP = 1e-9
 # Number of checks of the input's quality per window.
@@ -243,7 +243,7 @@ class SlidingEstimator:
         """Move the end of the window to the newest reading; earlier readings are lost."""
         t = self._kept.columns[0]
         if t.size:
-            self._begin = max(self._begin, t.item(-1) - (1.0 + _HAIR) * self._window)
+            self._begin = max(self._begin, t.item(-1) - (1.0 + _ROUNDING) * self._window)
 
     def _look(self, t: FloatArray) -> Quality:
         """Examine the raw samples, several times per window."""
@@ -322,10 +322,10 @@ class SlidingEstimator:
         smoothness = NAN
         if one[1] > _RAMP * one[0]:
             smoothness = _smoothness(two[1] / one[1], fit.alpha_step, m)
-        # Set the trend if the drift is faster than a random walk of these increments could be: if
-        # the voltage does not return in the window, the fit may take any drift for chance.  The
-        # increments over the longest lag include movements in one direction.  Only for constant
-        # throttle, because moving throttle is regressed out.
+        # Set the trend if the drift is faster than a random walk of these increments: if the
+        # voltage does not return within the window, the fit may attribute any drift to chance.
+        # The longest lag shows movements in one direction.  Only for constant throttle, because
+        # moving throttle is regressed out.
         if not load.size and far[2] >= _EVEN * t.size and one[2] * (
                 one[0] - one[1]) > TREND_SCORE ** 2 * max(one[1], far[1] / _LAGS):
             fit = replace(fit, trend=True)

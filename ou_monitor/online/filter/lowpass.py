@@ -138,7 +138,7 @@ class VoltageKalman:
         old, now = self._known, Known(math.exp(self._log_sigma), alpha, unsure)
         if (abs(now.sigma - old.sigma) <= _SAME * old.sigma
                 and abs(alpha - old.alpha) <= _SAME * old.alpha
-                and _alike(unsure, old.level_se)):
+                and _nearly_equal(unsure, old.level_se)):
             return
         if self._cov is not None and unsure > old.level_se:
             more = self._cov.copy()
@@ -215,7 +215,7 @@ def _ou(rate: float, intensity: float, dt: float) -> tuple[float, float, float]:
     return math.exp(-rate * dt), -still * math.expm1(-2.0 * rate * dt), still
 
 
-def _alike(one: float, other: float) -> bool:
+def _nearly_equal(one: float, other: float) -> bool:
     """Return whether two errors of the level are nearly equal, or both unknown."""
     if one != one or other != other:
         return one != one and other != other
@@ -309,13 +309,13 @@ class AdaptiveLowPass:
         With `shadow`, the one that would be in force; with `kalman`, that of a low-pass of equal
         lag.
         """
-        by_lag = self._of_its_lag()
+        by_lag = self._equivalent_cutoff()
         return self._within(by_lag) if by_lag == by_lag else self._control.cutoff
 
     @property
     def wanted(self) -> float:
         """Cutoff that the law requests, within fmin..fmax, Hz; NaN if unknown."""
-        by_lag = self._of_its_lag()
+        by_lag = self._equivalent_cutoff()
         return self._within(by_lag) if by_lag == by_lag else self._control.wanted
 
     @property
@@ -333,7 +333,7 @@ class AdaptiveLowPass:
         if self._kalman is not None and self._known:
             if self._kalman.mixed:
                 return Bound.LAG if self._settings.max_lag else Bound.LOWEST
-            by_lag = self._of_its_lag()
+            by_lag = self._equivalent_cutoff()
             if by_lag >= self._settings.fmax:
                 return Bound.HIGHEST
             return Bound.NONE if by_lag < self.highest * (1.0 - 1e-9) else Bound.RATE
@@ -360,7 +360,7 @@ class AdaptiveLowPass:
         With the law `kalman`, that of the low-pass of equal lag; 1 with `shadow`, and until
         the sample rate is known.
         """
-        by_lag = self._of_its_lag()
+        by_lag = self._equivalent_cutoff()
         cutoff = by_lag if by_lag == by_lag else self._control.cutoff
         angle = _TWO_PI * cutoff * self._interval.mean
         if self._settings.shadow or not angle > 0.0:
@@ -554,7 +554,7 @@ class AdaptiveLowPass:
         """Return the wanted cutoff of the law, evaluated again only if an input has changed."""
         s = self._settings
         if s.law == 'kalman':
-            return self._of_its_lag()
+            return self._equivalent_cutoff()
         # Jitter of the stamps needs no new search.
         if abs(interval - self._law_interval) > _MOVED * self._law_interval:
             self._law_interval = interval
@@ -566,7 +566,7 @@ class AdaptiveLowPass:
             self._law_inputs = inputs
         return self._wanted
 
-    def _of_its_lag(self) -> float:
+    def _equivalent_cutoff(self) -> float:
         """Return the cutoff of the low-pass with the lag of the Kalman filter, Hz."""
         s = self._settings
         if self._kalman is None or not self._known:

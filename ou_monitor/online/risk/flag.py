@@ -110,7 +110,7 @@ class FloorWatch:
         far = _FAR * self._longest_gap
         at = t + self._shift
         if arrival is not None or late.any() or (steps[np.isfinite(steps)] > far).any():
-            elapsed = np.cumsum(np.where(late, self._waits(arrival), np.minimum(steps, far)))
+            elapsed = np.cumsum(np.where(late, self._late_steps(arrival), np.minimum(steps, far)))
             if self._t.size:
                 at = float(self._t[-1]) + self._paced(elapsed, arrival)
             else:
@@ -129,7 +129,7 @@ class FloorWatch:
         """Longest time, s, between two samples that are combined in a median."""
         return max(self.settings.stale_after, SLOW_MISSED * self.interval)
 
-    def _waits(self, arrival: FloatArray | None) -> FloatArray | float:
+    def _late_steps(self, arrival: FloatArray | None) -> FloatArray | float:
         """Return the time by which late samples advance the time line, s."""
         if arrival is None or self._arrived == -math.inf:
             # Unknown interval: assume two per `brownout.floor_time`, so two of three decide.
@@ -293,7 +293,7 @@ class BrownoutFlag:
         low = self._floor.take(fresh if arriving is None else arriving)
         known = fresh and not math.isnan(risk)
         wanted, reason = self._wanted(risk, soon, tight, known, low)
-        level, reason = self._held(wanted, reason, known or low)
+        level, reason = self._after_hold(wanted, reason, known or low)
         if level is not self._level:
             self._enter(level)
         if known or low:
@@ -364,7 +364,7 @@ class BrownoutFlag:
         return (self._level.value < level.value
                 and self._now - self._above[level] < self._settings.brownout_delay)
 
-    def _held(self, wanted: FlagLevel, reason: str, sure: bool) -> tuple[FlagLevel, str]:
+    def _after_hold(self, wanted: FlagLevel, reason: str, sure: bool) -> tuple[FlagLevel, str]:
         """Return the level after latch and hold."""
         s = self._settings
         if wanted.value >= self._level.value:

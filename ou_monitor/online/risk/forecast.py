@@ -4,16 +4,17 @@ Brown-out risk by the method that predicts this flight best, and the risk if thr
 Methods: `first_passage` (the OU in the window, at the present throttle), `load` (half the response
 to the pilot's future throttle, half the excursions), and `excursions` (the drops of this flight,
 used alone if the load is unknown).  First passage and the other method are averaged, weighted by
-how well each predicted the lowest voltages of completed horizons (Bayes, with forgetting).  Each
-law is mixed with a wider one, whose weight is the share of horizons in which the law was wrong.
-For first passage the wider law is the excursions.  For a given throttle it is as wide as the
-excursions, but at most `_WIDEST` times the law (excursions include punches, which say nothing
-about idling), or wider if the voltage in those horizons was farther below the law's mean.
+how well each predicted the lowest voltages of completed horizons (Bayes, with forgetting).
 
-The law learned in flight, from completed horizons: (lowest - start) / s = b0 + b1 (mu - start) / s
+Law learned in flight, from completed horizons: (lowest - start) / s = b0 + b1 (mu - start) / s
 + k e, with mean mu and deviation s of `lowest`, by least squares with forgetting; e has Student's
-t distribution with five degrees of freedom.  A horizon counts as wrong with the probability that
-the law was wrong in it (rule of succession); overlapping horizons count as step / horizon each.
+t distribution with five degrees of freedom.
+
+Each law is mixed with a wider one, weighted by the share of horizons that contradict the law: each
+counts with the probability that the law was wrong in it (rule of succession), overlapping ones as
+step / horizon.  For first passage the wider law is the excursions.  For a given throttle it is as
+wide as the excursions, at most `_WIDEST` times the law (excursions include punches, which say
+nothing about idling), or wider if contradicting voltages were farther below the law's mean.
 
 Limits: "below" refers to the median of three samples, except in first passage; nothing is known in
 the first second; all throttles share one bias and one gain; values between two horizons are

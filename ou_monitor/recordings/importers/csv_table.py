@@ -48,8 +48,8 @@ _USUAL_STEP, _USUAL_SPAN = 2.0, 43200.0
 _OF_1970, _TO_2100 = (25569.0, 719529.0), 47482.0
 # Rows from which repeated stamps are the resolution of a clock.
 _FEW_ROWS = 8
-# Rows per stamp from which they are spread; share by which the number of a stamp may differ;
-# stamps between which rows are even: a row more or less there is 1 % of ten rows per stamp.
+# Stamps shared by rows: minimum rows per stamp to spread them; maximum relative deviation of their
+# number; stamps between which rows are even (one row is then 1 % of ten rows per stamp).
 _LEAST_SHARED, _UNSTEADY, _EVEN = 1.5, 0.2, 10
 # Change by rounding; standard errors above which a mean change is significant.
 _ROUNDING, _SURE = 1e-6, 4.0
