@@ -342,7 +342,7 @@ def on_grid(series: dict[str, tuple[FloatArray, FloatArray]]) -> Grid:
     spans = [_spans(t, 1.0 / r) for (t, _), r in zip(clean, rates)]
     shared = spans[0]
     for other in spans[1:]:
-        shared = _shared(shared, other)
+        shared = _intersection(shared, other)
     runs, begin = [], min(t[0] for t, _ in clean)
     for start, stop in shared:
         # One grid for all parts, so that a lag means the same in each.
@@ -367,8 +367,8 @@ def _spans(t: FloatArray, step: float) -> list[tuple[float, float]]:
     return [(float(t[a]), float(t[b])) for a, b in zip(starts, stops) if b - a >= _LEAST_SAMPLES]
 
 
-def _shared(one: list[tuple[float, float]], other: list[tuple[float, float]],
-            ) -> list[tuple[float, float]]:
+def _intersection(one: list[tuple[float, float]], other: list[tuple[float, float]],
+                  ) -> list[tuple[float, float]]:
     """Return the intersection of two ordered lists of time ranges."""
     found, i, j = [], 0, 0
     while i < len(one) and j < len(other):
@@ -465,9 +465,10 @@ def measure_coherence(voltage: ComplexArray, signal: ComplexArray, causes: list[
     response = response / share
     p_sum, p_max, threshold = chance(squared[::STRIDE], spare, level)
     tested = slice(None), slice(None, None, STRIDE)
-    drawn_sum, drawn_max = _drawn(v[tested], whole[tested], [one[tested] for one in basis], rng)
+    drawn_sum, drawn_max = _sign_test(v[tested], whole[tested], [one[tested] for one in basis],
+                                      rng)
     p_value = min(1.0, 2.0 * min(max(p_sum, drawn_sum), max(p_max, drawn_max)))
-    narrow = p_value <= level and _narrow(squared, response, ratio, spare)
+    narrow = p_value <= level and _is_narrow(squared, response, ratio, spare)
     return Coherence(p_value, squared, response, ratio, threshold, segments, spare, narrow)
 
 
@@ -521,8 +522,8 @@ def chance(squared: FloatArray, spare: float, level: float) -> tuple[float, floa
     return p_sum, p_max, -math.expm1(math.log(alone) / spare)
 
 
-def _drawn(v: ComplexArray, x: ComplexArray, basis: list[ComplexArray],
-           rng: np.random.Generator) -> tuple[float, float]:
+def _sign_test(v: ComplexArray, x: ComplexArray, basis: list[ComplexArray],
+               rng: np.random.Generator) -> tuple[float, float]:
     """Return the p-values of the sum and of the largest bin under random signs."""
     count = len(x)
     length = max(1, min(_BLOCK, count // _SIGNED))
@@ -563,7 +564,8 @@ def _tail(drawn: FloatArray, law: str) -> float:
     return float(stats.gumbel_r.sf(drawn[0], mean - float(np.euler_gamma) * scale, scale))
 
 
-def _narrow(squared: FloatArray, response: ComplexArray, ratio: FloatArray, spare: float) -> bool:
+def _is_narrow(squared: FloatArray, response: ComplexArray, ratio: FloatArray, spare: float
+               ) -> bool:
     """Return whether only a few bins are coherent and the others contradict their gain."""
     loud = squared > chance(squared[::STRIDE], spare, _LINE)[2]
     # A line spreads over the main lobe of the window and its first side lobes.

@@ -408,7 +408,7 @@ def fit_level(recording: Recording, left: Remainder, level: LoadLevel, levels: i
         ou, nothing = fit_parts(recording, left, ())
         return LevelResult(level.throttle, (), 0.0, 0, NAN, NAN, NAN, NAN, np.zeros(0), ou,
                            replace(nothing, throttle=level.throttle), examine_level([], nothing))
-    within = [part for s in segments for part in _known(s, left.voltage)]
+    within = [part for s in segments for part in _known_parts(s, left.voltage)]
     ou, estimate = fit_parts(recording, left, within, level.throttle)
     still = replace(recording, voltage=left.voltage)
     grids = [on_grid(still.t[s.start:s.stop], still.voltage[s.start:s.stop]) for s in within]
@@ -442,10 +442,10 @@ def fit_level(recording: Recording, left: Remainder, level: LoadLevel, levels: i
 def fit_all(recording: Recording, left: Remainder, levels: Sequence[LoadLevel]) -> Estimate:
     """Fit the segments of all levels together."""
     return fit_parts(recording, left, [part for level in levels for s in level.segments
-                                       for part in _known(s, left.voltage)])[1]
+                                       for part in _known_parts(s, left.voltage)])[1]
 
 
-def _known(segment: LevelSegment, voltage: FloatArray) -> list[LevelSegment]:
+def _known_parts(segment: LevelSegment, voltage: FloatArray) -> list[LevelSegment]:
     """Return the parts of a segment without gaps, for which the remainder is known."""
     known = np.isfinite(voltage[segment.start:segment.stop])
     turns = np.flatnonzero(np.diff(known, prepend=False, append=False)) + segment.start

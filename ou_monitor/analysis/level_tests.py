@@ -114,7 +114,7 @@ def examine_level(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Esti
     spread = float(np.sqrt(np.mean(join(own) ** 2)))
     if not spread > 0.0:
         return _untested(n, 'the voltage never changes')
-    correlated = _correlated('correlated', own, _LAGS_RAW)
+    correlated = _portmanteau('correlated', own, _LAGS_RAW)
     if model is None and estimate.status is not Status.NO_RELAXATION:
         why = 'without a usable fit the samples cannot be whitened'
         return replace(_untested(n, why), tests=tuple(
@@ -144,7 +144,7 @@ def examine_level(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Esti
     pole = OtherPole()
     if model:
         pole = other_pole(apart, (n - len(parts)) / time, alpha, var_inf, noise * noise, above)
-        tests += [_correlated('one_relaxation', [z], _LAGS_FITTED),
+        tests += [_portmanteau('one_relaxation', [z], _LAGS_FITTED),
                   TestResult('second_relaxation', pole.second_p, pole.second_share,
                              why_not='' if math.isfinite(pole.second_p) else 'too few samples')]
     else:
@@ -276,7 +276,7 @@ def _impulses(z: FloatArray, kurtosis: float, count: int) -> TestResult:
     return TestResult('impulses', p, max(kurtosis, 1000.0 * count / z.size))
 
 
-def _correlated(name: str, parts: Sequence[FloatArray], lags: int) -> TestResult:
+def _portmanteau(name: str, parts: Sequence[FloatArray], lags: int) -> TestResult:
     """Portmanteau of autocorrelations, their variances robust against changing intensity."""
     total = sum(float(d @ d) for d in parts)
     n = sum(d.size for d in parts)

@@ -77,17 +77,17 @@ def find_levels(t: FloatArray, throttle: FloatArray,
     width = half_width(t, throttle)
     if given is not None:
         return _split(t, throttle, _checked(given), width, True)
-    whole = (LoadLevel(NAN, tuple(_cut(LevelSegment(0, t.size), _gaps(t)))),)
+    whole = (LoadLevel(NAN, tuple(_split_at_pauses(LevelSegment(0, t.size), _gaps(t)))),)
     centres = _modes(t, throttle, width)
     while centres:
         found = _split(t, throttle, centres, width, False)
         held = [_is_long_enough(t, level) for level in found]
         if all(held):
-            return _most(t, found)
+            return _longest_held(t, found)
         if not any(held):
             # All segments are short: accept the levels if they cover half of the recording.
-            enough = 0.5 * float(t[-1] - t[0]) <= sum(_time(t, level) for level in found)
-            return _most(t, found) if enough else whole
+            enough = 0.5 * float(t[-1] - t[0]) <= sum(_time_at(t, level) for level in found)
+            return _longest_held(t, found) if enough else whole
         # Segments of a rejected level may belong to its neighbours.
         centres = [centre for centre, kept in zip(centres, held) if kept]
     return whole
@@ -106,7 +106,7 @@ def half_width(t: FloatArray, throttle: FloatArray) -> float:
     return max(HALF_WIDTH, min(_WIDEST, _SPREADS * jitter))
 
 
-def _time(t: FloatArray, level: LoadLevel) -> float:
+def _time_at(t: FloatArray, level: LoadLevel) -> float:
     """Return the time at a level, s; settling left out."""
     return sum(float(t[s.stop - 1] - t[s.start]) for s in level.segments)
 
@@ -117,13 +117,13 @@ def _is_long_enough(t: FloatArray, level: LoadLevel) -> bool:
     longest = max((float(t[s.stop - 1] - t[s.start]) for s in level.segments), default=0.0)
     # The limit is lower in short recordings.
     return longest >= min(MIN_STAY, 0.25 * whole) and (
-        longest >= LONG_STAY or _time(t, level) >= MIN_SHARE * whole)
+        longest >= LONG_STAY or _time_at(t, level) >= MIN_SHARE * whole)
 
 
-def _most(t: FloatArray, found: tuple[LoadLevel, ...]) -> tuple[LoadLevel, ...]:
+def _longest_held(t: FloatArray, found: tuple[LoadLevel, ...]) -> tuple[LoadLevel, ...]:
     """Return the levels at which most time was spent, in their order."""
-    least = sorted((_time(t, level) for level in found), reverse=True)[:MAX_LEVELS][-1]
-    return tuple(level for level in found if _time(t, level) >= least)[:MAX_LEVELS]
+    least = sorted((_time_at(t, level) for level in found), reverse=True)[:MAX_LEVELS][-1]
+    return tuple(level for level in found if _time_at(t, level) >= least)[:MAX_LEVELS]
 
 
 def _split(t: FloatArray, throttle: FloatArray, centres: list[float], width: float,
@@ -132,13 +132,13 @@ def _split(t: FloatArray, throttle: FloatArray, centres: list[float], width: flo
     broken = _gaps(t)
     runs: list[list[LevelSegment]] = [[] for _ in centres]
     for run, k in level_segments(throttle, centres, width):
-        runs[k] += _cut(run, broken)
+        runs[k] += _split_at_pauses(run, broken)
     found = []
-    for centre, inner, mine in zip(centres, _inner(centres, width), runs):
+    for centre, inner, mine in zip(centres, _half_widths(centres, width), runs):
         if not named:
             mine = [run for run in mine if not _passage(t, throttle, run, inner)]
         away = ~(np.abs(throttle - centre) <= 2.0 * width)
-        kept, lost = _settle(t, mine, away, broken)
+        kept, lost = _drop_settling(t, mine, away, broken)
         mean = centre
         if not named and kept:
             mean = float(np.median(np.concatenate([throttle[s.start:s.stop] for s in kept])))
@@ -213,8 +213,8 @@ def level_segments(throttle: FloatArray, centres: Sequence[float], width: float
     if not centres:
         return []
     level = np.asarray(centres)
-    nearest = _nearest(centres)
-    inner = _inner(centres, width)
+    nearest = _distance_to_nearest(centres)
+    inner = _half_widths(centres, width)
     # The outer limit ends before a close neighbour.
     outer = np.maximum(inner, np.minimum(2.0 * width, 0.8 * nearest))
     edges = np.unique(np.concatenate((level - outer, level - inner, level + inner,
@@ -241,18 +241,18 @@ def level_segments(throttle: FloatArray, centres: Sequence[float], width: float
     return found
 
 
-def _nearest(centres: Sequence[float]) -> FloatArray:
+def _distance_to_nearest(centres: Sequence[float]) -> FloatArray:
     """Return the distance to the nearest other level, for each level."""
     apart = np.diff(np.asarray(centres), prepend=-math.inf, append=math.inf)
     return np.minimum(apart[:-1], apart[1:])
 
 
-def _inner(centres: Sequence[float], width: float) -> FloatArray:
+def _half_widths(centres: Sequence[float], width: float) -> FloatArray:
     """Return the half width of each level, reduced if another is near."""
-    return np.minimum(width, 0.5 * _nearest(centres)) + 1e-9
+    return np.minimum(width, 0.5 * _distance_to_nearest(centres)) + 1e-9
 
 
-def _cut(run: LevelSegment, broken: BoolArray) -> list[LevelSegment]:
+def _split_at_pauses(run: LevelSegment, broken: BoolArray) -> list[LevelSegment]:
     """Return the pieces of a segment between pauses."""
     cuts = run.start + 1 + np.flatnonzero(broken[run.start + 1:run.stop])
     ends = [run.start, *cuts.tolist(), run.stop]
@@ -269,8 +269,8 @@ def _passage(t: FloatArray, throttle: FloatArray, run: LevelSegment, width: floa
     return moved > max(_CROSSED * width, _STEADY * float(np.ptp(inside)))
 
 
-def _settle(t: FloatArray, runs: Sequence[LevelSegment], away: BoolArray,
-            broken: BoolArray) -> tuple[tuple[LevelSegment, ...], float]:
+def _drop_settling(t: FloatArray, runs: Sequence[LevelSegment], away: BoolArray,
+                   broken: BoolArray) -> tuple[tuple[LevelSegment, ...], float]:
     """Leave out the settling time after changes of throttle larger than jitter."""
     kept, lost = [], 0.0
     for run in runs:

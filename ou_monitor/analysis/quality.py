@@ -54,7 +54,7 @@ def quality_list(recording: Recording, throttles: Sequence[float], estimates: Se
     """Return all cautions, worst first (known: the facts have alpha)."""
     found: dict[tuple[str, Severity, str], list[float]] = {}
     for throttle, estimate in zip(throttles, estimates):
-        for doubt in _of_estimate(estimate, known):
+        for doubt in _fit_doubts(estimate, known):
             found.setdefault(doubt, []).append(throttle)
     for item in more:
         found.setdefault((item.name, item.severity, item.text), []).extend(item.throttles)
@@ -62,11 +62,11 @@ def quality_list(recording: Recording, throttles: Sequence[float], estimates: Se
     for note in recording.notes:
         defect = defect_of(note)
         items.append(QualityItem(defect.name, defect.severity, note))
-    items = _of_units(recording) + items + _of_stamps(recording) + _of_samples(recording)
+    items = _unit_items(recording) + items + _stamp_items(recording) + _sample_items(recording)
     return tuple(sorted(items, key=lambda item: -item.severity))
 
 
-def _of_estimate(e: Estimate, known: bool) -> list[tuple[str, Severity, str]]:
+def _fit_doubts(e: Estimate, known: bool) -> list[tuple[str, Severity, str]]:
     items = []
     if e.status in _LIMITS and known:
         items.append(('LEVEL_ALONE', Severity.INFO, (
@@ -82,7 +82,7 @@ def _of_estimate(e: Estimate, known: bool) -> list[tuple[str, Severity, str]]:
     return items
 
 
-def _of_units(recording: Recording) -> list[QualityItem]:
+def _unit_items(recording: Recording) -> list[QualityItem]:
     items = []
     middle = float(np.median(np.abs(recording.voltage))) if recording.n else 0.0
     if middle > _MOST_VOLTS:
@@ -113,7 +113,7 @@ def _of_units(recording: Recording) -> list[QualityItem]:
     return items
 
 
-def _of_stamps(recording: Recording) -> list[QualityItem]:
+def _stamp_items(recording: Recording) -> list[QualityItem]:
     steps = np.diff(recording.t)
     if steps.size < 2:
         return []
@@ -137,7 +137,7 @@ def _of_stamps(recording: Recording) -> list[QualityItem]:
     return items
 
 
-def _of_samples(recording: Recording) -> list[QualityItem]:
+def _sample_items(recording: Recording) -> list[QualityItem]:
     """Return properties of the samples: the step of the ADC, and clipping."""
     n = recording.n
     starts = np.unique(np.linspace(0, max(0, n - TAIL), _LOOKS).astype(int))

@@ -275,21 +275,21 @@ class Relaxation:
     def moves_on(self) -> bool:
         """Whether the voltage moves and does not settle in the time fitted."""
         return not (self.detected or self.bounded) and (
-            self.likelihood_gain > _limit(len(self.releases)))
+            self.likelihood_gain > _detection_limit(len(self.releases)))
 
 
 def fit_relaxation(recording: Recording, kind: str, steps: Sequence[LevelChange],
                    throttles: Sequence[float], estimates: Sequence[Estimate],
                    rms: Sequence[float]) -> Relaxation:
     """Fit one tau to several changes of load (throttles 0..1, rms in V)."""
-    used, windows = _watched(recording, steps, estimates, rms, 0.0)
+    used, windows = _windows(recording, steps, estimates, rms, 0.0)
     if not windows:
         return Relaxation(kind, ())
     fit, left_out = _profile(windows), 0.0
     misfit_p = _misfit_p(windows, fit[0], fit[3])
     if misfit_p < BADLY_FITTED:
-        rest, once, p = _later(recording, steps, estimates, rms, _LATER * fit[0])
-        _, twice, _ = _later(recording, steps, estimates, rms, 2.0 * _LATER * fit[0])
+        rest, once, p = _begin_later(recording, steps, estimates, rms, _LATER * fit[0])
+        _, twice, _ = _begin_later(recording, steps, estimates, rms, 2.0 * _LATER * fit[0])
         # If tau changes again when more is left out, the misfit is not limited to the beginning.
         if p > _WELL and len(rest) == len(used) and once[1] < twice[0] < once[2]:
             left_out, windows, fit, misfit_p = _LATER * fit[0], rest, once, p
@@ -312,7 +312,7 @@ def fit_relaxation(recording: Recording, kind: str, steps: Sequence[LevelChange]
                       scale, drop, misfit_p, left_out)
 
 
-def _watched(recording: Recording, steps: Sequence[LevelChange], estimates: Sequence[Estimate],
+def _windows(recording: Recording, steps: Sequence[LevelChange], estimates: Sequence[Estimate],
              rms: Sequence[float], later: float) -> tuple[list[LevelChange], list[Window]]:
     """Return the changes with enough samples from `later` s after throttle is constant again."""
     used, windows = [], []
@@ -327,18 +327,18 @@ def _watched(recording: Recording, steps: Sequence[LevelChange], estimates: Sequ
     return used, windows
 
 
-def _later(recording: Recording, steps: Sequence[LevelChange], estimates: Sequence[Estimate],
-           rms: Sequence[float], later: float
-           ) -> tuple[list[Window], tuple[float, float, float, float, float], float]:
+def _begin_later(recording: Recording, steps: Sequence[LevelChange], estimates: Sequence[Estimate],
+                 rms: Sequence[float], later: float
+                 ) -> tuple[list[Window], tuple[float, float, float, float, float], float]:
     """Return windows that begin later, the result of `_profile`, and the p-value of a misfit."""
-    _, windows = _watched(recording, steps, estimates, rms, later)
+    _, windows = _windows(recording, steps, estimates, rms, later)
     if not windows:
         return [], (NAN, NAN, NAN, NAN, NAN), NAN
     fit = _profile(windows)
     return windows, fit, _misfit_p(windows, fit[0], fit[3])
 
 
-def _limit(changes: int) -> float:
+def _detection_limit(changes: int) -> float:
     """Return the gain of likelihood needed to detect a relaxation: chi^2 at `_CHANCE`."""
     return float(stats.chi2.isf(_CHANCE, changes + 1))
 
@@ -358,7 +358,7 @@ def _profile(windows: Sequence[Window]) -> tuple[float, float, float, float, flo
     scale = float(np.min(total)) / freedom
     flat = sum(w.rss_flat for w in windows)
     drop = float((flat - np.min(total)) / scale) if scale > 0.0 else NAN
-    if not drop > _limit(len(windows)):
+    if not drop > _detection_limit(len(windows)):
         return NAN, NAN, NAN, scale, drop
     # The fine grid covers the minimum and the interval.
     near = np.flatnonzero((total - np.min(total)) / scale < 16.0)

@@ -352,7 +352,7 @@ def noise_of(recording: Recording, left: Remainder | None = None) -> Noise:
         rms = (math.sqrt(float(square[seen].mean())),) * len(THROTTLES)
         return Noise(THROTTLES, rms, rms, flown)
     still = _still(recording.t, u)
-    enough = _enough(recording)
+    enough = _needed_readings(recording)
     return Noise(THROTTLES, _over_throttle(u[seen], square[seen], enough),
                  _over_throttle(u[seen & still], square[seen & still], enough, NAN), flown)
 
@@ -372,12 +372,12 @@ def _still(t: FloatArray, u: FloatArray) -> npt.NDArray[np.bool_]:
 def flown_near(recording: Recording, throttle: npt.ArrayLike, reach: float = BAND,
                ) -> npt.NDArray[np.bool_]:
     """Return whether there are enough readings within `reach` of throttles, shape (k,)."""
-    enough = _enough(recording)
+    enough = _needed_readings(recording)
     return np.array([np.count_nonzero(np.abs(recording.throttle - u) <= reach) >= enough
                      for u in np.atleast_1d(throttle)])
 
 
-def _enough(recording: Recording) -> float:
+def _needed_readings(recording: Recording) -> float:
     """Return how many readings near a throttle show that it was flown."""
     share = min(_IN_TIME / max(recording.duration, 1e-9), _IN_SHARE)
     return max(_IN_BAND, share * recording.n)

@@ -78,7 +78,7 @@ def find_step(voltage: FloatArray) -> float:
     codes = np.add.reduceat(values * counts, begins) / weight
     gaps = np.diff(codes)
     for first in (float(gaps.min()), float(np.median(gaps))):
-        step = _fitted(codes, gaps, weight, first)
+        step = _refine_step(codes, gaps, weight, first)
         if step > 8.0 * rounding:
             return step
     return _unprinted(codes, gaps, weight)
@@ -107,12 +107,12 @@ def _unprinted(codes: FloatArray, gaps: FloatArray, weight: FloatArray) -> float
     first = float(gaps[dense].mean())
     if first < _SPARSE * printed:
         return 0.0
-    step = _fitted(codes, gaps, weight, first, 0.55 * printed)
+    step = _refine_step(codes, gaps, weight, first, 0.55 * printed)
     return step if step >= _SPARSE * printed else 0.0
 
 
-def _fitted(codes: FloatArray, gaps: FloatArray, weight: FloatArray, first: float,
-            near: float = 0.0) -> float:
+def _refine_step(codes: FloatArray, gaps: FloatArray, weight: FloatArray, first: float,
+                 near: float = 0.0) -> float:
     """Return the step near `first` that fits the codes to `near`, V; 0 if none does."""
     step = float(gaps[gaps < 1.5 * first].mean())
     number = np.concatenate(([0.0], np.cumsum(np.rint(gaps / step))))
@@ -131,12 +131,12 @@ def find_rails(voltage: FloatArray, step: float, noise: float,
     """Return the readings at which the ADC clips, V; infinite if it does not (inputs in V)."""
     if step > _COARSE * noise:
         return -math.inf, math.inf
-    noisy = _noisy(voltage, step, throttle)
-    return -_limit(-voltage, step, noisy), _limit(voltage, step, noisy)
+    noisy = _at_noisy_throttle(voltage, step, throttle)
+    return -_clipping_limit(-voltage, step, noisy), _clipping_limit(voltage, step, noisy)
 
 
-def _noisy(voltage: FloatArray, step: float, throttle: FloatArray | None
-           ) -> npt.NDArray[np.bool_]:
+def _at_noisy_throttle(voltage: FloatArray, step: float, throttle: FloatArray | None
+                       ) -> npt.NDArray[np.bool_]:
     """Return the samples at throttles whose noise spans several codes."""
     # A quiet rail at idle may stay within the top code without clipping.
     if throttle is None or not step > 0.0:
@@ -154,7 +154,7 @@ def _idle(throttle: FloatArray) -> npt.NDArray[np.bool_]:
     return np.asarray(throttle <= throttle.min() + _STILL)
 
 
-def _rises(below: FloatArray, codes: int, step: float) -> bool:
+def _leans_up(below: FloatArray, codes: int, step: float) -> bool:
     """Return whether the code above the most frequent top code is fuller than the code below."""
     # Noise after clipping lowers as many readings as it raises.
     count = [int((np.abs(below - k * step) < 0.5 * step).sum()) for k in range(codes + 1)]
@@ -162,7 +162,7 @@ def _rises(below: FloatArray, codes: int, step: float) -> bool:
     return full > 0 and count[full - 1] > count[full + 1]
 
 
-def _limit(x: FloatArray, step: float, noisy: npt.NDArray[np.bool_]) -> float:
+def _clipping_limit(x: FloatArray, step: float, noisy: npt.NDArray[np.bool_]) -> float:
     """Return the top reading if it is more frequent than its neighbours predict; otherwise inf."""
     # If a stage before the ADC clips, later noise may raise some readings by a code or two.
     top = float(x.max())
@@ -187,7 +187,7 @@ def _limit(x: FloatArray, step: float, noisy: npt.NDArray[np.bool_]) -> float:
             expected = codes * max(next_ones)
             if codes > 1 and (
                     next_ones[0] > max(next_ones[1:]) + _CLEAR * math.sqrt(next_ones[0])
-                    or _rises(below[noisy], codes, step)):
+                    or _leans_up(below[noisy], codes, step)):
                 # A peak: the rail is at rest.
                 continue
         else:
@@ -313,12 +313,12 @@ def without_repeats(t: FloatArray, v: FloatArray, u: FloatArray | None
     if period > 1.0:
         return t, v, u, period
     first = max(0, (v.size - _EXAMINED) // 2)
-    held = v[1:] == v[:-1] if _ties(v[first:first + _EXAMINED]) else _stuck(v)
+    held = v[1:] == v[:-1] if _has_excess_ties(v[first:first + _EXAMINED]) else _in_long_runs(v)
     fresh = np.concatenate(([True], ~held))
     return t[fresh], v[fresh], None if u is None else u[fresh], v.size / int(fresh.sum())
 
 
-def _ties(v: FloatArray) -> bool:
+def _has_excess_ties(v: FloatArray) -> bool:
     """Return whether there are more repeats than the codes of the ADC explain."""
     step = np.diff(v)
     # Repeats at the ends of the range may be clipping.
@@ -329,7 +329,7 @@ def _ties(v: FloatArray) -> bool:
     moved = step[(step != 0.0) & inner]
     if moved.size < 2:
         return False
-    code = _code(v)
+    code = _code_step(v)
     # Probability that two normal values have the same code.
     chance = min(1.0, code / (math.sqrt(2.0 * math.pi) * float(np.sqrt(np.mean(moved**2)))))
     if chance >= _FINE and float(np.mean(moved[1:] * moved[:-1] > 0.0)) > 0.5:
@@ -346,7 +346,7 @@ def _ties(v: FloatArray) -> bool:
             and equal > count * _recurring_share(v, inner))
 
 
-def _code(v: FloatArray) -> float:
+def _code_step(v: FloatArray) -> float:
     """Return the step between codes, at least that of floats, V."""
     return max(find_step(v), usual_change(v), 0.5 * _FLOAT32 * float(np.abs(v).max()))
 
@@ -362,7 +362,7 @@ def _ties_of_codes(moved: FloatArray, code: float) -> tuple[float, float]:
     return expected, expected * math.sqrt(8.0 / (9.0 * one) + 1.0 / (18.0 * two))
 
 
-def _stuck(v: FloatArray) -> npt.NDArray[np.bool_]:
+def _in_long_runs(v: FloatArray) -> npt.NDArray[np.bool_]:
     """Return which samples (from the second on) belong to runs of repeats too long for chance."""
     # A calm rail enters and leaves a run with a change of about one code.  A lost link stops
     # between ordinary changes, and the voltage has moved further when the link is back.
@@ -370,7 +370,7 @@ def _stuck(v: FloatArray) -> npt.NDArray[np.bool_]:
     none = np.zeros(step.size, dtype=np.bool_)
     equal = (step == 0.0) & (v[1:] > v.min()) & (v[1:] < v.max())
     size = np.sort(np.abs(step[step != 0.0]))
-    code = _code(v)
+    code = _code_step(v)
     edge = np.diff(equal.astype(np.int8), prepend=0, append=0)
     begins, ends = np.flatnonzero(edge == 1), np.flatnonzero(edge == -1)
     if not size.size or not begins.size:

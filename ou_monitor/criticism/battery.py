@@ -85,7 +85,7 @@ def _all(z: FloatArray, given: Covariates, lines: bool) -> Iterator[tuple[str, f
     yield from _among_small(w)
     yield from _spectrum(w, given)
     if lines and given.throttle is not None:
-        yield 'order line', _order(w, given)
+        yield 'order line', _throttle_line(w, given)
     yield from _moments(z)
     yield from _clustering(square, given)
     yield from _inputs(w, square, given)
@@ -148,7 +148,7 @@ def _from_tail(chance: float) -> float:
     return -float(ndtri(min(max(chance, 1e-300), 0.999)))
 
 
-def _order(w: FloatArray, given: Covariates) -> float:
+def _throttle_line(w: FloatArray, given: Covariates) -> float:
     """Return the strongest line whose frequency follows throttle, as a normal score."""
     assert given.throttle is not None
     top, count = order_power(w, given.throttle, given.rate)
@@ -280,17 +280,18 @@ def throttle_paths(throttle: FloatArray, keep: float) -> Iterator[tuple[str, Flo
         return
     u = (throttle - throttle.mean()) / spread
     cubic = np.vander(u, 4)
-    yield from _extra('growing effect of throttle', u * time, np.column_stack((cubic, time)), keep)
+    yield from _residual('growing effect of throttle', u * time, np.column_stack((cubic, time)),
+                         keep)
     for low, high in _RELAYS:
         below, above = np.quantile(u, (low, high))
         state = np.where(u > above, 1.0, np.where(u < below, -1.0, 0.0))
         last = np.maximum.accumulate(np.where(state != 0.0, np.arange(u.size), 0))
-        yield from _extra(f'loop of throttle {100 * low:g} to {100 * high:g} %', state[last],
-                          cubic, keep)
+        yield from _residual(f'loop of throttle {100 * low:g} to {100 * high:g} %', state[last],
+                             cubic, keep)
 
 
-def _extra(name: str, wanted: FloatArray, known: FloatArray, keep: float
-           ) -> Iterator[tuple[str, FloatArray]]:
+def _residual(name: str, wanted: FloatArray, known: FloatArray, keep: float
+              ) -> Iterator[tuple[str, FloatArray]]:
     """Yield a regressor less its fit by others, whitened, if enough of its power is left."""
     less = wanted - known @ np.linalg.lstsq(known, wanted, rcond=None)[0]
     if float(less @ less) > _LEAST * float(wanted @ wanted):

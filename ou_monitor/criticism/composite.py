@@ -95,7 +95,7 @@ def fit_composite(samples: Samples, terms: Sequence[Term | type[Term]], part: sl
             power *= 1.0 if fit.power is None else np.clip(fit.power, *_POWERS)
             white *= 1.0 if fit.white is None else np.clip(fit.white, *_POWERS)
         found = Events(push, error, power, white)
-        if _same(events, offset, found, moved, gaussian) or turn == last:
+        if _converged(events, offset, found, moved, gaussian) or turn == last:
             break
         if push.any() or error.any() or events is not None or (power != 1.0).any():
             events = found
@@ -112,8 +112,8 @@ def _kinds(terms: Sequence[Term | type[Term]]) -> list[str]:
     return [term.NAME for term in terms if term.ROLE is Role.LAW]
 
 
-def _same(events: Events | None, offset: FloatArray | None, found: Events, moved: FloatArray,
-          gaussian: GaussianFit) -> bool:
+def _converged(events: Events | None, offset: FloatArray | None, found: Events, moved: FloatArray,
+               gaussian: GaussianFit) -> bool:
     """Return whether the events and the offset of the laws have converged."""
     before = events or Events(np.zeros(1), np.zeros(1), np.ones(1), np.ones(1))
     if ((found.push > 0.0) != (before.push > 0.0)).any() or (

@@ -115,7 +115,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     if stamps.error > 0.0:
         exact.append(ClockJitter(stamps.error))
     recorded = recording.has_throttle or math.isfinite(full)
-    samples = Samples(stamps.t, v, _useful(u, recorded, notes))
+    samples = Samples(stamps.t, v, _usable_throttle(u, recorded, notes))
     if between.size and drawn is None and stamps.error == 0.0:
         samples = _joined(samples, *events)
         notes.append(f'{between.size} samples around sudden changes were kept as well.')
@@ -171,7 +171,7 @@ def _saturation(v: FloatArray, low: float, high: float) -> Term:
                       high if math.isfinite(high) else float(v.max()) + far)
 
 
-def _useful(u: FloatArray | None, recorded: bool, notes: list[str]) -> FloatArray | None:
+def _usable_throttle(u: FloatArray | None, recorded: bool, notes: list[str]) -> FloatArray | None:
     """Return throttle if it moves; otherwise None, and note the causes that cannot be tested."""
     if u is not None and float(u.max() - u.min()) >= MOVES:
         return u
@@ -222,7 +222,7 @@ def judge_stamps(t: FloatArray, voltage: FloatArray) -> Stamps:
         notes.append(f'Stamps scatter by {percent(scatter)} of a step about an even grid, '
                      'which was used instead.')
         return Stamps(grid, 0.0, tuple(notes))
-    if white and scatter < _LARGE and _wrong(step / usual, number, voltage):
+    if white and scatter < _LARGE and _are_wrong(step / usual, number, voltage):
         error = float(off.std())
         notes.append(f'Stamps scatter by {1e3 * error:.3g} ms about an even grid, but the voltage '
                      'does not follow: the stamps are wrong, and the grid was used.')
@@ -233,7 +233,7 @@ def judge_stamps(t: FloatArray, voltage: FloatArray) -> Stamps:
     return Stamps(t, 0.0, tuple(notes))
 
 
-def _wrong(step: FloatArray, number: FloatArray, voltage: FloatArray) -> bool:
+def _are_wrong(step: FloatArray, number: FloatArray, voltage: FloatArray) -> bool:
     """Return whether increments do not follow the steps, so that the stamps are wrong."""
     # The likelihood ratio must exceed the penalty of a parameter, as for causes.  White noise of
     # the sensor, which does not depend on the steps, is allowed for.

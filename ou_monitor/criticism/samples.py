@@ -157,7 +157,7 @@ def choose_samples(voltage: FloatArray, rate: float) -> tuple[slice, str]:
     if n <= MOST:
         return slice(0, n), ''
     factor = math.ceil(n / MOST)
-    widest = _widest(voltage, factor)
+    widest = _widest_step(voltage, factor)
     if widest >= factor:
         return slice(0, n, factor), (
             f'{n} samples: every {_nth(factor)} was used ({rate / factor:.4g} Hz); lines above '
@@ -255,7 +255,7 @@ def _nth(k: int) -> str:
     return f'{k}{"th" if k % 100 in (11, 12, 13) else ends.get(k % 10, "th")}'
 
 
-def _widest(voltage: FloatArray, factor: int) -> int:
+def _widest_step(voltage: FloatArray, factor: int) -> int:
     """Return the largest step in samples, up to `factor`, that resolves the relaxation."""
     first = max(0, (voltage.size - _EXAMINED) // 2)
     v = voltage[first:first + _EXAMINED]

@@ -151,13 +151,13 @@ def _filter(samples: Samples, terms: Sequence[Term], events: Events | None) -> _
         run = Filter(space, samples.n)
         return _Run(s, run, run.variance, run.variance + (events.power - 1.0) * s.added
                     + events.push + (events.white - 1.0) * white_noise(samples, terms, s),
-                    _cost(space, samples.n))
+                    _filter_cost(space, samples.n))
     s, space, own = state_space(samples, terms, events)
     run = Filter(space, samples.n)
-    return _Run(s, run, run.variance - own, run.variance, _cost(space, samples.n))
+    return _Run(s, run, run.variance - own, run.variance, _filter_cost(space, samples.n))
 
 
-def _cost(space: StateSpace, n: int) -> float:
+def _filter_cost(space: StateSpace, n: int) -> float:
     """Return the processor time of a filter over n samples, s (measured on a desktop)."""
     length, states = map(int, space.f.shape[:2])
     return 1e-7 * length * states * states + 2e-8 * n * states
@@ -182,7 +182,7 @@ def state_space(samples: Samples, terms: Sequence[Term], events: Events | None
     blocks = [(phi[:, None, None], q[:, None, None], np.ones(1))]
     for term in terms:
         if isinstance(term, ACCoupling):
-            blocks[0] = _coupled(term, s, phi, q)
+            blocks[0] = _coupled_block(term, s, phi, q)
     own: FloatArray | float = 0.0
     white = white_noise(samples, terms, s)
     if events is not None:
@@ -228,8 +228,8 @@ def _first(s: Segment, n: int) -> Segment:
         'noise', 'voltage')})
 
 
-def _coupled(term: ACCoupling, s: Segment, phi: FloatArray, q: FloatArray
-             ) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _coupled_block(term: ACCoupling, s: Segment, phi: FloatArray, q: FloatArray
+                   ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the block of the OU and of its low-pass, which an AC coupling subtracts."""
     rate = 2.0 * math.pi * term.corner
     step = s.step.copy()
@@ -281,7 +281,7 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
             return _with_mean(samples, terms, events)
     elif states[0] * (states[1] - 1) > _EXPENSIVE and few < samples.n:
         # Begin with a part of the samples; keep the start in case it fits all samples better.
-        part = _liveliest(samples, few)
+        part = _busiest_part(samples, few)
         begin = terms
         first = _maximise(
             samples.part(part), terms, None if events is None else events.part(part),
@@ -305,7 +305,7 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
     value, damping = float(base.density.sum()), 0.0
     inverse = outer = np.zeros((0, 0))
     for _ in range(rounds):
-        scores, information, spent = _scored(samples, terms, events, base, free)
+        scores, information, spent = _scores_of(samples, terms, events, base, free)
         cost += spent
         gradient, outer = scores.sum(axis=0), scores.T @ scores
         scale = np.sqrt(information.diagonal()) + 1e-12
@@ -342,8 +342,8 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
     return replace(base, se=tuple(se), cost=cost)
 
 
-def _scored(samples: Samples, terms: tuple[Term, ...], events: Events | None, base: GaussianFit,
-            free: Sequence[tuple[int, str]]) -> tuple[FloatArray, FloatArray, float]:
+def _scores_of(samples: Samples, terms: tuple[Term, ...], events: Events | None, base: GaussianFit,
+               free: Sequence[tuple[int, str]]) -> tuple[FloatArray, FloatArray, float]:
     """Return scores, shape (n, free), expected information, and processor time, s."""
     # The information assumes normal errors with the predicted variances.  With heavy tails, the
     # outer product of the scores would shorten each step in proportion to the kurtosis.
@@ -359,7 +359,7 @@ def _scored(samples: Samples, terms: tuple[Term, ...], events: Events | None, ba
     return scores, means.T @ means + 0.5 * spreads.T @ spreads, cost
 
 
-def _liveliest(samples: Samples, size: int) -> slice:
+def _busiest_part(samples: Samples, size: int) -> slice:
     """Return the part of `size` samples in which throttle moves most; without it, the first."""
     if samples.throttle is None:
         return slice(0, size)

@@ -69,15 +69,15 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
     try:
         start = _start(samples, state)
         if state.drawn is not None:
-            samples, start = _unclipped(samples, state, start)
+            samples, start = _without_clipping(samples, state, start)
         # Name causes from readings drawn within the ADC's codes, but score them on logged codes.
-        inside, start = _uncoded(samples, state, start) if samples.cell else (samples, start)
+        inside, start = _within_codes(samples, state, start) if samples.cell else (samples, start)
         done(0.1)
         named = named_causes(inside, start, rng, state.exact,
                              lambda share: done(0.1 + 0.5 * share))
-        model, names = (named.whole, named.names) if inside is samples else _coded(
+        model, names = (named.whole, named.names) if inside is samples else _fit_to_codes(
             samples, state, named)
-        plain = _plain(samples, state)
+        plain = _plain_model(samples, state)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
         if blamed(error):
             raise
@@ -156,8 +156,8 @@ def _start(samples: Samples, state: Integrity) -> Composite:
     return start
 
 
-def _unclipped(samples: Samples, state: Integrity, start: Composite
-               ) -> tuple[Samples, Composite]:
+def _without_clipping(samples: Samples, state: Integrity, start: Composite
+                      ) -> tuple[Samples, Composite]:
     """Return the samples with clipped ones redrawn, and the start of the search."""
     assert state.drawn is not None
     ends = next(term for term in state.exact if isinstance(term, Saturation))
@@ -169,7 +169,8 @@ def _unclipped(samples: Samples, state: Integrity, start: Composite
     return samples, start
 
 
-def _uncoded(samples: Samples, state: Integrity, start: Composite) -> tuple[Samples, Composite]:
+def _within_codes(samples: Samples, state: Integrity, start: Composite
+                  ) -> tuple[Samples, Composite]:
     """Return the samples drawn within coarse codes, and the start of the search."""
     rng, inside = np.random.default_rng(0), samples
     for _ in range(_REDRAWN):
@@ -185,7 +186,8 @@ def _uncoded(samples: Samples, state: Integrity, start: Composite) -> tuple[Samp
     return inside, start
 
 
-def _coded(samples: Samples, state: Integrity, named: Named) -> tuple[Composite, tuple[str, ...]]:
+def _fit_to_codes(samples: Samples, state: Integrity, named: Named
+                  ) -> tuple[Composite, tuple[str, ...]]:
     """Fit the named model to the codes; return it and its causes, without terms that fail."""
     steps = [term for term in state.exact if term.ROLE is Role.NOISE]
     terms, names = list(named.whole.terms), list(named.names)
@@ -207,7 +209,7 @@ def _refitted(samples: Samples, terms: Sequence[Term]) -> Composite | None:
     return fit_composite(samples, terms, slice(0, samples.n))
 
 
-def _plain(samples: Samples, state: Integrity) -> HeldOut:
+def _plain_model(samples: Samples, state: Integrity) -> HeldOut:
     """Return the plain OU, fitted to the samples as logged, repeats and wrong stamps included."""
     everything = slice(0, samples.n)
     plain = fit_composite(samples, [guess(samples)], everything)

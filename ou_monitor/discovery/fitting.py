@@ -179,7 +179,7 @@ class Fitter:
                             start or composite)
             if start is not None and (full is None or self.evidence(full) < self.evidence(start)):
                 full = start
-            if full is not None and (full.terms[-1] if kind.ROLE is Role.LAW else _joined(full)
+            if full is not None and (full.terms[-1] if kind.ROLE is Role.LAW else _added_term(full)
                                      ).holds(self.view(composite)):
                 with_it = kind.CHANGES is not None and not composite.has(kind.CHANGES.NAME)
                 found.append(Trial(
@@ -234,7 +234,7 @@ class Fitter:
             kind.CHANGES.candidates(view))[-1:]
         for start in (*known[:_FULL], *hidden[:_FULL]):
             found = self.join(composite, [*changed, start], rough=True)
-            if found is not None and _joined(found).holds(view) and (
+            if found is not None and _added_term(found).holds(view) and (
                     best is None or self.evidence(found) > self.evidence(best)):
                 best = found
         return best
@@ -254,7 +254,7 @@ class Fitter:
                     if not any(fit[1] > other[1] - _ALIKE for other in moved[:k])]
         fits = [self.fit([*terms, *laws], composite, rough=True, begun=True)
                 for terms, _ in distinct[:_FULL]]
-        return max((fit for fit in fits if fit is not None and _joined(fit).holds(view)),
+        return max((fit for fit in fits if fit is not None and _added_term(fit).holds(view)),
                    default=None, key=self.evidence)
 
     def _by_likelihood(self, composite: Composite, starts: list[Term]) -> list[Term]:
@@ -281,7 +281,7 @@ def is_trend(samples: Samples, model: Composite) -> bool:
     return not decision.relaxes(ou.alpha, float(samples.t[-1] - samples.t[0]))
 
 
-def _joined(composite: Composite) -> Term:
+def _added_term(composite: Composite) -> Term:
     """Return the term that was added last."""
     return [term for term in composite.terms if term.ROLE is not Role.LAW][-1]
 
@@ -361,7 +361,7 @@ class _Spectrum:
 def standard_errors(samples: Samples, model: Composite, part: slice) -> tuple[dict[str, Any], ...]:
     """Return standard errors by parameter, one dict per term."""
     found = [_gathered(term, se) for term, se in zip(model.terms, model.se)]
-    for k, more in _of_mean(samples, model, part).items():
+    for k, more in _mean_errors(samples, model, part).items():
         found[k] = {**more, **found[k]}
     return tuple(found)
 
@@ -393,7 +393,7 @@ def _gathered(term: Term, se: dict[str, float]) -> dict[str, Any]:
     return gathered
 
 
-def _of_mean(samples: Samples, model: Composite, part: slice) -> dict[int, dict[str, Any]]:
+def _mean_errors(samples: Samples, model: Composite, part: slice) -> dict[int, dict[str, Any]]:
     """Return errors of the level and of the coefficients of the mean, by term index."""
     terms = model.gaussian.terms
     where = [(k, j) for k, term in enumerate(terms) for j in range(len(coefficients(term)))]
@@ -404,7 +404,7 @@ def _of_mean(samples: Samples, model: Composite, part: slice) -> dict[int, dict[
         beta = coefficients(terms[k])
         # Innovations are linear in the coefficients, so the size of the step does not matter.
         beta[j] += 1.0
-        moved = evaluate(samples, (*terms[:k], _with(terms[k], beta), *terms[k + 1:]))
+        moved = evaluate(samples, (*terms[:k], _with_coefficients(terms[k], beta), *terms[k + 1:]))
         through[:, column] = weight * (base.innovation - moved.innovation)[part]
     norm = np.sqrt((through * through).sum(axis=0))
     # Parameters hidden by the instrument (the level behind a high-pass) have no error.
@@ -419,7 +419,7 @@ def _of_mean(samples: Samples, model: Composite, part: slice) -> dict[int, dict[
     return found
 
 
-def _with(term: Term, beta: list[float]) -> Term:
+def _with_coefficients(term: Term, beta: list[float]) -> Term:
     return replace(term, u0=beta[0]) if isinstance(term, OU) else term.with_linear(beta)
 
 
@@ -435,7 +435,7 @@ def _by_parameter(term: Term, covariance: FloatArray) -> dict[str, Any]:
             continue
         up, down = list(beta), list(beta)
         up[j], down[j] = beta[j] + step, beta[j] - step
-        high, low = _with(term, up), _with(term, down)
+        high, low = _with_coefficients(term, up), _with_coefficients(term, down)
         for i, name in enumerate(names):
             a, b = getattr(high, name), getattr(low, name)
             if not isinstance(a, tuple):

@@ -76,7 +76,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
     refuted = -math.inf
     try:
         under_load(fitter, search)
-        begun = found = _finished(fitter, search, bank)
+        begun = found = _fit_everything(fitter, search, bank)
         for turn in range(_TURNS):
             less = search.copy()
             # The last turn is without latent causes, which were withdrawn repeatedly.
@@ -86,7 +86,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
             if fitter.evidence(search.composite) < refuted:
                 # These causes are worse than the withdrawn ones that they replace.
                 search = replace(less, stopped=search.stopped)
-            found = _finished(fitter, search, bank)
+            found = _fit_everything(fitter, search, bank)
             out = _withdrawn(fitter, found, begun)
             if not out:
                 break
@@ -97,7 +97,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
             if rest is None:
                 break
             search = rest
-            found = _finished(fitter, search, bank)
+            found = _fit_everything(fitter, search, bank)
     except KeyboardInterrupt:
         failure = INTERRUPTED
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
@@ -107,7 +107,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
         failure = f'The search for causes failed: {error}.'
     if failure and begun is not None:
         # Once the load model has been chosen, the search is consistent at any time.
-        found = _finished(fitter, search, bank)
+        found = _fit_everything(fitter, search, bank)
     names = found.search.accepted
     return Named(found.whole, bank, tuple(names),
                  _with_trends(samples, found.whole, found.search.rivals),
@@ -124,7 +124,7 @@ class _Result:
     after: Mapping[str, float]
 
 
-def _finished(fitter: Fitter, search: Search, bank: NullBank) -> _Result:
+def _fit_everything(fitter: Fitter, search: Search, bank: NullBank) -> _Result:
     """Return a search with its model fitted to everything, held-out events included."""
     whole = fitter.whole(search.composite)
     return _Result(search.copy(), whole, criticise(fitter.samples, whole, bank))

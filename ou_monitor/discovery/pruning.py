@@ -73,7 +73,7 @@ def prune_by_gain(samples: Samples, model: Composite, names: Sequence[str], plai
         if turn == _ROUNDS - 1:
             return state
         worst = (min(failing, key=lambda k: (-state.worth[k].chance, state.worth[k].gain))
-                 if failing else _straying(samples, state))
+                 if failing else _cause_of_straying(samples, state))
         if worst is None:
             return state
         _leave_out(state, worst)
@@ -110,7 +110,7 @@ def _leave_out(state: Pruned, worst: int) -> None:
     state.names, state.full = left, less
 
 
-def _straying(samples: Samples, state: Pruned) -> int | None:
+def _cause_of_straying(samples: Samples, state: Pruned) -> int | None:
     """Return the cause, if any, whose removal keeps simulations within the recorded range."""
     # A term may improve one-step predictions although its simulations exceed the recorded range.
     # Responses of the mean are not tested.

@@ -78,9 +78,9 @@ def mean_response(samples: Samples, composite: Composite, view: View,
                   start: Sequence[Term] = ()) -> MeanResponse:
     """Choose the terms of the mean; the other terms of the model stay as they are."""
     own = [term for term in composite.terms if _measured(term)]
-    pool = [*(term for term in start if not _is_among(term, own)), *own]
+    pool = [*(term for term in start if not _contains(term, own)), *own]
     # With only a rough noise model, a growing sag would take the place of other terms.
-    pool += [term for term in _candidates(view) if not _is_among(term, pool)
+    pool += [term for term in _candidates(view) if not _contains(term, pool)
              and not (start and isinstance(term, LoadSag) and term.growth)]
     if not pool:
         return MeanResponse((), (), ())
@@ -92,7 +92,7 @@ def _measured(term: Term) -> bool:
     return term.ROLE is Role.MEAN and term.MEASURED
 
 
-def _is_among(term: Term, others: Sequence[Term]) -> bool:
+def _contains(term: Term, others: Sequence[Term]) -> bool:
     """Return whether a term, or one that is nearly the same, is among others."""
     for other in others:
         if type(other) is not type(term) or other.LINEAR != term.LINEAR:
@@ -105,7 +105,7 @@ def _is_among(term: Term, others: Sequence[Term]) -> bool:
     return False
 
 
-def _nearby(one: Term, other: Term) -> bool:
+def _is_near(one: Term, other: Term) -> bool:
     """Return whether two terms differ only by a small step of the time constant."""
     return (isinstance(one, LoadTransient) and isinstance(other, LoadTransient)
             and one.delay == other.delay and 0.5 < one.tau / other.tau < 2.0)
@@ -148,8 +148,8 @@ class _Regression:
             if better is None:
                 break
             chosen = better
-        chosen = self._plainest(chosen)
-        worth = [self._value(chosen) - self._value(self._less(chosen, k)) for k in chosen]
+        chosen = self._with_plainer_term(chosen)
+        worth = [self._evidence(chosen) - self._evidence(self._less(chosen, k)) for k in chosen]
         order = np.argsort(-np.array(worth)) if worth else np.zeros(0, dtype=int)
         found = [chosen[k] for k in order.tolist()]
         return MeanResponse(tuple(self._pool[k] for k in found),
@@ -158,13 +158,13 @@ class _Regression:
 
     def _best_move(self, chosen: tuple[int, ...]) -> tuple[int, ...] | None:
         """Return the set after the most useful change; None if no change helps."""
-        value = self._value(chosen)
-        largest = value - self._value(())
+        value = self._evidence(chosen)
+        largest = value - self._evidence(())
         best, most = None, 0.0
         for k in chosen:
             less = self._less(chosen, k)
             # Removing a term saves its penalty.
-            gain = self._least(less, k, largest) - (value - self._value(less))
+            gain = self._needed_evidence(less, k, largest) - (value - self._evidence(less))
             if not self._steady(less, chosen):
                 gain = max(gain, 1e-6)
             if gain > most:
@@ -174,10 +174,10 @@ class _Regression:
         for k in range(len(self._pool)):
             if k in chosen:
                 continue
-            more = self._with(chosen, k)
+            more = self._with_term(chosen, k)
             swapped = len(more) == len(chosen)
-            gain = self._value(more) - value - (
-                0.0 if swapped else self._least(chosen, k, largest))
+            gain = self._evidence(more) - value - (
+                0.0 if swapped else self._needed_evidence(chosen, k, largest))
             if gain > max(most, 0.1) and (swapped or self._steady(chosen, more)):
                 best, most = more, gain
         return best or self._best_exchange(chosen, value)
@@ -186,11 +186,11 @@ class _Regression:
         """Return the set with one time constant replaced by a better nearby one."""
         others = [tuple(sorted((*self._less(chosen, j), k))) for j in chosen
                   for k in range(len(self._pool))
-                  if k not in chosen and _nearby(self._pool[j], self._pool[k])]
-        best = max(others, key=self._value, default=None)
-        return best if best is not None and self._value(best) > value + 0.1 else None
+                  if k not in chosen and _is_near(self._pool[j], self._pool[k])]
+        best = max(others, key=self._evidence, default=None)
+        return best if best is not None and self._evidence(best) > value + 0.1 else None
 
-    def _least(self, beside: tuple[int, ...], k: int, largest: float) -> float:
+    def _needed_evidence(self, beside: tuple[int, ...], k: int, largest: float) -> float:
         """Return the minimum evidence of a term beside others, nats."""
         kind = type(self._pool[k])
         again = any(type(self._pool[j]) is kind for j in beside)
@@ -199,7 +199,7 @@ class _Regression:
     def _less(self, chosen: tuple[int, ...], k: int) -> tuple[int, ...]:
         return tuple(j for j in chosen if j != k)
 
-    def _with(self, chosen: tuple[int, ...], k: int) -> tuple[int, ...]:
+    def _with_term(self, chosen: tuple[int, ...], k: int) -> tuple[int, ...]:
         """Return a set with one more term; it replaces one of its kind if only one may occur."""
         kind = type(self._pool[k])
         kept = chosen if kind.SEVERAL else tuple(
@@ -209,14 +209,14 @@ class _Regression:
     def _one_of_a_kind(self, start: Sequence[int]) -> tuple[int, ...]:
         chosen: tuple[int, ...] = ()
         for k in start:
-            chosen = self._with(chosen, k)
+            chosen = self._with_term(chosen, k)
         return chosen
 
-    def _value(self, chosen: tuple[int, ...]) -> float:
+    def _evidence(self, chosen: tuple[int, ...]) -> float:
         """Return the evidence for a set of terms, nats."""
-        return self._evaluated(chosen)[0]
+        return self._evaluate(chosen)[0]
 
-    def _evaluated(self, chosen: tuple[int, ...]) -> tuple[float, FloatArray]:
+    def _evaluate(self, chosen: tuple[int, ...]) -> tuple[float, FloatArray]:
         """Return the evidence, and the cost of each held-out block, nats."""
         if chosen not in self._known:
             at = np.concatenate([[1], *(self._at[k] for k in chosen)]).astype(int)
@@ -229,30 +229,30 @@ class _Regression:
 
     def _steady(self, less: tuple[int, ...], more: tuple[int, ...]) -> bool:
         """Return whether the larger set gains in more than one block."""
-        return decision.is_shared(self._evaluated(less)[1] - self._evaluated(more)[1])
+        return decision.is_shared(self._evaluate(less)[1] - self._evaluate(more)[1])
 
-    def _plainest(self, chosen: tuple[int, ...]) -> tuple[int, ...]:
+    def _with_plainer_term(self, chosen: tuple[int, ...]) -> tuple[int, ...]:
         """Return a set in which a term is replaced by a plainer one that does as well, if any."""
         for k in chosen:
-            plain = [j for j in self._as_good(chosen, k)
+            plain = [j for j in self._substitutes(chosen, k)
                      if decision.is_plainer(type(self._pool[j]), type(self._pool[k]))]
             if plain:
                 less = self._less(chosen, k)
-                return self._with(less, max(
-                    plain, key=lambda j: self._value(self._with(less, j))))
+                return self._with_term(less, max(
+                    plain, key=lambda j: self._evidence(self._with_term(less, j))))
         return chosen
 
-    def _as_good(self, chosen: tuple[int, ...], k: int) -> list[int]:
+    def _substitutes(self, chosen: tuple[int, ...], k: int) -> list[int]:
         """Return the terms of other kinds that would do as well in the place of a term."""
-        value, less = self._value(chosen), self._less(chosen, k)
+        value, less = self._evidence(chosen), self._less(chosen, k)
         return [j for j, term in enumerate(self._pool)
                 if type(term) is not type(self._pool[k]) and j not in chosen
-                and len(self._with(less, j)) == len(chosen)
-                and self._value(self._with(less, j)) > value - decision.TIE]
+                and len(self._with_term(less, j)) == len(chosen)
+                and self._evidence(self._with_term(less, j)) > value - decision.TIE]
 
     def _rivals(self, chosen: tuple[int, ...], k: int) -> tuple[str, ...]:
         """Return the causes that would do as well in the place of a term."""
-        return tuple(dict.fromkeys(self._pool[j].NAME for j in self._as_good(chosen, k)))
+        return tuple(dict.fromkeys(self._pool[j].NAME for j in self._substitutes(chosen, k)))
 
 
 def _loss(fitted: FloatArray, scored: FloatArray, at: npt.NDArray[np.int64]) -> float:

@@ -246,14 +246,14 @@ def _make_best_move(fitter: Fitter, search: Search) -> bool:
             continue
         needed = _needed(fitter, less, name, decision.TIE)
         if value - fitter.evidence(less) < needed + _ROUGH:
-            less = _in_full(fitter, less)
+            less = _refit(fitter, less)
         if fitter.holds(less):
             moves.append(_Move(name, '', less, needed - value + fitter.evidence(less)))
         for kind in _replacements(less, name):
             found = fitter.best_start(less, kind, fitter.view(less))
             if found is None or fitter.evidence(found) < value - _ROUGH or not fitter.holds(found):
                 continue
-            found = _in_full(fitter, found)
+            found = _refit(fitter, found)
             moves.append(_Move(name, kind.NAME, found, fitter.evidence(found) - value))
             if moves[-1].gain > -decision.TIE and kind.NAME != name:
                 swapped[name].append(kind.NAME)
@@ -289,7 +289,7 @@ def _without(fitter: Fitter, composite: Composite, name: str) -> Composite | Non
     return fitter.fit(terms, None if law else composite, rough=True)
 
 
-def _in_full(fitter: Fitter, found: Composite) -> Composite:
+def _refit(fitter: Fitter, found: Composite) -> Composite:
     full = fitter.fit(found.terms, found)
     return full if full is not None and fitter.evidence(full) > fitter.evidence(found) else found
 
@@ -339,10 +339,10 @@ def under_load(fitter: Fitter, search: Search) -> None:
             search.log.append(f'{term.NAME}: with the load')
     backward(fitter, search)
     choose_response(fitter, search, ())
-    _coupled(fitter, search)
+    _try_ac_coupling(fitter, search)
 
 
-def _coupled(fitter: Fitter, search: Search) -> None:
+def _try_ac_coupling(fitter: Fitter, search: Search) -> None:
     """Replace transients by a sag behind an AC coupling if that fits better; ties are rivals."""
     composite = search.composite
     means = [term for term in composite.terms if decision.is_response(type(term))]

@@ -181,7 +181,7 @@ def _verdict(verdict: Verdict, causes: Sequence[Cause], left: Sequence[Criticism
              gain_se: float, dropped: Sequence[str], why: str, uncovered: int,
              doubts: Sequence[str]) -> str:
     """Return the verdict without a refusal."""
-    names = _counted([cause.name for cause in causes])
+    names = _names_with_counts([cause.name for cause in causes])
     tried = (f' The nearest entries of the catalogue ({listed(list(dropped))}) fit only in part.'
              if dropped else '')
     if left and uncovered:
@@ -204,7 +204,7 @@ def _verdict(verdict: Verdict, causes: Sequence[Cause], left: Sequence[Criticism
             + gain_words(gain, gain_se, why))
 
 
-def _counted(names: Sequence[str]) -> list[str]:
+def _names_with_counts(names: Sequence[str]) -> list[str]:
     """Return each name once, with its number of terms."""
     return [name if names.count(name) == 1 else f'{name} ({names.count(name)} terms)'
             for name in dict.fromkeys(names)]

@@ -102,7 +102,7 @@ def test_a_spectrum_that_changes_its_shape_makes_no_coupling(signal, monkeypatch
         with monkeypatch.context() as patch:
             patch.setattr(engine, 'local_size', lambda part: np.sqrt(
                 np.mean(np.abs(part)**2, axis=1, keepdims=True)))
-            patch.setattr(engine, '_drawn', lambda *_: (0.0, 0.0))
+            patch.setattr(engine, '_sign_test', lambda *_: (0.0, 0.0))
             alarms['one weight'] += estimate_coupling(*given).seen
     assert alarms['test'] <= most(draws)
     assert signal is not bursts or alarms['one weight'] > most(draws)
@@ -125,7 +125,7 @@ def test_drawn_signs_alone_keep_their_level(count, bins):
     for _ in range(draws):
         v, x = segments(rng, count, bins), segments(rng, count, bins)
         assert x.shape == (count, bins)
-        p.append(engine._drawn(v, x * np.exp(rng.standard_normal((count, 1))), [], rng))
+        p.append(engine._sign_test(v, x * np.exp(rng.standard_normal((count, 1))), [], rng))
     for values in np.transpose(p):
         # The p-value is uniform: its share below each level, to four deviations.
         for level in (0.05, 0.25, 0.5):
@@ -137,7 +137,7 @@ def test_small_chances_are_extrapolated():
     """Beyond the draws: a strong coupling has a p-value far below one over their number."""
     rng = np.random.default_rng(5)
     v, noise = (rng.standard_normal((2, 120, 30)) + 1j * rng.standard_normal((2, 120, 30)))
-    p_sum, p_max = engine._drawn(v, v + noise, [], rng)
+    p_sum, p_max = engine._sign_test(v, v + noise, [], rng)
     assert p_sum < 1e-4 and p_max < 1e-3
 
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 from numpy.testing import assert_allclose
 from ou_monitor.criticism.adc import find_rails, redraw
-from ou_monitor.criticism.composite import _same
+from ou_monitor.criticism.composite import _converged
 from ou_monitor.criticism.curves import compare_curves
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate, Events, solved
@@ -79,7 +79,7 @@ def test_the_same_events_are_found_again_where_push_and_error_begin_at_the_same_
 
     def same(push, error, before, power=1.0, moved=0.0, offset=None):
         found = Events(push, error, np.full(3, power), np.ones(3))
-        return _same(before, offset, found, np.full(3, moved), fit)
+        return _converged(before, offset, found, np.full(3, moved), fit)
     none = Events(zero, zero, np.ones(3), np.ones(3))
     assert same(zero, zero, None) and same(zero, zero, none)
     for push, error in ((one, zero), (zero, one)):

@@ -8,7 +8,7 @@ from ou_monitor.criticism.composite import fit_composite, view_of
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import regression
 from ou_monitor.discovery.regression import (
-    _candidates, _is_among, _nearby, _Regression, FOLDS, mean_response)
+    _candidates, _contains, _is_near, _Regression, FOLDS, mean_response)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
@@ -33,10 +33,10 @@ def response(tau, delay=0.0):
     (Drift(0.1, 0.0), Drift(-0.2, 0.0), False, True)])
 def test_time_constants_are_compared_by_their_ratio(one, other, near, there):
     """By the ratio of time constants, whichever is longer, at one delay."""
-    assert _nearby(one, other) is near
-    assert _is_among(one, [other]) is there
-    assert _is_among(one, [LoadSag(0.1, 0.0), other]) is there
-    assert not _is_among(one, [])
+    assert _is_near(one, other) is near
+    assert _contains(one, [other]) is there
+    assert _contains(one, [LoadSag(0.1, 0.0), other]) is there
+    assert not _contains(one, [])
 
 
 @pytest.mark.parametrize('throttle', [None, np.linspace(0.0, 1.0, 400)])
@@ -99,7 +99,7 @@ def test_evidence_is_the_smaller_of_bic_and_held_out_gain(driven, monkeypatch):
         kept = sum(squares(at, np.setdiff1d(rows, block), block)
                    for block in np.array_split(rows, FOLDS))
         whole = squares(at, rows, rows) + 0.5 * math.log(N) * at.size
-        assert found._value(chosen) == pytest.approx(
+        assert found._evidence(chosen) == pytest.approx(
             -max(whole, kept) - sum(pool[k].SEARCH for k in chosen), rel=1e-6)
 
 
@@ -114,13 +114,14 @@ def test_the_search_finds_the_true_terms_from_any_start(driven, start, monkeypat
     assert lag.tau in (0.2, 0.3) and found_response.worth[0] >= found_response.worth[1] > 3.0
     chosen = tuple(sorted(pool.index(term) for term in found_response.terms))
     for k, worth in zip((pool.index(term) for term in found_response.terms), found_response.worth):
-        assert worth == pytest.approx(found._value(chosen) - found._value(found._less(chosen, k)))
+        assert worth == pytest.approx(
+            found._evidence(chosen) - found._evidence(found._less(chosen, k)))
     # A lag nearby in its place is no better.
-    assert found._best_exchange(chosen, found._value(chosen)) is None
+    assert found._best_exchange(chosen, found._evidence(chosen)) is None
     (other,) = {1, 2} - set(chosen)
     worse = tuple(sorted((0, other)))
-    if found._value(chosen) > found._value(worse) + 0.1:
-        assert found._best_exchange(worse, found._value(worse)) == chosen
+    if found._evidence(chosen) > found._evidence(worse) + 0.1:
+        assert found._best_exchange(worse, found._evidence(worse)) == chosen
 
 
 def test_a_steady_sag_gets_no_growth():

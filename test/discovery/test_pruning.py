@@ -60,7 +60,7 @@ def run(monkeypatch, values, names):
     rounds = iter(values)
     monkeypatch.setattr(pruning, 'held_out', lambda samples, model: scored_model(*names))
     monkeypatch.setattr(pruning, '_leave_out_vague', lambda samples, state: None)
-    monkeypatch.setattr(pruning, '_straying', lambda samples, state: None)
+    monkeypatch.setattr(pruning, '_cause_of_straying', lambda samples, state: None)
     monkeypatch.setattr(pruning, '_absorbs_trend', lambda *given: False)
 
     def measure(samples, state, plain, scored, progress):
@@ -114,7 +114,7 @@ def test_the_cheapest_cause_of_strays_is_found(full, less, gains, out, monkeypat
     far = {state.full.model.terms: full,
            **{worth.less.model.terms: by for worth, by in zip(state.worth, less)}}
     monkeypatch.setattr(pruning, 'outside_range', lambda samples, terms: far[terms])
-    assert pruning._straying(None, state) == out
+    assert pruning._cause_of_straying(None, state) == out
 
 
 def test_a_model_that_cannot_be_simulated_strays_without_bound(monkeypatch):
@@ -125,8 +125,8 @@ def test_a_model_that_cannot_be_simulated_strays_without_bound(monkeypatch):
         return 0.0
 
     monkeypatch.setattr(pruning, 'outside_range', far)
-    assert pruning._straying(None, state_of('drift', 'tone')) == 1
-    assert pruning._straying(None, state_of('drift')) is None
+    assert pruning._cause_of_straying(None, state_of('drift', 'tone')) == 1
+    assert pruning._cause_of_straying(None, state_of('drift')) is None
 
 
 @pytest.mark.parametrize('gain, far, said', [
