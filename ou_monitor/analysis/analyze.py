@@ -29,7 +29,8 @@ from ou_monitor.analysis.quality import (
     line_item, noise_items, quality_list, QualityItem)
 from ou_monitor.analysis.relaxation import (
     find_steps, fit_relaxation, judge_cause, Relaxation, ReleaseCause)
-from ou_monitor.analysis.supply import fed, flown_near, node_for, remainder, THROTTLES
+from ou_monitor.analysis.supply import (
+    alarms, Dips, fed, flown_near, node_for, remainder, THROTTLES)
 from ou_monitor.criticism.innovations import FAMILY_WISE
 from ou_monitor.criticism.readings import two_levels
 from ou_monitor.model.sinusoid import FALSE_ALARM
@@ -52,13 +53,14 @@ class Analysis:
     relaxations: tuple[Relaxation, ...]  # After falls of throttle (``release``) and rises
     causes: tuple[ReleaseCause, ...]  # Of each relaxation: rail or instrument
     alpha_test: AlphaTest  # Whether alpha is the same at all levels
-    by_throttle: ByThrottle  # Sag, noise and risk over throttle
+    by_throttle: ByThrottle  # Risk over throttle
     sliding: Sliding  # Reports of the node
     quality: tuple[QualityItem, ...]  # Cautions about the numbers, worst first
     brownout_default: bool  # Whether the voltage of the risk is the default of the node
     notes: tuple[str, ...]  # What was dropped or left out, one sentence each
     overview: Overview  # Lowest voltage, dips, sag and noise
     craft: Craft  # Cells, and a comparison with known crafts
+    alarms: tuple[Dips, ...]  # Dips below usual alarms per cell; none if the cells are unknown
 
 
 # Rate of a relaxation, 1/s, over the lowest frequency that the level leaves, Hz: for slower ones
@@ -97,6 +99,7 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
     wanders = any(level.wanders for level in judged)
     alpha = alpha_constancy(throttles, estimates,
                             [wanders or level.doubted for level in judged])
+    craft = craft_of(recording, seen.facts, cells)
     return Analysis(
         recording, judged, relaxations, tuple(judge_cause(r, alpha) for r in relaxations), alpha,
         by_throttle(recording, seen, voltage, brownout_horizon), sliding,
@@ -112,7 +115,7 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
                          for item in noise_items(name, [one.throttle for one in at]))],
                      seen.facts.ou.status == 'ok'),
         brownout_voltage is None, recording.notes + _left_out(recording, found), seen,
-        craft_of(recording, seen.facts, cells))
+        craft, alarms(all_of_it, craft.cells, seen.facts.noise))
 
 
 def _default_voltage(recording: Recording) -> float:
@@ -227,11 +230,6 @@ class ByThrottle:
     throttle: FloatArray  # 0, 0.1, .. 1; shape (k,)
     # Whether that throttle was flown; else sag and noise are inter- or extrapolated; shape (k,).
     known: npt.NDArray[np.bool_]
-    # Sag and its 95 % interval, V; NaN if unknown; shape (k,).
-    sag: FloatArray
-    sag_low: FloatArray
-    sag_high: FloatArray
-    noise: FloatArray  # Rms not explained by the load, V; shape (k,)
     risk: FloatArray  # Probability of a brown-out within the horizon; NaN if unknown; shape (k,)
     budget: float  # Highest throttle that keeps the risk within `limit`; NaN if unknown
     budget_reason: str  # What limits the budget, or why it is unknown
@@ -241,27 +239,17 @@ class ByThrottle:
     horizon: float
     time: float  # Stamp of the risk, s; NaN if the recording is shorter than a window
 
-    def at(self, throttle: float, name: str) -> float:
-        """Return one curve at a throttle, between its points; NaN when unknown."""
-        if math.isnan(throttle):
-            return NAN
-        return float(np.interp(throttle, self.throttle, getattr(self, name)))
-
 
 def by_throttle(recording: Recording, found: Overview, voltage: float, horizon: float,
                 ) -> ByThrottle:
-    """Return sag and noise of the facts, and risk of the node, over throttle (V, s)."""
-    grid, sag, last = np.array(THROTTLES), found.facts.sag, found.end
-    middle, reach = np.array(sag.sag_v), Z95 * np.array(sag.se_v)
-    if not sag.known:
-        middle = np.full(grid.size, NAN)
+    """Return the risk of the node over throttle (V, s)."""
+    grid, last = np.array(THROTTLES), found.end
     risk = np.full(grid.size, NAN)
     if last is not None and last.risk_curve:
         # RISK_CURVE has the same throttles; keep one beyond the highest flown, to interpolate.
         risk = np.where(grid >= found.highest + 0.1, NAN, last.risk_curve)
     return ByThrottle(
-        grid, flown_near(recording, grid), middle, middle - reach, middle + reach,
-        np.array(found.facts.noise.rms_v), risk, NAN if last is None else last.budget,
+        grid, flown_near(recording, grid), risk, NAN if last is None else last.budget,
         'No voltage limit was given.' if last is None else last.budget_reason,
         MonitorSettings().budget_limit, voltage, horizon,
         NAN if last is None else last.estimate.t)
@@ -287,10 +275,7 @@ def as_data(analysis: Analysis) -> dict[str, Any]:
                        for fit, cause in zip(analysis.relaxations, analysis.causes)],
         'alpha_constant': _alpha(analysis),
         'by_throttle': {
-            'throttle': curves.throttle, 'known': curves.known,
-            'sag': curves.sag, 'sag_low': curves.sag_low, 'sag_high': curves.sag_high,
-            'noise': curves.noise,
-            'brownout_risk': curves.risk},
+            'throttle': curves.throttle, 'known': curves.known, 'brownout_risk': curves.risk},
         'brownout': {
             'voltage': curves.voltage, 'horizon_s': curves.horizon,
             'voltage_source': 'default' if analysis.brownout_default else 'given',
@@ -309,7 +294,7 @@ def as_data(analysis: Analysis) -> dict[str, Any]:
         'quality': [{'name': item.name, 'severity': item.severity.name.lower(),
                      'text': item.text, 'throttles': list(item.throttles)}
                     for item in analysis.quality],
-        'craft': analysis.craft.to_dict(),
+        'craft': analysis.craft.to_dict(), 'alarms': [vars(one) for one in analysis.alarms],
         'notes': list(analysis.notes),
     }
 

@@ -51,6 +51,8 @@ _LATE = 0.06
 _STEADY, _STEADY_TIME = 0.02, 0.2
 # Half width of the band of throttle about each of THROTTLES; minimum readings in it.
 BAND, _IN_BAND = 0.05, 10
+# Usual alarms of pilots, V per cell, about Betaflight's vbat_warning_cell_voltage of 3.5.
+ALARMS = (3.7, 3.6, 3.5, 3.4, 3.3)
 # Minimum time of these readings, s, and as a share of a short recording.
 _IN_TIME, _IN_SHARE = 0.5, 0.02
 
@@ -72,6 +74,8 @@ class Dips:
     count: int  # dips
     seconds: float  # total time below, s
     longest_s: float  # time below in the longest dip, s
+    first_s: float = NAN  # begin of the first dip since the first reading, s
+    brief: int = 0  # dips shorter than a second
 
 
 @dataclass(frozen=True)
@@ -216,7 +220,7 @@ def facts_and_end(recording: Recording, limit: float | None = None, left: Remain
     load, budget, last = _at_the_end(there, limit, monitor)
     return SupplyFacts(
         Lowest(float(v[k]), float(t[k]) - began, float(u[k])),
-        None if limit is None else _dips(t, v, u, limit, noise),
+        None if limit is None else _dips(t - began, v, u, limit, noise),
         Sag(load.known, noise.flown, THROTTLES, _tuple(load.sag(THROTTLES)),
             _tuple(load.sag_se(THROTTLES))),
         noise, Resistance(load.resistance, load.resistance_se),
@@ -284,7 +288,15 @@ def _dips(t: FloatArray, v: FloatArray, u: FloatArray, limit: float, noise: Nois
     usual = float(np.median(spacing)) if spacing.size else 0.0
     held = np.where(v < limit, np.append(np.minimum(spacing, 10.0 * usual), usual), 0.0)
     seconds = np.add.reduceat(held, begins)
-    return Dips(limit, int(begins.size), float(seconds.sum()), float(seconds.max()))
+    return Dips(limit, int(begins.size), float(seconds.sum()), float(seconds.max()),
+                float(t[begins[0]]), int((seconds < 1.0).sum()))
+
+
+def alarms(recording: Recording, cells: int, noise: Noise) -> tuple[Dips, ...]:
+    """Return the dips below each of ALARMS; none if the cells are unknown (0)."""
+    there = supplied(recording, at_ends=True)
+    return tuple(_dips(there.t - recording.t[0], there.voltage, there.throttle, cells * one, noise)
+                 for one in ALARMS if cells and recording.n)
 
 
 def rise_that_ends(v: FloatArray, u: FloatArray, noise: Noise) -> FloatArray:

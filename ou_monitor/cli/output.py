@@ -191,8 +191,11 @@ def check_paths(inputs: Mapping[str, str | Path | None],
     for name, target in written:
         # `check_writable` reports a folder in place of a file.
         if os.path.lexists(target) and not target.is_dir() and not force:
-            raise InputError(f"{name} '{target}' exists already: --force overwrites it, or give "
-                             'another name')
+            raise _existing(f"{name} '{target}'")
+
+
+def _existing(what: str) -> InputError:
+    return InputError(f'{what} exists already: --force overwrites it, or give another name')
 
 
 def check_bag(name: str, bag: Path, force: bool) -> None:
@@ -201,8 +204,7 @@ def check_bag(name: str, bag: Path, force: bool) -> None:
         raise InputError(f"{name} '{bag}': {bag.suffix} is not written; give NAME.mcap for one "
                          'file, or NAME for a rosbag2 folder')
     if not force and (bag.exists() or bag.is_symlink()):
-        raise InputError(f"{name} '{bag}' exists already: --force overwrites it, or give another "
-                         'name')
+        raise _existing(f"{name} '{bag}'")
     check_folder(bag)
 
 
@@ -213,7 +215,7 @@ def replacing(bag: Path | None, force: bool) -> Iterator[None]:
         yield
         return
     if not force:
-        raise InputError(f"'{bag}' exists already: --force overwrites it, or give another name")
+        raise _existing(f"'{bag}'")
     from ou_monitor.recordings.bag import read_metadata, remove_bag
 
     if bag.is_dir() and not bag.is_symlink():

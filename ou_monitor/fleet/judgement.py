@@ -32,7 +32,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.criticism.curves import bin_width
 from ou_monitor.online.load.load_filter import LEAST_ERROR
 from ou_monitor.records import FloatArray, NAN
 from ou_monitor.text import Z95
@@ -50,7 +49,6 @@ _VAGUE = 0.5
 # Bend of Huber's function, in standard deviations (95 % efficiency); maximum rounds of the fit.
 _HUBER = 1.345
 _ROUNDS = 30
-_MOST_BINS = 60.0  # Of a histogram
 # Maximum pieces of the curve, rows needed for each, and minimum distance of its knots.
 _PIECES, _ROWS, _APART = 8, 12, 0.03
 
@@ -102,15 +100,6 @@ class Values:
         """Return the ends of the 95 % intervals in the unit of the quantity."""
         reach = Z95 * self.error
         return self.shown(self.value - reach), self.shown(self.value + reach)
-
-    def histogram(self) -> tuple[FloatArray, npt.NDArray[np.int_]]:
-        """Return edges, on the scale of `value`, and counts; outliers do not widen the bins."""
-        value = self.value
-        width = max(bin_width(value), float(np.ptp(value)) / _MOST_BINS, 1e-9)
-        first = math.floor(float(value.min()) / width) * width
-        bins = int(math.ceil((float(value.max()) - first) / width + 1e-9)) or 1
-        counts, edges = np.histogram(value, first + width * np.arange(bins + 1))
-        return edges, counts
 
     def common_curve(self, throttle: FloatArray) -> FloatArray:
         """Return the common curve through the median of all, in the unit of the quantity."""

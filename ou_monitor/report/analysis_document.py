@@ -55,6 +55,7 @@ def analysis_document(analysis: Analysis, command: str = '') -> Document:
         Facts([*facts(analysis), *_origin(analysis)]),
         Section('What to know before using these numbers', [notes(analysis)]),
         lambda: _over_time(analysis),
+        *_alarms(analysis),
         Section('Over throttle', [_by_throttle(analysis), lambda: _curves(analysis),
                                   Text(analysis.alpha_test.sentence)]),
         Section('Load levels', [*_levels(analysis.levels)]),
@@ -228,18 +229,34 @@ def _by_throttle(analysis: Analysis) -> Part:
         return number(1e3 * value) if not abs(value) < 5e-7 else '0'
 
     rows, throttle = [], analysis.recording.throttle
-    for u, flown, fall, se, rms, still in zip(sag.throttle, curves.known, sag.sag_v, sag.se_v,
-                                              noise.rms_v, noise.steady_rms_v):
+    for u, flown, fall, se, rms, still, risk in zip(
+            sag.throttle, curves.known, sag.sag_v, sag.se_v, noise.rms_v, noise.steady_rms_v,
+            curves.risk):
         briefly = analysis.recording.duration * float(np.mean(np.abs(throttle - u) <= BAND))
         rows.append([
             f'{100.0 * u:.0f} %' + ('' if flown else f'\nonly {number(briefly, 2)} s' if briefly
                                     else '\nnot flown'),
             f'{millivolts(fall)} +- {millivolts(2.0 * se)}' if math.isfinite(fall) else UNKNOWN,
             millivolts(rms) if flown else UNKNOWN, millivolts(still) if flown else UNKNOWN,
-            chance(curves.at(u, 'risk'))])
+            chance(risk)])
     heads = ['throttle', 'sag, mV', 'noise, mV rms', 'at steady\nthrottle, mV rms',
              'brown-out risk']
     return Table.of_known(heads, rows, left=[0])
+
+
+def _alarms(analysis: Analysis) -> list[Part]:
+    """Return when usual voltage alarms would have sounded, and for how long."""
+    craft, end = analysis.craft, analysis.recording.duration
+    lowest = analysis.overview.facts.lowest.time_s
+    rows = [[f'{one.limit_v / craft.cells:.1f}', *(
+        number(x) if one.count else UNKNOWN for x in (
+            one.first_s, lowest - one.first_s, end - one.first_s)), str(one.count),
+        str(one.brief), *(number(x, 2) for x in (one.longest_s, one.seconds))]
+        for one in analysis.alarms]
+    guess = ', a guess' * (craft.cells_from == 'guessed')
+    return [Section(f'Alarms ({counted(craft.cells, "cell")}{guess})', [Table(
+        ['alarm, V\nper cell', 'first at, s', 'before the\nlowest, s', 'before the\nend, s',
+         'dips', 'under 1 s', 'longest, s', 'below, s'], rows)])] if rows else []
 
 
 def _curves(analysis: Analysis) -> list[Part]:

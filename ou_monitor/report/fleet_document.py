@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 import math
 import re
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.criticism.curves import outline
 from ou_monitor.fleet.fleet import Fleet
 from ou_monitor.fleet.judgement import (
     DRIFT_RATE, Judgement, LEAST, LEAST_FLIGHTS, LEAST_VEHICLES, OF_PACK, OUTLIER_RATE, QUANTITIES,
@@ -78,7 +77,7 @@ def fleet_document(fleet: Fleet, command: str = '') -> Document:
                  'out.', legend=True), lambda: _strips(fleet)]
                 if vehicles.rows else [Text('No vehicle was identified.', legend=True)]),
         lambda: [Section('Drift over the flights', _drift(fleet)),
-                 Section('Distributions', _distributions(fleet), folded=True),
+                 Section('Sigma over throttle', _over_throttle(fleet), folded=True),
                  Section('Quality', _quality(fleet), folded=True)],
         Section('What to know before using these numbers', [
             Notes.of([*fleet.notes, *comparison_words(fleet)])]),
@@ -533,23 +532,7 @@ def facts(fleet: Fleet) -> list[tuple[str, str]]:
         lines.append((f'Below {fleet.limit:g} V', (
             f'{counted(count, "dip")}, {number(below, 2)} s in all, in {recordings} of '
             f'{counted(len(rows), "recording")}') if count else 'never'))
-    lines.append(('Sag', _range(rows, 'sag', volts, volts, ', at the highest throttle flown')
-                  or 'unknown in all: throttle is unknown, or did not move enough'))
-    resistances = _range(rows, 'resistance', lambda ohm: f'{number(1e3 * ohm)} mOhm',
-                         lambda se: number(1e3 * se, 2))
-    return [*lines, ('Resistance', resistances)] if resistances else lines
-
-
-def _range(rows: Sequence[Row], name: str, shown: Callable[[float], str],
-           of_error: Callable[[float], str], where: str = '') -> str:
-    """Return the least and the most of a quantity, with their recordings; empty if unknown."""
-    known = [row for row in rows if row[name] is not None]
-    if not known:
-        return ''
-    least, most = (choose(known, key=lambda row: row[name]) for choose in (min, max))
-    return ((f'{shown(least[name])}, {_name(least)}, to ' if len(known) > 1 else '')
-            + f"{shown(most[name])} (+- {of_error(2.0 * most[f'{name}_se'])}), {_name(most)}"
-            f'{where}; known in {len(known)} of {counted(len(rows), "recording")}')
+    return lines
 
 
 def _name(row: Row) -> str:
@@ -671,46 +654,20 @@ def _trend_plot(values: Values, trend: Trend) -> Plot:
     return plot.line(at, scale * values.shown(trend.line(at)), '', 1, 'thick')
 
 
-def _distributions(fleet: Fleet) -> list[Part]:
-    figures = []
-    for name in QUANTITIES:
-        values = fleet.judgement.values[name]
-        if values.value.size >= 5:
-            edges, count = values.histogram()
-            x, height = outline(edges, count)
-            # On a log axis the bins are even in the logarithm.
-            plot = Plot(f'{_TITLES[name]}, all recordings', _UNITS[name], 'recordings', width=450,
-                        height=240, log_x=True)
-            plot.limits(y=(0.0, 1.08 * float(count.max())))
-            figures.append(Figure(plot.line(
-                _thousandths(name) * values.shown(np.concatenate((x[:1], x, x[-1:]))),
-                np.concatenate(([0.0], height, [0.0])), '', 0, 'thick')))
-    over = _over_throttle(fleet)
-    if over:
-        figures.append(Figure(over))
-    if not figures:
-        return [Text('Fewer than five recordings have an estimate.', legend=True)]
-    parts: list[Part] = [*Pair.two_by_two(figures)]
-    if over:
-        parts.append(Text(
-            'Histograms show values at the reference throttle. Over throttle: every level of '
-            'every recording, and the common curve used to compare them, through their median.',
-            legend=True))
-    return parts
-
-
-def _over_throttle(fleet: Fleet) -> Plot | None:
+def _over_throttle(fleet: Fleet) -> list[Part]:
     values = fleet.judgement.values['sigma']
     good = [row for row in fleet.rows if row['status'] in USABLE and row['sigma'] is not None
             and row['throttle'] is not None]
     if len(good) < 5 or not math.isfinite(values.curve.reference):
-        return None
+        return []
     u = np.array([row['throttle'] for row in good])
     plot = Plot(f'{_TITLES["sigma"]} over throttle, all levels', 'throttle, %', _UNITS['sigma'],
                 width=450, height=240, log_y=True)
     plot.markers(100.0 * u, np.array([row['sigma'] for row in good]), '', 7)
     at = np.linspace(float(u.min()), float(u.max()), 60)
-    return plot.line(100.0 * at, values.common_curve(at), '', 1, 'thick')
+    return [Figure(plot.line(100.0 * at, values.common_curve(at), '', 1, 'thick'),
+                   'Every level of every recording, and the common curve used to compare them, '
+                   'through their median.')]
 
 
 def _quality(fleet: Fleet) -> list[Part]:

@@ -12,7 +12,7 @@ from simulated_recordings import recording
 
 KEYS = {'recording', 'n', 'duration_s', 'rate_hz', 'source', 'craft', 'overview', 'levels',
         'process_tests', 'lines', 'transients', 'alpha_constant', 'by_throttle', 'brownout',
-        'sliding', 'quality', 'notes'}
+        'sliding', 'quality', 'notes', 'alarms'}
 LEVEL_KEYS = {
     'throttle', 'segments', 'time_s', 'n', 'mean', 'vpp', 'peak', 'vrms', 'crest', 'alpha',
     'alpha_se', 'alpha_ci95', 'tau', 'tau_se', 'tau_ci95', 'sigma', 'sigma_se', 'sigma_ci95',

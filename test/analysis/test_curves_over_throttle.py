@@ -22,13 +22,14 @@ def swept(seed, seconds=60.0, rate=500.0):
 
 def test_throttle_that_only_passes_is_known():
     """Sag within 4 standard errors, noise within 15 %, where flown; the risk up to there."""
-    found = analyze(swept(1), brownout_voltage=4.5).by_throttle
+    analysis = analyze(swept(1), brownout_voltage=4.5)
+    found, facts = analysis.by_throttle, analysis.overview.facts
     at, inside = found.throttle, found.known
     assert at[inside] == pytest.approx([0.2, 0.3, 0.4, 0.5, 0.6, 0.7])
-    error = (found.sag_high - found.sag_low) / 3.92
-    assert (np.abs(found.sag - 0.4 * at) < 4.0 * error)[inside].all()
+    error = np.array(facts.sag.se_v)
+    assert (np.abs(np.array(facts.sag.sag_v) - 0.4 * at) < 4.0 * error)[inside].all()
     truth = (0.1 + at[inside]) / math.sqrt(2.0 * ALPHA)
-    assert found.noise[inside] == pytest.approx(truth, rel=0.15)
+    assert np.array(facts.noise.rms_v)[inside] == pytest.approx(truth, rel=0.15)
     assert np.isfinite(found.risk[at <= 0.7]).all() and np.isnan(found.risk[at > 0.81]).all()
 
 
@@ -50,4 +51,3 @@ def test_the_voltage_is_the_nodes_unless_asked_for():
     assert not analyze(simulated, brownout_voltage=4.5).brownout_default
     none = analyze(simulated, brownout_voltage=math.nan)
     assert np.isnan(none.by_throttle.risk).all() and math.isnan(none.by_throttle.budget)
-    assert default.by_throttle.at(math.nan, 'risk') != 0.0

@@ -88,9 +88,9 @@ def test_sag_of_the_flight_is_that_of_the_bag(found):
     sag = truth['parameters']['sag']
     for level in analysis.levels[1:]:
         assert level.sag.sag == pytest.approx(sag * level.throttle, abs=3.0 * level.sag.sag_se)
-    curves = analysis.by_throttle
-    off = np.abs(curves.sag - sag * curves.throttle)[curves.known]
-    assert np.all(off <= 3.0 * ((curves.sag_high - curves.sag_low) / 3.92)[curves.known])
+    curves, measured = analysis.by_throttle, analysis.overview.facts.sag
+    off = np.abs(np.array(measured.sag_v) - sag * curves.throttle)[curves.known]
+    assert np.all(off <= 3.0 * np.array(measured.se_v)[curves.known])
 
 
 def test_no_bag_has_a_line_a_flag_of_shape_or_another_alpha(found):
