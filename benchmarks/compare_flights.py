@@ -33,7 +33,7 @@ def row(name: str, found: Agreement, spent: float) -> list[str]:
     return [name, f'{found.simulated[1] - found.simulated[0]:.0f}', f'{found.explained:.2f}',
             f'{1e3 * found.bias:.0f}', f'{found.lowest.measured:.2f}', beside(found.lowest, 2),
             f'{first.measured:.1f}', beside(first, 1), f'{second.measured:.1f}',
-            beside(second, 1), f'{found.ks_distance:.2f}',
+            beside(second, 1), f'{found.apart.measured:.2f}',
             'looks like it' if found.verdict.name == 'LOOKS_LIKE_IT' else 'differs',
             f'{spent:.1f}']
 

@@ -171,9 +171,6 @@ def estimate_coupling(
     if found.narrow:
         notes.append('Only a few frequencies are coherent: this is a common line, such as motor '
                      'rotation, rather than coupling.')
-    if leads:
-        notes.append('The signal leads the voltage: it drives the motors and so the load, rather '
-                     'than the other way round.')
     return Coupling(
         seen, found.p_value, gain, interval, lag, lag_se, found.limit(level, POWER),
         found.narrow, leads, share, frequency, found.squared, response, found.threshold, level,

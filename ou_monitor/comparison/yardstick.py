@@ -125,11 +125,6 @@ class Agreement:
     traces: Traces  # For a page
 
     @property
-    def ks_distance(self) -> float:
-        """Return the largest difference of the two distributions."""
-        return self.apart.measured
-
-    @property
     def worst(self) -> str:
         """Return the largest difference in a sentence."""
         chance = '' if self.verdict is Likeness.DIFFERS else ', within chance'
@@ -160,7 +155,7 @@ class Agreement:
             'spectrum': [{'from_hz': one.low_hz, 'to_hz': one.high_hz,
                           'simulated_over_measured': _ratio(one.power)}
                          for one in self.spectrum],
-            'ks_distance': self.ks_distance, 'worst': self.worst,
+            'ks_distance': self.apart.measured, 'worst': self.worst,
             'verdict': self.verdict.name.lower()}
 
 

@@ -78,7 +78,7 @@ def fleet_document(fleet: Fleet, command: str = '') -> Document:
                 if vehicles.rows else [Text('No vehicle was identified.', legend=True)]),
         lambda: [Section('Drift over the flights', _drift(fleet)),
                  Section('Sigma over throttle', _over_throttle(fleet), folded=True),
-                 Section('Quality', _quality(fleet), folded=True)],
+                 Section('Verdicts and causes', _causes(fleet), folded=True)],
         Section('What to know before using these numbers', [
             Notes.of([*fleet.notes, *comparison_words(fleet)])]),
         lambda: [Section('Recordings', _recordings(fleet), folded=True)]]
@@ -670,24 +670,13 @@ def _over_throttle(fleet: Fleet) -> list[Part]:
                    'through their median.')]
 
 
-def _quality(fleet: Fleet) -> list[Part]:
-    """Return the counts of bad statuses, flags, verdicts and causes."""
-    counts: Counter[str] = Counter()
-    seen: set[str] = set()
-    for row in fleet.rows:
-        if row['status'] is not None:
-            if row['status'] not in USABLE:
-                counts[f"level without estimate: {row['status']}"] += 1
-            counts.update(f'level with flag {flag}' for flag in row['flags'] or ())
-        if row['path'] not in seen and row['verdict'] is not None:
-            counts[f"recording with verdict {row['verdict']}"] += 1
-            counts.update(f'recording with cause {cause}'
-                          for cause in dict.fromkeys(row['causes'] or ()))
-        seen.add(row['path'])
-    if not counts:
-        return [Text('Every level has an estimate, and no flag was raised.')]
-    return [Table(['what', 'how often'], [[text, str(n)] for text, n in counts.most_common()],
-                  left=[0])]
+def _causes(fleet: Fleet) -> list[Part]:
+    """Return the counts of the verdicts and causes of discover."""
+    found = {row['path']: row for row in fleet.rows if row['verdict'] is not None}.values()
+    counts = Counter([f"verdict {row['verdict']}" for row in found] + [
+        f'cause {cause}' for row in found for cause in dict.fromkeys(row['causes'] or ())])
+    return [Table(['what', 'recordings'], [[text, str(n)] for text, n in counts.most_common()],
+                  left=[0])] if counts else []
 
 
 def _recordings(fleet: Fleet) -> list[Part]:
