@@ -179,7 +179,7 @@ def check_paths(inputs: Mapping[str, str | Path | None],
                 raise InputError(f"{name} '{target}' would overwrite {source} '{given}', which "
                                  'is read: give another name')
         for other, earlier in written[:k]:
-            if _same(target, earlier):
+            if _is_same_file(target, earlier):
                 raise InputError(f"{other} and {name} are both '{target}': give each its own "
                                  'name')
             inner, outer = sorted((_real(target), _real(earlier)),
@@ -250,7 +250,7 @@ def _real(path: Path) -> Path:
     return Path(os.path.realpath(path))
 
 
-def _same(first: Path, second: Path) -> bool:
+def _is_same_file(first: Path, second: Path) -> bool:
     """Return whether two paths are one file, also through links."""
     if _real(first) == _real(second):
         return True
@@ -259,7 +259,7 @@ def _same(first: Path, second: Path) -> bool:
 
 def _overwrites(target: Path, source: Path) -> bool:
     """Return whether writing the target would harm the source: a file, or a bag's folder."""
-    if _same(target, source) or target.is_dir() and _real(target) in _real(source).parents:
+    if _is_same_file(target, source) or target.is_dir() and _real(target) in _real(source).parents:
         return True
     if not source.is_dir() or _real(source) not in _real(target).parents:
         return False

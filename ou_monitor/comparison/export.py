@@ -75,7 +75,7 @@ def export(model: SupplyModel, target: str, *, throttle: FloatArray, rate: float
         data = {'model': [{'term': t.NAME, 'params': t.values()} for t in model.terms],
                 'load': None if model.load is None else model.load.values()}
         return Export(json.dumps(data, indent=1, allow_nan=False), (), model)
-    n = replace(_numbers(model, throttle), stated=_stated(recording))
+    n = replace(_numbers(model, throttle), stated=_stated_capacity(recording))
     known = not math.isnan(full_current)
     if known and not 0.0 < full_current < math.inf:
         raise InputError(f'--full-current must be above 0 A, got {full_current:g}')
@@ -87,7 +87,7 @@ def export(model: SupplyModel, target: str, *, throttle: FloatArray, rate: float
         n.usual_sag if target == 'gazebo' else 0.0)), *(
         () if math.isinf(n.drain) else (Drift((n.empty - n.full) / n.drain, 0.0),)), *(
         t.at(0.0) for t in model.terms if target == 'ardupilot' and isinstance(t, LoadSag))))
-    notes = _lost(model, target, throttle, rate)
+    notes = _omitted_terms(model, target, throttle, rate)
     if target == 'gazebo' and n.usual_sag:
         notes.append(f'load_sag is for a constant load, {n.usual_sag:.3g} V: throttle does not '
                      'change it')
@@ -98,7 +98,7 @@ def export(model: SupplyModel, target: str, *, throttle: FloatArray, rate: float
         notes.append(f'the capacity, {_capacity(n, full_current):.3g} Ah, is estimated from the '
                      'fall of the voltage: replace it by what the pack states')
     if recording is not None:
-        notes += _cost(model, left, recording)
+        notes += _explained_words(model, left, recording)
     return Export(text, tuple(notes), left)
 
 
@@ -124,7 +124,7 @@ def _numbers(model: SupplyModel, throttle: FloatArray) -> _Numbers:
                     sag(np.ones(1)), sag(throttle))
 
 
-def _stated(recording: Recording | None) -> float:
+def _stated_capacity(recording: Recording | None) -> float:
     """Return the capacity that the log of a recording states, Ah; otherwise NaN."""
     source = {} if recording is None else recording.source
     text = source.get('capacity_mah', source.get('log_capacity_mah', ''))
@@ -187,9 +187,10 @@ _WRITERS: dict[str, Callable[[_Numbers, float], str]] = {
     'px4': _px4, 'gazebo': _gazebo, 'ardupilot': _ardupilot}
 
 
-def _lost(model: SupplyModel, target: str, throttle: FloatArray, rate: float) -> list[str]:
+def _omitted_terms(model: SupplyModel, target: str, throttle: FloatArray, rate: float
+                   ) -> list[str]:
     """Return a line for each term that is left out, with its effect on the simulated voltage."""
-    whole = _drawn(model, throttle, rate)
+    whole = _simulated(model, throttle, rate)
     notes = []
     for k, term in enumerate(model.terms):
         if term.NAME in _KEPT[target]:
@@ -197,17 +198,17 @@ def _lost(model: SupplyModel, target: str, throttle: FloatArray, rate: float) ->
         rest = (replace(model.ou, sigma=0.0), *model.terms[1:]) if k == 0 else (
             *model.terms[:k], *model.terms[k + 1:])
         # A term's draws do not depend on other terms, so the difference is its effect.
-        moved = whole - _drawn(SupplyModel(rest, model.load), throttle, rate)
+        moved = whole - _simulated(SupplyModel(rest, model.load), throttle, rate)
         notes.append(f'{term.NAME} is left out: {1e3 * float(np.std(moved)):.3g} mV rms, up to '
                      f'{1e3 * float(np.abs(moved).max()):.3g} mV')
     return notes
 
 
-def _drawn(model: SupplyModel, throttle: FloatArray, rate: float) -> FloatArray:
+def _simulated(model: SupplyModel, throttle: FloatArray, rate: float) -> FloatArray:
     return RunningSupply(model, rate=rate, seed=0).draw(throttle)
 
 
-def _cost(model: SupplyModel, left: SupplyModel, recording: Recording) -> list[str]:
+def _explained_words(model: SupplyModel, left: SupplyModel, recording: Recording) -> list[str]:
     """Compare the model, and its exported part, with a recording."""
     notes = []
     for words, one in (('the model', model), ('the exported part', left)):

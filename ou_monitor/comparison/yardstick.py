@@ -204,7 +204,7 @@ class Yardstick:
         self._segment = int(min(v.size, max(64, min(_SEGMENT * self._rate, v.size / 4))))
         lowest, highest = self._rate / self._segment, 0.5 * self._rate
         self.bands = np.geomspace(lowest, highest, _BANDS + 1)
-        self.rises = _rises(t, samples.throttle)
+        self.rises = _rise_times(t, samples.throttle)
         self.after = np.linspace(-_BEFORE, _AFTER, _POINTS)
         reach = 0.5 * (float(v.max()) - float(v.min())) + 10.0 * lsb
         # Of the distribution, V.
@@ -233,7 +233,7 @@ def between_codes(level: float, lsb: float) -> float:
     return (np.floor(level / lsb + 1e-6) + 0.5) * lsb if lsb > 0.0 else level
 
 
-def _rises(t: FloatArray, throttle: FloatArray | None) -> npt.NDArray[np.float64]:
+def _rise_times(t: FloatArray, throttle: FloatArray | None) -> npt.NDArray[np.float64]:
     """Return the stamps at which throttle begins to rise, s."""
     if throttle is None:
         return np.empty(0)

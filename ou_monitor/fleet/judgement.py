@@ -280,13 +280,13 @@ class Trend:
 def trends(all_values: Sequence[Values]) -> tuple[Trend, ...]:
     """Test every vehicle and quantity with enough flights."""
     from ou_monitor.analysis.level_tests import adjusted
-    found = [trend for values in all_values for trend in _of_values(values)]
+    found = [trend for values in all_values for trend in _trends_of(values)]
     done = [replace(trend, p_family=p) for trend, p in zip(
         found, adjusted([trend.p_value for trend in found]))]
     return tuple(sorted(done, key=lambda t: (t.p_family, t.p_value, t.vehicle, t.quantity)))
 
 
-def _of_values(values: Values) -> list[Trend]:
+def _trends_of(values: Values) -> list[Trend]:
     # Imported here because it takes a second and the workers do not need it.
     from scipy import stats
 
@@ -522,11 +522,11 @@ def _vehicles(values: Values, within: Outliers, flat: FloatArray, rate: float, s
         # The scatter of a vehicle with one flight is unknown.
         places = [k for k, one in enumerate(cells) if one == kind and of[k].size > 1]
         if 1 < len(places) and cells.count(kind) < LEAST_VEHICLES:
-            found = _few(found, places, [flat[of[k]] for k in places])
+            found = _judge_few(found, places, [flat[of[k]] for k in places])
     return VehicleValues(names, value, found, cells)
 
 
-def _few(found: Outliers, places: Sequence[int], flights: Sequence[FloatArray]) -> Outliers:
+def _judge_few(found: Outliers, places: Sequence[int], flights: Sequence[FloatArray]) -> Outliers:
     """Compare the mean of each of a few vehicles (two flights or more) with the others' mean."""
     # The null hypothesis is a difference of at most `_TOLERANCE`, either way.
     from ou_monitor.analysis.level_tests import adjusted

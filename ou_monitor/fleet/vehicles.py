@@ -69,7 +69,7 @@ def assign(stated: Mapping[Path, str], pattern: re.Pattern[str] | None = None
             mixed.append(path)
         else:
             found[path] = Vehicle(folders[path.parent], FOLDER)
-    notes = [_rule(found), *(f'{_quoted(paths)}: {words}' for paths, words in (
+    notes = [_rule_counts(found), *(f'{_quoted(paths)}: {words}' for paths, words in (
         (differing, 'metadata and --vehicle-from name different vehicles; the metadata are used.'),
         (unmatched, '--vehicle-from finds no vehicle in the path; these recordings are not '
          'compared.'),
@@ -105,7 +105,7 @@ def _folder_names(folders: set[Path]) -> dict[Path, str]:
     return names
 
 
-def _rule(found: Mapping[Path, Vehicle]) -> str:
+def _rule_counts(found: Mapping[Path, Vehicle]) -> str:
     """Return how many vehicles were named by which rule."""
     words = {METADATA: 'by their metadata', PATTERN: 'by --vehicle-from',
              FOLDER: 'by their folder'}

@@ -30,7 +30,7 @@ def forward(log_density: FloatArray, transition: FloatArray, start: FloatArray
     n, k, _ = log_density.shape
     top, padded = _in_blocks(log_density, transition)
     size, blocks = padded.shape[0], padded.shape[3]
-    first = _through(padded, start)
+    first = _before_blocks(padded, start)
     before = np.empty((size, k, blocks))
     norm = np.empty((size, blocks))
     now = first.T
@@ -38,7 +38,7 @@ def forward(log_density: FloatArray, transition: FloatArray, start: FloatArray
         before[j] = now
         now = (now[:, None] * padded[j]).sum(axis=0)
         norm[j] = np.maximum(now.sum(axis=0), _NONE)
-        now = _law(now, start)
+        now = _normalised(now, start)
     return (before.transpose(2, 0, 1).reshape(-1, k)[:n],
             np.log(norm.T.reshape(-1)[:n]) + top)
 
@@ -108,7 +108,7 @@ def _in_blocks(log_density: FloatArray, transition: FloatArray) -> tuple[FloatAr
     return top, padded
 
 
-def _through(padded: FloatArray, start: FloatArray) -> FloatArray:
+def _before_blocks(padded: FloatArray, start: FloatArray) -> FloatArray:
     """Return the probabilities of the states before each block."""
     size = padded.shape[0]
     whole = padded[0]
@@ -128,7 +128,7 @@ def _through(padded: FloatArray, start: FloatArray) -> FloatArray:
     return np.array(first)
 
 
-def _law(weight: FloatArray, start: FloatArray) -> FloatArray:
+def _normalised(weight: FloatArray, start: FloatArray) -> FloatArray:
     """Return weights, shape (k, blocks), normalised, or the initial law if all are too small."""
     total = weight.sum(axis=0)
     fresh = (start / start.sum())[:, None]

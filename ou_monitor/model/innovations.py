@@ -202,7 +202,7 @@ def _row_sum(h: FloatArray, a: FloatArray) -> FloatArray:
     return total
 
 
-def _times(a: FloatArray, b: FloatArray, left: Pattern, right: Pattern) -> FloatArray:
+def _multiply(a: FloatArray, b: FloatArray, left: Pattern, right: Pattern) -> FloatArray:
     """Multiply matrices of shape (d, d, n), skipping elements that are zero."""
     product = np.zeros_like(a)
     for i, k in np.argwhere(left).tolist():
@@ -271,7 +271,7 @@ def _filtered(f: FloatArray, q: FloatArray, h: FloatArray, r: FloatArray) -> Flo
     turns = _pattern(f)
     weight = _inverse(q)
     known = _pattern(weight)
-    forward = _times(weight, f, known, turns)
+    forward = _multiply(weight, f, known, turns)
     # Information on this sample from the step into the next one.
     back = np.zeros_like(f)
     _symmetric(f[..., 1:], forward[..., 1:], turns, known @ turns, back[..., :-1])

@@ -128,7 +128,7 @@ def _lagged(x: FloatArray, share: float) -> FloatArray:
     return np.asarray(x[0] + lagged)
 
 
-def _filled(t: FloatArray, x: FloatArray | None) -> FloatArray | None:
+def _fill_gaps(t: FloatArray, x: FloatArray | None) -> FloatArray | None:
     """Return a load with its gaps filled; None if it is unknown or does not move."""
     if x is None:
         return None
@@ -201,7 +201,7 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
     knots = np.linspace(t[0], t[-1], max(_PARTS, math.ceil(span / _HATS)) + 1)
     level = [np.interp(t, knots, row) for row in np.eye(knots.size)]
     taus = [tau for tau in _LAGS if 0.5 * dt < tau < span / 3.0]
-    u, i = _filled(t, u), _filled(t, i)
+    u, i = _fill_gaps(t, u), _fill_gaps(t, i)
 
     def responses(x: FloatArray) -> list[FloatArray]:
         return [x, *(_lagged(x, -math.expm1(-dt / tau)) for tau in taus)]
@@ -402,7 +402,7 @@ def fit_ou(part: Regression, span: float, *, precise: bool = False) -> OuFacts:
         for k, ((peak, lowest), root) in enumerate(zip(peaks, roots))]
     rng = np.random.default_rng(0)
     for _ in range(_ROUNDS):
-        points = np.concatenate([_drawn(rng, *law) for law in laws])
+        points = np.concatenate([_draw(rng, *law) for law in laws])
         points = points[np.all((points >= low) & (points <= high), axis=1)]
         value, variance = costs(points)
         share = 1.0 / (1.0 + np.exp(-points[:, 1]))
@@ -543,8 +543,8 @@ def _moments(points: FloatArray, weight: FloatArray, more: FloatArray
     return centre, np.linalg.cholesky((off * weight[:, None]).T @ off + more)
 
 
-def _drawn(rng: np.random.Generator, part: float, centre: FloatArray, root: FloatArray
-           ) -> FloatArray:
+def _draw(rng: np.random.Generator, part: float, centre: FloatArray, root: FloatArray
+          ) -> FloatArray:
     """Draw a share of `_DRAWS` from Student's t with 5 degrees of freedom."""
     n = round(part * _DRAWS)
     z = rng.standard_normal((n, 3)) / np.sqrt(rng.chisquare(5.0, (n, 1)) / 5.0)
@@ -553,7 +553,7 @@ def _drawn(rng: np.random.Generator, part: float, centre: FloatArray, root: Floa
 
 def _log_density(points: FloatArray, part: float, centre: FloatArray, root: FloatArray
                  ) -> FloatArray:
-    """Return the log density of `_drawn`, up to a constant."""
+    """Return the log density of `_draw`, up to a constant."""
     z = np.linalg.solve(root, (points - centre).T)
     return np.asarray(math.log(part) - np.log(root.diagonal()).sum()
                       - 4.0 * np.log1p(np.sum(z * z, axis=0) / 5.0))
@@ -606,8 +606,8 @@ def _bounds(costs: Callable[[FloatArray], tuple[FloatArray, FloatArray]], low: F
                                for x, y in ((cost, value), (size, variance)))
     # At the best walk, interpolate sqrt(loss), which is linear for a parabola.
     lost = (value - min(least, float(value.min()))).reshape(shape)
-    fine = _finer(np.sqrt(np.maximum(lost, 0.0))) ** 2
-    size, logit = (_finer(x.reshape(shape))
+    fine = _refine_grid(np.sqrt(np.maximum(lost, 0.0))) ** 2
+    size, logit = (_refine_grid(x.reshape(shape))
                    for x in (np.log(variance), points[:, 1]))
     tau = dt * np.exp(-np.linspace(low[0], high[0], fine.shape[0]))
     share = 1.0 / (1.0 + np.exp(-logit))
@@ -620,7 +620,7 @@ def _bounds(costs: Callable[[FloatArray], tuple[FloatArray, FloatArray]], low: F
         variance[slower].max() if slower.any() else _QUARTER * np.exp(size.min())))
 
 
-def _finer(values: FloatArray) -> FloatArray:
+def _refine_grid(values: FloatArray) -> FloatArray:
     """Return values on a grid 8 times as fine in both directions, by linear interpolation."""
     for _ in range(2):
         at = np.linspace(0.0, values.shape[0] - 1.0, 8 * values.shape[0])

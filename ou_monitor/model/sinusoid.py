@@ -62,8 +62,8 @@ def fit_sinusoid(piece: FloatArray, rate: float, frequency: float, reach: float)
     count = v.size // size
     # Each part of the piece as one complex number, in a rotating frame.
     turns = frequency / rate
-    sums = v[:count * size].reshape(count, size) @ _turning(turns, size)
-    sums *= _turning(turns * size, count)
+    sums = v[:count * size].reshape(count, size) @ _rotation(turns, size)
+    sums *= _rotation(turns * size, count)
     shifts = np.fft.fftfreq(_TRIED * count, size / rate)
     power = np.abs(np.fft.fft(np.hanning(count + 2)[1:-1] * sums, shifts.size))
     power[(np.abs(shifts) > reach) | (frequency + shifts <= 0.0)
@@ -74,13 +74,13 @@ def fit_sinusoid(piece: FloatArray, rate: float, frequency: float, reach: float)
     bent = before - 2.0 * here + after
     off = 0.5 * (before - after) / bent if before and after and bent < 0.0 else 0.0
     best = frequency + float(shifts[top] + off * shifts[1])
-    wave = _turning(best / rate, v.size)
+    wave = _rotation(best / rate, v.size)
     waves = np.column_stack((-wave.imag, wave.real))
     sine, cosine = np.linalg.solve(waves.T @ waves, waves.T @ v).tolist()
     return Sinusoid(math.hypot(sine, cosine), best, math.atan2(cosine, sine))
 
 
-def _turning(turns: float, count: int) -> npt.NDArray[np.complex128]:
+def _rotation(turns: float, count: int) -> npt.NDArray[np.complex128]:
     """Return a unit vector that rotates backwards by a number of turns per sample."""
     found: npt.NDArray[np.complex128] = np.exp(-2j * math.pi * (turns * np.arange(count) % 1.0))
     return found

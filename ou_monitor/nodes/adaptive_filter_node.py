@@ -108,7 +108,7 @@ class SupplyInput:
         # ADC's white noise, so it is never below the supply's own.
         fresh = within(self.state_silence.age, stale_after)
         error, alpha, throttle, level, level_se, noise = self._values if fresh else _UNKNOWN
-        why = self._why(fresh, stale_after)
+        why = self._why_no_sigma(fresh, stale_after)
         if why and noise > 0.0 and rate > 0.0:
             return KnownSupply(noise * math.sqrt(2.0 * rate), throttle=throttle, source='load')
         if why:
@@ -125,7 +125,7 @@ class SupplyInput:
             return f'{self._state_topic} has been silent for {age:.1f} s'
         return f'the state on {self._state_topic} has no throttle'
 
-    def _why(self, fresh: bool, stale_after: float) -> str:
+    def _why_no_sigma(self, fresh: bool, stale_after: float) -> str:
         age = self.sigma_silence.age
         if age is None:
             return f'no message on {self._topic}'

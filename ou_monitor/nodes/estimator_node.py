@@ -135,9 +135,9 @@ class EstimatorNode(MonitorNode):
     def check(self, values: Mapping[str, Any]) -> None:
         """Raise `ValueError` when the parameters contradict each other."""
         path = _settings(values).model_file
-        self._models.check(path, self._meanwhile)
+        self._models.check(path, self._keep_working)
 
-    def _meanwhile(self) -> None:
+    def _keep_working(self) -> None:
         """Do the work of the timers while a callback waits for a file."""
         if not self.running:
             return
@@ -298,7 +298,7 @@ class EstimatorNode(MonitorNode):
         path = self._models.save(learned, {
             'date': time.strftime('%Y-%m-%d', time.gmtime()),
             **{name: value if value > 0.0 else None for name, value in values.items()}},
-            self._meanwhile)
+            self._keep_working)
         self._monitor.set_model(self._models.use(path))
         return f'{path}: saved the load of this flight; {self._models.terms} are unchanged.'
 

@@ -259,7 +259,7 @@ class LatchFile:
         if not self.refused and self._written is not self._wanted:
             self._writer.submit(self._write, self._wanted)
         self._writer.shutdown()
-        self._hold(None)
+        self._keep_lock(None)
 
     def _write(self, record: dict[str, Any]) -> None:
         """Replace the file, unless the job before has written the same."""
@@ -293,7 +293,7 @@ class LatchFile:
                 # Its owner replaces the file before releasing the lock.
                 if not os.path.samestat(os.lstat(self.path), mine):
                     raise ValueError('another node of this name is using it')
-                self._hold(handle)
+                self._keep_lock(handle)
                 handle = -1
         finally:
             if handle >= 0:
@@ -334,12 +334,12 @@ class LatchFile:
             os.close(handle)
             os.unlink(beside)
             raise
-        self._hold(handle)
+        self._keep_lock(handle)
         _sync_folder(self.path)
         if not os.path.samestat(os.lstat(self.path), os.fstat(handle)):
             raise ValueError('another file has taken its place')
 
-    def _hold(self, handle: int | None) -> None:
+    def _keep_lock(self, handle: int | None) -> None:
         """Keep the handle that has the lock; close the one before."""
         old, self._lock = self._lock, handle
         if old is not None:

@@ -106,11 +106,11 @@ def find_source(quantity: str, values: Mapping[str, Any]) -> Source | None:
     if values['msg_config'] == AUTO:
         offered = _generic(quantity)
     else:
-        offered = _of_config(load_msg_config(values['msg_config']), quantity)
+        offered = _config_source(load_msg_config(values['msg_config']), quantity)
     if kind:
         usual = offered[0].topic if len(offered) == 1 else quantity
         offered = [s for s in offered if s.spec is not None and s.spec.type == kind] or [
-            _by_hand(quantity, topic or usual, kind, field)]
+            _user_source(quantity, topic or usual, kind, field)]
     elif topic and not offered:
         raise InputError(
             f"msg_config '{values['msg_config']}' has no {quantity}: give {quantity}.type and "
@@ -129,13 +129,13 @@ def _generic(quantity: str) -> list[Source]:
         for kind in (*_SCALARS, *(_ARRAYS if quantity == 'rpm' else ())):
             found[kind] = Source(quantity, quantity, FieldSpec(quantity, kind, 'data'), AUTO)
     for config in list_msg_configs().values():
-        for source in _of_config(config, quantity) if config.generic else ():
+        for source in _config_source(config, quantity) if config.generic else ():
             if source.spec is not None:
                 found.setdefault(source.spec.type, source)
     return list(found.values())
 
 
-def _of_config(config: MsgConfig, quantity: str) -> list[Source]:
+def _config_source(config: MsgConfig, quantity: str) -> list[Source]:
     """Return the source that a msg_config describes; empty if it does not have the quantity."""
     spec: FieldSpec | None = getattr(config, quantity)
     if spec is None:
@@ -145,7 +145,7 @@ def _of_config(config: MsgConfig, quantity: str) -> list[Source]:
                    current=config.current if quantity == 'voltage' else None)]
 
 
-def _by_hand(quantity: str, topic: str, kind: str, field: str) -> Source:
+def _user_source(quantity: str, topic: str, kind: str, field: str) -> Source:
     """Return a source of any installed type; a header's stamp is used if it has one."""
     if not field:
         raise InputError(

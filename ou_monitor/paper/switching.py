@@ -164,8 +164,8 @@ def averaging_rows(rng: np.random.Generator, paths: int = 400) -> list[Row]:
         beta=COUPLING * _SWING, alpha_p=published.ALPHA.value * _SWING)
     t = np.array([0.0, 0.5 * tau, tau])
     u = system.simulate(t, [1.0, 0.0, 1.0], rng, paths=paths)
-    amplitude, amplitude_se = _of_mean(u[:, :, 0])
-    power, power_se = _of_mean(u[:, :, 2])
+    amplitude, amplitude_se = _mean_decay_ratio(u[:, :, 0])
+    power, power_se = _mean_decay_ratio(u[:, :, 2])
     limit = _late_over_early(system.averaged().solve(t, [1.0, 0.0, 1.0])[:, [0, 2]])
     advance = np.diff(u[:, :, 1].mean(axis=0))
     ratio = float(advance[1] / advance[0])
@@ -187,7 +187,7 @@ def averaging_rows(rng: np.random.Generator, paths: int = 400) -> list[Row]:
             f'{limit[1]:.3f}); it is one exponential only if beta = 0.', error=power_se)]
 
 
-def _of_mean(paths: FloatArray) -> tuple[float, float]:
+def _mean_decay_ratio(paths: FloatArray) -> tuple[float, float]:
     """Return the late over early decay rate of the mean path, and its jackknife error."""
     count = len(paths)
     total = paths.sum(axis=0)

@@ -118,11 +118,11 @@ def table_2() -> list[Row]:
         Row('Table 2', 'tau', 'ms', TAU_MS, 1e3 / alpha, f'1 / {ALPHA.text}',
             'The arithmetic is right; the five digits come from the division, alpha has three.')]
     for state in (MEDIUM, HIGH):
-        found += _of_load(state)
+        found += _load_rows(state)
     return found + _repetitions()
 
 
-def _of_load(state: PrintedLoad) -> list[Row]:
+def _load_rows(state: PrintedLoad) -> list[Row]:
     sigma, printed = state.sigma, SIGMA[state.label]
     half = 1e-3 * state.vrms.half_unit * math.sqrt(2.0 * ALPHA.value)
     step = VRMS_STEP
@@ -191,10 +191,10 @@ def probabilities(rng: np.random.Generator, draws: int = 1_000_000) -> list[Row]
                 f'printed integral by quadrature, against {draws} independent samples of the OU',
                 f'The formula is right, and is erfc(delta / sqrt(2 Var_inf)) = {closed:.4g}.',
                 error=math.sqrt(share * (1.0 - share) / draws)))
-    return [*found, *_of_thresholds()]
+    return [*found, *_threshold_rows()]
 
 
-def _of_thresholds() -> list[Row]:
+def _threshold_rows() -> list[Row]:
     low, medium, high = (state.variance for state in LOADED)
     ratio = beyond(DELTA, high) / beyond(DELTA, medium)
     spread = [beyond(DELTA, (1e-3 * v) ** 2) for s in (MEDIUM, HIGH)

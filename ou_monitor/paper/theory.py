@@ -258,7 +258,7 @@ class Generator:
         return np.asarray(p)
 
     @cached_property
-    def _below(self) -> FloatArray:
+    def _cumulative_kernel(self) -> FloatArray:
         """Return the cumulative kernel, shape (n, n), exactly 1 from the last possible state."""
         below = np.cumsum(self.jump_probabilities, axis=1)
         return np.asarray(below / below[:, -1:])
@@ -296,7 +296,7 @@ class Generator:
                 held, at = hold[which], state[which]
                 yield k, which, at, held
                 rest = left[which] - held
-                at = (rng.random(at.size)[:, None] >= self._below[at]).sum(axis=1)
+                at = (rng.random(at.size)[:, None] >= self._cumulative_kernel[at]).sum(axis=1)
                 new = rng.standard_exponential(which.size) / rates[at]
                 left[which], state[which], hold[which] = rest, at, new
                 which = which[new < rest]

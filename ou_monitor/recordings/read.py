@@ -103,10 +103,10 @@ def _read(
     if csv:
         if flight is not None:
             raise InputError(f'{path} is a CSV: --flight is for logs')
-        return _cut(tidy(read_csv(path, columns, partial=partial)), start, end), None
+        return _part(tidy(read_csv(path, columns, partial=partial)), start, end), None
     if log:
-        recording, whole = _of_log(path, signal, columns, flight, progress)
-        return _cut(recording, start, end), whole
+        recording, whole = _read_log(path, signal, columns, flight, progress)
+        return _part(recording, start, end), whole
     if flight is not None or columns is not None:
         raise InputError(f'{path} is a bag: --flight is for logs, names and units of columns are '
                          'for logs and CSVs')
@@ -118,8 +118,8 @@ def _read(
         throttle_topic=throttle_topic, start=start, end=end, progress=progress)), None
 
 
-def _of_log(path: Path, signal: str | None, columns: CsvColumns | None, flight: int | None,
-            progress: Callable[[float], None] | None) -> tuple[Recording, Log]:
+def _read_log(path: Path, signal: str | None, columns: CsvColumns | None, flight: int | None,
+              progress: Callable[[float], None] | None) -> tuple[Recording, Log]:
     """Read the supply of a log; return also the log, with a signal by name."""
     named = columns or CsvColumns()
     if named != CsvColumns(voltage=named.voltage, throttle=named.throttle,
@@ -170,7 +170,7 @@ def _check_part(start: float | None, end: float | None) -> None:
                          f'{start or 0.0:g} s')
 
 
-def _cut(recording: Recording, start: float | None, end: float | None) -> Recording:
+def _part(recording: Recording, start: float | None, end: float | None) -> Recording:
     """Return the samples in a part, s after the first one."""
     if start is None and end is None:
         return recording

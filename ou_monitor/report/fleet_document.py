@@ -99,7 +99,7 @@ def _ageing(fleet: Fleet) -> str:
     tested = [t for t in judged.trends if t.quantity in OF_PACK]
     old = [t for t in tested if t.p_family <= DRIFT_RATE and t.slope > 0.0]
     if old:
-        words = [f'{vehicle}{_flown(fleet, [t for t in old if t.vehicle == vehicle])}: '
+        words = [f'{vehicle}{_flights_of_pack(fleet, [t for t in old if t.vehicle == vehicle])}: '
                  + ', '.join(_growth(judged, t) for t in old if t.vehicle == vehicle)
                  for vehicle in dict.fromkeys(t.vehicle for t in old)]
         more = f'; and {len(words) - _OLD} more' if len(words) > _OLD else ''
@@ -116,7 +116,7 @@ def _ageing(fleet: Fleet) -> str:
             f'{change(most.high)} per flight on {most.vehicle}, which has {most.flights} flights.')
 
 
-def _flown(fleet: Fleet, trends: Sequence[Trend]) -> str:
+def _flights_of_pack(fleet: Fleet, trends: Sequence[Trend]) -> str:
     """Return flights, dates and cells of an ageing pack."""
     mine = fleet.recordings_of(trends[0].vehicle)
     dates, cells = _dates(mine), _cells_of(mine)
@@ -127,7 +127,8 @@ def _flown(fleet: Fleet, trends: Sequence[Trend]) -> str:
 
 def _growth(judged: Judgement, trend: Trend) -> str:
     """Return by how much a quantity of a pack grows, from where to where."""
-    first, last = (_plain(judged.values[trend.quantity], trend.line(np.array(float(flight))))
+    values = judged.values[trend.quantity]
+    first, last = (_without_unit(values, trend.line(np.array(float(flight))))
                    for flight in (trend.first, trend.last))
     return (f'{trend.quantity} {change(trend.slope)} per flight (95 % {change(trend.low)} to '
             f'{change(trend.high)}), {first} to {last} {_UNITS[trend.quantity]}'
@@ -202,7 +203,7 @@ def finding_words(fleet: Fleet) -> list[str]:
         beside = 'the mean of the others' if few else 'the median of the vehicles'
         interval = '' if not few or reach is None else (
             f' (95 % {change(off - float(reach[k]))} to {change(off + float(reach[k]))})')
-        found.append(f'{one.names[k]}: {_compared(judged, name, one.names[k], one.value[k])}, '
+        found.append(f'{one.names[k]}: {_as_compared(judged, name, one.names[k], one.value[k])}, '
                      f'{change(off)}{interval} from {beside}; fleet-wide p '
                      f'{chance(float(one.outliers.chance[k]))}.')
     for name, k in judged.odd_recordings():
@@ -211,18 +212,18 @@ def finding_words(fleet: Fleet) -> list[str]:
         raw = f'{number(_thousandths(name) * float(values.measured[k]))} as measured' + (
             f' at {100.0 * at:.0f} %' if math.isfinite(at) else '')
         found.append(f'{vehicle}, {values.paths[k]}: '
-                     f'{_compared(judged, name, vehicle, values.value[k])} ({raw}), '
+                     f'{_as_compared(judged, name, vehicle, values.value[k])} ({raw}), '
                      f'{change(float(values.value[k] - out.centre[k]))} from the other flights; '
                      f'fleet-wide p {chance(float(out.chance[k]))}.')
     return found
 
 
-def _compared(judged: Judgement, name: str, vehicle: str, value: float) -> str:
+def _as_compared(judged: Judgement, name: str, vehicle: str, value: float) -> str:
     """Return a value of a vehicle as it is compared: at the common throttle."""
     values = judged.values[name]
     unit = _UNITS[name] if name in OF_PACK else QUANTITIES[name]
-    return (f'{name} is {_plain(values, value)} {unit}{_a_cell(judged, name, vehicle)}'
-            f'{_at(values)}')
+    return (f'{name} is {_without_unit(values, value)} {unit}{_a_cell(judged, name, vehicle)}'
+            f'{_at_throttle(values)}')
 
 
 def failure_words(fleet: Fleet) -> list[str]:
@@ -242,7 +243,7 @@ def _prefix(row: Row) -> str:
     return '' if row['vehicle'] is None else f"{row['vehicle']}: "
 
 
-def _plain(values: Values, value: float | FloatArray) -> str:
+def _without_unit(values: Values, value: float | FloatArray) -> str:
     """Return one value without its unit; resistance and sag in thousandths (mOhm, mV)."""
     return number(_thousandths(values.name) * float(values.shown(value)))
 
@@ -275,7 +276,7 @@ def _dates(rows: Sequence[Row]) -> str:
     return ' to '.join(days) or UNKNOWN
 
 
-def _at(values: Values) -> str:
+def _at_throttle(values: Values) -> str:
     """Return ' at' the throttle at which recordings are compared; empty without one."""
     if values.name in OF_PACK:
         return ' at full throttle' if values.name == 'sag' else ''
@@ -343,12 +344,12 @@ def pack_table(fleet: Fleet) -> Table:
         if any(row[name] is not None for row in mine for name in OF_PACK):
             rows.append([short[vehicle], _flights(mine), _dates(mine), _cells_of(mine)])
             for name in OF_PACK:
-                rows[-1] += [_of_pack(mine, name, _star(judged, name, vehicle)),
+                rows[-1] += [_pack_value(mine, name, _star(judged, name, vehicle)),
                              _slope(judged, name, vehicle, interval=True)]
     return Table.of_known(PACK_HEADS, rows, left=[0, 2], most=2 * _SHOWN)
 
 
-def _of_pack(rows: Sequence[Row], name: str, star: str) -> str:
+def _pack_value(rows: Sequence[Row], name: str, star: str) -> str:
     """Return the median of a quantity of a pack as measured, with its throttle."""
     mine = [row for row in rows if row[name] is not None]
     if not mine:
@@ -634,7 +635,7 @@ def _drift(fleet: Fleet) -> list[Part]:
 
 
 def _caption(trend: Trend, fleet: Fleet) -> str:
-    at = _at(fleet.judgement.values[trend.quantity]) or ' as measured'
+    at = _at_throttle(fleet.judgement.values[trend.quantity]) or ' as measured'
     return (f'{change(trend.slope)} per flight; fleet-wide p '
             f'{chance(trend.p_family)}. Values{at}, with 95 % intervals.')
 

@@ -184,7 +184,7 @@ _SYMBOLS = {'alpha': '\u03b1', 'sigma': '\u03c3', 'tau': '\u03c4', 'Var_inf': 'V
 _SYMBOL = re.compile(r'(?<!\w)(' + '|'.join(map(re.escape, _SYMBOLS)) + r')(?!\w)')
 
 
-def _set(text: str) -> str:
+def _html(text: str) -> str:
     """Return a text, escaped, with typographic signs."""
     for plain, sign in _SIGNS.items():
         text = text.replace(plain, sign)
@@ -226,7 +226,7 @@ def section(document: Document) -> str:
 
 def _top(document: Document) -> str:
     return (f'<h1>{escape(document.title)}</h1>\n<p{_SOFT}>{escape(document.subject)}</p>\n'
-            f'<p class="headline">{_set(document.headline)}</p>\n')
+            f'<p class="headline">{_html(document.headline)}</p>\n')
 
 
 def _joined(parts: Sequence[Part], live: bool = True) -> str:
@@ -236,21 +236,22 @@ def _joined(parts: Sequence[Part], live: bool = True) -> str:
 def _part(part: Part, live: bool = True) -> str:
     """Return one part of a document; live: with the data of its plots."""
     if isinstance(part, Text):
-        return '' if not part.text else f'<p{_SOFT if part.legend else ""}>{_set(part.text)}</p>'
+        return '' if not part.text else f'<p{_SOFT if part.legend else ""}>{_html(part.text)}</p>'
     if isinstance(part, Facts):
         return '' if not part.pairs else '<dl class="facts">' + ''.join(
-            f'<dt>{_set(name)}</dt><dd>{_set(words)}</dd>' for name, words in part.pairs) + '</dl>'
+            f'<dt>{_html(name)}</dt><dd>{_html(words)}</dd>'
+            for name, words in part.pairs) + '</dl>'
     if isinstance(part, Notes):
         return '' if not part.notes else '<ul>' + ''.join(
-            f'<li>{_set(text)}</li>' if severity is Severity.INFO else
-            f'<li class="warn">{severity.name.lower()}: {_set(text)}</li>'
+            f'<li>{_html(text)}</li>' if severity is Severity.INFO else
+            f'<li class="warn">{severity.name.lower()}: {_html(text)}</li>'
             for severity, text in part.notes) + '</ul>'
     if isinstance(part, Table):
         return _table(part)
     if isinstance(part, Figure):
         drawn = part.drawing if isinstance(part.drawing, str) else (
             part.drawing.svg() + (embed(part.drawing) if live else ''))
-        below = f'<figcaption>{_set(part.caption)}</figcaption>' if part.caption else ''
+        below = f'<figcaption>{_html(part.caption)}</figcaption>' if part.caption else ''
         return f'<figure>{drawn}{below}</figure>'
     if isinstance(part, Pair):
         # A single figure takes half the width.
@@ -258,7 +259,7 @@ def _part(part: Part, live: bool = True) -> str:
         both = ''.join(_part(figure, live) for figure in part.figures)
         return f'<div class="pair">{both}{more}</div>'
     if isinstance(part, Section):
-        inside, heading = _joined(part.parts, live), f'<h2>{_set(part.heading)}</h2>'
+        inside, heading = _joined(part.parts, live), f'<h2>{_html(part.heading)}</h2>'
         if not inside:
             return ''
         return _folded(heading, inside) if part.folded else (
@@ -275,7 +276,7 @@ def _table(part: Table) -> str:
         out = []
         for k, text in enumerate(cells):
             main, _, small = (_DASH if text == UNKNOWN else text).partition('\n')
-            inner = _set(main) + (f'<br/><small>{_set(small)}</small>' if small else '')
+            inner = _html(main) + (f'<br/><small>{_html(small)}</small>' if small else '')
             out.append(f'<{tag}{_LEFT if k in part.left else ""}>{inner}</{tag}>')
         return '<tr>' + ''.join(out) + '</tr>'
 

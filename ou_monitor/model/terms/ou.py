@@ -49,34 +49,34 @@ class OU(Term):
             nonlocal before
             kicks = rng.standard_normal(s.t.size)
             if s.bend == (0.0, 0.0):
-                phi, std = _law(s)
+                phi, std = _transition(s)
                 kicks *= std
                 if not (steady(s.push) and s.push[0] == 0.0):
                     kicks += s.push
                 s.x = first_order(phi, kicks, before)
             else:
-                s.x = _bent(s, kicks, before, parts)
+                s.x = _nonlinear(s, kicks, before, parts)
             before = float(s.x[-1])
 
         return effect
 
 
-def _law(s: Segment) -> tuple[FloatArray, FloatArray]:
+def _transition(s: Segment) -> tuple[FloatArray, FloatArray]:
     """Return the decay of the state in each step, and the deviation of the added noise, V."""
     n = s.step.size
     # If all steps and alphas are equal, two values suffice: of the first sample, which may follow
     # a gap, and of any other.
     some = slice(2) if steady(s.step[1:]) and steady(s.alpha[1:]) else slice(n)
     alpha, step = s.alpha[some], s.step[some]
-    phi = _over(n, np.exp(-alpha * step))
-    std = _over(n, np.sqrt(-np.expm1(-2.0 * alpha * step) / (2.0 * alpha)))
+    phi = _extended(n, np.exp(-alpha * step))
+    std = _extended(n, np.sqrt(-np.expm1(-2.0 * alpha * step) / (2.0 * alpha)))
     std *= s.sigma
     if not (steady(s.power) and s.power[0] == 1.0):
         std *= np.sqrt(s.power)
     return phi, std
 
 
-def _over(n: int, values: FloatArray) -> FloatArray:
+def _extended(n: int, values: FloatArray) -> FloatArray:
     """Return n values: the given ones, and then the last one repeated."""
     if values.size == n:
         return values
@@ -85,7 +85,8 @@ def _over(n: int, values: FloatArray) -> FloatArray:
     return filled
 
 
-def _bent(s: Segment, kicks: FloatArray, before: float, rng: np.random.Generator) -> FloatArray:
+def _nonlinear(s: Segment, kicks: FloatArray, before: float, rng: np.random.Generator
+               ) -> FloatArray:
     """Return the state under a nonlinear force; rng gives the draws of split steps."""
     square, cube = s.bend
     # A long first step starts from the stationary law.

@@ -317,7 +317,8 @@ class ClockJitter(Term):
         step = 1.0 / view.rate
         z = view.z[view.train]
         square = z * z
-        if float(np.mean(square**2)) > _MOST_KURTOSIS or _together(square) > _MOST_TOGETHER:
+        if (float(np.mean(square**2)) > _MOST_KURTOSIS
+                or _square_correlation(square) > _MOST_CORRELATION):
             # Errors of at most half a step have a smaller kurtosis, and a step that is too long
             # makes the next one too short.
             return None
@@ -341,7 +342,7 @@ class ClockJitter(Term):
                       density - log_normal(view.z), 2)
 
 
-def _together(square: FloatArray) -> float:
+def _square_correlation(square: FloatArray) -> float:
     """Return the correlation of neighbouring squares over its standard error."""
     c = square - square.mean()
     return math.sqrt(c.size) * float(c[1:] @ c[:-1]) / float(c @ c)
@@ -349,7 +350,7 @@ def _together(square: FloatArray) -> float:
 
 # Samples in a fit; maximum fourth moment that jitter causes; maximum correlation of neighbouring
 # squares, which jitter makes negative.
-_SHORT, _MOST_KURTOSIS, _MOST_TOGETHER = 15000, 6.0, 4.0
+_SHORT, _MOST_KURTOSIS, _MOST_CORRELATION = 15000, 6.0, 4.0
 # Number of levels of a stamp's error.
 _LEVELS = 7
 

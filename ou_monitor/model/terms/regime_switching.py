@@ -201,7 +201,7 @@ def calm_levels(view: View, part: slice, spread: float, rates: FloatArray
         return None
     best: tuple[float, FloatArray, View] | None = None
     for share in _CALMER:
-        calm = _calmer(view, share)
+        calm = _with_less_noise(view, share)
         scores, unit = Scores.of(calm).part(part), math.sqrt(float(np.median(calm.variance)))
         for height in _HEIGHTS:
             for rate in rates.tolist():
@@ -214,14 +214,14 @@ def calm_levels(view: View, part: slice, spread: float, rates: FloatArray
     return best[1], 1.0, best[2]
 
 
-def _calmer(view: View, share: float) -> View:
+def _with_less_noise(view: View, share: float) -> View:
     """Return the view for a rail with a share of the noise, and the same white noise."""
     keep = min(float(np.median(view.phi[view.train])), 1.0 - 1e-9)
     trust = float(np.median(np.broadcast_to(view.trust, view.z.shape)[view.train]))
     variance = float(np.median(view.variance))
     ahead, white = trust * variance, (1.0 - trust) * variance
     drive = share * (ahead - keep * keep * ahead * white / (ahead + white))
-    ahead, _ = _settled(keep, drive / (1.0 - keep * keep), white)
+    ahead, _ = _settled_variances(keep, drive / (1.0 - keep * keep), white)
     return _filtered(view, keep, ahead / (ahead + white), ahead + white)
 
 
@@ -248,7 +248,7 @@ def without_levels(view: View, levels: FloatArray) -> View:
     best: tuple[float, float, float] | None = None
     for keep, power in ((next_ / near, near), (far / next_, next_**2 / max(far, _LEAST * near))):
         keep, power = min(max(keep, _LEAST), usual), min(power, near)
-        ahead, white = _settled(keep, power, near - power)
+        ahead, white = _settled_variances(keep, power, near - power)
         trust = ahead / (ahead + white)
         e = r[1:] - first_order(np.full(r.size - 1, keep * (1.0 - trust)),
                                 keep * trust * r[:-1], 0.0)
@@ -260,7 +260,7 @@ def without_levels(view: View, levels: FloatArray) -> View:
     return _filtered(view, keep, trust, variance)
 
 
-def _settled(keep: float, power: float, white: float) -> tuple[float, float]:
+def _settled_variances(keep: float, power: float, white: float) -> tuple[float, float]:
     """Return the settled predictive variance of the OU, and the variance of the white noise."""
     drive = power * (1.0 - keep * keep)
     b = white * (1.0 - keep * keep) - drive
@@ -407,7 +407,7 @@ class RegimeSwitching(Term):
         levels = [trial[1] for trial in trials if trial[1] is not best.get(False, (0.0, None))[1]]
         while trials:
             _, x, once, relaxed = trials.pop()
-            fit = cls._finished(relaxed, [x], once, 80)
+            fit = cls._best_fit(relaxed, [x], once, 80)
             if fit is None:
                 continue
             if any(x is start for start in levels) and fit.offset is not None:
@@ -430,14 +430,14 @@ class RegimeSwitching(Term):
             slow, ahead, states = _slow_levels(view)
             if slow is not None and ahead > max(float(two.gain[view.train].sum()), _SLOW_AHEAD):
                 # The view mixes levels and noise in one relaxation; the next fit separates them.
-                return cls._finished(view, [slow], 0.0, 1, states) or two
+                return cls._best_fit(view, [slow], 0.0, 1, states) or two
         # Try three states that differ as the two do: in sigma, or in the level.
         starts = [np.array([0.0, 0.0, 0.0, ratio, -ratio]) for ratio in (0.45, 0.9)]
         if two.power is None:
             starts = [np.array(begin) * [1.0, 1.0, 0.6, 0.0, 1.0]]
         part, found = slice(0, min(view.train.stop, _LONG)), two
         for start in starts:
-            three = cls._finished(view, [start], at_once, 70, 3)
+            three = cls._best_fit(view, [start], at_once, 70, 3)
             ahead = _THIRD if found is two else 0.0
             if three is not None and float((three.gain - found.gain)[part].sum()) > ahead:
                 found = three
@@ -456,10 +456,10 @@ class RegimeSwitching(Term):
         starts = [np.array([math.log(self.rate_up), math.log(self.rate_down), self.level / unit,
                             ratio, scale])
                   for scale in (0.5 * math.log(mean / square), 0.0)]
-        return self._finished(view, starts, self.at_once, 40, states)
+        return self._best_fit(view, starts, self.at_once, 40, states)
 
     @classmethod
-    def _finished(cls, view: View, starts: Sequence[FloatArray], at_once: float, most: int,
+    def _best_fit(cls, view: View, starts: Sequence[FloatArray], at_once: float, most: int,
                   states: int = 2) -> LawFit | None:
         """Return the fit from the best of some starts that differ only in scale."""
         scores = Scores.of(view)
@@ -474,7 +474,7 @@ class RegimeSwitching(Term):
         start = max(starts, key=value)
         if states == 2:
             # Few changes determine the rates badly; counting them in all samples is better.
-            counted = _counted(forward(*chain_of(within, start, at_once)[0])[0], scores.step)
+            counted = _counted_rates(forward(*chain_of(within, start, at_once)[0])[0], scores.step)
             start = max(np.array(start), np.append(counted, start[2:]), key=value)
         x, top = climb(value, start, size=0.2, most=most)
         if top == -math.inf:
@@ -504,7 +504,7 @@ class RegimeSwitching(Term):
                       power=None if abs(x[3]) < _NO_RATIO else power, offset=offset)
 
 
-def _counted(before: FloatArray, step: float) -> FloatArray:
+def _counted_rates(before: FloatArray, step: float) -> FloatArray:
     """Return ln of the rates of leaving each of two states, counted in the likelier state."""
     high = before[:, 1] > 0.5
     ups, downs = (int((high[1:] & ~high[:-1]).sum()), int((~high[1:] & high[:-1]).sum()))

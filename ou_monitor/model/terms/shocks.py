@@ -195,7 +195,7 @@ class Glitches(Term):
             share = runs / view.z[view.train].size
             lengths = (found + 0.1) / (runs + 0.3)
         term = cls(min(count / view.z[view.train].size, 1.0), spread)
-        scores, gain, free = _scored(view, bad, share, spread, lengths)
+        scores, gain, free = _glitch_scores(view, bad, share, spread, lengths)
         se = {'probability': term.probability / math.sqrt(count),
               'std': spread / math.sqrt(2.0 * count)}
         # The variance of the error makes the next fit ignore the bad samples.
@@ -203,8 +203,8 @@ class Glitches(Term):
                       error=np.where(bad, spread * spread, 0.0))
 
 
-def _scored(view: View, bad: npt.NDArray[np.bool_], share: float, spread: float,
-            lengths: FloatArray) -> tuple[FloatArray, FloatArray, int]:
+def _glitch_scores(view: View, bad: npt.NDArray[np.bool_], share: float, spread: float,
+                   lengths: FloatArray) -> tuple[FloatArray, FloatArray, int]:
     """Return normal scores, gains in log density, and the number of parameters."""
     # States: good, and the first, second and third sample of a run with similar errors.
     e = view.z * np.sqrt(view.variance)

@@ -245,7 +245,7 @@ class SlidingEstimator:
         if t.size:
             self._begin = max(self._begin, t.item(-1) - (1.0 + _ROUNDING) * self._window)
 
-    def _look(self, t: FloatArray) -> Quality:
+    def _examine(self, t: FloatArray) -> Quality:
         """Examine the raw samples, several times per window."""
         if not 0.0 <= self._line.newest - self._looked < self._window / _LOOKS:
             self._quality = examine(self._tail, self._line.period)
@@ -258,7 +258,7 @@ class SlidingEstimator:
         line, kept = self._line, self._kept.columns
         at = int(kept[0].searchsorted(self._begin))
         t, y, u = kept[:, at:]
-        quality = self._look(t) if t.size else self._quality
+        quality = self._examine(t) if t.size else self._quality
         counters = line.counters
         if not t.size:
             waiting = self._thinner.waiting(line.newest - self._window)

@@ -111,11 +111,11 @@ def log_errors(fit: Fitted, duration: float) -> tuple[float, float, float]:
     # as for a normal distribution cut on one side (0.68 of the variance; theta makes up most of
     # sigma's).
     near = math.exp(-0.5 * math.pow(min(fit.noise_score / _NEAR, 1e3), 2))
-    return (_root(fit.log_var[0]) * wider, _root(fit.log_var[1]) * math.sqrt(1.0 - 0.32 * near),
-            _root(fit.log_var[2]) * wider)
+    return (_se(fit.log_var[0]) * wider, _se(fit.log_var[1]) * math.sqrt(1.0 - 0.32 * near),
+            _se(fit.log_var[2]) * wider)
 
 
-def _root(variance: float) -> float:
+def _se(variance: float) -> float:
     """Return a standard error; infinite where the information is singular."""
     return math.sqrt(variance) if variance >= 0.0 else math.inf
 

@@ -178,7 +178,7 @@ def least_error(settings: FilterSettings, sigma: float, alpha: float) -> float:
     s = settings
     rate = TWO_PI * s.signal_bandwidth
     size = s.signal_rms * (math.sqrt(2.0 * rate) if s.signal_poles == 1 else 1.0)
-    return _least(lambda fc: squared_error(
+    return _argmin(lambda fc: squared_error(
         s.order, TWO_PI * fc, (size, rate), (s.coupling * sigma, alpha), s.n0, s.signal_poles),
         s.lowest, s.fmax)
 
@@ -191,10 +191,10 @@ def least_sampled_error(settings: FilterSettings, sigma: float, alpha: float,
     if not low < high:
         return low
     var, white = sigma * (sigma / (2.0 * alpha)), s.n0 / interval
-    return _least(lambda fc: sampled_error(TWO_PI * fc, interval, alpha, var, white), low, high)
+    return _argmin(lambda fc: sampled_error(TWO_PI * fc, interval, alpha, var, white), low, high)
 
 
-def _least(error: Callable[[float], float], lowest: float, highest: float) -> float:
+def _argmin(error: Callable[[float], float], lowest: float, highest: float) -> float:
     """Return where an error is least, Hz, to 1e-4: a grid chooses one of two minima."""
     def at(level: float) -> float:
         return error(math.exp(level))

@@ -310,20 +310,20 @@ class AdaptiveLowPass:
         lag.
         """
         by_lag = self._equivalent_cutoff()
-        return self._within(by_lag) if by_lag == by_lag else self._control.cutoff
+        return self._within_limits(by_lag) if by_lag == by_lag else self._control.cutoff
 
     @property
     def wanted(self) -> float:
         """Cutoff that the law requests, within fmin..fmax, Hz; NaN if unknown."""
         by_lag = self._equivalent_cutoff()
-        return self._within(by_lag) if by_lag == by_lag else self._control.wanted
+        return self._within_limits(by_lag) if by_lag == by_lag else self._control.wanted
 
     @property
     def highest(self) -> float:
         """Highest cutoff that the sample rate allows, Hz; inf while the rate is unknown."""
         return OF_RATE / self._interval.mean if self._interval.mean > 0.0 else math.inf
 
-    def _within(self, cutoff: float) -> float:
+    def _within_limits(self, cutoff: float) -> float:
         s = self._settings
         return min(max(cutoff, s.lowest), s.fmax)
 

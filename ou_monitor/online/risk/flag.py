@@ -345,7 +345,7 @@ class BrownoutFlag:
             return FlagLevel.UNKNOWN, 'the risk is not known'
         for level, (found, enter, words) in asks.items():
             word = level.name.lower()
-            if level in above and not self._waits(level):
+            if level in above and not self._is_delayed(level):
                 return level, (f'{words} (brownout.{word}: {enter:g})' if found >= enter else
                                'throttle was above the present budget for a tenth of the last '
                                '30 s')
@@ -359,7 +359,7 @@ class BrownoutFlag:
                                  f'({s.brownout_delay:g} s)')
         return FlagLevel.OK, f'risk {risk:.2g} (brownout.warn: {s.brownout_warn:g})'
 
-    def _waits(self, level: FlagLevel) -> bool:
+    def _is_delayed(self, level: FlagLevel) -> bool:
         """Whether a level that is not entered yet has to wait for `brownout.delay`."""
         return (self._level.value < level.value
                 and self._now - self._above[level] < self._settings.brownout_delay)

@@ -287,7 +287,7 @@ def _shares(horizon: float) -> list[float]:
     return shares
 
 
-def _within(horizon: float) -> list[float]:
+def _shorter_horizons(horizon: float) -> list[float]:
     """Return a horizon and the shorter ones, down to a third, from which the flight learns."""
     return [*(one for one in RUNGS if 0.2 * horizon <= one < horizon), horizon]
 
@@ -307,7 +307,7 @@ class Forecast:
         self._rungs = tuple(map(_Rung, RUNGS))
         self._learning = self._rungs if math.isnan(horizon) else tuple(
             rung for rung, share in zip(self._rungs, _shares(horizon))
-            if share > _LEAST_SHARE or rung.horizon in _within(horizon))
+            if share > _LEAST_SHARE or rung.horizon in _shorter_horizons(horizon))
         self.new_time_line()
         self._known = False
         # Earliest arrival for the next update, s.
@@ -494,7 +494,7 @@ class Forecast:
             return np.ones(u.shape)
         risk = np.zeros(u.shape)
         # A fall within a shorter horizon is also within this one; shorter ones have more data.
-        for within in _within(horizon):
+        for within in _shorter_horizons(horizon):
             _, deviation, _ = self._flight(within)
             if state is None or math.isnan(deviation) or math.isnan(now):
                 return np.full(u.shape, NAN)

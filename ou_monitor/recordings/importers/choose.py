@@ -267,7 +267,7 @@ def signal_of(path: Path, log: Log, signal: str) -> tuple[Series, tuple[str, ...
     """Return a series by its name or by the topic that `convert` gives it, and notes on it."""
     if not signal:
         raise InputError('the name of the signal is empty: ' + _LIST)
-    return _cleaned(path, signal, _of_topic(path, log, signal) or named_series(path, log, signal))
+    return _cleaned(path, signal, _by_topic(path, log, signal) or named_series(path, log, signal))
 
 
 def _cleaned(path: Path, name: str, series: Series) -> tuple[Series, tuple[str, ...]]:
@@ -279,7 +279,7 @@ def _cleaned(path: Path, name: str, series: Series) -> tuple[Series, tuple[str, 
     return series, tuple(prefixed(name, (*said, *pace_notes(series.t))))
 
 
-def _of_topic(path: Path, log: Log, signal: str) -> Series | None:
+def _by_topic(path: Path, log: Log, signal: str) -> Series | None:
     """Return the series behind a topic of `convert`: NAME/angular_velocity.x, motor_speed/..."""
     found = re.fullmatch(rf'/?(.+)/(({RATE}|{FORCE})\.[xyz]|{VELOCITY}\[\d+\])', signal)
     if found is None:

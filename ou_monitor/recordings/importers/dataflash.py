@@ -99,11 +99,11 @@ def read(path: Path, request: Request) -> Log:
         notes.append(f'{counted(bad, "message")} could not be read and were left out.')
     series: list[Series] = []
     for (kind, instance), columns in table.items():
-        series += _plain(_name(kind, instance), columns, forms[kind])
+        series += _listed_fields(_name(kind, instance), columns, forms[kind])
     series += _outputs(table, parameters)
     known = {one.name for one in series}
     for (kind, instance), columns in table.items():
-        series += _others(_name(kind, instance), columns, forms[kind], known)
+        series += _other_fields(_name(kind, instance), columns, forms[kind], known)
     if not series:
         raise InputError(f'{path} holds none of the messages that carry a voltage or a throttle '
                          f'({", ".join(dict.fromkeys(row[0] for row in PLAIN))})'
@@ -262,7 +262,7 @@ def _facts(banner: list[str]) -> dict[str, str]:
     return facts
 
 
-def _plain(name: str, columns: Columns, form: Any) -> Iterator[Series]:
+def _listed_fields(name: str, columns: Columns, form: Any) -> Iterator[Series]:
     """Yield the fields of a message that `PLAIN` lists."""
     # Integers without a multiplier of their own.
     whole = {field for field, letter in zip(form.columns, form.format) if letter in 'bBhHiI'}
@@ -281,7 +281,7 @@ def _plain(name: str, columns: Columns, form: Any) -> Iterator[Series]:
             quantity != THROTTLE and one.silent) else one
 
 
-def _others(name: str, columns: Columns, form: Any, known: set[str]) -> Iterator[Series]:
+def _other_fields(name: str, columns: Columns, form: Any, known: set[str]) -> Iterator[Series]:
     """Yield the fields that no other series uses, as logged."""
     # Logs state units since 2018.
     units = KNOWN_UNITS | {field: unit.replace('/s/s', '/s^2') for field, unit in zip(

@@ -147,8 +147,8 @@ def read(path: Path, request: Request) -> Log:
         if 'timestamp' in columns:
             t, name = columns.pop('timestamp') * 1e-6, f'{data.name}[{data.multi_id}]'
             found = list(_series(name, data.name, t, columns))
-            series += [*found, *_others(name, data.name, t, columns,
-                                        {one.name for one in found})]
+            series += [*found, *_other_fields(name, data.name, t, columns,
+                                              {one.name for one in found})]
             inertial += _gyros(name, data.name, t, columns)
             speeds = speeds or _speeds(data.name, t, columns)
     return log_of('ulog', series, _facts(ulog) | _started(ulog), notes,
@@ -169,8 +169,8 @@ def _declared(ulog: Any) -> Iterator[str]:
                 yield f'{topic}[0].{field}' + ('[0]' if size else '')
 
 
-def _others(name: str, topic: str, t: FloatArray, columns: Columns, known: set[str],
-            ) -> Iterator[Series]:
+def _other_fields(name: str, topic: str, t: FloatArray, columns: Columns, known: set[str],
+                  ) -> Iterator[Series]:
     """Yield the fields that no other series uses, as logged."""
     rates = ('vehicle_angular_velocity', 'sensor_gyro')
     for field, values in columns.items():
