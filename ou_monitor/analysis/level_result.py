@@ -418,6 +418,13 @@ def fit_level(recording: Recording, left: Remainder, level: LoadLevel, levels: i
     lines = find_lines([grid.values for grid in grids], even, levels=levels, white=[
         _white(still.t[s.start:s.stop], still.voltage[s.start:s.stop], model)
         for s in within] if model.usable else ())
+    if lines.lines and math.isfinite(level.throttle):
+        # A line of throttle is the load's.
+        commanded = find_lines([on_grid(still.t[s.start:s.stop], still.throttle[s.start:s.stop]
+                                        ).values for s in within], even).lines
+        lines = replace(lines, lines=tuple(line for line in lines.lines if not any(
+            abs(line.frequency - other.frequency) < line.resolution + other.resolution
+            for other in commanded)))
     shape = examine_level(_parts(still, within), estimate, left.above)
     with_lines = None
     # Periodic impulses have spectral lines too, which are not subtracted.

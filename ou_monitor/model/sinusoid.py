@@ -24,9 +24,9 @@ from ou_monitor.records import FloatArray
 FALSE_ALARM = 0.01
 # Maximum length of a short piece, s: tones of motors and converters drift.
 SHORT = 4.0
-# Lowest frequency, in periods of a piece: lower ones are affected by the removal of mean and
-# trend.
-FIRST = 4
+# Lowest frequency, in periods of a piece: with fewer, slow noise looks like a line, and the mean
+# and trend that are removed contain a part of it.
+FIRST = 10
 # Neighbours: every second ordinate, because the window correlates adjacent ones.  Distance of the
 # nearest, in bins; their number.
 GUARD, NEIGHBOURS = 4, 64

@@ -15,8 +15,9 @@ A line of 4 mV beside an OU of 18 mV changes the fitted alpha by 30 % and sigma 
 120 Hz).  So each line is subtracted, as a sinusoid with its own amplitude, phase and frequency in
 each piece of the length in which it was found; this also removes a little noise.
 
-Limits: the noise is taken as constant over the neighbours (about 60 bins either side), so a
-narrower resonance is reported as a line; samples are taken as evenly spaced; a line may be an
+Limits: the noise is taken as constant over the neighbours (about 60 bins either side), and a line
+must also exceed the nearest eight on either side, so that a slope or a hump of the noise is none;
+a narrower resonance is reported as a line; samples are taken as evenly spaced; a line may be an
 alias; frequencies below `FIRST` periods of a piece are not searched.  A line whose frequency
 changes is spread over bins, and may be missed.  A tone that moves by more than a bin within a
 piece, or is modulated, leaves its sidebands.
@@ -32,8 +33,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.sinusoid import (
-    FALSE_ALARM, FEWEST_SAMPLES, FEWEST_TESTED, FIRST, fit_sinusoid, groups, LOBE, local_median,
-    neighbours, SHORT)
+    FALSE_ALARM, FEWEST_SAMPLES, FEWEST_TESTED, FIRST, fit_sinusoid, groups, GUARD, LOBE,
+    local_median, NEIGHBOURS, neighbours, SHORT)
 from ou_monitor.records import FloatArray, NAN
 from ou_monitor.text import Z95
 from scipy.optimize import brentq
@@ -45,6 +46,9 @@ _LONGEST = 1 << 20
 # Nodes and weights of quadrature over 0..1.
 _QUANTILES = 0.5 * (np.polynomial.legendre.leggauss(64)[0] + 1.0)
 _WEIGHTS = 0.5 * np.polynomial.legendre.leggauss(64)[1]
+# Number of the nearest ordinates on one side that a line must exceed, and the p-value of that; for
+# a weak line at the limit of the test it is 0.003.
+_BESIDE, _UNLIKE = 8, 0.05
 # Maximum ratio of samples with missing ones filled in to samples given.
 _FILLED = 4.0
 
@@ -113,10 +117,11 @@ def on_grid(t: FloatArray, values: FloatArray) -> EvenGrid:
 
 
 def find_lines(parts: Sequence[FloatArray], rate: float, *, false_alarm: float = FALSE_ALARM,
-               levels: int = 1, white: Sequence[FloatArray] = (), lowest: float = 0.0
-               ) -> LineSearch:
+               levels: int = 1, white: Sequence[FloatArray] = (), lowest: float = 0.0,
+               wide: bool = False) -> LineSearch:
     """Look for lines in segments of even samples, V (rate and lowest in Hz), strongest first."""
     # white: their innovations, whose flat spectrum is searched if the parts are not white.
+    # wide: whether a line may be as wide as a hump of the noise.
     # The mean is removed first: a detrended constant consists of rounding errors.
     parts, white = ([part - part.mean() for part in some if part.size]
                     for some in (parts, white or parts))
@@ -133,7 +138,7 @@ def find_lines(parts: Sequence[FloatArray], rate: float, *, false_alarm: float =
     detectable = NAN
     for length, where in tested.items():
         lines, least = _search(parts, white, rate, length, where,
-                               false_alarm / (levels * count))
+                               false_alarm / (levels * count), wide)
         # Drifting lines show in short pieces.  A line found in both passes is measured in short
         # pieces, unless only the long ones show it clearly.
         for line in lines:
@@ -145,12 +150,13 @@ def find_lines(parts: Sequence[FloatArray], rate: float, *, false_alarm: float =
         detectable = least if length == short else detectable
     found = [replace(line, p_value=min(1.0, levels * count * line.p_value)) for line in found]
     found.sort(key=lambda line: -line.rms)
-    first, last = tested[short][[0, -1]] * rate / short
-    return LineSearch(tuple(found), count, float(first), float(last), detectable)
+    first = min(float(where[0]) / length for length, where in tested.items() if where.size)
+    return LineSearch(tuple(found), count, first * rate, float(tested[short][-1]) * rate / short,
+                      detectable)
 
 
 def _search(parts: Sequence[FloatArray], whites: Sequence[FloatArray], rate: float, length: int,
-            where: np.ndarray, chance: float) -> tuple[list[Line], float]:
+            where: np.ndarray, chance: float, wide: bool) -> tuple[list[Line], float]:
     """Return lines among ordinates, at a false-alarm level, and the detectable rms, V."""
     pieces = sum(part.size // length for part in parts)
     raw, white = (sum(part.size // length * welch(
@@ -162,6 +168,10 @@ def _search(parts: Sequence[FloatArray], whites: Sequence[FloatArray], rate: flo
     ratio = white[where] / np.maximum(middle, 1e-300)
     limit = threshold(k, near, chance)
     hits = np.flatnonzero(ratio > limit)
+    if not wide:
+        # In a hump many ordinates are high; lines of a comb are farther apart.
+        count = np.searchsorted(hits, hits + NEIGHBOURS) - np.searchsorted(hits, hits - NEIGHBOURS)
+        hits = hits[_beside(white, where[hits], k) * count < _UNLIKE]
     p = np.ones(where.size)
     p[hits] = tail(ratio[hits], k, near)
     background = raw[where] / np.maximum(white[where], 1e-300) * middle
@@ -173,6 +183,21 @@ def _search(parts: Sequence[FloatArray], whites: Sequence[FloatArray], rate: flo
     lines = [_measure(raw, background, white[where], middle, where, group, p, df, total, k)
              for group in groups(hits)]
     return lines, _detectable(float(np.median(background)), df, k, limit)
+
+
+def _beside(density: FloatArray, at: np.ndarray, pieces: float) -> FloatArray:
+    """Return the probability that noise exceeds the ordinates on either side by as much."""
+    # The spectrum of slow noise is steep, or has a hump: many neighbours are then far below the
+    # ordinates on one side.
+    found = np.zeros(at.size)
+    for k, centre in enumerate(at.tolist()):
+        for side in (density[max(1, centre - GUARD - _BESIDE + 1):max(1, centre - GUARD + 1)],
+                     density[centre + GUARD:centre + GUARD + _BESIDE]):
+            if side.size:
+                middle = np.partition(side, side.size // 2)[side.size // 2]
+                found[k] = max(found[k], float(tail(
+                    density[centre] / np.maximum(middle, 1e-300)[None], pieces, side.size)[0]))
+    return found
 
 
 def tail(ratio: FloatArray, pieces: float, neighbours: int) -> FloatArray:

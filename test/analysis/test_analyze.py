@@ -103,6 +103,18 @@ def test_a_swaying_stick_is_not_noise():
         assert math.sqrt(level.ou.var_inf_below) < 0.002
 
 
+@pytest.mark.parametrize('sway, found', [(3.7, []), (9.1, [3.7])])
+def test_a_line_that_throttle_has_too_is_the_loads(sway, found):
+    """Its size changes, so the response to throttle does not remove it."""
+    rng = np.random.default_rng(1)
+    t = np.arange(4000) / 200.0
+    throttle = 0.3 + 0.01 * np.sin(2.0 * np.pi * sway * t)
+    wave = np.where(t > 14.0, 0.02, 0.004) * np.sin(2.0 * np.pi * 3.7 * t + 0.5)
+    voltage = 5.0 - 0.5 * throttle - wave + rng.normal(0.0, 0.004, t.size)
+    (level,) = analyze(Recording(t, voltage, throttle)).levels
+    assert [line.frequency for line in level.lines.lines] == pytest.approx(found, abs=0.02)
+
+
 def test_loads_that_come_and_go_are_no_lines():
     """10 A at 1.8 Hz through 0.1 Ohm, measured 50 ms late, at a throttle that stands still."""
     rng = np.random.default_rng(3)

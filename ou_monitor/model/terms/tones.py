@@ -113,7 +113,7 @@ def lines_of(view: View) -> tuple[Line, ...]:
     # Include the held-out part, because a line may begin late; its frequency is searched for, not
     # fitted, and a penalty covers the search.
     grid = on_grid(view.at, view.z)
-    return find_lines([grid.values], grid.rate, false_alarm=_PROPOSED).lines
+    return find_lines([grid.values], grid.rate, false_alarm=_PROPOSED, wide=True).lines
 
 
 # Number of lines to try; false-alarm probability of trying one, large because the evidence of the
