@@ -21,7 +21,7 @@ import time
 from common import arguments, deliver, flights, median3, say, table
 import numpy as np
 from ou_monitor import MonitorSettings, SupplyMonitor
-from ou_monitor.online.risk.courses import AT_PEAK, excursion_risk, excursions, Past
+from ou_monitor.online.risk.courses import AT_PEAK, excursion_risk, excursions, FlightHistory
 from ou_monitor.records import Recording
 from scipy.special import expit
 
@@ -79,7 +79,7 @@ def fly(name: str, recording: Recording) -> tuple[list[Case], list[Case], dict[s
     monitor = SupplyMonitor(MonitorSettings(
         brownout_voltage=float(levels['middle', 2.0][1]), brownout_horizon=2.0,
         brownout_floor=0.0))
-    past = Past()
+    past = FlightHistory()
     rows: dict[tuple[str, float], list[np.ndarray]] = {key: [] for key in levels}
     known, flags, budgets, costs, alarms = [], [], [], [], 0
     before, level_before = 0, 0

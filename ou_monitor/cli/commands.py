@@ -22,7 +22,7 @@ class Option:
         self.keywords = keywords
 
 
-class WithoutOut(argparse.Action):
+class OptionalOut(argparse.Action):
     """A flag that makes OUT optional; if it always were, it could not follow an option."""
 
     def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
@@ -300,7 +300,7 @@ _CONVERT = Command(
     (Option('log', metavar='LOG', type=path_argument, help='log to read'),
      Option('out', metavar='OUT', type=path_argument,
             help='bag to write: NAME.mcap for one file, NAME for a rosbag2 folder'),
-     Option('--list', action=WithoutOut, nargs=0, default=False,
+     Option('--list', action=OptionalOut, nargs=0, default=False,
             help='list the series (*: taken by default) and write nothing; OUT is not needed'),
      Option('--voltage', metavar='NAME',
             help='voltage (default: the battery, if there is one)'),

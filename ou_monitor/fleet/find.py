@@ -42,14 +42,14 @@ class FoundRecording:
 
 
 @dataclass(frozen=True)
-class Found:
+class SearchResult:
     """The result of a search."""
 
     sources: tuple[FoundRecording, ...]  # In order of path, each once
     notes: tuple[str, ...]  # What was skipped, one sentence each
 
 
-def find_recordings(given: Sequence[str], leave_out: Path | None = None) -> Found:
+def find_recordings(given: Sequence[str], leave_out: Path | None = None) -> SearchResult:
     """Return the recordings at some paths."""
     search = _Search(None if leave_out is None else leave_out.resolve())
     for text in given:
@@ -70,8 +70,8 @@ def find_recordings(given: Sequence[str], leave_out: Path | None = None) -> Foun
         raise InputError(f'no recording in {where}: expected .mcap files, rosbag2 folders, logs '
                          'of autopilots, or .csv files with columns of time and voltage'
                          + (f' ({" ".join(notes)})' if notes else ''))
-    return Found(tuple(_source(path) for path in sorted(search.paths)),
-                 tuple(map(printable, notes)))
+    return SearchResult(tuple(_source(path) for path in sorted(search.paths)),
+                        tuple(map(printable, notes)))
 
 
 class _Search:

@@ -20,7 +20,7 @@ from typing import Any
 from ou_monitor.analysis.crafts import fits
 from ou_monitor.errors import InputError
 from ou_monitor.fleet.analysis import Options, work
-from ou_monitor.fleet.find import duplicates, Found, FoundRecording
+from ou_monitor.fleet.find import duplicates, FoundRecording, SearchResult
 from ou_monitor.fleet.judgement import judge, Judgement
 from ou_monitor.fleet.table import Row, rows_of
 from ou_monitor.fleet.vehicles import assign, number_flights
@@ -45,7 +45,7 @@ def is_own(folder: Path) -> bool:
         return False
 
 
-class Parts:
+class SavedResults:
     """The saved results in the folder of a fleet, which is created; InputError if that fails."""
 
     def __init__(self, folder: Path, options: Mapping[str, Any]) -> None:
@@ -121,19 +121,20 @@ class Fleet:
                     if row['error'] is None and row['duplicate_of'] is None})
 
 
-def run_fleet(found: Found, folder: Path, options: Options, version: Callable[[], str], *,
+def run_fleet(found: SearchResult, folder: Path, options: Options, version: Callable[[], str], *,
               workers: int, scheduler: str | None = None, insecure: bool = False,
               pattern: re.Pattern[str] | None = None, stated_options: dict[str, Any] | None = None,
               comparing: Progress | None = None, progress: Progress | None = None) -> Fleet:
     """Analyse all unfinished recordings, and judge the fleet."""
-    parts = Parts(folder, {**asdict(options), **(stated_options or {}), 'version': version()})
+    saved = SavedResults(folder, {**asdict(options), **(stated_options or {}),
+                                  'version': version()})
     twice = duplicates(found.sources, comparing)
     results: dict[Path, dict[str, Any]] = {}
     missing: list[FoundRecording] = []
     for source in found.sources:
         if source.path in twice:
             continue
-        known = parts.load(source)
+        known = saved.load(source)
         if known is None:
             missing.append(source)
         else:
@@ -141,14 +142,14 @@ def run_fleet(found: Found, folder: Path, options: Options, version: Callable[[]
     if missing:
         with (LocalWorkers(min(workers, len(missing))) if scheduler is None else
               ClusterWorkers(scheduler, version, insecure)) as pool:
-            _work(missing, results, parts, options, pool, progress)
+            _work(missing, results, saved, options, pool, progress)
     rows, notes = _table(found.sources, results, twice, pattern)
     notes = list(map(printable, (*found.notes, *notes)))
     return Fleet(rows, judge(rows), tuple(notes), len(found.sources), options.brownout_voltage)
 
 
-def _work(missing: Sequence[FoundRecording], results: dict[Path, dict[str, Any]], parts: Parts,
-          options: Options, pool: Workers, progress: Progress | None) -> None:
+def _work(missing: Sequence[FoundRecording], results: dict[Path, dict[str, Any]],
+          saved: SavedResults, options: Options, pool: Workers, progress: Progress | None) -> None:
     """Analyse unfinished recordings, and save each result."""
     kept = len(results)
     # The largest first, so that no long one is left at the end.
@@ -160,7 +161,7 @@ def _work(missing: Sequence[FoundRecording], results: dict[Path, dict[str, Any]]
         if result is None:
             result = {'error': why, 'levels': []}
         if not result['error']:
-            parts.save(order[k], result)
+            saved.save(order[k], result)
         results[order[k].path] = result
         tell((kept + done + 1) / (kept + len(order)))
 

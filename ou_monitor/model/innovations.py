@@ -48,7 +48,7 @@ class Filter:
         self.shape = (model.f.shape[0], model.f.shape[1])
         self.variance: FloatArray = self._solve(model)
         if self._n > model.f.shape[0]:
-            self._steady = _Steady(self._last_loop, self._gain[-2], self._look[-2])
+            self._steady = _SteadyFilter(self._last_loop, self._gain[-2], self._look[-2])
             more = np.full(self._n - model.f.shape[0] + 1, self.variance[-2])
             self.variance = np.concatenate((self.variance[:-1], more))
 
@@ -128,7 +128,7 @@ _DISTINCT = 1e10
 _CHUNK = 4096
 
 
-class _Steady:
+class _SteadyFilter:
     """A filter with constant gain, run mode by mode if the modes are distinct."""
 
     def __init__(self, loop: FloatArray, gain: FloatArray, look: FloatArray) -> None:

@@ -58,7 +58,7 @@ _LONGER = 1.1
 _USABLE = (Status.OK.name, Status.SHORT_WINDOW.name)
 
 
-class KnownSupply(NamedTuple):
+class SupplyEstimate(NamedTuple):
     """Latest valid estimate of the supply."""
 
     # Noise intensity, V/sqrt(s), and the standard error of its logarithm; NaN: unknown.
@@ -101,7 +101,7 @@ class SupplyInput:
                 self._values = [error if error >= 0.0 else NAN, *others]
                 return
 
-    def now(self, stale_after: float, rate: float = NAN) -> KnownSupply:
+    def now(self, stale_after: float, rate: float = NAN) -> SupplyEstimate:
         """Return the latest values that are not older than `stale_after`, s."""
         # Without a sigma, derive it from the noise that the load does not explain at the present
         # throttle, as the sigma of an OU with relaxation `rate`, 1/s. This sigma includes the
@@ -110,10 +110,10 @@ class SupplyInput:
         error, alpha, throttle, level, level_se, noise = self._values if fresh else _UNKNOWN
         why = self._why_no_sigma(fresh, stale_after)
         if why and noise > 0.0 and rate > 0.0:
-            return KnownSupply(noise * math.sqrt(2.0 * rate), throttle=throttle, source='load')
+            return SupplyEstimate(noise * math.sqrt(2.0 * rate), throttle=throttle, source='load')
         if why:
-            return KnownSupply(throttle=throttle, why=why)
-        return KnownSupply(
+            return SupplyEstimate(throttle=throttle, why=why)
+        return SupplyEstimate(
             self._sigma, error, alpha, throttle, level, level_se, source='relaxation')
 
     def why_no_throttle(self, stale_after: float) -> str:
@@ -318,7 +318,7 @@ class AdaptiveFilterNode(MonitorNode):
             self.low_pass.noise_left))
         self._passed += 1
 
-    def _apply_notches(self, stamp: float, values: Sequence[float], supply: KnownSupply
+    def _apply_notches(self, stamp: float, values: Sequence[float], supply: SupplyEstimate
                        ) -> Sequence[float]:
         """Return the signals after the notches; in shadow mode unchanged."""
         if not self._notch.settings.count and not self._notch.active:
@@ -336,7 +336,7 @@ class AdaptiveFilterNode(MonitorNode):
         notched = 0.0 if s.shadow else max(self._notch.delays(s.lag_frequency), default=0.0)
         return self.low_pass.delay + notched
 
-    def _supply_now(self) -> KnownSupply:
+    def _supply_now(self) -> SupplyEstimate:
         return self._supply.now(self.low_pass.settings.stale_after,
                                 self.low_pass.settings.alpha)
 
@@ -380,7 +380,7 @@ class AdaptiveFilterNode(MonitorNode):
             'input_age': self._input_silence.age, 'callback_errors': self.faults}
         self.diagnose('adaptive low-pass', level, summary, fields, self._topic)
 
-    def _decided_by(self, supply: KnownSupply) -> str:
+    def _decided_by(self, supply: SupplyEstimate) -> str:
         low_pass = self.low_pass
         s, bound = low_pass.settings, low_pass.bound
         if not self._passed:
@@ -396,14 +396,14 @@ class AdaptiveFilterNode(MonitorNode):
             return f'{bound.value}, on the way to {aim}'
         return bound.value
 
-    def _unknown(self, supply: KnownSupply) -> str:
+    def _unknown(self, supply: SupplyEstimate) -> str:
         """Return why the inputs of the law are unknown."""
         s = self.low_pass.settings
         if s.law == 'throttle':
             return self._supply.why_no_throttle(s.stale_after)
         return supply.why or 'sigma was not known at the last message'
 
-    def _judge(self, supply: KnownSupply) -> tuple[Level, str]:
+    def _judge(self, supply: SupplyEstimate) -> tuple[Level, str]:
         s = self.low_pass.settings
         age = self._input_silence.age
         if self._channels is None and self._found:

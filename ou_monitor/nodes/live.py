@@ -109,7 +109,7 @@ def make_server(app: Any, patience: float = PATIENCE) -> Any:
     """Return the server of an application; timeout `patience` in s."""
     from tornado.httpserver import HTTPServer
 
-    class Bounded(HTTPServer):
+    class BoundedServer(HTTPServer):
         """Closes connections beyond `CONNECTIONS`."""
 
         def handle_stream(self, stream: Any, address: Any) -> None:
@@ -119,8 +119,8 @@ def make_server(app: Any, patience: float = PATIENCE) -> Any:
                 super().handle_stream(stream, address)
 
     # Neither timeout runs while a request is answered, so a stream of rows stays open.
-    return Bounded(app, idle_connection_timeout=patience, body_timeout=patience,
-                   max_header_size=_HEADER, max_body_size=_BODY)
+    return BoundedServer(app, idle_connection_timeout=patience, body_timeout=patience,
+                         max_header_size=_HEADER, max_body_size=_BODY)
 
 
 def application(node: Any, token: str) -> Any:
@@ -130,7 +130,7 @@ def application(node: Any, token: str) -> Any:
 
     html, policy = _html()
 
-    class Guarded(RequestHandler):
+    class GuardedHandler(RequestHandler):
         """Refuses requests without the token, or with a foreign host name (DNS rebinding)."""
 
         def prepare(self) -> None:
@@ -148,12 +148,12 @@ def application(node: Any, token: str) -> Any:
             self.set_header('Referrer-Policy', 'no-referrer')
             self.set_header('Cache-Control', 'no-store')
 
-    class Page(Guarded):
+    class Page(GuardedHandler):
 
         def get(self) -> None:
             self.finish(html)
 
-    class Rows(Guarded):
+    class Rows(GuardedHandler):
 
         async def get(self) -> None:
             """Send rows as they come, after the last one the browser received."""

@@ -19,7 +19,7 @@ from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.model_watch import ModelComparison
 from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.online.risk.flag import BrownoutFlag, FlagLevel, FlagState
-from ou_monitor.online.risk.forecast import Ahead, Forecast, LOOK, look_ahead
+from ou_monitor.online.risk.forecast import Forecast, LOOK, look_ahead, RiskOutlook
 from ou_monitor.online.settings import AUTO, DEFAULT_LIMIT, MonitorSettings, RAIL
 from ou_monitor.online.trust import Doubt, InputTrust, patience, StampOrder
 from ou_monitor.records import (
@@ -103,7 +103,7 @@ class SupplyMonitor:
             self._load_filter, self._look,
             self._settings.brownout_horizon if self._replay else NAN)
         # Risk and budget of the last report.
-        self._ahead = Ahead()
+        self._ahead = RiskOutlook()
 
     @property
     def settings(self) -> MonitorSettings:
@@ -341,14 +341,14 @@ class SupplyMonitor:
                                         else (e, e.duration)))
                 self._ahead = look_ahead(
                     self._forecast, self._load, self._settings, alone=alone) if (
-                        fresh) else Ahead(budget_reason=why)
+                        fresh) else RiskOutlook(budget_reason=why)
         except Exception as error:
             # As in `push`.
             self.restart(error)
             e = Estimate(counters=self._counters())
             limit, stamps, fresh = self._settings.stale_after, StampOrder.GOOD, False
             doubt, why = Doubt.NONE, ''
-            self._ahead = Ahead()
+            self._ahead = RiskOutlook()
             shown, ou, ou_age = e, of_estimate(e), 0.0
         # The risk always uses the sliding estimate of the last seconds.
         self._newest, e = e, shown

@@ -221,7 +221,7 @@ _COUNTED = 1.0
 _CHANGE = 1e-6
 
 
-class StillReading:
+class ConstantReading:
     """How long the newest reading has been repeated, and how long a working source repeats one."""
 
     def __init__(self) -> None:
@@ -310,7 +310,7 @@ class InputTrust:
     def __init__(self) -> None:
         self._stamps = StampWatch()
         self._interval = SourceInterval()
-        self._still = StillReading()
+        self._still = ConstantReading()
         self._recent = np.empty(0)
         #: External reason; empty: none.
         self.outside = ''

@@ -23,7 +23,7 @@ from ou_monitor.paper.crest import (
     rows as crest_rows, simulate_crests, simulate_jumps)
 from ou_monitor.paper.network import PowerNetwork
 from ou_monitor.paper.published import over, Row, RowVerdict
-from ou_monitor.paper.switching import Spreading
+from ou_monitor.paper.switching import IntegralVariance
 from ou_monitor.paper.tables import exponent, sigma_half_width
 from ou_monitor.paper.transient import CORNER, CORNER_HZ, PAPER_FIT
 from ou_monitor.records import FloatArray
@@ -240,9 +240,9 @@ class Reproduction:
     rows: tuple[Row, ...]  # In the order of the paper
     points: tuple[Point, ...]  # The eight points
     crests: Crests  # Simulated crest factors
-    spreading: Spreading  # Variance of the integral of telegraph noise
+    spreading: IntegralVariance  # Variance of the integral of telegraph noise
     screens: tuple[Screen, ...]  # One per load state
-    spectra: tuple[DrawnSpectrum, ...]  # Of 10 and 40 %
+    spectra: tuple[SimulatedSpectrum, ...]  # Of 10 and 40 %
 
     def parts(self) -> list[tuple[str, list[Row]]]:
         """Return the rows by table, figure and main section of the paper."""
@@ -344,7 +344,7 @@ class Screen:
 
 
 @dataclass(frozen=True, eq=False)
-class DrawnSpectrum:
+class SimulatedSpectrum:
     """One-sided density of a load state."""
 
     state: published.PrintedLoad  # Its row of Table 1
@@ -369,13 +369,13 @@ def _screen(state: published.PrintedLoad, rng: np.random.Generator) -> Screen:
         simulate(t, published.ALPHA.value, sigma, rng) / step))
 
 
-def _spectrum(state: published.PrintedLoad, rng: np.random.Generator) -> DrawnSpectrum:
+def _spectrum(state: published.PrintedLoad, rng: np.random.Generator) -> SimulatedSpectrum:
     """Return the spectrum of a simulated recording at 1 MHz, even on a log axis."""
     t = np.arange(round(_SPECTRUM * published.SAMPLING_HZ)) / published.SAMPLING_HZ
     ou = OU(published.ALPHA.value, state.sigma, 0.0)
     plain = _density(simulate(t, ou.alpha, ou.sigma, rng))
     coupled = _density(SupplyModel((ou, ACCoupling(CORNER_HZ, 0.0))).simulate(t, rng))
-    return DrawnSpectrum(state, plain[0], plain[1], coupled[1])
+    return SimulatedSpectrum(state, plain[0], plain[1], coupled[1])
 
 
 def _density(u: FloatArray) -> tuple[FloatArray, FloatArray]:

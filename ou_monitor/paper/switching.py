@@ -32,7 +32,7 @@ _SWING = np.array([1.3, 0.7])
 
 
 @dataclass(frozen=True, eq=False)
-class Spreading:
+class IntegralVariance:
     """Variance of the integral of telegraph noise, from Monte Carlo."""
 
     t: FloatArray  # Times, s; shape (k,)
@@ -74,14 +74,14 @@ def variance_rate(system: SwitchedSystem, rng: np.random.Generator,
     return mean_and_error((u[:, 2] ** 2 - u[:, 1] ** 2) / (t[2] - t[1]))
 
 
-def spreading(rng: np.random.Generator, paths: int) -> Spreading:
+def spreading(rng: np.random.Generator, paths: int) -> IntegralVariance:
     """Return the variance of the integral of telegraph noise over time."""
     system = telegraph()
     t = np.linspace(0.0, 30.0 / RATE, 31)
     u = system.simulate(t, [0.0], rng, paths=paths)[:, :, 0]
     variance = np.mean(u ** 2, axis=0)
     error = np.std(u ** 2, axis=0) / math.sqrt(paths)
-    return Spreading(t, variance, error, *(
+    return IntegralVariance(t, variance, error, *(
         float(switching_intensity(system, [0.0], factor)[0, 0])
         for factor in (CORRECT_FACTOR, PRINTED_FACTOR)))
 

@@ -570,7 +570,7 @@ class McapFile:
         return table
 
 
-class _Strict(ReadDataStream):
+class _StrictStream(ReadDataStream):
     """The library's stream, extended to refuse a text longer than its record."""
 
     def read(self, length: int) -> bytes:
@@ -583,7 +583,7 @@ class _Strict(ReadDataStream):
 
 def _parse(kind: Any, content: bytes) -> Any:
     """Return a record as the library reads it."""
-    stream = _Strict(io.BytesIO(content))
+    stream = _StrictStream(io.BytesIO(content))
     what = f'a {kind.__name__.lower()} record cannot be read'
     try:
         found = kind.read(stream)

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.bag import BagWriter
-from ou_monitor.recordings.importers.choose import Chosen, Extras, SPEEDS
+from ou_monitor.recordings.importers.choose import ChosenSeries, Extras, SPEEDS
 from ou_monitor.recordings.importers.log import Motion, Series, VELOCITY
 from ou_monitor.recordings.standard_types import (
     BATTERY_STATE, encode_battery, encode_blocks, encode_imu, encode_joints, encode_scalars,
@@ -164,7 +164,7 @@ def check_steady(name: str, since_first: npt.NDArray[np.int64], before: int,
 
 
 def write_log(
-    chosen: Chosen, extras: Extras, path: Path, about: Mapping[str, str], *,
+    chosen: ChosenSeries, extras: Extras, path: Path, about: Mapping[str, str], *,
     kind: str = 'battery_state', progress: Callable[[float], None] | None = None,
 ) -> tuple[dict[str, str], tuple[str, ...]]:
     """Write a bag (progress 0..1)."""

@@ -15,7 +15,7 @@ import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.fleet.analysis import Options, work
 from ou_monitor.fleet.find import duplicates, find_recordings
-from ou_monitor.fleet.fleet import Parts
+from ou_monitor.fleet.fleet import SavedResults
 from ou_monitor.fleet.vehicles import assign, natural, number_flights, read_pattern, start_of
 from ou_monitor.fleet.workers import check_address, LocalWorkers, LOST, usable_memory
 from ou_monitor.recordings.read import read_recording
@@ -213,11 +213,11 @@ def test_parts_hold_for_the_same_recording_and_options(tmp_path):
     def source():
         return find_recordings([str(path)]).sources[0]
 
-    parts = Parts(tmp_path / 'out', {'window': 2.0})
+    parts = SavedResults(tmp_path / 'out', {'window': 2.0})
     parts.save(source(), {'error': '', 'sigma': 0.1 + 0.2, 'nothing': float('nan')})
-    again = Parts(tmp_path / 'out', {'window': 2.0})
+    again = SavedResults(tmp_path / 'out', {'window': 2.0})
     assert again.load(source())['sigma'] == 0.1 + 0.2
-    assert Parts(tmp_path / 'out', {'window': 3.0}).load(source()) is None
+    assert SavedResults(tmp_path / 'out', {'window': 3.0}).load(source()) is None
     os.utime(path, ns=(1, 1))
     assert again.load(source()) is None
     os.utime(path, ns=(2, 2))

@@ -8,7 +8,7 @@ import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.fleet.analysis import Options
 from ou_monitor.fleet.find import duplicates, find_recordings
-from ou_monitor.fleet.fleet import Parts, run_fleet
+from ou_monitor.fleet.fleet import run_fleet, SavedResults
 from ou_monitor.fleet.vehicles import assign, read_pattern
 from ou_monitor.model.ou import simulate
 import pytest
@@ -92,7 +92,7 @@ def test_a_folder_without_permission_to_enter_is_noted(odd, monkeypatch):
 def test_invalid_saved_results_are_computed_again(odd, tmp_path, content):
     """A saved result that is a FIFO or foreign is computed again."""
     (source,) = find_recordings([str(odd / 'flight.csv')]).sources
-    parts = Parts(tmp_path / 'out', {})
+    parts = SavedResults(tmp_path / 'out', {})
     parts.save(source, {'error': '', 'levels': []})
     (path,) = (tmp_path / 'out' / 'parts').glob('*.json')
     path.unlink()

@@ -8,7 +8,7 @@ from ou_monitor.model.ou import simulate
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.risk.flag import FlagLevel
 from ou_monitor.online.settings import MonitorSettings
-from ou_monitor.online.trust import Doubt, InputClock, SourceInterval, StampOrder, StillReading
+from ou_monitor.online.trust import ConstantReading, Doubt, InputClock, SourceInterval, StampOrder
 from ou_monitor.records import Level
 from project import needs_recordings, REAL, recorded
 import pytest
@@ -76,19 +76,19 @@ def plateaus(still):
 def test_a_coarse_adc_on_a_slow_discharge_is_not_stuck():
     """The first plateau proves nothing; one that ended by one step allows four times as much."""
     volts, throttle = plateaus(still=True)
-    watch = StillReading()
+    watch = ConstantReading()
     for k, (value, load) in enumerate(zip(volts.reshape(-1, 500), throttle.reshape(-1, 500))):
         for j in range(0, 500, 50):
             watch.push(20.0 * k + 0.04 * np.arange(j, j + 50), value[j:j + 50], load[j:j + 50])
             assert (watch.why == '') is (k > 1 or (k == 1 and j < 500)), (k, j)
     volts, throttle = plateaus(still=False)
-    watch = StillReading()
+    watch = ConstantReading()
     watch.push(0.04 * np.arange(volts.size), volts, throttle)
     assert watch.why
 
 
 def test_a_gap_is_no_still_reading():
-    watch = StillReading()
+    watch = ConstantReading()
     watch.push(np.arange(20) * 0.1, 5.0 + 0.01 * np.arange(20), None)
     watch.push(np.array([100.0]), np.array([5.19]), None)
     watch.push(101.0 + 0.01 * np.arange(20), np.full(20, 5.19), None)
@@ -103,7 +103,7 @@ def test_no_recorded_source_is_called_stuck():
         if path.suffix == '.ulg':
             continue
         recording = recorded(path)
-        watch = StillReading()
+        watch = ConstantReading()
         for k in range(0, min(recording.n, 20_000), 7):
             part = slice(k, k + 7)
             watch.push(recording.t[part], recording.voltage[part], recording.throttle[part])

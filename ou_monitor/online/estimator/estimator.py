@@ -29,7 +29,8 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.model import arma
 from ou_monitor.model.ou_fit import known_ou
-from ou_monitor.online.estimator.fit import fit_window, FitEnd, Fitted, Maximum, MOST, TREND_SCORE
+from ou_monitor.online.estimator.fit import (
+    fit_window, FitEnd, Maximum, MOST, TREND_SCORE, WindowFit)
 from ou_monitor.online.estimator.quality import examine, input_flags, judge, Quality
 from ou_monitor.records import (
     as_numbers, as_seconds, Counters, Estimate, Flag, FloatArray, LARGEST_LOG_SE, LOG_NAMES,
@@ -119,9 +120,9 @@ class SlidingEstimator:
         self._window = _positive('window', window, 's')
         self._line = TimeLine() if line is None else line
         self._fastest = _positive('fastest', fastest, 'Hz')
-        self._thinner = Thinner(self._fastest)
+        self._thinner = BlockAverager(self._fastest)
         # Stamps, voltage and throttle; those before `_begin`, s, are for the lags of throttle.
-        self._kept = Kept(3)
+        self._kept = ReadingBuffer(3)
         self._begin = -math.inf
         self._tail = np.empty(0)
         self._quality = Quality()
@@ -217,8 +218,8 @@ class SlidingEstimator:
             self._forget()
         if batch.again:
             # Block means do not show which readings were repeats.
-            self._thinner = Thinner(self._fastest)
-            self._kept = Kept(3)
+            self._thinner = BlockAverager(self._fastest)
+            self._kept = ReadingBuffer(3)
             self._tail = np.empty(0)
         self._tail = batch.y[-TAIL:].copy() if batch.y.size >= TAIL else np.concatenate(
             [self._tail, batch.y])[-TAIL:]
@@ -226,14 +227,14 @@ class SlidingEstimator:
         if restart:
             # Block means of another size cannot be fitted with the old ones.
             self._line.count(resets=1)
-            self._kept = Kept(3)
+            self._kept = ReadingBuffer(3)
         if columns.size:
             self._kept.append(columns, self._window + LOOK_BACK)
             self._slide()
 
     def _forget(self) -> None:
         self._thinner.forget()
-        self._kept = Kept(3)
+        self._kept = ReadingBuffer(3)
         self._begin = -math.inf
         self._tail = np.empty(0)
         self._looked = -math.inf
@@ -297,7 +298,7 @@ class SlidingEstimator:
         return judge(fit, measured, quality, float(u.std()) if known else NAN, smoothness)
 
     def _fit(self, t: FloatArray, y: FloatArray, load: FloatArray, quality: Quality,
-             ) -> tuple[Fitted, float]:
+             ) -> tuple[WindowFit, float]:
         """Return the fit, and the excess smoothness of adjacent increments."""
         m = self._thinner.m
         steps = np.diff(t)
@@ -358,7 +359,7 @@ def _positive(name: str, value: float, unit: str) -> float:
     return number
 
 
-class Kept:
+class ReadingBuffer:
     """The newest readings in columns; row 0 holds the stamps, s.  Old ones are dropped."""
 
     def __init__(self, rows: int) -> None:
@@ -422,7 +423,7 @@ def lagged(t: FloatArray, u: FloatArray, tau: float) -> FloatArray:
     return out
 
 
-class Thinner:
+class BlockAverager:
     """Learns the rate of the source, and averages blocks of m samples beyond `fastest`, Hz."""
 
     def __init__(self, fastest: float) -> None:
@@ -503,7 +504,7 @@ class RelaxationFits:
     def forget(self) -> None:
         """Forget all readings."""
         # Stamp, voltage, throttle and current of each reading.
-        self._kept = Kept(4)
+        self._kept = ReadingBuffer(4)
         self._line += 1
         self.facts: OuFacts | None = None
         self.end = self._due = NAN

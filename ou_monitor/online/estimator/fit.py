@@ -81,7 +81,7 @@ class FitEnd(enum.Enum):
 
 
 @dataclass(slots=True)
-class Fitted:
+class WindowFit:
     """Parameters before correction for the length of the window."""
 
     outcome: FitEnd  # Outcome; unless it is FOUND the numbers may be NaN
@@ -412,7 +412,7 @@ _EXACT = 1e-14
 
 def fit_window(t: FloatArray, y: FloatArray, load: FloatArray, m: int, adc: float,
                stamps: Callable[[float], bool], before: Maximum | None,
-               ) -> tuple[Fitted, Maximum | None]:
+               ) -> tuple[WindowFit, Maximum | None]:
     """Fit the OU, the noise and the mean (t in s, y in V, load of shape (c, n), adc step in V)."""
     # load: empty while throttle is constant; m: raw samples averaged in each; stamps: function of
     # alpha times the mean step that tells whether the exact likelihood is needed (inf: for any
@@ -463,10 +463,10 @@ def fit_window(t: FloatArray, y: FloatArray, load: FloatArray, m: int, adc: floa
                 found, trend = drifting, True
     if found is None or found.edge > 0 or found.sigma ** 2 * likelihood.step < rounding:
         level[0] += plain[0]
-        return Fitted(FitEnd.UNCORRELATED, math.nan, math.nan, variance * m, math.nan,
-                      (math.nan,) * 3, level, np.append(basis @ plain[1:], 0.0),
-                      np.full((len(load) + 1,) * 2, math.nan), trend, t.size, math.nan,
-                      math.nan), None
+        return WindowFit(FitEnd.UNCORRELATED, math.nan, math.nan, variance * m, math.nan,
+                         (math.nan,) * 3, level, np.append(basis @ plain[1:], 0.0),
+                         np.full((len(load) + 1,) * 2, math.nan), trend, t.size, math.nan,
+                         math.nan), None
     whole = np.zeros((len(load) + 1, used - 1 + trend))
     whole[:-1, :used - 1] = basis
     beta = found.beta.copy()
@@ -477,7 +477,7 @@ def fit_window(t: FloatArray, y: FloatArray, load: FloatArray, m: int, adc: floa
     theta, bare = (arma.theta_at(found.a, likelihood.m, share) for share in (found.share, 0.0))
     spread = (1.0 - math.exp(-found.a) * theta) / (math.exp(-found.a) - theta) * math.sqrt(
         (1.0 - theta * theta) / likelihood.n)
-    return Fitted(
+    return WindowFit(
         FitEnd.UNBOUND if found.edge else FitEnd.FOUND, found.alpha, found.sigma,
         found.noise_var * likelihood.m, max(theta - bare, 0.0) / spread,
         arma.log_covariance(found.a, theta, likelihood.m, likelihood.n), level,

@@ -13,7 +13,7 @@ import math
 from typing import Any
 
 import numpy as np
-from ou_monitor.online.estimator.fit import FitEnd, Fitted
+from ou_monitor.online.estimator.fit import FitEnd, WindowFit
 from ou_monitor.records import Counters, Estimate, Flag, FloatArray, NAN, Status
 
 # Minimum number of samples for any finding.
@@ -101,7 +101,7 @@ MIN_THROTTLE_STD = 0.005
 _SMOOTH, _SMOOTH_SCORE = 0.05, 5.0
 
 
-def log_errors(fit: Fitted, duration: float) -> tuple[float, float, float]:
+def log_errors(fit: WindowFit, duration: float) -> tuple[float, float, float]:
     """Return the standard errors of ln(alpha), ln(sigma), ln(Var_inf) (duration in s)."""
     # At least a thousandth, to avoid a division by zero.
     relaxations = max(fit.alpha * duration - fit.high + _AS_FITTED, 1e-3)
@@ -120,7 +120,7 @@ def _se(variance: float) -> float:
     return math.sqrt(variance) if variance >= 0.0 else math.inf
 
 
-def judge(fit: Fitted, measured: Mapping[str, Any], quality: Quality, throttle_std: float,
+def judge(fit: WindowFit, measured: Mapping[str, Any], quality: Quality, throttle_std: float,
           smoothness: float) -> Estimate:
     """Return the published estimate; `measured`: its fields that need no fit."""
     flags = input_flags(measured['counters'], quality, throttle_std)
@@ -176,7 +176,7 @@ def input_flags(counters: Counters, quality: Quality, throttle_std: float) -> li
     return flags
 
 
-def _level(fit: Fitted, throttle: float, moves: bool) -> tuple[float, float]:
+def _level(fit: WindowFit, throttle: float, moves: bool) -> tuple[float, float]:
     """Return the mean at the present throttle, V, and its slope, V per unit throttle."""
     if not moves or math.isnan(throttle):
         return float(fit.level[0]), NAN

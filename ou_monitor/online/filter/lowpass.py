@@ -59,7 +59,7 @@ _MODELS = 64
 _HIGHEST = 1e60
 
 
-class Known(NamedTuple):
+class KalmanInputs(NamedTuple):
     """Known properties of the supply."""
 
     sigma: float  # Noise intensity, V/sqrt(s)
@@ -83,7 +83,7 @@ class VoltageKalman:
         self._settings = settings
         self.y = x
         self.lag, self.mixed = NAN, 0.0
-        self._log_sigma, self._known = NAN, Known(NAN, NAN, NAN)
+        self._log_sigma, self._known = NAN, KalmanInputs(NAN, NAN, NAN)
         self._level = level if level == level else x
         # Deviation from the level, error of the level.
         self._x = [x - self._level, 0.0]
@@ -135,7 +135,7 @@ class VoltageKalman:
         unsure = NAN
         if level == level:
             unsure = min(level_se, _HIGHEST) if level_se > 0.0 else 0.0
-        old, now = self._known, Known(math.exp(self._log_sigma), alpha, unsure)
+        old, now = self._known, KalmanInputs(math.exp(self._log_sigma), alpha, unsure)
         if (abs(now.sigma - old.sigma) <= _SAME * old.sigma
                 and abs(alpha - old.alpha) <= _SAME * old.alpha
                 and _nearly_equal(unsure, old.level_se)):
@@ -195,7 +195,7 @@ class VoltageKalman:
         self.lag = math.degrees(-cmath.phase(h + self.mixed * (1.0 - h)))
 
 
-def step_model(known: Known, dt: float) -> KalmanStep:
+def step_model(known: KalmanInputs, dt: float) -> KalmanStep:
     """Return the model for a step (dt in s)."""
     levelled = known.level_se == known.level_se
     slow = 1.0 / LEVEL_TIME

@@ -174,7 +174,7 @@ BLOCK, KEPT, SILENCE = 0.05, 300.0, 2.5
 AT_PEAK = 0.05
 
 
-class Past:
+class FlightHistory:
     """Past blocks; rows of `table`: lowest and last median of three, V; mean, highest throttle."""
 
     def __init__(self) -> None:
@@ -309,7 +309,7 @@ _SMALLEST = 1e-6
 _FEWEST = round(1.0 / BLOCK)
 
 
-def excursions(past: Past, horizon: float) -> tuple[float, float]:
+def excursions(past: FlightHistory, horizon: float) -> tuple[float, float]:
     """Return mean and deviation, V, of the drops within a horizon, s; NaN in the first second."""
     if past.table.shape[1] < _FEWEST:
         return NAN, NAN
@@ -348,7 +348,7 @@ _APART, _SHARE, _MOST = 0.2, 0.1, 320
 
 
 @dataclass(frozen=True, eq=False)
-class Flown:
+class FlownHorizons:
     """Completed horizons: throttle at first, peak, dwell (s), rest, age (s); shapes (k,)."""
 
     first: FloatArray
@@ -358,14 +358,14 @@ class Flown:
     age: FloatArray
 
 
-def flown(past: Past, horizon: float) -> Flown:
+def flown(past: FlightHistory, horizon: float) -> FlownHorizons:
     """Return throttle in completed horizons, s."""
     width = max(1, round(horizon / BLOCK))
     mean, high = past.table[2], past.table[3]
     n = mean.size - width
     if n <= 0:
         none = np.empty(0)
-        return Flown(none, none, none, none, none)
+        return FlownHorizons(none, none, none, none, none)
     step = max(1, round(_APART / BLOCK), round(_SHARE * width), -(-n // _MOST))
     at = np.arange((n - 1) % step, n, step)
     peak = sliding(np.maximum, high[1:], width)[at]
@@ -378,10 +378,10 @@ def flown(past: Past, horizon: float) -> Flown:
     good = np.isfinite(total + mean[at])
     # A block that holds the peak may have a mean below it.
     dwell = np.maximum(count, 1) * BLOCK
-    return Flown(*(x[good] for x in (mean[at], peak, dwell, rest, (n - 1 - at) * BLOCK)))
+    return FlownHorizons(*(x[good] for x in (mean[at], peak, dwell, rest, (n - 1 - at) * BLOCK)))
 
 
-def pilot(past: Flown, throttle: float, horizon: float) -> tuple[Courses, FloatArray]:
+def pilot(past: FlownHorizons, throttle: float, horizon: float) -> tuple[Courses, FloatArray]:
     """Return courses from a throttle on, and their weights, which add up to 1."""
     weight = np.exp(-0.5 * ((past.first - throttle) / _LIKE) ** 2 - past.age / _MEMORY)
     if past.age.size > 1:

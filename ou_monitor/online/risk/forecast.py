@@ -38,8 +38,8 @@ from ou_monitor.model.passage import prepare
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.supply_load import LoadState, LoadStatus, SupplyLoad
 from ou_monitor.online.risk.courses import (
-    BLOCK, Courses, excursion_risk, excursions, Flown, flown, held, lowest, mean_now, Past, pilot,
-    Sampling)
+    BLOCK, Courses, excursion_risk, excursions, FlightHistory, flown, FlownHorizons, held, lowest,
+    mean_now, pilot, Sampling)
 from ou_monitor.online.risk.first_passage import Passage, risk_of, Supply
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, FloatArray, NAN
@@ -150,7 +150,7 @@ class Calibrator:
         self._settle()
 
 
-class FarShare:
+class ContradictionRate:
     """Share of horizons that contradict a law; initially `right` horizons count as agreeing."""
 
     def __init__(self, right: float) -> None:
@@ -186,8 +186,8 @@ class FarShare:
 
 
 # Horizons, s, from which the flight learns; those between are interpolated in ln h.
-RUNGS = (0.5, 1.0, 2.0, 5.0, 15.0)
-_LN_RUNGS = np.log(RUNGS)
+HORIZONS = (0.5, 1.0, 2.0, 5.0, 15.0)
+_LN_HORIZONS = np.log(HORIZONS)
 # Share in the interpolation below which a horizon does not count: more than rounding.
 _LEAST_SHARE = 1e-9
 # Time between updates, s, and as a share of the horizon.
@@ -221,7 +221,7 @@ class Outcome:
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
+class _PendingHorizon:
     """State at one time, kept until a horizon from there on is complete."""
 
     t: float
@@ -233,15 +233,15 @@ class _Look:
     passage: Passage | None
 
 
-class _Rung:
+class _HorizonLaws:
     """Laws learned from completed horizons of one length."""
 
     def __init__(self, horizon: float) -> None:
         self.horizon = horizon
-        self.looks: deque[_Look] = deque()
+        self.pending: deque[_PendingHorizon] = deque()
         self.next = self.learned = -math.inf
         self.calibrator = Calibrator()
-        self.held, self.passage = FarShare(_AGREE), FarShare(_ODDS - 1.0)
+        self.held, self.passage = ContradictionRate(_AGREE), ContradictionRate(_ODDS - 1.0)
         # Log-likelihood ratio of first passage to the other method.
         self.evidence = 0.0
 
@@ -251,45 +251,47 @@ class _Rung:
         return np.append(self.calibrator.law.values, (
             self.held.value, *self.held.misses, self.passage.value, self.evidence))
 
-    def learn(self, look: _Look, low: float, peak: float, dwell: float, sampling: Sampling
-              ) -> None:
+    def learn(self, begun: _PendingHorizon, low: float, peak: float, dwell: float,
+              sampling: Sampling) -> None:
         """Learn from a completed horizon: lowest voltage, V, highest throttle, time there, s."""
-        weight = min(1.0, (look.t - self.learned) / self.horizon) if math.isfinite(
+        weight = min(1.0, (begun.t - self.learned) / self.horizon) if math.isfinite(
             self.learned) else 1.0
-        elapsed = max(look.t - self.learned, 0.0) if math.isfinite(self.learned) else 0.0
-        self.learned = look.t
+        elapsed = max(begun.t - self.learned, 0.0) if math.isfinite(self.learned) else 0.0
+        self.learned = begun.t
         y = np.array([low])
-        far = float(density(y, y * 0.0 + look.voltage - look.mean, y * 0.0 + look.deviation)[0])
+        far = float(density(y, y * 0.0 + begun.voltage - begun.mean, y * 0.0 + begun.deviation)[0])
         other = far
-        if look.state is not None and look.courses is not None and math.isfinite(peak):
-            start, law = mean_now(look.state), self.calibrator.law
-            courses, shares = look.courses
+        if begun.state is not None and begun.courses is not None and math.isfinite(peak):
+            start, law = mean_now(begun.state), self.calibrator.law
+            courses, shares = begun.courses
             mean, deviation = lowest(
-                look.state, courses.after(held(peak, dwell, look.state.throttle)), self.horizon,
+                begun.state, courses.after(held(peak, dwell, begun.state.throttle)), self.horizon,
                 sampling)
             middle, spread = law.moments(mean, deviation, start)
             found = density(y, middle, spread)
-            wide = density(y, middle[:1], _wider(spread[:1], look.deviation, self.held.misses))
+            wide = density(y, middle[:1], _wider(spread[:1], begun.deviation, self.held.misses))
             self.held.add(float(found[0]), float(wide[0]), weight, elapsed,
                           max(float((middle[0] - low) / spread[0]), 0.0))
             other = _HALF * far + (1.0 - _HALF) * float(shares @ found[1:])
             self.calibrator.add(low, float(mean[0]), float(deviation[0]), start, weight, elapsed)
         self.evidence *= math.exp(-elapsed / MEMORY)
-        if look.passage is not None:
-            first = self.passage.add(look.passage.density(low, self.horizon), far, weight, elapsed)
+        if begun.passage is not None:
+            first = self.passage.add(begun.passage.density(low, self.horizon), far, weight,
+                                     elapsed)
             self.evidence += weight * math.log(max(first, 1e-300) / max(other, 1e-300))
 
 
 def _shares(horizon: float) -> list[float]:
-    """Return the share of each of RUNGS in a law for a horizon, s."""
-    place = np.interp(math.log(horizon), _LN_RUNGS, np.arange(_LN_RUNGS.size))
-    shares: list[float] = np.maximum(1.0 - np.abs(np.arange(_LN_RUNGS.size) - place), 0.0).tolist()
+    """Return the share of each of HORIZONS in a law for a horizon, s."""
+    place = np.interp(math.log(horizon), _LN_HORIZONS, np.arange(_LN_HORIZONS.size))
+    off = np.abs(np.arange(_LN_HORIZONS.size) - place)
+    shares: list[float] = np.maximum(1.0 - off, 0.0).tolist()
     return shares
 
 
 def _shorter_horizons(horizon: float) -> list[float]:
-    """Return a horizon and the shorter ones, down to a third, from which the flight learns."""
-    return [*(one for one in RUNGS if 0.2 * horizon <= one < horizon), horizon]
+    """Return a horizon and the shorter ones, down to a fifth, from which the flight learns."""
+    return [*(one for one in HORIZONS if 0.2 * horizon <= one < horizon), horizon]
 
 
 class Forecast:
@@ -304,10 +306,10 @@ class Forecast:
         prepare()
         self._loads, self._look_time = loads, look
         self.follow(Estimate(), 0.0)
-        self._rungs = tuple(map(_Rung, RUNGS))
-        self._learning = self._rungs if math.isnan(horizon) else tuple(
-            rung for rung, share in zip(self._rungs, _shares(horizon))
-            if share > _LEAST_SHARE or rung.horizon in _shorter_horizons(horizon))
+        self._by_horizon = tuple(map(_HorizonLaws, HORIZONS))
+        self._learning = self._by_horizon if math.isnan(horizon) else tuple(
+            laws for laws, share in zip(self._by_horizon, _shares(horizon))
+            if share > _LEAST_SHARE or laws.horizon in _shorter_horizons(horizon))
         self.new_time_line()
         self._known = False
         # Earliest arrival for the next update, s.
@@ -316,17 +318,17 @@ class Forecast:
 
     def new_time_line(self) -> None:
         """Clear the past; keep the learned laws."""
-        self._past = Past()
+        self._past = FlightHistory()
         self._newest = -math.inf
         self._last: FloatArray = np.empty(0)
         self._samples = 0
         self._begun = NAN
         self._next = -math.inf
         self._laws: dict[float, tuple[LowestLaw, float, float, float, float, float]] = {}
-        self._kept: dict[float, tuple[float, float, Flown]] = {}
-        for rung in self._rungs:
-            rung.looks.clear()
-            rung.next = rung.learned = -math.inf
+        self._kept: dict[float, tuple[float, float, FlownHorizons]] = {}
+        for laws in self._by_horizon:
+            laws.pending.clear()
+            laws.next = laws.learned = -math.inf
 
     def take(self, batch: Batch, came: float = math.inf) -> None:
         """Take readings; came: arrival of the last, s, on a monotonic clock; inf: unknown."""
@@ -410,27 +412,27 @@ class Forecast:
         if self._samples > 1:
             interval = (self._newest - self._begun) / (self._samples - 1)
             self._sampling = Sampling(interval, self._past.activity())
-        due = any(self._newest >= rung.next for rung in self._learning)
+        due = any(self._newest >= laws.next for laws in self._learning)
         state = self._loads.state() if self._known and due else None
         now, passage = self.voltage, self.passage() if due else None
-        for rung in self._learning:
-            while rung.looks and self._past.end >= rung.looks[0].t + rung.horizon + BLOCK:
-                look = rung.looks.popleft()
-                outcome = self._past.outcome(look.t, rung.horizon)
+        for laws in self._learning:
+            while laws.pending and self._past.end >= laws.pending[0].t + laws.horizon + BLOCK:
+                begun = laws.pending.popleft()
+                outcome = self._past.outcome(begun.t, laws.horizon)
                 if outcome is not None:
-                    rung.learn(look, *outcome, self._sampling)
-            if self._newest < rung.next:
+                    laws.learn(begun, *outcome, self._sampling)
+            if self._newest < laws.next:
                 continue
-            rung.next = self._newest + max(
-                self._look_time, _LOOK_SHARE * rung.horizon) - 0.5 * BLOCK
-            mean, deviation, done = self._flight(rung.horizon)
+            laws.next = self._newest + max(
+                self._look_time, _LOOK_SHARE * laws.horizon) - 0.5 * BLOCK
+            mean, deviation, done = self._flight(laws.horizon)
             if math.isnan(deviation) or math.isnan(now):
                 continue
-            rung.looks.append(_Look(
+            laws.pending.append(_PendingHorizon(
                 self._newest, now, mean, deviation, state,
-                None if state is None else pilot(done, state.throttle, rung.horizon), passage))
+                None if state is None else pilot(done, state.throttle, laws.horizon), passage))
 
-    def _flight(self, horizon: float) -> tuple[float, float, Flown]:
+    def _flight(self, horizon: float) -> tuple[float, float, FlownHorizons]:
         """Return excursions and courses of the flight, computed once for the newest samples."""
         if horizon not in self._kept:
             self._kept[horizon] = *excursions(self._past, horizon), flown(self._past, horizon)
@@ -439,8 +441,8 @@ class Forecast:
     def _learned(self, horizon: float) -> tuple[LowestLaw, float, float, float, float, float]:
         """Return the law, both shares of wrong horizons, and the evidence for a horizon."""
         if horizon not in self._laws:
-            values = np.sum([share * rung.values for rung, share in zip(
-                self._rungs, _shares(horizon)) if share > _LEAST_SHARE], axis=0)
+            values = np.sum([share * laws.values for laws, share in zip(
+                self._by_horizon, _shares(horizon)) if share > _LEAST_SHARE], axis=0)
             self._laws[horizon] = (LowestLaw(values[:6]), *values[6:].tolist())
         return self._laws[horizon]
 
@@ -519,7 +521,7 @@ SOON = 1.0
 
 
 @dataclass(frozen=True)
-class Ahead:
+class RiskOutlook:
     """Risk and budget of one instant."""
 
     outcome: Outcome = Outcome()  # Risk, its method and its main cause.
@@ -533,13 +535,13 @@ class Ahead:
 
 
 def look_ahead(forecast: Forecast, load: SupplyLoad, settings: MonitorSettings, *,
-               alone: bool = False) -> Ahead:
+               alone: bool = False) -> RiskOutlook:
     """Return risk, risk curve and throttle budget for the settings; alone: only the risk."""
     s = settings
     voltage, horizon = s.brownout_voltage, s.brownout_horizon
     outcome = forecast.risk(voltage, horizon)
     if alone:
-        return Ahead(outcome)
+        return RiskOutlook(outcome)
     soon = forecast.risk_held(voltage, SOON)
     if math.isnan(soon):
         soon = forecast.risk(voltage, min(SOON, horizon)).risk
@@ -547,12 +549,13 @@ def look_ahead(forecast: Forecast, load: SupplyLoad, settings: MonitorSettings, 
     if np.isnan(risks).any():
         why = '' if load.status is LoadStatus.NO_DATA else load.status.value if (
             not load.known) else 'Less than a second has been flown.'
-        return Ahead(outcome, NAN, why, soon=soon)
+        return RiskOutlook(outcome, NAN, why, soon=soon)
     # Less throttle is never riskier, but just after high throttle the law rates idle as riskier.
     risks = np.minimum.accumulate(risks[::-1])[::-1]
     budget, reason = throttle_budget(risks, forecast.flown[1], s.budget_limit)
     # The comparison is false for NaN.
-    return Ahead(outcome, budget, reason, tuple(risks[::5].tolist()), soon, budget < forecast.used)
+    return RiskOutlook(outcome, budget, reason, tuple(risks[::5].tolist()), soon,
+                       budget < forecast.used)
 
 
 def throttle_budget(risks: FloatArray, highest: float, limit: float) -> tuple[float, str]:

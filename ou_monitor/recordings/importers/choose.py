@@ -32,7 +32,7 @@ MOST, _LIST = 4, 'see convert LOG --list'
 
 
 @dataclass(frozen=True, eq=False)
-class Chosen:
+class ChosenSeries:
     """The series chosen from a log."""
 
     voltage: Series  # At least one sample
@@ -43,7 +43,7 @@ class Chosen:
 
 
 def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | None = None,
-           current: str | None = None, option: str = '--{}') -> Chosen:
+           current: str | None = None, option: str = '--{}') -> ChosenSeries:
     """Choose series, and drop unusable samples (option: the option that chooses a quantity)."""
     volts = _pick(path, log, VOLTAGE, voltage, option)
     if volts is None:
@@ -83,10 +83,10 @@ def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | 
         raise InputError(f'{path}: {volts.name} has no usable sample'
                          + ''.join(f' ({note})' for note in notes))
     notes += _alternatives(log, (volts, first), option)
-    return Chosen(usable[VOLTAGE], usable.get(THROTTLE), usable.get(CURRENT), tuple(notes))
+    return ChosenSeries(usable[VOLTAGE], usable.get(THROTTLE), usable.get(CURRENT), tuple(notes))
 
 
-def columns_of(path: Path, log: Log, chosen: Chosen) -> RawColumns:
+def columns_of(path: Path, log: Log, chosen: ChosenSeries) -> RawColumns:
     """Return the samples of a log, rounded as in the bag that `convert` writes."""
     volts = chosen.voltage
     t = _in_a_bag(volts.t)

@@ -67,7 +67,7 @@ KINDS = frozenset(b'BFIMPQARDLCSO')
 LARGEST = 10_000
 
 
-class _Watched(io.BufferedReader):
+class _WatchedFile(io.BufferedReader):
     """
     A file that records which bytes pyulog skips silently.
 
@@ -120,7 +120,7 @@ def read(path: Path, request: Request) -> Log:
     one_flight(path, request)
     size = path.stat().st_size
     with quiet(path, 'pyulog') as said:
-        with _Watched(io.FileIO(path)) as file:
+        with _WatchedFile(io.FileIO(path)) as file:
             file.size, file.progress = size, request.progress
             ulog = ULog(file, None if request.everything else _topics(request.names))
     notes: list[str] = []

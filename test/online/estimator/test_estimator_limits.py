@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 from ou_monitor import SlidingEstimator
-from ou_monitor.online.estimator.estimator import Thinner
+from ou_monitor.online.estimator.estimator import BlockAverager
 from ou_monitor.records import Flag, Status
 from ou_monitor.timeline import TimeLine
 import pytest
@@ -113,7 +113,7 @@ def test_any_array_of_doubles_is_copied():
 
 
 def test_blocks_do_not_reach_across_a_gap():
-    thinner = Thinner(1e4)
+    thinner = BlockAverager(1e4)
     t = np.concatenate([np.arange(105), 1000 + np.arange(100)]) * 1e-5
     kept = taken(thinner, t, np.r_[np.zeros(105), np.ones(100)])
     assert kept[0][1].tolist() == [0.0] * 10 + [1.0] * 10
@@ -121,7 +121,7 @@ def test_blocks_do_not_reach_across_a_gap():
 
 def test_block_size_that_changes_restarts():
     """From 100 kHz to 1 MHz blocks of ten become blocks of a hundred."""
-    thinner = Thinner(1e4)
+    thinner = BlockAverager(1e4)
     intake = TimeLine()
     kept = thinner.take(batches(np.arange(1000) * 1e-5, intake=intake)[0][0])
     assert not kept[1] and thinner.m == 10

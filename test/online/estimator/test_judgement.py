@@ -4,14 +4,14 @@ from dataclasses import replace
 import math
 
 import numpy as np
-from ou_monitor.online.estimator.fit import FitEnd, Fitted
+from ou_monitor.online.estimator.fit import FitEnd, WindowFit
 from ou_monitor.online.estimator.quality import input_flags, judge, log_errors, Quality
 from ou_monitor.records import Counters, Flag, Status
 import pytest
 
 NAN = math.nan
-FIT = Fitted(FitEnd.FOUND, 63.0, 0.632, 25e-6, 5.0, (0.016, 0.001, 0.016),
-             np.array([5.0]), np.empty(0), np.empty((0, 0)), False, 2000, 0.063, 1.5)
+FIT = WindowFit(FitEnd.FOUND, 63.0, 0.632, 25e-6, 5.0, (0.016, 0.001, 0.016),
+                np.array([5.0]), np.empty(0), np.empty((0, 0)), False, 2000, 0.063, 1.5)
 BASE = {'t': 2.0, 'voltage': 5.0, 'throttle': NAN, 'n': 2000, 'duration': 2.0, 'rate': 1000.0,
         'counters': Counters()}
 CLEAN = Quality(0.0, 1, False, 0.02)

@@ -8,7 +8,7 @@ import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.analysis.analyze import analyze, as_data
 from ou_monitor.analysis.level_comparison import alpha_constancy, sigma_change
-from ou_monitor.online.estimator.fit import FitEnd, Fitted
+from ou_monitor.online.estimator.fit import FitEnd, WindowFit
 from ou_monitor.online.estimator.quality import judge, Quality
 from ou_monitor.records import (
     Counters, Estimate, LARGEST_FACTOR, LARGEST_LOG_SE, Recording, Status)
@@ -70,8 +70,8 @@ def test_an_interval_of_any_width(z):
        duration=st.floats(min_value=1e-9, max_value=1e9))
 def test_any_information_is_judged(log_var, score, alpha, duration):
     """Singular, negative, infinite: what is usable is known to a factor of 10."""
-    fit = Fitted(FitEnd.FOUND, alpha, 0.6, 0.0, score, log_var, np.array([5.0]),
-                 np.empty(0), np.empty((0, 0)), False, 2000, 0.06, 1.5)
+    fit = WindowFit(FitEnd.FOUND, alpha, 0.6, 0.0, score, log_var, np.array([5.0]),
+                    np.empty(0), np.empty((0, 0)), False, 2000, 0.06, 1.5)
     e = judge(fit, {'t': 0.0, 'voltage': 5.0, 'throttle': NAN, 'n': 2000, 'duration': duration,
                     'rate': 1e3, 'counters': Counters()}, Quality(), NAN, NAN)
     for name in NAMES:

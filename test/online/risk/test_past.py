@@ -3,7 +3,7 @@
 
 import numpy as np
 from ou_monitor.online.risk.courses import (
-    BLOCK, excursion_risk, flown, Past, pilot)
+    BLOCK, excursion_risk, FlightHistory, flown, pilot)
 import pytest
 
 RATE = 100.0
@@ -17,7 +17,7 @@ def made(seconds=60.0, parts=37, seed=1):
     t[0] -= 0.002
     u = np.repeat(rng.uniform(0.1, 0.9, round(seconds)), round(RATE))
     v = 16.0 - u + 0.05 * rng.standard_normal(t.size)
-    past = Past()
+    past = FlightHistory()
     for part in np.array_split(np.arange(t.size), parts):
         past.push(t[part], v[part], u[part])
     return past, t, v, u
@@ -40,7 +40,7 @@ def test_what_a_horizon_became():
 
 def test_parts_of_samples_change_nothing():
     u = np.random.default_rng(1).uniform(0.0, 1.0, 600)
-    whole, parts, single = Past(), Past(), Past()
+    whole, parts, single = FlightHistory(), FlightHistory(), FlightHistory()
     for past, step in ((whole, 600), (parts, 7), (single, 1)):
         for k in range(0, 600, step):
             part = slice(k, k + step)
@@ -50,7 +50,7 @@ def test_parts_of_samples_change_nothing():
 
 
 def test_slow_sources_are_held_and_silence_is_not():
-    past = Past()
+    past = FlightHistory()
     past.push(np.arange(10.0), np.arange(10.0) + 10.0, np.full(10, 0.5))
     assert np.isfinite(past.table).all() and past.table.shape[1] == 181
     past.push(np.array([14.0]), np.array([9.0]), np.array([0.5]))
@@ -61,7 +61,7 @@ def test_slow_sources_are_held_and_silence_is_not():
 
 
 def test_no_more_than_five_minutes_are_kept():
-    past = Past()
+    past = FlightHistory()
     t = np.arange(0.0, 400.0, 0.04)
     past.push(t, np.full(t.size, 12.0), np.full(t.size, 0.3))
     assert past.table.shape[1] == round(300.0 / BLOCK)
@@ -103,6 +103,6 @@ def test_futures_are_those_flown():
 
 
 def test_without_any_past_a_pilot_may_rise():
-    courses, weight = pilot(flown(Past(), 2.0), 0.2, 2.0)
+    courses, weight = pilot(flown(FlightHistory(), 2.0), 0.2, 2.0)
     np.testing.assert_allclose(weight, 0.2)
     np.testing.assert_allclose(courses.rest, 0.2)
