@@ -192,8 +192,8 @@ def _mean_drift(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Estima
             f'fewer than three blocks of {_MEAN_BLOCK:g} relaxation times'))
     centre = float(total.mean())
     z = join([innovations(t, v - centre, alpha, var_inf, noise_var) for t, v in parts])
-    # A constant voltage gives constant innovations, except for the first of each part, which has
-    # no past and is left out.
+    # A constant voltage gives constant innovations.  Leave out the first of each part, which has
+    # no past.
     ends = np.cumsum([t.size for t, _ in parts])[:-1]
     z = np.delete(z, np.concatenate(([0], ends)).astype(np.intp))
     pieces = np.array_split(z, blocks)
@@ -208,7 +208,7 @@ def _mean_drift(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Estima
         near = sum(float(c[lag:] @ c[:-lag]) for c in centred
                    for lag in range(1, _LAGS_RAW + 1)) / square
         scale = square / (z.size - blocks) * max(1.0, 1.0 + 2.0 * near)
-    # Innovations of a constant have the relative error of the fit, which limits the freedom.
+    # Innovations of a constant share the relative error of the fit, which limits the freedom.
     freedom = math.inf
     if math.isfinite(alpha):
         error = 2.0 * math.hypot(estimate.alpha_se, estimate.sigma_se)
@@ -293,7 +293,7 @@ def _portmanteau(name: str, parts: Sequence[FloatArray], lags: int) -> TestResul
         se = math.sqrt(max(variance, 1e-300)) / total
         q += (r / se) ** 2
         squares += max(0.0, r * r - se * se)
-    # Of the fitted parameters, only the noise affects so few lags.
+    # Only one fitted parameter, the noise, affects so few lags.
     freedom = lags - 1.0 if name == 'one_relaxation' else freedom
     return TestResult(name, float(stats.chi2.sf(q, freedom)), math.sqrt(squares))
 

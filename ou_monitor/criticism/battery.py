@@ -59,7 +59,7 @@ class Covariates:
     throttle: FloatArray | None  # 0..1; shape (n,)
     rate: float  # Samples per second, Hz
     keep: float  # Share of the state that remains from one sample to the next
-    # Where large errors begin, as `large_ones` returns them; shape (n,).
+    # Where large errors begin, as `large_signs` returns them; shape (n,).
     large: FloatArray | None = None
     paths: tuple[tuple[str, FloatArray], ...] = ()  # As `throttle_paths` yields them; shape (n,)
 
@@ -298,7 +298,7 @@ def _residual(name: str, wanted: FloatArray, known: FloatArray, keep: float
         yield name, less - keep * np.concatenate((less[:1], less[:-1]))
 
 
-def large_ones(errors: FloatArray, found: npt.NDArray[np.bool_] | None = None) -> FloatArray:
+def large_signs(errors: FloatArray, found: npt.NDArray[np.bool_] | None = None) -> FloatArray:
     """Return the signs of large errors; 0 elsewhere, and shortly after another large error."""
     large = np.abs(errors) > _LARGE
     if found is not None:
@@ -341,7 +341,7 @@ def covariates_of(samples: Samples, composite: Composite) -> Covariates:
     return Covariates(
         state=np.concatenate(([0.0], residual[:-1])), at=samples.t - samples.t[0],
         throttle=samples.throttle, rate=1.0 / float(np.median(samples.step[1:])), keep=keep,
-        large=large_ones(gaussian.z, found), paths=paths)
+        large=large_signs(gaussian.z, found), paths=paths)
 
 
 # Number of simulated recordings.

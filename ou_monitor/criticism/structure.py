@@ -86,7 +86,7 @@ def fit_gaussian(samples: Samples, terms: Sequence[Term], part: slice,
     voltage = samples.voltage if offset is None else samples.voltage - offset
     chosen = samples.part(part, voltage)
     inside = None if events is None else events.part(part)
-    fit = _beside_lines(chosen, tuple(terms), inside, rough, begun)
+    fit = _fit_terms(chosen, tuple(terms), inside, rough, begun)
     cost = fit.cost
     if whole_mean and chosen.n < samples.n:
         mean = _with_mean(samples.part(slice(None), voltage), fit.terms, events)
@@ -112,8 +112,8 @@ def whitened(samples: Samples, terms: Sequence[Term], more: Sequence[Term],
              events: Events | None = None, offset: FloatArray | None = None, *,
              own: bool = False) -> FloatArray:
     """Return voltage, level and columns of the mean, whitened by the noise of a model."""
-    # The columns are those of `more`, and with `own` also those of the model.  Without `own`,
-    # terms of the model that are not `MEASURED` are subtracted from the voltage.  offset in V.
+    # Columns: of `more`, after those of the model if `own`; otherwise the model's terms that are
+    # not `MEASURED` are subtracted from the voltage.  offset in V.
     run = _filter(samples, terms, events)
     kept = terms if own else [term for term in terms if term.ROLE is not Role.MEAN]
     columns = columns_of(samples, (*kept, *more), run.segment)
@@ -246,12 +246,12 @@ def _coupled_block(term: ACCoupling, s: Segment, phi: FloatArray, q: FloatArray
     return f, cov, np.array([1.0, -1.0])
 
 
-def _beside_lines(samples: Samples, terms: tuple[Term, ...], events: Events | None, rough: bool,
-                  begun: bool) -> GaussianFit:
-    """Fit by scoring; more than `_MANY` lines are first subtracted, given the initial noise."""
-    # The estimates of noise and of coefficients of the mean are uncorrelated, and a line depends
-    # only on the noise at its own frequency.  So the other terms are fitted to the rest, then all
-    # coefficients together.
+def _fit_terms(samples: Samples, terms: tuple[Term, ...], events: Events | None, rough: bool,
+               begun: bool) -> GaussianFit:
+    """Fit by scoring, without the lines if there are more than `_MANY`."""
+    # These lines are fitted with the initial noise and subtracted; after the fit of the rest, all
+    # coefficients of the mean are fitted together.  That suffices, because noise and coefficients
+    # are uncorrelated, and a line depends only on the noise at its own frequency.
     lines = [k for k, term in enumerate(terms) if isinstance(term, Tone)
              and term.ROLE is Role.MEAN]
     if len(lines) <= _MANY:

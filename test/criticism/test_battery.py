@@ -2,7 +2,7 @@
 
 import numpy as np
 from numpy.testing import assert_allclose
-from ou_monitor.criticism.battery import after_large, large_ones, score, throttle_paths
+from ou_monitor.criticism.battery import after_large, large_signs, score, throttle_paths
 import pytest
 from scipy.stats import kstest
 
@@ -63,7 +63,7 @@ def test_large_ones_are_the_first_of_each_group_and_what_laws_have_found():
     found = np.zeros(200, bool)
     found[100] = True
     errors[100] = -1.0
-    large = large_ones(errors, found)
+    large = large_signs(errors, found)
     assert_allclose(np.flatnonzero(large), [0, 41, 100, 150])
     assert_allclose(large[[0, 41, 100, 150]], [1.0, -1.0, -1.0, 1.0])
 
@@ -76,7 +76,7 @@ def test_after_large_errors_of_independent_scores_nothing_follows():
         w = rng.standard_normal(N)
         w[rng.integers(0, N, 20)] = rng.choice([-5.0, 5.0], 20)
         square = w * w - np.mean(w * w)
-        for name, value in after_large(w, square, large_ones(w)):
+        for name, value in after_large(w, square, large_signs(w)):
             values.setdefault(name, []).append(value)
     assert len(values) == 10
     for name, drawn in values.items():
@@ -93,7 +93,7 @@ def test_a_ramp_after_each_large_error_is_detected_with_its_sign(sign):
     for at in range(300, N - 300, 400):
         w[at] = 6.0 * sign
         w[at + 16:at + 64] += 0.5 * sign
-    statistics_of = dict(after_large(w, w * w - np.mean(w * w), large_ones(w)))
+    statistics_of = dict(after_large(w, w * w - np.mean(w * w), large_signs(w)))
     # 19 windows of 48 samples: 0.5 sqrt(912) = 15 standard deviations.
     assert statistics_of['after large errors 16 to 64'] == pytest.approx(15.1, abs=4.0)
     assert abs(statistics_of['after large errors 256 to 1024']) < 5.0

@@ -116,11 +116,10 @@ def lines_of(view: View) -> tuple[Line, ...]:
     return find_lines([grid.values], grid.rate, false_alarm=_PROPOSED, wide=True).lines
 
 
-# Number of lines to try; false-alarm probability of trying one, large because the evidence of the
-# fit decides.
+# Maximum number of lines tried; probability of a false one, large because evidence decides.
 _MOST, _PROPOSED = 3, 0.5
-# First initial linewidth, over the resolution of the recording (the second lies halfway to the
-# largest); linewidth, Hz, from which a line with a varying amplitude is ringing.
+# Smaller of two initial linewidths, over the resolution of the recording (the other is halfway to
+# the maximum); minimum linewidth of ringing, Hz, if the amplitude varies.
 _WANDERS, WIDEST = 3.0, 2.0
 # Largest width of a line over its frequency.
 SHARP = 0.05
