@@ -114,8 +114,8 @@ class _Column(NamedTuple):
     place: tuple[int, ...]  # Its cells: two for a date and a time; none: rows are counted
     name: str
     unit: str  # As stated or given, '' if neither
-    scale: float  # Factor that the maker states; 0: by the unit
-    unknown: float = math.nan  # Number of an unknown value
+    scale: float  # Factor by the maker's definition; 0: by the unit
+    unknown: float = math.nan  # Number that stands for "unknown"
 
 
 class _Table(NamedTuple):
@@ -314,7 +314,7 @@ def _choose(form: Form, quantity: str, taken: Sequence[int] = ()) -> list[int]:
     right = {_TIME_NAME: TIME_WORDS, logs.VOLTAGE: VOLT_WORDS, logs.CURRENT: AMPERE_WORDS,
              logs.THROTTLE: {**SHARE_WORDS, **_PULSE_WORDS}}[quantity]
     free = [k for k in range(len(plain)) if k not in taken and plain[k] is not None
-            and _of_kind(form, k, quantity == _TIME_NAME)]
+            and _holds_numbers(form, k, quantity == _TIME_NAME)]
     for pattern in _PATTERNS[quantity]:
         found = list(dict.fromkeys(
             k for texts in ([form.names[k].strip() for k in range(len(plain))], plain, ends)
@@ -332,7 +332,7 @@ def _choose(form: Form, quantity: str, taken: Sequence[int] = ()) -> list[int]:
     return found
 
 
-def _of_kind(form: Form, place: int, clock: bool) -> bool:
+def _holds_numbers(form: Form, place: int, clock: bool) -> bool:
     """Return whether the first cells of a column are numbers (clock: or dates or times)."""
     cells = [row[place] for row in form.rows if place < len(row) and row[place]
              and row[place].lower() not in MISSING]
@@ -376,7 +376,7 @@ def _finest(form: Form, first: int) -> int:
     """Return a finer time if the chosen one, in whole seconds, does not tell the rows apart."""
     named = [k for k in range(min(form.width, len(form.names)))
              if re.search('time|zeit', form.names[k].lower()) and not re.search(
-                 'step|lap|interval', form.names[k].lower()) and _of_kind(form, k, True)]
+                 'step|lap|interval', form.names[k].lower()) and _holds_numbers(form, k, True)]
     return first if _tells_apart(form, first) else next(
         (k for k in named if _tells_apart(form, k) and _rises(form, k)), first)
 
@@ -410,17 +410,17 @@ def _nameless_columns(form: Form) -> list[int]:
     """Return the columns without a telling name whose first cells are numbers."""
     filled = [k for k in range(form.width) if form.rows and all(
         k < len(row) and is_value(row[k]) for row in form.rows)]
-    # With names, only beside a time and nothing else: otherwise it may be of several series.
+    # In a file with names, only a single column beside the time; others may hold several series.
     return filled if not form.line else [k for k in filled[1:] if form.width == 2 and re.fullmatch(
         _VALUE_NAME, re.split('[./]', form.names[k].lower())[-1])]
 
 
-def _like_voltage(form: Form, places: list[int]) -> list[int]:
+def _steadiest(form: Form, places: list[int]) -> list[int]:
     """
-    Return the only column, or the first of several if it varies least for its size.
+    Return the only column, or the first of several if its relative variation is the smallest.
 
-    A load changes a supply's voltage by a few percent, and its current by far more; columns
-    that are constant, or below 1 somewhere, are not compared.
+    A load changes a supply's voltage by a few percent, and its current by far more.  Columns that
+    are constant, or anywhere below 1, are not compared.
     """
     if len(places) < 2 or form.line or len(form.rows) < _FEW_ROWS:
         return places if len(places) == 1 else []
@@ -476,7 +476,7 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: _Column, needed
             # Another option may have taken it; that is refused below.
             places = [k for k in _choose(form, quantity) if k in given]
         if not places and quantity == logs.VOLTAGE:
-            places = _like_voltage(form, [k for k in _nameless_columns(form) if k not in taken])
+            places = _steadiest(form, [k for k in _nameless_columns(form) if k not in taken])
         if places:
             found[quantity] = _unit_column(form, places[0], unit)
             taken.append(places[0])
@@ -501,9 +501,9 @@ def _series_of(path: Path, form: Form, wanted: CsvColumns, time: _Column,
             named if wanted.voltage is None else wanted.voltage in form.names):
         return None
     places = [k for k in range(min(form.width, len(form.names))) if k not in time.place]
-    value = [k for k in places if _of_kind(form, k, False) and re.fullmatch(
+    value = [k for k in places if _holds_numbers(form, k, False) and re.fullmatch(
         rf'(?=.)(?:{_VALUE_NAME}|state)', form.names[k].lower())] or named
-    for place in (k for k in places if value and not _of_kind(form, k, True)):
+    for place in (k for k in places if value and not _holds_numbers(form, k, True)):
         labels: list[str] = []
         numbers(path, form, [], {place: labels}, [])
         names = tuple(sorted({*labels} - {''}))
@@ -549,8 +549,8 @@ def _check_one_series(path: Path, form: Form, t: FloatArray, column: str, values
     """
     Raise InputError if a column of text names several series that share a column of values.
 
-    The stamps rise within each series.  Overall they overlap; or the column has no telling name,
-    and the series alternate.
+    Signs of several series: stamps rise within each, and either overlap between them, or the
+    series alternate in a column without a telling name.
     """
     known = np.isfinite(t) & np.isfinite(values)
     stamps = t[known]
@@ -576,7 +576,7 @@ def _check_one_series(path: Path, form: Form, t: FloatArray, column: str, values
 
 
 def _cells(path: Path, form: Form, place: int, size: int) -> list[str]:
-    """Return the cells of a column as written; none if bad lines make them fewer or more."""
+    """Return the cells of a column as written; none if bad lines change their number."""
     cells: list[str] = []
     numbers(path, form, [], {place: cells}, [])
     return cells if len(cells) == size else []
@@ -620,7 +620,7 @@ def _stamps(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: _Co
 
 def _spread(t: FloatArray, volts: FloatArray) -> FloatArray:
     """
-    Return stamps that steady numbers of rows share, spread evenly; others as they are.
+    Spread rows with equal stamps evenly, if their number per stamp is steady.
 
     The first row of a stamp is at the stamp, unless rows are missing before it.
     """
@@ -633,7 +633,8 @@ def _spread(t: FloatArray, volts: FloatArray) -> FloatArray:
     if rows.size < 2 or _LEAST_SHARED * begin.size > known.size or (step < 0.0).any():
         return t
     usual, first = float(np.median(rows)), change[begin[1:] - 1]
-    # Repeated rows change between stamps only, and series in turn change there in one direction.
+    # Not if the voltage changes only between stamps (repeated rows), or always in one direction
+    # there (several series in turn).
     if np.mean(np.abs(rows - usual) > max(1.0, _UNSTEADY * usual)) > WILD or np.count_nonzero(
             first) > (1.0 - WILD) * np.count_nonzero(change) or abs(
                 np.mean(first) - np.mean(change)) > _ROUNDING + np.std(first) * max(
@@ -643,7 +644,7 @@ def _spread(t: FloatArray, volts: FloatArray) -> FloatArray:
     pauses = np.flatnonzero(step > 1.5 * np.median(step)) + 1
     for part in np.split(begin, pauses):
         end = begin[begin > part[-1]].min(initial=known.size)
-        # The numbers of the first and the last stamp may be in part.
+        # The first and the last stamp may lack rows.
         x = np.unique(np.append(part[1::_EVEN], part[-1]))
         rate = np.ptp(stamps[x]) / np.ptp(x) if x.size > 1 else np.median(step) / usual
         here = row[part[0]:end]
@@ -658,8 +659,8 @@ def _in_si(quantity: str, column: _Column, values: FloatArray, given: str | None
     """
     Return values in V, 0..1 or A, and their unit in words.
 
-    beside: the words of the voltage's unit; a current of whole numbers beside a guess of mV is in
-    mA.
+    beside: the words of the voltage's unit.  If that is a guess of mV, a whole-number current is
+    in mA.
     """
     known = np.abs(values[np.isfinite(values)])
     if quantity == logs.THROTTLE:
@@ -677,7 +678,8 @@ def _in_si(quantity: str, column: _Column, values: FloatArray, given: str | None
         low, high = THROTTLE_UNITS.get(unit) or map(float, unit.split(':'))
         return (values - low) / (high - low), (
             '0..1' if unit == '1' else unit) + words
-    # A tool that has converted the numbers keeps the names: no supply is below 1 V.
+    # Use the maker's factor, unless the numbers have been converted already (names are then kept):
+    # no supply is below 1 V.
     if column.scale and 'V' not in (given, beside) and (
             math.isnan(column.unknown) or (known == np.rint(known)).all()) and (
             quantity == logs.CURRENT or known.size and np.median(known) * column.scale >= 1.0):
@@ -731,7 +733,7 @@ def _read_note(form: Form, time: _Column, found: dict[str, _Column], units: dict
     parts = [f"time from '{time.name}' ({units[_TIME_NAME]})"]
     parts += [f"{quantity} from '{column.name}' ({units[quantity]})"
               for quantity, column in found.items()]
-    places = _choose(form, logs.VOLTAGE, time.place)[1:3] if form.line else _like_voltage(
+    places = _choose(form, logs.VOLTAGE, time.place)[1:3] if form.line else _steadiest(
         form, [k for k in _nameless_columns(form) if k not in time.place])[:3]
     others = [form.names[k] for k in places
               if form.names[k] not in {column.name for column in found.values()}]
