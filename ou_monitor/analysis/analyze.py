@@ -30,7 +30,7 @@ from ou_monitor.analysis.quality import (
 from ou_monitor.analysis.relaxation import (
     find_steps, fit_relaxation, judge_cause, Relaxation, ReleaseCause)
 from ou_monitor.analysis.supply import (
-    alarms, Dips, fed, flown_near, node_for, remainder, THROTTLES)
+    alarms, Dips, fed, flown_near, node_for, remainder, THROTTLES, without_wild)
 from ou_monitor.criticism.innovations import FAMILY_WISE
 from ou_monitor.criticism.readings import two_levels
 from ou_monitor.model.sinusoid import FALSE_ALARM
@@ -78,8 +78,9 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
     all_of_it = readings_of(recording)
     recording = supplied(all_of_it)
     voltage = _default_voltage(recording) if brownout_voltage is None else brownout_voltage
+    raw = remainder(recording)
+    recording, left = without_wild(recording, raw)
     found = find_levels(recording.t, recording.throttle, levels)
-    left = remainder(recording)
     results = []
     whole = cache(lambda: fit_all(recording, left, found)) if len(found) > 1 else None
     for k, level in enumerate(found):
@@ -88,7 +89,7 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
     sliding = slide(recording, window, voltage, brownout_horizon,
                     lambda share: report(0.5 + 0.5 * share))
     seen = overview(all_of_it, None if math.isnan(voltage) else voltage, results, cells,
-                    left, sliding.monitor)
+                    raw, sliding.monitor)
     judged = judge_levels(results, seen.load)
     throttles = [level.throttle for level in judged]
     estimates = [level.estimate for level in judged]

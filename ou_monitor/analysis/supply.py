@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.adc import find_step
+from ou_monitor.criticism.readings import bad_notes, find_bad
 from ou_monitor.model.ou_fit import FEWEST, known_ou, regress
 from ou_monitor.online.estimator.estimator import SLIDING
 from ou_monitor.online.load.load_filter import LoadFilter
@@ -30,7 +31,7 @@ from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.online.risk.forecast import LOOK
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import FloatArray, NAN, OuFacts, plain_data, Recording
-from ou_monitor.timeline import ordered, readings_of, supplied
+from ou_monitor.timeline import ordered, part_of, readings_of, supplied
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 # Throttles at which sag and noise are given.
@@ -49,6 +50,8 @@ _SLICE = 100_000
 _LATE = 0.06
 # Maximum range of a steady throttle, and the time over which it is taken, s.
 _STEADY, _STEADY_TIME = 0.02, 0.2
+# Maximum share of single readings that are wild; more are noise.
+_WILD = 0.01
 # Half width of the band of throttle about each of THROTTLES; minimum readings in it.
 BAND, _IN_BAND = 0.05, 10
 # Usual alarms of pilots, V per cell, about Betaflight's vbat_warning_cell_voltage of 3.5.
@@ -198,8 +201,8 @@ def facts_and_end(recording: Recording, limit: float | None = None, left: Remain
                   monitor: SupplyMonitor | None = None,
                   ) -> tuple[SupplyFacts, SupplyLoad, MonitorReport | None]:
     """Return the facts, and the node's load and, with a limit, V, its report at the end."""
-    # left: `remainder` of the recording; monitor: of `node_for`, fed with it; both without the
-    # times off (`supplied`), and computed if omitted.
+    # left: `remainder` of the recording, wild readings included; monitor: of `node_for`, fed with
+    # it; both without the times off (`supplied`), and computed if omitted.
     if limit is not None and not math.isfinite(limit):
         raise ValueError(f'the limit must be finite, got {limit} V')
     if left is None and recording.n > 1:
@@ -214,6 +217,7 @@ def facts_and_end(recording: Recording, limit: float | None = None, left: Remain
             OuFacts('no_data'), None), SupplyLoad(), None
     began = float(recording.t[0])
     there, outer = supplied(recording), supplied(recording, at_ends=True)
+    there, left = without_wild(there, left or remainder(there))
     t, v, u = outer.t, outer.voltage, outer.throttle
     k = int(np.argmin(v))
     noise = noise_of(there, left)
@@ -348,6 +352,20 @@ def remainder(recording: Recording) -> Remainder:
             above = max(above, 0.5 / part.slowest)
     return Remainder(left, size, float(np.median(steps)) if steps else NAN,
                      float(np.median(walks)) if walks else NAN, above)
+
+
+def without_wild(recording: Recording, left: Remainder) -> tuple[Recording, Remainder]:
+    """Return a recording without single readings far from level and load, and its remainder."""
+    known = np.flatnonzero(np.isfinite(left.voltage))
+    wild = known[find_bad(left.voltage[known], int(_WILD * known.size))]
+    if not wild.size:
+        return recording, left
+    bad = np.zeros(recording.n, dtype=np.bool_)
+    bad[wild] = True
+    recording = part_of(recording, ~bad, *(
+        note.replace('left out', 'left out, except from lowest voltage and dips')
+        for note in bad_notes(recording.t, recording.voltage, bad)))
+    return recording, remainder(recording)
 
 
 def noise_of(recording: Recording, left: Remainder | None = None) -> Noise:

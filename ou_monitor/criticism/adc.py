@@ -16,7 +16,6 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.model.terms.shocks import outlying
 from ou_monitor.records import FloatArray
 from ou_monitor.timeline import reading_places, reading_times
 from scipy.special import ndtr, ndtri
@@ -232,9 +231,7 @@ def redraw(voltage: FloatArray, low: float, high: float, step: float,
 def find_knee(voltage: FloatArray, noise: float, side: float,
               throttle: FloatArray | None = None) -> float | None:
     """Return the voltage beyond which readings are compressed; None if there is none (V)."""
-    # Outliers widen a normal distribution, so they would hide or imitate a compression.
-    kept = ~outlying(voltage)
-    x, throttle = side * voltage[kept], None if throttle is None else throttle[kept]
+    x = side * voltage
     plain = _likelihood(x)
     best, found, undone, squeezed = plain + _FOUND, None, x, 0.0
     for share in _SHARES:

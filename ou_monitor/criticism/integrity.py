@@ -20,6 +20,7 @@ from ou_monitor.criticism.samples import (
     choose_samples, events_between, lines_between, Samples, without_tones)
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.reading import ClockJitter, HeldSamples, Quantization, Saturation
+from ou_monitor.model.terms.shocks import outlying
 from ou_monitor.model.terms.term import Term
 from ou_monitor.records import FloatArray, NAN, Recording
 from ou_monitor.text import counted, percent
@@ -95,12 +96,14 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     exact += lines
     report(0.6)
     drawn = None
-    noise = _innovation_std(v)
+    # Outliers widen a normal distribution, so they would hide or imitate a compression.
+    kept = ~outlying(v)
+    noise = _innovation_std(v[kept])
     step = find_step(v)
     low, high = find_rails(v, step or usual_change(v), noise, u)
     soft = 'readings compressed near the end of the range'
     if not math.isfinite(low) and not math.isfinite(high):
-        low, high = _knees(v, noise, u)
+        low, high = _knees(v[kept], noise, None if u is None else u[kept])
     else:
         soft = 'samples at the end of the range'
     if math.isfinite(low) or math.isfinite(high):
@@ -109,7 +112,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
         notes.append(f'{int(drawn.sum())} {soft} were replaced by random draws beyond the '
                      'range, from an OU through their neighbours.')
         v = redraw(v, low, high, step, np.random.default_rng(0))
-    cell = _judge_step(step, _innovation_std(v), exact, notes)
+    cell = _judge_step(step, _innovation_std(v[kept]), exact, notes)
     stamps = judge_stamps(t, v)
     notes += stamps.notes
     if stamps.error > 0.0:

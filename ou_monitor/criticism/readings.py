@@ -58,7 +58,7 @@ def usable(recording: Recording, notes: list[str]
     t, v, u = t[which], v[which], None if u is None else u[which]
     bad = find_bad(v)
     if bad.any():
-        notes += _bad_notes(t, v, bad)
+        notes += bad_notes(t, v, bad)
         t, v, u = t[~bad], v[~bad], None if u is None else u[~bad]
     usual = _quantiles(v[:_EXAMINED], 0.5)[0] if v.size else 0.0
     if _MILLIVOLTS < abs(usual) <= _LARGEST:
@@ -126,8 +126,8 @@ def _gain(t: FloatArray, v: FloatArray, load: FloatArray) -> float:
     return -0.5 * change.size * math.log(max(left, 1e-9))
 
 
-def find_bad(v: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return which samples are error codes or glitches (v in V)."""
+def find_bad(v: FloatArray, singles: int = _SINGLES) -> npt.NDArray[np.bool_]:
+    """Return which samples are error codes or glitches (v in V; singles: their maximum number)."""
     bad = np.zeros(v.size, dtype=np.bool_)
     some = v[::max(1, v.size // _EXAMINED)]
     if some.size < 2:
@@ -135,7 +135,7 @@ def find_bad(v: FloatArray) -> npt.NDArray[np.bool_]:
     off = _off_value(some)
     if off is not None:
         bad[v == off] = True
-        bad[~bad] = find_bad(v[~bad])
+        bad[~bad] = find_bad(v[~bad], singles)
         return bad
     low, middle, high = _quantiles(some, 0.2, 0.5, 0.8)
     if low == high:
@@ -159,7 +159,7 @@ def find_bad(v: FloatArray) -> npt.NDArray[np.bool_]:
     single = far[~code]
     if int(code.sum()) <= _MOST_CODES * v.size:
         bad[far[code]] = True
-    if single.size <= max(_SINGLES, v.size // _EACH):
+    if single.size <= max(singles, v.size // _EACH):
         bad[single] = True
     return bad
 
@@ -185,7 +185,8 @@ def _quantiles(v: FloatArray, *shares: float) -> list[float]:
     return found
 
 
-def _bad_notes(t: FloatArray, v: FloatArray, bad: npt.NDArray[np.bool_]) -> list[str]:
+def bad_notes(t: FloatArray, v: FloatArray, bad: npt.NDArray[np.bool_]) -> list[str]:
+    """Return notes of bad samples (t in s, v in V)."""
     rest = f'while all others lie within {_range(v[~bad])} V'
     values, count = np.unique(v[bad], return_counts=True)
     notes = [f'{many} samples read exactly {_short(value)} V, {rest}: taken as an error code, or '

@@ -39,6 +39,17 @@ def test_a_plain_rail_has_nothing(seed, rounded):
     assert found.raw is None
 
 
+@pytest.mark.parametrize('load', [0.0, 0.4])
+@pytest.mark.parametrize('count', [30, 200])
+def test_outliers_are_no_limit_of_the_adc(load, count):
+    """2 V below; as a compression of the rest they would gain hundreds of nats."""
+    t, v = rail(4, u0=12.0)
+    u = np.where(t % 4.0 < 3.0, 0.2, 0.7)
+    v = v - load * u
+    v[np.random.default_rng(1).choice(t.size, count, replace=False)] -= 2.0
+    assert names(examined(t, v, u)) == []
+
+
 @pytest.mark.parametrize('factor', [2.0, 4.0, 5.743])
 def test_repeats_are_dropped(factor):
     """The source's own rate and stamps come back, whole ratio or not."""
