@@ -168,9 +168,6 @@ def estimate_coupling(
                     * found.segments / count)
         lag_se = 1.0 / math.sqrt(known_by) if known_by > 0.0 else NAN
     leads = bool(seen and lag < -3.0 * lag_se and lag < -0.25 / grid.rate)
-    if found.narrow:
-        notes.append('Only a few frequencies are coherent: this is a common line, such as motor '
-                     'rotation, rather than coupling.')
     return Coupling(
         seen, found.p_value, gain, interval, lag, lag_se, found.limit(level, POWER),
         found.narrow, leads, share, frequency, found.squared, response, found.threshold, level,

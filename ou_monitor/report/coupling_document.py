@@ -43,6 +43,9 @@ def _answer(found: Coupling, name: str, per: str) -> str:
     if found.signal_leads:
         return (f'{name} leads the voltage by {number(-1e3 * found.lag)} ms from {band}: it '
                 'drives the load, so what they share is not supply noise.')
+    if found.narrow:
+        return (f'{name} and the voltage share only a few frequencies from {band}: a common line, '
+                'such as motor rotation, not supply noise.')
     if found.seen:
         return (f'{number(100.0 * found.noise_share, 2)} % of {name} from {band} is supply '
                 f'noise: {number(found.gain)} {per}.')
@@ -62,7 +65,8 @@ def _facts(found: Coupling, per: str) -> list[tuple[str, str]]:
     else:
         lines = [('Detectable', f'a gain of {number(found.limit, 4)} {per}, in '
                   f'{100.0 * POWER:.0f} % of such recordings')]
-    advice = f'coupling: {number(abs(found.gain))}' if found.seen and not found.signal_leads else (
+    of_supply = found.seen and not (found.signal_leads or found.narrow)
+    advice = f'coupling: {number(abs(found.gain))}' if of_supply else (
         'adapting the cutoff to sigma does not help this signal')
     return [*lines, ('For the filter', advice),
             ('Chance', f'{p_words(found.p_value)}; detected if below {chance(found.level)}'),
