@@ -106,7 +106,9 @@ class LoadBlocks:
     def _block(self, sums: FloatArray) -> LoadBlock:
         n, t, off, square, throttle, current, known, last = sums.tolist()
         within = max(0.0, square - off * off / n) / (n - 1.0) if n > 1.0 else NAN
-        return LoadBlock(t / n, last, self._zero + off / n, throttle / n,
+        # Without its rounding, which depends on the parts in which samples arrive, and which
+        # sqrt|du| of the noise would raise from 1e-17 to 1e-8.
+        return LoadBlock(t / n, last, self._zero + off / n, round(throttle / n, 12),
                          current / known if known else NAN, int(n), within)
 
 

@@ -182,7 +182,7 @@ class FlightHistory:
 
     def _clear(self) -> None:
         self.table: FloatArray = np.empty((4, 0))
-        self._start = self._end = NAN
+        self._start = NAN
         self._tail: FloatArray = np.empty(0)
         # Samples of the last block.
         self._last = 0
@@ -211,7 +211,8 @@ class FlightHistory:
         begin = np.flatnonzero(np.diff(at, prepend=-1))
         count = np.diff(begin, append=at.size)
         rows = np.stack([np.minimum.reduceat(medians, begin), medians[begin + count - 1],
-                         np.add.reduceat(throttle, begin) / count,
+                         # Rounded, because `activity` takes the root of differences.
+                         np.round(np.add.reduceat(throttle, begin) / count, 12),
                          np.maximum.reduceat(throttle, begin)])
         self._place(at[begin], rows, count)
 
