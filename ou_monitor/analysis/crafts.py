@@ -38,24 +38,24 @@ _FULL = 0.5
 # Maximum cells of the known classes; the largest known quads have 6.
 _MOST_CELLS = 8
 MICRO, QUAD, ROBOT = '1S micro', 'quad, 2S and more', 'robot on 12 V'
-# Class -> craft -> cells, sag and noise at half throttle, V, and instantaneous resistance, Ohm, of
+# Class -> craft -> cells, sag and noise at half throttle, V, and resistance, Ohm, of
 # the pack; by `supply_facts` in November 2026.
 KNOWN: dict[str, dict[str, tuple[float, float, float, float]]] = {
     # Crazyflie in close flight and taking off (aerorobotics/neural-swarm).
-    MICRO: {'cf_solo': (1, 0.095, 0.0034, NAN), 'cf_takeoff': (1, 0.128, 0.0038, NAN)},
+    MICRO: {'cf_solo': (1, 0.095, 0.0034, NAN), 'cf_takeoff': (1, 0.134, 0.0038, NAN)},
     # Betaflight: fc-blackbox (gecko), gimbal-ghost (roma), gyroflow issue 72 (ar8), and public
     # logs of a nazgul, a 3S and an older 4S, whose current is absent or wrongly scaled;
     # ArduCopter: Erle-Copter in AltHold, and one of version 3.1.3 with current, read at 1 Hz.
-    QUAD: {'gecko': (4, 0.615, 0.080, NAN), 'nazgul': (4, 0.479, 0.565, NAN),
-           '3s_erpm2': (3, 0.280, 0.217, NAN), 'ar8': (6, 1.511, 0.051, 0.0248),
-           'hiro': (4, 0.504, 0.767, NAN), 'roma': (6, 0.968, 0.538, 0.0302),
-           'erle': (3, 0.625, 0.109, NAN), 'jd': (4, 0.394, NAN, 0.0168)},
+    QUAD: {'gecko': (4, 0.750, 0.079, NAN), 'nazgul': (4, 0.554, 0.565, NAN),
+           '3s_erpm2': (3, 0.289, 0.214, NAN), 'ar8': (6, 1.889, 0.050, NAN),
+           'hiro': (4, 0.521, 0.767, NAN), 'roma': (6, 1.178, 0.537, 0.0351),
+           'erle': (3, 0.665, 0.109, NAN), 'jd': (4, 0.398, NAN, 0.0175)},
     # DTU REGBOT (zachasme/regbot), where sag and resistance are known; an FRC robot of 2022 with a
     # lead-acid battery (orangelight/DSLOG-Reader), which counts as 3 cells.
-    ROBOT: {'regbot_10': (3, 0.049, 0.0058, NAN), 'regbot_19': (3, 0.066, 0.0113, NAN),
-            'regbot_28': (3, 0.103, 0.0108, NAN), 'regbot_30': (3, 0.067, 0.0079, 0.160),
-            'regbot_62': (3, 0.128, 0.0169, 0.449), 'regbot_81': (3, NAN, 0.0117, NAN),
-            'frc_ol_1': (3, NAN, NAN, 0.0249)}}
+    ROBOT: {'regbot_10': (3, 0.043, 0.0058, NAN), 'regbot_19': (3, 0.063, 0.0113, NAN),
+            'regbot_28': (3, 0.083, 0.0108, 0.174), 'regbot_30': (3, 0.058, 0.0079, NAN),
+            'regbot_62': (3, 0.111, 0.0169, 0.415), 'regbot_81': (3, NAN, 0.0117, NAN),
+            'frc_ol_1': (3, NAN, NAN, 0.0275)}}
 # Cells of the class of robots, and formats that do not say what recorded them.
 _ROBOT_CELLS, _ANY_VEHICLE = 3, ('csv', 'mcap', '')
 _UNITS = {'sag': 'mV per cell at 50 % throttle', 'noise': 'mV rms per cell at 50 % throttle',

@@ -83,7 +83,7 @@ class Dips:
 
 @dataclass(frozen=True)
 class Sag:
-    """Sag over throttle at the end of the recording, positive."""
+    """Sag after a second at each throttle, at the end of the recording, positive."""
 
     known: bool  # whether it is known over the throttles flown
     flown: tuple[float, float]  # 1 % and 99 % quantile of throttle
@@ -104,7 +104,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class Resistance:
-    """Instantaneous resistance."""
+    """Resistance after a second at constant current."""
 
     ohm: float  # Ohm; NaN without a current that moves the voltage
     se_ohm: float  # Ohm
@@ -136,7 +136,7 @@ class SupplyFacts:
     noise : Noise
         Noise over throttle.
     resistance : Resistance
-        Instantaneous resistance, from the measured current.
+        Resistance, from the measured current.
     ou : OuFacts
         Relaxation, or bounds of it.
     budget : Budget or None

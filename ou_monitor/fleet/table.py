@@ -90,7 +90,7 @@ COLUMNS = (
            "vehicle's flights that fits this flight's voltage"),
     Column('cells_from', 'text', '', 'origin of the cells: given, log, guessed (by the voltage), '
            'unknown'),
-    Column('resistance', 'number', 'Ohm', 'instantaneous resistance of the whole pack, as in '
+    Column('resistance', 'number', 'Ohm', 'resistance of the whole pack after a second, as in '
            'analyze; null without a current that moves the voltage'),
     Column('resistance_se', 'number', 'Ohm', 'standard error of resistance'),
     Column('supply', 'json', '', 'the supply facts that all commands share, as JSON'),

@@ -152,8 +152,16 @@ class LoadModel:
         return np.asarray(rest - self.size * CELL * self.cells * response, dtype=np.float64)
 
 
-# Coefficients of x, u, u^3, x after three lags, and inrush, with x = u^1.8 (load/load_filter.py).
-SIZE = 7
+# Lags of the response in flight, s, a factor of 6 to 8 apart, so that sums of them follow any lag
+# from 0 to 10 s: motors (0.06), sensors and converters, polarisation (rounded medians of
+# `load_fit`: 2 and 15).
+LAGS = (0.06, 0.35, 2.0, 15.0)
+# Lags after which the response may also be linear in throttle, s.
+LINEAR_LAGS = (0.35, 2.0)
+# Coefficients of x, u, u^3, x after LAGS, u after LINEAR_LAGS, and inrush, with x = u^1.8.
+SIZE = 4 + len(LAGS) + len(LINEAR_LAGS)
+# Places of the coefficients in model files of 0.3.0, without x after 0.35 s and u after a lag.
+_FORMER = (0, 1, 2, 3, 5, 6, SIZE - 1)
 # A model file may omit the last entries.
 _OPTIONAL = 9
 _COLUMNS = ('coefficients', 'covariance', 'log_variance', 'flown')
@@ -165,7 +173,8 @@ class LoadStart:
 
     cells: float  # Cells in series.
     volts: float  # Open-circuit voltage when it was learned, V.
-    # Voltage drop at full throttle due to x, u, u^3, x after 0.06, 2 and 15 s, and inrush, V.
+    # Voltage drop at full throttle, V, due to x, u, u^3, x after LAGS, u after LINEAR_LAGS, and
+    # inrush.
     coefficients: tuple[float, ...]
     covariance: tuple[tuple[float, ...], ...]  # Of the coefficients, V^2.
     discharge: float  # Charge drawn per time at full load, 1/s.
@@ -225,9 +234,27 @@ class LoadStart:
         if missing:
             raise ValueError(f"the load lacks '{missing[0]}'")
         try:
-            return cls(**{name: _numbers(value) for name, value in values.items()})
+            return cls(**_present({name: _numbers(value) for name, value in values.items()}))
         except TypeError as error:
             raise ValueError(f'the load must hold numbers and lists of them: {error}') from error
+
+
+def _present(values: dict[str, Any]) -> dict[str, Any]:
+    """Add the coefficients that a file of 0.3.0 lacks: zero, with the usual deviation."""
+    try:
+        a, P = np.array(values['coefficients']), np.array(values['covariance'])
+    except ValueError:
+        return values
+    n = len(_FORMER)
+    if a.shape != (n,) or P.shape != (n, n):
+        return values
+    place = np.array(_FORMER)
+    full = np.diag(usual_coefficients()[1].diagonal()) * values['volts'] ** 2
+    full[np.ix_(place, place)] = P
+    mean = np.zeros(SIZE)
+    mean[place] = a
+    return values | {'coefficients': tuple(mean.tolist()),
+                     'covariance': tuple(tuple(row) for row in full.tolist())}
 
 
 def _numbers(value: Any) -> Any:
@@ -242,18 +269,24 @@ def _numbers(value: Any) -> Any:
 def usual_coefficients() -> tuple[FloatArray, FloatArray, float]:
     """Return mean and covariance of the coefficients, and mean sag, per volt: the prior."""
     # The coefficients are S b with a log-normal S, median 0.12.  In b, the share that lags by 60
-    # ms is beta(0.5, 1), the coefficients of u and u^3 are normal(0, 0.2), and the others
-    # log-normal. The first, of x, is 1 minus that share minus 0.7 times the sum of the two normal
-    # ones.
+    # ms is beta(0.5, 1), the share that lags by 0.35 s normal(0.05, 0.1), the coefficients of u
+    # and u^3 are normal(0, 0.2), of u after a lag normal(0, 0.1), and the others log-normal.  The
+    # first, of x, is 1 minus those shares minus 0.7 times the coefficients of u and u^3; x after a
+    # lag has -0.7 times the coefficient of u after that lag.  Half and twice the deviations for
+    # 0.35 s and for u after a lag predict twelve recorded flights as well.
     def lognormal(median: float, deviation: float) -> tuple[float, float]:
         mean = median * math.exp(0.5 * deviation ** 2)
         return mean, mean ** 2 * math.expm1(deviation ** 2)
 
     size, size_var = lognormal(0.12, 0.6)
-    parts = [(0.0, 0.2 ** 2), (0.0, 0.2 ** 2), (1.0 / 3.0, 4.0 / 45.0),
-             lognormal(0.2, 0.5), lognormal(0.3, 0.5), lognormal(1.5, 1.0)]
+    parts = [(0.0, 0.2 ** 2), (0.0, 0.2 ** 2), (1.0 / 3.0, 4.0 / 45.0), (0.05, 0.1 ** 2),
+             lognormal(0.2, 0.5), lognormal(0.3, 0.5), *[(0.0, 0.1 ** 2)] * len(LINEAR_LAGS),
+             lognormal(1.5, 1.0)]
     means, variances = np.array(parts).T
-    mix = np.vstack([(-0.7, -0.7, -1.0, 0.0, 0.0, 0.0), np.eye(6)])
+    mix = np.eye(SIZE)[:, 1:]
+    mix[0, :4] = -0.7, -0.7, -1.0, -1.0
+    for k, tau in enumerate(LINEAR_LAGS):
+        mix[3 + LAGS.index(tau), 2 + len(LAGS) + k] = -0.7
     mean = mix @ means
     mean[0] += 1.0
     square = np.outer(mean, mean)

@@ -26,7 +26,7 @@ _PRIOR = {
     'size': (math.log(0.12), 0.7), 'power': (math.log(1.8), 0.1),
     'fast_share': (math.log(0.2), 0.3), 'fast_time': (math.log(1.0), 0.7),
     'slow_share': (math.log(0.3), 0.3), 'slow_time': (math.log(20.0), 0.3),
-    'inrush': (math.log(0.5), 1.0), 'lag': (math.log(0.01), 0.7),
+    'inrush': (math.log(0.5), 1.0), 'lag': (math.log(0.01), 1.2),
     'endurance': (math.log(450.0), 0.6), 'charge': (0.7, 0.3), 'before': (0.3, 0.4),
 }
 _NAMES = tuple(_PRIOR)

@@ -42,7 +42,7 @@ def test_a_gap_after_a_low_sample_is_not_time_below():
 @pytest.mark.parametrize('step', [0.02, 0.2])
 def test_a_current_that_throttle_does_not_tell_gives_the_fall(step):
     """Of its largest value that lasts three readings, not of one wild reading."""
-    rng, n = np.random.default_rng(1), 4000
+    rng, n = np.random.default_rng(2), 4000
     drawn = np.repeat(rng.uniform(0.0, 60.0, n // 10), 10)
     drawn[1000] = 500.0
     v = 12.0 - 0.02 * drawn + 0.005 * rng.standard_normal(n)

@@ -5,7 +5,7 @@ import numpy as np
 from ou_monitor import MonitorSettings, SupplyMonitor
 from ou_monitor.cli.main import main
 from ou_monitor.errors import InputError
-from ou_monitor.model.load import charge_at, LoadStart, open_circuit
+from ou_monitor.model.load import charge_at, LoadStart, open_circuit, SIZE
 from ou_monitor.model.supply import SEGMENT, SupplyModel
 from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
 from ou_monitor.model.terms.nonlinear_restoring import NonlinearRestoring
@@ -66,7 +66,7 @@ def test_an_impossible_simulation_is_refused(terms, words):
 
 
 FLIGHT = PRESETS['flight_full'].model
-LOAD = LoadStart(4.0, 15.6, (1.0,) * 7, tuple(map(tuple, np.eye(7).tolist())), 0.01,
+LOAD = LoadStart(4.0, 15.6, (1.0,) * SIZE, tuple(map(tuple, np.eye(SIZE).tolist())), 0.01,
                  (-8.0, 0.0, 0.0), (0.1, 0.9))
 PACK = SupplyModel((OU(5.0, 0.0, 15.6), Drift(-0.01, 0.0), LoadSag(2.0, 0.5),
                     LoadTransient(-1.0, 0.1, 0.0)), LOAD)

@@ -22,16 +22,16 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.load import (
-    CELL, cells_in_series, INRUSH_TIME, LEVELS, LoadStart, ripple, SLOPES, usual_coefficients)
+    CELL, cells_in_series, INRUSH_TIME, LAGS, LEVELS, LINEAR_LAGS, LoadStart, ripple, SLOPES,
+    usual_coefficients)
 from ou_monitor.online.load.blocks import (
     CLIP, DIVERGED, LoadBlock, LoadBlocks, LoadDelay, LoadNoise, log_density)
 from ou_monitor.online.load.model_watch import (
     compare, LoadContrasts, ModelComparison, OTHER_LEVEL, other_pack, SIZE_ERROR)
 from ou_monitor.online.load.supply_load import (
-    Basis, LAGS, LoadState, LoadStatus, POWER, rising, static, SupplyLoad, TABLE)
+    Basis, hold, LoadState, LoadStatus, POWER, reached, rising, static, SupplyLoad, TABLE)
 from ou_monitor.records import FloatArray, NAN
 from ou_monitor.timeline import MOST_CURRENT, MOST_THROTTLE, plausible
-
 
 # Current from which the filter starts, A; factor by which the largest current must rise to restart
 # it.
@@ -39,8 +39,8 @@ _LEAST, _MORE = 1e-2, 4.0
 # Prior deviation of the voltage drop at the largest current, relative to the voltage; shares of
 # the drop that appear at once and after each of LAGS, and their deviations.
 _FALL = 0.3
-_SHARES = np.array([1.0, 0.1, 0.2, 0.3])
-_SHARE_STD = (0.3, 0.3, 0.1, 0.15)
+_SHARES = np.array([1.0, 0.1, 0.05, 0.2, 0.3])
+_SHARE_STD = (0.3, 0.3, 0.1, 0.1, 0.15)
 _PRIOR = _FALL ** 2 * (np.outer(_SHARES, _SHARES) + np.diag(np.square(_SHARE_STD)))
 _DRAWN_STATES = 2 + _SHARES.size
 # Random walk of the level, V per sqrt(s) and cell: twice that of the filter for throttle, because
@@ -70,7 +70,8 @@ class CurrentFilter:
 
     def __init__(self) -> None:
         self._t = self._known_at = self._unit = NAN
-        self._largest = self._peak = self._before = 0.0
+        # Seen: time for which current has been known, s.
+        self._largest = self._peak = self._before = self._seen = 0.0
         # Current at once and after each of LAGS, A.
         self._drawn: list[float] = []
         self.lost = False
@@ -96,6 +97,7 @@ class CurrentFilter:
         P[1, 1] = 1.0 / _EMPTY ** 2
         P[2:, 2:] = _PRIOR * self._volts ** 2
         self._m, self._P = m, P
+        self._seen = 0.0
         self._settle(voltage)
 
     def _settle(self, v: float) -> None:
@@ -172,6 +174,7 @@ class CurrentFilter:
     def _follow(self, block: LoadBlock, dt: float, cells: float) -> None:
         m, P = self._m, self._P
         x = self._drawn[0] / self._unit
+        self._seen += dt
         used = x * dt * cells * float(np.interp(m[0] / cells, LEVELS, SLOPES))
         m[0] -= used * m[1]
         P[0] -= P[1] * used
@@ -202,16 +205,21 @@ class CurrentFilter:
 
     @property
     def resistance(self) -> tuple[float, float]:
-        """Return the resistance within 0.1 s, Ohm, and its standard error; NaN: unknown."""
+        """Return the resistance after `hold`, Ohm, and its standard error; NaN: unknown."""
         if math.isnan(self._unit):
             return NAN, NAN
-        value = abs(float(self._m[2] + self._m[3]))
-        error = math.sqrt(float(self._P[2:4, 2:4].sum()) * max(1.0, self.noise.scale))
+        h = self._reached()
+        value = abs(float(h @ self._m[2:]))
+        error = math.sqrt(float(h @ self._P[2:, 2:] @ h) * max(1.0, self.noise.scale))
         if 0.0 < error < _KNOWN * value:
             error = math.hypot(max(error, LEAST_ERROR * value), self._bypassed * value)
         if not 0.0 < error < _KNOWN * value:
             return NAN, NAN
         return value / self._unit, error / self._unit
+
+    def _reached(self) -> FloatArray:
+        """Return the shares of the coefficients that have responded after `hold`."""
+        return np.append(1.0, reached(hold(self._seen)))
 
     def sag(self, throttle: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the sag, V, from the current at full throttle, and its standard error."""
@@ -221,8 +229,8 @@ class CurrentFilter:
         a = inverse @ self._squares[:4, 4]
         left = max(0.0, float(self._squares[4, 4] - a @ self._squares[:4, 4]))
         left = left / max(float(A[0, 0]), _ONE)
-        H = static(throttle)[:, :3]
-        drawn = math.copysign(1.0, float(self._m[2] + self._m[3])) * (H @ a[1:])
+        H = np.stack([throttle ** POWER, throttle, throttle ** 3], axis=-1)
+        drawn = math.copysign(1.0, float(self._reached() @ self._m[2:])) * (H @ a[1:])
         variance = left * _ONE * np.einsum('ij,jk,ik->i', H, inverse[1:, 1:], H)
         return ohm * drawn, np.sqrt((ohm_se * drawn) ** 2 + ohm * ohm * variance)
 
@@ -332,8 +340,7 @@ class FastLevel:
 class LoadFilter:
     """Level, sag and noise of a supply, sample by sample."""
 
-    # States: level, V; discharge per load, 1/s; coefficients, V, of x, u, u^3, x after three
-    # lags, and inrush, with x = u^1.8.  White noise: see `LoadNoise`.
+    # States: level, V; discharge per load, 1/s; coefficients, V, as in `LoadStart`.
 
     def __init__(self) -> None:
         self._start: LoadStart | None = None
@@ -470,6 +477,8 @@ class LoadFilter:
         self._contrasts = LoadContrasts()
         # Noise with known throttle, and with unknown throttle, whose effect is then noise too.
         self._noise, self._other = LoadNoise(self._volts), LoadNoise(self._volts)
+        # Time for which throttle has been known, s.
+        self._seen = 0.0 if self._start is None else math.inf
         self._opening = True
         m, P = np.zeros(_STATES), np.zeros((_STATES, _STATES))
         m[2:], P[2:, 2:] = _MEAN * self._volts, _COV * self._volts ** 2
@@ -505,8 +514,8 @@ class LoadFilter:
         held = u if math.isfinite(u) else 0.0
         self._lagged = self._settled = held
         x = held ** POWER
-        # The state of the slow lag is unknown, between rest and a steady load.
-        self._lags = [x, x, 0.5 * x]
+        # The state of the slowest lag is unknown, between rest and a steady load.
+        self._lags = [x] * (len(LAGS) - 1) + [0.5 * x] + [held] * len(LINEAR_LAGS)
         m, P = self._m, self._P
         h = self._regressors()
         m[0] = self._rest = v - float(h[2:] @ m[2:])
@@ -536,7 +545,9 @@ class LoadFilter:
         self._settled = self._lagged + (self._settled - self._lagged) * math.exp(
             -dt / INRUSH_TIME)
         x = self._lagged ** POWER
-        self._lags = [x + (low - x) * math.exp(-dt / tau) for low, tau in zip(self._lags, LAGS)]
+        loads = (x,) * len(LAGS) + (self._lagged,) * len(LINEAR_LAGS)
+        self._lags = [load + (low - load) * math.exp(-dt / tau) for load, low, tau in zip(
+            loads, self._lags, LAGS + LINEAR_LAGS)]
         return float(x)
 
     def _fall(self, level: float) -> float:
@@ -552,6 +563,7 @@ class LoadFilter:
             self._t = pieces[-1][0]
             P[0, 0] += (_WALK * self._cells) ** 2 * dt
             return
+        self._seen += dt
         self._flown *= 1.0 - min(dt / _FLOWN_MEMORY, 1.0)
         for t, u in pieces:
             used += self._advance(t - self._t, u) * (t - self._t)
@@ -639,7 +651,7 @@ class LoadFilter:
         if not math.isfinite(self._t):
             return SupplyLoad()
         a, C = self._sag_law()
-        H = static(TABLE)
+        H = static(TABLE, hold(self._seen))
         raw = H @ a
         sag = np.maximum.accumulate(H @ rising(a, C, H))
         # The correction of a negative or decreasing sag counts as an error too.
@@ -680,7 +692,7 @@ class LoadFilter:
     def _sag_law(self) -> tuple[FloatArray, FloatArray]:
         """Return coefficients of the static sag, V, and their covariance."""
         scale = max(1.0, (self._noise if math.isfinite(self._throttle) else self._other).scale)
-        return (self._m[2:6] * self._factor, self._P[2:6, 2:6] * self._factor ** 2 * scale)
+        return (self._m[2:-1] * self._factor, self._P[2:-1, 2:-1] * self._factor ** 2 * scale)
 
     def _flown_range(self) -> tuple[float, float]:
         low, high = self._between(0.1)
@@ -689,7 +701,8 @@ class LoadFilter:
 
     def _by_throttle(self, low: float, high: float) -> tuple[LoadStatus, float]:
         """Return the status without a current, and the largest error of a known sag, V."""
-        (a, C), d, b = self._sag_law(), static(high) - static(low), self._noise.log_variance
+        (a, C), b, held = self._sag_law(), self._noise.log_variance, hold(self._seen)
+        d = static(high, held) - static(low, held)
         swing, swing_se = float(d @ a), math.sqrt(max(0.0, float(d @ C @ d)))
         most = _NOISE_SHARE * math.exp(0.5 * (b[0] + b[1] * ripple(0.5 * (low + high))))
         limit = max(_SAG_SHARE * swing, most)

@@ -13,12 +13,15 @@ import math
 
 import numpy as np
 import numpy.typing as npt
+from ou_monitor.model.load import LAGS, LINEAR_LAGS
 from ou_monitor.records import Estimate, FloatArray, NAN, Status
 
-# Time constants of the load, s: motors, and polarisation (rounded medians of `load_fit`).
-LAGS = (0.06, 2.0, 15.0)
 # Exponent of the load over throttle, and, less 1, over the level: the prior of `load_fit`.
 POWER = 1.8
+# Time at constant throttle after which the sag is read, s: motors and converters have settled, and
+# longer punch-outs are rare.  In less than ten such times it would be an extrapolation: a tenth of
+# the time for which the load has been known is then read.
+HOLD, _HOLDS = 1.0, 10.0
 # Throttles of the table of the sag.
 TABLE = np.linspace(0.0, 1.0, 101)
 # Sweeps in which the sag is made to rise; in 10 it is within 3 % of the limit on cf_pair.
@@ -31,11 +34,21 @@ _NO_ALPHA = {
     Status.TOO_SHORT: 'The window is too short for the relaxation{at}.'}
 
 
-def static(throttle: npt.ArrayLike) -> FloatArray:
-    """Return the regressors of a steady sag without polarisation, shape (n, 4)."""
-    u = np.asarray(throttle, dtype=np.float64)
+def reached(seconds: float, lags: tuple[float, ...] = LAGS) -> FloatArray:
+    """Return the shares of responses that lag, in that time after a step."""
+    return -np.expm1(-seconds / np.array(lags))
+
+
+def hold(known: float) -> float:
+    """Return the time after which the sag is read, s, of a load known for some seconds."""
+    return min(HOLD, known / _HOLDS)
+
+
+def static(throttle: npt.ArrayLike, held: float = HOLD) -> FloatArray:
+    """Return the regressors of the sag after that time, s, at a throttle, shape (n, SIZE - 1)."""
+    u = np.asarray(throttle, dtype=np.float64)[..., None]
     x = u ** POWER
-    return np.stack([x, u, u ** 3, x], axis=-1)
+    return np.concatenate([x, u, u ** 3, x * reached(held), u * reached(held, LINEAR_LAGS)], -1)
 
 
 def rising(a: FloatArray, covariance: FloatArray, table: FloatArray) -> FloatArray:
@@ -77,7 +90,7 @@ class SupplyLoad:
     level: float = NAN
     # Last voltage without the response to load (sag-compensated), V; the level is its mean.
     rest: float = NAN
-    # Instantaneous resistance, Ohm; NaN without a current that affects the voltage.
+    # Resistance after a second, Ohm; NaN without a current that affects the voltage.
     resistance: float = NAN
     resistance_se: float = NAN  # Its standard error, Ohm.
     time_constants: tuple[float, ...] = LAGS  # Time constants of the response, s; fixed.
@@ -97,7 +110,7 @@ class SupplyLoad:
         return self.status is LoadStatus.KNOWN
 
     def sag(self, throttle: npt.ArrayLike) -> FloatArray:
-        """Return the sag, V, at constant throttle, by the prior unless `known`; NaN: unknown."""
+        """Return the sag, V, after a second, by the prior unless `known`; NaN: unknown."""
         return self._read(throttle, self._sag)
 
     def sag_se(self, throttle: npt.ArrayLike) -> FloatArray:
@@ -148,11 +161,11 @@ class LoadState:
     # Stamp, s, and throttle now.
     t: float
     throttle: float
-    # Of level, V, discharge per load, and the coefficients, V, of x = u^1.8, u, u^3, x after each
-    # lag, and inrush (u: throttle); covariance: enlarged if innovations exceed their prediction.
+    # Of level, V, discharge per load, and the coefficients, V, of `LoadStart`; covariance: larger
+    # if innovations exceed their prediction.
     mean: FloatArray
     covariance: FloatArray
-    lags: tuple[float, ...]  # x after the three lags.
+    lags: tuple[float, ...]  # x = u^1.8 after LAGS, and throttle u after LINEAR_LAGS.
     size: float  # Load at the present level, relative to the load at 3.8 V per cell.
     fall: float  # Fall of the level, V per unit of charge.
     # Coefficients of ln variance, V^2, of a sample: 1, ripple, sqrt|du|.

@@ -35,9 +35,9 @@ import math
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 import numpy.typing as npt
-from ou_monitor.model.load import INRUSH_TIME, ripple
+from ou_monitor.model.load import INRUSH_TIME, LAGS, LINEAR_LAGS, ripple
 from ou_monitor.model.passage import normal_below
-from ou_monitor.online.load.supply_load import LAGS, LoadState, POWER
+from ou_monitor.online.load.supply_load import LoadState, POWER
 from ou_monitor.records import FloatArray, NAN
 
 # The first group after a rise, in time constants of the inrush.
@@ -114,21 +114,22 @@ def held(throttle: npt.ArrayLike, dwell: npt.ArrayLike, rest: float) -> Courses:
 
 
 def _groups(state: LoadState, u: FloatArray, tau: FloatArray, inrush: FloatArray) -> FloatArray:
-    """Return the regressors (k, j, 9) of groups in the order in which they are flown."""
+    """Return the regressors (k, j, states) of groups in the order in which they are flown."""
     x = u ** POWER
     g = -state.size
-    rows = np.empty(u.shape + (9,))
+    rows = np.empty(u.shape + (state.mean.size,))
     rows[..., 0] = 1.0
     rows[..., 1] = -state.fall * np.cumsum(x * tau, axis=1)
     rows[..., 2], rows[..., 3], rows[..., 4] = g * x, g * u, g * u ** 3
-    rows[..., 8] = g * inrush
-    time, now, lags = tau[..., None], np.array(state.lags), np.array(LAGS)
+    rows[..., -1] = g * inrush
+    time, now, lags = tau[..., None], np.array(state.lags), np.array(LAGS + LINEAR_LAGS)
+    loads = np.stack([x] * len(LAGS) + [u] * len(LINEAR_LAGS), axis=-1)
     decay = np.exp(-time / lags)
     share = (1.0 - decay) * lags / np.maximum(time, 1e-9)
     for j in range(u.shape[1]):
-        load = x[:, j, None]
+        load = loads[:, j]
         apart = now - load
-        rows[:, j, 5:8] = g * (load + apart * share[:, j])
+        rows[:, j, 5:-1] = g * (load + apart * share[:, j])
         now = load + apart * decay[:, j]
     return rows
 
@@ -137,7 +138,7 @@ def mean_now(state: LoadState) -> float:
     """Return the mean voltage, V, at the present throttle and lags, without inrush."""
     u = state.throttle
     answers = np.array([u ** POWER, u, u ** 3, *state.lags])
-    return float(state.mean[0] - state.size * (answers @ state.mean[2:8]))
+    return float(state.mean[0] - state.size * (answers @ state.mean[2:-1]))
 
 
 def lowest(state: LoadState, courses: Courses, horizon: float, sampling: Sampling
@@ -211,8 +212,7 @@ class FlightHistory:
         begin = np.flatnonzero(np.diff(at, prepend=-1))
         count = np.diff(begin, append=at.size)
         rows = np.stack([np.minimum.reduceat(medians, begin), medians[begin + count - 1],
-                         # Rounded, because `activity` takes the root of differences.
-                         np.round(np.add.reduceat(throttle, begin) / count, 12),
+                         np.add.reduceat(throttle, begin) / count,
                          np.maximum.reduceat(throttle, begin)])
         self._place(at[begin], rows, count)
 
@@ -262,7 +262,8 @@ class FlightHistory:
         """Return the mean sqrt|du| between blocks in the last minute."""
         change = np.abs(np.diff(self.table[2, -round(60.0 / BLOCK):]))
         change = change[np.isfinite(change)]
-        return float(np.sqrt(change).mean()) if change.size else 0.0
+        # Without rounding, of which the root would be 1e-8.
+        return float(np.sqrt(np.round(change, 12)).mean()) if change.size else 0.0
 
     def outcome(self, t: float, horizon: float) -> tuple[float, float, float] | None:
         """Return lowest voltage, highest throttle, and time there, s; None: incomplete horizon."""

@@ -4,17 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 from ou_monitor.errors import InputError
-from ou_monitor.model.load import LoadModel, LoadStart
+from ou_monitor.model.load import LoadModel, LoadStart, SIZE
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.online.load.load_filter import LoadFilter
-from ou_monitor.online.load.supply_load import LoadStatus
+from ou_monitor.online.load.supply_load import HOLD, LoadStatus
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.recordings.model_file import as_yaml, ModelFile, parse_model, read_model
 import pytest
 import yaml
 
 TRUE = LoadModel(4, 0.25, charge=0.85, size=0.15, power=1.8)
+# Sag after a second at full throttle, relative to `size`, V.
+SAG = 15.2 * (1.0 + 0.2 * -np.expm1(-HOLD / 1.0) + 0.3 * -np.expm1(-HOLD / 20.0))
 
 
 def flight(seed, model=TRUE):
@@ -48,7 +50,7 @@ def test_the_sag_is_known_at_take_off(learned):
         one.push(t[:50], v[:50], u[:50])
     load = loads.load()
     assert load.known and plain.load().status is LoadStatus.STILL
-    assert abs(load.sag(0.5) - 0.15 * 15.2 * 0.5 ** 1.8) < 2.0 * load.sag_se(0.5)
+    assert abs(load.sag(0.5) - 0.15 * SAG * 0.5 ** 1.8) < 2.0 * load.sag_se(0.5)
     assert load.sag_se(0.5) > 0.15 * load.sag(0.5)
     loads.push(t[50:], v[50:], u[50:])
     assert loads.load().sag_se(0.5) < load.sag_se(0.5)
@@ -61,7 +63,7 @@ def test_another_day_is_learned(learned):
     loads.push(*flight(3, worn))
     load = loads.load()
     assert load.known
-    assert abs(load.sag(0.5) - 0.22 * 15.2 * 0.5 ** 1.8) < 2.0 * load.sag_se(0.5)
+    assert abs(load.sag(0.5) - 0.22 * SAG * 0.5 ** 1.8) < 2.0 * load.sag_se(0.5)
 
 
 def test_a_pack_of_another_size_begins_without_it(learned):
@@ -93,16 +95,34 @@ def test_a_model_file_carries_it(learned, tmp_path):
     assert monitor.report(0.0).load.status is LoadStatus.STILL
 
 
+def test_a_file_with_fewer_lags_begins_as_before(learned):
+    """Three lags, none linear: the same sag as learned then, with a wider error."""
+    kept = np.array([0, 1, 2, 3, 5, 6, SIZE - 1])
+    a, P = np.array(learned.coefficients), np.array(learned.covariance)
+    file = learned.values() | {'coefficients': a[kept].tolist(),
+                               'covariance': P[np.ix_(kept, kept)].tolist()}
+    start = LoadStart.read(file)
+    mean, error = np.array(start.coefficients), np.array(start.covariance)
+    added = np.setdiff1d(np.arange(SIZE), kept)
+    assert (mean[kept] == a[kept]).all() and (mean[added] == 0.0).all()
+    assert (error[np.ix_(kept, kept)] == P[np.ix_(kept, kept)]).all()
+    t, v, u = flight(2)
+    loads = begun(start)
+    loads.push(t[:50], v[:50], u[:50])
+    load = loads.load()
+    assert load.known and abs(load.sag(0.5) - 0.15 * SAG * 0.5 ** 1.8) < 2.0 * load.sag_se(0.5)
+
+
 def test_a_file_without_it_is_as_before():
     text = as_yaml(ModelFile(SupplyModel((OU(63.0, 0.3, 16.0),))))
     assert 'load' not in text and parse_model(yaml.safe_load(text), 'file').model.load is None
 
 
 @pytest.mark.parametrize('change, words', [
-    ({'coefficients': [1.0]}, '7 coefficients'), ({'volts': 0.0}, 'above 0'),
+    ({'coefficients': [1.0]}, '10 coefficients'), ({'volts': 0.0}, 'above 0'),
     ({'cells': 'four'}, 'number'), ({'sag': 1.0}, "no entry 'sag'"), ({'delay': 9.0}, 'delay'),
     ({'flown': [0.5, 0.2]}, 'flown'), ({'discharge': float('nan')}, 'finite'),
-    ({'covariance': (-np.eye(7)).tolist()}, 'negative'), ({'log_variance': [0.0]}, '3 numbers')])
+    ({'covariance': (-np.eye(10)).tolist()}, 'negative'), ({'log_variance': [0.0]}, '3 numbers')])
 def test_a_broken_entry_is_refused_by_name(learned, change, words):
     data = yaml.safe_load(as_yaml(ModelFile(SupplyModel((OU(63.0, 0.3, 16.0),), learned))))
     data['load'].update(change)

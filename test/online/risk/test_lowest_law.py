@@ -4,22 +4,24 @@ from dataclasses import replace
 import math
 
 import numpy as np
+from ou_monitor.model.load import LAGS, LINEAR_LAGS, SIZE
 from ou_monitor.online.load.supply_load import LoadState
 from ou_monitor.online.risk import courses
 from ou_monitor.online.risk.courses import held, lowest, mean_now, Sampling
 import pytest
 
-# A pack that sags by 1.5 V of 16 V, without errors: x, u, u^3, three lags, inrush.
-COEFFICIENTS = np.array([16.0, 0.0, 1.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+# A pack of 16 V that sags by 1.5 V at once, without errors: level, discharge, coefficients.
+COEFFICIENTS = np.array([16.0, 0.0, 1.5] + [0.0] * (SIZE - 1))
+AFTER_2_S = 5 + LAGS.index(2.0)
 NOISE = 0.05
 SAMPLING = Sampling(0.02, 0.0)
 
 
 def state(throttle=0.4, **changes):
     """Return what a filter would know that knows all."""
-    x = throttle ** 1.8
+    lags = (throttle ** 1.8,) * len(LAGS) + (throttle,) * len(LINEAR_LAGS)
     return replace(LoadState(
-        0.0, throttle, COEFFICIENTS, np.zeros((9, 9)), (x, x, x), 1.0, 0.0,
+        0.0, throttle, COEFFICIENTS, np.zeros((2 + SIZE, 2 + SIZE)), lags, 1.0, 0.0,
         (2.0 * math.log(NOISE), 0.0, 0.0), 0.0, (0.0, 1.0)), **changes)
 
 
@@ -51,8 +53,8 @@ def test_throttle_that_stays():
 @pytest.mark.parametrize('interval, share', [(0.02, 1.0), (0.1, 1.0), (0.16, 0.25), (1.0, 0.0)])
 def test_a_slow_sensor_misses_the_inrush(interval, share):
     """A coefficient of 10 +- 30 V that no reading shows; two of three are within 0.2 s or not."""
-    coefficients, error = COEFFICIENTS.copy(), np.zeros((9, 9))
-    coefficients[8], error[8, 8] = 10.0, 900.0
+    coefficients, error = COEFFICIENTS.copy(), np.zeros((2 + SIZE, 2 + SIZE))
+    coefficients[-1], error[-1, -1] = 10.0, 900.0
     quiet = {'log_variance': (2.0 * math.log(1e-6), 0.0, 0.0)}
     mean, deviation = lowest(state(mean=coefficients, covariance=error, **quiet),
                              held(0.9, 5.0, 0.4), 5.0, Sampling(interval, 0.0))
@@ -64,7 +66,7 @@ def test_a_slow_sensor_misses_the_inrush(interval, share):
 def test_a_peak_and_its_lag():
     """Throttle after a lag of 2 s, the mean of its way to the peak; the noise is far smaller."""
     coefficients = COEFFICIENTS.copy()
-    coefficients[2], coefficients[6] = 0.0, 1.5
+    coefficients[2], coefficients[AFTER_2_S] = 0.0, 1.5
     quiet = (2.0 * math.log(1e-6), 0.0, 0.0)
     known = state(mean=coefficients, log_variance=quiet)
     for dwell in (0.5, 2.0):
@@ -82,14 +84,14 @@ def test_a_peak_and_its_lag():
 def test_inrush_is_that_of_a_ramp():
     """A tenth of the step, 20 ms of 0.2 s, and only in the first group."""
     coefficients = COEFFICIENTS.copy()
-    coefficients[2], coefficients[8] = 0.0, 2.0
+    coefficients[2], coefficients[-1] = 0.0, 2.0
     known = state(mean=coefficients, log_variance=(2.0 * math.log(1e-6), 0.0, 0.0))
     mean, _ = lowest(known, held(0.9, 1.0, 0.4), 2.0, SAMPLING)
     assert mean[0] == pytest.approx(16.0 - 2.0 * 0.5 * 0.1, abs=1e-4)
 
 
 def test_what_is_not_known_of_the_level_is_in_the_deviation():
-    error = np.zeros((9, 9))
+    error = np.zeros((2 + SIZE, 2 + SIZE))
     error[0, 0] = 0.3 ** 2
     _, exact = lowest(state(), held(0.4, 1.0, 0.4), 1.0, SAMPLING)
     _, wide = lowest(state(covariance=error), held(0.4, 1.0, 0.4), 1.0, SAMPLING)
@@ -107,7 +109,7 @@ def test_the_level_falls_as_charge_is_drawn():
 def test_a_rise_is_noisier():
     """Its noise is that of the change that a ramp of 0.2 s makes: a tenth of the step."""
     noisy = state(log_variance=(2.0 * math.log(NOISE), 0.0, 4.0), mean=COEFFICIENTS * (
-        np.arange(9) == 0))
+        np.arange(2 + SIZE) == 0))
     mean, deviation = lowest(noisy, held(0.9, 0.04, 0.9), 0.04, SAMPLING)
     factor = math.exp(0.5 * 4.0 * math.sqrt(0.05))
     plain, narrow = lowest(noisy, held(0.4, 0.04, 0.4), 0.04, SAMPLING)

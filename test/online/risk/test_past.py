@@ -28,19 +28,6 @@ def middle_of(v):
     return np.median(np.stack((padded[:-2], padded[1:-1], padded[2:])), axis=0)
 
 
-@pytest.mark.parametrize('size', [1, 7, 64])
-def test_the_parts_in_which_samples_arrive_do_not_matter(size):
-    """The same blocks and activity, though their edges are not those of the parts."""
-    rng, t = np.random.default_rng(1), np.arange(2000) * 0.003
-    v, u = rng.normal(12.0, 0.1, t.size), rng.uniform(0.0, 1.0, t.size // 5).repeat(5)
-    whole, parts = FlightHistory(), FlightHistory()
-    whole.push(t, v, u)
-    for k in range(0, t.size, size):
-        parts.push(t[k:k + size], v[k:k + size], u[k:k + size])
-    np.testing.assert_allclose(parts.table, whole.table, rtol=1e-10)
-    assert parts.activity() == pytest.approx(whole.activity(), rel=1e-9)
-
-
 def test_what_a_horizon_became():
     past, t, v, u = made()
     lowest, peak, dwell = past.outcome(10.02, 2.0)
