@@ -215,7 +215,7 @@ def test_resistance_and_sag_are_those_of_analyze(tmp_path, one_process, capsys):
     # It is told with vehicle and file, and so is the resistance.
     told = ' '.join(said.split())
     assert 'uav7: f_2024-05-02.csv: 1 bad line left out' in told
-    assert 'mOhm, f_2024-05-0' in told and '4?' in told
+    assert f"{1e3 * row['resistance']:.1f}" in told and '4?' in told
     # Columns and series are chosen as in analyze, and other ones are another run.
     assert main(['fleet', str(logs.parent), '--output', str(tmp_path / 'out'),
                  '--current-column', 'none']) == 0
