@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.online.load.load_filter import LEAST_ERROR
+from ou_monitor.online.load.current_filter import LEAST_ERROR
 from ou_monitor.records import FloatArray, NAN
 from ou_monitor.text import Z95
 
