@@ -129,7 +129,7 @@ def test_bad_arguments_are_refused_with_the_reason(name, arguments, words):
     ('estimator', ['-p', 'window:=-1.0'], 'window must lie within 0.05..3600'),
     ('estimator', ['--params-file', 'no_such.yaml'], 'cannot read the ROS arguments'),
     ('adaptive_filter', ['-r', '__node:=9 lives'], 'cannot read the ROS arguments'),
-    ('replay', [], 'no bag missing.mcap'),
+    ('replay', [], 'no recording missing.mcap'),
     ('replay', ['-p', 'x'], 'cannot read the ROS arguments'),
 ], ids=lambda value: '' if isinstance(value, list) else value[:24])
 def test_a_refusal_is_one_line(world, name, arguments, words):
