@@ -10,8 +10,8 @@ moved along it to the median throttle, with the error of the move; without throt
 Resistance and sag come from the `supply` facts, per cell where cells are known.
 
 Drift: a line through the logarithms over the number of the flight, weighted by their errors and a
-scatter between flights (Paule and Mandel), which is assumed normal; t test, with the scatter about
-the line as the scale, so that an error common to all flights does not count.
+normal scatter between flights (Paule and Mandel).  The scale of the t test is the scatter about
+the line, so an error common to all flights does not count.
 
 Few vehicles (fewer than `LEAST_VEHICLES`): the pooled scatter between flights is the scale of the
 t test.  A pack is compared only with packs of the same number of cells.
@@ -218,7 +218,7 @@ def _curve(y: FloatArray, u: FloatArray, vehicles: Sequence[str], recordings: In
 def _jackknife(inner: FloatArray, rest: FloatArray, weight: FloatArray, of: IntArray,
                vehicle: IntArray) -> FloatArray:
     """Return the covariance of slopes by leaving out one recording (`of`) at a time."""
-    # Residuals within a recording are correlated, and the level of each vehicle is fitted too.
+    # Whole recordings, because residuals within one are correlated.
     # Derivative of Huber's function: 0 beyond its bend.
     pulls = (weight >= 1.0).astype(np.float64)
     bread = np.linalg.pinv((inner * pulls[:, None]).T @ inner, rcond=1e-9)
@@ -493,7 +493,7 @@ def judge(rows: Sequence[Row], seed: int = 0) -> Judgement:
                 trend[mine] = t.line(one.flights[mine].astype(np.float64)) - t.line(np.array(
                     0.5 * (t.first + t.last)))
         recordings[name] = outliers(one.value, one.error, one.vehicles, rate, trend, seed=seed)
-        vehicles[name] = _vehicles(one, recordings[name], one.value - trend, rate, seed)
+        vehicles[name] = _compare_vehicles(one, recordings[name], one.value - trend, rate, seed)
     return Judgement(values, tested, recordings, vehicles)
 
 
@@ -502,8 +502,8 @@ def _is_of_vehicle(values: Values, vehicle: str) -> npt.NDArray[np.bool_]:
     return mine
 
 
-def _vehicles(values: Values, within: Outliers, flat: FloatArray, rate: float, seed: int,
-              ) -> VehicleValues:
+def _compare_vehicles(values: Values, within: Outliers, flat: FloatArray, rate: float, seed: int
+                      ) -> VehicleValues:
     """Compare vehicles (flat: values without drift); packs only with equal numbers of cells."""
     names = tuple(sorted(set(values.vehicles) - {''}))
     scatter = float(np.nan_to_num(within.scatter))

@@ -13,9 +13,7 @@ doc/messages.md lists its topics:
 
 Limits: of an Imu only the angular velocity is filtered, and with `input.acceleration` the linear
 acceleration; their covariances shrink as for white noise.  Of a BatteryState only the voltage is
-filtered, unless `input.field` names another field.  Other fields stay unchanged.  Messages with a
-non-finite signal are counted and dropped.  If stamps repeat or go back, the arrival times are
-used, and the diagnostics report it.
+filtered, unless `input.field` names another field.  Other fields stay unchanged.
 """
 
 from __future__ import annotations

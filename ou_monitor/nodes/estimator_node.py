@@ -2,11 +2,10 @@
 The node `estimator`: voltage and throttle -> OU estimate, brown-out risk and flag.
 
 doc/messages.md lists its topics, services and fields.  Inputs are best effort; outputs, at
-`publish_rate` of real time, are reliable.  Unknown numbers are NaN, and `~/brownout` is published
-only while it is known, so that it is never silently false.  Windows of up to a minute are fitted
-in a thread.  Messages wait in the middleware, which keeps the newest 2000, and are fetched 50
-times a second and read before each report, so that a flood of messages does not delay an output.
-Hold, delay and latch run in real time, even under `use_sim_time`.
+`publish_rate` of real time, are reliable.  `~/brownout` is published only while it is known, so
+that it is never silently false.  Messages wait in the middleware, which keeps the newest 2000, and
+are fetched 50 times a second and read before each report, so that a flood of messages does not
+delay an output.  Hold, delay and latch run in real time, even under `use_sim_time`.
 
 Limits: one voltage; an estimate older than `stale_after` is not published as
 a number, though `~/state` still shows its fields.

@@ -120,9 +120,9 @@ _Chosen = tuple[str, 'ModelFile | None', bytes]
 
 
 def _read(path: str) -> tuple[ModelFile, bytes]:
-    """Read a model file; terms and fits are imported only where there is one."""
+    """Return a parsed model file, and its bytes."""
     try:
-        # Importing them takes a second on a busy machine; this error comes at once.
+        # Before the import, which takes a second on a busy machine: this error comes at once.
         with open_regular(path) as file:
             known = file.read(_LARGEST)
     except (OSError, ValueError) as error:
@@ -213,7 +213,7 @@ class LatchFile:
         self._lock: int | None = None
         self._wanted: dict[str, Any] = self._record(False, '')
         self._written: dict[str, Any] | None = None
-        self._tried = 0.0
+        self._last_try = 0.0
         # A disk may take a second for an fsync: not in a callback.
         self._writer = ThreadPoolExecutor(1, 'latch_file')
         self._job: Future[None] | None = None
@@ -250,8 +250,8 @@ class LatchFile:
         if changed:
             self._wanted = self._record(latched, reason)
         if self._written is not self._wanted and (self._job is None or self._job.done()) and (
-                changed or time.monotonic() - self._tried >= RETRY):
-            self._tried = time.monotonic()
+                changed or time.monotonic() - self._last_try >= RETRY):
+            self._last_try = time.monotonic()
             self._job = self._writer.submit(self._write, self._wanted)
 
     def close(self) -> None:
@@ -321,13 +321,13 @@ class LatchFile:
 
     def _replace(self, text: bytes) -> None:
         """Write beside, sync, read back, lock and rename."""
-        there = self._claim() is not None
+        exists = self._claim() is not None
         # Readable by all, like an ordinary file.
         handle, beside = _write_beside(self.path, text, 0o644)
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if not there:
-                # Fails if a file has appeared meanwhile.  File systems of SD cards have no links.
+            if not exists:
+                # Fails if a file has appeared meanwhile (so would a link, which FAT lacks).
                 os.close(os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
             os.rename(beside, self.path)
         except BaseException:

@@ -174,16 +174,15 @@ class StampWatch:
 
 
 class InputClock:
-    """Time of messages that must all be used: their stamps, or their arrival if those fail."""
+    """Times of messages: their stamps, or their arrival if those fail; none is dropped."""
 
     def __init__(self) -> None:
         self.stamps = StampOrder.GOOD
         # Number of messages placed by their arrival.
         self.by_arrival = 0
         self._watch = StampWatch()
-        # Arrival and time of the last message, and what is added to stamps, s.
-        self._arrived = self._time = NAN
-        self._shift = 0.0
+        self._arrived = self._time = NAN  # Of the last message, s
+        self._shift = 0.0  # Time less stamp, s
 
     def time_of(self, stamp: float, arrived: float) -> float:
         """Return the time of a message, s (stamp in s, arrived in s on a monotonic clock)."""
@@ -203,8 +202,8 @@ class InputClock:
         return self._time
 
 
-# A sensor is stuck if its reading is constant for this time, s, and this number of readings; if it
-# has never changed, the number is enough.  Longest constant readings of working sources: 2.81 s
+# A sensor is stuck if its reading is constant for this time, s, and this number of readings; or
+# only the number, if it has never changed.  Longest constant readings of working sources: 2.81 s
 # (139 readings) on the ground, in_xr_141340; 1.70 s (172) in flight, cf_solo_large; 3 readings at
 # 1 Hz in flight, ac_jd_2004.
 _STUCK, _STUCK_READINGS = 5.0, 10

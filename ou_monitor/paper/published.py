@@ -117,10 +117,9 @@ class Row:
     @property
     def verdict(self) -> RowVerdict:
         """Return the verdict from the ranges."""
-        # The recomputed number rounds to the printed one, or its interval includes it.
         if _overlap(self.printed.ends, self.interval):
             return RowVerdict.AGREES
-        # This holds with the inputs of either varied within their rounding.
+        # With the inputs of both varied within their rounding.
         if _overlap(_join(self.printed.ends, self.printed_inputs),
                     _join(self.interval, self.inputs)):
             return RowVerdict.ROUNDING

@@ -1,20 +1,14 @@
 """
 Alpha, sigma and Var_inf online: `SlidingEstimator`, and `RelaxationFits` for `window: auto`.
 
-voltage = level + response to throttle + OU(alpha, sigma) + white noise, all
-estimated together.  Limits: one relaxation (no second pole, no resonance);
-sigma constant within the window; alpha known no better than sqrt(2/(alpha T));
-faster sources are averaged down to `fastest`; if a source changes its step by a
-third or more, the window begins anew.  Measured accuracy and cost: doc/estimation.md.
+voltage = level + response to throttle + OU(alpha, sigma) + white noise, all estimated together.
+doc/estimation.md has the steps, the measured accuracy and the limits.  If a source changes its
+step by a third or more, the window begins anew.
 
-`RelaxationFits` keeps the readings of a minute.  `known_ou` of `ou_fit`, which `supply_facts` uses
-too, fits the shortest of 2, 8, 30 and 60 s in which alpha is known well.  A fit costs 30 to 600 ms
-of CPU, so it is repeated only after a quarter of its window, at least 1 s; in the background it
-runs in a thread that takes at most 5 % of a core.
-
-Between two fits of a window of 2 s, the sliding estimate of 2 s is used as long as the intervals
-of both overlap.  Limits: as in `ou_fit`; a source above 1 kHz keeps its last 65 536 readings; a
-change of the supply is followed one window late.
+`RelaxationFits` keeps the readings of a minute, fitted by `known_ou` of `ou_fit`.  A fit costs 30
+to 600 ms of CPU, so it is repeated only after a quarter of its window, at least 1 s; in the
+background it runs in a thread that takes at most 5 % of a core.  Limits: as in `ou_fit`; a source
+above 1 kHz keeps its last 65 536 readings; a change of the supply is followed one window late.
 """
 
 from __future__ import annotations

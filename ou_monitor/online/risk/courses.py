@@ -1,27 +1,21 @@
 """
 The last minutes of a flight, possible future throttle, and the lowest voltage of each course.
 
+doc/risk.md has the formulas: of the lowest voltage (step 1), of the pilot's future throttle (3),
+and of the excursions (4).
+
 A course jumps to a peak of throttle, then to another throttle.  Its samples form three groups: in
-the inrush, at the peak after it, and after the peak.  The lowest voltage has approximately the
-mean mu = min over groups of (mean path - sd a(n)); its variance is that group's variance of the
-path plus (sd b(n))^2.  a and b are mean and deviation of the largest of n running medians of three
-normal samples.  Limits: within a group the mean path counts as constant; only the lowest group
-counts; samples of noise are independent, as in the load filter.
+the inrush, at the peak after it, and after the peak.  Limits: within a group the mean path counts
+as constant; only the lowest group counts; samples of noise are independent, as in the load filter.
 
-The pilot: each completed horizon is one course, with its highest throttle, the time spent there,
-and the mean of the rest.  Its weight is larger if its first throttle is near the present one, and
-if it is recent.  Rises from the present throttle are added, one into each fifth of the range above
-it, with the weight of one horizon in total (rule of succession).  Limits: within a horizon, the
-peak is assumed to come first.
+The pilot: each completed horizon is one course.  Rises from the present throttle are added, one
+into each fifth of the range above it (rule of succession).  Limits: within a horizon, the peak is
+assumed to come first.
 
-Excursions: if even the load is unknown, the risk follows from the margin of the voltage now over
-the limit L alone: P = expit(b0 + b1 z1 + b2 z2), z1 = (now - L - m)/S within -4..8, z2 = (now -
-L)/S within 0..8.  m and S are mean and deviation of the drops in completed horizons, with an extra
-drop of twice the deviation of the last 5 s.  The coefficients were fitted on eight quadcopters for
-horizons of 1, 2 and 5 s, and are interpolated over ln h; shorter and longer horizons use the
-nearest coefficients, but their own m and S.  Limits: throttle is not used; beyond 8 S the risk
-falls with the fifth power of the margin, like the tail of Student's t in the other laws; this part
-was not fitted.
+Excursions need no load: the risk follows from the margin of the voltage now.  One drop of twice
+the deviation of the last 5 s is added to those of the flight.  Horizons below 1 s and above 5 s
+use the nearest coefficients.  Limits: throttle is not used; the tail beyond 8 deviations falls
+like that of Student's t in the other laws.
 
 Limits of the blocks: a source slower than a block fills blocks with its last value.  A longer
 silence is not filled, and a horizon that contains it is not complete.

@@ -1,14 +1,8 @@
 """
 The brown-out flag: a level from risks and a voltage floor.
 
-CRITICAL: the voltage is below the limit, or is expected to be within 1 s at the present throttle.
-WARN: the risk within `brownout.horizon` is high, or the throttle budget is below the throttle in
-use.
-
-A level is entered after `brownout.delay`, three reports by default.  It is left after
-`brownout.hold`, once the risk is below `brownout.leave` times the probability at which the level
-is entered.  `brownout.latch` keeps CRITICAL until it is cleared.  Limits: a flag is as good as its
-risk; with an unknown risk the level is UNKNOWN, never OK, and the flag is never false.
+doc/risk.md lists the levels, and when they are entered and left.  A flag is as good as its risk;
+with an unknown risk the level is UNKNOWN, never OK, and the flag is never false.
 
 The voltage floor is a threshold on the samples that needs no model.  The median of the last
 `brownout.floor_time` seconds decides, so a single wrong sample does not.  Every sample is checked,

@@ -16,12 +16,11 @@ step / horizon.  For first passage the wider law is the excursions.  For a given
 wide as the excursions, at most `_WIDEST` times the law (excursions include punches, which say
 nothing about idling), or wider if contradicting voltages were farther below the law's mean.
 
-Limits: "below" refers to the median of three samples, except in first passage; nothing is known in
-the first second; all throttles share one bias and one gain; values between two horizons are
-interpolated.
+Limits, beside those of doc/risk.md: all throttles share one bias and one gain; values between two
+horizons are interpolated.
 
 `look_ahead` computes the risk, its curve over throttle, and the throttle budget for the present
-settings; no throttle above the highest flown in the last minutes is called safe.
+settings.
 """
 
 from __future__ import annotations

@@ -236,7 +236,7 @@ def _lost_text(log: Any) -> list[str]:
 
 
 def _cells(parameters: dict[str, float]) -> dict[str, str]:
-    """Return the capacity, the cells, from MOT_BAT_VOLT_MAX, and a cell's lowest voltage."""
+    """Return capacity, number of cells (from MOT_BAT_VOLT_MAX), and a cell's lowest voltage."""
     full, capacity = (parameters.get(name, 0.0) for name in ('MOT_BAT_VOLT_MAX', 'BATT_CAPACITY'))
     # The default, 3300, says nothing about the pack.
     facts = {'capacity_mah': f'{capacity:.0f}'} if capacity > 0.0 and capacity != 3300.0 else {}
