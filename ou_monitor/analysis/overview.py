@@ -123,7 +123,8 @@ def answers(found: Overview) -> list[str]:
     if known and sag > 2.0 * se:
         parts.append(f'The rail sags by {volts(sag)} at {100.0 * at:.0f} % throttle.')
     elif fall := _fall_words(found):
-        parts.append(f'The rail falls by {fall}; no sag over throttle is measurable.')
+        parts.append(f'The resistance lowers the rail by {fall} (computed); no sag over throttle '
+                     'is measurable.')
     elif known:
         parts.append(f'The sag at {100.0 * at:.0f} % throttle is below {volts(sag + 2.0 * se)}.')
     if found.line is not None and found.line.all_share > _LOUD:
@@ -153,7 +154,7 @@ def known_lines(found: Overview) -> list[tuple[str, str]]:
         lines.append(('Resistance', f'{number(1e3 * resistance.ohm)} mOhm (+- '
                       f'{number(2e3 * resistance.se_ohm, 2)}) within '
                       f'{max(_AT_ONCE, found.step):.2g} s'
-                      + (f': {fall}' if (fall := _fall_words(found)) else '')))
+                      + (f'; computed: {fall}' if (fall := _fall_words(found)) else '')))
     elif found.drawn > 0.0:
         lines.append(('Resistance', 'unknown: the current changes too little, or a load seems '
                       'to bypass its sensor'))
@@ -168,7 +169,7 @@ def known_lines(found: Overview) -> list[tuple[str, str]]:
 
 
 def _fall_words(found: Overview) -> str:
-    """Return the fall by the resistance and its current, in words; empty if unknown."""
+    """Return resistance times largest current, in words; empty if unknown."""
     drop = found.facts.resistance.ohm * found.drawn
     return f'{volts(drop)} at {number(found.drawn)} A' if drop > 0.0 else ''
 

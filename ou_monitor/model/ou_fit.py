@@ -255,6 +255,9 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
         for _ in range(2):
             left = left - (basis @ left) @ basis
         left = left * size
+    if law.follows and left.any():
+        # Even with a wrong law of the size, the fitted variance is that of the noise.
+        size = size * math.sqrt(float(np.sum((left / size) ** 2)) / float(left @ left))
     return Regression(dt, places, left, size, basis, [s.stop - s.start for s in parts],
                       walk, 0.5 * float(knots[1] - knots[0]))
 

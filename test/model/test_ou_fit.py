@@ -59,6 +59,21 @@ def test_intervals_cover_the_truth_beside_a_tone():
     assert inside >= 24
 
 
+def test_the_fitted_variance_is_that_of_the_noise_under_any_law_of_its_size():
+    """Noise that bursts 0.5 s after each step of throttle, which the law of its size has not."""
+    rng = np.random.default_rng(3)
+    t, v, u = rail(rng, 200.0, 40.0, 0.0, 0.0, 30.0)
+    steps = np.abs(np.diff(u, prepend=u[0])) > 0.05
+    late = np.convolve(steps, np.arange(200) > 100)[:t.size] > 0.0
+    phi = np.exp(-40.0 / 200.0)
+    x = lfilter([1.0], [1.0, -phi], np.sqrt(1.0 - phi * phi) * rng.standard_normal(t.size))
+    x *= np.where(late, 0.05, 0.002)
+    part = regress(t, v + x, u, None)
+    found = fit_ou(part, 30.0)
+    assert np.mean((part.voltage / part.size) ** 2) == pytest.approx(np.mean(part.voltage ** 2))
+    assert found.var_inf == pytest.approx(float(np.var(x)), rel=0.3)
+
+
 @pytest.mark.parametrize('seed', range(12))
 def test_white_noise_is_no_relaxation(seed):
     """Not visible; an OU slower than the bound of tau is smaller than the noise."""
