@@ -77,8 +77,8 @@ def answer(analysis: Analysis) -> list[str]:
     safe = [] if math.isnan(curves.budget) else [
         f'Safe up to {100.0 * curves.budget:.0f} % throttle{_fall_within_budget(analysis)}.'
         if curves.budget > 0.0 else
-        f'No throttle keeps the risk below {100.0 * curves.limit:g} % {_why_none(analysis)}: at '
-        f'idle it is {percent(curves.risk[0])}.']
+        f'No throttle keeps the risk below {100.0 * curves.limit:g} % '
+        f'{_why_no_throttle(analysis)}: at idle it is {percent(curves.risk[0])}.']
     return [first, *safe, *others, *craft_advice(analysis.craft),
             *_numbers(analysis), *_change(analysis),
             *(words for name, words in _BEWARE.items() if name in names)]
@@ -89,8 +89,8 @@ def facts(analysis: Analysis) -> list[tuple[str, str]]:
     found = known_lines(analysis.overview)
     if not found:
         return []
-    beside = craft_line(analysis.craft)
-    return [*found[:-1], *([('Known craft', beside)] if beside else []),
+    craft = craft_line(analysis.craft)
+    return [*found[:-1], *([('Known craft', craft)] if craft else []),
             ('Safe up to', _budget(analysis)), *found[-1:]]
 
 
@@ -113,7 +113,8 @@ def _budget(analysis: Analysis) -> str:
     if math.isnan(curves.budget):
         return f'unknown: {curves.budget_reason}'
     if not curves.budget:
-        return f'no throttle, {_why_none(analysis)}: the risk {what} is {curves.risk[0]:.2g}'
+        return (f'no throttle, {_why_no_throttle(analysis)}: the risk {what} is '
+                f'{curves.risk[0]:.2g}')
     words = (f'{100.0 * curves.budget:.0f} % throttle if held: the risk {what} stays under '
              f'{100.0 * curves.limit:g} %')
     beyond = [(u, p) for u, p in zip(curves.throttle, curves.risk)
@@ -138,7 +139,7 @@ def _fall_within_budget(analysis: Analysis) -> str:
     return f'; yet the voltage was below {curves.voltage:g} V at {100.0 * top:.0f} % throttle'
 
 
-def _why_none(analysis: Analysis) -> str:
+def _why_no_throttle(analysis: Analysis) -> str:
     """Return why no throttle meets the limit: the flight before, or a supply low even at rest."""
     rest = analysis.overview.load.level
     if rest > analysis.by_throttle.voltage:
@@ -172,16 +173,16 @@ def _numbers(analysis: Analysis) -> list[str]:
              f'tau = {number(1e3 / ou.alpha)} (95 % {number(1e3 / high)} to {number(1e3 / low)}) '
              f'ms, and has a standard deviation of {number(1e3 * math.sqrt(ou.var_inf))} mV.']
     steady = [level.estimate for level in analysis.levels if level.estimate.usable]
-    apart = []
+    differing = []
     if steady and all(e.interval('sigma')[1] < ou.sigma_95[0] for e in steady):
-        apart.append(f'sigma is {_range([e.sigma for e in steady])} V/sqrt(s)')
+        differing.append(f'sigma is {_range([e.sigma for e in steady])} V/sqrt(s)')
     ends = np.array([e.interval('alpha') for e in steady]).reshape(-1, 2)
     if steady and ((ends[:, 1] < low).all() or (ends[:, 0] > high).all()):
-        apart.append(f'tau is {_range([1e3 / e.alpha for e in steady])} ms')
-    if apart:
+        differing.append(f'tau is {_range([1e3 / e.alpha for e in steady])} ms')
+    if differing:
         where = ('At steady throttle' if analysis.recording.has_throttle else
                  'Over the whole recording')
-        found.append(f'{where} {listed(apart)}: the values above also describe what '
+        found.append(f'{where} {listed(differing)}: the values above also describe what '
                      'follows changes of load, or lines.')
     return found
 

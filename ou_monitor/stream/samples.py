@@ -83,7 +83,7 @@ class _Track:
     arrived: float
     interval: float = math.nan
 
-    def off(self, number: int, time: float) -> float:
+    def deviation(self, number: int, time: float) -> float:
         """Return the deviation of a message from this publisher's expected number, messages."""
         if number <= self.number or time < self.time:
             return math.inf
@@ -91,8 +91,8 @@ class _Track:
         if math.isnan(self.interval) or self.interval <= 0.0:
             return float(step - 1)
         expected = (time - self.time) / self.interval
-        # After a silence either messages were lost, or none was sent; the latter costs half a
-        # message more.
+        # After a silence, either messages were lost, or none was sent: prefer the first by half a
+        # message.
         return min(abs(step - expected), step - 0.5 if expected > PAUSE else math.inf)
 
     def take(self, number: int, time: float, arrived: float) -> None:
@@ -169,7 +169,7 @@ class Publishers:
 
     def _take_one(self, number: int, time: float, arrived: float, publishers: int) -> bool:
         """Assign one message to a publisher; return whether it is the followed one."""
-        off = [track.off(number, time) for track in self._tracks]
+        off = [track.deviation(number, time) for track in self._tracks]
         best = min(range(len(off)), key=off.__getitem__, default=-1)
         # A number that fits no track well belongs to a publisher not seen yet, if there is one.
         new = best < 0 or off[best] == math.inf or (
@@ -191,9 +191,9 @@ class Publishers:
 
 BoolArray = npt.NDArray[np.bool_]
 
-# Time constant with which the time line follows the stamps.  5 ms of jitter then changes the
-# spacing by at most 5e-4 (0.05 us at 10 kHz); a clock error of 100 ppm is followed 1 ms behind.
-FOLLOW = 10.0  # s
+# Time constant with which the time line follows the stamps, s.  5 ms of jitter then changes the
+# spacing by at most 5e-4 (0.05 us at 10 kHz); a clock error of 100 ppm leaves a lag of 1 ms.
+FOLLOW = 10.0
 
 # A difference above this and above two blocks counts as a gap: a busy companion computer delays
 # blocks by about 100 ms and then sends them all.

@@ -246,8 +246,8 @@ def _curve(square: FloatArray, x: FloatArray, shares: FloatArray, log: FloatArra
     centre, values, count = _binned(square, x, edges)
     if log is not None:
         # The mean of heavy-tailed squares is less certain than that of normal ones.
-        alike = square * np.exp(-2.0 * log)
-        count = count / max(0.5 * float(np.mean(alike**2) / np.mean(alike)**2) - 0.5, 1.0)
+        unit = square * np.exp(-2.0 * log)
+        count = count / max(0.5 * float(np.mean(unit**2) / np.mean(unit)**2) - 0.5, 1.0)
     flat = 0.0 if centre.size < 2 else float(np.sum(
         count * (values - np.average(values, weights=count)) ** 2))
     penalty = 0.5 * math.log(x.size)
