@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from functools import partial
+from functools import cache, partial
 import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING, Union
@@ -17,7 +17,7 @@ from typing import Any, TYPE_CHECKING, Union
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
-from ou_monitor.records import as_numbers, as_seconds, Recording
+from ou_monitor.records import as_numbers, as_seconds, FloatArray, Recording
 from ou_monitor.report.result import Result
 from ou_monitor.text import counted
 from ou_monitor.timeline import ordered, readings_of, supplied
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ou_monitor.analysis.coupling import Coupling
     from ou_monitor.analysis.supply import SupplyFacts
     from ou_monitor.model.supply import SupplyModel
-    from ou_monitor.paper.design import Flight
+    from ou_monitor.paper.design import Flight, FlownRisk
     from ou_monitor.paper.network import PowerNetwork
     from ou_monitor.recordings.importers.log import Series
     from ou_monitor.recordings.model_file import ModelFile
@@ -414,8 +414,8 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
         if stated is not None and stated[0] == cells:
             level, source = stated[1], 'from the log'
         level, source = (level, source) if voltage is None else (voltage, 'given')
-        flight, facts, risks = _flight(flown, full, cells, level if rail == 'bus' else None,
-                                       horizon, risk)
+        flight, facts, risk_of = _flight(
+            flown, full, cells, level if rail == 'bus' else None, horizon, risk)
         if not facts.sag.known and 'battery_resistance' not in values:
             raise InputError(f'the sag of {flown.name} is unknown, so a remedy cannot be chosen: '
                              'give --set battery_resistance=OHM, or fly more changes of throttle')
@@ -426,10 +426,9 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
         taken = taken_words(flight, circuit, throttle, values)
         error = float(np.interp(throttle, flight.throttle, flight.sag_se) / np.interp(
             throttle, flight.throttle, flight.sag))
-        if facts.budget is not None and risks and not values.keys() & SHOWN and math.isfinite(
+        if facts.budget is not None and not values.keys() & SHOWN and math.isfinite(
                 facts.budget.throttle):
-            known = (facts.budget.throttle, float(np.interp(throttle, facts.sag.throttle, risks)),
-                     float(np.interp(0.8 * throttle, facts.sag.throttle, risks)))
+            known = risk_of
     found = designed(circuit, throttle, voltage=level, horizon=horizon, risk=risk, rail=rail,
                      esr_follows=not esr_fixed, capacitances=capacitances or (LEAST, MOST),
                      sag_error=error, flown=known)
@@ -438,8 +437,8 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
 
 
 def _flight(recording: Recording, full: float, cells: int, level: float | None, horizon: float,
-            risk: float) -> tuple[Flight, SupplyFacts, tuple[float, ...]]:
-    """Return a flight in numbers, its facts, and its risks over throttle (full, level in V)."""
+            risk: float) -> tuple[Flight, SupplyFacts, FlownRisk | None]:
+    """Return a flight in numbers, its facts, and the risk at its end (full, level in V)."""
     from ou_monitor.analysis.supply import facts_and_end, node_for
     from ou_monitor.online.estimator.estimator import SLIDING
     from ou_monitor.online.settings import MonitorSettings
@@ -453,11 +452,22 @@ def _flight(recording: Recording, full: float, cells: int, level: float | None, 
             window=SLIDING, brownout_voltage=level, brownout_horizon=horizon,
             brownout_budget_limit=risk, brownout_critical=max(risk, 0.5)))
         deque(parts, 0)
-    facts, load, end = facts_and_end(recording, level, monitor=monitor)
+    facts, load, _ = facts_and_end(recording, level, monitor=monitor)
+
+    @cache
+    def over_throttle(sag: float, noise: float) -> FloatArray:
+        assert monitor is not None
+        # The logarithm is interpolated, as for the budget.
+        return np.asarray(np.log(np.maximum(monitor.changed_risk(sag, noise), 1e-300)))
+
+    def risk_at(throttle: float, sag: float, noise: float) -> float:
+        risks = over_throttle(sag, noise)
+        return float(np.exp(np.interp(throttle, np.linspace(0.0, 1.0, risks.size), risks)))
+
     return Flight(load.level, full, cells, facts.sag.throttle, facts.sag.sag_v, facts.sag.se_v,
                   facts.noise.rms_v, facts.noise.steady_rms_v, facts.noise.flown,
                   min(1.0, float(np.nanmax(recording.throttle))), facts.resistance.ohm,
-                  facts.ou.alpha, facts.ou.var_inf), facts, () if end is None else end.risk_curve
+                  facts.ou.alpha, facts.ou.var_inf), facts, risk_at if monitor else None
 
 
 def reproduce(*, seed: int = 1, progress: Progress | None = None) -> Result:

@@ -19,11 +19,13 @@ from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.load.model_watch import ModelComparison
 from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.online.risk.flag import BrownoutFlag, FlagLevel, FlagState
-from ou_monitor.online.risk.forecast import Forecast, LOOK, look_ahead, RiskOutlook
+from ou_monitor.online.risk.forecast import (
+    Forecast, LOOK, look_ahead, risk_over_throttle, RiskOutlook)
 from ou_monitor.online.settings import AUTO, DEFAULT_LIMIT, MonitorSettings, RAIL
 from ou_monitor.online.trust import Doubt, InputTrust, patience, StampOrder
 from ou_monitor.records import (
-    as_numbers, as_seconds, Counters, Estimate, Flag, Level, MOST_STAMP, NAN, OuFacts, Status)
+    as_numbers, as_seconds, Counters, Estimate, Flag, FloatArray, Level, MOST_STAMP, NAN, OuFacts,
+    Status)
 from ou_monitor.timeline import (
     as_column, as_columns, Batch, MOST_CURRENT, MOST_THROTTLE, MOST_VOLTAGE, OFF, plausible,
     TimeLine, WILD_FACTOR)
@@ -435,6 +437,11 @@ class SupplyMonitor:
         if not self._trusted:
             return NAN
         return float(self._forecast.risk_if(throttle, dwell, level, ahead)[0])
+
+    def changed_risk(self, sag: float, noise: float) -> FloatArray:
+        """Return the risks behind the budget, (51,), with sag and noise variance times these."""
+        level, ahead = self._checked(None, None)
+        return risk_over_throttle(self._forecast, level, ahead, sag, noise)
 
     @property
     def _trusted(self) -> bool:

@@ -13,13 +13,16 @@ Without an LC filter, both risks fall as C rises once the network is slower than
 that C, the second rose by up to 1.44 times in 39 of 6000 random networks.  With an LC filter the
 risk may rise with C, up to an oscillation.
 
-`network_of` chooses components that reproduce a flight; the error of its sag counts in all risks
-of the bus, and the throttle limit is the budget of the flight.  Limits: sag and noise are as
-measured, including the white noise and the filter of the sensor.  Noise added by changes of
-throttle, and an OU if one was found, count as slow fluctuations of the current, which capacitors
-on a board do not change; the rest is attributed to the switching of the ESCs.  Without a measured
-current, the resistance is the given or default one, and the current is scaled to the sag: the
-effect of packs in parallel is then still right, but the effect of an ESR is uncertain.
+`network_of` chooses components that reproduce a flight. All risks of its bus are then those of the
+live risk at the end of the flight (the one behind the budget of `analyze`): of the throttle, with
+the sag times the share of the resistance, and with the noise times the share that the network
+leaves of it. They include the errors of sag and level and what throttle did not explain. Limits:
+sag and noise are as measured, including the white noise and the filter of the sensor. Noise added
+by changes of throttle, and an OU if one was found, count as slow fluctuations of the current,
+which capacitors on a board do not change; the rest is attributed to the switching of the ESCs.
+Without a measured current, the resistance is the given or default one, and the current is scaled
+to the sag: the effect of packs in parallel is then still right, but the effect of an ESR is
+uncertain.
 """
 
 from __future__ import annotations
@@ -54,6 +57,10 @@ _PACKS, _RESISTANCE, _THROTTLE = 3, 0.5, 0.5
 # Quadrature over the error of a mean: range, standard errors; Gauss-Legendre nodes and weights.
 _FAR = 8.0
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(40)
+
+
+# Risk of a flight by throttle, share of the sag, and share of the variance of the noise.
+FlownRisk = Callable[[float, float, float], float]
 
 
 class DesignVerdict(enum.Enum):
@@ -116,7 +123,9 @@ class Lever:
     present: float
     tried: float  # A value that is easy to get.
     risk: float  # Risk with the value tried.
-    least: float  # Value of the smallest change that meets the target; NaN: out of reach.
+    # Value of the smallest change that meets the target (the present value: none is needed); NaN:
+    # out of reach.
+    least: float
 
     def words(self, value: float) -> str:
         """Return a value as shown."""
@@ -146,7 +155,6 @@ class Design:
     resistance: float
     levers: tuple[Lever, ...]  # More capacitance and its alternatives.
     sag_error: float = 0.0  # Standard error of the sag of the bus, relative.
-    flown_risk: float = math.nan  # Risk at this throttle that a flight showed; NaN: unknown.
 
 
 def default_voltage(network: PowerNetwork, rail: str) -> tuple[float, str]:
@@ -210,13 +218,13 @@ def _risks(horizon: float, mean_time: float, crossing: float) -> tuple[float, fl
 def design(
     network: PowerNetwork, throttle: float, *, voltage: float, horizon: float, risk: float,
     rail: str = 'bus', esr_follows: bool = True, capacitances: tuple[float, float] = (LEAST, MOST),
-    sag_error: float = 0.0, flown: tuple[float, float, float] | None = None,
+    sag_error: float = 0.0, flown: FlownRisk | None = None,
 ) -> Design:
     """
     Return the minimum bulk capacitance that meets a brown-out risk (capacitances in F).
 
-    sag_error as in `row_of`; flown: throttle budget of a flight at this voltage, horizon and
-    risk, and its risks at this throttle and at 0.8 of it, by `supply_facts`.
+    sag_error as in `row_of`, for a network without a flight; flown: the risk of a flight at this
+    voltage and horizon, which then is that of all rows and levers.
     """
     low, high = capacitances
     for name, value, unit in (('voltage', voltage, 'V'), ('horizon', horizon, 's'),
@@ -230,12 +238,22 @@ def design(
         raise ValueError(f'the minimum capacitance must be below the maximum, got {low:g} F and '
                          f'{high:g} F')
 
-    present = row_of(rail_at(network, throttle, rail), voltage, horizon, sag_error)
+    own = row_of(rail_at(network, throttle, rail), voltage, horizon, sag_error)
+
+    def as_flown(row: DesignRow) -> DesignRow:
+        if flown is None:
+            return row
+        found = flown(throttle, 1.0, row.var_inf / own.var_inf if own.var_inf > 0.0 else 1.0)
+        rate = -math.log1p(-min(found, 1.0 - 1e-16)) / horizon
+        return replace(row, mean_time=1.0 / rate if rate else math.inf, crossing_rate=rate,
+                       risk_ou=found, risk_crossing=found)
+
+    present = as_flown(own)
 
     def at(capacitance: float) -> DesignRow:
         changed = with_capacitance(network, capacitance, esr_follows)
         try:
-            return row_of(rail_at(changed, throttle, rail), voltage, horizon, sag_error)
+            return as_flown(row_of(rail_at(changed, throttle, rail), voltage, horizon, sag_error))
         except UnstableNetworkError:
             return replace(present, capacitance=capacitance, esr=changed.bulk_esr,
                            alpha=math.nan, tau=math.nan, sigma=math.nan, var_inf=math.inf,
@@ -255,12 +273,12 @@ def design(
         target=risk, esr_follows=esr_follows, verdict=verdict, present=present, least=least,
         rows=tuple(rows), falls=all(b <= a * (1.0 + 1e-9) for a, b in zip(risks, risks[1:])),
         resistance=_resistance(network, throttle, voltage) if rail == 'bus' else math.nan,
-        levers=(), sag_error=sag_error, flown_risk=math.nan if flown is None else flown[1])
+        levers=(), sag_error=sag_error)
     return replace(found, levers=_levers(found, at, flown))
 
 
 def _levers(found: Design, at: Callable[[float], DesignRow],
-            flown: tuple[float, float, float] | None) -> tuple[Lever, ...]:
+            flown: FlownRisk | None) -> tuple[Lever, ...]:
     network, throttle, target, least = found.network, found.throttle, found.target, found.least
 
     def risk(changed: PowerNetwork, u: float = throttle) -> float:
@@ -272,24 +290,24 @@ def _levers(found: Design, at: Callable[[float], DesignRow],
             return 1.0
 
     def resistance(share: float) -> float:
-        return risk(replace(network, battery_resistance=share * network.battery_resistance))
+        return flown(throttle, share, 1.0) if flown is not None else risk(
+            replace(network, battery_resistance=share * network.battery_resistance))
 
     def limit(share: float) -> float:
-        return risk(network, share * throttle)
+        return flown(share * throttle, 1.0, 1.0) if flown is not None else risk(
+            network, share * throttle)
 
     bulk, ohm = network.bulk_capacitance, network.battery_resistance
-    # The budget of the flight, as in other commands, limits throttle; 0: no throttle is safe.
-    most, then = (100.0 * throttle * _share(limit, _THROTTLE, target), limit(0.8)) if (
-        flown is None) else (100.0 * min(flown[0], throttle) if flown[0] > 0.0 else math.nan,
-                             flown[2])
     packs = next((n for n in range(1, _PACKS + 1) if resistance(1.0 / n) <= target), math.nan)
     return (
         Lever('bulk capacitance', 'uF', 1e6 * bulk, 2e6 * bulk, at(2.0 * bulk).risk,
-              math.nan if least is None else 1e6 * max(least.capacitance, bulk)),
+              1e6 * bulk if found.present.risk <= target else
+              math.nan if least is None else 1e6 * least.capacitance),
         Lever('packs in parallel', '', 1.0, 2.0, resistance(0.5), packs),
         Lever('battery and lead resistance', 'mOhm', 1e3 * ohm, 0.75e3 * ohm, resistance(0.75),
               1e3 * ohm * _share(resistance, _RESISTANCE, target)),
-        Lever('throttle limit', '%', 100.0 * throttle, 80.0 * throttle, then, most))
+        Lever('throttle limit', '%', 100.0 * throttle, 80.0 * throttle, limit(0.8),
+              100.0 * throttle * _share(limit, 0.0 if flown is not None else _THROTTLE, target)))
 
 
 def _share(risk: Callable[[float], float], least: float, target: float) -> float:
@@ -299,7 +317,7 @@ def _share(risk: Callable[[float], float], least: float, target: float) -> float
     if risk(least) > target:
         return math.nan
     low, high = least, 1.0
-    while high - low > 1e-3:
+    while high - low > 1e-8:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if risk(middle) <= target else (low, middle)
     return low
@@ -353,17 +371,6 @@ def as_data(result: Design, source: str, taken: str) -> dict[str, Any]:
 
 def answer(result: Design) -> str:
     """Return the answer in words."""
-    fits, limit = result.present.risk <= result.target, result.levers[-1]
-    # The budget of the flight decides; the risk at one throttle differs from it by rounding.
-    over = result.flown_risk > result.target and not limit.least >= limit.present
-    more = '' if not (fits and over) else (
-        f' But right after the flight the risk at this throttle is '
-        f'{probability(result.flown_risk)} (see analyze), from the level and from excursions that '
-        f'no capacitor changes. {_others(result)}')
-    return _network_answer(result) + more
-
-
-def _network_answer(result: Design) -> str:
     present, least = result.present, result.least
     if result.verdict is DesignVerdict.ENOUGH:
         also = '' if least is None else f' {_uf(least)} or more meets the target.'

@@ -48,8 +48,9 @@ def design_document(result: Design, source: str, taken: str = '', command: str =
                'mean time', 'risk OU', 'crossing', ''], cells, left=[9]),
         Table(['what', 'unit', 'present', 'tried', 'risk then', f'needed for {result.target:g}'],
               [[lever.name, lever.unit, lever.words(lever.present), lever.words(lever.tried),
-                probability(lever.risk), lever.words(lever.least)
-                if math.isfinite(lever.least) else 'out of reach'] for lever in result.levers],
+                probability(lever.risk), 'none' if lever.least == lever.present else
+                lever.words(lever.least) if math.isfinite(lever.least) else 'out of reach']
+               for lever in result.levers],
               left=[0, 1]),
         *map(Text, (effect(result), *remarks(result), taken))], command)
 
@@ -77,8 +78,8 @@ def taken_words(flight: Flight, network: PowerNetwork, throttle: float, values: 
     return (f'From the flight: {flight.level:.4g} V open-circuit at its end, {network.cells} '
             f'cells (highest {flight.full:.4g} V; --set cells=N for others), sag {sag:.3g} V (+- '
             f'{2.0 * se:.2g} V, which '
-            'the risks include; the throttle limit is the budget that analyze gives at this risk) '
-            'and noise '
+            'the risks include: those of analyze, with the sag and noise of each row) and '
+            'noise '
             f'{1e3 * float(np.interp(throttle, flight.throttle, flight.noise)):.3g} mV rms at '
             f'{throttle:.0%} throttle, resistance '
             + (f'{1e3 * flight.resistance:.3g} mOhm.' if known else

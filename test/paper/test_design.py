@@ -63,14 +63,21 @@ def test_a_capacitor_that_is_large_enough_is_said_so():
     assert 'No more capacitance is needed' in answer(result)
 
 
-def test_changes_that_already_meet_the_target_are_not_offered():
-    """A flight whose risk is worse than the network's: only throttle may help."""
-    result = design(PowerNetwork(), 0.1, **QUESTION, flown=(0.05, 0.02, 0.01))
-    assert result.verdict is DesignVerdict.ENOUGH
-    assert answer(result).endswith('What would help: throttle limit 5.00 %.')
-    # The budget of the flight lies above this throttle: nothing is missing.
-    enough = design(PowerNetwork(), 0.1, **QUESTION, flown=(0.2, 0.02, 0.01))
-    assert 'But right after' not in answer(enough) and 'Neither' not in answer(enough)
+def test_all_risks_are_those_of_the_flight():
+    """Of throttle, share of the sag and of the noise; no change is needed below the target."""
+    def flown(throttle, sag, noise):
+        return min(1.0, 0.02 * throttle * sag ** 4 * (0.5 + 0.5 * noise))
+
+    found = design(PowerNetwork(), 0.1, **{**QUESTION, 'risk': 1e-3}, flown=flown)
+    bulk, packs, ohm, limit = found.levers
+    assert found.present.risk == pytest.approx(0.002) and found.verdict is not DesignVerdict.ENOUGH
+    assert limit.risk == pytest.approx(0.0016) and limit.least == pytest.approx(5.0, rel=0.01)
+    assert packs.risk == pytest.approx(0.002 / 16.0) and packs.least == 2
+    assert ohm.least / ohm.present == pytest.approx(0.5 ** 0.25, rel=0.01)
+    assert found.rows[-1].risk <= bulk.risk < found.present.risk
+    enough = design(PowerNetwork(), 0.1, **{**QUESTION, 'risk': 0.01}, flown=flown)
+    assert enough.verdict is DesignVerdict.ENOUGH
+    assert all(lever.least == lever.present for lever in enough.levers)
 
 
 def test_a_fixed_esr_may_leave_no_capacitance():

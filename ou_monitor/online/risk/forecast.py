@@ -486,11 +486,18 @@ class Forecast:
         return NAN if state is None else float(
             self.risk_if(state.throttle, horizon, voltage, horizon)[0])
 
-    def risk_if(self, throttle: npt.ArrayLike, dwell: float, voltage: float, horizon: float
-                ) -> FloatArray:
+    def risk_if(self, throttle: npt.ArrayLike, dwell: float, voltage: float, horizon: float,
+                sag: float = 1.0, noise: float = 1.0) -> FloatArray:
         """Return the risk, (k,), of each throttle held for `dwell`, s; NaN: load unknown."""
+        # With the response to throttle times `sag`, and the variance of the noise times `noise`.
         u = np.clip(np.atleast_1d(np.asarray(throttle, dtype=np.float64)), 0.0, 1.0)
         state, now = self._state(), self.voltage
+        if state is not None and (sag, noise) != (1.0, 1.0):
+            scale = np.append((1.0, 1.0), np.full(state.mean.size - 2, sag))
+            b = state.log_variance
+            state = replace(state, mean=scale * state.mean,
+                            covariance=np.outer(scale, scale) * state.covariance,
+                            log_variance=(b[0] + math.log(max(noise, 1e-300)), *b[1:]))
         if now <= voltage:
             return np.ones(u.shape)
         risk = np.zeros(u.shape)
@@ -544,17 +551,23 @@ def look_ahead(forecast: Forecast, load: SupplyLoad, settings: MonitorSettings, 
     soon = forecast.risk_held(voltage, SOON)
     if math.isnan(soon):
         soon = forecast.risk(voltage, min(SOON, horizon)).risk
-    risks = forecast.risk_if(_GRID, horizon, voltage, horizon)
+    risks = risk_over_throttle(forecast, voltage, horizon)
     if np.isnan(risks).any():
         why = '' if load.status is LoadStatus.NO_DATA else load.status.value if (
             not load.known) else 'Less than a second has been flown.'
         return RiskOutlook(outcome, NAN, why, soon=soon)
-    # Less throttle is never riskier, but just after high throttle the law rates idle as riskier.
-    risks = np.minimum.accumulate(risks[::-1])[::-1]
     budget, reason = throttle_budget(risks, forecast.flown[1], s.budget_limit)
     # The comparison is false for NaN.
     return RiskOutlook(outcome, budget, reason, tuple(risks[::5].tolist()), soon,
                        budget < forecast.used)
+
+
+def risk_over_throttle(forecast: Forecast, voltage: float, horizon: float, sag: float = 1.0,
+                       noise: float = 1.0) -> FloatArray:
+    """Return the risk of each throttle of a grid, (51,), held for the horizon; see `risk_if`."""
+    risks = forecast.risk_if(_GRID, horizon, voltage, horizon, sag, noise)
+    # Less throttle is never riskier, but just after high throttle the law rates idle as riskier.
+    return np.asarray(np.minimum.accumulate(risks[::-1])[::-1])
 
 
 def throttle_budget(risks: FloatArray, highest: float, limit: float) -> tuple[float, str]:
