@@ -85,7 +85,9 @@ def _all(z: FloatArray, given: Covariates, lines: bool) -> Iterator[tuple[str, f
     yield from _among_small(w)
     yield from _spectrum(w, given)
     if lines and given.throttle is not None:
-        yield 'order line', _throttle_line(w, given)
+        # The strongest line whose frequency follows throttle.
+        top, count = order_power(w, given.throttle, given.rate)
+        yield 'order line', _from_tail(-math.expm1(-count * math.exp(-top))) if count else 0.0
     yield from _moments(z)
     yield from _clustering(square, given)
     yield from _inputs(w, square, given)
@@ -146,13 +148,6 @@ def _gumbel(top: float, count: float) -> float:
 
 def _from_tail(chance: float) -> float:
     return -float(ndtri(min(max(chance, 1e-300), 0.999)))
-
-
-def _throttle_line(w: FloatArray, given: Covariates) -> float:
-    """Return the strongest line whose frequency follows throttle, as a normal score."""
-    assert given.throttle is not None
-    top, count = order_power(w, given.throttle, given.rate)
-    return 0.0 if count == 0 else _from_tail(-math.expm1(-count * math.exp(-top)))
 
 
 def _moments(z: FloatArray) -> Iterator[tuple[str, float]]:

@@ -108,7 +108,10 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
         soft = 'samples at the end of the range'
     if math.isfinite(low) or math.isfinite(high):
         drawn = (v <= low) | (v >= high)
-        exact.append(_saturation(v, low, high))
+        # A limit that was not found is set far from all readings.
+        far = 1e3 * float(np.ptp(v))
+        exact.append(Saturation(low if math.isfinite(low) else float(v.min()) - far,
+                                high if math.isfinite(high) else float(v.max()) + far))
         notes.append(f'{int(drawn.sum())} {soft} were replaced by random draws beyond the '
                      'range, from an OU through their neighbours.')
         v = redraw(v, low, high, step, np.random.default_rng(0))
@@ -165,13 +168,6 @@ def _knees(v: FloatArray, noise: float, u: FloatArray | None) -> tuple[float, fl
         return -math.inf, math.inf
     bottom, top = find_knee(v, noise, -1.0, u), find_knee(v, noise, 1.0, u)
     return -math.inf if bottom is None else bottom, math.inf if top is None else top
-
-
-def _saturation(v: FloatArray, low: float, high: float) -> Term:
-    """Return the term; a limit that was not found is set far from all readings."""
-    far = 1e3 * (float(v.max()) - float(v.min()))
-    return Saturation(low if math.isfinite(low) else float(v.min()) - far,
-                      high if math.isfinite(high) else float(v.max()) + far)
 
 
 def _usable_throttle(u: FloatArray | None, recorded: bool, notes: list[str]) -> FloatArray | None:

@@ -62,16 +62,12 @@ def kinds_to_try(kinds: Iterable[Kind], model: Sequence[Kind], given: Collection
     # also tried together with latent causes, which imitate it.
     return [kind for kind in kinds
             if kind.NAME not in ('ou', *given) and kind.ROLE is not Role.EXACT
-            and comes_first(kind) is first and (not is_response(kind) or kind.FAMILY == 'slow')
+            and ((kind.MEASURED and not is_response(kind)) or kind.ROLE is Role.NOISE) is first
+            and (not is_response(kind) or kind.FAMILY == 'slow')
             and (throttle or not kind.NEEDS_THROTTLE)
             and (kind.ROLE is not Role.LAW or kind.CHANGES is None or kind.CHANGES in model)
             and (kind.RECURS or all(other.NAME != kind.NAME for other in model))
             and not any(imitate(kind, other) for other in model)]
-
-
-def comes_first(kind: Kind) -> bool:
-    """Return whether a kind is tried before latent causes."""
-    return (kind.MEASURED and not is_response(kind)) or kind.ROLE is Role.NOISE
 
 
 def imitate(one: Kind, other: Kind) -> bool:

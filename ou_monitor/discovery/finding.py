@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.model.supply import SupplyModel
-from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.records import FloatArray, NAN, plain_data
@@ -225,11 +224,8 @@ def _discrepancy(c: Criticism, observed: float, chance: float) -> dict[str, Any]
             'simulated_high': c.high, 'p_value': chance}
 
 
-# Punch-out: quantiles of throttle from which and to which it goes, simulated time before and after
-# it, s, and maximum number of samples.
-_FLOWN, _BEFORE, _AFTER, _MOST = (0.01, 0.99), 1.0, 5.0, 6000
-# Share of the recovery that counts as complete, and minimum recovery as a share of the dip.
-_BACK, _COUNTS = 0.9, 0.1
+# Quantiles of the load between which a fall is measured.
+_FLOWN = (0.01, 0.99)
 # Minimum time between two dips, s, and range in which the predicted minimum of a dip is sought, s.
 _APART, _NEAR = 0.2, 0.05
 # Relative error of a fall under load above which the model does not reproduce it.
@@ -240,63 +236,28 @@ _MADE = 0.5
 
 @dataclass(frozen=True)
 class ThrottleEffects:
-    """Effects of throttle: a punch-out halfway through the recording, and the recorded dips."""
+    """Effects of the load: the fall of the voltage from low to high load, and the dips."""
 
-    # Load before and after the punch-out.
+    # Low and high load.
     low: float = NAN
     high: float = NAN
-    # Median fall from readings at the lower load to those at the higher, V: as measured, and of
-    # the mean of the model.
+    # Fall of the median from readings at the low load to those at the high, V: as measured, of the
+    # mean of the model, and standard error of their difference.
     measured: float = NAN
     explained: float = NAN
-    error: float = NAN  # Standard error of their difference, V
+    error: float = NAN
     full: float = NAN  # Current that is a load of 1, A; NaN if the load is throttle
-    # Maximum fall of the mean, V, and its time after the punch-out, s.
-    dip: float = NAN
-    after: float = NAN
-    # Recovery while throttle is held, V, and time to 90 % of it, s; 0 and NaN without any.
-    recovered: float = 0.0
-    within: float = NAN
     level: float = NAN  # Voltage, V, below which dips are counted
-    # Number of dips, and of dips of which throttle caused more than half.
+    # Number of dips, and of dips of which the load caused more than half.
     dips: int = 0
     made: int = 0
 
     def as_data(self) -> dict[str, Any]:
         """Return the fields for JSON."""
         return {
-            'punch_out': {'from': self.low, 'to': self.high, 'measured_v': self.measured,
-                          'explained_v': self.explained, 'dip_v': self.dip,
-                          'dip_after_s': self.after, 'recovered_v': self.recovered,
-                          'recovered_within_s': self.within},
+            'fall': {'from': self.low, 'to': self.high, 'measured_v': self.measured,
+                     'explained_v': self.explained},
             'dips': {'level_v': self.level, 'count': self.dips, 'made_by_throttle': self.made}}
-
-    @property
-    def words(self) -> str:
-        """Return the effects in words; empty if throttle has none."""
-        if not self.dip > 0.0:
-            return ''
-        load, unit = ('current', ' A') if math.isfinite(self.full) else ('throttle', '')
-        low, high = (number(self.full * end if unit else end, 2) + unit
-                     for end in (self.low, self.high))
-        found = (f'The median voltage at {load} {high} is {number(self.measured, 2)} V below that '
-                 f'at {low}')
-        if not self.fits:
-            found += f', but {number(self.explained, 2)} V by the model: trust the readings.'
-        else:
-            found += (f'; by the model, a step from {low} to {high} lowers it by '
-                      f'{number(self.dip, 2)} V')
-            if self.recovered > 0.0:
-                found += (f' after {number(1e3 * self.after, 2)} ms, of which '
-                          f'{number(self.recovered, 2)} V recover within '
-                          f'{number(self.within, 2)} s')
-            found += '.'
-        if self.dips:
-            made = (f'caused {self.made} of the {self.dips} dips' if self.dips > 1 else
-                    f'{"caused" if self.made else "did not cause"} the only dip')
-            found += (f' {"The current" if unit else "Throttle"} {made} below '
-                      f'{number(self.level, 4)} V.')
-        return found
 
     @property
     def fits(self) -> bool:
@@ -304,40 +265,41 @@ class ThrottleEffects:
         off = abs(self.explained - self.measured)
         return not (off > _WRONG * abs(self.measured) and off > Z95 * self.error)
 
+    @property
+    def words(self) -> str:
+        """Return the effects in words; empty if the load has none."""
+        if math.isnan(self.measured):
+            return ''
+        load, unit = ('current', ' A') if math.isfinite(self.full) else ('throttle', '')
+        low, high = (number(self.full * end if unit else end, 2) + unit
+                     for end in (self.low, self.high))
+        found = (f'The median voltage falls by {number(self.measured, 2)} V from {load} {low} to '
+                 f'{high}, {number(self.explained, 2)} V by the model'
+                 + ('.' if self.fits else ': trust the readings.'))
+        if self.dips:
+            made = (f'caused {self.made} of the {self.dips} dips' if self.dips > 1 else
+                    f'{"caused" if self.made else "did not cause"} the only dip')
+            found += (f' {"The current" if unit else "Throttle"} {made} below '
+                      f'{number(self.level, 4)} V.')
+        return found
+
 
 def throttle_effects(samples: Samples, terms: Sequence[Term], level: float, full: float = NAN
                      ) -> ThrottleEffects:
-    """Return what a model predicts for punch-outs and for dips below a level, V (full in A)."""
+    """Compare the fall under load with the model's; count dips below a level, V (full in A)."""
     responses = [term for term in terms if term.ROLE is Role.MEAN and term.MEASURED]
-    u = samples.throttle
+    u, v = samples.throttle, samples.logged
     if u is None or not any(term.NEEDS_THROTTLE for term in responses):
         return ThrottleEffects()
     low, high = np.quantile(u, _FLOWN).tolist()
-    step = max(float(np.median(samples.step[1:])), (_BEFORE + _AFTER) / _MOST)
-    t = step * np.arange(math.ceil((_BEFORE + _AFTER) / step), dtype=np.float64)
-    half = 0.5 * float(samples.t[-1] - samples.t[0])
-    held = [term.at(half) if isinstance(term, LoadSag) else term
-            for term in responses if term.NEEDS_THROTTLE]
-    path = _path(Samples(t, t, np.where(t < _BEFORE, low, high)), held)
-    begin = int(np.searchsorted(t, _BEFORE))
-    fall = path[begin - 1] - path[begin:]
-    deepest = int(np.argmax(fall))
-    dip = float(fall[deepest])
-    back = dip - fall[deepest:]
-    recovered = float(back.max(initial=0.0))
-    if not recovered > _COUNTS * dip:
-        recovered = 0.0
-    within = step * int(np.argmax(back >= _BACK * recovered)) if recovered else NAN
-    mean = _path(samples, responses)
-    v, ends = samples.logged, (u <= low, u >= high)
+    mean, ends = _path(samples, responses), (u <= low, u >= high)
     measured, explained = (float(np.median(y[ends[0]]) - np.median(y[ends[1]]))
                            for y in (v, mean))
     # Readings of one stay at a load are not independent.
     stays = [1 + int((end[1:] & ~end[:-1])[1:].sum()) for end in ends]
     error = float(np.std(v - mean)) * math.sqrt(sum(1.0 / count for count in stays))
-    dips, made = _dips(samples, mean, level)
-    return ThrottleEffects(low, high, measured, explained, error, full, dip, step * (deepest + 1),
-                           recovered, within, level, dips, made)
+    return ThrottleEffects(low, high, measured, explained, error, full, level,
+                           *_dips(samples, mean, level))
 
 
 def _path(samples: Samples, responses: Sequence[Term]) -> FloatArray:

@@ -137,8 +137,11 @@ def _withdrawn(fitter: Fitter, found: _Result, begun: _Result) -> list[int]:
                              found.search.before_accepted)
     # Noise terms of the load model stay.
     out = [k for k in out if names[k] not in begun.search.accepted]
+    view = fitter.view(found.whole)
     return sorted({*_in_doubt(fitter.samples, found.whole, names, out),
-                   *_mislabelled(fitter, found.whole, names)})
+                   # Causes with states of their own that no longer fit their name.
+                   *(k for k, kind in enumerate(kinds_of(names)) if kind.ROLE is Role.BLOCK
+                     and not found.whole.terms[position(found.whole, names, k)].holds(view))})
 
 
 def _with_trends(samples: Samples, whole: Composite, rivals: Mapping[str, list[str]]
@@ -174,10 +177,3 @@ def _in_doubt(samples: Samples, whole: Composite, names: Sequence[str], out: Seq
         return prominence(z, rate, term.frequency, term.damping / math.pi) > decision.FAILS
 
     return [k for k in out if not is_sure(k)]
-
-
-def _mislabelled(fitter: Fitter, whole: Composite, names: Sequence[str]) -> list[int]:
-    """Return the causes with states of their own that no longer fit their name."""
-    view = fitter.view(whole)
-    return [k for k, kind in enumerate(kinds_of(names)) if kind.ROLE is Role.BLOCK
-            and not whole.terms[position(whole, names, k)].holds(view)]

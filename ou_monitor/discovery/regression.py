@@ -142,7 +142,9 @@ class _Regression:
 
     def search(self, start: Sequence[int]) -> MeanResponse:
         """Add and remove terms until no change improves the evidence."""
-        chosen = self._one_of_a_kind(start)
+        chosen: tuple[int, ...] = ()
+        for k in start:
+            chosen = self._with_term(chosen, k)
         for _ in range(_ROUNDS):
             better = self._best_move(chosen)
             if better is None:
@@ -205,12 +207,6 @@ class _Regression:
         kept = chosen if kind.SEVERAL else tuple(
             j for j in chosen if type(self._pool[j]) is not kind)
         return tuple(sorted((*kept, k)))
-
-    def _one_of_a_kind(self, start: Sequence[int]) -> tuple[int, ...]:
-        chosen: tuple[int, ...] = ()
-        for k in start:
-            chosen = self._with_term(chosen, k)
-        return chosen
 
     def _evidence(self, chosen: tuple[int, ...]) -> float:
         """Return the evidence for a set of terms, nats."""

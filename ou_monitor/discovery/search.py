@@ -171,18 +171,15 @@ def _round(fitter: Fitter, search: Search, bank: NullBank, given: Sequence[str],
         trials += [trial for trial in fitter.trials(
             search.composite, kinds, lambda model: criticise(fitter.samples, model, bank))
                    if trial.evidence > _needed(fitter, search.composite, trial.name)]
-        steady = [trial for trial in trials if _is_steady(trial, search)]
+        steady = [trial for trial in trials if decision.is_shared([
+            float(part.sum()) for part in np.array_split(
+                trial.composite.density - search.composite.density, BLOCKS)], Z95)]
         if first and steady:
             return steady
     trials.sort(key=lambda trial: -trial.evidence)
     # In a tie measured causes come first; a trend is one, because time is measured.
     return sorted(trials, key=lambda trial: not (
         catalogue()[trial.name].MEASURED and trial.evidence > trials[0].evidence - decision.TIE))
-
-
-def _is_steady(trial: Trial, search: Search) -> bool:
-    gains = trial.composite.density - search.composite.density
-    return decision.is_shared([float(part.sum()) for part in np.array_split(gains, BLOCKS)], Z95)
 
 
 def _needed(fitter: Fitter, model: Composite, name: str, least: float = decision.ACCEPT) -> float:
