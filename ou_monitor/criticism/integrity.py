@@ -115,7 +115,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
         notes.append(f'{int(drawn.sum())} {soft} were replaced by random draws beyond the '
                      'range, from an OU through their neighbours.')
         v = redraw(v, low, high, step, np.random.default_rng(0))
-    cell = _judge_step(step, _innovation_std(v[kept]), exact, notes)
+    cell = _judge_step(step, _innovation_std(v), exact, notes)
     stamps = judge_stamps(t, v)
     notes += stamps.notes
     if stamps.error > 0.0:
