@@ -7,13 +7,14 @@ penalty (BIC), and the gain in cross-validation over blocks.  The first guards a
 second against a form that only improves one part of the recording.  Starting from the load model,
 terms are added and removed one at a time.
 
-Limits: time constants and delays come from a list; the noise is not fitted again.
+Limits: delays come from a list, as do time constants before they are refined; the noise is not
+fitted again.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -26,7 +27,7 @@ from ou_monitor.model.load import INRUSH_TIME
 from ou_monitor.model.load_fit import fit_load
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.laws import View
-from ou_monitor.model.terms.load_response import LoadSag, LoadTransient, SHORTEST
+from ou_monitor.model.terms.load_response import LoadSag, LoadTransient, LONGEST, SHORTEST
 from ou_monitor.model.terms.slow import Drift
 from ou_monitor.model.terms.term import NEXT_TO_ZERO, Role, Term
 from ou_monitor.records import FloatArray
@@ -37,6 +38,8 @@ FOLDS = 10
 _MOST = 2000
 # Ratio below which two time constants count as equal: half an octave, the spacing of the list.
 _ALIKE = 1.5
+# Steps by which time constants are refined, octaves.
+_FINER = (0.25, 0.125, 0.0625)
 # Maximum number of terms added, removed or exchanged.
 _ROUNDS = 40
 
@@ -59,7 +62,7 @@ def load_terms(samples: Samples) -> tuple[Term, ...]:
     duration = float(samples.t[-1] - samples.t[0])
     shortest = float(np.median(samples.step[1:]))
     times = [tau for tau in (INRUSH_TIME, model.fast_time, model.slow_time)
-             if SHORTEST * shortest <= tau and decision.relaxes(1.0 / tau, duration)]
+             if SHORTEST * shortest <= tau <= LONGEST * duration]
     terms = (LoadSag(0.0, NEXT_TO_ZERO), *(LoadTransient(0.0, tau, 0.0) for tau in times),
              Drift(0.0, NEXT_TO_ZERO))
     return tuple(term for term in terms if term.NAME in catalogue())
@@ -84,8 +87,26 @@ def mean_response(samples: Samples, composite: Composite, view: View,
              and not (start and isinstance(term, LoadSag) and term.growth)]
     if not pool:
         return MeanResponse((), (), ())
-    return _Regression(samples, composite, pool).search([
+    found = _Regression(samples, composite, pool).search([
         k for k, term in enumerate(pool) if term in own or term in start])
+    return _refined(samples, composite, found)
+
+
+def _refined(samples: Samples, composite: Composite, found: MeanResponse) -> MeanResponse:
+    """Return a response with its time constants between those of the list."""
+    # Half an octave beside the truth, a response of 0.6 V leaves 40 mV, which pass for a slow OU.
+    terms, worth = found.terms, found.worth
+    for octaves in _FINER:
+        nearby = [(k, replace(term, tau=term.tau * 2.0 ** by)) for k, term in enumerate(terms)
+                  if isinstance(term, LoadTransient) and not term.delay
+                  for by in (-octaves, octaves)]
+        if not nearby:
+            break
+        pool = [*terms, *(term for _, term in nearby)]
+        chosen, worth = _Regression(samples, composite, pool).exchanged(
+            len(terms), [k for k, _ in nearby])
+        terms = tuple(pool[k] for k in chosen)
+    return MeanResponse(terms, worth, found.rivals)
 
 
 def _measured(term: Term) -> bool:
@@ -113,15 +134,10 @@ def _is_near(one: Term, other: Term) -> bool:
 
 def _candidates(view: View) -> Iterator[Term]:
     """Yield the candidates of all measured causes of the mean."""
-    duration = float(view.at[-1])
     for kind in catalogue().values():
         if kind.ROLE is Role.MEAN and kind.MEASURED and (
                 view.throttle is not None or not kind.NEEDS_THROTTLE):
-            for term in kind.candidates(view):
-                # A delayed response need not relax.
-                if (not isinstance(term, LoadTransient) or term.delay > 0.0
-                        or decision.relaxes(1.0 / term.tau, duration)):
-                    yield term
+            yield from kind.candidates(view)
 
 
 class _Regression:
@@ -151,12 +167,29 @@ class _Regression:
                 break
             chosen = better
         chosen = self._with_plainer_term(chosen)
-        worth = [self._evidence(chosen) - self._evidence(self._less(chosen, k)) for k in chosen]
+        worth = self._worth(chosen)
         order = np.argsort(-np.array(worth)) if worth else np.zeros(0, dtype=int)
         found = [chosen[k] for k in order.tolist()]
         return MeanResponse(tuple(self._pool[k] for k in found),
                             tuple(worth[k] for k in order.tolist()),
                             tuple(self._rivals(chosen, k) for k in found))
+
+    def exchanged(self, own: int, places: Sequence[int]
+                  ) -> tuple[tuple[int, ...], tuple[float, ...]]:
+        """Return the first terms, each in its place or a better later one, and their worth."""
+        # places: the place of each later term of the pool.
+        chosen = list(range(own))
+        for k, place in enumerate(places, own):
+            other = [*chosen[:place], k, *chosen[place + 1:]]
+            if self._evidence(tuple(other)) > self._evidence(tuple(chosen)) + decision.TIE:
+                chosen = other
+        kept = tuple(chosen)
+        return kept, self._worth(kept)
+
+    def _worth(self, chosen: tuple[int, ...]) -> tuple[float, ...]:
+        """Return the evidence lost without each term, nats."""
+        return tuple(self._evidence(chosen) - self._evidence(self._less(chosen, k))
+                     for k in chosen)
 
     def _best_move(self, chosen: tuple[int, ...]) -> tuple[int, ...] | None:
         """Return the set after the most useful change; None if no change helps."""

@@ -7,15 +7,19 @@ import numpy as np
 from ou_monitor.criticism.composite import fit_composite, view_of
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import regression
+from ou_monitor.discovery.discover import discover
 from ou_monitor.discovery.regression import (
     _candidates, _contains, _is_near, _Regression, FOLDS, mean_response)
+from ou_monitor.model.ou import simulate
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.slow import Drift
+from ou_monitor.model.terms.slow import Drift, SecondRelaxation
 from ou_monitor.model.terms.term import Role
+from ou_monitor.records import Recording
 import pytest
+from scipy.signal import lfilter
 
 
 def response(tau, delay=0.0):
@@ -50,11 +54,11 @@ def test_candidates_are_measured_causes_of_the_mean(throttle):
               and (throttle is not None or not kind.NEEDS_THROTTLE)}
     assert kinds == wanted and (LoadSag in kinds) is (throttle is not None)
     lags = [term for term in found if isinstance(term, LoadTransient)]
-    # In 4 s a rate of 5 1/s is one; what is late for good has none.
-    assert all(term.tau <= 0.2 for term in lags if term.delay == 0.0)
+    # At most an eighth of 4 s; what is late for good has none.
+    assert all(term.tau <= 0.5 for term in lags if term.delay == 0.0)
     assert all(term.tau > 100.0 for term in lags if term.delay > 0.0)
     if throttle is not None:
-        assert max(term.tau for term in lags if term.delay == 0.0) > 0.13
+        assert max(term.tau for term in lags if term.delay == 0.0) > 0.3
         assert any(term.delay > 0.0 for term in lags)
 
 
@@ -151,3 +155,19 @@ def test_a_sag_replaces_a_lag_that_ties(driven, size, named, monkeypatch):
     found_response = found.search((1,))
     assert [type(term) for term in found_response.terms] == [named]
     assert found_response.rivals == ((('load_transient',) if named is LoadSag else ()),)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_time_constant_between_those_of_the_list_is_measured(seed):
+    """A polarisation of 1.5 s is found within 7 %, and no second relaxation."""
+    # Half a step of the list is 19 %; the steps of the refinement end at 2 %.
+    rng = np.random.default_rng(seed)
+    t = np.arange(6000) / 100.0
+    u = np.repeat(rng.uniform(0.0, 1.0, 60), 100)
+    keep = math.exp(-0.01 / 1.5)
+    late = lfilter([1.0 - keep], [1.0, -keep], u, zi=[keep * u[0]])[0]
+    v = 12.0 - 0.6 * u - 0.5 * late + simulate(t, 30.0, 0.08, rng)
+    found = discover(Recording(t, v + 0.005 * rng.standard_normal(t.size), u, 'made'))
+    (lag,) = [cause.term for cause in found.causes if isinstance(cause.term, LoadTransient)]
+    assert lag.tau == pytest.approx(1.5, rel=0.07)
+    assert not any(isinstance(cause.term, SecondRelaxation) for cause in found.causes)

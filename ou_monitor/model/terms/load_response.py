@@ -140,7 +140,7 @@ class LoadTransient(Term):
     def candidates(cls, view: View) -> Sequence[Term]:
         """Return time constants from half a step to a quarter of the recording, and delays."""
         step = 1.0 / view.rate
-        longest = 0.25 * float(view.at[-1])
+        longest = LONGEST * float(view.at[-1])
         if longest <= 2.0 * step:
             return ()
         count = max(2, math.ceil(2.0 * math.log2(longest / (SHORTEST * step))))
@@ -151,11 +151,13 @@ class LoadTransient(Term):
         late = np.unique(np.rint(np.geomspace(step, latest, _DELAYS) / step)) * step
         inrush = [cls(0.0, lag.tau, 0.0, NEXT_TO_ZERO) for lag in lags if lag.tau < _INRUSH]
         return [*lags, *inrush, *(
-            cls(0.0, _LASTING * 4.0 * longest, float(delay)) for delay in late)]
+            cls(0.0, _LASTING / LONGEST * longest, float(delay)) for delay in late)]
 
 
 # Shortest visible time constant, in steps: one seventh of the response remains at the next sample.
 SHORTEST = 0.5
+# Longest time constant, in durations of the recording: a slower response looks like a drift.
+LONGEST = 0.125
 # Longest time that motors take to speed up, s.
 _INRUSH = 0.2
 # Number of delays to try, and the longest, s.
