@@ -271,7 +271,9 @@ def _filtered(f: FloatArray, q: FloatArray, h: FloatArray, r: FloatArray) -> Flo
     turns = _pattern(f)
     weight = _inverse(q)
     known = _pattern(weight)
-    forward = _multiply(weight, f, known, turns)
+    # What is not finite is refused below.
+    with np.errstate(over='ignore', invalid='ignore'):
+        forward = _multiply(weight, f, known, turns)
     # Information on this sample from the step into the next one.
     back = np.zeros_like(f)
     _symmetric(f[..., 1:], forward[..., 1:], turns, known @ turns, back[..., :-1])
