@@ -27,6 +27,8 @@ _USUAL = 2.0
 # A lithium cell at rest, V: highest after charging (LiHV 4.35 V, and 0.1 V for the sensor), lowest
 # without damage (a lead-acid cell has 2.1 V), and lowest at the beginning of a flight.
 HIGHEST_CELL, LOWEST_CELL, _BEGINS = 4.45, 2.5, 3.0
+# Between a full cell (4.2 V) and one stored half full (3.8 V).
+_HALF = 4.0
 # Cells of usual packs of LiFePO4, and the plateau of such a cell at rest, V.
 _IRON_CELLS, _IRON = (4, 8, 12, 16), (3.2, 3.45)
 # Voltage of an empty lithium cell under load, V (vbat_min_cell_voltage of Betaflight, and the
@@ -121,11 +123,12 @@ def full_voltage(recording: Recording) -> float:
 
 
 def cell_count(full: float) -> int:
-    """Return the minimum number of cells with this voltage at rest, V; 0 if implausible."""
+    """Return the most likely number of cells with this voltage at rest, V; 0 if implausible."""
     if not (math.isfinite(full) and full > 0.0):
         return 0
-    cells = math.ceil(full / HIGHEST_CELL)
-    return cells if fits(full, cells) else 0
+    least = math.ceil(full / HIGHEST_CELL)
+    likely = [cells for cells in range(least, int(full / _BEGINS) + 1) if fits(full, cells)]
+    return min(likely, key=lambda cells: abs(full / cells - _HALF), default=0)
 
 
 def fits(full: float, cells: int) -> bool:

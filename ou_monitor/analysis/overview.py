@@ -15,7 +15,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.supply import (
     facts_and_end, flown_near, Remainder, SupplyFacts, THROTTLES)
-from ou_monitor.online.load.supply_load import LoadStatus, SupplyLoad
+from ou_monitor.online.load.supply_load import hold, LoadStatus, SupplyLoad
 from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.records import FloatArray, NAN, OuFacts, Recording
 from ou_monitor.text import counted, number, percent, volts, Z95
@@ -24,8 +24,6 @@ from ou_monitor.text import counted, number, percent, volts, Z95
 _GROWS = 1.25
 # Minimum noise, V; less is rounding.
 _NOTHING = 1e-9
-# Time within which the resistance acts, s.
-_AT_ONCE = 0.1
 # Minimum share of the noise of a level that lines must make up to be mentioned in the answer.
 _LOUD = 0.25
 
@@ -152,8 +150,8 @@ def known_lines(found: Overview) -> list[tuple[str, str]]:
     lines += [('Sag', _sag_words(found)), ('Noise', _noise_words(found))]
     if math.isfinite(resistance.ohm):
         lines.append(('Resistance', f'{number(1e3 * resistance.ohm)} mOhm (+- '
-                      f'{number(2e3 * resistance.se_ohm, 2)}) within '
-                      f'{max(_AT_ONCE, found.step):.2g} s'
+                      f'{number(2e3 * resistance.se_ohm, 2)}) after '
+                      f'{max(hold(found.duration), found.step):.2g} s'
                       + (f'; computed: {fall}' if (fall := _fall_words(found)) else '')))
     elif found.drawn > 0.0:
         lines.append(('Resistance', 'unknown: the current changes too little, or a load seems '

@@ -148,6 +148,7 @@ class Design:
     present: DesignRow  # With the present capacitor.
     # With the smallest capacitance such that all larger ones meet the target; None: no such one.
     least: DesignRow | None
+    doubled: DesignRow  # With twice the present capacitance.
     rows: tuple[DesignRow, ...]  # A table over capacitances, rising.
     falls: bool  # Whether the risk never rises with capacitance in the table.
     # Battery resistance at which the mean of the bus is at the level, Ohm; NaN if there is none or
@@ -271,7 +272,8 @@ def design(
     found = Design(
         network=network, rail=rail, throttle=throttle, voltage=voltage, horizon=horizon,
         target=risk, esr_follows=esr_follows, verdict=verdict, present=present, least=least,
-        rows=tuple(rows), falls=all(b <= a * (1.0 + 1e-9) for a, b in zip(risks, risks[1:])),
+        doubled=at(2.0 * present.capacitance), rows=tuple(rows),
+        falls=all(b <= a * (1.0 + 1e-9) for a, b in zip(risks, risks[1:])),
         resistance=_resistance(network, throttle, voltage) if rail == 'bus' else math.nan,
         levers=(), sag_error=sag_error)
     return replace(found, levers=_levers(found, at, flown))
@@ -416,12 +418,7 @@ def effect(result: Design) -> str:
           and result.rows[-1].capacitance > a.capacitance):
         b = result.rows[-1]
     else:
-        twice = with_capacitance(result.network, 2.0 * a.capacitance, result.esr_follows)
-        try:
-            b = row_of(rail_at(twice, result.throttle, result.rail), result.voltage,
-                       result.horizon, result.sag_error)
-        except UnstableNetworkError as error:
-            return f'With {number(2e6 * a.capacitance)} uF {error}.'
+        b = result.doubled
     if not b.stable:
         return f'With {_uf(b)} the network is unstable.'
     text = (f'From {_uf(a)} to {_uf(b)}: alpha {_change(a.alpha, b.alpha, " 1/s")}, Var_inf '

@@ -78,7 +78,7 @@ def answer(analysis: Analysis) -> list[str]:
         f'Safe up to {100.0 * curves.budget:.0f} % throttle{_fall_within_budget(analysis)}.'
         if curves.budget > 0.0 else
         f'No throttle keeps the risk below {100.0 * curves.limit:g} % '
-        f'{_why_no_throttle(analysis)}: at idle it is {percent(curves.risk[0])}.']
+        f'{_why_no_throttle(analysis)}.']
     return [first, *safe, *others, *craft_advice(analysis.craft),
             *_numbers(analysis), *_change(analysis),
             *(words for name, words in _BEWARE.items() if name in names)]
@@ -140,8 +140,10 @@ def _fall_within_budget(analysis: Analysis) -> str:
 
 
 def _why_no_throttle(analysis: Analysis) -> str:
-    """Return why no throttle meets the limit: the flight before, or a supply low even at rest."""
-    rest = analysis.overview.load.level
+    """Return why no throttle meets the limit: a low end, the flight before, or a low rest."""
+    rest, last = analysis.overview.load.level, float(analysis.recording.voltage[-1])
+    if last < analysis.by_throttle.voltage < rest:
+        return f'at the end of this recording, which reads {number(last, 4)} V'
     if rest > analysis.by_throttle.voltage:
         return f'right after this flight, though the supply at rest is at {number(rest, 4)} V'
     return f'even at idle, as the supply at rest is at {number(rest, 4)} V'

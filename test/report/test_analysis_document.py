@@ -63,16 +63,20 @@ def test_the_table_over_throttle_is_that_of_the_facts(analysis):
     assert all(row['throttle'].endswith('\nnot flown') for row in others)
 
 
-@pytest.mark.parametrize('level, words', [(14.0, 'right after this flight'),
-                                          (13.0, 'even at idle')])
-def test_a_missing_budget_states_its_cause(analysis, level, words):
-    """The supply at rest is below the limit, or what was flown just now takes it there."""
-    curves = analysis.by_throttle
+@pytest.mark.parametrize('level, last, words', [(14.0, 13.5, 'right after this flight'),
+                                                (14.0, 13.1, 'at the end of this recording'),
+                                                (13.0, 13.1, 'even at idle')])
+def test_a_missing_budget_states_its_cause(analysis, level, last, words):
+    """A supply below the limit at rest or at the end, or a flight that just now takes it there."""
+    curves, voltage = analysis.by_throttle, analysis.recording.voltage.copy()
+    voltage[-1] = last
+    analysis = replace(analysis, recording=replace(analysis.recording, voltage=voltage))
     none = replace(analysis, by_throttle=replace(
         curves, voltage=13.2, budget=0.0, risk=np.full(curves.throttle.size, 0.3)),
         overview=replace(analysis.overview, load=replace(analysis.overview.load, level=level)))
     safe = dict(facts(none))['Safe up to']
-    assert safe.startswith(f'no throttle, {words}') and f'{level:.2f} V' in safe
+    assert safe.startswith(f'no throttle, {words}')
+    assert f'{last if "end" in words else level:.2f} V' in safe
     assert safe.endswith('within 5 s is 0.3')
 
 
