@@ -47,7 +47,7 @@ def test_intervals_cover_the_truth():
 def test_intervals_cover_the_truth_beside_a_tone():
     """Of 30 rails with a tone as large as the OU, 95 % intervals of sigma cover at least 24."""
     # Binomial: fewer than 24 of 30 at a coverage of 95 % has a chance of 0.04 %.  With the tone
-    # in the noise, sigma is at least 30 % too high, and none is covered.
+    # in the noise, sigma is 0.5 to 3.7 times the true one, and none is covered.
     inside = 0
     for seed in range(30):
         rng = np.random.default_rng(seed)
