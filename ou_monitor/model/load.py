@@ -160,7 +160,7 @@ LAGS = (0.06, 0.35, 2.0, 15.0)
 LINEAR_LAGS = (0.35, 2.0)
 # Coefficients of x, u, u^3, x after LAGS, u after LINEAR_LAGS, and inrush, with x = u^1.8.
 SIZE = 4 + len(LAGS) + len(LINEAR_LAGS)
-# Places of the coefficients in model files of 0.3.0, without x after 0.35 s and u after a lag.
+# Places of the coefficients in former model files, without x after 0.35 s and u after a lag.
 _FORMER = (0, 1, 2, 3, 5, 6, SIZE - 1)
 # A model file may omit the last entries.
 _OPTIONAL = 9
@@ -240,7 +240,7 @@ class LoadStart:
 
 
 def _present(values: dict[str, Any]) -> dict[str, Any]:
-    """Add the coefficients that a file of 0.3.0 lacks: zero, with the usual deviation."""
+    """Add the coefficients that a former file lacks: zero, with the usual deviation."""
     try:
         a, P = np.array(values['coefficients']), np.array(values['covariance'])
     except ValueError:

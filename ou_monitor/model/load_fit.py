@@ -21,7 +21,8 @@ from ou_monitor.records import determined, FloatArray, log_interval, NAN
 from scipy.optimize import least_squares
 
 # Prior centre and deviation of each parameter (of its logarithm unless it is in _LINEAR): usual
-# figures of lithium-polymer packs with two RC pairs, tightened on the recordings (doc/load.md).
+# figures of lithium-polymer packs with two RC pairs, tightened on the recordings; lag and
+# endurance widened again on simulated boats, planes and e-bikes (doc/load.md).
 _PRIOR = {
     'size': (math.log(0.12), 0.7), 'power': (math.log(1.8), 0.1),
     'fast_share': (math.log(0.2), 0.3), 'fast_time': (math.log(1.0), 0.7),

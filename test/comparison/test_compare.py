@@ -1,10 +1,11 @@
 """A recording compared with its simulations: verdicts, and the largest difference."""
 
 from dataclasses import replace
+import math
 
 import numpy as np
 from ou_monitor.comparison.compare import compare
-from ou_monitor.comparison.flight_model import damping, Readings
+from ou_monitor.comparison.flight_model import damping, fit_flight, Readings
 from ou_monitor.comparison.yardstick import Likeness
 from ou_monitor.errors import InputError
 from ou_monitor.model.load import LoadModel, lowpass
@@ -95,6 +96,19 @@ def test_only_the_part_after_fit_until_is_simulated():
     assert found.simulated == (30.0, pytest.approx(39.99))
     assert found.fitted == (0.0, 0.0)
     assert found.traces.t[0] == 30.0
+
+
+class Marked:
+    """A fit of the load that counts how often it is drawn."""
+
+    def __init__(self, fit, kinds):
+        """Count in the list `kinds`."""
+        self.fit, self.kinds, self.slow_std = fit, kinds, fit.slow_std
+
+    def draw(self, rng):
+        """Draw a model, and count it."""
+        self.kinds.append(1)
+        return self.fit.draw(rng)
 
 
 def flight(seed: int, n: int = 1500, rate: float = 50.0) -> Recording:
@@ -195,6 +209,25 @@ def test_a_bench_supply_does_not_discharge():
     found = compare(Recording(t, v, u, 'bench'), fit_until=30.0, seeds=20)
     assert found.explained > 0.95
     assert any('the level is constant' in note for note in found.notes)
+
+
+def test_both_kinds_of_level_are_simulated_by_their_probability():
+    """The mean path is their weighted mean, and of 300 simulations their share has the other."""
+    recording = flight(0)
+    samples = Readings(recording.t, recording.voltage, recording.throttle)
+    found = fit_flight(samples, lambda share: None)
+    ahead = abs(found.load.evidence - found.other.evidence)
+    assert math.isnan(found.load.model.constant_level) != math.isnan(
+        found.other.model.constant_level)
+    assert found.doubt == pytest.approx(1.0 / (1.0 + math.exp(ahead)))
+    one, other, both = (replace(found, doubt=doubt).path(samples) for doubt in (0.0, 1.0, 0.3))
+    assert both == pytest.approx(0.7 * one + 0.3 * other)
+    # 300 draws: 0.3 +- 0.026; 4 of them.
+    rng, kinds = np.random.default_rng(1), []
+    chosen = replace(found, doubt=0.3, other=Marked(found.other, kinds))
+    for _ in range(300):
+        chosen.draw(samples.part(slice(0, 200)), rng)
+    assert len(kinds) / 300 == pytest.approx(0.3, abs=0.106)
 
 
 def test_held_samples_count_once():

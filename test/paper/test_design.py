@@ -77,6 +77,8 @@ def test_all_risks_are_those_of_the_flight():
     assert found.rows[-1].risk <= bulk.risk < found.present.risk
     enough = design(PowerNetwork(), 0.1, **{**QUESTION, 'risk': 0.01}, flown=flown)
     assert enough.verdict is DesignVerdict.ENOUGH
+    noise = enough.doubled.var_inf / enough.present.var_inf
+    assert enough.doubled.risk == pytest.approx(flown(0.1, 1.0, noise)) and noise < 0.9
     assert all(lever.least == lever.present for lever in enough.levers)
 
 
