@@ -15,11 +15,11 @@ import math
 
 import numpy as np
 from ou_monitor.analysis.levels import GAP_STEPS
-from ou_monitor.online.estimator.quality import examine
+from ou_monitor.criticism.adc import (
+    EXAMINED, find_rails, find_step, innovation_std, usual_change)
 from ou_monitor.records import (
     clock_unit, defect_of, Estimate, Flag, Recording, Severity, Status)
 from ou_monitor.text import counted, Z95
-from ou_monitor.timeline import TAIL
 
 # Flags for information; the others are warnings.
 _INFORMS = frozenset({Flag.HELD_SAMPLES, Flag.IRREGULAR, Flag.NO_EXCITATION})
@@ -35,8 +35,8 @@ _MOST_VOLTS = 1000.0
 _LONG_STEP, _SLOW, _LONG_FLIGHT = 5.0, 0.9, 10_800.0
 # Tolerance of throttle beyond 0..1 (trim), and maximum share of samples beyond that.
 _TRIM, _RARE = 0.05, 0.01
-# Segments of samples examined for ADC steps.
-_LOOKS = 8
+# Minimum samples for a statement on the ADC.
+_FEWEST = 64
 
 
 @dataclass(frozen=True)
@@ -139,22 +139,18 @@ def _stamp_items(recording: Recording) -> list[QualityItem]:
 
 def _sample_items(recording: Recording) -> list[QualityItem]:
     """Return properties of the samples: the step of the ADC, and clipping."""
-    n = recording.n
-    starts = np.unique(np.linspace(0, max(0, n - TAIL), _LOOKS).astype(int))
-    looks = [examine(recording.voltage[k:k + TAIL]) for k in starts.tolist()]
-    items = []
-    steps = [look.step for look in looks if look.step > 0.0]
-    if 2 * len(steps) > len(looks):
-        step = float(np.median(steps))
-        rms = float(np.median([look.rms_increment for look in looks if look.step > 0.0]))
+    v = recording.voltage[:EXAMINED]
+    if v.size < _FEWEST:
+        return []
+    items, step, noise = [], find_step(v), innovation_std(v)
+    if step > 0.0 and noise > 0.0:
         items.append(QualityItem('ADC_STEP', Severity.INFO, (
-            f'The voltage resolution is {1e3 * step:.3g} mV ({step / rms:.2g} times the scatter '
-            'from sample to sample).')))
-    clipped = sum(look.saturated for look in looks)
-    if clipped:
+            f'The voltage resolution is {1e3 * step:.3g} mV ({step / noise:.2g} times the noise '
+            'between samples).')))
+    throttle = np.nan_to_num(recording.throttle[:EXAMINED]) if recording.has_throttle else None
+    if np.isfinite(find_rails(v, step or usual_change(v), noise, throttle)).any():
         items.append(QualityItem('CLIPPED', Severity.WARNING, (
-            f'In {clipped} of {len(looks)} segments examined, readings accumulate at one end of '
-            'the range: the ADC may be saturated.')))
+            'Readings accumulate at one end of the range: the ADC may be saturated.')))
     return items
 
 

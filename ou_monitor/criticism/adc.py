@@ -20,8 +20,8 @@ from ou_monitor.records import FloatArray
 from ou_monitor.timeline import reading_places, reading_times
 from scipy.special import ndtr, ndtri
 
-# Maximum values used to find the step.
-_MOST = 200_000
+# Maximum values used to find the step and clipping.
+EXAMINED = 200_000
 # Relative rounding error of the difference of two float32.
 _FLOAT32 = 2.5e-7
 # Minimum share of the samples on the grid of codes, and their maximum distance from it, steps.
@@ -63,7 +63,7 @@ _TINY = 1e-280
 
 def find_step(voltage: FloatArray) -> float:
     """Return the step of the grid on which the values lie (voltage in V)."""
-    v = voltage[:_MOST]
+    v = voltage[:EXAMINED]
     if v.size > 16:
         # The extremes may be clipped off the grid.
         inner = v[(v > v.min()) & (v < v.max())]
@@ -87,7 +87,7 @@ def usual_change(voltage: FloatArray) -> float:
     """Return the most frequent change, V; 0 if no change is frequent."""
     # If an offset was added at times, the codes are not on a grid, but most changes are.
     rounding = 2.0 * _FLOAT32 * float(np.abs(voltage).max())
-    size = np.sort(np.abs(np.diff(voltage[:_MOST])))
+    size = np.sort(np.abs(np.diff(voltage[:EXAMINED])))
     size = size[size > rounding]
     first = np.flatnonzero(np.diff(size, prepend=-np.inf) > rounding)
     count = np.diff(first, append=size.size)
@@ -123,6 +123,16 @@ def _refine_step(codes: FloatArray, gaps: FloatArray, weight: FloatArray, first:
     level = float(weight @ codes) / float(weight.sum())
     off = np.abs(codes - level - step * (number - middle))
     return step if weight[off < max(near, _NEAR * step)].sum() >= _SHARE * weight.sum() else 0.0
+
+
+def innovation_std(v: FloatArray) -> float:
+    """Return the standard deviation of the error of an AR(1) prediction, V, without outliers."""
+    a, b = v[:-1] - v[:-1].mean(), v[1:] - v[1:].mean()
+    e = b - float(a @ b) / max(float(a @ a), 1e-300) * a
+    # Limit the errors of events and load steps.
+    middle = float(np.quantile(np.abs(e), 0.95))
+    return float(np.minimum(np.abs(e), middle).std()) if middle == 0.0 else float(
+        np.sqrt(np.mean(np.square(np.clip(e, -middle, middle)))) / 0.8729)
 
 
 def find_rails(voltage: FloatArray, step: float, noise: float,

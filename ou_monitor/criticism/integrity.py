@@ -98,7 +98,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     drawn = None
     # Outliers widen a normal distribution, so they would hide or imitate a compression.
     kept = ~outlying(v)
-    noise = _innovation_std(v[kept])
+    noise = innovation_std(v[kept])
     step = find_step(v)
     low, high = find_rails(v, step or usual_change(v), noise, u)
     soft = 'readings compressed near the end of the range'
@@ -115,7 +115,7 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
         notes.append(f'{int(drawn.sum())} {soft} were replaced by random draws beyond the '
                      'range, from an OU through their neighbours.')
         v = redraw(v, low, high, step, np.random.default_rng(0))
-    cell = _judge_step(step, _innovation_std(v), exact, notes)
+    cell = _judge_step(step, innovation_std(v), exact, notes)
     stamps = judge_stamps(t, v)
     notes += stamps.notes
     if stamps.error > 0.0:
@@ -137,16 +137,6 @@ def _joined(samples: Samples, t: FloatArray, v: FloatArray, u: FloatArray | None
     at = np.searchsorted(samples.t, t)
     more = None if samples.throttle is None or u is None else np.insert(samples.throttle, at, u)
     return Samples(np.insert(samples.t, at, t), np.insert(samples.voltage, at, v), more)
-
-
-def _innovation_std(v: FloatArray) -> float:
-    """Return the standard deviation of the error of an AR(1) prediction, V, without outliers."""
-    a, b = v[:-1] - v[:-1].mean(), v[1:] - v[1:].mean()
-    e = b - float(a @ b) / max(float(a @ a), 1e-300) * a
-    # Limit the errors of events and load steps.
-    middle = float(np.quantile(np.abs(e), 0.95))
-    return float(np.minimum(np.abs(e), middle).std()) if middle == 0.0 else float(
-        np.sqrt(np.mean(np.square(np.clip(e, -middle, middle)))) / 0.8729)
 
 
 def _judge_step(step: float, noise: float, exact: list[Term], notes: list[str]) -> float:
