@@ -14,13 +14,13 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.supply import (
-    facts_and_end, flown_near, Remainder, SupplyFacts, THROTTLES)
-from ou_monitor.online.load.supply_load import hold, LoadStatus, SupplyLoad
+    BAND, facts_and_end, flown_near, Remainder, SupplyFacts, THROTTLES)
+from ou_monitor.online.load.supply_load import hold, SupplyLoad
 from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.records import FloatArray, NAN, OuFacts, Recording
 from ou_monitor.text import counted, number, percent, volts, Z95
 
-# Minimum ratio between the noise at the two ends of throttle that is reported as a change.
+# Minimum ratio of the fitted noise between the ends of throttle that is reported as a trend.
 _GROWS = 1.25
 # Minimum noise, V; less is rounding.
 _NOTHING = 1e-9
@@ -52,6 +52,8 @@ class Overview:
     # Lowest and highest index of THROTTLES near which there are enough readings.
     flown: tuple[int, int]
     drawn: float = NAN  # Largest current, A, after a median of three readings; NaN without one
+    # Ratio of the noise at the highest throttle flown to that at the lowest, from all between.
+    growth: float = 1.0
     step: float = 0.0  # Median time between readings, s
     line: LoudestLine | None = None  # Strongest spectral line
     cells: int = 0  # Cells in series to which the limit refers; 0: none
@@ -86,9 +88,19 @@ def overview(recording: Recording, limit: float | None = None,
     near = np.flatnonzero(flown_near(recording, THROTTLES)).tolist() or [0]
     return Overview(facts, recording.duration if recording.n else 0.0, load,
                     float(known.max()) if known.size else NAN, (near[0], near[-1]),
-                    _largest(recording.current),
+                    _largest(recording.current), _growth(recording, facts.noise.rms_v, near),
                     float(np.median(np.diff(recording.t))) if recording.n > 1 else 0.0,
                     _strongest(levels), cells, end)
+
+
+def _growth(recording: Recording, rms: Sequence[float], near: Sequence[int]) -> float:
+    """Return the ratio of the noise, V, between the ends of throttle, by a weighted fit."""
+    if len(near) < 2 or not min(rms[k] for k in near) > 0.0:
+        return 1.0
+    u = np.array(THROTTLES)[near]
+    weight = np.sqrt([np.count_nonzero(np.abs(recording.throttle - at) <= BAND) for at in u])
+    slope = float(np.polyfit(u, np.log(np.array(rms)[near]), 1, w=weight)[0])
+    return math.exp(slope * float(u[-1] - u[0]))
 
 
 def _largest(current: FloatArray | None) -> float:
@@ -117,13 +129,13 @@ def answers(found: Overview) -> list[str]:
         parts.append(f'The voltage fell to {number(least.voltage_v, 4)} V at '
                      f'{number(least.time_s)} s.')
     at, sag, se = found.sag
-    known = found.facts.sag.known or _bounded(found)
-    if known and sag > 2.0 * se:
+    seen = determined(found, found.flown[1])
+    if seen and found.facts.sag.known:
         parts.append(f'The rail sags by {volts(sag)} at {100.0 * at:.0f} % throttle.')
     elif fall := _fall_words(found):
         parts.append(f'The resistance lowers the rail by {fall} (computed); no sag over throttle '
                      'is measurable.')
-    elif known:
+    elif not seen and math.isfinite(sag):
         parts.append(f'The sag at {100.0 * at:.0f} % throttle is below {volts(sag + 2.0 * se)}.')
     if found.line is not None and found.line.all_share > _LOUD:
         line = found.line
@@ -183,10 +195,11 @@ def _dips(found: Overview, below: float = NAN) -> str:
             f'{number(dips.seconds, 2)} s in all ({percent(share)} of the time)')
 
 
-def _bounded(found: Overview) -> bool:
-    """Return whether there is no measurable sag, only an upper limit for it."""
-    _, sag, se = found.sag
-    return found.load.status is LoadStatus.NO_RELATION and sag < 2.0 * se
+def determined(found: Overview, k: int, flown: bool = True) -> bool:
+    """Return whether the sag at a throttle of THROTTLES is larger than its 95 % error."""
+    # Where it was not flown, the sag at the highest throttle flown must be, too.
+    sag, se = found.facts.sag.sag_v, found.facts.sag.se_v
+    return all(sag[i] > 2.0 * se[i] for i in (k, k if flown else found.flown[1]))
 
 
 def _sag_words(found: Overview) -> str:
@@ -194,16 +207,16 @@ def _sag_words(found: Overview) -> str:
     if math.isnan(sag.flown[0]):
         return 'unknown: the recording has no throttle'
     at, there, se = found.sag
-    if _bounded(found):
-        return (f'not measurable: at {100.0 * at:.0f} % throttle it is below '
-                f'{volts(there + 2.0 * se)} (95 %). {found.load.status.value}')
-    if not sag.known:
-        return f'unknown. {found.load.status.value}'
+    why = '' if sag.known else f'. {found.load.status.value}'
+    if math.isnan(there):
+        return f'unknown{why}'
+    if not determined(found, found.flown[1]):
+        return f'below {volts(there + 2.0 * se)} at {100.0 * at:.0f} % throttle (95 %){why}'
     words = f'{volts(there)} (+- {volts(2.0 * se)}) at {100.0 * at:.0f} % throttle'
-    if at < 1.0:
+    if at < 1.0 and determined(found, -1, flown=False):
         words += (f'; about {volts(sag.sag_v[-1])} (+- {volts(2.0 * sag.se_v[-1])}) extrapolated '
                   'to full throttle')
-    return words
+    return words + why
 
 
 def _noise_words(found: Overview) -> str:
@@ -214,13 +227,13 @@ def _noise_words(found: Overview) -> str:
         return 'none'
     if first == last:
         return f'{number(1e3 * low)} mV rms'
-    pair = (f'{number(1e3 * low)} mV rms at {100.0 * first:.0f} % throttle, '
-            f'{number(1e3 * high)} mV at {100.0 * last:.0f} %')
-    if high > _GROWS * low:
-        return f'{pair}: it grows with throttle'
-    if low > _GROWS * high:
-        return f'{pair}: it falls with throttle'
-    return f'{pair}: throttle hardly matters'
+    if _GROWS * found.growth > 1.0 and found.growth < _GROWS:
+        rms = found.facts.noise.rms_v[slice(found.flown[0], found.flown[1] + 1)]
+        return (f'{number(1e3 * min(rms))} to {number(1e3 * max(rms))} mV rms, without a trend '
+                'over throttle')
+    return (f'{number(1e3 * low)} mV rms at {100.0 * first:.0f} % throttle, '
+            f'{number(1e3 * high)} mV at {100.0 * last:.0f} %: it '
+            f'{"grows" if found.growth > 1.0 else "falls"} with throttle')
 
 
 def other_scale(ou: OuFacts, alpha: float, ln_alpha_se: float, sigma: float, ln_sigma_se: float,

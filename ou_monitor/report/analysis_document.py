@@ -12,7 +12,7 @@ from ou_monitor.analysis.analyze import Analysis
 from ou_monitor.analysis.crafts import CELL_LIMIT, craft_advice, craft_line
 from ou_monitor.analysis.level_comparison import sigma_change
 from ou_monitor.analysis.level_result import LevelResult
-from ou_monitor.analysis.overview import answers, known_lines
+from ou_monitor.analysis.overview import answers, determined, known_lines
 from ou_monitor.analysis.quality import QualityItem
 from ou_monitor.analysis.relaxation import Relaxation
 from ou_monitor.analysis.supply import BAND
@@ -232,14 +232,16 @@ def _by_throttle(analysis: Analysis) -> Part:
         return number(1e3 * value) if not abs(value) < 5e-7 else '0'
 
     rows, throttle = [], analysis.recording.throttle
-    for u, flown, fall, se, rms, still, risk in zip(
+    for k, (u, flown, fall, se, rms, still, risk) in enumerate(zip(
             sag.throttle, curves.known, sag.sag_v, sag.se_v, noise.rms_v, noise.steady_rms_v,
-            curves.risk):
+            curves.risk)):
         briefly = analysis.recording.duration * float(np.mean(np.abs(throttle - u) <= BAND))
         rows.append([
             f'{100.0 * u:.0f} %' + ('' if flown else f'\nonly {number(briefly, 2)} s' if briefly
                                     else '\nnot flown'),
-            f'{millivolts(fall)} +- {millivolts(2.0 * se)}' if math.isfinite(fall) else UNKNOWN,
+            '0' if not u and fall == 0.0 else f'{millivolts(fall)} +- {millivolts(2.0 * se)}'
+            if determined(analysis.overview, k, bool(flown)) else
+            f'below {millivolts(fall + 2.0 * se)}' if flown and math.isfinite(fall) else UNKNOWN,
             millivolts(rms) if flown else UNKNOWN, millivolts(still) if flown else UNKNOWN,
             chance(risk)])
     heads = ['throttle', 'sag, mV', 'noise, mV rms', 'at steady\nthrottle, mV rms',

@@ -7,7 +7,8 @@ from types import SimpleNamespace
 
 import numpy as np
 from ou_monitor import supply_facts
-from ou_monitor.analysis.overview import answers, known_lines, other_scale, overview
+from ou_monitor.analysis.overview import (
+    answers, determined, known_lines, other_scale, overview)
 from ou_monitor.records import OuFacts, Recording
 import pytest
 
@@ -77,6 +78,28 @@ def test_words_are_those_of_the_facts():
     assert f'{facts.lowest.voltage_v:.2f} V' in words['Lowest voltage']
 
 
+def test_a_sag_smaller_than_its_error_is_a_bound():
+    """The same rule in each row; not flown: unknown unless the highest throttle flown is known."""
+    found = overview(flight(seconds=20.0))
+    assert found.flown == (1, 8)
+    for se, at_end, beyond in ((0.1, True, True), (0.4, False, False)):
+        sag = replace(found.facts.sag, sag_v=(0.5,) * 11, se_v=(0.1,) * 8 + (se,) + (0.1,) * 2)
+        one = replace(found, facts=replace(found.facts, sag=sag))
+        assert (determined(one, 8), determined(one, 10, flown=False)) == (at_end, beyond)
+        assert determined(one, 4)
+
+
+@pytest.mark.parametrize('last, words', [(0.030, 'without a trend over throttle'),
+                                         (0.015, 'without a trend over throttle')])
+def test_one_loud_throttle_is_no_trend(last, words):
+    """Of 16 mV at all throttles; as an end alone, 30 mV would be growth."""
+    one = flight()
+    high = one.throttle > 0.78
+    noise = np.where(high, last, 0.016) * np.random.default_rng(5).standard_normal(one.n)
+    found = overview(replace(one, voltage=16.0 - SAG * one.throttle ** 1.8 + noise))
+    assert 0.8 < found.growth < 1.25 and dict(known_lines(found))['Noise'].endswith(words)
+
+
 @pytest.mark.parametrize('alpha, se, other', [
     (20.0, 0.0, False), (8.0, 0.1, True), (8.0, 0.3, False), (60.0, 0.1, True),
     (math.nan, math.nan, False)])
@@ -96,7 +119,7 @@ def test_unknown_facts_are_stated_and_the_others_kept():
     assert answers(blind)[0].startswith('The voltage fell to ')
     idle = dict(known_lines(overview(flight(sag=0.0, seconds=20.0), 3.0)))
     # What is known: a bound, above the true 0.
-    bound = re.match(r'not measurable: at 80 % throttle it is below ([\d.]+) mV', idle['Sag'])
+    bound = re.match(r'below ([\d.]+) mV at 80 % throttle \(95 %\)', idle['Sag'])
     assert 0.0 < float(bound[1]) < 200.0 and idle['Below 3 V'] == 'never'
     high = answers(overview(flight(seconds=20.0), 3.0))[0]
     assert high.startswith('The voltage stayed above 3 V')
