@@ -14,7 +14,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.adc import (
-    find_knee, find_rails, find_step, redraw, usual_change, without_repeats)
+    find_knee, find_rails, find_step, innovation_std, redraw, usual_change, without_repeats)
 from ou_monitor.criticism.readings import load_of, two_levels, usable, why_no_model
 from ou_monitor.criticism.samples import (
     choose_samples, events_between, lines_between, Samples, without_tones)
