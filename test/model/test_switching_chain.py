@@ -102,9 +102,11 @@ def test_levels_that_the_filter_followed_are_found():
     """The `ou` was fitted with the levels, so that it follows them: calmer ones do not."""
     voltage, levels = drawn(0.4, 1.0, 5)
     view = filtered(voltage, 5.0 * DRIVE)
-    x, at_once, calm = calm_levels(view, slice(0, N), float(voltage.std()), np.array([0.7]))
+    start = calm_levels(view, slice(0, N), float(voltage.std()), np.array([0.7]))
+    assert start is not None
+    x, calm = start.x, start.view
     assert x[2] * math.sqrt(calm.variance[0]) == pytest.approx(0.4, rel=0.4)
-    chain = chain_of(Scores.of(calm).following(x, at_once), x, at_once)[0]
+    chain = chain_of(Scores.of(calm).following(x, start.at_once), x, start.at_once)[0]
     found = smoothed(*chain)[:, 1] > 0.5
     assert np.mean(found == (levels > 0.0)) > 0.94
     again = without_levels(view, levels)

@@ -192,14 +192,23 @@ def relaxing(view: View, faster: float) -> View:
                    trust=1.0)
 
 
-def calm_levels(view: View, part: slice, spread: float, rates: FloatArray
-                ) -> tuple[FloatArray, float, View] | None:
-    """Return a start for levels in white noise, and a view that shows them; None without noise."""
+@dataclass(frozen=True, eq=False)
+class Start:
+    """A start of a fit."""
+
+    x: FloatArray  # Two ln rates, level in std of an innovation, ln sigma ratio, ln scale
+    at_once: float
+    view: View
+    to_refine: bool  # Whether to fit again after `without_levels`
+
+
+def calm_levels(view: View, part: slice, spread: float, rates: FloatArray) -> Start | None:
+    """Return a start for levels in white noise, with a view that shows them; None without it."""
     # An `ou` that was fitted to the levels follows them, so starts with less noise are tried.
     # Heights are tried up to twice the spread, V, where two levels explain all of it.
     if bool((Scores.of(view).trust == 1.0).all()):
         return None
-    best: tuple[float, FloatArray, View] | None = None
+    best: tuple[float, Start] | None = None
     for share in _CALMER:
         calm = _with_less_noise(view, share)
         scores, unit = Scores.of(calm).part(part), math.sqrt(float(np.median(calm.variance)))
@@ -209,9 +218,9 @@ def calm_levels(view: View, part: slice, spread: float, rates: FloatArray
                 chain = chain_of(scores.following(x, 1.0), x, 1.0)[0]
                 top = log_likelihood(*chain) - 0.5 * float(np.log(calm.variance[part]).sum())
                 if best is None or top > best[0]:
-                    best = top, x, calm
+                    best = top, Start(x, 1.0, calm, True)
     assert best is not None
-    return best[1], 1.0, best[2]
+    return best[1]
 
 
 def _with_less_noise(view: View, share: float) -> View:
@@ -265,6 +274,62 @@ def _settled_variances(keep: float, power: float, white: float) -> tuple[float, 
     drive = power * (1.0 - keep * keep)
     b = white * (1.0 - keep * keep) - drive
     return 0.5 * (-b + math.sqrt(b * b + 4.0 * drive * white)), white
+
+
+def _dwells(view: View) -> FloatArray:
+    """Return the times in a state, s, from which fits start."""
+    return np.array([5.0, 50.0]) * math.exp(-_fastest(view))
+
+
+def _densities(view: View, other: View) -> FloatArray:
+    """Return the log densities of the scores of a view, in the unit of another view's scores."""
+    log: FloatArray = log_normal(view.z) - 0.5 * np.log(view.variance / other.variance)
+    return log
+
+
+def _ahead(fit: LawFit, other: LawFit, part: slice) -> float:
+    """Return by how much a fit is more likely than another in a part of the samples, nats."""
+    return float((fit.gain - other.gain)[part].sum())
+
+
+def _first_fits(view: View) -> list[Start]:
+    """Return the best short fit without a level, and the best with one."""
+    best: dict[bool, tuple[float, Start]] = {}
+    spread = math.sqrt(float(np.mean(view.residual[view.train] ** 2)))
+    first = slice(0, min(_SHORT, view.train.stop))
+    busy = moving(view, first.stop)
+    for faster in _FASTER:
+        relaxed = relaxing(view, faster)
+        scores = Scores.of(relaxed).at_once
+        # Levels that hide a faster relaxation explain most of the spread.
+        height = (1.0 if faster == 1.0 else 2.0) * spread / math.sqrt(
+            float(np.median(relaxed.variance)))
+        plain = _densities(view, relaxed)
+
+        def value(x: FloatArray) -> float:
+            if not _is_inside(x, view):
+                return -math.inf
+            chain = chain_of(scores.part(part), x, once)[0]
+            return log_likelihood(*chain) - float(plain[part].sum())
+
+        for dwell in _dwells(view).tolist():
+            for level, ratio, once in ((0.0, 0.7, 1.0), (height, 0.0, 1.0), (height, 0.0, 0.0)):
+                if level == 0.0 and faster > 1.0:
+                    continue
+                part = busy if level else first
+                rate = -math.log(dwell)
+                x, top = climb(value, [rate, rate, level, ratio, -0.3 * ratio], most=40)
+                if (level != 0.0) not in best or top > best[level != 0.0][0]:
+                    best[level != 0.0] = top, Start(x, once, relaxed, level != 0.0)
+    return [start for _, start in best.values()]
+
+
+def _fit_again(fit: LawFit, start: Start, view: View) -> Start:
+    """Return a start at a fit, for a view of another relaxation and noise."""
+    term, unit = fit.term, math.sqrt(float(np.median(view.variance)))
+    assert isinstance(term, RegimeSwitching)
+    return Start(np.array([math.log(term.rate_up), math.log(term.rate_down), term.level / unit,
+                           0.0, 0.0]), start.at_once, view, False)
 
 
 # Maximum number of events in one segment; limits time and memory.
@@ -367,79 +432,46 @@ class RegimeSwitching(Term):
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
         """Fit a hidden chain of two or three states."""
-        # The best start with a level, and without.
-        best: dict[bool, tuple[float, FloatArray, float, View]] = {}
+        starts = _first_fits(view)
         spread = math.sqrt(float(np.mean(view.residual[view.train] ** 2)))
-        first = slice(0, min(_SHORT, view.train.stop))
-        busy = moving(view, first.stop)
-        # Coordinates: two ln rates, level in std of an innovation, ln sigma ratio, ln scale.
-        shortest = math.exp(-_fastest(view))
-        for faster in _FASTER:
-            relaxed = relaxing(view, faster)
-            unit = math.sqrt(float(np.median(relaxed.variance)))
-            scores = Scores.of(relaxed).at_once
-            # Levels that hide a faster relaxation explain most of the spread.
-            height = (1.0 if faster == 1.0 else 2.0) * spread / unit
-            # Log densities in V without states, to subtract.
-            plain = log_normal(view.z) - 0.5 * np.log(view.variance / relaxed.variance)
-
-            def value(x: FloatArray) -> float:
-                if not _is_inside(x, view):
-                    return -math.inf
-                chain = chain_of(scores.part(part), x, once)[0]
-                return log_likelihood(*chain) - float(plain[part].sum())
-
-            for dwell in (5.0 * shortest, 50.0 * shortest):
-                for level, ratio, once in ((0.0, 0.7, 1.0), (height, 0.0, 1.0),
-                                           (height, 0.0, 0.0)):
-                    if level == 0.0 and faster > 1.0:
-                        continue
-                    part = busy if level else first
-                    rate = -math.log(dwell)
-                    x, top = climb(value, [rate, rate, level, ratio, -0.3 * ratio], most=40)
-                    if (level != 0.0) not in best or top > best[level != 0.0][0]:
-                        best[level != 0.0] = top, x, once, relaxed
-        two: LawFit | None = None
-        trials = list(best.values())
-        hidden = calm_levels(view, busy, spread, -np.log([5.0 * shortest, 50.0 * shortest]))
-        if hidden is not None:
-            trials.append((0.0, *hidden))
-        levels = [trial[1] for trial in trials if trial[1] is not best.get(False, (0.0, None))[1]]
-        while trials:
-            _, x, once, relaxed = trials.pop()
-            fit = cls._best_fit(relaxed, [x], once, 80)
+        calm = calm_levels(view, moving(view, min(_SHORT, view.train.stop)), spread,
+                           -np.log(_dwells(view)))
+        if calm is not None:
+            starts.append(calm)
+        best: tuple[LawFit, Start] | None = None
+        while starts:
+            start = starts.pop()
+            fit = cls._best_fit(start.view, [start.x], start.at_once, 80)
             if fit is None:
                 continue
-            if any(x is start for start in levels) and fit.offset is not None:
+            if start.to_refine and fit.offset is not None:
                 # The voltage without levels shows the relaxation and the noise of the rail.
-                again = without_levels(view, fit.offset)
-                unit = math.sqrt(float(np.median(again.variance)))
-                term = fit.term
-                assert isinstance(term, RegimeSwitching)
-                trials.append((0.0, np.array([
-                    math.log(term.rate_up), math.log(term.rate_down), term.level / unit, 0.0,
-                    0.0]), once, again))
-            if relaxed is not view:
-                fit = replace(fit, gain=fit.gain + log_normal(relaxed.z) - log_normal(view.z)
-                              - 0.5 * np.log(relaxed.variance / view.variance))
-            if two is None or float((fit.gain - two.gain)[view.train].sum()) > 0.0:
-                two, begin, at_once, chosen = fit, x, once, relaxed
-        if two is None or chosen is not view:
-            return two
+                starts.append(_fit_again(fit, start, without_levels(view, fit.offset)))
+            if start.view is not view:
+                fit = replace(fit, gain=fit.gain + log_normal(start.view.z)
+                              - _densities(view, start.view))
+            if best is None or _ahead(fit, best[0], view.train) > 0.0:
+                best = fit, start
+        if best is None or best[1].view is not view:
+            return best and best[0]
+        return cls._slow_or_three(view, *best)
+
+    @classmethod
+    def _slow_or_three(cls, view: View, two: LawFit, start: Start) -> LawFit:
+        """Return a fit of slow levels or of three states if it is better than the two states."""
         if two.power is None:
             slow, ahead, states = _slow_levels(view)
             if slow is not None and ahead > max(float(two.gain[view.train].sum()), _SLOW_AHEAD):
                 # The view mixes levels and noise in one relaxation; the next fit separates them.
                 return cls._best_fit(view, [slow], 0.0, 1, states) or two
-        # Try three states that differ as the two do: in sigma, or in the level.
-        starts = [np.array([0.0, 0.0, 0.0, ratio, -ratio]) for ratio in (0.45, 0.9)]
+        # Three states that differ as the two do: in sigma, or in the level.
+        trials = [np.array([0.0, 0.0, 0.0, ratio, -ratio]) for ratio in (0.45, 0.9)]
         if two.power is None:
-            starts = [np.array(begin) * [1.0, 1.0, 0.6, 0.0, 1.0]]
+            trials = [start.x * [1.0, 1.0, 0.6, 0.0, 1.0]]
         part, found = slice(0, min(view.train.stop, _LONG)), two
-        for start in starts:
-            three = cls._best_fit(view, [start], at_once, 70, 3)
-            ahead = _THIRD if found is two else 0.0
-            if three is not None and float((three.gain - found.gain)[part].sum()) > ahead:
+        for trial in trials:
+            three = cls._best_fit(view, [trial], start.at_once, 70, 3)
+            if three is not None and _ahead(three, found, part) > _THIRD * (found is two):
                 found = three
         return found
 
