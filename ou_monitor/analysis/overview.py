@@ -15,7 +15,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.supply import (
     BAND, facts_and_end, flown_near, Remainder, SupplyFacts, THROTTLES)
-from ou_monitor.online.load.supply_load import hold, SupplyLoad
+from ou_monitor.online.load.supply_load import AT_ONCE, hold, SupplyLoad
 from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.records import FloatArray, NAN, OuFacts, Recording
 from ou_monitor.text import counted, number, percent, volts, Z95
@@ -161,9 +161,11 @@ def known_lines(found: Overview) -> list[tuple[str, str]]:
                       (_dips(found) or 'never') + cells))
     lines += [('Sag', _sag_words(found)), ('Noise', _noise_words(found))]
     if math.isfinite(resistance.ohm):
+        held = max(hold(found.duration), found.step)
         lines.append(('Resistance', f'{number(1e3 * resistance.ohm)} mOhm (+- '
-                      f'{number(2e3 * resistance.se_ohm, 2)}) after '
-                      f'{max(hold(found.duration), found.step):.2g} s'
+                      f'{number(2e3 * resistance.se_ohm, 2)}) after {held:.2g} s'
+                      + (f', {number(1e3 * resistance.at_once_ohm)} after {AT_ONCE:g} s'
+                         if AT_ONCE < held and resistance.at_once_ohm > 0.0 else '')
                       + (f'; computed: {fall}' if (fall := _fall_words(found)) else '')))
     elif found.drawn > 0.0:
         lines.append(('Resistance', 'unknown: the current changes too little, or a load seems '

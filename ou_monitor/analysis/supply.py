@@ -26,7 +26,7 @@ from ou_monitor.criticism.readings import bad_notes, find_bad
 from ou_monitor.model.ou_fit import FEWEST, known_ou, regress
 from ou_monitor.online.estimator.estimator import SLIDING
 from ou_monitor.online.load.load_filter import LoadFilter
-from ou_monitor.online.load.supply_load import SupplyLoad
+from ou_monitor.online.load.supply_load import AT_ONCE, SupplyLoad
 from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.online.risk.forecast import LOOK
 from ou_monitor.online.settings import MonitorSettings
@@ -108,6 +108,7 @@ class Resistance:
 
     ohm: float  # Ohm; NaN without a current that moves the voltage
     se_ohm: float  # Ohm
+    at_once_ohm: float = NAN  # after 0.1 s, Ohm; NaN with fewer than 20 readings per second
 
 
 @dataclass(frozen=True)
@@ -227,7 +228,9 @@ def facts_and_end(recording: Recording, limit: float | None = None, left: Remain
         None if limit is None else _dips(t - began, v, u, limit, noise),
         Sag(load.known, noise.flown, THROTTLES, _tuple(load.sag(THROTTLES)),
             _tuple(load.sag_se(THROTTLES))),
-        noise, Resistance(load.resistance, load.resistance_se),
+        noise, Resistance(
+            load.resistance, load.resistance_se, load.resistance_at_once
+            if 2.0 * float(np.median(np.diff(t, append=t[-1:]))) <= AT_ONCE else NAN),
         known_ou(there.t, there.voltage, there.throttle, there.current), budget), load, last
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from ou_monitor.model.load import LAGS, LEVELS, SLOPES
 from ou_monitor.online.load.blocks import (
     CLIP, DIVERGED, LoadBlock, LoadDelay, LoadNoise, log_density)
-from ou_monitor.online.load.supply_load import hold, POWER, reached
+from ou_monitor.online.load.supply_load import AT_ONCE, hold, POWER, reached
 from ou_monitor.records import FloatArray, NAN
 
 # Current from which the filter starts, A; factor by which the largest current must rise before the
@@ -46,10 +46,11 @@ _LOUDEST = 0.7
 # coefficients, in units of those deviations.
 _MEMORY, _ONE, _WIDE = 120.0, 1.0, 30.0
 # Ends of the band, s, in which throttle is tried beside current, and minimum share of the variance
-# of throttle that current leaves unexplained; of a smaller one, most is rounding of the current
-# (1e-6 in simulations, 5e-5 on hebi_x; 0.007 to 0.8 on roma 1 and 3, ar8, jd, in_xr, js_11t,
+# of throttle that current leaves unexplained; a smaller one is rounding or lag of the current (1e-6
+# to 0.0045 in simulated vehicles without a bypass, where up to 0.11 of the rest of the voltage
+# follows it by chance, 5e-5 on hebi_x; 0.007 to 0.8 on roma 1 and 3, ar8, jd, in_xr, js_11t,
 # as_f60, euc_1, frc_ol_1, and regbot_28, 62 and 81).
-_BAND, _APART = np.array([[1.0], [20.0]]), 1e-3
+_BAND, _APART = np.array([[1.0], [20.0]]), 5e-3
 # Time for which unknown throttle or current is held, s.
 UNKNOWN_HELD = 1.0
 
@@ -221,6 +222,11 @@ class CurrentFilter:
         if not 0.0 < error < _KNOWN * value:
             return NAN, NAN
         return value / self._unit, error / self._unit
+
+    @property
+    def at_once(self) -> float:
+        """Return the resistance after `AT_ONCE`, Ohm, whether or not it is known."""
+        return abs(float(np.append(1.0, reached(AT_ONCE)) @ self._m[2:])) / self._unit
 
     def _reached(self) -> FloatArray:
         """Return the shares of the coefficients that have responded after `hold`."""

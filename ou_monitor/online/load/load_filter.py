@@ -430,13 +430,15 @@ class LoadFilter:
         error = np.sqrt(np.maximum(np.einsum('ij,jk,ik->i', H, C, H), (sag - raw) ** 2))
         low, high = self._flown_range()
         basis, level, rest = Basis.THROTTLE, self._level, self._rest
-        resistance = resistance_se = NAN
+        resistance = resistance_se = at_once = NAN
         if self._current is not None:
             resistance, resistance_se = self._current.resistance
-            if math.isfinite(resistance) and self._better > 0.0:
-                basis, level, rest = Basis.CURRENT, self._current.level, self._current.rest
+            if math.isfinite(resistance):
+                at_once = self._current.at_once
+                if self._better > 0.0:
+                    basis, level, rest = Basis.CURRENT, self._current.level, self._current.rest
         load = SupplyLoad(
-            LoadStatus.STILL, level, rest, resistance, resistance_se, basis=basis,
+            LoadStatus.STILL, level, rest, resistance, resistance_se, at_once, basis=basis,
             flown=(low, high),
             _sag=tuple(sag.tolist()),
             _sag_se=tuple(np.maximum(error, _LEAST_ERROR * sag).tolist()),

@@ -22,6 +22,9 @@ POWER = 1.8
 # longer punch-outs are rare.  In less than ten such times it would be an extrapolation: a tenth of
 # the time for which the load has been known is then read.
 HOLD, _HOLDS = 1.0, 10.0
+# Time at constant current after which the resistance at once is read, s: as a user would, from the
+# changes between samples at 10 Hz.
+AT_ONCE = 0.1
 # Throttles of the table of the sag.
 TABLE = np.linspace(0.0, 1.0, 101)
 # Sweeps in which the sag is made to rise; in 10 it is within 3 % of the limit on cf_pair.
@@ -93,6 +96,7 @@ class SupplyLoad:
     # Resistance after a second, Ohm; NaN without a current that affects the voltage.
     resistance: float = NAN
     resistance_se: float = NAN  # Its standard error, Ohm.
+    resistance_at_once: float = NAN  # Resistance after `AT_ONCE`, Ohm.
     time_constants: tuple[float, ...] = LAGS  # Time constants of the response, s; fixed.
     delay: float = 0.0  # Delay of throttle behind the voltage, s.
     # Input of the level, and of the sag if throttle does not determine it.

@@ -149,3 +149,17 @@ def test_the_sag_follows_from_the_current_where_throttle_hides_it():
     assert load.known and load.basis is Basis.CURRENT
     assert abs(float(load.sag(1.0)) - 0.6) < 2.0 * float(load.sag_se(1.0))
     assert float(load.sag_se(1.0)) < 0.5
+
+
+def test_a_resistance_at_once_and_after_a_second():
+    """20 mOhm, and 15 mOhm that relax in 0.7 s."""
+    rng = np.random.default_rng(1)
+    current = np.repeat(rng.uniform(5.0, 40.0, 60), 100)
+    late = np.empty_like(current)
+    late[0] = current[0]
+    for k in range(1, late.size):
+        late[k] = current[k] + (late[k - 1] - current[k]) * np.exp(-0.02 / 0.7)
+    v = 16.0 - 0.02 * current - 0.015 * late + 0.01 * rng.standard_normal(late.size)
+    load = loaded(0.02 * np.arange(late.size), v, None, current)
+    assert load.resistance == pytest.approx(0.02 - 0.015 * np.expm1(-1.0 / 0.7), rel=0.05)
+    assert load.resistance_at_once == pytest.approx(0.02 - 0.015 * np.expm1(-0.1 / 0.7), rel=0.05)
