@@ -46,10 +46,9 @@ _LOUDEST = 0.7
 # coefficients, in units of those deviations.
 _MEMORY, _ONE, _WIDE = 120.0, 1.0, 30.0
 # Ends of the band, s, in which throttle is tried beside current, and minimum share of the variance
-# of throttle that current leaves unexplained; a smaller one is rounding or lag of the current (1e-6
-# to 0.0045 in simulated vehicles without a bypass, where up to 0.11 of the rest of the voltage
-# follows it by chance, 5e-5 on hebi_x; 0.007 to 0.8 on roma 1 and 3, ar8, jd, in_xr, js_11t,
-# as_f60, euc_1, frc_ol_1, and regbot_28, 62 and 81).
+# of throttle that current leaves unexplained; a smaller one is rounding or lag of the current (up
+# to 0.0045 in simulated vehicles without a bypass, 5e-5 on hebi_x; 0.007 to 0.8 on roma 1 and 3,
+# ar8, jd, in_xr, js_11t, as_f60, euc_1, frc_ol_1, and regbot_28, 62 and 81).
 _BAND, _APART = np.array([[1.0], [20.0]]), 5e-3
 # Time for which unknown throttle or current is held, s.
 UNKNOWN_HELD = 1.0
