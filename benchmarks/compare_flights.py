@@ -13,8 +13,8 @@ from common import arguments, deliver, flights, say, table
 from ou_monitor.comparison.compare import compare
 from ou_monitor.comparison.yardstick import Agreement, Band
 
-HEAD = ['flight', 's', 'explained', 'bias mV', 'lowest V', 'simulated', 'falls 1 %', 'simulated',
-        'falls 5 %', 'simulated', 'KS', 'verdict', 'CPU s']
+HEAD = ['flight', 's', 'explained', 'bias mV', 'lowest V', 'simulated', 'dips 1 %', 'simulated',
+        'dips 5 %', 'simulated', 'KS', 'verdict', 'CPU s']
 
 
 def beside(of: Band, digits: int) -> str:
@@ -29,7 +29,7 @@ def within(of: Band, factor: float = 2.0) -> bool:
 
 def row(name: str, found: Agreement, spent: float) -> list[str]:
     """Return the row of a flight."""
-    first, second = found.falls
+    first, second = found.dips
     return [name, f'{found.simulated[1] - found.simulated[0]:.0f}', f'{found.explained:.2f}',
             f'{1e3 * found.bias:.0f}', f'{found.lowest.measured:.2f}', beside(found.lowest, 2),
             f'{first.measured:.1f}', beside(first, 1), f'{second.measured:.1f}',
@@ -51,8 +51,8 @@ def main() -> int:
         rows.append(row(name, found, time.process_time() - started))
         say(rows[-1], found.worst)
         lowest += found.lowest.inside
-        rates += all(within(falls) for falls in found.falls)
-        one += any(within(falls) for falls in found.falls)
+        rates += all(within(dips) for dips in found.dips)
+        one += any(within(dips) for dips in found.dips)
     text = table(HEAD, rows) + (
         f'\nLowest voltage within its band: {lowest} of {len(rows)}. Falls within a factor of 2 '
         f'of the measured: through both levels {rates} of {len(rows)}, through one at least '

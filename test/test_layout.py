@@ -16,7 +16,7 @@ PACKAGE = 'ou_monitor'
 LEVEL = {
     'errors': 0, 'text': 0, 'records': 0, 'timeline': 0.5, 'model': 1, 'online': 2,
     'stream': 3, 'adc': 3, 'recordings': 4, 'simulation': 5, 'criticism': 5, 'analysis': 6,
-    'comparison': 6.5, 'discovery': 6, 'paper': 6, 'fleet': 7, 'report': 8, 'bench': 8.4,
+    'comparison': 6.5, 'discovery': 6.5, 'paper': 6, 'fleet': 7, 'report': 8, 'bench': 8.4,
     'nodes': 9, 'cli': 9,
 }
 # What users reach as `from ou_monitor import ...`: above all but the programs.

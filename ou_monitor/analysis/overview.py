@@ -133,8 +133,8 @@ def answers(found: Overview) -> list[str]:
     if seen and found.facts.sag.known:
         parts.append(f'The rail sags by {volts(sag)} at {100.0 * at:.0f} % throttle.')
     elif fall := _fall_words(found):
-        parts.append(f'The resistance lowers the rail by {fall} (computed); no sag over throttle '
-                     'is measurable.')
+        without = '' if math.isnan(found.highest) else '; no sag over throttle is measurable'
+        parts.append(f'The resistance lowers the rail by {fall} (computed){without}.')
     elif not seen and math.isfinite(sag):
         parts.append(f'The sag at {100.0 * at:.0f} % throttle is below {volts(sag + 2.0 * se)}.')
     if found.line is not None and found.line.all_share > _LOUD:

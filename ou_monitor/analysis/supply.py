@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from typing import Any
 
@@ -31,7 +31,8 @@ from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.online.risk.forecast import LOOK
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import FloatArray, NAN, OuFacts, plain_data, Recording
-from ou_monitor.timeline import ordered, part_of, readings_of, supplied
+from ou_monitor.timeline import (
+    in_order, MOST_THROTTLE, MOST_VOLTAGE, ordered, part_of, plausible, readings_of, supplied)
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 # Throttles at which sag and noise are given.
@@ -225,7 +226,7 @@ def facts_and_end(recording: Recording, limit: float | None = None, left: Remain
     load, budget, last = _at_the_end(there, limit, monitor)
     return SupplyFacts(
         Lowest(float(v[k]), float(t[k]) - began, float(u[k])),
-        None if limit is None else _dips(t - began, v, u, limit, noise),
+        None if limit is None else _dips(t - began, v, limit, rise_that_ends(v, u, noise)),
         Sag(load.known, noise.flown, THROTTLES, _tuple(load.sag(THROTTLES)),
             _tuple(load.sag_se(THROTTLES))),
         noise, Resistance(
@@ -286,8 +287,8 @@ def _at_the_end(recording: Recording, limit: float | None, monitor: SupplyMonito
         last.budget, limit, asked.brownout_horizon, asked.budget_limit), last
 
 
-def _dips(t: FloatArray, v: FloatArray, u: FloatArray, limit: float, noise: Noise) -> Dips:
-    begins = dip_begins(v, limit, rise_that_ends(v, u, noise))
+def _dips(t: FloatArray, v: FloatArray, limit: float, rise: FloatArray) -> Dips:
+    begins = dip_begins(v, limit, rise)
     if not begins.size:
         return Dips(limit, 0, 0.0, 0.0)
     # Each reading stands for the time to the next one, without gaps.
@@ -301,9 +302,25 @@ def _dips(t: FloatArray, v: FloatArray, u: FloatArray, limit: float, noise: Nois
 
 def alarms(recording: Recording, cells: int, noise: Noise) -> tuple[Dips, ...]:
     """Return the dips below each of ALARMS; none if the cells are unknown (0)."""
+    if not (cells and recording.n):
+        return ()
     there = supplied(recording, at_ends=True)
-    return tuple(_dips(there.t - recording.t[0], there.voltage, there.throttle, cells * one, noise)
-                 for one in ALARMS if cells and recording.n)
+    t, rise = there.t - recording.t[0], rise_that_ends(there.voltage, there.throttle, noise)
+    return tuple(_dips(t, there.voltage, cells * one, rise) for one in ALARMS)
+
+
+def rise_at(recording: Recording, t: FloatArray) -> FloatArray:
+    """Return the hysteresis of a dip of `supply_facts`, V, at some stamps, s."""
+    which, _ = in_order(recording.t, recording.voltage[:, None], MOST_VOLTAGE)
+    recording = part_of(recording, which)
+    if recording.n < 2:
+        return np.zeros(t.size)
+    recording = readings_of(replace(
+        recording, throttle=plausible(recording.throttle, MOST_THROTTLE)))
+    there, outer = supplied(recording), supplied(recording, at_ends=True)
+    rise = rise_that_ends(
+        outer.voltage, outer.throttle, noise_of(*without_wild(there, remainder(there))))
+    return np.asarray(np.interp(t, outer.t, rise))
 
 
 def rise_that_ends(v: FloatArray, u: FloatArray, noise: Noise) -> FloatArray:

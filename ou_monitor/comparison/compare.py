@@ -175,7 +175,7 @@ def _agreement(recording: Recording, own: Readings, yardstick: Yardstick, simula
         np.ptp(own.throttle) >= MOVES))
     pooled = np.mean([m.distribution for m in measured], axis=0)
     responses = np.array([m.response for m in measured])
-    dips = [one.band for one in found if one.kind == 'answer']
+    falls = [one.band for one in found if one.kind == 'answer']
     stride = -(-own.t.size // traces.shape[1])
     low, high = np.percentile(traces, [2.5, 97.5], axis=0)
     empty = np.empty(0)
@@ -187,11 +187,11 @@ def _agreement(recording: Recording, own: Readings, yardstick: Yardstick, simula
         tuple(float(part.mean()) for part in np.array_split(error, 3)),  # type: ignore[arg-type]
         band(real.lowest, np.array([m.lowest for m in measured])),
         band(real.mean, np.array([m.mean for m in measured])), tuple(yardstick.levels),
-        tuple(one.band for one in found if one.kind == 'falls'),
+        tuple(one.band for one in found if one.kind == 'dips'),
         tuple(SpectrumBand(float(a), float(b), band(
             float(real.power[k]), np.array([m.power[k] for m in measured])))
             for k, (a, b) in enumerate(zip(yardstick.bands, yardstick.bands[1:]))),
-        dips[0] if dips else None, dips[1] if dips else None, int(yardstick.rises.size),
+        falls[0] if falls else None, falls[1] if falls else None, int(yardstick.rises.size),
         band(distance(real, pooled), np.array([distance(m, pooled) for m in measured])),
         seeds, p, verdict, words, farthest, tuple(notes),
         Traces(own.t + offset, own.voltage,

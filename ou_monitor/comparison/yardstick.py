@@ -108,10 +108,10 @@ class Agreement:
     lowest: Band
     mean: Band
     levels: tuple[float, ...]  # Levels, V
-    falls: tuple[Band, ...]  # Dips below each per minute
+    dips: tuple[Band, ...]  # Dips below each per minute
     spectrum: tuple[SpectrumBand, ...]  # By band of frequency
     # Deepest point of the mean response to rises of throttle, and its value 1 s after, V.
-    dip: Band | None
+    fall: Band | None
     recovery: Band | None
     rises: int  # Rises of throttle
     # Largest difference of the distribution from that of all simulations.
@@ -120,7 +120,7 @@ class Agreement:
     p_value: float  # Share of simulations, recording included, with a score as large
     verdict: Likeness
     words: str  # The largest difference, as a part of a sentence
-    farthest: str  # Kind of that difference: lowest, falls, level, answer, spectrum, ks or path
+    farthest: str  # Kind of that difference: lowest, dips, level, answer, spectrum, ks or path
     notes: tuple[str, ...]  # What was left out or assumed
     traces: Traces  # For a page
 
@@ -132,10 +132,10 @@ class Agreement:
 
     def measures(self) -> list[dict[str, Any]]:
         """Return all numbers of the recording and of the simulations."""
-        response = [('dip after rises, V', self.dip), ('1 s after rises, V', self.recovery)]
+        response = [('fall after rises, V', self.fall), ('1 s after rises, V', self.recovery)]
         bands = [('lowest voltage, V', self.lowest), ('mean voltage, V', self.mean),
-                 *((f'falls through {level:.4g} V, 1/min', falls)
-                   for level, falls in zip(self.levels, self.falls)),
+                 *((f'dips below {level:.6g} V, 1/min', dips)
+                   for level, dips in zip(self.levels, self.dips)),
                  *((name, one) for name, one in response if one is not None),
                  ('KS distance', self.apart),
                  *((f'power {one.low_hz:.3g} to {one.high_hz:.3g} Hz, V^2', one.power)
@@ -150,8 +150,8 @@ class Agreement:
             'mean_path': {'variance_explained': self.explained, 'rmse_v': self.rmse,
                           'bias_v': self.bias, 'bias_by_third_v': list(self.bias_by_third)},
             'lowest_v': self.lowest.as_data(),
-            'crossings_per_min': [{'level_v': level, **falls.as_data()}
-                                  for level, falls in zip(self.levels, self.falls)],
+            'dips_per_min': [{'level_v': level, **dips.as_data()}
+                             for level, dips in zip(self.levels, self.dips)],
             'spectrum': [{'from_hz': one.low_hz, 'to_hz': one.high_hz,
                           'simulated_over_measured': _ratio(one.power)}
                          for one in self.spectrum],
@@ -181,7 +181,7 @@ class Measures:
 
     mean: float  # V
     lowest: float  # V
-    falls: FloatArray  # Dips below each level per minute; shape (levels,)
+    dips: FloatArray  # Dips below each level per minute; shape (levels,)
     power: FloatArray  # Power in each band, V^2; shape (bands,)
     response: FloatArray  # Mean response to rises, V; empty with too few; shape (points,)
     distribution: FloatArray  # Share of the samples below each edge; shape (bins,)
@@ -212,12 +212,12 @@ class Yardstick:
 
     def measure(self, v: FloatArray) -> Measures:
         """Measure a voltage at the stamps of the part, V."""
-        falls = [dip_begins(v, level, self._rise).size / self.minutes for level in self.levels]
+        dips = [dip_begins(v, level, self._rise).size / self.minutes for level in self.levels]
         f, density = welch(v, self._rate, nperseg=self._segment)
         at = np.clip(np.searchsorted(self.bands, f, side='right') - 1, -1, _BANDS - 1)
         power = np.array([density[at == k].sum() for k in range(_BANDS)]) * (f[1] - f[0])
         return Measures(
-            float(v.mean()), float(v.min()), np.array(falls), power, self._response(v),
+            float(v.mean()), float(v.min()), np.array(dips), power, self._response(v),
             np.searchsorted(np.sort(v), self.edges, side='right') / v.size)
 
     def _response(self, v: FloatArray) -> FloatArray:
@@ -256,7 +256,7 @@ def _rise_times(t: FloatArray, throttle: FloatArray | None) -> npt.NDArray[np.fl
 # must exceed all.  At 5 %, one good model in twenty was refused.
 LEVEL = 0.02
 # Importance for a pilot, relative to the lowest voltage and the number of dips.
-_WEIGHTS = {'lowest': 1.0, 'falls': 1.0, 'level': 0.8, 'answer': 0.8, 'spectrum': 0.5, 'ks': 0.5}
+_WEIGHTS = {'lowest': 1.0, 'dips': 1.0, 'level': 0.8, 'answer': 0.8, 'spectrum': 0.5, 'ks': 0.5}
 # Differences that a pilot would not notice: a share of the range of the voltage, factors of a rate
 # and of a power, and a KS distance.
 _RANGE, _RATE, _POWER, _KS = 0.03, 1.25, 1.5, 0.05
@@ -322,20 +322,20 @@ def differences(yardstick: Yardstick, own: Measures, others: Sequence[Measures],
             f'the voltage is on average {number(1e3 * abs(b.median - b.measured), 2)} mV too '
             f'{"high" if b.median > b.measured else "low"}'))]
     for k, level in enumerate(yardstick.levels):
-        rate = own.falls[k]
+        rate = own.dips[k]
         # Poisson error of the count.
         chance = math.sqrt(max(rate * yardstick.minutes, 1.0)) / yardstick.minutes
         found.append(Difference(
-            'falls', float(rate), of(lambda m, k=k: float(m.falls[k])),  # type: ignore[misc]
+            'dips', float(rate), of(lambda m, k=k: float(m.dips[k])),  # type: ignore[misc]
             max((_RATE - 1.0) * float(rate), chance), lambda b, level=level: (  # type: ignore
-                f'the voltage falls through {number(level, 4)} V {number(b.median, 2)} times a '
+                f'the voltage dips below {level:.6g} V {number(b.median, 2)} times a '
                 f'minute ({_span(b, 2)}), measured {number(b.measured, 2)}')))
     if own.response.size:
         begin, later = np.searchsorted(yardstick.after, [0.0, RECOVERED]).tolist()
         found += [
             Difference('answer', float(own.response[begin:].min()),
                        of(lambda m: float(m.response[begin:].min())), volts, lambda b: (
-                f'after rises of throttle the voltage dips by {_fall(b.median)} '
+                f'after rises of throttle the voltage falls by {_fall(b.median)} '
                 f'({_fall(b.high)} to {_fall(b.low)}), measured {_fall(b.measured)}')),
             Difference('answer', float(own.response[later]),
                        of(lambda m: float(m.response[later])), volts, lambda b: (

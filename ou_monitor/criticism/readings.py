@@ -105,8 +105,9 @@ def load_of(recording: Recording, t: FloatArray, v: FloatArray, u: FloatArray | 
         0.0 if u is None else _gain(t[some], v[some], u[some]))
     if not gain > 0.5 * _LAGS.size * math.log(v.size):
         return u, NAN
-    notes.append('The load is the measured current, which predicts the voltage better than '
-                 f'throttle (by {number(gain)} nats). Parameters are for a current of 1 '
+    why = 'throttle was not recorded' if u is None else (
+        f'it predicts the voltage better than throttle, by {number(gain)} nats')
+    notes.append(f'The load is the measured current ({why}). Parameters are for a current of 1 '
                  f'= {number(full)} A.')
     return np.asarray(load), full
 

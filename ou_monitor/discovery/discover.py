@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from ou_monitor.analysis.supply import rise_at
 from ou_monitor.criticism.battery import criticise, family_chance, family_edge
 from ou_monitor.criticism.composite import Composite, fit_composite
 from ou_monitor.criticism.integrity import examine, Integrity
@@ -16,11 +17,12 @@ from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate, fit_gaussian
 from ou_monitor.discovery.decision import relaxes
 from ou_monitor.discovery.finding import (
-    Cause, Criticism, CrossingRate, Finding, throttle_effects, ThrottleEffects, Verdict)
+    Cause, Criticism, Finding, LoadFall, LowDips, Verdict)
 from ou_monitor.discovery.fitting import Fitter, standard_errors, with_reach
 from ou_monitor.discovery.gain import (
-    covered, crossing_rates, errors_grew, gain_of, guess, held_out, HeldOut, mean_score, shrink_of,
-    why_unknown, without)
+    covered, errors_grew, gain_of, guess, held_out, HeldOut, mean_score, shrink_of, why_unknown,
+    without)
+from ou_monitor.discovery.load_effects import load_fall, low_dips
 from ou_monitor.discovery.named import INTERRUPTED, Named, named_causes
 from ou_monitor.discovery.pruning import prune_by_gain, Pruned, refusal
 from ou_monitor.discovery.redraw import redraw_clipped, redraw_within_codes
@@ -116,10 +118,10 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
     undone = tuple(t for t in state.exact if t.NAME != 'quantization')
     baseline = plain.model.terms[0]
     assert isinstance(baseline, OU)
-    crossing = crossing_rates(samples, (baseline,), () if unknown else whole.terms, rng, scored)
-    effects = throttle_effects(samples, whole.terms, crossing.level, state.full)
-    against = doubts(whole.terms, crossing, recording.duration,
-                     float(np.median(samples.step[1:])), larger, effects) if causes else ()
+    dips = low_dips(samples, rise_at(recording, samples.t), (baseline,), whole.terms, rng)
+    fall = load_fall(samples, whole.terms)
+    against = doubts(whole.terms, dips, recording.duration,
+                     float(np.median(samples.step[1:])), larger, fall) if causes else ()
     verdict = judge(remaining, len(causes), against)
     done(1.0)
     return Finding(
@@ -132,18 +134,18 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
         se=(*se, *(with_reach(term, {}, samples) for term in undone)),
         score=mean_score(left.full.density, scored & left.full.known),
         gain=gain, gain_se=gain_se, shrink=shrink_of(left.full, plain, scored), larger=larger,
-        crossing=crossing, throttle_effects=effects,
+        dips=dips, fall=fall,
         notes=(*state.notes, *(by_load(note, load) for note in _notes(
             named, whole, dropped, samples, uncovered))),
         samples=samples, simulated=SupplyModel(whole.terms), refused=refused,
-        full=state.full, seed=seed)
+        full=state.full, has_throttle=recording.has_throttle, seed=seed)
 
 
 def _insufficient(recording: Recording, state: Integrity, reason: str, seed: int) -> Finding:
     return Finding(
         recording=recording.name, n=recording.n, duration=recording.duration,
         verdict=Verdict.INSUFFICIENT_DATA, sentence=f'Nothing can be said about it. {reason}',
-        notes=state.notes, seed=seed)
+        notes=state.notes, has_throttle=recording.has_throttle, seed=seed)
 
 
 def _start(samples: Samples, state: Integrity) -> Composite:
@@ -314,20 +316,18 @@ def judge(remaining: Sequence[Criticism], causes: int, doubts: Sequence[str] = (
     return Verdict.PARTLY_EXPLAINED if remaining or doubts else Verdict.EXPLAINED
 
 
-def doubts(terms: Sequence[Term], crossing: CrossingRate, duration: float, step: float,
-           larger: bool = False, effects: ThrottleEffects = ThrottleEffects()
-           ) -> tuple[str, ...]:
+def doubts(terms: Sequence[Term], dips: LowDips, duration: float, step: float,
+           larger: bool = False, fall: LoadFall = LoadFall()) -> tuple[str, ...]:
     """Return objections to a model besides its statistics, in words (times in s)."""
     # larger: whether its one-step errors are larger than those of the plain OU.
     found = ['its one-step errors are larger than those of the plain OU'] if larger else []
-    if crossing.worse:
-        found.append(f'it falls through {number(crossing.level, 4)} V '
-                     f'{number(crossing.extended)} times a minute; the recording does so '
-                     f'{number(crossing.observed)} times, and the plain OU '
-                     f'{number(crossing.baseline)} times')
-    if not effects.fits:
-        found.append(f'its voltage falls by {number(effects.explained, 2)} V from low to high '
-                     f'throttle; the readings do by {number(effects.measured, 2)} V')
+    if dips.worse:
+        found.append(f'it dips below {dips.level:g} V {number(dips.extended)} times a minute; the '
+                     f'recording does so {number(dips.observed)} times, and the plain OU '
+                     f'{number(dips.baseline)} times')
+    if not fall.fits:
+        found.append(f'its voltage falls by {number(fall.explained, 2)} V from low to high '
+                     f'throttle; the readings do by {number(fall.measured, 2)} V')
     ends = [f'{name} of {term.NAME}' for term in terms for name in _at_ends(term, duration, step)]
     if ends:
         found.append(f'{listed(ends)} {"are" if ends[1:] else "is"} at the end of the range')

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 import enum
 import math
 from typing import Any
 
-import numpy as np
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.term import Role, Term
-from ou_monitor.records import FloatArray, NAN, plain_data
-from ou_monitor.text import number, Z95
+from ou_monitor.model.terms.term import Term
+from ou_monitor.records import NAN, plain_data
+from ou_monitor.text import Z95
 
 
 class Verdict(enum.Enum):
@@ -79,15 +78,17 @@ class Cause:
 
 
 @dataclass(frozen=True)
-class CrossingRate:
-    """How often the voltage falls through a level, on the held-out part."""
+class LowDips:
+    """Dips below a low level: in the samples, and how many of them simulations have."""
 
     level: float = NAN  # V
-    # Crossings per minute in the data and on average in simulations.
+    count: int = 0  # Dips in the samples
+    made: int | None = None  # Dips of which the load caused more than half; None: no response
+    # Dips per minute in the samples and on average in simulations.
     observed: float = NAN
     baseline: float = NAN
     extended: float = NAN
-    # Standard errors: of the count, for independent crossings, and of the averages.
+    # Standard errors: of the count, for independent dips, and of the averages.
     observed_se: float = NAN
     baseline_se: float = NAN
     extended_se: float = NAN
@@ -98,6 +99,36 @@ class CrossingRate:
         off = abs(self.extended - self.observed)
         return (off > Z95 * math.hypot(self.extended_se, self.observed_se)
                 and off > abs(self.baseline - self.observed))
+
+    def as_data(self) -> dict[str, Any]:
+        """Return the fields for JSON."""
+        return {'level_v': self.level, 'count': self.count, 'made_by_load': self.made,
+                'per_min': {name: getattr(self, name) for name in (
+                    'observed', 'baseline', 'extended', 'observed_se', 'baseline_se',
+                    'extended_se')}}
+
+
+# Relative error of a fall under load above which the model does not reproduce it.
+_WRONG = 0.5
+
+
+@dataclass(frozen=True)
+class LoadFall:
+    """Fall of the median voltage from readings at low load to those at high load."""
+
+    # Low and high load.
+    low: float = NAN
+    high: float = NAN
+    # Fall, V: as measured, of the mean of the model, and standard error of their difference.
+    measured: float = NAN
+    explained: float = NAN
+    error: float = NAN
+
+    @property
+    def fits(self) -> bool:
+        """Whether the model explains most of the measured fall, and not much more."""
+        off = abs(self.explained - self.measured)
+        return not (off > _WRONG * abs(self.measured) and off > Z95 * self.error)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,20 +154,22 @@ class Finding:
     # Relative reduction of the rms of one-step errors on held-out blocks, against the plain OU.
     shrink: float = NAN
     larger: bool = False  # Whether these errors are significantly larger than the plain OU's
-    crossing: CrossingRate = field(default_factory=CrossingRate)  # Falls through a low level
-    throttle_effects: ThrottleEffects = field(default_factory=lambda: ThrottleEffects())
+    dips: LowDips = LowDips()
+    fall: LoadFall = LoadFall()
     notes: tuple[str, ...] = ()  # What was dropped, left out or cannot be decided
     samples: Samples | None = None  # Samples that were fitted
     # The extended model of `samples`; it lacks effects removed from them, such as repeats.
     simulated: SupplyModel | None = None
     refused: str = ''  # Why the extended model is refused, in words; otherwise empty
-    full: float = NAN  # Current that is a load of 1, A; NaN if the load is throttle
+    full: float = NAN  # Current that is a load of 1, A; NaN if it is not the load
+    has_throttle: bool = True  # Whether the recording has one
     seed: int = 0  # Random seed
 
     @property
     def load(self) -> str:
-        """Return the load: 'throttle', or 'current' if that predicts the voltage better."""
-        return 'current' if math.isfinite(self.full) else 'throttle'
+        """Return the load: 'throttle', 'current' if that predicts better, or 'none'."""
+        return ('current' if math.isfinite(self.full) else
+                'throttle' if self.has_throttle else 'none')
 
     @property
     def size_gain(self) -> float:
@@ -148,14 +181,16 @@ class Finding:
         """Return why a model file cannot hold the extended model; empty if it can."""
         if self.model is None:
             return f"'{self.recording}' was not fitted. {self.sentence}"
-        return '' if self.load == 'throttle' else (
-            'Its load is the measured current, and a model file is for throttle (--current-column '
-            'none uses throttle as the load)')
+        if self.load != 'current':
+            return ''
+        return 'Its load is the measured current, and a model file is for throttle' + (
+            ' (--current-column none uses throttle as the load)' if self.has_throttle else
+            ', which was not recorded')
 
     @property
     def closer(self) -> bool:
-        """Whether errors and falls of the extended model are no worse than the plain OU's."""
-        return bool(self.causes) and not self.larger and not self.crossing.worse
+        """Whether errors and dips of the extended model are no worse than the plain OU's."""
+        return bool(self.causes) and not self.larger and not self.dips.worse
 
     @property
     def discrepancies(self) -> tuple[Criticism, ...]:
@@ -190,15 +225,11 @@ class Finding:
             'extended': {
                 **self._extended(), 'heldout_score': self.score, 'gain': self.gain,
                 'gain_se': self.gain_se, 'errors_shrink': self.shrink,
-                'size_gain': self.size_gain, 'closer': self.closer,
-                'crossing_rate': {
-                    'observed': self.crossing.observed, 'baseline': self.crossing.baseline,
-                    'extended': self.crossing.extended, 'level_v': self.crossing.level,
-                    'observed_se': self.crossing.observed_se,
-                    'baseline_se': self.crossing.baseline_se,
-                    'extended_se': self.crossing.extended_se, 'unit': '1/min'}},
+                'size_gain': self.size_gain, 'closer': self.closer},
             'remaining': [_discrepancy(c, c.after, c.p_after) for c in self.remaining],
-            'throttle_effects': self.throttle_effects.as_data(),
+            'dips': self.dips.as_data(),
+            'fall': {'from': self.fall.low, 'to': self.fall.high,
+                     'measured_v': self.fall.measured, 'explained_v': self.fall.explained},
             'refused': self.unsaved or self.refused or None, 'notes': list(self.notes)})
         return found
 
@@ -222,107 +253,3 @@ def _units(kind: type[Term]) -> dict[str, str]:
 def _discrepancy(c: Criticism, observed: float, chance: float) -> dict[str, Any]:
     return {'statistic': c.statistic, 'observed': observed, 'simulated_low': c.low,
             'simulated_high': c.high, 'p_value': chance}
-
-
-# Quantiles of the load between which a fall is measured.
-_FLOWN = (0.01, 0.99)
-# Minimum time between two dips, s, and range in which the predicted minimum of a dip is sought, s.
-_APART, _NEAR = 0.2, 0.05
-# Relative error of a fall under load above which the model does not reproduce it.
-_WRONG = 0.5
-# Share of a dip's depth above which throttle has caused it.
-_MADE = 0.5
-
-
-@dataclass(frozen=True)
-class ThrottleEffects:
-    """Effects of the load: the fall of the voltage from low to high load, and the dips."""
-
-    # Low and high load.
-    low: float = NAN
-    high: float = NAN
-    # Fall of the median from readings at the low load to those at the high, V: as measured, of the
-    # mean of the model, and standard error of their difference.
-    measured: float = NAN
-    explained: float = NAN
-    error: float = NAN
-    full: float = NAN  # Current that is a load of 1, A; NaN if the load is throttle
-    level: float = NAN  # Voltage, V, below which dips are counted
-    # Number of dips, and of dips of which the load caused more than half.
-    dips: int = 0
-    made: int = 0
-
-    def as_data(self) -> dict[str, Any]:
-        """Return the fields for JSON."""
-        return {
-            'fall': {'from': self.low, 'to': self.high, 'measured_v': self.measured,
-                     'explained_v': self.explained},
-            'dips': {'level_v': self.level, 'count': self.dips, 'made_by_throttle': self.made}}
-
-    @property
-    def fits(self) -> bool:
-        """Whether the model explains most of the measured fall, and not much more."""
-        off = abs(self.explained - self.measured)
-        return not (off > _WRONG * abs(self.measured) and off > Z95 * self.error)
-
-    @property
-    def words(self) -> str:
-        """Return the effects in words; empty if the load has none."""
-        if math.isnan(self.measured):
-            return ''
-        load, unit = ('current', ' A') if math.isfinite(self.full) else ('throttle', '')
-        low, high = (number(self.full * end if unit else end, 2) + unit
-                     for end in (self.low, self.high))
-        found = (f'The median voltage falls by {number(self.measured, 2)} V from {load} {low} to '
-                 f'{high}, {number(self.explained, 2)} V by the model'
-                 + ('.' if self.fits else ': trust the readings.'))
-        if self.dips:
-            made = (f'caused {self.made} of the {self.dips} dips' if self.dips > 1 else
-                    f'{"caused" if self.made else "did not cause"} the only dip')
-            found += (f' {"The current" if unit else "Throttle"} {made} below '
-                      f'{number(self.level, 4)} V.')
-        return found
-
-
-def throttle_effects(samples: Samples, terms: Sequence[Term], level: float, full: float = NAN
-                     ) -> ThrottleEffects:
-    """Compare the fall under load with the model's; count dips below a level, V (full in A)."""
-    responses = [term for term in terms if term.ROLE is Role.MEAN and term.MEASURED]
-    u, v = samples.throttle, samples.logged
-    if u is None or not any(term.NEEDS_THROTTLE for term in responses):
-        return ThrottleEffects()
-    low, high = np.quantile(u, _FLOWN).tolist()
-    mean, ends = _path(samples, responses), (u <= low, u >= high)
-    measured, explained = (float(np.median(y[ends[0]]) - np.median(y[ends[1]]))
-                           for y in (v, mean))
-    # Readings of one stay at a load are not independent.
-    stays = [1 + int((end[1:] & ~end[:-1])[1:].sum()) for end in ends]
-    error = float(np.std(v - mean)) * math.sqrt(sum(1.0 / count for count in stays))
-    return ThrottleEffects(low, high, measured, explained, error, full, level,
-                           *_dips(samples, mean, level))
-
-
-def _path(samples: Samples, responses: Sequence[Term]) -> FloatArray:
-    """Return the effect of throttle and time on the mean, V."""
-    s = samples.segment(1.0, 0.0)
-    path = np.zeros(samples.n)
-    for term in responses:
-        path += term.columns(s) @ np.array(term.linear_values())
-    return path
-
-
-def _dips(samples: Samples, path: FloatArray, level: float) -> tuple[int, int]:
-    """Return the number of dips below a level, V, and of dips caused by the path."""
-    v, t = samples.logged, samples.t
-    below = np.flatnonzero(v < level)
-    if not below.size:
-        return 0, 0
-    depth, made = float(np.median(v)), 0
-    usual = float(np.median(path))
-    groups = np.split(below, np.flatnonzero(np.diff(t[below]) > _APART) + 1)
-    for group in groups:
-        bottom = int(group[int(np.argmin(v[group]))])
-        first, last = np.searchsorted(t, [t[bottom] - _NEAR, t[bottom] + _NEAR])
-        lowest = float(path[first:last + 1].min())
-        made += usual - lowest > _MADE * (depth - float(v[bottom]))
-    return len(groups), made

@@ -23,9 +23,7 @@ import numpy.typing as npt
 from ou_monitor.criticism.composite import Composite, fit_composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate, whitened, with_mean
-from ou_monitor.discovery.finding import CrossingRate
 from ou_monitor.discovery.words import unmeasured_words
-from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.records import FloatArray, NAN
@@ -37,11 +35,6 @@ from scipy.stats import chi2
 BLOCKS = 24
 # A gain is unknown if its error exceeds both: this multiple of the gain, and nats per sample.
 _VAGUE, _WIDE = 10.0, 0.1
-# Level of the crossings, in standard deviations below the mean: start, step and end of the search,
-# and the minimum number of crossings in the fitted and in the held-out part.
-_DEEP, _LOWER, _SHALLOW, _OFTEN = 2.5, 0.25, 0.5, 5
-# Simulations of each model.
-_DRAWS = 8
 
 
 def mean_score(density: FloatArray, scored: npt.NDArray[np.bool_]) -> float:
@@ -149,63 +142,6 @@ def cause_gain(full: HeldOut, less: HeldOut, scored: npt.NDArray[np.bool_]
     fitted = math.exp(min(tail + full.model.search - less.model.search, 0.0))
     kept = float(ndtr(-gain / error)) if error > 0.0 else 1.0
     return gain, error, min(1.0, 2.0 * min(fitted, kept))
-
-
-def crossings(t: FloatArray, voltage: FloatArray, level: float,
-              scored: npt.NDArray[np.bool_] | None = None) -> float:
-    """Return downward crossings of a level per minute, between adjacent scored samples."""
-    pairs = np.ones(t.size - 1, dtype=np.bool_) if scored is None else scored[1:] & scored[:-1]
-    span = float(np.diff(t)[pairs].sum())
-    return 60.0 * _falls(voltage, level, pairs) / span if span > 0.0 else NAN
-
-
-def crossing_level(samples: Samples, scored: npt.NDArray[np.bool_] | None = None) -> float:
-    """Return a low level that both parts cross, V."""
-    v = samples.logged
-    fitted, kept = np.zeros((2, samples.n), dtype=np.bool_)
-    fitted[samples.train] = True
-    kept[samples.test] = True
-    parts = [part[1:] & part[:-1] for part in (fitted, kept if scored is None else scored)]
-    mean, spread = float(v.mean()), float(v.std())
-    depth = _DEEP
-    while depth > _SHALLOW and min(
-            _falls(v, mean - depth * spread, pairs) for pairs in parts) < _OFTEN:
-        depth -= _LOWER
-    level = mean - depth * spread
-    below, above = v[v < level], v[v >= level]
-    # Halfway between ADC codes, so that rounding changes no crossing.
-    return 0.5 * float(below.max() + above.min()) if below.size and above.size else level
-
-
-def _falls(v: FloatArray, level: float, pairs: npt.NDArray[np.bool_]) -> int:
-    return int(((v[:-1] >= level) & (v[1:] < level) & pairs).sum())
-
-
-def crossing_rates(samples: Samples, baseline: Sequence[Term], extended: Sequence[Term],
-                   rng: np.random.Generator, scored: npt.NDArray[np.bool_] | None = None
-                   ) -> CrossingRate:
-    """Compare crossing rates of a level in the data and in simulations."""
-    scored = np.ones(samples.n, dtype=np.bool_) if scored is None else scored
-    if int(scored.sum()) < BLOCKS:
-        return CrossingRate()
-    level, t = crossing_level(samples, scored), samples.t
-    rates = []
-    for terms in (baseline, extended):
-        try:
-            model = SupplyModel(tuple(terms))
-            # All samples are simulated, because drift and tones depend on the time since the
-            # first.
-            found = [crossings(t, model.simulate(t, rng, samples.throttle), level, scored)
-                     for _ in range(_DRAWS)]
-        except ValueError:
-            found = [NAN, NAN]
-        rates.append((float(np.mean(found)), float(np.std(found, ddof=1)) / math.sqrt(len(found))))
-    observed = crossings(t, samples.logged, level, scored)
-    # Poisson error, at least that of one crossing.
-    minutes = float(np.diff(t)[scored[1:] & scored[:-1]].sum()) / 60.0
-    error = math.sqrt(max(observed * minutes, 1.0)) / minutes if minutes > 0.0 else NAN
-    return CrossingRate(level, observed, rates[0][0], rates[1][0], error, rates[0][1],
-                        rates[1][1])
 
 
 # Number of blocks of the cross-validation.

@@ -381,7 +381,7 @@ def plain(text: str) -> str:
 
 def by_load(text: str, load: str) -> str:
     """Return a text about throttle with the name of the load instead."""
-    return re.sub(r'\b([Tt])hrottle\b', lambda found: (
+    return text if load == 'none' else re.sub(r'\b([Tt])hrottle\b', lambda found: (
         load.capitalize() if found[1] == 'T' else load), text)
 
 

@@ -111,7 +111,9 @@ def _budget(analysis: Analysis) -> str:
             + ('(the default for a 5 V rail) ' if analysis.brownout_default else '')
             + f'within {curves.horizon:g} s')
     if math.isnan(curves.budget):
-        return f'unknown: {curves.budget_reason}'
+        reason = (curves.budget_reason if analysis.recording.has_throttle else
+                  'the recording has no throttle')
+        return f'unknown: {reason}'
     if not curves.budget:
         return (f'no throttle, {_why_no_throttle(analysis)}: the risk {what} is '
                 f'{curves.risk[0]:.2g}')

@@ -13,7 +13,7 @@ from ou_monitor.text import listed, number
 # Colours: measured, simulated.
 _MEASURED, _SIMULATED = 7, 1
 _VOLTAGE = ('Line: measured. Band: 95 % of the simulations at each moment. Pale line: one '
-            'simulation. Dashed lines: levels at which falls are counted.')
+            'simulation. Dashed lines: levels below which dips are counted.')
 # Fitted range if a model was given, so nothing was fitted.
 _NOTHING = (0.0, 0.0)
 # Of 12 numbers, so many or more are outside their 95 % bands in 2 % of good simulations.
@@ -73,11 +73,11 @@ def _rows(found: Agreement) -> list[tuple[str, str, str, str]]:
                 f'{number(high, digits)}]', '' if of.inside else 'outside')
 
     out = [row('lowest voltage, V', found.lowest, 4), row('mean voltage, V', found.mean, 4)]
-    out += [row(f'falls through {number(level, 4)} V, 1/min', falls, 3)
-            for level, falls in zip(found.levels, found.falls)]
-    if found.dip is not None and found.recovery is not None:
-        out += [row(f'dip after {found.rises} rises, mV', found.dip, 3, -1e3),
-                row('dip left after 1 s, mV', found.recovery, 3, -1e3)]
+    out += [row(f'dips below {level:.6g} V, 1/min', dips, 3)
+            for level, dips in zip(found.levels, found.dips)]
+    if found.fall is not None and found.recovery is not None:
+        out += [row(f'fall after {found.rises} rises, mV', found.fall, 3, -1e3),
+                row('fall left after 1 s, mV', found.recovery, 3, -1e3)]
     out.append(row('KS distance', found.apart, 2))
     out += [row(f'rms {number(one.low_hz, 2)} to {number(one.high_hz, 2)} Hz, mV',
                 Band(*(max(x, 0.0) ** 0.5 for x in (

@@ -38,8 +38,8 @@ def discovery_document(finding: Finding, seen: Overview | None = None, command: 
     """Return the report of a discovery; `seen` holds the facts of the recording."""
     samples, baseline = finding.samples, finding.baseline
     used = '' if samples is None or samples.n == finding.n else f', {samples.n} used'
-    load = ('' if finding.load == 'throttle' else
-            f'; load: the measured current, 1 = {number(finding.full)} A')
+    load = (f'; load: the measured current, 1 = {number(finding.full)} A'
+            if finding.load == 'current' else '')
     subject = (f'{finding.recording or "recording"}: {finding.n} samples in '
                f'{number(finding.duration, 4)} s{used}{load}')
     known = [] if seen is None else known_lines(seen)
@@ -49,7 +49,7 @@ def discovery_document(finding: Finding, seen: Overview | None = None, command: 
     parts: list[Part] = [
         lambda: [] if samples is None else [Figure(_voltage(finding), (
             f'Band: range of {_DRAWS} simulations of the {_model_name(finding)} at each moment, '
-            f'with the {finding.load} of the recording.') if finding.simulated else '')],
+            f'with the {_inputs(finding)} of the recording.') if finding.simulated else '')],
         Facts(known)]
     if baseline is not None:
         after = ' before and after' if finding.causes else ''
@@ -74,8 +74,8 @@ def answer(finding: Finding) -> list[str]:
     more = len(names) - _FIRST
     others = [f'{more} more'] if more > 0 else []
     worse = [*(['one-step errors are larger'] if finding.larger else []),
-             *(['the rate of falls is further from the measured one']
-               if finding.crossing.worse else [])]
+             *(['the rate of dips is further from the measured one']
+               if finding.dips.worse else [])]
     closer = ('With them the simulation ' + (
         'passes every test.' if finding.verdict is Verdict.EXPLAINED else
         'comes closer, but is not yet right.' if finding.closer else
@@ -97,6 +97,10 @@ def _gain_words(finding: Finding) -> str:
             f'{smaller} mnat per sample) and their size is predicted '
             f'{"better" if size >= 0.0 else "worse"} ({better}): '
             f'{number(1e3 * gain)} +- {number(1e3 * finding.gain_se, 2)} mnat in all.')
+
+
+def _inputs(finding: Finding) -> str:
+    return 'stamps' if finding.load == 'none' else f'stamps and {finding.load}'
 
 
 def _model_name(finding: Finding) -> str:
@@ -146,21 +150,39 @@ def _causes(finding: Finding) -> list[Part]:
 
 
 def _gain(finding: Finding) -> list[Part]:
-    c, baseline = finding.crossing, finding.baseline
+    dips, baseline = finding.dips, finding.baseline
     assert baseline is not None
     rows = [['held-out score, nats/sample', '-', number(finding.baseline_score, 4),
              number(finding.score, 4), with_se(finding.gain, finding.gain_se)]]
-    if math.isfinite(c.level):
-        rows.append([f'falls through {number(c.level, 4)} V, 1/min',
-                     *(with_se(*pair) for pair in (
-                         (c.observed, c.observed_se), (c.baseline, c.baseline_se),
-                         (c.extended, c.extended_se))), '-'])
+    rows.append([f'dips below {dips.level:g} V, 1/min', *(with_se(*pair) for pair in (
+        (dips.observed, dips.observed_se), (dips.baseline, dips.baseline_se),
+        (dips.extended, dips.extended_se))), '-'])
     # If nothing was added to the plain OU, there is nothing to compare.
     kept = 5 if finding.causes else 3
     return [Table(['', 'observed', 'plain OU', 'extended', 'gain'][:kept],
                   [row[:kept] for row in rows], left=[0]), Text(
-                      '' if finding.refused else finding.throttle_effects.words),
+                      '' if finding.refused else _under_load(finding)),
             Text(f'The plain OU has {plain_model_words(baseline)}.')]
+
+
+def _under_load(finding: Finding) -> str:
+    """Return the effects of the load in words; empty if it has none."""
+    fall, dips, load = finding.fall, finding.dips, finding.load
+    if math.isnan(fall.measured):
+        return ''
+    factor, unit = (finding.full, ' A') if load == 'current' else (1.0, '')
+    low, high = (number(factor * end, 2) + unit for end in (fall.low, fall.high))
+    found = (f'The median voltage falls by {number(fall.measured, 2)} V from {load} {low} to '
+             f'{high}, {number(fall.explained, 2)} V by the model'
+             + ('.' if fall.fits else ': trust the readings.'))
+    if dips.count and dips.made is not None:
+        made = (f'caused {dips.made} of the {dips.count} dips' if dips.count > 1 else
+                f'{"caused" if dips.made else "did not cause"} the only dip')
+        used = '' if finding.samples is None or finding.samples.n == finding.n else (
+            ' in the samples used')
+        found += (f' {load.capitalize()} {made} below {dips.level:g} V{used}. A dip lasts until a '
+                  'reading is clearly above that voltage, as in every command.')
+    return found
 
 
 def _statistics(finding: Finding) -> list[Part]:
@@ -188,8 +210,8 @@ def _comparisons(finding: Finding) -> list[Part]:
                                   x_label=by_load(curve.x_label, finding.load)), k, name))
              for curve in compared for k, name in enumerate(named)]
     return [*Pair.two_by_two(drawn), Text(
-        'Line or dots: the data. Band or bars: the range of 40 simulations with the stamps and '
-        f'{finding.load} of the data; with a correct model about one point in twenty lies '
+        'Line or dots: the data. Band or bars: the range of 40 simulations with the '
+        f'{_inputs(finding)} of the data; with a correct model about one point in twenty lies '
         'outside.',
         legend=True)]
 

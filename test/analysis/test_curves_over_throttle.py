@@ -7,6 +7,7 @@ from ou_monitor.analysis.analyze import analyze
 from ou_monitor.model.ou import simulate
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Recording
+from ou_monitor.report.analysis_document import answer
 import pytest
 from simulated_recordings import ALPHA, recording
 
@@ -40,6 +41,16 @@ def test_without_a_fit_the_budget_says_why():
     t = np.arange(3000) / 500.0
     stuck = analyze(Recording(t, np.full(t.size, 5.0), np.full(t.size, 0.1))).by_throttle
     assert math.isnan(stuck.budget) and 'sensor is stuck' in stuck.budget_reason
+
+
+def test_without_throttle_the_budget_is_unknown():
+    """Even where the recording ends below the limit."""
+    low = swept(4, seconds=20.0)
+    low = Recording(low.t, low.voltage, np.full(low.n, math.nan), current=20.0 * low.throttle)
+    found = analyze(low, brownout_voltage=float(low.voltage[-1]) + 0.1)
+    assert math.isnan(found.by_throttle.budget)
+    assert math.isnan(found.overview.facts.budget.throttle)
+    assert 'no throttle keeps' not in ' '.join(answer(found)).lower()
 
 
 def test_the_voltage_is_the_nodes_unless_asked_for():

@@ -87,7 +87,7 @@ def test_a_wrong_sag_is_the_worst(sag):
     """A sag that is wrong by a factor is told by levels and answers, not by noise."""
     found = compare(drawn(3), model(sag=sag), seeds=40)
     assert found.verdict is Likeness.DIFFERS
-    assert any(word in found.worst for word in ('rises of throttle', 'lowest', 'falls through'))
+    assert any(word in found.worst for word in ('rises of throttle', 'lowest', 'dips below'))
 
 
 def test_only_the_part_after_fit_until_is_simulated():
@@ -128,10 +128,10 @@ def test_the_second_half_follows_from_the_first():
     assert found.verdict is Likeness.LOOKS_LIKE_IT
     assert 'load_sag' in found.model and 'load_dependent_noise' in found.model
     assert found.explained > 0.9
-    assert found.lowest.inside and all(falls.inside for falls in found.falls)
+    assert found.lowest.inside and all(dips.inside for dips in found.dips)
     # What is farthest off is named, too, though it is within chance.
     assert found.words
-    assert found.farthest in ('lowest', 'falls', 'level', 'answer', 'spectrum', 'ks')
+    assert found.farthest in ('lowest', 'dips', 'level', 'answer', 'spectrum', 'ks')
 
 
 def test_jitter_of_throttle_is_no_noise_and_no_path():
@@ -238,8 +238,8 @@ def test_held_samples_count_once():
     one, other = (compare(each, model(), seeds=20) for each in (slow, fast))
     assert any('repeats its last value' in note for note in other.notes)
     # But for the first reading, whose begin is not in the recording.
-    assert other.falls[1].measured == pytest.approx(one.falls[1].measured, rel=0.1)
-    assert other.falls[1].median == pytest.approx(one.falls[1].median, rel=0.4)
+    assert other.dips[1].measured == pytest.approx(one.dips[1].measured, rel=0.1)
+    assert other.dips[1].median == pytest.approx(one.dips[1].median, rel=0.4)
 
 
 @pytest.mark.parametrize('change, words', [
@@ -276,7 +276,7 @@ def test_numbers_outside_their_bands_are_named_beside_the_verdict():
     said = ' '.join(_answer(far))
     assert 'Outside their own bands' in said and 'lowest voltage' in said.split('Outside')[1]
     assert 'chance allows this' in said
-    many = replace(far, falls=tuple(replace(one, measured=one.high + 1.0) for one in far.falls),
+    many = replace(far, dips=tuple(replace(one, measured=one.high + 1.0) for one in far.dips),
                    mean=replace(far.mean, measured=far.mean.high + 1.0))
     assert 'only in part' in _answer(many)[0] and 'KS distance' in {
         row['measure'] for row in found.measures()}

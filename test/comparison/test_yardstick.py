@@ -22,11 +22,11 @@ def test_falls_of_white_noise_are_counted_as_theory_says():
     """Of independent samples p below and q above by the noise: p q / (p + q) falls a sample."""
     noise = white(1)
     found = Yardstick(noise, 0.0).measure(noise.voltage)
-    for share, falls in zip((0.01, 0.05), found.falls):
+    for share, dips in zip((0.01, 0.05), found.dips):
         above = norm.sf(norm.ppf(share) + 1.0)
         expected = share * above / (share + above) * RATE * 60.0
         # The count is nearly Poisson; the level is the sample's own quantile, which helps.
-        assert falls == pytest.approx(expected, abs=4.0 * np.sqrt(expected * 60.0 * RATE / N))
+        assert dips == pytest.approx(expected, abs=4.0 * np.sqrt(expected * 60.0 * RATE / N))
 
 
 def test_a_fall_is_a_dip_of_the_facts():
@@ -37,7 +37,7 @@ def test_a_fall_is_a_dip_of_the_facts():
     own = Recording(samples.t, v, u)
     levels = (4.75, 5.0)
     yardstick = Yardstick(Readings(own.t, v, u), 0.0, levels)
-    counts = yardstick.measure(v).falls[:2] * yardstick.minutes
+    counts = yardstick.measure(v).dips[:2] * yardstick.minutes
     assert counts.tolist() == pytest.approx([supply_facts(own, x).dips.count for x in levels])
     crossings = [np.count_nonzero((v[:-1] >= x) & (v[1:] < x)) for x in levels]
     assert np.all(counts < 0.8 * np.array(crossings)) and np.all(counts > 0)

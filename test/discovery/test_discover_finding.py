@@ -7,7 +7,7 @@ import math
 import numpy as np
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.discover import doubts, judge
-from ou_monitor.discovery.finding import Cause, Criticism, CrossingRate, Finding, Verdict
+from ou_monitor.discovery.finding import Cause, Criticism, Finding, LowDips, Verdict
 from ou_monitor.discovery.fitting import with_reach
 from ou_monitor.discovery.words import parameters
 from ou_monitor.model.supply import SupplyModel
@@ -34,7 +34,7 @@ def finding(**changes):
         'criticism': (FINE, OFF, WORSE), 'causes': (cause,),
         'model': SupplyModel((OU(61.0, 0.3, 5.0), sag, tone, tone)),
         'se': ({'alpha': 1.0}, {'linear': 0.02}, {}, {}), 'score': 2.015, 'gain': 0.015,
-        'gain_se': 0.002, 'crossing': CrossingRate(4.8, 10.0, 20.0, 11.0)}
+        'gain_se': 0.002, 'dips': LowDips(4.8, 5, 3, 10.0, 20.0, 11.0)}
     return Finding(**{**simulated, **changes})
 
 
@@ -61,18 +61,28 @@ def test_json_has_the_documented_keys():
     assert list(extended['params']) == ['ou', 'load_sag', 'tone', 'tone 2']
     assert (extended['heldout_score'], extended['gain'], extended['gain_se']) == (
         2.015, 0.015, 0.002)
-    assert {'observed': 10.0, 'baseline': 20.0, 'extended': 11.0}.items() <= extended[
-        'crossing_rate'].items()
+    assert {'level_v': 4.8, 'count': 5, 'made_by_load': 3}.items() <= data['dips'].items()
+    assert {'observed': 10.0, 'baseline': 20.0, 'extended': 11.0}.items() <= data['dips'][
+        'per_min'].items()
+
+
+@pytest.mark.parametrize('full, throttle, load, unsaved', [
+    (math.nan, True, 'throttle', ''), (20.0, True, 'current', '--current-column none'),
+    (20.0, False, 'current', 'not recorded'), (math.nan, False, 'none', '')])
+def test_a_finding_knows_its_load(full, throttle, load, unsaved):
+    """Throttle is advised as the load only if it was recorded."""
+    found = finding(full=full, has_throttle=throttle)
+    assert found.load == load and (unsaved in found.unsaved if unsaved else not found.unsaved)
 
 
 def test_unknown_numbers_are_null():
     """Nothing fitted: all keys are there, no NaN is."""
     data = finding(baseline=None, baseline_score=math.nan, criticism=(), causes=(), model=None,
                    se=(), score=math.nan, gain=math.nan, gain_se=math.nan, duration=math.nan,
-                   crossing=CrossingRate()).as_data()
+                   dips=LowDips()).as_data()
     json.dumps(data, allow_nan=False)
     assert data['duration_s'] is None and data['baseline']['params']['alpha'] is None
-    assert data['extended']['crossing_rate']['observed'] is None
+    assert data['dips']['per_min']['observed'] is None and data['dips']['made_by_load'] is None
     assert data['extended']['params'] == {} and data['causes'] == []
 
 
@@ -84,17 +94,17 @@ def test_the_verdict_follows_causes_and_what_is_left(remaining, causes, verdict)
     assert judge(remaining, causes).value == verdict
 
 
-def test_explained_needs_statistics_errors_falls_and_parameters():
-    """A statistic outside, larger errors, more wrong falls, a parameter at an end forbid it."""
-    falls = CrossingRate(14.0, 46.0, 15.5, 2.9, 2.0, 1.0, 0.5)
-    assert falls.worse and not replace(falls, extended=20.0).worse
+def test_explained_needs_statistics_errors_dips_and_parameters():
+    """A statistic outside, larger errors, more wrong dips, a parameter at an end forbid it."""
+    dips = LowDips(14.0, 46, None, 46.0, 15.5, 2.9, 2.0, 1.0, 0.5)
+    assert dips.worse and not replace(dips, extended=20.0).worse
     # 1.96 of the error of both, 2.06, is 4.04.
     for extended, worse in ((42.1, False), (41.8, True)):
-        assert replace(falls, extended=extended, baseline=45.0).worse is worse
-    (said,) = doubts((OU(60.0, 0.3, 5.0),), falls, 60.0, 0.001)
+        assert replace(dips, extended=extended, baseline=45.0).worse is worse
+    (said,) = doubts((OU(60.0, 0.3, 5.0),), dips, 60.0, 0.001)
     assert judge([], 1, (said,)) is Verdict.PARTLY_EXPLAINED
     assert all(words in said for words in ('2.9', '46', '15.5'))
-    good = CrossingRate(14.0, 46.0, 15.5, 44.0, 2.0, 1.0, 0.5)
+    good = LowDips(14.0, 46, None, 46.0, 15.5, 44.0, 2.0, 1.0, 0.5)
     assert len(doubts((OU(60.0, 0.3, 5.0),), good, 60.0, 0.001, larger=True)) == 1
     lag = LoadTransient(0.2, 0.0005, 0.0)
     (said,) = doubts((lag,), good, 60.0, 0.001)

@@ -10,13 +10,11 @@ from ou_monitor.criticism.structure import evaluate
 from ou_monitor.discovery import gain as gains
 from ou_monitor.discovery.fitting import standard_errors
 from ou_monitor.discovery.gain import (
-    BLOCKS, blocks_of, cause_gain, covered, crossing_level, crossing_rates, crossings, FOLDS,
-    gain_of, guess, held_out, HeldOut, if_known, mean_difference, mean_score, why_unknown, without)
+    BLOCKS, blocks_of, cause_gain, covered, gain_of, guess, held_out, HeldOut, if_known,
+    mean_difference, mean_score, why_unknown, without)
 from ou_monitor.model.ou import simulate
-from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
-from ou_monitor.model.terms.reading import Quantization
 import pytest
 from scipy.signal import lfilter
 from scipy.stats import chi2, norm
@@ -113,26 +111,6 @@ def test_errors_of_the_mean_are_its_scatter():
     assert np.mean(stated, axis=0) == pytest.approx(scatter, rel=0.34)
 
 
-def test_crossing_rates_tell_a_wrong_sigma_from_the_true_one():
-    """The truth within 4 joint errors of its own expectation; half of sigma far below."""
-    true = SupplyModel((OU(ALPHA, SIGMA, 5.0), Quantization(0.005)))
-    t = np.arange(30_000) / 1000.0
-    rng = np.random.default_rng(4)
-    samples = Samples(t, true.simulate(t, rng), None)
-    rates = crossing_rates(samples, (OU(ALPHA, 0.5 * SIGMA, 5.0),), true.terms, rng)
-    assert abs(rates.observed - rates.extended) < 4.0 * math.hypot(
-        1.3 * rates.observed_se, rates.extended_se)
-    assert rates.baseline < 0.5 * rates.observed
-
-
-def test_a_model_that_cannot_be_simulated_has_no_rate():
-    """Sag without throttle: NaN, no exception."""
-    samples = Samples(simulated(5).t, simulated(5).voltage, None)
-    rates = crossing_rates(samples, (OU(ALPHA, SIGMA, 5.0),),
-                           (OU(ALPHA, SIGMA, 5.0), LoadSag(0.5, 0.0)), np.random.default_rng(0))
-    assert math.isnan(rates.extended) and math.isfinite(rates.baseline)
-
-
 @pytest.mark.parametrize('gain, error, known', [
     (0.00072, 0.797, False), (-1e-4, 50.0, False), (0.00072, 0.05, True), (4.0, 4.0, True),
     (0.1, 0.02, True)])
@@ -177,55 +155,6 @@ def test_a_gain_needs_as_many_samples_as_blocks():
             a, b = held(new, known=masks[0]), held(old, known=masks[1])
             assert math.isfinite(gain_of(a, b, masks[2])[0]) == known
             assert (why_unknown(a, b, masks[2], False) == '') == known
-
-
-def test_crossings_count_between_neighbours_that_are_scored():
-    """From the level on is above; times of pairs that are left out do not count."""
-    t = np.array([0.0, 1.0, 2.0, 3.0, 13.0, 14.0])
-    v = np.array([0.0, -1.0, 1.0, -1.0, 1.0, -1.0])
-    assert crossings(t, v, 0.0) == 60.0 * 3 / 14.0
-    scored = np.array([True, True, True, True, False, True])
-    assert crossings(t, v, 0.0, scored) == 60.0 * 2 / 3.0
-    assert math.isnan(crossings(t, v, 0.0, np.zeros(6, bool)))
-
-
-def test_the_level_of_crossings_is_lowered_until_both_parts_cross_it_five_times():
-    """From 2.5 deviations in quarters; half-way between the samples beside it."""
-    n = 4000
-    v = 0.05 * np.sin(np.arange(n) * 1.7) + 5.0
-    v[100:2000:400] = v[2500:4000:300] = 4.0
-    samples = Samples(np.arange(n) * 1e-3, v, None)
-    level = crossing_level(samples)
-    below, above = v[v < 4.5].max(), v[v >= 4.5].min()
-    assert level == pytest.approx(0.5 * (below + above))
-    # One dip fewer in the part kept: the level lies within the sine, at a half or above.
-    w = v.copy()
-    w[3700] = 5.0
-    shallow = crossing_level(Samples(samples.t, w, None))
-    assert 4.94 < shallow < w.mean() - 0.4 * w.std()
-
-
-def test_rates_of_crossings_have_errors_of_counts():
-    t = np.arange(3000) * 1e-3
-    v = simulate(t, 63.0, 0.3, np.random.default_rng(3), u0=5.0)
-    samples = Samples(t, v, None)
-    rates = crossing_rates(samples, (OU(63.0, 0.3, 5.0),), (OU(63.0, 0.3, 5.0),),
-                           np.random.default_rng(4))
-    assert rates.observed == crossings(t, v, rates.level)
-    minutes = (t[-1] - t[0]) / 60.0
-    assert rates.observed_se == pytest.approx(math.sqrt(rates.observed * minutes) / minutes)
-    none = crossing_rates(samples, (OU(63.0, 0.3, 5.0),), (OU(63.0, 0.3, 5.0),),
-                          np.random.default_rng(4), np.arange(3000) < BLOCKS - 1)
-    assert math.isnan(none.level)
-
-
-@pytest.mark.parametrize('n', (10, 101, 1000))
-def test_blocks_are_all_samples_once(n):
-    parts = blocks_of(n)
-    assert len(parts) == FOLDS
-    assert np.concatenate([np.arange(n)[part] for part in parts]).tolist() == list(range(n))
-    sizes = [part.stop - part.start for part in parts]
-    assert max(sizes) - min(sizes) <= 1
 
 
 def test_the_error_of_a_mean_comes_from_24_blocks():

@@ -16,7 +16,8 @@ from ou_monitor.criticism.structure import evaluate, Events, fit_gaussian
 from ou_monitor.discovery.decision import kinds_to_try
 from ou_monitor.discovery.fitting import Fitter, standard_errors
 from ou_monitor.discovery.gain import (
-    cause_gain, covered, crossing_rates, gain_of, guess, held_out, without)
+    cause_gain, covered, gain_of, guess, held_out, without)
+from ou_monitor.discovery.load_effects import low_dips
 from ou_monitor.discovery.regression import load_terms, mean_response
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
@@ -215,8 +216,8 @@ def discovery():
             'covered': int(scored.sum()),
             'gains': [gain_of(scores[1], scores[0], scored),
                       cause_gain(scores[1], scores[2], scored)],
-            'crossings': crossing_rates(samples, plain.terms, full.terms,
-                                        np.random.default_rng(2), scored),
+            'dips': low_dips(samples, np.zeros(samples.n), plain.terms, full.terms,
+                             np.random.default_rng(2)),
             'load': [[one.NAME, one.values()] for one in load_terms(samples)],
             'answer': [[one.NAME for one in answer.terms], answer.worth, answer.rivals],
             'trials': [[one.name, float(one.evidence)] for one in fitter.trials(

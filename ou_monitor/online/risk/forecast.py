@@ -552,7 +552,7 @@ def look_ahead(forecast: Forecast, load: SupplyLoad, settings: MonitorSettings, 
     if math.isnan(soon):
         soon = forecast.risk(voltage, min(SOON, horizon)).risk
     risks = risk_over_throttle(forecast, voltage, horizon)
-    if np.isnan(risks).any():
+    if np.isnan(risks).any() or load.status is LoadStatus.NO_THROTTLE:
         why = '' if load.status is LoadStatus.NO_DATA else load.status.value if (
             not load.known) else 'Less than a second has been flown.'
         return RiskOutlook(outcome, NAN, why, soon=soon)
