@@ -167,12 +167,12 @@ def _agreement(recording: Recording, own: Readings, yardstick: Yardstick, simula
                simulated: tuple[float, float]) -> Agreement:
     real = yardstick.measure(own.voltage)
     spread = float(np.ptp(own.voltage))
-    found = differences(yardstick, real, measured, spread)
     error = path - own.voltage
+    found = differences(yardstick, real, measured, spread, float(error.mean()))
     explained = 1.0 - float(error @ error) / float(
         np.sum((own.voltage - own.voltage.mean()) ** 2))
     p, verdict, words, farthest = judge(found, explained, own.throttle is not None and bool(
-        np.ptp(own.throttle) >= MOVES))
+        np.ptp(own.throttle) >= MOVES and np.ptp(path) > 0.0))
     pooled = np.mean([m.distribution for m in measured], axis=0)
     responses = np.array([m.response for m in measured])
     falls = [one.band for one in found if one.kind == 'answer']

@@ -307,8 +307,8 @@ def band(measured: float, simulated: FloatArray) -> Band:
 
 
 def differences(yardstick: Yardstick, own: Measures, others: Sequence[Measures],
-                spread: float) -> list[Difference]:
-    """Return all numbers that are judged; spread is the range of the measured voltage, V."""
+                spread: float, bias: float) -> list[Difference]:
+    """Return all numbers that are judged; V: range of the measured voltage, bias of the path."""
     volts = max(_RANGE * spread, 1e-12)
 
     def of(pick: Callable[[Measures], float]) -> FloatArray:
@@ -319,8 +319,8 @@ def differences(yardstick: Yardstick, own: Measures, others: Sequence[Measures],
             f'the lowest voltage is {number(b.median, 4)} V ({_span(b, 4)}), measured '
             f'{number(b.measured, 4)} V')),
         Difference('level', own.mean, of(lambda m: m.mean), volts, lambda b: (
-            f'the voltage is on average {number(1e3 * abs(b.median - b.measured), 2)} mV too '
-            f'{"high" if b.median > b.measured else "low"}'))]
+            f'the voltage is on average {number(1e3 * abs(bias), 2)} mV too '
+            f'{"high" if bias > 0.0 else "low"}'))]
     for k, level in enumerate(yardstick.levels):
         rate = own.dips[k]
         # Poisson error of the count.
@@ -374,7 +374,7 @@ def _fall(v: float) -> str:
 def judge(found: Sequence[Difference], explained: float, moved: bool
           ) -> tuple[float, Likeness, str, str]:
     """Return p-value, verdict, the largest difference in words, and its kind."""
-    # explained: share of the variance explained by the mean path; moved: whether throttle moved.
+    # explained: share of the variance explained by the mean path; moved: whether that path moves.
     scores = np.array([one.scores() for one in found])
     largest = scores.max(axis=0)
     p = float(np.mean(largest >= largest[0]))

@@ -292,8 +292,10 @@ def _levers(found: Design, at: Callable[[float], DesignRow],
             return 1.0
 
     def resistance(share: float) -> float:
-        return flown(throttle, share, 1.0) if flown is not None else risk(
-            replace(network, battery_resistance=share * network.battery_resistance))
+        if flown is None:
+            return risk(replace(network, battery_resistance=share * network.battery_resistance))
+        # A smaller sag leaves more of the error of the level, but no course of voltage is lower.
+        return min(flown(throttle, share, 1.0), found.present.risk)
 
     def limit(share: float) -> float:
         return flown(share * throttle, 1.0, 1.0) if flown is not None else risk(
@@ -480,7 +482,7 @@ class Flight:
     """Facts of a supply from a recording, as numbers; NaN: unknown."""
 
     level: float  # Open-circuit voltage at its end, V
-    full: float  # Highest voltage, outliers excluded, V
+    full: float  # Highest median of half a second, V
     cells: int  # In series; 0: unknown
     throttle: Sequence[float]  # 0..1, at which the next four fields are given
     sag: Sequence[float]  # V

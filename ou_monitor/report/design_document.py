@@ -76,9 +76,9 @@ def taken_words(flight: Flight, network: PowerNetwork, throttle: float, values: 
     sag, se = (float(np.interp(throttle, flight.throttle, one))
                for one in (flight.sag, flight.sag_se))
     return (f'From the flight: {flight.level:.4g} V open-circuit at its end, {network.cells} '
-            f'cells (highest {flight.full:.4g} V; --set cells=N for others), sag {sag:.3g} V (+- '
-            f'{2.0 * se:.2g} V, which '
-            'the risks include: those of analyze, with the sag and noise of each row) and '
+            f'cells (highest median of 0.5 s {flight.full:.4g} V; --set cells=N for others), sag '
+            f'{sag:.3g} V (+- {2.0 * se:.2g} V, which the risks include: those of analyze, with '
+            'the sag and noise of each row) and '
             'noise '
             f'{1e3 * float(np.interp(throttle, flight.throttle, flight.noise)):.3g} mV rms at '
             f'{throttle:.0%} throttle, resistance '

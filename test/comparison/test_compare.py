@@ -151,15 +151,16 @@ def test_jitter_of_throttle_is_no_noise_and_no_path():
 
 
 def test_without_throttle_there_is_level_and_noise():
-    """An OU and white noise, and the note says so; at most one of two differs by chance."""
+    """Also with one that does nothing: no path to fail; at most one of three differs by chance."""
     t = np.arange(6000) / 200.0
     supply = SupplyModel((OU(ALPHA, SIGMA, 5.0), MeasurementNoise(0.02)))
     differ = 0
-    for seed, held in enumerate((np.nan, 0.4)):
+    for seed, held in enumerate((np.nan, 0.4, np.where(t % 2.0 < 1.0, 0.2, 0.8))):
         v = supply.simulate(t, np.random.default_rng(seed), np.full(t.size, 0.4))
         found = compare(Recording(t, v, np.full(t.size, held), 'bench'), seeds=40)
         assert found.model == ('ou', 'measurement_noise')
         assert any('only level and noise' in note for note in found.notes)
+        assert found.farthest != 'path'
         differ += found.verdict is Likeness.DIFFERS
     assert differ <= 1
 

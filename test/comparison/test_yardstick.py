@@ -4,7 +4,7 @@ import numpy as np
 from ou_monitor.analysis.supply import supply_facts
 from ou_monitor.comparison.flight_model import Readings
 from ou_monitor.comparison.yardstick import (
-    band, between_codes, Difference, judge, Likeness, Yardstick)
+    band, between_codes, Difference, differences, judge, Likeness, Yardstick)
 from ou_monitor.records import Recording
 import pytest
 from scipy.stats import norm
@@ -27,6 +27,15 @@ def test_falls_of_white_noise_are_counted_as_theory_says():
         expected = share * above / (share + above) * RATE * 60.0
         # The count is nearly Poisson; the level is the sample's own quantile, which helps.
         assert dips == pytest.approx(expected, abs=4.0 * np.sqrt(expected * 60.0 * RATE / N))
+
+
+def test_the_level_is_off_by_the_bias_of_the_path():
+    """Not by the median of few simulations, which the page would show as a second number."""
+    noise = white(3)
+    yardstick = Yardstick(noise, 0.0)
+    own, other = (yardstick.measure(noise.voltage + x) for x in (0.0, 0.03))
+    level = differences(yardstick, own, [other] * 20, 1.0, -0.019)[1]
+    assert level.kind == 'level' and ' 19 mV too low' in level.words(level.band)
 
 
 def test_a_fall_is_a_dip_of_the_facts():

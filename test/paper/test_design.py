@@ -82,6 +82,12 @@ def test_all_risks_are_those_of_the_flight():
     assert all(lever.least == lever.present for lever in enough.levers)
 
 
+def test_a_smaller_resistance_is_never_riskier():
+    """Where an estimate says so, because a smaller sag leaves more of the level's error."""
+    found = design(PowerNetwork(), 0.1, **QUESTION, flown=lambda u, sag, noise: 0.3 - 0.05 * sag)
+    assert {lever.risk for lever in found.levers[1:3]} == {found.present.risk}
+
+
 def test_a_fixed_esr_may_leave_no_capacitance():
     result = design(PowerNetwork(), 0.4, esr_follows=False, **QUESTION)
     assert result.verdict is DesignVerdict.OUT_OF_RANGE and result.least is None
