@@ -307,7 +307,7 @@ def _overview(found: Overview) -> dict[str, Any]:
         'highest_throttle': found.highest,
         'strongest_line': None if line is None else {
             'frequency_hz': line.frequency, 'rms_v': line.rms, 'share_of_variance': line.share,
-            'level': line.level},
+            'level': line.level, 'fundamental_hz': line.fundamental},
     }
 
 

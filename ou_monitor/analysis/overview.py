@@ -15,6 +15,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.supply import (
     BAND, facts_and_end, flown_near, Remainder, SupplyFacts, THROTTLES)
+from ou_monitor.model.spectral_lines import comb_of
 from ou_monitor.online.load.supply_load import AT_ONCE, hold, SupplyLoad
 from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.records import FloatArray, NAN, OuFacts, Recording
@@ -39,6 +40,7 @@ class LoudestLine:
     # Number of lines of that level, and their total share.
     lines: int
     all_share: float
+    fundamental: float  # Of which most of these lines are multiples, Hz; NaN: of none
 
 
 @dataclass(frozen=True)
@@ -114,8 +116,10 @@ def _strongest(levels: Sequence[LevelResult]) -> LoudestLine | None:
         return None
     line, level = max(found, key=lambda pair: pair[0].rms)
     lines = level.lines.lines
+    comb = comb_of([each.frequency for each in lines])
     return LoudestLine(line.frequency, line.rms, line.share, level.label, len(lines),
-                       min(1.0, sum(each.share for each in lines)))
+                       min(1.0, sum(each.share for each in lines)),
+                       comb.fundamental if comb else NAN)
 
 
 def answers(found: Overview) -> list[str]:
@@ -140,7 +144,9 @@ def answers(found: Overview) -> list[str]:
     if found.line is not None and found.line.all_share > _LOUD:
         line = found.line
         what = (f'A line at {number(line.frequency, 4)} Hz makes' if line.lines == 1 else
-                f'{line.lines} lines, the strongest at {number(line.frequency, 4)} Hz, make')
+                f'{line.lines} lines, the strongest at {number(line.frequency, 4)} Hz, make'
+                if math.isnan(line.fundamental) else
+                f'{line.lines} lines, most at multiples of {number(line.fundamental, 4)} Hz, make')
         where = '' if line.level == 'all' else f' at {line.level} throttle'
         parts.append(f'{what} {100.0 * line.all_share:.0f} % of the noise{where}.')
     return parts

@@ -13,11 +13,13 @@ import re
 from typing import Any
 
 from ou_monitor.discovery.finding import Cause, Criticism, Verdict
+from ou_monitor.model.spectral_lines import comb_of
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Term
+from ou_monitor.model.terms.tones import Tone
 from ou_monitor.records import LARGEST_LOG_SE
-from ou_monitor.text import chance as shown_chance, listed, number, p_words, Z95
+from ou_monitor.text import chance as shown_chance, listed, number, p_words, volts, Z95
 
 # The unit of a gain.
 MNAT = ('mnat: a thousandth of a nat of log predictive density. A gain of 1 mnat per sample makes '
@@ -62,7 +64,7 @@ def plain_words(statistic: str) -> str:
     return max(fits)[1] if fits else statistic
 
 
-# Longest list of numbers that is printed.
+# Longest list of numbers, or of tones with all parameters, that is printed.
 _LISTED = 6
 
 
@@ -267,7 +269,6 @@ class CauseRow:
     remark: str  # Why the cause is named if its gain is not significant; otherwise empty
     chance: str  # p, ``exact``, or `NOT_KNOWN`
     alternatives: tuple[str, ...]  # Causes that the recording cannot separate from it
-    estimates: tuple[str, ...]  # Parameters of each term, with units and standard errors
     explanation: str  # With the parameters of each term
 
 
@@ -283,7 +284,6 @@ def cause_rows(causes: Sequence[Cause]) -> list[CauseRow]:
         group[0].term.FAMILY, gain_text(group[0].gain, group[0].gain_se),
         _remark(group[0]), _chance(group[0]),
         tuple(dict.fromkeys(name for cause in group for name in cause.alternatives)),
-        tuple(parameters(cause.term, cause.se) for cause in group),
         _explanation(group)) for group in groups.values()]
 
 
@@ -326,11 +326,31 @@ def _explanation(group: Sequence[Cause]) -> str:
     if len(group) == 1:
         return first.explanation
     own = f'Estimate: {parameters(first.term, first.se)}.'
-    every = ' '.join(f'({k}) {parameters(cause.term, cause.se)}.'
-                     for k, cause in enumerate(group, 1))
+    every = _tones([cause.term for cause in group]) or 'Estimates: ' + ' '.join(
+        f'({k}) {parameters(cause.term, cause.se)}.' for k, cause in enumerate(group, 1))
     if own not in first.explanation:
-        return f'{first.explanation} Estimates: {every}'
-    return first.explanation.replace(own, f'Estimates: {every}', 1)
+        return f'{first.explanation} {every}'
+    return first.explanation.replace(own, every, 1)
+
+
+def _tones(terms: Sequence[Term]) -> str:
+    """Return many tones by their frequencies, harmonics together; empty for a few."""
+    tones = [term for term in terms if isinstance(term, Tone)]
+    if len(tones) <= _LISTED:
+        return ''
+    comb = comb_of([tone.frequency for tone in tones])
+    orders = comb.harmonics if comb else (0,) * len(tones)
+    others = [f'{number(tone.frequency, 4)} Hz ({volts(tone.amplitude)})'
+              for tone, order in zip(tones, orders) if not order]
+    words = []
+    if comb:
+        largest = {order: max(tone.amplitude for tone, k in zip(tones, orders) if k == order)
+                   for order in sorted(set(orders) - {0})}
+        words = [f'{len(tones) - len(others)} are at multiples of '
+                 f'{number(comb.fundamental, 5)} Hz, so probably of one source: '
+                 + ', '.join(f'{order}x ({volts(top)})' for order, top in largest.items()) + '.']
+    return ' '.join([*words, *([f'Others: {", ".join(others)}.'] if others else []),
+                     'Amplitudes are peaks; --json has all parameters.'])
 
 
 PLAIN_NAMES = {

@@ -67,6 +67,36 @@ class Line:
     p_value: float  # p-value of the ordinate, times the number of ordinates tested at all levels
 
 
+# Largest distance of a harmonic from a multiple of the fundamental, in fundamentals, and the
+# probability that as many lines of unrelated frequencies are that near to multiples.
+_NEAR_MULTIPLE, _UNRELATED = 0.01, 1e-3
+
+
+@dataclass(frozen=True)
+class Comb:
+    """Lines at multiples of one frequency."""
+
+    fundamental: float  # Hz
+    harmonics: tuple[int, ...]  # Multiple at which each line is; 0: at none
+
+
+def comb_of(frequencies: Sequence[float]) -> Comb | None:
+    """Return the comb that holds most of the lines (Hz); None without one beyond chance."""
+    f = np.asarray(frequencies, dtype=np.float64)
+    best: tuple[int, float, npt.NDArray[np.intp]] | None = None
+    for trial in np.unique(np.outer(f, (1.0, 0.5, 1.0 / 3.0)))[::-1].tolist():
+        order = np.rint(f / trial).astype(np.intp)
+        near = (order > 0) & (np.abs(f / trial - order) < _NEAR_MULTIPLE)
+        count = np.unique(order[near]).size
+        chance = sum(math.comb(f.size, k) * (2.0 * _NEAR_MULTIPLE)**k
+                     * (1.0 - 2.0 * _NEAR_MULTIPLE)**(f.size - k)
+                     for k in range(count - 1, f.size + 1))
+        if count > max(2, best[0] if best else 0) and 3.0 * f.size * chance < _UNRELATED:
+            fundamental = float(f[near] @ order[near] / (order[near] @ order[near]))
+            best = count, fundamental, np.where(near, order, 0)
+    return best and Comb(best[1], tuple(best[2].tolist()))
+
+
 @dataclass(frozen=True)
 class LineSearch:
     """Result of a search for lines."""

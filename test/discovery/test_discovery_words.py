@@ -6,7 +6,7 @@ import math
 from ou_monitor.discovery.finding import Cause, Criticism, Verdict
 from ou_monitor.discovery.words import (
     cause_rows, coupling_note, explain, gain_remark, gain_text, gain_words, overlap_words,
-    plain_words, verdict_sentence, why_named, with_error)
+    parameters, plain_words, verdict_sentence, why_named, with_error)
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.tones import Tone
@@ -81,18 +81,23 @@ def test_terms_that_share_a_gain_are_one_row_with_the_estimates_of_all():
     """The explanation is that of the first; its estimate gives way to those of all."""
     first, other = tone_cause(31.0, ''), tone_cause(67.0, 'The second.')
     (single,) = cause_rows([first])
-    estimate = single.estimates[0]
+    estimate, other_one = (parameters(cause.term, {}) for cause in (first, other))
     assert '31.00 Hz' in estimate
     first = replace(first, explanation=f'The first. Estimate: {estimate}. Mend it.')
     (row,) = cause_rows([first, other])
-    assert row.label == f'{first.name} x2' and len(row.estimates) == 2
-    assert row.explanation == (f'The first. Estimates: (1) {row.estimates[0]}. '
-                               f'(2) {row.estimates[1]}. Mend it.')
+    assert row.label == f'{first.name} x2'
+    assert row.explanation == f'The first. Estimates: (1) {estimate}. (2) {other_one}. Mend it.'
     # One that holds no estimate has them added.
     (added,) = cause_rows([replace(first, explanation='Bare.'), other])
-    assert added.explanation == (f'Bare. Estimates: (1) {row.estimates[0]}. '
-                                 f'(2) {row.estimates[1]}.')
+    assert added.explanation == f'Bare. Estimates: (1) {estimate}. (2) {other_one}.'
     assert single.label == first.name and cause_rows([other])[0].explanation == 'The second.'
+
+
+def test_many_lines_are_told_by_their_fundamental():
+    """Seven lines: six harmonics of 50 Hz, and one beside them."""
+    (row,) = cause_rows([tone_cause(one, 'Lines.') for one in (50, 100, 150, 250, 300, 350, 73)])
+    assert '6 are at multiples of 50.000 Hz' in row.explanation
+    assert '7x (10.0 mV)' in row.explanation and 'Others: 73.00 Hz (10.0 mV).' in row.explanation
 
 
 @pytest.mark.parametrize('verdict, left, begin, gain', (
