@@ -56,10 +56,10 @@ def percent(share: float) -> str:
     return f'{value:g} %'
 
 
-def with_se(value: float, se: float, digits: int = 3) -> str:
-    """Return a number with its standard error, if both are known."""
+def with_interval(value: float, se: float, digits: int = 3) -> str:
+    """Return a number with half its 95 % interval, if both are known."""
     return number(value, digits) + (
-        f' +- {number(se, 2)}' if math.isfinite(value) and math.isfinite(se) else '')
+        f' +- {number(Z95 * se, 2)}' if math.isfinite(value) and math.isfinite(se) else '')
 
 
 def listed(names: Sequence[str]) -> str:

@@ -75,7 +75,7 @@ class AlphaTest:
     def _verdict(self) -> str:
         if self.levels < 2:
             return ('This recording cannot decide whether alpha depends on load: '
-                    f'{"only one load level has" if self.levels else "no load level has"} '
+                    f'{"only one" if self.levels else "no"} throttle held long enough has '
                     f'a usable fit{" that one OU describes" if self.withheld else ""}.')
         least, ends = _factor(self.detectable_ratio), 'from the lowest to the highest throttle'
         if self.verdict == 'differs':

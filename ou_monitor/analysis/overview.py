@@ -13,13 +13,13 @@ import math
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from ou_monitor.analysis.level_result import LevelResult
-from ou_monitor.analysis.supply import (
-    BAND, facts_and_end, flown_near, Remainder, SupplyFacts, THROTTLES)
+from ou_monitor.analysis.noise import BAND, flown_near, Remainder, THROTTLES
+from ou_monitor.analysis.supply import facts_and_end, SupplyFacts
 from ou_monitor.model.spectral_lines import comb_of
 from ou_monitor.online.load.supply_load import AT_ONCE, hold, SupplyLoad
 from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.records import FloatArray, NAN, OuFacts, Recording
-from ou_monitor.text import counted, number, percent, volts, Z95
+from ou_monitor.text import counted, number, percent, volts
 
 # Minimum ratio of the fitted noise between the ends of throttle that is reported as a trend.
 _GROWS = 1.25
@@ -242,15 +242,6 @@ def _noise_words(found: Overview) -> str:
     return (f'{number(1e3 * low)} mV rms at {100.0 * first:.0f} % throttle, '
             f'{number(1e3 * high)} mV at {100.0 * last:.0f} %: it '
             f'{"grows" if found.growth > 1.0 else "falls"} with throttle')
-
-
-def other_scale(ou: OuFacts, alpha: float, ln_alpha_se: float, sigma: float, ln_sigma_se: float,
-                ) -> bool:
-    """Return whether another fit's interval of alpha or sigma and the facts' are disjoint."""
-    return ou.status == 'ok' and any(
-        x * math.exp(Z95 * se) < low or x * math.exp(-Z95 * se) > high
-        for x, se, (low, high) in ((alpha, ln_alpha_se, ou.alpha_95),
-                                   (sigma, ln_sigma_se, ou.sigma_95)) if math.isfinite(x))
 
 
 def _ou_words(ou: OuFacts) -> str:

@@ -187,8 +187,9 @@ _NOISE = {
         'describe rail and instrument together; repeat with a DC-coupled instrument. '
         '`ou-monitor discover` fits both.'),
     'SLOW_RELAXATION': (
-        'The relaxation is nearly as slow as the changes of level that are removed: alpha is too '
-        'high (by a factor of 2 where tau is 1.3 s), and its interval too narrow.'),
+        'What varies beside white noise is nearly as slow as the level that is removed: an alpha '
+        'fitted to it is too high (by a factor of 2 where tau is 1.3 s), and its interval too '
+        'narrow.'),
     'IMPULSES': (
         'The noise has impulses: alpha, sigma and Var_inf include them, and their intervals are '
         'too narrow. `ou-monitor discover` tells impulses from noise.')}

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.analysis.supply import dip_begins, noise_of, rise_that_ends
+from ou_monitor.analysis.noise import dip_begins, noise_of, rise_that_ends
 from ou_monitor.comparison.flight_model import Readings
 from ou_monitor.records import FloatArray, NAN, Recording
 from ou_monitor.text import number, Z95

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.analysis.supply import rise_at
+from ou_monitor.analysis.noise import rise_at
 from ou_monitor.criticism.battery import criticise, family_chance, family_edge
 from ou_monitor.criticism.composite import Composite, fit_composite
 from ou_monitor.criticism.integrity import examine, Integrity
@@ -298,7 +298,8 @@ def _notes(named: Named, model: Composite, dropped: Sequence[str], samples: Samp
         notes.append(coupling_found(duration))
     elif ou.alpha * step > _BLIND:
         notes.append(no_relaxation_note(ou.alpha, step))
-    elif relaxes(ou.alpha, duration):
+    elif relaxes(ou.alpha, duration) and not model.has('load_sag') and not model.has('drift'):
+        # Behind an AC coupling no change of the level lasts.
         notes.append(coupling_note(ou.alpha, duration))
     return tuple(notes)
 

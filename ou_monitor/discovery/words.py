@@ -21,9 +21,10 @@ from ou_monitor.model.terms.tones import Tone
 from ou_monitor.records import LARGEST_LOG_SE
 from ou_monitor.text import chance as shown_chance, listed, number, p_words, volts, Z95
 
-# The unit of a gain.
-MNAT = ('mnat: a thousandth of a nat of log predictive density. A gain of 1 mnat per sample makes '
-        '1000 samples e = 2.7 times as likely as before.')
+# What a gain is, and the errors beside it.
+GAIN = ('Gain: log predictive density of samples not used for the fit, in mnat (thousandths of a '
+        'nat: 1 mnat per sample makes 1000 samples e = 2.7 times as likely); +- is half the 95 % '
+        'interval.')
 # Reasons why a gain is unknown.
 VAGUE = ('its error is more than ten times the gain, because the rest of the recording hardly '
          'determines its parameters.')
@@ -74,14 +75,15 @@ def parameters(term: Term, se: Mapping[str, Any]) -> str:
              if se.get(name) != math.inf and value != term.usual().get(name)}
     long = [name for name, value in known.items()
             if isinstance(value, list) and len(value) > _LISTED]
-    found = [f'{name} = {with_error(value, se.get(name), positive=term.positive(name))}'
-             f'{_unit(term, name)}' for name, value in known.items() if name not in long]
+    found = [f'{term.label(name)} = '
+             f'{with_error(value, se.get(name), positive=term.positive(name))} {term.unit(name)}'
+             .rstrip() for name, value in known.items() if name not in long]
     return '; '.join([*found, *([f'{listed(long)} have {len(known[long[0]])} values each, see the '
                                  'plot and --json'] if long else [])])
 
 
 def with_error(value: Any, error: Any, *, positive: bool = False) -> str:
-    """Return a number, or a list of numbers, with its standard error if known."""
+    """Return a number, or a list of numbers, with half its 95 % interval if known."""
     # A positive number may be "not determined", see `is_vague`.
     if isinstance(value, list):
         errors = error if isinstance(error, list) else [None] * len(value)
@@ -92,8 +94,9 @@ def with_error(value: Any, error: Any, *, positive: bool = False) -> str:
     if isinstance(error, float) and math.isfinite(error) and error > 0.0:
         if positive and is_vague(value, error):
             return 'not determined'
-        digits = min(max(2 + math.floor(math.log10(max(abs(value) / error, 1.0))), 2), 6)
-        return f'{number(value, digits)} +- {number(error, 2)}'
+        half = Z95 * error
+        digits = min(max(2 + math.floor(math.log10(max(abs(value) / half, 1.0))), 2), 6)
+        return f'{number(value, digits)} +- {number(half, 2)}'
     return number(value, 4)
 
 
@@ -101,11 +104,6 @@ def is_vague(value: Any, error: Any) -> bool:
     """Return whether the error of a positive number exceeds `LARGEST_LOG_SE`, as in `Estimate`."""
     return (isinstance(value, float) and isinstance(error, float)
             and 0.0 < LARGEST_LOG_SE * value < error)
-
-
-def _unit(term: Term, name: str) -> str:
-    unit = term.unit(name)
-    return f' {unit}' if unit else ''
 
 
 def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
@@ -116,11 +114,9 @@ def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
     if exact:
         parts.append('The samples themselves show it, without a model.')
     if not exact or gain != 0.0:
-        parts.append(gain_words(gain, gain_se, why))
+        parts.append(gain_words(gain, gain_se, why, math.nan if exact else chance))
     if together > 1 and math.isfinite(gain):
         parts.append(f'That is the gain of all {together} terms {term.NAME} together.')
-    if not exact:
-        parts.append(why_named(gain, gain_se, chance))
     if alternatives:
         separate = [f'{catalogue()[name].SEPARATED_BY} (for {name})'
                     for name in (term.NAME, *alternatives)]
@@ -139,12 +135,10 @@ def left_out_note(count: int, scored: int) -> str:
 def coupling_note(alpha: float, duration: float) -> str:
     """Return for which rails an AC coupling is ruled out (alpha in 1/s, duration in s)."""
     # Evidence for one grows as 0.24 alpha T nats with the rate alpha of the rail behind it.
-    slowest = 6.0 / (0.24 * duration)
-    corner = alpha / (2.0 * math.pi)
-    return (f'An AC-coupled instrument with a corner at {number(corner)} Hz would show '
-            f'the same relaxation. {number(duration)} s of data rule it out only if the rail '
-            f'itself is faster than {number(slowest)} 1/s (a rail of 1 1/s needs 25 s, one of 0.1 '
-            '1/s 250 s): if in doubt, repeat with a DC-coupled instrument.')
+    slowest = 0.24 * duration / 6.0
+    return (f'If the supply itself relaxes more slowly than in {number(slowest)} s, the '
+            'relaxation found could be that of an AC-coupled instrument (a high-pass at '
+            f'{number(alpha / (2.0 * math.pi))} Hz); a recording with a DC-coupled one decides.')
 
 
 def no_relaxation_note(alpha: float, step: float) -> str:
@@ -218,23 +212,18 @@ def plain_model_words(baseline: OU) -> str:
             f'u0 = {number(baseline.u0, 4)} V')
 
 
-def gain_words(gain: float, gain_se: float, why: str = '') -> str:
-    """Return the gain in a sentence."""
+def gain_words(gain: float, gain_se: float, why: str = '', chance: float = math.nan) -> str:
+    """Return the gain in a sentence, and if it is not significant, the p of a named cause."""
+    named = '' if math.isnan(chance) else (
+        f' Named because it explains the whole recording better ({p_words(chance)}).')
     if not math.isfinite(gain):
-        return 'Its gain cannot be measured on this recording' + (f': {why}' if why else '.')
-    size = f'{number(1e3 * gain)} +- {number(1e3 * gain_se, 2)} mnat per sample'
+        return f'Its gain cannot be measured on this recording{f": {why}" if why else "."}{named}'
+    size = f'{gain_text(gain, gain_se)} mnat per sample'
     if gain > Z95 * gain_se:
         return f'Gain on samples not used for the fit: {size}.'
     if gain < -Z95 * gain_se:
-        return f'Worse on samples not used for the fit: {size}.'
-    return f'No measurable gain on samples not used for the fit ({size}).'
-
-
-def why_named(gain: float, gain_se: float, chance: float) -> str:
-    """Return why a cause without a significant gain is named; otherwise empty."""
-    if gain > Z95 * gain_se or not math.isfinite(chance):
-        return ''
-    return f'Named because it explains the whole recording better ({p_words(chance)}).'
+        return f'Worse on samples not used for the fit: {size}.{named}'
+    return f'No measurable gain on samples not used for the fit ({size}).{named}'
 
 
 def overlap_words(causes: Sequence[Cause], gain: float) -> str:
@@ -265,8 +254,7 @@ class CauseRow:
     name: str  # Name of the cause
     label: str  # Name, with the number of terms if there are several
     family: str  # Family in the catalogue
-    gain: str  # mnat per sample with its standard error, or `NOT_KNOWN`
-    remark: str  # Why the cause is named if its gain is not significant; otherwise empty
+    gain: str  # mnat per sample, or `NOT_KNOWN`
     chance: str  # p, ``exact``, or `NOT_KNOWN`
     alternatives: tuple[str, ...]  # Causes that the recording cannot separate from it
     explanation: str  # With the parameters of each term
@@ -282,36 +270,18 @@ def cause_rows(causes: Sequence[Cause]) -> list[CauseRow]:
     return [CauseRow(
         group[0].name, group[0].name if len(group) == 1 else f'{group[0].name} x{len(group)}',
         group[0].term.FAMILY, gain_text(group[0].gain, group[0].gain_se),
-        _remark(group[0]), _chance(group[0]),
+        _chance(group[0]),
         tuple(dict.fromkeys(name for cause in group for name in cause.alternatives)),
         _explanation(group)) for group in groups.values()]
 
 
 def gain_text(gain: float, gain_se: float) -> str:
-    """Return a gain, nats, in mnat with its standard error."""
+    """Return a gain, nats, in mnat with half its 95 % interval."""
     if not math.isfinite(gain):
         return NOT_KNOWN
     if not math.isfinite(gain_se):
         return f'{number(1e3 * gain)}, error {NOT_KNOWN}'
-    return f'{number(1e3 * gain)} +- {number(1e3 * gain_se, 2)}'
-
-
-def gain_remark(gain: float, gain_se: float) -> str:
-    """Return a remark on a gain that is not significant; otherwise empty."""
-    if not (math.isfinite(gain) and math.isfinite(gain_se)) or gain > Z95 * gain_se:
-        return ''
-    if gain < -Z95 * gain_se:
-        return 'worse on held-out samples'
-    return 'not distinguishable from 0'
-
-
-def _remark(cause: Cause) -> str:
-    """Return a remark on the gain, and why the cause is named nevertheless."""
-    remark = gain_remark(cause.gain, cause.gain_se) if math.isfinite(cause.gain) else (
-        'not measurable here')
-    if cause.exact or not remark:
-        return remark
-    return remark + '; named because it explains the whole recording better'
+    return f'{number(1e3 * gain)} +- {number(1e3 * Z95 * gain_se, 2)}'
 
 
 def _chance(cause: Cause) -> str:

@@ -12,10 +12,10 @@ from ou_monitor.analysis.analyze import Analysis
 from ou_monitor.analysis.crafts import CELL_LIMIT, craft_advice, craft_line
 from ou_monitor.analysis.level_comparison import sigma_change
 from ou_monitor.analysis.level_result import LevelResult
+from ou_monitor.analysis.noise import BAND
 from ou_monitor.analysis.overview import answers, determined, known_lines
 from ou_monitor.analysis.quality import QualityItem
 from ou_monitor.analysis.relaxation import Relaxation
-from ou_monitor.analysis.supply import BAND
 from ou_monitor.criticism.curves import outline
 from ou_monitor.online.risk.courses import KEPT
 from ou_monitor.online.settings import DEFAULT_LIMIT
@@ -24,7 +24,7 @@ from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text, UNKNOWN,
     worst_first)
 from ou_monitor.report.svg import Plot, span
-from ou_monitor.text import chance, counted, listed, number, percent, with_se
+from ou_monitor.text import chance, counted, listed, number, percent, with_interval
 
 # Maximum changes of throttle drawn in one plot, and the length of the plot, relaxation times.
 _MOST_DRAWN, _DRAWN_TAUS = 6, 8.0
@@ -58,7 +58,7 @@ def analysis_document(analysis: Analysis, command: str = '') -> Document:
         *_alarms(analysis),
         Section('Over throttle', [_by_throttle(analysis), lambda: _curves(analysis),
                                   Text(analysis.alpha_test.sentence)]),
-        Section('Load levels', [*_levels(analysis.levels)]),
+        Section('Load levels', _levels(analysis)),
         lambda: [Section('Sigma and alpha over time', _sliding(analysis), folded=True)],
         Section('After changes of throttle', _transients(analysis), folded=True),
         Section('Spectrum and distribution', [lambda: _shape(analysis), *_lines(analysis)],
@@ -323,13 +323,19 @@ def _with_estimates(plot: Plot, x: FloatArray, levels: Sequence[LevelResult], na
                  _column([level.estimate.interval(name) for level in levels]))
 
 
-def _levels(levels: Sequence[LevelResult]) -> list[Part]:
+def _levels(analysis: Analysis) -> list[Part]:
+    levels = analysis.levels
+    # A relaxation at the edge of what the level leaves, and not visible to the facts, is none.
+    slow = [] if analysis.overview.facts.ou.status == 'ok' else [
+        str(at) for item in analysis.quality if item.name == 'SLOW_RELAXATION'
+        for at in item.throttles]
     rows = [[level.label, number(level.time), str(level.n), number(level.mean, 4),
              *[number(1e3 * v) for v in (level.vpp, level.peak, level.vrms)],
              number(level.crest), number(1e3 * level.estimate.noise_std), level.kind.value]
             for level in levels]
     fits = [[level.label, *[_interval(level, name) for name in ('alpha', 'sigma', 'var_inf')],
-             number(1e3 * level.estimate.tau)] for level in levels if level.estimate.usable]
+             number(1e3 * level.estimate.tau)] for level in levels
+            if level.estimate.usable and str(level.throttle) not in slow]
     return [
         Table(['throttle', 'time, s', 'samples', 'mean, V', 'Vpp, mV', 'peak, mV', 'Vrms, mV',
                'Vpp/Vrms', 'white, mV', 'process'], rows, left=[0, 9]),
@@ -438,9 +444,9 @@ def _changes(analysis: Analysis, fit: Relaxation) -> Table:
     side = 'overshoot, mV' if fit.kind == 'release' else 'undershoot, mV'
     rows = [[number(change.t - start, 4),
              f'{100.0 * change.throttle_before:.3g} to {100.0 * change.throttle_after:.3g} %',
-             with_se(change.level_before, change.level_before_se, 4),
-             with_se(change.level, change.level_se, 4),
-             with_se(1e3 * change.amplitude, 1e3 * change.amplitude_se),
+             with_interval(change.level_before, change.level_before_se, 4),
+             with_interval(change.level, change.level_se, 4),
+             with_interval(1e3 * change.amplitude, 1e3 * change.amplitude_se),
              number(1e3 * change.beyond), chance(change.beyond_p)] for change in fit.clear]
     return Table(['at, s', 'throttle', 'before, V', 'after, V', 'A, mV', side, 'p (noise only)'],
                  rows, left=[1], most=_MOST_CHANGES)

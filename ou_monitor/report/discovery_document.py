@@ -8,17 +8,17 @@ from html import escape
 import math
 
 import numpy as np
-from ou_monitor.analysis.overview import known_lines, other_scale, Overview
+from ou_monitor.analysis.overview import known_lines, Overview
 from ou_monitor.criticism.curves import compare_curves, Comparison
 from ou_monitor.discovery.finding import Finding, Verdict
 from ou_monitor.discovery.words import (
-    both_names, by_load, cause_rows, gain_words, MNAT, overlap_words, plain, plain_model_words,
-    PLAIN_NAMES, plain_words, with_error)
+    both_names, by_load, cause_rows, GAIN, gain_text, gain_words, overlap_words, plain,
+    plain_model_words, PLAIN_NAMES, plain_words, with_error)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text)
 from ou_monitor.report.svg import Plot, span
-from ou_monitor.text import listed, number, with_se, Z95
+from ou_monitor.text import listed, number, Z95
 
 # Maximum causes in the first sentence, and remaining discrepancies on a terminal.
 _FIRST, _SHOWN = 3, 8
@@ -43,9 +43,6 @@ def discovery_document(finding: Finding, seen: Overview | None = None, command: 
     subject = (f'{finding.recording or "recording"}: {finding.n} samples in '
                f'{number(finding.duration, 4)} s{used}{load}')
     known = [] if seen is None else known_lines(seen)
-    if seen is not None and baseline is not None and other_scale(
-            seen.facts.ou, baseline.alpha, 0.0, baseline.sigma, 0.0):
-        known.append(('Plain OU', 'has another time scale, because it includes level and load'))
     parts: list[Part] = [
         lambda: [] if samples is None else [Figure(_voltage(finding), (
             f'Band: range of {_DRAWS} simulations of the {_model_name(finding)} at each moment, '
@@ -96,7 +93,7 @@ def _gain_words(finding: Finding) -> str:
     return (f'On samples not used for the fit, one-step errors {errors} (rms; '
             f'{smaller} mnat per sample) and their size is predicted '
             f'{"better" if size >= 0.0 else "worse"} ({better}): '
-            f'{number(1e3 * gain)} +- {number(1e3 * finding.gain_se, 2)} mnat in all.')
+            f'{gain_text(gain, finding.gain_se)} mnat in all.')
 
 
 def _inputs(finding: Finding) -> str:
@@ -131,19 +128,18 @@ def _causes(finding: Finding) -> list[Part]:
     if not finding.causes:
         return [Text('No cause was named.')]
     found = cause_rows(finding.causes)
-    remarks = [f'Gain {remark}: ' + ', '.join(
-        f'{row.label} ({row.gain})' for row in found if row.remark == remark)
-        for remark in dict.fromkeys(row.remark for row in found if row.remark)]
     return [
-        Table(['cause', 'what it is', 'family', 'gain,\nmnat/sample', 'p', 'alternatives'],
+        Table(['cause', 'what it is', 'family', 'gain,\nmnat/sample',
+               'p (fit or\ngain)', 'alternatives'],
               [[row.label, by_load(PLAIN_NAMES.get(row.name, row.name), finding.load),
                 row.family, row.gain, row.chance, ', '.join(row.alternatives) or '-']
                for row in found], left=[0, 1, 2, 5]),
-        Notes.of([*remarks, overlap_words(finding.causes, finding.gain),
+        Text(GAIN),
+        Notes.of([overlap_words(finding.causes, finding.gain),
                   *(f'{row.label}: {row.explanation}' for row in found)]),
-        Text(f'{MNAT} Gain: the loss of held-out score when the cause is left out and the rest is '
-             'fitted again; its standard error combines the scatter of block means and the '
-             'errors of the parameters. p: twice the smaller of two p-values: the likelihood '
+        Text('The gain of a cause is the loss of held-out score when it is left out and the rest '
+             'is fitted again; its error combines the scatter of block means and the errors of '
+             'the parameters. p: twice the smaller of two p-values: the likelihood '
              'ratio on the fitted part (corrected for the search) and the gain. "Exact" causes '
              'are visible in the samples themselves; causes corrected in the samples share one '
              'gain. Terms of one kind that share a gain are one row.', legend=True)]
@@ -152,9 +148,9 @@ def _causes(finding: Finding) -> list[Part]:
 def _gain(finding: Finding) -> list[Part]:
     dips, baseline = finding.dips, finding.baseline
     assert baseline is not None
-    rows = [['held-out score, nats/sample', '-', number(finding.baseline_score, 4),
-             number(finding.score, 4), with_se(finding.gain, finding.gain_se)]]
-    rows.append([f'dips below {dips.level:g} V, 1/min', *(with_se(*pair) for pair in (
+    rows = [['held-out score, mnat/sample', '-', number(1e3 * finding.baseline_score, 4),
+             number(1e3 * finding.score, 4), gain_text(finding.gain, finding.gain_se)]]
+    rows.append([f'dips below {dips.level:g} V, 1/min', *(with_error(*pair) for pair in (
         (dips.observed, dips.observed_se), (dips.baseline, dips.baseline_se),
         (dips.extended, dips.extended_se))), '-'])
     # If nothing was added to the plain OU, there is nothing to compare.
@@ -162,7 +158,8 @@ def _gain(finding: Finding) -> list[Part]:
     return [Table(['', 'observed', 'plain OU', 'extended', 'gain'][:kept],
                   [row[:kept] for row in rows], left=[0]), Text(
                       '' if finding.refused else _under_load(finding)),
-            Text(f'The plain OU has {plain_model_words(baseline)}.')]
+            Text('The plain OU, which includes level and load, has '
+                 f'{plain_model_words(baseline)}.')]
 
 
 def _under_load(finding: Finding) -> str:
@@ -268,7 +265,7 @@ def _parameters(finding: Finding) -> list[Part]:
              'sigma describe the relaxation and noise not explained by the causes; alpha and '
              'sigma of the plain OU above include the causes.'
              if finding.causes else 'No cause was named: this is the plain OU above.')
-    return [Text(about), Table(['term', 'parameter', 'estimate +- standard error', 'unit',
+    return [Text(about), Table(['term', 'parameter', 'estimate +- 95 %', 'unit',
                                 'what it is'], rows, left=[0, 1, 4])]
 
 

@@ -76,7 +76,7 @@ def test_less_than_two_levels_decide_nothing(estimates):
     """And the sentence says how many there are."""
     found = alpha_constancy(THROTTLES, estimates)
     assert found.verdict == 'undetermined' and math.isnan(found.p_value)
-    assert 'load level has' in found.sentence
+    assert 'throttle held long enough has' in found.sentence
 
 
 def test_fitted_levels_of_one_alpha_do_not_differ():
@@ -101,10 +101,11 @@ def test_levels_that_one_ou_does_not_describe_are_withheld():
         'Withheld: 70 %, because a level shows more than one relaxation, or both '
         'lines and impulses.')
     alone = alpha_constancy(THROTTLES, four, [False, True, True, True])
-    assert alone.verdict == 'undetermined' and 'depends on load: only one load' in alone.sentence
+    assert alone.verdict == 'undetermined'
+    assert 'depends on load: only one throttle' in alone.sentence
     none = alpha_constancy(THROTTLES, four, [True] * 4)
     assert none.levels == 0 and math.isnan(none.alpha)
-    assert 'no load level has a usable fit that one OU describes' in none.sentence
+    assert 'no throttle held long enough has a usable fit that one OU describes' in none.sentence
 
 
 def test_a_tone_is_not_taken_for_another_alpha():

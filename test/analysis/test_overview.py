@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 from ou_monitor import supply_facts
 from ou_monitor.analysis.overview import (
-    answers, determined, known_lines, other_scale, overview)
-from ou_monitor.records import OuFacts, Recording
+    answers, determined, known_lines, overview)
+from ou_monitor.records import Recording
 import pytest
 
 RATE, SECONDS = 50.0, 80.0
@@ -98,16 +98,6 @@ def test_one_loud_throttle_is_no_trend(last, words):
     noise = np.where(high, last, 0.016) * np.random.default_rng(5).standard_normal(one.n)
     found = overview(replace(one, voltage=16.0 - SAG * one.throttle ** 1.8 + noise))
     assert 0.8 < found.growth < 1.25 and dict(known_lines(found))['Noise'].endswith(words)
-
-
-@pytest.mark.parametrize('alpha, se, other', [
-    (20.0, 0.0, False), (8.0, 0.1, True), (8.0, 0.3, False), (60.0, 0.1, True),
-    (math.nan, math.nan, False)])
-def test_another_time_scale_is_told_by_both_intervals(alpha, se, other):
-    """Of ln alpha; sigma agrees."""
-    ou = OuFacts('ok', 30.0, 20.0, (14.0, 28.0), 0.1, (0.08, 0.12), 2.5e-4, (2e-4, 3e-4))
-    assert other_scale(ou, alpha, se, 0.1, 0.1) is other
-    assert not other_scale(OuFacts('not_visible', 30.0), alpha, se, 0.1, 0.1)
 
 
 def test_unknown_facts_are_stated_and_the_others_kept():

@@ -76,7 +76,7 @@ def test_one_run_writes_summary_model_and_page(flight, tmp_path, capsys):
     out = capsys.readouterr().out
     assert all(len(line) <= 100 for line in out.replace(str(tmp_path), '').splitlines())
     for part in ('A plain simulation lacks sag (load_sag)', 'gain, mnat/sample', 'dips below',
-                 'The plain OU has alpha', str(model), str(page)):
+                 'The plain OU, which includes level', str(model), str(page)):
         assert part in out
     file = read_model(model)
     found = strict(data.read_text())
@@ -168,13 +168,13 @@ def test_the_headline_names_the_strongest_and_what_all_are_worth():
         *[(Tone(0.01, f, 0.0, 0.0), 0.3, 0.01, 0.0) for f in (11.0, 23.0)]),
         gain=math.log(2.0), gain_se=0.1, shrink=0.2)
     said = ' '.join(terminal(discovery_document(finding)).split())
-    assert 'Gain not measurable here; named because it explains' in said
+    assert 'mnat (thousandths of a nat' in said
     strongest, worth, passes = answer(finding)
     assert re.findall(r'\((\w+)\)', strongest) == ['tone', 'load_sag', 'drift']
-    assert re.findall(r'\d+', worth) == ['20', '223', '470', '693', '100']
+    assert re.findall(r'\d+', worth) == ['20', '223', '470', '693', '196']
     assert 'every test' in passes
     grown = answer(replace(finding, shrink=-0.2))[1]
-    assert re.findall(r'[-+]?\b\d+', grown) == ['20', '-182', '+875', '693', '100']
+    assert re.findall(r'[-+]?\b\d+', grown) == ['20', '-182', '+875', '693', '196']
     more = replace(finding, verdict=Verdict.PARTLY_EXPLAINED, refused='It strays', causes=(
         *finding.causes, *made((MeasurementNoise(0.01), 0.1, 0.01, 0.0)).causes))
     strongest, _, closer, refused = answer(more)

@@ -41,14 +41,16 @@ class LoadSag(Term):
     MEASURED: ClassVar[bool] = True
     LIVE: ClassVar[bool] = True
     MEANING: ClassVar[str] = (
-        'The mean falls with throttle: IR drop of battery, leads and regulator.')
+        'The mean falls with throttle: IR drop of battery, leads and regulator. This is the fall '
+        'once settled; sag and resistance of the supply are read after 1 s.')
     REMEDY: ClassVar[str] = (
         'Give the estimator the throttle, so that it removes the sag; thicker or shorter leads '
         'reduce it.')
     SEPARATED_BY: ClassVar[str] = 'throttle held for some seconds at several levels'
 
-    linear: float = parameter('V', 'drop at full throttle, linear part')
-    square: float = parameter('V', 'drop at full throttle, quadratic part')
+    linear: float = parameter('V', 'drop at full throttle, linear part', label='settled fall')
+    square: float = parameter('V', 'drop at full throttle, quadratic part',
+                              label='with the square of throttle')
     growth: float = parameter('V/s', 'growth of the linear part', default=0.0)
 
     def change(self, s: Segment) -> None:
@@ -97,12 +99,13 @@ class LoadTransient(Term):
     MEANING: ClassVar[str] = (
         'The mean responds to changes of throttle: lag, inrush or slow recovery of polarisation.')
     REMEDY: ClassVar[str] = (
-        'Include the dip after a throttle step in the brown-out margin; capacitance at the ESC '
+        'Include the fall after a throttle step in the brown-out margin; capacitance at the ESC '
         'shortens it.')
     SEPARATED_BY: ClassVar[str] = (
         'single steps of throttle, each held for ten times the time constant of the response')
 
-    gain: float = parameter('V', 'immediate response to a step to full throttle')
+    gain: float = parameter('V', 'immediate response to a step to full throttle',
+                            label='immediate response')
     tau: float = parameter('s', 'time constant of its decay', 0.0, above=True)
     delay: float = parameter('s', 'delay before the response begins', 0.0)
     rise: float = parameter('V', 'added to the gain while throttle rises', default=0.0)

@@ -46,9 +46,10 @@ class Role(enum.Enum):
 
 
 def parameter(unit: str, text: str, low: float = -math.inf, high: float = math.inf, *,
-              above: bool = False, default: float | None = None) -> Any:
+              above: bool = False, default: float | None = None, label: str = '') -> Any:
     """Declare a parameter; one with a default may be omitted, also in a model file."""
-    about = {'unit': unit, 'text': text, 'low': low, 'high': high, 'above': above}
+    # label: its name in texts, if not that of the attribute.
+    about = {'unit': unit, 'text': text, 'low': low, 'high': high, 'above': above, 'label': label}
     return field(metadata=about) if default is None else field(default=default, metadata=about)
 
 
@@ -252,6 +253,12 @@ class Term:
     def unit(cls, name: str) -> str:
         """Return the unit of a parameter; empty for a number."""
         return next(str(spec.metadata['unit']) for spec in fields(cls) if spec.name == name)
+
+    @classmethod
+    def label(cls, name: str) -> str:
+        """Return the name of a parameter in texts."""
+        return next(str(spec.metadata.get('label') or name) for spec in fields(cls)
+                    if spec.name == name)
 
     @classmethod
     def positive(cls, name: str) -> bool:
