@@ -26,8 +26,7 @@ from ou_monitor.analysis.level_tests import EFFECT, LEAST
 from ou_monitor.analysis.levels import find_levels, LoadLevel
 from ou_monitor.analysis.noise import flown_near, remainder, THROTTLES, without_wild
 from ou_monitor.analysis.overview import Overview, overview
-from ou_monitor.analysis.quality import (
-    line_item, noise_items, quality_list, QualityItem)
+from ou_monitor.analysis.quality import noise_items, quality_list, QualityItem
 from ou_monitor.analysis.relaxation import (
     find_steps, fit_relaxation, judge_cause, Relaxation, ReleaseCause)
 from ou_monitor.analysis.supply import alarms, Dips, fed, node_for
@@ -94,8 +93,6 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
     throttles = [level.throttle for level in judged]
     estimates = [level.estimate for level in judged]
     relaxations = _relaxations(recording, judged)
-    lines = [line_item(level.throttle, level.estimate, level.with_lines) for level in judged
-             if level.lines.lines]
     # A second relaxation biases alpha even at levels where it is too weak to be detected.
     wanders = any(level.wanders for level in judged)
     alpha = alpha_constancy(throttles, estimates,
@@ -105,7 +102,8 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
         recording, judged, relaxations, tuple(judge_cause(r, alpha) for r in relaxations), alpha,
         by_throttle(recording, seen, voltage, brownout_horizon), sliding,
         quality_list(recording, throttles, estimates,
-                     [*lines, *(item for name, at in (
+                     [item for name, at in (
+                         ('LINES_LEFT_IN', [one for one in judged if one.lines_kept]),
                          ('SECOND_RELAXATION', [one for one in judged if one.wanders]),
                          ('AC_COUPLING', [one for one in judged if one.coupled]),
                          ('SLOW_RELAXATION', [
@@ -113,7 +111,7 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
                              and one.estimate.alpha < _SLOWEST * left.above]),
                          ('IMPULSES', [one for one in judged if one.estimate.usable
                                        and one.verdict.within is ProcessType.IMPULSES]))
-                         for item in noise_items(name, [one.throttle for one in at]))],
+                         for item in noise_items(name, [one.throttle for one in at])],
                      seen.facts.ou.status == 'ok'),
         brownout_voltage is None, recording.notes + _left_out(recording, found), seen,
         craft, alarms(all_of_it, craft.cells, seen.facts.noise))
@@ -349,8 +347,6 @@ def _level(level: LevelResult) -> dict[str, Any]:
                    'rms': line.rms, 'rms_ci95': [line.rms_low, line.rms_high],
                    'share_of_variance': line.share, 'p_value': line.p_value}
                   for line in level.lines.lines],
-        'with_lines': None if level.with_lines is None else {
-            name: getattr(level.with_lines, name) for name in ('alpha', 'sigma', 'var_inf')},
         'line_search': {'from_hz': level.lines.lowest, 'to_hz': level.lines.highest,
                         'tested': level.lines.tested, 'detectable_rms': level.lines.detectable,
                         'not_done': level.lines.why_not},

@@ -354,7 +354,7 @@ class LevelResult:
     sag: LevelSag = LevelSag()
     spectrum: LevelSpectrum = field(default_factory=LevelSpectrum)
     lines: LineSearch = field(default_factory=LineSearch)  # Spectral lines
-    with_lines: Estimate | None = None  # Fit with the lines, if these were subtracted
+    lines_kept: bool = False  # Whether the fit includes them, because impulses may cause them
 
     @property
     def kind(self) -> ProcessType:
@@ -364,8 +364,7 @@ class LevelResult:
     @property
     def doubted(self) -> bool:
         """Whether one OU in white noise does not describe what was fitted."""
-        lines_in = bool(self.lines.lines) and self.with_lines is None
-        return lines_in or self.shape['one_relaxation'].rejects or self.wanders
+        return self.lines_kept or self.shape['one_relaxation'].rejects or self.wanders
 
     @property
     def wanders(self) -> bool:
@@ -426,14 +425,14 @@ def fit_level(recording: Recording, left: Remainder, level: LoadLevel, levels: i
             abs(line.frequency - other.frequency) < line.resolution + other.resolution
             for other in commanded)))
     shape = examine_level(_parts(still, within), estimate, left.above)
-    with_lines = None
     # Periodic impulses have spectral lines too, which are not subtracted.
-    if lines.lines and not holm([shape])[0]['impulses'].rejects:
-        with_lines = estimate
-        clean = _without_lines(still, within, even, lines)
-        ou, estimate = fit_parts(recording, replace(left, voltage=clean.voltage), within,
-                                 level.throttle)
-        shape = examine_level(_parts(clean, within), estimate, left.above)
+    kept = bool(lines.lines) and holm([shape])[0]['impulses'].rejects
+    if lines.lines and not kept:
+        clean = still.voltage.copy()
+        for s, grid in zip(within, grids):
+            clean[s.start:s.stop] = without_lines(grid.values, even, lines.lines)[grid.where]
+        ou, estimate = fit_parts(recording, replace(left, voltage=clean), within, level.throttle)
+        shape = examine_level(_parts(replace(still, voltage=clean), within), estimate, left.above)
     parts = [recording.voltage[s.start:s.stop] for s in segments]
     deviation = np.concatenate([v - v.mean() for v in parts])
     return LevelResult(
@@ -443,7 +442,7 @@ def fit_level(recording: Recording, left: Remainder, level: LoadLevel, levels: i
         vpp=float(np.ptp(deviation)), peak=float(np.abs(deviation).max()),
         vrms=float(np.sqrt(np.mean(deviation ** 2))), deviation=deviation, ou=ou,
         estimate=estimate, shape=shape, spectrum=level_spectrum(still, within, estimate),
-        lines=lines, with_lines=with_lines)
+        lines=lines, lines_kept=kept)
 
 
 def fit_all(recording: Recording, left: Remainder, levels: Sequence[LoadLevel]) -> Estimate:
@@ -477,16 +476,6 @@ def _grid_rate(grids: Sequence[EvenGrid]) -> float:
     steps = sum(grid.values.size - 1 for grid in grids)
     time = sum((grid.values.size - 1) / grid.rate for grid in grids)
     return steps / time if time > 0.0 else 0.0
-
-
-def _without_lines(recording: Recording, segments: Sequence[LevelSegment], rate: float,
-                   lines: LineSearch) -> Recording:
-    """Return the recording without the spectral lines of a level, in its segments."""
-    voltage = recording.voltage.copy()
-    for s in segments:
-        grid = on_grid(recording.t[s.start:s.stop], voltage[s.start:s.stop])
-        voltage[s.start:s.stop] = without_lines(grid.values, rate, lines.lines)[grid.where]
-    return replace(recording, voltage=voltage)
 
 
 def judge_levels(results: Sequence[LevelResult], load: SupplyLoad) -> tuple[LevelResult, ...]:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-import math
 
 import numpy as np
 from ou_monitor.analysis.levels import GAP_STEPS
@@ -19,7 +18,7 @@ from ou_monitor.criticism.adc import (
     EXAMINED, find_rails, find_step, innovation_std, usual_change)
 from ou_monitor.records import (
     clock_unit, defect_of, Estimate, Flag, Recording, Severity, Status)
-from ou_monitor.text import counted, Z95
+from ou_monitor.text import counted
 
 # Flags for information; the others are warnings.
 _INFORMS = frozenset({Flag.HELD_SAMPLES, Flag.IRREGULAR, Flag.NO_EXCITATION})
@@ -154,30 +153,11 @@ def _sample_items(recording: Recording) -> list[QualityItem]:
     return items
 
 
-def line_item(throttle: float, without: Estimate, with_lines: Estimate | None) -> QualityItem:
-    """Return the effect of spectral lines on the fit of a level (throttle 0..1)."""
-    if with_lines is None:
-        worry = Severity.WARNING if without.usable else Severity.INFO
-        return QualityItem('LINES_LEFT_IN', worry, (
-            'The level shows impulses and spectral lines. The lines may come from the impulses, '
-            'so they were not subtracted: alpha and sigma include both.'), (throttle,))
-    taken = 'Spectral lines were subtracted before the fit'
-    if without.usable and with_lines.usable:
-        moved = any(abs(math.log(getattr(with_lines, name) / getattr(without, name)))
-                    > Z95 * getattr(without, name + '_se') for name in ('alpha', 'sigma'))
-        text = (f'{taken}; with them, as in the window of the node, alpha would be '
-                f'{with_lines.alpha:.3g} 1/s and sigma {with_lines.sigma:.3g} V/sqrt(s).')
-    else:
-        moved = without.usable or with_lines.usable
-        left = ', and the remainder cannot be fitted' if not without.usable else (
-            ', and the fit succeeds only then: the node keeps the lines and gives no numbers')
-        text = f'{taken}{left}.'
-    return QualityItem('LINES_TAKEN_OUT', Severity.WARNING if moved else Severity.INFO, text,
-                       (throttle,))
-
-
 # Cautions about the noise of a level: name and sentence.
 _NOISE = {
+    'LINES_LEFT_IN': (
+        'The level shows impulses and spectral lines. The lines may come from the impulses, so '
+        'they were not subtracted: alpha and sigma include both.'),
     'SECOND_RELAXATION': (
         'The noise shows a second relaxation, slower or faster than the fitted one: alpha, tau '
         'and Var_inf describe a mixture, and their intervals are valid for neither; other levels '

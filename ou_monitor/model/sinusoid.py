@@ -13,6 +13,7 @@ only the average of pieces shows is missed.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 
@@ -80,6 +81,15 @@ def fit_sinusoid(piece: FloatArray, rate: float, frequency: float, reach: float)
     return Sinusoid(math.hypot(sine, cosine), best, math.atan2(cosine, sine))
 
 
+def without_sinusoids(piece: FloatArray, rate: float, frequencies: Sequence[float],
+                      reach: float) -> FloatArray:
+    """Return a piece, V, without the strongest sinusoid near each frequency, in order (Hz)."""
+    for frequency in frequencies:
+        piece = piece - fit_sinusoid(piece, rate, frequency, reach).sampled(
+            np.arange(piece.size) / rate)
+    return piece
+
+
 def _rotation(turns: float, count: int) -> npt.NDArray[np.complex128]:
     """Return a unit vector that rotates backwards by a number of turns per sample."""
     found: npt.NDArray[np.complex128] = np.exp(-2j * math.pi * (turns * np.arange(count) % 1.0))
@@ -138,12 +148,8 @@ def tones(v: FloatArray, white: FloatArray, rate: float, lowest: float = 0.0) ->
         log_p = -np.log1p(ratio[:, None] / ranks).sum(axis=1)
         hits = np.flatnonzero(log_p < math.log(FALSE_ALARM / (pieces * tested.size)))
         peaks = [int(group[np.argmax(ratio[group])]) for group in groups(hits)]
-        left = v[where] - v[where].mean()
-        for peak in sorted(peaks, key=lambda k: -ratio[k]):
-            wave = fit_sinusoid(left, rate, tested[peak] * rate / n, rate / n)
-            left = left - wave.sampled(np.arange(n) / rate)
-        if peaks:
-            found[where] = v[where] - v[where].mean() - left
+        found[where] = v[where] - without_sinusoids(v[where], rate, [
+            tested[peak] * rate / n for peak in sorted(peaks, key=lambda k: -ratio[k])], rate / n)
     return found
 
 

@@ -11,9 +11,8 @@ model of the spectrum, and a second line nearby does not hide the first.  There 
 pieces of a few seconds, because tones of motors and converters drift, and in the longest possible
 pieces, where the tone of a crystal is clearest.
 
-A line of 4 mV beside an OU of 18 mV changes the fitted alpha by 30 % and sigma by 15 % (1 kHz,
-120 Hz).  So each line is subtracted, as a sinusoid with its own amplitude, phase and frequency in
-each piece of the length in which it was found; this also removes a little noise.
+Each line is subtracted as a sinusoid with its own amplitude, phase and frequency in each piece of
+the length in which it was found; this also removes a little noise.
 
 Limits: the noise is taken as constant over the neighbours (about 60 bins either side), and a line
 must also exceed the nearest eight on either side, so that a slope or a hump of the noise is none;
@@ -33,8 +32,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.model.sinusoid import (
-    FALSE_ALARM, FEWEST_SAMPLES, FEWEST_TESTED, FIRST, fit_sinusoid, groups, GUARD, LOBE,
-    local_median, NEIGHBOURS, neighbours, SHORT)
+    FALSE_ALARM, FEWEST_SAMPLES, FEWEST_TESTED, FIRST, groups, GUARD, LOBE,
+    local_median, NEIGHBOURS, neighbours, SHORT, without_sinusoids)
 from ou_monitor.records import FloatArray, NAN
 from ou_monitor.text import Z95
 from scipy.optimize import brentq
@@ -305,6 +304,6 @@ def without_lines(voltage: FloatArray, rate: float, lines: Sequence[Line]) -> Fl
     for line in lines if voltage.size else ():
         pieces = max(1, round(voltage.size * line.resolution / rate))
         voltage = np.concatenate([
-            piece - fit_sinusoid(piece, rate, line.frequency, line.resolution).sampled(
-                np.arange(piece.size) / rate) for piece in np.array_split(voltage, pieces)])
+            without_sinusoids(piece, rate, (line.frequency,), line.resolution)
+            for piece in np.array_split(voltage, pieces)])
     return voltage

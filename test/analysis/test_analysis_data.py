@@ -19,7 +19,7 @@ LEVEL_KEYS = {
     'var_inf', 'var_inf_se', 'var_inf_ci95', 'sag', 'sag_se', 'sag_ci95', 'u0', 'u0_se',
     'noise_std', 'process_type', 'process_within', 'process_reason', 'process_tests', 'skewness',
     'excess_kurtosis', 'impulses', 'impulse_rate_hz', 'impulse_rate_ci95', 'lines',
-    'line_search', 'with_lines', 'psd', 'status', 'status_text', 'flags', 'tau_below_s',
+    'line_search', 'psd', 'status', 'status_text', 'flags', 'tau_below_s',
     'var_inf_below'}
 
 

@@ -1,13 +1,11 @@
-"""Spectral lines are removed before the fit, and their effect on it is reported."""
-
-from dataclasses import replace
+"""Spectral lines are removed before the fit."""
 
 import numpy as np
-from ou_monitor.analysis.analyze import analyze
-from ou_monitor.analysis.quality import line_item
+from ou_monitor.analysis.level_result import fit_all
+from ou_monitor.analysis.levels import find_levels
+from ou_monitor.analysis.supply import remainder
 from ou_monitor.model.spectral_lines import find_lines, without_lines
-from ou_monitor.records import Estimate, Recording, Severity, Status
-import pytest
+from ou_monitor.records import Recording
 from scipy.signal import lfilter
 from simulated_recordings import as_one_level
 
@@ -43,45 +41,15 @@ def test_a_steady_tone_goes_and_the_rest_stays():
 
 def test_a_faint_tone_does_not_bias_alpha_and_sigma():
     """4 mV beside 27 mV: 20 recordings, each interval holds the truth as often as it says."""
-    # Of 20 at 95 % fewer than 16 have a probability of 0.003; with the line in, 20 of 20 of sigma
-    # were too high.
+    # Of 20 at 95 % fewer than 16 have a probability of 0.003.
     holds = {'alpha': 0, 'sigma': 0}
     for seed in range(20):
-        level = as_one_level(simulated(0.004, seed))
+        noisy = simulated(0.004, seed)
+        level = as_one_level(noisy)
         assert level.lines.lines
-        assert level.with_lines.sigma > level.estimate.sigma
+        plain = fit_all(noisy, remainder(noisy), find_levels(noisy.t, noisy.throttle))
+        assert plain.sigma > level.estimate.sigma
         for name, truth in (('alpha', ALPHA), ('sigma', SIGMA)):
             low, high = level.estimate.interval(name)
             holds[name] += low <= truth <= high
     assert min(holds.values()) >= 16
-
-
-def test_the_effect_of_a_removed_line_is_reported():
-    """The quality list names the level's alpha and sigma with the line."""
-    analysis = analyze(simulated(0.02, 3))
-    (level,) = analysis.levels
-    (item,) = [one for one in analysis.quality if one.name == 'LINES_TAKEN_OUT']
-    assert item.severity is Severity.WARNING
-    assert f'{level.with_lines.alpha:.3g} 1/s' in item.text
-    assert f'{level.with_lines.sigma:.3g} V' in item.text
-
-
-GOOD = Estimate(alpha=63.0, sigma=0.3, var_inf=7e-4, u0=5.0, alpha_se=0.1, sigma_se=0.02,
-                var_inf_se=0.1, status=Status.OK)
-BAD = Estimate(status=Status.NO_RELAXATION)
-
-
-OUT, IN = 'LINES_TAKEN_OUT', 'LINES_LEFT_IN'
-
-
-@pytest.mark.parametrize('without, with_lines, severity, name, told', [
-    (GOOD, replace(GOOD, sigma=0.305), Severity.INFO, OUT, '0.305'),
-    (GOOD, replace(GOOD, sigma=0.32), Severity.WARNING, OUT, '0.32'),
-    (GOOD, BAD, Severity.WARNING, OUT, ''), (BAD, GOOD, Severity.WARNING, OUT, ''),
-    (BAD, BAD, Severity.INFO, OUT, ''), (GOOD, None, Severity.WARNING, IN, ''),
-    (BAD, None, Severity.INFO, IN, '')])
-def test_it_warns_where_the_numbers_hang_on_it(without, with_lines, severity, name, told):
-    """Out of the 95 % interval, or a fit with and none without."""
-    item = line_item(0.4, without, with_lines)
-    assert (item.name, item.severity, item.throttles) == (name, severity, (0.4,))
-    assert told in item.text

@@ -9,6 +9,9 @@ every bag and of every recorded run there is, tables and raw logs.
 import math
 
 import numpy as np
+from ou_monitor.analysis.level_result import fit_all
+from ou_monitor.analysis.levels import find_levels
+from ou_monitor.analysis.supply import remainder
 from ou_monitor.analysis.level_comparison import alpha_constancy, sigma_change
 from ou_monitor.analysis.level_result import fit_parts
 from ou_monitor.analysis.levels import LevelSegment
@@ -51,9 +54,10 @@ def both(request):
         assert not as_one_level(whole).estimate.usable
         pytest.skip(kept.reason)
     samples = Samples(kept.samples.t, kept.samples.voltage, None)
-    level = as_one_level(Recording(samples.t, samples.voltage, np.full(samples.n, np.nan), 'same'))
+    same = Recording(samples.t, samples.voltage, np.full(samples.n, np.nan), 'same')
+    level = as_one_level(same)
     # Lines were found before they were taken out of the fit.
-    fit = level.with_lines or level.estimate
+    fit = fit_all(same, remainder(same), find_levels(same.t, same.throttle))
     if fit.usable:
         terms = [OU(fit.alpha, fit.sigma, float(samples.voltage.mean()))]
         if fit.noise_std > 0.0:
