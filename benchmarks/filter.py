@@ -35,8 +35,8 @@ SEED = 20261121
 RATE = 1000.0
 # Standard deviation of the supply at half throttle, V, and of the body rate, rad/s.
 SPREAD, BODY = 0.05, 1.0
-# Noise of an ADC that needs a filter, V; of a gyro, rad/s.
-ADC, GYRO = 0.03, 0.01
+# Noise of a gyro, rad/s.
+GYRO = 0.01
 # Supply noise in the gyro, rad/s per V: at half throttle as large as the body rate.
 COUPLING = 20.0
 _DWELL, _RAMP = (2.0, 6.0), (0.5, 1.5)
@@ -47,8 +47,7 @@ class Case:
     """One kind of signal to be filtered."""
 
     name: str  # For the table.
-    # 'voltage': the voltage with noise of the ADC; 'ou' or 'smooth': a body rate with one pole or
-    # two (Butterworth), with noise of the supply and of the gyro.
+    # A body rate with one pole ('ou') or two (Butterworth, 'smooth').
     kind: str
     alpha: float  # Of the supply, 1/s.
     bandwidth: float  # Of the body rate, Hz.
@@ -56,15 +55,8 @@ class Case:
     limits: tuple[float, float]  # fmin and fmax for all of them, Hz.
     coupling: float = COUPLING  # Supply noise in the gyro, rad/s per V.
 
-    @property
-    def white(self) -> float:
-        """Standard deviation of the white noise of a sample."""
-        return ADC if self.kind == 'voltage' else GYRO
-
 
 CASES = (
-    Case('Voltage, alpha 10', 'voltage', 10.0, 0.0, 1, (2.0, 400.0)),
-    Case('Voltage, alpha 63', 'voltage', 63.0, 0.0, 1, (2.0, 400.0)),
     Case('Body rate of one pole at 5 Hz, alpha 600', 'ou', 600.0, 5.0, 2, (1.0, 300.0)),
     Case('Body rate of two poles at 5 Hz, alpha 600', 'smooth', 600.0, 5.0, 2, (1.0, 300.0)),
     Case('Body rate of one pole at 5 Hz, alpha 63', 'ou', 63.0, 5.0, 2, (1.0, 300.0)),
@@ -91,9 +83,8 @@ class Flights:
 def _motion(case: Case) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the transition over a sample, its noise and the stationary covariance."""
     if case.kind != 'smooth':
-        rate = case.alpha if case.kind == 'voltage' else 2.0 * math.pi * case.bandwidth
-        phi = math.exp(-rate / RATE)
-        power = 1.0 if case.kind == 'voltage' else BODY**2
+        phi = math.exp(-2.0 * math.pi * case.bandwidth / RATE)
+        power = BODY**2
         return (np.array([[phi]]), np.array([[power * (1.0 - phi * phi)]]),
                 np.array([[power]]))
     w = 2.0 * math.pi * case.bandwidth
@@ -119,11 +110,8 @@ def fly(case: Case, rng: np.random.Generator, flights: int, seconds: float) -> F
     for k in range(n):
         u = decay * u + kick[:, k]
         supply[:, k] = u
-    white = case.white * rng.standard_normal((flights, n))
+    white = GYRO * rng.standard_normal((flights, n))
     t = np.arange(n) / RATE
-    if case.kind == 'voltage':
-        return Flights(t, throttle, sigma, 5.0 + supply + white, 5.0 + supply,
-                       np.full((flights, n), np.nan), 5.0 + supply + white, white)
     phi, driven, still = _motion(case)
     size = phi.shape[0]
     state = np.linalg.cholesky(still) @ rng.standard_normal((size, flights))
@@ -144,22 +132,17 @@ def kalman(case: Case, flights: Flights) -> tuple[np.ndarray, np.ndarray]:
     phi, driven, still = _motion(case)
     decay = math.exp(-case.alpha / RATE)
     grown = flights.sigma**2 * (1.0 - decay**2) / (2.0 * case.alpha)
-    if case.kind == 'voltage':
-        look, size = np.array([1.0]), 1
-    else:
-        size = phi.shape[0] + 1
-        wide = np.zeros((size, size))
-        wide[:-1, :-1], wide[-1, -1] = phi, decay
-        phi, look = wide, np.zeros(size)
-        look[0], look[-1] = 1.0, case.coupling
+    size = phi.shape[0] + 1
+    wide = np.zeros((size, size))
+    wide[:-1, :-1], wide[-1, -1] = phi, decay
+    phi, look = wide, np.zeros(size)
+    look[0], look[-1] = 1.0, case.coupling
     noise = np.zeros((count, size, size))
-    if case.kind != 'voltage':
-        noise[:, :-1, :-1] = driven
+    noise[:, :-1, :-1] = driven
     p = np.zeros((count, size, size))
     p[:, :still.shape[0], :still.shape[0]] = still
     p[:, -1, -1] = flights.sigma[:, 0]**2 / (2.0 * case.alpha)
     x = np.zeros((count, size))
-    level = 5.0 if case.kind == 'voltage' else 0.0
     out = np.full((2, count, n), np.nan)
     for k in range(n):
         if k:
@@ -167,10 +150,10 @@ def kalman(case: Case, flights: Flights) -> tuple[np.ndarray, np.ndarray]:
             noise[:, -1, -1] = grown[:, k]
             p = phi @ p @ phi.T + noise
         gain = p @ look
-        gain /= (gain @ look + case.white**2)[:, None]
-        x = x + gain * (flights.measured[:, k] - level - x @ look)[:, None]
+        gain /= (gain @ look + GYRO**2)[:, None]
+        x = x + gain * (flights.measured[:, k] - x @ look)[:, None]
         p = p - gain[:, :, None] * (look @ p)[:, None, :]
-        out[0, :, k] = level + x[:, 0]
+        out[0, :, k] = x[:, 0]
         if case.kind == 'smooth':
             out[1, :, k] = x[:, 1]
     return out[0], out[1]
@@ -182,10 +165,10 @@ _ROOT2 = math.sqrt(2.0)
 
 
 def estimates(flights: Flights, window: float) -> np.ndarray:
-    """Return sigma, its error, alpha, u0 and its error at each sample, shape (5, flights, n)."""
+    """Return sigma, its error and alpha at each sample, shape (3, flights, n)."""
     count, n = flights.voltage.shape
     block = int(EVERY * RATE)
-    out = np.full((5, count, n), np.nan)
+    out = np.full((3, count, n), np.nan)
     for f in range(count):
         estimator = SlidingEstimator(window=window)
         for at in range(0, n, block):
@@ -196,7 +179,7 @@ def estimates(flights: Flights, window: float) -> np.ndarray:
             if e.usable:
                 # Known from the next sample on.
                 out[:, f, at + block:at + 2 * block] = np.array(
-                    [e.sigma, e.sigma_se, e.alpha, e.u0, e.u0_se])[:, None]
+                    [e.sigma, e.sigma_se, e.alpha])[:, None]
     return out
 
 
@@ -206,9 +189,9 @@ def adaptive(options: Mapping[str, Any], flights: Flights, seen: np.ndarray,
     out, cutoff = np.empty(x.shape), np.empty(x.shape)
     for f in range(x.shape[0]):
         one = AdaptiveLowPass(**options)
-        sigma, error, alpha, level, level_se = (s[f].tolist() for s in seen)
+        sigma, error, alpha = (s[f].tolist() for s in seen)
         rows = zip(flights.t.tolist(), x[f].tolist(), sigma, error, alpha,
-                   flights.throttle[f].tolist(), level, level_se)
+                   flights.throttle[f].tolist())
         for k, row in enumerate(rows):
             out[f, k] = one.step(*row)
             cutoff[f, k] = one.cutoff
@@ -280,26 +263,16 @@ def laws(case: Case) -> dict[str, dict[str, Any]]:
     """Return the options of each law, as a user who knows the case would set them."""
     fmin, fmax = case.limits
     base = {'order': case.order, 'fmin': fmin, 'fmax': fmax, 'alpha': case.alpha,
-            'n0': case.white**2 / RATE}
-    wiener = {**base, 'law': 'wiener'}
-    constant = {**base, 'law': 'constant_noise'}
-    if case.kind == 'voltage':
-        return {'kalman': {**base, 'law': 'kalman'}, 'wiener': wiener, 'constant_noise': {
-            **constant, 'sigma_ref': 0.5 * SPREAD * math.sqrt(2.0 * case.alpha)}}
-    return {
-        'kalman': {**base, 'law': 'kalman', 'coupling': case.coupling},
-        'wiener': {**wiener, 'signal_rms': BODY, 'coupling': case.coupling,
-                   'signal_poles': 2 if case.kind == 'smooth' else 1,
-                   'signal_bandwidth': case.bandwidth},
-        'constant_noise': {**constant, 'coupling': case.coupling, 'noise_wanted': 0.2 * BODY}}
+            'n0': GYRO**2 / RATE, 'coupling': case.coupling}
+    return {'kalman': {**base, 'law': 'kalman'},
+            'constant_noise': {**base, 'law': 'constant_noise', 'noise_wanted': 0.2 * BODY}}
 
 
 def mistaken(case: Case) -> dict[str, dict[str, Any]]:
     """Return the options of `kalman` with one parameter wrong by a factor of 2."""
     right = laws(case)['kalman']
     # The gyro's own noise is negligible against the supply's.
-    name = 'n0' if case.kind == 'voltage' else 'coupling'
-    return {f'kalman, {name} {word} the true one': {**right, name: factor * right[name]}
+    return {f'kalman, coupling {word} the true one': {**right, 'coupling': factor * case.coupling}
             for factor, word in ((0.5, 'half'), (2.0, 'twice'))}
 
 
@@ -366,7 +339,7 @@ def run_dterm(flights: int, seconds: float, seed: int, window: float) -> list[Po
                             sweep(flown.truth, cutoff[None], 2, True)[0], cutoff))
     for limit in _LAGS:
         options = {**base, 'law': 'kalman', 'coupling': CASE.coupling, 'fmin': 5.0,
-                   'fmax': 300.0, 'max_lag': limit, 'n0': CASE.white**2 / RATE}
+                   'fmax': 300.0, 'max_lag': limit, 'n0': GYRO**2 / RATE}
         setting = f'lag <= {limit:g} degrees' if limit else 'free'
         say(f'{KALMAN}, {setting}')
         # It learns from powers, which hardly change with the sign of the noise: half the
@@ -479,7 +452,7 @@ def span(cutoff: np.ndarray, form: str) -> str:
 def error(given: argparse.Namespace) -> tuple[str, Plot | None]:
     """Score the mean square error and lag of every law over simulated flights."""
     parts = []
-    for k, case in enumerate(CASES):
+    for k, case in enumerate(CASES, 2):
         say(case.name)
         flown = fly(case, np.random.default_rng([given.seed, k]), given.flights, given.seconds)
         parts.append(f'**{case.name}** ({given.flights} flights)\n\n' + table(

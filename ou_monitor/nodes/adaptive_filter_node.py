@@ -4,7 +4,7 @@ The node `adaptive_filter`: low-pass a topic, with a cutoff that follows the noi
 doc/messages.md lists its topics:
 
 - `input`: a type of `filter_channels.CHANNELS`, or with `input.field` any installed type;
-- `state` of the estimator, if published: sigma's error, alpha, throttle, level, and whether the
+- `state` of the estimator, if published: sigma's error, alpha, throttle, and whether the
   estimate is usable;
 - `throttle` and `rpm`, if `notch.count` is above 0: for the notches, which come before the
   low-pass; without `throttle`, the throttle in `state` is used;
@@ -49,7 +49,7 @@ INPUT_PARAMETERS = (
               'Filter the linear acceleration of an IMU beside its angular velocity.'))
 OWN_TOPICS = ('input', 'sigma', 'state', '~/output', '~/cutoff', '~/lag')
 # Fields of the state that the filter uses.
-_FIELDS = ('sigma_se', 'alpha', 'throttle', 'u0', 'u0_se', 'load_noise')
+_FIELDS = ('sigma_se', 'alpha', 'throttle', 'load_noise')
 _UNKNOWN = [NAN] * len(_FIELDS)
 # A sigma whose window exceeds the sliding one by this ratio comes from a fit.
 _LONGER = 1.1
@@ -64,9 +64,6 @@ class SupplyEstimate(NamedTuple):
     sigma_se: float = NAN
     alpha: float = NAN  # Relaxation rate, 1/s; NaN: unknown
     throttle: float = NAN  # Throttle, 0..1; NaN: unknown
-    # Level at the present throttle and its standard error, V; NaN: unknown.
-    level: float = NAN
-    level_se: float = NAN
     why: str = ''  # Why sigma is unknown; empty when it is valid
     # 'relaxation': the estimator's sigma; 'load': the noise not explained by the load; 'none'.
     source: str = 'none'
@@ -105,14 +102,13 @@ class SupplyInput:
         # throttle, as the sigma of an OU with relaxation `rate`, 1/s. This sigma includes the
         # ADC's white noise, so it is never below the supply's own.
         fresh = within(self.state_silence.age, stale_after)
-        error, alpha, throttle, level, level_se, noise = self._values if fresh else _UNKNOWN
+        error, alpha, throttle, noise = self._values if fresh else _UNKNOWN
         why = self._why_no_sigma(fresh, stale_after)
         if why and noise > 0.0 and rate > 0.0:
             return SupplyEstimate(noise * math.sqrt(2.0 * rate), throttle=throttle, source='load')
         if why:
             return SupplyEstimate(throttle=throttle, why=why)
-        return SupplyEstimate(
-            self._sigma, error, alpha, throttle, level, level_se, source='relaxation')
+        return SupplyEstimate(self._sigma, error, alpha, throttle, source='relaxation')
 
     def why_no_throttle(self, stale_after: float) -> str:
         """Return why the throttle is unknown."""
@@ -190,14 +186,10 @@ class AdaptiveFilterNode(MonitorNode):
     RUN_TIME = (*(p for p in FILTER_PARAMETERS if p is not _MODE), *NOTCH_PARAMETERS,
                 PUBLISH_RATE)
     FIXED = (*INPUT_PARAMETERS, _MODE, *MOTOR_PARAMETERS)
-    # `check` reads it before `start` has set it.
-    _channels: Channels | None = None
-    _type = AUTO
-    _topic = ''
 
     def start(self) -> None:
         """Begin with no message filtered."""
-        self._channels = None
+        self._channels: Channels | None = None
         self._filters: list[AdaptiveLowPass] = []
         values = self.values()
         # Used until the filters exist.
@@ -234,14 +226,9 @@ class AdaptiveFilterNode(MonitorNode):
         self.publish_every(self._publish)
 
     def check(self, values: Mapping[str, Any]) -> None:
-        """Raise `ValueError` when the parameters contradict each other or the signal."""
-        settings = FilterSettings(**_filter_options(values))
+        """Raise `ValueError` when the parameters contradict each other."""
+        FilterSettings(**_filter_options(values))
         NotchSettings.from_options(notch_options(values))
-        if self._channels is not None and _lacks_voltage(self._type, settings):
-            needed = _signal_parameter(settings)
-            raise ValueError(
-                f'law {settings.law} without {needed} is for a voltage, but {self._topic} is '
-                f'{self._type}: set {needed} first')
 
     def apply(self, values: Mapping[str, Any]) -> None:
         """Bring checked parameters into force; the output does not move."""
@@ -311,7 +298,7 @@ class AdaptiveFilterNode(MonitorNode):
         values = self._apply_notches(stamp, values, supply)
         self._output.publish(self._channels.put(message, [
             channel.step(stamp, value, supply.sigma, supply.sigma_se, supply.alpha,
-                         supply.throttle, supply.level, supply.level_se)
+                         supply.throttle)
             for channel, value in zip(self._filters, values, strict=True)],
             self.low_pass.noise_left))
         self._passed += 1
@@ -363,7 +350,7 @@ class AdaptiveFilterNode(MonitorNode):
             'delay': self._delay, 'lag_frequency': settings.lag_frequency,
             'sigma': supply.sigma, 'sigma_source': supply.source,
             'sigma_se': supply.sigma_se, 'alpha': supply.alpha,
-            'throttle': supply.throttle, 'level': supply.level,
+            'throttle': supply.throttle,
             'notch_active': self._notch.active, 'notch_source': self._notch.source,
             'notch_frequencies': ', '.join(f'{f:.4g}' for f in self._notch.frequencies),
             'notch_law_a': self._notch.law[0], 'notch_law_b': self._notch.law[1],
@@ -417,11 +404,6 @@ class AdaptiveFilterNode(MonitorNode):
             return Level.WARN, NO_CLOCK
         if self._input_clock.stamps is not StampOrder.GOOD:
             return Level.WARN, f'{self._topic}: {self._input_clock.stamps.by_arrival}'
-        if _lacks_voltage(self._type, s):
-            needed = _signal_parameter(s)
-            return Level.WARN, (
-                f'Law {s.law} without {needed} assumes that {self._topic} is the voltage, '
-                f'but it is {self._type}: set {needed}.')
         missing = math.isnan(supply.throttle if s.law == 'throttle' else supply.sigma)
         if missing:
             return Level.WARN, (
@@ -451,14 +433,3 @@ class AdaptiveFilterNode(MonitorNode):
 
 def _filter_options(values: Mapping[str, Any]) -> dict[str, Any]:
     return {p.name: values[p.name] for p in FILTER_PARAMETERS}
-
-
-def _lacks_voltage(kind: str, settings: FilterSettings) -> bool:
-    """Return whether the law needs the voltage itself but the signal is another."""
-    own = {'kalman': settings.of_voltage, 'wiener': not settings.signal_bandwidth}
-    return kind == 'sensor_msgs/msg/Imu' and own.get(settings.law, False)
-
-
-def _signal_parameter(settings: FilterSettings) -> str:
-    """Return the parameter that must be set if the signal is not the voltage."""
-    return 'coupling' if settings.law == 'kalman' else 'signal_bandwidth'

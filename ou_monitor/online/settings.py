@@ -57,7 +57,7 @@ _Settings = TypeVar('_Settings')
 AUTO = 'auto'
 
 
-LAWS = ('constant_noise', 'kalman', 'threshold', 'throttle', 'wiener')
+LAWS = ('constant_noise', 'kalman', 'threshold', 'throttle')
 
 
 def _documented(settings: type[_Settings]) -> type[_Settings]:
@@ -201,19 +201,11 @@ class FilterSettings:
         0.0, 'Rms of the output noise that constant_noise keeps constant, unit of the output, '
         'with coupling; 0: the noise at sigma_ref and fmax.', 0.0, 1.0e12)
     n0: float = _parameter(
-        0.0, 'White measurement noise for wiener and kalman, unit^2/Hz, two-sided: variance of a '
+        0.0, 'White measurement noise for kalman, unit^2/Hz, two-sided: variance of a '
         'sample over the sample rate.', 0.0, 1.0e12)
     alpha: float = _parameter(
         63.0, 'Relaxation rate of the supply while the estimator does not know it, 1/s.',
         1.0e-6, 1.0e9)
-    signal_bandwidth: float = _parameter(
-        0.0, 'Bandwidth of the true signal for wiener, Hz; 0: the signal is the voltage itself '
-        '(for kalman: only if coupling is 0).', 0.0, 1.0e6)
-    signal_rms: float = _parameter(
-        0.0, 'Rms of the true signal for wiener, unit of the signal.', 0.0, 1.0e12)
-    signal_poles: int = _parameter(
-        1, 'Poles of the true signal for wiener: 1 (its spectrum falls with f^2 above its '
-        'bandwidth), or 2 (Butterworth, f^4).', 1, 2)
     expo: float = _parameter(5.0, 'Curvature of the throttle law, 0..10.', 0.0, 10.0)
     smoothing: float = _parameter(
         0.2, 'Time constant of ln(cutoff) if the relative error of sigma is smoothing_error, s.',
@@ -265,35 +257,9 @@ class FilterSettings:
             raise ValueError(
                 f'noise_wanted ({self.noise_wanted:g}) needs coupling (above 0): without it '
                 'the noise in the signal is known only relative to sigma_ref')
-        if self.law not in ('kalman', 'wiener'):
-            return
-        if self.mode == 'derivative' and self.law == 'wiener':
-            raise ValueError(
-                'law wiener cannot be used in mode derivative: it is the cutoff for the signal '
-                'itself; use constant_noise, or kalman with signal_poles 2')
-        if self.law == 'kalman':
-            if self.mode == 'derivative' and self.of_voltage:
-                raise ValueError(
-                    'law kalman in mode derivative is for a signal that is not the voltage: it '
-                    'needs coupling (above 0)')
-            if not (self.coupling > 0.0 or self.n0 > 0.0):
-                raise ValueError(
-                    'law kalman needs the noise: n0 (white noise of the measurement), and '
-                    'coupling where the signal is not the voltage')
-        elif self.signal_bandwidth:
-            if not (self.signal_rms > 0.0 and (self.coupling > 0.0 or self.n0 > 0.0)):
-                raise ValueError(
-                    'law wiener with signal_bandwidth needs signal_rms and the noise: coupling, '
-                    'n0 or both (above 0)')
-        elif not self.n0 > 0.0:
-            raise ValueError(
-                'law wiener needs n0 (the white noise of the measurement, above 0), or '
-                'signal_bandwidth, signal_rms and coupling')
-
-    @property
-    def of_voltage(self) -> bool:
-        """Whether the signal is the voltage itself, for the law kalman."""
-        return not (self.coupling or self.signal_bandwidth)
+        if self.law == 'kalman' and not (self.coupling > 0.0 or self.n0 > 0.0):
+            raise ValueError('law kalman needs the noise: coupling (supply noise in the signal), '
+                             'n0 (its white noise), or both, above 0')
 
     @property
     def lowest(self) -> float:

@@ -117,7 +117,7 @@ def test_a_signal_while_it_ends_is_only_noted(tmp_path):
                          'input.field:=temprature'], "did you mean 'temperature'?"),
     ('adaptive_filter', ['-p', 'input.type:=std_msgs/msg/Int32', '-p', 'input.field:=data'],
      'name a float field'),
-    ('adaptive_filter', ['-p', 'law:=wiener'], 'law wiener needs n0'),
+    ('adaptive_filter', ['-p', 'law:=kalman'], 'law kalman needs the noise'),
     ('adaptive_filter', ['-p', 'max_lag:=5.0'], 'allow more lag or raise fmax'),
 ], ids=lambda value: '' if isinstance(value, list) else value[:24])
 def test_bad_arguments_are_refused_with_the_reason(name, arguments, words):

@@ -290,11 +290,6 @@ def test_parameter_change_does_not_move_the_output(rig):
     after = [m.angular_velocity.x for m in rig.output
              if seconds(m.header.stamp) > settled + 1e-6]
     assert len(after) >= 3 and after == pytest.approx([0.7] * len(after), abs=1e-9)
-    assert rig.probe.set_parameter(NODE, 'n0', 1e-6).successful
-    for law in ('kalman', 'wiener'):
-        refused = rig.probe.set_parameter(NODE, 'law', law)
-        assert not refused.successful and 'is for a voltage' in refused.reason
-    assert rig.probe.set_parameter(NODE, 'n0', 0.0).successful
     refused = rig.probe.set_parameter(NODE, 'fmin', 300.0)
     assert not refused.successful and 'fmin' in refused.reason
     for name, value, words in (('order', 3, ''), ('law', 'treshold', 'threshold'),
@@ -305,7 +300,7 @@ def test_parameter_change_does_not_move_the_output(rig):
 
 def test_the_law_kalman_goes_where_the_offline_filter_goes(rig):
     """Switched on in flight: the output goes on, then noise is filtered as offline."""
-    model = {'n0': 9e-5, 'signal_bandwidth': 5.0, 'fmin': 1.0}
+    model = {'n0': 9e-5, 'fmin': 1.0}
     twin = AdaptiveLowPass(law='kalman', **model, smoothing=0.0)
     x = 0.7 + 0.3 * np.random.default_rng(4).standard_normal(3000)
     wanted = np.std(twin.filter(np.arange(3000) * 1e-3, x, 0.6)[1000:])

@@ -13,10 +13,6 @@ output variance is (coupling sigma)^2 V(w), by the integral of
 
 All grow with w, so each variance has one cutoff.
 
-The law `wiener` minimises the mean square error of a low-pass of gain 1.  For a signal of one or
-two poles in supply noise and white noise it uses the error of the continuous filter, for the
-voltage itself in white noise the error of the sampled filter.
-
 White noise: with the input linear between samples a step of the filter is z' = F z + a x_(k-1)
 + b x_k (its columns come from `LowPassState`), so independent samples of variance 1
 give the stationary covariance
@@ -39,7 +35,6 @@ from functools import cache, lru_cache
 import math
 
 import numpy as np
-from ou_monitor.online.filter.cutoff_control import OF_RATE
 from ou_monitor.online.filter.filter_state import LowPassState
 from ou_monitor.online.settings import FilterSettings
 from ou_monitor.records import FloatArray, NAN
@@ -115,103 +110,6 @@ def held_cutoff(mode: str, order: int, fmax: float, times: float, interval: floa
 TWO_PI = 2.0 * math.pi
 _ROOT2 = math.sqrt(2.0)
 _ROOT8 = 2.0 * _ROOT2
-_GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
-
-
-def squared_error(order: int, w: float, signal: tuple[float, float],
-                  noise: tuple[float, float], n0: float, poles: int = 1) -> float:
-    """Return the mean square error of a low-pass with a cutoff of `w`, 1/s (rates in 1/s)."""
-    # Lost signal, by 1 - H: for an OU of intensity a and rate b, a^2 / (2 (w + b)) for order 1 and
-    # a^2 (3 w + sqrt2 b) / (2 sqrt2 (w^2 + sqrt2 w b + b^2)) for order 2.  Noise that passes: V of
-    # the supply, as above; n0 w / 2 or n0 w / (2 sqrt2) from white noise.
-    a, b = signal
-    c, d = noise
-    if poles == 2:
-        lost = a * a * _lost_of_two_poles(order, w, b)
-    elif order == 1:
-        lost = 0.5 * a * a / (w + b)
-    else:
-        lost = a * a * (3.0 * w + _ROOT2 * b) / (w * w + _ROOT2 * w * b + b * b) / _ROOT8
-    if order == 1:
-        return lost + 0.5 * c * c * w / (d * (w + d)) + 0.5 * n0 * w
-    through = c * c * w * (_ROOT2 * w + d) / (d * (w * w + _ROOT2 * w * d + d * d))
-    return lost + (through + n0 * w) / _ROOT8
-
-
-def _lost_of_two_poles(order: int, w: float, b: float) -> float:
-    """Return the variance that a low-pass removes from a two-pole signal of variance 1."""
-    # The signal has the spectrum 2 sqrt2 b^3 / |s^2 + sqrt2 b s + b^2|^2 at s = i w'.  The
-    # integral of |c / d|^2 is in the table of Newton, Gould & Kaiser (Analytical Design of Linear
-    # Feedback Controls, 1957, appendix E); in units of b:
-    #   order 1   c = s,               d = (s + w) (s^2 + sqrt2 b s + b^2)
-    #   order 2   c = s^2 + sqrt2 w s, d = (s^2 + sqrt2 w s + w^2) (s^2 + sqrt2 b s + b^2)
-    u = w / b
-    if order == 1:
-        # d = s^3 + (u + sqrt2) s^2 + (1 + sqrt2 u) s + u; I = 1 / (2 (d1 d2 - d0)).
-        return _ROOT2 / ((1.0 + _ROOT2 * u) * (u + _ROOT2) - u)
-    d0, d1 = u * u, _ROOT2 * u * (1.0 + u)
-    d2, d3 = 1.0 + 2.0 * u + u * u, _ROOT2 * (1.0 + u)
-    top = d0 * d1 + 2.0 * u * u * d0 * d3
-    return _ROOT2 * top / (d0 * (d1 * d2 * d3 - d0 * d3 * d3 - d1 * d1))
-
-
-def sampled_error(w: float, dt: float, alpha: float, var: float, white: float) -> float:
-    """Return the mean square error of the sampled low-pass of order 1 for an OU in white noise."""
-    # The filter is y_k = q y_(k-1) + b x_k + a x_(k-1) (w in 1/s, dt in s).  White noise passes
-    # with the variance (a^2 + b^2 + 2 a b q) / (1 - q^2); the lost signal is the response to an
-    # AR(1) process of (b - 1, a + q) over the same pole.
-    angle = w * dt
-    lost = -math.expm1(-angle)
-    q, phi = math.exp(-angle), math.exp(-alpha * dt)
-    b = 1.0 - lost / angle
-    a = lost - b
-    square = lost * (1.0 + q)
-    through = (a * a + b * b + 2.0 * a * b * q) / square
-    first, second = b - 1.0, a + q
-    power = (first * first + second * second + 2.0 * first * second * q) / square
-    beside = q * power + first * second
-    return var * (power + 2.0 * phi * beside / (1.0 - phi * q)) + white * through
-
-
-def least_error(settings: FilterSettings, sigma: float, alpha: float) -> float:
-    """Return the cutoff of the least `squared_error` within the limits, Hz."""
-    s = settings
-    rate = TWO_PI * s.signal_bandwidth
-    size = s.signal_rms * (math.sqrt(2.0 * rate) if s.signal_poles == 1 else 1.0)
-    return _argmin(lambda fc: squared_error(
-        s.order, TWO_PI * fc, (size, rate), (s.coupling * sigma, alpha), s.n0, s.signal_poles),
-        s.lowest, s.fmax)
-
-
-def least_sampled_error(settings: FilterSettings, sigma: float, alpha: float,
-                        interval: float) -> float:
-    """Return the cutoff of the least `sampled_error` within the limits, Hz."""
-    s = settings
-    low, high = s.lowest, min(s.fmax, OF_RATE / interval)
-    if not low < high:
-        return low
-    var, white = sigma * (sigma / (2.0 * alpha)), s.n0 / interval
-    return _argmin(lambda fc: sampled_error(TWO_PI * fc, interval, alpha, var, white), low, high)
-
-
-def _argmin(error: Callable[[float], float], lowest: float, highest: float) -> float:
-    """Return where an error is least, Hz, to 1e-4: a grid chooses one of two minima."""
-    def at(level: float) -> float:
-        return error(math.exp(level))
-
-    low, high = math.log(lowest), math.log(highest)
-    n = max(2, math.ceil((high - low) / (math.log(2.0) / 8.0)))
-    width = (high - low) / n
-    best = min((low + k * width for k in range(n + 1)), key=at)
-    left, right = max(best - width, low), min(best + width, high)
-    while right - left > 1e-4:
-        inner, outer = right - _GOLDEN * (right - left), left + _GOLDEN * (right - left)
-        if at(inner) <= at(outer):
-            right = outer
-        else:
-            left = inner
-    # Include the ends of the range, which the search only approaches.
-    return math.exp(min((0.5 * (left + right), low, high), key=at))
 
 
 def wanted_cutoff(settings: FilterSettings, sigma: float, alpha: float, throttle: float,
@@ -297,23 +195,6 @@ def cutoff_for_noise(mode: str, order: int, rms: float, intensity: float,
     return math.exp(low)
 
 
-def wiener_law(settings: FilterSettings, sigma: float, alpha: float, interval: float) -> float:
-    """Return the cutoff of least mean square error."""
-    # Without `signal_bandwidth` the signal is the voltage itself, in white noise of density n0.
-    # The Kalman-Bucy filter of an OU process has one pole: from its Riccati equation 0 = sigma^2 -
-    # 2 alpha P - P^2 / n0 it lies at alpha + P / n0 = sqrt(alpha^2 + sigma^2 / n0).  The best
-    # low-pass of gain 1 is slightly off it, and a sampled one more so.  A second-order Butterworth
-    # has the error 3 sigma^2 / (2 sqrt2 w) + n0 w / (2 sqrt2) for w >> alpha, least at w = sqrt(3)
-    # sigma / sqrt(n0): the law for order 2 is sqrt(alpha^2 + 3 sigma^2 / n0).
-    s = settings
-    if s.signal_bandwidth:
-        return least_error(s, sigma, alpha)
-    if s.order == 1 and interval > 0.0:
-        return least_sampled_error(s, sigma, alpha, interval)
-    factor = 1.0 if s.order == 1 else 3.0
-    return math.sqrt(alpha * alpha + factor * sigma * sigma / s.n0) / TWO_PI
-
-
 def throttle_law(settings: FilterSettings, throttle: float) -> float:
     """Return Betaflight's curve: fmin + (fmax - fmin) (t + e t (1 - t)), e = expo / 10."""
     if not math.isfinite(throttle):
@@ -327,5 +208,4 @@ def throttle_law(settings: FilterSettings, throttle: float) -> float:
 LAWS: dict[str, Callable[[FilterSettings, float, float, float], float]] = {
     'constant_noise': constant_noise_law,
     'threshold': threshold_law,
-    'wiener': wiener_law,
 }

@@ -1,5 +1,5 @@
 """
-The law `kalman` for a signal in supply noise: a Wiener filter, learned in flight.
+The law `kalman`: a Wiener filter of a signal in supply noise, learned in flight.
 
 The vector z holds the outputs of four low-passes, and the input: an unknown signal plus noise,
 z = z_s + z_n.  The noise is known: `coupling` times the supply's noise, an OU with sigma and
@@ -176,8 +176,8 @@ class LearnedWiener:
         self._settings = settings
 
     def advance(self, dt: float, interval: float, x: float, slope: float, sigma: float,
-                error: float, alpha: float, level: float, level_se: float) -> float:
-        """Take a sample (dt in s, alpha in 1/s); the level is not used."""
+                error: float, alpha: float) -> float:
+        """Take a sample (dt in s, alpha in 1/s)."""
         state, raw = self._state, slope if self._slope else x
         state[-2], state[-1] = slope if self._slope else self._x, raw
         self._x = x

@@ -7,220 +7,29 @@ sigma -> law (`cutoff_laws`) -> wanted cutoff -> limits, smoothing, slew
 The derivative is the same low-pass, applied to the slope of the input.  It does not jump when the
 cutoff changes, and is exact for an input that is linear between samples.
 
-With the law `kalman` the output comes from `VoltageKalman` or `learned_wiener`.  The low-pass runs
-in parallel at the cutoff of equal lag, and takes over while sigma is unknown.
-
-The law `kalman` for the voltage itself: an OU around its level, measured with white noise.  The
-level is the estimator's; its error is a second OU, with time constant `LEVEL_TIME`.  Without a
-level the voltage counts as a random walk.  The state is the deviation from the level and the error
-of the level, both exact over a step of any length.  The estimate has the least mean square error
-(Kalman 1960; Anderson & Moore, Optimal Filtering, 1979, ch. 3), with the estimated sigma in place
-of the true one.
-
-Its lag is that of the steady filter with the present gain, over the mean step.  If it exceeds the
-limit, just enough of the unfiltered input is mixed in to keep the limit (`lag.share_for_lag`).
+With the law `kalman` the output comes from `learned_wiener`.  The low-pass runs in parallel at the
+cutoff of equal lag, and takes over while sigma is unknown.
 
 Limits: the cutoff is constant within a step; frequencies above half the sample rate are aliased
-before any filter.  The gain of `kalman` at frequency 0 is below 1; steps within 1 % of each other
-count as equal.
+before any filter.
 """
 
 from __future__ import annotations
 
-import cmath
 from copy import copy
 from dataclasses import dataclass
 import math
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.online.filter.cutoff_control import (
-    Bound, CutoffControl, OF_RATE, SampleInterval, time_constant)
+    Bound, CutoffControl, OF_RATE, SampleInterval)
 from ou_monitor.online.filter.cutoff_laws import noise_left, wanted_cutoff
 from ou_monitor.online.filter.filter_state import LowPassState
-from ou_monitor.online.filter.lag import cutoff_for_lag, delay, most_lag, phase_lag, share_for_lag
+from ou_monitor.online.filter.lag import cutoff_for_lag, delay, most_lag, phase_lag
 from ou_monitor.online.filter.learned_wiener import LearnedWiener
 from ou_monitor.online.settings import FilterSettings
 from ou_monitor.records import FloatArray, NAN
-
-# Time constant of the error of the level, s: ten default windows.
-LEVEL_TIME = 20.0
-# Relative change of sigma, alpha or the step, and factor in the error of the level, above which
-# the model is computed again.
-_SAME = 0.01
-_SAME_LEVEL = 1.5
-# Relative change of the gain below which it has settled, and above which the lag is computed
-# again.
-_SETTLED, _LAG_CHANGES = 1e-9, 1e-3
-# Maximum number of step lengths whose models are kept.
-_MODELS = 64
-# Magnitude up to which squares and products cannot overflow.
-_HIGHEST = 1e60
-
-
-class KalmanInputs(NamedTuple):
-    """Known properties of the supply."""
-
-    sigma: float  # Noise intensity, V/sqrt(s)
-    alpha: float  # Relaxation rate, 1/s
-    level_se: float  # Standard error of the level, V; NaN: there is no level
-
-
-class KalmanStep(NamedTuple):
-    """The model over one step: transition, driving and stationary variance of each state."""
-
-    # All covariances are diagonal; shape (2,).
-    phi: FloatArray
-    drive: FloatArray
-    still: FloatArray
-
-
-class VoltageKalman:
-    """Kalman filter of the voltage, V; for `y`, `lag` and `mixed` see `LearnedWiener`."""
-
-    def __init__(self, settings: FilterSettings, x: float, level: float) -> None:
-        self._settings = settings
-        self.y = x
-        self.lag, self.mixed = NAN, 0.0
-        self._log_sigma, self._known = NAN, KalmanInputs(NAN, NAN, NAN)
-        self._level = level if level == level else x
-        # Deviation from the level, error of the level.
-        self._x = [x - self._level, 0.0]
-        self._cov: FloatArray | None = None
-        self._forget()
-
-    def _forget(self) -> None:
-        """Forget models, gain and lag."""
-        self._models: dict[int, KalmanStep] = {}
-        self._key: int | None = None
-        self._moving = True
-        self._gain, self._lag_gain = [0.0, 0.0], [NAN, NAN]
-
-    def configure(self, settings: FilterSettings) -> None:
-        """Change settings; keep the estimate."""
-        self._settings = settings
-        self._forget()
-
-    def advance(self, dt: float, interval: float, x: float, slope: float, sigma: float,
-                error: float, alpha: float, level: float, level_se: float) -> float:
-        """Take a sample (dt in s, interval in s, alpha in 1/s, level in V, level_se in V)."""
-        if level == level and level != self._level:
-            # The error of the level absorbs the change, so that the output does not jump.
-            self._x[1] -= level - self._level
-            self._level = level
-        self._learn(sigma, error, alpha, level, level_se, dt)
-        key = round(math.log(dt) / _SAME)
-        if key != self._key:
-            self._key, self._moving = key, True
-        step = self._model(key, dt)
-        if self._moving:
-            self._correct(step, interval)
-        deviation, wrong = self._x[0] * float(step.phi[0]), self._x[1] * float(step.phi[1])
-        off = x - self._level - deviation - wrong
-        self._x = [deviation + self._gain[0] * off, wrong + self._gain[1] * off]
-        found = self._level + self._x[0] + self._x[1]
-        self.y = found + self.mixed * (x - found)
-        return self.y
-
-    def _learn(self, sigma: float, error: float, alpha: float, level: float, level_se: float,
-               dt: float) -> None:
-        """Smooth ln sigma; compute new models after sufficient changes."""
-        wanted = math.log(min(max(sigma, 1.0 / _HIGHEST), _HIGHEST))
-        if self._log_sigma != self._log_sigma:
-            self._log_sigma = wanted
-        constant = time_constant(self._settings, error)
-        self._log_sigma += (wanted - self._log_sigma) * (
-            -math.expm1(-dt / constant) if constant > 0.0 else 1.0)
-        unsure = NAN
-        if level == level:
-            unsure = min(level_se, _HIGHEST) if level_se > 0.0 else 0.0
-        old, now = self._known, KalmanInputs(math.exp(self._log_sigma), alpha, unsure)
-        if (abs(now.sigma - old.sigma) <= _SAME * old.sigma
-                and abs(alpha - old.alpha) <= _SAME * old.alpha
-                and _nearly_equal(unsure, old.level_se)):
-            return
-        if self._cov is not None and unsure > old.level_se:
-            more = self._cov.copy()
-            more[1, 1] += unsure * unsure - old.level_se * old.level_se
-            self._cov = more
-        self._known = now
-        self._models.clear()
-        self._moving = True
-
-    def _model(self, key: int, dt: float) -> KalmanStep:
-        step = self._models.get(key)
-        if step is None:
-            if len(self._models) >= _MODELS:
-                self._models.clear()
-            step = self._models[key] = step_model(self._known, dt)
-        return step
-
-    def _correct(self, step: KalmanStep, interval: float) -> None:
-        """Advance covariance and gain by a step, until they have settled."""
-        white = self._settings.n0 / interval
-        before = self._gain
-        gain, self._cov = self._gain_over(step, white)
-        self._gain = gain.tolist()
-        self._moving = any(abs(a - b) > _SETTLED * abs(a) for a, b in
-                           zip(self._gain, before, strict=True))
-        even = self._model(round(math.log(interval) / _SAME), interval)
-        if even is not step:
-            gain, _ = self._gain_over(even, white)
-        if any(not abs(a - b) <= _LAG_CHANGES * abs(a) for a, b in
-               zip(gain.tolist(), self._lag_gain, strict=True)):
-            self._lag_gain = gain.tolist()
-            self._update_lag(even.phi, gain, interval)
-
-    def _gain_over(self, step: KalmanStep, white: float) -> tuple[FloatArray, FloatArray]:
-        p = np.diag(step.still) if self._cov is None else (
-            step.phi[:, None] * self._cov * step.phi + np.diag(step.drive))
-        seen = p.sum(axis=1)
-        total = float(seen.sum()) + white
-        gain = seen / total if total > 0.0 else np.zeros_like(seen)
-        return gain, p - np.outer(gain, seen)
-
-    def _update_lag(self, phi: FloatArray, gain: FloatArray, interval: float) -> None:
-        """Compute the present lag, and the share of the input that limits it."""
-        s = self._settings
-        back = cmath.exp(-2j * math.pi * s.lag_frequency * interval)
-        loop = (np.eye(2) - gain[:, None]) * phi
-        try:
-            h = complex(np.linalg.solve(np.eye(2) - loop * back, gain).sum())
-        except np.linalg.LinAlgError:
-            # No correction and no decay: the response is undefined.
-            return
-        most = math.radians(phase_lag(s.order, s.lowest, s.lag_frequency))
-        self.mixed = share_for_lag(h, 1.0 + 0.0j, most)
-        self.lag = math.degrees(-cmath.phase(h + self.mixed * (1.0 - h)))
-
-
-def step_model(known: KalmanInputs, dt: float) -> KalmanStep:
-    """Return the model for a step (dt in s)."""
-    levelled = known.level_se == known.level_se
-    slow = 1.0 / LEVEL_TIME
-    error = known.level_se if levelled else 0.0
-    both = (_ou(known.alpha if levelled else 0.0, known.sigma, dt),
-            _ou(slow, error * math.sqrt(2.0 * slow), dt))
-    return KalmanStep(*(np.array(one) for one in zip(*both, strict=True)))
-
-
-def _ou(rate: float, intensity: float, dt: float) -> tuple[float, float, float]:
-    """Return transition, driving and stationary variance of an OU; of a random walk at rate 0."""
-    if rate == 0.0:
-        # The initial value is unknown: the first sample determines it.
-        drive = intensity * intensity * dt
-        return 1.0, drive, 1e6 * drive
-    still = intensity * intensity / (2.0 * rate)
-    return math.exp(-rate * dt), -still * math.expm1(-2.0 * rate * dt), still
-
-
-def _nearly_equal(one: float, other: float) -> bool:
-    """Return whether two errors of the level are nearly equal, or both unknown."""
-    if one != one or other != other:
-        return one != one and other != other
-    return other / _SAME_LEVEL <= one <= other * _SAME_LEVEL
-
 
 _TWO_PI = 2.0 * math.pi
 # Signals and stamps beyond this, and steps below it, overflow in the filter.
@@ -280,11 +89,11 @@ class AdaptiveLowPass:
         self._control = CutoffControl(self._settings)
         self._state = LowPassState()
         # For the law kalman; None until sigma is known for the first time.
-        self._kalman: VoltageKalman | LearnedWiener | None = None
+        self._kalman: LearnedWiener | None = None
         self._known = False
         self._sigma = NAN
         # State before a parameter changed, until the next sample.
-        self._before: VoltageKalman | LearnedWiener | None = None
+        self._before: LearnedWiener | None = None
         self._interval = SampleInterval()
         self.counters = FilterCounters()
         self._t: float | None = None
@@ -386,11 +195,10 @@ class AdaptiveLowPass:
             raise ValueError(
                 f"mode cannot change from '{self._settings.mode}' to '{settings.mode}' while "
                 'filtering: the output would change its unit; make a new filter')
-        other = settings.of_voltage != self._settings.of_voltage
         self._settings = settings
         self._control.configure(settings)
         self._law_inputs = None
-        if settings.law != 'kalman' or other:
+        if settings.law != 'kalman':
             self._kalman, self._before, self._known = None, None, False
         elif self._kalman is not None:
             self._before = copy(self._kalman)
@@ -400,8 +208,7 @@ class AdaptiveLowPass:
 
     def filter(self, t: npt.ArrayLike, x: npt.ArrayLike,  # noqa: A003
                sigma: npt.ArrayLike, *, sigma_se: _Maybe = None, alpha: _Maybe = None,
-               throttle: _Maybe = None, level: _Maybe = None, level_se: _Maybe = None,
-               ) -> FloatArray | float:
+               throttle: _Maybe = None) -> FloatArray | float:
         """
         Filter samples.
 
@@ -422,11 +229,6 @@ class AdaptiveLowPass:
             Relaxation rate of the supply, 1/s; NaN or omitted: the parameter.
         throttle : float or array_like, shape (n,), optional
             Throttle, 0..1, for the law `throttle`.
-        level : float or array_like, shape (n,), optional
-            Level of the supply at the present throttle, V (`Estimate.u0`), for
-            the law `kalman` of the voltage itself.
-        level_se : float or array_like, shape (n,), optional
-            Standard error of the level, V; NaN or omitted: it is exact.
 
         Returns
         -------
@@ -445,9 +247,8 @@ class AdaptiveLowPass:
             raise ValueError('t and x must be two numbers or two arrays of one shape (n,): got '
                              f'{stamps.shape} and {signal.shape}')
         others = [np.asarray(NAN if one is None else one, dtype=np.float64)
-                  for one in (sigma, sigma_se, alpha, throttle, level, level_se)]
-        names = ('sigma', 'sigma_se', 'alpha', 'throttle', 'level', 'level_se')
-        for name, one in zip(names, others, strict=True):
+                  for one in (sigma, sigma_se, alpha, throttle)]
+        for name, one in zip(('sigma', 'sigma_se', 'alpha', 'throttle'), others, strict=True):
             if one.shape not in ((), stamps.shape):
                 raise ValueError(
                     f'{name} must be one number or of the shape of t, {stamps.shape}: got '
@@ -463,8 +264,7 @@ class AdaptiveLowPass:
         return out
 
     def step(self, t: float, x: float, sigma: float, sigma_se: float = NAN,
-             alpha: float = NAN, throttle: float = NAN, level: float = NAN,
-             level_se: float = NAN) -> float:
+             alpha: float = NAN, throttle: float = NAN) -> float:
         """Filter one sample like `filter`, but faster; NaN for unknown inputs."""
         if not (abs(x) < LARGEST and abs(t) < LATEST):
             self.counters.non_finite += 1
@@ -475,7 +275,7 @@ class AdaptiveLowPass:
             self.counters.samples += 1
             if self._settings.law == 'kalman':
                 # The lag is unknown before the first step.
-                self._start_kalman(x, sigma, level)
+                self._start_kalman(x, sigma)
             self._control.update(self._law_cutoff(sigma, alpha, throttle, 0.0), error, 0.0, 0.0)
             self._state.y = self._raw = self._out = 0.0 if derivative else x
             self._t, self._x = t, x
@@ -494,8 +294,7 @@ class AdaptiveLowPass:
             self.counters.gaps += 1
         interval = self._interval.add(dt)
         if self._settings.law == 'kalman':
-            about = (level if abs(level) < LARGEST else NAN, level_se)
-            self._run_kalman(dt, interval, x, sigma, error, alpha, about)
+            self._run_kalman(dt, interval, x, sigma, error, alpha)
         cutoff = self._control.update(
             self._law_cutoff(sigma, alpha, throttle, interval), error, dt, interval)
         angle = _TWO_PI * cutoff * dt
@@ -516,28 +315,26 @@ class AdaptiveLowPass:
             return self._raw
         return self._kalman.y if self._kalman is not None and self._known else self._state.y
 
-    def _start_kalman(self, x: float, sigma: float, level: float) -> None:
+    def _start_kalman(self, x: float, sigma: float) -> None:
         """Make the Kalman filter at the first known sigma."""
         self._known = math.isfinite(sigma) and sigma >= 0.0
         if self._known:
             self._sigma = sigma
-            self._kalman = (
-                VoltageKalman(self._settings, x, level if abs(level) < LARGEST else NAN)
-                if self._settings.of_voltage else LearnedWiener(self._settings, x))
+            self._kalman = LearnedWiener(self._settings, x)
 
     def _run_kalman(self, dt: float, interval: float, x: float, sigma: float, error: float,
-                    alpha: float, level: tuple[float, float]) -> None:
+                    alpha: float) -> None:
         """Run the Kalman filter, with the last known sigma."""
         begun = self._kalman is None
         if self._kalman is None:
-            self._start_kalman(x, sigma, level[0])
+            self._start_kalman(x, sigma)
         if self._kalman is None:
             return
         known = math.isfinite(sigma) and sigma >= 0.0
         if known:
             self._sigma = sigma
         rate = alpha if 1e-6 <= alpha <= 1e9 else self._settings.alpha
-        sample = (dt, interval, x, (x - self._x) / dt, self._sigma, error, rate, *level)
+        sample = (dt, interval, x, (x - self._x) / dt, self._sigma, error, rate)
         self._kalman.advance(*sample)
         if begun:
             self._offset = self._out - self._kalman.y

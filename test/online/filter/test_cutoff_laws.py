@@ -5,8 +5,7 @@ import math
 from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor.online.filter.cutoff_laws import (
-    cutoff_for_noise, LAWS, least_error, relative_cutoff, sampled_error, squared_error,
-    supply_noise, wanted_cutoff)
+    cutoff_for_noise, LAWS, relative_cutoff, supply_noise, wanted_cutoff)
 from ou_monitor.online.filter.filter_state import LowPassState
 from ou_monitor.online.filter.lowpass import AdaptiveLowPass
 from ou_monitor.online.settings import FilterSettings, LAWS as NAMES
@@ -87,86 +86,6 @@ def test_white_samples_come_out_alike(mode, order, fc, times):
     assert times * rms(wanted) == pytest.approx(rms(fc), rel=1e-4)
 
 
-def test_wiener_of_order_1_is_the_pole_of_the_kalman_filter():
-    """The discrete Kalman filter of a finely sampled OU, by scipy's Riccati solver."""
-    from scipy import linalg
-    alpha, sigma, n0, dt = 63.0, 0.6, 2e-6, 1e-5
-    s = FilterSettings(law='wiener', order=1, n0=n0, fmin=1.0, fmax=1000.0, fallback=75.0)
-    phi = math.exp(-alpha * dt)
-    q = sigma ** 2 * -math.expm1(-2.0 * alpha * dt) / (2.0 * alpha)
-    r = n0 / dt
-    p = linalg.solve_discrete_are([[phi]], [[1.0]], [[q]], [[r]])[0, 0]
-    pole = phi * (1.0 - p / (p + r))
-    assert wanted_cutoff(s, sigma, alpha, NAN, 0.0) == pytest.approx(
-        -math.log(pole) / dt / TWO_PI, rel=1e-2)
-
-
-def test_wiener_of_order_2_has_the_least_error_where_it_is_fast():
-    """Beside a rail that relaxes a thousand times as slowly as it, to the first order of that."""
-    s = FilterSettings(law='wiener', order=2, n0=1e-6, fmin=1.0, fmax=1000.0)
-    grid = np.geomspace(50.0, 500.0, 1001)
-    errors = [squared_error(2, TWO_PI * fc, (0.6, 1.0), (0.0, 63.0), 1e-6) for fc in grid]
-    assert wanted_cutoff(s, 0.6, 1.0, NAN, 0.0) == pytest.approx(
-        grid[np.argmin(errors)], rel=0.01)
-
-
-@pytest.mark.parametrize('fc', [20.0, 150.0, 400.0])
-def test_sampled_error_is_the_integral_over_the_circle(fc):
-    """Of the spectra of an AR(1) process and of white noise, by the trapezoidal rule."""
-    dt, alpha, var, white = 1e-3, 63.0, 0.003, 9e-4
-    z = np.exp(1j * np.linspace(-math.pi, math.pi, 1 << 16, endpoint=False))
-    angle, phi = TWO_PI * fc * dt, math.exp(-alpha * dt)
-    # The exact response to the line between samples: y' = w (x - y) over a step.
-    q = math.exp(-angle)
-    h = ((1.0 - (1.0 - q) / angle) + ((1.0 - q) / angle - q) / z) / (1.0 - q / z)
-    of_signal = var * (1.0 - phi * phi) / np.abs(1.0 - phi / z) ** 2
-    assert sampled_error(TWO_PI * fc, dt, alpha, var, white) == pytest.approx(float(np.mean(
-        np.abs(1.0 - h) ** 2 * of_signal + white * np.abs(h) ** 2)), rel=1e-9)
-
-
-@pytest.mark.parametrize('sigma', [0.05, 0.6, 5.0])
-def test_sampled_wiener_is_the_least(sigma):
-    """Of order 1 at 1 kHz, against a fine grid of the cutoffs within the limits."""
-    alpha, dt, white = 63.0, 1e-3, 9e-4
-    s = FilterSettings(law='wiener', order=1, n0=white * dt, fmin=2.0, fmax=440.0)
-    errors = [sampled_error(TWO_PI * fc, dt, alpha, sigma ** 2 / (2.0 * alpha), white)
-              for fc in (wanted_cutoff(s, sigma, alpha, NAN, dt), *np.geomspace(2.0, 440.0, 2001))]
-    assert errors[0] <= min(errors[1:]) * (1.0 + 1e-6)
-
-
-@pytest.mark.parametrize('poles', [1, 2])
-@pytest.mark.parametrize('order', [1, 2])
-def test_squared_error_is_the_integral_over_the_spectra(order, poles):
-    """What is lost of the signal, and what comes through of both noises."""
-    w, a, b, c, d, n0 = 120.0, 2.0, 30.0, 0.7, 63.0, 1e-4
-
-    def lost(u):
-        h = 1.0 / (1j * u / w + 1.0) if order == 1 else 1.0 / (
-            (1j * u / w) ** 2 + math.sqrt(2.0) * 1j * u / w + 1.0)
-        one = a * a / (b * b + u * u)
-        two = a * a * 2.0 * math.sqrt(2.0) * b ** 3 / (b ** 4 + u ** 4)
-        return abs(1.0 - h) ** 2 * (one if poles == 1 else two)
-    expected = through(lost) + through(
-        lambda u: power(order, w, 'lowpass', u) * (c * c / (d * d + u * u) + n0))
-    assert squared_error(order, w, (a, b), (c, d), n0, poles) == pytest.approx(
-        expected, rel=1e-6)
-
-
-@pytest.mark.parametrize('order', [1, 2])
-@pytest.mark.parametrize('sigma', [0.05, 0.3, 1.0, 3.0, 20.0])
-def test_least_error_is_the_least(order, sigma):
-    """Against a fine grid of the cutoffs within the limits."""
-    s = FilterSettings(law='wiener', order=order, fmin=2.0, fmax=200.0, signal_bandwidth=3.0,
-                       signal_rms=0.2, coupling=0.5, n0=1e-7)
-    rate = TWO_PI * 3.0
-    grid = np.geomspace(2.0, 200.0, 4001)
-
-    def error(fc):
-        return squared_error(order, TWO_PI * fc, (0.2 * math.sqrt(2.0 * rate), rate),
-                             (0.5 * sigma, 63.0), 1e-7)
-    assert error(least_error(s, sigma, 63.0)) <= min(map(error, grid)) * (1.0 + 1e-6)
-
-
 @pytest.mark.parametrize('throttle, expected', [
     (0.0, 75.0), (0.2, 75.0 + 75.0 * 0.28), (0.5, 75.0 + 75.0 * 0.625), (1.0, 150.0),
     (-0.2, 75.0), (1.7, 150.0)])
@@ -189,7 +108,7 @@ def test_threshold_switches_at_sigma_ref(sigma, expected):
 
 @pytest.mark.parametrize('law, more', [
     ('threshold', {}), ('constant_noise', {}), ('constant_noise', {'coupling': 1.0}),
-    ('wiener', {'n0': 1e-6}), ('throttle', {})])
+    ('throttle', {})])
 def test_unknown_values_give_nan(law, more):
     s = FilterSettings(law=law, **more)
     for bad in (NAN, math.inf, -1.0):
@@ -199,8 +118,7 @@ def test_unknown_values_give_nan(law, more):
 @pytest.mark.parametrize('law, more', [
     ('constant_noise', {}), ('constant_noise', {'coupling': 1.0, 'noise_wanted': 0.01}),
     ('constant_noise', {'coupling': 1.0, 'noise_wanted': 5.0, 'mode': 'derivative'}),
-    ('threshold', {}),
-    ('wiener', {'signal_bandwidth': 3.0, 'signal_rms': 0.1, 'coupling': 1.0})])
+    ('threshold', {})])
 @pytest.mark.parametrize('order', [1, 2])
 def test_more_noise_never_raises_the_cutoff(law, more, order):
     """Within the limits for sigmas over ten decades, 0 included."""
@@ -214,12 +132,10 @@ def test_more_noise_never_raises_the_cutoff(law, more, order):
 
 ANY = st.floats(allow_nan=True, allow_infinity=True)
 SETTINGS = [FilterSettings(**{'mode': mode, 'order': order, **more}) for mode, more in (
-    *((mode, more) for mode in ('lowpass', 'derivative') for more in (
+    (mode, more) for mode in ('lowpass', 'derivative') for more in (
         {}, {'law': 'threshold'}, {'law': 'throttle'}, {'coupling': 2.0},
-        {'coupling': 1e9, 'noise_wanted': 1e-9}, {'coupling': 1e-9, 'noise_wanted': 1e12})),
-    *(('lowpass', {'law': 'wiener', **more}) for more in (
-        {'n0': 1e-300}, {'n0': 1e12}, {'signal_bandwidth': 1e-3, 'signal_rms': 1e12, 'n0': 1e-9},
-        {'signal_bandwidth': 1e6, 'signal_rms': 1e-9, 'coupling': 1e9}))) for order in (1, 2)]
+        {'coupling': 1e9, 'noise_wanted': 1e-9}, {'coupling': 1e-9, 'noise_wanted': 1e12}))
+    for order in (1, 2)]
 
 
 @settings(max_examples=1000, deadline=None)

@@ -13,7 +13,7 @@ SIGMA = st.one_of(st.floats(0.0, 10.0), ANY)
 CHANGE = st.one_of(st.none(), st.fixed_dictionaries({}, optional={
     'fmin': st.sampled_from([0.01, 5.0, 20.0, 60.0]), 'fmax': st.sampled_from([100.0, 3000.0]),
     'max_lag': st.sampled_from([0.0, 30.0]), 'fallback': st.sampled_from([70.0, 99.0]),
-    'law': st.sampled_from(['threshold', 'constant_noise', 'kalman', 'wiener', 'throttle']),
+    'law': st.sampled_from(['threshold', 'constant_noise', 'kalman', 'throttle']),
     'slew': st.sampled_from([0.0, 4.0]), 'shadow': st.booleans()}))
 
 

@@ -1,4 +1,4 @@
-"""Law kalman for a signal that is not the voltage: learned, limited, and robust."""
+"""Law kalman: learned, limited, and robust."""
 
 import cmath
 import math
@@ -10,7 +10,6 @@ from ou_monitor import AdaptiveLowPass
 from ou_monitor.online.filter import learned_wiener
 from ou_monitor.online.filter.cutoff_control import Bound
 from ou_monitor.online.filter.lag import phase_lag
-from ou_monitor.online.settings import FilterSettings
 import pytest
 from scipy import linalg, signal
 
@@ -162,7 +161,7 @@ def test_less_lag_than_the_difference_quotient_there_is_not():
 @pytest.mark.parametrize('mode', ['lowpass', 'derivative'])
 @pytest.mark.parametrize('change', [
     {'coupling': 20.0}, {'n0': 1e-3}, {'fmin': 140.0}, {'order': 1, 'max_lag': 20.0},
-    {'coupling': 0.0, 'n0': 1e-6, 'signal_bandwidth': 5.0}, {'law': 'threshold'}], ids=str)
+    {'coupling': 0.0, 'n0': 1e-6}, {'law': 'threshold'}], ids=str)
 def test_a_change_does_not_move_the_output(flown, change, mode):
     """At the stamp not at all, soon after as if nothing had changed."""
     f, twin = made(mode=mode), made(mode=mode)
@@ -188,14 +187,6 @@ def test_without_sigma_the_fallback_takes_over_without_a_jump(flown):
     plain = AdaptiveLowPass(law='threshold', fmin=29.99999, fmax=30.0, fallback=30.0)
     assert y[-1] == pytest.approx(plain.filter(t[:4000], x[:4000], 0.1)[-1], abs=1e-3)
     assert f.step(t[3999] + 1e-9, x[3999], SIGMA) == pytest.approx(y[-1], abs=1e-4)
-
-
-@pytest.mark.parametrize('options, word', [
-    ({}, 'needs the noise'), ({'signal_bandwidth': 5.0}, 'needs the noise'),
-    ({'n0': 1e-6, 'mode': 'derivative'}, 'needs coupling')])
-def test_what_it_needs_is_said(options, word):
-    with pytest.raises(ValueError, match=word):
-        FilterSettings.from_options({'law': 'kalman', **options})
 
 
 ANY = st.floats(allow_nan=True, allow_infinity=True)
