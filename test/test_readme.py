@@ -176,7 +176,7 @@ def test_filter_parameters_are_listed():
     where = [f'{quantity}.{key}' for quantity in ('throttle', 'rpm')
              for key in ('topic', 'type', 'field')]
     assert listed == {
-        'input.type': 'auto', 'input.field': 'none', 'input.acceleration': 'false',
+        'input.type': 'auto', 'input.field': 'none',
         'msg_config': 'auto',
         **dict.fromkeys(where, 'none'), **{
             p.name: f'{p.default:g}' if isinstance(p.default, float) else str(p.default).lower()

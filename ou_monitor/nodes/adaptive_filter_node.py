@@ -11,9 +11,8 @@ doc/messages.md lists its topics:
 - `~/output`: type, stamp and frame of the input; a derivative is a geometry_msgs/AccelStamped or
   Vector3Stamped.
 
-Limits: of an Imu only the angular velocity is filtered, and with `input.acceleration` the linear
-acceleration; their covariances shrink as for white noise.  Of a BatteryState only the voltage is
-filtered, unless `input.field` names another field.  Other fields stay unchanged.
+Limits: of an Imu only the angular velocity is filtered, of a BatteryState only the voltage, unless
+`input.field` names another field.  Other fields, covariances included, stay unchanged.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from typing import Any, NamedTuple
 from diagnostic_msgs.msg import DiagnosticArray
 from ou_monitor.errors import InputError
 from ou_monitor.nodes.base import MonitorNode, PUBLISH_RATE
-from ou_monitor.nodes.filter_channels import CHANNELS, Channels, channels_of, IMU
+from ou_monitor.nodes.filter_channels import CHANNELS, Channels, channels_of
 from ou_monitor.nodes.inputs import (
     Console, decode, INPUT_QOS, NO_CLOCK, Silence, SourceFinder, Stamper, types_on, within)
 from ou_monitor.nodes.sources import AUTO, message_class, MOTOR_PARAMETERS, Source
@@ -44,9 +43,7 @@ INPUT_PARAMETERS = (
     Parameter('input.type', AUTO, "Message type of `input`; auto: the publisher's type."),
     Parameter('input.field', '',
               'Field path of the signal; empty: data, voltage of a battery, angular velocity of '
-              'an IMU.'),
-    Parameter('input.acceleration', False,
-              'Filter the linear acceleration of an IMU beside its angular velocity.'))
+              'an IMU.'))
 OWN_TOPICS = ('input', 'sigma', 'state', '~/output', '~/cutoff', '~/lag')
 # Fields of the state that the filter uses.
 _FIELDS = ('sigma_se', 'alpha', 'throttle', 'load_noise')
@@ -205,11 +202,7 @@ class AdaptiveFilterNode(MonitorNode):
         self._found: list[str] = []
         self._unplaced = False
         self._console = Console(self)
-        self._type, self._field, self._acceleration = (
-            values[f'input.{key}'] for key in ('type', 'field', 'acceleration'))
-        if self._acceleration:
-            # Contradictions are reported at the start, before any message.
-            self._channels_of(IMU)
+        self._type, self._field = values['input.type'], values['input.field']
         self._topic = self.resolve_topic_name('input')
         self._stamper = Stamper(self, self._jumped)
         self._cutoff_output = self.create_publisher(Float64, '~/cutoff', 10)
@@ -257,12 +250,8 @@ class AdaptiveFilterNode(MonitorNode):
         if self._input_silence.age is None and (self._channels is not None or not self._found):
             self._console.waiting(self._topic)
 
-    def _channels_of(self, kind: str) -> Channels:
-        return channels_of(kind, self._field, mode=self._idle.settings.mode,
-                           acceleration=self._acceleration)
-
     def _open(self, kind: str) -> None:
-        channels = self._channels_of(kind)
+        channels = channels_of(kind, self._field, mode=self._idle.settings.mode)
         message = message_class(kind)
         self._type, self._channels = kind, channels
         self._filters = [AdaptiveLowPass(**_filter_options(self.values()))
@@ -299,8 +288,7 @@ class AdaptiveFilterNode(MonitorNode):
         self._output.publish(self._channels.put(message, [
             channel.step(stamp, value, supply.sigma, supply.sigma_se, supply.alpha,
                          supply.throttle)
-            for channel, value in zip(self._filters, values, strict=True)],
-            self.low_pass.noise_left))
+            for channel, value in zip(self._filters, values, strict=True)]))
         self._passed += 1
 
     def _apply_notches(self, stamp: float, values: Sequence[float], supply: SupplyEstimate

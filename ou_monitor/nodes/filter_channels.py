@@ -17,7 +17,6 @@ from ou_monitor.nodes.sources import definition_of, message_class
 from ou_monitor.recordings.cdr import value_path
 from ou_monitor.stream.config import FieldPath, FieldSpec, put, walk
 
-IMU = 'sensor_msgs/msg/Imu'
 # Output types of derivatives: of an angular velocity; of another signal with a stamp (in x); of
 # one without.
 ACCEL, VECTOR, PLAIN = ('geometry_msgs/msg/AccelStamped', 'geometry_msgs/msg/Vector3Stamped',
@@ -26,97 +25,57 @@ _NONE = (math.nan, math.nan, math.nan)
 
 
 @dataclass(frozen=True)
-class Group:
-    """Numbers of which a message contains either all or none."""
-
-    fields: tuple[FieldPath, ...]  # One for each signal
-    # Their covariance, which is scaled with the noise; if its first element is -1, the message
-    # does not have the numbers; if all are 0, the covariance is unknown.
-    covariance: FieldPath | None = None
-    # Whether a message without them is dropped; otherwise the filter takes 0, and they stay
-    # unchanged in the message.
-    needed: bool = True
-
-
-@dataclass(frozen=True)
 class Channels:
     """The signals of one message type."""
 
     names: tuple[str, ...]  # Signals, one low-pass each
-    groups: tuple[Group, ...]  # Where they are in the message
+    fields: tuple[FieldPath, ...]  # Where each is in the message
+    # Covariance of the signals, which stays unchanged; its first element is -1 if the message does
+    # not have them.
+    covariance: FieldPath | None = None
     output: str = ''  # Type of the output; empty: the type of the input
     # Makes the output of a message and filtered values; None: the values replace the signals.
     make: Callable[[Any, Sequence[float]], Any] | None = None
 
     def take(self, message: Any) -> Sequence[float]:
         """Return the values in a message; empty if it does not hold them."""
-        values: list[float] = []
-        for group in self.groups:
-            found = None if _is_absent(message, group) else [
-                walk(message, path) for path in group.fields]
-            if found is None or None in found:
-                if group.needed:
-                    return ()
-                found = [0.0] * len(group.fields)
-            values += map(float, found)
-        return tuple(values)
+        if self.covariance is not None and walk(message, self.covariance)[0] == -1.0:
+            return ()
+        values = [walk(message, path) for path in self.fields]
+        return () if None in values else tuple(map(float, values))
 
-    def put(self, message: Any, values: Sequence[float], left: float) -> Any:
-        """Return the output message; left: the remaining share of the variance of white noise."""
+    def put(self, message: Any, values: Sequence[float]) -> Any:
+        """Return the output message."""
         if self.make is not None:
             return self.make(message, values)
-        at = 0
-        for group in self.groups:
-            mine, at = values[at:at + len(group.fields)], at + len(group.fields)
-            if _is_absent(message, group):
-                continue
-            for path, value in zip(group.fields, mine, strict=True):
-                put(message, path, value)
-            if group.covariance is not None:
-                matrix = walk(message, group.covariance)
-                for place, value in enumerate(matrix):
-                    matrix[place] = value * left
+        for path, value in zip(self.fields, values, strict=True):
+            put(message, path, value)
         return message
-
-
-def _is_absent(message: Any, group: Group) -> bool:
-    return group.covariance is not None and walk(message, group.covariance)[0] == -1.0
 
 
 def _fill(vector: Any, values: Sequence[float]) -> None:
     vector.x, vector.y, vector.z = values
 
 
-def _vector(name: str, *, needed: bool = True) -> Group:
-    return Group(tuple((name, axis) for axis in 'xyz'), (f'{name}_covariance',), needed)
-
-
-_RATES = _vector('angular_velocity')
-_DATA = Channels(('data',), (Group((('data',),)),))
-_GYRO = Channels(('x', 'y', 'z'), (_RATES,))
+_DATA = Channels(('data',), (('data',),))
+_GYRO = Channels(tuple('xyz'), tuple(('angular_velocity', axis) for axis in 'xyz'),
+                 ('angular_velocity_covariance',))
 
 # Types that are filtered without naming a field.
 CHANNELS: dict[str, Channels] = {
     'std_msgs/msg/Float32': _DATA,
     'std_msgs/msg/Float64': _DATA,
-    'sensor_msgs/msg/BatteryState': Channels(('voltage',), (Group((('voltage',),)),)),
-    IMU: _GYRO,
+    'sensor_msgs/msg/BatteryState': Channels(('voltage',), (('voltage',),)),
+    'sensor_msgs/msg/Imu': _GYRO,
 }
-_BOTH = Channels(('x', 'y', 'z', 'acceleration x', 'acceleration y', 'acceleration z'),
-                 (_RATES, _vector('linear_acceleration', needed=False)))
 
 
-def channels_of(kind: str, field: str, *, mode: str = 'lowpass',
-                acceleration: bool = False) -> Channels:
+def channels_of(kind: str, field: str, *, mode: str = 'lowpass') -> Channels:
     """Return the signals of a type."""
-    if acceleration and (kind != IMU or field or mode == 'derivative'):
-        raise InputError(
-            f'input.acceleration is for {IMU}, without input.field and in mode lowpass: got '
-            f"{kind}, input.field '{field}', mode {mode}")
     if field:
         found = _field_channel(kind, field)
     elif kind in CHANNELS:
-        found = _BOTH if acceleration else CHANNELS[kind]
+        found = CHANNELS[kind]
     else:
         raise InputError(
             f"input.type: cannot filter '{kind}' without input.field (the path of its signal); "
@@ -157,4 +116,4 @@ def _field_channel(kind: str, field: str) -> Channels:
         raise InputError(
             f"input.field: '{field}' of {kind} holds a {type(value).__name__}, which cannot take "
             'a filtered value: name a float field')
-    return Channels((field,), (Group((steps,)),))
+    return Channels((field,), (steps,))

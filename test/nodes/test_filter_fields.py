@@ -6,7 +6,6 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, PoseWithCovariance, Vector3Stamped
 from live import values_of, wait_until
-import numpy as np
 from ou_monitor.errors import InputError
 from ou_monitor.nodes.adaptive_filter_node import SupplyInput
 from ou_monitor.nodes.filter_channels import CHANNELS, channels_of
@@ -26,7 +25,7 @@ def test_one_field_is_taken_and_put_back(message, field):
     channel = channels_of(f'{package}/msg/{type(message).__name__}', field)
     assert channel.names == (field,)
     before = str(message)
-    assert channel.put(message, (3.25,), 1.0) is message
+    assert channel.put(message, (3.25,)) is message
     assert list(channel.take(message)) == [3.25]
     assert str(message) != before
 
@@ -156,35 +155,23 @@ ABSENT = [-1.0, *[0.0] * 8]
 IMU = 'sensor_msgs/msg/Imu'
 
 
-@pytest.mark.parametrize('acceleration', [False, True])
-def test_an_imu_keeps_what_is_not_filtered(acceleration):
-    """Rates, and if asked forces, with the covariance stated times what is left of the noise."""
-    channels = channels_of(IMU, '', acceleration=acceleration)
+def test_an_imu_keeps_what_is_not_filtered():
+    """All but the rates, the covariances included."""
+    channels = channels_of(IMU, '')
     message = imu(angular_velocity=KNOWN, linear_acceleration=KNOWN)
     values = channels.take(message)
-    assert values == ((1.0, 2.0, 3.0, 11.0, 12.0, 13.0) if acceleration else (1.0, 2.0, 3.0))
-    out = channels.put(message, [-x for x in values], 0.25)
+    assert values == (1.0, 2.0, 3.0)
+    out = channels.put(message, [-x for x in values])
     assert (out.header.frame_id, out.header.stamp.sec) == ('base_link', 7)
     assert (out.angular_velocity.x, out.angular_velocity.z) == (-1.0, -3.0)
-    assert out.linear_acceleration.y == (-12.0 if acceleration else 12.0)
-    np.testing.assert_allclose(out.angular_velocity_covariance, [x / 4.0 for x in KNOWN])
-    np.testing.assert_allclose(out.linear_acceleration_covariance,
-                               [x / (4.0 if acceleration else 1.0) for x in KNOWN])
+    assert out.linear_acceleration.y == 12.0
+    assert list(out.angular_velocity_covariance) == KNOWN
     assert channels.output == ''
 
 
-def test_absent_fields_of_an_imu_stay_absent():
-    """An unknown covariance stays 0, an absent acceleration -1; no gyro, no output."""
-    channels = channels_of(IMU, '', acceleration=True)
-    message = imu(linear_acceleration=ABSENT)
-    message.linear_acceleration.x = math.nan
-    values = channels.take(message)
-    assert values == (1.0, 2.0, 3.0, 0.0, 0.0, 0.0)
-    out = channels.put(message, values, 0.5)
-    assert not any(out.angular_velocity_covariance)
-    assert list(out.linear_acceleration_covariance) == ABSENT
-    assert math.isnan(out.linear_acceleration.x)
-    assert channels.take(imu(angular_velocity=ABSENT)) == ()
+def test_an_imu_without_a_gyro_gives_nothing():
+    """Its covariance begins with -1."""
+    assert channels_of(IMU, '').take(imu(angular_velocity=ABSENT)) == ()
 
 
 @pytest.mark.parametrize('kind, field, message, output', [
@@ -198,7 +185,7 @@ def test_a_derivative_has_a_message_of_its_own(kind, field, message, output):
     channels = channels_of(kind, field, mode='derivative')
     before = str(message)
     values = channels.take(message)
-    out = channels.put(message, [float(k) for k in range(5, 5 + len(values))], 0.5)
+    out = channels.put(message, [float(k) for k in range(5, 5 + len(values))])
     assert channels.output == output and type(out).__name__ == output.rsplit('/', 1)[1]
     assert str(message) == before
     if kind == IMU:
@@ -213,15 +200,6 @@ def test_a_derivative_has_a_message_of_its_own(kind, field, message, output):
 def test_a_derivative_without_unit_stays_a_number():
     """Float64 in, Float64 out."""
     assert channels_of('std_msgs/msg/Float64', '', mode='derivative').output == ''
-
-
-@pytest.mark.parametrize('kind, field, mode', [
-    ('std_msgs/msg/Float64', '', 'lowpass'), (IMU, 'orientation.x', 'lowpass'),
-    (IMU, '', 'derivative')])
-def test_acceleration_is_refused_where_there_is_none(kind, field, mode):
-    """One line at the start."""
-    with pytest.raises(InputError, match='input.acceleration'):
-        channels_of(kind, field, mode=mode, acceleration=True)
 
 
 @pytest.mark.parametrize('length', [0, 3, 4, 11, 60, 200])

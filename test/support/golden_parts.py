@@ -100,8 +100,7 @@ def chains():
         for begin in range(0, n, 1400):
             part = slice(begin, begin + 1400)
             y = one.filter(t[part], x[part], 0.6, sigma_se=0.1)
-            found.append(table([y[::350], one.cutoff, one.phase_lag, one.bound.name,
-                                one.noise_left]))
+            found.append(table([y[::350], one.cutoff, one.phase_lag, one.bound.name]))
     even = 2e-3 * np.arange(n)
     for options in ({}, {'order': 1}, {'mode': 'derivative'}, {'smoothing': 0.0, 'slew': 0.0},
                     {'smoothing': 0.0}, {'slew': 0.0}, {'dead_band': 0.0}, {'shadow': True},

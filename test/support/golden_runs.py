@@ -242,7 +242,7 @@ def filters():
                 y = [one.filter(t[:700], x[:700], sigma[:700], **{
                     name: value[:700] if np.ndim(value) else value
                     for name, value in more.items()})]
-                said = [one.cutoff, one.wanted, one.phase_lag, one.delay, one.noise_left]
+                said = [one.cutoff, one.wanted, one.phase_lag, one.delay]
                 one.configure(smoothing=0.05, fmax=120.0)
                 for k in range(700, n):
                     y.append([one.step(t[k], x[k], sigma[k], 0.1, float(more['alpha'][k]),
@@ -250,8 +250,8 @@ def filters():
                 y = np.concatenate(y)
                 found.append(table({
                     'which': [law, mode, order], 'y': y[99::200], 'said': said,
-                    'end': [one.cutoff, one.wanted, one.bound.name, one.phase_lag, one.delay,
-                            one.noise_left], 'counters': one.counters}))
+                    'end': [one.cutoff, one.wanted, one.bound.name, one.phase_lag, one.delay],
+                    'counters': one.counters}))
     return found
 
 

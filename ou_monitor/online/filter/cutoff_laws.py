@@ -31,7 +31,7 @@ the sample rate, which is aliased.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache, lru_cache
+from functools import cache
 import math
 
 import numpy as np
@@ -66,12 +66,6 @@ def white_noise(mode: str, order: int, angle: float) -> float:
               [-f11 * f21, 1.0 - f11 * f22 - f12 * f21, -f12 * f22],
               [-f21 * f21, -2.0 * f21 * f22, 1.0 - f22 * f22]]
     return float(np.linalg.solve(turned, drive)[0])
-
-
-@lru_cache(maxsize=256)
-def noise_left(order: int, angle: int) -> float:
-    """Return the share of the variance of white noise after a low-pass (angle: 100 ln(w dt))."""
-    return white_noise('lowpass', order, math.exp(angle / 100.0))
 
 
 def _step(order: int, angle: float, y: float, slope: float, start: float, end: float,

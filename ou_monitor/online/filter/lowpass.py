@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.online.filter.cutoff_control import (
     Bound, CutoffControl, OF_RATE, SampleInterval)
-from ou_monitor.online.filter.cutoff_laws import noise_left, wanted_cutoff
+from ou_monitor.online.filter.cutoff_laws import wanted_cutoff
 from ou_monitor.online.filter.filter_state import LowPassState
 from ou_monitor.online.filter.lag import cutoff_for_lag, delay, most_lag, phase_lag
 from ou_monitor.online.filter.learned_wiener import LearnedWiener
@@ -160,21 +160,6 @@ class AdaptiveLowPass:
     def delay(self) -> float:
         """Phase delay of the present filter at `lag_frequency`, s."""
         return delay(self.phase_lag, self._settings.lag_frequency)
-
-    @property
-    def noise_left(self) -> float:
-        """
-        Share of the variance of white noise that passes the low-pass, to 1 %.
-
-        With the law `kalman`, that of the low-pass of equal lag; 1 with `shadow`, and until
-        the sample rate is known.
-        """
-        by_lag = self._equivalent_cutoff()
-        cutoff = by_lag if by_lag == by_lag else self._control.cutoff
-        angle = _TWO_PI * cutoff * self._interval.mean
-        if self._settings.shadow or not angle > 0.0:
-            return 1.0
-        return noise_left(self._settings.order, round(100.0 * math.log(angle)))
 
     def configure(self, **options: object) -> None:
         """

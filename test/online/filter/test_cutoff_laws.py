@@ -7,7 +7,6 @@ import numpy as np
 from ou_monitor.online.filter.cutoff_laws import (
     cutoff_for_noise, LAWS, relative_cutoff, supply_noise, wanted_cutoff)
 from ou_monitor.online.filter.filter_state import LowPassState
-from ou_monitor.online.filter.lowpass import AdaptiveLowPass
 from ou_monitor.online.settings import FilterSettings, LAWS as NAMES
 import pytest
 from scipy import integrate
@@ -147,18 +146,3 @@ def test_any_number_gives_a_cutoff_within_the_limits_or_nan(s, sigma, alpha, thr
     known = (math.isfinite(throttle) if s.law == 'throttle' else
              math.isfinite(sigma) and sigma >= 0.0)
     assert s.fmin <= got <= s.fmax if known else math.isnan(got)
-
-
-@pytest.mark.parametrize('order, shadow', [(1, False), (2, False), (2, True)])
-def test_what_is_left_of_white_noise_is_told(order, shadow):
-    """The share of the variance, as the filter itself makes it; 1 of a shadow."""
-    low_pass = AdaptiveLowPass(fallback=30.0, order=order, shadow=shadow)
-    assert low_pass.noise_left == 1.0
-    n, rate = 60_000, 500.0
-    noise = np.random.default_rng(31).standard_normal(n)
-    out = low_pass.filter(np.arange(n) / rate, noise, NAN)
-    # Of noise of this band some 2 * 30 / 500 n values are independent; cutoffs are taken to 1 %.
-    spread = 4.0 * math.sqrt(2.0 / (n * 0.1))
-    assert np.var(out[500:]) / np.var(noise) == pytest.approx(
-        low_pass.noise_left, rel=spread + 0.01)
-    assert (low_pass.noise_left == 1.0) == shadow
