@@ -305,8 +305,11 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
     value, damping = float(base.density.sum()), 0.0
     inverse = outer = np.zeros((0, 0))
     for _ in range(rounds):
-        scores, information, spent = _scores_of(samples, terms, events, base, free)
-        cost += spent
+        # The information assumes normal errors with the predicted variances.  With heavy tails,
+        # the outer product of the scores would shorten each step in proportion to the kurtosis.
+        means, spreads, spent = slopes_of(samples, terms, events, base, free)
+        information, cost = means.T @ means + 0.5 * spreads.T @ spreads, cost + spent
+        scores = gradients(base, means, spreads)
         gradient, outer = scores.sum(axis=0), scores.T @ scores
         scale = np.sqrt(information.diagonal()) + 1e-12
         inverse = np.linalg.pinv(information / np.outer(scale, scale)) / np.outer(scale, scale)
@@ -342,21 +345,36 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
     return replace(base, se=tuple(se), cost=cost)
 
 
-def _scores_of(samples: Samples, terms: tuple[Term, ...], events: Events | None, base: GaussianFit,
-               free: Sequence[tuple[int, str]]) -> tuple[FloatArray, FloatArray, float]:
-    """Return scores, shape (n, free), expected information, and processor time, s."""
-    # The information assumes normal errors with the predicted variances.  With heavy tails, the
-    # outer product of the scores would shorten each step in proportion to the kurtosis.
+def slopes_of(samples: Samples, terms: Sequence[Term], events: Events | None, base: GaussianFit,
+              free: Sequence[tuple[int, str]]) -> tuple[FloatArray, FloatArray, float]:
+    """Return slopes of the scores, and of the log variances, shape (n, free), and time, s."""
     v, cost = base.variance, 0.0
-    z = base.innovation / np.sqrt(v)
     means, spreads = np.empty((2, samples.n, len(free)))
     for j, (k, name) in enumerate(free):
-        there = evaluate(samples, _moved(terms, k, name, _STEP), events, inside=True)
+        moved, step = _stepped(terms[k], name)
+        there = evaluate(samples, (*terms[:k], moved, *terms[k + 1:]), events, inside=True)
         cost += there.cost
-        means[:, j] = (there.innovation - base.innovation) / (_STEP * np.sqrt(v))
-        spreads[:, j] = (there.variance - v) / (_STEP * v)
-    scores = -means * z[:, None] + 0.5 * spreads * (z * z - 1.0)[:, None]
-    return scores, means.T @ means + 0.5 * spreads.T @ spreads, cost
+        means[:, j] = (there.innovation - base.innovation) / (step * np.sqrt(v))
+        spreads[:, j] = (there.variance - v) / (step * v)
+    return means, spreads, cost
+
+
+def _stepped(term: Term, name: str) -> tuple[Term, float]:
+    """Return a term with a parameter moved by a small step within its range, and the step."""
+    for step in (_STEP, -_STEP):
+        try:
+            moved = term.moved(name, step)
+        except ValueError:
+            continue
+        if moved != term:
+            return moved, step
+    return term, _STEP
+
+
+def gradients(base: GaussianFit, means: FloatArray, spreads: FloatArray) -> FloatArray:
+    """Return the slopes of the log density of each sample, shape (n, free)."""
+    z = base.z
+    return -means * z[:, None] + 0.5 * spreads * (z * z - 1.0)[:, None]
 
 
 def _busiest_part(samples: Samples, size: int) -> slice:
@@ -382,7 +400,7 @@ def _with_mean(samples: Samples, terms: tuple[Term, ...], events: Events | None)
         raise ArithmeticError('variances are not positive')
     weight = 1.0 / np.sqrt(variance)
     through = run.kalman.innovations(design) * weight[:, None]
-    beta = solved(through[:, 1:], through[:, 0])
+    beta, _ = solved(through.T @ through)
     e = (through[:, 0] - through[:, 1:] @ beta) / weight
     return GaussianFit(with_mean(terms, beta), (), design[:, 1:] @ beta, e, variance,
                        _log_density(e, variance), run.segment.phi,
@@ -440,15 +458,16 @@ def owners(terms: Sequence[Term]) -> list[Term | None]:
     return [None, *(term for term in _means(terms) for _ in term.LINEAR)]
 
 
-def solved(columns: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the least-squares coefficients; undetermined ones are as small as possible."""
-    # Normal equations take a tenth of the time of a QR, and scaled columns are accurate enough.
-    scale = np.sqrt(np.einsum('ij,ij->j', columns, columns))
-    scale[scale == 0.0] = 1.0
-    gram = columns.T @ columns / np.outer(scale, scale)
-    inverse = np.asarray(np.linalg.pinv(gram, rcond=1e-12, hermitian=True), dtype=np.float64)
-    beta: FloatArray = inverse @ (columns.T @ y / scale) / scale
-    return beta
+def solved(gram: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return least-squares coefficients and their covariance, from products of y and columns."""
+    # Normal equations take a tenth of the time of a QR, and scaled columns are accurate enough;
+    # undetermined coefficients are as small as possible.
+    inside = gram[1:, 1:]
+    scale = np.sqrt(inside.diagonal())
+    scale = np.where(scale > 0.0, scale, 1.0)
+    inverse = np.linalg.pinv(inside / np.outer(scale, scale), rcond=1e-12, hermitian=True)
+    covariance: FloatArray = inverse / np.outer(scale, scale)
+    return covariance @ gram[1:, 0], covariance
 
 
 def with_mean(terms: tuple[Term, ...], beta: FloatArray) -> tuple[Term, ...]:

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from ou_monitor.criticism.composite import Composite, fit_composite, LAW_COST, view_of
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.criticism.structure import coefficients, driven, evaluate, state_space, white_noise
+from ou_monitor.criticism.structure import (
+    coefficients, driven, evaluate, state_space, white_noise, whitened)
 from ou_monitor.discovery import decision
 from ou_monitor.discovery.gain import all_moved
 from ou_monitor.model.terms.catalogue import catalogue
@@ -397,15 +398,7 @@ def _mean_errors(samples: Samples, model: Composite, part: slice) -> dict[int, d
     """Return errors of the level and of the coefficients of the mean, by term index."""
     terms = model.gaussian.terms
     where = [(k, j) for k, term in enumerate(terms) for j in range(len(coefficients(term)))]
-    base = evaluate(samples, terms)
-    weight = 1.0 / np.sqrt(base.variance[part])
-    through = np.empty((weight.size, len(where)))
-    for column, (k, j) in enumerate(where):
-        beta = coefficients(terms[k])
-        # Innovations are linear in the coefficients, so the size of the step does not matter.
-        beta[j] += 1.0
-        moved = evaluate(samples, (*terms[:k], _with_coefficients(terms[k], beta), *terms[k + 1:]))
-        through[:, column] = weight * (base.innovation - moved.innovation)[part]
+    through = whitened(samples, terms, [], own=True)[part, 1:]
     norm = np.sqrt((through * through).sum(axis=0))
     # Parameters hidden by the instrument (the level behind a high-pass) have no error.
     norm = np.where(norm > 1e-9 * norm.max(), norm, np.inf)

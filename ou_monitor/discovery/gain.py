@@ -22,7 +22,8 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.composite import Composite, fit_composite
 from ou_monitor.criticism.samples import Samples
-from ou_monitor.criticism.structure import evaluate, whitened, with_mean
+from ou_monitor.criticism.structure import (
+    evaluate, gradients, slopes_of, solved, whitened, with_mean)
 from ou_monitor.discovery.words import unmeasured_words
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Role, Term
@@ -146,8 +147,6 @@ def cause_gain(full: HeldOut, less: HeldOut, scored: npt.NDArray[np.bool_]
 
 # Number of blocks of the cross-validation.
 FOLDS = 6
-# Step of the numerical derivatives, in the logarithm of a parameter.
-_STEP = 1e-4
 # Maximum change of a parameter, in its logarithm, as in a fit.
 _FAR = 1.5
 # Maximum mean loss from errors of the parameters, nats per sample; at the limit they are as large
@@ -183,28 +182,21 @@ def held_out(samples: Samples, model: Composite) -> HeldOut:
         slice(None), samples.voltage - model.offset)
     terms, events = model.gaussian.terms, model.events
     base = evaluate(data, terms, events, inside=True)
-    e, v = base.innovation, base.variance
     free = [(k, name) for k, term in enumerate(terms) for name in term.free()]
-    slopes = np.empty((2, samples.n, len(free)))
-    for j, (k, name) in enumerate(free):
-        moved, step = _stepped(terms[k], name)
-        there = evaluate(data, (*terms[:k], moved, *terms[k + 1:]), events, inside=True)
-        slopes[0, :, j] = (there.innovation - e) / (step * np.sqrt(v))
-        slopes[1, :, j] = (there.variance - v) / (step * v)
-    score = (-slopes[0] * (e / np.sqrt(v))[:, None]
-             + 0.5 * slopes[1] * (e * e / v - 1.0)[:, None])
+    means, spreads, _ = slopes_of(data, terms, events, base, free)
+    score = gradients(base, means, spreads)
     columns = whitened(data, terms, [], events, own=True)
     blocks = blocks_of(samples.n)
-    info = np.array([slopes[0, b].T @ slopes[0, b] + 0.5 * slopes[1, b].T @ slopes[1, b]
-                     for b in blocks])
+    info = np.array([means[b].T @ means[b] + 0.5 * spreads[b].T @ spreads[b] for b in blocks])
     gram = np.array([columns[b].T @ columns[b] for b in blocks])
     density, known = model.density.copy(), np.ones(samples.n, dtype=np.bool_)
     # With an offset, which a law estimates from later samples too, use errors without it.
-    error = e.copy() if model.offset is None else evaluate(samples, terms, events).innovation
+    plain = base if model.offset is None else evaluate(samples, terms, events)
+    error = plain.innovation.copy()
     for b, own, mean in zip(blocks, info, gram, strict=True):
         others, rest = info.sum(axis=0) - own, gram.sum(axis=0) - mean
         inverse = np.linalg.pinv(others, rcond=1e-12, hermitian=True)
-        beta, spread = _solved(rest)
+        beta, spread = solved(rest)
         loss = 0.5 * (float(np.sum(inverse * own)) + float(np.sum(spread * mean[1:, 1:])))
         if not loss < _UNKNOWN * (b.stop - b.start):
             known[b] = False
@@ -237,18 +229,6 @@ def errors_grow(new: FloatArray, old: FloatArray, variance: FloatArray, errors: 
     return float(np.sum(new**2 - old**2)) > errors * error
 
 
-def _stepped(term: Term, name: str) -> tuple[Term, float]:
-    """Return a term with a parameter moved by a small step within its range, and the step."""
-    for step in (_STEP, -_STEP):
-        try:
-            moved = term.moved(name, step)
-        except ValueError:
-            continue
-        if moved != term:
-            return moved, step
-    return term, _STEP
-
-
 def all_moved(terms: Sequence[Term], free: Sequence[tuple[int, str]], step: FloatArray
               ) -> tuple[Term, ...]:
     """Return terms with parameters moved, but not beyond their ranges."""
@@ -259,16 +239,6 @@ def all_moved(terms: Sequence[Term], free: Sequence[tuple[int, str]], step: Floa
         except ValueError:
             continue
     return tuple(found)
-
-
-def _solved(gram: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the coefficients of the mean and their covariance, from sums of products."""
-    inside = gram[1:, 1:]
-    scale = np.sqrt(inside.diagonal())
-    scale = np.where(scale > 0.0, scale, 1.0)
-    inverse = np.linalg.pinv(inside / np.outer(scale, scale), rcond=1e-12, hermitian=True)
-    covariance: FloatArray = inverse / np.outer(scale, scale)
-    return covariance @ gram[1:, 0], covariance
 
 
 def covered(samples: Samples) -> npt.NDArray[np.bool_]:

@@ -61,7 +61,6 @@ class Search:
     accepted: list[str] = field(default_factory=list)  # Causes in the order of their acceptance
     # For each cause, the causes that tied in its round.
     rivals: dict[str, list[str]] = field(default_factory=dict)
-    log: list[str] = field(default_factory=list)  # Trials and their results, one line each
     # For each latent cause, the statistics before it was accepted.
     before_accepted: dict[str, Mapping[str, float]] = field(default_factory=dict)
     stopped: bool = False  # Whether the search ended because it took too long
@@ -69,7 +68,7 @@ class Search:
     def copy(self) -> Search:
         """Return an independent copy of the search."""
         return replace(self, accepted=list(self.accepted), rivals=dict(self.rivals),
-                       log=list(self.log), before_accepted=dict(self.before_accepted))
+                       before_accepted=dict(self.before_accepted))
 
 
 def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
@@ -142,9 +141,8 @@ def choose_response(fitter: Fitter, search: Search, start: Sequence[Term]) -> No
     before = [name for name in search.accepted if decision.is_response(catalogue()[name])]
     names = [term.NAME for term in response.terms]
     search.accepted = [*names, *(name for name in search.accepted if name not in before)]
-    for term, worth, rivals in zip(response.terms, response.worth, response.rivals, strict=True):
+    for term, rivals in zip(response.terms, response.rivals, strict=True):
         search.rivals[term.NAME] = list(rivals)
-        search.log.append(f'{term.NAME}: {worth:.1f} nats')
 
 
 def position(model: Composite, names: Sequence[str], k: int) -> int:
@@ -195,9 +193,6 @@ def _needed(fitter: Fitter, model: Composite, name: str, least: float = decision
 def _accept(search: Search, best: Trial, trials: Sequence[Trial]) -> None:
     search.rivals[best.name] = decision.rivals_of(
         best.name, [(trial.name, trial.evidence) for trial in trials])
-    search.log.append(f'{best.name}: {best.evidence:.1f} nats; '
-                      + ', '.join(f'{t.name} {t.evidence:.1f}' for t in trials[:6]
-                                  if t is not best))
     search.composite = best.composite
     search.accepted += [name for name in (best.beside, best.name) if name]
 
@@ -215,7 +210,6 @@ def _more_lines(fitter: Fitter, search: Search) -> bool:
     if fit is None or (fitter.evidence(fit) - fitter.evidence(composite)
                        < decision.ACCEPT * len(lines)):
         return False
-    search.log.append(f'{len(lines)} more lines')
     search.composite = fit
     search.accepted += [Tone.NAME] * len(lines)
     return True
@@ -262,8 +256,6 @@ def _make_best_move(fitter: Fitter, search: Search) -> bool:
     at = len(search.accepted) - 1 - search.accepted[::-1].index(best.name)
     search.accepted[at:at + 1] = [best.replacement] if best.replacement else []
     search.accepted = [name for name in search.accepted if best.model.has(name)]
-    search.log.append(f'{best.replacement or "nothing"} in place of {best.name}: '
-                      f'{best.gain:.1f} nats')
     search.composite = best.model
     return True
 
@@ -333,7 +325,6 @@ def under_load(fitter: Fitter, search: Search) -> None:
         if term.NAME not in known and not decision.is_response(type(term)):
             search.accepted.append(term.NAME)
             search.rivals.setdefault(term.NAME, [])
-            search.log.append(f'{term.NAME}: with the load')
     backward(fitter, search)
     choose_response(fitter, search, ())
     _try_ac_coupling(fitter, search)
@@ -366,8 +357,6 @@ def _try_ac_coupling(fitter: Fitter, search: Search) -> None:
             search.rivals[name] = [*search.rivals.get(name, []), ACCoupling.NAME]
     if gain < decision.TIE:
         return
-    search.log.append(f'{ACCoupling.NAME} and {LoadSag.NAME} in place of {", ".join(names)}: '
-                      f'{gain:.1f} nats')
     search.composite = fit
     search.accepted = [LoadSag.NAME, ACCoupling.NAME,
                        *(name for name in search.accepted if name not in names)]

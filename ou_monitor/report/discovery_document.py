@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from html import escape
 import math
 
 import numpy as np
 from ou_monitor.analysis.overview import known_lines, Overview
-from ou_monitor.criticism.curves import compare_curves, Comparison
 from ou_monitor.discovery.finding import Finding, Verdict
 from ou_monitor.discovery.words import (
     both_names, by_load, cause_rows, GAIN, gain_text, gain_words, overlap_words, plain,
     plain_model_words, PLAIN_NAMES, plain_words, with_error)
-from ou_monitor.model.supply import SupplyModel
 from ou_monitor.report.document import (
-    Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text)
-from ou_monitor.report.svg import Plot, span
+    Document, Facts, Figure, Notes, Part, Section, Table, Text)
+from ou_monitor.report.svg import Plot
 from ou_monitor.text import listed, number, Z95
 
 # Maximum causes in the first sentence, and remaining discrepancies on a terminal.
@@ -52,9 +50,7 @@ def discovery_document(finding: Finding, seen: Overview | None = None, command: 
         after = ' before and after' if finding.causes else ''
         parts += [Section('Causes', _causes(finding)),
                   Section('Gain' if finding.causes else 'What it predicts', _gain(finding)),
-                  lambda: [Section(f'Statistics{after}', _statistics(finding), folded=True),
-                           Section('Data and simulations', _comparisons(finding),
-                                   folded=True)],
+                  lambda: [Section(f'Statistics{after}', _statistics(finding), folded=True)],
                   Section('What is left', [_discrepancies(finding)], folded=True),
                   lambda: [Section('Parameters', _parameters(finding), folded=True)]]
     parts.append(Section('What to know before using these numbers', [Notes.of(finding.notes)]))
@@ -194,48 +190,6 @@ def _statistics(finding: Finding) -> list[Part]:
         _dot_rows(f'{dots}. Band: range of simulations', 'standard scores', rows),
         text + 'The band comes from simulations that are fitted in the same way: with a correct '
         'model, one recording in a hundred has a statistic outside it.')]
-
-
-def _comparisons(finding: Finding) -> list[Part]:
-    samples, baseline, extended = finding.samples, finding.baseline, finding.simulated
-    assert samples is not None and baseline is not None and extended is not None
-    plain = SupplyModel((baseline,))
-    named = ('plain OU', 'extended model') if finding.causes else ('plain OU',)
-    compared = compare_curves(samples, [plain, extended] if finding.causes else [plain],
-                              np.random.default_rng(finding.seed))
-    drawn = [Figure(_plot(replace(curve, title=by_load(curve.title, finding.load),
-                                  x_label=by_load(curve.x_label, finding.load)), k, name))
-             for curve in compared for k, name in enumerate(named)]
-    return [*Pair.two_by_two(drawn), Text(
-        'Line or dots: the data. Band or bars: the range of 40 simulations with the '
-        f'{_inputs(finding)} of the data; with a correct model about one point in twenty lies '
-        'outside.',
-        legend=True)]
-
-
-def _plot(curve: Comparison, k: int, name: str) -> Plot:
-    low, high = curve.bands[k]
-    plot = Plot(f'{curve.title}: {name}', curve.x_label, curve.y_label, width=450,
-                height=250, log_x=curve.log_x, log_y=curve.log_y, legend_row=True)
-    data = curve.data
-    if curve.log_y:
-        # A bin without samples cannot be drawn on a logarithmic axis.
-        floor = 0.3 * float(np.nanmin(np.where(data > 0.0, data, np.nan)))
-        low, high = np.where(high > 0.0, np.maximum(low, floor), np.nan), np.maximum(high, floor)
-        data = np.where(data > 0.0, data, np.nan)
-    ends = [data, *[edge for pair in curve.bands for edge in pair]]
-    # Both plots of a pair share one axis.
-    ends = [np.where(e > 0.0, np.maximum(e, floor), np.nan) for e in ends] if curve.log_y \
-        else ends
-    bottom, top = span(ends, curve.log_y)
-    plot.limits(y=(bottom, top))
-    if curve.points:
-        # Margin for the markers at both ends.
-        plot.limits(span([curve.x], pad=0.12), (bottom, top))
-        plot.bars(curve.x, low, high, 'simulated', k)
-        return plot.markers(curve.x, data, 'data', 7)
-    plot.band(curve.x, low, high, 'simulated', k)
-    return plot.line(curve.x, data, 'data', 7, 'thick')
 
 
 def _discrepancies(finding: Finding) -> Part:

@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 from numpy.testing import assert_allclose
-from ou_monitor.criticism.curves import compare_curves
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import columns_of, evaluate, state_space
 from ou_monitor.discovery.decision import rivals_of, TIE
@@ -30,31 +29,6 @@ def test_the_first_sample_behind_a_high_pass_has_the_law_of_its_throttle():
     assert_allclose(space.q[0] / first, [[1.0, share], [share, share]], rtol=0.02)
     late = -1e3 * math.log(state_space(samples, (ou, alpha), None)[1].f[-1, 0, 0])
     assert abs(rate / (rate + late) / share - 1.0) > 0.1
-
-
-def test_a_model_that_runs_away_has_no_band():
-    """Whether at the first simulation or at a later one; the others keep theirs."""
-    class Away:
-        """Fails from a given simulation on."""
-
-        def __init__(self, good):
-            self.left = good
-
-        def simulate(self, t, rng, throttle):
-            self.left -= 1
-            if self.left < 0:
-                raise ValueError('runs away')
-            return 5.0 + rng.standard_normal(t.size)
-
-    rng = np.random.default_rng(2)
-    samples = Samples(1e-3 * np.arange(500), 5.0 + rng.standard_normal(500), None)
-    for found in compare_curves(samples, [Away(0), Away(1), Away(9)], rng, 3):
-        (none, _), one, three = found.bands
-        assert np.isnan(none).all()
-        assert_allclose(one[0], one[1])
-        known = np.isfinite(three[0])
-        assert known.any() and (three[0][known] <= three[1][known]).all()
-        assert (three[0][known] < three[1][known]).any()
 
 
 def test_rivals_are_within_a_tie():

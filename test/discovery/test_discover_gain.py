@@ -83,8 +83,8 @@ def test_a_block_whose_rest_gives_no_model_is_not_scored(monkeypatch):
 
     def fails_once(*given, **more):
         calls.append(None)
-        # One of the model, one a parameter, then one a block.
-        if len(calls) == 1 + 2 + 3:
+        # One of the model, then one a block.
+        if len(calls) == 1 + 3:
             raise ValueError('singular')
         return evaluate(*given, **more)
 

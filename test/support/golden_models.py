@@ -9,7 +9,6 @@ from ou_monitor.analysis.level_tests import examine_level, holm
 from ou_monitor.criticism.battery import (
     covariates_of, criticise, simulate_bank, simulate_bank_of, statistics)
 from ou_monitor.criticism.composite import fit_composite, view_of
-from ou_monitor.criticism.curves import compare_curves
 from ou_monitor.criticism.integrity import examine
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate, Events, fit_gaussian
@@ -166,8 +165,6 @@ def criticism():
             part['bank'] = [bank.mean, bank.std, criticise(samples, plain, bank)]
             bank = simulate_bank_of(samples, plain, np.random.default_rng(2), 3)
             part['bank of'] = [bank.mean, bank.std]
-            part['curves'] = [[c.x[::9], c.data[::9]] for c in compare_curves(
-                samples, [SupplyModel(plain.terms)], np.random.default_rng(3), 2)]
         e = Estimate(alpha=63.0, sigma=0.632, var_inf=3.2e-3, u0=5.0, noise_std=0.0, alpha_se=0.1,
                      sigma_se=0.02, var_inf_se=0.1, status=Status.OK, rate=1000.0)
         half = samples.n // 2
