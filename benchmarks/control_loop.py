@@ -168,7 +168,7 @@ def fly(loop: Loop, seconds: float, seed: int) -> Flight:
         at = k % block
         voltage[at], throttle[at] = level + noise + adc[k], collective
         measured = rate + loop.coupling * noise + loop.gyro_noise * gyro[k]
-        slope = low_pass.step(t, measured, seen, error, alpha, collective)
+        slope = low_pass.step(t, measured, seen, error, alpha)
         integral = min(max(integral - loop.i * measured * dt, -0.3), 0.3)
         command = min(max(integral - loop.p * measured - loop.d * slope, -1.0), 1.0)
         # A sagging supply needs a larger collective for the same thrust.

@@ -190,8 +190,7 @@ def adaptive(options: Mapping[str, Any], flights: Flights, seen: np.ndarray,
     for f in range(x.shape[0]):
         one = AdaptiveLowPass(**options)
         sigma, error, alpha = (s[f].tolist() for s in seen)
-        rows = zip(flights.t.tolist(), x[f].tolist(), sigma, error, alpha,
-                   flights.throttle[f].tolist())
+        rows = zip(flights.t.tolist(), x[f].tolist(), sigma, error, alpha)
         for k, row in enumerate(rows):
             out[f, k] = one.step(*row)
             cutoff[f, k] = one.cutoff

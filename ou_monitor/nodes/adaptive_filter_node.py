@@ -69,8 +69,8 @@ class SupplyEstimate(NamedTuple):
 class SupplyInput:
     """Newest `sigma` and `state`, each dropped when stale (`now`: monotonic, s)."""
 
-    def __init__(self, now: Callable[[], float], topics: tuple[str, str]) -> None:
-        self._topic, self._state_topic = topics
+    def __init__(self, now: Callable[[], float], topic: str) -> None:
+        self._topic = topic
         self._sigma = NAN
         self._state: dict[str, str] = {}
         self.sigma_silence, self.state_silence = Silence(now), Silence(now)
@@ -106,15 +106,6 @@ class SupplyInput:
         if why:
             return SupplyEstimate(throttle=throttle, why=why)
         return SupplyEstimate(self._sigma, error, alpha, throttle, source='relaxation')
-
-    def why_no_throttle(self, stale_after: float) -> str:
-        """Return why the throttle is unknown."""
-        age = self.state_silence.age
-        if age is None:
-            return f'no message on {self._state_topic}'
-        if not within(age, stale_after):
-            return f'{self._state_topic} has been silent for {age:.1f} s'
-        return f'the state on {self._state_topic} has no throttle'
 
     def _why_no_sigma(self, fresh: bool, stale_after: float) -> str:
         age = self.sigma_silence.age
@@ -193,8 +184,7 @@ class AdaptiveFilterNode(MonitorNode):
         self._idle = AdaptiveLowPass(**_filter_options(values))
         self._notch = AdaptiveNotch(**notch_options(values))
         self._motors = MotorInputs(self, values, self.steady_now)
-        self._supply = SupplyInput(self.steady_now, (
-            self.resolve_topic_name('sigma'), self.resolve_topic_name('state')))
+        self._supply = SupplyInput(self.steady_now, self.resolve_topic_name('sigma'))
         self._input_silence = Silence(self.steady_now)
         self._dropped = self._passed = 0
         self._input_clock = InputClock()
@@ -286,8 +276,7 @@ class AdaptiveFilterNode(MonitorNode):
         supply = self._supply_now()
         values = self._apply_notches(stamp, values, supply)
         self._output.publish(self._channels.put(message, [
-            channel.step(stamp, value, supply.sigma, supply.sigma_se, supply.alpha,
-                         supply.throttle)
+            channel.step(stamp, value, supply.sigma, supply.sigma_se, supply.alpha)
             for channel, value in zip(self._filters, values, strict=True)]))
         self._passed += 1
 
@@ -359,22 +348,15 @@ class AdaptiveFilterNode(MonitorNode):
         if not self._passed:
             return f'nothing yet: no message was filtered; it starts at {s.fallback:g} Hz'
         if bound is Bound.FALLBACK:
-            return f'the fallback, because {self._unknown(supply)}'
+            return f'the fallback, because {_unknown(supply)}'
         if bound is Bound.LAG:
             return (f'fmin, {s.lowest:.4g} Hz by max_lag ({s.max_lag:g} degrees at '
                     f'{s.lag_frequency:g} Hz)')
         if bound in (Bound.SLEW, Bound.SMOOTHING):
             aim = (f'the {low_pass.wanted:.4g} Hz wanted' if math.isfinite(low_pass.wanted) else
-                   f'the fallback, because {self._unknown(supply)}')
+                   f'the fallback, because {_unknown(supply)}')
             return f'{bound.value}, on the way to {aim}'
         return bound.value
-
-    def _unknown(self, supply: SupplyEstimate) -> str:
-        """Return why the inputs of the law are unknown."""
-        s = self.low_pass.settings
-        if s.law == 'throttle':
-            return self._supply.why_no_throttle(s.stale_after)
-        return supply.why or 'sigma was not known at the last message'
 
     def _judge(self, supply: SupplyEstimate) -> tuple[Level, str]:
         s = self.low_pass.settings
@@ -392,22 +374,20 @@ class AdaptiveFilterNode(MonitorNode):
             return Level.WARN, NO_CLOCK
         if self._input_clock.stamps is not StampOrder.GOOD:
             return Level.WARN, f'{self._topic}: {self._input_clock.stamps.by_arrival}'
-        missing = math.isnan(supply.throttle if s.law == 'throttle' else supply.sigma)
-        if missing:
+        if math.isnan(supply.sigma):
             return Level.WARN, (
                 f'The cutoff goes to the fallback, {s.fallback:g} Hz, because '
-                f'{self._unknown(supply)}.')
+                f'{_unknown(supply)}.')
         if self.low_pass.highest < s.lowest:
             return Level.WARN, (
                 f'The messages on {self._topic} are too slow: 0.45 of their rate is '
                 f'{self.low_pass.highest:.4g} Hz, below fmin ({s.lowest:.4g} Hz), which is used.')
         shadow = 'Shadow, the signal passes unfiltered: ' if s.shadow else ''
-        of = f'throttle {supply.throttle:.2f}' if s.law == 'throttle' else (
-            f'sigma {supply.sigma:.4g} V/sqrt(s)')
         return Level.OK, (
-            f'{shadow}Cutoff {self.low_pass.cutoff:.4g} Hz by law {s.law} at {of}; decided by '
-            f'{self._decided_by(supply)}; lag {360.0 * s.lag_frequency * self._delay:.3g} degrees '
-            f'({1e3 * self._delay:.3g} ms) at {s.lag_frequency:g} Hz{self._notch_words()}.')
+            f'{shadow}Cutoff {self.low_pass.cutoff:.4g} Hz by law {s.law} at sigma '
+            f'{supply.sigma:.4g} V/sqrt(s); decided by {self._decided_by(supply)}; lag '
+            f'{360.0 * s.lag_frequency * self._delay:.3g} degrees ({1e3 * self._delay:.3g} ms) at '
+            f'{s.lag_frequency:g} Hz{self._notch_words()}.')
 
     def _notch_words(self) -> str:
         notch = self._notch
@@ -417,6 +397,11 @@ class AdaptiveFilterNode(MonitorNode):
             return '; notches off, they would not help' if notch.source == 'none' else ''
         at = ', '.join(f'{f:.0f}' for f in notch.frequencies)
         return f'; notches at {at} Hz by {notch.source}'
+
+
+def _unknown(supply: SupplyEstimate) -> str:
+    """Return why sigma is unknown."""
+    return supply.why or 'sigma was not known at the last message'
 
 
 def _filter_options(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -57,7 +57,7 @@ _Settings = TypeVar('_Settings')
 AUTO = 'auto'
 
 
-LAWS = ('constant_noise', 'kalman', 'threshold', 'throttle')
+LAWS = ('constant_noise', 'kalman', 'threshold')
 
 
 def _documented(settings: type[_Settings]) -> type[_Settings]:
@@ -206,16 +206,9 @@ class FilterSettings:
     alpha: float = _parameter(
         63.0, 'Relaxation rate of the supply while the estimator does not know it, 1/s.',
         1.0e-6, 1.0e9)
-    expo: float = _parameter(5.0, 'Curvature of the throttle law, 0..10.', 0.0, 10.0)
     smoothing: float = _parameter(
-        0.2, 'Time constant of ln(cutoff) if the relative error of sigma is smoothing_error, s.',
-        0.0, 3600.0)
-    smoothing_error: float = _parameter(
-        0.1, 'Relative error of sigma at which smoothing holds; the time constant is proportional '
-        'to the error.', 0.001, 10.0)
-    smoothing_range: float = _parameter(
-        4.0, 'Maximum factor on the time constant, up or down, for the error of sigma; 1: '
-        'constant.', 1.0, 100.0)
+        0.2, 'Time constant of ln(cutoff) if the relative error of sigma is 0.1, s; it is '
+        'proportional to that error, within a factor of 4.', 0.0, 3600.0)
     slew: float = _parameter(
         4.0, 'Maximum rate of change of the cutoff, octaves/s; 0: no limit.', 0.0, 1.0e6)
     dead_band: float = _parameter(

@@ -72,7 +72,7 @@ def state_of(**values):
 def test_sigma_falls_back_along_a_time_line():
     """Nothing, sigma, sigma and state, state silent, unusable, garbage, sigma silent."""
     clock = Clock()
-    supply = SupplyInput(clock, ('/sigma', '/state'))
+    supply = SupplyInput(clock, '/sigma')
     assert supply.now(1.0).why == 'no message on /sigma' and math.isnan(supply.now(1.0).sigma)
     supply.take_sigma(0.5)
     assert supply.now(1.0).sigma == 0.5 and math.isnan(supply.now(1.0).alpha)

@@ -214,7 +214,7 @@ def estimates():
 
 _LAWS = ({'law': 'constant_noise'}, {'law': 'constant_noise', 'coupling': 2.0, 'n0': 1e-3,
                                      'noise_wanted': 0.3},
-         {'law': 'threshold'}, {'law': 'throttle', 'expo': 3.0},
+         {'law': 'threshold'},
          {'law': 'kalman', 'coupling': 2.0},
          {'law': 'kalman', 'coupling': 1.0, 'max_lag': 25.0, 'n0': 1e-3},
          {'law': 'kalman', 'coupling': 1.0, 'max_lag': 10.0})
@@ -232,8 +232,7 @@ def filters():
     x[400] = np.nan
     sigma = np.repeat(rng.uniform(0.1, 1.2, n // 50), 50)
     sigma[700:800] = np.nan
-    more = {'sigma_se': 0.1, 'alpha': np.where(t < 0.6, 63.0, 30.0),
-            'throttle': np.repeat(rng.random(n // 30), 30)}
+    more = {'sigma_se': 0.1, 'alpha': np.where(t < 0.6, 63.0, 30.0)}
     for law in _LAWS:
         for mode in ('lowpass', 'derivative'):
             for order in (1, 2):
@@ -245,8 +244,7 @@ def filters():
                 said = [one.cutoff, one.wanted, one.phase_lag, one.delay]
                 one.configure(smoothing=0.05, fmax=120.0)
                 for k in range(700, n):
-                    y.append([one.step(t[k], x[k], sigma[k], 0.1, float(more['alpha'][k]),
-                                       float(more['throttle'][k]))])
+                    y.append([one.step(t[k], x[k], sigma[k], 0.1, float(more['alpha'][k]))])
                 y = np.concatenate(y)
                 found.append(table({
                     'which': [law, mode, order], 'y': y[99::200], 'said': said,

@@ -23,6 +23,9 @@ OF_RATE = 0.45
 INTERVALS = 100
 ODD = 5.0
 _NEW = 5
+# Relative error of sigma for which the time constant `smoothing` is stated, and maximum factor on
+# it (our choice, within Betaflight's 1 to 10).
+_ERROR, _RANGE = 0.1, 4.0
 
 
 class Bound(enum.Enum):
@@ -83,8 +86,7 @@ def time_constant(settings: FilterSettings, error: float) -> float:
     # Betaflight moves its notches 1 to 10 times as fast.
     if error != error:
         return settings.smoothing
-    most = settings.smoothing_range
-    return settings.smoothing * min(max(error / settings.smoothing_error, 1.0 / most), most)
+    return settings.smoothing * min(max(error / _ERROR, 1.0 / _RANGE), _RANGE)
 
 
 class CutoffControl:

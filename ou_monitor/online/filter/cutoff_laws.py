@@ -106,11 +106,8 @@ _ROOT2 = math.sqrt(2.0)
 _ROOT8 = 2.0 * _ROOT2
 
 
-def wanted_cutoff(settings: FilterSettings, sigma: float, alpha: float, throttle: float,
-                  interval: float) -> float:
-    """Return the cutoff of the law, Hz (V/sqrt(s), 1/s, 0..1, interval in s)."""
-    if settings.law == 'throttle':
-        return throttle_law(settings, throttle)
+def wanted_cutoff(settings: FilterSettings, sigma: float, alpha: float, interval: float) -> float:
+    """Return the cutoff of the law, Hz (V/sqrt(s), 1/s, interval in s)."""
     if not (math.isfinite(sigma) and sigma >= 0.0):
         return NAN
     rate = alpha if 1e-6 <= alpha <= 1e9 else settings.alpha
@@ -187,15 +184,6 @@ def cutoff_for_noise(mode: str, order: int, rms: float, intensity: float,
         else:
             high = middle
     return math.exp(low)
-
-
-def throttle_law(settings: FilterSettings, throttle: float) -> float:
-    """Return Betaflight's curve: fmin + (fmax - fmin) (t + e t (1 - t)), e = expo / 10."""
-    if not math.isfinite(throttle):
-        return NAN
-    t = min(max(throttle, 0.0), 1.0)
-    share = t + 0.1 * settings.expo * t * (1.0 - t)
-    return settings.lowest + (settings.fmax - settings.lowest) * min(share, 1.0)
 
 
 # The law `kalman` has no cutoff of its own: see `lowpass`.

@@ -193,7 +193,7 @@ class AdaptiveLowPass:
 
     def filter(self, t: npt.ArrayLike, x: npt.ArrayLike,  # noqa: A003
                sigma: npt.ArrayLike, *, sigma_se: _Maybe = None, alpha: _Maybe = None,
-               throttle: _Maybe = None) -> FloatArray | float:
+               ) -> FloatArray | float:
         """
         Filter samples.
 
@@ -212,8 +212,6 @@ class AdaptiveLowPass:
             it is, the faster the cutoff follows.
         alpha : float or array_like, shape (n,), optional
             Relaxation rate of the supply, 1/s; NaN or omitted: the parameter.
-        throttle : float or array_like, shape (n,), optional
-            Throttle, 0..1, for the law `throttle`.
 
         Returns
         -------
@@ -232,8 +230,8 @@ class AdaptiveLowPass:
             raise ValueError('t and x must be two numbers or two arrays of one shape (n,): got '
                              f'{stamps.shape} and {signal.shape}')
         others = [np.asarray(NAN if one is None else one, dtype=np.float64)
-                  for one in (sigma, sigma_se, alpha, throttle)]
-        for name, one in zip(('sigma', 'sigma_se', 'alpha', 'throttle'), others, strict=True):
+                  for one in (sigma, sigma_se, alpha)]
+        for name, one in zip(('sigma', 'sigma_se', 'alpha'), others, strict=True):
             if one.shape not in ((), stamps.shape):
                 raise ValueError(
                     f'{name} must be one number or of the shape of t, {stamps.shape}: got '
@@ -249,7 +247,7 @@ class AdaptiveLowPass:
         return out
 
     def step(self, t: float, x: float, sigma: float, sigma_se: float = NAN,
-             alpha: float = NAN, throttle: float = NAN) -> float:
+             alpha: float = NAN) -> float:
         """Filter one sample like `filter`, but faster; NaN for unknown inputs."""
         if not (abs(x) < LARGEST and abs(t) < LATEST):
             self.counters.non_finite += 1
@@ -261,7 +259,7 @@ class AdaptiveLowPass:
             if self._settings.law == 'kalman':
                 # The lag is unknown before the first step.
                 self._start_kalman(x, sigma)
-            self._control.update(self._law_cutoff(sigma, alpha, throttle, 0.0), error, 0.0, 0.0)
+            self._control.update(self._law_cutoff(sigma, alpha, 0.0), error, 0.0, 0.0)
             self._state.y = self._raw = self._out = 0.0 if derivative else x
             self._t, self._x = t, x
             return self._out
@@ -281,7 +279,7 @@ class AdaptiveLowPass:
         if self._settings.law == 'kalman':
             self._run_kalman(dt, interval, x, sigma, error, alpha)
         cutoff = self._control.update(
-            self._law_cutoff(sigma, alpha, throttle, interval), error, dt, interval)
+            self._law_cutoff(sigma, alpha, interval), error, dt, interval)
         angle = _TWO_PI * cutoff * dt
         start, end = self._x, x
         if derivative:
@@ -332,7 +330,7 @@ class AdaptiveLowPass:
             self._offset += self._state.y - self._kalman.y if known else (
                 self._kalman.y - self._state.y)
 
-    def _law_cutoff(self, sigma: float, alpha: float, throttle: float, interval: float) -> float:
+    def _law_cutoff(self, sigma: float, alpha: float, interval: float) -> float:
         """Return the wanted cutoff of the law, evaluated again only if an input has changed."""
         s = self._settings
         if s.law == 'kalman':
@@ -341,10 +339,10 @@ class AdaptiveLowPass:
         if abs(interval - self._law_interval) > _MOVED * self._law_interval:
             self._law_interval = interval
         # Replace NaN, which never equals itself.
-        inputs = (*(one if one == one else math.inf for one in (sigma, alpha, throttle)),
+        inputs = (*(one if one == one else math.inf for one in (sigma, alpha)),
                   self._law_interval)
         if inputs != self._law_inputs:
-            self._wanted = wanted_cutoff(s, sigma, alpha, throttle, self._law_interval)
+            self._wanted = wanted_cutoff(s, sigma, alpha, self._law_interval)
             self._law_inputs = inputs
         return self._wanted
 

@@ -75,11 +75,6 @@ def test_a_certain_sigma_moves_the_cutoff_faster(error, expected):
     assert got == pytest.approx(50.0 * 2.0 ** math.exp(-DT / expected))
 
 
-def test_a_range_of_one_switches_confidence_off():
-    s = FilterSettings(smoothing_range=1.0)
-    assert {time_constant(s, error) for error in (0.001, 0.1, 10.0)} == {0.2}
-
-
 def test_slew_limits_octaves_per_second():
     """4 octaves/s: from 150 to 37.5 Hz takes half a second, on a straight line in log2."""
     made = control(slew=4.0)

@@ -28,7 +28,7 @@ def through(spectrum):
 
 
 def test_every_law_has_its_function():
-    assert {*LAWS, 'kalman', 'throttle'} == set(NAMES)
+    assert {*LAWS, 'kalman'} == set(NAMES)
 
 
 @pytest.mark.parametrize('mode', ['lowpass', 'derivative'])
@@ -85,33 +85,18 @@ def test_white_samples_come_out_alike(mode, order, fc, times):
     assert times * rms(wanted) == pytest.approx(rms(fc), rel=1e-4)
 
 
-@pytest.mark.parametrize('throttle, expected', [
-    (0.0, 75.0), (0.2, 75.0 + 75.0 * 0.28), (0.5, 75.0 + 75.0 * 0.625), (1.0, 150.0),
-    (-0.2, 75.0), (1.7, 150.0)])
-def test_throttle_law_is_betaflights(throttle, expected):
-    """Expo 5, D-term limits 75..150 Hz."""
-    s = FilterSettings(law='throttle', fmin=75.0, fmax=150.0)
-    assert wanted_cutoff(s, NAN, NAN, throttle, 1e-3) == pytest.approx(expected)
-
-
-def test_throttle_law_with_full_expo_stays_within_fmax():
-    s = FilterSettings(law='throttle', expo=10.0)
-    assert max(wanted_cutoff(s, NAN, NAN, t, 1e-3) for t in np.linspace(0.0, 1.0, 101)) <= s.fmax
-
-
 @pytest.mark.parametrize('sigma, expected', [(0.3, 150.0), (0.301, 20.0), (0.0, 150.0)])
 def test_threshold_switches_at_sigma_ref(sigma, expected):
     s = FilterSettings(law='threshold')
-    assert wanted_cutoff(s, sigma, NAN, NAN, 1e-3) == expected
+    assert wanted_cutoff(s, sigma, NAN, 1e-3) == expected
 
 
 @pytest.mark.parametrize('law, more', [
-    ('threshold', {}), ('constant_noise', {}), ('constant_noise', {'coupling': 1.0}),
-    ('throttle', {})])
+    ('threshold', {}), ('constant_noise', {}), ('constant_noise', {'coupling': 1.0})])
 def test_unknown_values_give_nan(law, more):
     s = FilterSettings(law=law, **more)
     for bad in (NAN, math.inf, -1.0):
-        assert math.isnan(wanted_cutoff(s, bad, NAN, NAN, 1e-3))
+        assert math.isnan(wanted_cutoff(s, bad, NAN, 1e-3))
 
 
 @pytest.mark.parametrize('law, more', [
@@ -122,7 +107,7 @@ def test_unknown_values_give_nan(law, more):
 def test_more_noise_never_raises_the_cutoff(law, more, order):
     """Within the limits for sigmas over ten decades, 0 included."""
     s = FilterSettings(law=law, order=order, **more)
-    cutoffs = [wanted_cutoff(s, sigma, 63.0, NAN, 1e-3)
+    cutoffs = [wanted_cutoff(s, sigma, 63.0, 1e-3)
                for sigma in (0.0, *np.geomspace(1e-6, 1e4, 41))]
     assert all(s.fmin <= fc <= s.fmax for fc in cutoffs)
     assert all(b <= a * (1.0 + 1e-3) for a, b in zip(cutoffs, cutoffs[1:]))
@@ -132,17 +117,16 @@ def test_more_noise_never_raises_the_cutoff(law, more, order):
 ANY = st.floats(allow_nan=True, allow_infinity=True)
 SETTINGS = [FilterSettings(**{'mode': mode, 'order': order, **more}) for mode, more in (
     (mode, more) for mode in ('lowpass', 'derivative') for more in (
-        {}, {'law': 'threshold'}, {'law': 'throttle'}, {'coupling': 2.0},
+        {}, {'law': 'threshold'}, {'coupling': 2.0},
         {'coupling': 1e9, 'noise_wanted': 1e-9}, {'coupling': 1e-9, 'noise_wanted': 1e12}))
     for order in (1, 2)]
 
 
 @settings(max_examples=1000, deadline=None)
-@given(s=st.sampled_from(SETTINGS), sigma=ANY, alpha=ANY, throttle=ANY,
+@given(s=st.sampled_from(SETTINGS), sigma=ANY, alpha=ANY,
        interval=st.one_of(st.just(0.0), st.floats(1e-9, 1e6)))
-def test_any_number_gives_a_cutoff_within_the_limits_or_nan(s, sigma, alpha, throttle, interval):
+def test_any_number_gives_a_cutoff_within_the_limits_or_nan(s, sigma, alpha, interval):
     """Numbers from a topic may be anything; nothing overflows, and NaN is for the unknown."""
-    got = wanted_cutoff(s, sigma, alpha, throttle, interval)
-    known = (math.isfinite(throttle) if s.law == 'throttle' else
-             math.isfinite(sigma) and sigma >= 0.0)
+    got = wanted_cutoff(s, sigma, alpha, interval)
+    known = math.isfinite(sigma) and sigma >= 0.0
     assert s.fmin <= got <= s.fmax if known else math.isnan(got)

@@ -13,7 +13,7 @@ SIGMA = st.one_of(st.floats(0.0, 10.0), ANY)
 CHANGE = st.one_of(st.none(), st.fixed_dictionaries({}, optional={
     'fmin': st.sampled_from([0.01, 5.0, 20.0, 60.0]), 'fmax': st.sampled_from([100.0, 3000.0]),
     'max_lag': st.sampled_from([0.0, 30.0]), 'fallback': st.sampled_from([70.0, 99.0]),
-    'law': st.sampled_from(['threshold', 'constant_noise', 'kalman', 'throttle']),
+    'law': st.sampled_from(['threshold', 'constant_noise', 'kalman']),
     'slew': st.sampled_from([0.0, 4.0]), 'shadow': st.booleans()}))
 
 
@@ -47,8 +47,8 @@ def test_any_stamps_sigma_and_parameters(order, blocks):
             stamps = 100.0 * rng.random(n)
         t = float(stamps[-1]) if math.isfinite(stamps[-1]) else 100.0
         x = rng.standard_normal(n)
-        out = f.filter(stamps, x, sigma, throttle=0.5) if seed % 2 else np.array(
-            [f.filter(*one, sigma, throttle=0.5) for one in zip(stamps, x)])
+        out = f.filter(stamps, x, sigma) if seed % 2 else np.array(
+            [f.filter(*one, sigma) for one in zip(stamps, x)])
         check(f)
         assert not np.isinf(out).any()
         assert f.settings.law == 'kalman' or np.nanmax(np.abs(np.append(out, 0.0))) < 10.0

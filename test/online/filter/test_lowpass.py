@@ -54,12 +54,12 @@ def test_the_cutoff_may_jump_at_every_sample(order, mode):
 
 # Another accepted value of every parameter, with what it needs beside it.
 CHANGES = [
-    {'order': 1}, {'law': 'threshold'}, {'law': 'throttle'}, {'law': 'kalman', 'n0': 1e-6},
+    {'order': 1}, {'law': 'threshold'}, {'law': 'kalman', 'n0': 1e-6},
     {'law': 'kalman', 'n0': 1e-6, 'coupling': 1.0},
     {'fmin': 3.0}, {'fmax': 400.0}, {'max_lag': 30.0}, {'lag_frequency': 3.0},
     {'sigma_ref': 0.01}, {'coupling': 0.4}, {'coupling': 0.4, 'noise_wanted': 0.1},
-    {'n0': 1e-3}, {'alpha': 5.0}, {'expo': 1.0},
-    {'smoothing': 0.0}, {'smoothing_error': 1.0}, {'smoothing_range': 2.0}, {'slew': 0.0},
+    {'n0': 1e-3}, {'alpha': 5.0},
+    {'smoothing': 0.0}, {'slew': 0.0},
     {'dead_band': 0.0}, {'fallback': 30.0}, {'shadow': True}, {'stale_after': 5.0}]
 
 
@@ -79,7 +79,7 @@ def test_no_parameter_change_moves_the_output(change, mode):
     x = np.random.default_rng(0).standard_normal(100)
     going_on = x[-1] + (x[-1] - x[-2]) * 1e-6
     # 2 pi 400 Hz 1 ns = 2.5e-6 of the distance to the input.
-    assert f.filter(0.099 + 1e-9, going_on, 0.5, throttle=0.3) == pytest.approx(
+    assert f.filter(0.099 + 1e-9, going_on, 0.5) == pytest.approx(
         y, abs=2e-5 * (1e3 if mode == 'derivative' else 1.0))
 
 
@@ -223,7 +223,7 @@ def test_time_line_of_a_sigma_that_fails_and_comes_back():
     assert cutoffs[there - 10] < 75.0 == cutoffs[there + 10]
 
 
-def test_confidence_and_throttle_are_used():
+def test_confidence_is_used():
     t, x = np.arange(50) * 1e-3, np.zeros(50)
     sigma = np.where(t < 0.01, 0.3, 0.6)
     got = []
@@ -232,9 +232,6 @@ def test_confidence_and_throttle_are_used():
         f.filter(t, x, sigma, sigma_se=error)
         got.append(f.cutoff)
     assert got[0] < got[1] < got[2]
-    f = AdaptiveLowPass(law='throttle', fmin=50.0)
-    f.filter(t, x, NAN, throttle=np.linspace(0.0, 1.0, 50)[0])
-    assert f.cutoff == 50.0
 
 
 def test_lag_is_that_of_the_cutoff_in_force():
@@ -266,7 +263,7 @@ def test_mode_does_not_change_while_filtering():
     ({'max_lag': 20.0, 'fallback': 30.0}, 'fmin by max_lag 20 degrees'),
     ({'law': 'kalman'}, 'needs the noise'), ({'law': 'wiener'}, 'unknown .wiener'),
     ({'noise_wanted': 1.0}, 'needs coupling'), ({'shadow': 1}, 'true or false'),
-    ({'slew': -1.0}, 'slew'), ({'smoothing_range': 0.5}, 'smoothing_range')])
+    ({'slew': -1.0}, 'slew')])
 def test_bad_options_are_refused_by_name_and_the_old_ones_stay(options, words):
     """At the start and later."""
     with pytest.raises(ValueError, match=words) as caught:
@@ -288,7 +285,7 @@ def test_limits_alone_are_enough():
 @pytest.mark.parametrize('arguments, more, words', [
     (([0.0, 1.0], [1.0], 0.1), {}, 't and x'),
     (([0.0, 1.0], [1.0, 2.0], [0.1] * 3), {}, 'sigma'),
-    (([0.0, 1.0], [1.0, 2.0], 0.1), {'throttle': [0.1]}, 'throttle')])
+    (([0.0, 1.0], [1.0, 2.0], 0.1), {'alpha': [0.1]}, 'alpha')])
 def test_shapes_must_agree(arguments, more, words):
     with pytest.raises(ValueError, match=words):
         AdaptiveLowPass().filter(*arguments, **more)
