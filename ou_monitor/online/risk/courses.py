@@ -144,10 +144,11 @@ def lowest(state: LoadState, courses: Courses, horizon: float, sampling: Samplin
     first = np.minimum(stay, max(2.0 * dt, _RISE * INRUSH_TIME))
     tau = np.stack([first, stay - first, span - stay], axis=1)
     u = np.stack([peak, peak, courses.rest], axis=1)
-    up = np.maximum(0.0, peak - state.throttle) * _SHARE_OF_RISE
+    # A median of three shows inrush and noise of a rise if two samples are within the ramp.
+    up = np.maximum(0.0, peak - state.throttle) * _SHARE_OF_RISE * min(
+        max(_RAMP / dt - 1.0, 0.0), 1.0)
     inrush = np.zeros_like(u)
-    # A median of three shows it if two samples are within the ramp.
-    inrush[:, 0] = up * min(max(_RAMP / dt - 1.0, 0.0), 1.0)
+    inrush[:, 0] = up
     rows = _groups(state, u, tau, inrush)
     activity = np.full_like(u, sampling.activity)
     activity[:, 0] = np.maximum(np.sqrt(up), sampling.activity)

@@ -91,7 +91,7 @@ def below(level: float, mean: FloatArray, deviation: FloatArray) -> FloatArray:
 def _wider(spread: FloatArray, deviation: float, misses: tuple[float, float]) -> FloatArray:
     n, squares = misses
     first = np.minimum(np.hypot(spread, deviation), _WIDEST * spread)
-    missed = np.sqrt((_FIRST * first * first + squares * spread * spread) / (_FIRST + n))
+    missed = np.sqrt((_FIRST * first * first + squares) / (_FIRST + n))
     return np.asarray(np.maximum(first, missed))
 
 
@@ -164,7 +164,7 @@ class ContradictionRate:
 
     @property
     def misses(self) -> tuple[float, float]:
-        """Return number and sum of squares of the misses that contradict, in deviations."""
+        """Return number and sum of squares, V^2, of the misses that contradict."""
         return self._wrong - 1.0, self._squares
 
     def add(self, law: float, far: float, weight: float, elapsed: float, miss: float = 0.0
@@ -172,7 +172,7 @@ class ContradictionRate:
         """
         Learn from the two densities, 1/V, of a lowest voltage; return that of the mixture.
 
-        miss: how far that voltage is below the law's mean, in deviations of the law; else 0.
+        miss: how far that voltage is below the law's mean, V; else 0.
         """
         keep = math.exp(-elapsed / MEMORY)
         share = self.value
@@ -270,7 +270,7 @@ class _HorizonLaws:
             found = density(y, middle, spread)
             wide = density(y, middle[:1], _wider(spread[:1], begun.deviation, self.held.misses))
             self.held.add(float(found[0]), float(wide[0]), weight, elapsed,
-                          max(float((middle[0] - low) / spread[0]), 0.0))
+                          max(float(middle[0] - low), 0.0))
             other = _HALF * far + (1.0 - _HALF) * float(shares @ found[1:])
             self.calibrator.add(low, float(mean[0]), float(deviation[0]), start, weight, elapsed)
         self.evidence *= math.exp(-elapsed / MEMORY)

@@ -10,7 +10,7 @@ from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.risk.first_passage import brownout_probability
 from ou_monitor.online.risk.flag import FlagLevel
-from ou_monitor.online.risk.forecast import Forecast, throttle_budget
+from ou_monitor.online.risk.forecast import _wider, Forecast, throttle_budget
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, Status
 from ou_monitor.timeline import Batch
@@ -395,6 +395,13 @@ def test_dips_that_throttle_does_not_tell_are_counted():
     for k in range(0, t.size, 10):
         monitor.push(t[k:k + 10], v[k:k + 10], u[k:k + 10])
     assert 0.02 < monitor.risk_if(1.0, 2.0, 9.0, 2.0) < 0.5
+
+
+def test_misses_widen_a_law_by_their_volts():
+    """Ten misses of 0.1 V, ten deviations at idle, do not make full throttle ten times as wide."""
+    wide = _wider(np.array([0.01, 0.5]), 0.02, (10.0, 10.0 * 0.1 ** 2))
+    assert wide == pytest.approx([math.sqrt((4.0 * (0.01 ** 2 + 0.02 ** 2) + 0.1) / 14.0),
+                                  math.hypot(0.5, 0.02)])
 
 
 def test_the_risk_does_not_fall_with_the_horizon():

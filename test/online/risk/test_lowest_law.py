@@ -63,6 +63,20 @@ def test_a_slow_sensor_misses_the_inrush(interval, share):
     assert deviation == pytest.approx(share * 0.5 * 0.02 / 0.2 * 30.0, abs=1e-5)
 
 
+@pytest.mark.parametrize('interval, share', [(0.1, 1.0), (0.16, 0.25), (0.25, 0.0)])
+def test_a_slow_sensor_misses_the_noise_of_a_rise(interval, share):
+    """As it misses the inrush: a source of 5 Hz never had so large a change between samples."""
+    noisy = state(log_variance=(2.0 * math.log(NOISE), 0.0, 8.0), mean=COEFFICIENTS * (
+        np.arange(2 + SIZE) == 0))
+    mean, deviation = lowest(noisy, held(0.9, 2.0 * interval, 0.4), 2.0 * interval,
+                             Sampling(interval, 0.0))
+    plain, narrow = lowest(replace(noisy, log_variance=(2.0 * math.log(NOISE), 0.0, 0.0)),
+                           held(0.9, 2.0 * interval, 0.4), 2.0 * interval, Sampling(interval, 0.0))
+    factor = math.exp(0.5 * 8.0 * math.sqrt(0.05 * share))
+    assert 16.0 - mean[0] == pytest.approx(factor * (16.0 - plain[0]))
+    assert deviation[0] == pytest.approx(factor * narrow[0])
+
+
 def test_a_peak_and_its_lag():
     """Throttle after a lag of 2 s, the mean of its way to the peak; the noise is far smaller."""
     coefficients = COEFFICIENTS.copy()
