@@ -184,7 +184,6 @@ class FlightModel:
     level: float
     level_se: float
     damping: Damping  # Damping of the load's path
-    spread: float  # Factor on the variance of the slow process, from held-out parts
     sag_error: float  # Relative error of the sag, from held-out parts
     noise: FlightNoise  # The residual
     until: float  # End of the fitted part, s
@@ -225,7 +224,7 @@ class FlightModel:
             # The mean over the fitted part is known, so with a larger sag the level is higher.
             path = resized - float((resized - path)[samples.t <= self.until].mean())
             voltage = self.damping.of(path, samples.t)
-            slow = self.spread * self.load.slow_std ** 2
+            slow = self.load.slow_std ** 2
         if slow > 0.0:
             voltage = voltage + simulate(
                 samples.t, 1.0 / SLOW_TIME, math.sqrt(2.0 * slow / SLOW_TIME), rng)
@@ -267,8 +266,6 @@ _CLEAR = 1.0
 _MOST = 40_000
 # Time constants tried for the damping, s.
 _FAST = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64)
-# Number of models drawn for the error of a mean.
-_DRAWN = 16
 
 
 def fit_flight(samples: Readings, report: Callable[[float], None]) -> FlightModel:
@@ -291,12 +288,10 @@ def fit_flight(samples: Readings, report: Callable[[float], None]) -> FlightMode
                       0.0 if load is None else load.slow_std ** 2)
     duration = float(samples.t[-1] - samples.t[0])
     report(1.0)
-    spread, sag_error = (1.0, 0.0) if best is None else (
-        _spread(samples, best), _sag_error(samples, best))
     return FlightModel(
         load, None if best is None else best.other, 0.0 if best is None else best.doubt,
-        mean, noise.mean_error(duration), damped, spread, sag_error, noise,
-        float(samples.t[-1]))
+        mean, noise.mean_error(duration), damped,
+        0.0 if best is None else _sag_error(samples, best), noise, float(samples.t[-1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -391,17 +386,3 @@ def _sag_error(samples: Readings, load: _Load) -> float:
         weights.append(float(moved @ moved))
         squares.append((float(moved @ errors) / max(weights[-1], 1e-300)) ** 2)
     return math.sqrt(float(np.dot(squares, weights)) / max(sum(weights), 1e-300) / 2.0)
-
-
-def _spread(samples: Readings, load: _Load) -> float:
-    """Return the factor by which the variance of slow errors exceeds the fit."""
-    rng = np.random.default_rng(0)
-    ratios = []
-    for (fit, errors), part in zip(load.parts, _parts(samples)):
-        means = [fit.draw(rng).path(samples.t, samples.throttle, load.current)[part].mean()
-                 for _ in range(_DRAWN)]
-        # Variance of the mean of an OU over this number of relaxation times.
-        times = float(samples.t[part.stop - 1] - samples.t[part.start]) / SLOW_TIME
-        slow = fit.slow_std ** 2 * 2.0 / times * (1.0 + math.expm1(-times) / times)
-        ratios.append((float(errors.mean()) ** 2 - float(np.var(means, ddof=1))) / slow)
-    return max(1.0, float(np.mean(ratios)))
