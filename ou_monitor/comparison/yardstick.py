@@ -195,6 +195,7 @@ class Yardstick:
         self.bands = np.geomspace(lowest, highest, _BANDS + 1)
         self.rises = _rise_times(t, samples.throttle)
         self.after = np.linspace(-_BEFORE, _AFTER, _POINTS)
+
     def measure(self, v: FloatArray) -> Measures:
         """Measure a voltage at the stamps of the part, V."""
         dips = [dip_begins(v, level, self._rise).size / self.minutes for level in self.levels]
