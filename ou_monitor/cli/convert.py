@@ -40,15 +40,14 @@ def _convert(args: argparse.Namespace, log: Any) -> int:
 
     chosen = choose(args.log, log, voltage=args.voltage, throttle=args.throttle,
                     current=args.current)
-    extras = choose_extras(args.log, log, imus=args.imu, signals=args.signal)
+    extras = choose_extras(args.log, log, imu=args.imu, signals=args.signal)
     about = {'log_file': args.log.name, 'log_format': log.format,
              'log_time': 'as in the file, s' if log.format == 'csv' else
              's from the start of the log',
              **{f'log_{key}': value for key, value in log.facts.items()}}
     with Progress('writing', args.json == output.STDOUT) as progress, \
             output.replacing(args.out, args.force):
-        topics, moved = write_log(chosen, extras, args.out, about, kind=args.type,
-                                  progress=progress)
+        topics, moved = write_log(chosen, extras, args.out, about, progress=progress)
     notes = (*log.notes, *chosen.notes, *extras.notes, *moved)
     volts = chosen.voltage
     duration = float(volts.t[-1] - volts.t[0])
@@ -68,7 +67,7 @@ def _convert(args: argparse.Namespace, log: Any) -> int:
 
 def _topic_contents(chosen: Any, extras: Any) -> dict[str, dict[str, Any]]:
     found = {'voltage': chosen.voltage, 'throttle': chosen.throttle, 'current': chosen.current,
-             **extras.signals, **extras.inertial, 'motor_speed': extras.speeds}
+             **extras.signals, 'imu': extras.imu, 'motor_speed': extras.speeds}
     return {f'/{topic}': {'field': one.name, 'scale': one.scale, 'what': one.words,
                           'unit': one.unit, 'n': int(one.t.size)}
             for topic, one in found.items() if one is not None}
@@ -76,7 +75,7 @@ def _topic_contents(chosen: Any, extras: Any) -> dict[str, dict[str, Any]]:
 
 def _list(args: argparse.Namespace, log: Any) -> int:
     import numpy as np
-    from ou_monitor.recordings.importers.choose import default, default_inertial
+    from ou_monitor.recordings.importers.choose import default, default_gyro
     from ou_monitor.recordings.importers.log import CURRENT, SIGNAL, THROTTLE, VOLTAGE
 
     taken = {quantity: [one.name for one in default(log, quantity)]
@@ -93,7 +92,7 @@ def _list(args: argparse.Namespace, log: Any) -> int:
             'default': one.name in taken.get(one.quantity, ()), 'n': one.n,
             'rate_hz': one.rate, 'min': low, 'max': high, 'unit': one.unit,
             'repeats': one.repeats, 'scale': one.scale})
-    gyros = _gyros(log, {one.name for one in default_inertial(log)})
+    gyros = _gyros(log, default_gyro(log))
     several = [f'Several series are candidates for {quantity}: choose by --{quantity} NAME.'
                for quantity in (VOLTAGE, THROTTLE) if len(taken[quantity]) > 1]
     speeds = [] if log.speeds is None else list(log.speeds.motors)
@@ -116,9 +115,9 @@ def _list(args: argparse.Namespace, log: Any) -> int:
     return 0
 
 
-def _gyros(log: Any, taken: set[str]) -> list[dict[str, Any]]:
+def _gyros(log: Any, taken: Any) -> list[dict[str, Any]]:
     """Return the series that could become sensor_msgs/Imu."""
     return [{'name': one.name, 'what': one.words, 'n': int(one.t.size), 'scale': one.scale,
              'angular_velocity': 'angular_velocity' in one.vectors,
-             'acceleration': 'linear_acceleration' in one.vectors, 'default': one.name in taken}
+             'acceleration': 'linear_acceleration' in one.vectors, 'default': one is taken}
             for one in log.inertial]

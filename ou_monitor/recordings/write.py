@@ -36,7 +36,7 @@ TYPES = {
 # Maximum samples encoded at once, which limits memory; a multiple of BLOCK.
 SLICE = 1000
 
-# An adc_block of a log: rate of its samples, Hz, and samples per block.
+# Usual rate of the samples in an adc_block, Hz, and samples per block.
 BLOCK_RATE = 10000.0
 BLOCK = 100
 
@@ -165,23 +165,21 @@ def check_steady(name: str, since_first: npt.NDArray[np.int64], before: int,
 
 def write_log(
     chosen: ChosenSeries, extras: Extras, path: Path, about: Mapping[str, str], *,
-    kind: str = 'battery_state', progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> tuple[dict[str, str], tuple[str, ...]]:
     """Write a bag (progress 0..1)."""
     # At equal times the voltage comes last, after the values that hold for it.
     held: dict[str, Series | Motion | None] = {
-        'throttle': chosen.throttle, 'current': chosen.current, **extras.inertial,
+        'throttle': chosen.throttle, 'current': chosen.current, 'imu': extras.imu,
         SPEEDS: extras.speeds, **extras.signals, 'voltage': chosen.voltage}
     streams = {topic: one for topic, one in held.items() if one is not None}
-    kinds = {'throttle': FLOAT32, 'current': FLOAT32, **dict.fromkeys(extras.inertial, IMU),
-             SPEEDS: JOINT_STATE, **dict.fromkeys(extras.signals, FLOAT64), 'voltage': TYPES[kind]}
+    kinds = {'throttle': FLOAT32, 'current': FLOAT32, 'imu': IMU, SPEEDS: JOINT_STATE,
+             **dict.fromkeys(extras.signals, FLOAT64), 'voltage': BATTERY_STATE}
     first = min(float(one.t[0]) for one in streams.values())
     shift = max(0, -round(first * 1e9))
     total = sum(one.t.size for one in streams.values())
     # Refused before anything is written to disk.
     stamps = {topic: as_nanoseconds(one.t, one.name) + shift for topic, one in streams.items()}
-    if kind == 'adc_block':
-        check_steady(chosen.voltage.name, stamps['voltage'] - stamps['voltage'][0], 0, BLOCK_RATE)
     whole, origins = {**about}, {}
     for topic, one in streams.items():
         _check_header(kinds[topic], one.name, stamps[topic])
@@ -191,9 +189,7 @@ def write_log(
     with BagWriter(path, about=whole) as bag:
         # Topics in the order of the table of contents: the voltage first.
         for topic in reversed(streams):
-            rate = BLOCK_RATE if kinds[topic] == FLOAT32_ARRAY else None
-            bag.add_topic(topic, kinds[topic], sample_rate=rate,
-                          origin={**about, **origins[topic]})
+            bag.add_topic(topic, kinds[topic], origin={**about, **origins[topic]})
         names = [f'/{topic}' for topic in streams]
         parts = [_messages(k, kinds[topic], stamps[topic], one)
                  for k, (topic, one) in enumerate(streams.items())]

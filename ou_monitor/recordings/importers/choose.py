@@ -205,29 +205,26 @@ _GAP = 3.0
 class Extras:
     """Series chosen from a log beside voltage, throttle and current."""
 
-    inertial: dict[str, Motion]  # By topic, without the slash
+    imu: Motion | None  # Gyro, with its accelerometer
     speeds: Motion | None  # Speeds of the motors
     signals: dict[str, Series]  # By topic, without the slash
     notes: tuple[str, ...]  # Dropped samples, and quantities missing in the log
 
 
-def choose_extras(path: Path, log: Log, *, imus: Sequence[str] = (),
+def choose_extras(path: Path, log: Log, *, imu: str | None = None,
                   signals: Sequence[str] = ()) -> Extras:
-    """Choose the requested or the default gyro, and the named series."""
+    """Choose the named or the default gyro, and the named series."""
     notes: list[str] = []
-    inertial: dict[str, Motion] = {}
-    for one in _inertial(path, log, imus):
-        kept, said = clean_motion(one)
-        notes += prefixed(one.name, (*said, *pace_notes(kept.t)))
-        if not kept.t.size:
-            notes.append(f'{one.name} has no usable sample.')
-            continue
-        name = IMU if not inertial else f'{IMU}_{topic_of(one.name)}'
-        inertial[name] = kept
-    if not inertial and NONE not in imus and log.format != 'csv':
+    gyro = _gyro(path, log, imu)
+    if gyro is not None:
+        gyro, said = clean_motion(gyro)
+        notes += prefixed(gyro.name, (*said, *pace_notes(gyro.t)))
+        if not gyro.t.size:
+            notes.append(f'{gyro.name} has no usable sample.')
+            gyro = None
+    if gyro is None and imu != NONE and log.format != 'csv':
         notes.append('The log holds no gyro, so there is no topic /imu.')
-    others = [one.name for one in log.inertial if one.name not in {
-        kept.name for kept in inertial.values()}]
+    others = [one.name for one in log.inertial if gyro is None or one.name != gyro.name]
     if others:
         notes.append(f"Also in the log: {', '.join(others)} (--imu NAME).")
     speeds = log.speeds
@@ -241,14 +238,14 @@ def choose_extras(path: Path, log: Log, *, imus: Sequence[str] = (),
         notes += said
         if series.unit == UNKNOWN:
             notes.append(f'{name}: the log does not state its unit; written as it is logged.')
-        named[_unused_topic(topic_of(name), {*_TAKEN, *inertial, *named})] = series
-    return Extras(inertial, speeds, named, tuple(notes))
+        named[_unused_topic(topic_of(name), {*_TAKEN, *named})] = series
+    return Extras(gyro, speeds, named, tuple(notes))
 
 
-def default_inertial(log: Log) -> list[Motion]:
-    """Return the default series for /imu: one, or none."""
-    ranked = [one for one in log.inertial if one.rank is not None and one.t.size]
-    return sorted(ranked, key=lambda one: one.rank or 0)[:1]
+def default_gyro(log: Log) -> Motion | None:
+    """Return the default series for /imu."""
+    return min((one for one in log.inertial if one.rank is not None and one.t.size),
+               key=lambda one: one.rank or 0, default=None)
 
 
 def named_series(path: Path, log: Log, name: str) -> Series:
@@ -286,15 +283,15 @@ def _by_topic(path: Path, log: Log, signal: str) -> Series | None:
         return None
     name, column, field = found.groups()
     if field is not None:
-        held = _inertial(path, log, () if name == IMU else (name,))
+        held = _gyro(path, log, None if name == IMU else name)
     elif name == SPEEDS:
-        held = [log.speeds] if log.speeds else []
+        held = log.speeds
     else:
         return None
-    if not held:
+    if held is None:
         raise InputError(f"{path} holds no {'motor speeds' if field is None else 'gyro'}"
                          + ''.join(f' ({note})' for note in log.notes if 'eRPM' in note))
-    one, _ = clean_motion(held[0])
+    one, _ = clean_motion(held)
     if column not in one.columns:
         raise InputError(f"{path}: '{name}' has no {column}: it holds {', '.join(one.columns)}")
     return Series(signal, SIGNAL, one.t, one.columns[column], one.scale,
@@ -320,21 +317,15 @@ def _unused_topic(topic: str, taken: set[str]) -> str:
     return free
 
 
-def _inertial(path: Path, log: Log, names: Sequence[str]) -> list[Motion]:
-    if not names:
-        return default_inertial(log)
-    found = []
+def _gyro(path: Path, log: Log, name: str | None) -> Motion | None:
+    """Return the gyro of a name; None: the default, if there is one."""
+    if name is None or name == NONE:
+        return None if name else default_gyro(log)
     known = [one.name for one in log.inertial]
-    for name in dict.fromkeys(names):
-        if name == NONE:
-            if len(names) > 1:
-                raise InputError("--imu: 'none' cannot be combined with a gyro")
-            return []
-        if name not in known:
-            raise InputError(f"{path} has no gyro '{name}': "
-                             + (nearest(name, known) if known else 'it holds none'))
-        found += [one for one in log.inertial if one.name == name]
-    return found
+    if name not in known:
+        raise InputError(f"{path} has no gyro '{name}': "
+                         + (nearest(name, known) if known else 'it holds none'))
+    return log.inertial[known.index(name)]
 
 
 def clean_motion(one: Motion) -> tuple[Motion, tuple[str, ...]]:
