@@ -245,13 +245,9 @@ class Block:
 
 
 class IioBuffer:
-    """
-    The buffer of one IIO device: its folder in sysfs and its character device.
+    """The buffer of one IIO device: its folder in sysfs, and its character device."""
 
-    `channel` is 'in_voltage0' or empty (the only one); `block` samples are read at a time (0: as
-    many as in 10 ms); `rate`, Hz, and `trigger` are set unless 0 or empty.  The attributes: `rate`
-    of the device, NaN if unknown, and `holes`, the number of gaps in its stamps.
-    """
+    # `block` 0: the samples of 10 ms; `rate`, Hz, and `trigger` are set unless 0 or empty.
 
     def __init__(self, folder: Path, character: Path, channel: str = '', block: int = 0,
                  rate: float = 0.0, trigger: str = '') -> None:

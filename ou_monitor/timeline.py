@@ -191,13 +191,10 @@ def _several_sizes(sizes: FloatArray) -> bool:
 
 
 class Repeats:
-    """
-    Drops repeats from a stream, in batches of any size; `period`: samples per refresh.
+    """Drops repeats from a stream, in batches of any size; `period`: samples per refresh."""
 
-    A refresh may return the previous value; to drop it as a repeat would bias the noise.  So in a
-    run longer than a period, a refresh is assumed where it is due, and passed on half a period
-    later.
-    """
+    # A refresh may return the previous value, and dropping it would bias the noise.  So in a long
+    # run a refresh is assumed each period, and passed on half a period later.
 
     def __init__(self) -> None:
         self.period = 1.0
@@ -265,12 +262,9 @@ def refreshes(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, flo
 
 
 def reading_times(t: FloatArray, period: float) -> FloatArray:
-    """
-    Return the reading times of a source from the stamps of their first log entries, s.
-
-    A logger is late by up to one of its steps.  A source with its own clock, whose period is not a
-    whole number of those steps, was read on the even grid nearest to the stamps.
-    """
+    """Return the reading times of a source from the stamps of their first log entries, s."""
+    # A logger is late by up to one of its steps.  A source with its own clock, whose period is not
+    # a whole number of those steps, was read on the even grid nearest to the stamps.
     if t.size < 2 or abs(period - round(period)) < _WHOLE:
         return t
     usual = (t[-1] - t[0]) / (t.size - 1)

@@ -57,14 +57,11 @@ PUBLISH_RATE = Parameter('publish_rate', 10.0, 'How often the outputs are publis
 
 
 class MonitorNode(Node):
-    """
-    Node whose parameters come from tables.
+    """Node whose parameters come from tables; a managed one begins when it is activated."""
 
-    Changes to `RUN_TIME` parameters are checked together (`check` raises `ValueError` with the
-    reason, and the old values stay), then passed to `apply`, which must keep all state. `FIXED`
-    ones are read at the start. A managed node (lifecycle) reads them and begins on each
-    activation; any other node begins at the end of its constructor.
-    """
+    # Changes of `RUN_TIME` parameters are checked together (`check` raises `ValueError`, and the
+    # old values stay), then given to `apply`, which must keep all state. `FIXED` ones are read at
+    # the start.
 
     RUN_TIME: ClassVar[tuple[Parameter, ...]] = ()
     FIXED: ClassVar[tuple[Parameter, ...]] = ()

@@ -41,13 +41,7 @@ _HISTORY, _LARGEST = 200, 2_000_000
 
 
 class ModelChoice:
-    """
-    Model of the parameter `model_file`.
-
-    A file is read when the path changes, not when another parameter does: to reload it, give an
-    empty path and then the old one.  It is read in a thread, and the check waits for it, so that
-    its answer is final.
-    """
+    """Model of the parameter `model_file`; a file is read in a thread when the path changes."""
 
     def __init__(self) -> None:
         self._used: _Chosen = '', None, b''

@@ -36,21 +36,9 @@ by the trapezoidal rule with g = tan(pi f dt), so that the zero lies on f exactl
 
 A step of the coefficients moves y within the sample, so the caller moves them smoothly.
 
-**Stable under any sequence of f, k and m.**  With A = [[-k, -1], [1, 0]] and
-P = [[1, e], [e, 1]],
-
-    -(A^T P + P A) = [[2 k - 2 e, k e], [k e, 2 e]]
-
-is positive definite if 4 k > e (4 + k^2).  Any e < 4 K / (4 + K^2), with the least k, K, suits
-all k in K..2, so V(s) = s^T P s is a Lyapunov function of all of them.  The rule gives
-s+ - s = 2 g (A v + b x) and s+ + s = 2 v, so
-
-    V(s+) - V(s) = 2 g (v^T (A^T P + P A) v + 2 x b^T P v),
-
-which is negative if |v| > 2 |P b| X / q, with the least eigenvalue q of the form above and a
-bound X of the input.  A large state implies a large v, because |v| >= (|s| - g X) / |I - g A| and
-`HIGHEST` bounds g.  So the state is bounded (test_biquads.py computes the bound; adversarial
-sequences reach a tenth of it).  m, in 0..1, is outside the loop.
+Stable under any sequence of f, k and m: with K the least k, P = [[1, e], [e, 1]] and
+e < 4 K / (4 + K^2), s^T P s is a Lyapunov function for every k in K..2, and m is outside the loop.
+test_biquads.py computes the bound of the state; adversarial sequences reach a tenth of it.
 """
 
 from __future__ import annotations

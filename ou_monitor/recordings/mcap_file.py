@@ -726,13 +726,9 @@ def _all_records(data: bytes, begins: IntArray) -> tuple[IntArray, list[tuple[in
 
 def _by_index(data: bytes, indexes: Sequence[bytes], begins: IntArray,
               ) -> tuple[IntArray, list[tuple[int, int, int]]] | None:
-    """
-    Return the records of chunks as `_records`, by the message indexes behind each.
-
-    begins: start of each chunk in `data`, and the end of the last.  None if the messages
-    in these indexes and records of other kinds do not fill each chunk from end to end: then the
-    indexes do not describe the chunks.
-    """
+    """Return the records of chunks as `_records`; None if the indexes do not describe them."""
+    # begins: start of each chunk in `data`, and the end of the last.  Messages in the indexes and
+    # records of other kinds must fill each chunk from end to end.
     parts = [np.empty(0, np.int64)]
     for first, index in zip(begins.tolist(), indexes):
         at = 0

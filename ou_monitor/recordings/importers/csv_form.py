@@ -451,11 +451,8 @@ def _stated_step(lines: list[str], above: list[list[str]]) -> tuple[float, str]:
 def numbers(path: Path, form: Form, places: Sequence[int],
             texts: dict[int, list[str]] | None = None,
             left_out: list[str] | None = None) -> list[FloatArray]:
-    """
-    Return columns of numbers, NaN where blank; `texts` gets cells as written.
-
-    A bad line raises InputError; with `left_out`, it is dropped and its error is appended there.
-    """
+    """Return columns of numbers, NaN where blank; `texts` gets cells as written."""
+    # A bad line raises InputError, or with `left_out` is dropped and its error appended there.
     parts: list[list[FloatArray]] = [[] for _ in places]
     last = max([*places, *(texts or {})])
     width = len(form.names)
@@ -564,12 +561,8 @@ def _fitting(path: Path, rows: list[list[str]], width: int, last: int, form: For
 
 def _floats(cells: Sequence[str], where: Callable[[int], str], comma: bool, stated: str,
             good: npt.NDArray[np.bool_] | None, left_out: list[str] | None) -> FloatArray:
-    """
-    Return cells as numbers (where: words for the place of one; stated: their unit).
-
-    A bad cell raises InputError; with `good`, its line is marked there instead, and the error is
-    appended to `left_out`, once per line.
-    """
+    """Return cells as numbers (where: the place of one in words; stated: their unit)."""
+    # A bad cell raises InputError, or with `good` marks its line there and appends the error once.
     try:
         values = np.fromiter(map(float, cells), np.float64, len(cells))
         # As in `plain_number`.

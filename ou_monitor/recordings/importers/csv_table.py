@@ -228,11 +228,7 @@ def holds_supply(path: Path) -> bool:
 
 def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: bool = False,
            left_out: list[str] | None = None) -> _Table:
-    """
-    Read time, the columns of a supply, and others by name (needed: a voltage must be there).
-
-    left_out as in `numbers`.
-    """
+    """Read time, the columns of a supply, and others by name (needed: with a voltage)."""
     raw = form = form_of(path, wanted)
     time = clock = _time_of(path, form, wanted)
     if series := _series_of(path, form, wanted, time):
@@ -416,12 +412,9 @@ def _nameless_columns(form: Form) -> list[int]:
 
 
 def _steadiest(form: Form, places: list[int]) -> list[int]:
-    """
-    Return the only column, or the first of several if its relative variation is the smallest.
-
-    A load changes a supply's voltage by a few percent, and its current by far more.  Columns that
-    are constant, or anywhere below 1, are not compared.
-    """
+    """Return the only column, or the first of several if its relative variation is smallest."""
+    # A load changes a supply's voltage by a few percent, and its current by far more.  Constant
+    # columns, and those anywhere below 1, are not compared.
     if len(places) < 2 or form.line or len(form.rows) < _FEW_ROWS:
         return places if len(places) == 1 else []
     values = np.array([[number_of(row[k])[0] if is_number(row[k]) else math.nan for k in places]
@@ -546,12 +539,9 @@ def _read(path: Path, form: Form, time: _Column, places: list[int],
 
 def _check_one_series(path: Path, form: Form, t: FloatArray, column: str, values: FloatArray,
                       ) -> None:
-    """
-    Raise InputError if a column of text names several series that share a column of values.
-
-    Signs of several series: stamps rise within each, and either overlap between them, or the
-    series alternate in a column without a telling name.
-    """
+    """Raise InputError if a column of text names several series that share a column of values."""
+    # Their stamps rise within each, and overlap, or the series alternate in a column without a
+    # telling name.
     known = np.isfinite(t) & np.isfinite(values)
     stamps = t[known]
     overlap = np.count_nonzero(
@@ -619,11 +609,8 @@ def _stamps(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: _Co
 
 
 def _spread(t: FloatArray, volts: FloatArray) -> FloatArray:
-    """
-    Spread rows with equal stamps evenly, if their number per stamp is steady.
-
-    The first row of a stamp is at the stamp, unless rows are missing before it.
-    """
+    """Spread rows with equal stamps evenly, if their number per stamp is steady."""
+    # The first row of a stamp is at the stamp, unless rows are missing before it.
     known = np.flatnonzero(np.isfinite(t) & np.isfinite(volts))
     stamps, change = t[known], np.diff(volts[known])
     begin = np.flatnonzero(np.diff(stamps, prepend=math.inf))
@@ -656,12 +643,7 @@ def _spread(t: FloatArray, volts: FloatArray) -> FloatArray:
 
 def _in_si(quantity: str, column: _Column, values: FloatArray, given: str | None,
            volts: FloatArray, beside: str) -> tuple[FloatArray, str]:
-    """
-    Return values in V, 0..1 or A, and their unit in words.
-
-    beside: the words of the voltage's unit.  If that is a guess of mV, a whole-number current is
-    in mA.
-    """
+    """Return values in V, 0..1 or A, and their unit in words (beside: the voltage's unit)."""
     known = np.abs(values[np.isfinite(values)])
     if quantity == logs.THROTTLE:
         unit = given or SHARE_WORDS.get(column.unit) or _PULSE_WORDS.get(column.unit)

@@ -68,13 +68,10 @@ LARGEST = 10_000
 
 
 class _WatchedFile(io.BufferedReader):
-    """
-    A file that records which bytes pyulog skips silently.
+    """A file that records which bytes pyulog skips silently, and prevents two faults of it."""
 
-    It also prevents two faults of pyulog: an endless loop, because pyulog steps back by the stated
-    length of a message even if the file ended within it; and reading the rest of the file again
-    at each byte of a damaged part.
-    """
+    # An endless loop, because pyulog steps back by the stated length of a message even if the file
+    # ended within it; and reading the rest of the file again at each byte of a damaged part.
 
     progress: Progress | None = None
     size = 1
