@@ -80,7 +80,6 @@ _BLOCK = 64 * 1024
 _MOST_RATIO = 256
 # Lowest limit of a chunk, bytes, and its largest share of the memory.
 _LEAST_LIMIT, _CHUNKS_AT_ONCE = 64 * 1024 * 1024, 8
-_VARIABLE = 'OU_MONITOR_MAX_CHUNK_MB'  # Environment variable that raises it
 
 
 class Damage(Exception):
@@ -125,19 +124,12 @@ def usable_memory() -> int:
 
 def _chunk_limit(size: int) -> int:
     """Return the bytes that a chunk of a file of `size` bytes may unpack to."""
-    text = os.environ.get(_VARIABLE, '')
-    if text:
-        try:
-            return max(1, int(float(text) * 1e6))
-        except (ValueError, OverflowError):
-            raise InputError(f'{_VARIABLE} must be a number of MB, got '
-                             f"'{printable(text, 40)}'") from None
     return max(_LEAST_LIMIT, min(_MOST_RATIO * size, usable_memory() // _CHUNKS_AT_ONCE))
 
 
 def _over_limit(what: str, length: int, limit: int) -> str:
-    return (f'{what} {length / 1e6:.4g} MB, and {limit / 1e6:.4g} MB is the limit: set '
-            f'{_VARIABLE} to allow more')
+    return (f'{what} {length / 1e6:.4g} MB, and {limit / 1e6:.4g} MB is the limit: '
+            "'ros2 bag convert' writes smaller chunks")
 
 
 def moment(log_time_ns: int, origin_ns: int) -> str:

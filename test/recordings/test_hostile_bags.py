@@ -9,6 +9,7 @@ import lz4.frame
 from made_bags import by_hand, channel, chunk, message, messages, Op, record, schema, text
 import numpy as np
 from ou_monitor.errors import InputError
+from ou_monitor.recordings import mcap_file
 from ou_monitor.recordings.bag import BagReader, BagWriter
 from ou_monitor.recordings.importers.csv_table import MOST_COLUMNS
 from ou_monitor.recordings.importers.formats import import_log
@@ -67,9 +68,9 @@ def test_a_chunk_that_unpacks_to_more(tmp_path, monkeypatch, compression, packed
         b'', compression=compression, packed=packed(), stated=stated))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     if stated != N:
-        monkeypatch.setenv('OU_MONITOR_MAX_CHUNK_MB', '64')
+        monkeypatch.setattr(mcap_file, '_chunk_limit', lambda size: 64_000_000)
     line = complaint(BagReader, path)
-    assert ('MAX_CHUNK_MB' in line) == (stated != N) and 'the chunk there is broken' in line
+    assert ('is the limit' in line) == (stated != N) and 'the chunk there is broken' in line
     bag = BagReader(path, partial=True)
     assert len(list(bag.raw_messages())) == N
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
@@ -78,12 +79,12 @@ def test_a_chunk_that_unpacks_to_more(tmp_path, monkeypatch, compression, packed
 def test_the_limit_of_a_chunk(tmp_path, monkeypatch):
     path = by_hand(tmp_path / 'a.mcap', chunk(schema() + channel() + messages(N)))
     assert BagReader(path).message_count == N
-    monkeypatch.setenv('OU_MONITOR_MAX_CHUNK_MB', '0.001')
+    monkeypatch.setattr(mcap_file, '_chunk_limit', lambda size: 1000)
     assert '0.001 MB is the limit' in complaint(BagReader, path)
-    monkeypatch.setenv('OU_MONITOR_MAX_CHUNK_MB', '1')
-    assert BagReader(path).message_count == N
-    monkeypatch.setenv('OU_MONITOR_MAX_CHUNK_MB', 'much\x1b')
-    assert 'must be a number of MB' in complaint(BagReader, path)
+    monkeypatch.undo()
+    monkeypatch.setattr(mcap_file, 'usable_memory', lambda: 800_000_000)
+    assert [mcap_file._chunk_limit(size) for size in (1000, 300_000, 10**9)] == [
+        2**26, 256 * 300_000, 10**8]
 
 
 def index_of(chunk_at, chunk_length, unpacked, *, index_length=0, offset=None):
@@ -204,9 +205,8 @@ BOMB = message(0, bytes(2**20 - 100), 1)
       for encoding in (b'\x00\x07', b'\x00\x09', b'\x00\x02', b'\x01\x01')),
 ], ids=lambda value: value.replace(' ', '-') if isinstance(value, str) else '')
 def test_what_is_refused(tmp_path, monkeypatch, parts, words):
-    monkeypatch.setenv('OU_MONITOR_MAX_CHUNK_MB', '10')
-    if words.startswith('and those'):
-        monkeypatch.setenv('OU_MONITOR_MAX_CHUNK_MB', str(2**20 / 1e6))
+    limit = 2**20 if words.startswith('and those') else 10_000_000
+    monkeypatch.setattr(mcap_file, '_chunk_limit', lambda size: limit)
     assert words in complaint(read_recording, by_hand(tmp_path / 'a.mcap', *parts), within=5.0)
 
 
