@@ -343,7 +343,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     Parameters
     ----------
     throttle : float, optional
-        Throttle, 0..1; with a recording, by default the highest flown.
+        Throttle, 0..1; with a recording, by default the one exceeded for 1 % of it.
     recording : Recording or path, optional
         Flight that gives level, sag, resistance and noise.
     network : mapping or PowerNetwork, optional
@@ -396,7 +396,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     if recording is None:
         if throttle is None:
             raise ValueError('the throttle is missing: pass 0.4 for 40 %, or a recording, whose '
-                             'highest throttle is used')
+                             '99 % quantile of throttle is used')
         circuit = network if isinstance(network, PowerNetwork) else PowerNetwork(
             **completed(dict(network or {})))
         level, source = default_voltage(circuit, rail) if voltage is None else (voltage, 'given')
@@ -419,7 +419,8 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
         if not facts.sag.known and 'battery_resistance' not in values:
             raise InputError(f'the sag of {flown.name} is unknown, so a remedy cannot be chosen: '
                              'give --set battery_resistance=OHM, or fly more changes of throttle')
-        throttle = flight.highest if throttle is None else throttle
+        # A peak of a few readings is not the throttle to design for.
+        throttle = min(1.0, flight.flown[1]) if throttle is None else throttle
         circuit = network_of(flight, throttle, values)
         if rail != 'bus' and voltage is None:
             level, source = default_voltage(circuit, rail)
@@ -466,8 +467,8 @@ def _flight(recording: Recording, full: float, cells: int, level: float | None, 
 
     return Flight(load.level, full, cells, facts.sag.throttle, facts.sag.sag_v, facts.sag.se_v,
                   facts.noise.rms_v, facts.noise.steady_rms_v, facts.noise.flown,
-                  min(1.0, float(np.nanmax(recording.throttle))), facts.resistance.ohm,
-                  facts.ou.alpha, facts.ou.var_inf), facts, risk_at if monitor else None
+                  facts.resistance.ohm, facts.ou.alpha, facts.ou.var_inf), facts, (
+                      risk_at if monitor else None)
 
 
 def reproduce(*, seed: int = 1, progress: Progress | None = None) -> Result:

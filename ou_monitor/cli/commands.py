@@ -355,7 +355,7 @@ _DESIGN = Command(
             '%(default)s)'),
      Option('--throttle', metavar='Y', type=number(
          'between 0 and 1; write 40 % as 0.4', lambda value: 0.0 <= value <= 1.0),
-            help='throttle, 0..1 (default with --from: the highest flown)'),
+            help='throttle, 0..1 (default with --from: exceeded for 1 %% of it)'),
      Option('--rail', choices=('bus', 'regulated'), default='bus',
             help='the battery bus at the ESCs, or the regulated rail (default: %(default)s)'),
      Option('--voltage', metavar='V', type=quantity('V'),

@@ -490,7 +490,6 @@ class Flight:
     noise: Sequence[float]  # Rms as flown, V
     steady: Sequence[float]  # Rms while throttle is constant, V
     flown: tuple[float, float]  # 1 % and 99 % quantile of throttle
-    highest: float  # Highest throttle, 0..1
     resistance: float  # After a second, from a measured current, Ohm
     alpha: float  # Relaxation rate of the OU, 1/s
     var_inf: float  # Variance of the OU, V^2

@@ -1,10 +1,12 @@
 """`ou-monitor design`: options in; table, sentence and JSON out; one line for bad input."""
 
 from argparse import ArgumentTypeError
+from dataclasses import replace
 import json
 import re
 
 import numpy as np
+from ou_monitor import design, read_recording
 from ou_monitor.cli.commands import quantity
 from ou_monitor.cli.main import main
 from ou_monitor.paper.design import row_of
@@ -177,6 +179,15 @@ def test_a_flight_gives_the_network(flight, capsys):
     assert present['var_inf'] == pytest.approx(0.03 ** 2, rel=0.2)
     assert present['mean'] == pytest.approx(16.2 - 0.025 * 80.0 * 0.8 ** 1.5, abs=0.15)
     assert found['brownout_voltage'] == pytest.approx(13.2) and '4 cells' in found['measured']
+
+
+def test_a_peak_of_a_few_readings_is_not_the_throttle_to_design_for(flight):
+    """Five readings at full throttle, of a flight up to 0.8."""
+    one = read_recording(flight)
+    throttle = one.throttle.copy()
+    throttle[100:105] = 1.0
+    assert design(recording=replace(one, throttle=throttle)).throttle == pytest.approx(
+        0.8, abs=0.02)
 
 
 def test_an_unknown_sag_is_not_designed_with(tmp_path, capsys):
