@@ -98,7 +98,7 @@ class EstimatorNode(MonitorNode):
         self.serve('~/clear_brownout', self._clear)
         self.serve('~/save_model', self._save_model)
         self._stamper = Stamper(self, self._jumped)
-        self._send_clock = SendClock() if values['smooth_stamps'] else None
+        self._send_clock: SendClock | None = SendClock()
         self._latch = self._open_latch(values[STATE_FILE.name])
         self._sources = SourceFinder(self, ('voltage', 'throttle'), values, self._open)
         self._sources.watch('voltage')

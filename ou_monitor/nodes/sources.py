@@ -42,8 +42,6 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
     _CONFIG, *_where('voltage', 'voltage'), *_where('throttle', 'throttle'),
     Parameter('adc.sample_rate', 0.0,
               'True rate of the samples in a block, Hz; 0: as the msg_config says.', 0.0, 1.0e9),
-    Parameter('smooth_stamps', True,
-              'Whether unstamped samples of a steady source are put on an even time line.'),
 )
 # For the node that follows the motors.
 MOTOR_PARAMETERS: tuple[Parameter, ...] = (

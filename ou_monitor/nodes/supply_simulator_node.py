@@ -46,8 +46,7 @@ FIXED_PARAMETERS: tuple[Parameter, ...] = (
               'Throttle to play, repeat and publish: a profile (flight, hover), 0..1, points T:U, '
               'or a recording; empty: use the throttle topic.'),
 )
-_SOURCES = tuple(p for p in SOURCE_PARAMETERS if p.name not in (
-    'adc.sample_rate', 'smooth_stamps'))
+_SOURCES = tuple(p for p in SOURCE_PARAMETERS if p.name != 'adc.sample_rate')
 # Types if the parameters do not specify them.
 _USUAL = {'voltage': 'sensor_msgs/msg/BatteryState', 'throttle': 'std_msgs/msg/Float32'}
 # Up to this rate, Hz, samples are drawn one by one; above it, in pieces of this length, s: a call
