@@ -177,7 +177,7 @@ def test_a_signal_that_a_bag_lacks_is_one_line(bag, signal, words, capsys):
 
 
 def test_a_log_is_taken_as_it_is(tmp_path, capsys):
-    """Series and topics of a blackbox, its refresh of the voltage, its part; what is missing."""
+    """A series of a blackbox, its refresh of the voltage, its part; what is missing."""
     rng = np.random.default_rng(4)
     n, held = 10_000, 4
     t = 0.002 * np.arange(n)
@@ -191,18 +191,15 @@ def test_a_log_is_taken_as_it_is(tmp_path, capsys):
     path = tmp_path / 'a.bbl'
     path.write_bytes(b''.join(blackbox(rows, fields, {'gyro_scale': '0x3f800000'})))
     expected = 20.0 * np.pi / 180.0
-    for signal in ('gyroADC[1]', '/imu/angular_velocity.y', 'gyroADC/angular_velocity.y'):
-        data = found(capsys, path, '--signal', signal, '--from', '2')
-        # Against the steps of the held voltage the gain were less, and the signal 3 ms ahead.
-        assert data['seen'] and data['gain_per_v'] == pytest.approx(expected, rel=0.03)
-        assert abs(data['lag_s']) < 0.5e-3 and data['signal_unit'] == 'rad/s'
-        assert data['voltage_rate_hz'] == pytest.approx(125.0, rel=0.01)
-        assert data['duration_s'] < 18.1
+    data = found(capsys, path, '--signal', 'gyroADC[1]', '--from', '2')
+    # Against the steps of the held voltage the gain were less, and the signal 3 ms ahead.
+    assert data['seen'] and data['gain_per_v'] == pytest.approx(expected, rel=0.03)
+    assert abs(data['lag_s']) < 0.5e-3 and data['signal_unit'] == 'rad/s'
+    assert data['voltage_rate_hz'] == pytest.approx(125.0, rel=0.01)
+    assert data['duration_s'] < 18.1
     for arguments, words in (
             (['--signal', 'gyroADC[9]'], "did you mean 'gyroADC["),
-            (['--signal', '/imu/linear_acceleration.x'], 'no linear_acceleration.x'),
-            (['--signal', '/motor_speed/velocity[0]'], 'no motor speeds'),
-            (['--signal', 'debug/angular_velocity.x'], "no gyro 'debug'"),
+            (['--signal', '/imu/linear_acceleration.x'], 'see convert LOG --list'),
             (['--signal', 'motor[0]', '--msg-config', 'x'], 'is for bags'),
             (['--signal', 'motor[0]', '--flight', '2'], 'no flight 2'),
             (['--signal', 'motor[0]', '--from', '90'], 'holds no sample')):

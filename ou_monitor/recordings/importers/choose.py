@@ -18,8 +18,8 @@ import re
 import numpy as np
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.importers.log import (
-    ANY, clean, CURRENT, FORCE, Log, Motion, RATE, RawColumns, Series, SIGNAL, sound, THROTTLE,
-    UNKNOWN, VELOCITY, VOLTAGE)
+    ANY, clean, CURRENT, Log, Motion, RawColumns, Series, sound, THROTTLE,
+    UNKNOWN, VOLTAGE)
 from ou_monitor.records import Defect, FloatArray, Note, prefixed
 from ou_monitor.text import counted, printable
 from ou_monitor.timeline import check_throttle
@@ -261,10 +261,10 @@ def named_series(path: Path, log: Log, name: str) -> Series:
 
 
 def signal_of(path: Path, log: Log, signal: str) -> tuple[Series, tuple[str, ...]]:
-    """Return a series by its name or by the topic that `convert` gives it, and notes on it."""
+    """Return a series by its name, and notes on it."""
     if not signal:
         raise InputError('the name of the signal is empty: ' + _LIST)
-    return _cleaned(path, signal, _by_topic(path, log, signal) or named_series(path, log, signal))
+    return _cleaned(path, signal, named_series(path, log, signal))
 
 
 def _cleaned(path: Path, name: str, series: Series) -> tuple[Series, tuple[str, ...]]:
@@ -274,28 +274,6 @@ def _cleaned(path: Path, name: str, series: Series) -> tuple[Series, tuple[str, 
         raise InputError(f'{path}: {name} has no usable sample'
                          + ''.join(f' ({sentence})' for sentence in said))
     return series, tuple(prefixed(name, (*said, *pace_notes(series.t))))
-
-
-def _by_topic(path: Path, log: Log, signal: str) -> Series | None:
-    """Return the series behind a topic of `convert`: NAME/angular_velocity.x, motor_speed/..."""
-    found = re.fullmatch(rf'/?(.+)/(({RATE}|{FORCE})\.[xyz]|{VELOCITY}\[\d+\])', signal)
-    if found is None:
-        return None
-    name, column, field = found.groups()
-    if field is not None:
-        held = _gyro(path, log, None if name == IMU else name)
-    elif name == SPEEDS:
-        held = log.speeds
-    else:
-        return None
-    if held is None:
-        raise InputError(f"{path} holds no {'motor speeds' if field is None else 'gyro'}"
-                         + ''.join(f' ({note})' for note in log.notes if 'eRPM' in note))
-    one, _ = clean_motion(held)
-    if column not in one.columns:
-        raise InputError(f"{path}: '{name}' has no {column}: it holds {', '.join(one.columns)}")
-    return Series(signal, SIGNAL, one.t, one.columns[column], one.scale,
-                  own_unit='m/s^2' if field == FORCE else 'rad/s')
 
 
 def topic_of(name: str) -> str:

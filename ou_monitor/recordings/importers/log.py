@@ -60,12 +60,6 @@ class Motion:
         """Return the units of the values."""
         return 'rad/s' if self.motors else 'rad/s, m/s^2'
 
-    @property
-    def columns(self) -> dict[str, FloatArray]:
-        """Return path in the message -> values, shape (n,)."""
-        return {f'{field}[{k}]' if self.motors else f"{field}.{'xyz'[k]}": column
-                for field, values in self.vectors.items() for k, column in enumerate(values.T)}
-
 
 def gyro_of(name: str, t: FloatArray, rates: FloatArray | None, forces: FloatArray | None,
             scale: str, words: str, rank: int | None = None) -> Iterator[Motion]:

@@ -42,7 +42,7 @@ def test_a_crazyflie_log_is_analyzed_and_converted(tmp_path, capsys):
     np.testing.assert_array_equal(log.t, bag.t)
     np.testing.assert_array_equal(log.voltage, bag.voltage)
     np.testing.assert_array_equal(log.throttle, bag.throttle)
-    _, gyro = read_beside(path, 'imu/angular_velocity.z')
+    _, gyro = read_beside(path, 'gyro.z')
     np.testing.assert_allclose(gyro.values, np.radians(table[:, 7]))
     capsys.readouterr()
     assert main(['analyze', str(path), '--json', '-']) == 0

@@ -112,7 +112,8 @@ def test_a_signal_of_a_log_and_of_its_bag_is_one(tmp_path):
     path.write_bytes(b''.join(blackbox(rows, fields, {'gyro_scale': '0x3f800000'})))
     assert main(['convert', str(path), str(out)]) == 0
     (log, own), (bag, converted) = (
-        read_beside(one, '/imu/angular_velocity.y') for one in (path, out))
+        read_beside(one, name) for one, name in (
+            (path, 'gyroADC[1]'), (out, '/imu/angular_velocity.y')))
     assert log.n == bag.n == 3000
     np.testing.assert_array_equal(readings_of(log).t, read_recording(path).t)
     share = (rows[:, 5:7].mean(axis=1) - 100) / 2000
