@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 import math
 
 import numpy as np
@@ -155,17 +156,21 @@ class _Regression:
         self._all = self._blocks.sum(axis=0)
         self._penalty = 0.5 * math.log(samples.n)
         self._known: dict[tuple[int, ...], tuple[float, FloatArray]] = {}
+        # Whether sets with time constants too near to be told apart have no evidence.
+        self._apart = False
 
     def search(self, start: Sequence[int]) -> MeanResponse:
         """Add and remove terms until no change improves the evidence."""
         chosen: tuple[int, ...] = ()
         for k in start:
             chosen = self._with_term(chosen, k)
-        for _ in range(_ROUNDS):
-            better = self._best_move(chosen)
-            if better is None:
-                break
-            chosen = better
+        chosen = self._moved(chosen)
+        # On the way, a better time constant may stand beside the one that it replaces.
+        self._apart = True
+        while self._has_twins(chosen):
+            chosen = max((self._less(chosen, k) for k in chosen),
+                         key=lambda less: self._evaluate(less)[0])
+        chosen = self._moved(chosen)
         chosen = self._with_plainer_term(chosen)
         worth = self._worth(chosen)
         order = np.argsort(-np.array(worth)) if worth else np.zeros(0, dtype=int)
@@ -174,10 +179,25 @@ class _Regression:
                             tuple(worth[k] for k in order.tolist()),
                             tuple(self._rivals(chosen, k) for k in found))
 
+    def _moved(self, chosen: tuple[int, ...]) -> tuple[int, ...]:
+        """Return the set after the best moves, one at a time, until none helps."""
+        for _ in range(_ROUNDS):
+            better = self._best_move(chosen)
+            if better is None:
+                break
+            chosen = better
+        return chosen
+
+    def _has_twins(self, chosen: tuple[int, ...]) -> bool:
+        """Return whether two time constants are too near to be told apart."""
+        return any(_is_near(one, other)
+                   for one, other in combinations([self._pool[k] for k in chosen], 2))
+
     def exchanged(self, own: int, places: Sequence[int]
                   ) -> tuple[tuple[int, ...], tuple[float, ...]]:
         """Return the first terms, each in its place or a better later one, and their worth."""
         # places: the place of each later term of the pool.
+        self._apart = True
         chosen = list(range(own))
         for k, place in enumerate(places, own):
             other = [*chosen[:place], k, *chosen[place + 1:]]
@@ -243,6 +263,8 @@ class _Regression:
 
     def _evidence(self, chosen: tuple[int, ...]) -> float:
         """Return the evidence for a set of terms, nats."""
+        if self._apart and self._has_twins(chosen):
+            return -math.inf
         return self._evaluate(chosen)[0]
 
     def _evaluate(self, chosen: tuple[int, ...]) -> tuple[float, FloatArray]:
