@@ -38,8 +38,8 @@ from ou_monitor.text import plain_number
 TIME, VOLTAGE, THROTTLE = 'time_s', 'voltage_v', 'throttle'
 
 # Words of loggers for a missing number, or for one beyond the range.
-MISSING = frozenset(',nan,null,none,na,n/a,#n/a,-,--,---,----,x,∞,-∞,ol,-ol,ovl,overload,'
-                    'unavailable,unknown,1.#qnan,-1.#qnan,-1.#ind,1.#inf,-1.#inf'.split(','))
+_MISSING = frozenset('nan,null,none,na,n/a,#n/a,x,∞,-∞,ol,-ol,ovl,overload,'
+                     'unavailable,unknown,1.#qnan,-1.#qnan,-1.#ind,1.#inf,-1.#inf'.split(','))
 # Added to the error about a cell with a decimal comma, and to errors of single lines.
 _MARK = ': the decimal mark is a point (with --decimal . a comma separates thousands)'
 _PARTIAL = '; --partial leaves bad lines out'
@@ -49,6 +49,8 @@ _LONGEST = 40
 MOST_OF_LINE = 65536
 # Bytes, then lines, in which the format is detected; characters and rows read at once.
 _HEAD, _HEAD_LINES, _CHUNK, _BLOCK = 65536, 200, 1 << 20, 8192
+# Rows of numbers that must follow one another where the data begin.
+_IN_A_ROW = 8
 
 DELIMITERS = {'tab': '\t', 'space': ' '}
 
@@ -105,7 +107,7 @@ _NUMBER = r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?'
 # Possessive, so that the time is proportional to the length of a line of blanks.
 _INTERVAL = re.compile(
     r'((?:sampl(?:e|ing)|time)[ _]*(?:interval|period)|sampl(?:e|ing)[ _]*time|'
-    r't_?inc(?:rement)?|x[ _-]?inc(?:rement)?|increment|delta[ _]?t|h_?resolution|'
+    r't_?inc(?:rement)?|x[ _-]?inc(?:rement)?|increment|delta[ _]?[tx]|h_?resolution|'
     r'sampl(?:e|ing)[ _]*(?:rate|frequency))\b'
     r'["\s]*+(?:[\[(](\w+)[\])])?+'
     rf'[\s"=:,;]*+(?:\w+:)?[\s"]*+({_NUMBER})\s*+(n|u|µ|m|k|M|G)?(s|sec|hz|sa/s)?',
@@ -193,7 +195,9 @@ def _encoding(path: Path, head: bytes) -> str:
     if head[1:2] == b'\0' != head[:1] and head[3:4] == b'\0':
         return 'utf-16-le'
     kind = kind_of_foreign(head, path)
-    if b'\0' in head and not is_text(head) or kind.startswith('it is') and kind != 'it is text':
+    # A logger that lost power leaves NUL bytes at the end; `numbers` names their line.
+    nul = b'\0' in head and not (b'\n' in head and is_text(head.rstrip(b'\0')))
+    if nul or kind.startswith('it is') and kind != 'it is text':
         raise InputError(f'{path} is not text: {kind}')
     try:
         codecs.getincrementaldecoder('utf-8')().decode(head)
@@ -231,10 +235,14 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool,
     rows, full = ([_unlabelled(row, labels) for row in some] for some in (rows, full))
     good = [[is_value(row[k]) for row in full if row[k]] for k in range(width)]
     places = [k for k, ok in enumerate(good) if ok and (ok[-1] or 2 * sum(ok) >= len(ok))]
-    first = next((k for k, row in enumerate(rows) if k >= skip and len(row) >= min(width, 2)
-                  and any(row[j:j + 1] and is_value(row[j]) for j in places)
-                  and all(not row[j:j + 1] or is_value(row[j]) or row[j].lower() in MISSING
-                          for j in places)), None)
+    numeric = {k: any(row[j:j + 1] and is_value(row[j]) for j in places)
+               for k, row in enumerate(rows)
+               if k >= skip and any(row) and len(row) >= min(width, 2)}
+    fits = [k for k, found in numeric.items() if found and all(
+        not rows[k][j:j + 1] or is_value(rows[k][j]) or is_missing(rows[k][j]) for j in places)]
+    # A number may stand above the data: more rows with numbers must follow it.
+    first = next((k for k in fits if all(numeric[j] for j in islice(
+        (j for j in numeric if j >= k), _IN_A_ROW))), fits[0] if fits else None)
     if first is not None:
         first = _after_names(rows, skip, first, width, places)
     else:
@@ -249,7 +257,8 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool,
         return None
     cells = [cell for row in rows[first:] for cell in row if cell]
     fit = sum(map(is_value, cells)) / max(len(cells), 1)
-    step, stated = _stated_step(lines[:max(first, 20)], rows[:first])
+    above = lines[:max(first, 20)]
+    step, stated = _stated_step(list(map(_with_point, above)) if comma else above, rows[:first])
     first_rows = tuple(tuple(row) for row in rows[first:] if any(row))
     return fit * (1.0 if width > 1 else 0.4) + 0.01 * min(width, 20) / 20, Form(
         encoding, delimiter, comma, given, first, at, labels, ''.join(lines[:first]), names,
@@ -308,6 +317,11 @@ def number_of(cell: str) -> tuple[float, str]:
     if unit and unit not in WORDS:
         raise ValueError(cell)
     return plain_number(text.replace(',', '') if _GROUPED.fullmatch(text) else text), unit
+
+
+def is_missing(cell: str) -> bool:
+    """Return whether a cell says that there is no number: blank, a word, or dashes (--.--)."""
+    return not cell.strip(' \t\n-.') or cell.strip().lower() in _MISSING
 
 
 def is_number(cell: str) -> bool:
@@ -413,11 +427,17 @@ def _header(rows: list[list[str]], lines: list[str], first: int, width: int, del
     return tuple(names), tuple(stated), line
 
 
+def has_unit_beside(names: Sequence[str], place: int) -> bool:
+    """Return whether the next column has the unit of each row, as meters write it."""
+    return re.fullmatch(r'(?:.*[ _])?units?|einheit',
+                        ''.join(names[place + 1:place + 2]).lower()) is not None
+
+
 def _unit_beside(names: Sequence[str], rows: list[list[str]], place: int) -> str:
     """Return the unit in the next column, such as Volt DC, if that is named so."""
-    words = ' '.join(rows[0][place + 1:][:1]).lower().split() if rows and ''.join(
-        names[place + 1:][:1]).lower() in ('unit', 'units', 'einheit') else []
-    return words[0] if words and words[0] in WORDS else ''
+    words = [row[place + 1].lower().split() for row in rows if any(row[place + 1:place + 2])
+             ] if has_unit_beside(names, place) else []
+    return words[0][0] if words and words[0][0] in WORDS else ''
 
 
 def _are_units(row: list[str]) -> bool:
@@ -450,11 +470,13 @@ def _stated_step(lines: list[str], above: list[list[str]]) -> tuple[float, str]:
 
 def numbers(path: Path, form: Form, places: Sequence[int],
             texts: dict[int, list[str]] | None = None,
-            left_out: list[str] | None = None) -> list[FloatArray]:
+            left_out: list[str] | None = None, units: bool = True) -> list[FloatArray]:
     """Return columns of numbers, NaN where blank; `texts` gets cells as written."""
     # A bad line raises InputError, or with `left_out` is dropped and its error appended there.
+    # units: whether a number with another unit in the next column is converted.
     parts: list[list[FloatArray]] = [[] for _ in places]
-    last = max([*places, *(texts or {})])
+    with_unit = [place for place in places if units and has_unit_beside(form.names, place)]
+    last = max([*places, *(texts or {}), *(place + 1 for place in with_unit)])
     width = len(form.names)
     try:
         with io.TextIOWrapper(open_regular(path), form.encoding, newline=None) as file:
@@ -469,18 +491,30 @@ def numbers(path: Path, form: Form, places: Sequence[int],
                 good = np.ones(len(rows), dtype=bool)
                 for place, part in zip(places, parts):
                     where = partial(_place, path, form, place, begin, block)
-                    part.append(_floats(columns[place], where, form.comma, form.units[place],
+                    cells = columns[place]
+                    if place in with_unit:
+                        cells = _with_units(cells, columns[place + 1], form.units[place])
+                    part.append(_floats(cells, where, form.comma, form.units[place],
                                         good if left_out is not None else None, left_out))
                 if not good.all():
                     for part in parts:
                         part[-1] = part[-1][good]
-                for place, cells in (texts or {}).items():
-                    cells += (cell for cell, fine in zip(columns[place], good) if fine)
+                for place, text in (texts or {}).items():
+                    text += (cell for cell, fine in zip(columns[place], good) if fine)
     except OSError as error:
         raise InputError(f'cannot read {path}: {error.strerror}') from error
-    except UnicodeError as error:
-        raise InputError(f'{path} is not text throughout: {error}') from error
+    except UnicodeDecodeError as error:
+        why = ('it is cut off in the middle of a character'
+               if re.search('truncated|unexpected end', error.reason) else error)
+        raise InputError(f'{path} is not text throughout: {why}') from error
     return [np.concatenate(part) if part else np.empty(0) for part in parts]
+
+
+def _with_units(cells: Sequence[str], units: Sequence[str], stated: str) -> tuple[str, ...]:
+    """Return cells with the units of their rows where these are not that of the column."""
+    return tuple(
+        cell if is_missing(cell) or (word := unit.lower().split()[:1]) in ([], [stated])
+        else f'{cell} {word[0]}' for cell, unit in zip(cells, units))
 
 
 def _blocks(path: Path, file: TextIO, form: Form, width: int,
@@ -579,7 +613,7 @@ def _floats(cells: Sequence[str], where: Callable[[int], str], comma: bool, stat
             value = math.nan
         if value == value:
             found.append(value)
-        elif cell.strip().lower() in MISSING:
+        elif is_missing(cell):
             found.append(math.nan)
         else:
             if comma:

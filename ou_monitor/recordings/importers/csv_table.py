@@ -21,9 +21,9 @@ import numpy as np
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.importers import log as logs
 from ou_monitor.recordings.importers.csv_form import (
-    AMPERE_WORDS, CHANNEL, clock_times, factor_of, Form, form_of, has_day, is_clock, is_number,
-    is_value, MISSING, number_of, numbers, SCALES, SHARE_WORDS, shown, THROTTLE, TIME, TIME_WORDS,
-    unit_of, VOLT_WORDS, VOLTAGE)
+    AMPERE_WORDS, CHANNEL, clock_times, factor_of, Form, form_of, has_day, has_unit_beside,
+    is_clock, is_missing, is_number, is_value, number_of, numbers, SCALES, SHARE_WORDS, shown,
+    THROTTLE, TIME, TIME_WORDS, unit_of, VOLT_WORDS, VOLTAGE)
 from ou_monitor.recordings.importers.log import (
     ANY, CsvColumns, Log, one_flight, RawColumns, Request, Series)
 from ou_monitor.records import (
@@ -34,8 +34,8 @@ from ou_monitor.timeline import hold, MOST_THROTTLE, WILD
 CURRENT = 'current_a'
 NONE = 'none'
 # Unit -> ends of the throttle; other ends are written LOW:HIGH.
-THROTTLE_UNITS = {'1': (0.0, 1.0), '%': (0.0, 100.0), 'us': (1000.0, 2000.0)}
-_PULSE_WORDS = {word: unit for word, unit in TIME_WORDS.items() if unit == 'us'}
+THROTTLE_UNITS = {'1': (0.0, 1.0), '%': (0.0, 100.0), 'us': (1000.0, 2000.0), 'ms': (1.0, 2.0)}
+_PULSE_WORDS = {word: unit for word, unit in TIME_WORDS.items() if unit in THROTTLE_UNITS}
 # Ends of sticks that are centred at 0: EdgeTX, DJI, 16 bits.
 _STICKS = (1024, 10000, 32768)
 # Maximum columns listed; autopilots log a few hundred.
@@ -72,10 +72,10 @@ _PATTERNS = {
         r'voltage_v',
         r'v_?bat(?:t|tery)?(?:_?latest|_?filtered|_?voltage|_?v)?|batt?(?:ery)?_?(?:v|volt|volts|'
         r'voltage)|pack_?voltage|(?:input|inp|bus|supply|rail|main|link)_?(?:v|volt|voltage)'
-        r'|v_?bus|rxbt|vfas|voltage_?(?:battery|batt?|raw)|bat_?spannung|akku_?spannung|pm_vbat',
+        r'|v_?bus|vfas|voltage_?(?:battery|batt?|raw)|bat_?spannung|akku_?spannung|pm_vbat',
         r'u|v|volts?|voltage|spannung|tension|tensione|voltaje|[UVuv]\(.*\)|'
         r'[uv](?:rms|dc|mean|mn)?_?1?',
-        r'volt(?:age)?_?filtered(?:_v)?',
+        r'volt(?:age)?_?filtered(?:_v)?|rxbt',
         r'(?!.*(?:axis|cell|temp|limit|zelle|motor|servo|rssi|phase|cpu|mcu|5v|sag)).*(?:volt|'
         r'spannung|vbat).*'),
     logs.THROTTLE: (
@@ -331,7 +331,7 @@ def _choose(form: Form, quantity: str, taken: Sequence[int] = ()) -> list[int]:
 def _holds_numbers(form: Form, place: int, clock: bool) -> bool:
     """Return whether the first cells of a column are numbers (clock: or dates or times)."""
     cells = [row[place] for row in form.rows if place < len(row) and row[place]
-             and row[place].lower() not in MISSING]
+             and not is_missing(row[place])]
     return not cells or any(is_value(cell) if clock else is_number(cell) for cell in cells)
 
 
@@ -347,6 +347,8 @@ def _time_of(path: Path, form: Form, wanted: CsvColumns) -> _Column:
     found = [] if numbered and math.isfinite(form.step) else _choose(form, _TIME_NAME) or [
         k for k in range(min(form.width, len(form.names))) if form.rows and all(
             k < len(row) and ':' in row[k] and is_clock(row[k]) for row in form.rows)]
+    if form.rows:
+        found = [k for k in found if any(''.join(row[k:k + 1]) for row in form.rows)]
     if found:
         first = _finest(form, found[0])
         beside = [k for k in range(min(form.width, len(form.names))) if k != first and any(
@@ -523,14 +525,14 @@ def _read(path: Path, form: Form, time: _Column, places: list[int],
     if sample and not is_number(sample[0]) and is_clock(sample[0]):
         clocks: list[list[str]] = [[] for _ in time.place]
         values = numbers(path, form, places, dict(zip(time.place, clocks)) | (texts or {}),
-                         left_out)
+                         left_out, texts is None)
         cells = clocks[0]
         if len(clocks) > 1 and all(map(str.isdigit, clocks[1])):
             cells = [f'{clock}.{part:0>3}' for clock, part in zip(*clocks)]
         elif len(clocks) > 1:
             cells = [' '.join(pair) for pair in zip(*clocks)]
         return clock_times(path, cells, time.name, left_out), values
-    t, *values = numbers(path, form, [*time.place, *places], texts, left_out)
+    t, *values = numbers(path, form, [*time.place, *places], texts, left_out, texts is None)
     if len(time.place) > 1:
         part, *values = values
         t = t + part * TIME_UNITS[time.unit]
@@ -550,7 +552,8 @@ def _check_one_series(path: Path, form: Form, t: FloatArray, column: str, values
         return
     for place, label in enumerate(form.names[:form.width]):
         first = [row[place] for row in form.rows if place < len(row) and row[place]]
-        cells = [] if not first or any(map(is_value, first)) else _cells(path, form, place, t.size)
+        cells = [] if not first or any(map(is_value, first)) or has_unit_beside(
+            form.names, place - 1) else _cells(path, form, place, t.size)
         if not cells:
             continue
         names, which = np.unique(np.array(cells)[known], return_inverse=True)
@@ -654,7 +657,7 @@ def _in_si(quantity: str, column: _Column, values: FloatArray, given: str | None
                 re.search('duty|pwm', column.name.lower())):
             guess, unit = True, '-100:100'
         words = ', a guess: --throttle-unit' if guess and unit != '1' else ''
-        if unit == 'us':
+        if unit in ('us', 'ms'):
             # An output without pulses.
             values = np.where(values == 0.0, THROTTLE_UNITS[unit][0], values)
         low, high = THROTTLE_UNITS.get(unit) or map(float, unit.split(':'))
@@ -726,7 +729,7 @@ def _read_note(form: Form, time: _Column, found: dict[str, _Column], units: dict
         rest = [name for k, name in enumerate(form.names[:form.width])
                 if k not in used and name not in others
                 and not re.fullmatch(_INDEX_NAME, name.strip('# ').lower())
-                and any(k < len(row) and is_number(row[k]) and row[k].lower() not in MISSING
+                and any(k < len(row) and is_number(row[k]) and not is_missing(row[k])
                         for row in form.rows)]
         also += f'; not read: {some(rest, 3)} (--throttle-column)' if rest else ''
     return (f"Read {', '.join(parts)}{also}; cells between {between}, decimal "

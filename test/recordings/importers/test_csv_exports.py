@@ -196,7 +196,7 @@ FORMS = {
                      lambda k: f"{k},{clock(k, '%Y-%m-%d %H:%M:%S')},00:00:{0.01 * k:06.3f},"
                                f'CC_DChg,{1e3 * AMPS[k]:.1f},{1e3 * V[k]:.0f}'), 0.01, False,
                True),
-    'labview': (table(['LabVIEW Measurement', 'Separator\tTab', '***End_of_Header***',
+    'labview_lvm': (table(['LabVIEW Measurement', 'Separator\tTab', '***End_of_Header***',
                        'Delta_X\t0.01\t0.01', '***End_of_Header***\t\t\t',
                        'X_Value\tPack Voltage\tPack Current\tComment'],
                       lambda k: f'{0.01 * k:.6f}\t{V[k]}\t{AMPS[k]}\t'), 0.01, False, True),
@@ -308,6 +308,23 @@ FORMS = {
     'megasquirt': (table(['"MS3"', 'Time\tRPM\tMAP\tBatt V\tAFR', 's\tRPM\tkPa\tV\tAFR'],
                          lambda k: f'{0.01 * k:.3f}\t2100\t45\t{V[k]}\t14.7'), 0.01, False,
                    False),
+    # LVM: facts beside words and numbers above the rows, whose time is left blank.
+    'labview_blank_time': (table([
+        'LabVIEW Measurement', 'Writer_Version\t2', 'Reader_Version\t2', '***End_of_Header***', '',
+        'Channels\t2', 'Samples\t60\t60', 'Date\t2024/05/16\t2024/05/16',
+        'Time\t08:02:06,1\t08:02:06,1', 'Y_Unit_Label\tVolts\tAmps',
+        'Delta_X\t0,001000\t0,001000', '***End_of_Header***',
+        'X_Value\tVoltage\tCurrent\tComment'],
+        lambda k: f'\t{german(V[k])}\t{german(AMPS[k])}', '\r\n'), 1e-3, False, True),
+    # A meter that changes its range: the unit of each row.
+    'autorange': (table(['Time,Value,Unit,Current,Current Unit'], lambda k: f'{0.1 * k:.1f},' + (
+        f'{1e3 * V[k]:.0f},mV' if k % 7 == 3 else f'{V[k]},V DC') + (
+            f',{AMPS[k]},A' if k % 5 else f',{1e3 * AMPS[k]:.0f},mA')), 0.1, False, True),
+    # Castle: pulses in ms; EdgeTX: the pack beside the receiver.
+    'castle': (table(['Seconds,Throttle (ms),Voltage (v),Current (A)'], lambda k: (
+        f'{0.1 * k:.1f},{1.0 + U[k]:.3f},{V[k]},{AMPS[k]}')), 0.1, True, True),
+    'edgetx_vfas': (table(['Date,Time,RxBt(V),VFAS(V),Curr(A)'], lambda k: (
+        f"{clock(k, '%Y-%m-%d,%H:%M:%S.%f', 0.1)},5.1,{V[k]},{AMPS[k]}")), 0.1, False, True),
 }
 
 
@@ -491,7 +508,7 @@ def test_a_stated_mark_makes_the_other_one_separate_thousands(tmp_path):
 
 def test_words_of_loggers_for_a_missing_number(tmp_path):
     """They are counted, not refused; a factor in the unit of a column is applied."""
-    words = ['OL', '----', '1.#QNAN', '-1.#IND']
+    words = ['OL', '----', '--.--', '1.#QNAN', '-1.#IND']
     found = read_recording(written(tmp_path, 'time,VBAT (x10 mV)\n' + ''.join(
         f'{k},{word}\n' for k, word in enumerate(['1200', *words, '1210']))))
     assert found.voltage.tolist() == [12.0, pytest.approx(12.1)]
@@ -600,6 +617,8 @@ def test_counts_of_unknown_size_and_mixed_units_are_refused(tmp_path):
     np.testing.assert_allclose(found.throttle, 0.01 * np.arange(99))
     with pytest.raises(InputError, match="holds '12 mA', not a number"):
         read_recording(written(tmp_path, rows.replace('9,12 V', '9,12 mA')))
+    with pytest.raises(InputError, match="3: column 'Value' holds '3 a', not a number"):
+        read_recording(written(tmp_path, 'Time,Value,Unit\n0,12,V\n1,3,A\n2,12,V\n'))
 
 
 @pytest.mark.parametrize('row', [
@@ -670,6 +689,8 @@ def test_a_file_of_another_kind_is_named(content, words, tmp_path):
 @pytest.mark.parametrize('content, words', [
     ('Zeit;U\n04.05.2024 10:00:00;12,5\nnoon;12,6\n', "'noon'"), ('t,U\n0,12\n1,1_5\n', "'1_5'"),
     ('date,U\n2024-13-01,12\n2024-13-02,12\n', 'month'),
+    ('t,U\n0,12\n1,13\n'.encode('utf-16')[:-1], 'cut off in the middle of a character'),
+    (b't,U\n0,12\n1,13\n' + bytes(4096), ':4: the line ends before'),
     ('date,U\n2024-01-01 33:00,12\n2024-01-02 33:00,12\n', 'hour'),
     ('time,U\n10:00:00,12\n10:00:99,12\n', "'10:00:99'"),
     ('time,U\n10:00:00,12\n10:99:00,12\n', "'10:99:00'"),
