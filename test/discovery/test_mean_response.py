@@ -157,6 +157,16 @@ def test_a_sag_replaces_a_lag_that_ties(driven, size, named, monkeypatch):
     assert found_response.rivals == ((('load_transient',) if named is LoadSag else ()),)
 
 
+def test_no_two_time_constants_are_within_an_octave(driven, monkeypatch):
+    """A difference of two lags of 0.2 and 0.3 s is described by one, though two fit better."""
+    pool, columns, voltage = driven
+    voltage = voltage - 60.0 * columns[1][:, 0] + 60.0 * columns[2][:, 0]
+    found, _ = made(pool, columns, voltage, monkeypatch)
+    assert found._evidence((0, 1, 2)) > max(found._evidence((0, 1)), found._evidence((0, 2))) + 5.0
+    chosen = found.search((0, 1, 2)).terms
+    assert sum(isinstance(term, LoadTransient) and term.tau < 1.0 for term in chosen) == 1
+
+
 @pytest.mark.parametrize('seed', range(3))
 def test_a_time_constant_between_those_of_the_list_is_measured(seed):
     """A polarisation of 1.5 s is found within 7 %, and no second relaxation."""
