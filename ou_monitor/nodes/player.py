@@ -9,16 +9,19 @@ messages ahead.
 from __future__ import annotations
 
 import argparse
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 import gc
 import itertools
 import math
+from queue import Empty, Queue
 import sys
 import threading
 import time
 from typing import Any
 
+import numpy as np
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.nodes.base import SWITCH, wait_until
 from ou_monitor.nodes.run import one_line
@@ -41,8 +44,9 @@ FLUSH = Duration(seconds=1)
 RCLError = rclpy_implementation.RCLError
 
 Message = tuple[str, str, int, bytes]
-# Maximum messages held: about 20 s at 10 kHz, some 50 MB.
-AHEAD = 200_000
+# Messages that the thread hands over at a time, and maximum number of batches held: about 20 s at
+# 10 kHz, some 50 MB.
+BATCH, AHEAD = 1000, 200
 
 
 class SpacingError:
@@ -64,86 +68,63 @@ class SpacingError:
             self._counts[round(abs(error) * 1e6)] += 1
         self._last = (due, done)
 
-    @property
-    def n(self) -> int:
-        """Return the number of spacings."""
-        return self._counts.total()
-
-    def quantile(self, share: float) -> float:
-        """Return the error, s, that a share of the spacings did not exceed; NaN when empty."""
-        rank, seen = math.ceil(share * self.n), 0
-        for error, count in sorted(self._counts.items()):
-            seen += count
-            if seen >= rank:
-                return error * 1e-6
-        return math.nan
-
     def summary(self) -> dict[str, float]:
         """Return p50, p99 and max, s; empty when there was no spacing."""
-        if not self.n:
+        if not self._counts:
             return {}
-        return {'p50': self.quantile(0.5), 'p99': self.quantile(0.99), 'max': self.quantile(1.0)}
+        errors = np.array(sorted(self._counts.items())).T
+        share = np.cumsum(errors[1]) / errors[1].sum()
+        return {name: 1e-6 * float(errors[0, np.searchsorted(share, quantile)])
+                for name, quantile in (('p50', 0.5), ('p99', 0.99), ('max', 1.0))}
 
 
 class Prefetch:
-    """Iterate over a source that a thread reads ahead, up to `ahead` items; raise its errors."""
+    """Iterate over a source that a thread reads ahead, up to `ahead` batches; raise its errors."""
 
-    def __init__(self, source: Iterable[Message], ahead: int = AHEAD) -> None:
-        self._source = source
-        self._ahead = ahead
-        self._items: deque[Message] = deque()
-        self._changed = threading.Condition()
-        self._finished = self._closed = False
+    def __init__(self, source: Iterable[Message], ahead: int = AHEAD, batch: int = BATCH) -> None:
+        self._batches: Queue[list[Message] | None] = Queue(ahead)
+        self._full, self._closed = threading.Event(), threading.Event()
         self._error: BaseException | None = None
-        self._thread = threading.Thread(target=self._read, name='prefetch', daemon=True)
+        self._thread = threading.Thread(
+            target=self._read, args=(iter(source), batch), name='prefetch', daemon=True)
         sys.setswitchinterval(SWITCH)
         self._thread.start()
 
     def fill(self) -> None:
-        """Wait until `ahead` items or the whole source have been read."""
-        with self._changed:
-            self._changed.wait_for(
-                lambda: self._finished or self._closed or len(self._items) >= self._ahead)
+        """Wait until all batches or the whole source have been read."""
+        self._full.wait()
 
     def close(self) -> None:
         """End the thread."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
+        self._closed.set()
+        while self._thread.is_alive():
+            # It may wait for a free place.
+            with suppress(Empty):
+                self._batches.get(timeout=0.01)
         self._thread.join()
 
-    def _read(self) -> None:
+    def _read(self, source: Iterator[Message], size: int) -> None:
+        batch: list[Message] = []
         try:
-            for item in self._source:
-                # Appending to a deque needs no lock; the lock is only for waiting.
-                self._items.append(item)
-                if len(self._items) in (1, self._ahead):
-                    with self._changed:
-                        self._changed.notify_all()
-                        self._changed.wait_for(
-                            lambda: self._closed or len(self._items) < self._ahead)
-                if self._closed:
+            while not self._closed.is_set():
+                batch = []
+                # What came before an error is kept.
+                batch.extend(itertools.islice(source, size))
+                if self._batches.full() or not batch:
+                    self._full.set()
+                if not batch:
                     break
+                self._batches.put(batch)
         except BaseException as error:
             self._error = error
+            self._batches.put(batch)
         finally:
-            with self._changed:
-                self._finished = True
-                self._changed.notify_all()
+            self._full.set()
+            self._batches.put(None)
 
     def __iter__(self) -> Iterator[Message]:
-        while True:
-            if not self._items:
-                with self._changed:
-                    self._changed.wait_for(lambda: self._items or self._finished)
-                if not self._items:
-                    break
-            full = len(self._items) >= self._ahead
-            item = self._items.popleft()
-            if full:
-                with self._changed:
-                    self._changed.notify_all()
-            yield item
+        while (batch := self._batches.get()) is not None:
+            yield from batch
         if self._error is not None:
             raise self._error
 
