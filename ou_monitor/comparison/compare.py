@@ -14,7 +14,7 @@ import numpy as np
 from ou_monitor.comparison.flight_model import (
     FiledModel, fit_flight, FlightModel, MOVES, Readings, Simulator)
 from ou_monitor.comparison.yardstick import (
-    Agreement, band, differences, judge, Measures, SpectrumBand, Traces, Yardstick)
+    Agreement, band, differences, distance, judge, Measures, SpectrumBand, Traces, Yardstick)
 from ou_monitor.criticism.adc import without_repeats
 from ou_monitor.criticism.curves import stray
 from ou_monitor.criticism.readings import current_at, usable, why_no_model
@@ -173,6 +173,7 @@ def _agreement(recording: Recording, own: Readings, yardstick: Yardstick, simula
         np.sum((own.voltage - own.voltage.mean()) ** 2))
     p, verdict, words, farthest = judge(found, explained, own.throttle is not None and bool(
         np.ptp(own.throttle) >= MOVES and np.ptp(path) > 0.0))
+    pooled = np.mean([m.distribution for m in measured], axis=0)
     responses = np.array([m.response for m in measured])
     falls = [one.band for one in found if one.kind == 'answer']
     stride = -(-own.t.size // traces.shape[1])
@@ -191,8 +192,10 @@ def _agreement(recording: Recording, own: Readings, yardstick: Yardstick, simula
             float(real.power[k]), np.array([m.power[k] for m in measured])))
             for k, (a, b) in enumerate(zip(yardstick.bands, yardstick.bands[1:]))),
         falls[0] if falls else None, falls[1] if falls else None, int(yardstick.rises.size),
+        band(distance(real, pooled), np.array([distance(m, pooled) for m in measured])),
         seeds, p, verdict, words, farthest, tuple(notes),
         Traces(own.t + offset, own.voltage,
                np.full(own.t.size, np.nan) if own.throttle is None else own.throttle, first,
                own.t[::stride] + offset, low, high, yardstick.after if responses.size else empty,
-               real.response, response_low, response_high))
+               real.response, response_low, response_high, yardstick.edges,
+               real.distribution, pooled))

@@ -84,6 +84,10 @@ class Traces:
     response: FloatArray
     response_low: FloatArray
     response_high: FloatArray
+    # Voltages, V, and the share of the samples below each.
+    edges: FloatArray
+    distribution: FloatArray
+    simulated_distribution: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,11 +114,13 @@ class Agreement:
     fall: Band | None
     recovery: Band | None
     rises: int  # Rises of throttle
+    # Largest difference of the distribution from that of all simulations.
+    apart: Band
     seeds: int  # Simulations
     p_value: float  # Share of simulations, recording included, with a score as large
     verdict: Likeness
     words: str  # The largest difference, as a part of a sentence
-    farthest: str  # Kind of that difference: lowest, dips, level, answer, spectrum or path
+    farthest: str  # Kind of that difference: lowest, dips, level, answer, spectrum, ks or path
     notes: tuple[str, ...]  # What was left out or assumed
     traces: Traces  # For a page
 
@@ -131,6 +137,7 @@ class Agreement:
                  *((f'dips below {level:.6g} V, 1/min', dips)
                    for level, dips in zip(self.levels, self.dips)),
                  *((name, one) for name, one in response if one is not None),
+                 ('KS distance', self.apart),
                  *((f'power {one.low_hz:.3g} to {one.high_hz:.3g} Hz, V^2', one.power)
                    for one in self.spectrum)]
         return [{'measure': name, **one.as_data(), 'inside': one.inside} for name, one in bands]
@@ -148,7 +155,8 @@ class Agreement:
             'spectrum': [{'from_hz': one.low_hz, 'to_hz': one.high_hz,
                           'simulated_over_measured': _ratio(one.power)}
                          for one in self.spectrum],
-            'worst': self.worst, 'verdict': self.verdict.name.lower()}
+            'ks_distance': self.apart.measured, 'worst': self.worst,
+            'verdict': self.verdict.name.lower()}
 
 
 def _ratio(power: Band) -> float:
@@ -163,6 +171,8 @@ _BANDS, _SEGMENT = 5, 20.0
 _RISE, _WITHIN, _QUIET = 0.1, 0.2, 1.0
 # Response: time before and after a rise begins, s, points, and minimum number of rises.
 _BEFORE, _AFTER, _POINTS, _FEWEST = 0.2, 1.5, 86, 3
+# Bins of the distribution.
+_BINS = 2000
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,6 +184,7 @@ class Measures:
     dips: FloatArray  # Dips below each level per minute; shape (levels,)
     power: FloatArray  # Power in each band, V^2; shape (bands,)
     response: FloatArray  # Mean response to rises, V; empty with too few; shape (points,)
+    distribution: FloatArray  # Share of the samples below each edge; shape (bins,)
 
 
 class Yardstick:
@@ -195,6 +206,9 @@ class Yardstick:
         self.bands = np.geomspace(lowest, highest, _BANDS + 1)
         self.rises = _rise_times(t, samples.throttle)
         self.after = np.linspace(-_BEFORE, _AFTER, _POINTS)
+        reach = 0.5 * (float(v.max()) - float(v.min())) + 10.0 * lsb
+        # Of the distribution, V.
+        self.edges = np.linspace(v.min() - reach, v.max() + reach, _BINS)
 
     def measure(self, v: FloatArray) -> Measures:
         """Measure a voltage at the stamps of the part, V."""
@@ -203,7 +217,8 @@ class Yardstick:
         at = np.clip(np.searchsorted(self.bands, f, side='right') - 1, -1, _BANDS - 1)
         power = np.array([density[at == k].sum() for k in range(_BANDS)]) * (f[1] - f[0])
         return Measures(
-            float(v.mean()), float(v.min()), np.array(dips), power, self._response(v))
+            float(v.mean()), float(v.min()), np.array(dips), power, self._response(v),
+            np.searchsorted(np.sort(v), self.edges, side='right') / v.size)
 
     def _response(self, v: FloatArray) -> FloatArray:
         if self.rises.size < _FEWEST:
@@ -241,10 +256,10 @@ def _rise_times(t: FloatArray, throttle: FloatArray | None) -> npt.NDArray[np.fl
 # must exceed all.  At 5 %, one good model in twenty was refused.
 LEVEL = 0.02
 # Importance for a pilot, relative to the lowest voltage and the number of dips.
-_WEIGHTS = {'lowest': 1.0, 'dips': 1.0, 'level': 0.8, 'answer': 0.8, 'spectrum': 0.5}
-# Differences that a pilot would not notice: a share of the range of the voltage, and factors of a
-# rate and of a power.
-_RANGE, _RATE, _POWER = 0.03, 1.25, 1.5
+_WEIGHTS = {'lowest': 1.0, 'dips': 1.0, 'level': 0.8, 'answer': 0.8, 'spectrum': 0.5, 'ks': 0.5}
+# Differences that a pilot would not notice: a share of the range of the voltage, factors of a rate
+# and of a power, and a KS distance.
+_RANGE, _RATE, _POWER, _KS = 0.03, 1.25, 1.5, 0.05
 # Ends of a 95 % band, %.
 _LOW, _HIGH = 2.5, 97.5
 # Time after a rise begins at which the recovery is measured, s.
@@ -335,7 +350,17 @@ def differences(yardstick: Yardstick, own: Measures, others: Sequence[Measures],
                 math.log(_POWER), lambda b, low=low, high=high: (  # type: ignore[misc]
                     f'between {number(low, 2)} and {number(high, 2)} Hz the simulated voltage has '
                     f'{number(math.exp(b.median - b.measured), 2)} times the measured power')))
+    pooled = np.mean([m.distribution for m in (own, *others)], axis=0)
+    found.append(Difference(
+        'ks', distance(own, pooled), of(lambda m: distance(m, pooled)), _KS, lambda b: (
+            f'the shares of time at each voltage differ by up to {number(b.measured, 2)} '
+            f'(simulations among themselves: {_span(b, 2)})')))
     return found
+
+
+def distance(one: Measures, pooled: FloatArray) -> float:
+    """Return the Kolmogorov-Smirnov distance between a voltage and all simulations."""
+    return float(np.max(np.abs(one.distribution - pooled)))
 
 
 def _span(b: Band, digits: int) -> str:

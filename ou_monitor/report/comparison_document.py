@@ -6,7 +6,7 @@ import numpy as np
 from ou_monitor.analysis.overview import known_lines, Overview
 from ou_monitor.comparison.yardstick import Agreement, Band, LEVEL, Likeness
 from ou_monitor.report.document import (
-    Document, Facts, Figure, Notes, Part, Section, Table, Text)
+    Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text)
 from ou_monitor.report.svg import Plot
 from ou_monitor.text import listed, number
 
@@ -16,7 +16,7 @@ _VOLTAGE = ('Line: measured. Band: 95 % of the simulations at each moment. Pale 
             'simulation. Dashed lines: levels below which dips are counted.')
 # Fitted range if a model was given, so nothing was fitted.
 _NOTHING = (0.0, 0.0)
-# Of 11 numbers, so many or more are outside their 95 % bands in 2 % of good simulations.
+# Of 12 numbers, so many or more are outside their 95 % bands in 2 % of good simulations.
 _TOO_MANY = 3
 
 
@@ -33,7 +33,7 @@ def comparison_document(found: Agreement, seen: Overview, command: str = '') -> 
         lambda: [Figure(_voltage(found), _VOLTAGE)],
         Table(['', 'measured', 'simulated\n[95 %]', ''], _rows(found), left=[0, 3]),
         Facts(_path(found)), Section('The whole recording', [Facts(known_lines(seen))]),
-        lambda: [Section('Throttle, response to rises, spectrum', _others(found),
+        lambda: [Section('Throttle, response to rises, distribution, spectrum', _others(found),
                          folded=True)],
         Notes.of(found.notes),
         Text(f'{found.seeds} simulations with the stamps, throttle and ADC steps of the '
@@ -78,6 +78,7 @@ def _rows(found: Agreement) -> list[tuple[str, str, str, str]]:
     if found.fall is not None and found.recovery is not None:
         out += [row(f'fall after {found.rises} rises, mV', found.fall, 3, -1e3),
                 row('fall left after 1 s, mV', found.recovery, 3, -1e3)]
+    out.append(row('KS distance', found.apart, 2))
     out += [row(f'rms {number(one.low_hz, 2)} to {number(one.high_hz, 2)} Hz, mV',
                 Band(*(max(x, 0.0) ** 0.5 for x in (
                     one.power.measured, one.power.low, one.power.median, one.power.high))), 3,
@@ -112,12 +113,17 @@ def _others(found: Agreement) -> list[Part]:
     if np.isfinite(at.throttle).any():
         drawn.append(Figure(Plot('Throttle', 'time, s', 'throttle', height=160).line(
             at.t, at.throttle, '', 2)))
+    beside = []
     if at.response.size:
         plot = Plot('Mean response to rises of throttle', 'time since the rise, s', 'change, V',
-                    height=250, legend_row=True)
+                    width=450, height=250, legend_row=True)
         plot.band(at.after, at.response_low, at.response_high, 'simulated, 95 %', _SIMULATED)
-        drawn.append(Figure(plot.line(at.after, at.response, 'measured', 0, 'thick')))
-    return [*drawn, Figure(_spectrum(found))]
+        beside.append(Figure(plot.line(at.after, at.response, 'measured', 0, 'thick')))
+    plot = Plot('Distribution', 'voltage, V', 'share of time below', width=450, height=250,
+                legend_row=True)
+    plot.line(at.edges, at.simulated_distribution, 'simulated', _SIMULATED, 'thick')
+    beside.append(Figure(plot.line(at.edges, at.distribution, 'measured', 0, 'thick')))
+    return [*drawn, Pair(beside), Figure(_spectrum(found))]
 
 
 def _spectrum(found: Agreement) -> Plot:

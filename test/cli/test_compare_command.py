@@ -21,7 +21,7 @@ CONTRACT = {
                   'bias_by_third_v': [float]},
     'lowest_v': BAND, 'dips_per_min': [{'level_v': float, **BAND}],
     'spectrum': [{'from_hz': float, 'to_hz': float, 'simulated_over_measured': float}],
-    'worst': str, 'verdict': str}
+    'ks_distance': float, 'worst': str, 'verdict': str}
 MODEL = SupplyModel((OU(20.0, 0.3, 15.0), LoadSag(1.5, 0.0)))
 
 

@@ -131,7 +131,7 @@ def test_the_second_half_follows_from_the_first():
     assert found.lowest.inside and all(dips.inside for dips in found.dips)
     # What is farthest off is named, too, though it is within chance.
     assert found.words
-    assert found.farthest in ('lowest', 'dips', 'level', 'answer', 'spectrum')
+    assert found.farthest in ('lowest', 'dips', 'level', 'answer', 'spectrum', 'ks')
 
 
 def test_jitter_of_throttle_is_no_noise_and_no_path():
@@ -279,4 +279,5 @@ def test_numbers_outside_their_bands_are_named_beside_the_verdict():
     assert 'chance allows this' in said
     many = replace(far, dips=tuple(replace(one, measured=one.high + 1.0) for one in far.dips),
                    mean=replace(far.mean, measured=far.mean.high + 1.0))
-    assert 'only in part' in _answer(many)[0]
+    assert 'only in part' in _answer(many)[0] and 'KS distance' in {
+        row['measure'] for row in found.measures()}

@@ -136,7 +136,7 @@ def test_a_recording_is_the_farthest_as_often_as_each_simulation():
     for _ in range(600):
         x = rng.standard_normal((4, 21))
         p, *_ = judge([Difference(kind, row[0], row[1:], 1e-12, lambda b: '') for kind, row in zip(
-            ('lowest', 'level', 'spectrum', 'answer'), x)], 1.0, True)
+            ('lowest', 'level', 'spectrum', 'ks'), x)], 1.0, True)
         farthest += p < 1.5 / 21.0
         y = rng.standard_normal(51)
         outside += not band(y[0], y[1:]).inside
