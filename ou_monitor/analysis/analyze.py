@@ -89,7 +89,7 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
                     lambda share: report(0.5 + 0.5 * share))
     seen = overview(all_of_it, None if math.isnan(voltage) else voltage, results, cells,
                     raw, sliding.monitor)
-    judged = judge_levels(results, seen.load)
+    judged = judge_levels(results)
     throttles = [level.throttle for level in judged]
     estimates = [level.estimate for level in judged]
     relaxations = _relaxations(recording, judged)
@@ -329,7 +329,6 @@ def _level(level: LevelResult) -> dict[str, Any]:
         'var_inf': e.var_inf, 'var_inf_se': e.var_inf_se,
         'var_inf_ci95': list(e.interval('var_inf')),
         'tau_below_s': level.ou.tau_below_s, 'var_inf_below': level.ou.var_inf_below,
-        'sag': level.sag.sag, 'sag_se': level.sag.sag_se, 'sag_ci95': list(level.sag.interval),
         'u0': e.u0, 'u0_se': e.u0_se,
         'noise_std': e.noise_std,
         'process_type': level.kind.value,

@@ -44,10 +44,9 @@ from ou_monitor.model.ou_fit import fit_pieces, white_variance
 from ou_monitor.model.spectral_lines import (
     EvenGrid, find_lines, LineSearch, on_grid, without_lines)
 from ou_monitor.online.estimator.quality import examine, input_flags
-from ou_monitor.online.load.supply_load import SupplyLoad
 from ou_monitor.records import (
     Counters, Estimate, Flag, FloatArray, LOG_NAMES, NAN, OuFacts, Recording, Status)
-from ou_monitor.text import number, p_words, percent, Z95
+from ou_monitor.text import number, p_words, percent
 from ou_monitor.timeline import TAIL
 from scipy import stats
 from scipy.signal import welch
@@ -277,19 +276,6 @@ _LEAST_BINNED = 50
 _WANDERS = 0.5
 
 
-@dataclass(frozen=True)
-class LevelSag:
-    """Sag of one level, from the supply facts."""
-
-    sag: float = NAN  # V, positive
-    sag_se: float = NAN  # V
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """Return the 95 % interval, V."""
-        return self.sag - Z95 * self.sag_se, self.sag + Z95 * self.sag_se
-
-
 def mean_variance(time: float, n: int, estimate: Estimate, rms: float) -> float:
     """Return the variance of the mean of a segment of OU in white noise, V^2 (s, rms in V)."""
     if not estimate.usable:
@@ -351,7 +337,6 @@ class LevelResult:
     estimate: Estimate  # The same as the node reports it
     shape: Shape  # Tests of the type of process, adjusted over all levels
     verdict: KindVerdict = KindVerdict(ProcessType.UNDETERMINED, 'not judged')
-    sag: LevelSag = LevelSag()
     spectrum: LevelSpectrum = field(default_factory=LevelSpectrum)
     lines: LineSearch = field(default_factory=LineSearch)  # Spectral lines
     lines_kept: bool = False  # Whether the fit includes them, because impulses may cause them
@@ -478,13 +463,8 @@ def _grid_rate(grids: Sequence[EvenGrid]) -> float:
     return steps / time if time > 0.0 else 0.0
 
 
-def judge_levels(results: Sequence[LevelResult], load: SupplyLoad) -> tuple[LevelResult, ...]:
+def judge_levels(results: Sequence[LevelResult]) -> tuple[LevelResult, ...]:
     """Return the levels with their verdicts, all tests adjusted together."""
     shapes = holm([level.shape for level in results])
-    return tuple(
-        replace(level, shape=shape, sag=LevelSag(
-            float(load.sag(level.throttle)), float(load.sag_se(level.throttle)))
-                if load.known and math.isfinite(level.throttle) else LevelSag(),
-                verdict=classify(level.estimate, shape, sum(
-                    line.share for line in level.lines.lines)))
-        for level, shape in zip(results, shapes))
+    return tuple(replace(level, shape=shape, verdict=classify(level.estimate, shape, sum(
+        line.share for line in level.lines.lines))) for level, shape in zip(results, shapes))

@@ -276,8 +276,6 @@ def _curves(analysis: Analysis) -> list[Part]:
     answer, error = 1e3 * _column(found.sag.sag_v), 2e3 * _column(found.sag.se_v)
     sag = _empty('Sag', 'mV').band(x, np.maximum(answer - error, 0.0), answer + error, '95 %', 0)
     sag.line(x, answer, 'estimate', 0, 'thick')
-    _with_levels(sag, at, 1e3 * _column([level.sag.sag for level in levels]),
-                 1e3 * _column([level.sag.interval for level in levels]))
     noise = _empty('Noise', 'mV rms')
     for values, label, colour in ((found.noise.rms_v, 'all samples', 0),
                                   (found.noise.steady_rms_v, 'steady throttle', 2)):
@@ -313,14 +311,10 @@ def _column(values: Sequence[float] | Sequence[tuple[float, float]]) -> FloatArr
     return np.array(values, dtype=np.float64)
 
 
-def _with_levels(plot: Plot, x: FloatArray, y: FloatArray, ends: FloatArray) -> None:
-    low, high = ends.reshape(-1, 2).T
-    plot.bars(x, low, high, '', 7).markers(x, y, 'load levels', 7)
-
-
 def _with_estimates(plot: Plot, x: FloatArray, levels: Sequence[LevelResult], name: str) -> None:
-    _with_levels(plot, x, _column([getattr(level.estimate, name) for level in levels]),
-                 _column([level.estimate.interval(name) for level in levels]))
+    low, high = _column([level.estimate.interval(name) for level in levels]).reshape(-1, 2).T
+    plot.bars(x, low, high, '', 7).markers(
+        x, _column([getattr(level.estimate, name) for level in levels]), 'load levels', 7)
 
 
 def _levels(analysis: Analysis) -> list[Part]:

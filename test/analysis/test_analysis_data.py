@@ -16,7 +16,7 @@ KEYS = {'recording', 'n', 'duration_s', 'rate_hz', 'source', 'craft', 'overview'
 LEVEL_KEYS = {
     'throttle', 'segments', 'time_s', 'n', 'mean', 'vpp', 'peak', 'vrms', 'crest', 'alpha',
     'alpha_se', 'alpha_ci95', 'tau', 'tau_se', 'tau_ci95', 'sigma', 'sigma_se', 'sigma_ci95',
-    'var_inf', 'var_inf_se', 'var_inf_ci95', 'sag', 'sag_se', 'sag_ci95', 'u0', 'u0_se',
+    'var_inf', 'var_inf_se', 'var_inf_ci95', 'u0', 'u0_se',
     'noise_std', 'process_type', 'process_within', 'process_reason', 'process_tests', 'skewness',
     'excess_kurtosis', 'impulses', 'impulse_rate_hz', 'impulse_rate_ci95', 'lines',
     'line_search', 'psd', 'status', 'status_text', 'flags', 'tau_below_s',
