@@ -33,7 +33,7 @@ class Executable:
     def _work(self, lifecycle: bool) -> int:
         kind = getattr(import_module(f'ou_monitor.nodes.{self.module}'), self.kind)
         if lifecycle:
-            from ou_monitor.nodes.lifecycle import managed
+            from ou_monitor.nodes.base import managed
             kind = managed(kind)
         return spin(lambda: kind(self.node))
 

@@ -17,12 +17,14 @@ from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from ou_monitor.errors import InputError, nearest
+from ou_monitor.nodes.run import one_line
 from ou_monitor.online.settings import Parameter
 from ou_monitor.records import Level
 from rcl_interfaces.msg import (
     FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult)
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.publisher import Publisher
@@ -373,6 +375,63 @@ def _descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
     return ParameterDescriptor(
         description=parameter.description, read_only=read_only, dynamic_typing=parameter.mixed,
         additional_constraints=' | '.join(words), **ends)
+
+
+def managed(kind: type[MonitorNode]) -> Callable[[str], MonitorNode]:
+    """Return the unconfigured managed version of a kind of node (design.ros2.org)."""
+    # Before it is active it has parameters and lifecycle services only.  After a failure it stays
+    # in its former state.
+    class Managed(LifecycleNodeMixin, kind):  # type: ignore[misc, valid-type]
+        """A node whose work is begun and ended by transitions."""
+
+        def __init__(self, name: str) -> None:
+            kind.__init__(self, name, managed=True)  # type: ignore[call-arg]
+            LifecycleNodeMixin.__init__(self)
+            change = self._service_change_state
+            original = change.callback
+
+            def answer(request: Any, response: Any) -> Any:
+                # rclpy 7.1 raises if a state has no such transition, which would end the node.
+                try:
+                    return original(request, response)
+                except Exception as error:
+                    self.get_logger().error(f'no such transition now: {one_line(error)}')
+                    response.success = False
+                    return response
+            change.callback = answer
+
+        def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+            """Check that the node can begin; then stop it."""
+            def tried() -> None:
+                self.begin()
+                self.stop()
+            return self._done('configured', tried)
+
+        def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+            return self._done('activated', self.begin)
+
+        def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+            return self._done('deactivated', self.stop)
+
+        def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+            return self._done('shut down', self.stop)
+
+        def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+            return self._done('reset', self.stop)
+
+        def _done(self, what: str, work: Callable[[], Any]) -> TransitionCallbackReturn:
+            # rclpy would report an exception without its message.
+            try:
+                work()
+            except InputError as error:
+                self.get_logger().error(f'cannot be {what}: {error}')
+                return TransitionCallbackReturn.FAILURE
+            except Exception as error:
+                self.get_logger().error(f'cannot be {what}: {type(error).__name__}: {error}')
+                return TransitionCallbackReturn.ERROR
+            return TransitionCallbackReturn.SUCCESS
+
+    return Managed
 
 
 def wait_until(instant: float, going: Callable[[], bool]) -> bool:

@@ -15,7 +15,7 @@ from numbers import Real
 from typing import Any, cast, TypeVar
 
 from ou_monitor.errors import nearest
-from ou_monitor.online.filter.lag import cutoff_for_lag, most_lag
+from ou_monitor.online.filter.filter_state import cutoff_for_lag, most_lag
 
 
 @dataclass(frozen=True)

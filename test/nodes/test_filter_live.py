@@ -8,7 +8,7 @@ from live import diagnosis, seconds, values_of, wait_until
 import numpy as np
 from ou_monitor import AdaptiveLowPass
 from ou_monitor.online.filter.cutoff_laws import relative_cutoff
-from ou_monitor.online.filter.lag import phase_lag
+from ou_monitor.online.filter.filter_state import phase_lag
 import pytest
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Float64

@@ -5,7 +5,7 @@ import time
 from diagnostic_msgs.msg import DiagnosticArray
 from live import diagnosis, values_of, wait_until
 import numpy as np
-from ou_monitor.online.filter.lag import delay, phase_lag
+from ou_monitor.online.filter.filter_state import delay, phase_lag
 import pytest
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Float32, Float64

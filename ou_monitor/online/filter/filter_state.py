@@ -1,5 +1,5 @@
 """
-The low-pass itself: two states, advanced by steps of any length.
+The low-pass itself: two states, advanced by steps of any length; its phase lag.
 
 With w = 2 pi fc, input x, output y:
 
@@ -13,11 +13,14 @@ impulse response: 1 for order 1, coth(pi / 2) = 1.0903 for order 2.
 
 Between samples the input is linear.  An input held at its newest value would lead by
 half a sample (18 degrees at a tenth of the sample rate); a linear one has no phase
-error, and its amplitude is too small by (pi f dt)^2 / 3.
+error, and its amplitude is too small by (pi f dt)^2 / 3.  So with r = f / fc the lag is that of
+the continuous filter: atan r for order 1, atan2(sqrt(2) r, 1 - r^2) for order 2.  The lag of a
+derivative is relative to the true derivative.
 """
 
 from __future__ import annotations
 
+import cmath
 import math
 
 _ROOT2 = math.sqrt(2.0)
@@ -51,3 +54,48 @@ class LowPassState:
         self.y += (c + s) * off + _ROOT2 * s * slope + rise * (1.0 + c / p)
         self.slope += (c - s) * slope - _ROOT2 * s * off - rise * (c + s) / angle
         return self.y
+
+
+def phase_lag(order: int, cutoff: float, frequency: float) -> float:
+    """Return the phase lag of a low-pass (cutoff in Hz, frequency in Hz)."""
+    ratio = frequency / cutoff
+    if order == 1:
+        return math.degrees(math.atan(ratio))
+    return math.degrees(math.atan2(_ROOT2 * ratio, 1.0 - ratio * ratio))
+
+
+def delay(lag: float, frequency: float) -> float:
+    """Return the phase delay, s, of a `lag` in degrees at `frequency`, Hz."""
+    return lag / (360.0 * frequency)
+
+
+def most_lag(order: int) -> float:
+    """Return the limit that the lag of a low-pass approaches, degrees."""
+    return 90.0 * order
+
+
+def cutoff_for_lag(order: int, lag: float, frequency: float) -> float:
+    """Return the cutoff, Hz, whose lag at a frequency, Hz, is `lag`: inverse of `phase_lag`."""
+    # Order 1: fc = f / tan(lag).  Order 2: with c = cot(lag), r^2 + sqrt(2) c r - 1 = 0, so fc = f
+    # / r = f (c + sqrt(c^2 + 2)) / sqrt(2).
+    if not 0.0 < lag < most_lag(order):
+        raise ValueError(
+            f'a low-pass of order {order} lags by more than 0 and less than '
+            f'{most_lag(order):g} degrees, got {lag:g}')
+    angle = math.radians(lag)
+    cot = math.cos(angle) / math.sin(angle)
+    if order == 1:
+        return frequency * cot
+    return frequency * (cot + math.hypot(cot, _ROOT2)) / _ROOT2
+
+
+def share_for_lag(response: complex, raw: complex, most: float) -> float:
+    """Return the share of the unfiltered signal that reduces a lag to a limit, rad."""
+    # A mixture (1 - m) H + m R has the lag p where (1 - m) H e^(ip) + m R e^(ip) has the imaginary
+    # part 0.
+    if -cmath.phase(response) <= most:
+        return 0.0
+    turned, straight = (one * cmath.exp(1j * most) for one in (response, raw))
+    if straight.imag <= 0.0:
+        return 1.0
+    return turned.imag / (turned.imag - straight.imag)

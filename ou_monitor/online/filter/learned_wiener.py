@@ -20,7 +20,7 @@ with noise^2.  C_s keeps only what exceeds the sampling error of C_z - C_n, in e
 - Manoeuvre after calm: if a hop does not fit C_s + C_n (largest normalised square above the 99.9 %
   quantile of chi squared), C_s is scaled up in proportion, which opens the filter at once.
 - If the lag of the combination exceeds its limit, just enough of the input is mixed in to meet it
-  (`lag.share_for_lag`).
+  (`share_for_lag`).
 
 A step of the low-passes (`filter_state`) is z' = F z + a start + b end, exact for an input that is
 linear between samples; for a derivative the input is the difference quotient.
@@ -42,8 +42,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.online.filter.cutoff_control import time_constant
-from ou_monitor.online.filter.filter_state import LowPassState
-from ou_monitor.online.filter.lag import phase_lag, share_for_lag
+from ou_monitor.online.filter.filter_state import LowPassState, phase_lag, share_for_lag
 from ou_monitor.online.settings import FilterSettings
 from ou_monitor.records import FloatArray, NAN
 

@@ -25,8 +25,8 @@ import numpy.typing as npt
 from ou_monitor.online.filter.cutoff_control import (
     Bound, CutoffControl, OF_RATE, SampleInterval)
 from ou_monitor.online.filter.cutoff_laws import wanted_cutoff
-from ou_monitor.online.filter.filter_state import LowPassState
-from ou_monitor.online.filter.lag import cutoff_for_lag, delay, most_lag, phase_lag
+from ou_monitor.online.filter.filter_state import (
+    cutoff_for_lag, delay, LowPassState, most_lag, phase_lag)
 from ou_monitor.online.filter.learned_wiener import LearnedWiener
 from ou_monitor.online.settings import FilterSettings
 from ou_monitor.records import FloatArray, NAN

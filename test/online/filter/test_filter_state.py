@@ -4,8 +4,8 @@ import math
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
-from ou_monitor.online.filter.filter_state import LowPassState
-from ou_monitor.online.filter.lag import cutoff_for_lag, delay, phase_lag
+from ou_monitor.online.filter.filter_state import (
+    cutoff_for_lag, delay, LowPassState, phase_lag)
 import pytest
 from scipy import integrate, signal
 

@@ -9,7 +9,7 @@ import numpy as np
 from ou_monitor import AdaptiveLowPass
 from ou_monitor.online.filter import learned_wiener
 from ou_monitor.online.filter.cutoff_control import Bound
-from ou_monitor.online.filter.lag import phase_lag
+from ou_monitor.online.filter.filter_state import phase_lag
 import pytest
 from scipy import linalg, signal
 
