@@ -1,13 +1,7 @@
 """
-Effects of the ADC and its input on the readings: steps, clipping, compression, repeats.
+Effects of the ADC on the readings: steps, clipping, repeats.
 
-Ties have probability zero in a diffusion, so steps and clipping need no model.  A protection diode
-before the ADC compresses readings beyond a knee logarithmically; knee and scale maximise the
-likelihood of an AR(1) for the expanded readings, Jacobian included.
-
-Omitting clipped samples would truncate the distribution and bias every statistic of the rest.  So
-they are drawn from an AR(1), given their neighbours and the limit (Gibbs sampling; Tanner & Wong,
-J. Am. Stat. Assoc. 82 (1987) 528).
+Ties have probability zero in a diffusion, so they need no model.
 """
 
 from __future__ import annotations
@@ -18,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.records import FloatArray
 from ou_monitor.timeline import reading_places, reading_times
-from scipy.special import ndtr, ndtri
 
 # Maximum values used to find the step and clipping.
 EXAMINED = 200_000
@@ -42,23 +35,6 @@ _LIFTED = 2
 _COARSE = 2.0
 # Number of throttle ranges, each with its own noise; throttle above the lowest that is still idle.
 _LOADS, _STILL = 8, 0.01
-# Sweeps of Gibbs sampling; excursions last a few relaxation times.
-_SWEEPS = 60
-# Compression: shares of the samples beyond the knee, and scales in standard deviations of the
-# innovations.  A larger scale is a bent characteristic, not a limit.
-_SHARES = (0.01, 0.02, 0.03, 0.045, 0.06, 0.08, 0.1)
-_SCALES = (0.05, 0.1, 0.15, 0.2, 0.3)
-# Minimum log likelihood ratio, nats.
-_FOUND = 50.0
-# Minimum number of falls that begin just below the knee; their minimum rms, relative to all falls;
-# number of parts of the recording, half of which must have samples beyond the knee.
-_FEWEST, _AS_NOISY, _PARTS = 30, 0.6, 10
-# Order of the AR that also predicts lines: two for each line, and as many for the noise.
-_LINES = 16
-# Maximum excess over the knee, in scales, that is expanded exponentially.
-_FAR = 8.0
-# Lower limit of a sum of squares, so that its inverse is finite.
-_TINY = 1e-280
 
 
 def find_step(voltage: FloatArray) -> float:
@@ -210,92 +186,6 @@ def _clipping_limit(x: FloatArray, step: float, noisy: npt.NDArray[np.bool_]) ->
     return math.inf
 
 
-def redraw(voltage: FloatArray, low: float, high: float, step: float,
-           rng: np.random.Generator) -> FloatArray:
-    """Return the voltage with clipped samples drawn beyond their limits (all in V)."""
-    v = voltage.astype(np.float64)
-    top, bottom = voltage >= high, voltage <= low
-    sites = np.flatnonzero(top | bottom)
-    sites = sites[(sites > 0) & (sites < v.size - 1)]
-    halves = [sites[sites % 2 == parity] for parity in (0, 1)]
-    for _ in range(_SWEEPS):
-        mean = float(v.mean())
-        c = v - mean
-        phi = min(float(c[1:] @ c[:-1]) / float(c @ c), 0.9999)
-        spread = float(np.sqrt(np.mean((c[1:] - phi * c[:-1]) ** 2) / (1.0 + phi * phi)))
-        for k in halves:
-            centre = mean + phi / (1.0 + phi * phi) * (c[k - 1] + c[k + 1])
-            side = np.where(top[k], 1.0, -1.0)
-            limit = np.where(top[k], high, low)
-            # Probability of the side beyond the limit, then a draw there.
-            room = ndtr(side * (centre - limit) / spread)
-            draw = -ndtri(np.maximum(room * (1.0 - rng.random(k.size)), 1e-300))
-            c[k] = np.where(room > 1e-12, centre + side * spread * draw, limit) - mean
-        v = c + mean
-    if step > 0.0:
-        for at, end in ((top, high), (bottom, low)):
-            v[at] = end + step * np.rint((v[at] - end) / step)
-    return v
-
-
-def find_knee(voltage: FloatArray, noise: float, side: float,
-              throttle: FloatArray | None = None) -> float | None:
-    """Return the voltage beyond which readings are compressed; None if there is none (V)."""
-    x = side * voltage
-    plain = _likelihood(x)
-    best, found, undone, squeezed = plain + _FOUND, None, x, 0.0
-    for share in _SHARES:
-        knee = float(np.quantile(x, 1.0 - share))
-        over = np.maximum(x - knee, 0.0)
-        for scale in _SCALES:
-            far = over / (scale * noise)
-            if float(far.max()) > 1e3:
-                continue
-            part = np.minimum(far, _FAR)
-            # Beyond `_FAR`, continue along the tangent.
-            stretched = np.expm1(part) + (far - part) * math.exp(_FAR)
-            whole = np.minimum(x, knee) + scale * noise * stretched
-            value = float(part.sum()) + _likelihood(whole)
-            if value > best:
-                best, found, undone, squeezed = value, knee, whole, float(part.sum())
-    if found is None or not _is_limit(x, found):
-        return None
-    # If the samples beyond the knee are mostly at idle, the rail may just be quiet there.
-    idle = None if throttle is None else _idle(throttle)
-    if idle is not None and not idle.all() and min(
-            float(idle[x > found].mean()), float((x > found)[idle].mean())) > 0.5:
-        return None
-    # A spectral line is also slow at its turning points, but an AR of higher order predicts it.
-    gain = squeezed + _likelihood(undone, _LINES) - _likelihood(x, _LINES)
-    return side * found if gain > _FOUND else None
-
-
-def _is_limit(x: FloatArray, knee: float) -> bool:
-    """Return whether noise is compressed above the knee only, and repeatedly."""
-    # A rail that is quiet without load also stays near its top, but it is quiet just below the
-    # knee too, and only during one long time.
-    step = np.diff(x)
-    near = (x[:-1] < knee) & (x[:-1] > knee - 3.0 * float(np.std(step)))
-    # With a limit, falls from just below the knee are not compressed.
-    below, all_ = step[near & (step < 0.0)], step[step < 0.0]
-    if below.size < _FEWEST or float(np.sqrt(np.mean(below**2))) < _AS_NOISY * float(
-            np.sqrt(np.mean(all_**2))):
-        return False
-    parts = np.array_split(x > knee, _PARTS)
-    return sum(bool(part.any()) for part in parts) >= _PARTS // 2
-
-
-def _likelihood(x: FloatArray, order: int = 1) -> float:
-    """Return the log-likelihood of an AR of an order, less a constant, nats."""
-    count = int(x.size - order)
-    c = x - x.mean()
-    past = np.lib.stride_tricks.sliding_window_view(c, order + 1)
-    square = past.T @ past
-    weights = np.linalg.lstsq(square[:order, :order], square[:order, order], rcond=None)[0]
-    e = past[:, order] - past[:, :order] @ weights
-    return -0.5 * count * math.log(max(float(e @ e), _TINY) / count)
-
-
 # Minimum number of repeats, or of runs of repeats; chance of a tie up to which the size of the
 # changes predicts the number of ties.
 _FEWEST_TIES, _FINE = 20, 0.15
@@ -306,7 +196,7 @@ _APART, _PERIODS = (2, 4, 8), range(9, 101)
 _CALMEST = 100.0
 # Minimum excess of ties, and maximum deficit of the changes at the ends of runs, standard errors.
 _CLEARLY, _SHORT = 6.0, 3.0
-# Share at either end of the range where readings may be compressed.
+# Share at either end of the range where a limit may hold readings.
 _END = 0.1
 # Maximum samples used to find repeats.
 _EXAMINED = 200_000

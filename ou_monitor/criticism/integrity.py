@@ -14,7 +14,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.criticism.adc import (
-    find_knee, find_rails, find_step, innovation_std, redraw, usual_change, without_repeats)
+    find_rails, find_step, innovation_std, usual_change, without_repeats)
 from ou_monitor.criticism.readings import load_of, two_levels, usable, why_no_model
 from ou_monitor.criticism.samples import (
     choose_samples, events_between, lines_between, Samples, without_tones)
@@ -96,25 +96,16 @@ def examine(recording: Recording, progress: Callable[[float], None] | None = Non
     exact += lines
     report(0.6)
     drawn = None
-    # Outliers widen a normal distribution, so they would hide or imitate a compression.
-    kept = ~outlying(v)
-    noise = innovation_std(v[kept])
     step = find_step(v)
-    low, high = find_rails(v, step or usual_change(v), noise, u)
-    soft = 'readings compressed near the end of the range'
-    if not math.isfinite(low) and not math.isfinite(high):
-        low, high = _knees(v[kept], noise, None if u is None else u[kept])
-    else:
-        soft = 'samples at the end of the range'
+    low, high = find_rails(v, step or usual_change(v), innovation_std(v[~outlying(v)]), u)
     if math.isfinite(low) or math.isfinite(high):
         drawn = (v <= low) | (v >= high)
         # A limit that was not found is set far from all readings.
         far = 1e3 * float(np.ptp(v))
         exact.append(Saturation(low if math.isfinite(low) else float(v.min()) - far,
                                 high if math.isfinite(high) else float(v.max()) + far))
-        notes.append(f'{int(drawn.sum())} {soft} were replaced by random draws beyond the '
-                     'range, from an OU through their neighbours.')
-        v = redraw(v, low, high, step, np.random.default_rng(0))
+        notes.append(f'{int(drawn.sum())} samples at the end of the range were replaced by '
+                     'random draws beyond it, from a model of the others.')
     cell = _judge_step(step, innovation_std(v), exact, notes)
     stamps = judge_stamps(t, v)
     notes += stamps.notes
@@ -150,14 +141,6 @@ def _judge_step(step: float, noise: float, exact: list[Term], notes: list[str]) 
     size = f'{step / own:.2g} times the' if named else 'small relative to the'
     notes.append(f'The ADC has steps of {1e3 * step:.3g} mV, {size} noise between samples.')
     return step if named else 0.0
-
-
-def _knees(v: FloatArray, noise: float, u: FloatArray | None) -> tuple[float, float]:
-    """Return the limits beyond which readings are compressed; infinite if there is none."""
-    if not noise > 0.0:
-        return -math.inf, math.inf
-    bottom, top = find_knee(v, noise, -1.0, u), find_knee(v, noise, 1.0, u)
-    return -math.inf if bottom is None else bottom, math.inf if top is None else top
 
 
 def _usable_throttle(u: FloatArray | None, recorded: bool, notes: list[str]) -> FloatArray | None:

@@ -42,8 +42,8 @@ from ou_monitor.text import listed, number, Z95
 
 # Why the gain of a line above the Nyquist frequency of the samples used is unknown.
 FAST = 'the rate of the samples used is too low to show this line.'
-# Alternations between drawing clipped samples and fitting the load to them.
-_REDRAWN = 2
+# Alternations between drawing clipped or coarse samples and fitting the load to them.
+_REDRAWN = 3
 # Maximum sampling step, in relaxation times, that still shows the relaxation.
 _BLIND = 1.0
 

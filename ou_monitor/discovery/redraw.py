@@ -1,7 +1,8 @@
 """
 Redraw readings that the ADC clips, or rounds to codes wider than the rail's moves.
 
-A path of the rail is drawn given all readings, then each affected reading given the path.
+Omitting clipped samples would truncate the distribution and bias every statistic of the rest.  So
+a path of the rail is drawn given all readings, then each affected reading given the path.
 
 Rounding errors of wide codes are neither normal nor white; taken for white noise, they look like
 heavy tails or switching.  Under the right model, readings redrawn within their codes follow it

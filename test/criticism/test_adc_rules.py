@@ -1,9 +1,9 @@
-"""Steps, clipping and compressed ends of an ADC, each rule at its edge."""
+"""Steps and clipping of an ADC, each rule at its edge."""
 
 import math
 
 import numpy as np
-from ou_monitor.criticism.adc import find_knee, find_rails, find_step
+from ou_monitor.criticism.adc import find_rails, find_step
 import pytest
 from scipy.signal import lfilter
 
@@ -140,39 +140,3 @@ def test_a_value_far_from_all_others_is_no_rail():
     for gap, found in ((0.15, True), (0.25, False)):
         v = np.concatenate((others, np.full(60, gap)))
         assert (find_rails(rng.permutation(v), 0.0, 1.0)[1] == gap) == found
-
-
-def squeezed(side, share=0.03, scale=0.15, n=8000, seed=7):
-    """Return an OU that a diode squeezes beyond a knee, and the knee; deviation of steps."""
-    x = noise(n, seed)
-    step = math.sqrt(0.2)
-    knee = np.quantile(x, 1.0 - share)
-    over = np.maximum(x - knee, 0.0)
-    return side * (np.minimum(x, knee) + scale * step * np.log1p(over / (scale * step))), (
-        side * knee), step
-
-
-@pytest.mark.parametrize('side', (1.0, -1.0))
-@pytest.mark.parametrize('share', (0.02, 0.03, 0.06))
-def test_a_knee_is_found_where_it_is(side, share):
-    """Within the quantiles that are tried; and on its own side only."""
-    v, knee, step = squeezed(side, share)
-    found = find_knee(v, step, side)
-    assert found is not None and abs(found - knee) < 0.12
-    assert find_knee(v, step, -side) is None
-    # All of it at idle: how quiet the rail is then; at a throttle that never moves, all is.
-    idle = np.where(side * v > side * knee, 0.0, 0.5)
-    assert find_knee(v, step, side, idle) is None
-    assert find_knee(v, step, side, 0.5 - idle) == find_knee(v, step, side, 0.0 * idle) == found
-
-
-@pytest.mark.parametrize('seed', range(3))
-def test_an_uncompressed_voltage_has_no_knee(seed):
-    """An OU; nor where all beyond it is one long while."""
-    v = noise(8000, seed)
-    assert find_knee(v, math.sqrt(0.2), 1.0) is None and find_knee(v, math.sqrt(0.2), -1.0) is None
-    v, _, step = squeezed(1.0, 0.06)
-    rest = np.minimum(v, np.quantile(v, 0.9))
-    once = np.where(np.arange(v.size) // 1600 == 2, v, rest)
-    assert find_knee(once, step, 1.0) is None
-

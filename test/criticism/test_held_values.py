@@ -1,7 +1,7 @@
 """Held values, distinguished from codes equal by chance, from lines, and from rest."""
 
 import numpy as np
-from ou_monitor.criticism.adc import find_knee, without_repeats
+from ou_monitor.criticism.adc import without_repeats
 import pytest
 from scipy.signal import lfilter
 
@@ -77,13 +77,3 @@ def test_a_rail_at_rest_is_not_held():
     rest = np.mod(T, 3.0) < 1.0
     still = lfilter([0.05], [1.0, -0.95], np.where(rest, 0.0, wander(7)))
     assert left(coded(still + 0.02 * wander(8), 0.05)) == N
-
-
-@pytest.mark.parametrize('noise', [0.2, 0.4])
-def test_turning_points_of_a_line_are_not_squeezed(noise):
-    for seed in range(3):
-        load = np.abs(wander(seed, phi=0.99))
-        v = (3.0 * np.sin(2.0 * np.pi * np.cumsum(0.06 + 0.05 * load)) + noise * wander(seed + 20)
-             - 2.0 * load)
-        error = v[1:] - np.polyval(np.polyfit(v[:-1], v[1:], 1), v[:-1])
-        assert find_knee(v, error.std(), 1.0) is None

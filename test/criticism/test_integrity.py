@@ -42,7 +42,7 @@ def test_a_plain_rail_has_nothing(seed, rounded):
 @pytest.mark.parametrize('load', [0.0, 0.4])
 @pytest.mark.parametrize('count', [30, 200])
 def test_outliers_are_no_limit_of_the_adc(load, count):
-    """2 V below; as a compression of the rest they would gain hundreds of nats."""
+    """2 V below all others."""
     t, v = rail(4, u0=12.0)
     u = np.where(t % 4.0 < 3.0, 0.2, 0.7)
     v = v - load * u
@@ -100,7 +100,7 @@ def test_no_lattice_in_what_is_rounded_to_text():
 @pytest.mark.parametrize('step', [0.0, 0.3 * STEP_STD])
 @pytest.mark.parametrize('sides', ['low', 'high', 'both'])
 def test_rails_are_found(step, sides):
-    """4 % beyond an end: the limits; other samples as they are; beyond them the rail goes on."""
+    """4 % beyond an end: the limits; all samples stay as they are."""
     t, v = rail(5)
     v = step * np.rint(v / step) if step else v
     low, high = np.quantile(v, [0.04, 0.96])
@@ -109,13 +109,8 @@ def test_rails_are_found(step, sides):
     (term,) = [term for term in found.exact if term.NAME == 'saturation']
     s = found.samples.voltage
     assert (term.low == low) == (sides != 'high') and (term.high == high) == (sides != 'low')
-    inside = (clipped > term.low) & (clipped < term.high)
-    assert np.array_equal(s[inside], clipped[inside])
-    assert np.array_equal(found.drawn, ~inside)
-    assert (clipped <= term.low).sum() == (s <= term.low).sum()
-    # What is drawn beyond the limit has the variance of the rail back: within three standard
-    # errors, sqrt(2 / (alpha T)) = 4 % for 20 s; clipping takes 5 to 10 %.
-    assert abs(s.var() / v.var() - 1.0) < 0.03 < 1.0 - clipped.var() / v.var()
+    assert np.array_equal(s, clipped)
+    assert np.array_equal(found.drawn, (clipped <= term.low) | (clipped >= term.high))
 
 
 def test_wrong_stamps_differ_from_uneven_sampling():

@@ -5,39 +5,13 @@ from types import SimpleNamespace
 
 import numpy as np
 from numpy.testing import assert_allclose
-from ou_monitor.criticism.adc import find_rails, redraw
+from ou_monitor.criticism.adc import find_rails
 from ou_monitor.criticism.composite import _converged
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.criticism.structure import evaluate, Events, solved
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise
 import pytest
-
-
-@pytest.mark.parametrize('side', (1.0, -1.0))
-@pytest.mark.parametrize('step', (0.0, 0.02))
-def test_samples_beyond_a_limit_are_drawn_from_the_bridge(side, step):
-    """Clipped at one deviation: variance and lag-1 correlation of the AR(1) come back."""
-    # Their standard errors by Bartlett, of n / 8 independent ones, and the rest by what is known.
-    n, keep = 40_000, 0.8
-    rng = np.random.default_rng(4)
-    x = np.zeros(n)
-    noise = rng.standard_normal(n) * math.sqrt(1.0 - keep * keep)
-    for k in range(1, n):
-        x[k] = keep * x[k - 1] + noise[k]
-    if step:
-        x = step * np.rint(x / step)
-    x *= side
-    low, high = (-math.inf, 1.0) if side > 0.0 else (-1.0, math.inf)
-    clipped = np.clip(x, low, high)
-    found = redraw(clipped, low, high, step, np.random.default_rng(5))
-    inside = (clipped > low) & (clipped < high)
-    assert_allclose(found[inside], x[inside])
-    assert (side * found[~inside] >= 1.0 - 1e-9).all()
-    assert found.std() == pytest.approx(x.std(), abs=0.05)
-    assert np.corrcoef(found[1:], found[:-1])[0, 1] == pytest.approx(keep, abs=0.02)
-    if step:
-        assert_allclose(found / step, np.rint(found / step), atol=1e-6)
 
 
 @pytest.mark.parametrize('offset', (50.0, -50.0))

@@ -5,7 +5,9 @@ import math
 import numpy as np
 from ou_monitor import discover, Recording
 from ou_monitor.criticism.composite import fit_composite
+from ou_monitor.criticism.integrity import examine
 from ou_monitor.criticism.samples import Samples
+from ou_monitor.discovery.discover import _start, _without_clipping
 from ou_monitor.discovery.redraw import redraw_clipped
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_dependent import LoadDependentSigma
@@ -42,6 +44,20 @@ def test_drawn_readings_have_the_mean_of_the_clipped_ones(seed):
     # A run of clipped readings counts once.
     runs = int((clipped[1:] & ~clipped[:-1]).sum())
     assert abs(float(off.mean())) < 4.0 * float(off.std()) / math.sqrt(runs)
+
+
+@pytest.mark.parametrize('step', [0.0, 0.003])
+@pytest.mark.parametrize('sides', ['low', 'both'])
+def test_what_is_drawn_has_the_variance_of_the_rail(step, sides):
+    """Within 3 standard errors, sqrt(2 / (alpha T)) = 4 % for 20 s; clipping takes 5 to 10 %."""
+    t = np.arange(20_000) / 1000.0
+    v = SupplyModel((OU(63.0, 0.3156, 5.0),)).simulate(t, np.random.default_rng(5))
+    v = step * np.rint(v / step) if step else v
+    low, high = np.quantile(v, [0.04, 0.96])
+    clipped = np.clip(v, low, high if sides == 'both' else np.inf)
+    state = examine(Recording(t, clipped, np.full(t.size, np.nan)))
+    samples, _ = _without_clipping(state.samples, state, _start(state.samples, state))
+    assert abs(samples.voltage.var() / v.var() - 1.0) < 0.03 < 1.0 - clipped.var() / v.var()
 
 
 def test_codes_stay_codes():

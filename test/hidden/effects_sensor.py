@@ -115,20 +115,6 @@ def saturation_two(bench: Bench, gain: float) -> dict[str, object]:
     return {'share': share}
 
 
-@effect('saturation/soft')
-def saturation_soft(bench: Bench, gain: float) -> dict[str, object]:
-    """Let a protection diode clamp the input: beyond a knee it rises as a logarithm only."""
-    share = bench.draw.uniform(0.03, 0.08) * gain
-    scale = 0.15 * bench.innovation
-
-    def clamp(v: np.ndarray) -> np.ndarray:
-        knee = np.quantile(v, 1 - share)
-        over = np.maximum(v - knee, 0)
-        return np.minimum(v, knee) + scale * np.log1p(over / scale)
-    bench.stage('range', clamp)
-    return {'share': share, 'diode_v': scale}
-
-
 @effect('ac_coupling')
 def ac_coupling(bench: Bench, gain: float) -> dict[str, object]:
     """Read a rail of 1..5 1/s through a series capacitor, corner 5..12 Hz."""
