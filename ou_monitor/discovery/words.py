@@ -70,9 +70,9 @@ _LISTED = 6
 
 
 def parameters(term: Term, se: Mapping[str, Any]) -> str:
-    """Return the estimates of a term with units and errors, without undetermined ones."""
+    """Return the estimates of a term with units and errors; without those unknown, or unused."""
     known = {name: value for name, value in term.values().items()
-             if se.get(name) != math.inf and value != term.usual().get(name)}
+             if se.get(name) != math.inf and value != term.usual().get(name, 0.0)}
     long = [name for name, value in known.items()
             if isinstance(value, list) and len(value) > _LISTED]
     found = [f'{term.label(name)} = '

@@ -48,9 +48,10 @@ class LoadSag(Term):
         'reduce it.')
     SEPARATED_BY: ClassVar[str] = 'throttle held for some seconds at several levels'
 
-    linear: float = parameter('V', 'drop at full throttle, linear part', label='settled fall')
+    linear: float = parameter('V', 'drop at full throttle, linear part',
+                              label='settled fall, linear')
     square: float = parameter('V', 'drop at full throttle, quadratic part',
-                              label='with the square of throttle')
+                              label='settled fall, square')
     growth: float = parameter('V/s', 'growth of the linear part', default=0.0)
 
     def change(self, s: Segment) -> None:
