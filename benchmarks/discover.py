@@ -255,7 +255,7 @@ def recorded_runs(given: argparse.Namespace) -> str:
             alike = agreement(*(discover(part_of(run, part)).as_data()
                                 for part in (slice(0, middle), slice(middle, None))))
         extended = whole['extended']
-        falls = [extended['crossing_rate'][key] for key in ('observed', 'baseline', 'extended')]
+        dips = [whole['dips']['per_min'][key] for key in ('observed', 'baseline', 'extended')]
         left = len(whole['remaining'])
         rows.append([
             name + (', by current' if whole['load'] == 'current' else ''),
@@ -265,12 +265,12 @@ def recorded_runs(given: argparse.Namespace) -> str:
             + (', refused' if whole['refused'] else ''),
             *('-' if extended[key] is None else f'{factor * extended[key]:.{digits}f}'
               for key, factor, digits in (('gain', 1.0, 2), ('errors_shrink', 100.0, 0))),
-            ', '.join('-' if one is None else f'{one:.3g}' for one in falls),
+            ', '.join('-' if one is None else f'{one:.3g}' for one in dips),
             '-' if np.isnan(alike) else f'{alike:.2f}', f'{spent[-1]:.1f}'])
         say(' | '.join(rows[-1]))
         agreed += [] if np.isnan(alike) else [alike]
     text = table(['recording', 'causes', 'statistics left', 'gain, nats', 'errors shrink, %',
-                  'falls a minute: seen, plain OU, extended', 'halves agree', 'CPU s'], rows)
+                  'dips a minute: seen, plain OU, extended', 'halves agree', 'CPU s'], rows)
     text += f'\nCPU time: {median(spent):.1f} s at the median, {max(spent):.1f} s at most.'
     return text + (f' Halves name the same causes (Jaccard): {mean(agreed):.2f} in the mean of '
                    f'{len(agreed)} recordings.\n' if agreed else '\n')
