@@ -171,7 +171,7 @@ def known_lines(found: Overview) -> list[tuple[str, str]]:
         lines.append(('Resistance', f'{number(1e3 * resistance.ohm)} mOhm (+- '
                       f'{number(2e3 * resistance.se_ohm, 2)}) after {held:.2g} s'
                       + (f', {number(1e3 * resistance.at_once_ohm)} after {AT_ONCE:g} s'
-                         if AT_ONCE < held and resistance.at_once_ohm > 0.0 else '')
+                         if resistance.at_once_ohm > 0.0 else '')
                       + (f'; computed: {fall}' if (fall := _fall_words(found)) else '')))
     elif found.drawn > 0.0:
         lines.append(('Resistance', 'unknown: the current changes too little, or a load seems '

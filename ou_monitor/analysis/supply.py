@@ -26,7 +26,7 @@ from ou_monitor.analysis.noise import (
 from ou_monitor.model.ou_fit import known_ou
 from ou_monitor.online.estimator.estimator import SLIDING
 from ou_monitor.online.load.load_filter import LoadFilter
-from ou_monitor.online.load.supply_load import AT_ONCE, SupplyLoad
+from ou_monitor.online.load.supply_load import AT_ONCE, hold, SupplyLoad
 from ou_monitor.online.monitor import MonitorReport, SupplyMonitor
 from ou_monitor.online.risk.forecast import LOOK
 from ou_monitor.online.settings import MonitorSettings
@@ -204,7 +204,8 @@ def facts_and_end(recording: Recording, limit: float | None = None, left: Remain
             floats(load.sag_se(THROTTLES))),
         noise, Resistance(
             load.resistance, load.resistance_se, load.resistance_at_once
-            if 2.0 * float(np.median(np.diff(t, append=t[-1:]))) <= AT_ONCE else NAN),
+            if t.size > 1 and 2.0 * float(np.median(np.diff(t))) < 1.01 * AT_ONCE < hold(
+                float(t[-1] - t[0])) else NAN),
         known_ou(there.t, there.voltage, there.throttle, there.current), budget), load, last
 
 

@@ -222,3 +222,16 @@ def test_a_replay_takes_less_time_and_has_the_same_risk(horizon):
         risks.append(known.risk)
     assert len(set(risks)) > 20 and node.load_filter.known
     assert replayed.report(0.0).risk_curve == pytest.approx(known.risk_curve, rel=1e-9)
+
+
+@pytest.mark.parametrize('rate, seconds, known', [
+    (20.0, 60.0, True), (10.0, 60.0, False), (200.0, 0.8, False)])
+def test_a_resistance_at_once_needs_two_readings_in_its_time(rate, seconds, known):
+    """And a recording that is long enough to read one later."""
+    rng, n = np.random.default_rng(6), int(rate * seconds)
+    drawn = np.repeat(rng.uniform(5.0, 60.0, n // 10), 10)
+    facts = supply_facts(Recording(
+        np.arange(n) / rate, 12.0 - 0.02 * drawn + 0.002 * rng.standard_normal(n),
+        np.full(n, math.nan), current=drawn))
+    assert facts.resistance.ohm == pytest.approx(0.02, rel=0.2)
+    assert math.isfinite(facts.resistance.at_once_ohm) == known
