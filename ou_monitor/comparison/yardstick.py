@@ -150,8 +150,8 @@ class Agreement:
             'mean_path': {'variance_explained': self.explained, 'rmse_v': self.rmse,
                           'bias_v': self.bias, 'bias_by_third_v': list(self.bias_by_third)},
             'lowest_v': self.lowest.as_data(),
-            'dips_per_min': [{'level_v': level, **dips.as_data()}
-                             for level, dips in zip(self.levels, self.dips)],
+            'crossings_per_min': [{'level_v': level, **dips.as_data()}
+                                  for level, dips in zip(self.levels, self.dips)],
             'spectrum': [{'from_hz': one.low_hz, 'to_hz': one.high_hz,
                           'simulated_over_measured': _ratio(one.power)}
                          for one in self.spectrum],

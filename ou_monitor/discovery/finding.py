@@ -101,11 +101,13 @@ class LowDips:
                 and off > abs(self.baseline - self.observed))
 
     def as_data(self) -> dict[str, Any]:
-        """Return the fields for JSON."""
-        return {'level_v': self.level, 'count': self.count, 'made_by_load': self.made,
-                'per_min': {name: getattr(self, name) for name in (
-                    'observed', 'baseline', 'extended', 'observed_se', 'baseline_se',
-                    'extended_se')}}
+        """Return the count for JSON."""
+        return {'level_v': self.level, 'count': self.count, 'made_by_load': self.made}
+
+    def rates(self) -> dict[str, float]:
+        """Return dips per minute for JSON."""
+        return {name: getattr(self, name) for name in (
+            'observed', 'baseline', 'extended', 'observed_se', 'baseline_se', 'extended_se')}
 
 
 # Relative error of a fall under load above which the model does not reproduce it.
@@ -225,7 +227,8 @@ class Finding:
             'extended': {
                 **self._extended(), 'heldout_score': self.score, 'gain': self.gain,
                 'gain_se': self.gain_se, 'errors_shrink': self.shrink,
-                'size_gain': self.size_gain, 'closer': self.closer},
+                'size_gain': self.size_gain, 'closer': self.closer,
+                'crossing_rate': self.dips.rates()},
             'remaining': [_discrepancy(c, c.after, c.p_after) for c in self.remaining],
             'dips': self.dips.as_data(),
             'fall': {'from': self.fall.low, 'to': self.fall.high,

@@ -12,14 +12,14 @@ from ou_monitor.model.terms.ou import OU
 from ou_monitor.recordings.model_file import as_yaml, ModelFile
 import pytest
 
-# Keys of the JSON, and the type of each value.
+# Keys of the JSON that users hold on to (none may go or change its name), and their types.
 BAND = {'measured': float, 'simulated_low': float, 'simulated_median': float,
         'simulated_high': float}
 CONTRACT = {
     'recording': str, 'fitted_s': [float], 'simulated_s': [float], 'model': [str],
     'mean_path': {'variance_explained': float, 'rmse_v': float, 'bias_v': float,
                   'bias_by_third_v': [float]},
-    'lowest_v': BAND, 'dips_per_min': [{'level_v': float, **BAND}],
+    'lowest_v': BAND, 'crossings_per_min': [{'level_v': float, **BAND}],
     'spectrum': [{'from_hz': float, 'to_hz': float, 'simulated_over_measured': float}],
     'ks_distance': float, 'worst': str, 'verdict': str}
 MODEL = SupplyModel((OU(20.0, 0.3, 15.0), LoadSag(1.5, 0.0)))
@@ -68,7 +68,7 @@ def test_json_has_the_documented_keys(folder, capsys, name, options, monkeypatch
     assert data.pop('supply')['ou']['status'] in ('ok', 'not_visible')
     check(data, CONTRACT)
     assert data['verdict'] in ('looks_like_it', 'differs')
-    assert len(data['dips_per_min']) == 2 and len(data['fitted_s']) == 2
+    assert len(data['crossings_per_min']) == 2 and len(data['fitted_s']) == 2
     assert len(data['mean_path']['bias_by_third_v']) == 3
     assert data['simulated_s'][1] == pytest.approx(39.98)
     assert data['fitted_s'][1] == data['simulated_s'][0]

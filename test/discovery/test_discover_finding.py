@@ -62,8 +62,8 @@ def test_json_has_the_documented_keys():
     assert (extended['heldout_score'], extended['gain'], extended['gain_se']) == (
         2.015, 0.015, 0.002)
     assert {'level_v': 4.8, 'count': 5, 'made_by_load': 3}.items() <= data['dips'].items()
-    assert {'observed': 10.0, 'baseline': 20.0, 'extended': 11.0}.items() <= data['dips'][
-        'per_min'].items()
+    assert {'observed': 10.0, 'baseline': 20.0, 'extended': 11.0}.items() <= data['extended'][
+        'crossing_rate'].items()
 
 
 @pytest.mark.parametrize('full, throttle, load, unsaved', [
@@ -82,7 +82,8 @@ def test_unknown_numbers_are_null():
                    dips=LowDips()).as_data()
     json.dumps(data, allow_nan=False)
     assert data['duration_s'] is None and data['baseline']['params']['alpha'] is None
-    assert data['dips']['per_min']['observed'] is None and data['dips']['made_by_load'] is None
+    assert data['extended']['crossing_rate']['observed'] is None
+    assert data['dips']['made_by_load'] is None
     assert data['extended']['params'] == {} and data['causes'] == []
 
 
