@@ -255,7 +255,8 @@ def recorded_runs(given: argparse.Namespace) -> str:
             alike = agreement(*(discover(part_of(run, part)).as_data()
                                 for part in (slice(0, middle), slice(middle, None))))
         extended = whole['extended']
-        dips = [whole['dips']['per_min'][key] for key in ('observed', 'baseline', 'extended')]
+        dips = [whole['extended']['crossing_rate'][key]
+                for key in ('observed', 'baseline', 'extended')]
         left = len(whole['remaining'])
         rows.append([
             name + (', by current' if whole['load'] == 'current' else ''),
