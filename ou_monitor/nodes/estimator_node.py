@@ -203,13 +203,13 @@ class EstimatorNode(MonitorNode):
         """Place throttle messages among voltages, by arrival; return the voltages left."""
         times = self._times(throttle)
         column = throttle.column
-        values = np.split(column.values, np.cumsum(column.counts)[:-1])
         for k in range(0, column.n, -(-column.n // MOST_THROTTLES)):
             if voltage is not None:
                 first, voltage = voltage.split(int(np.searchsorted(
                     voltage.arrived, throttle.arrived[k], 'left')))
                 self._take_voltages(first)
-            if self._stream.take_throttles(times.item(k), bool(column.stamped[k]), values[k]):
+            if self._stream.add_throttle(times.item(k), bool(column.stamped[k]),
+                                         column.values.item(k)):
                 self._throttle_silence.record(throttle.arrived.item(k))
         return voltage
 

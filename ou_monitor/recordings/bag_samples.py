@@ -24,7 +24,7 @@ from ou_monitor.recordings.importers.log import (
 from ou_monitor.recordings.standard_types import FLOAT32, FLOAT64, IMU
 from ou_monitor.records import Defect, defect_of, FloatArray, Note
 from ou_monitor.stream.config import FieldSpec, list_msg_configs, load_msg_config, MsgConfig
-from ou_monitor.stream.samples import BlockClock, clock_of, ThrottleHold
+from ou_monitor.stream.samples import clock_of, ThrottleHold
 from ou_monitor.text import counted, outside_words, part_words, printable, some
 from ou_monitor.timeline import check_throttle
 
@@ -265,7 +265,6 @@ class _Load:
 
     def __init__(self, spec: FieldSpec, sample_rate: float | None) -> None:
         self._spec = spec
-        self._clock = clock_of(spec)
         self.hold = ThrottleHold(sample_rate)
         # Messages since the last voltage.
         self.waiting: list[FieldColumn] = []
@@ -284,17 +283,16 @@ class _Load:
         if self.waiting:
             column = join(self.waiting)
             self.waiting.clear()
-            at, values = _stamps(self._clock, column), column.values
+            at, values = column.stamp, column.values
             known = np.isfinite(at)
             if self._spec.nan == 'drop':
                 finite = np.isfinite(values)
                 self.unknown += int(np.count_nonzero(~finite))
                 known &= finite
             at, values = at[known], values[known]
-            stamped = np.repeat(column.stamped, column.counts)[known]
+            stamped = column.stamped[known]
             # At equal log times the throttle counts as earlier than the voltage.
-            before = np.searchsorted(
-                log_time, np.repeat(column.log_time, column.counts)[known], 'left')
+            before = np.searchsorted(log_time, column.log_time[known], 'left')
         self.hold.take(at, values, stamped, ends, own, before)
 
 
@@ -317,7 +315,8 @@ class _Supply:
         column = batch.get(VOLTAGE)
         if column is None or not column.values.size:
             return
-        stamps = _stamps(self._clock, column)
+        stamps = column.stamp if self._clock is None else self._clock.stamps(
+            column.stamp, column.counts)
         log_time, ends, own = column.log_time, stamps, column.stamped
         if self._clock is not None:
             some = column.counts > 0
@@ -354,11 +353,6 @@ class _Supply:
             found[THROTTLE] = np.full(t.size, np.nan)
         return RawColumns(t, np.frombuffer(self._voltage), found[THROTTLE],
                           found.get(CURRENT), name, source, tuple(notes))
-
-
-def _stamps(clock: BlockClock | None, column: FieldColumn) -> FloatArray:
-    """Return the stamp of each value, s."""
-    return column.stamp if clock is None else clock.stamps(column.stamp, column.counts)
 
 
 def read_bag_signal(path: Path, signal: str, partial: bool) -> Series:

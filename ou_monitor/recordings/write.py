@@ -139,8 +139,7 @@ def _moved(shift: int) -> tuple[str, ...]:
 
 def _check_header(kind: str, name: str, stamps: Stamps) -> None:
     if kind in (BATTERY_STATE, IMU, JOINT_STATE) and stamps[-1] > LAST_HEADER_NS:
-        raise InputError(f"'{name}' has stamps after 2^31 s, which a header cannot hold"
-                         + (': use another type' if kind == BATTERY_STATE else ''))
+        raise InputError(f"'{name}' has stamps after 2^31 s, which a header cannot hold")
 
 
 def as_nanoseconds(t: FloatArray, name: str) -> npt.NDArray[np.int64]:

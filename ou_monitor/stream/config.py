@@ -155,6 +155,8 @@ def _load(path: Path) -> MsgConfig:
         if top.get(key) is not None:
             top[key] = _field_spec(top[key], f'{where}: {key}',
                                    parse_each_path if key == 'rpm' else parse_field_path)
+            if key != 'voltage' and top[key].sample_rate is not None:
+                raise InputError(f'{where}: {key}: sample_rate is for blocks of the voltage')
     for key in ('description', 'install'):
         top[key] = ' '.join(top[key].split())
     return MsgConfig(name=path.stem, **top)

@@ -360,7 +360,6 @@ class SampleStream:
     def __init__(self, monitor: SupplyMonitor) -> None:
         self._monitor = monitor
         self._block: BlockClock | None = None
-        self._throttle_block: BlockClock | None = None
         # Whether throttles that are not finite are transmission errors.
         self._drop = True
         self._hold = ThrottleHold()
@@ -387,7 +386,6 @@ class SampleStream:
     def open_throttle(self, spec: FieldSpec) -> None:
         """Set the field of the throttle's messages."""
         self._drop = spec.nan == 'drop'
-        self._throttle_block = clock_of(spec)
 
     @property
     def throttle(self) -> float:
@@ -451,24 +449,16 @@ class SampleStream:
         self._count += ends.size
         self._newest = max(self._newest, float(ends.max()))
 
-    def take_throttles(self, end: float, own: bool, found: FloatArray) -> bool:
-        """Add the values of one throttle message; end: stamp of the last value, s."""
-        values = found.tolist()
-        stamps = [end]
-        if self._throttle_block is not None and math.isfinite(end):
-            stamps = self._throttle_block.stamps(
-                np.array([end]), np.array([len(values)])).tolist()
-        if not values or not stamps:
-            return False
-        if stamps[0] < self._newest_throttle - BACK:
+    def add_throttle(self, end: float, own: bool, value: float) -> bool:
+        """Add the value of one throttle message with the stamp `end`, s; `own`: it carries it."""
+        if end < self._newest_throttle - BACK:
             self.flush()
             self._hold.restart(self._last_throttle)
-        if math.isfinite(stamps[-1]):
-            self._newest_throttle = stamps[-1]
-        for stamp, value in zip(stamps, values[-len(stamps):], strict=True):
-            if math.isfinite(value) or not self._drop:
-                self._loads.append((stamp, value, own, self._count))
-                self._last_throttle = value
+        if math.isfinite(end):
+            self._newest_throttle = end
+        if math.isfinite(value) or not self._drop:
+            self._loads.append((end, value, own, self._count))
+            self._last_throttle = value
         return math.isfinite(self._last_throttle)
 
     def lose_throttle(self) -> None:

@@ -49,7 +49,7 @@ def test_one_voltage_message_to_one_report(moving):
         voltages = (np.array([t]), np.zeros(1, bool), np.ones(1, int),
                     np.array([5.0 - 0.3 * throttle + away]))
         if k % 20 == 0:
-            stream.take_throttles(t, False, np.array([throttle]))
+            stream.add_throttle(t, False, throttle)
         if k % 100 or k < 5000:
             stream.take_voltages(*voltages)
             if k % 100 == 0:

@@ -73,6 +73,7 @@ def test_px4_throttle_is_mapped_to_0_1():
     ('voltage', {'nan': 'dorp'}, ["'dorp'", "'drop'"]),
     ('voltage', {'sample_rate': 0}, ['sample_rate', 'above 0']),
     ('voltage', {'sample_rate': -5.0}, ['sample_rate', 'above 0']),
+    (None, {'throttle': {**GOOD['voltage'], 'sample_rate': 5.0}}, ['blocks of the voltage']),
     ('voltage', {'type': 'my_msgs/Rail'}, ["'my_msgs/Rail'", 'package/msg/Type']),
     ('voltage', {'topic': 'a b'}, ["'a b'", 'topic']),
     ('voltage', {'field': 'cells[x]'}, ["'cells[x]'"]),

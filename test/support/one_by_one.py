@@ -37,4 +37,4 @@ class OneByOne(SampleStream):
     def take_throttle(self, message, source_time):
         values, stamp = extracted(self.loads, message)
         end = source_time() if stamp is None else stamp
-        return self.take_throttles(end, stamp is not None, values)
+        return self.add_throttle(end, stamp is not None, *(values.tolist() or [np.nan]))

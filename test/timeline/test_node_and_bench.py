@@ -80,8 +80,8 @@ def of_the_node(rng, sent, monkeypatch):
         end = COUNT if end > cuts[-1] else int(cuts[cuts >= end][0])
         for first in range(at, end):
             if first % 20 == 0:
-                stream.take_throttles(seconds(moved[first // 20]), False,
-                                      throttle[first // 20:first // 20 + 1].astype(float))
+                stream.add_throttle(seconds(moved[first // 20]), False,
+                                    float(throttle[first // 20]))
             one = slice(first, first + 1)
             stream.take_voltages(
                 seconds(stamp[one]), np.ones(1, bool), np.ones(1, int), volts[one].astype(float),
