@@ -234,33 +234,21 @@ _BY_AMPLITUDE = 0.5
 _TINY = 1e-300
 
 
-class Family(NamedTuple):
-    """Kind of notches, of any width."""
-
-    source: str  # 'rpm' or 'throttle'
-    each: bool  # Whether each motor has its own notch
-    times: int  # Number of equal notches in series
-
-
 class Candidate(NamedTuple):
-    """Notches that may be chosen."""
+    """Notches that may be chosen: one on the throttle's frequency, or one on each motor's."""
 
-    family: Family
+    source: str
     width: float  # Bandwidth over frequency
 
 
-def families(count: int) -> tuple[Family, ...]:
-    """Return the families with at most `count` notches."""
-    found = [Family(source, False, times) for source in ('throttle', 'rpm')
-             for times in range(1, min(count, 2) + 1)]
-    return (*found, Family('rpm', True, 1)) if count > 1 else tuple(found)
+SOURCES = ('throttle', 'rpm')
 
 
 class NotchChoice:
     """Choice of a candidate for each channel; `chosen`: by channel, None: no notch."""
 
     def __init__(self, frequencies: FloatArray, settings: tuple[float, float], rate: float,
-                 channels: int, count: int) -> None:
+                 channels: int) -> None:
         self._fmin, cutoff = settings
         self._rate = rate
         self._used = frequencies >= self._fmin
@@ -271,12 +259,11 @@ class NotchChoice:
         self._fourth: FloatArray = (self._warped[None, :] / at[:, None])**4
         self._lag: FloatArray = np.sqrt(2.0) / (2.0 * rate * at)
         self._low: FloatArray = 1.0 / (1.0 + self._fourth)
-        self.families = families(count)
-        shape = (len(self.families), WIDTHS.size, channels, len(_BEHIND))
+        shape = (len(SOURCES), WIDTHS.size, channels, len(_BEHIND))
         self._noise: FloatArray = np.zeros(shape)
         self._without: FloatArray = np.zeros((shape[0], 1, *shape[2:]))
         self._left: FloatArray = np.ones((*shape[:2], len(_BEHIND)))
-        self._frames = [0] * len(self.families)
+        self._frames = [0] * len(SOURCES)
         self._loudest: FloatArray = np.zeros(channels)
         self.chosen: list[Candidate | None] = [None] * channels
 
@@ -303,14 +290,11 @@ class NotchChoice:
         # throttle: frequency by the law, Hz, NaN if unknown; motors: their frequencies, Hz.
         power = power[:, self._used]
         none = power @ self._low.T
-        mean = motors.mean(keepdims=True) if motors.size else motors
-        for j, family in enumerate(self.families):
-            f = (np.array([throttle]) if family.source == 'throttle' else
-                 motors if family.each else mean)
+        for j, f in enumerate((np.array([throttle]), motors)):
             f = f[(f >= self._fmin) & (f <= HIGHEST * self._rate)]
             if not f.size:
                 continue
-            passes, delay = self._cascade(f, family.times)
+            passes, delay = self._cascade(f)
             left = np.maximum(1.0 - delay[:, None] / self._lag, _LEAST)
             noise = np.einsum('ck,wk,wrk->wcr', power, passes,
                               1.0 / (1.0 + self._fourth * left[..., None]**4))
@@ -320,18 +304,18 @@ class NotchChoice:
             self._without[j] += weight * (none - self._without[j])
             self._left[j] += weight * (left - self._left[j])
 
-    def _cascade(self, f: FloatArray, times: int) -> tuple[FloatArray, FloatArray]:
+    def _cascade(self, f: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the power response of the notches for each width, shape (W, K), and delays, s."""
         at = np.tan(np.pi * f / self._rate)
         p = self._warped / at[:, None]
         off = (1.0 - p * p)**2
         passes = np.prod(off / (off + (WIDTHS[:, None, None] * p)**2), axis=1)
-        return passes**times, times * WIDTHS * float(np.sum(0.5 / (self._rate * at)))
+        return passes, WIDTHS * float(np.sum(0.5 / (self._rate * at)))
 
     def decide(self, sources: set[str]) -> None:
         """Choose for each channel among the candidates whose source is known now."""
-        known = np.array([one.source in sources and frames >= _FEWEST for one, frames in
-                          zip(self.families, self._frames, strict=True)])
+        known = np.array([source in sources and frames >= _FEWEST for source, frames in
+                          zip(SOURCES, self._frames, strict=True)])
         left = self._noise / np.maximum(self._without, _TINY)
         harms: npt.NDArray[np.bool_] = (np.max(left, axis=3) > _HARM**2) | (
             np.min(self._left, axis=2) < _LEAST_MEAN)[..., None]
@@ -339,10 +323,10 @@ class NotchChoice:
         for c, old in enumerate(self.chosen):
             able = np.where(harms[..., c], np.inf, gain[..., c])
             j, w = np.unravel_index(int(np.argmin(able)), able.shape)
-            best, found = float(able[j, w]), Candidate(self.families[j], float(WIDTHS[w]))
+            best, found = float(able[j, w]), Candidate(SOURCES[j], float(WIDTHS[w]))
             now = np.inf
             if old is not None:
-                k = self.families.index(old.family)
+                k = SOURCES.index(old.source)
                 now = float(able[k, int(np.argmin(np.abs(WIDTHS - old.width)))])
             # If the source of the old candidate is lost, the other takes over.
             limit = _ON if old is None else _OFF
@@ -441,7 +425,7 @@ class AdaptiveNotch:
     def source(self) -> str:
         """Return what the notches follow: 'rpm', 'throttle' or 'none'."""
         chosen = [] if self._choice is None else self._choice.chosen
-        found = {one.family.source for one in chosen if one is not None}
+        found = {one.source for one in chosen if one is not None}
         return 'rpm' if 'rpm' in found else 'throttle' if found else 'none'
 
     @property
@@ -598,8 +582,7 @@ class AdaptiveNotch:
             self._frames = frames = NotchFrames(self._interval.mean)
             rate = 1.0 / frames.interval
             self._law = MotorLaw(frames.frequencies, s.fmin, rate)
-            self._choice = NotchChoice(frames.frequencies, (s.fmin, s.cutoff), rate, channels,
-                                       s.count)
+            self._choice = NotchChoice(frames.frequencies, (s.fmin, s.cutoff), rate, channels)
         speeds = self._motors + [NAN] * (s.count - len(self._motors))
         due = self._frames.add(t, [*values, self._root, *speeds])
         sources = {name for name, known in (('throttle', self._root == self._root),
@@ -622,11 +605,7 @@ class AdaptiveNotch:
         """Return the present frequencies of a candidate, Hz; NaN: none."""
         if chosen is None or self._law is None:
             return []
-        if chosen.family.source == 'throttle':
-            return [self._law.frequency(self._root)] * chosen.family.times
-        if chosen.family.each or not self._motors:
-            return self._motors
-        return [sum(self._motors) / len(self._motors)] * chosen.family.times
+        return [self._law.frequency(self._root)] if chosen.source == 'throttle' else self._motors
 
     def _filter_channel(self, c: int, x: float, dt: float) -> float:
         chosen = None if self._choice is None else self._choice.chosen[c]
