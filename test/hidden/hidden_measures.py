@@ -63,11 +63,6 @@ def band(h: Hidden, low: float, high: float, seconds: float = 2.0) -> float:
     return float(np.mean(p[inside] / plain_density(h, f[inside])))
 
 
-def local_std(e: np.ndarray, block: int) -> np.ndarray:
-    """Return the root mean square of consecutive blocks."""
-    return np.sqrt((e[:e.size // block * block].reshape(-1, block)**2).mean(axis=1))
-
-
 def signs(h: Hidden) -> dict[str, float]:
     """Return z-scores that are about N(0,1) on a plain rail, and large with a hidden effect."""
     # They know the true alpha and innovation; all but 'line' and the bands are plain averages.
