@@ -89,7 +89,6 @@ def test_a_tenth_of_late_samples_is_disorder_and_repeats_are_none(every, order):
 
 
 def test_irregular_is_never_ok_and_ends():
-    """One late sample: WARN for a window, then OK again."""
     monitor, _ = good()
     monitor.push(1.0, 5.0)
     report = monitor.report(0.0)
@@ -137,7 +136,6 @@ def test_what_is_no_reading_is_counted_as_none(volts, throttle, wrong):
 
 @pytest.mark.parametrize('where, name', [('_estimator', 'take'), ('_forecast', 'take')])
 def test_an_error_restarts_the_estimator_and_is_told(where, name, monkeypatch):
-    """Unknown, ERROR with the cause, counted; counters go on, and the flag is held."""
     monitor, t = good(brownout_hold=60.0)
     low = t + DT * np.arange(1, 101)
     monitor.push(low, np.full(100, 4.0), 0.4, arrival=low)
@@ -187,7 +185,6 @@ STEPS = st.one_of(st.sampled_from([0.001, 0.0, -0.001, 1e-9, 1e-300, 1.0]), ANY)
 @hypothesis_settings(max_examples=150, deadline=None)
 @pytest.mark.filterwarnings('ignore::RuntimeWarning')
 def test_no_float_breaks_the_monitor_or_is_called_fine(history):
-    """Stamps, voltages and throttles of any kind, each in runs, with and without noise."""
     monitor = SupplyMonitor(MonitorSettings(window=0.2))
     rng = np.random.default_rng(2)
     t, now = 1000.0, 0.0

@@ -93,7 +93,6 @@ class Feed:
 
 
 def test_summary_says_why():
-    """Risk, horizon, level, throttle, what the flag does and since when."""
     report = Feed(brownout_voltage=4.93, brownout_delay=0.0).feed(5.0)
     assert report.level is Level.ERROR and report.flag.level is FlagLevel.CRITICAL
     for words in ('Risk of falling below 4.93 V within 5 s: ', 'critical from 0.5 within 1 s',
@@ -266,7 +265,6 @@ def test_contradictions_are_refused_in_one_line(values, words):
     {'brownout.voltage': 0.0}, {'brownout.budget_limit': 0.1}, {'brownout.leave': 0.999},
     {'brownout.hold': 0, 'brownout.floor_time': 0}])
 def test_what_does_not_contradict_is_taken(values):
-    """One parameter is enough for another rail: the floor follows the voltage."""
     made = monitor_settings(values)
     assert made.floor <= made.brownout_voltage
 

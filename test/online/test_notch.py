@@ -59,7 +59,6 @@ def test_follows_the_rpm():
 
 
 def test_erpm_needs_the_poles():
-    """With poles eRPM is what rpm is; without, one line says what is missing."""
     t, x, _, f = flight(3.0)
     notch = AdaptiveNotch(rpm_unit='erpm', poles=14)
     notch.filter(t, x, rpm=60.0 * 7.0 * f)
@@ -150,7 +149,6 @@ def test_rpm_that_freezes():
 
 
 def test_delay_is_what_the_output_shows():
-    """A slow tone comes out as much later as the delay says."""
     t, x, throttle, f = flight(8.0)
     rpm = np.full(t.size, 60.0 * 250.0)
     slow = 1e3 * np.sin(2 * np.pi * 10.0 * t)
@@ -178,7 +176,6 @@ def test_what_is_above_half_the_sample_rate():
 
 
 def test_bad_samples_are_counted_and_do_not_move_the_output():
-    """NaN, repeats, steps back and gaps are counted; the output stays near the input."""
     t, x, throttle, f = flight(4.0)
     t, x = t.copy(), x.copy()
     x[1500], x[1600], t[1700], t[1800] = np.nan, np.inf, t[1699], t[1790]
@@ -241,7 +238,6 @@ def test_none_at_all():
 
 
 def test_places_of_motors_that_are_not_there():
-    """Zeros of an array that holds more motors than there are share no notch with the others."""
     t, x, throttle, f = flight(3.0)
     rpm = np.zeros((t.size, 8))
     rpm[:, 2], rpm[:, 5] = 60.0 * f, 60.0 * 1.1 * f

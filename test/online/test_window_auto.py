@@ -155,7 +155,6 @@ def test_a_new_time_line_and_repeats():
 
 
 def test_the_state_has_the_facts():
-    """One sag, positive; window, status, intervals and bounds; what is unknown is nan."""
     recording = flown(1, 0.03, 0.005, 40.0)
     monitor = SupplyMonitor()
     for begin in range(0, 40, 4):

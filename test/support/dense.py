@@ -48,20 +48,3 @@ def fisher(covariance, at, steps):
         shift[i] = step
         parts.append(inverse @ (covariance(at + shift) - covariance(at - shift)) / (2.0 * step))
     return np.array([[0.5 * np.sum(p * q.T) for q in parts] for p in parts])
-
-
-def kalman_log_likelihood(t, y, alpha, sigma, noise_var, level):
-    """Return the log-likelihood of an OU in white noise about a known level, sample by sample."""
-    stationary = sigma ** 2 / (2.0 * alpha)
-    state, variance, total = 0.0, stationary, 0.0
-    for j in range(t.size):
-        if j:
-            phi = math.exp(-alpha * (t[j] - t[j - 1]))
-            state *= phi
-            variance = phi * phi * variance + stationary * (1.0 - phi * phi)
-        spread = variance + noise_var
-        error = y[j] - level - state
-        total -= 0.5 * (math.log(2.0 * math.pi * spread) + error * error / spread)
-        state += variance / spread * error
-        variance -= variance * variance / spread
-    return total

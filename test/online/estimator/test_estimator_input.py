@@ -83,7 +83,6 @@ def test_non_finite_samples_are_dropped_and_counted():
 
 
 def test_late_samples_in_one_batch_are_sorted_in():
-    """Any order within a push; equal stamps keep the first."""
     order = np.random.default_rng(42).permutation(N)
     # The first stamp stays first: what comes before the window begins is another matter.
     order = np.concatenate([[0], order[order != 0]])
@@ -151,7 +150,6 @@ SAMPLE = st.tuples(
 @settings(deadline=None, max_examples=150)
 @given(st.lists(SAMPLE, max_size=80), st.integers(1, 30), st.booleans())
 def test_the_account_adds_up(samples, block, throttle):
-    """Any mix of bad samples in any blocks: pushed is the sum of its parts."""
     estimator = SlidingEstimator(0.05)
     now, t, y = 0.0, [], []
     for kind, _ in samples:

@@ -36,7 +36,6 @@ def test_quality_is_that_of_the_newest_thousand(since, told):
 
 @pytest.mark.parametrize('window, step, n', [(2.0, 1.0, 3), (0.5, 1.0, 1)])
 def test_what_waits_for_the_rate_is_that_of_the_window(window, step, n):
-    """Too few to tell the rate from, some of them older than the window."""
     estimator = SlidingEstimator(window)
     for j in range(6):
         estimator.push(j * step, 5.0)
@@ -69,47 +68,12 @@ def test_trends_are_few_where_there_is_none_and_seen_where_there_is():
         0.6, abs=0.086)
 
 
-def batches(t, y=None, window=1.0, intake=None, u=None):
-    intake = intake or TimeLine()
-    t = np.asarray(t, dtype=float)
-    intake.put(t, np.zeros(t.size) if y is None else np.asarray(y, dtype=float), u)
-    return intake.flush(window), intake
-
-
-def taken(thinner, t, y=None, u=None, window=1e9):
+def taken(thinner, t, y, intake=None):
     """Return what a thinner keeps of clean samples."""
-    got, _ = batches(t, y, window)
-    assert len(got) == 1
-    return thinner.take(got[0])
-
-
-def test_throttle_does_not_leak_into_the_next_batch():
-    intake = TimeLine()
-    got, _ = batches([0.0, 0.1], intake=intake, u=0.7)
-    assert got[0].columns[2].tolist() == [0.7, 0.7]
-    intake.put(np.array([0.2]), np.zeros(1), 0.1)
-    intake.put(np.array([0.3]), np.zeros(1), None)
-    u = intake.flush(1.0)[0].columns[2]
-    assert u[0] == 0.1 and math.isnan(u[1])
-    got, _ = batches([0.4], intake=intake)
-    assert np.isnan(got[0].columns[2]).all()
-
-
-def test_any_array_of_doubles_is_copied():
-    """Strided, reversed, read-only, unaligned, repeated and empty ones."""
-    plain = np.arange(1.0, 5.0)
-    records = np.zeros(4, dtype=[('pad', 'i1'), ('y', 'f8')])
-    records['y'] = plain
-    fixed = plain.copy()
-    fixed.setflags(write=False)
-    for y in (np.repeat(plain, 3)[::3], plain[::-1].copy()[::-1], fixed, records['y']):
-        intake = TimeLine()
-        intake.put(np.empty(0), np.empty(0), np.empty(0))
-        intake.put(0.1 * plain, y, y)
-        intake.put(0.1 * plain + 1.0, np.broadcast_to(2.0, 4), np.broadcast_to(0.5, 4))
-        batch = intake.flush(2.0)[0]
-        assert batch.y.tolist() == [1.0, 2.0, 3.0, 4.0, 2.0, 2.0, 2.0, 2.0]
-        assert batch.columns[2].tolist() == [1.0, 2.0, 3.0, 4.0, 0.5, 0.5, 0.5, 0.5]
+    intake = intake or TimeLine()
+    intake.put(t, y, None)
+    (got,) = intake.flush(1e9)
+    return thinner.take(got)
 
 
 def test_blocks_do_not_reach_across_a_gap():
@@ -123,7 +87,6 @@ def test_block_size_that_changes_restarts():
     """From 100 kHz to 1 MHz blocks of ten become blocks of a hundred."""
     thinner = BlockAverager(1e4)
     intake = TimeLine()
-    kept = thinner.take(batches(np.arange(1000) * 1e-5, intake=intake)[0][0])
-    assert not kept[1] and thinner.m == 10
-    kept = thinner.take(batches(0.01 + np.arange(1000) * 1e-6, intake=intake)[0][0])
-    assert kept[1] and thinner.m == 100
+    for begin, step, m in ((0.0, 1e-5, 10), (0.01, 1e-6, 100)):
+        kept = taken(thinner, begin + step * np.arange(1000), np.zeros(1000), intake)
+        assert kept[1] == (m == 100) and thinner.m == m

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from ou_monitor import SlidingEstimator
 from ou_monitor.model.ou import simulate
-from ou_monitor.records import Flag, Status
+from ou_monitor.records import Status
 import pytest
 from simulated_windows import ALPHA, DT, errors, estimate, LEVEL, paths, SIGMA, stamps
 
@@ -20,39 +20,50 @@ def unbiased(found, limit=0.02, truth=None):
     return bool((np.abs(error.mean(axis=0)) < limit + 2.6 * spread).all())
 
 
-def test_irregular_stamps_are_taken_as_they_are():
-    """Poisson sampling at 200 Hz: exact exp(-alpha dt) leaves no bias."""
+def poisson(rng):
+    """Return stamps at 200 Hz on average, and an OU."""
     # One rate for all steps would make alpha 13 % low (the mean of exp(-alpha dt) is 1/(1 + alpha
-    # D) for alpha D = 0.315), six standard errors here.
-    rng = np.random.default_rng(21)
-    found = []
-    for _ in range(60):
-        t = np.cumsum(rng.exponential(5e-3, 400))
-        found.append(estimate(t, LEVEL + simulate(t, ALPHA, SIGMA, rng)))
-    assert errors(found)[:, 0].std() / math.sqrt(60) < 0.03
-    assert unbiased(found, 0.03)
+    # D) for alpha D = 0.315), six standard errors of 60.
+    t = np.cumsum(rng.exponential(5e-3, 400))
+    return t, LEVEL + simulate(t, ALPHA, SIGMA, rng)
 
 
-def test_jitter_of_many_relaxations_is_taken_as_it_is():
-    """Stamps +-45 % of 8 ms: each step is within "even", yet the grid is no grid."""
-    rng = np.random.default_rng(22)
-    found = []
-    for _ in range(40):
-        t = np.cumsum(8e-3 * rng.uniform(0.55, 1.45, 600))
-        found.append(estimate(t, LEVEL + simulate(t, ALPHA, SIGMA, rng)))
-    assert unbiased(found, 0.02)
+def jittering(rng):
+    """Return stamps +-45 % of 8 ms: each step is within "even", yet the grid is no grid."""
+    t = np.cumsum(8e-3 * rng.uniform(0.55, 1.45, 600))
+    return t, LEVEL + simulate(t, ALPHA, SIGMA, rng)
 
 
-@pytest.mark.parametrize('lost', [0.1, 0.3, 0.6])
-def test_samples_lost_at_random(lost):
-    """Pairs across holes do not count as neighbours; 60 % leave hardly a run whole."""
-    rng = np.random.default_rng(23)
-    found = []
-    for y in paths(rng, 40, N):
-        keep = rng.random(N) >= lost
-        found.append(estimate(T[keep], y[keep]))
+def losing(share):
+    """Return samples of which some are lost: 60 % leave hardly a run whole."""
+    def made(rng):
+        keep = rng.random(N) >= share
+        return T[keep], paths(rng, 1, N)[0][keep]
+    return made
+
+
+def holding(hold):
+    """Return a 1 kHz logger of a source that is slower by a factor."""
+    which = np.floor(np.arange(N) / hold + 1e-9).astype(int)
+    return lambda rng: (T, paths(rng, 1, N, hold * DT)[0][which])
+
+
+def coarse(rng):
+    """Return refreshes that happen to repeat the code; they are refreshes all the same."""
+    return T, np.repeat(0.02 * np.round(paths(rng, 1, N // 4, 4 * DT)[0] / 0.02), 4)
+
+
+@pytest.mark.parametrize('made, count, limit', [
+    (poisson, 60, 0.03), (jittering, 40, 0.02), (losing(0.1), 40, 0.02), (losing(0.3), 40, 0.02),
+    (losing(0.6), 40, 0.02),
+    # A noise that is bounded at zero costs some percent at so slow a rate.
+    (holding(4.0), 40, 0.06), (holding(2.5), 40, 0.06), (coarse, 40, 0.08)])
+def test_odd_sampling_leaves_no_bias(made, count, limit):
+    rng = np.random.default_rng(25)
+    found = [estimate(*made(rng)) for _ in range(count)]
     assert {e.status for e in found} == {Status.OK}
-    assert unbiased(found)
+    assert errors(found)[:, 0].std() / math.sqrt(count) < 0.03
+    assert unbiased(found, limit)
 
 
 def test_a_gap_is_not_a_step():
@@ -62,25 +73,6 @@ def test_a_gap_is_not_a_step():
     found = [estimate(T[keep], y[keep]) for y in paths(rng, 60, N)]
     assert unbiased(found)
     assert found[0].n == keep.sum() and found[0].duration == pytest.approx(1.999)
-
-
-@pytest.mark.parametrize('hold', [4.0, 2.5])
-def test_held_samples_are_dropped(hold):
-    """A 1 kHz logger of a source four times, or 2.5 times, slower."""
-    rng = np.random.default_rng(25)
-    which = np.floor(np.arange(N) / hold + 1e-9).astype(int)
-    found = [estimate(T, y[which]) for y in paths(rng, 40, N, hold * DT)]
-    assert all(Flag.HELD_SAMPLES in e.flags for e in found)
-    # A noise that is bounded at zero costs some percent at so slow a rate.
-    assert unbiased(found, 0.06)
-
-
-def test_held_samples_of_a_coarse_adc():
-    """Refreshes that happen to repeat the code are refreshes all the same."""
-    rng = np.random.default_rng(26)
-    found = [estimate(T, np.repeat(0.02 * np.round(y / 0.02), 4))
-             for y in paths(rng, 40, N // 4, 4 * DT)]
-    assert unbiased(found, 0.08)
 
 
 def test_adc_blocks_of_a_megahertz():

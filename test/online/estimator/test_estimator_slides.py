@@ -35,18 +35,6 @@ def test_estimates_on_the_way_change_nothing(moving):
     assert (a.n, a.duration, a.status, a.flags) == (b.n, b.duration, b.status, b.flags)
 
 
-def test_sliding_is_the_fit_of_what_is_left():
-    """An estimator that has seen 4 s before is one that has seen the window alone."""
-    slid = SlidingEstimator(2.0)
-    for begin in range(0, 6000, 250):
-        slid.push(T[begin:begin + 250], Y[begin:begin + 250])
-        slid.estimate()
-    e = slid.estimate()
-    assert e.n == 2001 and e.duration == pytest.approx(DT * (e.n - 1))
-    alone = estimate(T[6000 - e.n:], Y[6000 - e.n:], window=2.1)
-    assert numbers(e)[:3] == pytest.approx(numbers(alone)[:3], rel=1e-4)
-
-
 @pytest.mark.parametrize('seconds', [1.0, 2.0, 5.0])
 def test_the_window_is_as_long_as_asked(seconds):
     estimator = SlidingEstimator(seconds)
@@ -60,7 +48,6 @@ def test_the_window_is_as_long_as_asked(seconds):
 @settings(deadline=None, max_examples=25)
 @given(st.floats(0.01, 100.0), st.floats(-100.0, 100.0), st.floats(0.1, 10.0), st.booleans())
 def test_units_and_shifts(scale, shift, slower, moving):
-    """Other volts, another level, another origin and unit of time."""
     # Doubles at a level of 100 V leave 1e-12 of sums of squares, the search its 1e-4 standard
     # errors (see above).
     n = 1500

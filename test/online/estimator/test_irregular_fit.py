@@ -2,7 +2,7 @@
 
 import math
 
-from dense import kalman_log_likelihood, ou_covariance, restricted
+from dense import ou_covariance, restricted
 from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor.model.ou import simulate
@@ -32,7 +32,6 @@ def exact(t, y, x):
 @given(st.integers(0, 10 ** 6), st.floats(-1.0, 5.0), st.floats(-6.0, 4.0),
        st.integers(1, 3))
 def test_value_is_that_of_dense_matrices(seed, log_alpha, log_share, p):
-    """Any parameters, any stamps, any regressors: value, scale, beta, its covariance."""
     # The dense matrix has condition up to 1e6 here, so 1e-8 is what doubles leave.
     t, y, x = made(seed, n=60)
     x = x[:, :p]
@@ -84,22 +83,6 @@ def test_optimum_is_that_of_dense_matrices(seed, noise):
     for alpha in np.geomspace(1.0, 60.0, 9):
         for other in (0.0, 1e-4, 1e-3, 1e-2, 1e-1):
             assert dense(alpha, other)[0] <= value + 2e-5
-
-
-def test_value_is_that_of_a_kalman_filter():
-    """Integrate the level out of the Kalman filter's likelihood, numerically."""
-    # Restricted likelihood is the integral over a flat prior of the level; the Gaussian integrand
-    # is summed exactly enough with 41 points over +-8 sd.
-    t, y, x = made(3)
-    fit = exact(t, y, x[:, :1])
-    sd = math.sqrt(fit.beta_cov[0, 0])
-    levels = fit.beta[0] + sd * np.linspace(-8.0, 8.0, 41)
-    logs = np.array([kalman_log_likelihood(t, y, fit.alpha, fit.sigma, fit.noise_var, level)
-                     for level in levels])
-    total = math.log(np.exp(logs - logs.max()).sum() * (levels[1] - levels[0])) + logs.max()
-    # The contrasts are of unit length but for log|X'X| = ln n.
-    # (dense.restricted takes the flat prior without that factor.)
-    assert fit.log_likelihood == pytest.approx(total, abs=1e-6)
 
 
 def test_edges_are_told():

@@ -23,7 +23,6 @@ def judged(fit=FIT, base=BASE, quality=CLEAN, throttle_std=NAN, smoothness=NAN, 
 
 
 def test_bias_is_taken_off_alpha_and_variance():
-    """The bias off alpha; Var_inf goes with it; sigma and the noise stay."""
     e = judged()
     assert e.alpha == pytest.approx(63.0 - 1.5 / 2.0)
     assert (e.sigma, e.noise_std) == (0.632, pytest.approx(5e-3))
@@ -66,7 +65,6 @@ def test_enough_relaxations_are_needed(found, status):
 
 
 def test_one_standard_error_is_granted():
-    """40 relaxations known to 30 % are surely 29, to 60 % no more than 22."""
     for se, status in ((0.3, Status.OK), (0.45, Status.SHORT_WINDOW)):
         assert judged(alpha=41.5 / 2.0, log_var=(se ** 2, 1e-3, se ** 2)).status is status
 

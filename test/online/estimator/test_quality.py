@@ -111,7 +111,6 @@ def test_tiny_noise_on_a_large_voltage_is_measured():
 
 
 def test_what_is_dropped_is_said_though_the_numbers_stand():
-    """A late sample after an estimate changes counters and flag, nothing else."""
     estimator = SlidingEstimator(2.1)
     estimator.push(T, paths(np.random.default_rng(5), 1, N)[0])
     before = estimator.estimate()

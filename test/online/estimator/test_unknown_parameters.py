@@ -44,7 +44,6 @@ def test_a_nearly_white_rail_is_analysed(seed):
 
 @given(value=POSITIVE, error=ERRORS)
 def test_an_estimate_holds_what_is_known(value, error):
-    """Every other number, its error and its interval are NaN, and the estimate is not usable."""
     e = Estimate(alpha=value, sigma=value, var_inf=value, u0=5.0, alpha_se=error, sigma_se=error,
                  var_inf_se=error, u0_se=0.01, status=Status.OK, rate=math.inf)
     # NaN: the error was not given.

@@ -31,7 +31,6 @@ def check(f):
     min_size=1, max_size=10))
 @pytest.mark.filterwarnings('ignore::RuntimeWarning')
 def test_any_stamps_sigma_and_parameters(order, blocks):
-    """Single samples and arrays; steps of one length, of any, and at random."""
     f = AdaptiveLowPass(order=order, n0=1e-5)
     t = 100.0
     for step, sigma, change, n, seed in blocks:

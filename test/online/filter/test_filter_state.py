@@ -2,15 +2,11 @@
 
 import math
 
-from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor.online.filter.filter_state import (
     cutoff_for_lag, delay, LowPassState, phase_lag)
 import pytest
 from scipy import integrate, signal
-
-# Integral of the absolute impulse response: the bound of the output for inputs within +-1.
-BOUND = {1: 1.0, 2: 1.0 / math.tanh(0.5 * math.pi)}
 
 
 def analog(order, fc, mode):
@@ -49,7 +45,6 @@ def test_equals_the_linear_input_solution_of_scipy(order, fc, mode):
 @pytest.mark.parametrize('mode', ['lowpass', 'derivative'])
 @pytest.mark.parametrize('order', [1, 2])
 def test_irregular_steps_and_moving_cutoffs_against_an_ode_solver(order, mode):
-    """Each step integrated numerically, the cutoff another in each."""
     rng = np.random.default_rng(5)
     t = np.concatenate([[0.0], np.cumsum(10.0 ** rng.uniform(-4.0, -1.0, 60))])
     x = rng.standard_normal(61)
@@ -71,18 +66,6 @@ def test_irregular_steps_and_moving_cutoffs_against_an_ode_solver(order, mode):
         assert got == pytest.approx(reference[0], rel=1e-7, abs=1e-8)
 
 
-@settings(max_examples=200, deadline=None)
-@given(order=st.sampled_from([1, 2]), steps=st.lists(
-    st.tuples(st.floats(1e-9, 50.0), st.floats(-1.0, 1.0)), min_size=1, max_size=60))
-def test_bounded_for_any_cutoffs_and_steps(order, steps):
-    """Inputs within +-1, angles 2 pi fc dt at will."""
-    state, before = LowPassState(), 0.0
-    for angle, x in steps:
-        y = state.advance(order, angle, before, x)
-        before = x
-        assert abs(y) <= BOUND[order] * (1.0 + 1e-9)
-
-
 @pytest.mark.parametrize('order', [1, 2])
 def test_short_steps_lose_nothing(order):
     """100 000 steps of 1e-8 of the time constant add up to the one long step."""
@@ -102,14 +85,6 @@ def test_lag_is_that_of_the_filter(order, fc):
     assert lag == pytest.approx(-math.degrees(np.angle(response)))
     assert delay(lag, 10.0) == pytest.approx(lag / 3600.0)
     assert cutoff_for_lag(order, lag, 10.0) == pytest.approx(fc)
-
-
-@settings(max_examples=100, deadline=None)
-@given(order=st.sampled_from([1, 2]), share=st.floats(0.001, 0.999), f=st.floats(0.01, 1e3))
-def test_the_lag_has_its_inverse(order, share, f):
-    """Both ways, over all lags that an order can have."""
-    lag = 90.0 * order * share
-    assert phase_lag(order, cutoff_for_lag(order, lag, f), f) == pytest.approx(lag, rel=1e-9)
 
 
 @pytest.mark.parametrize('order, lag', [(1, 90.0), (2, 180.0), (1, 0.0), (2, math.nan)])

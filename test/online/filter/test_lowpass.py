@@ -117,7 +117,6 @@ def test_leaving_shadow_goes_over_to_the_filter():
     st.one_of(st.floats(0.0, 1e3), st.sampled_from([NAN, -1.0, math.inf]))),
     min_size=1, max_size=60))
 def test_bounded_and_finite_whatever_comes(order, shadow, samples):
-    """Steps back, NaN and sigmas at will: within the bound of the filter, and all counted."""
     f = AdaptiveLowPass(order=order, shadow=shadow, smoothing=0.0, slew=0.0)
     t, started = 0.0, False
     for dt, x, sigma in samples:
@@ -265,7 +264,6 @@ def test_mode_does_not_change_while_filtering():
     ({'noise_wanted': 1.0}, 'needs coupling'), ({'shadow': 1}, 'true or false'),
     ({'slew': -1.0}, 'slew')])
 def test_bad_options_are_refused_by_name_and_the_old_ones_stay(options, words):
-    """At the start and later."""
     with pytest.raises(ValueError, match=words) as caught:
         AdaptiveLowPass(**options)
     assert '\n' not in str(caught.value)
@@ -276,7 +274,6 @@ def test_bad_options_are_refused_by_name_and_the_old_ones_stay(options, words):
 
 
 def test_limits_alone_are_enough():
-    """The fallback moves into them where it was not given."""
     assert AdaptiveLowPass(fmin=100.0, fmax=400.0).settings.fallback == 100.0
     assert AdaptiveLowPass(fmin=1.0, fmax=50.0).settings.fallback == 50.0
     assert AdaptiveLowPass(max_lag=9.0, fmax=150.0).settings.fallback == pytest.approx(90.7, 1e-2)

@@ -28,7 +28,6 @@ def loaded(t, v, u):
 
 @pytest.mark.parametrize('late', DELAYS)
 def test_late_throttle_is_found_and_costs_nothing(flight, late):
-    """The sag is that of throttle in time, within its error; so is the path."""
     t, v, u = flight
     n = round(late / 0.02)
     heard = np.concatenate((np.full(n, u[0]), u))[:t.size]
@@ -85,10 +84,3 @@ def test_steps_of_the_adc_that_hide_the_answer():
     assert fine.known
     swing = fine.sag(0.65) - fine.sag(0.55)
     assert swing == pytest.approx(0.15 * 3.8 * (0.65 ** 1.8 - 0.55 ** 1.8), rel=0.35)
-
-
-def test_steps_of_the_adc_do_no_harm_to_many_cells(flight):
-    """0.1 V under a sag of a volt."""
-    t, v, u = flight
-    load, plain = loaded(t, np.round(v, 1), u).load(), loaded(t, v, u).load()
-    assert load.known and abs(load.sag(0.5) - plain.sag(0.5)) < load.sag_se(0.5)

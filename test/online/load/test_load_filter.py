@@ -135,7 +135,6 @@ def test_throttle_of_the_wrong_sign_is_no_relation():
 
 
 def test_throttle_that_is_not_repeated_holds():
-    """Only its changes were sent."""
     t, v, u = flight()
     gap = u.copy()
     gap[1:][np.diff(u) == 0.0] = np.nan
@@ -169,7 +168,6 @@ def test_a_pack_of_another_size_begins_anew():
 
 
 def test_throttle_that_was_never_heard():
-    """Level and noise are known, the sag is not; percent counts as none."""
     t, v, u = flight()
     v = 16.0 + 0.05 * np.random.default_rng(1).standard_normal(t.size)
     for throttle in (None, np.full(t.size, np.nan), 100.0 * u + 3.0):

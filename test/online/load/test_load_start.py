@@ -67,7 +67,6 @@ def test_another_day_is_learned(learned):
 
 
 def test_a_pack_of_another_size_begins_without_it(learned):
-    """6 cells for 4."""
     t, v, u = flight(2)
     loads, plain = begun(learned), LoadFilter()
     for one in loads, plain:
@@ -76,7 +75,6 @@ def test_a_pack_of_another_size_begins_without_it(learned):
 
 
 def test_a_model_file_carries_it(learned, tmp_path):
-    """The same numbers come back, and the monitor begins with them; a change in flight is none."""
     model = SupplyModel((OU(63.0, 0.3, 16.0),), learned)
     path = tmp_path / 'model.yaml'
     path.write_text(as_yaml(ModelFile(model)))
@@ -96,7 +94,6 @@ def test_a_model_file_carries_it(learned, tmp_path):
 
 
 def test_a_file_with_fewer_lags_begins_as_before(learned):
-    """Three lags, none linear: the same sag as learned then, with a wider error."""
     kept = np.array([0, 1, 2, 3, 5, 6, SIZE - 1])
     a, P = np.array(learned.coefficients), np.array(learned.covariance)
     file = learned.values() | {'coefficients': a[kept].tolist(),

@@ -37,7 +37,6 @@ def watched(model, made, voltage=1.0):
 @pytest.mark.parametrize('age, verdict', [
     (1.0, ModelVerdict.AS_MODEL), (1.2, ModelVerdict.WEAKER), (1.4, ModelVerdict.WEAKER)])
 def test_a_pack_that_has_aged_is_found_within_a_minute(age, verdict):
-    """By how much, within the error, in record and fields; weaker is a warning with the date."""
     report = watched(GECKO, flight(60.0, 1, age=age))
     found = report.model
     assert found.verdict is verdict
@@ -74,7 +73,6 @@ def test_another_number_of_cells_is_said_within_five_seconds(voltage):
 
 
 def test_what_cannot_be_compared_has_no_verdict():
-    """Throttle that stands still, a model without load, no model."""
     still = watched(GECKO, flight(20.0, 1, throttle=constant(0.3))).model
     assert still.verdict is ModelVerdict.CANNOT_TELL and not still.words
     made = flight(20.0, 1)
@@ -156,7 +154,6 @@ def taught(made):
 @pytest.mark.parametrize('age, verdict', [
     (1.0, ModelVerdict.AS_MODEL), (1.4, ModelVerdict.WEAKER)])
 def test_a_pack_that_warmed_in_the_other_flight_is_no_weaker_now(age, verdict):
-    """The sag falls in flight: what its later part taught is scaled to a full pack."""
     made, now = flight(130.0, 1), flight(60.0, 2, age=age)
     late = made.t >= 70.0
     start = taught(Recording(made.t[late], made.voltage[late], made.throttle[late], 'late'))

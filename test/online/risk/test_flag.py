@@ -95,7 +95,6 @@ def test_latch_switched_off_ends_it_and_on_begins_it():
 
 
 def test_unknown_after_the_grace():
-    """CRITICAL outlasts `hold` s of not knowing, from what was known last; then it is unknown."""
     flag = made(brownout_hold=3.0)
     states = line(flag, [0.5] * 6 + [NAN] * 4)
     check(states, 'cccccc cc uu')
@@ -199,7 +198,6 @@ options = st.fixed_dictionaries({
 @given(options, events)
 @hypothesis_settings(max_examples=200, deadline=None)
 def test_whatever_happens_it_is_never_silently_fine(changes, happened):
-    """Never OK, and never false, while the risk is unknown; CRITICAL while it must be."""
     flag = made(**changes)
     t, known = 0.0, -math.inf
     for step, risk, fresh, voltage, clear in happened:

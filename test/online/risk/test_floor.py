@@ -129,7 +129,6 @@ def test_stamps_that_start_anew_keep_what_is_known_by_its_arrival():
 
 @pytest.mark.parametrize('part', [slice(0, 3000), slice(1500, 2500), slice(2005, 2011)])
 def test_samples_without_a_stamp_count_by_their_arrival(part):
-    """Of all, of many around a dip, of some of its samples: a dip trips it, a glitch does not."""
     arrived = 50.0 + 0.001 * np.arange(3000)
     stamps = 1000.0 + arrived
     stamps[part] = math.nan

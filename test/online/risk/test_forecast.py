@@ -10,7 +10,7 @@ from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.online.monitor import SupplyMonitor
 from ou_monitor.online.risk.first_passage import brownout_probability
 from ou_monitor.online.risk.flag import FlagLevel
-from ou_monitor.online.risk.forecast import _wider, Forecast, throttle_budget
+from ou_monitor.online.risk.forecast import Forecast, throttle_budget
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, Status
 from ou_monitor.timeline import Batch
@@ -248,7 +248,6 @@ def test_what_cannot_be_asked(arguments, words):
 
 
 def test_throttle_is_lost_and_found():
-    """Without throttle the excursions stand; the risk is never NaN."""
     monitor, t = monitor_of()
     _, v, _ = flight('telegraph')
     bases = []
@@ -292,7 +291,6 @@ def test_another_battery_is_learned_within_seconds():
 
 
 def test_known_from_the_first_second_and_flag_hardly_unknown():
-    """Even before any throttle has moved: on the excursions."""
     _, v, _ = flight('telegraph')
     monitor = SupplyMonitor(MonitorSettings(brownout_voltage=13.0, brownout_floor=0.0))
     for k in range(200):
@@ -359,13 +357,6 @@ def test_the_budget_is_where_the_risk_passes_the_limit(limit):
     assert f'{limit:.2g}' in reason or end > 0.9
 
 
-def test_monotone_in_the_limit():
-    """A higher limit never gives a lower budget, whatever the curve."""
-    risks = np.random.default_rng(1).random(51)
-    budgets = [budget(risks, limit)[0] for limit in np.geomspace(1e-6, 1.0, 30)]
-    assert np.all(np.diff(budgets) >= 0.0) and budgets[-1] == 0.9
-
-
 def test_the_edge_of_the_flight_is_no_claim_of_safety():
     """Flown up to 0.4 only, where the risk is small: the budget ends there and says why."""
     throttle, reason = budget(np.full(51, 1e-9), highest=0.4)
@@ -395,13 +386,6 @@ def test_dips_that_throttle_does_not_tell_are_counted():
     for k in range(0, t.size, 10):
         monitor.push(t[k:k + 10], v[k:k + 10], u[k:k + 10])
     assert 0.02 < monitor.risk_if(1.0, 2.0, 9.0, 2.0) < 0.5
-
-
-def test_misses_widen_a_law_by_their_volts():
-    """Ten misses of 0.1 V, ten deviations at idle, do not make full throttle ten times as wide."""
-    wide = _wider(np.array([0.01, 0.5]), 0.02, (10.0, 10.0 * 0.1 ** 2))
-    assert wide == pytest.approx([math.sqrt((4.0 * (0.01 ** 2 + 0.02 ** 2) + 0.1) / 14.0),
-                                  math.hypot(0.5, 0.02)])
 
 
 def test_the_risk_does_not_fall_with_the_horizon():

@@ -79,7 +79,6 @@ def test_excursions_fall_with_the_margin(horizon, mean):
 
 
 def test_futures_are_those_flown():
-    """Each with its throttle at first, peak, dwell and rest; the nearer and newer weigh more."""
     past, *_ = made()
     done = flown(past, 2.0)
     mean, high = past.table[2:]
