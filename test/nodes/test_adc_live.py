@@ -14,7 +14,6 @@ RATE = 10_000
 
 
 def test_ten_kilohertz_reach_the_estimator_without_loss(world, tmp_path):
-    """Every sample is estimated from, at the kernel's stamps; alpha and sigma are right."""
     folder, character = iio_device(tmp_path, RATE)
     probe = world.probe()
     states = probe.listen('/ou_estimator/state', DiagnosticArray)
@@ -88,7 +87,6 @@ def test_hwmon_publishes_battery_states(world, tmp_path):
 
 
 def test_an_unknown_device_is_one_line(world, tmp_path):
-    """One line, with what there is."""
     iio_device(tmp_path)
     adc = world.start('adc', '--ros-args', '-p', 'device:=ads1115', '-p', f'sysfs:={tmp_path}/sys')
     assert adc.wait() == 2

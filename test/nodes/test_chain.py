@@ -79,7 +79,6 @@ def wanted(times, interval):
 
 
 def test_ctrl_c_ends_all_with_status_0(chain):
-    """In the middle of their work, without a traceback."""
     assert chain['statuses'] == [0, 0, 0]
     assert all('Traceback' not in text for text in chain['errors'])
 
@@ -110,7 +109,6 @@ def filtered(times, values, cutoffs):
 
 
 def test_output_is_the_filtered_input(chain):
-    """As many messages, and the steps of what this low-pass makes of these inputs."""
     # Best effort at 1 kHz: a machine that does other things loses some.
     assert len(chain['output']) >= 0.3 * len(chain['input'])
     times, cutoff_times = (np.array(chain[name]) for name in ('input sent', 'cutoff sent'))
@@ -131,7 +129,6 @@ def test_output_is_the_filtered_input(chain):
 
 
 def test_outputs_are_reliable_and_of_the_contracts_type(chain):
-    """One publisher each, reliable, of the type that the contract says."""
     kinds = {'/ou_adaptive_filter/output': 'std_msgs/msg/Float32',
              '/ou_adaptive_filter/cutoff': 'std_msgs/msg/Float64',
              '/ou_estimator/sigma': 'std_msgs/msg/Float64',
@@ -145,7 +142,6 @@ def test_outputs_are_reliable_and_of_the_contracts_type(chain):
 
 
 def test_the_filter_reports_diagnostics(chain):
-    """It waits, then works; it counts."""
     first, last = statuses(chain)[0], chain['ok']
     assert first.level == b'\x03' and first.message == 'Waiting for a publisher on /voltage.'
     fields = values_of(last)

@@ -49,7 +49,6 @@ def test_every_parameter_at_its_default(file, kinds):
 
 @pytest.mark.parametrize('file', [FILE, ADC_FILE])
 def test_every_key_has_a_comment(file):
-    """The line above it."""
     lines = file.read_text().splitlines()
     for above, line in zip(lines, lines[1:]):
         if re.match(r' {4,}\w+: \S', line):
@@ -95,7 +94,6 @@ def of_kind(described, kind):
 
 
 def test_launch_takes_namespace_parameters_and_clock(described):
-    """Namespace, parameter file, simulated time; the file is the shipped one."""
     arguments = {a.args[0]: a.kwargs['default_value']
                  for a in of_kind(described, 'DeclareLaunchArgument')}
     network = arguments.pop('discovery_range')
@@ -118,7 +116,6 @@ def test_the_nodes_are_found_on_this_machine_alone(described):
 
 
 def test_launch_starts_executables_wired_to_each_other(described):
-    """Executables of the package, names that the file has, sigma wired to the estimator."""
     nodes = of_kind(described, 'Node')
     assert [n.kwargs['name'] for n in nodes] == list(NODES)
     assert set(yaml.safe_load(FILE.read_text())) == {f'/**/{name}' for name in NODES}
@@ -158,7 +155,6 @@ def test_a_parameter_file_that_is_not_there_is_an_error(described, tmp_path):
 
 @pytest.mark.parametrize('described', [TWO], indirect=True)
 def test_two_batteries_are_two_scopes_of_one_launch(described):
-    """Each by the other launch file, with arguments that it has, in a scope of its own."""
     known = {name for name, _, _ in _arguments_of(LAUNCH)}
     declared = {a.args[0] for a in of_kind(described, 'DeclareLaunchArgument')}
     groups = of_kind(described, 'GroupAction')
@@ -175,7 +171,6 @@ def test_two_batteries_are_two_scopes_of_one_launch(described):
 
 @pytest.mark.parametrize('described', [SIMULATED], indirect=True)
 def test_the_simulated_launch_includes_the_other(described):
-    """The other launch file first, with arguments that it has; parameters that the node has."""
     (include,), (node,) = of_kind(described, 'IncludeLaunchDescription'), of_kind(
         described, 'Node')
     kinds = [type(entry).__name__ for entry in described]
@@ -204,7 +199,6 @@ def _arguments_of(path):
 
 
 def test_the_file_is_taken_in_any_namespace(world):
-    """The wildcard matches the bare node and one in a namespace, without a warning."""
     from live import wait_until
     from rcl_interfaces.srv import GetParameters
     changed = world.folder / 'changed.yaml'

@@ -7,7 +7,7 @@ from live import Estimator, ou_path, wait_until
 import numpy as np
 import pytest
 from sensor_msgs.msg import BatteryState
-from std_msgs.msg import Float32, Float32MultiArray, Float64, String
+from std_msgs.msg import Float64, String
 
 OK, WARN, STALE = b'\x00', b'\x01', b'\x03'
 DT = 0.001
@@ -75,7 +75,6 @@ def test_two_namespaces_do_not_mix(rigs):
 
 
 def test_silence_is_stale_and_never_false(rig):
-    """After `stale_after`: STALE, NaN, and no flag that says false."""
     rig.feed(ou_path(500, DT, seed=2))
     wait_until(lambda: rig.status.level == STALE and 'No voltage for' in rig.status.message,
                what='STALE after samples')
@@ -123,7 +122,6 @@ def test_time_going_back_clears_the_window(rig):
 
 
 def test_parameter_change_keeps_the_window(rig):
-    """Longer, shorter, brown-out level: n counts on, nothing is reset."""
     rig.feed(ou_path(1500, DT, seed=7))
     rig.catch_up()
     n, resets = rig.count('n'), rig.count('resets')
@@ -144,14 +142,11 @@ def test_parameter_change_keeps_the_window(rig):
 
 
 @pytest.mark.parametrize('name, value, words', [
-    ('window', -1.0, 'must lie within 0.05..3600'),
     ('window', 'long', "unknown 'long'"),
-    ('window', True, 'a finite number or auto'),
     ('brownout.warn', 0.5, 'must be less than brownout.critical'),
     ('msg_config', 'px4', 'read-only'),
 ])
 def test_bad_parameters_are_refused(rig, name, value, words):
-    """With the reason; the old value stays."""
     from rcl_interfaces.srv import GetParameters
 
     def values():
@@ -230,33 +225,3 @@ def test_another_type_than_configured_is_named(world):
     keep = probe.publisher('/c/voltage', Float64)
     wait_until(lambda: 'expects std_msgs/msg/Float32' in rig.status.message, what='complaint')
     assert keep and rig.status.level == b'\x02'
-
-
-def test_blocks_of_adc_samples(world):
-    """Blocks of 100 at 10 kHz without a stamp: every sample counts, sigma is the truth."""
-    rig = Rig(world, 'adc')
-    throttle = rig.probe.publisher('/adc/throttle', Float32)
-    wait_until(throttle.get_subscription_count)
-    # The throttle is there before the voltage: the node waits on.
-    states = len(rig.states)
-    wait_until(lambda: len(rig.states) > states + 1)
-    assert rig.status.message == 'Waiting for a publisher on /adc/voltage.'
-    rig.connect(Float32MultiArray)
-    path = ou_path(20000, 1e-4, seed=9, sigma=0.3)
-
-    def full():
-        start = time.monotonic()
-        for k in range(200):
-            time.sleep(max(start + 0.01 * k - time.monotonic(), 0.0))
-            throttle.publish(Float32(data=0.25))
-            rig.output.publish(Float32MultiArray(data=path[100 * k:100 * (k + 1)]))
-        told = len(rig.states)
-        wait_until(lambda: len(rig.states) > told + 3)
-        return rig.count('n') >= 16000
-    # Where a busy machine holds the sender up, the window is not full: then once more.
-    wait_until(full)
-    # 0.5 % of standard error; but two pauses of 0.15 s of a busy machine within the window, each
-    # taken for a gap by the blocks' time line, cost 15 % of the samples and 11 % of sigma.
-    assert float(rig.field('sigma')) == pytest.approx(0.3, rel=0.2)
-    assert float(rig.field('rate')) == pytest.approx(10000.0, rel=0.2)
-    assert float(rig.field('throttle')) == 0.25

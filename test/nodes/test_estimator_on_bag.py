@@ -71,7 +71,6 @@ def test_says_what_it_waits_for(run):
 
 
 def test_inputs_are_best_effort(run):
-    """Inputs best effort, whatever the publisher offers."""
     assert [end.qos_profile.reliability for end in run['inputs']] == [
         ReliabilityPolicy.BEST_EFFORT]
 
@@ -114,7 +113,6 @@ def test_the_same_numbers_as_offline(states):
 
 
 def test_the_flag_is_published_only_with_a_risk(states, run):
-    """Risk is a probability that follows the barrier; the flag is told only with a risk."""
     risks = [float(f['brownout_risk']) for _, f in states]
     assert all(0.0 < risk <= 1.0 for risk in risks)
     known = [m for m in run['brownout_risk'] if not math.isnan(m.data)]
@@ -143,7 +141,6 @@ def test_throttle_is_in_the_state(states):
 
 
 def test_stamps_are_those_of_the_bag(states):
-    """Not those of the day of the test."""
     bag = BagReader(BAG)
     stamps = [seconds(m.header.stamp) for m, _ in states]
     assert stamps == sorted(stamps)
@@ -151,7 +148,6 @@ def test_stamps_are_those_of_the_bag(states):
 
 
 def test_diagnostics_have_the_full_name_and_simulated_time(run):
-    """On the absolute topic, by the full name of the node, at simulated time."""
     mine = [m for m in run['diagnostics'] if m.status[0].name == 'uav1/ou_estimator: supply']
     assert len(mine) >= 5
     fields = values_of(mine[-1].status[0])

@@ -48,7 +48,6 @@ def test_signals_end_the_nodes(world, number):
 
 @pytest.mark.parametrize('name', NODES)
 def test_arguments_that_rclpy_ignores_are_refused(world, name):
-    """A parameter without --ros-args is refused, not ignored; --help helps."""
     process = world.start(name, 'fmin:=30.0', '--ros-args', '-p', 'publish_rate:=5.0')
     assert process.wait() == 2
     assert "'fmin:=30.0' is not an option" in process.err and '--ros-args -p' in process.err
@@ -121,7 +120,6 @@ def test_a_signal_while_it_ends_is_only_noted(tmp_path):
     ('adaptive_filter', ['-p', 'max_lag:=5.0'], 'allow more lag or raise fmax'),
 ], ids=lambda value: '' if isinstance(value, list) else value[:24])
 def test_bad_arguments_are_refused_with_the_reason(name, arguments, words):
-    """With the reason."""
     assert words in refusal(lambda: KINDS[name](NODES[name]), *arguments)
 
 
@@ -143,7 +141,6 @@ def test_a_refusal_is_one_line(world, name, arguments, words):
 
 
 def test_a_misspelt_parameter_is_named(world, tmp_path):
-    """ROS ignores it without a word: by -p and in a file, with the nearest name."""
     path = tmp_path / 'params.yaml'
     path.write_text('/**:\n  ros__parameters:\n    brownout:\n      horizn: 2.0\n')
     process = world.start('estimator', '--ros-args', '-p', 'windw:=3.0', '-p', 'window:=3',
@@ -156,7 +153,6 @@ def test_a_misspelt_parameter_is_named(world, tmp_path):
 
 
 def test_the_throttles_package_is_not_needed(world):
-    """MAVROS without mavros_msgs: voltage works, one warning for the throttle."""
     probe = world.probe()
     process = world.start('estimator', '--ros-args', '-p', 'msg_config:=mavros')
     wait_until(lambda: probe.node.get_subscriptions_info_by_topic('/mavros/battery'))
@@ -178,7 +174,6 @@ def test_without_ros_one_line_says_so(tmp_path, name):
 
 
 def test_qos_overrides_are_taken_or_refused(world):
-    """Of an input: the subscription has it; of a topic that is none of the node's: refused."""
     from rclpy.qos import ReliabilityPolicy
     probe = world.probe()
     process = world.start(

@@ -70,7 +70,6 @@ def state_of(**values):
 
 
 def test_sigma_falls_back_along_a_time_line():
-    """Nothing, sigma, sigma and state, state silent, unusable, garbage, sigma silent."""
     clock = Clock()
     supply = SupplyInput(clock, '/sigma')
     assert supply.now(1.0).why == 'no message on /sigma' and math.isnan(supply.now(1.0).sigma)
@@ -156,7 +155,6 @@ IMU = 'sensor_msgs/msg/Imu'
 
 
 def test_an_imu_keeps_what_is_not_filtered():
-    """All but the rates, the covariances included."""
     channels = channels_of(IMU, '')
     message = imu(angular_velocity=KNOWN, linear_acceleration=KNOWN)
     values = channels.take(message)
@@ -170,7 +168,6 @@ def test_an_imu_keeps_what_is_not_filtered():
 
 
 def test_an_imu_without_a_gyro_gives_nothing():
-    """Its covariance begins with -1."""
     assert channels_of(IMU, '').take(imu(angular_velocity=ABSENT)) == ()
 
 
@@ -181,7 +178,6 @@ def test_an_imu_without_a_gyro_gives_nothing():
     ('geometry_msgs/msg/Point', 'x', Point(x=1.0), 'std_msgs/msg/Float64'),
 ])
 def test_a_derivative_has_a_message_of_its_own(kind, field, message, output):
-    """It leaves in a message of its own, with the header; the input is not touched."""
     channels = channels_of(kind, field, mode='derivative')
     before = str(message)
     values = channels.take(message)
@@ -198,7 +194,6 @@ def test_a_derivative_has_a_message_of_its_own(kind, field, message, output):
 
 
 def test_a_derivative_without_unit_stays_a_number():
-    """Float64 in, Float64 out."""
     assert channels_of('std_msgs/msg/Float64', '', mode='derivative').output == ''
 
 

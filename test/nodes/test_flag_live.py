@@ -73,7 +73,6 @@ def test_no_flag_is_published_while_unknown(rig):
 
 
 def test_the_floor_sets_the_latch_and_the_service_clears_it(rig):
-    """A dip that no estimate sees: set by the floor, latched, cleared by the service."""
     # 50 ms below the floor, of which best effort may lose some.
     rig.give('brownout.latch', True)
     rig.give('brownout.hold', 0.0)
@@ -107,7 +106,6 @@ def test_the_floor_sets_the_latch_and_the_service_clears_it(rig):
     ('model_file', '/no/such/model.yaml', 'cannot read the model file'),
 ])
 def test_contradictions_are_refused_at_run_time(rig, name, value, words):
-    """With the reason; the old value stays."""
     before = rig.get(name)
     result = rig.probe.set_parameter(rig.node, name, value)
     assert not result.successful and words in result.reason and '\n' not in result.reason
@@ -115,7 +113,6 @@ def test_contradictions_are_refused_at_run_time(rig, name, value, words):
 
 
 def test_a_bad_model_file_leaves_the_old_one(rig, shared_world):
-    """Read when it is set; a bad one is refused with its line and the old one stays."""
     good, bad = shared_world.folder / 'good.yaml', shared_world.folder / 'bad.yaml'
     good.write_text(MODEL)
     bad.write_text(MODEL.replace('measurement_noise', 'measurment_noise'))

@@ -107,7 +107,6 @@ def test_of_two_nodes_on_one_file_the_second_refuses(tmp_path):
 
 
 def test_a_file_replaced_meanwhile_is_left_alone(tmp_path):
-    """By notes: not written until they are gone; then the latch comes back by itself."""
     path = tmp_path / 'state'
     latch = LatchFile(path, '/n')
     latch.read()

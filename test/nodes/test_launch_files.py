@@ -40,7 +40,6 @@ def test_nodes_come_up_and_end(world, file):
 
 
 def test_a_missing_parameter_file_starts_no_node(tmp_path):
-    """An error, and no node."""
     done = subprocess.run(
         ['ros2', 'launch', 'ou_monitor', 'ou_monitor_launch.py',
          f'params_file:={tmp_path}/none.yaml'], capture_output=True, text=True, timeout=120,

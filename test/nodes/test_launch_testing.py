@@ -46,5 +46,4 @@ class TestEnd(unittest.TestCase):
     """When they have ended."""
 
     def test_status(self, proc_info):
-        """Status 0 of both."""
         assertExitCodes(proc_info)

@@ -90,46 +90,6 @@ def test_every_path_is_there(paths, topics):
 
 @pytest.mark.parametrize('paths', [foxglove_paths, plotjuggler_paths])
 def test_nothing_is_missing(paths):
-    """Voltage, throttle and every number that the nodes publish are drawn."""
     drawn = {topic for topic, _ in paths()}
     assert {'/voltage', '/throttle', *(f'/ou_estimator/{name}' for name in SUPPLY),
             *(f'/ou_adaptive_filter/{name}' for name in FILTER)} <= drawn
-
-
-def test_foxglove_panels_are_placed():
-    """Each panel has its place, each place its panel; state and diagnostics are whole messages."""
-    layout = foxglove()
-    leaves = []
-
-    def walk(node) -> None:
-        if isinstance(node, str):
-            leaves.append(node)
-            return
-        assert node['direction'] in ('row', 'column') and 0 < node['splitPercentage'] < 100
-        walk(node['first'])
-        walk(node['second'])
-
-    walk(layout['layout'])
-    assert sorted(leaves) == sorted(layout['configById'])
-    whole = {topic for topic, field in foxglove_paths() if not field}
-    assert whole == {'/ou_estimator/state', '/diagnostics'}
-    (flag,) = (p for key, p in layout['configById'].items() if key.startswith('Indicator!'))
-    # The state says 'unknown' where the topic of the flag is silent, and would keep its colour.
-    assert flag['path'] == FLAG
-    # Neither colour of a known flag is that of an unknown one.
-    assert {rule['rawValue'] for rule in flag['rules']} == {'true', 'false'}
-    assert flag['fallbackColor'] not in {rule['color'] for rule in flag['rules']}
-
-
-def test_plotjuggler_subscribes_to_what_it_draws():
-    """The topics of the streaming plug-in are those of the curves; every splitter adds up."""
-    root = ElementTree.parse(PLOTJUGGLER).getroot()
-    (selected,) = root.iter('selected_topics')
-    assert set(selected.get('value').split(';')) == {topic for topic, _ in plotjuggler_paths()}
-    assert root.find('previouslyLoaded_Streamer').get('name') == 'ROS2 Topic Subscriber'
-    for splitter in root.iter('DockSplitter'):
-        sizes = [float(size) for size in splitter.get('sizes').split(';')]
-        assert len(sizes) == int(splitter.get('count')) == len(splitter)
-        assert sum(sizes) == pytest.approx(1.0, abs=1e-5)
-    for tab in root.iter('Tab'):
-        assert int(tab.get('containers')) == len(tab.findall('Container'))

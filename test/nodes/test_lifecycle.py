@@ -52,7 +52,6 @@ def topics_of(probe, node):
 
 @pytest.mark.parametrize('name', NODES)
 def test_only_an_active_node_has_anything_open(world, name):
-    """Only an active node has anything open; deactivated and activated it has it again."""
     node = NODES[name]
     probe = world.probe()
     process = world.start(name, '--lifecycle')

@@ -28,7 +28,6 @@ def address(process):
 @pytest.mark.flaky(reruns=1)
 @pytest.mark.skipif(BROWSER is None, reason='no Chromium or Chrome')
 def test_a_browser_shows_a_flight_and_outlives_both_ends(world, tmp_path):
-    """OK with numbers; a low limit is a brown-out; silence and reconnection are said."""
     estimator = world.start('estimator')
     world.start('adaptive_filter', '--ros-args', '-r', 'sigma:=ou_estimator/sigma',
                 '-r', 'state:=ou_estimator/state', '-r', 'input:=voltage')
@@ -130,7 +129,6 @@ class TestOpen(TestLocal):
     test_any_last_row_is_taken = None
 
     def test_the_token_is_wanted(self):
-        """Without it, and with a wrong one, nothing; by any name with it."""
         for path in ('/', '/rows', '/?token=', '/?token=secre', '/rows?token=secret2'):
             assert self.fetch(path).code == 403, path
         assert self.fetch('/?token=secret', headers={'Host': 'drone.local'}).code == 200
@@ -193,5 +191,4 @@ def test_bad_options_are_one_line(world, arguments, words):
 
 
 def test_unknown_values_are_null():
-    """JSON has no NaN."""
     assert [known(x) for x in ('nan', 'inf', None, '', 'x', '0.5', 2)] == [None] * 5 + [0.5, 2.0]

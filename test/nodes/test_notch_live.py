@@ -86,7 +86,6 @@ def test_rpm_of_any_field_sets_the_notches(rig):
 
 
 def test_a_bad_unit_is_refused_and_none_is_accepted(rig):
-    """Ask for eRPM without poles: one line; for no notch: they fade, the lag is the low-pass's."""
     refused = rig.probe.set_parameter(NODE, 'notch.poles', 0)
     assert not refused.successful and 'notch.poles' in refused.reason
     assert rig.probe.set_parameter(NODE, 'notch.count', 0).successful

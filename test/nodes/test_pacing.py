@@ -1,24 +1,9 @@
 """Waiting, spacing statistics, and reading ahead."""
 
 import threading
-import time
 
-from ou_monitor.nodes.base import wait_until
 from ou_monitor.nodes.player import Prefetch, SpacingError
 import pytest
-
-
-def test_waits_until_the_instant():
-    """It never returns early."""
-    instant = time.monotonic() + 0.02
-    assert wait_until(instant, lambda: True)
-    assert time.monotonic() >= instant
-
-
-def test_stops_waiting_when_told():
-    """A signal ends a wait of an hour."""
-    answers = iter([True, True, False])
-    assert not wait_until(time.monotonic() + 3600.0, lambda: next(answers))
 
 
 def test_spacing_error_quantiles():
@@ -38,14 +23,6 @@ def test_the_gap_between_passes_is_not_counted():
     spacing.restart()
     spacing.add(0.0, 7.0)
     assert spacing.summary() == {}
-
-
-@pytest.mark.parametrize('ahead, batch', [(1, 1), (2, 7), (7, 1000)])
-def test_prefetch_gives_everything_in_order(ahead, batch):
-    """Whatever may be held."""
-    source = Prefetch(range(500), ahead, batch)
-    assert list(source) == list(range(500))
-    source.close()
 
 
 def test_prefetch_is_bounded_and_fills():

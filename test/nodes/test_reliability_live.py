@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import resource
 import signal
 import subprocess
 import sys
@@ -52,7 +51,6 @@ def rig(shared_world):
 
 
 def test_the_page_lists_every_field(rig):
-    """Each field of a state, once, and no other."""
     page = (ROOT / 'doc/messages.md').read_text(encoding='utf-8')
     table = page.split('## Fields of')[1].split('\n## ')[0]
     firsts = re.findall(r'^\| (`.*?) \|', table, re.MULTILINE)
@@ -64,7 +62,6 @@ def test_the_page_lists_every_field(rig):
 
 
 def test_stamps_that_stop_are_named_and_hide_no_dip(rig):
-    """No false flag and no OK while they stand still; dips are seen all the same."""
     rig.live(ou_path(1500, 0.002, seed=1))
     assert rig.field('clock') == 'ros'
     still = time.time()
@@ -107,7 +104,6 @@ def test_old_data_that_arrive_now_are_old(rig):
 
 
 def test_a_second_publisher_is_named_and_left_out(rig, world):
-    """Its samples are counted and not used."""
     other = rig.probe.publisher('/attack/voltage', BatteryState, 100)
     wait_until(lambda: (rig.live(ou_path(200, 0.002, seed=4)), rig.field('stamps'))[1] == 'GOOD')
     wait_until(lambda: '2 publishers' in rig.status.message, what='two publishers')
@@ -119,28 +115,6 @@ def test_a_second_publisher_is_named_and_left_out(rig, world):
     wait_until(lambda: int(rig.field('foreign_messages')) >= foreign + 80, what='foreign ones')
     assert int(rig.field('used')) > used and rig.field('brownout_level') != 'CRITICAL'
     rig.probe.node.destroy_publisher(other)
-
-
-def test_model_files_that_are_none_hang_nothing(rig, tmp_path):
-    """A FIFO, a device: refused at once, and states go on."""
-    fifo = tmp_path / 'fifo'
-    os.mkfifo(fifo)
-    for path in (str(fifo), '/dev/zero'):
-        states = len(rig.states)
-        result = rig.probe.set_parameter(rig.node, 'model_file', path)
-        assert not result.successful and 'model_file' in result.reason
-        wait_until(lambda n=states: len(rig.states) > n + 2, what='states')
-
-
-def test_a_model_file_that_takes_long_to_refuse_is_answered_with_the_reason(rig, tmp_path):
-    """Numbers where terms belong, read for a second or more; states go on meanwhile."""
-    path = tmp_path / 'long.yaml'
-    path.write_text('model:\n' + '- 0.12345678901234567890123456789012345678\n' * 15_000)
-    for _ in range(2):
-        states = len(rig.states)
-        result = rig.probe.set_parameter(rig.node, 'model_file', str(path))
-        assert not result.successful and 'a term needs' in result.reason
-        assert len(rig.states) > states and rig.field('model_terms') == ''
 
 
 def test_no_parameter_ends_the_node(rig):
@@ -157,7 +131,6 @@ def test_no_parameter_ends_the_node(rig):
 
 
 def test_locked_parameters_refuse_what_can_disarm(world):
-    """What can disarm is refused with the reason, at run time only."""
     rig = Rig(world, 'locked', '-p', 'lock_parameters:=true', '-p', 'brownout.voltage:=4.6')
     for name, value in (('brownout.voltage', 1.0), ('stale_after', 100.0), ('model_file', ''),
                         ('window', 9.0), ('use_sim_time', True)):
@@ -187,7 +160,6 @@ def test_a_dip_that_the_diagnostics_find_is_told_by_all(rig):
 
 
 def test_the_latch_survives_a_restart(world, tmp_path):
-    """Killed, started anew, still CRITICAL with the reason; cleared, it stays cleared."""
     path = tmp_path / 'latch'
     arguments = ('-p', 'brownout.latch:=true', '-p', f'state_file:={path}')
     rig = Rig(world, 'keep', *arguments)
@@ -226,26 +198,6 @@ def test_a_state_file_of_another_is_refused_and_told(world, tmp_path):
     assert rig.process.stop() == 0 and path.read_text() == 'my notes'
 
 
-def test_a_latch_that_the_disk_refused_is_written_later(world, tmp_path):
-    """A limit of the size of files stands for a full disk, of the node alone."""
-    path = tmp_path / 'latch'
-    arguments = ('-p', 'brownout.latch:=true', '-p', f'state_file:={path}')
-    rig = Rig(world, 'full', *arguments)
-    pid = rig.process.popen.pid
-    limits = resource.prlimit(pid, resource.RLIMIT_FSIZE)
-    resource.prlimit(pid, resource.RLIMIT_FSIZE, (10, limits[1]))
-    rig.live([5.0] * 50 + [4.0] * 200)
-    wait_until(lambda: 'cannot be written' in rig.status.message, what='the problem')
-    assert rig.status.level == ERROR and json.loads(path.read_text())['level'] == 'OK'
-    resource.prlimit(pid, resource.RLIMIT_FSIZE, limits)
-    wait_until(lambda: json.loads(path.read_text())['level'] == 'CRITICAL', what='the latch')
-    wait_until(lambda: 'cannot be written' not in rig.status.message, what='no problem')
-    rig.process.kill()
-    again = Rig(world, 'full', *arguments)
-    wait_until(lambda: again.field('brownout_level') == 'CRITICAL', what='the latch')
-    assert again.process.stop() == 0 and list(tmp_path.glob('.latch*')) == []
-
-
 @pytest.fixture
 def own_domain():
     """Give a ROS domain that is left as it was once the nodes have ended."""
@@ -262,7 +214,6 @@ def own_domain():
     (False, 5000, (4800, 4900), 300)])
 def test_messages_wait_for_a_stopped_node(
         own_domain, world, profile, number, dip, kept):
-    """As many messages as its queue holds, and the dip in them."""
     # The default of ROS; limited to this machine it has Fast DDS's own queues.
     world.domain, world.reach = own_domain, 'SUBNET'
     rig = Rig(world, 'stopped', '-p', 'brownout.hold:=0.0')

@@ -81,7 +81,6 @@ def test_spacing_at_1_khz(world, numbered):
 
 
 def test_every_message_arrives_in_order_and_on_time(world, numbered):
-    """It waits for its subscriber; what arrives is what was recorded."""
     probe = world.probe()
     qos = QoSProfile(depth=3000)
     sent = []
@@ -137,7 +136,6 @@ def test_loop_jumps_back_until_ctrl_c(world, tmp_path):
 
 
 def test_only_selected_topics_are_played(world, tmp_path):
-    """Only what was asked for."""
     path = tmp_path / 'two.mcap'
     with BagWriter(path) as bag:
         for name in ('/a', '/b'):
@@ -155,7 +153,6 @@ def test_only_selected_topics_are_played(world, tmp_path):
 
 
 def test_truncated_is_refused_or_played_as_far_as_it_holds(world, tmp_path):
-    """The damage is told in both cases."""
     whole = next(BAG.glob('*.mcap')).read_bytes()
     path = tmp_path / 'cut.mcap'
     path.write_bytes(whole[:len(whole) // 4])
@@ -210,7 +207,6 @@ def test_log_times_beyond_the_clock_are_handled(world, numbered):
     ([BAG, '--topics', '/volage'], "did you mean '/voltage'?"),
 ], ids=lambda value: '' if isinstance(value, list) else value[:20])
 def test_bad_bags_are_refused_with_the_reason(tmp_path, arguments, words):
-    """With the reason."""
     chosen = options([str(a(tmp_path) if callable(a) else a) for a in arguments])
     assert words in refusal(lambda: Player('ou_replay', BagReader(chosen.bag), chosen))
 
@@ -229,7 +225,6 @@ def test_options_that_are_refused(arguments, words):
 
 
 def test_types_that_are_not_installed_are_left_out(world, tmp_path):
-    """With one line that names the package; the rest is played; nothing left is an error."""
     for name, installed in (('mixed', True), ('alien', False)):
         with BagWriter(tmp_path / f'{name}.mcap') as bag:
             bag.add_topic('/alien', 'px4_msgs/msg/Thing', schema='float32 x')
@@ -249,7 +244,6 @@ def test_types_that_are_not_installed_are_left_out(world, tmp_path):
 
 
 def test_help_needs_no_ros(world):
-    """It tells the options."""
     process = world.start('replay', '--help')
     assert process.wait() == 0
     assert all(option in process.out for option in (

@@ -38,7 +38,6 @@ def test_a_steady_source_becomes_even():
 
 
 def test_an_irregular_source_is_left_alone():
-    """Of a Poisson source the sent times are all there is."""
     rng = np.random.default_rng(5)
     sent = 1.7e9 + np.cumsum(rng.exponential(0.001, 5000))
     clock = SendClock()
@@ -165,7 +164,6 @@ def test_a_burst_is_not_a_rate():
 
 @pytest.mark.parametrize('n', [200, 400, 1000, 10_000])
 def test_steady_sources_are_told_from_random_ones(n):
-    """Of a Poisson source fewer are near its line than `ON_LINE`, of a timer with losses more."""
     # The distance of a Poisson source is a random walk, NEAR sqrt(n) periods a fixed part of it;
     # losses of 1 % make a walk a tenth as wide.
     rng = np.random.default_rng(7)

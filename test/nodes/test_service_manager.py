@@ -23,7 +23,6 @@ def manager(tmp_path, monkeypatch):
 
 
 def test_the_watchdog_is_fed_twice_per_period(manager, monkeypatch):
-    """In s; not that of another process, nor without a watchdog."""
     assert ServiceManager().interval == 0.0
     monkeypatch.setenv('WATCHDOG_USEC', '3000000')
     assert ServiceManager().interval == 1.5
@@ -44,7 +43,6 @@ def test_an_abstract_socket_is_notified(monkeypatch):
 
 
 def test_no_listener_is_no_error(monkeypatch, tmp_path):
-    """Neither without a socket, nor with one that is gone, is there an error."""
     monkeypatch.delenv('NOTIFY_SOCKET', raising=False)
     ServiceManager().tell('READY=1')
     monkeypatch.setenv('NOTIFY_SOCKET', str(tmp_path / 'gone'))
@@ -91,7 +89,6 @@ def test_the_unit_has_the_scheduling_that_was_measured():
     ('estimator', []), ('adaptive_filter', ['sigma:=ou_estimator/sigma',
                                             'state:=ou_estimator/state', 'input:=imu'])])
 def test_the_units_command_sources_ros_and_the_package(tmp_path, name, names):
-    """As bash runs it: both set-ups sourced, the file of parameters, names of topics as words."""
     install = tmp_path / 'opt/ou_monitor/install'
     ros = tmp_path / 'opt/ros/jazzy'
     node = install / 'ou_monitor/lib/ou_monitor' / name

@@ -15,7 +15,6 @@ def values(**changed):
 
 
 def test_auto_chooses_by_type():
-    """Each generic type has its field; a foreign type has none."""
     source = find_source('voltage', values())
     assert source.spec is None and source.topic == 'voltage'
     kinds = {'std_msgs/msg/Float32': 'data', 'std_msgs/msg/Float64': 'data',
@@ -30,12 +29,10 @@ def test_auto_chooses_by_type():
 
 @pytest.mark.parametrize('kind', ['std_msgs/msg/Float32', 'std_msgs/msg/Float64'])
 def test_auto_takes_any_scalar_throttle(kind):
-    """Without a msg_config that says so."""
     assert find_source('throttle', values()).choose([kind]).spec.field == 'data'
 
 
 def test_a_named_config_says_all():
-    """Topic, type, field."""
     source = find_source('voltage', values(msg_config='battery_state'))
     assert (source.spec.type, source.spec.field, source.config) == (
         'sensor_msgs/msg/BatteryState', 'voltage', 'battery_state')
@@ -57,7 +54,6 @@ def test_a_rate_does_not_make_a_block_of_a_scalar():
 
 
 def test_any_installed_type_by_name_and_path():
-    """The header's stamp is used where the message has a header."""
     source = find_source('voltage', values(
         voltage__type='sensor_msgs/msg/Temperature', voltage__field='temperature'))
     assert source.spec.stamp_field == 'header.stamp' and source.open()
@@ -67,7 +63,6 @@ def test_any_installed_type_by_name_and_path():
 
 
 def test_a_config_without_throttle():
-    """There is none, unless the user names one."""
     assert find_source('throttle', values(msg_config='ardupilot_dds')) is None
     named = values(msg_config='ardupilot_dds', throttle__topic='/t',
                    throttle__type='std_msgs/msg/Float32', throttle__field='data')
@@ -81,7 +76,6 @@ def test_a_config_without_throttle():
     ({'voltage__type': 'px4_msgs/msg/X', 'voltage__field': 'v'}, 'ros-jazzy-px4-msgs'),
 ])
 def test_a_refusal_says_what_to_do(changed, words):
-    """One line that says what to do."""
     with pytest.raises(InputError) as caught:
         find_source('voltage', values(**changed))
     assert words in str(caught.value) and '\n' not in str(caught.value)
@@ -95,7 +89,6 @@ def test_a_refusal_says_what_to_do(changed, words):
     ('px4_msgs/msg/BatteryStatus', "package 'px4_msgs', which is not installed"),
 ])
 def test_unavailable_types_are_refused(name, words):
-    """Malformed, misspelt, not installed."""
     with pytest.raises(InputError, match='.') as caught:
         message_class(name)
     assert words in str(caught.value)
@@ -109,7 +102,6 @@ def test_a_wrong_field_is_told_before_any_message():
 
 
 def test_a_bag_does_not_choose_what_is_imported(tmp_path, monkeypatch):
-    """Only packages of the ament index are loaded, whatever modules there are by such a name."""
     (tmp_path / 'evil_msgs').mkdir()
     (tmp_path / 'evil_msgs' / '__init__.py').write_text('')
     (tmp_path / 'evil_msgs' / 'msg.py').write_text(
@@ -131,7 +123,6 @@ def test_a_bag_does_not_choose_what_is_imported(tmp_path, monkeypatch):
 
 
 def test_motor_speeds_are_scalars_arrays_or_fields():
-    """By msg_config, by type, by hand; a scalar, an array, and a field of each element."""
     from ou_monitor.nodes.sources import MOTOR_PARAMETERS
     from std_msgs.msg import Float64MultiArray
     found = {p.name: p.default for p in MOTOR_PARAMETERS}

@@ -31,7 +31,6 @@ def saved(folder, model):
 
 
 def test_simulated_time_repeats_the_path_after_a_reset(world):
-    """On /clock: the path that `simulate` has with that seed, sample by sample; again after."""
     model = PRESETS['flight_full'].model
     probe = world.probe()
     got = probe.listen('/voltage', BatteryState, 1000)
@@ -125,7 +124,6 @@ def test_failed_throttle_is_held_and_then_idles(world):
     (('rate:=5000.0',), 'rate'),
 ])
 def test_bad_input_is_named(tmp_path, options, words):
-    """It is named."""
     if options and not options[0].startswith('model_file'):
         options = (*options, f'model_file:={saved(tmp_path, EXACT)}')
     assert words in refusal(lambda: SupplySimulatorNode('supply_simulator'),
