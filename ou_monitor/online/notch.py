@@ -124,21 +124,20 @@ class MotorLaw:
     """Candidate laws, and the best of them: `a` and `b`, Hz, NaN while unknown."""
 
     def __init__(self, frequencies: FloatArray, fmin: float, rate: float) -> None:
-        highest = HIGHEST * rate
-        self._grid: FloatArray = np.geomspace(fmin, max(highest, fmin * 1.01), _GRID)
+        grid: FloatArray = np.geomspace(fmin, max(HIGHEST * rate, fmin * 1.01), _GRID)
         warped = np.tan(np.pi * np.minimum(frequencies / rate, 0.499))
-        off = warped[None, :] / np.tan(np.pi * self._grid / rate)[:, None]
+        off = warped[None, :] / np.tan(np.pi * grid / rate)[:, None]
         cut = (_WIDTH * off)**2
         self._removed: FloatArray = cut / ((1.0 - off * off)**2 + cut)
-        at_low, at_high = np.meshgrid(self._grid, self._grid, indexing='ij')
-        rising = at_high >= at_low * (1.0 - 1e-9)
-        self._low, self._high = at_low[rising], at_high[rising]
-        self._b = (self._high - self._low) / (HIGH - LOW)
-        self._a = self._low - self._b * LOW
-        off = self._a / (_SPREAD * self._high)
-        self._prior: FloatArray = _FRAMES * _PRIOR * np.exp(-0.5 * off**2)
-        self._found: FloatArray = np.zeros_like(self._low)
-        self._log = (np.log(self._grid[0]), np.log(self._grid[1] / self._grid[0]))
+        low, high = (grid[one] for one in np.triu_indices(_GRID))
+        self._b = (high - low) / (HIGH - LOW)
+        self._a = low - self._b * LOW
+        self._prior: FloatArray = _FRAMES * _PRIOR * np.exp(
+            -0.5 * (self._a / (_SPREAD * high))**2)
+        self._found: FloatArray = np.zeros_like(low)
+        # A law may end at an end of the grid, within rounding.
+        self._log: FloatArray = np.log(grid)
+        self._log[[0, -1]] += -1e-3, 1e-3
         self.a = self.b = np.nan
 
     def frequency(self, root: float) -> float:
@@ -151,26 +150,11 @@ class MotorLaw:
         keep = float(np.exp(-passed / _LAW_MEMORY))
         removed = self._removed @ power
         f = self._a + self._b * root
-        place = np.clip((np.log(np.maximum(f, self._grid[0])) - self._log[0]) / self._log[1],
-                        0.0, _GRID - 1.001)
-        whole = place.astype(np.intp)
-        part = place - whole
-        got = removed[whole] * (1.0 - part) + removed[whole + 1] * part
         # Outside the grid there is no notch.
-        got = np.where((f >= self._grid[0] * 0.999) & (f <= self._grid[-1] * 1.001), got, 0.0)
+        got = np.interp(np.log(np.maximum(f, 1e-9)), self._log, removed, 0.0, 0.0)
         self._found = keep * lost * self._found + got
-        score = self._found + self._prior
-        best = int(np.argmax(score))
-        # The mean of all laws nearly as good as the best is finer than the grid.
-        near = score - 0.98 * score[best]
-        near = np.where((near > 0.0)
-                        & (np.abs(np.log(self._low / self._low[best])) < 2.5 * self._log[1])
-                        & (np.abs(np.log(self._high / self._high[best])) < 2.5 * self._log[1]),
-                        near, 0.0)
-        total = float(np.sum(near))
-        low, high = (float(np.sum(near * one)) / total for one in (self._low, self._high))
-        self.b = (high - low) / (HIGH - LOW)
-        self.a = low - self.b * LOW
+        best = int(np.argmax(self._found + self._prior))
+        self.a, self.b = float(self._a[best]), float(self._b[best])
 
 
 # Length and distance of frames, s: throttle changes little within one, and it resolves 4 Hz.
