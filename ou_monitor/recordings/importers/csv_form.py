@@ -52,6 +52,8 @@ _HEAD, _HEAD_LINES, _CHUNK, _BLOCK = 65536, 200, 1 << 20, 8192
 # Rows of numbers that must follow one another where the data begin.
 _IN_A_ROW = 8
 
+# What a line of comment begins with.
+COMMENTS = ('#', '%')
 DELIMITERS = {'tab': '\t', 'space': ' '}
 
 # Words of units, in lower case -> unit.
@@ -165,7 +167,7 @@ def form_of(path: Path, wanted: CsvColumns) -> Form:
         lines.pop()
     if max(map(len, lines), default=0) >= min(MOST_OF_LINE, _HEAD - 3):
         raise InputError(f'{path}:1: the line has more than {MOST_OF_LINE} characters')
-    if not any(line.strip() and not line.lstrip().startswith('#') for line in lines):
+    if not any(line.strip() and not line.lstrip().startswith(COMMENTS) for line in lines):
         raise InputError(f'{path} is empty: expected a header with {TIME},{VOLTAGE}[,{THROTTLE}]')
     given = None if wanted.delimiter is None else DELIMITERS.get(
         wanted.delimiter, wanted.delimiter)
@@ -213,7 +215,7 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool,
     skip, given = wanted.skip_rows or 0, wanted.decimal or ''
     rows: list[list[str]] = []
     for line in lines:
-        plain = '' if line.lstrip().startswith('#') else line
+        plain = '' if line.lstrip().startswith(COMMENTS) else line
         try:
             rows.append([cell.strip() for cell in next(iter(csv.reader(
                 _prepared([plain], delimiter, comma, given), delimiter=delimiter,
@@ -357,6 +359,8 @@ def _swapped(cell: str) -> str:
         cell = f'{cell[:found.start()]}-{month}-{cell[found.end():]}'
     if _MINUTES.fullmatch(cell):
         cell = f'0:{cell}'
+    # 14/03/2024 10.22.31
+    cell = re.sub(r' (\d\d)[.,](\d\d)[.,](\d\d)(?!\d)', r' \1:\2:\3', cell)
     return cell.replace(',', '.') if cell.count(',') > 1 else cell
 
 
@@ -404,7 +408,7 @@ def _header(rows: list[list[str]], lines: list[str], first: int, width: int, del
     else:
         # A header marked as a comment.
         for k in range(first - 1, skip - 1, -1):
-            text = lines[k].lstrip('# \t')
+            text = lines[k].lstrip('#% \t')
             # Delimited as the data, or by blanks, with units in brackets.
             for cells in (next(iter(csv.reader([text], delimiter=delimiter)), []),
                           _NAMES.findall(text)):
@@ -434,10 +438,16 @@ def has_unit_beside(names: Sequence[str], place: int) -> bool:
 
 
 def _unit_beside(names: Sequence[str], rows: list[list[str]], place: int) -> str:
-    """Return the unit in the next column, such as Volt DC, if that is named so."""
-    words = [row[place + 1].lower().split() for row in rows if any(row[place + 1:place + 2])
+    """Return the unit in the next column, such as Volt DC, if that is named so; '' if mixed."""
+    words = [first_word(row[place + 1]) for row in rows if any(row[place + 1:place + 2])
              ] if has_unit_beside(names, place) else []
-    return words[0][0] if words and words[0][0] in WORDS else ''
+    kinds = {WORDS.get(word, word)[-1:] for word in words}
+    return words[0] if len(kinds) == 1 and words[0] in WORDS else ''
+
+
+def first_word(text: str) -> str:
+    """Return the first word of a text in lower case; '' if there is none."""
+    return ''.join(text.lower().split()[:1])
 
 
 def _are_units(row: list[str]) -> bool:
@@ -512,9 +522,8 @@ def numbers(path: Path, form: Form, places: Sequence[int],
 
 def _with_units(cells: Sequence[str], units: Sequence[str], stated: str) -> tuple[str, ...]:
     """Return cells with the units of their rows where these are not that of the column."""
-    return tuple(
-        cell if is_missing(cell) or (word := unit.lower().split()[:1]) in ([], [stated])
-        else f'{cell} {word[0]}' for cell, unit in zip(cells, units))
+    return tuple(cell if is_missing(cell) or first_word(unit) in ('', stated)
+                 else f'{cell} {unit.strip()}' for cell, unit in zip(cells, units))
 
 
 def _blocks(path: Path, file: TextIO, form: Form, width: int,
@@ -562,8 +571,8 @@ def _lines(path: Path, file: TextIO, form: Form) -> Iterator[list[str]]:
 
 
 def _without_comments(lines: list[str], form: Form, text: str) -> list[str]:
-    if '#' in text:
-        lines = ['\n' if line.lstrip().startswith('#') else line for line in lines]
+    if any(mark in text for mark in COMMENTS):
+        lines = ['\n' if line.lstrip().startswith(COMMENTS) else line for line in lines]
     return _prepared(lines, form.delimiter, form.comma, form.mark)
 
 

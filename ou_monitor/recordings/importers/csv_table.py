@@ -21,9 +21,9 @@ import numpy as np
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.importers import log as logs
 from ou_monitor.recordings.importers.csv_form import (
-    AMPERE_WORDS, CHANNEL, clock_times, factor_of, Form, form_of, has_day, has_unit_beside,
-    is_clock, is_missing, is_number, is_value, number_of, numbers, SCALES, SHARE_WORDS, shown,
-    THROTTLE, TIME, TIME_WORDS, unit_of, VOLT_WORDS, VOLTAGE)
+    AMPERE_WORDS, CHANNEL, clock_times, factor_of, first_word, Form, form_of, has_day,
+    has_unit_beside, is_clock, is_missing, is_number, is_value, number_of, numbers, SCALES,
+    SHARE_WORDS, shown, THROTTLE, TIME, TIME_WORDS, unit_of, VOLT_WORDS, VOLTAGE, WORDS)
 from ou_monitor.recordings.importers.log import (
     ANY, CsvColumns, Log, one_flight, RawColumns, Request, Series)
 from ou_monitor.records import (
@@ -38,6 +38,8 @@ THROTTLE_UNITS = {'1': (0.0, 1.0), '%': (0.0, 100.0), 'us': (1000.0, 2000.0), 'm
 _PULSE_WORDS = {word: unit for word, unit in TIME_WORDS.items() if unit in THROTTLE_UNITS}
 # Ends of sticks that are centred at 0: EdgeTX, DJI, 16 bits.
 _STICKS = (1024, 10000, 32768)
+# Ends of the stick in the flight logs of DJI, by the names that CsvView and PhantomHelp write.
+_DJI = '364:1684'
 # Maximum columns listed; autopilots log a few hundred.
 MOST_COLUMNS = 300
 # Share of backward steps above which a column is not a time.
@@ -72,7 +74,7 @@ _PATTERNS = {
         r'voltage_v',
         r'v_?bat(?:t|tery)?(?:_?latest|_?filtered|_?voltage|_?v)?|batt?(?:ery)?_?(?:v|volt|volts|'
         r'voltage)|pack_?voltage|(?:input|inp|bus|supply|rail|main|link)_?(?:v|volt|voltage)'
-        r'|v_?bus|vfas|voltage_?(?:battery|batt?|raw)|bat_?spannung|akku_?spannung|pm_vbat',
+        r'|v_?bus|vfas|cels|voltage_?(?:battery|batt?|raw)|bat_?spannung|akku_?spannung|pm_vbat',
         r'u|v|volts?|voltage|spannung|tension|tensione|voltaje|[UVuv]\(.*\)|'
         r'[uv](?:rms|dc|mean|mn)?_?1?',
         r'volt(?:age)?_?filtered(?:_v)?|rxbt',
@@ -373,7 +375,8 @@ def _time_of(path: Path, form: Form, wanted: CsvColumns) -> _Column:
 def _finest(form: Form, first: int) -> int:
     """Return a finer time if the chosen one, in whole seconds, does not tell the rows apart."""
     named = [k for k in range(min(form.width, len(form.names)))
-             if re.search('time|zeit', form.names[k].lower()) and not re.search(
+             if (re.search('time|zeit', form.names[k].lower()) or form.units[k] in TIME_WORDS)
+             and not re.search(
                  'step|lap|interval', form.names[k].lower()) and _holds_numbers(form, k, True)]
     return first if _tells_apart(form, first) else next(
         (k for k in named if _tells_apart(form, k) and _rises(form, k)), first)
@@ -391,16 +394,15 @@ def _parts_of_second(form: Form, clock: int) -> _Column | None:
     if all(map(str.isdigit, cells)):
         unit, pattern = 'ns', r'.*n(?:ano)?_?se?cs?'
         rest = [clock + 1] if not form.line and clock_unit(float(cells[0])) == 's' else []
-    elif not _tells_apart(form, clock) and all(
-            re.search(r':\d\d:\d\d$', cell) for cell in cells):
-        unit, pattern, rest = 'ms', 'ms|millis|milliseconds', []
+    elif all(re.search(r':\d\d:\d\d$', cell) for cell in cells):
+        unit, pattern, rest = 'ms', 'ms|millis|milliseconds?|frac.* sec.*', []
     else:
         return None
     most = 3 if unit == 'ms' else 9
     return next((_Column((clock, k), f'{form.names[clock]}, {form.names[k]}', unit, 0.0)
                  for k, name in enumerate(form.names[:form.width])
                  if k != clock and (k in rest or re.fullmatch(pattern, name.strip().lower()))
-                 and all(k < len(row) and re.fullmatch(rf'\d{{1,{most}}}', row[k])
+                 and all(k < len(row) and re.fullmatch(rf'0?\.\d+|\d{{1,{most}}}', row[k])
                          for row in form.rows)), None)
 
 
@@ -500,10 +502,14 @@ def _series_of(path: Path, form: Form, wanted: CsvColumns, time: _Column,
         rf'(?=.)(?:{_VALUE_NAME}|state)', form.names[k].lower())] or named
     for place in (k for k in places if value and not _holds_numbers(form, k, True)):
         labels: list[str] = []
-        numbers(path, form, [], {place: labels}, [])
+        stated: list[str] = []
+        beside = has_unit_beside(form.names, value[0]) and value[0] + 1 != place
+        numbers(path, form, [], {place: labels} | ({value[0] + 1: stated} if beside else {}), [])
         names = tuple(sorted({*labels} - {''}))
+        own = {name: first_word(unit) for name, unit in zip(labels, stated)}
         series = form._replace(names=names, width=len(names), rows=(), units=tuple(
-            unit_of(name)[1] or unit_of(form.names[value[0]])[1] for name in names))
+            unit_of(name)[1] or (word if (word := own.get(name, '')) in WORDS else '')
+            or unit_of(form.names[value[0]])[1] for name in names))
         if wanted.voltage in names or len(names) <= MOST_COLUMNS and _choose(
                 series, logs.VOLTAGE):
             return series, place, value[0]
@@ -527,8 +533,9 @@ def _read(path: Path, form: Form, time: _Column, places: list[int],
         values = numbers(path, form, places, dict(zip(time.place, clocks)) | (texts or {}),
                          left_out, texts is None)
         cells = clocks[0]
-        if len(clocks) > 1 and all(map(str.isdigit, clocks[1])):
-            cells = [f'{clock}.{part:0>3}' for clock, part in zip(*clocks)]
+        if len(clocks) > 1 and all(re.fullmatch(r'[\d.]+', part) for part in clocks[1]):
+            cells = [f"{clock}.{part.split('.')[-1] if '.' in part else f'{part:0>3}'}"
+                     for clock, part in zip(*clocks)]
         elif len(clocks) > 1:
             cells = [' '.join(pair) for pair in zip(*clocks)]
         return clock_times(path, cells, time.name, left_out), values
@@ -651,6 +658,8 @@ def _in_si(quantity: str, column: _Column, values: FloatArray, given: str | None
     if quantity == logs.THROTTLE:
         unit = given or SHARE_WORDS.get(column.unit) or _PULSE_WORDS.get(column.unit)
         guess = unit is None
+        if guess and column.name.lower() == 'rc.throttle' and known.size and known.max() > 100.0:
+            unit = _DJI
         unit = unit or _throttle_unit(values[np.isfinite(values)], volts)
         # Percent below 0 are of a stick; a duty below 0 is of a motor in reverse.
         if given is None and unit == '%' and np.mean(values < -MOST_THROTTLE) > WILD and not (

@@ -320,6 +320,20 @@ FORMS = {
     'autorange': (table(['Time,Value,Unit,Current,Current Unit'], lambda k: f'{0.1 * k:.1f},' + (
         f'{1e3 * V[k]:.0f},mV' if k % 7 == 3 else f'{V[k]},V DC') + (
             f',{AMPS[k]},A' if k % 5 else f',{1e3 * AMPS[k]:.0f},mA')), 0.1, False, True),
+    # A scanner of cars: the unit beside each value of a series.
+    'scanner': (table(['"SECONDS";"PID";"VALUE";"UNITS"'], lambda k: (
+        f'"{0.1 * k:.2f}";"Speed";"{k}";"km/h"\n"{0.1 * k:.2f}";"Pack current";'
+        f'"{1e3 * AMPS[k]:.0f}";"mA"\n"{0.1 * k:.2f}";"Pack voltage";"{V[k]}";"V"')), 0.1, False,
+        True),
+    # A fraction of the second in a column of its own.
+    'keithley_parts': (table(['Date,Time,Fractional Seconds,Reading,Unit'], lambda k: (
+        f"{clock(k, '%m/%d/%Y,%H:%M:%S', 2.5)},{(2.5 * k) % 1.0:.6f},{V[k]},V")), 2.5, False,
+        False),
+    # DJI: the stick from 364 to 1684.
+    'phantomhelp': (table(['CUSTOM.date [local],CUSTOM.updateTime [local],RC.throttle,'
+                           'BATTERY.voltage [V],BATTERY.current [A]'], lambda k: (
+        f"{clock(k, '%m/%d/%Y,%I:%M:%S.%f %p', 0.1)},{364.0 + 1320.0 * U[k]:.2f},{V[k]},"
+        f'{AMPS[k]}')), 0.1, True, True),
     # Castle: pulses in ms; EdgeTX: the pack beside the receiver.
     'castle': (table(['Seconds,Throttle (ms),Voltage (v),Current (A)'], lambda k: (
         f'{0.1 * k:.1f},{1.0 + U[k]:.3f},{V[k]},{AMPS[k]}')), 0.1, True, True),
@@ -617,8 +631,12 @@ def test_counts_of_unknown_size_and_mixed_units_are_refused(tmp_path):
     np.testing.assert_allclose(found.throttle, 0.01 * np.arange(99))
     with pytest.raises(InputError, match="holds '12 mA', not a number"):
         read_recording(written(tmp_path, rows.replace('9,12 V', '9,12 mA')))
-    with pytest.raises(InputError, match="3: column 'Value' holds '3 a', not a number"):
-        read_recording(written(tmp_path, 'Time,Value,Unit\n0,12,V\n1,3,A\n2,12,V\n'))
+    # A meter that is switched to amperes, late or between the first rows.
+    volts = 'Time,Value,Unit\n' + ''.join(f'{k},12,V\n' for k in range(300))
+    with pytest.raises(InputError, match="302: column 'Value' holds '3 A', not a number"):
+        read_recording(written(tmp_path, volts + '300,3,A\n'))
+    found = read_recording(written(tmp_path, 'Time,Value,Unit\n0,12,V\n1,3,A\n2,12,V\n'))
+    assert found.voltage.tolist() == [12.0, 12.0]
 
 
 @pytest.mark.parametrize('row', [
