@@ -3,7 +3,6 @@
 import math
 
 from dense import block_autocovariances, fisher
-from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor.model import arma
 import pytest
@@ -45,21 +44,6 @@ def spectral(a, m, share):
 def test_theta_is_that_of_the_spectrum(a, share, m):
     """The geometric mean of the spectrum is the innovation variance; 4096 points give 1e-9."""
     assert arma.theta_at(a, m, share) == pytest.approx(spectral(a, m, share), abs=1e-8)
-
-
-@settings(deadline=None)
-@given(st.floats(-7.0, 1.0), st.integers(2, 1000), st.floats(-4.0, 4.0))
-def test_noise_raises_theta_between_its_ends(log_a, m, log_share):
-    """-0.268 = sqrt(3) - 2 is Working's (1960) averaged random walk; phi is pure noise."""
-    a = math.exp(log_a)
-    low, theta = arma.theta_at(a, m, 0.0), arma.theta_at(a, m, math.exp(log_share))
-    assert math.sqrt(3.0) - 2.0 - 1e-9 < low < theta < math.exp(-a)
-
-
-def test_theta_of_long_blocks_tends_to_that_of_a_random_walk():
-    """Working, Econometrica 28 (1960) 916: theta = sqrt(3) - 2 as m grows."""
-    assert arma.theta_at(1e-5, 4000, 0.0) == pytest.approx(math.sqrt(3.0) - 2.0, abs=1e-5)
-    assert arma.theta_at(0.3, 1, 0.0) == pytest.approx(0.0, abs=1e-15)
 
 
 @pytest.mark.parametrize('m', [1, 4])

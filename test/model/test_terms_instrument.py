@@ -92,21 +92,6 @@ def test_noise_after_the_instrument_is_not_high_passed():
     np.testing.assert_allclose(together, alone + own, rtol=0, atol=1e-12)
 
 
-def test_coupling_takes_a_slow_second_pole_away():
-    """A second relaxation passes the same high-pass: at fine steps, variances add up."""
-    # Steps of 0.5 ms; the second pole is 20 times slower than the corner, so what is left of it is
-    # var a/(a + rate).
-    n, dt, corner = 400_000, 5e-4, 10.0
-    rate = 2.0 * math.pi * corner
-    model = still(term('second_relaxation', alpha=3.0, sigma=1.0),
-                  term('ac_coupling', corner=corner, offset=0.0))
-    x = model.simulate(np.arange(n) * dt, np.random.default_rng(6))
-    truth = covariance(3.0, rate, 0.0, 1.0 / 6.0)
-    c = np.array([covariance(3.0, rate, j * dt, 1.0 / 6.0) for j in range(8000)])
-    error = math.sqrt((c[0] ** 2 + 2.0 * np.sum(c[1:] ** 2)) * 2.0 / n)
-    agrees(np.mean(x * x), truth, error, 0.1)
-
-
 def test_columns_of_the_mean_pass_as_levels_do():
     """A constant is gone from the start, a step decays, and sums of columns stay sums."""
     t = 0.01 * np.arange(200)

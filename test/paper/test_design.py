@@ -3,7 +3,6 @@
 from dataclasses import replace
 import math
 
-from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor.model.passage import mean_first_passage
 from ou_monitor.paper.design import (
@@ -142,32 +141,6 @@ def test_a_capacitor_may_undo_the_damping_of_a_filter():
     assert 'With 480 uF the network is unstable' in effect(design(on_the_edge, 0.4, **question))
     with pytest.raises(ValueError, match='unstable'):
         design(replace(network, bulk_capacitance=1e-3), 0.4, **question)
-
-
-def test_slow_noise_is_noted():
-    result = design(PowerNetwork(flutter=0.05), 0.4, **QUESTION)
-    assert any('rate of the noise' in text for text in remarks(result))
-    assert 'alpha stays at 33.3' in effect(result)
-
-
-@settings(max_examples=100, deadline=None)
-@given(st.floats(0.005, 0.2), st.floats(10e-6, 10e-3), st.floats(0.001, 0.3), st.floats(8e3, 96e3),
-       st.floats(0.05, 0.95), st.floats(1.05, 10.0), st.floats(1.8, 12.0), st.booleans())
-def test_without_filter_capacitance_lowers_the_risk(
-        resistance, capacitance, esr, frequency, throttle, factor, distance, follows):
-    """For levels beyond sqrt(3) standard deviations, where d exp(-d^2/2) / Var falls with Var."""
-    network = PowerNetwork(battery_resistance=resistance, bulk_capacitance=capacitance,
-                           bulk_esr=esr, current_max=50.0, esc_frequency=frequency)
-    here = rail_at(network, throttle)
-    more = rail_at(with_capacitance(network, factor * capacitance, follows), throttle)
-    level = here.mean - distance * math.sqrt(here.var_inf)
-    a, b = row_of(here, level, 1.0), row_of(more, level, 1.0)
-    if 1.0 / ((resistance + esr) * capacitance) < here.load.switching_rate:
-        assert b.crossing_rate <= a.crossing_rate * (1.0 + 1e-9)
-    if b.alpha <= a.alpha:
-        assert b.mean_time >= a.mean_time * (1.0 - 1e-9)
-    if follows:
-        assert b.alpha <= a.alpha * (1.0 + 1e-6)
 
 
 def test_default_levels_follow_cells_and_rail():

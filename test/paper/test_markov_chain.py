@@ -2,8 +2,6 @@
 
 import math
 
-from chains import drawn
-from convergence import cycle
 import numpy as np
 from ou_monitor.paper.theory import Generator
 import pytest
@@ -58,11 +56,6 @@ def test_stationary_law_keeps_its_digits_over_forty_decades():
     assert chain.stationary == pytest.approx(law / law.sum(), rel=1e-13)
 
 
-def test_constructors_give_their_stationary_laws():
-    assert Generator.telegraph(1.0, 3.0).stationary == pytest.approx([0.75, 0.25])
-    assert cycle([1.0, 2.0, 4.0]).stationary == pytest.approx(np.array([4, 2, 1]) / 7)
-
-
 @pytest.mark.parametrize('speed', [1.0, 1e5])
 def test_potential_is_the_integral(speed):
     """The defining integral, by quadrature, at rates of 1/s and of 100 kHz."""
@@ -90,41 +83,6 @@ def test_paths_jump_by_the_kernel_and_hold_exponentially():
     possible = expected > 0.0
     statistic = ((counts - expected)[possible] ** 2 / expected[possible]).sum()
     assert statistic < chi2.ppf(1.0 - 1e-4, possible.sum() - 5)
-
-
-def test_ensembles_have_the_transition_law():
-    """P(x(t) = y), of those that begin in one state, is a row of exp(Q t): five errors."""
-    states, spent = drawn(FIVE, [0.0, 0.2, 1.0], 60_000, np.random.default_rng(6))
-    mine = states[:, 0] == 3
-    states, spent, n = states[mine], spent[mine], int(mine.sum())
-    assert n > 5_000
-    for k, t in enumerate((0.0, 0.2, 1.0)):
-        law = FIVE.transition(t)[3]
-        found = np.bincount(states[:, k], minlength=5) / n
-        assert (np.abs(found - law) <= 5.0 * np.sqrt(law * (1.0 - law) / n)).all()
-    integral, _ = quad_vec(lambda t: expm(FIVE.q * t)[3], 0.0, 1.0)
-    total = spent.sum(axis=1)
-    error = total.std(axis=0) / math.sqrt(n)
-    assert (np.abs(total.mean(axis=0) - integral) < 5.0 * error).all()
-
-
-def test_monte_carlo_decides_for_the_factor_two():
-    """Var of the integral of +-1 telegraph noise over its length is 1/q, not 1/(2q)."""
-    # Exact: (1/q) (1 - (1 - exp(-2 q T)) / (2 q T)). A variance from n nearly Gaussian samples has
-    # the relative error sqrt(2 / n): 2.2 % for n = 4000. Five of these are allowed, a false alarm
-    # in 2 million. Without the factor 2 the ratio would be 2, forty errors away: power 1 to any
-    # digit.
-    q, horizon, n = 1.5, 30.0, 4000
-    chain, rng = Generator.telegraph(q, q), np.random.default_rng(7)
-    value = np.array([-1.0, 1.0])
-    _, spent = drawn(chain, [0.0, horizon], n, rng)
-    total = spent[:, 0] @ value
-    memory = (1.0 - math.exp(-2.0 * q * horizon)) / (2.0 * q * horizon)
-    exact = horizon / q * (1.0 - memory)
-    ratio = np.mean(total**2) / exact
-    assert abs(ratio - 1.0) < 5.0 * math.sqrt(2.0 / n)
-    potential = chain.stationary * value @ chain.potential @ value
-    assert 2.0 * potential * horizon * (1.0 - memory) == pytest.approx(exact, rel=1e-12)
 
 
 @pytest.mark.parametrize('call, message', [

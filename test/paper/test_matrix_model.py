@@ -27,37 +27,6 @@ def test_closed_form_is_the_matrix_exponential(model):
     assert model.solve(T, U0) == pytest.approx(expected, rel=1e-11, abs=1e-13)
 
 
-def test_rates_that_nearly_meet_keep_their_digits():
-    """Beta A0 t exp(-alpha t) when the rates differ in the twelfth digit."""
-    model = matrix_model(63.0, 0.0, 3.0, 63.0 * (1.0 + 1e-12))
-    power = model.solve([0.0, 0.02], [2.0, 0.0, 0.0])[1, 2]
-    assert power == pytest.approx(3.0 * 2.0 * 0.02 * math.exp(-63.0 * 0.02), rel=1e-10)
-
-
-def test_as_printed_is_the_matrix_of_the_paper():
-    alpha, omega, beta, gamma = 5.0, 4.0, 3.0, 63.0
-    model = matrix_model(alpha, omega, beta, gamma, printed=True)
-    assert model.matrix.tolist() == [[-alpha, 0, 0], [0, omega, 0], [beta, 0, gamma]]
-    assert model.offset.tolist() == [0.0, 0.0, 0.0]
-
-
-def test_the_sign_decides_between_relaxation_and_growth():
-    """After five relaxation times P has gone by exp(-5) or grown by exp(5)."""
-    t, u0 = [0.0, 5.0 / 63.0], [0.0, 0.0, 1.0]
-    assert matrix_model(5.0, 4.0, 0.0, 63.0).solve(t, u0)[1, 2] == pytest.approx(math.exp(-5.0))
-    printed = matrix_model(5.0, 4.0, 0.0, 63.0, printed=True)
-    assert printed.solve(t, u0)[1, 2] == pytest.approx(math.exp(5.0))
-    assert printed.growth_rate == pytest.approx(63.0)
-
-
-def test_the_printed_phase_grows_and_the_carrier_advances():
-    printed = matrix_model(5.0, 4.0, 3.0, -63.0, printed=True)
-    assert printed.growth_rate == pytest.approx(4.0)
-    carrier = matrix_model(5.0, 2.0 * math.pi * 50.0, 3.0, 63.0)
-    assert carrier.solve([0.0, 0.04], [0.0, 0.1, 0.0])[1, 1] == pytest.approx(
-        0.1 + 4.0 * math.pi)
-
-
 def test_overflow_is_one_clear_line():
     with pytest.raises(ValueError, match='unstable: the solution overflows.* [+]63 1/s'):
         matrix_model(5.0, 1.0, 1.0, 63.0, printed=True).solve([0.0, 1.0, 20.0], U0)

@@ -7,10 +7,9 @@ from hypothesis import given, settings, strategies as st
 import numpy as np
 from ou_monitor.model.passage import mean_first_passage
 from ou_monitor.paper.network import (
-    load_at, PowerNetwork, rail_at, UNITS, UnstableNetworkError)
+    load_at, PowerNetwork, rail_at, UNITS)
 import pytest
 from scipy.integrate import quad
-from scipy.linalg import expm
 
 # Battery, capacitor and ESC current alone: the textbook RC.
 RC = PowerNetwork(bulk_esr=0.0, mcu_current=0.0, mcu_noise=0.0)
@@ -42,16 +41,6 @@ def test_rc_has_the_textbook_pole_and_variance():
     assert rail.alpha == pytest.approx(a, rel=1e-12)
     assert rail.var_inf == pytest.approx(variance * 0.04**2 * a / (a + rate), rel=1e-10)
     assert rail.mean == pytest.approx(22.2 - 0.04 * 120.0 * 0.4**1.5, rel=1e-14)
-
-
-def test_rc_in_white_noise_is_the_ou_of_the_theory():
-    """Var_inf -> S R / (2 C) and sigma -> sqrt(S) / C, S two-sided."""
-    # The noise is white up to a/lambda, here 2e-5; alpha is 62.5 1/s at 0.4 F.
-    rail = rail_at(replace(RC, bulk_capacitance=0.4, esc_frequency=1e6), 0.4)
-    density = 2.0 * rail.load.switching_rms**2 / rail.load.switching_rate
-    assert rail.alpha == pytest.approx(62.5, rel=1e-9)
-    assert rail.var_inf == pytest.approx(density * 0.04 / (2.0 * 0.4), rel=1e-4)
-    assert rail.sigma == pytest.approx(math.sqrt(density) / 0.4, rel=1e-4)
 
 
 def test_esr_moves_the_pole_and_leaves_a_floor():
@@ -131,43 +120,6 @@ def test_variance_is_the_integral_of_the_density(network, rail):
     assert here.shares.sum() == pytest.approx(1.0, rel=1e-8)
 
 
-def test_equal_poles_are_handled():
-    """Noise exactly as fast as the network: Var = v R^2 / 2 and that rate."""
-    network = replace(RC, esc_frequency=0.24 / (0.04 * 470e-6))
-    rail = rail_at(network, 0.4)
-    assert rail.alpha == pytest.approx(1.0 / (0.04 * 470e-6), rel=1e-6)
-    assert rail.var_inf == pytest.approx(rail.load.switching_rms**2 * 0.04**2 / 2.0, rel=1e-9)
-
-
-def test_esc_current_is_that_of_a_telegraph():
-    """Mean, variance and rate against 60 000 drawn cycles of one ESC."""
-    # The mean on-share of n cycles of two exponential times has the standard error D (1 - D)
-    # sqrt(2/n); the covariance at one relaxation time over a grid of m independent points at most
-    # v sqrt(2/m).
-    network = PowerNetwork(escs=1)
-    load = load_at(network, 0.3)
-    rng = np.random.default_rng(4)
-    n, period = 60_000, 1.0 / network.esc_frequency
-    holds = rng.exponential(1.0, (n, 2)) * period * np.array([0.3, 0.7])
-    edges = np.cumsum(holds.ravel())
-    phase = load.current / 0.3
-    share = holds[:, 0].sum() / edges[-1]
-    assert abs(share - 0.3) < 5.0 * 0.21 * math.sqrt(2.0 / n)
-    # Points eight relaxation times apart are independent to exp(-8).
-    t = np.arange(0.0, edges[-2], 8.0 / load.switching_rate)
-
-    def current(at):
-        return np.where(np.searchsorted(edges, at) % 2 == 0, phase, 0.0) - load.current
-
-    here, later = current(t), current(t + 1.0 / load.switching_rate)
-    variance = load.switching_rms**2
-    assert variance == pytest.approx(phase**2 * 0.21, rel=1e-12)
-    error = 5.0 * variance * math.sqrt(2.0 / t.size)
-    assert error < 0.05 * variance
-    assert abs(np.mean(here**2) - variance) < error
-    assert abs(np.mean(here * later) - variance * math.exp(-1.0)) < error
-
-
 def test_ripple_is_largest_at_two_thirds_and_independent_escs_add_in_power():
     throttles = np.linspace(0.0, 1.0, 301)
     rms = [load_at(PowerNetwork(), float(u)).switching_rms for u in throttles]
@@ -204,22 +156,6 @@ def test_without_filter_capacitance_lowers_the_variance(network, throttle, facto
     if follows and network.flutter == 0.0:
         a, b = rail_at(network, throttle), rail_at(more, throttle)
         assert b.alpha <= a.alpha * (1.0 + 1e-6)
-
-
-def test_the_three_exceptions_for_capacitance_hold():
-    """The three exceptions that the module names, each by an example."""
-    fixed = [rail_at(PowerNetwork(bulk_capacitance=c), 0.4) for c in (10e-3, 40e-3)]
-    assert fixed[1].alpha > 100.0 * fixed[0].alpha
-    slow = [rail_at(PowerNetwork(bulk_capacitance=c, flutter=0.05), 0.4) for c in (1e-3, 2e-3)]
-    assert slow[0].alpha == slow[1].alpha == pytest.approx(33.3)
-    ringing = PowerNetwork(battery_resistance=0.08, bulk_esr=0.002, filter_inductance=22e-6,
-                           filter_resistance=0.01, filter_capacitance=4.7e-6, filter_esr=0.002)
-    weak, strong = (rail_at(replace(ringing, bulk_capacitance=c), 0.4, 'regulated')
-                    for c in (100e-6, 200e-6))
-    assert strong.resonance.q > 4.0 * weak.resonance.q
-    assert strong.var_inf > 4.0 * weak.var_inf
-    with pytest.raises(UnstableNetworkError):
-        rail_at(replace(ringing, bulk_capacitance=1e-3), 0.4)
 
 
 @pytest.mark.parametrize('name', sorted(UNITS))
@@ -279,26 +215,3 @@ def test_crossing_rate_of_a_rough_rail_is_that_of_its_ou():
     level = rail.mean - d * math.sqrt(rail.var_inf)
     exact = rail.alpha / mean_first_passage(0.0, d)
     assert rail.crossing_rate(level) == pytest.approx(exact, rel=2.0 / d**2)
-
-
-def test_crossing_rate_of_a_smooth_rail_is_counted():
-    """Rice's rate against the downcrossings in 4000 paths without ESR."""
-    # 1333 passages are expected. Over 20 seeds their number had 1.3 times the variance of a
-    # Poisson count, and 1.5 % were missed between the steps.
-    rail = rail_at(RC, 0.4)
-    d, dt, paths, steps = 2.0, 5e-7, 4000, 300
-    transition = expm(rail.a * dt)
-    # What a step adds is what the stationary covariance has lost by it.
-    covariance = rail.covariance - transition @ rail.covariance @ transition.T
-    rng = np.random.default_rng(3)
-    values, vectors = np.linalg.eigh(covariance)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    x = rng.multivariate_normal(np.zeros(len(rail.a)), rail.covariance, paths, method='eigh')
-    level, count = -d * math.sqrt(rail.var_inf), 0
-    for _ in range(steps):
-        above = x @ rail.c > level
-        x = x @ transition.T + rng.standard_normal(x.shape) @ root.T
-        count += int(np.sum(above & (x @ rail.c <= level)))
-    expected = rail.crossing_rate(rail.mean + level) * paths * steps * dt
-    assert 500.0 < expected
-    assert abs(count - expected) < 5.0 * math.sqrt(1.3 * expected) + 0.015 * expected

@@ -2,9 +2,9 @@
 
 import math
 
-from chains import CYCLE, drawn, moments_of_switched, PAPER
+from chains import CYCLE, moments_of_switched, PAPER
 import numpy as np
-from ou_monitor.paper.theory import flow, Generator, matrix_model, SwitchedSystem
+from ou_monitor.paper.theory import flow, Generator, SwitchedSystem
 import pytest
 from scipy.linalg import expm
 
@@ -34,16 +34,6 @@ def test_flow_is_the_matrix_exponential(matrix):
         assert flow(a, b, -tau, each) == pytest.approx(states, rel=1e-9)
 
 
-def test_averaging_the_matrix_model_averages_its_coefficients():
-    """C is linear in them, so the average is the model of the averages, solution and all."""
-    pi = CYCLE.stationary
-    mean = matrix_model(pi @ [1, 2, 6], pi @ [3, 6, 9], pi @ [1, 0, 2], pi @ [4, 5, 9])
-    t = np.linspace(0.0, 1.0, 5)
-    averaged = PAPER.averaged()
-    assert averaged.matrix == pytest.approx(mean.matrix, abs=1e-14)
-    assert averaged.solve(t, U0) == pytest.approx(mean.solve(t, U0), rel=1e-11, abs=1e-13)
-
-
 def test_the_average_holds_the_unswitched_drift():
     """Matrix and offset each: D + sum pi A and d + sum pi a."""
     system = SwitchedSystem(
@@ -51,27 +41,6 @@ def test_the_average_holds_the_unswitched_drift():
         np.array([[-7.0]]), np.array([10.0]))
     assert system.averaged().matrix == pytest.approx(np.array([[-5.0]]))
     assert system.averaged().offset == pytest.approx([12.5])
-
-
-def test_paths_are_exact_along_their_jumps():
-    """Rates that commute: u = u0 exp(sum of A_x times the time in x), on the same draws."""
-    rates = np.array([-1.0, 0.5, -3.0])
-    system = SwitchedSystem(CYCLE, rates[:, None, None])
-    t = np.array([0.0, 0.7, 0.7, 2.0])
-    found = system.simulate(t, [2.0], np.random.default_rng(8), paths=300)[:, :, 0]
-    _, spent = drawn(CYCLE, t, 300, np.random.default_rng(8))
-    exponent = np.cumsum(spent @ rates, axis=1)
-    assert found[:, 1:] == pytest.approx(2.0 * np.exp(exponent), rel=1e-12)
-
-
-def test_mean_follows_feynman_and_kac():
-    """E exp(integral of r(x)) = pi exp((Q + diag r) t) 1."""
-    rates = np.array([-1.0, 0.5, -3.0])
-    system = SwitchedSystem(CYCLE, rates[:, None, None])
-    mean, covariance = moments_of_switched(system, 0.9, [1.0], 1.0)
-    for power, found in ((1, mean[0]), (2, covariance[0, 0] + mean[0] ** 2)):
-        expected = CYCLE.stationary @ expm((CYCLE.q + np.diag(power * rates)) * 0.9)
-        assert found == pytest.approx(expected.sum(), rel=1e-11)
 
 
 @pytest.mark.parametrize('eps, scaling', [(0.5, 'averaging'), (0.7, 'diffusion')])
