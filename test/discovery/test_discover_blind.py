@@ -28,6 +28,10 @@ SEED = f'seed {BASE}'
 MINUTE, DURATION, SHORT, RATE = 60.0, 20.0, 10.0, 1000.0
 # The generator limits how nonlinear a force can be: no strength compensates a short recording.
 WHOLE = ('nonlinear_restoring',)
+# Effects of single samples and lines: named alone at 10 s as at 20 s, with each of two base seeds.
+# Effects of seconds or of throttle are not.
+QUICK = ('measurement_noise', 'quantization', 'held_samples', 'saturation', 'resonance', 'tone',
+         'ac_coupling', 'jumps', 'heavy_tails', 'glitches', 'clock_jitter')
 # A count fails if it is less probable than this at the required level.
 RARE = 0.01
 TRIES = 3
@@ -35,7 +39,8 @@ TRIES = 3
 
 def drawn(kind: str, effect: str, number: int) -> tuple[Recording, object]:
     """Return a recording and its hidden effect."""
-    duration = MINUTE if effect in WHOLE else SHORT if kind in ('none', 'unknown') else DURATION
+    short = kind in ('none', 'unknown') or effect in QUICK
+    duration = MINUTE if effect in WHOLE else SHORT if short else DURATION
     hidden = hide(kind, effect, BASE, number, duration=duration, rate=RATE,
                   strength=math.sqrt(MINUTE / duration))
     return Recording(hidden.t, hidden.voltage, hidden.throttle, 'blind'), hidden

@@ -15,7 +15,6 @@ RATES = (1e-7, 1e-4, 9.9e-4, 1.01e-3, 0.02, 0.3, 4.0)
 @pytest.mark.parametrize('m', BLOCKS)
 @pytest.mark.parametrize('a', RATES)
 def test_block_autocovariances_are_the_double_sums(a, m):
-    """Both closed forms, and their difference, which is what theta lives on."""
     # gamma0 and gamma1 agree to a few roundings; their difference is a times smaller, and where
     # the closed form is used (a >= 1e-3) it loses eps/a^2. Below, the reference itself loses eps/a
     # in the difference.

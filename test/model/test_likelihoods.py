@@ -19,7 +19,6 @@ from scipy.linalg import toeplitz
 @pytest.mark.parametrize('states', [1, 2, 3, 7])
 @pytest.mark.parametrize('n', [1, 2, 24, 25, 1000])
 def test_blocks_give_the_laws_and_evidence_of_the_recursion(states, n):
-    """Laws and evidence, whether or not the blocks come out even."""
     rng = np.random.default_rng(states * 1000 + n)
     density = 3.0 * rng.standard_normal((n, states, states))
     transition = rng.dirichlet(np.ones(states), states)
@@ -93,7 +92,6 @@ def relaxations(n, rates, noise, *, uneven=False, seed=1):
 @pytest.mark.parametrize('noise', [0.1, 1e-6])
 @pytest.mark.parametrize('uneven', [False, True])
 def test_the_filter_equals_the_kalman_recursion(rates, noise, uneven):
-    """Same innovations and variances, whatever the steps."""
     # Almost no noise costs digits: the precision of a sample is then some 1e6 of that of a step,
     # and of 16 digits ten are left.
     model = relaxations(400, rates, noise, uneven=uneven)

@@ -61,7 +61,6 @@ def test_two_half_steps_are_one():
 
 
 def test_current_as_the_load_gives_ohms_law():
-    """With current the sag is its Ohm's law; without it nothing is invented."""
     model = replace(STIFF, full_current=50.0, inrush=1e-12, fast_share=1e-12, slow_share=1e-12)
     t = np.arange(0.0, 5.0, 0.01)
     v = model.path(t, np.zeros(t.size), np.full(t.size, 25.0))

@@ -15,7 +15,6 @@ def test_stationary_variance_solves_the_lyapunov_equation():
 
 
 def test_two_half_steps_are_one_step():
-    """Two half steps are one step: phi multiplies, variances add through phi."""
     phi, q = transition(63.0, 0.632, [0.004, 0.002])
     assert phi[1] ** 2 == pytest.approx(phi[0], rel=1e-14)
     assert q[1] * (1.0 + phi[1] ** 2) == pytest.approx(q[0], rel=1e-13)

@@ -76,7 +76,6 @@ def test_the_fitted_variance_is_that_of_the_noise_under_any_law_of_its_size():
 
 @pytest.mark.parametrize('seed', range(12))
 def test_white_noise_is_no_relaxation(seed):
-    """Not visible; an OU slower than the bound of tau is smaller than the noise."""
     rng = np.random.default_rng(seed)
     t, v, u = rail(rng, 200.0, 50.0, 0.0, 0.01)
     found = fit_ou(regress(t, v, u, None), 30.0)
@@ -148,7 +147,6 @@ def test_intervals_hold_if_noise_grows_with_throttle_changes():
 
 
 def test_current_takes_its_load_out():
-    """A load that only the measured current shows is no OU: alpha is that of the noise."""
     rng = np.random.default_rng(1)
     t, v, u = rail(rng, 250.0, 60.0, 0.01, 0.002)
     # A current that wanders by 5 A over 0.2 s, read 3 samples late; 20 mOhm.
@@ -161,7 +159,6 @@ def test_current_takes_its_load_out():
 
 
 def test_gaps_and_short_stretches_change_little():
-    """A tenth of the readings lost in ten gaps: alpha within the interval of all readings."""
     t, v, u = rail(np.random.default_rng(3), 250.0, 40.0, 0.02, 0.005)
     whole = fit_ou(regress(t, v, u, None), 30.0)
     lost = (np.arange(t.size) // 75) % 10 == 5
@@ -175,7 +172,6 @@ def test_gaps_and_short_stretches_change_little():
 
 
 def test_lost_messages_cost_little_memory():
-    """2 % of 1 kHz lost, one by one: the same answer."""
     # At most 150 MB: it runs in the node.
     rng = np.random.default_rng(3)
     t, v, u = rail(rng, 1000.0, 20.0, 0.05, 0.01)

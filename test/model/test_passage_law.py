@@ -145,7 +145,6 @@ spans = st.floats(-4.0 * math.log(10.0), 5.0 * math.log(10.0)).map(math.exp)
 @settings(max_examples=300, deadline=None)
 @given(levels, levels, levels, spans, spans)
 def test_more_time_or_a_nearer_barrier_is_no_less_likely(x, b, c, s, r):
-    """More time, a start nearer, a barrier nearer: no less likely, as far as the table goes."""
     near, far = min(b, c), max(b, c)
     short, long = min(s, r), max(s, r)
     p = passage_probability([x, x, x], [near, far, near], [short, short, long])

@@ -57,7 +57,6 @@ def test_the_order_of_terms_does_not_matter():
 
 
 def test_all_terms_together_give_finite_samples():
-    """All terms together: finite samples, the same whatever the cuts."""
     model = supply(*(term(name, **EXAMPLES[name]) for name in EXAMPLES if name != 'ou'))
     load = 0.3 + 0.2 * np.sin(40.0 * T)
     whole = model.simulate(T, np.random.default_rng(3), load)
@@ -128,7 +127,6 @@ def test_the_caller_keeps_his_arrays():
 
 
 def test_throttle_may_be_unknown_if_no_term_needs_it():
-    """Unknown (NaN) is fine without a term of throttle, and changes nothing."""
     np.testing.assert_array_equal(
         supply().simulate(T, np.random.default_rng(1), math.nan),
         supply().simulate(T, np.random.default_rng(1)))

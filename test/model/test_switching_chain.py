@@ -99,7 +99,6 @@ def test_without_white_noise_nothing_is_behind():
 
 
 def test_levels_that_the_filter_followed_are_found():
-    """The `ou` was fitted with the levels, so that it follows them: calmer ones do not."""
     voltage, levels = drawn(0.4, 1.0, 5)
     view = filtered(voltage, 5.0 * DRIVE)
     start = calm_levels(view, slice(0, N), float(voltage.std()), np.array([0.7]))

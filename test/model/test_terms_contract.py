@@ -183,7 +183,6 @@ def test_samples_do_not_depend_on_the_segments(name, uneven):
 
 @pytest.mark.parametrize('name', OTHERS)
 def test_ordinary_parameters_change_the_samples(name):
-    """The ordinary parameters change the samples, so that the test of neutral ones can fail."""
     t = stamps()
     needed = catalogue()[name].CHANGES
     beside = () if needed is None else (term(needed.NAME, **EXAMPLES[needed.NAME]),)
@@ -218,7 +217,6 @@ def test_terms_without_a_neutral_value_have_a_limit():
     'load_sag', 'load_transient', 'drift', 'measurement_noise', 'second_relaxation', 'resonance',
     'tone', 'throttle_tone', 'flicker_noise', 'glitches', 'jumps'])
 def test_a_term_of_the_level_leaves_other_draws_unchanged(name):
-    """The sum is the ou alone plus the term alone, draw for draw, also beside others."""
     t = stamps()
     added = term(name, **EXAMPLES[name])
     # Volatility multiplies the white noise.
@@ -233,7 +231,6 @@ def test_a_term_of_the_level_leaves_other_draws_unchanged(name):
 
 @pytest.mark.parametrize('name', sorted(THROTTLED))
 def test_terms_of_throttle_ask_for_it(name):
-    """None, and a NaN among the values, are refused with the name."""
     t = stamps(20)
     model = SupplyModel((term('ou', **OU), term(name, **EXAMPLES[name])))
     assert model.needs_throttle == (name,)

@@ -56,7 +56,6 @@ def test_jumps_are_a_poisson_process():
 
 @pytest.mark.parametrize('dof', [3.0, 5.0, 12.0])
 def test_innovations_are_student_t(dof):
-    """Innovations are Student-t of the stated degrees, scaled to the variance of the ou."""
     # 100 000 of them tell 15 % more or fewer degrees up to 5, and 60 % at 12.
     n, dt = 100_000, 1e-3
     x = supply(term('heavy_tails', dof=dof), u0=0.0).simulate(
@@ -134,7 +133,6 @@ def test_a_level_that_comes_at_the_rate_alpha():
 
 
 def test_three_states_keep_detailed_balance():
-    """Shares of the states, by detailed balance of up and down; each adds its level once."""
     # With q = up/down: 0 is left at 2 up, 1 at up + down, 2 at 2 down. Samples 6 relaxations of
     # the chain apart correlate by exp(-6): half a percent of a variance.
     up, down, count = 20.0, 30.0, 60_000

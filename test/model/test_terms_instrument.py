@@ -22,7 +22,6 @@ def covariance(alpha, rate, lag, var=VAR):
 
 @pytest.mark.parametrize('corner', [0.5, 5.0, 10.026, 10.03, 100.0, 1000.0])
 def test_the_covariance_is_exact_at_any_spacing(corner):
-    """Variance Var alpha/(alpha + rate) and its autocovariance, steps from fine to very coarse."""
     # At steps of a relaxation or more the rail between samples is not a straight line: only the
     # exact bridge has this law. 10.027 Hz is alpha itself.
     rate = 2.0 * math.pi * corner
@@ -66,7 +65,6 @@ def test_first_sample_is_stationary():
 
 @pytest.mark.parametrize('corner', [2.0, 10.027, 50.0])
 def test_a_step_of_the_level_decays_at_the_corner(corner):
-    """A step of the level decays as exp(-rate t); constant levels are gone from the start."""
     # The level is taken as a straight line between samples: the step is a ramp of one sample,
     # whose answer at its end is (1 - exp(-rate dt)) / (rate dt).
     dt, k = 1e-4, 50
@@ -82,7 +80,6 @@ def test_a_step_of_the_level_decays_at_the_corner(corner):
 
 
 def test_noise_after_the_instrument_is_not_high_passed():
-    """Noise of the ADC and its offset codes are added after the high-pass."""
     t = np.arange(2000) / 1000.0
     ac = term('ac_coupling', corner=10.0, offset=0.0)
     noise = term('measurement_noise', std=0.05)

@@ -30,7 +30,6 @@ def test_standard_errors_are_those_of_a_parabola():
 
 
 def test_the_climb_finds_the_top_of_a_parabola():
-    """Top 5 at (0.4, -1)."""
     at, top = climb(lambda x: 5.0 - (x[0] - 0.4) ** 2 - 3.0 * (x[1] + 1.0) ** 2, np.zeros(2), 0.5,
                     most=400)
     assert at == pytest.approx([0.4, -1.0], abs=0.02) and top == pytest.approx(5.0, abs=0.01)

@@ -53,7 +53,6 @@ def test_transient_of_uneven_stamps():
 @pytest.mark.parametrize('delay, later', [(0.02, 20), (0.001, 1), (0.1, 100), (0.0205, 21)])
 @pytest.mark.parametrize('start', [0.0, 0.3, 1000.1])
 def test_transient_comes_after_its_delay(delay, later, start):
-    """The answer is that without delay, later by the samples that the delay lasts."""
     t = start + np.arange(400) / 1000.0
     throttle = step_at(100) * 0.5 + 0.1
     prompt = level(term('load_transient', gain=0.4, tau=0.03, delay=0.0), throttle=throttle, t=t)

@@ -66,7 +66,6 @@ def test_sigma_follows_throttle(throttle, log_factor):
 @pytest.mark.parametrize('throttle, rate', [(0.0, 63.0), (0.5, 63.0 * math.exp(-0.4)),
                                             (1.0, 63.0 * math.exp(-0.8))])
 def test_alpha_follows_throttle(throttle, rate):
-    """Rate alpha exp(slope throttle); sigma as it was, so that the variance is that over rate."""
     offsets = np.array([0.0, 0.01])
     groups = clusters(supply(term('load_dependent_alpha', slope=-0.8)), offsets, 0.5, 80_000, 6,
                       throttle) - U0
@@ -89,7 +88,6 @@ def test_throttle_acts_on_the_step_before_its_stamp():
 
 
 def test_the_log_of_sigma_is_an_ou():
-    """Ln sigma is an OU of the stated std and rate."""
     # The ou relaxes in 1 us here, so a sample is sigma times a fresh normal z, and ln x^2 = ln Var
     # + 2 L + ln z^2: mean ln Var - gamma - ln 2, lagged covariance 4 std^2 exp(-rate lag); exp(2
     # L) has mean exp(2 std^2).

@@ -50,7 +50,6 @@ def test_readings_are_whole_steps(std):
 
 
 def test_samples_beyond_a_rail_read_the_rail():
-    """Samples beyond a rail read the rail, the others are untouched; the shares are normal."""
     raw = drawn(t=T[:20_000] * 200.0)
     clipped = drawn(term('saturation', low=4.95, high=5.02), t=T[:20_000] * 200.0)
     np.testing.assert_array_equal(clipped, np.minimum(np.maximum(raw, 4.95), 5.02))
@@ -61,7 +60,6 @@ def test_samples_beyond_a_rail_read_the_rail():
 
 
 def test_noise_comes_before_clipping_and_clipping_before_codes():
-    """Noise, then the rails, then codes: codes of the clipped noisy voltage."""
     noise = term('measurement_noise', std=0.05)
     rail = term('saturation', low=4.93, high=5.06)
     code = term('quantization', step=0.02)
@@ -75,7 +73,6 @@ def test_noise_comes_before_clipping_and_clipping_before_codes():
 @pytest.mark.parametrize('start', [0.0, 12.345, 1.7e9])
 @pytest.mark.parametrize('rate', [1000, 500, 250, 400, 270, 999, 1])
 def test_a_value_holds_until_the_source_has_the_next(rate, start):
-    """A value holds until the source has the next one, counted in whole numbers here."""
     # At 1 kHz, sample k is in turn k rate // 1000; it shows the first sample of its turn.
     k = np.arange(20_000)
     fresh = np.diff(k * rate // 1000, prepend=-1) > 0
@@ -87,7 +84,6 @@ def test_a_value_holds_until_the_source_has_the_next(rate, start):
 
 
 def test_glitches_hit_their_share_and_no_other_sample():
-    """The stated share of samples has a normal error; the others are untouched."""
     error = drawn(term('glitches', probability=0.04, std=0.3)) - drawn()
     bad = error != 0.0
     agrees(bad.mean(), 0.04, math.sqrt(0.04 * 0.96 / N), 0.07)
@@ -128,7 +124,6 @@ def test_clock_errors_never_swap_samples():
 
 
 def test_samples_are_taken_at_the_wrong_time():
-    """At the true instants the samples are an exact ou; at the stamps they are not."""
     # A stamp in the data is k dt, the sample of k dt + error. Innovations over the true steps have
     # variance 1 and no memory, over the stated ones they are wider.
     jitter = term('clock_jitter', std=2.5e-4)

@@ -25,7 +25,6 @@ def test_the_least_capacitance_meets_the_risk_and_less_does_not():
 
 
 def test_adding_a_capacitor_lowers_alpha_and_the_variance():
-    """Both, as the theory has it, and the sentence says so."""
     result = design(PowerNetwork(), 0.4, **QUESTION)
     table = np.array([[r.alpha, r.var_inf, r.risk] for r in result.rows])
     assert (np.diff(table, axis=0) <= 0.0).all() and result.falls
@@ -36,7 +35,6 @@ def test_adding_a_capacitor_lowers_alpha_and_the_variance():
 
 
 def test_a_row_is_the_ou_of_the_rail():
-    """All derived numbers, from alpha and Var_inf alone."""
     row = design(PowerNetwork(), 0.3, **QUESTION).present
     assert row.tau * row.alpha == pytest.approx(1.0)
     assert row.sigma**2 == pytest.approx(2.0 * row.alpha * row.var_inf)
@@ -96,7 +94,6 @@ def test_a_fixed_esr_may_leave_no_capacitance():
 
 
 def test_no_capacitor_helps_below_the_level_and_the_resistance_that_would_is_named():
-    """At the resistance named the mean of the bus is the level."""
     for network in (PowerNetwork(), PowerNetwork(filter_inductance=10e-6)):
         result = design(network, 0.9, **QUESTION)
         assert result.verdict is DesignVerdict.LEVEL and result.least is None

@@ -41,7 +41,6 @@ def test_intensity_and_drift_are_integrals_of_correlations():
     ([[[0.0]], [[0.0]]], [[1.0], [-0.5]], r'component 0 is \+0.25 per second at u = 0'),
 ])
 def test_without_balance_the_limit_is_refused(matrices, offsets, message):
-    """Refused with the component and the amount; `balanced` is named and mends it."""
     system = SwitchedSystem(Generator.telegraph(1.0, 1.0), matrices, offsets)
     with pytest.raises(ValueError, match=message + r'.*balanced\(\)'):
         switching_intensity(system, [0.0])

@@ -10,6 +10,7 @@ from ou_monitor.paper.network import (
     load_at, PowerNetwork, rail_at, UNITS)
 import pytest
 from scipy.integrate import quad
+from scipy.linalg import expm
 
 # Battery, capacitor and ESC current alone: the textbook RC.
 RC = PowerNetwork(bulk_esr=0.0, mcu_current=0.0, mcu_noise=0.0)
@@ -215,3 +216,26 @@ def test_crossing_rate_of_a_rough_rail_is_that_of_its_ou():
     level = rail.mean - d * math.sqrt(rail.var_inf)
     exact = rail.alpha / mean_first_passage(0.0, d)
     assert rail.crossing_rate(level) == pytest.approx(exact, rel=2.0 / d**2)
+
+
+def test_crossing_rate_of_a_smooth_rail_is_counted():
+    """Rice's rate against the downcrossings in 4000 paths without ESR."""
+    # 1333 passages are expected. Over 20 seeds their number had 1.3 times the variance of a
+    # Poisson count, and 1.5 % were missed between the steps.
+    rail = rail_at(RC, 0.4)
+    d, dt, paths, steps = 2.0, 5e-7, 4000, 300
+    transition = expm(rail.a * dt)
+    # What a step adds is what the stationary covariance has lost by it.
+    covariance = rail.covariance - transition @ rail.covariance @ transition.T
+    rng = np.random.default_rng(3)
+    values, vectors = np.linalg.eigh(covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    x = rng.multivariate_normal(np.zeros(len(rail.a)), rail.covariance, paths, method='eigh')
+    level, count = -d * math.sqrt(rail.var_inf), 0
+    for _ in range(steps):
+        above = x @ rail.c > level
+        x = x @ transition.T + rng.standard_normal(x.shape) @ root.T
+        count += int(np.sum(above & (x @ rail.c <= level)))
+    expected = rail.crossing_rate(rail.mean + level) * paths * steps * dt
+    assert 500.0 < expected
+    assert abs(count - expected) < 5.0 * math.sqrt(1.3 * expected) + 0.015 * expected

@@ -1,11 +1,12 @@
 """Recomputed numbers against an independent calculation."""
 
 import math
+import re
 
 import numpy as np
 from ou_monitor.paper import published, switching, tables, transient
 from ou_monitor.paper.network import PowerNetwork
-from ou_monitor.paper.published import RowVerdict
+from ou_monitor.paper.published import Printed, RowVerdict
 import pytest
 from scipy.integrate import trapezoid
 from scipy.signal import lsim
@@ -39,8 +40,22 @@ def test_steps_of_the_oscilloscope():
     assert vpp.multiples == (10, 13, 36, 46) and vrms.multiples == (1, 3, 6)
 
 
+def test_chance_of_a_step_is_about_right():
+    # The formula is a bound on a union, so the count lies between a fifth and twice of it; 5000
+    # triples.
+    rng = np.random.default_rng(3)
+    claimed = published.VRMS_STEP.chance
+    hits = 0
+    for second, third in rng.uniform([20.0, 50.0], [38.0, 62.0], (5_000, 2)):
+        readings = [Printed('9.38'), Printed(f'{second:.1f}'), Printed(f'{third:.1f}')]
+        try:
+            hits += published.common_step(readings).size > 9.0
+        except ValueError:
+            pass
+    assert 0.2 * claimed * 5_000 < hits < 2.0 * claimed * 5_000
+
+
 def test_amp_can_be_a_peak_at_5_percent_only(first_table):
-    """25 < 31.25, 75 < 112.5, 66.7 < 143.75; 62.5 >= 40.65."""
     verdicts = {q: r.verdict for q, r in first_table.items() if q.startswith('Amp')}
     assert verdicts.pop('Amp, 5 %') is RowVerdict.AGREES
     assert len(verdicts) == 3 and set(verdicts.values()) == {RowVerdict.DOES_NOT_HOLD}
@@ -67,7 +82,6 @@ def test_exponents_of_growth_agree_with_brute_force():
 
 
 def test_alpha_by_least_squares(fig5):
-    """The normal equations by hand; 63.046."""
     t, y = np.array([0.0, 0.010, 0.025, 0.035]), np.log([368.0, 200.0, 80.0, 40.0])
     design = np.column_stack([np.ones(4), t])
     normal = np.linalg.inv(design.T @ design)
@@ -142,7 +156,6 @@ def test_coupling_hides_the_rail():
 
 
 def test_table_2_is_recomputed_by_hand():
-    """sigma, Var_inf, tau and their errors, by hand."""
     rows = by_quantity([r for r in tables.table_2() if r.where in ('Table 2', 'Section 5')])
     assert rows['sqrt(2 alpha)'].recomputed == pytest.approx(11.2249722)
     assert rows['tau'].recomputed == pytest.approx(15.8730159)
@@ -181,6 +194,25 @@ def test_probability_by_simulation():
     assert ratio == pytest.approx(norm.sf(100 / 56.3) / norm.sf(100 / 28.1))
 
 
+def test_falls_agree_with_simulated_paths():
+    """Mean time from the mean to 100 mV below, against simulated paths at 40 %."""
+    # 2000 paths in steps of 0.2 ms, up to the last passage; a discrete path passes as if the level
+    # were 0.58 sigma sqrt(dt) = 5.2 mV further away.
+    rng, dt, s = np.random.default_rng(6), 2e-4, 0.0563
+    phi = math.exp(-63.0 * dt)
+    level = 0.1 - 0.5826 * s * math.sqrt(2.0 * 63.0 * dt)
+    u, time, alive = np.zeros(2000), np.zeros(2000), np.ones(2000, dtype=bool)
+    while alive.any():
+        u[alive] = phi * u[alive] + s * math.sqrt(1.0 - phi * phi) * rng.standard_normal(
+            int(alive.sum()))
+        time[alive] += dt
+        alive &= u < level
+    row = by_quantity(tables.probabilities(rng, 1000))['falls by 100 mV a second, 40 over 10 %']
+    said = float(re.search(r'([0-9.]+) s at 40 %', row.sentence).group(1))
+    assert abs(time.mean() - said) < 4.0 * time.std() / math.sqrt(2000) + 0.02 * said
+    assert row.verdict is RowVerdict.AGREES
+
+
 def test_more_capacitance_lowers_alpha_and_variance():
     """1/(R C) and S R/(2 C); both elasticities are -1, so alpha falls."""
     alpha, var = tables.rc_rail(0.05, 2e-3, 3e-6)
@@ -203,7 +235,6 @@ def test_share_of_the_variance_at_the_esc_lines():
 
 
 def test_the_printed_matrix_grows_and_the_averaged_one_relaxes():
-    """Growth by e; a phase that is e times faster; a power of two exponentials."""
     rows = by_quantity(switching.averaging_rows(np.random.default_rng(7), paths=200))
     assert rows['P(tau)/P(0), +gamma on the diagonal'].recomputed == pytest.approx(math.e)
     assert rows['phase: late over early advance'].recomputed == pytest.approx(math.e)

@@ -25,7 +25,6 @@ def test_rounding_is_half_a_unit_of_the_last_digit(text, value, half_unit):
 
 @pytest.mark.parametrize('text', ['abc', '', 'nan', 'inf'])
 def test_text_without_a_number_is_refused(text):
-    """Its text is named."""
     with pytest.raises(ValueError, match=f"'{text}'"):
         Printed(text)
 
@@ -43,7 +42,6 @@ def test_arithmetic_must_round_to_the_printed_number(recomputed, verdict):
     ('> 0', -1.0, RowVerdict.DOES_NOT_HOLD), ('< 1', 0.999, RowVerdict.AGREES),
     ('< 1', 1.0, RowVerdict.DOES_NOT_HOLD)])
 def test_a_claim_is_a_bound(text, recomputed, verdict):
-    """Strictly."""
     assert row(text, recomputed).verdict is verdict
 
 
@@ -71,7 +69,6 @@ def test_rounding_needs_the_range_of_an_input(name):
 
 @given(st.floats(-1e6, 1e6), st.floats(0.0, 1e3), st.floats(0.0, 1e3), st.floats(0.0, 1e3))
 def test_wider_ranges_never_make_it_worse(recomputed, error, below, above):
-    """More error or more rounding: agrees stays, does not hold may become better."""
     order = [RowVerdict.DOES_NOT_HOLD, RowVerdict.ROUNDING, RowVerdict.AGREES]
     plain = order.index(row('100', recomputed).verdict)
     loose = row('100', recomputed, inputs=(recomputed - below, recomputed + above))
@@ -80,7 +77,6 @@ def test_wider_ranges_never_make_it_worse(recomputed, error, below, above):
 
 
 def test_the_verdict_cannot_be_given():
-    """Neither at birth nor later."""
     with pytest.raises(TypeError):
         row('1', 1.0, verdict=RowVerdict.AGREES)
     with pytest.raises(AttributeError):

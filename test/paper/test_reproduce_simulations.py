@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from ou_monitor.model.passage import mean_first_passage
 from ou_monitor.paper import crest, published, switching
 from ou_monitor.paper.published import RowVerdict
 import pytest
@@ -77,9 +78,16 @@ def test_logarithm_does_not_grow(formulas):
 
 
 def test_the_potential_of_a_telegraph_agrees(formulas):
-    """1/(4 q) = 0.25 ms."""
     row = formulas['R0(0, 0) of a telegraph']
     assert row.recomputed == pytest.approx(0.25) and row.verdict is RowVerdict.AGREES
+
+
+def test_spreading_follows_the_closed_form():
+    """Var = c^2/q (t - (1 - exp(-2 q t)) / (2 q)), at every time within 4.5 standard errors."""
+    found = switching.spreading(np.random.default_rng(13), PATHS)
+    exact = 1e-3 * (found.t + np.expm1(-2000.0 * found.t) / 2000.0)
+    assert (np.abs(found.variance - exact)[1:] < 4.5 * found.error[1:]).all()
+    assert (found.correct, found.printed) == pytest.approx((1e-3, 5e-4))
 
 
 def test_crest_factors_are_those_of_1_mhz(crests):
@@ -111,6 +119,28 @@ def test_verdicts_on_the_crest_factors(crests):
     assert medium.printed_inputs[0] == pytest.approx(least, rel=1e-3)
     inside = crests.quantile(500, 0.95) >= medium.printed_inputs[0]
     assert medium.verdict is (RowVerdict.ROUNDING if inside else RowVerdict.DOES_NOT_HOLD)
+
+
+def test_screen_that_a_crest_factor_takes():
+    """Half of the screens of that length pass 5 deviations; the law is that of rare passages."""
+    mean = mean_first_passage(0.0, 5.0) / 63.0
+    # To the first order, 1/d^2.
+    assert crest.screen_for(10.0) == pytest.approx(math.log(2.0) * mean, rel=0.05)
+
+
+def test_jumps_have_the_kurtosis_said():
+    """Moments of the simulated process against 3 alpha share^2 / rate."""
+    # Drawn here in closed form: each of the jumps of the last 12 tau, relaxed.
+    rng, alpha, rate, share = np.random.default_rng(16), 63.0, 20.0, 0.75
+    draws, span = 200_000, 12.0 / alpha
+    count = rng.poisson(rate * span, draws)
+    owner = np.repeat(np.arange(draws), count)
+    size = math.sqrt(2.0 * alpha * share / rate) * rng.standard_normal(owner.size)
+    x = np.bincount(owner, size * np.exp(-alpha * span * rng.random(owner.size)), draws)
+    x += math.sqrt(1.0 - share) * rng.standard_normal(draws)
+    assert x.var() == pytest.approx(1.0, rel=0.03)
+    kurtosis = np.mean(x ** 4) / x.var() ** 2 - 3.0
+    assert kurtosis == pytest.approx(crest.excess_kurtosis(rate, share), rel=0.15)
 
 
 def test_jumps_raise_the_crest_factor_of_long_screens(crests):

@@ -73,7 +73,6 @@ def test_balanced_changes_nothing_at_eps_one():
 
 
 def test_paths_that_overflow_are_refused():
-    """One line instead of infinities."""
     system = SwitchedSystem(CYCLE, np.full((3, 1, 1), 9.0))
     with pytest.raises(ValueError, match='unstable: a path overflows before t = 100 s'):
         system.simulate([0.0, 1.0, 100.0], [1.0], np.random.default_rng(0))
