@@ -90,7 +90,6 @@ def test_unknown_is_null(tmp_path, capsys):
     (['--json', '/nowhere/r.json'], '/nowhere'), (['--report', '/'], 'folder'),
 ])
 def test_bad_options_are_named(flight, options, word, capsys):
-    """One line with the option or the value."""
     assert word in failure(capsys, 'analyze', flight, *options)
 
 
@@ -113,18 +112,6 @@ def test_levels_need_a_throttle(tmp_path, capsys):
     path = tmp_path / 'plain.csv'
     write_csv(path, np.arange(100) / 100.0, 5.0 + 0.01 * np.sin(np.arange(100)))
     assert 'no throttle' in failure(capsys, 'analyze', path, '--levels', '0.1')
-
-
-def test_the_limit_is_stated(flight, capsys):
-    """The node's default by name, or the one that was asked for; the JSON as well."""
-    assert main(['analyze', str(flight)]) == 0
-    text = ' '.join(capsys.readouterr().out.split())
-    assert 'falling below 4.5 V (the default for a 5 V rail)' in text
-    assert main(['analyze', str(flight), '--brownout-voltage', '4.7', '--json', '-']) == 0
-    found = strict(capsys.readouterr().out)
-    assert (found['brownout']['voltage'], found['brownout']['voltage_source']) == (4.7, 'given')
-    # The sag of 0.2 V at 40 % leaves 0.1 V, two standard deviations.
-    assert found['brownout']['throttle_budget'] < 0.4
 
 
 def test_a_horizon_asked_for_is_that_of_every_budget(flight, capsys):

@@ -98,12 +98,10 @@ def test_the_page_shows_the_traces_first(folder, tmp_path, capsys):
     (['--model', 'my flight.csv'], 'my flight.csv'),
     (['--model', 'none.yaml'], 'none.yaml')])
 def test_bad_input_is_one_line(folder, capsys, options, words, monkeypatch):
-    """What is wrong, and what to do."""
     monkeypatch.chdir(folder)
     assert words in failure(capsys, 'compare', 'my flight.csv', *options)
 
 
 def test_a_model_that_needs_throttle_is_refused_without(folder, capsys):
-    """It is named, with the term."""
     error = failure(capsys, 'compare', folder / 'bench.csv', '--model', folder / 'model.yaml')
     assert "the model's term 'load_sag' needs throttle, and the recording has none" in error

@@ -95,7 +95,6 @@ def test_column_and_field_path_say_the_same(table, bag, capsys):
 
 
 def test_a_csv_with_other_names_and_units_is_read(series, tmp_path, capsys):
-    """The time of the signal is that of the voltage: its column, in ms."""
     path = tmp_path / 'other.csv'
     t, voltage, throttle, x, _ = series
     np.savetxt(path, np.column_stack([1e3 * t, 1e3 * voltage, throttle, x]), '%.9g', ',',
@@ -119,7 +118,6 @@ def test_only_the_part_asked_for_counts(table, bag, capsys):
 
 
 def test_no_coupling_is_reported_with_the_detectable_gain(table, capsys):
-    """In words and as null."""
     data = found(capsys, table, '--signal', 'gyro_y')
     assert not data['seen'] and data['gain_per_v'] is None
     assert 0.0 < data['gain_limit_per_v'] < GAIN
@@ -132,7 +130,6 @@ def test_no_coupling_is_reported_with_the_detectable_gain(table, capsys):
 
 
 def test_the_page_says_what_the_text_says(table, tmp_path, capsys):
-    """Voltage with its limit first, then the coherence; well formed; the same words as in text."""
     target = tmp_path / 'coupling.html'
     assert main(['coupling', str(table), '--signal', 'gyro_x', '--brownout-voltage', '4.9',
                  '--report', str(target)]) == 0
@@ -158,7 +155,6 @@ def test_the_page_says_what_the_text_says(table, tmp_path, capsys):
     (['--signal', 'gyro_x', '--json', '/nowhere/x.json'], '/nowhere'),
 ])
 def test_bad_input_is_one_line(table, options, words, capsys):
-    """With the option or the nearest name."""
     if not options:
         assert main(['coupling', str(table)]) == 2
         assert words in capsys.readouterr().err
@@ -172,7 +168,6 @@ def test_bad_input_is_one_line(table, options, words, capsys):
     ('/imu/header..x', 'form'),
 ])
 def test_a_signal_that_a_bag_lacks_is_one_line(bag, signal, words, capsys):
-    """Topic, field and path."""
     assert words in failure(capsys, 'coupling', bag, '--signal', signal)
 
 

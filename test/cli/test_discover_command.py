@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 import json
-import math
 import re
 from xml.etree import ElementTree
 
@@ -11,7 +10,7 @@ import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.finding import Cause, Finding, Verdict
-from ou_monitor.discovery.words import both_names, explain, plain, PLAIN_NAMES
+from ou_monitor.discovery.words import explain, PLAIN_NAMES
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_response import LoadSag
@@ -22,8 +21,7 @@ from ou_monitor.model.terms.tones import Tone
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.recordings.model_file import read_model
 from ou_monitor.recordings.read import read_recording
-from ou_monitor.report.discovery_document import answer, discovery_document
-from ou_monitor.report.terminal import terminal
+from ou_monitor.report.discovery_document import answer
 from project import ROOT
 import pytest
 
@@ -41,7 +39,6 @@ def flight(tmp_path_factory):
 
 
 def test_json_on_standard_output_is_alone(flight, capsys):
-    """Strict JSON, nothing beside it, the sag in it."""
     assert main(['discover', str(flight), '--json', '-']) == 0
     out, err = capsys.readouterr()
     data = strict(out)
@@ -53,7 +50,6 @@ def test_json_on_standard_output_is_alone(flight, capsys):
 
 
 def test_a_part_is_read_and_said_again(flight, tmp_path, capsys, monkeypatch):
-    """--from and --to: only that part, the page repeats it, reading shows on a terminal."""
     page = tmp_path / 'a.html'
     part = ['--from', '2', '--to', '2.2']
     assert main(['discover', str(flight), *part, '--json', '-', '--report', str(page)]) == 0
@@ -98,7 +94,6 @@ def test_one_run_writes_summary_model_and_page(flight, tmp_path, capsys):
 
 
 def test_too_short_still_writes_all_but_the_model(tmp_path, capsys):
-    """Report and JSON tell the verdict; the one line, that there is no model."""
     path, data, page = (tmp_path / name for name in ('short.csv', 'd.json', 'r.html'))
     write_csv(path, np.array([0.0, 0.1]), np.array([5.0, 5.1]))
     words = ['discover', path, '--save-model', tmp_path / 'm.yaml', '--report', page, '--json']
@@ -127,19 +122,32 @@ def made(*causes):
         simulated=SupplyModel((OU(60.0, 0.3, 5.0),)))
 
 
+def test_the_answer_begins_with_the_largest_gains():
+    """Three names, the number of the others; then the reason why the model is not to be used."""
+    nan = float('nan')
+    finding = made(
+        (LoadSag(0.6, 0.0), 0.2, 0.01, 0.0), (Drift(0.1, 0.0), nan, nan, nan),
+        *[(Tone(0.01, f, 0.0, 0.0), 0.3, 0.01, 0.0) for f in (11.0, 23.0)])
+    assert re.findall(r'\((\w+)\)', answer(finding)[0]) == ['tone', 'load_sag', 'drift']
+    more = replace(finding, verdict=Verdict.PARTLY_EXPLAINED, refused='It strays', causes=(
+        *finding.causes, *made((MeasurementNoise(0.01), 0.1, 0.01, 0.0)).causes))
+    strongest, *_, refused = answer(more)
+    assert re.findall(r'\((\w+)\)', strongest) == ['tone', 'load_sag', 'measurement_noise']
+    assert '1 more' in strongest and refused.startswith('It strays')
+    assert more.closer and not replace(more, larger=True).closer
+
+
 @pytest.mark.parametrize('words, part', [
     (['--seed', '-1'], '--seed'), (['--report', '-'], '--report'),
     (['--save-model', '-'], '--save-model'), (['--json', '/no/such/folder/x.json'], 'folder'),
     (['--msg-config', 'px4'], 'CSV'), (['--reprot', 'x'], '--report')])
 def test_bad_options_are_one_line(flight, capsys, words, part):
-    """Each names what is wrong."""
     assert main(['discover', str(flight), *words]) == 2
     out, err = capsys.readouterr()
     assert out == '' and part in err and err.count('\n') == 1
 
 
 def test_bad_recordings_are_one_line(tmp_path, capsys):
-    """A missing file, and one without the columns."""
     assert 'none.csv' in failure(capsys, 'discover', tmp_path / 'none.csv')
     path = tmp_path / 'odd.csv'
     path.write_text('a,b\n1,2\n')
@@ -147,46 +155,8 @@ def test_bad_recordings_are_one_line(tmp_path, capsys):
 
 
 def test_every_cause_has_a_plain_name():
-    """Of the catalogue, none more; each stands for one cause."""
     assert set(PLAIN_NAMES) == set(catalogue()) - {'ou'}
     assert len(set(PLAIN_NAMES.values())) == len(PLAIN_NAMES)
-
-
-def test_plain_names_stand_before_the_names_in_code():
-    """Once each; names that are English words stay."""
-    assert plain('load_sag, drift and tone explain it. Worse without load_sag.') == (
-        'Sag (load_sag), drift and tone explain it. Worse without sag.')
-    assert plain('The plain OU simulates it.') == 'The plain OU simulates it.'
-    assert both_names('load_sag') == 'sag (load_sag)' and both_names('new') == 'new'
-
-
-def test_the_headline_names_the_strongest_and_what_all_are_worth():
-    """Three by their gain, the rest counted; smaller errors and their size apart."""
-    nan = float('nan')
-    finding = replace(made(
-        (LoadSag(0.6, 0.0), 0.2, 0.01, 0.0), (Drift(0.1, 0.0), nan, nan, nan),
-        *[(Tone(0.01, f, 0.0, 0.0), 0.3, 0.01, 0.0) for f in (11.0, 23.0)]),
-        gain=math.log(2.0), gain_se=0.1, shrink=0.2)
-    said = ' '.join(terminal(discovery_document(finding)).split())
-    assert 'mnat (thousandths of a nat' in said
-    strongest, worth, passes = answer(finding)
-    assert re.findall(r'\((\w+)\)', strongest) == ['tone', 'load_sag', 'drift']
-    assert re.findall(r'\d+', worth) == ['20', '223', '470', '693', '196']
-    assert 'every test' in passes
-    grown = answer(replace(finding, shrink=-0.2))[1]
-    assert re.findall(r'[-+]?\b\d+', grown) == ['20', '-182', '+875', '693', '196']
-    more = replace(finding, verdict=Verdict.PARTLY_EXPLAINED, refused='It strays', causes=(
-        *finding.causes, *made((MeasurementNoise(0.01), 0.1, 0.01, 0.0)).causes))
-    strongest, _, closer, refused = answer(more)
-    assert re.findall(r'\((\w+)\)', strongest) == ['tone', 'load_sag', 'measurement_noise']
-    assert '1 more' in strongest and 'comes closer' in closer and more.closer
-    assert refused.startswith('It strays')
-    worse = replace(more, larger=True)
-    assert not worse.closer and not worse.as_data()['extended']['closer']
-    assert 'does not come closer' in answer(worse)[2]
-    assert 'No measurable gain' in answer(replace(finding, gain=0.19))[1]
-    nothing = replace(finding, causes=(), sentence='load_sag was tried.')
-    assert answer(nothing) == ['Sag (load_sag) was tried.']
 
 
 def test_a_model_that_is_not_saved_is_not_announced(tmp_path, capsys):

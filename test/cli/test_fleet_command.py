@@ -152,7 +152,6 @@ def rows(whole) -> list[dict]:
 
 
 def test_every_recording_has_its_rows(rows):
-    """One row a level of each good one, one row for a bad one and for a copy."""
     levels: dict[str, list] = {}
     for row in rows:
         levels.setdefault(Path(row['path']).name, []).append(row['throttle'])
@@ -166,7 +165,6 @@ def test_every_recording_has_its_rows(rows):
 
 
 def test_the_numbers_are_those_of_analyze(rows, logs):
-    """The same recording analysed alone gives the same estimate."""
     from ou_monitor.analysis.analyze import analyze
     from ou_monitor.recordings.read import read_recording
     path = logs / 'uav2' / 'flight_5.csv'
@@ -179,7 +177,6 @@ def test_the_numbers_are_those_of_analyze(rows, logs):
 
 
 def test_resistance_and_sag_are_those_of_analyze(tmp_path, one_process, capsys):
-    """The row is `supply` of analyze; a bad line costs a line; a guess of cells is the fullest."""
     rng = np.random.default_rng(2)
     t = np.arange(1500) * 0.02
     logs = tmp_path / 'logs' / 'uav7'
@@ -248,7 +245,6 @@ def test_skipped_files_are_named(whole):
 
 
 def test_vehicles_flights_and_dates(rows, whole):
-    """Folders are vehicles, flights are counted, and a date is there only where it is known."""
     flights = {(row['vehicle'], row['flight']) for row in rows if row['flight']}
     assert flights == {(v, k) for v, last in (('uav1', FLIGHTS), ('uav2', FLIGHTS + 1))
                        for k in range(1, last + 1)}
@@ -259,7 +255,6 @@ def test_vehicles_flights_and_dates(rows, whole):
 
 
 def test_each_column_has_unit_and_meaning(whole):
-    """Each column has its unit and meaning, and the JSON holds the same rows."""
     table = parquet.read_table(whole[0] / 'fleet.parquet')
     assert tuple(table.column_names) == NAMES
     for column in COLUMNS:
@@ -272,7 +267,6 @@ def test_each_column_has_unit_and_meaning(whole):
 
 
 def test_columns_are_documented():
-    """Each has its row in the documentation, with its unit."""
     text = (ROOT / 'doc' / 'fleet.md').read_text(encoding='utf-8')
     for column in COLUMNS:
         assert f'| `{column.name}` | {column.unit or "-"} |' in text
@@ -346,7 +340,6 @@ def test_bad_input_is_one_line(arguments, words, logs, tmp_path, capsys):
 
 @pytest.mark.parametrize('name', ['fleet.html', 'fleet.parquet', 'parts/ou_monitor_fleet.txt'])
 def test_files_in_a_folder_of_that_shape_are_not_its_own(name, logs, tmp_path, capsys):
-    """A folder is a fleet's own where the mark in it says so, not where it has `parts`."""
     out = tmp_path / 'out'
     (out / 'parts').mkdir(parents=True)
     (out / name).write_text('precious')

@@ -18,13 +18,11 @@ def test_with_cells_the_limit_is_volts_per_cell(voltage, cells, limit):
 
 
 def test_volts_of_the_pack_beside_cells_are_refused():
-    """With the number that is meant."""
     with pytest.raises(InputError, match='no cell has 14 V: write 3.5, or leave --cells out'):
         brownout_limit(Namespace(brownout_voltage=14.0, cells=4))
 
 
 @pytest.mark.parametrize('cells', ['0', '-1', '2.5', 'four', '99'])
 def test_an_invalid_number_of_cells_is_one_line(cells, capsys):
-    """One line."""
     assert main(['analyze', 'x.csv', '--cells', cells]) == 2
     assert f"'{cells}' is not a number of cells, 1 to 28" in capsys.readouterr().err

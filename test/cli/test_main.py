@@ -37,7 +37,6 @@ def test_every_command_has_help_and_json(command, capsys):
 
 @pytest.mark.parametrize('command', sorted(cli.COMMANDS))
 def test_every_help_ends_with_examples(command, capsys):
-    """Each on a line of its own, to be copied; and each is a command line that is understood."""
     assert cli.main([command, '--help']) == 0
     told = capsys.readouterr().out.partition('Examples:\n')[2].splitlines()
     assert len(told) >= 2
@@ -82,7 +81,6 @@ def test_input_errors_are_one_line_whatever_their_text(monkeypatch, capsys):
 
 @pytest.mark.parametrize('encoding', ['utf-8', 'ascii'])
 def test_file_names_that_the_terminal_cannot_show_are_escaped(tmp_path, encoding):
-    """Its bytes are no text, or not in the encoding: shown by their numbers."""
     path = os.fsdecode(os.path.join(os.fsencode(tmp_path), b'\xff\xc3\xa4.csv'))
     with open(path, 'w') as file:
         file.writelines(['time_s,voltage_v\n', '0,5\n', '1,5\n', '2,5\n'])
@@ -122,7 +120,6 @@ def test_closed_outputs_are_no_failure(tmp_path, closed):
     (MemoryError(), 'not enough memory: take a part'),
 ])
 def test_system_errors_are_one_line(monkeypatch, capsys, error, words):
-    """Whatever call it came from."""
     def run(args):
         raise error
 
@@ -133,13 +130,11 @@ def test_system_errors_are_one_line(monkeypatch, capsys, error, words):
 @pytest.mark.parametrize('command', [['analyze'], ['convert', '--list'], ['discover'],
                                      ['fleet', '--output', 'out']])
 def test_a_path_that_is_too_long_is_one_line(tmp_path, monkeypatch, capsys, command):
-    """The system refuses to look for it."""
     monkeypatch.chdir(tmp_path)
     assert 'File name too long' in failure(capsys, *command, 'x' * 300)
 
 
 def test_interrupt_is_quiet(monkeypatch, capsys):
-    """Ctrl-C: 130 and no text."""
     def run(args):
         raise KeyboardInterrupt
 
@@ -149,7 +144,6 @@ def test_interrupt_is_quiet(monkeypatch, capsys):
 
 
 def test_a_shell_completes_commands_and_their_options(monkeypatch):
-    """With what a shell sets, and only then, the parsers go to argcomplete, an extra."""
     asked = []
     stand = SimpleNamespace(autocomplete=asked.append)
     monkeypatch.setitem(sys.modules, 'argcomplete', stand)
@@ -237,7 +231,6 @@ def test_a_full_standard_output_is_one_line(argv, tmp_path):
     ['discover', ''], ['analyze', ''], ['convert', '', 'NEW.mcap'], ['simulate', '--output', ''],
     ['discover', 'IN', '--report', '']])
 def test_no_command_overwrites_its_input_or_its_output(argv, tmp_path, capsys):
-    """One line; the input is as it was, and nothing was written."""
     source = tmp_path / 'in.csv'
     source.write_text('time_s,voltage_v\n0,5\n0.1,5.1\n')
     names = {'IN': source, 'NEW': tmp_path / 'new', 'NEW.mcap': tmp_path / 'new.mcap'}

@@ -34,7 +34,6 @@ def test_plain_is_strict_json_at_any_depth():
 
 
 def test_write_json_to_a_file_and_to_standard_output(tmp_path, capsys):
-    """Both hold the same text, one object, in any encoding."""
     target = tmp_path / 'x.json'
     output.write_json({'unit': 'V/√s', 'x': math.nan}, str(target))
     output.write_json({'unit': 'V/√s', 'x': math.nan}, '-')
@@ -53,12 +52,6 @@ def test_unwritable_outputs_are_named(tmp_path):
     output.check_writable(None)
     output.check_writable('-')
     output.check_writable(str(tmp_path / 'new.json'))
-
-
-def test_table_is_aligned():
-    """Numbers flush right, words flush left, no trailing blanks."""
-    text = terminal.table(['n', 'word'], [['1', 'a'], ['1000', 'long one']], left=[1])
-    assert text.splitlines() == ['   n  word', '----  --------', '   1  a', '1000  long one']
 
 
 def test_paths_that_collide_or_are_empty_are_named(tmp_path):
@@ -155,7 +148,6 @@ def test_a_bag_makes_room_for_the_next(tmp_path):
 @pytest.mark.parametrize('foreign', ['notes.txt', 'monday.mcap', 'backup.tar.zst', 'bag_1.mcap'])
 @pytest.mark.parametrize('whole', [True, False])
 def test_a_folder_that_is_not_one_bag_stays(tmp_path, foreign, whole):
-    """With a file that its metadata does not name, or without metadata."""
     bag = bag_folder(tmp_path / 'bag', 'old')
     (bag / foreign).write_text('mine')
     if not whole:
@@ -189,7 +181,6 @@ def test_an_output_within_another_or_around_an_input_is_refused(tmp_path):
 
 
 def test_files_that_appear_during_the_work_are_not_overwritten(tmp_path):
-    """Nor is a link, wherever it leads; with force both are."""
     late, link = tmp_path / 'late.json', tmp_path / 'link.json'
     late.write_text('mine')
     link.symlink_to(tmp_path / 'nowhere')
@@ -228,24 +219,6 @@ def test_the_width_of_the_terminal_is_kept(monkeypatch, width):
     assert text.count('uav1') == text.count('vehicle') >= (2 if width < 92 else 1)
     for head in heads:
         assert head in text
-
-
-def test_a_file_is_as_wide_as_ever(monkeypatch):
-    """What no terminal shows is not broken by the width of one."""
-    monkeypatch.setenv('COLUMNS', '40')
-    assert terminal.columns() == 100
-    heads = [f'column {k}' for k in range(20)]
-    assert len(terminal.table(heads, [['1'] * 20]).splitlines()) == 3
-
-
-def test_the_last_lines_repeat_the_answer_and_name_the_files(capsys):
-    """Three: the answer, what stands behind it, and what was written where."""
-    said = ['It fell to 13 V.', 'It sags by 2 V.', 'It is safe up to half throttle.']
-    output.summary(said, report='a.html', json='-', model=None)
-    output.summary(said, report=None)
-    first, second = capsys.readouterr().out.strip('\n').split('\n\n')
-    assert first.splitlines() == ['It fell to 13 V.', 'It sags by 2 V.', 'Report: a.html']
-    assert second.splitlines()[-1].startswith('No file was written: --report')
 
 
 def test_a_link_that_loops_is_replaced_only_with_force(tmp_path):

@@ -2,7 +2,7 @@
 
 import io
 
-from ou_monitor.cli.output import duration, Progress
+from ou_monitor.cli.output import Progress
 import pytest
 
 
@@ -74,7 +74,6 @@ def test_the_bar_fits_and_tells_the_time_left(monkeypatch, clock, width):
 
 
 def test_a_standard_error_that_is_closed_stops_nothing(monkeypatch, clock):
-    """The work is worth more than its progress."""
     gone = io.StringIO()
     monkeypatch.setattr('sys.stderr', gone)
     with Progress('work') as progress:
@@ -82,10 +81,3 @@ def test_a_standard_error_that_is_closed_stops_nothing(monkeypatch, clock):
         gone.close()
         clock[0] += 90.0
         progress(0.5)
-
-
-@pytest.mark.parametrize('seconds, words', [
-    (0.2, '1 s'), (61.4, '61 s'), (100.0, '2 min'), (3000.0, '50 min'), (9000.0, '2.5 h')])
-def test_the_time_left_is_rounded(seconds, words):
-    """Seconds, minutes, hours."""
-    assert duration(seconds) == words

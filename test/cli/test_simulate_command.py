@@ -56,27 +56,7 @@ def test_the_simulated_bag_can_be_analyzed(tmp_path, name, capsys):
     assert abs(level['sigma'] / 0.632 - 1.0) < 4.0 * 0.007
 
 
-def test_default_is_a_flight(tmp_path, capsys):
-    """Without a word: 120 s at 1 kHz in battery messages, named in the list too."""
-    simulate('--duration', 5, '--output', tmp_path / 'f.mcap', '--json', '-')
-    data = json.loads(capsys.readouterr().out)
-    assert (data['n'], data['rate_hz'], data['throttle']) == (5000, 1000.0, 'flight')
-    assert data['topics'] == {'/voltage': 'sensor_msgs/msg/BatteryState',
-                              '/throttle': 'std_msgs/msg/Float32'}
-    assert PRESETS['flight'].duration == 120.0
-
-
-def test_list_is_json_alone_on_standard_output(tmp_path, capsys):
-    """For programs, alone on standard output."""
-    simulate('--list', '--json', '-')
-    listed = json.loads(capsys.readouterr().out)
-    assert listed['presets']['load_40']['throttle'] == '0.4'
-    assert listed['presets']['flight']['rate_hz'] == 1000.0
-    assert set(listed['profiles']) == {'flight', 'hover', 'loads', 'transient'}
-
-
 def test_json_has_the_parameters_of_every_term(tmp_path, capsys):
-    """What was made, with the parameters of every term."""
     target = tmp_path / 'a.json'
     simulate('--preset', 'load_10', '--duration', 2, '--rate', 500, '--seed', 7, '--throttle',
              '0.3', '--output', tmp_path / 'a.mcap', '--json', target)
@@ -103,7 +83,6 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path, name):
 
 
 def test_a_saved_model_gives_the_same_samples(tmp_path):
-    """--save-model and then --model: every sample, with the same seed and throttle."""
     for preset in ('flight_full', 'transient'):
         saved = tmp_path / f'{preset}.yaml'
         simulate('--preset', preset, '--duration', 8, '--seed', 5, '--output',
@@ -118,7 +97,6 @@ def test_a_saved_model_gives_the_same_samples(tmp_path):
 
 
 def test_a_model_can_be_saved_without_a_recording(tmp_path, capsys):
-    """A start for one's own."""
     simulate('--preset', 'loads', '--save-model', tmp_path / 'm.yaml')
     assert read_model(tmp_path / 'm.yaml').model == PRESETS['loads'].model
     assert [p.name for p in tmp_path.iterdir()] == ['m.yaml']
@@ -173,7 +151,6 @@ def test_blocks_say_their_own_rate(tmp_path, rate, duration):
 
 
 def test_throttle_changes_within_a_block(tmp_path):
-    """A step within a block is at its sample."""
     path = tmp_path / 'a.mcap'
     simulate('--preset', 'loads', '--duration', 0.1, '--rate', 20_000, '--throttle',
              '0:0.1,0.05125:0.1,0.05125:0.4', '--output', path)
@@ -251,7 +228,6 @@ def test_an_error_half_way_leaves_nothing(tmp_path, name, model, words, capsys):
 @pytest.mark.parametrize('number, status', [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 @pytest.mark.parametrize('name', ['a.mcap', 'a'])
 def test_a_signal_brings_the_old_bag_back(tmp_path, name, number, status):
-    """Ended while it writes: no traceback, no new bag, and the old one in its place."""
     # An hour at 20 kHz lasts far longer than the test; the signal goes out once the bag has grown.
     path = tmp_path / name
     assert main(['simulate', '--preset', 'idle', '--duration', '1', '--output', str(path)]) == 0
@@ -274,7 +250,6 @@ def test_a_signal_brings_the_old_bag_back(tmp_path, name, number, status):
 
 
 def test_the_writer_leaves_nothing_when_finishing_fails(tmp_path, monkeypatch):
-    """A disk that is full at the last block: no bag is left that looks like one."""
     from ou_monitor.recordings.bag import BagWriter
     from ou_monitor.recordings.write import write_recording
     from ou_monitor.records import Recording
@@ -336,7 +311,6 @@ def test_a_model_is_drawn_at_the_rate_of_its_recording(learned, options, rate, t
 
 
 def test_a_saved_model_has_the_rate_of_its_recording(tmp_path):
-    """So that it is drawn as often as the recording was read."""
     flight, model, again = (tmp_path / name for name in ('f.mcap', 'm.yaml', 'again.mcap'))
     assert main(['simulate', '--preset', 'idle', '--rate', '125', '--duration', '8', '--output',
                  str(flight)]) == 0

@@ -49,7 +49,6 @@ def said(command, path, limit, folder, *more):
     ('flight', 4.6, {'compare': ('--seeds', '20'), 'discover': ()}),
     ('recorded/gecko_gyro.csv', 15.5, {'coupling': ('--signal', 'gyro_x_deg_s')})])
 def test_all_commands_give_the_same_object(name, limit, others, tmp_path):
-    """Equal to the last digit."""
     part = ROOT / 'bags' / name, limit, tmp_path, '--from', '0', '--to', '6'
     supply = said('analyze', *part)['supply']
     assert all(said(one, *part, *more)['supply'] == supply for one, more in others.items())
@@ -64,7 +63,6 @@ def near(found, wanted, tolerance=0.0):
 
 @pytest.mark.parametrize('path, limit, part', RECORDINGS, ids=lambda x: getattr(x, 'stem', ''))
 def test_commands_fleet_and_node_agree_on_the_facts(path, limit, part, tmp_path):
-    """`analyze`, `compare`, a row of the fleet, and the node at the end of twelve recordings."""
     if not path.exists():
         pytest.skip('OU_MONITOR_REALDATA is not set')
     table, recording = part_of(path, part, tmp_path)

@@ -36,7 +36,6 @@ def test_headline_warns_of_what_changes_its_own_numbers():
 
 
 def test_the_same_caution_of_two_levels_is_said_once(analysis):
-    """It is led by both labels."""
     def said(**changes):
         items = quality_list(
             analysis.recording, [level.throttle for level in analysis.levels],
@@ -49,7 +48,6 @@ def test_the_same_caution_of_two_levels_is_said_once(analysis):
 
 
 def test_the_table_over_throttle_is_that_of_the_facts(analysis):
-    """Sag and noise at the tenths of throttle, as `supply` has them, noise only where flown."""
     table, *_ = next(part for part in analysis_document(analysis).parts
                      if getattr(part, 'heading', '') == 'Over throttle').parts
     assert table.heads[0] == 'throttle' and table.heads[-1] == 'brown-out risk'

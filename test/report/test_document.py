@@ -39,7 +39,6 @@ def test_every_part_is_on_the_page_escaped():
 
 
 def test_a_terminal_draws_nothing_for_a_page_only():
-    """Functions, figures and legends; a section of nothing else has no heading."""
     def drawn():
         pytest.fail('a terminal draws nothing')
 
@@ -51,7 +50,6 @@ def test_a_terminal_draws_nothing_for_a_page_only():
 @pytest.mark.parametrize('severity, led', [
     (Severity.ERROR, 'error: '), (Severity.WARNING, 'warning: '), (Severity.INFO, '')])
 def test_the_severity_of_a_note_is_that_of_its_record(severity, led):
-    """Not of its words, on either."""
     notes = document(Notes.of(['An error and a warning.'], severity))
     assert terminal(notes).endswith(f'\n- {led}An error and a warning.')
     (item,) = parsed(html(notes)).iter('li')
@@ -60,14 +58,12 @@ def test_the_severity_of_a_note_is_that_of_its_record(severity, led):
 
 
 def test_the_worst_note_is_first_and_each_is_said_once():
-    """With the greater of two severities."""
     found = worst_first([(Severity.INFO, 'a'), (Severity.WARNING, 'b'), (Severity.ERROR, 'a'),
                          (Severity.WARNING, 'c')])
     assert found.notes == [(Severity.ERROR, 'a'), (Severity.WARNING, 'b'), (Severity.WARNING, 'c')]
 
 
 def test_a_terminal_leaves_out_rows_and_says_so():
-    """The page has them all."""
     rows = [[f'row {k}', '1'] for k in range(9)]
     found = document(Table(['name', 'n'], rows, left=[0], most=4), Notes.of('abc', most=2))
     text = terminal(found)

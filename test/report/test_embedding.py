@@ -68,7 +68,6 @@ def test_values_that_no_float32_holds_are_exact():
 
 @given(st.lists(st.sampled_from([0.0, 1.0, 2.0, np.nan]), min_size=1, max_size=30))
 def test_steps_lose_nothing(values):
-    """Between and at all stamps the embedded steps hold the same value."""
     y = np.array(values)
     x = np.arange(float(y.size))
     (curve,) = embedded(Plot('t', 'x', 'y').steps(x, y))
@@ -138,7 +137,6 @@ def test_pages_stay_small(seconds, exact):
 
 
 def test_hostile_names_stay_names():
-    """In title, axes, curves, marks and shades: one text to parsers of HTML and of XML."""
     plot = Plot(EVIL, EVIL, EVIL).line(np.arange(3.0), np.arange(3.0), EVIL)
     plot.shade(0.0, 1.0, 2, EVIL).mark(0.5, EVIL)
     script = embed(plot)

@@ -9,7 +9,7 @@ import numpy as np
 from ou_monitor.analysis.analyze import analyze
 from ou_monitor.report.analysis_document import analysis_document
 from ou_monitor.report.document import Document, Figure, Pair
-from ou_monitor.report.page import embed, html
+from ou_monitor.report.page import html
 from ou_monitor.report.svg import Plot
 import pytest
 from simulated_recordings import recording
@@ -250,33 +250,11 @@ def test_outlines_dots_and_bars_read_right(tab):
         assert [number(row) for row in rows if row.startswith('dot')] == [dot]
 
 
-@pytest.mark.parametrize('k, low, high', [(PEAK, 3.15, 4.6), (HIGH, 5.06, 5.14)])
-def test_single_samples_are_drawn(tab, k, low, high):
-    """One of 40000 samples stands out of its column of 48, downwards and upwards."""
-    at, y = k / 1000.0 / SECONDS, ((low - 3.0) / 2.2, (high - 3.0) / 2.2)
-    assert View(tab, 0).ink('c0', (at - 0.003, at + 0.003), y) > 2
-    assert View(tab, 0).ink('c0', (at + 0.01, at + 0.02), y) == 0
-
-
 def test_gaps_stay_gaps(tab, data):
     """Neither ink nor a value where nothing is known; both beside it."""
     view, (a, b) = View(tab, 0), (float(data[0][GAP][k]) / SECONDS for k in (0, -1))
     assert len(view.point(0.5 * (a + b))) == 1 and len(view.point(a - 0.01)) == 2
     assert view.ink('c0', (a + 0.005, b - 0.005)) == 0 < view.ink('c0', (a - 0.02, a))
-
-
-def test_steps_are_level_and_upright(tab):
-    """The value is held up to the next stamp: all of the way at its height, none between."""
-    view = View(tab, 1)
-    low, high = view.ends('y')
-    level = [(10.0 * k - low) / (high - low) for k in range(7)]
-    for k in (1, 2, 3):
-        start, stop = 6.0 * k / SECONDS, 6.0 * (k + 1) / SECONDS
-        width = (stop - start) * 824.0
-        beside = (level[k] - 0.02, level[k] + 0.02)
-        assert view.ink('c0', (start, stop), beside) > 0.9 * width
-        between = (level[k] + 0.03, level[k + 1] - 0.03)
-        assert view.ink('c0', (start + 0.01, stop - 0.01), between) == 0
 
 
 def test_a_click_on_a_name_hides_it(tab):
@@ -330,17 +308,6 @@ def test_fingers_read_and_pinch(tab):
     tab.touch('touchEnd')
 
 
-def test_colours_follow_the_theme(tab):
-    """The same curve in the colour of the light and of the dark form."""
-    view = View(tab, 0)
-    light = tab.run('getComputedStyle(document.documentElement).getPropertyValue("--c0")')
-    many = view.ink('c0')
-    tab.media(theme='dark')
-    tab.until(f'getComputedStyle(document.documentElement).getPropertyValue("--c0") !== {light!r}')
-    tab.run('new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))')
-    assert view.ink('c0') == pytest.approx(many, rel=0.02) and many > 500
-
-
 def test_paper_shows_the_drawings(tab):
     """In print the static drawings stand in their places again."""
     tab.media('print')
@@ -368,15 +335,3 @@ def test_the_policy_forbids_the_network_and_other_scripts(browser, file):
     assert browser.run('window.broken') is None
     blocked = [e for e in browser.errors if 'Content Security Policy' in e]
     assert len(blocked) >= 3, browser.errors
-
-
-def test_envelopes_say_that_they_are(browser, tmp_path, data):
-    """A curve beyond the budget is drawn with its peak, and the page says what its points are."""
-    t, v = data
-    plot = Plot('Voltage', 'time, s', 'V').line(t, v)
-    path = tmp_path / 'e.html'
-    path.write_text(html(Document('t', 's', [], [Figure(plot.svg() + embed(plot, 20_000))])))
-    browser.visit(path, 'document.documentElement.dataset.plots')
-    note = browser.run('document.querySelector(".live-note").textContent')
-    assert 'lowest and highest of each 4 samples' in note
-    assert '3.123' in View(browser, 0).point(PEAK / 1000.0 / SECONDS)[1]
