@@ -10,7 +10,7 @@ import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.finding import Cause, Finding, Verdict
-from ou_monitor.discovery.words import explain, PLAIN_NAMES
+from ou_monitor.discovery.words import both_names, explain, plain, PLAIN_NAMES
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_response import LoadSag
@@ -157,6 +157,14 @@ def test_bad_recordings_are_one_line(tmp_path, capsys):
 def test_every_cause_has_a_plain_name():
     assert set(PLAIN_NAMES) == set(catalogue()) - {'ou'}
     assert len(set(PLAIN_NAMES.values())) == len(PLAIN_NAMES)
+
+
+def test_plain_names_stand_before_the_names_in_code():
+    """Once each; names that are English words stay."""
+    assert plain('load_sag, drift and tone explain it. Worse without load_sag.') == (
+        'Sag (load_sag), drift and tone explain it. Worse without sag.')
+    assert plain('The plain OU simulates it.') == 'The plain OU simulates it.'
+    assert both_names('load_sag') == 'sag (load_sag)' and both_names('new') == 'new'
 
 
 def test_a_model_that_is_not_saved_is_not_announced(tmp_path, capsys):

@@ -54,6 +54,12 @@ def test_unwritable_outputs_are_named(tmp_path):
     output.check_writable(str(tmp_path / 'new.json'))
 
 
+def test_table_is_aligned():
+    """Numbers flush right, words flush left, no trailing blanks."""
+    text = terminal.table(['n', 'word'], [['1', 'a'], ['1000', 'long one']], left=[1])
+    assert text.splitlines() == ['   n  word', '----  --------', '   1  a', '1000  long one']
+
+
 def test_paths_that_collide_or_are_empty_are_named(tmp_path):
     """By name, by another spelling, by a link; two outputs; but not two devices."""
     source = tmp_path / 'in.csv'
@@ -219,6 +225,14 @@ def test_the_width_of_the_terminal_is_kept(monkeypatch, width):
     assert text.count('uav1') == text.count('vehicle') >= (2 if width < 92 else 1)
     for head in heads:
         assert head in text
+
+
+def test_a_file_is_as_wide_as_ever(monkeypatch):
+    """What no terminal shows is not broken by the width of one."""
+    monkeypatch.setenv('COLUMNS', '40')
+    assert terminal.columns() == 100
+    heads = [f'column {k}' for k in range(20)]
+    assert len(terminal.table(heads, [['1'] * 20]).splitlines()) == 3
 
 
 def test_a_link_that_loops_is_replaced_only_with_force(tmp_path):

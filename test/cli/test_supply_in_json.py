@@ -45,11 +45,11 @@ def said(command, path, limit, folder, *more):
     return json.loads(target.read_text()) if target.exists() else None
 
 
-@pytest.mark.parametrize('name, limit, others', [
-    ('flight', 4.6, {'compare': ('--seeds', '20'), 'discover': ()}),
-    ('recorded/gecko_gyro.csv', 15.5, {'coupling': ('--signal', 'gyro_x_deg_s')})])
-def test_all_commands_give_the_same_object(name, limit, others, tmp_path):
-    part = ROOT / 'bags' / name, limit, tmp_path, '--from', '0', '--to', '6'
+@pytest.mark.parametrize('name, limit, end, others', [
+    ('flight', 4.6, '3', {'compare': ('--seeds', '20'), 'discover': ()}),
+    ('recorded/gecko_gyro.csv', 15.5, '6', {'coupling': ('--signal', 'gyro_x_deg_s')})])
+def test_all_commands_give_the_same_object(name, limit, end, others, tmp_path):
+    part = ROOT / 'bags' / name, limit, tmp_path, '--from', '0', '--to', end
     supply = said('analyze', *part)['supply']
     assert all(said(one, *part, *more)['supply'] == supply for one, more in others.items())
     assert supply['dips']['limit_v'] == limit and supply['budget']['throttle'] > 0.0
@@ -80,11 +80,6 @@ def test_commands_fleet_and_node_agree_on_the_facts(path, limit, part, tmp_path)
     sag = supply['sag']
     if sag['known']:
         assert near(row['sag_full'], sag['sag_v'][-1])
-        for level in analysis['levels']:
-            if level['throttle'] is not None:
-                # Between two of the eleven throttles.
-                wanted = np.interp(level['throttle'], sag['throttle'], sag['sag_v'])
-                assert level['sag'] == pytest.approx(wanted, abs=0.02 * max(sag['sag_v']))
     # The node at the end.
     monitor = SupplyMonitor(MonitorSettings(brownout_voltage=limit))
     monitor.push(recording.t, recording.voltage,

@@ -16,7 +16,7 @@ from ou_monitor.report.terminal import terminal
 import pytest
 from scipy.signal import lfilter
 
-RATE, N = 100.0, 5000
+RATE, N = 100.0, 3000
 T = np.arange(N) / RATE
 RAIL = OU(8.0, 0.1, 15.0)
 

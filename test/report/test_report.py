@@ -12,7 +12,7 @@ from ou_monitor.records import Recording
 from ou_monitor.report.analysis_document import analysis_document
 from ou_monitor.report.page import html as page_of
 from ou_monitor.report.svg import (
-    linear_ticks, log_ticks, Plot, Scale, span, tick_text)
+    linear_ticks, log_ticks, Plot, Scale, span, thin, tick_text)
 from pages import parsed, self_contained
 import pytest
 from simulated_recordings import recording, without_throttle
@@ -67,6 +67,16 @@ def test_span_is_always_an_axis(values, log):
     low, high = span([np.array(values)], log)
     assert math.isfinite(low) and math.isfinite(high) and low < high
     assert low > 0.0 or not log
+
+
+def test_thinning_keeps_every_extreme_and_break():
+    """A single peak in 100000 samples stays, and so does a NaN."""
+    x = np.arange(100000.0)
+    y = np.sin(x)
+    y[41234], y[77777] = 50.0, math.nan
+    kept_x, kept_y = thin(x, y, 800)
+    assert kept_x.size <= 3 * 800 and np.all(np.diff(kept_x) > 0.0)
+    assert np.nanmax(kept_y) == 50.0 and np.isnan(kept_y).sum() == 1
 
 
 def test_a_line_goes_through_its_points_and_breaks_at_nan():

@@ -4,8 +4,8 @@ from collections import Counter
 import re
 
 from ou_monitor.paper import published, reproduce as module
-from ou_monitor.paper.published import RowVerdict
-from ou_monitor.paper.reproduce import as_data, headline
+from ou_monitor.paper.published import Printed, Row, RowVerdict
+from ou_monitor.paper.reproduce import as_data, headline, recomputed
 from ou_monitor.report.page import html
 from ou_monitor.report.reproduction_document import reproduction_document
 from pages import self_contained
@@ -56,6 +56,16 @@ def test_headline_counts_the_rows(result):
     data = as_data(result)
     assert data['counts'] == {verdict.name: counts[verdict] for verdict in RowVerdict}
     assert len(data['rows']) == numbers[0] and len(data['points']) == 8
+
+
+@pytest.mark.parametrize('printed, value, error, text', [
+    ('63.0', 63.04585, None, '63.05'), ('15.873', 15.873016, None, '15.8730'),
+    ('1', 0.99512, 0.0123, '0.995 +- 0.012'), ('500', 1004.4, 10.7, '1004 +- 11'),
+    ('368', 373.4, 123.0, '373 +- 123'), ('> 0', -1.0, None, '-1.000')])
+def test_digits_follow_the_error(printed, value, error, text):
+    """Two digits of error; without one, more digits than were printed."""
+    row = Row('Table 0', 'x', '', Printed(printed), value, 'how', 'Says.', error=error)
+    assert recomputed(row) == text
 
 
 def test_page_shows_every_row_and_figure(result, tree):
