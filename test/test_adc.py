@@ -38,7 +38,6 @@ def feed(character, data, pieces=7):
 
 
 def test_a_buffer_is_set_up_and_gives_blocks(tmp_path):
-    """Only the channel and the timestamp are enabled; blocks have the stamp of the last one."""
     folder, character = iio_device(tmp_path)
     counts = np.arange(-300, 300)
     done = feed(character, scans(counts, T0 + 100_000 * np.arange(600)))
@@ -59,7 +58,6 @@ def test_a_buffer_is_set_up_and_gives_blocks(tmp_path):
 
 
 def test_a_hole_splits_a_block(tmp_path):
-    """Samples that the buffer lost: two blocks, each with its own stamp."""
     folder, character = iio_device(tmp_path)
     stamps = T0 + 100_000 * np.concatenate([np.arange(50), np.arange(80, 130)])
     done = feed(character, scans(np.arange(100), stamps))
@@ -87,7 +85,6 @@ def test_samples_lost_between_two_blocks_are_a_hole(tmp_path, block):
 
 
 def test_a_monotonic_clock_is_brought_to_1970(tmp_path):
-    """By the difference of the clocks when the block is read."""
     folder, character = iio_device(tmp_path, clock='monotonic')
     buffer = IioBuffer(folder, character, 'in_voltage1', block=10)
     now = time.time()
@@ -188,7 +185,6 @@ def test_stored_bits_become_numbers(kind, stored, expected):
 
 
 def test_elements_lie_at_multiples_of_their_size():
-    """By their index; the scan is padded to its largest element."""
     scan = Scan([parse_element('in_timestamp', 5, 'le:s64/64'),
                  parse_element('in_voltage1', 2, 'le:u16/16'),
                  parse_element('in_voltage0', 1, 'le:u8/8')])

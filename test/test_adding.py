@@ -92,7 +92,6 @@ def test_a_format_is_read_and_a_fact_is_told(copy):
 
 
 def test_a_parameter_is_declared_and_checked(copy):
-    """Its field is enough for its name, its range and the settings of the monitor."""
     said = run(copy, '-c', (
         'from ou_monitor.online.settings import ESTIMATOR_PARAMETERS, monitor_settings\n'
         'print([p.high for p in ESTIMATOR_PARAMETERS if p.name == "reserve"])\n'

@@ -59,7 +59,6 @@ def bag(request):
 
 
 def test_both_readers_agree(bag):
-    """Voltage exactly, log times to the ns, throttle as held."""
     name, truth, recording, (times, volts, stick_times, stick) = bag
     step = round(1e9 / truth['rate'])
     assert times.tolist() == [truth['start_ns'] + step * k for k in range(truth['n'])]
@@ -87,7 +86,6 @@ def test_truth_says_what_is_in_the_bag(bag):
 
 
 def test_every_message_type_has_a_bag():
-    """One bag at least for each generic msg config."""
     assert {truth_of(name)['msg_config'] for name in NAMES} == {
         'std_float32', 'std_float64', 'adc_block', 'battery_state'}
 
@@ -156,7 +154,6 @@ def test_the_transient_relaxes():
 
 
 def test_the_flight_holds_its_law():
-    """Hover: sag, sigma and sensor noise; the throttle follows the stated profile."""
     truth = truth_of('flight')
     p = truth['parameters']
     recording = read_recording(BAGS / 'flight')
@@ -213,7 +210,6 @@ def test_the_library_is_small():
 
 
 def test_recorded_files_have_a_notice():
-    """Each real recording can be read, and its source and licence are stated."""
     notice = (BAGS / 'recorded' / 'NOTICE').read_text(encoding='utf-8')
     files = sorted((BAGS / 'recorded').glob('*.csv'))
     assert len(files) == 3 and 'made by `ou-monitor convert`' in notice

@@ -70,7 +70,6 @@ def test_a_design_of_a_flight_has_its_facts(tmp_path):
 
 
 def test_simulate_equals_the_command(tmp_path):
-    """The samples of its bag, and its JSON; drawn in memory or written."""
     bag, other = tmp_path / 'a.mcap', tmp_path / 'b.mcap'
     assert main(['simulate', '--preset', 'flight_full', '--duration', '3', '--seed', '4',
                  '--output', str(bag), '--type', 'float64', '--json', str(tmp_path / 'a.json')
@@ -106,7 +105,6 @@ def test_a_result_is_pickled_and_copied(found):
 
 
 def test_a_result_has_the_attributes_of_its_record(found):
-    """And what is printed is what the command prints."""
     finding = found['discover']
     assert finding.causes is finding.record.causes and not hasattr(finding, 'nonsense')
     assert str(finding) == terminal(finding.document(''))
@@ -119,7 +117,6 @@ def frame(monkeypatch, result):
 
 
 def test_the_main_table_becomes_a_dataframe(found, monkeypatch):
-    """A row a level, measure, frequency, cause, capacitance, number; scalars, unknown as NaN."""
     rows = {name: frame(monkeypatch, result) for name, result in found.items()}
     lowest = found['compare'].lowest
     assert [row['throttle'] for row in rows['analyze']] == [
@@ -148,7 +145,6 @@ class Axes:
 
 @pytest.mark.parametrize('name', CALLS)
 def test_every_plot_is_drawn_on_axes(name, found):
-    """Each curve by its kind, with its numbers and the labels and ends of the page."""
     calls = {'line': 'plot', 'steps': 'plot', 'markers': 'plot', 'band': 'fill_between',
              'bars': 'errorbar'}
     plots = found[name].plots()
@@ -178,7 +174,6 @@ def test_without_the_extras_one_line_says_so(found, monkeypatch):
 
 
 def test_results_convert_to_pandas_and_matplotlib(found):
-    """If these are installed."""
     pandas, matplotlib = pytest.importorskip('pandas'), pytest.importorskip('matplotlib')
     matplotlib.use('Agg')
     for result in found.values():
@@ -245,7 +240,6 @@ def test_the_namespace_is_light():
     (lambda: design(Recording([0.0, 1.0], [5.0, 5.1])), 'got a Recording: pass'),
     (lambda: analyze({'voltage': [5.0]}), 'a Recording or a path is needed, got a dict')])
 def test_an_argument_of_a_wrong_type_is_named(call, words):
-    """Not by an error from deep inside."""
     with pytest.raises(TypeError, match=words):
         call()
 

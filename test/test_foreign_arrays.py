@@ -121,7 +121,6 @@ def test_stamps_in_disorder_are_sorted_as_of_a_file(call):
 
 
 def test_masked_values_are_unknown():
-    """In voltage, throttle and time; NaT too."""
     masked = np.ma.masked_array(VOLTS, VOLTS > 15.01)
     recording = Recording(SECONDS, masked, np.ma.masked_less(np.full(N, 0.3), 0.5))
     assert np.isnan(recording.voltage).sum() == (VOLTS > 15.01).sum() > 0
@@ -177,7 +176,6 @@ def test_missing_throttle_is_unknown():
     (SECONDS, VOLTS.astype(complex)),
     (SECONDS, Axis(np.array([object()] * N)))])
 def test_other_arrays_are_refused(t, volts):
-    """Dates as voltage, text, complex numbers, objects."""
     for use in (lambda: Recording(t, volts, np.full(N, 0.3)),
                 lambda: SlidingEstimator().push(t, volts),
                 lambda: SupplyMonitor(MonitorSettings()).push(t, volts)):

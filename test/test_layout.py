@@ -120,7 +120,6 @@ def modules() -> dict[str, Path]:
 
 
 def test_imports_follow_the_arrows():
-    """No module imports against the arrows."""
     wrong = [sentence for module, path in modules().items()
              for sentence in wrong_imports(path.read_text(encoding='utf-8'), module)]
     assert not wrong, '\n'.join(wrong)

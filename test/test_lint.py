@@ -36,7 +36,6 @@ def test_ruff_finds_nothing():
 
 
 def test_pre_commit_runs_what_the_suite_runs():
-    """Each hook is a tool of .venv that the suite uses too, or bash."""
     hooks = yaml.safe_load((ROOT / '.pre-commit-config.yaml').read_text(encoding='utf-8'))
     tools = {hook['entry'].split()[0] for repo in hooks['repos'] for hook in repo['hooks']}
     assert tools == {'bash', '.venv/bin/ruff', '.venv/bin/ament_flake8', '.venv/bin/ament_pep257'}
@@ -51,7 +50,6 @@ def test_pep257_finds_nothing(capsys):
 
 @pytest.mark.skipif(np.__version__ < '2', reason='the types that NumPy 1 states are others')
 def test_mypy_finds_nothing():
-    """Strict mypy (setup.cfg) finds nothing in the package."""
     out, err, code = mypy.run(['--config-file', str(ROOT / 'setup.cfg'), '--cache-dir',
                                str(ROOT / '.mypy_cache'), str(ROOT / 'ou_monitor')])
     assert code == 0, out + err
@@ -59,7 +57,6 @@ def test_mypy_finds_nothing():
 
 @pytest.mark.skipif(np.__version__ < '2', reason='the types that NumPy 1 states are others')
 def test_strict_where_there_is_no_ros(tmp_path):
-    """The settings refuse an untyped function in the core, so they are strict there."""
     module = tmp_path / 'core.py'
     module.write_text('def f(x):\n    return x\n', encoding='utf-8')
     out, err, code = mypy.run(['--config-file', str(ROOT / 'setup.cfg'), '--cache-dir',

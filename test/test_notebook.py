@@ -10,7 +10,6 @@ NOTEBOOK = ROOT / 'doc/recording_in_python.ipynb'
 
 
 def test_the_notebook_runs_and_its_answers_are_those_of_the_recording(monkeypatch):
-    """Code cells in order, without Jupyter; the lowest voltage is that of the samples."""
     monkeypatch.chdir(NOTEBOOK.parent)
     shown = []
     space = {'display': shown.append}

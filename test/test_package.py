@@ -282,7 +282,6 @@ def test_pip_installs_the_mark_of_a_typed_package(offline, tmp_path):
 
 
 def test_changelog_is_of_this_version():
-    """Catkin reads the changelog; the newest released section is the package's version."""
     released = list(get_changelog_from_path(str(ROOT)).foreach_version(reverse=True))
     version = ElementTree.parse(ROOT / 'package.xml').getroot().findtext('version')
     assert str(released[0][0]) == version
@@ -295,14 +294,12 @@ def test_changelog_is_of_this_version():
 
 @pytest.mark.parametrize('name', ['adaptive_filter', 'estimator', 'replay'])
 def test_nodes_without_ros_say_so(offline, tmp_path, name):
-    """The error is one line, with status 2."""
     done = run(offline / name, *(['some.mcap'] if name == 'replay' else []), cwd=tmp_path)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1 and 'ROS 2' in done.stderr
 
 
 def test_the_installed_analyze_reads_a_bag(offline, tmp_path):
-    """Its page has the script of the plots."""
     done = run(offline / 'ou-monitor', 'analyze', ROOT / 'bags' / 'load_10', '--json', '-',
                '--report', tmp_path / 'r.html', cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -311,7 +308,6 @@ def test_the_installed_analyze_reads_a_bag(offline, tmp_path):
 
 
 def test_package_xml_agrees_with_the_metadata(tree):
-    """Name, version, licence and maintainer are the same for ROS and for pip."""
     package = ElementTree.parse(ROOT / 'package.xml').getroot()
     asked = run(sys.executable, 'setup.py', '--quiet', '--name', '--version', '--license',
                 cwd=tree)
@@ -355,7 +351,6 @@ LISTS = {'build': ['build'], 'run': ['build', 'ros', 'run', 'live'],
 @pytest.mark.parametrize('python', ['3.11.0', '3.12.0'])
 @pytest.mark.parametrize('level', LISTS)
 def test_locks_are_within_the_bounds(level, python):
-    """Every requirement has lower and upper bounds, and one locked version that meets them."""
     here = {'python_version': python[:4], 'python_full_version': python, 'sys_platform': 'linux',
             'platform_machine': 'x86_64'}
     locked: dict[str, str] = {}

@@ -46,7 +46,6 @@ def test_unknown_names_are_attribute_errors():
 
 
 def test_import_loads_nothing_else():
-    """NumPy, SciPy and mcap wait for the first name; the estimator never loads mcap."""
     program = ('import sys, ou_monitor\n'
                'assert not {"numpy", "scipy", "mcap"} & set(sys.modules)\n'
                'ou_monitor.SlidingEstimator\n'

@@ -52,7 +52,6 @@ def test_the_quick_start_is_the_two_commands():
 
 
 def test_readme_is_short():
-    """At most 150 lines."""
     assert len(README.splitlines()) <= 150
 
 
@@ -101,7 +100,6 @@ def test_paths_named_in_the_documents_exist(path):
 
 @pytest.mark.parametrize('path', RESULTS, ids=lambda path: path.name)
 def test_tables_of_benchmarks_have_their_place(path):
-    """The first lines name the program, numbers are between marks, and a page links the file."""
     text = path.read_text(encoding='utf-8')
     first = text.split('\n## ')[0].split('<!--')[0]
     (program,) = set(re.findall(r'`benchmarks/(\w+)\.py', first))
@@ -147,7 +145,6 @@ def test_executables_exist():
 
 
 def test_brownout_parameters_are_listed():
-    """Each with its default; none is named anywhere that does not exist."""
     from ou_monitor.online.settings import ESTIMATOR_PARAMETERS
     defaults = {p.name: p.default for p in ESTIMATOR_PARAMETERS}
     for path in [ROOT / 'README.md', *PAGES]:
@@ -215,7 +212,6 @@ def test_python_example_of_the_readme_runs(monkeypatch):
 
 
 def test_log_example_is_true(tmp_path):
-    """The command of the README prints what the README shows; make_readme.py renews it."""
     spec = importlib.util.spec_from_file_location('make_readme', ROOT / 'scripts/make_readme.py')
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)

@@ -82,7 +82,6 @@ def test_a_wrong_interpreter_is_refused(tree, tmp_path):
 
 
 def test_no_interpreter_is_refused(tree, tmp_path):
-    """A pyenv shim exists and yet does not run: it is no candidate."""
     shim = 'echo "pyenv: command not found" >&2; exit 127'
     path = fake(tmp_path / 'bin', python3_12=shim, python3_11=shim, python3=shim)
     refused(run(tree, PATH=path), 'no Python 3.11 or 3.12', 'python3.12 python3.11 python3')
@@ -114,7 +113,6 @@ def made(tmp_path_factory) -> tuple[Path, subprocess.CompletedProcess]:
 
 
 def test_nothing_is_installed_twice_and_a_broken_environment_is_mended(made):
-    """A second run installs nothing; without its interpreter the environment is made again."""
     tree, first = made
     expected = f'{tree}/.venv|{tree}|--bag|some bag\n'
     assert (first.returncode, first.stdout) == (0, expected), first.stderr
@@ -250,7 +248,6 @@ def test_demo_shows_estimates_and_leaves_a_report(tmp_path, source):
 
 
 def test_the_man_page_has_the_texts_of_help():
-    """It is as scripts/make_man.py writes it, with every option of every command."""
     name = 'make_man'
     spec = importlib.util.spec_from_file_location(name, ROOT / 'scripts' / f'{name}.py')
     maker = importlib.util.module_from_spec(spec)

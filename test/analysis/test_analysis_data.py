@@ -60,7 +60,6 @@ def names(value):
 
 
 def test_every_key_is_documented(analysis):
-    """doc/analysis.md names each in backticks; those of `source` are the reader's."""
     text = (ROOT / 'doc' / 'analysis.md').read_text(encoding='utf-8')
     documented = set(re.findall(r'`([a-z0-9_]+)`', text))
     data = plain_data(as_data(analyze(read_recording(ROOT / 'bags' / 'transient'))))

@@ -160,7 +160,6 @@ def test_a_slow_relaxation_at_levels_too_short_to_fit_is_no_line():
 
 
 def test_without_throttle_there_is_one_level_and_it_is_said():
-    """The level is called 'all'."""
     analysis = analyze(without_throttle(recording(6, ((0.1, 0.3),))))
     assert [level.label for level in analysis.levels] == ['all']
     assert analysis.levels[0].estimate.status is Status.OK
@@ -209,14 +208,12 @@ def test_impulses_are_called_so():
 
 
 def test_a_level_that_was_never_flown_stays_in_the_table():
-    """With no samples and no numbers."""
     levels = analyze(recording(10, TRUTH), levels=(0.1, 0.9)).levels
     assert levels[1].n == 0 and math.isnan(levels[1].vrms)
     assert levels[1].estimate.status is Status.TOO_FEW_SAMPLES
 
 
 def test_time_between_levels_is_accounted_for():
-    """A ramp that no level holds is named in the notes."""
     simulated = recording(11, TRUTH)
     ramp = simulated.throttle.copy()
     ramp[8000:12000] = np.linspace(0.1, 0.4, 4000)
@@ -258,7 +255,6 @@ def test_the_node_takes_each_reading_once(monkeypatch):
 
 
 def test_progress_ends_at_one():
-    """It never runs backwards."""
     shares = []
     analyze(recording(14, TRUTH, seconds=4.0), progress=shares.append)
     assert shares == sorted(shares) and shares[-1] == pytest.approx(1.0, abs=0.1)
@@ -267,7 +263,6 @@ def test_progress_ends_at_one():
 @pytest.mark.parametrize('options', [{'window': 0.0}, {'window': math.nan},
                                      {'brownout_horizon': -1.0}, {'levels': (2.0,)}])
 def test_options_out_of_range_raise_value_error(options):
-    """ValueError."""
     with pytest.raises(ValueError):
         analyze(recording(15, TRUTH, seconds=0.5), **options)
 

@@ -76,7 +76,6 @@ def test_long_levels_decide_and_short_ones_do_not():
 @pytest.mark.parametrize('estimates', [
     [], [Estimate()] * 4, [estimate(63.0, 0.1), Estimate(), Estimate(), Estimate()]])
 def test_less_than_two_levels_decide_nothing(estimates):
-    """And the sentence says how many there are."""
     found = alpha_constancy(THROTTLES, estimates)
     assert found.verdict == 'undetermined' and math.isnan(found.p_value)
     assert 'throttle held long enough has' in found.sentence

@@ -77,7 +77,6 @@ def test_a_common_cause_is_taken_for_coupling_where_throttle_is_not_known():
 
 
 def test_limit_is_the_gain_detected_with_the_stated_power():
-    """A coupling of the limiting gain is seen as often as promised; a quarter of it rarely."""
     rng = np.random.default_rng(4)
     t, voltage, signal, throttle = flight(rng)
     limit = np.mean([estimate_coupling(*s[:2], s[0], s[2], throttle=s[3]).limit
@@ -161,7 +160,6 @@ def test_a_line_that_both_share_is_called_narrow():
 
 
 def test_leading_signal_is_noted():
-    """The voltage answers to the signal: said, with the lag negative."""
     rng = np.random.default_rng(8)
     t, voltage, signal, throttle = flight(rng)
     found = estimate_coupling(t, voltage + 0.05 * np.roll(signal, 5), t, signal,
@@ -183,7 +181,6 @@ T = np.arange(5000) / RATE
     (T, np.sin(99 * T), {'level': 0.0}, 'between 0 and 1'),
 ])
 def test_undecidable_input_is_refused(signal_t, signal, options, words):
-    """One line that says why."""
     voltage = 5.0 + np.random.default_rng(9).standard_normal(T.size)
     with pytest.raises(InputError, match=words):
         estimate_coupling(T, voltage, signal_t, signal, **options)

@@ -127,7 +127,6 @@ def test_a_verdict_is_by_the_interval(value, reach, verdict):
 
 
 def test_impossible_cells_are_refused_with_the_likely_number(tmp_path, capsys):
-    """Cells that the voltage cannot have are refused, with the likely number."""
     path = tmp_path / 'a.csv'
     one = flown(n=600)
     path.write_text('time_s,voltage_v,throttle\n' + ''.join(

@@ -59,7 +59,6 @@ def test_a_recorded_gyro_is_not_coupled_to_a_foreign_supply(gyro, kind):
 
 
 def test_a_gain_of_five_is_seen_on_a_recorded_gyro(gyro):
-    """Six of six, within the interval in all but one, and near twice the limit at most."""
     t, _, throttle, axes = gyro
     rng, inside = np.random.default_rng(2), 0
     for axis in [*axes, *axes]:
@@ -92,7 +91,6 @@ def moving_line(rng, t):
 
 @pytest.mark.parametrize('signal', [bursts, moving_line])
 def test_a_spectrum_that_changes_its_shape_makes_no_coupling(signal, monkeypatch):
-    """Not with local weights and drawn signs; with one weight a segment bursts always would."""
     t = np.arange(15_000) / 500.0
     alarms = dict.fromkeys(('test', 'one weight'), 0)
     rng, draws = np.random.default_rng(3), 24
@@ -142,7 +140,6 @@ def test_small_chances_are_extrapolated():
 
 
 def test_repeats_of_a_logger_are_not_a_signal(gyro):
-    """A voltage is taken where its ADC was read, and the gain is that of the readings."""
     t, logged, throttle, axes = gyro
     found = estimate_coupling(t, logged, t, axes[0], throttle=throttle)
     assert any('refreshed every 2.5' in note for note in found.notes)

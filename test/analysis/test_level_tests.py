@@ -146,7 +146,6 @@ def test_a_few_large_impulses_are_no_change_of_intensity():
 
 
 def test_steps_of_the_adc_hide_the_shape():
-    """Flagged as quantized: no p-value, and the reason instead."""
     found = examined(np.round(ou(1), 2), truth(flags=(Flag.QUANTIZED,)))
     for name in ('gaussian', 'impulses'):
         assert math.isnan(found[name].p_value) and 'ADC' in found[name].why_not
@@ -155,7 +154,6 @@ def test_steps_of_the_adc_hide_the_shape():
 
 @pytest.mark.parametrize('n', [0, 1, 2, 49])
 def test_few_samples_are_not_tested(n):
-    """Every test says why."""
     found = examine_level([(T[:n], ou(1)[:n])], truth())
     assert all(math.isnan(test.p_value) and test.why_not for test in found.tests)
 

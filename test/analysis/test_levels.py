@@ -85,13 +85,11 @@ def test_a_ramp_between_stays_makes_no_level():
 
 
 def test_a_few_seconds_of_full_throttle_are_a_level_of_a_long_flight():
-    """Four seconds of 300."""
     t, throttle = profile((0.1, 150), (0.9, 4), (0.4, 146))
     assert [level.throttle for level in find_levels(t, throttle)] == [0.1, 0.4, 0.9]
 
 
 def test_a_slow_drift_of_throttle_within_a_level_does_not_split_it():
-    """Four percent in 20 s."""
     t, throttle = profile((0.2, 20), (0.5, 20))
     assert len(find_levels(t, throttle + 0.002 * t)) == 2
 
@@ -121,7 +119,6 @@ def test_a_throttle_that_never_rests_is_one_level():
 
 
 def test_unknown_throttle_belongs_to_no_level():
-    """Samples before the first throttle are left out."""
     t, throttle = profile((0.1, 2))
     throttle[:100] = np.nan
     (level,) = find_levels(t, throttle)
@@ -132,7 +129,6 @@ def test_unknown_throttle_belongs_to_no_level():
 @pytest.mark.parametrize('given, word', [((0.1, 1.2), '1.2'), ((0.1, 0.1), 'twice'),
                                          ((float('nan'),), 'nan'), ((-0.1,), '-0.1')])
 def test_bad_levels_are_refused(given, word):
-    """The value is in the message."""
     t, throttle = profile((0.1, 2))
     with pytest.raises(ValueError, match=word):
         find_levels(t, throttle, given)
@@ -163,5 +159,4 @@ def test_a_staircase_of_short_stays_keeps_its_levels():
 
 
 def test_an_empty_recording_has_no_levels():
-    """An empty recording has none."""
     assert find_levels(np.zeros(0), np.zeros(0)) == ()

@@ -52,13 +52,11 @@ def test_each_kind_has_its_reason(estimate, tests, kind):
 
 
 def test_a_changing_level_keeps_its_process_type():
-    """Apart from its changes the level keeps its name."""
     assert classify(USABLE, shape('correlated', 'mean_drift')).within is ProcessType.DIFFUSION
     assert classify(USABLE, shape('mean_drift', 'impulses')).within is ProcessType.IMPULSES
 
 
 def test_lines_that_carry_most_of_the_variance_are_no_relaxation():
-    """60 % in lines names the level, 40 % does not."""
     assert classify(USABLE, shape('correlated'), 0.6).kind is ProcessType.STATIONARY
     assert classify(USABLE, shape('correlated'), 0.4).kind is ProcessType.DIFFUSION
 
@@ -72,7 +70,6 @@ def test_a_rejection_without_consequence_does_not_count():
 
 
 def test_visible_kurtosis_is_what_the_test_sees():
-    """From 24 (2.576 + 1.282)^2 samples on it is below 1: half of 1 %, and 90 %."""
     assert detectable_kurtosis(0) == math.inf
     n = next(n for n in range(50, 2000) if detectable_kurtosis(n) < 1.0)
     assert n == pytest.approx(24.0 * (stats.norm.isf(0.005) + stats.norm.isf(0.1)) ** 2, abs=2)

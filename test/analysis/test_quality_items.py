@@ -33,7 +33,6 @@ def test_a_clean_recording_has_an_empty_list():
 
 
 def test_worst_comes_first_and_levels_share_an_entry():
-    """An unusable level, a doubtful flag of two, one that only informs."""
     bad = Estimate(status=Status.CONSTANT)
     flagged = replace(GOOD, flags=(Flag.QUANTIZED, Flag.HELD_SAMPLES))
     items = quality_list(recording(1, ((0.1, 0.3),)), [0.1, 0.2, 0.3], [flagged, bad, flagged])
@@ -67,7 +66,6 @@ def test_a_note_is_judged_by_what_it_is_about(defect):
 
 
 def test_the_stage_of_samples_says_what_it_notes():
-    """Out of order, there twice, not finite."""
     t = np.array([0.0, 2.0, 1.0, 1.0, 3.0, 4.0])
     notes = in_order(t, np.array([1.0, 1.0, 1.0, 1.0, math.nan, 1.0])[:, None], 1e6)[1]
     assert {defect_of(note) for note in notes} == {
@@ -125,7 +123,6 @@ def test_the_samples_show_the_step_of_the_adc():
 
 
 def test_the_same_doubt_of_two_levels_is_one_item():
-    """Also if it is not of an estimate."""
     twice = [QualityItem('LINES', Severity.INFO, 'Same.', (u,)) for u in (0.1, 0.4)]
     (item,) = quality_list(recording(1, ((0.1, 0.3),)), [0.1], [GOOD], twice)
     assert item.throttles == (0.1, 0.4)

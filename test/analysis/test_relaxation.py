@@ -75,7 +75,6 @@ def test_no_steps_without_levels():
 
 
 def test_the_fit_is_that_of_dense_generalised_least_squares():
-    """Residual sum, level, amplitude and errors of one change, from the covariance matrix."""
     # With tau held where the fast fit has it; 500 samples.
     simulated = steps_of(2, changes=1)
     fit = fitted(simulated)
@@ -166,7 +165,6 @@ def test_a_drift_that_goes_on_is_no_relaxation():
 
 
 def test_white_noise_without_a_fit_is_enough():
-    """A level without a relaxation of its own: its rms stands for the noise."""
     simulated = steps_of(4)
     rng = np.random.default_rng(4)
     quiet = simulated.voltage - simulate(simulated.t, ALPHA, SIGMA, rng, u0=0.0)

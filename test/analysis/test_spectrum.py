@@ -17,7 +17,6 @@ def test_the_curve_holds_the_whole_variance():
 
 
 def test_measured_and_true_spectrum_agree():
-    """The mean of their ratio is 1."""
     # About 40 points a decade over two decades; each averages >= 8 pieces (relative error below
     # 1/sqrt(8) = 35 %), and most points average several bins; the mean of 60 or more is known to
     # 35 % / sqrt(60) = 5 %. A two-sided or badly scaled density is off by 2.
@@ -40,7 +39,6 @@ def test_short_segments_give_nothing():
 
 
 def test_unknown_noise_counts_as_none():
-    """It does not spread."""
     frequency = np.array([1.0])
     assert ou_spectrum(frequency, 63.0, 0.3, 1e3, np.nan) == ou_spectrum(
         frequency, 63.0, 0.3, 1e3)

@@ -29,7 +29,6 @@ def flight(rng, rising=0.02, seconds=30.0):
 
 
 def test_dips_are_runs():
-    """A dip ends only clearly above the limit; seconds are those of the readings below."""
     v = np.full(2000, 12.0)
     v[500:510] = 9.0
     # Above the limit by less than a step of the ADC (1 V): the same dip.
@@ -80,7 +79,6 @@ def test_a_supply_that_is_off_counts_within_the_recording_for_lowest_and_dips_on
 
 
 def test_error_codes_change_no_fact():
-    """A reading of 65535 V, now and then."""
     whole = flight(np.random.default_rng(4))
     v = whole.voltage.copy()
     v[[700, 701, 3000]] = 65535.0
@@ -93,7 +91,6 @@ def test_error_codes_change_no_fact():
     np.tile([0.0, 12.0], 500).repeat(10), np.random.default_rng(6).standard_normal(10_000),
     np.linspace(0.0, 12.0, 10_000)], ids=['switched', 'ac_coupled', 'ramp'])
 def test_a_signal_about_zero_is_no_supply_that_was_off(v):
-    """All readings are kept."""
     whole = Recording(np.arange(v.size) / RATE, v, np.full(v.size, np.nan))
     assert supplied(whole) is whole
 
@@ -137,7 +134,6 @@ def test_a_log_of_1_hz_has_noise():
 
 
 def test_sag_and_resistance_are_those_of_the_filter():
-    """Positive, at eleven throttles; without a limit as with one."""
     recording = flight(np.random.default_rng(5))
     found, limited = supply_facts(recording), supply_facts(recording, 14.5)
     load = LoadFilter()
@@ -207,7 +203,6 @@ def test_a_long_recording_is_looked_at_no_more_often_than_15_minutes(monkeypatch
 
 @pytest.mark.parametrize('horizon', [1.0, 3.0, 20.0])
 def test_a_replay_takes_less_time_and_has_the_same_risk(horizon):
-    """It learns from the horizons about its own only; without a budget the risk is the same."""
     recording = flight(np.random.default_rng(4))
     settings = MonitorSettings(window=2.0, brownout_voltage=15.0, brownout_horizon=horizon)
     replayed, parts = node_for(recording, settings)

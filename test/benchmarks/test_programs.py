@@ -139,7 +139,6 @@ def test_notches_halve_the_noise_of_a_loud_craft():
 
 @needs_recordings
 def test_notches_cost_a_quiet_craft_at_most_2_percent():
-    """It may not cost more than 2 %."""
     pytest.importorskip('orangebox')
     *_, throttle, nothing, _, _, _ = ratios('nazgul', 25.0, 80.0)
     assert throttle <= 1.02 and nothing <= 1.02

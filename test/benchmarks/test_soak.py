@@ -84,7 +84,6 @@ def test_silence_excludes_the_time_of_stops():
 
 
 def test_overlapping_pauses_count_once():
-    """Stopped or without CPU: their union, so that no time counts twice."""
     made = heard([11.4], stops=[(10.1, 10.3)])
     made.withheld = [(5.0, 6.0), (10.2, 10.6)]
     assert made.pauses() == [(5.0, 6.0), (10.1, 10.6)]

@@ -91,7 +91,6 @@ def test_a_wrong_sag_is_the_worst(sag):
 
 
 def test_only_the_part_after_fit_until_is_simulated():
-    """--fit-until with a model: the part after it, aligned there."""
     found = compare(drawn(4), model(), fit_until=30.0, seeds=20)
     assert found.simulated == (30.0, pytest.approx(39.99))
     assert found.fitted == (0.0, 0.0)
@@ -122,7 +121,6 @@ def flight(seed: int, n: int = 1500, rate: float = 50.0) -> Recording:
 
 
 def test_the_second_half_follows_from_the_first():
-    """The model that is fitted explains what is not noise, and its bands hold the recording."""
     found = compare(flight(1), seeds=40)
     assert found.fitted == (0.0, pytest.approx(14.99, abs=0.03))
     assert found.verdict is Likeness.LOOKS_LIKE_IT
@@ -189,7 +187,6 @@ def test_a_measured_current_is_the_load(seconds, rate):
 
 
 def test_a_current_with_gaps_is_used_and_one_that_ends_is_not():
-    """A gap of the logger is no current that is missing; a current that ends is."""
     whole = robot(2)
     off = (whole.t < 3.0) | (whole.t > 4.2)
     gap = Recording(whole.t[off], whole.voltage[off], whole.throttle[off], 'gap',
@@ -249,13 +246,11 @@ def test_held_samples_count_once():
     ({'fit_until': 0.2}, 'the part to be fitted has'),
     ({'fit_until': 39.9}, 'the part to be simulated has')])
 def test_parts_that_are_too_short_are_refused_by_name(change, words):
-    """One line that says which part."""
     with pytest.raises(InputError, match=words):
         compare(drawn(6), **change)
 
 
 def test_recordings_that_cannot_be_compared_are_refused():
-    """Too few samples, no voltage that changes, no throttle for a model that needs it."""
     t = np.arange(400) / 100.0
     none = np.full(t.size, np.nan)
     with pytest.raises(InputError, match='needs at least 100'):
@@ -269,7 +264,6 @@ def test_recordings_that_cannot_be_compared_are_refused():
 
 
 def test_numbers_outside_their_bands_are_named_beside_the_verdict():
-    """A joint verdict may hold although one of many numbers lies outside its own band."""
     found = compare(drawn(1), model())
     low = found.lowest
     far = replace(found, verdict=Likeness.LOOKS_LIKE_IT,

@@ -29,7 +29,6 @@ def parameters(text):
 
 
 def test_px4_falls_from_full_to_empty_in_the_time_that_throttle_takes():
-    """Per cell; the time is that of the model's charge under this throttle."""
     found = export(GECKO, 'px4', throttle=HOVER, rate=100.0)
     values = parameters(found.text)
     assert set(values) == {'BAT1_N_CELLS', 'BAT1_V_CHARGED', 'BAT1_V_EMPTY', 'SIM_BAT_DRAIN',
@@ -59,7 +58,6 @@ def test_gazebo_is_a_line_and_a_constant_sag():
 
 
 def test_ardupilot_has_charge_and_resistance():
-    """Full throttle times the resistance is the model's sag."""
     found = export(GECKO, 'ardupilot', throttle=HOVER, rate=100.0, full_current=60.0)
     assert set(parameters(found.text)) == {
         'SIM_BATT_VOLTAGE', 'SIM_BATT_CAP_AH', 'BATT_CAPACITY', 'BATT_LOW_VOLT', 'BATT_CRT_VOLT'}
@@ -98,7 +96,6 @@ def test_a_sag_that_grows_is_exported_as_it_begins(target):
 
 
 def test_each_term_left_out_is_named_with_its_size():
-    """White noise by its deviation; and a recording shows what the whole export explains."""
     recording = read_recording(ROOT / 'bags' / 'recorded' / 'gecko.csv', start=20.0, end=50.0)
     found = export(GECKO, 'px4', throttle=np.nan_to_num(recording.throttle), rate=200.0,
                    recording=recording)
@@ -111,7 +108,6 @@ def test_each_term_left_out_is_named_with_its_size():
 
 
 def test_json_is_the_model():
-    """Nothing is lost."""
     found = export(SupplyModel((OU(5.0, 0.1, 5.0), LoadSag(1.0, 0.0))), 'json', throttle=HOVER,
                    rate=100.0)
     assert json.loads(found.text)['model'][1] == {

@@ -26,7 +26,6 @@ def correlation(x: np.ndarray, lag: int) -> float:
 
 
 def test_an_ou_in_white_noise_is_drawn_again():
-    """Variance and correlations of what is drawn are those of the process."""
     found = fitted(series(1, 0.05, 0.05))
     drawn = np.concatenate([found.draw(N, None, np.random.default_rng(k)) for k in range(8)])
     # 120 s hold 300 relaxation times: the OU's variance is known to 8 %, its rate to some 12 %.
@@ -55,7 +54,6 @@ def test_white_noise_stays_white():
 
 
 def test_the_size_follows_load_and_changes():
-    """What is drawn is as loud at each throttle, and at its changes, as what was fitted."""
     rng = np.random.default_rng(5)
     u = rng.random(N // 10)[np.arange(N) // 10]
     changed = np.abs(np.diff(u, prepend=u[0])) > 0.2
@@ -71,7 +69,6 @@ def test_the_size_follows_load_and_changes():
 
 
 def test_rounding_is_not_drawn():
-    """The ADC adds it again."""
     rng = np.random.default_rng(6)
     x = 0.1 * np.rint(10.0 * 0.1 * rng.standard_normal(N))
     found = fit_noise(Readings(T, 15.0 + x, None), x, None, 0.0)
@@ -79,6 +76,5 @@ def test_rounding_is_not_drawn():
 
 
 def test_a_voltage_without_noise_has_none():
-    """As of a noise-free simulation."""
     found = fitted(np.zeros(N), np.linspace(0.0, 1.0, N))
     assert np.all(found.draw(N, np.linspace(0.0, 1.0, N), np.random.default_rng(7)) == 0.0)

@@ -62,7 +62,6 @@ def test_white_noise_has_equal_power_in_equal_bands():
 
 
 def test_levels_lie_between_codes():
-    """No reading is on a level, and the level is not below what was asked for by a step."""
     assert between_codes(14.15, 0.01) == pytest.approx(14.155)
     assert between_codes(14.153, 0.0) == 14.153
     coarse = white(3)
@@ -87,7 +86,6 @@ def test_the_mean_response_to_rises_is_measured():
 
 
 def test_the_worst_is_the_farthest_in_half_bands():
-    """Scores are distances in half-bands, weighted; the p-value is a rank."""
     seeds = np.random.default_rng(4).standard_normal(400)
 
     def of(kind: str, measured: float, least: float = 1e-9) -> Difference:

@@ -103,7 +103,6 @@ def test_a_rail_is_five_errors_above_its_neighbours():
 @pytest.mark.parametrize('side', (1.0, -1.0))
 @pytest.mark.parametrize('later', [0.0, 0.015, 0.03])
 def test_the_limit_of_an_earlier_stage_is_the_code_where_readings_pile_up(side, later):
-    """Some readings come out a code beyond; the limit is the code in which they pile up."""
     rng = np.random.default_rng(7)
     v = np.minimum(noise(), 1.5) + later * rng.standard_normal(noise().size)
     v = side * 0.1 * np.round(v / 0.1)

@@ -89,7 +89,6 @@ def test_moments_and_tails_have_their_normal_scores():
 
 
 def test_clusters_are_correlations_of_squares():
-    """Neighbouring squares, the nine before, blocks of a span, and the spread of their means."""
     n = 2100
     # Squares that rise and fall every 120 samples.
     z = np.random.default_rng(4).uniform(-1.0, 1.0, n) * (1.5 + np.sin(np.arange(n) / 19.0))

@@ -69,7 +69,6 @@ def test_nothing_is_kept_beside_all_samples_or_where_codes_are_coarse():
 @pytest.mark.parametrize('move, late, found', (
     (0.5, 21, True), (0.5, 20, False), (0.5, 0, False), (0.5, -1, True), (0.009, 0, True)))
 def test_changes_within_20_ms_of_a_throttle_step_belong_to_the_load(move, late, found):
-    """For 20 ms after a step of more than 0.01."""
     v, (at,) = jumps([99.0])
     throttle = np.full(v.size, 0.3)
     throttle[at - late + 1:] += move

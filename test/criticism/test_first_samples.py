@@ -14,7 +14,6 @@ from ou_monitor.model.terms.ou import OU
 
 
 def test_the_first_sample_behind_a_high_pass_has_the_law_of_its_throttle():
-    """OU and its low-pass: variances in the ratio rate / (rate + alpha), alpha as at first."""
     n = 50
     throttle = np.linspace(0.1, 0.9, n)
     samples = Samples(1e-3 * np.arange(n), np.random.default_rng(1).standard_normal(n), throttle)

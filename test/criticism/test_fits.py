@@ -53,7 +53,6 @@ RAIL = OU(20.0, 0.3, 5.0)
 @pytest.mark.parametrize('law', [
     RegimeSwitching(1.5, 1.0, 0.0, 3.0, 1.0, 2.0), Volatility(0.8, 3.0)])
 def test_simulations_of_the_fit_spread_as_far_as_the_data(law):
-    """Sigma and the spread of simulations, where sigma of all would be twice as large."""
     # In 30 s the share of each state is known to a fifth, the mean of ln sigma to 0.8 sqrt(2/90).
     voltage = SupplyModel((RAIL, law)).simulate(T, np.random.default_rng(2), None)
     samples, whole = Samples(T, voltage, None), slice(0, N)

@@ -42,7 +42,6 @@ def test_a_plain_rail_has_nothing(seed, rounded):
 @pytest.mark.parametrize('load', [0.0, 0.4])
 @pytest.mark.parametrize('count', [30, 200])
 def test_outliers_are_no_limit_of_the_adc(load, count):
-    """2 V below all others."""
     t, v = rail(4, u0=12.0)
     u = np.where(t % 4.0 < 3.0, 0.2, 0.7)
     v = v - load * u
@@ -114,7 +113,6 @@ def test_rails_are_found(step, sides):
 
 
 def test_wrong_stamps_differ_from_uneven_sampling():
-    """The same stamps: wrong over an even sampling, true where the samples were taken there."""
     rng = np.random.default_rng(7)
     t, v = rail(7)
     stamps = t + 0.25 / RATE * np.clip(rng.standard_normal(t.size), -1.8, 1.8)
@@ -138,7 +136,6 @@ def test_a_short_recording_tells_wrong_stamps_by_their_likelihood(seed):
 
 
 def test_gaps_stay_and_are_counted():
-    """Lost samples leave their gap, and the note counts it."""
     t, v = rail(8)
     keep = np.ones(t.size, bool)
     keep[5000:5400] = keep[9000:9003] = False
@@ -148,7 +145,6 @@ def test_gaps_stay_and_are_counted():
 
 
 def test_nan_is_dropped_and_stamps_are_sorted():
-    """Not-a-number and doubles dropped, stamps sorted, holes of the throttle filled."""
     t, v = rail(9, 1000)
     u = np.linspace(0.0, 1.0, t.size)
     expected = np.delete(t, 10)
@@ -167,7 +163,6 @@ def test_nan_is_dropped_and_stamps_are_sorted():
 
 @pytest.mark.parametrize('n, value', [(2, None), (LEAST - 1, None), (5000, 3.3), (0, None)])
 def test_too_little_has_a_reason(n, value):
-    """Two samples, a constant, none at all: a reason, no exception."""
     t = np.arange(n) / RATE
     v = rail(1, n)[1] if value is None and n else np.full(n, value or 0.0)
     found = examined(t, v)

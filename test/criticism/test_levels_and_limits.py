@@ -59,7 +59,6 @@ def test_least_squares_agree_for_few_and_for_many_columns(width):
 
 
 def test_events_add_to_the_joint_normal_law():
-    """Powers of diffusion and white noise, pushes, errors of the sensor: dense covariance."""
     rng = np.random.default_rng(9)
     n, alpha, sigma, u0 = 40, 1.3, 0.5, 5.0
     t = np.cumsum(rng.choice([0.1, 0.2, 0.5], n))

@@ -32,7 +32,6 @@ def test_the_edge_is_where_the_chance_is(chance, count):
 
 
 def test_of_plain_recordings_few_are_off():
-    """Of 30 at most 5 are below 5 %: 1.5 are expected, and 6 or more have a chance of 0.3 %."""
     t, found = np.arange(2000) / 200.0, []
     for seed in range(30):
         rng = np.random.default_rng([7, seed])

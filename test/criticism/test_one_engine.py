@@ -81,7 +81,6 @@ def test_the_scores_are_the_same(both):
 
 
 def test_the_lines_are_the_same(both):
-    """Each clear line of one is a line of the other, to the width of two bins."""
     # Both are asked at one false-alarm rate: at the higher one of `lines_of`, which proposes, the
     # feet of neighbouring lines join (five in the 8 Hz of bf_ar8_6s.BFL become two). A line below
     # one percent of the noise may be found by one alone (18 Hz in frc_ol_1, .1 %).
@@ -96,7 +95,6 @@ def test_the_lines_are_the_same(both):
 
 
 def test_another_pole_is_the_same(both):
-    """A second relaxation and an AC coupling, from the scores of either."""
     samples, _, fit, view = both
     if not fit.usable:
         pytest.skip('no OU in white noise')

@@ -43,7 +43,6 @@ def test_three_of_one_value_are_a_code_and_more_than_three_singles_are_none(valu
 
 
 def test_of_long_recordings_more_single_samples_may_be_bad():
-    """One more for each 100 000."""
     v = np.tile(EVEN, 400)[:400_000]
     for count, bad in ((4, 4), (5, 0)):
         at = 1000 * np.arange(1, count + 1) + 1
@@ -118,7 +117,6 @@ def test_holes_of_throttle_are_held_and_measured():
 
 
 def test_readings_are_sorted_and_finite():
-    """What was dropped is counted; of two samples of one stamp the first stays."""
     t = np.array([0.0, 0.1, 0.3, 0.2, 0.2, math.nan, 0.5, 0.6])
     v = np.array([5.0, 5.1, 5.3, 5.2, 9.9, 5.4, math.inf, 5.6])
     notes = []

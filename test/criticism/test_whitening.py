@@ -84,7 +84,6 @@ def test_a_single_relaxation_is_called_a_diffusion():
 
 
 def test_too_few_samples_are_not_tested():
-    """NaN, not 0 and not 1."""
     pole = other_pole([np.ones(40)], RATE, ALPHA, 4e-4, 0.0)
     assert np.isnan([pole.second_p, pole.second_share, pole.coupling_p]).all()
 

@@ -134,7 +134,6 @@ def test_kinds_that_do_not_apply_are_not_tried(changes, missing):
     (Cheap, {'band 3': 3.0, 'line': 4.0, 'time': 20.0}, 8.0), (Cheap, {'order line': 9.0}, 0.0),
     (Cheap, {}, 0.0)])
 def test_the_score_gain_of_a_kind_is_half_the_square_of_its_largest_sign(kind, values, nats):
-    """Half the square of its largest sign, in its direction."""
     assert decision.score_gain(kind, values) == nats
 
 

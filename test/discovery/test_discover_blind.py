@@ -110,7 +110,6 @@ def test_most_causes_are_named_alone_or_in_the_set():
 
 
 def test_nothing_is_found_where_nothing_is_hidden():
-    """Required: alarms in at most 5 %; at most two of eight."""
     # Three or more have a chance of 0.6 % at 5 %, and of 86 % if half are alarms.
     enough([('none', '', number) for number in range(8)], 0.95, lambda one: not one.alarm)
 
@@ -174,7 +173,6 @@ SAG, NOISE = 'load_sag', 'measurement_noise'
     ([['tone'], ['resonance']], {'resonance': ()}, True, True, True, True),
 ])
 def test_outcomes_are_scored_by_what_is_true(accepted, named, alone, in_set, all_named, family):
-    """The definitions of right, in the set, named, and right family."""
     one = Outcome('single', 'x', tuple(map(tuple, accepted)), (), 'explained', named)
     assert (one.alone, one.in_set, one.all_named, one.family) == (
         alone, in_set, all_named, family)
@@ -188,6 +186,5 @@ def test_outcomes_are_scored_by_what_is_true(accepted, named, alone, in_set, all
     ({}, False), ({'jumps': ()}, False), ({'tone': ()}, True), ({'tone': ('jumps',)}, False),
     ({'jumps': (), 'tone': ()}, True)])
 def test_a_name_near_the_unknown_is_not_wrong(named, wrong):
-    """Only names for a part of it are not wrong; the verdict is counted separately."""
     one = Outcome('unknown', 'unknown/x', ((),), ('jumps',), 'partly_explained', named)
     assert one.misnamed is wrong and one.left_open

@@ -70,7 +70,6 @@ def test_json_has_the_documented_keys():
     (math.nan, True, 'throttle', ''), (20.0, True, 'current', '--current-column none'),
     (20.0, False, 'current', 'not recorded'), (math.nan, False, 'none', '')])
 def test_a_finding_knows_its_load(full, throttle, load, unsaved):
-    """Throttle is advised as the load only if it was recorded."""
     found = finding(full=full, has_throttle=throttle)
     assert found.load == load and (unsaved in found.unsaved if unsaved else not found.unsaved)
 
@@ -91,12 +90,10 @@ def test_unknown_numbers_are_null():
     ([], 0, 'no_effect'), ([WORSE], 0, 'unexplained'), ([], 2, 'explained'),
     ([WORSE], 2, 'partly_explained')])
 def test_the_verdict_follows_causes_and_what_is_left(remaining, causes, verdict):
-    """Passing or failing, with and without causes."""
     assert judge(remaining, causes).value == verdict
 
 
 def test_explained_needs_statistics_errors_dips_and_parameters():
-    """A statistic outside, larger errors, more wrong dips, a parameter at an end forbid it."""
     dips = LowDips(14.0, 46, None, 46.0, 15.5, 2.9, 2.0, 1.0, 0.5)
     assert dips.worse and not replace(dips, extended=20.0).worse
     # 1.96 of the error of both, 2.06, is 4.04.

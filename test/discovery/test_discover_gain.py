@@ -144,7 +144,6 @@ def test_the_chance_of_a_cause_is_twice_the_smaller_of_two(gain, search):
 
 
 def test_a_gain_needs_as_many_samples_as_blocks():
-    """Scored, and determined by the others in both models."""
     n = 100
     new, old = np.full(n, 1.0), np.zeros(n)
     for count, known in ((BLOCKS, True), (BLOCKS - 1, False)):

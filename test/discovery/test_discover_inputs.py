@@ -129,7 +129,6 @@ SHORT = {'two': '2 usable samples; at least 100', '99': '99 usable samples',
 
 @pytest.mark.parametrize('what', sorted(SHORT))
 def test_too_little_is_insufficient_and_says_why(what):
-    """Why, in the sentence; no model, no gain."""
     found = discover(Recording(*short(what), what))
     assert found.verdict is Verdict.INSUFFICIENT_DATA
     assert SHORT[what] in found.sentence
@@ -139,7 +138,6 @@ def test_too_little_is_insufficient_and_says_why(what):
 
 @pytest.mark.parametrize('n', [N, 8000])
 def test_a_constant_but_for_one_sample_is_not_a_plain_ou(n):
-    """Constant but for one sample: a verdict, never that the plain OU is right."""
     t, v, u = simulated(n)
     found = discover(Recording(t, np.where(np.arange(n) == n // 2, 5.1, 5.0), u, 'one'))
     assert found.verdict is not Verdict.NO_EFFECT
@@ -180,7 +178,6 @@ def test_a_bad_csv_gives_one_line_and_no_traceback(what, tmp_path, capsys):
 
 
 def test_a_slow_rail_at_10_hz_keeps_its_sag():
-    """A slow rail with a sag, at the rate of telemetry."""
     t, v, u = simulated(6000, 10.0, (LoadSag(0.3, 0.0),), OU(1.0, 0.1, 5.0))
     found = discover(Recording(t, v, u, 'slow'))
     assert [cause.name for cause in found.causes] == ['load_sag']
@@ -197,7 +194,6 @@ def test_a_long_recording_keeps_the_relaxation_of_the_rail(terms):
 
 
 def test_lines_of_one_kind_are_measured_together(monkeypatch):
-    """Five lines: one fit without them, the gain of all, and that is said."""
     lines = [Tone(0.01, f, 0.3, 0.0) for f in (31.0, 67.0, 101.0, 149.0, 211.0)]
     t, v, u = simulated(8000, 1000.0, lines)
     fits = []

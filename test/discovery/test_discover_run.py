@@ -63,7 +63,6 @@ def test_a_sag_is_found_and_its_gain_measured(sag):
 
 
 def test_repeats_are_undone_and_the_rail_found_behind():
-    """Each value four times: an exact finding; alpha is that of the rail."""
     found = discover(drawn_from(HeldSamples(250.0)))
     assert 'held_samples' in names(found)
     cause = found.causes[0]
@@ -96,7 +95,6 @@ def test_discover_loads_few_modules():
 
 
 def test_a_path_is_read(tmp_path):
-    """A CSV by its name, as a string or a path; a missing one is bad input."""
     recording = drawn_from(n=1500)
     path = tmp_path / 'x.csv'
     np.savetxt(path, np.column_stack([recording.t, recording.voltage]), '%.9g', ',', comments='',

@@ -77,7 +77,6 @@ def tone_cause(frequency, explanation):
 
 
 def test_terms_that_share_a_gain_are_one_row_with_the_estimates_of_all():
-    """The explanation is that of the first; its estimate gives way to those of all."""
     first, other = tone_cause(31.0, ''), tone_cause(67.0, 'The second.')
     (single,) = cause_rows([first])
     estimate, last = (parameters(one.term, one.se) for one in (first, other))
@@ -148,5 +147,4 @@ def test_the_verdict_counts_its_causes_and_says_what_is_left():
 @pytest.mark.parametrize('gain, error, text', [
     (NAN, 0.1, 'not known'), (0.25, NAN, '250, error not known'), (0.25, 0.01, '250 +- 20')])
 def test_a_gain_has_its_error_or_says_that_it_is_unknown(gain, error, text):
-    """In thousandths of a nat."""
     assert gain_text(gain, error) == text

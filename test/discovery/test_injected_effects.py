@@ -46,7 +46,6 @@ def test_held_values_are_told_from_chance(dither, share, found):
 
 @pytest.mark.parametrize('effect', sorted(EFFECTS))
 def test_holds_steps_and_clipping_are_named_without_a_model(effect):
-    """Holds, steps and a rail are named; what is added to the supply is none of them."""
     t, voltage, throttle = flown()
     flight = Recording(t, voltage, throttle)
     inject, names = EFFECTS[effect]

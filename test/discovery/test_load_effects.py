@@ -58,7 +58,6 @@ def test_without_a_response_to_load_there_is_no_effect():
 
 
 def test_a_model_with_another_fall_than_the_readings_is_not_trusted():
-    """A third of the fall; not so where the voltage wanders by more between two stays."""
     samples, third = flown(INRUSH[0]), (REST, LoadSag(0.3, 0.0))
     found = load_fall(samples, third)
     assert (found.measured, found.explained) == pytest.approx((1.0, 0.3)) and not found.fits

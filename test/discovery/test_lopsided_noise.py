@@ -48,7 +48,6 @@ def recording(noise, seed):
 
 
 def test_bursts_of_load_are_named_and_explain_the_recording():
-    """The charge of two bursts of random size between two readings: a gamma law."""
     found = discover(recording(lambda rng: -(rng.gamma(2.0, size=N) - 2.0) / np.sqrt(2.0), 3))
     assert {'load_sag', 'measurement_noise', 'lopsided_noise'} == {c.name for c in found.causes}
     law = next(c.term for c in found.causes if c.name == 'lopsided_noise')

@@ -36,7 +36,6 @@ def response(tau, delay=0.0):
     (response(0.1), LoadSag(0.1, 0.0), False, False),
     (Drift(0.1, 0.0), Drift(-0.2, 0.0), False, True)])
 def test_time_constants_are_compared_by_their_ratio(one, other, near, there):
-    """By the ratio of time constants, whichever is longer, at one delay."""
     assert _is_near(one, other) is near
     assert _contains(one, [other]) is there
     assert _contains(one, [LoadSag(0.1, 0.0), other]) is there
@@ -109,7 +108,6 @@ def test_evidence_is_the_smaller_of_bic_and_held_out_gain(driven, monkeypatch):
 
 @pytest.mark.parametrize('start', [(), (4,), (0, 3), (0, 1, 3, 4)])
 def test_the_search_finds_the_true_terms_from_any_start(driven, start, monkeypatch):
-    """From any start: sag and one lag, the one that is worth more first, none of them free."""
     pool, columns, voltage = driven
     found, _ = made(pool, columns, voltage, monkeypatch)
     found_response = found.search(start)

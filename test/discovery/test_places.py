@@ -44,7 +44,6 @@ def scores_of(log, u):
     lambda u: 1.5 * lfilter([1.0], [1.0, -np.exp(-1.0 / (0.5 * RATE))],
                             np.maximum(np.diff(u, prepend=u[0]), 0.0))])
 def test_white_noise_may_follow_throttle_its_changes_and_its_rises(form):
-    """Over throttle, its changes and its rises: the curves have nine tenths of the gain."""
     u = flown(1)
     view = scores_of(form(u), u)
     term, *_ = LoadDependentNoise.candidates(view)
@@ -138,7 +137,6 @@ def test_an_inrush_responds_to_rises_only():
 
 
 def test_a_model_file_without_a_rise_is_read():
-    """A file without it has none."""
     old = {'gain': 0.1, 'tau': 0.02, 'delay': 0.0}
     assert LoadTransient.read(old).rise == 0.0
     with pytest.raises(ValueError, match="'tau'"):

@@ -37,7 +37,6 @@ def state_of(*names, sizes=()):
     (['tone', 'drift', 'tone'], 0, ['drift', 'tone'], 1, ['drift', 'tone'], ['tone']),
     (['tone', 'drift', 'tone', 'tone', 'tone'], 0, ['drift'], 4, ['drift'], ['tone'])])
 def test_a_removed_cause_leaves_names_and_model_consistent(names, worst, less, size, left, out):
-    """Names and model go on without it."""
     state = state_of(*names)
     rest = scored_model(*less)
     state.worth[worst] = Worth(0.0, 1.0, 1.0, size, rest)
@@ -134,7 +133,6 @@ def test_a_model_that_cannot_be_simulated_strays_without_bound(monkeypatch):
     (0.1, 0.25, 'by 0.25 V'), (0.1, float('inf'), 'without bound'),
     (0.1, None, 'cannot be simulated (runs away)')])
 def test_a_model_is_refused_for_its_gain_or_its_simulations(gain, far, said, monkeypatch):
-    """Its gain first, then its simulations."""
     def given(samples, terms):
         if far is None:
             raise ValueError('runs away')
@@ -148,7 +146,6 @@ def test_a_model_is_refused_for_its_gain_or_its_simulations(gain, far, said, mon
 
 
 def test_after_four_rounds_what_is_left_stays(monkeypatch):
-    """Even if it fails."""
     names = ['drift', 'tone', 'measurement_noise', 'second_relaxation']
     bad = dict.fromkeys(names, (-0.1, 0.9))
     found = run(monkeypatch, [bad] * 4, names)

@@ -133,7 +133,6 @@ def test_the_best_start_is_of_those_that_hold(held, best, monkeypatch):
 
 
 def test_starts_come_by_what_they_explain_or_by_their_likelihood(monkeypatch):
-    """Only the first two are fitted, in that order."""
     starts = [Drift(0.1 * k, 0.0) for k in range(1, 6)]
     monkeypatch.setattr(Drift, 'candidates', classmethod(lambda cls, view: starts))
     monkeypatch.setattr(fitting, '_by_scores', lambda samples, known, view: known[::-1])
@@ -151,7 +150,6 @@ def test_starts_come_by_what_they_explain_or_by_their_likelihood(monkeypatch):
 
 
 def test_starts_are_ordered_by_the_scores_they_explain():
-    """Starts in the order of the part of the scores that their columns explain."""
     rng = np.random.default_rng(1)
     n = 2000
     t, u = 1e-2 * np.arange(n), rng.random(n)
@@ -173,7 +171,6 @@ def test_starts_are_ordered_by_the_scores_they_explain():
 @pytest.mark.parametrize('name, price', [
     ('load_dependent_noise', 10.0), ('drift', 6.0), ('load_dependent_sigma', 6.0)])
 def test_a_second_curve_must_add_a_tenth_of_the_first(name, price):
-    """It must bring a tenth of what the other one explains."""
     # A rough fit of the table is a nat worse.
     fitter = Table({('measurement_noise',): 401.0})
     assert rules._needed(fitter, Model([BASE, NOISE, SIGMA], 500.0), name) == pytest.approx(price)
@@ -194,7 +191,6 @@ def test_an_accepted_trial_is_recorded_with_its_rivals():
 
 
 def test_starts_that_the_spectrum_moved_the_same_way_are_one(monkeypatch):
-    """The best of those that hold are fitted, roughly and from there on."""
     starts = [SecondRelaxation(float(k), 0.1) for k in range(1, 6)]
     gains = dict(zip(starts, (9.0, 8.95, 7.0, 19.0, 5.9)))
     monkeypatch.setattr(fitting, 'from_spectrum', lambda samples, composite, terms: (

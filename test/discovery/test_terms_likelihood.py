@@ -158,7 +158,6 @@ def law_fitted(name, params, seed):
 
 
 def test_every_term_with_a_likelihood_is_here():
-    """No term but the OU and the exact ones is without a test."""
     kinds = catalogue()
     assert {*GAUSSIAN, *LAWS} == {
         name for name, kind in kinds.items() if name != 'ou' and kind.ROLE is not Role.EXACT}
@@ -167,7 +166,6 @@ def test_every_term_with_a_likelihood_is_here():
 
 @pytest.mark.parametrize('seed', range(20))
 def test_the_statistics_are_standard(seed):
-    """Independent N(0, 1) passes."""
     z, state = np.random.default_rng(seed).standard_normal((2, LENGTH))
     name, value = worst(z, state)
     assert abs(value) < LIMIT, name
@@ -183,7 +181,6 @@ def test_scores_of_the_right_model_are_white(name):
 @pytest.mark.parametrize('name, wrong', [
     (name, wrong) for name, (_, *changes) in GAUSSIAN.items() for wrong in changes])
 def test_a_wrong_parameter_shows(name, wrong):
-    """With one parameter wrong, so far from that that nearly every recording shows it."""
     samples, (*others, term) = simulated(name, GAUSSIAN[name][0], 11)
     assert abs(filtered(samples, (*others, replace(term, **wrong)))[1]) > LIMIT + 3.0
 

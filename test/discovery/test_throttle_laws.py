@@ -100,7 +100,6 @@ def test_two_curves_stay_where_each_explains_a_tenth_of_the_other(both, left):
 
 
 def test_constant_white_noise_does_not_follow_throttle():
-    """Sigma that follows throttle beside constant white noise is named, its rivals are not."""
     rng = np.random.default_rng(6)
     t = np.arange(6000) / 100.0
     walk = np.repeat(rng.uniform(0.2, 0.7, 120), 50)

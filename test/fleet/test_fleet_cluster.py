@@ -52,7 +52,6 @@ def scheduler(certificate) -> Iterator[str]:
 
 
 def test_work_is_done_over_tls(scheduler, certificate):
-    """With the certificates of Dask's configuration the tasks are done, and a failure is a row."""
     assert scheduler.startswith('tls://')
     with config.set({f'distributed.comm.tls.{name}': value
                      for name, value in certificate.items()}), \

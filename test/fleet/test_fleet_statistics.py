@@ -40,7 +40,6 @@ def test_a_bend_between_near_throttles_is_followed():
 
 
 def test_the_curve_knows_its_error():
-    """The error of the curve is its scatter over fleets; levels of one flight are not two."""
     rng = np.random.default_rng(11)
     slopes, errors, runs = [], [], 300
     for _ in range(runs):
@@ -61,7 +60,6 @@ def test_the_curve_knows_its_error():
 
 
 def test_without_throttle_recordings_are_compared_unchanged():
-    """Without throttle they are compared unchanged, without an estimate not at all."""
     rng = np.random.default_rng(2)
     rows = table(rng, 1, 6, levels=((None, 20.0),))
     rows[0] |= {'status': 'TOO_SHORT', 'sigma': None, 'alpha': None, 'sag_full': None}
@@ -89,7 +87,6 @@ def test_outliers_keep_their_rate(sizes):
 
 
 def test_outliers_are_found():
-    """A flight five standard deviations off is named in nearly every fleet, and only that one."""
     rng = np.random.default_rng(4)
     groups = ['a'] * 20 + ['b'] * 20
     hits = others = 0
@@ -118,7 +115,6 @@ def test_small_groups_and_unknown_vehicles_are_not_judged():
 @pytest.mark.parametrize('flights', [3, 4, 9])
 @pytest.mark.parametrize('scatter', [0.0, 0.05, 0.3])
 def test_the_interval_of_a_line_holds_the_truth(flights, scatter):
-    """With known errors of any size and an unknown scatter, from three flights on."""
     rng = np.random.default_rng(12)
     x, runs, held = np.arange(1.0, flights + 1.0), 400, 0
     for _ in range(runs):
@@ -131,7 +127,6 @@ def test_the_interval_of_a_line_holds_the_truth(flights, scatter):
 
 
 def test_a_line_without_scatter_is_exact():
-    """Errors of zero, and values on a line, are no division by zero."""
     x = np.arange(1.0, 5.0)
     slope, start, se = weighted_line(x, 2.0 - 0.5 * x, np.zeros(4))
     assert (slope, start) == (pytest.approx(-0.5), pytest.approx(2.0)) and se < 1e-12

@@ -37,7 +37,6 @@ def deadly(task: int, folder: str) -> dict:
 
 
 def test_a_worker_that_dies_is_one_row(tmp_path):
-    """A recording that kills its worker twice is lost; all others are done."""
     with LocalWorkers(2) as pool:
         done = list(pool.each(deadly, [(k, str(tmp_path)) for k in range(8)]))
     results = {k: result for k, result, why in done if not why}
@@ -68,7 +67,6 @@ def look(_: int) -> dict:
 
 
 def test_no_process_opens_a_socket():
-    """Neither the workers nor this process open a network or local socket."""
     before = sockets('self')
     with LocalWorkers(2) as pool:
         done = [result for _, result, why in pool.each(look, [(k,) for k in range(4)]) if not why]
@@ -112,7 +110,6 @@ def test_a_result_that_cannot_come_back_is_one_row():
     ('10.0.0.2:8786', False), ('tcp://localhost.example.org:8786', False), ('x', False),
     ('ws://10.0.0.2:8786', False), ('tcp://0.0.0.0:8786', False), ('tcp://', False)])
 def test_a_scheduler_of_another_machine_wants_tls(address, fine):
-    """Without it only this machine is spoken to, or what --insecure allows."""
     check_address(address, insecure=True)
     if fine:
         check_address(address)
@@ -264,7 +261,6 @@ def paths(*names: str) -> dict[Path, str]:
 
 
 def test_a_vehicle_is_named_by_metadata_pattern_or_folder():
-    """In this order; folders with equal names get more of their paths."""
     found, notes = assign({**paths('/f/uav1/a.csv', '/x/logs/a.csv', '/y/logs/a.csv'),
                            Path('/z/b.mcap'): 'SN42'})
     assert [v.name for v in found.values()] == ['uav1', 'x/logs', 'y/logs', 'SN42']
@@ -315,7 +311,6 @@ def test_flights_are_in_order_of_date_or_else_of_name():
     ('flight_20241399.csv', {}, 0.0, None, ''), ('120240503.csv', {}, 0.0, None, ''),
     ('flight_12.csv', {}, 0.0, None, '')])
 def test_the_date_comes_from_stamps_header_or_name(name, source, t, date, origin):
-    """From the stamps, else the header of the log, else the name of the file."""
     at = np.array([t, t + 1.0])
     start, found = start_of(Recording(at, at, None, name, source))
     assert found == origin

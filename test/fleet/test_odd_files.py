@@ -43,7 +43,6 @@ def odd(tmp_path):
 
 
 def test_each_failure_is_one_row(odd, tmp_path, one_process):
-    """The flight is analysed; every other file has a row with the reason."""
     began = time.monotonic()
     found = find_recordings([str(odd)])
     assert duplicates(found.sources) == {}
@@ -90,7 +89,6 @@ def test_a_folder_without_permission_to_enter_is_noted(odd, monkeypatch):
 @pytest.mark.parametrize('content', [
     None, '[' * 100_000, '{}', '[]', '"x"', '{"error": 0}', '1' * 9999])
 def test_invalid_saved_results_are_computed_again(odd, tmp_path, content):
-    """A saved result that is a FIFO or foreign is computed again."""
     (source,) = find_recordings([str(odd / 'flight.csv')]).sources
     parts = SavedResults(tmp_path / 'out', {})
     parts.save(source, {'error': '', 'levels': []})
@@ -105,7 +103,6 @@ def test_invalid_saved_results_are_computed_again(odd, tmp_path, content):
 
 @pytest.mark.parametrize('text', ['(' * 900, 'a{99999999999999999999}', '*'])
 def test_an_invalid_pattern_is_refused(text):
-    """Too deep, too large: one line."""
     with pytest.raises(InputError, match='--vehicle-from') as caught:
         read_pattern(text)
     assert '\n' not in str(caught.value)

@@ -88,7 +88,6 @@ def test_metadata_is_version_9(tmp_path):
 
 
 def test_memory_holds_overlapping_chunks_only(tmp_path, monkeypatch):
-    """A long bag is never in memory as a whole: chunks are read when they are due."""
     write_two(tmp_path / 'bag.mcap', n=30_000)
     read = []
     original = McapFile.tables

@@ -192,7 +192,6 @@ class Maker:
 @settings(max_examples=150, deadline=None)
 @given(st.randoms(use_true_random=False), st.data())
 def test_any_schema_any_message(rnd, data):
-    """Random definitions, paths, shapes, texts, broken bytes: one outcome, both ways."""
     maker = Maker(rnd)
     text = maker.text()
     base = maker.message()
@@ -310,7 +309,6 @@ def test_blocks_of_any_layout_and_length(labels):
 
 
 def test_time_order_keeps_the_fields_of_a_message_together():
-    """Blocks move as a whole; blocks of equal time keep their order."""
     messages = [encode_block([float(k)] * n) for k, n in enumerate((2, 1, 3, 0, 2))]
     spec = FieldSpec('/v', cdr.FLOAT32_ARRAY, 'data', sample_rate=10.0)
     column = read_all(spec, messages, [30, 10, 10, 5, 20])[0].in_time_order()
@@ -356,7 +354,6 @@ def test_paths_that_the_type_does_not_have(options, words):
 
 
 def test_units_and_stamps():
-    """The value is sign * unit_factor * raw + offset; an element too many is a missing value."""
     spec = FieldSpec('/v', KIND, 'n[1].mv', sign=-1, unit_factor=1e-3, offset=0.5, stamp_field='t')
     rest = {'d': [], 'x': 0.0, 's': ''}
     messages = [encode(KIND, {'n': [{'mv': 1}, {'mv': 4200}][:k],

@@ -33,7 +33,6 @@ def test_a_converted_log_reads_back(log, tmp_path, capsys, name):
 
 
 def test_json_goes_to_standard_output_or_a_file(log, tmp_path, capsys):
-    """With `-` standard output has nothing else."""
     assert main(['convert', str(log), str(tmp_path / 'a'), '--json', '-']) == 0
     content = json.loads(capsys.readouterr().out)
     assert content['n'] == 3
@@ -102,7 +101,6 @@ def test_file_name_of_invalid_text(tmp_path, capsys):
 
 
 def test_columns_of_a_csv(tmp_path, capsys):
-    """Any column can be the voltage, the throttle or the current; all are listed."""
     path = tmp_path / 'a.csv'
     path.write_text('time_s,bus,duty,amps,word\n0,5.0,0.1,2,x\n1,5.1,0.2,3,y\n2,5.2,0.3,4,z\n')
     assert main(['convert', str(path), '--list']) == 0

@@ -54,7 +54,6 @@ def test_a_current_that_most_voltages_lack_is_held(tmp_path, blank, held):
 
 
 def test_missing_throttle_is_unknown(tmp_path):
-    """Unknown, not zero."""
     recording = read_recording(written(tmp_path, 'time_s,voltage_v\n0,5\n1,5.5\n'))
     assert not recording.has_throttle
     assert recording.n == 2
@@ -88,7 +87,6 @@ def test_missing_throttle_is_unknown(tmp_path):
     ('time_s,voltage_v\n0,nan\nnan,5\n', ['no usable sample', '2 samples', 'finite']),
 ])
 def test_a_malformed_csv_is_refused_with_the_place(tmp_path, text, words):
-    """The error is one line with the place."""
     path = written(tmp_path, text)
     with pytest.raises(InputError) as caught:
         read_recording(path)
@@ -100,7 +98,6 @@ def test_a_malformed_csv_is_refused_with_the_place(tmp_path, text, words):
 
 
 def test_a_binary_file_named_csv_is_refused(tmp_path):
-    """A binary file by the name of a CSV."""
     path = tmp_path / 'log.csv'
     path.write_bytes(bytes(range(256)))
     with pytest.raises(InputError, match='not text'):
@@ -134,7 +131,6 @@ def test_a_single_sample_is_a_recording(tmp_path):
 
 
 def test_options_of_bags_are_refused_for_a_csv(tmp_path):
-    """A CSV has no topics."""
     path = written(tmp_path, 'time_s,voltage_v\n3,5\n')
     with pytest.raises(InputError, match='--msg-config is for bags'):
         read_recording(path, msg_config='px4')
@@ -207,7 +203,6 @@ def test_a_time_without_a_unit(begin, unit, tmp_path):
     ('3.0,5\0.0,0.3', r"line 302: column 'voltage_v' holds '5\x00.0'"),
     ('?,y,z', "1 bad line left out, such as line 302: column 'time_s'")])
 def test_one_bad_line_costs_one_line(line, words, tmp_path):
-    """With --partial; without it the file is refused, and so is one with many of them."""
     rows = [f'{0.01 * k:.2f},{5.0 + 0.01 * (k % 7):.2f},0.3' for k in range(400)]
     good = read_recording(written(tmp_path, '\n'.join(['time_s,voltage_v,throttle', *rows])))
     rows[300] = line

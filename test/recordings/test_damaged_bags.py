@@ -98,7 +98,6 @@ def test_bytes_after_the_end_are_reported(sound, tmp_path):
 @pytest.mark.parametrize('way', ['zstd', 'lz4', 'plain'])
 @pytest.mark.parametrize('spot', ['content', 'checksum'])
 def test_a_broken_chunk(tmp_path, way, spot):
-    """Refused with its byte and time where it is met; `partial` loses that chunk alone."""
     path = write(tmp_path / 'bag.mcap', ROWS, chunk_size=2000, **WAYS[way])
     data = bytearray(path.read_bytes())
     chunks = [r for r in records(bytes(data)) if r[2]]
@@ -245,7 +244,6 @@ def test_a_damaged_summary(tmp_path, shift):
 
 
 def test_one_of_several_files(tmp_path):
-    """The damaged file is named; its time counts from the start of the whole bag."""
     folder = tmp_path / 'bag'
     folder.mkdir()
     write(folder / 'bag_0.mcap', ROWS)
@@ -269,7 +267,6 @@ def complaint(path, **options):
 
 
 def test_missing_and_empty_paths_are_refused(tmp_path):
-    """A missing file, an empty file and an empty folder."""
     assert 'there is no recording' in complaint(tmp_path / 'no.mcap')
     (tmp_path / 'empty.mcap').touch()
     assert 'empty (0 bytes)' in complaint(tmp_path / 'empty.mcap')

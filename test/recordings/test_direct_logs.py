@@ -19,7 +19,6 @@ import pytest
     ('ac_erle_althold2.BIN', 'pymavlink', None),
     ('px_sample_log_small.ulg', 'pyulog', 'battery_status[1].voltage_v')])
 def test_a_log_equals_its_converted_bag(file, package, voltage, tmp_path):
-    """Equal samples, throttle and notes; the name is the log's."""
     pytest.importorskip(package)
     log = REAL / 'raw' / file
     assert main(['convert', str(log), str(tmp_path / 'bag'),
@@ -38,7 +37,6 @@ def test_a_log_equals_its_converted_bag(file, package, voltage, tmp_path):
 @needs_recordings
 @pytest.mark.parametrize('file,rate', [('in_xr_141340.TXT', 49.47), ('ie_btfl_002.bbl', 199.1)])
 def test_one_flight_as_log_csv_and_bag_is_one_recording(file, rate, tmp_path):
-    """With every repeat of its logger in each: the same readings, and the same analysis."""
     pytest.importorskip('orangebox')
     path = tmp_path / file
     # Seconds are enough: the reader of blackbox logs takes one for each 300 kB.
@@ -83,7 +81,6 @@ def test_repeats_in_a_csv_do_not_raise_its_rate():
 
 
 def test_columns_and_units_of_a_csv(tmp_path):
-    """Any names, mV, ms; a throttle that was named must be there."""
     path = tmp_path / 'own.csv'
     path.write_text('when,mv,stick,throttle\n0,5000,0.25,9\n20,4900,0.5,9\n40,4950,0.75,9\n')
     found = read_recording(path, columns=CsvColumns('when', 'mv', 'stick', 'mV', 'ms'))
@@ -102,7 +99,6 @@ def test_columns_and_units_of_a_csv(tmp_path):
     (['--unit', 'kV'], 'invalid choice'),
     (['--voltage-column', 'volts'], "no column 'volts'")])
 def test_options_that_do_not_fit_are_refused(options, words, tmp_path, capsys):
-    """One line, and status 2."""
     path = tmp_path / 'a.csv'
     path.write_text('time_s,voltage_v\n0,5\n1,5\n')
     try:
@@ -113,7 +109,6 @@ def test_options_that_do_not_fit_are_refused(options, words, tmp_path, capsys):
 
 
 def test_suspicious_units_and_columns_are_noted(tmp_path):
-    """Swapped columns are refused; stamps seconds apart are noted; a folder names fleet."""
     path = tmp_path / 'odd.csv'
     path.write_text('time_s,voltage_v,throttle\n0,0.1,16.1\n1,0.2,16.0\n2,0.2,15.9\n')
     with pytest.raises(InputError, match='are the two columns swapped'):

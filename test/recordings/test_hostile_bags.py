@@ -111,7 +111,6 @@ LIES = {
 @pytest.mark.parametrize('lie', LIES)
 @pytest.mark.parametrize('times', [1, 50])
 def test_false_index_is_refused(tmp_path, lie, times):
-    """A false index is replaced by the walk, or refused; nothing is read twice."""
     one = chunk(schema() + channel() + messages(N))
     at = len(MAGIC) + len(record(Op.HEADER, text('ros2'), text('')))
     place = {'chunk_at': at, 'chunk_length': len(one), 'unpacked': len(one) - 9 - 40,
@@ -241,7 +240,6 @@ def test_what_is_left_out(tmp_path, parts, about, notes):
 
 
 def test_messages_outside_of_chunks(tmp_path):
-    """Beside chunks that a summary lists they are read as well."""
     part = messages(N)[:STEP * 60]
     one = chunk(schema() + channel() + part, n=60)
     at = len(MAGIC) + len(record(Op.HEADER, text('ros2'), text('')))

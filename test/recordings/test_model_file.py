@@ -96,7 +96,6 @@ def test_unknown_standard_errors_are_null():
     ({**OU, 'se': {'alpha': math.inf}}, ['standard error of ou.alpha', 'inf']),
 ])
 def test_bad_standard_errors(entry, words):
-    """One line with the file, the term and the error."""
     text = failure({'model': [entry]})
     assert 'term 1' in text and all(word in text for word in words), text
 
@@ -138,7 +137,6 @@ def test_numbers_with_an_exponent_need_no_point(tmp_path):
      ['load_dependent_sigma.throttle', 'list']),
 ])
 def test_a_wrong_term_is_named_with_the_nearest_word(entry, words):
-    """The error names file, place and name of the term, parameter, and the nearest valid word."""
     text = failure({'model': [OU, entry]})
     assert 'term 2' in text and all(word in text for word in words), text
 

@@ -76,7 +76,6 @@ def expected(rows):
 
 
 def test_a_whole_bag_is_sorted_with_throttle_held(bag, rows):
-    """Every sample, sorted by stamp, each stamp once, with the last throttle."""
     recording = read_recording(bag)
     stamps, voltage, throttle = expected(rows)
     np.testing.assert_allclose(recording.t - START * 1e-9, (np.array(stamps) - START) * 1e-9,
@@ -96,7 +95,6 @@ def test_a_whole_bag_is_sorted_with_throttle_held(bag, rows):
     {'use_chunking': False, 'use_statistics': False, 'index_types': IndexType.NONE,
      'use_summary_offsets': False, 'repeat_channels': False, 'repeat_schemas': False}])
 def test_every_way_of_writing(bag, rows, tmp_path, compression, options):
-    """Compressed, chunked, indexed, summarised or not: the same recording, whole or partial."""
     path = write(tmp_path / 'bag.mcap', rows, compression=compression, **options)
     whole = read_recording(bag)
     for partial in (False, True):
@@ -157,7 +155,6 @@ def test_empty_parts_are_refused(bag, start, end, words):
 
 
 def test_a_part_of_a_csv_is_read(tmp_path):
-    """A CSV is read in part, too."""
     path = tmp_path / 'log.csv'
     path.write_text('time_s,voltage_v\n' + ''.join(f'{5 + k},{k}\n' for k in range(10)))
     part = read_recording(path, start=2.0, end=5.0)
@@ -168,7 +165,6 @@ def test_a_part_of_a_csv_is_read(tmp_path):
 
 
 def test_progress_ends_at_one(bag, monkeypatch):
-    """It rises to 1."""
     monkeypatch.setattr(bag_module, '_TOGETHER', 1)
     shares = []
     read_recording(bag, progress=shares.append)
@@ -176,7 +172,6 @@ def test_progress_ends_at_one(bag, monkeypatch):
 
 
 def test_fewer_messages_than_stated(bag, tmp_path):
-    """A summary without a checksum that counts too few messages is not used."""
     path = tmp_path / 'bag.mcap'
     data = bytearray(bag.read_bytes())
     start = int.from_bytes(data[-28:-20], 'little')

@@ -102,7 +102,6 @@ def test_unreadable_metadata_is_ignored_or_refused(tmp_path):
 
 @pytest.mark.parametrize('kind, config', [(FLOAT32, 'std_float32'), (FLOAT64, 'std_float64')])
 def test_scalar_topics_are_stamped_by_log_time(tmp_path, kind, config):
-    """The log time is the stamp; the throttle is the last at or before it."""
     path = make(tmp_path / 'bag.mcap', ('voltage', kind, scalars([5.0, 5.5, 4.5], kind)),
                 ('throttle', FLOAT32, scalars([0.25, 0.75], start=2 * MS)))
     recording = read_recording(path)
@@ -116,7 +115,6 @@ def test_scalar_topics_are_stamped_by_log_time(tmp_path, kind, config):
 
 
 def test_header_stamps_are_used_unless_zero(tmp_path):
-    """A zero stamp is missing, and the log time is used."""
     path = make(tmp_path / 'bag.mcap', (
         'voltage', BATTERY_STATE, battery([100 * MS, 101 * MS, 0], [5.0, 5.1, 5.2], 200 * MS)))
     recording = read_recording(path)
@@ -160,7 +158,6 @@ def px4(tmp_path, version=''):
 
 @pytest.mark.parametrize('version, config', [('_v1', 'px4'), ('', 'px4_1_16')])
 def test_a_type_that_is_not_installed_is_read(tmp_path, version, config):
-    """The definition in the bag is enough."""
     recording = read_recording(px4(tmp_path, version))
     assert recording.source['msg_config'] == config
     np.testing.assert_allclose(recording.t, [1e-3, 2e-3, 3e-3], rtol=0, atol=1e-12)
@@ -184,7 +181,6 @@ def test_in_a_namespace(tmp_path):
 
 
 def test_by_type_alone(tmp_path):
-    """The only BatteryState is the voltage, whatever its name; a lone throttle is not."""
     path = make(tmp_path / 'bag.mcap', ('/power/state', BATTERY_STATE, battery([MS], [12.0])),
                 ('/throttle', FLOAT32, scalars([0.5])))
     assert read_recording(path).voltage.tolist() == [12.0]
@@ -193,7 +189,6 @@ def test_by_type_alone(tmp_path):
 
 
 def test_two_fitting_configs_need_a_choice(tmp_path):
-    """Both are listed; one is used when named."""
     path = make(tmp_path / 'bag.mcap', ('/voltage', FLOAT32, scalars([5.0])),
                 ('/mavros/battery', BATTERY_STATE, battery([MS], [12.0])))
     text = complaint(path)
@@ -236,7 +231,6 @@ def test_throttle_by_name(tmp_path):
 
 
 def test_an_own_config_is_read(tmp_path):
-    """A YAML file by its path: unit, sign, offset and a nested field."""
     kind = 'my_msgs/msg/Pack'
     TEXT[kind] = 'Cell[] cells\n' + 80 * '=' + '\nMSG: my_msgs/Cell\nint32 mv\n'
     path = make(tmp_path / 'bag.mcap', ('/pack', kind, [
@@ -256,7 +250,6 @@ def test_an_own_config_is_read(tmp_path):
 
 @pytest.mark.parametrize('kind', [FLOAT32, BATTERY_STATE])
 def test_repairs_are_noted(tmp_path, kind):
-    """Values that are not finite dropped, order restored, repeats dropped; each is noted."""
     values = [5.0, np.nan, 5.2, np.inf, 5.1, 9.0, 5.5]
     stamps = np.array([1, 2, 4, 5, 3, 3, 6]) * MS
     if kind == FLOAT32:
@@ -277,7 +270,6 @@ def test_repairs_are_noted(tmp_path, kind):
 
 
 def test_a_bag_with_no_sample_is_refused_and_one_is_enough(tmp_path):
-    """None usable is refused, one is a recording."""
     path = make(tmp_path / 'nan.mcap', ('voltage', FLOAT32, scalars([np.nan, np.inf])))
     assert 'no usable sample: 2 samples dropped' in complaint(path)
     path = make(tmp_path / 'nan2.mcap', ('voltage', BATTERY_STATE, battery([MS], [np.nan])))
@@ -332,7 +324,6 @@ def test_throttle_in_other_units_is_refused(tmp_path, throttle):
 
 @pytest.mark.parametrize('kind', ['csv', 'mcap'])
 def test_backward_clock_is_noted_with_its_step(tmp_path, kind):
-    """A stretch that lies in a time that was is more than a few late samples."""
     t = np.concatenate((np.arange(100), 60.5 + np.arange(100))) * 1e-3 + 1.0
     path = tmp_path / f'a.{kind}'
     if kind == 'csv':

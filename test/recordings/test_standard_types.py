@@ -22,7 +22,6 @@ def test_schemas_are_those_of_jazzy(kind):
 
 @pytest.mark.parametrize('kind', [cdr.FLOAT32, cdr.FLOAT64])
 def test_scalars_equal_an_independent_encoder(kind):
-    """The bytes are equal, and decode to the same values."""
     messages = cdr.encode_scalars(kind, VOLTS)
     for data, volts in zip(messages, VOLTS, strict=True):
         theirs = STORE.deserialize_cdr(data, kind)
@@ -32,7 +31,6 @@ def test_scalars_equal_an_independent_encoder(kind):
 
 
 def test_unmeasured_battery_fields_are_unknown():
-    """Stamp and voltage are set; every other field says "not measured"."""
     messages = cdr.encode_battery(STAMPS, VOLTS)
     for data, ns, volts in zip(messages, STAMPS.tolist(), VOLTS, strict=True):
         theirs = STORE.deserialize_cdr(data, cdr.BATTERY_STATE)
@@ -49,7 +47,6 @@ def test_unmeasured_battery_fields_are_unknown():
 
 @pytest.mark.parametrize('n', [0, 1, 100])
 def test_an_independent_decoder_reads_blocks(n):
-    """Samples and layout are equal."""
     samples = np.linspace(4.0, 5.0, n).astype(np.float32)
     data = encode_block(samples)
     theirs = STORE.deserialize_cdr(data, cdr.FLOAT32_ARRAY)
@@ -82,7 +79,6 @@ def test_imu_covariances_say_unmeasured_or_unknown(absent):
 
 @pytest.mark.parametrize('names', [('motor_0',), ('motor_0', 'b', 'motor_10'), ('',)])
 def test_joint_names_of_any_length_precede_velocities(names):
-    """No positions, no efforts."""
     speeds = np.arange(3.0 * len(names)).reshape(3, -1)
     for data, ns, row in zip(cdr.encode_joints(STAMPS, names, speeds), STAMPS.tolist(), speeds,
                              strict=True):

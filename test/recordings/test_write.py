@@ -23,7 +23,6 @@ def recording(n=2500, start=0.0, throttle=True):
 @pytest.mark.parametrize('type', sorted(TYPES))
 @pytest.mark.parametrize('start', [0.0, 100.0])
 def test_a_written_recording_reads_back(tmp_path, type, start):  # noqa: A002
-    """Stamps to the ns, voltage to the resolution of the message, throttle exactly."""
     rec = recording(start=start)
     assert write_recording(rec, tmp_path / 'bag', type=type)[1] == ()
     back = read_recording(tmp_path / 'bag')
@@ -56,7 +55,6 @@ def test_throttle_is_sent_when_it_changes_and_once_a_second(tmp_path):
 
 
 def test_unknown_throttle_is_not_written(tmp_path):
-    """Nothing is made up."""
     write_recording(recording(throttle=False), tmp_path / 'bag')
     assert list(BagReader(tmp_path / 'bag').topics) == ['/voltage']
 

@@ -22,7 +22,6 @@ def drawn(name, seconds, seed=1, rate=None):
 
 
 def test_the_presets_and_profiles_have_these_names():
-    """What users can ask for."""
     assert set(PRESETS) == {'idle', 'load_05', 'load_10', 'load_40', 'transient', 'loads',
                             'flight', 'flight_full'}
     for preset in PRESETS.values():

@@ -62,7 +62,6 @@ def test_the_stick_moves_fifty_times_a_second(name):
 
 
 def test_the_flight_profile_repeats_every_40_s():
-    """Every 40 s."""
     t = np.arange(0.0, 40.0, 0.02)
     flight = read_profile('flight')
     np.testing.assert_allclose(flight(t + 80.0), flight(t), rtol=0, atol=1e-9)
@@ -72,7 +71,6 @@ def test_the_flight_profile_repeats_every_40_s():
 @pytest.mark.parametrize('text, value', [('0', 0.0), ('1', 1.0), ('0.4', 0.4), ('4e-1', 0.4),
                                          (' 0.25 ', 0.25)])
 def test_a_number_is_a_constant_profile(text, value):
-    """A constant."""
     assert at(read_profile(text), -1.0, 0.0, 1e9) == [value] * 3
     assert at(constant(value), 0.0) == [value]
 
@@ -113,7 +111,6 @@ def test_a_csv_is_a_profile(tmp_path):
     ('0:0,nan:0', ['fall']), ('0:0,1_0:0', ["'1_0:0'"]), ('\u0660', ['valid: flight']),
 ])
 def test_a_wrong_profile_is_named_in_one_line(text, words):
-    """One line that names what was given."""
     line = refused(text)
     assert all(word in line for word in words), line
 

@@ -73,7 +73,6 @@ PACK = SupplyModel((OU(5.0, 0.0, 15.6), Drift(-0.01, 0.0), LoadSag(2.0, 0.5),
 
 
 def test_step_by_step_equals_one_batch():
-    """Whatever the pieces: the path of `simulated`, with the same seed."""
     profile = read_profile('flight')
     batch = np.concatenate([piece.voltage for piece in simulated(
         FLIGHT, profile, duration=40.0, rate=250.0, seed=5)])
@@ -147,7 +146,6 @@ def test_each_value_holds_until_the_next(flight):
 
 
 def test_recordings_are_told_from_profiles(flight, tmp_path):
-    """A CSV with voltage is one; one of throttle alone is a profile; so is a profile's name."""
     stick = tmp_path / 'stick.csv'
     stick.write_text('time_s,throttle\n0,0.1\n', encoding='utf-8')
     assert is_recording(str(flight)) and is_recording(str(tmp_path))
@@ -173,7 +171,6 @@ def test_a_simulation_over_a_recording(flight, tmp_path, capsys):
 
 
 def test_throttle_of_an_unusable_recording_is_refused(flight, tmp_path, capsys):
-    """No throttle, throttle in percent, a part outside the recording: one line each."""
     none = tmp_path / 'none.csv'
     none.write_text('time_s,voltage_v\n0,5\n1,5\n', encoding='utf-8')
     with pytest.raises(InputError, match='has no throttle'):

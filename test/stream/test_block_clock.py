@@ -94,7 +94,6 @@ def test_a_clock_since_1970_is_as_accurate():
 
 
 def test_a_reset_starts_a_new_time_line():
-    """The next stamp starts it, and this is not a gap."""
     clock = BlockClock(RATE)
     run([100.0], clock)
     clock.reset()

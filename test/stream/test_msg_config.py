@@ -42,7 +42,6 @@ def test_the_shipped_msg_configs_load():
 
 
 def test_a_msg_config_is_read_as_written(tmp_path):
-    """Every key reaches the record."""
     config = load_msg_config(written(tmp_path))
     spec = config.voltage
     assert (config.name, config.package, config.generic) == ('rail', 'my_msgs', False)
@@ -54,7 +53,6 @@ def test_a_msg_config_is_read_as_written(tmp_path):
 
 
 def test_px4_throttle_is_mapped_to_0_1():
-    """The stick is -1..1 in PX4."""
     spec = load_msg_config('px4').throttle
     ends = [spec.sign * spec.unit_factor * raw + spec.offset for raw in (-1.0, 1.0)]
     assert ends == [0.0, 1.0]
@@ -94,7 +92,6 @@ def test_a_mistake_is_named(tmp_path, part, change, expected):
 
 @pytest.mark.parametrize('key', ['topic', 'type', 'field'])
 def test_a_missing_key_is_named(tmp_path, key):
-    """A source needs a topic, a type and a field."""
     content = {**GOOD, 'voltage': {k: v for k, v in GOOD['voltage'].items() if k != key}}
     path = tmp_path / 'rail.yaml'
     path.write_text(yaml.safe_dump(content), encoding='utf-8')
@@ -114,7 +111,6 @@ def test_file_without_a_mapping_is_refused(tmp_path, text, expected):
 
 
 def test_unknown_name_and_missing_file(tmp_path):
-    """The nearest name is offered."""
     with pytest.raises(InputError, match="no msg config 'batery_state'.*'battery_state'"):
         load_msg_config('batery_state')
     with pytest.raises(InputError, match='nowhere.yaml'):
@@ -136,7 +132,6 @@ def test_msg_configs_are_found_when_installed(tmp_path, monkeypatch, layout):
 
 
 def test_a_missing_folder_of_msg_configs_is_one_line(tmp_path, monkeypatch):
-    """An installation without its data says so."""
     monkeypatch.setattr('ou_monitor.stream.config.__file__', str(tmp_path / 'a/b/c/config.py'))
     with pytest.raises(InputError, match='no msg_config folder'):
         msg_config_dir()
@@ -146,13 +141,11 @@ def test_a_missing_folder_of_msg_configs_is_one_line(tmp_path, monkeypatch):
     ('data', ('data',)), ('header.stamp', ('header', 'stamp')),
     ('channels[0].value', ('channels', 0, 'value')), ('a[1][20]', ('a', 1, 20))])
 def test_a_field_path_has_names_and_indices(path, steps):
-    """Outermost first."""
     assert parse_field_path(path) == steps
 
 
 @pytest.mark.parametrize('path', ['', '.', 'a.', 'a[', 'a[-1]', 'a[0', '[0]', 'a b', '1a', 'a..b'])
 def test_a_malformed_path_is_refused_at_once(path):
-    """Not only at the first message."""
     with pytest.raises(InputError, match='field path'):
         parse_field_path(path)
 
@@ -184,6 +177,5 @@ def test_several_numbers_are_extracted(field, values):
     ('esc[].rp', "did you mean 'rpm'"), ('name', 'holds no numbers'), ('esc', 'holds no numbers'),
     ('esc[]]', 'not of the form'), ('one[]', 'holds no numbers'), ('one[0]', 'not an array')])
 def test_lists_without_numbers_are_refused(field, words):
-    """Refused in one line."""
     with pytest.raises(InputError, match=words):
         ManyExtractor(FieldSpec('rpm', 'my_msgs/msg/Escs', field)).extract(ESCS)

@@ -162,7 +162,6 @@ def test_stamps_that_go_back_clear_the_window_once():
 
 
 def test_a_step_back_within_one_call_clears_the_window_once():
-    """All that follows the step stays."""
     stream, sink = stream_of()
     t = np.concatenate([10.0 + 0.001 * np.arange(50), 3.0 + 0.001 * np.arange(300)])
     held = stream.take_voltages(t, np.ones(350, bool), np.ones(350, int), np.full(350, 5.0))
@@ -202,7 +201,6 @@ def test_a_lost_throttle_is_unknown(stamps):
 
 
 def test_current_goes_with_its_message():
-    """Past messages without a stamp, a clock that goes back, and blocks."""
     for rate, counts in ((None, [1, 1, 1, 1]), (100.0, [2, 1, 2, 2])):
         stream, sink = stream_of('stamp', sample_rate=rate)
         n = sum(counts)

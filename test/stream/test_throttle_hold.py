@@ -30,7 +30,6 @@ def hold_of(pushed, newest=2.0, own=True, voltage_own=True):
     st.lists(st.tuples(STAMPS, st.floats(0.0, 1.0)), max_size=30),
     st.lists(STAMPS, min_size=1, max_size=60))
 def test_agrees_with_its_definition(pushed, asked):
-    """The value of the latest stamp at or before; of equal stamps the later message."""
     hold = hold_of(pushed)
     expected = []
     for at in asked:
@@ -40,7 +39,6 @@ def test_agrees_with_its_definition(pushed, asked):
 
 
 def test_more_samples_than_a_batch_are_placed():
-    """A multiple of it, and one more."""
     hold = hold_of([(1.0, 0.3), (2.0, 0.4)])
     at = np.linspace(0.0, 4.0, 2 * BATCH + 1)
     np.testing.assert_array_equal(
@@ -57,7 +55,6 @@ def test_unneeded_throttles_are_dropped():
 
 
 def test_unknown_throttle_is_held_too():
-    """A NaN says "unknown from here on"."""
     hold = hold_of([(1.0, 0.5), (2.0, math.nan)])
     np.testing.assert_array_equal(hold.at(np.array([0.5, 1.5, 2.5])), [np.nan, 0.5, np.nan])
 
@@ -207,7 +204,6 @@ ONE = [('voltage', EPOCH * 10**9, EPOCH + 0.1, 1.0)]
 @example(([('voltage', EPOCH * 10**9 + k, EPOCH + 0.1 - 0.09 * k, [4.0 * k + j for j in range(4)])
            for k in range(2)], True, 'drop', set()))
 def test_node_and_bench_pair_alike(tmp_path, drawn):
-    """The bench reads what the node knew when it handed on each sample."""
     messages, block, nan, flushes = drawn
     config = config_of(tmp_path, block, nan)
     if block and not any(name == 'voltage' and data for name, _, _, data in messages) or (
@@ -225,7 +221,6 @@ def test_node_and_bench_pair_alike(tmp_path, drawn):
 
 
 def test_late_throttle_changes_only_samples_not_yet_handed_on(tmp_path):
-    """In a recording it changes all samples from its stamp on."""
     messages = [('throttle', EPOCH * 10**9, EPOCH + 0.0, 0.1)]
     messages += [('voltage', EPOCH * 10**9 + k, EPOCH + 0.01 * k, float(k)) for k in range(1, 7)]
     messages += [('throttle', EPOCH * 10**9 + 9, EPOCH + 0.025, 0.7)]

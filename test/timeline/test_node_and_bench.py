@@ -134,7 +134,6 @@ CASES = [*((period, kinds) for period in (1.0, 5.0, 2.5, 20.05)
     f'{period}-' + (', '.join(kinds) if len(kinds) < 2 else 'together')
     for period, kinds in CASES])
 def test_node_and_bench_take_the_same_readings(tmp_path, monkeypatch, period, kinds):
-    """Equal number, stamps, voltages, throttle and current, and equal counters."""
     # Where the period is no whole number the bench puts the stamps on the grid of the source,
     # which takes the whole recording: by less than 1.5 logged steps.
     rng = np.random.default_rng([int(100 * period), *(KINDS.index(kind) for kind in kinds)])

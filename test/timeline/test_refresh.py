@@ -48,7 +48,6 @@ def test_repeats_are_counted_and_noted(factor):
 
 @pytest.mark.parametrize('factor', [2, 3, 10 / 3, 5, 8, 10])
 def test_repeats_through_a_coarse_adc(factor):
-    """An ADC step as large as the increment: a third of the refreshes repeat the code."""
     rng = np.random.default_rng(2)
     found = [refresh_period(INCREMENT * np.round(logged(rng, 1024, factor) / INCREMENT))
              for _ in range(40)]
@@ -195,7 +194,6 @@ def test_steps_and_throttle_of_refreshes():
 
 @pytest.mark.parametrize('factor', FACTORS + RATIOS[:2])
 def test_dropping_leaves_no_bias(factor):
-    """Logger and source against the source alone, and against the truth."""
     # Paired with the fit of the source itself, a refresh is late by half a logged sample on
     # average, the same for all: what is left is one sample more or less in 2000, 0.05 %. Against
     # the truth: an error of 3.5 Monte Carlo errors is chance once in 2000, and the bias of windows
@@ -221,7 +219,6 @@ def test_dropping_leaves_no_bias(factor):
 
 
 def test_counters_of_repeats():
-    """`used` and `held` add up; one sample in ten is used."""
     rng = np.random.default_rng(8)
     y = np.repeat(paths(rng, 1, 800)[0], 10)
     t = 1e-4 * np.arange(y.size)
@@ -314,7 +311,6 @@ def series(gaps, sizes=(1.0, 2.0, 5.0)):
 
 @pytest.mark.parametrize('period', [2, 3, 4, 7])
 def test_a_period_needs_twenty_nats(period):
-    """Against changes at random, of which a gap is a whole number of periods by chance."""
     gaps = np.arange(1, 2000)
     law = (1.0 - 1.0 / period) ** (gaps - 1) / period
     chance = law[gaps % period == 0].sum()
@@ -350,7 +346,6 @@ def test_a_known_period_is_kept_while_eight_in_ten_gaps_are_regular(odd, kept):
 
 @pytest.mark.parametrize('same, found', [(90, 5.0), (91, 1.0)])
 def test_a_tenth_of_the_steps_has_another_size(same, found):
-    """Sizes within a thousandth are one."""
     # Counted is what lies between two changes: the first step of all included.
     sizes = [1.0, 1.0005] * 46
     steps = np.array([*sizes[:same], *[2.0 + 0.01 * k for k in range(100 - same)]])

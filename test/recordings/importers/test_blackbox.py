@@ -16,7 +16,6 @@ TIME, STICK, VOLTS, AMPERES = 1, 2, 3, 4
 
 
 def test_voltage_motors_and_current_are_read(tmp_path):
-    """Voltage, motors and current are the written ones, with the stamps of the log."""
     rows = quad()
     path, log = load(tmp_path, blackbox(rows))
     chosen = choose(path, log)
@@ -52,7 +51,6 @@ def test_a_stick_below_its_lowest_pulse_is_zero_throttle(tmp_path):
     ('', {'vbatcellvoltage': '33,35,43'}, 0.1, None),
 ])
 def test_the_firmware_determines_the_voltage_unit(tmp_path, firmware, headers, volts, amperes):
-    """The unit of the voltage follows the firmware, as in Betaflight's own viewer."""
     rows = quad(64)
     path, log = load(tmp_path, blackbox(rows, headers={'Firmware revision': firmware, **headers}))
     found = named(log)
@@ -117,7 +115,6 @@ def test_a_pause_of_the_log(tmp_path):
 
 
 def test_frames_before_the_first_key_frame_are_dropped(tmp_path):
-    """Frames that add to a missing frame are dropped, with a note."""
     pieces = blackbox(quad(128))
     path, log = load(tmp_path, [pieces[0], *pieces[5:]])
     assert choose(path, log).voltage.n == 96
@@ -134,7 +131,6 @@ def test_readings_of_the_adc(tmp_path):
 
 
 def test_a_truncated_log_is_read_up_to_its_end(tmp_path):
-    """Everything before the cut is read, and the cut is reported."""
     rows = quad(200)
     pieces = blackbox(rows)
     whole = b''.join(pieces)
@@ -165,7 +161,6 @@ def test_cut_within_the_header(tmp_path):
 
 
 def test_flipped_bytes_give_an_error_or_sound_frames(tmp_path):
-    """Flipped bytes give a one-line error, or sound frames and a note on the lost ones."""
     rows = quad(600)
     truth = dict(zip(((rows[:, TIME] - rows[0, TIME]) * 1e-6).round(6), rows[:, VOLTS] / 100))
     pieces = blackbox(rows)

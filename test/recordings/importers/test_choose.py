@@ -18,7 +18,6 @@ def series(name='v', quantity=VOLTAGE, t=(0.0, 1.0, 2.0), values=(5.0, 5.1, 5.2)
 
 
 def test_the_smallest_rank_is_the_default():
-    """The smallest rank is chosen; a series without a rank only by name."""
     log = Log('x', (series('a', rank=None), series('b', rank=1), series('c', rank=0)))
     assert choose(PATH, log).voltage.name == 'c'
     assert choose(PATH, log, voltage='a').voltage.name == 'a'
@@ -27,7 +26,6 @@ def test_the_smallest_rank_is_the_default():
 
 
 def test_an_unknown_name_is_refused_with_the_nearest():
-    """An error names the nearest series; a throttle cannot be the voltage."""
     log = Log('x', (series('battery'), series('gas', THROTTLE)))
     with pytest.raises(InputError, match="did you mean 'battery'"):
         choose(PATH, log, voltage='batery')
@@ -49,7 +47,6 @@ def test_values_that_no_message_holds_are_dropped():
 
 
 def test_two_throttles_of_one_rank_need_a_choice():
-    """If two series have the smallest rank, the user must choose."""
     log = Log('x', (series(), series('a', THROTTLE), series('b', THROTTLE)))
     with pytest.raises(InputError, match='several: a .*b .*--throttle'):
         choose(PATH, log)
@@ -70,7 +67,6 @@ def test_the_current_beside_the_voltage():
 
 
 def test_unusable_samples_are_dropped_with_a_note():
-    """Each kind of unusable sample is dropped, with a sentence of its own."""
     t = [0.0, 1.0, 1.0, np.nan, 2.0, 1.5, 3.0, 1e9, 4.0, *range(5, 20)]
     mended, notes = clean(series(t=t, values=[1, 2, 3, 4, np.inf, 6, 7, 8, 9.0, *range(15)]))
     np.testing.assert_array_equal(mended.t[:5], [0.0, 1.0, 1.5, 3.0, 4.0])
@@ -107,7 +103,6 @@ def test_throttle_is_a_share():
 
 
 def test_a_voltage_without_usable_samples_is_refused():
-    """A voltage without usable samples is refused; a throttle is left out with a note."""
     bad = series(values=(np.nan,) * 3)
     with pytest.raises(InputError, match='no usable sample'):
         choose(PATH, Log('x', (bad,)))

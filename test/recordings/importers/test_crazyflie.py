@@ -32,7 +32,6 @@ def test_values_and_stamps(tmp_path, version, unit):
 
 
 def test_a_crazyflie_log_is_analyzed_and_converted(tmp_path, capsys):
-    """Battery, mean of the motors and gyro are read, without repeats."""
     events, records, table = hover(3000, refresh=5)
     path, _ = load(tmp_path, crazyflie(events, records))
     assert main(['convert', str(path), str(tmp_path / 'bag')]) == 0

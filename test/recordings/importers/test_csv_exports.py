@@ -390,7 +390,6 @@ def test_an_export_is_read_without_an_option(form, tmp_path):
     ('Time,V\n59:59.0,12\n59:59.5,13\n00:00.0,14\n', CsvColumns(), 0.5, [12, 13, 14]),
 ])
 def test_a_guess_is_overruled(content, columns, step, volts, tmp_path):
-    """Units, delimiter, decimal mark, lines above and the time from row to row."""
     found = read_recording(written(tmp_path, content), columns=columns)
     np.testing.assert_allclose(found.voltage, volts)
     np.testing.assert_allclose(np.diff(found.t), step)
@@ -486,7 +485,6 @@ def test_other_rows_that_share_a_stamp_are_dropped(stamps, volts, tmp_path):
 
 
 def test_the_unit_of_a_throttle(tmp_path):
-    """Percent and pulses are found by their size, and overruled; none, and no current, by name."""
     rows = 't,U,gas,I\n' + ''.join(f'{k},12,{g},3\n' for k, g in enumerate((1100, 1500, 1900)))
     path = written(tmp_path, rows)
     np.testing.assert_allclose(read_recording(path).throttle, [0.1, 0.5, 0.9])
@@ -546,7 +544,6 @@ def test_a_current_is_not_read_as_a_voltage(tmp_path):
 
 @pytest.mark.parametrize('order', ['one after another', 'equal stamps', 'in turn'])
 def test_series_that_rows_name_are_columns(tmp_path, order):
-    """Foxglove, InfluxDB: a column of text names the series of each value."""
     late = 0.5 if order == 'in turn' else 0.0
     rows = [(k + late * place, name, size + 0.1 * (k % 7))
             for place, (name, size) in enumerate((('pack/current', 3.0), ('pack/voltage', 12.0),
@@ -667,7 +664,6 @@ def test_stacked_series_and_other_quantities_are_no_voltage(tmp_path):
 
 
 def test_one_column_is_one_series(tmp_path):
-    """A time is no signal, a column of unknown kind not two quantities."""
     path = written(tmp_path, 'time_s,x\n0,0.5\n1,0.6\n')
     with pytest.raises(InputError, match="'time_s' is the time, not a signal"):
         import_log(path, Request(names=frozenset(('time_s',))))
@@ -714,6 +710,5 @@ def test_a_file_of_another_kind_is_named(content, words, tmp_path):
     ('time,U\n10:00:00,12\n10:99:00,12\n', "'10:99:00'"),
     ('time,U\n10:00:00,12\n10:00:01+99:99,12\n', r"'10:00:01\+99:99'")])
 def test_cells_that_are_no_time_or_number_are_refused(content, words, tmp_path):
-    """With the cell, and never misread."""
     with pytest.raises(InputError, match=words):
         read_recording(written(tmp_path, content))

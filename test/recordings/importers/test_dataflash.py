@@ -12,7 +12,6 @@ import pytest
 
 @pytest.mark.parametrize('form', ['dataflash', 'dataflash_text'])
 def test_binary_and_text_logs_are_read_exactly(tmp_path, form):
-    """Binary and text give the same battery, throttle and current, bit for bit."""
     made, t, volts, share, amperes, pulses = copter()
     path, log = load(tmp_path, made.binary if form == 'dataflash' else made.text)
     chosen = choose(path, log)
@@ -64,7 +63,6 @@ def test_scales_of_the_throttle(tmp_path, factor):
 
 
 def test_outputs_without_parameters(tmp_path):
-    """Without parameters it is unknown which outputs are motors."""
     _, log = load(tmp_path, copter(parameters=False)[0].binary)
     assert 'RCOU.motors' not in named(log)
     assert named(log)['RCOU.C1'].rank is None
@@ -86,7 +84,6 @@ def test_units_of_old_logs_are_converted(tmp_path):
 
 
 def test_a_log_without_a_battery_names_the_missing_messages(tmp_path):
-    """The error names the messages that were searched."""
     log = Dataflash()
     log.form(1, 'MSG', 'QZ', 'TimeUS,Message')
     log.put('MSG', 1, 'ArduCopter V4.5.1')
@@ -95,7 +92,6 @@ def test_a_log_without_a_battery_names_the_missing_messages(tmp_path):
 
 
 def test_a_truncated_log_is_read_up_to_its_end(tmp_path):
-    """A cut inside a message is reported with its byte; everything before is read."""
     made, _, volts, *_ = copter(40)
     ends = np.cumsum([len(piece) for piece in made.pieces])
     first = int(ends[-60])
@@ -121,7 +117,6 @@ def test_erased_page_is_not_damage(tmp_path):
 
 @pytest.mark.parametrize('form', ['binary', 'text'])
 def test_flipped_bytes_give_an_error_or_a_note(tmp_path, form):
-    """Flipped bytes give a one-line error, or samples and a note on the lost ones."""
     whole = getattr(copter(60)[0], form)
     first = 3 if form == 'text' else whole.index(b'ArduCopter') // 2
     refused, mended = outcomes_of_flipped_bytes(tmp_path, whole, first, 9, 50)
@@ -145,7 +140,6 @@ def test_messages_of_the_parser_are_suppressed(tmp_path, capfd):
 
 
 def test_a_text_log_cut_off(tmp_path):
-    """The incomplete last line is reported."""
     text = copter(30)[0].text
     path, log = load(tmp_path, text[:-7], 'a.log')
     assert log.notes == (

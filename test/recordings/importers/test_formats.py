@@ -58,7 +58,6 @@ def test_a_log_given_as_a_recording(tmp_path, name):
 
 
 def test_a_missing_file_and_a_folder_are_refused(tmp_path):
-    """A missing file, and a folder."""
     with pytest.raises(InputError, match='there is no log'):
         detect(tmp_path / 'none.ulg')
     with pytest.raises(InputError, match='is a folder'):

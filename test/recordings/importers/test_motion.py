@@ -114,7 +114,6 @@ def test_ulog_is_turned_to_base_link(tmp_path):
 
 
 def test_dataflash_states_units_and_holds_escs(tmp_path):
-    """IMU turned, the second one by name, speeds of ESCs that report in turns."""
     log_file = Dataflash()
     log_file.form(3, 'BAT', 'QBf', 'TimeUS,Inst,Volt')
     log_file.form(4, 'IMU', 'QBffffff', 'TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ')
@@ -142,7 +141,6 @@ def test_dataflash_states_units_and_holds_escs(tmp_path):
 
 
 def test_topics_and_units_of_a_converted_log(tmp_path, capsys):
-    """Topics, units and values come back; the list names what convert takes."""
     rows, moving = frames()
     path, _ = load(tmp_path, blackbox(rows, FIELDS, HEADERS))
     assert main(['convert', str(path), '--list', '--json', '-']) == 0

@@ -50,7 +50,6 @@ def betaflight():
 @pytest.mark.parametrize('log', [px4, ardupilot, betaflight])
 @pytest.mark.parametrize('name', ['out', 'out.mcap'])
 def test_log_to_bag_and_back(tmp_path, log, name):
-    """Voltage, throttle and current come back, and so does where they are from."""
     content, volts, throttle, amperes, field, firmware = log()
     path, out = tmp_path / 'a.log', tmp_path / name
     path.write_bytes(content)
@@ -103,7 +102,6 @@ def test_a_log_and_its_bag_give_one_json(tmp_path):
 
 
 def test_a_signal_of_a_log_and_of_its_bag_is_one(tmp_path):
-    """Beside a signal throttle keeps its rate; `readings_of` gives what `analyze` reads."""
     path, out = tmp_path / 'a.bbl', tmp_path / 'bag'
     fields = ('loopIteration', 'time', 'rcCommand[3]', 'vbatLatest', 'amperageLatest',
               'motor[0]', 'motor[1]', *(f'gyroADC[{k}]' for k in range(3)))
@@ -127,7 +125,6 @@ def test_a_signal_of_a_log_and_of_its_bag_is_one(tmp_path):
 
 
 def test_a_fleet_is_grouped_by_the_vehicle_of_its_logs(tmp_path, one_process):
-    """A folder, a file, one cut off, and what a person wrote: whatever folder they lie in."""
     path, logs = tmp_path / 'a.log', tmp_path / 'logs'
     logs.mkdir()
     for k, name in enumerate(('one', 'two.mcap', 'three.mcap', 'four', 'five')):
@@ -152,7 +149,6 @@ def test_a_fleet_is_grouped_by_the_vehicle_of_its_logs(tmp_path, one_process):
 
 
 def test_rosbags_reads_a_converted_log(tmp_path):
-    """The rosbags library reads every topic; the bag and its metadata.yaml state the source."""
     path, out = tmp_path / 'a.log', tmp_path / 'bag'
     path.write_bytes(betaflight()[0])
     assert main(['convert', str(path), str(out)]) == 0

@@ -48,7 +48,6 @@ def test_a_sample_before_the_start_is_the_start(tmp_path):
 
 
 def test_two_connected_batteries_need_a_choice(tmp_path):
-    """Only connected batteries count: with two of them the user must choose."""
     topics, t, volts, *_ = px4_flight()
     second = ('battery_status', 1, BATTERY,
               [(int(a), b + 1, -1.0, True) for a, b in zip(t, volts)])
@@ -75,7 +74,6 @@ def test_two_connected_batteries_need_a_choice(tmp_path):
      'actuator_outputs[0].output[0]', 0.25),
 ])
 def test_every_source_of_throttle_becomes_0_to_1(tmp_path, fields, row, name, value):
-    """Each source of throttle is converted to 0..1."""
     topics, *_ = px4_flight(20)
     topic = name.split('[')[0]
     fields = [('uint64_t', 'timestamp'), *fields]
@@ -99,7 +97,6 @@ def test_a_log_without_a_battery_is_refused(tmp_path):
 
 
 def test_dropouts_are_reported(tmp_path):
-    """A note reports messages that the logger lost."""
     topics, *_ = px4_flight()
     _, log = load(tmp_path, ulog(topics, extra=ulog_message('O', b'\x2c\x01')))
     assert log.notes == ('The logger lost data 1 time, 0.300 s in all.',)
@@ -128,7 +125,6 @@ def test_a_truncated_log_is_read_up_to_its_end(tmp_path):
 
 
 def test_flipped_bytes_give_an_error_or_a_note(tmp_path):
-    """Flipped bytes give a one-line error, or samples and a note on the lost ones."""
     topics, *_ = px4_flight(60)
     assert all(outcomes_of_flipped_bytes(tmp_path, b''.join(ulog(topics)), 16, 7, 120))
 
