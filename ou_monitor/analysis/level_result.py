@@ -272,7 +272,8 @@ def ou_spectrum(frequency: FloatArray, alpha: float, sigma: float, rate: float,
 _MIN_SEGMENT = 16
 # Minimum samples of a histogram.
 _LEAST_BINNED = 50
-# Half the mean square of the steps over the mean square, 1 for white noise: below, a random walk.
+# A series is a random walk if half the mean square of its steps is below this share of its mean
+# square (1 for white noise).
 _WANDERS = 0.5
 
 
@@ -397,13 +398,13 @@ def fit_level(recording: Recording, left: Remainder, level: LoadLevel, levels: i
     still = replace(recording, voltage=left.voltage)
     grids = [on_grid(still.t[s.start:s.stop], still.voltage[s.start:s.stop]) for s in within]
     even = _grid_rate(grids)
-    # Without whitening, the spectrum of a slow relaxation, steep at low frequencies, shows lines.
+    # Without whitening, the steep spectrum of a slow relaxation would show false lines.
     model = estimate if estimate.usable or whole is None else whole()
     lines = find_lines([grid.values for grid in grids], even, levels=levels, white=[
         _white(still.t[s.start:s.stop], still.voltage[s.start:s.stop], model)
         for s in within] if model.usable else ())
     if lines.lines and math.isfinite(level.throttle):
-        # A line of throttle is the load's.
+        # A line that throttle has too belongs to the load.
         commanded = find_lines([on_grid(still.t[s.start:s.stop], still.throttle[s.start:s.stop]
                                         ).values for s in within], even).lines
         lines = replace(lines, lines=tuple(line for line in lines.lines if not any(

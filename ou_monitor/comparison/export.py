@@ -37,7 +37,7 @@ SOURCES = {
 _KEPT = {'px4': ('drift',), 'gazebo': ('drift', 'load_sag'), 'ardupilot': ('drift', 'load_sag')}
 # Voltages of a cell that counts as empty, and as critical, V.
 _EMPTY, _CRITICAL = 3.5, 3.3
-# Exponent of the current over throttle, for which the discharge of the model is valid.
+# Exponent of the current over throttle that the discharge of the model assumes.
 _POWER = 1.8
 _SEEDS = 20  # Simulations of each model
 
@@ -154,7 +154,7 @@ def _capacity(n: _Numbers, full_current: float) -> float:
 def _gazebo(n: _Numbers, full_current: float) -> str:
     current = full_current * n.share
     capacity = _capacity(n, full_current)
-    # The line through level now and empty, over charge drawn: E = e0 + e1 (1 - q/c).
+    # A straight line over charge drawn, from the present level to empty: E = e0 + e1 (1 - q/c).
     slope = (n.empty - n.full) / n.charge
     return '\n'.join((
         f'<!-- {SOURCES["gazebo"]} -->',

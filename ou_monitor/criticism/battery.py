@@ -1,10 +1,10 @@
 """
 Test statistics of a model's scores: each is about standard normal if the model is right.
 
-Each is scaled to be about N(0, 1) for independent normal scores.  Mean and spread come from a
-`NullBank`: simulations of the fitted baseline with the stamps and throttle of the data, fitted and
-evaluated in the same way.  Only lines that follow throttle (too slow to simulate) and errors after
-large ones use theory.  A name begins with its kind, to which the `SIGNS` of terms refer.
+Mean and spread of each come from a `NullBank`: simulations of the fitted baseline with the stamps
+and throttle of the data, fitted and evaluated in the same way.  Two kinds use theory instead:
+lines that follow throttle, because simulating them takes too long, and errors after large ones.
+A name begins with its kind, to which the `SIGNS` of terms refer.
 
 Three kinds of statistics belong to no term: loops of throttle, a growing effect of throttle, and
 errors after large ones.  They expose effects that imitate a term but have hysteresis, develop over
@@ -287,7 +287,7 @@ def throttle_paths(throttle: FloatArray, keep: float) -> Iterator[tuple[str, Flo
 
 def _residual(name: str, wanted: FloatArray, known: FloatArray, keep: float
               ) -> Iterator[tuple[str, FloatArray]]:
-    """Yield a regressor less its fit by others, whitened, if enough of its power is left."""
+    """Yield the part of a regressor that others do not explain, whitened, if large enough."""
     less = wanted - known @ np.linalg.lstsq(known, wanted, rcond=None)[0]
     if float(less @ less) > _LEAST * float(wanted @ wanted):
         yield name, less - keep * np.concatenate((less[:1], less[:-1]))

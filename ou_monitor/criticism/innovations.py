@@ -14,8 +14,8 @@ hundreds of samples.
 
 AC-coupled instrument, a high-pass: the ordinates below its corner are too small.  Their sum is
 tested by the gamma distribution, which holds for few ordinates, unlike the lower tail of the
-score.  It counts only if more than half of their power is missing, because a regression removes
-some.
+score.  It counts only if more than half of their power is missing, because the regression of
+the mean removes some, too.
 
 Limits: only the rates in `FACTORS`, one at a time; a corner at the rate of the OU itself is
 absorbed by the fit; linear drifts are removed; samples are taken as evenly spaced.
@@ -42,7 +42,8 @@ LEAST_SHARE = 0.1
 FACTORS = (1.0 / 30.0, 1.0 / 10.0, 1.0 / 3.0, 3.0, 10.0)
 # Minimum ordinates of a test, and minimum samples of a segment.
 _FEWEST, _SHORTEST = 64, 64
-# Maximum mean ordinate, minus 1, below the corner of a high-pass, which removes 79 % there.
+# A high-pass is considered only if the mean ordinate below its corner, minus 1, is less than this;
+# it removes 79 % there.
 _MISSING = -0.5
 # Relative difference up to which steps count as equal.
 ALIKE = 0.3

@@ -27,13 +27,13 @@ from ou_monitor.model.terms.term import LawFit, Role, Term
 from ou_monitor.model.whittle import Ordinates
 from ou_monitor.records import FloatArray, NAN
 
-# Maximum starting points that are fitted, samples to select them, and kinds with a full fit.
+# Maximum starting points to fit, samples by which they are selected, and kinds fitted in full.
 _FULL, _PREVIEW, _FEW = 2, 8000, 4
 # First estimates below this share of the best are dropped: a full fit at most doubles an estimate.
 _WITHIN = 0.5
 # Maximum alternations between the fit and the `APART` parameters of its terms.
 _AGAIN = 3
-# Tolerances within which fits to one spectrum, nats, and scores are equal.
+# Differences that count as none: between gains of two fits, nats, and between scores.
 _ALIKE, _SAME = 0.1, 1e-6
 
 
@@ -123,7 +123,7 @@ class Fitter:
     def trials(self, composite: Composite, kinds: Sequence[type[Term]],
                statistics: Callable[[Composite], Mapping[str, float]]) -> list[Trial]:
         """Return kinds that improve a model: all are estimated, the best few fitted in full."""
-        # Kinds that failed before are tried again if score tests now show more than then.  Slow
+        # Kinds that failed are tried again if their gain by score tests has risen since.  Slow
         # kinds come last, and only if they imitate the best other kind or score tests still show
         # them after it is added.
         values = statistics(composite)
@@ -172,7 +172,7 @@ class Fitter:
         found, names = list(known), {trial.name for trial in known}
         best = sorted(estimates, key=lambda estimate: -estimate[0])[:_FEW]
         for gain, kind, start in best:
-            # Compare with full fits, because a law may lose all of its first estimate in one.
+            # Compare with full fits, in which a law may lose all of its estimated gain.
             top = max((trial.evidence for trial in found), default=0.0)
             if gain < _WITHIN * top or kind.NAME in names:
                 continue
@@ -200,7 +200,7 @@ class Fitter:
         return last[1]
 
     def _finds_events(self, kind: type[Term], view: View) -> bool:
-        """Return whether a law finds events, which have widened the Gaussian part until now."""
+        """Return whether a law finds events (until it is added, they widen the Gaussian part)."""
         found = None if kind.SLOW_FIT else self.law_fit(kind, view)
         return found is not None and (found.push is not None or found.error is not None)
 

@@ -95,7 +95,8 @@ def mean_response(samples: Samples, composite: Composite, view: View,
 
 def _refined(samples: Samples, composite: Composite, found: MeanResponse) -> MeanResponse:
     """Return a response with its time constants between those of the list."""
-    # Half an octave beside the truth, a response of 0.6 V leaves 40 mV, which pass for a slow OU.
+    # With a time constant wrong by half an octave, a response of 0.6 V leaves an error of 40 mV,
+    # which would be taken for a slow OU.
     terms, worth = found.terms, found.worth
     for octaves in _FINER:
         nearby = [(k, replace(term, tau=term.tau * 2.0 ** by)) for k, term in enumerate(terms)
@@ -156,7 +157,7 @@ class _Regression:
         self._all = self._blocks.sum(axis=0)
         self._penalty = 0.5 * math.log(samples.n)
         self._known: dict[tuple[int, ...], tuple[float, FloatArray]] = {}
-        # Whether sets with time constants too near to be told apart have no evidence.
+        # Whether to refuse sets that contain nearly equal time constants.
         self._apart = False
 
     def search(self, start: Sequence[int]) -> MeanResponse:
@@ -195,8 +196,8 @@ class _Regression:
 
     def exchanged(self, own: int, places: Sequence[int]
                   ) -> tuple[tuple[int, ...], tuple[float, ...]]:
-        """Return the first terms, each in its place or a better later one, and their worth."""
-        # places: the place of each later term of the pool.
+        """Exchange the first `own` terms for better later ones; return them and their worth."""
+        # places: for each term of the rest, the place that it may take.
         self._apart = True
         chosen = list(range(own))
         for k, place in enumerate(places, own):

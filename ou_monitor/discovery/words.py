@@ -70,7 +70,7 @@ _LISTED = 6
 
 
 def parameters(term: Term, se: Mapping[str, Any]) -> str:
-    """Return the estimates of a term with units and errors; without those unknown, or unused."""
+    """Return the estimates of a term with units and errors; omit unknown and unused ones."""
     known = {name: value for name, value in term.values().items()
              if se.get(name) != math.inf and value != term.usual().get(name, 0.0)}
     long = [name for name, value in known.items()
@@ -134,7 +134,8 @@ def left_out_note(count: int, scored: int) -> str:
 
 def coupling_note(alpha: float, duration: float) -> str:
     """Return for which rails an AC coupling is ruled out (alpha in 1/s, duration in s)."""
-    # Evidence for one grows as 0.24 alpha T nats with the rate alpha of the rail behind it.
+    # Evidence for an AC coupling is 0.24 alpha T nats (alpha: rate of the rail behind it; T:
+    # duration).
     slowest = 0.24 * duration / 6.0
     return (f'If the supply itself relaxes more slowly than in {number(slowest)} s, the '
             'relaxation found could be that of an AC-coupled instrument (a high-pass at '

@@ -80,7 +80,7 @@ def channels_of(kind: str, field: str, *, mode: str = 'lowpass') -> Channels:
         raise InputError(
             f"input.type: cannot filter '{kind}' without input.field (the path of its signal); "
             f'{nearest(kind, CHANNELS)}')
-    # A number without a unit stays without one.
+    # The derivative of a number without a unit is a number, too: the type stays.
     return found if mode != 'derivative' or found is _DATA else _derivative(kind, found)
 
 

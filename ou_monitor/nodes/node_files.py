@@ -116,7 +116,7 @@ _Chosen = tuple[str, 'ModelFile | None', bytes]
 def _read(path: str) -> tuple[ModelFile, bytes]:
     """Return a parsed model file, and its bytes."""
     try:
-        # Before the import, which takes a second on a busy machine: this error comes at once.
+        # Read before the slow import (a second on a busy machine), so that errors come at once.
         with open_regular(path) as file:
             known = file.read(_LARGEST)
     except (OSError, ValueError) as error:

@@ -48,8 +48,8 @@ class FieldSpec:
     # Meaning of an exact 0: 'value'; "not measured" ('unknown'); or "not measured" until another
     # value has come ('unknown_at_first').
     zero: str = 'value'
-    # Hz; if given, the field is an array, a block of samples at this rate, and the stamp belongs
-    # to the LAST sample of the block.
+    # Hz, for the voltage only; if given, the field is an array, a block of samples at this rate,
+    # and the stamp belongs to the LAST sample of the block.
     sample_rate: float | None = None
     # Path of a builtin_interfaces/Time ('header.stamp') or of a number ('timestamp'); None: the
     # middleware's source timestamp.

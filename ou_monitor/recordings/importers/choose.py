@@ -27,7 +27,7 @@ from ou_monitor.timeline import check_throttle
 # Word that leaves a quantity out.
 NONE = 'none'
 
-# Maximum series named in one line, and what shows the others.
+# Maximum number of series named in one line, and the hint where to find the others.
 MOST, _LIST = 4, 'see convert LOG --list'
 
 
@@ -44,7 +44,7 @@ class ChosenSeries:
 
 def choose(path: Path, log: Log, *, voltage: str | None = None, throttle: str | None = None,
            current: str | None = None, option: str = '--{}') -> ChosenSeries:
-    """Choose series, and drop unusable samples (option: the option that chooses a quantity)."""
+    """Choose series, drop unusable samples (option: name of a quantity's option, for errors)."""
     volts = _pick(path, log, VOLTAGE, voltage, option)
     if volts is None:
         raise InputError(_no_voltage(path, log, option))

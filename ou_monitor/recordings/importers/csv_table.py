@@ -50,8 +50,8 @@ _USUAL_STEP, _USUAL_SPAN = 2.0, 43200.0
 _OF_1970, _TO_2100 = (25569.0, 719529.0), 47482.0
 # Rows from which repeated stamps are the resolution of a clock.
 _FEW_ROWS = 8
-# Stamps shared by rows: minimum rows per stamp to spread them; maximum relative deviation of their
-# number; stamps between which rows are even (one row is then 1 % of ten rows per stamp).
+# To spread rows that share stamps: minimum mean number of rows per stamp; maximum relative
+# deviation of that number; stamps per straight piece (with ten rows a stamp, a row is 1 % of it).
 _LEAST_SHARED, _UNSTEADY, _EVEN = 1.5, 0.2, 10
 # Change by rounding; standard errors above which a mean change is significant.
 _ROUNDING, _SURE = 1e-6, 4.0
@@ -94,10 +94,10 @@ _PATTERNS = {
         r'(?:_?(?:avg|average|mean))?(?:_?1)?|'
         r'(?!.*(?:max|min|limit)).*_batt?(?:ery)?_current'),
 }
-# Column that identifies a program, '' for any -> ends of the names of its columns, in lower case:
-# factor, unit and the number of an unknown value.  Betaflight's blackbox explorer writes the
-# numbers of the log: us, 0.01 V and 0.01 A from version 4.0 on; MAVLink those of SYS_STATUS,
-# BATTERY_STATUS and POWER_STATUS (common.xml).
+# Column by which a program is recognised ('': any program) -> for each of its columns, by the end
+# of the name in lower case: factor, unit, and the number that stands for "unknown".  Betaflight's
+# blackbox explorer writes the numbers of the log: us, 0.01 V and 0.01 A from version 4.0 on;
+# MAVLink those of SYS_STATUS, BATTERY_STATUS and POWER_STATUS (common.xml).
 _RAW: dict[str, dict[str, tuple[float, str, float]]] = {
     'loopIteration': {'time': (1e-6, 'us', math.nan), 'rccommand[3]': (0.0, 'us', math.nan), **{
         f'{name}{end}': (0.01, unit, math.nan) for name, unit in (
@@ -549,8 +549,8 @@ def _read(path: Path, form: Form, time: _Column, places: list[int],
 def _check_one_series(path: Path, form: Form, t: FloatArray, column: str, values: FloatArray,
                       ) -> None:
     """Raise InputError if a column of text names several series that share a column of values."""
-    # Their stamps rise within each, and overlap, or the series alternate in a column without a
-    # telling name.
+    # Stamps rise within each series.  Several series are likely if stamps go back (they overlap),
+    # or if the column of values has a general name.
     known = np.isfinite(t) & np.isfinite(values)
     stamps = t[known]
     overlap = np.count_nonzero(
@@ -630,8 +630,8 @@ def _spread(t: FloatArray, volts: FloatArray) -> FloatArray:
     if rows.size < 2 or _LEAST_SHARED * begin.size > known.size or (step < 0.0).any():
         return t
     usual, first = float(np.median(rows)), change[begin[1:] - 1]
-    # Not if the voltage changes only between stamps (repeated rows), or always in one direction
-    # there (several series in turn).
+    # Leave the stamps if the voltage changes only from one stamp to the next (repeated rows), or
+    # always in one direction there (several series in turn).
     if np.mean(np.abs(rows - usual) > max(1.0, _UNSTEADY * usual)) > WILD or np.count_nonzero(
             first) > (1.0 - WILD) * np.count_nonzero(change) or abs(
                 np.mean(first) - np.mean(change)) > _ROUNDING + np.std(first) * max(
