@@ -507,6 +507,9 @@ class Recording:
 
     def __post_init__(self) -> None:
         """Convert dates and masked values; refuse arrays that cannot be one recording."""
+        if not isinstance(self.name, str):
+            raise TypeError(f'name must be a text, got {type(self.name).__name__}: give a current '
+                            'as current=')
         # Samples are paired by position: pandas series in different orders would be mixed.
         found: list[Any] = [getattr(given, 'index', None) for given in (
             self.t, self.voltage, self.throttle, self.current)]

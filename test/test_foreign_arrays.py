@@ -163,6 +163,11 @@ def test_series_of_two_orders_are_refused():
         Recording(Indexed(SECONDS, 'by size'), volts)
 
 
+def test_a_fourth_array_is_not_taken_for_the_name():
+    with pytest.raises(TypeError, match='give a current as current='):
+        Recording(SECONDS, VOLTS, VOLTS, VOLTS)
+
+
 def test_missing_throttle_is_unknown():
     """Left out or None it is unknown; a number holds for all samples."""
     for recording in (Recording(SECONDS, VOLTS), Recording(DATES, VOLTS, None)):

@@ -121,7 +121,7 @@ def test_parameters_that_the_recording_cannot_determine_are_not_shown():
     ends = Saturation(14.0, 2000.0)
     slow = OU(0.01, 0.3, 15.0)
     assert parameters(late, with_reach(late, {}, samples)) == (
-        'immediate response = 0.2000 V; delay = 0.02000 s')
+        'decaying part = 0.2000 V; delay = 0.02000 s')
     assert parameters(ends, with_reach(ends, {}, samples)) == 'low = 14.00 V'
     assert 'alpha' not in parameters(slow, with_reach(slow, {'alpha': 1.0}, samples))
     near = LoadTransient(0.2, 16.0, 0.0)

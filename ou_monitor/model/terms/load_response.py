@@ -105,8 +105,8 @@ class LoadTransient(Term):
     SEPARATED_BY: ClassVar[str] = (
         'single steps of throttle, each held for ten times the time constant of the response')
 
-    gain: float = parameter('V', 'immediate response to a step to full throttle',
-                            label='immediate response')
+    gain: float = parameter('V', 'part of a step to full throttle that decays with tau',
+                            label='decaying part')
     tau: float = parameter('s', 'time constant of its decay', 0.0, above=True)
     delay: float = parameter('s', 'delay before the response begins', 0.0)
     rise: float = parameter('V', 'added to the gain while throttle rises', default=0.0)
