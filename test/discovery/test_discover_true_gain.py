@@ -131,7 +131,7 @@ def test_the_loss_by_parameters_is_that_of_theory():
 def test_the_gain_reported_is_the_true_models(name):
     """Within three errors of the true model's, over the plain fit that `discover` made."""
     true, _ = KINDS[name]
-    simulated_of = simulated(2000, true, seconds=30.0)
+    simulated_of = simulated(2000, true)
     found = discover(Recording(simulated_of.t, simulated_of.voltage, simulated_of.throttle, name))
     samples = found.samples
     assert samples.n == simulated_of.n

@@ -65,7 +65,7 @@ def test_codes_moved_by_what_is_no_code_are_no_holds(height):
 
 # Recorded runs, and the seconds of each in which effects are hidden: short, so that it is cheap.
 FLIGHTS = {'gecko': (ROOT / 'bags' / 'recorded' / 'gecko.csv', 30.0, 40.0),
-           'cf_solo': (REAL / 'cf_solo_large.csv', 10.0, 30.0)}
+           'cf_solo': (REAL / 'cf_solo_large.csv', 10.0, 22.0)}
 
 
 @cache

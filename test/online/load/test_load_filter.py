@@ -55,10 +55,10 @@ def test_a_simulated_pack_is_recovered():
 
 
 @pytest.mark.parametrize('lag', [0.0, 0.03, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0])
-@pytest.mark.parametrize('power', [1.0, 1.8])
-def test_a_lag_of_any_length_is_in_the_sag(lag, power):
+def test_a_lag_of_any_length_is_in_the_sag(lag):
     """0.9 V that lag by 0 to 10 s: the interval holds the sag after a second."""
-    for seed in range(3):
+    # A sag two errors off is outside of half of the intervals, and in all six of a lag with 1/64.
+    for seed, power in enumerate((1.0, 1.8, 1.8)):
         rng = np.random.default_rng(seed)
         t = np.arange(0.0, 60.0, 0.02)
         load = lowpass(throttle_of_a_flight(t, rng), t, 0.06)
