@@ -38,7 +38,6 @@ def run(args):
 
 
 def insert(path: Path, before: str, text: str) -> None:
-    """Put a text before the only place at which the file has `before`."""
     found = path.read_text(encoding='utf-8')
     assert found.count(before) == 1, before
     path.write_text(found.replace(before, text + before), encoding='utf-8')

@@ -135,11 +135,9 @@ class Axes:
     """What `plot` asks of axes, kept."""
 
     def __init__(self):
-        """Begin with nothing drawn."""
         self.calls = []
 
     def __getattr__(self, name):
-        """Keep a call."""
         return lambda *args, **more: self.calls.append((name, args, more))
 
 

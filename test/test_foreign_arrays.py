@@ -20,11 +20,9 @@ class Axis:
     """An array of another library, as `pandas.Series` and `xarray.DataArray` are to NumPy."""
 
     def __init__(self, values):
-        """Keep the values."""
         self._values = values
 
     def __array__(self, dtype=None, copy=None):
-        """Return the values."""
         return self._values if dtype is None else self._values.astype(dtype)
 
 
@@ -142,13 +140,11 @@ class Indexed(Axis):
     """A `pandas.Series`: an array with an index, which has `equals`."""
 
     def __init__(self, values, order):
-        """Keep values and index."""
         super().__init__(values)
         self.index = self
         self._order = order
 
     def equals(self, other):
-        """Return whether two indices are the same."""
         return self._order == other._order
 
 

@@ -113,7 +113,6 @@ def wrong_imports(source: str, module: str) -> list[str]:
 
 
 def modules() -> dict[str, Path]:
-    """Return every module of the package by its dotted name."""
     return {
         '.'.join(path.relative_to(ROOT).with_suffix('').parts): path
         for path in sorted((ROOT / PACKAGE).rglob('*.py'))}

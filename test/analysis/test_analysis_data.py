@@ -25,7 +25,6 @@ LEVEL_KEYS = {
 
 @pytest.fixture(scope='module')
 def analysis():
-    """Return the analysis of two levels."""
     return analyze(recording(6, ((0.1, 0.3156), (0.4, 0.632))))
 
 

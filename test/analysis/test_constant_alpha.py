@@ -18,7 +18,6 @@ THROTTLES = (0.1, 0.3, 0.5, 0.7)
 
 
 def estimate(alpha, se):
-    """Return a usable estimate."""
     return Estimate(alpha=alpha, sigma=0.3, var_inf=7e-4, u0=5.0, alpha_se=se, sigma_se=0.01,
                     var_inf_se=se, status=Status.OK, rate=1000.0)
 

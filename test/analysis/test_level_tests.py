@@ -26,7 +26,6 @@ def truth(**changes):
 
 
 def ou(seed, sigma=SIGMA, t=T):
-    """Return an OU."""
     return simulate(t, ALPHA, sigma, np.random.default_rng(seed), u0=5.0)
 
 

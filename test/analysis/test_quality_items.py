@@ -18,12 +18,10 @@ BACK = np.concatenate((np.arange(900.0), np.arange(900.0) - 1.5)) / 450.0
 
 
 def listed(simulated, estimates=(GOOD,)):
-    """Return the list of a recording of one level."""
     return quality_list(simulated, [0.1] * len(estimates), estimates)
 
 
 def names(items):
-    """Return name -> severity."""
     return {item.name: item.severity for item in items}
 
 

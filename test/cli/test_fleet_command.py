@@ -62,7 +62,6 @@ def logs(tmp_path_factory) -> Path:
 
 
 def command(*arguments: object) -> list[str]:
-    """Return the command line of a process of its own."""
     return [sys.executable, '-m', 'ou_monitor.cli.main', 'fleet', *map(str, arguments)]
 
 
@@ -147,7 +146,6 @@ def whole(story) -> tuple[Path, subprocess.CompletedProcess]:
 
 @pytest.fixture(scope='module')
 def rows(whole) -> list[dict]:
-    """Return the rows of the table."""
     return parquet.read_table(whole[0] / 'fleet.parquet').to_pylist()
 
 

@@ -64,7 +64,6 @@ def test_bad_arguments_are_one_line(argv, words, capsys):
 
 
 def stand_in(monkeypatch, action):
-    """Make the command `analyze` do something else."""
     command = replace(cli.COMMANDS['analyze'], module='stand_in', options=())
     monkeypatch.setitem(cli.COMMANDS, 'analyze', command)
     monkeypatch.setitem(sys.modules, 'stand_in', SimpleNamespace(run=action))

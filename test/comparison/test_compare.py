@@ -34,7 +34,6 @@ def drawn(seed: int, n: int = 4000, rate: float = 100.0) -> Recording:
 
 
 def model(sigma: float = SIGMA, sag: float = SAG) -> SupplyModel:
-    """Return an OU that sags."""
     return SupplyModel((OU(ALPHA, sigma, LEVEL), LoadSag(sag, 0.0)))
 
 
@@ -101,7 +100,6 @@ class Marked:
     """A fit of the load that counts how often it is drawn."""
 
     def __init__(self, fit, kinds):
-        """Count in the list `kinds`."""
         self.fit, self.kinds, self.slow_std = fit, kinds, fit.slow_std
 
     def draw(self, rng):

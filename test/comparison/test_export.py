@@ -22,7 +22,6 @@ HOVER = np.full(2000, 0.4)
 
 
 def parameters(text):
-    """Return the numbers of parameter lines by name."""
     lines = [line.replace('param set ', '').split() for line in text.splitlines()
              if not line.startswith('#')]
     return {name: float(value) for name, value in lines}

@@ -21,7 +21,6 @@ def fitted(x: np.ndarray, load: np.ndarray | None = None, slow: float = 0.0) -> 
 
 
 def correlation(x: np.ndarray, lag: int) -> float:
-    """Return the correlation of samples that are so many apart."""
     return float(x[lag:] @ x[:-lag]) / float(x @ x)
 
 

@@ -20,7 +20,6 @@ def plain(z, **changes):
 
 
 def correlation(a, b):
-    """Return a correlation times the root of the number of pairs."""
     return math.sqrt(a.size) * np.corrcoef(a, b)[0, 1]
 
 

@@ -20,7 +20,6 @@ def coded(x, code=CODE):
 
 
 def left(v):
-    """Return how many samples are left of a recording."""
     return without_repeats(T, v, None)[1].size
 
 

@@ -91,7 +91,6 @@ TOYS = [Cheap, Dear, Imitator, Law, White, Mean, Intensity, Trend, Ringing]
 
 
 def tried(model=(), given=(), throttle=True, first=False, kinds=TOYS):
-    """Return the names of the kinds to try."""
     return [kind.NAME for kind in decision.kinds_to_try(
         kinds, list(model), given, throttle, first)]
 

@@ -32,7 +32,6 @@ def rail(rng, n, alpha, rate, std, mean=0.0):
 
 
 def score(a, b):
-    """Return the correlation of two series as a normal score."""
     a, b = a - a.mean(), b - b.mean()
     return math.sqrt(a.size) * float(a @ b) / math.sqrt(float(a @ a) * float(b @ b))
 

@@ -37,12 +37,10 @@ def drawn_from(*terms, seed=1, n=20_000, throttle=True, name='made'):
 
 @pytest.fixture(scope='module')
 def sag():
-    """Return what is found of a sag."""
     return discover(drawn_from(LoadSag(0.5, 0.0), n=12_000, name='sag <b>'))
 
 
 def names(finding):
-    """Return the causes."""
     return [cause.name for cause in finding.causes]
 
 

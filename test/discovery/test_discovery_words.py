@@ -17,7 +17,6 @@ SAG = Cause(LoadSag(0.5, 0.0), {}, 0.02, 0.003, 1e-3, (), 'It sags.', False)
 
 
 def left_over(name):
-    """Return a statistic that still fails."""
     return Criticism(name, 9.0, 9.0, 0.0, 0.0, 0.0, 0.0)
 
 

@@ -25,7 +25,6 @@ def flown(seed, rate=RATE, n=N):
 
 
 def named(found):
-    """Return the names of the causes."""
     return [cause.name for cause in found.causes]
 
 

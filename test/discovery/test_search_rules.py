@@ -32,7 +32,6 @@ class Model:
         self.gaussian = SimpleNamespace(terms=self.terms, cost=cost)
 
     def has(self, name):
-        """Return whether there is a term of that name."""
         return any(term.NAME == name for term in self.terms)
 
 
@@ -44,7 +43,6 @@ class Table(Fitter):
         self.worth, self.asked = worth, []
 
     def evidence(self, composite):
-        """Return that of the model."""
         return composite.worth
 
     def view(self, composite):

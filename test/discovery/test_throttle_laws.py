@@ -28,7 +28,6 @@ class Model:
         self.terms, self.worth = tuple(terms), evidence
 
     def has(self, name):
-        """Return whether there is a term of that name."""
         return any(term.NAME == name for term in self.terms)
 
 
@@ -40,7 +39,6 @@ class Table(Fitter):
         self.worth, self.white = worth, white
 
     def evidence(self, composite):
-        """Return that of the model."""
         return composite.worth
 
     def view(self, composite):
@@ -59,7 +57,6 @@ class Table(Fitter):
         return Model(terms, self.worth[''.join(letters)])
 
     def best_start(self, composite, kind, view):
-        """Return the model with one law more."""
         return self.fit([*composite.terms, LAWS[LETTER[kind.NAME]]], composite)
 
 

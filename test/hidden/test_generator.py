@@ -14,7 +14,6 @@ QUIET = 5.0
 
 
 def simulated(kind, cause=None, seed=0, **options):
-    """Draw by seed."""
     return draw(kind, np.random.default_rng(seed), cause=cause, **options)
 
 

@@ -15,7 +15,6 @@ def level(*terms, throttle=None, t=T):
 
 
 def step_at(k, low=0.0, high=1.0):
-    """Return a throttle that is `high` from sample k on."""
     return np.where(np.arange(T.size) < k, low, high)
 
 

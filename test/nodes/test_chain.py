@@ -57,7 +57,6 @@ def chain(shared_world):
 
 
 def statuses(heard):
-    """Return what the filter said on /diagnostics."""
     return [m.status[0] for m in heard['diagnostics']
             if m.status[0].name == 'ou_adaptive_filter: adaptive low-pass']
 

@@ -89,7 +89,6 @@ def described(request, monkeypatch):
 
 
 def of_kind(described, kind):
-    """Return the entries of one class."""
     return [entry for entry in described if type(entry).__name__ == kind]
 
 

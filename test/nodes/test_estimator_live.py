@@ -22,7 +22,6 @@ class Rig(Estimator):
         wait_until(lambda: self.states, what='first state')
 
     def feed(self, voltages, dt=DT, currents=None):
-        """Remember the last one."""
         self.last = voltages[-1]
         super().feed(voltages, dt, currents)
 
@@ -58,7 +57,6 @@ def rigs(shared_world):
 
 @pytest.fixture
 def rig(rigs):
-    """Give the estimator that is fed."""
     return rigs[0]
 
 

@@ -18,7 +18,6 @@ KINDS = {'estimator': EstimatorNode, 'adaptive_filter': AdaptiveFilterNode}
 
 
 def names(probe):
-    """Return the full names of the nodes that can be seen."""
     return probe.node.get_fully_qualified_node_names()
 
 

@@ -54,13 +54,11 @@ class Rig:
 
     @property
     def status(self):
-        """Return what it said last on /diagnostics."""
         return diagnosis(self.diagnostics, NAME)
 
 
 @pytest.fixture(scope='module')
 def rig(shared_world):
-    """Give the filter."""
     return Rig(shared_world)
 
 

@@ -33,28 +33,23 @@ class Rig(Estimator):
         super().feed(voltages, DT)
 
     def wait_level(self, level):
-        """Wait until the flag has a level."""
         wait_until(lambda: self.field('brownout_level') == level, what=f'the level {level}')
 
     def get(self, name):
-        """Return a parameter as the node has it."""
         answer = self.probe.call(GetParameters, f'{self.node}/get_parameters',
                                  GetParameters.Request(names=[name]))
         return answer.values[0]
 
     def give(self, name, value):
-        """Set a parameter that must be taken."""
         result = self.probe.set_parameter(self.node, name, value)
         assert result.successful, result.reason
 
     def clear(self):
-        """Call the service."""
         return self.probe.call(Trigger, f'{self.node}/clear_brownout', Trigger.Request())
 
 
 @pytest.fixture(scope='module')
 def rig(shared_world):
-    """Give one estimator."""
     return Rig(shared_world, 'flag')
 
 

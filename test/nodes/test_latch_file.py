@@ -15,7 +15,6 @@ GOOD = {'node': '/n', 'level': 'CRITICAL', 'reason': 'low', 'time': 1.7e9}
 
 
 def level_of(path):
-    """Return what the file says."""
     return json.loads(path.read_text())['level']
 
 

@@ -42,7 +42,6 @@ def topics() -> dict[str, set[str]]:
 
 
 def foxglove() -> dict:
-    """Return the layout."""
     return json.loads(FOXGLOVE.read_text(encoding='utf-8'))
 
 
@@ -58,7 +57,6 @@ def foxglove_paths() -> dict[str, str]:
 
 
 def plotjuggler_paths() -> dict[str, str]:
-    """Return topic -> field of every curve."""
     root = ElementTree.parse(PLOTJUGGLER).getroot()
     return split(curve.get('name').rsplit('/', 1) for curve in root.iter('curve'))
 

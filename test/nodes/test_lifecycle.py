@@ -28,7 +28,6 @@ class Manager:
 
     @property
     def state(self):
-        """Return the state by its number."""
         return self.probe.call(GetState, f'/{self.node}/get_state',
                                GetState.Request()).current_state.id
 

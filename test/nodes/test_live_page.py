@@ -78,12 +78,10 @@ class Rows:
 
         @classmethod
         def ok(cls):
-            """Allow one round."""
             cls.left -= 1
             return cls.left > 0
 
     def rows(self, after):
-        """Return the newer of two rows."""
         return [row for row in ({'k': 1, 'voltage': 5.0}, {'k': 2, 'voltage': None})
                 if row['k'] > after]
 
@@ -94,7 +92,6 @@ class TestLocal(AsyncHTTPTestCase):
     token = ''
 
     def get_app(self):
-        """Return the page."""
         Rows.context.left = 2
         return application(Rows(), self.token)
 

@@ -58,14 +58,12 @@ class Rig:
 
     @property
     def said(self):
-        """Return what it said last on /diagnostics."""
         status = diagnosis(self.diagnostics, NAME)
         return {} if status is None else values_of(status)
 
 
 @pytest.fixture(scope='module')
 def rig(shared_world):
-    """Give the filter."""
     return Rig(shared_world)
 
 

@@ -46,7 +46,6 @@ class Rig(Estimator):
 
 @pytest.fixture(scope='module')
 def rig(shared_world):
-    """Give one estimator."""
     return Rig(shared_world, 'attack', '-p', 'brownout.hold:=0.0')
 
 

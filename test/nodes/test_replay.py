@@ -37,7 +37,6 @@ def numbered(tmp_path):
 
 
 def summary_of(process):
-    """Return the JSON of a replay that ended well."""
     assert process.wait() == 0, process.err
     return json.loads(process.out)
 
@@ -169,7 +168,6 @@ def test_truncated_is_refused_or_played_as_far_as_it_holds(world, tmp_path):
 
 
 def foreign(folder):
-    """Return a file that is no bag."""
     path = folder / 'foreign.mcap'
     path.write_text('time_s,voltage_v\n0,5\n')
     return path

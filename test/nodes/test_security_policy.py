@@ -48,7 +48,6 @@ def complaints(element: ElementTree.Element) -> list[str]:
 
 
 def policy() -> ElementTree.Element:
-    """Return the shipped policy."""
     return ElementTree.parse(FILE).getroot()
 
 

@@ -24,7 +24,6 @@ EXACT = SupplyModel((OU(10.0, 0.0, 5.0), LoadSag(1.0, 0.0)))
 
 
 def saved(folder, model):
-    """Return the path of a model file."""
     path = folder / 'model.yaml'
     path.write_text(as_yaml(ModelFile(model)))
     return path

@@ -30,7 +30,6 @@ def impedance(rail, f):
 
 
 def density(rail, f):
-    """Return the one-sided power spectral density of a rail."""
     return float(2.0 * np.sum(np.abs(gains(f, rail.a, rail.b, rail.c)) ** 2))
 
 

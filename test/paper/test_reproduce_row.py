@@ -8,7 +8,6 @@ import pytest
 
 
 def row(printed, recomputed, **ranges):
-    """Return a row of which only the verdict matters."""
     return Row('Table 0', 'x', '', Printed(printed), recomputed, 'how', 'What it says.', **ranges)
 
 

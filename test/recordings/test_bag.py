@@ -18,7 +18,6 @@ START = 1_704_067_200_000_000_000
 
 
 def rows(reader, topics=None):
-    """Return messages without their bytes' identity."""
     return [(m.topic, m.type, m.log_time_ns, m.data) for m in reader.raw_messages(topics)]
 
 

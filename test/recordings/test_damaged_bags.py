@@ -30,7 +30,6 @@ def read(path, **options):
 
 
 def volts(rows=ROWS):
-    """Return the voltages of some rows."""
     return [float(np.frombuffer(row[3], '<f8', 1, 4)[0]) for row in rows if row[0] == '/voltage']
 
 

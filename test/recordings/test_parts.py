@@ -39,7 +39,6 @@ def flight(seed=3, stamped=True):
 
 
 def same(one, other):
-    """All bits of two recordings are the same."""
     for name in ('t', 'voltage', 'throttle'):
         np.testing.assert_array_equal(getattr(one, name).view(np.uint64),
                                       getattr(other, name).view(np.uint64))

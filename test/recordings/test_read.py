@@ -35,7 +35,6 @@ def make(path, *topics):
 
 
 def scalars(values, kind=FLOAT32, start=MS, step=MS):
-    """Return timed messages of a standard scalar."""
     return [(start + k * step, data) for k, data in enumerate(encode_scalars(kind, values))]
 
 

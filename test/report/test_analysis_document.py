@@ -15,7 +15,6 @@ TRUTH = ((0.1, 0.3156), (0.4, 0.632))
 
 @pytest.fixture(scope='module')
 def analysis():
-    """Return the analysis of two levels with a limit."""
     return analyze(recording(1, TRUTH), brownout_voltage=4.5)
 
 

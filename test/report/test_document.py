@@ -17,12 +17,10 @@ EVIL = '<script>alert("x")</script>&amp;'
 
 
 def plot():
-    """Return a plot."""
     return Plot(EVIL, EVIL, EVIL).line(np.arange(3.0), np.arange(3.0), EVIL).mark(0.5, EVIL)
 
 
 def document(*parts, **more):
-    """Return a document of these parts."""
     return Document(**{'title': 'Title', 'subject': 'a.csv', 'answer': ['One.', 'Two.'],
                        'parts': parts, **more})
 

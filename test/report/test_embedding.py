@@ -19,7 +19,6 @@ def noise(n, seed=0):
 
 
 def embedded(plot, **more):
-    """Return the curves as a browser reads them."""
     return unpacked(embed(plot, **more))['curves']
 
 

@@ -87,7 +87,6 @@ def test_fleets_with_little_data_have_a_report(rows, words):
 
 
 def seen(path: str, vehicle: str, lowest: float, dips: int | None, **more) -> dict:
-    """Return the row of a recording of which the lowest voltage is known."""
     return {'path': path, 'recording': path, 'vehicle': vehicle, 'lowest': lowest,
             'lowest_at': 12.0, 'dips': dips, 'below_s': None if dips is None else 0.1 * dips,
             **more}

@@ -58,7 +58,6 @@ def file(data, tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def started(tmp_path_factory):
-    """Return one tab for all tests."""
     with Browser(PROGRAM, tmp_path_factory.mktemp('profile')) as tab:
         yield tab
 
@@ -96,7 +95,6 @@ class View:
         return left + 62.0 + x * (width - 76.0), top + height - 42.0 - y * (height - 50.0)
 
     def point(self, x, y=0.5):
-        """Point at shares of the axes and return the lines of the tooltip."""
         self._tab.mouse('mouseMoved', *self.at(x, y))
         return self.tip()
 
@@ -107,7 +105,6 @@ class View:
             'return e.hidden ? [] : [...e.children].map((c) => c.textContent); })()')
 
     def ends(self, axis='x'):
-        """Return the ends of an axis."""
         return [float(v) for v in self._tab.run(
             f'{self._one}.querySelector(".live-view").dataset.{axis}').split()]
 
@@ -130,19 +127,16 @@ class View:
             return count; }})()""")
 
     def click(self, name):
-        """Press a button of the plot."""
         self._tab.run(f'[...{self._one}.querySelectorAll("button")]'
                       f'.find((b) => b.textContent === {name!r}).click()')
 
 
 def shown(tab, selector):
-    """Return how many elements are laid out."""
     return tab.run(f'[...document.querySelectorAll({selector!r})]'
                    '.filter((e) => e.getClientRects().length).length')
 
 
 def number(text):
-    """Return the first number of a text of the page."""
     return float(re.search(r'\u2212?[\d.]+(e\u2212?\d+)?', text)[0].replace('\u2212', '-'))
 
 

@@ -106,7 +106,6 @@ def test_plots_accept_any_data(values, log):
 
 
 def analysis_of(**changes):
-    """Return the analysis of a recording with a hostile name."""
     return analyze(replace(recording(1, seconds=3.0, name='<b>.csv'), notes=('2 <dropped>.',),
                            source={'file': '<b>.csv'}), **changes)
 

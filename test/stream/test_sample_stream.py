@@ -24,7 +24,6 @@ class Sink:
         self.current += [] if current is None else current.tolist()
 
     def watch(self, voltage, arrival):
-        """Note samples without a time."""
         self.watched += list(zip(voltage.tolist(), arrival.tolist()))
 
     def reset(self, reason):

@@ -20,12 +20,10 @@ RATIOS = [10 / 3, 2.5, 2.2, 1000 / 96]
 
 
 def which(rng, n, factor):
-    """Return the number of the refresh that each of n logged samples shows."""
     return np.floor((np.arange(n) + rng.uniform(0.0, factor)) / factor).astype(int)
 
 
 def logged(rng, n, factor, alpha=ALPHA):
-    """Return n logged samples of a source that refreshes every DT."""
     return paths(rng, 1, n // 2 + 2, DT, alpha)[0][which(rng, n, factor)]
 
 

@@ -24,7 +24,6 @@ def likelihood_of(t, y, x):
 
 
 def exact(t, y, x):
-    """Return the fit with all regressors."""
     return maximise(likelihood_of(t, y, x), x.shape[1])
 
 

@@ -18,7 +18,6 @@ CLEAN = Quality(0.0, 1, False, 0.02)
 
 
 def judged(fit=FIT, base=BASE, quality=CLEAN, throttle_std=NAN, smoothness=NAN, **changes):
-    """Return the estimate of the fit with some things changed."""
     return judge(replace(fit, **changes), base, quality, throttle_std, smoothness)
 
 

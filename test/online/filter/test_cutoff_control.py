@@ -19,7 +19,6 @@ def control(**options):
 
 
 def line(made, wanted, error=NAN, interval=0.0):
-    """Return the cutoffs for a time line of wanted ones."""
     return [made.update(one, error, DT, interval) for one in wanted]
 
 

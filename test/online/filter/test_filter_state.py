@@ -10,7 +10,6 @@ from scipy import integrate, signal
 
 
 def analog(order, fc, mode):
-    """Return numerator and denominator of the continuous filter."""
     num, den = signal.butter(order, 2.0 * math.pi * fc, analog=True)
     return (np.polymul(num, [1.0, 0.0]) if mode == 'derivative' else num), den
 

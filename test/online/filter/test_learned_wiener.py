@@ -20,14 +20,12 @@ GYRO = Path(__file__).parents[3] / 'bags' / 'recorded' / 'gecko_gyro.csv'
 
 
 def ou(rng, n, alpha, deviation, rate=RATE):
-    """Return an OU."""
     keep = math.exp(-alpha / rate)
     kick = deviation * math.sqrt(1.0 - keep * keep)
     return signal.lfilter([kick], [1.0, -keep], rng.standard_normal(n))
 
 
 def made(**more):
-    """Return a filter that is told the noise and nothing else."""
     return AdaptiveLowPass(**{
         'law': 'kalman', 'fmin': 0.5, 'coupling': COUPLING, 'n0': WHITE**2 / RATE, 'alpha': ALPHA,
         **more})
@@ -51,7 +49,6 @@ def error(flown, y, mode='lowpass'):
 
 
 def best_fixed(t, x, of, mode, order=2):
-    """Return the least of the errors of fixed cutoffs."""
     return min(of(AdaptiveLowPass(
         mode=mode, law='threshold', fmin=0.4, fmax=f + 1e-3, fallback=f, order=order).filter(
             t, x, NAN)) for f in np.geomspace(1.0, 140.0, 15))

@@ -25,7 +25,6 @@ def flight():
 
 
 def loaded(t, v, u, current):
-    """Return what the filter knows after these samples."""
     loads = LoadFilter()
     loads.push(t, v, u, current)
     return loads.load()

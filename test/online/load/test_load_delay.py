@@ -20,7 +20,6 @@ def flight():
 
 
 def loaded(t, v, u):
-    """Return the filter after these samples."""
     loads = LoadFilter()
     loads.push(t, v, u)
     return loads

@@ -17,7 +17,6 @@ SAG = 0.15 * 15.2 * (1.0 + 0.2 * -np.expm1(-HOLD / 1.0) + 0.3 * -np.expm1(-HOLD 
 
 
 def throttle_of_a_flight(t, rng):
-    """Return throttle that steps twice a second."""
     steps = np.clip(0.35 + 0.25 * rng.standard_normal(int(2 * t[-1]) + 2), 0.0, 1.0)
     return steps[(2 * t).astype(int)]
 
@@ -31,7 +30,6 @@ def flight(seconds=40.0, noise=0.05, seed=3):
 
 
 def loaded(t, v, u):
-    """Return what the filter knows after these samples."""
     loads = LoadFilter()
     loads.push(t, v, u)
     return loads.load()

@@ -36,7 +36,6 @@ def learned():
 
 
 def begun(start):
-    """Return a filter that begins with what was learned."""
     loads = LoadFilter()
     loads.begin_with(start)
     return loads

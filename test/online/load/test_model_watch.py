@@ -145,7 +145,6 @@ def against(start, made):
 
 
 def taught(made):
-    """Return what a flight teaches."""
     loads = LoadFilter()
     loads.push(made.t, made.voltage, made.throttle)
     return loads.learned()

@@ -26,7 +26,6 @@ LOOK = round(1.0 * RATE)
 
 
 def batch(t, v):
-    """Return readings without throttle."""
     return Batch.of(np.stack((t, v, *np.full((2, t.size), math.nan))), restart=False)
 
 
@@ -304,7 +303,6 @@ def test_known_from_the_first_second_and_flag_hardly_unknown():
 
 
 def estimated(u0, deviation, alpha):
-    """Return an estimate without errors."""
     return Estimate(alpha=alpha, sigma=deviation * math.sqrt(2.0 * alpha), var_inf=deviation ** 2,
                     u0=u0, alpha_se=0.0, sigma_se=0.0, var_inf_se=0.0, u0_se=0.0, rate=RATE,
                     status=Status.OK)

@@ -27,12 +27,10 @@ def table(header, row, end='\n', more=''):
 
 
 def german(value):
-    """Return a number with a decimal comma."""
     return f'{value}'.replace('.', ',')
 
 
 def clock(k, pattern='%Y-%m-%d %H:%M:%S.%f', step=0.01):
-    """Return the time of a sample."""
     return (BEGIN + timedelta(seconds=step * k)).strftime(pattern)
 
 
