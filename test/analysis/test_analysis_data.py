@@ -1,4 +1,4 @@
-"""The JSON of `analyze`: stable keys, all of them documented."""
+"""The JSON of `analyze`: its numbers, and its keys, all of them documented."""
 
 import math
 import re
@@ -10,32 +10,18 @@ from project import ROOT
 import pytest
 from simulated_recordings import recording
 
-KEYS = {'recording', 'n', 'duration_s', 'rate_hz', 'source', 'craft', 'overview', 'levels',
-        'process_tests', 'lines', 'transients', 'alpha_constant', 'by_throttle', 'brownout',
-        'sliding', 'quality', 'notes', 'alarms'}
-LEVEL_KEYS = {
-    'throttle', 'segments', 'time_s', 'n', 'mean', 'vpp', 'peak', 'vrms', 'crest', 'alpha',
-    'alpha_se', 'alpha_ci95', 'tau', 'tau_se', 'tau_ci95', 'sigma', 'sigma_se', 'sigma_ci95',
-    'var_inf', 'var_inf_se', 'var_inf_ci95', 'u0', 'u0_se',
-    'noise_std', 'process_type', 'process_within', 'process_reason', 'process_tests', 'skewness',
-    'excess_kurtosis', 'impulses', 'impulse_rate_hz', 'impulse_rate_ci95', 'lines',
-    'line_search', 'psd', 'status', 'status_text', 'flags', 'tau_below_s',
-    'var_inf_below'}
-
 
 @pytest.fixture(scope='module')
 def analysis():
     return analyze(recording(6, ((0.1, 0.3156), (0.4, 0.632))))
 
 
-def test_data_has_all_keys_and_the_values_of_the_levels(analysis):
-    """Keys are stable; the tau interval is that of alpha, turned over."""
+def test_data_has_the_values_of_the_levels(analysis):
+    """The tau interval is that of alpha, turned over."""
     data = as_data(analysis)
-    assert set(data) == KEYS
     assert (data['n'], data['duration_s']) == (20000, pytest.approx(19.999))
     assert data['rate_hz'] == pytest.approx(1000.0)
     for level, found in zip(data['levels'], analysis.levels):
-        assert set(level) == LEVEL_KEYS
         assert level['alpha'] == found.estimate.alpha
         assert level['tau'] == pytest.approx(1.0 / level['alpha'])
         assert level['tau_ci95'][0] == pytest.approx(1.0 / level['alpha_ci95'][1])

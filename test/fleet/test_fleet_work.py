@@ -1,11 +1,9 @@
 """The fleet's disk and processes: workers that die, saved results, search."""
 
 from datetime import datetime, timezone
-import errno
 import json
 import os
 from pathlib import Path
-import re
 import resource
 import signal
 from types import SimpleNamespace
@@ -223,21 +221,6 @@ def test_parts_hold_for_the_same_recording_and_options(tmp_path):
                  if json.loads(p.read_text()) == {'error': ''}]
     newest.write_text('{"err')
     assert again.load(source()) is None
-
-
-def test_a_disk_that_fills_up_leaves_the_old_file(tmp_path, monkeypatch):
-    """The file is there as it was, no draft is left, and the line says why."""
-    target = tmp_path / 'fleet.parquet'
-    write_whole(target, b'old')
-
-    def full(self: Path, content: bytes) -> int:
-        with open(self, 'wb') as file:
-            file.write(content[:1])
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    monkeypatch.setattr(Path, 'write_bytes', full)
-    with pytest.raises(InputError, match=re.escape(f"cannot write '{target}': No space left")):
-        write_whole(target, b'new and longer')
-    assert target.read_bytes() == b'old' and [p.name for p in tmp_path.iterdir()] == [target.name]
 
 
 def test_a_fifo_in_the_place_of_a_draft_hangs_nothing(tmp_path):

@@ -276,7 +276,7 @@ def test_overload_mutes_nothing(world):
                      for values in (values_of(message.status[0]) for message in rig.states)]
             return any(said) and sum(b and not a for a, b in zip(floor, floor[1:])) >= 2
         wait_until(dips, what='two dips')
-        wait_until(lambda: time.monotonic() - begin > 6.0)
+        wait_until(lambda: time.monotonic() - begin > 4.0)
         times = rig.times[first:]
         silence = max(b - a for a, b in zip(times, times[1:]))
         assert silence < 2.0 + 10.0 * starved.longest, silence
