@@ -232,7 +232,7 @@ def test_demo_shows_estimates_and_leaves_a_report(tmp_path, source):
     environment = dict(os.environ)
     environment.pop('ROS_DOMAIN_ID', None)
     done = subprocess.run(
-        [sys.executable, 'scripts/run_demo.py', '--seconds', '4', '--report', report, *source],
+        [sys.executable, 'scripts/run_demo.py', '--seconds', '8', '--report', report, *source],
         cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     assert str(report) in done.stdout and '<html' in report.read_text(encoding='utf-8').lower()
