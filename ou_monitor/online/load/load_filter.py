@@ -511,7 +511,8 @@ class LoadFilter:
         return LoadState(
             self._t, self._throttle, mean, covariance, tuple(self._lags), self._factor,
             self._fall(self._level),
-            self._noise.log_variance, self._noise.ripple_se, self._between(0.02))
+            self._noise.log_variance, self._noise.ripple_se, self._deviations(),
+            self._between(0.02))
 
     def learned(self) -> LoadStart | None:
         """Return start values for the next flight of this craft; None: the sag is unknown."""

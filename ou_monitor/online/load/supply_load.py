@@ -175,4 +175,5 @@ class LoadState:
     # Coefficients of ln variance, V^2, of a sample: 1, ripple, sqrt|du|.
     log_variance: tuple[float, float, float]
     ripple_se: float  # Standard error of the second of them.
+    deviation: tuple[float, ...]  # Noise, V, at equal steps of throttle from 0 to 1.
     flown: tuple[float, float]  # Throttles between which the noise is known.

@@ -4,9 +4,9 @@ The last minutes of a flight, possible future throttle, and the lowest voltage o
 doc/risk.md has the formulas: of the lowest voltage (step 1), of the pilot's future throttle (3),
 and of the excursions (4).
 
-A course jumps to a peak of throttle, then to another throttle.  Its samples form three groups: in
-the inrush, at the peak after it, and after the peak.  Limits: within a group the mean path counts
-as constant; only the lowest group counts; samples of noise are independent, as in the load filter.
+A course jumps to a peak of throttle, then to another throttle.  Its samples form four groups: in
+the inrush, in both halves of the time at the peak after it, and after the peak.  Limits: within a
+group the mean path counts as constant; samples of noise are independent, as in the load filter.
 
 The pilot: each completed horizon is one course.  Rises from the present throttle are added, one
 into each fifth of the range above it (rule of succession).  Limits: within a horizon, the peak is
@@ -29,7 +29,7 @@ import math
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 import numpy.typing as npt
-from ou_monitor.model.load import INRUSH_TIME, LAGS, LINEAR_LAGS, ripple
+from ou_monitor.model.load import INRUSH_TIME, LAGS, LINEAR_LAGS
 from ou_monitor.model.passage import normal_below
 from ou_monitor.online.load.supply_load import LoadState, POWER
 from ou_monitor.records import FloatArray, NAN
@@ -142,8 +142,9 @@ def lowest(state: LoadState, courses: Courses, horizon: float, sampling: Samplin
     span = max(horizon, dt)
     stay = np.clip(courses.dwell, dt, span)
     first = np.minimum(stay, max(2.0 * dt, _RISE * INRUSH_TIME))
-    tau = np.stack([first, stay - first, span - stay], axis=1)
-    u = np.stack([peak, peak, courses.rest], axis=1)
+    half = 0.5 * (stay - first)
+    tau = np.stack([first, half, half, span - stay], axis=1)
+    u = np.stack([peak, peak, peak, courses.rest], axis=1)
     # A median of three shows inrush and noise of a rise if two samples are within the ramp.
     up = np.maximum(0.0, peak - state.throttle) * _SHARE_OF_RISE * min(
         max(_RAMP / dt - 1.0, 0.0), 1.0)
@@ -152,16 +153,19 @@ def lowest(state: LoadState, courses: Courses, horizon: float, sampling: Samplin
     rows = _groups(state, u, tau, inrush)
     activity = np.full_like(u, sampling.activity)
     activity[:, 0] = np.maximum(np.sqrt(up), sampling.activity)
-    b = state.log_variance
-    sd = np.exp(0.5 * (b[0] + b[1] * ripple(np.clip(u, *state.flown)) + b[2] * activity))
-    ln_n = np.log(np.maximum(tau / dt, 1.0))
-    low = np.where(tau > 0.5 * dt, rows @ state.mean - sd * np.interp(ln_n, _LN_N, _MEAN), np.inf)
-    j = np.argmin(low, axis=1)
-    k = np.arange(j.size)
-    row = rows[k, j]
+    sd = np.interp(np.clip(u, *state.flown), np.linspace(0.0, 1.0, len(state.deviation)),
+                   state.deviation)
+    sd *= np.exp(0.5 * state.log_variance[2] * (activity - sampling.activity))
+    means, count, k = rows @ state.mean, tau / dt, np.arange(peak.size)
+    largest = np.interp(np.log(np.maximum(count, 1.0)), _LN_N, _MEAN)
+    j = np.argmin(np.where(tau > 0.5 * dt, means - sd * largest, np.inf), axis=1)
+    row, mean, sd, largest = rows[k, j], means[k, j], sd[k, j], largest[k, j]
+    # Samples of other groups count by how often they are as low: the tail of the largest.
+    apart = np.maximum(means - mean[:, None], 0.0) / sd[:, None]
+    ln_n = np.log(np.maximum((count * np.exp(-largest[:, None] * apart)).sum(axis=1), 1.0))
     known = np.maximum(((row @ state.covariance) * row).sum(axis=1), 0.0)
-    noise = sd[k, j] * np.interp(ln_n[k, j], _LN_N, _DEVIATION)
-    return low[k, j], np.sqrt(known + noise ** 2)
+    return (mean - sd * np.interp(ln_n, _LN_N, _MEAN),
+            np.sqrt(known + (sd * np.interp(ln_n, _LN_N, _DEVIATION)) ** 2))
 
 
 # Length of a block, s, time that is kept, s, and silence that is not filled, s.

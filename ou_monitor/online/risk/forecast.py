@@ -6,9 +6,9 @@ to the pilot's future throttle, half the excursions), and `excursions` (the drop
 used alone if the load is unknown).  First passage and the other method are averaged, weighted by
 how well each predicted the lowest voltages of completed horizons (Bayes, with forgetting).
 
-Law learned in flight, from completed horizons: (lowest - start) / s = b0 + b1 (mu - start) / s
-+ k e, with mean mu and deviation s of `lowest`, by least squares with forgetting; e has Student's
-t distribution with five degrees of freedom.
+Law learned in flight, from completed horizons: lowest - start = b0 s + b1 (mu - start) + e, with
+mean mu and deviation s of `lowest`, by least squares with forgetting; e has Student's t
+distribution with five degrees of freedom, and the variance k0 s^2 + k1 (mu - start)^2.
 
 Each law is mixed with a wider one, weighted by the share of horizons that contradict the law: each
 counts with the probability that the law was wrong in it (rule of succession), overlapping ones as
@@ -51,14 +51,12 @@ _NORM = math.exp(math.lgamma(0.5 * FREEDOM + 0.5) - math.lgamma(0.5 * FREEDOM)) 
 # Coefficients of the power series of its tail in FREEDOM / (FREEDOM + t^2), highest power first.
 _TAIL = [8.0 / (3.0 * math.pi) * math.comb(2 * k, k) / 4.0**k / (2 * k + 5)
          for k in range(9, -1, -1)]
-# Prior: its weight in horizons, its variance, and its deviations of bias and gain.
-_PRIOR, _PRIOR_VARIANCE = 5.0, 3.0
-_BIAS, _GAIN = 0.5, 0.4
-_PRECISION = (_BIAS ** -2, 0.0, _GAIN ** -2)
+# Prior: its weight in horizons; its variances, in those of the noise and in squares of the fall;
+# its precisions of bias and gain.
+_PRIOR, _VARIANCES = 5.0, np.array([3.0, 0.03])
+_PRECISION = (1.0 / 0.75, 0.0, 1.0 / 0.48)
 # Memory, s; maximum squared error that counts: errors beyond 3 deviations weigh less.
 MEMORY, _LARGEST, _HUBER = 120.0, 36.0, 3.0
-# Error of the model as a share of the drop.
-_SHARE = 0.1
 # Maximum initial widening of a law: chosen on gecko, nazgul, roma, bf3s, erle, cf_solo (2 to 6
 # tried).
 _WIDEST = 4.0
@@ -96,7 +94,7 @@ def _wider(spread: FloatArray, deviation: float, misses: tuple[float, float]) ->
 
 
 class LowestLaw:
-    """Bias, gain and spread of the lowest voltage: b0, b1, k^2, and the errors of b0 and b1."""
+    """Bias, gain, both variances (of noise and fall), and the errors of bias and gain."""
 
     def __init__(self, values: FloatArray) -> None:
         self.values = values
@@ -104,21 +102,22 @@ class LowestLaw:
     def moments(self, mean: FloatArray, deviation: FloatArray, start: float
                 ) -> tuple[FloatArray, FloatArray]:
         """Return mean and deviation, V, of the lowest voltage, errors of the law included."""
-        bias, gain, variance, c00, c01, c11 = self.values.tolist()
-        deviation = np.hypot(deviation, _SHARE * (start - mean))
-        x = (mean - start) / deviation
-        return start + deviation * (bias + gain * x), deviation * np.sqrt(
-            variance + c00 + 2.0 * c01 * x + c11 * x * x)
+        bias, gain, noise, fall, c00, c01, c11 = self.values.tolist()
+        x = mean - start
+        return start + bias * deviation + gain * x, np.sqrt(
+            (noise + c00) * deviation * deviation + 2.0 * c01 * deviation * x
+            + (fall + c11) * x * x)
 
 
 class Calibrator:
     """Learns a `LowestLaw` from completed horizons."""
 
     def __init__(self) -> None:
-        # Sums for the regression of y on 1 and x: of 1, x and x^2, and of y and x y.
+        # Sums for the regression on deviation and predicted fall: of products, and with the fall.
         self._information: tuple[float, ...] = _PRECISION
         self._weighted: tuple[float, ...] = _PRECISION[1:]
-        self._count = self._squares = 0.0
+        # Horizons, and their squared misses over those expected, that count for each variance.
+        self._count, self._squares = np.zeros(2), np.zeros(2)
         self._settle()
 
     def _settle(self) -> None:
@@ -126,26 +125,31 @@ class Calibrator:
         first, second = self._weighted
         whole = a * b - both * both
         self._b = (b * first - both * second) / whole, (a * second - both * first) / whole
-        variance = (_PRIOR * _PRIOR_VARIANCE + self._squares) / (_PRIOR + self._count)
-        self.law = LowestLaw(np.array([*self._b, variance, *(
-            variance / whole * one for one in (b, -both, a))]))
+        self._variance = (_PRIOR * _VARIANCES + self._squares) / (_PRIOR + self._count)
+        self.law = LowestLaw(np.array([*self._b, *self._variance, b / whole, -both / whole,
+                                       a / whole]))
 
     def add(self, low: float, mean: float, deviation: float, start: float, weight: float,
             elapsed: float) -> None:
         """Learn from a completed horizon: lowest, predicted and first voltage, V."""
-        deviation = math.hypot(deviation, _SHARE * (start - mean))
         keep = math.exp(-elapsed / MEMORY)
-        x, y = (mean - start) / deviation, (low - start) / deviation
-        miss = y - self._b[0] - self._b[1] * x
-        least = weight * min(1.0, _HUBER * math.sqrt(self.law.values[2]) / max(abs(miss), 1e-9))
-        self._count = self._count * keep + weight
-        self._squares = self._squares * keep + weight * min(miss * miss, _LARGEST)
+        x, y = mean - start, low - start
+        miss = y - self._b[0] * deviation - self._b[1] * x
+        parts = self._variance * np.array([deviation * deviation, x * x])
+        total = float(parts.sum())
+        least = weight / total * min(1.0, _HUBER * math.sqrt(total) / max(abs(miss), 1e-9))
+        # Each variance learns from a horizon as much as it contributes: the score equations.
+        share = weight * parts / total
+        self._count = self._count * keep + share
+        self._squares = self._squares * keep + share * self._variance * min(
+            miss * miss / total, _LARGEST)
         self._information = tuple(
             prior + (old - prior) * keep + least * one
-            for prior, old, one in zip(_PRECISION, self._information, (1.0, x, x * x)))
+            for prior, old, one in zip(_PRECISION, self._information, (
+                deviation * deviation, deviation * x, x * x)))
         self._weighted = tuple(
             prior + (old - prior) * keep + least * y * one
-            for prior, old, one in zip(_PRECISION[1:], self._weighted, (1.0, x)))
+            for prior, old, one in zip(_PRECISION[1:], self._weighted, (deviation, x)))
         self._settle()
 
 
@@ -442,7 +446,7 @@ class Forecast:
         if horizon not in self._laws:
             values = np.sum([share * laws.values for laws, share in zip(
                 self._by_horizon, _shares(horizon)) if share > _LEAST_SHARE], axis=0)
-            self._laws[horizon] = (LowestLaw(values[:6]), *values[6:].tolist())
+            self._laws[horizon] = (LowestLaw(values[:7]), *values[7:].tolist())
         return self._laws[horizon]
 
     def risk(self, voltage: float, horizon: float) -> Outcome:
@@ -494,10 +498,9 @@ class Forecast:
         state, now = self._state(), self.voltage
         if state is not None and (sag, noise) != (1.0, 1.0):
             scale = np.append((1.0, 1.0), np.full(state.mean.size - 2, sag))
-            b = state.log_variance
             state = replace(state, mean=scale * state.mean,
                             covariance=np.outer(scale, scale) * state.covariance,
-                            log_variance=(b[0] + math.log(max(noise, 1e-300)), *b[1:]))
+                            deviation=tuple(math.sqrt(noise) * x for x in state.deviation))
         if now <= voltage:
             return np.ones(u.shape)
         risk = np.zeros(u.shape)

@@ -15,6 +15,7 @@ COEFFICIENTS = np.array([16.0, 0.0, 1.5] + [0.0] * (SIZE - 1))
 AFTER_2_S = 5 + LAGS.index(2.0)
 NOISE = 0.05
 SAMPLING = Sampling(0.02, 0.0)
+QUIET = {'deviation': (1e-6, 1e-6)}
 
 
 def state(throttle=0.4, **changes):
@@ -22,7 +23,7 @@ def state(throttle=0.4, **changes):
     lags = (throttle ** 1.8,) * len(LAGS) + (throttle,) * len(LINEAR_LAGS)
     return replace(LoadState(
         0.0, throttle, COEFFICIENTS, np.zeros((2 + SIZE, 2 + SIZE)), lags, 1.0, 0.0,
-        (2.0 * math.log(NOISE), 0.0, 0.0), 0.0, (0.0, 1.0)), **changes)
+        (2.0 * math.log(NOISE), 0.0, 0.0), 0.0, (NOISE, NOISE), (0.0, 1.0)), **changes)
 
 
 @pytest.mark.parametrize('n', [1, 2, 8, 64, 512])
@@ -55,10 +56,9 @@ def test_a_slow_sensor_misses_the_inrush(interval, share):
     """A coefficient of 10 +- 30 V that no reading shows; two of three are within 0.2 s or not."""
     coefficients, error = COEFFICIENTS.copy(), np.zeros((2 + SIZE, 2 + SIZE))
     coefficients[-1], error[-1, -1] = 10.0, 900.0
-    quiet = {'log_variance': (2.0 * math.log(1e-6), 0.0, 0.0)}
-    mean, deviation = lowest(state(mean=coefficients, covariance=error, **quiet),
+    mean, deviation = lowest(state(mean=coefficients, covariance=error, **QUIET),
                              held(0.9, 5.0, 0.4), 5.0, Sampling(interval, 0.0))
-    plain, _ = lowest(state(**quiet), held(0.9, 5.0, 0.4), 5.0, Sampling(interval, 0.0))
+    plain, _ = lowest(state(**QUIET), held(0.9, 5.0, 0.4), 5.0, Sampling(interval, 0.0))
     assert plain - mean == pytest.approx(share * 0.5 * 0.02 / 0.2 * 10.0, abs=1e-5)
     assert deviation == pytest.approx(share * 0.5 * 0.02 / 0.2 * 30.0, abs=1e-5)
 
@@ -78,17 +78,17 @@ def test_a_slow_sensor_misses_the_noise_of_a_rise(interval, share):
 
 
 def test_a_peak_and_its_lag():
-    """Throttle after a lag of 2 s, the mean of its way to the peak; the noise is far smaller."""
+    """Throttle after a lag of 2 s, the mean of the second half of its way; little noise."""
     coefficients = COEFFICIENTS.copy()
     coefficients[2], coefficients[AFTER_2_S] = 0.0, 1.5
-    quiet = (2.0 * math.log(1e-6), 0.0, 0.0)
-    known = state(mean=coefficients, log_variance=quiet)
+    known = state(mean=coefficients, **QUIET)
     for dwell in (0.5, 2.0):
         mean, _ = lowest(known, held(0.9, dwell, 0.4), 4.0, SAMPLING)
         a, b = 0.4 ** 1.8, 0.9 ** 1.8
         stay = dwell - 0.04
         start = b + (a - b) * math.exp(-0.04 / 2.0)
-        way = b + (start - b) * (1.0 - math.exp(-stay / 2.0)) * 2.0 / stay
+        half = start + (b - start) * (1.0 - math.exp(-0.5 * stay / 2.0))
+        way = b + (half - b) * (1.0 - math.exp(-0.5 * stay / 2.0)) * 2.0 / (0.5 * stay)
         back = start + (b - start) * (1.0 - math.exp(-stay / 2.0))
         rest = 4.0 - dwell
         after = a + (back - a) * (1.0 - math.exp(-rest / 2.0)) * 2.0 / rest
@@ -99,7 +99,7 @@ def test_inrush_is_that_of_a_ramp():
     """A tenth of the step, 20 ms of 0.2 s, and only in the first group."""
     coefficients = COEFFICIENTS.copy()
     coefficients[2], coefficients[-1] = 0.0, 2.0
-    known = state(mean=coefficients, log_variance=(2.0 * math.log(1e-6), 0.0, 0.0))
+    known = state(mean=coefficients, **QUIET)
     mean, _ = lowest(known, held(0.9, 1.0, 0.4), 2.0, SAMPLING)
     assert mean[0] == pytest.approx(16.0 - 2.0 * 0.5 * 0.1, abs=1e-4)
 
@@ -115,7 +115,7 @@ def test_what_is_not_known_of_the_level_is_in_the_deviation():
 def test_the_level_falls_as_charge_is_drawn():
     coefficients = COEFFICIENTS.copy()
     coefficients[1], coefficients[2] = 1.0 / 80.0, 0.0
-    known = state(mean=coefficients, fall=8.0, log_variance=(2.0 * math.log(1e-6), 0.0, 0.0))
+    known = state(mean=coefficients, fall=8.0, **QUIET)
     mean, _ = lowest(known, held(0.8, 10.0, 0.4), 10.0, SAMPLING)
     assert mean[0] == pytest.approx(16.0 - 8.0 / 80.0 * 0.8 ** 1.8 * 10.0, abs=1e-4)
 
