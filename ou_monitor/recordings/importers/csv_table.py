@@ -84,12 +84,12 @@ _PATTERNS = {
         r'throttle', r'thr(?:ottle)?_?(?:out|cmd|command|pct|percent)?|ga[sz]|'
         r'acelerador|duty(?:_cycle)?|tho?o|tps|tastgrad|tastverh.*',
         r'rc_?command_3|rc_?out?(?:_?ch?_?3)?|servo3_raw',
-        r'pwm|rc_?out?_?ch?_?1|thrust|gas_?(?:kanal|stellung|hebel)|esc(?:_signal)?|'
+        r'pwm|rc_?out?_?ch?_?1|thrust|gas_?(?:kanal|stellung|hebel)|esc(?:_signal|_pwm)?|'
         r'(?!.*(?:limit|trim|max|min)).*throttle.*'),
     logs.CURRENT: (
         r'current_a', r'amperage(?:_?latest)?|current_in|i_?bat(?:t|tery)?|'
         r'batt?(?:ery)?_?\d?_?(?:i|curr(?:ent)?|amps?)|current_?batt?(?:ery)?|'
-        r'(?:.*_)?(?:bus|input|supply|main|pack|total)_?current|i_?bus|curr',
+        r'(?:.*_)?(?:bus|input|supply|main|pack|total|bms)_?current|i_?bus|curr',
         r'(?:i(?:rms|dc|mn)?|curr(?:ent)?|amps?|strom|courant|corriente)'
         r'(?:_?(?:avg|average|mean))?(?:_?1)?|'
         r'(?!.*(?:max|min|limit)).*_batt?(?:ery)?_current'),
@@ -107,6 +107,8 @@ _RAW: dict[str, dict[str, tuple[float, str, float]]] = {
              ('voltage_battery', 1e-3, 'mV', 65535.0), ('voltages[0]', 1e-3, 'mV', 65535.0),
              ('vcc', 1e-3, 'mV', 0.0), ('vservo', 1e-3, 'mV', 0.0),
              ('current_battery', 1e-2, '10 mA', -1.0))}}
+# Parts of the names of currents.
+_LIKE_CURRENT = 'curr|amps|strom|courant|corriente'
 _CELLS = re.compile(r'(.*voltages\[)0\]', re.IGNORECASE)
 
 
@@ -284,7 +286,7 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
     spread = _spread(t, volts)
     if not np.array_equal(spread, t, equal_nan=True):
         guesses[_TIME_NAME] += ', equal stamps spread evenly, a guess: --sample-interval'
-    note = _read_note(form, time, found, guesses, wanted.throttle is None)
+    note = _read_note(form, time, found, guesses, wanted)
     return _Table(form, time, spread, scaled, dict(zip(others, values[len(found):])), note)
 
 
@@ -715,7 +717,7 @@ def _throttle_unit(values: FloatArray, volts: FloatArray) -> str:
 
 
 def _read_note(form: Form, time: _Column, found: dict[str, _Column], units: dict[str, str],
-               search: bool) -> str:
+               wanted: CsvColumns) -> str:
     """Return in one line how a file was read; '' if nothing was detected."""
     if time.name == TIME and not form.comma and form.encoding in ('utf-8', 'utf-8-sig') and all(
             column.name == {logs.VOLTAGE: VOLTAGE, logs.THROTTLE: THROTTLE,
@@ -732,15 +734,20 @@ def _read_note(form: Form, time: _Column, found: dict[str, _Column], units: dict
     others = [form.names[k] for k in places
               if form.names[k] not in {column.name for column in found.values()}]
     also = f'; also found: {", ".join(others)} (--voltage-column)' if others else ''
-    if search and logs.THROTTLE not in found:
-        # Mention columns that may be a throttle under another name.
+    lacking = [quantity for quantity, given in (
+        (logs.THROTTLE, wanted.throttle), (logs.CURRENT, wanted.current))
+        if given is None and quantity not in found]
+    if lacking:
+        # Mention columns that may be a throttle or current under another name.
         used = {*time.place, *(column.place[0] for column in found.values())}
         rest = [name for k, name in enumerate(form.names[:form.width])
                 if k not in used and name not in others
+                and (logs.THROTTLE in lacking or re.search(_LIKE_CURRENT, name.lower()))
                 and not re.fullmatch(_INDEX_NAME, name.strip('# ').lower())
-                and any(k < len(row) and is_number(row[k]) and not is_missing(row[k])
-                        for row in form.rows)]
-        also += f'; not read: {some(rest, 3)} (--throttle-column)' if rest else ''
+                and (not form.rows or any(k < len(row) and is_number(row[k]) and not is_missing(
+                    row[k]) for row in form.rows))]
+        options = ' or '.join(f'--{quantity}-column' for quantity in lacking)
+        also += f'; not read: {some(rest, 3)} ({options})' if rest else ''
     return (f"Read {', '.join(parts)}{also}; cells between {between}, decimal "
             f"{'comma' if form.comma else 'point'}"
             + (f', {form.encoding}' if form.encoding not in ('utf-8', 'utf-8-sig') else '')

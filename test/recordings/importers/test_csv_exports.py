@@ -643,14 +643,16 @@ def test_columns_without_names_are_not_mistaken(row, tmp_path):
         read_recording(written(tmp_path, '\n'.join(lines)))
 
 
-def test_a_column_that_may_be_the_throttle_is_named(tmp_path):
-    """Though in rows of its own; nothing is said where it was found, or given as none."""
-    rows = 't,U,load\n' + ''.join(f'{k},12,\n{k + 0.1},,{k / 9}\n' for k in range(9))
-    path = written(tmp_path, rows)
-    assert 'not read: load (--throttle-column)' in read_recording(path).notes[0]
-    for name in ('load', 'none'):
-        notes = read_recording(path, columns=CsvColumns(throttle=name)).notes
-        assert 'not read' not in notes[0]
+@pytest.mark.parametrize('header, row, words', [
+    ('t,U,load', '{0},12,\n{0}.1,,{0}', 'load (--throttle-column or --current-column)'),
+    ('t,U,throttle,gyro,rotor current', '{0},12,0.5,{0},{0}', 'rotor current (--current-column)'),
+    ('t,name,state', '{0},vbat,12\n{0},load,{0}', 'load (--throttle-column or --current-column)')])
+def test_columns_that_may_be_throttle_or_current_are_named(header, row, words, tmp_path):
+    """Though in rows of their own, or beside a throttle that was found; not if given as none."""
+    path = written(tmp_path, '\n'.join([header, *map(row.format, range(9))]))
+    assert f'not read: {words};' in read_recording(path).notes[0]
+    notes = read_recording(path, columns=CsvColumns(throttle='none', current='none')).notes
+    assert 'not read' not in notes[0]
 
 
 def test_stacked_series_and_other_quantities_are_no_voltage(tmp_path):
