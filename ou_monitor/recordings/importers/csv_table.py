@@ -48,6 +48,8 @@ _BACK = 0.25
 _USUAL_STEP, _USUAL_SPAN = 2.0, 43200.0
 # Number of the first day of 1970 in Excel and MATLAB; days from there to 2100.
 _OF_1970, _TO_2100 = (25569.0, 719529.0), 47482.0
+# Values of a counter of 32 bits.
+_COUNTS = 2.0**32
 # Rows from which repeated stamps are the resolution of a clock.
 _FEW_ROWS = 8
 # To spread rows that share stamps: minimum mean number of rows per stamp; maximum relative
@@ -545,7 +547,20 @@ def _read(path: Path, form: Form, time: _Column, places: list[int],
     if len(time.place) > 1:
         part, *values = values
         t = t + part * TIME_UNITS[time.unit]
-    return t * factor_of(time.name), values
+    return _unwrapped(t) * factor_of(time.name), values
+
+
+def _unwrapped(t: FloatArray) -> FloatArray:
+    """Let a 32-bit counter go on where it began anew at 0: micros() does so after 72 minutes."""
+    known = np.flatnonzero(np.isfinite(t))
+    step = np.diff(t[known])
+    # After a restart of the logger, the step would be longer than others.
+    wraps = (step < -0.5 * _COUNTS) & (step + _COUNTS <= 2.0 * step.max(initial=0.0))
+    if not wraps.any() or t[known].min() < 0.0 or t[known].max() >= _COUNTS:
+        return t
+    t = t.copy()
+    t[known[1:]] += _COUNTS * np.cumsum(wraps)
+    return t
 
 
 def _check_one_series(path: Path, form: Form, t: FloatArray, column: str, values: FloatArray,

@@ -643,6 +643,15 @@ def test_columns_without_names_are_not_mistaken(row, tmp_path):
         read_recording(written(tmp_path, '\n'.join(lines)))
 
 
+@pytest.mark.parametrize('pause, span', [(0, 0.059), (500000, 4294.9664)])
+def test_a_counter_of_32_bits_goes_on(pause, span, tmp_path):
+    """Unless the step there would be longer than others, as after a restart."""
+    stamps = (2**32 - 10000 + 1000 * K + pause * (K > 9)) % 2**32
+    path = written(tmp_path, table(['micros,vbat'], lambda k: f'{stamps[k]},{V[k]}'))
+    t = read_recording(path).t
+    assert t[-1] - t[0] == pytest.approx(span, rel=1e-3)
+
+
 @pytest.mark.parametrize('header, row, words', [
     ('t,U,load', '{0},12,\n{0}.1,,{0}', 'load (--throttle-column or --current-column)'),
     ('t,U,throttle,gyro,rotor current', '{0},12,0.5,{0},{0}', 'rotor current (--current-column)'),
