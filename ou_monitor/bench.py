@@ -335,7 +335,7 @@ def discover(recording: Given, *, seed: int = 0, brownout_voltage: float | None 
 
 def design(throttle: float | None = None, *, recording: Given | None = None,
            network: Mapping[str, Any] | PowerNetwork | None = None, rail: str = 'bus',
-           voltage: float | None = None, horizon: float = 5.0, risk: float = 1e-3,
+           voltage: float | None = None, horizon: float = 5.0, risk: float = 0.01,
            capacitances: tuple[float, float] | None = None, esr_fixed: bool = False) -> Result:
     """
     Find the smallest bulk capacitance that keeps the brown-out risk of a rail below a target.
@@ -356,7 +356,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     horizon : float
         Horizon of the risk, s.
     risk : float
-        Maximum risk, 0..1.
+        Maximum risk, 0..1; the default is that of the throttle budget of `analyze`.
     capacitances : tuple of float, optional
         Smallest and largest capacitance tried, F.
     esr_fixed : bool
@@ -392,7 +392,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     if throttle is not None and not hasattr(throttle, '__float__'):
         raise TypeError(f'the throttle is a number, 0..1, got a {type(throttle).__name__}: pass '
                         'a Recording or a path as recording=')
-    taken, facts, error, known = '', None, 0.0, None
+    taken, facts, error, known, assumed = '', None, 0.0, None, False
     if recording is None:
         if throttle is None:
             raise ValueError('the throttle is missing: pass 0.4 for 40 %, or a recording, whose '
@@ -408,7 +408,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
         full, stated = full_voltage(flown), stated_limit(flown.source)
         cells = values.setdefault('cells', cells_of(flown)[0])
         if not cells:
-            raise InputError(f'{full:.4g} V fits no number of cells: give --set cells=N')
+            raise InputError(f'{full:.4g} V fits no number of cells: give --cells N')
         check_cells(full, cells)
         level, source = cells * CELL_BROWNOUT, f'{CELL_BROWNOUT} V per LiPo cell'
         if stated is not None and stated[0] == cells:
@@ -424,7 +424,8 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
         circuit = network_of(flight, throttle, values)
         if rail != 'bus' and voltage is None:
             level, source = default_voltage(circuit, rail)
-        taken = taken_words(flight, circuit, throttle, values)
+        assumed = not (flight.resistance > 0.0 or 'battery_resistance' in values)
+        taken = taken_words(flight, circuit, throttle, assumed)
         error = float(np.interp(throttle, flight.throttle, flight.sag_se) / np.interp(
             throttle, flight.throttle, flight.sag))
         if facts.budget is not None and not values.keys() & SHOWN and math.isfinite(
@@ -432,7 +433,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
             known = risk_of
     found = designed(circuit, throttle, voltage=level, horizon=horizon, risk=risk, rail=rail,
                      esr_follows=not esr_fixed, capacitances=capacitances or (LEAST, MOST),
-                     sag_error=error, flown=known)
+                     sag_error=error, flown=known, assumed=assumed)
     return Result(found, partial(design_document, found, source, taken),
                   partial(as_data, found, source, taken), 'rows', facts)
 

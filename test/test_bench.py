@@ -1,7 +1,6 @@
 """The commands as functions: JSON, tables, plots and HTML, and missing packages."""
 
 import copy
-from dataclasses import replace
 import json
 import pickle
 import re
@@ -59,14 +58,12 @@ def test_to_dict_is_the_json_of_the_command(name, found, tmp_path):
 
 
 def test_a_design_of_a_flight_has_its_facts(tmp_path):
-    assert main(['design', '--from', GECKO, '--throttle', '0.5', '--set', 'cells=4', '--json',
+    assert main(['design', '--from', GECKO, '--throttle', '0.5', '--cells', '4', '--json',
                  str(tmp_path / 'x.json')]) == 0
     result = design(0.5, recording=GECKO, network={'cells': 4})
     assert result.to_dict() == json.loads((tmp_path / 'x.json').read_text())
-    # The budget is that of the risk allowed, 1e-3.
-    assert replace(result.supply, budget=None).to_dict() == replace(
-        supply_facts(read_recording(GECKO), limit=4 * 3.3), budget=None).to_dict()
-    assert result.supply.budget.risk == 1e-3
+    # The default risk is that of the budget.
+    assert result.supply.to_dict() == supply_facts(read_recording(GECKO), limit=4 * 3.3).to_dict()
 
 
 def test_simulate_equals_the_command(tmp_path):

@@ -192,9 +192,10 @@ def levels(found: str) -> Option:
                   help=f'throttles 0..1 of the load levels (default: {found})')
 
 
-def limit(meaning: str) -> tuple[Option, ...]:
-    """Return the options of the limit; meaning: what --brownout-voltage does, and its default."""
-    return (Option('--brownout-voltage', metavar='V', type=POSITIVE, help=meaning),
+def limit(meaning: str, *also: str, kind: Callable[[str], float] = POSITIVE,
+          ) -> tuple[Option, ...]:
+    """Return the options of the limit; meaning: of --brownout-voltage; also: its other names."""
+    return (Option('--brownout-voltage', *also, metavar='V', type=kind, help=meaning),
             Option('--cells', metavar='N', type=_CELLS,
                    help='cells in series: --brownout-voltage is then in volts per cell (default '
                    'with --cells: 3.3)'))
@@ -350,18 +351,17 @@ _DESIGN = Command(
     (Option('--from', metavar='RECORDING', dest='recording',
             help='take level, sag, resistance and noise from a flight (any recording that analyze '
             'reads); --set overrides it'),
-     Option('--risk', metavar='X', type=quantity(''), default='1e-3',
+     Option('--risk', metavar='X', type=quantity(''), default='0.01',
             help='probability of a brown-out allowed within the horizon, 0..1 (default: '
-            '%(default)s)'),
+            '%(default)s, as for the throttle budget of analyze)'),
      Option('--throttle', metavar='Y', type=number(
          'between 0 and 1; write 40 % as 0.4', lambda value: 0.0 <= value <= 1.0),
             help='throttle, 0..1 (default with --from: exceeded for 1 %% of it)'),
      Option('--rail', choices=('bus', 'regulated'), default='bus',
             help='the battery bus at the ESCs, or the regulated rail (default: %(default)s)'),
-     Option('--voltage', metavar='V', type=quantity('V'),
-            help='brown-out level, V (default: 3.3 V per cell on the bus; 4.5 V on a regulated '
-            'rail of 5 V, 2.88 V on one of 3.3 V)'),
-     Option('--horizon', metavar='S', type=quantity('s'), default='5',
+     *limit('brown-out level, V (default: 3.3 V per cell on the bus; 4.5 V on a regulated rail of '
+            '5 V, 2.88 V on one of 3.3 V)', '--voltage', kind=quantity('V')),
+     Option('--brownout-horizon', '--horizon', metavar='S', type=quantity('s'), default='5',
             help='horizon, s (default: %(default)s)'),
      Option('--capacitance-min', metavar='F', type=quantity('F'), default='10uF',
             help='smallest capacitance to try (default: %(default)s)'),
@@ -376,7 +376,7 @@ _DESIGN = Command(
             help='components as a YAML mapping of name to value; --set overrides it'),
      Option('--list', action='store_true', help='list the components and their defaults'),
      *TOPICS, *FILES, REPORT, JSON, FORCE),
-    ('--from flight.bbl --set cells=4', '--risk 1e-3 --throttle 0.6 --set cells=4',
+    ('--from flight.bbl --cells 4', '--risk 1e-3 --throttle 0.6 --cells 4',
      '--list'),
     'Values are in SI units, or with prefix and unit: 470uF, 40mOhm, 24kHz.')
 

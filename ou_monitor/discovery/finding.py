@@ -183,11 +183,7 @@ class Finding:
         """Return why a model file cannot hold the extended model; empty if it can."""
         if self.model is None:
             return f"'{self.recording}' was not fitted. {self.sentence}"
-        if self.load != 'current':
-            return ''
-        return 'Its load is the measured current, and a model file is for throttle' + (
-            ' (--current-column none uses throttle as the load)' if self.has_throttle else
-            ', which was not recorded')
+        return unsaved_load(self.full, self.has_throttle)
 
     @property
     def closer(self) -> bool:
@@ -256,3 +252,11 @@ def _units(kind: type[Term]) -> dict[str, str]:
 def _discrepancy(c: Criticism, observed: float, chance: float) -> dict[str, Any]:
     return {'statistic': c.statistic, 'observed': observed, 'simulated_low': c.low,
             'simulated_high': c.high, 'p_value': chance}
+
+
+def unsaved_load(full: float, has_throttle: bool) -> str:
+    """Return why a model file cannot hold a load; full: current that is a load of 1, A, or NaN."""
+    return '' if math.isnan(full) else (
+        'Its load is the measured current, and a model file is for throttle' + (
+            ' (--current-column none uses throttle as the load)' if has_throttle else
+            ', which was not recorded'))

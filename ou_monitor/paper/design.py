@@ -37,7 +37,7 @@ import numpy as np
 from ou_monitor.model.passage import mean_first_passage
 from ou_monitor.paper.network import (
     completed, PowerNetwork, Rail, rail_at, UnstableNetworkError)
-from ou_monitor.text import number
+from ou_monitor.text import number, percent
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
@@ -156,6 +156,7 @@ class Design:
     resistance: float
     levers: tuple[Lever, ...]  # More capacitance and its alternatives.
     sag_error: float = 0.0  # Standard error of the sag of the bus, relative.
+    assumed: bool = False  # Whether the battery resistance is assumed: only shares of it mean much.
 
 
 def default_voltage(network: PowerNetwork, rail: str) -> tuple[float, str]:
@@ -219,7 +220,7 @@ def _risks(horizon: float, mean_time: float, crossing: float) -> tuple[float, fl
 def design(
     network: PowerNetwork, throttle: float, *, voltage: float, horizon: float, risk: float,
     rail: str = 'bus', esr_follows: bool = True, capacitances: tuple[float, float] = (LEAST, MOST),
-    sag_error: float = 0.0, flown: FlownRisk | None = None,
+    sag_error: float = 0.0, flown: FlownRisk | None = None, assumed: bool = False,
 ) -> Design:
     """
     Return the minimum bulk capacitance that meets a brown-out risk (capacitances in F).
@@ -275,7 +276,7 @@ def design(
         doubled=at(2.0 * present.capacitance), rows=tuple(rows),
         falls=all(b <= a * (1.0 + 1e-9) for a, b in zip(risks, risks[1:])),
         resistance=_resistance(network, throttle, voltage) if rail == 'bus' else math.nan,
-        levers=(), sag_error=sag_error)
+        levers=(), sag_error=sag_error, assumed=assumed)
     return replace(found, levers=_levers(found, at, flown))
 
 
@@ -301,15 +302,16 @@ def _levers(found: Design, at: Callable[[float], DesignRow],
         return flown(share * throttle, 1.0, 1.0) if flown is not None else risk(
             network, share * throttle)
 
-    bulk, ohm = network.bulk_capacitance, network.battery_resistance
+    bulk = network.bulk_capacitance
+    unit, ohm = ('%', 100.0) if found.assumed else ('mOhm', 1e3 * network.battery_resistance)
     packs = next((n for n in range(1, _PACKS + 1) if resistance(1.0 / n) <= target), math.nan)
     return (
         Lever('bulk capacitance', 'uF', 1e6 * bulk, 2e6 * bulk, at(2.0 * bulk).risk,
               1e6 * bulk if found.present.risk <= target else
               math.nan if least is None else 1e6 * least.capacitance),
         Lever('packs in parallel', '', 1.0, 2.0, resistance(0.5), packs),
-        Lever('battery and lead resistance', 'mOhm', 1e3 * ohm, 0.75e3 * ohm, resistance(0.75),
-              1e3 * ohm * _share(resistance, _RESISTANCE, target)),
+        Lever('battery and lead resistance', unit, ohm, 0.75 * ohm, resistance(0.75),
+              ohm * _share(resistance, _RESISTANCE, target)),
         Lever('throttle limit', '%', 100.0 * throttle, 80.0 * throttle, limit(0.8),
               100.0 * throttle * _share(limit, 0.0 if flown is not None else _THROTTLE, target)))
 
@@ -388,7 +390,10 @@ def answer(result: Design) -> str:
         return (f'No capacitance between {_uf(result.rows[0])} and {_uf(result.rows[-1])} brings '
                 f'the risk under {result.target:g}: with the largest it is still '
                 f'{probability(result.rows[-1].risk)}. {_others(result)}')
-    cure = (f'The mean is above the level with less than {1e3 * result.resistance:.3g} mOhm.'
+    ratio = result.resistance / result.network.battery_resistance
+    cure = ('The mean is above the level with less than ' + (
+        f'{percent(ratio)} of the resistance.' if result.assumed else
+        f'{1e3 * result.resistance:.3g} mOhm.')
             if math.isfinite(result.resistance) else
             'The level is at or above the open-circuit voltage: check cells and battery_voltage, '
             'or lower the level.' if result.rail == 'bus' else
@@ -404,8 +409,8 @@ def _others(result: Design) -> str:
              if math.isfinite(lever.least) and lever.least != lever.present]
     if found:
         return 'What would help: ' + ', or '.join(found) + '.'
-    return (f'Neither {_PACKS} packs in parallel, nor {_RESISTANCE:.0%} of the resistance, nor '
-            f'{_THROTTLE:.0%} of the throttle would be enough: land with more charge left, use '
+    return (f'Neither {_PACKS} packs in parallel, nor {percent(_RESISTANCE)} of the resistance, nor '
+            f'{percent(_THROTTLE)} of the throttle would be enough: land with more charge left, use '
             'more cells, or allow a lower voltage.')
 
 

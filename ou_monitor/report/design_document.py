@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from ou_monitor.paper.design import (
@@ -11,7 +10,7 @@ from ou_monitor.paper.design import (
 from ou_monitor.paper.network import PowerNetwork
 from ou_monitor.report.document import Document, Figure, Table, Text
 from ou_monitor.report.svg import Plot
-from ou_monitor.text import number
+from ou_monitor.text import number, percent
 
 # Rows of the calculation for each row of the printed table.
 _EVERY = 10
@@ -69,22 +68,20 @@ def _time(value: float) -> str:
     return 'never' if value > 1e100 else f'{number(value)} s'
 
 
-def taken_words(flight: Flight, network: PowerNetwork, throttle: float, values: dict[str, Any],
-                ) -> str:
+def taken_words(flight: Flight, network: PowerNetwork, throttle: float, assumed: bool) -> str:
     """Return the values taken from a flight, and the missing ones."""
-    known = flight.resistance > 0.0 and values.get('battery_resistance') is None
     sag, se = (float(np.interp(throttle, flight.throttle, one))
                for one in (flight.sag, flight.sag_se))
     return (f'From the flight: {flight.level:.4g} V open-circuit at its end, {network.cells} '
-            f'cells (highest median of 0.5 s {flight.full:.4g} V; --set cells=N for others), sag '
+            f'cells (highest median of 0.5 s {flight.full:.4g} V; --cells N for others), sag '
             f'{sag:.3g} V (+- {2.0 * se:.2g} V, which the risks include: those of analyze, with '
             'the sag and noise of each row) and '
             'noise '
             f'{1e3 * float(np.interp(throttle, flight.throttle, flight.noise)):.3g} mV rms at '
-            f'{throttle:.0%} throttle, resistance '
-            + (f'{1e3 * flight.resistance:.3g} mOhm.' if known else
-               f'{1e3 * network.battery_resistance:.3g} mOhm as given or assumed: the current is '
-               'scaled to the sag.')
+            f'{percent(throttle)} throttle, resistance '
+            + ('unknown without a measured current (--set battery_resistance=OHM): it is shown '
+               'relative to the present one.' if assumed else
+               f'{1e3 * network.battery_resistance:.3g} mOhm.')
             + ('' if math.isfinite(flight.alpha) else ' It shows no relaxation: alpha of slow '
                f'noise is assumed to be {number(network.flutter_rate)} 1/s.')
             + ' A flight shows neither bulk capacitor nor ESR: --set bulk_capacitance=470uF.')

@@ -187,7 +187,8 @@ def test_an_unknown_sag_is_not_designed_with(tmp_path, capsys):
 def test_set_values_override_the_flight(flight, capsys):
     """Resistance and throttle; a number of cells that the voltage cannot have is refused."""
     found = asked(capsys, '--from', flight, '--set', 'battery_resistance=50mOhm', '--throttle',
-                  '0.5')
+                  '0.5', '--cells', '4', '--brownout-voltage', '3.2')
+    assert found['brownout_voltage'] == pytest.approx(12.8)
     assert found['network']['battery_resistance'] == 0.05
     assert found['present']['sag'] == pytest.approx(0.025 * 80.0 * 0.5 ** 1.5, rel=0.15)
     assert main(['design', '--from', str(flight), '--set', 'cells=3']) == 2
@@ -219,6 +220,10 @@ def test_each_lever_shows_its_effect(flight, capsys):
     limit = levers['throttle limit']['least'] / 100.0
     less = asked(capsys, '--from', flight, '--voltage', '14.9', '--throttle', f'{limit:.3f}')
     assert less['present']['mean'] > 14.9
+    # Without a current the resistance is unknown, and shown as shares of the present one.
+    shares = asked(capsys, '--from', flight, '--voltage', '14.9', '--current-column', 'none')
+    ohm = shares['levers'][2]
+    assert (ohm['unit'], ohm['present'], ohm['tried']) == ('%', 100.0, 75.0)
     none = asked(capsys, '--from', flight, '--voltage', '16.15')
     assert 'would be enough' in none['answer']
     assert all(one['least'] is None for one in none['levers'])

@@ -168,7 +168,7 @@ def test_plain_names_stand_before_the_names_in_code():
 
 
 def test_a_model_that_is_not_saved_is_not_announced(tmp_path, capsys):
-    """Its load is the measured current; the finding names no file."""
+    """Its load is the measured current: refused before the search, and nothing is written."""
     rng = np.random.default_rng(4)
     t = np.arange(3000) / 50.0
     amps = np.repeat(rng.uniform(1.0, 40.0, 60), 50)
@@ -180,5 +180,5 @@ def test_a_model_that_is_not_saved_is_not_announced(tmp_path, capsys):
     data = tmp_path / 'a.json'
     assert main(['discover', str(path), '--save-model', str(model), '--json', str(data)]) == 2
     out, err = capsys.readouterr()
-    assert 'measured current' in json.loads(data.read_text())['refused']
-    assert 'no model saved' in err and str(model) not in out and not model.exists()
+    assert 'no model saved: its load is the measured current' in err and not out
+    assert not model.exists() and not data.exists()
