@@ -87,9 +87,9 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
         report(0.5 * (k + 1) / len(found))
     sliding = slide(recording, window, voltage, brownout_horizon,
                     lambda share: report(0.5 + 0.5 * share))
-    seen = overview(all_of_it, None if math.isnan(voltage) else voltage, results, cells,
-                    raw, sliding.monitor)
     judged = judge_levels(results)
+    seen = overview(all_of_it, None if math.isnan(voltage) else voltage, judged, cells,
+                    raw, sliding.monitor)
     throttles = [level.throttle for level in judged]
     estimates = [level.estimate for level in judged]
     relaxations = _relaxations(recording, judged)

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from ou_monitor.analysis.level_result import LevelResult
+from ou_monitor.analysis.level_result import LevelResult, ProcessType
 from ou_monitor.analysis.noise import BAND, flown_near, Remainder, THROTTLES
 from ou_monitor.analysis.supply import facts_and_end, SupplyFacts
 from ou_monitor.model.spectral_lines import comb_of
@@ -23,6 +23,8 @@ from ou_monitor.text import counted, number, percent, volts
 
 # Minimum ratio of the fitted noise between the ends of throttle that is reported as a trend.
 _GROWS = 1.25
+# Minimum share of a recording in its only level that stands for the whole (our choice).
+_WHOLE = 0.9
 # Minimum noise, V; less is rounding.
 _NOTHING = 1e-9
 # Minimum share of the noise of a level that lines must make up to be mentioned in the answer.
@@ -60,6 +62,9 @@ class Overview:
     line: LoudestLine | None = None  # Strongest spectral line
     cells: int = 0  # Cells in series to which the limit refers; 0: none
     end: MonitorReport | None = None  # Report of the node at the end; None without a limit
+    # Fit of a whole recording of one stationary level, if it is known better than in the window of
+    # `facts.ou` and agrees with it.
+    whole: OuFacts | None = None
 
     @property
     def limit(self) -> float:
@@ -92,7 +97,7 @@ def overview(recording: Recording, limit: float | None = None,
                     float(known.max()) if known.size else NAN, (near[0], near[-1]),
                     _largest(recording.current), _growth(recording, facts.noise.rms_v, near),
                     float(np.median(np.diff(recording.t))) if recording.n > 1 else 0.0,
-                    _strongest(levels), cells, end)
+                    _strongest(levels), cells, end, _whole(levels, recording, facts.ou))
 
 
 def _growth(recording: Recording, rms: Sequence[float], near: Sequence[int]) -> float:
@@ -108,6 +113,18 @@ def _growth(recording: Recording, rms: Sequence[float], near: Sequence[int]) -> 
 def _largest(current: FloatArray | None) -> float:
     known = np.empty(0) if current is None else np.abs(current[np.isfinite(current)])
     return float(np.median(sliding_window_view(known, 3), axis=1).max()) if known.size > 2 else NAN
+
+
+def _whole(levels: Sequence[LevelResult], recording: Recording, ou: OuFacts) -> OuFacts | None:
+    if len(levels) != 1 or levels[0].kind is not ProcessType.DIFFUSION or (
+            levels[0].time < _WHOLE * recording.duration):
+        return None
+    e, (least, most) = levels[0].estimate, ou.alpha_95
+    low, high = e.interval('alpha')
+    if not (low <= most and least <= high and high / low < most / least):
+        return None
+    return OuFacts('ok', levels[0].time, e.alpha, (low, high), e.sigma, e.interval('sigma'),
+                   e.var_inf, e.interval('var_inf'))
 
 
 def _strongest(levels: Sequence[LevelResult]) -> LoudestLine | None:
@@ -176,7 +193,7 @@ def known_lines(found: Overview) -> list[tuple[str, str]]:
     elif found.drawn > 0.0:
         lines.append(('Resistance', 'unknown: the current changes too little, or a load seems '
                       'to bypass its sensor'))
-    lines.append(('Relaxation', _ou_words(found.facts.ou)))
+    lines.append(('Relaxation', _ou_words(found.facts.ou, found.whole)))
     if found.line is not None:
         line = found.line
         where = '' if line.level == 'all' else f' at {line.level} throttle'
@@ -244,8 +261,13 @@ def _noise_words(found: Overview) -> str:
             f'{"grows" if found.growth > 1.0 else "falls"} with throttle')
 
 
-def _ou_words(ou: OuFacts) -> str:
+def _ou_words(ou: OuFacts, whole: OuFacts | None = None) -> str:
     window = f'the last {number(ou.window_s)} s'
+    if whole is not None:
+        low, high = ou.alpha_95
+        window = (f'all {number(whole.window_s)} s (in {window}, as in the JSON: alpha '
+                  f'{number(ou.alpha)}, {number(low)} to {number(high)})')
+        ou = whole
     if ou.status == 'ok':
         alpha, sigma = (f'{number(x)} (95 % {number(low)} to {number(high)})'
                         for x, (low, high) in ((ou.alpha, ou.alpha_95), (ou.sigma, ou.sigma_95)))

@@ -168,7 +168,8 @@ def _agreement(recording: Recording, own: Readings, yardstick: Yardstick, simula
     real = yardstick.measure(own.voltage)
     spread = float(np.ptp(own.voltage))
     error = path - own.voltage
-    found = differences(yardstick, real, measured, spread, float(error.mean()))
+    thirds = tuple(float(part.mean()) for part in np.array_split(error, 3))
+    found = differences(yardstick, real, measured, spread, thirds)
     explained = 1.0 - float(error @ error) / float(
         np.sum((own.voltage - own.voltage.mean()) ** 2))
     p, verdict, words, farthest = judge(found, explained, own.throttle is not None and bool(
@@ -184,13 +185,16 @@ def _agreement(recording: Recording, own: Readings, yardstick: Yardstick, simula
     return Agreement(
         recording.name, fitted, simulated, tuple(simulator.names),
         explained, math.sqrt(float(np.mean(error ** 2))), float(error.mean()),
-        tuple(float(part.mean()) for part in np.array_split(error, 3)),  # type: ignore[arg-type]
+        thirds,  # type: ignore[arg-type]
         band(real.lowest, np.array([m.lowest for m in measured])),
         band(real.mean, np.array([m.mean for m in measured])), tuple(yardstick.levels),
         tuple(one.band for one in found if one.kind == 'dips'),
         tuple(SpectrumBand(float(a), float(b), band(
-            float(real.power[k]), np.array([m.power[k] for m in measured])))
+            math.sqrt(real.power[k]), np.sqrt([m.power[k] for m in measured])))
             for k, (a, b) in enumerate(zip(yardstick.bands, yardstick.bands[1:]))),
+        None if yardstick.line is None else SpectrumBand(
+            yardstick.line.frequency, yardstick.line.frequency,
+            band(real.line, np.array([m.line for m in measured]))),
         falls[0] if falls else None, falls[1] if falls else None, int(yardstick.rises.size),
         band(distance(real, pooled), np.array([distance(m, pooled) for m in measured])),
         seeds, p, verdict, words, farthest, tuple(notes),

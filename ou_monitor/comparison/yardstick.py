@@ -23,6 +23,8 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.analysis.noise import dip_begins, noise_of, rise_that_ends
 from ou_monitor.comparison.flight_model import Readings
+from ou_monitor.model.sinusoid import LOBE
+from ou_monitor.model.spectral_lines import find_lines
 from ou_monitor.records import FloatArray, NAN, Recording
 from ou_monitor.text import number, Z95
 from scipy.signal import welch
@@ -59,11 +61,16 @@ class Band:
 
 @dataclass(frozen=True)
 class SpectrumBand:
-    """Power, V^2, between two frequencies, Hz."""
+    """Rms, V, between two frequencies, Hz."""
 
     low_hz: float
     high_hz: float
-    power: Band
+    rms: Band
+
+    @property
+    def middle_hz(self) -> float:
+        """Return the geometric middle, Hz."""
+        return math.sqrt(self.low_hz * self.high_hz)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +117,7 @@ class Agreement:
     levels: tuple[float, ...]  # Levels, V
     dips: tuple[Band, ...]  # Dips below each per minute
     spectrum: tuple[SpectrumBand, ...]  # By band of frequency
+    line: SpectrumBand | None  # About the strongest spectral line of the recording, if any
     # Deepest point of the mean response to rises of throttle, and its value 1 s after, V.
     fall: Band | None
     recovery: Band | None
@@ -120,7 +128,7 @@ class Agreement:
     p_value: float  # Share of simulations, recording included, with a score as large
     verdict: Likeness
     words: str  # The largest difference, as a part of a sentence
-    farthest: str  # Kind of that difference: lowest, dips, level, answer, spectrum, ks or path
+    farthest: str  # Kind of that difference: a key of _WEIGHTS, or path
     notes: tuple[str, ...]  # What was left out or assumed
     traces: Traces  # For a page
 
@@ -138,8 +146,10 @@ class Agreement:
                    for level, dips in zip(self.levels, self.dips)),
                  *((name, one) for name, one in response if one is not None),
                  ('KS distance', self.apart),
-                 *((f'power {one.low_hz:.3g} to {one.high_hz:.3g} Hz, V^2', one.power)
-                   for one in self.spectrum)]
+                 *((f'rms {one.low_hz:.3g} to {one.high_hz:.3g} Hz, V', one.rms)
+                   for one in self.spectrum),
+                 *([] if self.line is None else [
+                     (f'line at {self.line.middle_hz:.4g} Hz, V', self.line.rms)])]
         return [{'measure': name, **one.as_data(), 'inside': one.inside} for name, one in bands]
 
     def as_data(self) -> dict[str, Any]:
@@ -153,14 +163,14 @@ class Agreement:
             'crossings_per_min': [{'level_v': level, **dips.as_data()}
                                   for level, dips in zip(self.levels, self.dips)],
             'spectrum': [{'from_hz': one.low_hz, 'to_hz': one.high_hz,
-                          'simulated_over_measured': _ratio(one.power)}
+                          'simulated_over_measured': _ratio(one.rms) ** 2}
                          for one in self.spectrum],
             'ks_distance': self.apart.measured, 'worst': self.worst,
             'verdict': self.verdict.name.lower()}
 
 
-def _ratio(power: Band) -> float:
-    return power.median / power.measured if power.measured > 0.0 else float('nan')
+def _ratio(rms: Band) -> float:
+    return rms.median / rms.measured if rms.measured > 0.0 else float('nan')
 
 
 # Quantiles of the measured voltage that are the two low levels.
@@ -183,6 +193,7 @@ class Measures:
     lowest: float  # V
     dips: FloatArray  # Dips below each level per minute; shape (levels,)
     power: FloatArray  # Power in each band, V^2; shape (bands,)
+    line: float  # Rms about the recording's strongest line, V; 0 without one
     response: FloatArray  # Mean response to rises, V; empty with too few; shape (points,)
     distribution: FloatArray  # Share of the samples below each edge; shape (bins,)
 
@@ -204,6 +215,9 @@ class Yardstick:
         self._segment = int(min(v.size, max(64, min(_SEGMENT * self._rate, v.size / 4))))
         lowest, highest = self._rate / self._segment, 0.5 * self._rate
         self.bands = np.geomspace(lowest, highest, _BANDS + 1)
+        # Of the differences, whose spectrum is flatter than that of a voltage under load.
+        found = find_lines([v], self._rate, white=[np.diff(v, prepend=v[0])]).lines
+        self.line = max(found, key=lambda line: line.rms, default=None)
         self.rises = _rise_times(t, samples.throttle)
         self.after = np.linspace(-_BEFORE, _AFTER, _POINTS)
         reach = 0.5 * (float(v.max()) - float(v.min())) + 10.0 * lsb
@@ -217,8 +231,15 @@ class Yardstick:
         at = np.clip(np.searchsorted(self.bands, f, side='right') - 1, -1, _BANDS - 1)
         power = np.array([density[at == k].sum() for k in range(_BANDS)]) * (f[1] - f[0])
         return Measures(
-            float(v.mean()), float(v.min()), np.array(dips), power, self._response(v),
-            np.searchsorted(np.sort(v), self.edges, side='right') / v.size)
+            float(v.mean()), float(v.min()), np.array(dips), power, self._line(v),
+            self._response(v), np.searchsorted(np.sort(v), self.edges, side='right') / v.size)
+
+    def _line(self, v: FloatArray) -> float:
+        if self.line is None:
+            return 0.0
+        width = self.line.resolution
+        f, density = welch(v, self._rate, nperseg=min(v.size, round(self._rate / width)))
+        return math.sqrt(width * density[np.abs(f - self.line.frequency) <= LOBE * width].sum())
 
     def _response(self, v: FloatArray) -> FloatArray:
         if self.rises.size < _FEWEST:
@@ -256,7 +277,8 @@ def _rise_times(t: FloatArray, throttle: FloatArray | None) -> npt.NDArray[np.fl
 # must exceed all.  At 5 %, one good model in twenty was refused.
 LEVEL = 0.02
 # Importance for a pilot, relative to the lowest voltage and the number of dips.
-_WEIGHTS = {'lowest': 1.0, 'dips': 1.0, 'level': 0.8, 'answer': 0.8, 'spectrum': 0.5, 'ks': 0.5}
+_WEIGHTS = {'lowest': 1.0, 'dips': 1.0, 'level': 0.8, 'answer': 0.8, 'line': 0.8,
+            'spectrum': 0.5, 'ks': 0.5}
 # Differences that a pilot would not notice: a share of the range of the voltage, factors of a rate
 # and of a power, and a KS distance.
 _RANGE, _RATE, _POWER, _KS = 0.03, 1.25, 1.5, 0.05
@@ -307,8 +329,8 @@ def band(measured: float, simulated: FloatArray) -> Band:
 
 
 def differences(yardstick: Yardstick, own: Measures, others: Sequence[Measures],
-                spread: float, bias: float) -> list[Difference]:
-    """Return all numbers that are judged; V: range of the measured voltage, bias of the path."""
+                spread: float, bias: Sequence[float]) -> list[Difference]:
+    """Return all numbers that are judged; V: range of the voltage, bias of the path by third."""
     volts = max(_RANGE * spread, 1e-12)
 
     def of(pick: Callable[[Measures], float]) -> FloatArray:
@@ -318,9 +340,11 @@ def differences(yardstick: Yardstick, own: Measures, others: Sequence[Measures],
         Difference('lowest', own.lowest, of(lambda m: m.lowest), volts, lambda b: (
             f'the lowest voltage is {number(b.median, 4)} V ({_span(b, 4)}), measured '
             f'{number(b.measured, 4)} V')),
-        Difference('level', own.mean, of(lambda m: m.mean), volts, lambda b: (
-            f'the voltage is on average {number(1e3 * abs(bias), 2)} mV too '
-            f'{"high" if bias > 0.0 else "low"}'))]
+        Difference('level', own.mean, of(lambda m: m.mean), volts, lambda _: (
+            f'the voltage is on average {_off(float(np.mean(bias)))}'
+            + (f' ({_off(bias[0])} in the first third, {_off(bias[-1])} in the last: it falls '
+               f'{"less" if bias[-1] > bias[0] else "more"} with time than the recording)'
+               if abs(bias[-1] - bias[0]) > max(volts, abs(bias[0])) else '')))]
     for k, level in enumerate(yardstick.levels):
         rate = own.dips[k]
         # Poisson error of the count.
@@ -350,6 +374,10 @@ def differences(yardstick: Yardstick, own: Measures, others: Sequence[Measures],
                 math.log(_POWER), lambda b, low=low, high=high: (  # type: ignore[misc]
                     f'between {number(low, 2)} and {number(high, 2)} Hz the simulated voltage has '
                     f'{number(math.exp(b.median - b.measured), 2)} times the measured power')))
+    if (line := yardstick.line) is not None:
+        found.append(Difference('line', own.line, of(lambda m: m.line), volts, lambda b: (
+            f'the line at {number(line.frequency, 4)} Hz has '
+            f'{number(1e3 * b.median, 2)} mV rms, measured {number(1e3 * b.measured, 3)} mV')))
     pooled = np.mean([m.distribution for m in (own, *others)], axis=0)
     found.append(Difference(
         'ks', distance(own, pooled), of(lambda m: distance(m, pooled)), _KS, lambda b: (
@@ -365,6 +393,10 @@ def distance(one: Measures, pooled: FloatArray) -> float:
 
 def _span(b: Band, digits: int) -> str:
     return f'{number(b.low, digits)} to {number(b.high, digits)}'
+
+
+def _off(v: float) -> str:
+    return f'{number(1e3 * abs(v), 2)} mV too {"high" if v > 0.0 else "low"}'
 
 
 def _fall(v: float) -> str:
@@ -386,6 +418,7 @@ def judge(found: Sequence[Difference], explained: float, moved: bool
         return p, Likeness.DIFFERS, (
             f'the mean path explains {number(100.0 * explained, 2)} % of the variance, less than '
             'a constant would'), 'path'
-    if verdict is Likeness.LOOKS_LIKE_IT and found[level].off:
+    if found[level].off and not any(one.off for one in found if one.kind == 'answer'):
+        # The other differences follow from the level, unless the response to throttle is wrong.
         verdict, worst = Likeness.DIFFERS, level
     return p, verdict, found[worst].words(found[worst].band), found[worst].kind

@@ -156,7 +156,7 @@ class Design:
     resistance: float
     levers: tuple[Lever, ...]  # More capacitance and its alternatives.
     sag_error: float = 0.0  # Standard error of the sag of the bus, relative.
-    assumed: bool = False  # Whether the battery resistance is assumed: only shares of it mean much.
+    assumed: bool = False  # Whether the battery resistance is assumed: shares of it are shown.
 
 
 def default_voltage(network: PowerNetwork, rail: str) -> tuple[float, str]:
@@ -409,9 +409,9 @@ def _others(result: Design) -> str:
              if math.isfinite(lever.least) and lever.least != lever.present]
     if found:
         return 'What would help: ' + ', or '.join(found) + '.'
-    return (f'Neither {_PACKS} packs in parallel, nor {percent(_RESISTANCE)} of the resistance, nor '
-            f'{percent(_THROTTLE)} of the throttle would be enough: land with more charge left, use '
-            'more cells, or allow a lower voltage.')
+    return (f'Neither {_PACKS} packs in parallel, nor {percent(_RESISTANCE)} of the resistance, '
+            f'nor {percent(_THROTTLE)} of the throttle would be enough: land with more charge '
+            'left, use more cells, or allow a lower voltage.')
 
 
 def effect(result: Design) -> str:

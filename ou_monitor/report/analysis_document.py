@@ -168,7 +168,7 @@ def _origin(analysis: Analysis) -> list[tuple[str, str]]:
 
 
 def _numbers(analysis: Analysis) -> list[str]:
-    ou = analysis.overview.facts.ou
+    ou = analysis.overview.whole or analysis.overview.facts.ou
     if ou.status != 'ok':
         return []
     low, high = ou.alpha_95

@@ -79,11 +79,10 @@ def _rows(found: Agreement) -> list[tuple[str, str, str, str]]:
         out += [row(f'fall after {found.rises} rises, mV', found.fall, 3, -1e3),
                 row('fall left after 1 s, mV', found.recovery, 3, -1e3)]
     out.append(row('KS distance', found.apart, 2))
-    out += [row(f'rms {number(one.low_hz, 2)} to {number(one.high_hz, 2)} Hz, mV',
-                Band(*(max(x, 0.0) ** 0.5 for x in (
-                    one.power.measured, one.power.low, one.power.median, one.power.high))), 3,
-                1e3) for one in found.spectrum]
-    return out
+    out += [row(f'rms {number(one.low_hz, 2)} to {number(one.high_hz, 2)} Hz, mV', one.rms, 3, 1e3)
+            for one in found.spectrum]
+    return out if found.line is None else [*out, row(
+        f'line at {number(found.line.middle_hz, 4)} Hz, mV rms', found.line.rms, 3, 1e3)]
 
 
 def _path(found: Agreement) -> list[tuple[str, str]]:
@@ -127,9 +126,9 @@ def _others(found: Agreement) -> list[Part]:
 
 
 def _spectrum(found: Agreement) -> Plot:
-    middle = np.array([np.sqrt(one.low_hz * one.high_hz) for one in found.spectrum])
-    power = [one.power for one in found.spectrum]
-    plot = Plot('Power by frequency band', 'frequency, Hz', 'power, V\u00b2', height=220,
+    middle = np.array([one.middle_hz for one in found.spectrum])
+    power = [one.rms for one in found.spectrum]
+    plot = Plot('Rms by frequency band', 'frequency, Hz', 'rms, V', height=220,
                 log_x=True, log_y=True, legend_row=True)
     plot.bars(middle, np.array([one.low for one in power]), np.array([one.high for one in power]),
               'simulated, 95 %', _SIMULATED)

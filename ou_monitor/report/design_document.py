@@ -72,7 +72,8 @@ def taken_words(flight: Flight, network: PowerNetwork, throttle: float, assumed:
     """Return the values taken from a flight, and the missing ones."""
     sag, se = (float(np.interp(throttle, flight.throttle, one))
                for one in (flight.sag, flight.sag_se))
-    return (f'From the flight: {flight.level:.4g} V open-circuit at its end, {network.cells} '
+    return (f'From the flight: {flight.level:.4g} V open-circuit at its end (by the load '
+            f'model; the risks include its error), {network.cells} '
             f'cells (highest median of 0.5 s {flight.full:.4g} V; --cells N for others), sag '
             f'{sag:.3g} V (+- {2.0 * se:.2g} V, which the risks include: those of analyze, with '
             'the sag and noise of each row) and '

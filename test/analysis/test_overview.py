@@ -7,6 +7,8 @@ from types import SimpleNamespace
 
 import numpy as np
 from ou_monitor import supply_facts
+from ou_monitor import read_recording
+from ou_monitor.analysis.analyze import analyze
 from ou_monitor.analysis.overview import (
     answers, determined, known_lines, overview)
 from ou_monitor.records import Recording
@@ -125,6 +127,16 @@ def test_lines_are_part_of_the_answer_when_they_make_a_quarter_of_the_noise(shar
     """Alone or together; weaker ones are in the list only."""
     lines = [SimpleNamespace(frequency=40.0 * k, rms=0.01 / k, share=share)
              for k, share in enumerate(shares, 1)]
-    level = SimpleNamespace(label='all', lines=SimpleNamespace(lines=lines))
+    level = SimpleNamespace(label='all', kind=None, lines=SimpleNamespace(lines=lines))
     said = answers(overview(flight(seconds=10.0), 15.2, [level]))
     assert said[-1] == f'{words}.' if words else not any('line' in one for one in said)
+
+
+def test_a_stationary_recording_of_one_level_is_known_from_all_of_it():
+    """Its fit agrees with that of the last 2 s, and is known better; two levels have none."""
+    seen = analyze(read_recording('bags/load_40')).overview
+    (low, high), (least, most) = seen.whole.alpha_95, seen.facts.ou.alpha_95
+    assert low < 63.0 < high and high / low < 0.7 * most / least and low < most and least < high
+    assert seen.whole.window_s == pytest.approx(20.0, rel=0.01) and seen.facts.ou.window_s == 2.0
+    assert known_lines(seen)[-1][1].startswith(f'alpha {seen.whole.alpha:.1f} ')
+    assert analyze(flight(seconds=20.0)).overview.whole is None

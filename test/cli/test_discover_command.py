@@ -1,7 +1,6 @@
 """`ou-monitor discover`: CSV in; summary, JSON, model, page out; one line for bad input."""
 
 from dataclasses import replace
-import json
 import re
 from xml.etree import ElementTree
 

@@ -76,9 +76,30 @@ def test_a_doubled_sigma_differs():
                     SupplyModel((OU(ALPHA, 2.0 * SIGMA, LEVEL),)), seeds=40)
     assert found.verdict is Likeness.DIFFERS
     assert found.worst.startswith('Largest difference:')
-    top = found.spectrum[-1].power
+    top = found.spectrum[-1].rms
     # 2000 ordinates: 2 % each for the recording and for the median.
-    assert top.median / top.measured == pytest.approx(4.0, rel=0.15)
+    assert (top.median / top.measured) ** 2 == pytest.approx(4.0, rel=0.15)
+    assert found.as_data()['spectrum'][-1]['simulated_over_measured'] == pytest.approx(
+        (top.median / top.measured) ** 2)
+    assert found.line is None
+
+
+def test_a_line_that_the_simulation_lacks_is_a_difference():
+    """Of 60 mV rms, in noise of 47 mV."""
+    one = drawn(3)
+    line = 0.06 * math.sqrt(2.0) * np.sin(2.0 * np.pi * 17.3 * one.t)
+    found = compare(replace(one, voltage=one.voltage + line), model(), seeds=40)
+    assert found.line.middle_hz == pytest.approx(17.3, abs=0.1)
+    assert found.line.rms.measured == pytest.approx(0.06, rel=0.1) and not found.line.rms.inside
+    assert found.line.rms.high < 0.02
+
+
+def test_a_faster_discharge_is_the_cause_of_lower_dips():
+    """Of 1 V in 40 s: the lowest voltage is farther off, but follows from the level."""
+    one = drawn(3)
+    found = compare(replace(one, voltage=one.voltage - one.t / 40.0), model(), seeds=40)
+    assert found.farthest == 'level' and not found.lowest.inside
+    assert 'less with time than the recording' in found.words
 
 
 @pytest.mark.parametrize('sag', [0.5 * SAG, 2.0 * SAG])

@@ -34,7 +34,7 @@ def test_the_level_is_off_by_the_bias_of_the_path():
     noise = white(3)
     yardstick = Yardstick(noise, 0.0)
     own, other = (yardstick.measure(noise.voltage + x) for x in (0.0, 0.03))
-    level = differences(yardstick, own, [other] * 20, 1.0, -0.019)[1]
+    level = differences(yardstick, own, [other] * 20, 1.0, [-0.019] * 3)[1]
     assert level.kind == 'level' and ' 19 mV too low' in level.words(level.band)
 
 
