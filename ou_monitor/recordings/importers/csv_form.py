@@ -507,6 +507,9 @@ def numbers(path: Path, form: Form, places: Sequence[int],
                     part.append(_floats(cells, where, form.comma, form.units[place],
                                         good if left_out is not None else None, left_out))
                 if not good.all():
+                    for k in np.flatnonzero(~good).tolist():
+                        _check_same_names(rows[k], form.names, partial(
+                            _place, path, form, begin=begin, rows=block, k=k))
                     for part in parts:
                         part[-1] = part[-1][good]
                 for place, text in (texts or {}).items():
@@ -518,6 +521,15 @@ def numbers(path: Path, form: Form, places: Sequence[int],
                if re.search('truncated|unexpected end', error.reason) else error)
         raise InputError(f'{path} is not text throughout: {why}') from error
     return [np.concatenate(part) if part else np.empty(0) for part in parts]
+
+
+def _check_same_names(row: list[str], names: Sequence[str], where: Callable[[int], str]) -> None:
+    """Raise InputError if a bad line is a header in another order: another table begins."""
+    cells = [cell.strip() for cell in row]
+    others = [k for k, (cell, name) in enumerate(zip(cells, names)) if cell != name]
+    if others and set(cells) & {*names} - {''} and not any(map(is_value, cells)):
+        raise InputError(f"{where(others[0])} becomes '{shown(cells[others[0]])}': another table "
+                         'begins there; move it to a file of its own')
 
 
 def _with_units(cells: Sequence[str], units: Sequence[str], stated: str) -> tuple[str, ...]:
