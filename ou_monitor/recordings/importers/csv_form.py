@@ -213,17 +213,7 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool,
                 wanted: CsvColumns) -> tuple[float, Form] | None:
     """Return how well a delimiter and a decimal mark fit, and the form; None if they do not."""
     skip, given = wanted.skip_rows or 0, wanted.decimal or ''
-    rows: list[list[str]] = []
-    for line in lines:
-        plain = '' if line.lstrip().startswith(COMMENTS) else line
-        try:
-            rows.append([cell.strip() for cell in next(iter(csv.reader(
-                _prepared([plain], delimiter, comma, given), delimiter=delimiter,
-                skipinitialspace=True)), [])])
-        except csv.Error:
-            rows.append([])
-    if comma and delimiter == ',':
-        rows = [list(map(_with_point, row)) for row in rows]
+    rows = _split(lines, delimiter, comma, given)
     # A quoted field may hold line breaks; the rest of it is not a row of the format.
     filled = [row for row in rows[skip:] if any(row)]
     widths = Counter(len(row) for row in filled[len(filled) // 3:])
@@ -231,28 +221,17 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool,
         return None
     width = max(widths, key=lambda size: (widths[size], size))
     full = [row for row in filled if len(row) == width]
-    either = [[found[0] if (found := _LABEL.match(cell)) and is_number(cell[found.end():]) else ''
-               for cell in row] for row in full[len(full) // 2:][:2]]
-    labels = tuple(one if one == other else '' for one, other in zip(either[0], either[-1]))
+    labels = _labels_of(full)
     rows, full = ([_unlabelled(row, labels) for row in some] for some in (rows, full))
     good = [[is_value(row[k]) for row in full if row[k]] for k in range(width)]
     places = [k for k, ok in enumerate(good) if ok and (ok[-1] or 2 * sum(ok) >= len(ok))]
-    numeric = {k: any(row[j:j + 1] and is_value(row[j]) for j in places)
-               for k, row in enumerate(rows)
-               if k >= skip and any(row) and len(row) >= min(width, 2)}
-    fits = [k for k, found in numeric.items() if found and all(
-        not rows[k][j:j + 1] or is_value(rows[k][j]) or is_missing(rows[k][j]) for j in places)]
-    # A number may stand above the data: more rows with numbers must follow it.
-    first = next((k for k in fits if all(numeric[j] for j in islice(
-        (j for j in numeric if j >= k), _IN_A_ROW))), fits[0] if fits else None)
-    if first is not None:
-        first = _after_names(rows, skip, first, width, places)
-    else:
+    first = _first_of_data(rows, skip, width, places)
+    if first is None:
         # A header alone is a format without rows.
-        first, places = len(rows), []
+        first = len(rows)
         if len(filled) != 1 or any(map(is_value, filled[0])):
             return None
-    names, units, at = _header(rows, lines, first, width, delimiter, skip, labels)
+    names, words, at = _header(rows, lines, first, width, delimiter, skip, labels)
     if not at and any(len(row) > 2 and all(row) and not any(map(is_value, row))
                       for row in rows[skip:first]):
         # The names do not fit the columns: rows have lost or gained cells.
@@ -263,8 +242,44 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool,
     step, stated = _stated_step(list(map(_with_point, above)) if comma else above, rows[:first])
     first_rows = tuple(tuple(row) for row in rows[first:] if any(row))
     return fit * (1.0 if width > 1 else 0.4) + 0.01 * min(width, 20) / 20, Form(
-        encoding, delimiter, comma, given, first, at, labels, ''.join(lines[:first]), names,
-        units, width, first_rows, step, stated)
+        encoding, delimiter, comma, given, first, at, labels, ''.join(lines[:first]),
+        tuple(names), _units_of(names, words, rows, first), width, first_rows, step, stated)
+
+
+def _split(lines: list[str], delimiter: str, comma: bool, mark: str) -> list[list[str]]:
+    """Return the cells of each line, none of a comment or of a line that cannot be split."""
+    rows: list[list[str]] = []
+    for line in lines:
+        plain = '' if line.lstrip().startswith(COMMENTS) else line
+        try:
+            rows.append([cell.strip() for cell in next(iter(csv.reader(
+                _prepared([plain], delimiter, comma, mark), delimiter=delimiter,
+                skipinitialspace=True)), [])])
+        except csv.Error:
+            rows.append([])
+    return [list(map(_with_point, row)) for row in rows] if comma and delimiter == ',' else rows
+
+
+def _labels_of(rows: list[list[str]]) -> tuple[str, ...]:
+    """Return the word before the number of each column, the same in two rows; '' if none."""
+    either = [[found[0] if (found := _LABEL.match(cell)) and is_number(cell[found.end():]) else ''
+               for cell in row] for row in rows[len(rows) // 2:][:2]]
+    return tuple(one if one == other else '' for one, other in zip(either[0], either[-1]))
+
+
+def _first_of_data(rows: list[list[str]], skip: int, width: int, places: list[int]) -> int | None:
+    """Return the first row of numbers (places: their columns); None: there is none."""
+    numeric = {k: any(row[j:j + 1] and is_value(row[j]) for j in places)
+               for k, row in enumerate(rows)
+               if k >= skip and any(row) and len(row) >= min(width, 2)}
+    fits = [k for k, found in numeric.items() if found and all(
+        not rows[k][j:j + 1] or is_value(rows[k][j]) or is_missing(rows[k][j]) for j in places)]
+    if not fits:
+        return None
+    # A number may stand above the data: more rows with numbers must follow it.
+    first = next((k for k in fits if all(numeric[j] for j in islice(
+        (j for j in numeric if j >= k), _IN_A_ROW))), fits[0])
+    return _after_names(rows, skip, first, width, places)
 
 
 def _unlabelled(row: list[str], labels: Sequence[str]) -> list[str]:
@@ -388,36 +403,55 @@ def factor_of(name: str) -> float:
 
 
 def _header(rows: list[list[str]], lines: list[str], first: int, width: int, delimiter: str,
-            skip: int, labels: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...], int]:
-    """Return names, units as stated, and the line of the names."""
-    above = [k for k in range(skip, first) if any(rows[k])]
-    names: list[str] = []
-    units: list[str] = []
-    line = 0
-    if len(above) > 1 and _are_units(rows[above[-1]]) and len(rows[above[-2]]) >= min(
-            width, len(rows[above[-1]])):
-        units = [cell.strip('[](){} ').lower() for cell in rows[above.pop()]]
-    # An index at the left has no name, any other column has one.
-    if above and (not any(labels) or len(rows[above[-1]]) == width) and all(
-            rows[above[-1]][k:k + 1] != [''] or not any(
-                row[k:k + 1] not in ([], ['']) for row in rows[first:]) for k in range(1, width)):
-        names, line = rows[above[-1]], above[-1] + 1
-    elif any(labels):
+            skip: int, labels: Sequence[str]) -> tuple[list[str], list[str], int]:
+    """Return names, the words of a line of units, and the number of the line of the names."""
+    plain = [(k, rows[k]) for k in range(skip, first) if any(rows[k])]
+    if any(labels) and plain and len(plain[-1][1]) != width:
+        plain = []
+    needed = {k for row in rows[first:] for k, cell in enumerate(row[:width]) if cell}
+    names, units, line = _names_and_units(plain, width, needed)
+    if not line and any(labels):
         names, line = [label[:-1].strip() or ('time' if is_clock(cell) else f'column {k + 1}')
                        for k, (label, cell) in enumerate(zip(labels, rows[first]))], first + 1
-    else:
-        # A header marked as a comment.
-        for k in range(first - 1, skip - 1, -1):
+    elif not line and width > 1:
+        # A header marked as a comment: delimited as the data, or by blanks, units in brackets.
+        comments = []
+        for k in range(skip, first):
             text = lines[k].lstrip('#% \t')
-            # Delimited as the data, or by blanks, with units in brackets.
-            for cells in (next(iter(csv.reader([text], delimiter=delimiter)), []),
-                          _NAMES.findall(text)):
-                if not line and len(cells) == width and width > 1:
-                    names, line = [cell.strip() for cell in cells], k + 1
-            if line:
-                break
-    names = names or [f'column {k + 1}' for k in range(width)]
-    stated = [units[k] if k < len(units) and units[k] in WORDS else unit_of(name)[1]
+            either = next(iter(csv.reader([text], delimiter=delimiter)), []), _NAMES.findall(text)
+            comments += [(k, [cell.strip() for cell in cells])
+                         for cells in either if len(cells) == width][:1]
+        names, more, line = _names_and_units(comments, width, needed)
+        units = units or more
+    return names or [f'column {k + 1}' for k in range(width)], units, line
+
+
+def _names_and_units(above: list[tuple[int, list[str]]], width: int, needed: set[int],
+                     ) -> tuple[list[str], list[str], int]:
+    """Return names, words of units and a line as `_header`; 0: no line names all columns."""
+    units: list[str] = []
+    if len(above) > 1 and _are_units(above[-1][1]) and len(above[-2][1]) >= min(
+            width, len(above[-1][1])):
+        units = [cell.strip('[](){} ').lower() for cell in above.pop()[1]]
+    if not above:
+        return [], units, 0
+    line, names = above[-1]
+    for _, over in reversed(above[:-1]):
+        # Names in several lines: a blank cell has the name above, a repeated one both.
+        if len(over) != len(names) or any(map(is_value, over)):
+            break
+        count = Counter(names)
+        names = [f'{more} {name}'.strip() if k and count[name] > 1 else name or more
+                 for k, (name, more) in enumerate(zip(names, over))]
+    # An index at the left has no name, any other column has one.
+    named = all(names[k:k + 1] != [''] or k not in needed for k in range(1, width))
+    return (names, units, line + 1) if named else ([], units, 0)
+
+
+def _units_of(names: list[str], words: list[str], rows: list[list[str]], first: int,
+              ) -> tuple[str, ...]:
+    """Return the stated unit of each column (words: the line of units), '' if there is none."""
+    stated = [words[k] if k < len(words) and words[k] in WORDS else unit_of(name)[1]
               for k, name in enumerate(names)]
     # Else the unit of a channel in a line above, such as 'Vertical Units,V,CH2:A'.
     for k, cell in ((k, cell) for row in rows[:first] if row and 'unit' in row[0].lower()
@@ -428,7 +462,7 @@ def _header(rows: list[list[str]], lines: list[str], first: int, width: int, del
     for k, unit in enumerate(stated):
         cell = next((row[k] for row in rows[first:] if k < len(row) and is_number(row[k])), '0')
         stated[k] = unit or number_of(cell)[1] or _unit_beside(names, rows[first:], k)
-    return tuple(names), tuple(stated), line
+    return tuple(stated)
 
 
 def has_unit_beside(names: Sequence[str], place: int) -> bool:

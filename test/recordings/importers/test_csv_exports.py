@@ -81,6 +81,14 @@ FORMS = {
     'joulescope': (table(['#time,current,voltage,power,charge,energy'],
                          lambda k: f'{0.01 * k:.2f},{AMPS[k]},{V[k]},{AMPS[k] * V[k]:.4f},0,0'),
                    0.01, False, True),
+    # Names and units in comments; names in several lines, of which some are blank or repeated.
+    'commented_units': (table(['# Export of a meter', '#time,current,voltage,power', '#s,A,V,W'],
+                              lambda k: f'{0.01 * k:.2f},{AMPS[k]},{V[k]},0'), 0.01, False, True),
+    'names_above': (table([',battery,battery,rc', ',voltage,current,throttle', 'time,,,'],
+                          lambda k: f'{clock(k)},{V[k]},{AMPS[k]},{U[k]}'), 0.01, True, True),
+    'names_repeated': (table(['timestamp,Voltage,Current', 'Berlin (+02:00),Pack [279],Pack [279]',
+                              ',V,A'], lambda k: f'{clock(k)},{V[k]},{AMPS[k]}'), 0.01, False,
+                       True),
     'otii': (table(['Timestamp(s),Main current (A),Main voltage (V)'],
                    lambda k: f'{0.01 * k:.3f},{AMPS[k]},{V[k]}'), 0.01, False, True),
     # Each topic at stamps of its own.
