@@ -56,12 +56,6 @@ def percent(share: float) -> str:
     return f'{value:g} %'
 
 
-def with_interval(value: float, se: float, digits: int = 3) -> str:
-    """Return a number with half its 95 % interval, if both are known."""
-    return number(value, digits) + (
-        f' +- {number(Z95 * se, 2)}' if math.isfinite(value) and math.isfinite(se) else '')
-
-
 def listed(names: Sequence[str]) -> str:
     """Return names as a list in a sentence."""
     return names[0] if len(names) == 1 else ', '.join(names[:-1]) + ' and ' + names[-1]

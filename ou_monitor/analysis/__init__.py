@@ -1,1 +1,1 @@
-"""`analyze` (load levels, tests, transients), `coupling`, and the facts all commands report."""
+"""`analyze` (load levels, tests), `coupling`, and the facts all commands report."""

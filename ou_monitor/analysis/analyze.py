@@ -10,7 +10,7 @@ for the state at the end of the recording.  Throttles not flown are NaN.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 import math
@@ -27,8 +27,6 @@ from ou_monitor.analysis.levels import find_levels, LoadLevel
 from ou_monitor.analysis.noise import flown_near, remainder, THROTTLES, without_wild
 from ou_monitor.analysis.overview import Overview, overview
 from ou_monitor.analysis.quality import noise_items, quality_list, QualityItem
-from ou_monitor.analysis.relaxation import (
-    find_steps, fit_relaxation, judge_cause, Relaxation, ReleaseCause)
 from ou_monitor.analysis.supply import alarms, Dips, fed, node_for
 from ou_monitor.criticism.innovations import FAMILY_WISE
 from ou_monitor.criticism.readings import two_levels
@@ -49,8 +47,6 @@ class Analysis:
 
     recording: Recording
     levels: tuple[LevelResult, ...]  # In order of throttle
-    relaxations: tuple[Relaxation, ...]  # After falls of throttle (``release``) and rises
-    causes: tuple[ReleaseCause, ...]  # Of each relaxation: rail or instrument
     alpha_test: AlphaTest  # Whether alpha is the same at all levels
     by_throttle: ByThrottle  # Risk over throttle
     sliding: Sliding  # Reports of the node
@@ -92,14 +88,13 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
                     raw, sliding.monitor)
     throttles = [level.throttle for level in judged]
     estimates = [level.estimate for level in judged]
-    relaxations = _relaxations(recording, judged)
     # A second relaxation biases alpha even at levels where it is too weak to be detected.
     wanders = any(level.wanders for level in judged)
     alpha = alpha_constancy(throttles, estimates,
                             [wanders or level.doubted for level in judged])
     craft = craft_of(recording, seen.facts, cells)
     return Analysis(
-        recording, judged, relaxations, tuple(judge_cause(r, alpha) for r in relaxations), alpha,
+        recording, judged, alpha,
         by_throttle(recording, seen, voltage, brownout_horizon), sliding,
         quality_list(recording, throttles, estimates,
                      [item for name, at in (
@@ -122,17 +117,6 @@ def _default_voltage(recording: Recording) -> float:
     low, high = RAIL
     middle = float(np.median(recording.voltage)) if recording.n else NAN
     return DEFAULT_LIMIT if low <= middle <= high else NAN
-
-
-def _relaxations(recording: Recording, levels: Sequence[LevelResult]) -> tuple[Relaxation, ...]:
-    throttles = [level.throttle for level in levels]
-    estimates, rms = [level.estimate for level in levels], [level.vrms for level in levels]
-    steps = find_steps(recording, throttles)
-    falls = [throttles[step.after] < throttles[step.before] for step in steps]
-    return tuple(
-        fit_relaxation(recording, kind, [step for step, down in zip(steps, falls)
-                                         if down == wanted], throttles, estimates, rms)
-        for kind, wanted in (('release', True), ('load', False)))
 
 
 def _left_out(recording: Recording, found: tuple[LoadLevel, ...]) -> tuple[str, ...]:
@@ -270,8 +254,6 @@ def as_data(analysis: Analysis) -> dict[str, Any]:
                           'effects': {name: {'meaning': EFFECT[name], 'least': LEAST[name]}
                                       for name in EFFECT}},
         'lines': {'false_alarm': FALSE_ALARM},
-        'transients': [_relaxation(fit, cause)
-                       for fit, cause in zip(analysis.relaxations, analysis.causes)],
         'alpha_constant': _alpha(analysis),
         'by_throttle': {
             'throttle': curves.throttle, 'known': curves.known, 'brownout_risk': curves.risk},
@@ -354,30 +336,6 @@ def _level(level: LevelResult) -> dict[str, Any]:
         'status': e.status.name,
         'status_text': e.status.value,
         'flags': [{'name': flag.name, 'text': flag.value} for flag in e.flags],
-    }
-
-
-def _relaxation(fit: Relaxation, cause: ReleaseCause) -> dict[str, Any]:
-    return {
-        'kind': fit.kind,
-        'tau': fit.tau, 'tau_ci95': [fit.tau_low, fit.tau_high],
-        'misfit': fit.misfit, 'misfit_p_value': fit.misfit_p, 'badly_fitted': fit.badly_fitted,
-        'left_out_s': fit.left_out, 'likelihood_gain': fit.likelihood_gain,
-        'tau_alpha': cause.ratio, 'tau_alpha_ci95': [cause.ratio_low, cause.ratio_high],
-        'tau_alpha_p_value': cause.p_value,
-        'against_noise': cause.noise,
-        'instrument': cause.instrument,
-        'instrument_corner_hz': cause.corner,
-        'level_step': cause.step, 'level_step_se': cause.step_se,
-        'sentence': f'{fit.caveat} {cause.sentence}'.strip(),
-        'changes': [{
-            't': change.t, 'throttle_before': change.throttle_before,
-            'throttle_after': change.throttle_after, 'level_before': change.level_before,
-            'level_before_se': change.level_before_se, 'level': change.level,
-            'level_se': change.level_se, 'amplitude': change.amplitude,
-            'amplitude_se': change.amplitude_se, 'beyond': change.beyond,
-            'beyond_p_value': change.beyond_p, 'duration_s': change.duration, 'n': change.n}
-            for change in fit.releases],
     }
 
 

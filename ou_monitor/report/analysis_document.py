@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from functools import partial
 import math
 
 import numpy as np
@@ -15,7 +14,6 @@ from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.noise import BAND
 from ou_monitor.analysis.overview import answers, determined, known_lines
 from ou_monitor.analysis.quality import QualityItem
-from ou_monitor.analysis.relaxation import Relaxation
 from ou_monitor.criticism.curves import outline
 from ou_monitor.online.risk.courses import KEPT
 from ou_monitor.online.settings import DEFAULT_LIMIT
@@ -24,12 +22,10 @@ from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text, UNKNOWN,
     worst_first)
 from ou_monitor.report.svg import Plot, span
-from ou_monitor.text import chance, counted, listed, number, percent, with_interval
+from ou_monitor.text import chance, counted, listed, number, percent
 
-# Maximum changes of throttle drawn in one plot, and the length of the plot, relaxation times.
-_MOST_DRAWN, _DRAWN_TAUS = 6, 8.0
-# Maximum rows of a table on a terminal.
-_MOST_LINES, _MOST_CHANGES = 12, 8
+# Maximum lines of a table on a terminal.
+_MOST_LINES = 12
 # Lower limit of the drawn risk.
 _LEAST_RISK = 1e-4
 # Maximum levels drawn (more would repeat colours), and lines marked in the spectrum of a level.
@@ -60,7 +56,6 @@ def analysis_document(analysis: Analysis, command: str = '') -> Document:
                                   Text(analysis.alpha_test.sentence)]),
         Section('Load levels', _levels(analysis)),
         lambda: [Section('Sigma and alpha over time', _sliding(analysis), folded=True)],
-        Section('After changes of throttle', _transients(analysis), folded=True),
         Section('Spectrum and distribution', [lambda: _shape(analysis), *_lines(analysis)],
                 folded=True),
         Section('Type of process', _process(analysis), folded=True)]
@@ -390,60 +385,6 @@ def _lines(analysis: Analysis) -> list[Part]:
     return [Table(['throttle', 'line, Hz', 'rms, mV\n[95 %]', 'of variance', 'p'], rows,
                   left=[0], most=_MOST_LINES) if rows else
             Text(f'No spectral line at any level (1 % false alarms); {detectable}.')]
-
-
-def _transients(analysis: Analysis) -> list[Part]:
-    parts: list[Part] = []
-    for k, fit in enumerate(analysis.relaxations):
-        if fit.releases:
-            parts.append(Text(_relaxation_sentence(analysis, k)))
-        if fit.detected:
-            parts += [partial(_relaxation_plot, analysis, fit), _changes(analysis, fit)]
-    return parts
-
-
-def _relaxation_sentence(analysis: Analysis, k: int) -> str:
-    """Return the relaxation after falls (k = 0) or rises (k = 1) of throttle."""
-    fit, cause = analysis.relaxations[k], analysis.causes[k]
-    if not fit.detected:
-        return cause.sentence
-    caveat = f'{fit.caveat} ' if fit.caveat else ''
-    what = counted(len(fit.releases), 'fall' if fit.kind == 'release' else 'rise')
-    return (f'After {what} of throttle the voltage relaxes in '
-            f'tau = {number(1e3 * fit.tau)} (95 % {number(1e3 * fit.tau_low)} to '
-            f'{number(1e3 * fit.tau_high)}) ms. {caveat}{cause.sentence}')
-
-
-def _relaxation_plot(analysis: Analysis, fit: Relaxation) -> list[Part]:
-    recording = analysis.recording
-    what = 'falls' if fit.kind == 'release' else 'rises'
-    plot = Plot(f'After throttle {what} (dashed: fit)', 'time since throttle settled, ms', 'mV',
-                height=240)
-    for k, change in enumerate(fit.releases[:_MOST_DRAWN]):
-        if not math.isfinite(change.amplitude):
-            continue
-        stop = change.t + min(change.duration, _DRAWN_TAUS * fit.tau)
-        here = slice(int(np.searchsorted(recording.t, change.t)),
-                     int(np.searchsorted(recording.t, stop, side='right')))
-        since = recording.t[here] - change.t
-        plot.line(1e3 * since, 1e3 * (recording.voltage[here] - change.level),
-                  f'{100.0 * change.throttle_before:.3g} to '
-                  f'{100.0 * change.throttle_after:.3g} %', k, 'faint')
-        plot.line(1e3 * since, 1e3 * fit.decay(change, since), '', k, 'dash thick')
-    return [Figure(plot)]
-
-
-def _changes(analysis: Analysis, fit: Relaxation) -> Table:
-    start = float(analysis.recording.t[0])
-    side = 'overshoot, mV' if fit.kind == 'release' else 'undershoot, mV'
-    rows = [[number(change.t - start, 4),
-             f'{100.0 * change.throttle_before:.3g} to {100.0 * change.throttle_after:.3g} %',
-             with_interval(change.level_before, change.level_before_se, 4),
-             with_interval(change.level, change.level_se, 4),
-             with_interval(1e3 * change.amplitude, 1e3 * change.amplitude_se),
-             number(1e3 * change.beyond), chance(change.beyond_p)] for change in fit.clear]
-    return Table(['at, s', 'throttle', 'before, V', 'after, V', 'A, mV', side, 'p (noise only)'],
-                 rows, left=[1], most=_MOST_CHANGES)
 
 
 def voltage_plot(recording: Recording, limit: float) -> Plot:
