@@ -90,8 +90,8 @@ def current_at(recording: Recording, t: FloatArray) -> FloatArray | None:
 def load_of(recording: Recording, t: FloatArray, v: FloatArray, u: FloatArray | None,
             notes: list[str]) -> tuple[FloatArray | None, float]:
     """Return the load, and the current that is a load of 1, A; NaN if the load is throttle."""
-    # t in s, v in V.  The current is the load if it predicts the voltage better.  It is divided by
-    # its 99 % quantile, and shifted by the delay of the voltage.
+    # t in s, v in V.  The current is the load unless throttle predicts the voltage better.  It is
+    # divided by its 99 % quantile, and shifted by the delay of the voltage.
     current = current_at(recording, t)
     if current is None or not float(np.ptp(current)) > 0.0:
         return u, NAN
@@ -103,10 +103,12 @@ def load_of(recording: Recording, t: FloatArray, v: FloatArray, u: FloatArray | 
     load = np.interp(t + late, t, current) / full
     gain = _gain(t[some], v[some], load[some]) - (
         0.0 if u is None else _gain(t[some], v[some], u[some]))
-    if not gain > 0.5 * _LAGS.size * math.log(v.size):
+    limit = 0.5 * _LAGS.size * math.log(v.size)
+    if gain < (limit if u is None else -limit):
         return u, NAN
     why = 'throttle was not recorded' if u is None else (
-        f'it predicts the voltage better than throttle, by {number(gain)} nats')
+        f'it predicts the voltage better than throttle, by {number(gain)} nats' if gain > limit
+        else 'it predicts the voltage as well as throttle')
     notes.append(f'The load is the measured current ({why}). Parameters are for a current of 1 '
                  f'= {number(full)} A.')
     return np.asarray(load), full

@@ -18,7 +18,8 @@ from ou_monitor.criticism.structure import evaluate, fit_gaussian
 from ou_monitor.discovery.decision import relaxes
 from ou_monitor.discovery.finding import (
     Cause, Criticism, Finding, LoadFall, LowDips, Verdict)
-from ou_monitor.discovery.fitting import Fitter, standard_errors, with_reach
+from ou_monitor.discovery.fitting import (
+    COLLINEAR, Fitter, follows_time, standard_errors, with_reach)
 from ou_monitor.discovery.gain import (
     covered, errors_grew, gain_of, guess, held_out, HeldOut, mean_score, shrink_of, why_unknown,
     without)
@@ -29,8 +30,8 @@ from ou_monitor.discovery.redraw import redraw_clipped, redraw_within_codes
 from ou_monitor.discovery.regression import load_terms
 from ou_monitor.discovery.search import position, Progress, Search, under_load, whole_load
 from ou_monitor.discovery.words import (
-    by_load, coupling_found, coupling_note, explain, left_out_note, NO_OTHER, no_relaxation_note,
-    VAGUE, verdict_sentence)
+    by_load, collinear_note, coupling_found, coupling_note, explain, left_out_note, NO_OTHER,
+    no_relaxation_note, VAGUE, verdict_sentence)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import blamed, catalogue, left_out, withdraw
 from ou_monitor.model.terms.load_response import LoadTransient, SHORTEST
@@ -290,6 +291,8 @@ def _notes(named: Named, model: Composite, dropped: Sequence[str], samples: Samp
                      'or its size is not determined: left out.')
     if uncovered:
         notes.append(left_out_note(uncovered, samples.n - uncovered))
+    if model.has('load_sag') and follows_time(samples):
+        notes.append(collinear_note(follows_time(samples), COLLINEAR))
     duration = float(samples.t[-1] - samples.t[0])
     ou = model.terms[0]
     assert isinstance(ou, OU)

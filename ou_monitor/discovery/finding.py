@@ -218,7 +218,10 @@ class Finding:
                 'name': cause.name, 'family': cause.term.FAMILY, 'gain': cause.gain,
                 'gain_se': cause.gain_se, 'p_value': cause.p_value, 'exact': cause.exact,
                 'params': cause.term.values(), 'se': dict(cause.se),
-                'units': _units(type(cause.term)), 'alternatives': list(cause.alternatives),
+                'units': _units(type(cause.term)), 'curves': {
+                    name: {'at': at, 'factor': factor}
+                    for name, (at, factor) in cause.term.factors().items()},
+                'alternatives': list(cause.alternatives),
                 'explanation': cause.explanation} for cause in self.causes],
             'extended': {
                 **self._extended(), 'heldout_score': self.score, 'gain': self.gain,

@@ -21,6 +21,7 @@ from ou_monitor.discovery import decision
 from ou_monitor.discovery.gain import all_moved
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.laws import View
+from ou_monitor.model.terms.load_response import LoadTransient
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import Saturation
 from ou_monitor.model.terms.term import LawFit, Role, Term
@@ -35,6 +36,12 @@ _WITHIN = 0.5
 _AGAIN = 3
 # Differences that count as none: between gains of two fits, nats, and between scores.
 _ALIKE, _SAME = 0.1, 1e-6
+# Degree of a smooth drift, as of a discharge under changing load, and the variance inflation
+# factor above which the load counts as collinear with it: flights have 1.0 to 1.4, staircases and
+# ramps of test stands 5.2 to 11.
+_SMOOTH, COLLINEAR = 4, 5.0
+# Step of the derivative of a mean, in the logarithm of a time constant.
+_STEP = 1e-3
 
 
 # First estimate: gain, nats, kind, and start (None for a law).
@@ -381,6 +388,17 @@ def with_reach(term: Term, se: dict[str, Any], samples: Samples) -> dict[str, An
     return {**se, **dict.fromkeys(far, math.inf)}
 
 
+def follows_time(samples: Samples) -> float:
+    """Return the variance inflation of the load by a smooth drift; 0 below the limit."""
+    if samples.throttle is None:
+        return 0.0
+    x = 2.0 * (samples.t - samples.t[0]) / (samples.t[-1] - samples.t[0]) - 1.0
+    drift = np.polynomial.legendre.legvander(x, _SMOOTH)
+    left = samples.throttle - drift @ np.linalg.lstsq(drift, samples.throttle, rcond=None)[0]
+    found = float(np.var(samples.throttle) / max(np.var(left), 1e-12))
+    return found if found > COLLINEAR else 0.0
+
+
 def _gathered(term: Term, se: dict[str, float]) -> dict[str, Any]:
     """Gather the errors of single knots, named `parameter 2` and so on, in lists."""
     gathered: dict[str, Any] = {}
@@ -395,20 +413,33 @@ def _gathered(term: Term, se: dict[str, float]) -> dict[str, Any]:
 
 
 def _mean_errors(samples: Samples, model: Composite, part: slice) -> dict[int, dict[str, Any]]:
-    """Return errors of the level and of the coefficients of the mean, by term index."""
+    """Return errors of the level, and of coefficients and lags of the mean, by term index."""
     terms = model.gaussian.terms
     where = [(k, j) for k, term in enumerate(terms) for j in range(len(coefficients(term)))]
-    through = whitened(samples, terms, [], own=True)[part, 1:]
+    lags = {k: term for k, term in enumerate(terms)
+            if isinstance(term, LoadTransient) and not term.delay}
+    moved = [replace(term, tau=term.tau * math.exp(by)) for term in lags.values()
+             for by in (_STEP, -_STEP)]
+    columns = whitened(samples, terms, moved, own=True)[part, 1:]
+    through, rest = columns[:, :len(where)], columns[:, len(where):]
+    for k in lags:
+        # The derivative of the mean with respect to ln(tau).
+        beta = np.array(coefficients(terms[k])) / (2.0 * _STEP)
+        slope = rest[:, :2 * beta.size] @ np.append(beta, -beta)
+        through, rest = np.column_stack((through, slope)), rest[:, 2 * beta.size:]
     norm = np.sqrt((through * through).sum(axis=0))
     # Parameters hidden by the instrument (the level behind a high-pass) have no error.
     norm = np.where(norm > 1e-9 * norm.max(), norm, np.inf)
     through /= norm
     covariance = np.linalg.pinv(through.T @ through) / np.outer(norm, norm)
+    covariance *= follows_time(samples) or 1.0
     found: dict[int, dict[str, Any]] = {}
     for k, term in enumerate(terms):
         at = [column for column, (owner, _) in enumerate(where) if owner == k]
         if at:
             found[k] = _by_parameter(term, covariance[np.ix_(at, at)])
+    for k, variance in zip(lags, covariance.diagonal()[len(where):].tolist()):
+        found[k]['tau'] = lags[k].tau * math.sqrt(variance)
     return found
 
 

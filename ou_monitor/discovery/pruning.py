@@ -16,7 +16,7 @@ import numpy.typing as npt
 from ou_monitor.criticism.composite import Composite
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery import decision
-from ou_monitor.discovery.fitting import is_trend, standard_errors
+from ou_monitor.discovery.fitting import follows_time, is_trend, standard_errors
 from ou_monitor.discovery.gain import cause_gain, held_out, HeldOut, without
 from ou_monitor.discovery.search import outside_range, position
 from ou_monitor.discovery.words import is_vague
@@ -69,7 +69,8 @@ def prune_by_gain(samples: Samples, model: Composite, names: Sequence[str], plai
             return state
         failing = [k for k, worth in enumerate(state.worth) if worth.less is not None
                    and not decision.improves_predictions(worth.gain, worth.error, worth.chance)
-                   and not _absorbs_trend(samples, state, k)]
+                   and not _absorbs_trend(samples, state, k)
+                   and not _extrapolated(samples, state, k)]
         if turn == _ROUNDS - 1:
             return state
         worst = (min(failing, key=lambda k: (-state.worth[k].chance, state.worth[k].gain))
@@ -81,10 +82,12 @@ def prune_by_gain(samples: Samples, model: Composite, names: Sequence[str], plai
 
 
 def _leave_out_vague(samples: Samples, state: Pruned) -> None:
-    """Remove causes whose amplitudes are all undetermined."""
+    """Remove causes whose amplitudes are all undetermined, unless another one needs them."""
     for k in reversed(range(len(state.names))):
         at = position(state.full.model, state.names, k)
         term = state.full.model.terms[at]
+        if any(other.CHANGES is type(term) for other in state.full.model.terms):
+            continue
         errors = standard_errors(samples, state.full.model, slice(0, samples.n))[at]
         vague = [is_vague(value, errors.get(name)) for name, value in term.values().items()
                  if term.positive(name) and term.unit(name) in ('V', 'V/sqrt(s)')]
@@ -135,6 +138,13 @@ def _absorbs_trend(samples: Samples, state: Pruned, k: int) -> bool:
     less = state.worth[k].less
     return (decision.is_response(catalogue()[state.names[k]]) and less is not None
             and is_trend(samples, less.model) and not is_trend(samples, state.full.model))
+
+
+def _extrapolated(samples: Samples, state: Pruned, k: int) -> bool:
+    """Return whether held-out blocks cannot judge a response that the fit shows."""
+    # Without one block of a staircase, load and time must both be extrapolated.
+    return (state.worth[k].chance <= decision.CHANCE
+            and decision.is_response(catalogue()[state.names[k]]) and follows_time(samples) > 0.0)
 
 
 def _measure(samples: Samples, state: Pruned, plain: HeldOut, scored: npt.NDArray[np.bool_],

@@ -84,7 +84,8 @@ def mean_response(samples: Samples, composite: Composite, view: View,
     own = [term for term in composite.terms if _measured(term)]
     pool = [*(term for term in start if not _contains(term, own)), *own]
     # With only a rough noise model, a growing sag would take the place of other terms.
-    pool += [term for term in _candidates(view) if not _contains(term, pool)
+    forms = [form for term in pool if isinstance(term, LoadTransient) for form in term.forms()]
+    pool += [term for term in (*forms, *_candidates(view)) if not _contains(term, pool)
              and not (start and isinstance(term, LoadSag) and term.growth)]
     if not pool:
         return MeanResponse((), (), ())
@@ -155,7 +156,7 @@ class _Regression:
         through[:, 1:] /= np.maximum(np.sqrt(np.mean(through[:, 1:]**2, axis=0)), 1e-300)
         self._blocks = np.array([part.T @ part for part in np.array_split(through, FOLDS)])
         self._all = self._blocks.sum(axis=0)
-        self._penalty = 0.5 * math.log(samples.n)
+        self._n, self._penalty = samples.n, 0.5 * math.log(samples.n)
         self._known: dict[tuple[int, ...], tuple[float, FloatArray]] = {}
         # Whether to refuse sets that contain nearly equal time constants.
         self._apart = False
@@ -250,7 +251,7 @@ class _Regression:
         """Return the minimum evidence of a term beside others, nats."""
         kind = type(self._pool[k])
         again = any(type(self._pool[j]) is kind for j in beside)
-        return decision.least_evidence(kind, max(largest, 0.0), again)
+        return decision.least_evidence(kind, max(largest, 0.0), self._n if again else 0)
 
     def _less(self, chosen: tuple[int, ...], k: int) -> tuple[int, ...]:
         return tuple(j for j in chosen if j != k)

@@ -71,13 +71,18 @@ _LISTED = 6
 
 def parameters(term: Term, se: Mapping[str, Any]) -> str:
     """Return the estimates of a term with units and errors; omit unknown and unused ones."""
+    curves = term.factors()
     known = {name: value for name, value in term.values().items()
-             if se.get(name) != math.inf and value != term.usual().get(name, 0.0)}
+             if se.get(name) != math.inf and value != term.usual().get(name, 0.0)
+             and not (curves and isinstance(value, list))}
     long = [name for name, value in known.items()
             if isinstance(value, list) and len(value) > _LISTED]
     found = [f'{term.label(name)} = '
              f'{with_error(value, se.get(name), positive=term.positive(name))} {term.unit(name)}'
              .rstrip() for name, value in known.items() if name not in long]
+    found += [f'factor over {name} = ' + ', '.join(
+        f'{number(factor)} at {number(at)}' for at, factor in zip(*curve))
+        for name, curve in curves.items()]
     return '; '.join([*found, *([f'{listed(long)} have {len(known[long[0]])} values each, see the '
                                  'plot and --json'] if long else [])])
 
@@ -205,6 +210,14 @@ def _names_with_counts(names: Sequence[str]) -> list[str]:
     """Return each name once, with its number of terms."""
     return [name if names.count(name) == 1 else f'{name} ({names.count(name)} terms)'
             for name in dict.fromkeys(names)]
+
+
+def collinear_note(inflation: float, limit: float) -> str:
+    """Return a note that sag and drift are hard to tell apart."""
+    return ('Throttle follows the time like a staircase or a ramp (variance inflation '
+            f'{number(inflation, 2)}; limit {limit:g}): a sag and a drift are hard to tell '
+            'apart, and the errors of the response include that. Return to a low throttle between '
+            'the steps.')
 
 
 def plain_model_words(baseline: OU) -> str:

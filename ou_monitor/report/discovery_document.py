@@ -13,6 +13,7 @@ from ou_monitor.discovery.finding import Finding, Verdict
 from ou_monitor.discovery.words import (
     both_names, by_load, cause_rows, GAIN, gain_text, gain_words, overlap_words, plain,
     plain_model_words, PLAIN_NAMES, plain_words, with_error)
+from ou_monitor.model.terms.ou import OU
 from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Part, Section, Table, Text)
 from ou_monitor.report.svg import Plot
@@ -143,7 +144,8 @@ def _causes(finding: Finding) -> list[Part]:
 
 def _gain(finding: Finding) -> list[Part]:
     dips, baseline = finding.dips, finding.baseline
-    assert baseline is not None
+    assert baseline is not None and finding.model is not None
+    ou = finding.model.terms[0]
     rows = [['held-out score, mnat/sample', '-', number(1e3 * finding.baseline_score, 4),
              number(1e3 * finding.score, 4), gain_text(finding.gain, finding.gain_se)]]
     rows.append([f'dips below {dips.level:g} V, 1/min', *(with_error(*pair) for pair in (
@@ -155,7 +157,9 @@ def _gain(finding: Finding) -> list[Part]:
                   [row[:kept] for row in rows], left=[0]), Text(
                       '' if finding.refused else _under_load(finding)),
             Text('The plain OU, which includes level and load, has '
-                 f'{plain_model_words(baseline)}.')]
+                 f'{plain_model_words(baseline)}.'
+                 + (f' The extended model, as saved, has {plain_model_words(ou)}.'
+                    if finding.causes and isinstance(ou, OU) else ''))]
 
 
 def _under_load(finding: Finding) -> str:

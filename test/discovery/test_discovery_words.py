@@ -119,9 +119,12 @@ def test_every_cause_has_its_words(name):
     values.update({p: [0.7] for p in ('throttle', 'log_factor', 'at') if p in values})
     values.update({'number': [0.0]} if 'number' in values else {})
     values.update({p: v for p, v in (('dof', 5.0), ('states', 2.0)) if p in values})
-    text = explain(kind.read(values), {}, 0.01, 0.001, ['drift'], False)
+    term = kind.read(values)
+    text = explain(term, {}, 0.01, 0.001, ['drift'], False)
     assert len(text) > 120 and 'this would' in text and '(for drift)' in text
-    assert all(f'{kind.label(p)} = ' in text for p in kind.parameters())
+    told = [p for p in kind.parameters() if not (term.factors() and isinstance(values[p], list))]
+    assert all(f'{kind.label(p)} = ' in text for p in told)
+    assert all(f'factor over {name} = ' in text for name in term.factors())
 
 
 def test_the_verdict_counts_its_causes_and_says_what_is_left():

@@ -313,6 +313,13 @@ class LoadDependentNoise(Term):
         return {k: (np.asarray(self.at)[numbers == k], np.asarray(self.log_factor)[numbers == k])
                 for k in np.unique(numbers).tolist()}
 
+    def factors(self) -> dict[str, tuple[list[float], list[float]]]:
+        """Return knots and factors by the name of the input; the product has an input itself."""
+        names = [f'{what} {span:g} s' if span else what for what, span in INPUTS]
+        return {(*names, 'product')[k]: (
+            (np.exp(at) if k == SUM else at).tolist(), np.exp(log).tolist())
+            for k, (at, log) in self.curves().items()}
+
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
         inputs = Inputs(self.curves())

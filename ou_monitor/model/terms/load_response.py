@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from typing import ClassVar
 
@@ -12,6 +12,7 @@ from ou_monitor.model.ou import first_order
 from ou_monitor.model.terms.laws import View
 from ou_monitor.model.terms.segment import Effect, Segment, Stage
 from ou_monitor.model.terms.term import by_parameters, NEXT_TO_ZERO, parameter, Role, Term
+from ou_monitor.records import FloatArray
 
 
 # Evidence needed for a growth beyond the penalty of its parameter, nats: as much as for a cause.
@@ -65,9 +66,9 @@ class LoadSag(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return a straight line and a parabola, each with and without growth."""
-        return tuple(cls(0.0, square, growth) for growth in (0.0, NEXT_TO_ZERO)
-                     for square in (0.0, NEXT_TO_ZERO))
+        """Return a straight line, a parabola, and one that grows."""
+        # A straight line that grows would take its curvature from a slow transient.
+        return cls(0.0, 0.0), cls(0.0, NEXT_TO_ZERO), cls(0.0, NEXT_TO_ZERO, NEXT_TO_ZERO)
 
 
 # Tolerance of stamps, s: the resolution of a bag.
@@ -77,11 +78,12 @@ _ROUNDING = 1e-9
 @dataclass(frozen=True)
 class LoadTransient(Term):
     """
-    Add gain * d + rise * max(d, 0), where d is the delayed throttle less its low-pass (tau).
+    Add gain * d(u) + square * d(u^2) + rise * max(d(u), 0): d is a value less its low-pass (tau).
 
-    A unit step up adds (gain + rise) * exp(-t/tau), a unit step down -gain * exp(-t/tau): motors
-    draw more current while they speed up, and return none while they slow down.  gain > 0 delays
-    the sag (equal to the sag, it gives a low-pass); gain < 0 deepens the sag at first (inrush).
+    u is the delayed throttle.  Without square, a unit step up adds (gain + rise) * exp(-t/tau), a
+    unit step down -gain * exp(-t/tau): motors draw more current while they speed up, and return
+    none while they slow down.  gain > 0 delays the sag (gain and square equal to those of the sag
+    give a low-pass); gain < 0 deepens the sag at first (inrush).
     """
 
     NAME: ClassVar[str] = 'load_transient'
@@ -89,9 +91,10 @@ class LoadTransient(Term):
     STAGE: ClassVar[Stage] = Stage.LEVEL
     NEEDS_THROTTLE: ClassVar[bool] = True
     ROLE: ClassVar[Role] = Role.MEAN
-    # A rise of 0 stays 0 in a fit.
+    # A rise or square of 0 stays 0 in a fit.
     LINEAR: ClassVar[tuple[str, ...]] = by_parameters(
-        ('gain', 'rise'), lambda term: ('gain', 'rise') if term.rise else ('gain',))
+        ('gain', 'rise', 'square'), lambda term: (
+            'gain', *(name for name in ('rise', 'square') if getattr(term, name))))
     SIGNS: ClassVar[tuple[str, ...]] = ('throttle',)
     SEARCH: ClassVar[float] = 3.4
     MEASURED: ClassVar[bool] = True
@@ -110,15 +113,17 @@ class LoadTransient(Term):
     tau: float = parameter('s', 'time constant of its decay', 0.0, above=True)
     delay: float = parameter('s', 'delay before the response begins', 0.0)
     rise: float = parameter('V', 'added to the gain while throttle rises', default=0.0)
+    square: float = parameter('V', 'decaying part that follows the square of throttle',
+                              label='decaying part, square', default=0.0)
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
-        slow = math.nan
+        slow: dict[int, float] = {}
         times = np.empty(0)
         values = np.empty(0)
 
         def effect(s: Segment) -> None:
-            nonlocal slow, times, values
+            nonlocal times, values
             throttle = s.throttle
             if self.delay > 0.0:
                 # Throttle `delay` ago; before the start, the first throttle.
@@ -130,13 +135,19 @@ class LoadTransient(Term):
                 throttle = values[np.maximum(then, 0)]
                 keep = max(int(then[-1]), 0)
                 times, values = times[keep:], values[keep:]
-            if math.isnan(slow):
-                slow = float(throttle[0])
             phi = np.exp(-s.step / self.tau)
-            low = first_order(phi, (1.0 - phi) * throttle, slow)
-            slow = float(low[-1])
-            change = throttle - low
-            s.level += self.gain * change + self.rise * np.maximum(change, 0.0)
+
+            def change(power: int) -> FloatArray:
+                value = throttle ** power
+                low = first_order(phi, (1.0 - phi) * value, slow.get(power, float(value[0])))
+                slow[power] = float(low[-1])
+                return value - low
+
+            if self.gain or self.rise:
+                linear = change(1)
+                s.level += self.gain * linear + self.rise * np.maximum(linear, 0.0)
+            if self.square:
+                s.level += self.square * change(2)
 
         return effect
 
@@ -152,10 +163,16 @@ class LoadTransient(Term):
             SHORTEST * step, longest, count)]
         # A pure delay of whole steps: a response that never decays.
         latest = max(_LATEST, 4.0 * step)
-        late = np.unique(np.rint(np.geomspace(step, latest, _DELAYS) / step)) * step
-        inrush = [cls(0.0, lag.tau, 0.0, NEXT_TO_ZERO) for lag in lags if lag.tau < _INRUSH]
-        return [*lags, *inrush, *(
-            cls(0.0, _LASTING / LONGEST * longest, float(delay)) for delay in late)]
+        delays = np.unique(np.rint(np.geomspace(step, latest, _DELAYS) / step)) * step
+        late = [cls(0.0, _LASTING / LONGEST * longest, float(delay)) for delay in delays]
+        return tuple(form for term in (*lags, *late) for form in term.forms())
+
+    def forms(self) -> tuple[LoadTransient, ...]:
+        """Return the response to throttle itself, to its square too, and with an inrush."""
+        plain = replace(self, rise=0.0, square=0.0)
+        inrush = self.tau < _INRUSH and not self.delay
+        return (plain, replace(plain, square=NEXT_TO_ZERO),
+                *([replace(plain, rise=NEXT_TO_ZERO)] if inrush else []))
 
 
 # Shortest visible time constant, in steps: one seventh of the response remains at the next sample.

@@ -196,6 +196,10 @@ class Term:
         """Return the term with new coefficients of its columns."""
         return replace(self, **dict(zip(self.LINEAR, map(float, beta), strict=True)))
 
+    def factors(self) -> dict[str, tuple[list[float], list[float]]]:
+        """Return knots and factors on the noise by the name of an input, if lists hide them."""
+        return {}
+
     def free(self) -> tuple[str, ...]:
         """Return the names of the coordinates for maximum likelihood."""
         return self.FREE
