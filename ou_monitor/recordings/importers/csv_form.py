@@ -100,6 +100,10 @@ _GROUPED = re.compile(r'[-+]?\d{1,3}(?:,\d{3})+\.\d+')
 # A number with points or commas between thousands, not a part of a date or a clock.
 _OF_POINT, _OF_COMMA = (re.compile(rf'(?<![\d.,:])\d{{1,3}}(?:{mark}\d{{3}})+(?![\d{mark}:])')
                         for mark in (r'\.', ','))
+# A number with thousands and decimals shows which mark is which.
+_BOTH_MARKS = {
+    mark: rf'(?<![\d.,:])[-+]?\d{{1,3}}(?:{other}\d{{3}})+{re.escape(mark)}\d+(?![\d.,:])'
+    for mark, other in (('.', ','), (',', r'\.'))}
 _OF_QUOTED = re.compile(r'"[-+]?\d{1,3}(?:,\d{3})+(?:\.\d+)?"')
 _AND_UNIT = re.compile(r'(\S*[\d.])\s*+([^\d\s.]{1,12}+(?: [AaDd][Cc])?)')  # 12.3 mV DC
 # A number whose decimal comma is within quotes, and does not separate thousands.
@@ -140,7 +144,7 @@ class Form(NamedTuple):
     encoding: str
     delimiter: str
     comma: bool  # Whether the decimal mark is a comma
-    mark: str  # Decimal mark given by the user: the other one separates thousands; '': not given
+    mark: str  # Decimal mark if the other one is known to separate thousands, else ''
     skip: int  # Lines above the first row of numbers
     line: int  # Number of the line with the names; 0: there is none
     labels: tuple[str, ...]  # Words before the numbers of each column, '' if none
@@ -176,11 +180,13 @@ def form_of(path: Path, wanted: CsvColumns) -> Form:
                          "cells, 'tab' or 'space'")
     best: tuple[float, Form] | None = None
     for delimiter in (',', ';', '\t', '|', ' ') if given is None else (given,):
-        for mark in (wanted.decimal,) if wanted.decimal else ('.', ','):
-            if mark == delimiter and not (wanted.decimal or _QUOTED.search(text)) or (
+        known = wanted.decimal or next((mark for mark, pattern in _BOTH_MARKS.items() if re.search(
+            f'"{pattern}"' if delimiter == ',' else pattern, text)), '')
+        for mark in known or '.,':
+            if mark == delimiter and not (known or _QUOTED.search(text)) or (
                     best and delimiter == ' ' and best[1].width > 1):
                 continue
-            found = _score_form(lines, encoding, delimiter, mark == ',', wanted)
+            found = _score_form(lines, encoding, delimiter, mark == ',', known, wanted.skip_rows)
             if found and (best is None or found[0] > best[0]):
                 best = found
     if best is None:
@@ -209,11 +215,11 @@ def _encoding(path: Path, head: bytes) -> str:
     return 'utf-8'
 
 
-def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool,
-                wanted: CsvColumns) -> tuple[float, Form] | None:
+def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool, mark: str,
+                skip_rows: int | None) -> tuple[float, Form] | None:
     """Return how well a delimiter and a decimal mark fit, and the form; None if they do not."""
-    skip, given = wanted.skip_rows or 0, wanted.decimal or ''
-    rows = _split(lines, delimiter, comma, given)
+    skip = skip_rows or 0
+    rows = _split(lines, delimiter, comma, mark)
     # A quoted field may hold line breaks; the rest of it is not a row of the format.
     filled = [row for row in rows[skip:] if any(row)]
     widths = Counter(len(row) for row in filled[len(filled) // 3:])
@@ -242,7 +248,7 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool,
     step, stated = _stated_step(list(map(_with_point, above)) if comma else above, rows[:first])
     first_rows = tuple(tuple(row) for row in rows[first:] if any(row))
     return fit * (1.0 if width > 1 else 0.4) + 0.01 * min(width, 20) / 20, Form(
-        encoding, delimiter, comma, given, first, at, labels, ''.join(lines[:first]),
+        encoding, delimiter, comma, mark, first, at, labels, ''.join(lines[:first]),
         tuple(names), _units_of(names, words, rows, first), width, first_rows, step, stated)
 
 

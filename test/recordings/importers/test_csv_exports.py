@@ -514,14 +514,21 @@ def test_the_unit_of_a_throttle(tmp_path):
     np.testing.assert_allclose(read_recording(duty).throttle, [-0.5, 0.5])
 
 
-def test_a_stated_mark_makes_the_other_one_separate_thousands(tmp_path):
-    """Integers in groups are ambiguous without --decimal; with it, quoted groups are numbers."""
-    path = written(tmp_path, '"Time (ms)","U (mV)"\n' + ''.join(
-        f'"{10 * k:,}","{12_000.5 + k:,.1f}"\n' for k in range(200)))
-    with pytest.raises(InputError, match="'1,000', not a number.*--decimal"):
-        read_recording(path)
-    found = read_recording(path, columns=CsvColumns(decimal='.'))
-    assert found.t[-1] == pytest.approx(1.99) and found.voltage[-1] == pytest.approx(12.1995)
+@pytest.mark.parametrize('delimiter, decimal', [(',', '.'), ('\t', '.'), (';', ',')])
+def test_a_known_mark_makes_the_other_one_separate_thousands(delimiter, decimal, tmp_path):
+    """Integers in groups are ambiguous, unless decimals in groups show the mark, or --decimal."""
+    quote, other = '"' * (delimiter == ','), '.,'.replace(decimal, '')
+    rows = [f'{10 * k:,}|{12_000 + k:,}' for k in range(200)]
+    for known, more in ((None, '.5'), (decimal, '')):
+        path = written(tmp_path, '\n'.join([
+            f'Time (ms){delimiter}U (mV)', *(f'{quote}{row}{more}{quote}'.translate(str.maketrans(
+                {'.': decimal, ',': other, '|': f'{quote}{delimiter}{quote}'})) for row in rows)]))
+        found = read_recording(path, columns=CsvColumns(decimal=known))
+        assert found.t[-1] == pytest.approx(1.99)
+        assert found.voltage[-1] == pytest.approx(12.199 + float(f'0{more}') / 1000)
+    if quote:
+        with pytest.raises(InputError, match='--'):
+            read_recording(path)
 
 
 def test_words_of_loggers_for_a_missing_number(tmp_path):
