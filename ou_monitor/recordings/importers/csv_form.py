@@ -16,9 +16,10 @@ from array import array
 import codecs
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 import csv
 from datetime import date
-from functools import lru_cache, partial
+from functools import partial
 import io
 from itertools import chain, islice
 import math
@@ -56,26 +57,26 @@ _IN_A_ROW = 8
 COMMENTS = ('#', '%')
 DELIMITERS = {'tab': '\t', 'space': ' '}
 
-# Words of units, in lower case -> unit.
-TIME_WORDS = {
-    's': 's', 'sec': 's', 'secs': 's', 'second': 's', 'seconds': 's', 'sekunden': 's', 'ms': 'ms',
-    'msec': 'ms', 'millis': 'ms', 'millisecond': 'ms', 'milliseconds': 'ms', 'us': 'us',
-    'µs': 'us', 'μs': 'us', 'usec': 'us', 'micros': 'us', 'microseconds': 'us', 'ns': 'ns',
-    'nsec': 'ns', 'nanoseconds': 'ns', 'min': 'min', 'mins': 'min', 'minutes': 'min', 'h': 'h',
-    'hr': 'h', 'hours': 'h', 'd': 'd', 'days': 'd'}
+
+def _by_word(**units: str) -> dict[str, str]:
+    """Return words of units, in lower case -> unit."""
+    return {word: unit for unit, words in units.items() for word in words.split()}
+
+
+TIME_WORDS = _by_word(
+    s='s sec secs second seconds sekunden', ms='ms msec millis millisecond milliseconds',
+    us='us µs μs usec micros microseconds', ns='ns nsec nanoseconds', min='min mins minutes',
+    h='h hr hours', d='d days')
 # These end the names of other quantities too: Voltage (min).
 _LONG = 'min|mins|minutes|h|hr|hours|d|days'
-VOLT_WORDS = {'v': 'V', 'volt': 'V', 'volts': 'V', 'vdc': 'V', 'mv': 'mV', 'mvdc': 'mV',
-              'millivolt': 'mV', 'millivolts': 'mV', 'cv': 'cV', 'dv': 'dV', 'kv': 'kV',
-              'uv': 'uV', 'µv': 'uV', 'μv': 'uV'}
-AMPERE_WORDS = {'a': 'A', 'amp': 'A', 'amps': 'A', 'ampere': 'A', 'amperes': 'A', 'adc': 'A',
-                'da': 'dA', 'ca': 'cA', 'ma': 'mA', 'madc': 'mA', 'µa': 'uA', 'μa': 'uA',
-                'ua': 'uA'}
-SHARE_WORDS = {'%': '%', 'percent': '%', 'pct': '%', 'prozent': '%'}
+VOLT_WORDS = _by_word(V='v volt volts vdc', mV='mv mvdc millivolt millivolts', cV='cv', dV='dv',
+                      kV='kv', uV='uv µv μv')
+AMPERE_WORDS = _by_word(A='a amp amps ampere amperes adc', mA='ma madc', cA='ca', dA='da',
+                        uA='ua µa μa')
+SHARE_WORDS = dict.fromkeys(('%', 'percent', 'pct', 'prozent'), '%')
 # Other units that a line of units may hold.
-OTHER_WORDS = frozenset((
-    '', '-', 'sequence', 'w', 'wh', 'ah', 'mah', 'hz', 'khz', 'rpm', '1/min', '°', 'deg', '°c',
-    'degc', '°f', 'm', 'm/s', 'km/h', 'g', 'kg', 'n', 'nm', 'ohm', 'mohm'))
+OTHER_WORDS = frozenset(('', *('- sequence w wh ah mah hz khz rpm 1/min ° deg °c degc °f m m/s '
+                               'km/h g kg n nm ohm mohm').split()))
 WORDS = {**TIME_WORDS, **VOLT_WORDS, **AMPERE_WORDS, **SHARE_WORDS}
 # Units in V, A, s and 1; the last letter is the quantity.
 SCALES = {**TIME_UNITS, 'min': 60.0, 'h': 3600.0, 'd': 86400.0, 'V': 1.0, 'dV': 0.1, 'cV': 0.01,
@@ -95,16 +96,13 @@ _BEFORE = re.compile(rf'(.*?)( ?[\[(]{_WORD}[\])]) ?[-:] ?(\w.*)', re.IGNORECASE
 _MULTIPLE = re.compile(
     r'(.*?)(?: ?\* ?(10+)|([\[(] ?)(?:x ?)?(10+|0?\.0*1) ?([a-zµμ%]+ ?[\])]))', re.IGNORECASE)
 _NAMES = re.compile(r'[^\s\[(]+(?: ?[\[(][^\])]*[\])])?')
-# A number with commas between thousands, and decimals.
-_GROUPED = re.compile(r'[-+]?\d{1,3}(?:,\d{3})+\.\d+')
 # A number with points or commas between thousands, not a part of a date or a clock.
 _OF_POINT, _OF_COMMA = (re.compile(rf'(?<![\d.,:])\d{{1,3}}(?:{mark}\d{{3}})+(?![\d{mark}:])')
                         for mark in (r'\.', ','))
-# A number with thousands and decimals shows which mark is which.
-_BOTH_MARKS = {
-    mark: rf'(?<![\d.,:])[-+]?\d{{1,3}}(?:{other}\d{{3}})+{re.escape(mark)}\d+(?![\d.,:])'
-    for mark, other in (('.', ','), (',', r'\.'))}
-_OF_QUOTED = re.compile(r'"[-+]?\d{1,3}(?:,\d{3})+(?:\.\d+)?"')
+_OF_QUOTED = re.compile(r'"[-+]?\d{1,3}(?:,\d{3})+(?:\.\d+)?[^",\d]*"')
+# A number with both marks shows which of them separates thousands.
+_BOTH_MARKS = {'.': r'(?<![\d.,:])\d{1,3}(?:,\d{3})+\.\d+(?![\d.,:])',
+               ',': r'(?<![\d.,:])\d{1,3}(?:\.\d{3})+,\d+(?![\d.,:])'}
 _AND_UNIT = re.compile(r'(\S*[\d.])\s*+([^\d\s.]{1,12}+(?: [AaDd][Cc])?)')  # 12.3 mV DC
 # A number whose decimal comma is within quotes, and does not separate thousands.
 _QUOTED = re.compile(r'"[-+]?\d+,(?!\d{3}(?!\d))\d+[^",]*"')
@@ -156,6 +154,10 @@ class Form(NamedTuple):
     step: float  # From row to row, s; NaN: not stated
     stated: str  # Words that state the step
 
+    def cells(self, place: int) -> list[str]:
+        """Return the cells of a column in the first rows that are not blank."""
+        return [row[place] for row in self.rows if place < len(row) and row[place]]
+
 
 def form_of(path: Path, wanted: CsvColumns) -> Form:
     """Detect the format of a file from its first lines."""
@@ -167,21 +169,20 @@ def form_of(path: Path, wanted: CsvColumns) -> Form:
     encoding = _encoding(path, head)
     text = head.decode(encoding, 'ignore')
     lines = io.StringIO(text, newline=None).readlines()[:_HEAD_LINES]
-    if len(head) == _HEAD and len(lines) > 1 and len(lines) < _HEAD_LINES:
+    if len(head) == _HEAD and 1 < len(lines) < _HEAD_LINES:
         lines.pop()
     if max(map(len, lines), default=0) >= min(MOST_OF_LINE, _HEAD - 3):
         raise InputError(f'{path}:1: the line has more than {MOST_OF_LINE} characters')
     if not any(line.strip() and not line.lstrip().startswith(COMMENTS) for line in lines):
         raise InputError(f'{path} is empty: expected a header with {TIME},{VOLTAGE}[,{THROTTLE}]')
-    given = None if wanted.delimiter is None else DELIMITERS.get(
-        wanted.delimiter, wanted.delimiter)
+    given = DELIMITERS.get(wanted.delimiter or '', wanted.delimiter)
     if given is not None and (len(given) != 1 or given in '"\r\n'):
         raise InputError(f"--delimiter: '{shown(given)}' is not one character that separates "
                          "cells, 'tab' or 'space'")
     best: tuple[float, Form] | None = None
     for delimiter in (',', ';', '\t', '|', ' ') if given is None else (given,):
-        known = wanted.decimal or next((mark for mark, pattern in _BOTH_MARKS.items() if re.search(
-            f'"{pattern}"' if delimiter == ',' else pattern, text)), '')
+        known = wanted.decimal or next((mark for mark, both in _BOTH_MARKS.items() if re.search(
+            f'"[-+]?{both}[^",]*"' if delimiter == ',' else both, text)), '')
         for mark in known or '.,':
             if mark == delimiter and not (known or _QUOTED.search(text)) or (
                     best and delimiter == ' ' and best[1].width > 1):
@@ -256,11 +257,10 @@ def _split(lines: list[str], delimiter: str, comma: bool, mark: str) -> list[lis
     """Return the cells of each line, none of a comment or of a line that cannot be split."""
     rows: list[list[str]] = []
     for line in lines:
-        plain = '' if line.lstrip().startswith(COMMENTS) else line
         try:
-            rows.append([cell.strip() for cell in next(iter(csv.reader(
-                _prepared([plain], delimiter, comma, mark), delimiter=delimiter,
-                skipinitialspace=True)), [])])
+            rows.append([cell.strip() for cell in next(csv.reader(
+                _prepared([line], delimiter, comma, mark), delimiter=delimiter,
+                skipinitialspace=True), [])])
         except csv.Error:
             rows.append([])
     return [list(map(_with_point, row)) for row in rows] if comma and delimiter == ',' else rows
@@ -307,7 +307,8 @@ def _after_names(rows: list[list[str]], skip: int, first: int, width: int, place
 
 
 def _prepared(lines: list[str], delimiter: str, comma: bool, mark: str) -> list[str]:
-    """Return lines with decimal points, and single blanks if blanks separate the cells."""
+    """Return lines with decimal points and blank comments (between blanks: single ones)."""
+    lines = ['\n' if line.lstrip().startswith(COMMENTS) else line for line in lines]
     if lines and _RECEIVED.match(lines[0]):
         lines = [f'{found[1]}{delimiter}{rest}' if (found := _RECEIVED.match(line)) and (
             delimiter in (rest := line[found.end():]).strip() or ' ' not in rest.strip())
@@ -328,10 +329,8 @@ def _with_point(text: str) -> str:
 
 def number_of(cell: str) -> tuple[float, str]:
     """Return a number and the unit written after it, in lower case; '': none."""
-    try:
+    with suppress(ValueError):
         return plain_number(cell), ''
-    except ValueError:
-        pass
     # Graphtec puts blanks between sign and digits.
     cell = re.sub(r'^([-+]) +', r'\1', cell.strip())
     found = _AND_UNIT.fullmatch(cell)
@@ -339,7 +338,7 @@ def number_of(cell: str) -> tuple[float, str]:
     unit = unit.removesuffix(' dc').removesuffix(' ac')
     if unit and unit not in WORDS:
         raise ValueError(cell)
-    return plain_number(text.replace(',', '') if _GROUPED.fullmatch(text) else text), unit
+    return plain_number(text), unit
 
 
 def is_missing(cell: str) -> bool:
@@ -361,8 +360,7 @@ def is_value(cell: str) -> bool:
 
 def is_clock(cell: str) -> bool:
     """Return whether a cell is a date, a time, or both."""
-    return bool(cell[:1].isdigit() and (':' in cell or cell.count('-') > 1 or cell.count('.') > 1
-                                        or cell.count('/') > 1 or cell.count(',') > 1)
+    return bool(cell[:1].isdigit() and (':' in cell or max(map(cell.count, '-./,')) > 1)
                 and _CLOCK.fullmatch(_swapped(cell)))
 
 
@@ -412,35 +410,31 @@ def _header(rows: list[list[str]], lines: list[str], first: int, width: int, del
             skip: int, labels: Sequence[str]) -> tuple[list[str], list[str], int]:
     """Return names, the words of a line of units, and the number of the line of the names."""
     plain = [(k, rows[k]) for k in range(skip, first) if any(rows[k])]
-    if any(labels) and plain and len(plain[-1][1]) != width:
-        plain = []
+    if any(labels) and not (plain and len(plain[-1][1]) == width):
+        return [label[:-1].strip() or ('time' if is_clock(cell) else f'column {k + 1}')
+                for k, (label, cell) in enumerate(zip(labels, rows[first]))], [], first + 1
+    # Else marked as a comment: delimited as the data, or by blanks, units in brackets.
+    comments = []
+    for k in range(skip, first):
+        text = lines[k].lstrip('#% \t')
+        either = next(csv.reader([text], delimiter=delimiter), []), _NAMES.findall(text)
+        comments += [(k, [cell.strip() for cell in cells])
+                     for cells in either if len(cells) == width > 1][:1]
     needed = {k for row in rows[first:] for k, cell in enumerate(row[:width]) if cell}
-    names, units, line = _names_and_units(plain, width, needed)
-    if not line and any(labels):
-        names, line = [label[:-1].strip() or ('time' if is_clock(cell) else f'column {k + 1}')
-                       for k, (label, cell) in enumerate(zip(labels, rows[first]))], first + 1
-    elif not line and width > 1:
-        # A header marked as a comment: delimited as the data, or by blanks, units in brackets.
-        comments = []
-        for k in range(skip, first):
-            text = lines[k].lstrip('#% \t')
-            either = next(iter(csv.reader([text], delimiter=delimiter)), []), _NAMES.findall(text)
-            comments += [(k, [cell.strip() for cell in cells])
-                         for cells in either if len(cells) == width][:1]
-        names, more, line = _names_and_units(comments, width, needed)
-        units = units or more
-    return names or [f'column {k + 1}' for k in range(width)], units, line
+    return next((found for above in (plain, comments) if (
+        found := _names_and_units(above, width, needed))), (
+            [f'column {k + 1}' for k in range(width)], [], 0))
 
 
 def _names_and_units(above: list[tuple[int, list[str]]], width: int, needed: set[int],
-                     ) -> tuple[list[str], list[str], int]:
-    """Return names, words of units and a line as `_header`; 0: no line names all columns."""
+                     ) -> tuple[list[str], list[str], int] | None:
+    """Return names, words of units and a line as `_header`; None: no line names all columns."""
     units: list[str] = []
     if len(above) > 1 and _are_units(above[-1][1]) and len(above[-2][1]) >= min(
             width, len(above[-1][1])):
         units = [cell.strip('[](){} ').lower() for cell in above.pop()[1]]
     if not above:
-        return [], units, 0
+        return None
     line, names = above[-1]
     for _, over in reversed(above[:-1]):
         # Names in several lines: a blank cell has the name above, a repeated one both.
@@ -451,7 +445,7 @@ def _names_and_units(above: list[tuple[int, list[str]]], width: int, needed: set
                  for k, (name, more) in enumerate(zip(names, over))]
     # An index at the left has no name, any other column has one.
     named = all(names[k:k + 1] != [''] or k not in needed for k in range(1, width))
-    return (names, units, line + 1) if named else ([], units, 0)
+    return (names, units, line + 1) if named else None
 
 
 def _units_of(names: list[str], words: list[str], rows: list[list[str]], first: int,
@@ -505,8 +499,7 @@ def _stated_step(lines: list[str], above: list[list[str]]) -> tuple[float, str]:
         if name.lower() == 'increment' and is_number(cell):
             return float(cell), name
     for line in lines:
-        found = _INTERVAL.search(line)
-        if found:
+        if found := _INTERVAL.search(line):
             words, unit, number, prefix, _ = found.groups()
             value = float(number) * _PREFIX[prefix or '']
             if unit and unit.lower() in TIME_WORDS:
@@ -581,9 +574,7 @@ def _with_units(cells: Sequence[str], units: Sequence[str], stated: str) -> tupl
 def _blocks(path: Path, file: TextIO, form: Form, width: int,
             ) -> Iterator[tuple[int, list[list[str]]]]:
     """Yield rows, with the number of the line before the first of them."""
-    lines = chain.from_iterable(_lines(path, file, form))
-    for _ in islice(lines, form.skip):
-        pass
+    lines = islice(chain.from_iterable(_lines(path, file, form)), form.skip, None)
     reader = csv.reader(lines, delimiter=form.delimiter, strict=True, skipinitialspace=True)
     while True:
         before = reader.line_num
@@ -607,7 +598,7 @@ def _blocks(path: Path, file: TextIO, form: Form, width: int,
 
 
 def _lines(path: Path, file: TextIO, form: Form) -> Iterator[list[str]]:
-    """Yield lines, a chunk at a time; comments are blank."""
+    """Yield prepared lines, a chunk at a time."""
     rest, number = '', 0
     while text := file.read(_CHUNK):
         lines = io.StringIO(rest + text).readlines()
@@ -617,15 +608,9 @@ def _lines(path: Path, file: TextIO, form: Form) -> Iterator[list[str]]:
             raise InputError(f'{path}:{number + long + 1}: the line has more than '
                              f'{MOST_OF_LINE} characters')
         number += len(lines)
-        yield _without_comments(lines, form, text)
+        yield _prepared(lines, form.delimiter, form.comma, form.mark)
     if rest:
-        yield _without_comments([rest], form, rest)
-
-
-def _without_comments(lines: list[str], form: Form, text: str) -> list[str]:
-    if any(mark in text for mark in COMMENTS):
-        lines = ['\n' if line.lstrip().startswith(COMMENTS) else line for line in lines]
-    return _prepared(lines, form.delimiter, form.comma, form.mark)
+        yield _prepared([rest], form.delimiter, form.comma, form.mark)
 
 
 def _line(before: int, rows: list[list[str]], k: int) -> int:
@@ -638,19 +623,19 @@ def _fitting(path: Path, rows: list[list[str]], width: int, last: int, form: For
     """Return the rows that are not blank, all of one width."""
     for k, row in enumerate(rows):
         wrong, blank = '', not any(cell.strip() for cell in row)
-        if len(row) > width and any(cell.strip() for cell in row[width:]):
-            wrong = (f'{path}:{_line(begin, rows, k)}: {len(row)} cells, and the header names '
-                     f'{width} columns: mend the line; the decimal mark is a point')
+        if any(cell.strip() for cell in row[width:]):
+            wrong = (f'{len(row)} cells, and the header names {width} columns: mend the line; '
+                     'the decimal mark is a point')
         elif not blank and len(row) <= last:
-            wrong = (f'{path}:{_line(begin, rows, k)}: the line ends before column '
-                     f"'{form.names[last]}'")
-        if wrong and left_out is None:
-            raise InputError(wrong + _PARTIAL)
+            wrong = f"the line ends before column '{form.names[last]}'"
+        if wrong:
+            wrong = f'{path}:{_line(begin, rows, k)}: {wrong}'
+            if left_out is None:
+                raise InputError(wrong + _PARTIAL)
+            left_out.append(wrong)
         if wrong or blank:
             # It stays in the block, so that line numbers can be counted.
             row.clear()
-        if wrong and left_out is not None:
-            left_out.append(wrong)
     return [row[:last + 1] for row in rows if row]
 
 
@@ -672,11 +657,7 @@ def _floats(cells: Sequence[str], where: Callable[[int], str], comma: bool, stat
             value *= _ratio(unit, stated)
         except ValueError:
             value = math.nan
-        if value == value:
-            found.append(value)
-        elif is_missing(cell):
-            found.append(math.nan)
-        else:
+        if value != value and not is_missing(cell):
             if comma:
                 cell = _with_point(cell)
             mark = ': the decimal mark is a comma (--decimal)' if comma else (
@@ -687,7 +668,7 @@ def _floats(cells: Sequence[str], where: Callable[[int], str], comma: bool, stat
             if good[k]:
                 left_out.append(wrong)
             good[k] = False
-            found.append(math.nan)
+        found.append(value)
     return np.array(found, dtype=np.float64)
 
 
@@ -711,7 +692,6 @@ def shown(text: str) -> str:
     return shown if len(shown) <= _LONGEST else shown[:_LONGEST] + '...'
 
 
-@lru_cache(maxsize=64)
 def _days(year: int, month: int, day: int) -> int:
     return date(year + (2000 if year < 100 else 0), month, day).toordinal() - 719163
 

@@ -109,8 +109,6 @@ _RAW: dict[str, dict[str, tuple[float, str, float]]] = {
              ('voltage_battery', 1e-3, 'mV', 65535.0), ('voltages[0]', 1e-3, 'mV', 65535.0),
              ('vcc', 1e-3, 'mV', 0.0), ('vservo', 1e-3, 'mV', 0.0),
              ('current_battery', 1e-2, '10 mA', -1.0))}}
-# Parts of the names of currents.
-_LIKE_CURRENT = 'curr|amps|strom|courant|corriente'
 _CELLS = re.compile(r'(.*voltages\[)0\]', re.IGNORECASE)
 
 
@@ -309,13 +307,13 @@ def _column_place(path: Path, form: Form, name: str, option: str) -> int:
 def _choose(form: Form, quantity: str, taken: Sequence[int] = ()) -> list[int]:
     """Return the candidate columns of a quantity, the first of the best pattern first."""
     plain = [re.sub(r'\W+', '_', unit_of(name)[0].strip().lower()).strip('_') or 'time' * bool(
-        form.units[k]) if name else None for k, name in enumerate(form.names[:form.width])]
-    ends = [name if name is None else re.sub(r'\W+', '_', re.split(
-        r'[/.:](?=[^/.:])(?![^\[(]*[\])]$)', form.names[k].strip().lower())[-1]).strip('_')
-        for k, name in enumerate(plain)]
+        unit) for name, unit in zip(form.names[:form.width], form.units)]
+    ends = [re.sub(r'\W+', '_', re.split(
+        r'[/.:](?=[^/.:])(?![^\[(]*[\])]$)', name.strip().lower())[-1]).strip('_')
+        for name in form.names[:form.width]]
     right = {_TIME_NAME: TIME_WORDS, logs.VOLTAGE: VOLT_WORDS, logs.CURRENT: AMPERE_WORDS,
              logs.THROTTLE: {**SHARE_WORDS, **_PULSE_WORDS}}[quantity]
-    free = [k for k in range(len(plain)) if k not in taken and plain[k] is not None
+    free = [k for k in range(len(plain)) if k not in taken and form.names[k]
             and _holds_numbers(form, k, quantity == _TIME_NAME)]
     for pattern in _PATTERNS[quantity]:
         found = list(dict.fromkeys(
@@ -336,9 +334,13 @@ def _choose(form: Form, quantity: str, taken: Sequence[int] = ()) -> list[int]:
 
 def _holds_numbers(form: Form, place: int, clock: bool) -> bool:
     """Return whether the first cells of a column are numbers (clock: or dates or times)."""
-    cells = [row[place] for row in form.rows if place < len(row) and row[place]
-             and not is_missing(row[place])]
+    cells = [cell for cell in form.cells(place) if not is_missing(cell)]
     return not cells or any(is_value(cell) if clock else is_number(cell) for cell in cells)
+
+
+def _holds_clocks(form: Form, place: int) -> bool:
+    """Return whether the first cell of a column is a date or a time, and no number."""
+    return any(not is_number(cell) and is_clock(cell) for cell in form.cells(place)[:1])
 
 
 def _time_of(path: Path, form: Form, wanted: CsvColumns) -> _Column:
@@ -354,15 +356,15 @@ def _time_of(path: Path, form: Form, wanted: CsvColumns) -> _Column:
         k for k in range(min(form.width, len(form.names))) if form.rows and all(
             k < len(row) and ':' in row[k] and is_clock(row[k]) for row in form.rows)]
     if form.rows:
-        found = [k for k in found if any(''.join(row[k:k + 1]) for row in form.rows)]
+        found = [k for k in found if form.cells(k)]
     if found:
         first = _finest(form, found[0])
         beside = [k for k in range(min(form.width, len(form.names))) if k != first and any(
             k < len(row) and has_day(row[k]) and ':' not in row[k] for row in form.rows[:3])]
-        cells = [row[first] for row in form.rows if first < len(row)]
         if parts := _parts_of_second(form, first):
             return parts
-        if beside and cells and ':' in cells[0] and not has_day(cells[0]):
+        cells = form.cells(first)
+        if beside and ':' in cells[0] and not has_day(cells[0]):
             return _Column((beside[0], first),
                            f'{form.names[beside[0]]}, {form.names[first]}', 's', 0.0)
         return _unit_column(form, first, wanted.time_unit)
@@ -371,8 +373,7 @@ def _time_of(path: Path, form: Form, wanted: CsvColumns) -> _Column:
         return _parts_of_second(form, filled[0]) or _unit_column(
             form, filled[0], wanted.time_unit)
     if not math.isfinite(form.step):
-        raise InputError(_absent(
-            path, form, TIME, ' (--time-column or --sample-interval)'))
+        raise InputError(_absent(path, form, TIME, ' (--time-column or --sample-interval)'))
     return _Column((), form.stated, 's', form.step)
 
 
@@ -382,19 +383,14 @@ def _finest(form: Form, first: int) -> int:
              if (re.search('time|zeit', form.names[k].lower()) or form.units[k] in TIME_WORDS)
              and not re.search(
                  'step|lap|interval', form.names[k].lower()) and _holds_numbers(form, k, True)]
-    return first if _tells_apart(form, first) else next(
-        (k for k in named if _tells_apart(form, k) and _rises(form, k)), first)
-
-
-def _tells_apart(form: Form, place: int) -> bool:
-    """Return whether most of the first rows differ in a column."""
-    cells = [row[place] for row in form.rows if place < len(row)]
-    return 2 * len(set(cells)) > len(cells) or len(cells) < _FEW_ROWS
+    apart = [k for k in (first, *named) if (
+        2 * len({*form.cells(k)}) > len(form.rows) or len(form.rows) < _FEW_ROWS)]
+    return first if first in apart else next((k for k in apart if _rises(form, k)), first)
 
 
 def _parts_of_second(form: Form, clock: int) -> _Column | None:
     """Return a time in whole seconds with the column of ms or ns beside it, if there is one."""
-    cells = [row[clock] for row in form.rows if clock < len(row)]
+    cells = form.cells(clock)
     if all(map(str.isdigit, cells)):
         unit, pattern = 'ns', r'.*n(?:ano)?_?se?cs?'
         rest = [clock + 1] if not form.line and clock_unit(float(cells[0])) == 's' else []
@@ -412,8 +408,8 @@ def _parts_of_second(form: Form, clock: int) -> _Column | None:
 
 def _nameless_columns(form: Form) -> list[int]:
     """Return the columns without a telling name whose first cells are numbers."""
-    filled = [k for k in range(form.width) if form.rows and all(
-        k < len(row) and is_value(row[k]) for row in form.rows)]
+    filled = [k for k in range(form.width) if form.rows and len(form.cells(k)) == len(
+        form.rows) and all(map(is_value, form.cells(k)))]
     # In a file with names, only a single column beside the time; others may hold several series.
     return filled if not form.line else [k for k in filled[1:] if form.width == 2 and re.fullmatch(
         _VALUE_NAME, re.split('[./]', form.names[k].lower())[-1])]
@@ -435,7 +431,7 @@ def _steadiest(form: Form, places: list[int]) -> list[int]:
 
 def _rises(form: Form, place: int) -> bool:
     """Return whether a column without a name never falls in the first rows."""
-    cells = [row[place] for row in form.rows]
+    cells = form.cells(place)
     return not all(map(is_number, cells)) or bool(
         (np.diff([number_of(cell)[0] for cell in cells]) >= 0.0).all())
 
@@ -483,8 +479,7 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: _Column, needed
             taken.append(places[0])
     owners = dict.fromkeys(time.place, 'time')
     for quantity, column in found.items():
-        place = column.place[0]
-        if place in owners:
+        if (place := column.place[0]) in owners:
             raise InputError(f"{path}: column '{column.name}' cannot be both {owners[place]} and "
                              f'{quantity}: name another with --{quantity}-column or '
                              f'--{owners[place]}-column')
@@ -524,24 +519,20 @@ def _read(path: Path, form: Form, time: _Column, places: list[int],
           left_out: list[str] | None = None, texts: dict[int, list[str]] | None = None,
           ) -> tuple[FloatArray, list[FloatArray]]:
     """Return the time as written, days and clocks in s, and columns; texts as in `numbers`."""
-    sample = [row[time.place[0]] for row in form.rows
-              if time.place and time.place[0] < len(row) and row[time.place[0]]]
     if not time.place:
         if not LEAST_STEP <= time.scale <= LONGEST_STEP:
             raise InputError(f"{path}: '{time.name}' says rows {time.scale:g} s apart, outside "
                              f'{LEAST_STEP:g} to {LONGEST_STEP:g} s')
         values = numbers(path, form, places or [0], left_out=left_out)
         return time.scale * np.arange(float(values[0].size)), values
-    if sample and not is_number(sample[0]) and is_clock(sample[0]):
+    if _holds_clocks(form, time.place[0]):
         clocks: list[list[str]] = [[] for _ in time.place]
         values = numbers(path, form, places, dict(zip(time.place, clocks)) | (texts or {}),
                          left_out, texts is None)
-        cells = clocks[0]
+        cells = list(map(' '.join, zip(*clocks)))
         if len(clocks) > 1 and all(re.fullmatch(r'[\d.]+', part) for part in clocks[1]):
             cells = [f"{clock}.{part.split('.')[-1] if '.' in part else f'{part:0>3}'}"
                      for clock, part in zip(*clocks)]
-        elif len(clocks) > 1:
-            cells = [' '.join(pair) for pair in zip(*clocks)]
         return clock_times(path, cells, time.name, left_out), values
     t, *values = numbers(path, form, [*time.place, *places], texts, left_out, texts is None)
     if len(time.place) > 1:
@@ -552,14 +543,12 @@ def _read(path: Path, form: Form, time: _Column, places: list[int],
 
 def _unwrapped(t: FloatArray) -> FloatArray:
     """Let a 32-bit counter go on where it began anew at 0: micros() does so after 72 minutes."""
-    known = np.flatnonzero(np.isfinite(t))
-    step = np.diff(t[known])
+    known = np.isfinite(t)
+    on = np.unwrap(t[known], period=_COUNTS)
     # After a restart of the logger, the step would be longer than others.
-    wraps = (step < -0.5 * _COUNTS) & (step + _COUNTS <= 2.0 * step.max(initial=0.0))
-    if not wraps.any() or t[known].min() < 0.0 or t[known].max() >= _COUNTS:
-        return t
-    t = t.copy()
-    t[known[1:]] += _COUNTS * np.cumsum(wraps)
+    longest = 2.0 * np.diff(t[known]).max(initial=0.0)
+    if ((t[known] >= 0.0) & (t[known] < _COUNTS)).all() and (np.diff(on) <= longest).all():
+        t[known] = on
     return t
 
 
@@ -575,7 +564,7 @@ def _check_one_series(path: Path, form: Form, t: FloatArray, column: str, values
     if not overlap and not re.fullmatch(_VALUE_NAME, column.lower()):
         return
     for place, label in enumerate(form.names[:form.width]):
-        first = [row[place] for row in form.rows if place < len(row) and row[place]]
+        first = form.cells(place)
         cells = [] if not first or any(map(is_value, first)) or has_unit_beside(
             form.names, place - 1) else _cells(path, form, place, t.size)
         if not cells:
@@ -604,8 +593,7 @@ def _stamps(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: _Co
     """Return the time in s, and its unit in words."""
     if not time.place:
         return t, f'{time.scale:g} s'
-    cell = ''.join(form.rows[0][time.place[0]:][:1]) if form.rows else ''
-    if not is_number(cell) and is_clock(cell):
+    if _holds_clocks(form, time.place[0]):
         return t, 'dates and times'
     if time.scale:
         return t * time.scale, time.unit
@@ -696,14 +684,14 @@ def _in_si(quantity: str, column: _Column, values: FloatArray, given: str | None
             quantity == logs.CURRENT or known.size and np.median(known) * column.scale >= 1.0):
         return np.where(values == column.unknown, np.nan, values * column.scale), column.unit
     if quantity == logs.CURRENT:
-        whole = not column.unit and bool((known == np.rint(known)).all())
-        small = whole and beside.startswith('mV,')
+        small = not column.unit and beside.startswith('mV,') and bool(
+            (known == np.rint(known)).all())
         unit = 'mA' if small else AMPERE_WORDS.get(column.unit, 'A')
         return values * SCALES[unit], unit + ', a guess' * small
     unit, words = given or VOLT_WORDS.get(column.unit) or '', ''
     if not unit:
-        wild = known.size > 0 and float(np.median(known)) > _MOST_VOLTS
-        unit, words = ('mV', ', a guess: --unit') if wild else ('V', '')
+        unit, words = ('mV', ', a guess: --unit') if known.size and np.median(
+            known) > _MOST_VOLTS else ('V', '')
     return values * SCALES[unit], unit + words
 
 
@@ -734,13 +722,13 @@ def _throttle_unit(values: FloatArray, volts: FloatArray) -> str:
 def _read_note(form: Form, time: _Column, found: dict[str, _Column], units: dict[str, str],
                wanted: CsvColumns) -> str:
     """Return in one line how a file was read; '' if nothing was detected."""
-    if time.name == TIME and not form.comma and form.encoding in ('utf-8', 'utf-8-sig') and all(
-            column.name == {logs.VOLTAGE: VOLTAGE, logs.THROTTLE: THROTTLE,
-                            logs.CURRENT: CURRENT}[quantity] for quantity, column in found.items()
-    ) and not any('guess' in words for words in units.values()):
+    encoding = '' if form.encoding in ('utf-8', 'utf-8-sig') else f', {form.encoding}'
+    if time.name == TIME and not form.comma and not encoding and {
+            column.name for column in found.values()} <= {VOLTAGE, THROTTLE, CURRENT} and not any(
+                'guess' in words for words in units.values()):
         return ''
-    names = {',': 'commas', ';': 'semicolons', '\t': 'tabs', ' ': 'blanks'}
-    between = names.get(form.delimiter, f"'{form.delimiter}'")
+    between = {',': 'commas', ';': 'semicolons', '\t': 'tabs', ' ': 'blanks'}.get(
+        form.delimiter, f"'{form.delimiter}'")
     parts = [f"time from '{time.name}' ({units[_TIME_NAME]})"]
     parts += [f"{quantity} from '{column.name}' ({units[quantity]})"
               for quantity, column in found.items()]
@@ -749,21 +737,19 @@ def _read_note(form: Form, time: _Column, found: dict[str, _Column], units: dict
     others = [form.names[k] for k in places
               if form.names[k] not in {column.name for column in found.values()}]
     also = f'; also found: {", ".join(others)} (--voltage-column)' if others else ''
-    lacking = [quantity for quantity, given in (
-        (logs.THROTTLE, wanted.throttle), (logs.CURRENT, wanted.current))
-        if given is None and quantity not in found]
+    lacking = [quantity for quantity in (logs.THROTTLE, logs.CURRENT)
+               if quantity not in found and getattr(wanted, quantity) is None]
     if lacking:
         # Mention columns that may be a throttle or current under another name.
         used = {*time.place, *(column.place[0] for column in found.values())}
         rest = [name for k, name in enumerate(form.names[:form.width])
                 if k not in used and name not in others
-                and (logs.THROTTLE in lacking or re.search(_LIKE_CURRENT, name.lower()))
+                and (logs.THROTTLE in lacking or re.search('curr|amps|strom|cour', name.lower()))
                 and not re.fullmatch(_INDEX_NAME, name.strip('# ').lower())
-                and (not form.rows or any(k < len(row) and is_number(row[k]) and not is_missing(
-                    row[k]) for row in form.rows))]
+                and (not form.rows or any(
+                    is_number(cell) and not is_missing(cell) for cell in form.cells(k)))]
         options = ' or '.join(f'--{quantity}-column' for quantity in lacking)
         also += f'; not read: {some(rest, 3)} ({options})' if rest else ''
     return (f"Read {', '.join(parts)}{also}; cells between {between}, decimal "
-            f"{'comma' if form.comma else 'point'}"
-            + (f', {form.encoding}' if form.encoding not in ('utf-8', 'utf-8-sig') else '')
-            + f', numbers from line {form.skip + 1} on.')
+            f"{'comma' if form.comma else 'point'}{encoding}, numbers from line "
+            f'{form.skip + 1} on.')
