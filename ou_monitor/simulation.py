@@ -28,7 +28,7 @@ from ou_monitor.recordings.importers.csv_form import (
 from ou_monitor.recordings.importers.log import CsvColumns
 from ou_monitor.recordings.model_file import ModelFile, read_model
 from ou_monitor.recordings.read import read_recording
-from ou_monitor.records import FloatArray, Recording
+from ou_monitor.records import FloatArray, NAN, Recording
 from ou_monitor.text import plain_number, printable
 
 # Stamps (s) -> throttle 0..1.
@@ -382,8 +382,10 @@ def plan(model: SupplyModel | ModelFile | str | Path | None = None, *, preset: s
         file, name = read_model(model), Path(model).stem
     else:
         file, name = model if isinstance(model, ModelFile) else ModelFile(model), 'model'
-    profile, words, flown = _throttle_of(usual.throttle if throttle is None else throttle,
-                                         start, end)
+    still = throttle is None and model is not None and not (
+        file.model.needs_throttle or file.model.load)
+    profile, words, flown = (_unknown, 'none', None) if still else _throttle_of(
+        usual.throttle if throttle is None else throttle, start, end)
     length = usual.duration if flown is None else float(flown.t[-1] - flown.t[0])
     rate = _positive('--rate', _rate_of(file, usual.rate) if rate is None else rate, 'Hz')
     duration = _positive('--duration', length if duration is None else duration, 's')
@@ -400,6 +402,11 @@ def plan(model: SupplyModel | ModelFile | str | Path | None = None, *, preset: s
     resistance = _positive('--scale-resistance', resistance, '')
     charge = math.nan if capacity_left == -1.0 else capacity_left
     return Run(file, name, profile, words, flown, duration, rate, seed, charge, resistance)
+
+
+def _unknown(t: FloatArray) -> FloatArray:
+    """Return the throttle of a supply that does not depend on it: it is not written."""
+    return np.full(t.shape, NAN)
 
 
 def _rate_of(file: ModelFile, usual: float) -> float:

@@ -13,6 +13,8 @@ from ou_monitor import (
     analyze, compare, coupling, design, discover, InputError, read_recording, Recording,
     reproduce, Result, simulate, supply_facts)
 from ou_monitor.cli.main import main
+from ou_monitor.model.supply import SupplyModel
+from ou_monitor.model.terms.ou import OU
 from ou_monitor.paper import reproduce as reproduction
 from ou_monitor.report.terminal import terminal
 from project import ROOT
@@ -248,3 +250,12 @@ def test_a_throttle_in_another_unit_is_refused(scale):
     for function in (analyze, supply_facts):
         with pytest.raises(InputError, match='0 to 1 is expected.*percent'):
             function(Recording(t, 12.0 - throttle, scale * throttle))
+
+
+def test_a_model_without_throttle_writes_none(tmp_path):
+    """Unless one is named; a preset keeps its own."""
+    model = SupplyModel((OU(63.0, 0.3, 5.0),))
+    drawn = simulate(model, duration=2.0, rate=100.0, output=tmp_path / 'a.mcap')
+    assert list(drawn.to_dict()['topics']) == ['/voltage'] and not drawn.recording.has_throttle
+    assert simulate(model, duration=2.0, rate=100.0, throttle=0.4).recording.has_throttle
+    assert simulate(preset='idle', duration=2.0).recording.has_throttle

@@ -38,8 +38,6 @@ CELL_LIMIT = 3.3
 # The voltage of the full pack is the highest median over this time, s.
 _FULL = 0.5
 
-# Maximum cells of the known classes; the largest known quads have 6.
-_MOST_CELLS = 8
 MICRO, QUAD, ROBOT = '1S micro', 'quad, 2S and more', 'robot on 12 V'
 # Class -> craft -> cells, sag and noise at half throttle, V, and resistance, Ohm, of
 # the pack; by `supply_facts` in November 2026.
@@ -59,6 +57,8 @@ KNOWN: dict[str, dict[str, tuple[float, float, float, float]]] = {
             'regbot_28': (3, 0.083, 0.0108, 0.174), 'regbot_30': (3, 0.058, 0.0079, NAN),
             'regbot_62': (3, 0.111, 0.0169, 0.415), 'regbot_81': (3, NAN, 0.0117, NAN),
             'frc_ol_1': (3, NAN, NAN, 0.0275)}}
+# Maximum cells of the known quads: a pack of 24 V, which robots have, looks like 7 cells.
+_MOST_CELLS = max(cells for cells, *_ in KNOWN[QUAD].values())
 # Cells of the class of robots, and formats that do not say what recorded them.
 _ROBOT_CELLS, _ANY_VEHICLE = 3, ('csv', 'mcap', '')
 _UNITS = {'sag': 'mV per cell at 50 % throttle', 'noise': 'mV rms per cell at 50 % throttle',
@@ -222,13 +222,14 @@ def craft_line(craft: Craft) -> str:
             found.setdefault(one.kind, []).append(
                 f'{one.name} {number(1e3 * one.value)} {_UNITS[one.name]} is {one.verdict}'
                 + ('' if one.verdict == 'usual' else f' (usual: {low} to {high})'))
-    if not found:
+    if not found and (craft.measures or not craft.cells):
         return ''
     iron = next((n for n in _IRON_CELLS if _IRON[0] <= craft.full_v / n <= _IRON[1]), 0)
     source = {'log': ' (from the log)', 'guessed': ' of LiPo (from the voltage)' + (
         f' or {iron} of LiFePO4' if iron > craft.cells else '')}.get(craft.cells_from, '')
-    return f'{counted(craft.cells, "cell")}{source}, ' + '; or '.join(
+    return f'{counted(craft.cells, "cell")}{source}, ' + ('; or '.join(
         f'class "{kind}": {"; ".join(words)}' for kind, words in found.items())
+        or 'no class known to compare with')
 
 
 def craft_advice(craft: Craft) -> list[str]:

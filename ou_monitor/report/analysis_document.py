@@ -258,7 +258,9 @@ def _alarms(analysis: Analysis) -> list[Part]:
     guess = ', a guess' * (craft.cells_from == 'guessed')
     return [Section(f'Alarms ({counted(craft.cells, "cell")}{guess})', [Table(
         ['alarm, V\nper cell', 'first at, s', 'before the\nlowest, s', 'before the\nend, s',
-         'dips', 'under 1 s', 'longest, s', 'below, s'], rows)])] if rows else []
+         'dips', 'under 1 s', 'longest, s', 'below, s'], rows),
+        Text('Dips merge at a higher alarm: their number may fall while the time below '
+             'grows.')])] if rows else []
 
 
 def _curves(analysis: Analysis) -> list[Part]:

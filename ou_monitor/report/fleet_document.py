@@ -103,7 +103,10 @@ def _ageing(fleet: Fleet) -> str:
                  + ', '.join(_growth(judged, t) for t in old if t.vehicle == vehicle)
                  for vehicle in dict.fromkeys(t.vehicle for t in old)]
         more = f'; and {len(words) - _OLD} more' if len(words) > _OLD else ''
-        return f'Ageing pack{"s" * (len(words) > 1)}: {"; ".join(words[:_OLD])}{more}.'
+        likely = {t.vehicle for t in tested if t.low > 0.0} - {t.vehicle for t in old}
+        also = f'; the 95 % interval of {len(likely)} more lies above 0, too' if likely else ''
+        return (f'Ageing pack{"s" * (len(words) > 1)} ({len(words)} of '
+                f'{len({t.vehicle for t in tested})}{also}): {"; ".join(words[:_OLD])}{more}.')
     if not tested:
         return (f'Whether a pack ages is unknown: no vehicle has {LEAST_FLIGHTS} flights with a '
                 'known resistance or sag.')

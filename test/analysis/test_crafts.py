@@ -72,8 +72,10 @@ def test_values_are_called_usual_high_or_low():
             assert f'is {verdict}' in craft_line(known) and not craft_advice(craft)
             assert [found[name].remedy in said for said in craft_advice(known)] == (
                 [True] if verdict == 'high' else [])
-    wheel = flown(cells=16)
-    assert craft_of(wheel, supply_facts(wheel)).measures == ()
+    for cells in (7, 16):
+        wheel = flown(cells=cells)
+        craft = craft_of(wheel, supply_facts(wheel))
+        assert craft.measures == () and 'no class known' in craft_line(craft)
     micro = flown(cells=1, sag=0.1, noise=0.02)
     found = craft_of(micro, supply_facts(micro))
     assert found.kind == MICRO
