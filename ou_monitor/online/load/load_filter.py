@@ -109,6 +109,14 @@ class FastLevel:
         return (self._level - self._drawn, self._variance) if self._better else (level, variance)
 
 
+def _beyond(flown: tuple[float, float], error: FloatArray) -> FloatArray:
+    """Return errors over TABLE; beyond the throttles flown none is smaller than there."""
+    # A correction that counts as error vanishes where the corrected curve crosses the other.
+    low, high = np.searchsorted(TABLE, flown, 'right').tolist()
+    return np.append(error[:high], np.maximum.accumulate(
+        np.append(error[low - 1:high].max(), error[high:]))[1:])
+
+
 class LoadFilter:
     """Level, sag and noise of a supply, sample by sample."""
 
@@ -426,9 +434,10 @@ class LoadFilter:
         H = static(TABLE, hold(self._seen))
         raw = H @ a
         sag = np.maximum.accumulate(H @ rising(a, C, H))
-        # The correction of a negative or decreasing sag counts as an error too.
-        error = np.sqrt(np.maximum(np.einsum('ij,jk,ik->i', H, C, H), (sag - raw) ** 2))
         low, high = self._flown_range()
+        # The correction of a negative or decreasing sag counts as an error too.
+        error = _beyond((low, high), np.sqrt(np.maximum(
+            np.einsum('ij,jk,ik->i', H, C, H), (sag - raw) ** 2)))
         basis, level, rest = Basis.THROTTLE, self._level, self._rest
         resistance = resistance_se = at_once = NAN
         if self._current is not None:
@@ -495,7 +504,7 @@ class LoadFilter:
         """Return the sag from the current at each throttle."""
         raw, se = current.sag(TABLE)
         sag = np.maximum.accumulate(np.maximum(raw, 0.0))
-        error = np.maximum(np.hypot(se, sag - raw), _LEAST_ERROR * sag)
+        error = np.maximum(_beyond(load.flown, np.hypot(se, sag - raw)), _LEAST_ERROR * sag)
         at = np.interp(load.flown, TABLE, error)
         swing = np.diff(np.interp(load.flown, TABLE, sag))
         known = float(np.max(at)) < max(_SAG_SHARE * float(swing[0]), most)

@@ -76,6 +76,17 @@ def test_the_sag_rises_and_its_error_has_a_floor():
     assert (load.sag_se(u) >= 0.1 * load.sag(u) - 1e-12).all()
 
 
+def test_an_extrapolated_sag_is_known_no_better_than_a_measured_one():
+    """A law that falls below the throttles flown: its correction crosses zero above them."""
+    rng = np.random.default_rng(1)
+    t, u = np.arange(6000) / 100.0, np.repeat(rng.uniform(0.42, 0.8, 120), 50)
+    v = 4.0 - 0.6 * np.maximum(u - 0.6, 0.0) ** 1.5 + 0.004 * rng.standard_normal(t.size)
+    load = loaded(t, v, u)
+    flown, beyond = (load.sag_se(np.linspace(*ends, 20)) for ends in (
+        load.flown, (load.flown[1] + 0.01, 1.0)))
+    assert load.known and flown.max() <= beyond.min() and (np.diff(beyond) >= 0.0).all()
+
+
 def test_a_held_throttle_ends_at_a_steady_answer():
     """The path ahead forgets its start: a minute later only discharge is left."""
     loads = LoadFilter()
