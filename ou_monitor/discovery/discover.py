@@ -31,7 +31,7 @@ from ou_monitor.discovery.regression import load_terms
 from ou_monitor.discovery.search import position, Progress, Search, under_load, whole_load
 from ou_monitor.discovery.words import (
     by_load, collinear_note, coupling_found, coupling_note, explain, left_out_note, NO_OTHER,
-    no_relaxation_note, VAGUE, verdict_sentence)
+    no_relaxation_note, VAGUE, verdict_words)
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import blamed, catalogue, left_out, withdraw
 from ou_monitor.model.terms.load_response import LoadTransient, SHORTEST
@@ -125,11 +125,8 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
                      float(np.median(samples.step[1:])), larger, fall) if causes else ()
     verdict = judge(remaining, len(causes), against)
     done(1.0)
-    return Finding(
+    found = Finding(
         recording=recording.name, n=recording.n, duration=recording.duration, verdict=verdict,
-        sentence=by_load(verdict_sentence(
-            verdict, causes, remaining, gain, gain_se, named.dropped, why, uncovered, refused,
-            named.failure == INTERRUPTED, against), load),
         baseline=baseline, baseline_score=mean_score(plain.density, scored & plain.known),
         criticism=criticism, causes=causes, model=SupplyModel((*whole.terms, *undone)),
         se=(*se, *(with_reach(term, {}, samples) for term in undone)),
@@ -140,12 +137,14 @@ def _discover(recording: Recording, seed: int, progress: Progress | None) -> Fin
             named, whole, dropped, samples, uncovered))),
         samples=samples, simulated=SupplyModel(whole.terms), refused=refused,
         full=state.full, has_throttle=recording.has_throttle, seed=seed)
+    return replace(found, words=verdict_words(
+        found, why, named.dropped, uncovered, named.failure == INTERRUPTED, against))
 
 
 def _insufficient(recording: Recording, state: Integrity, reason: str, seed: int) -> Finding:
     return Finding(
         recording=recording.name, n=recording.n, duration=recording.duration,
-        verdict=Verdict.INSUFFICIENT_DATA, sentence=f'Nothing can be said about it. {reason}',
+        verdict=Verdict.INSUFFICIENT_DATA, words=('Nothing can be said about it.', reason),
         notes=state.notes, has_throttle=recording.has_throttle, seed=seed)
 
 

@@ -141,7 +141,7 @@ class Finding:
     n: int  # Samples of the recording
     duration: float  # s
     verdict: Verdict
-    sentence: str  # The verdict in a sentence
+    words: tuple[str, ...] = ()  # The verdict, a sentence each
     baseline: OU | None = None  # The plain model, fitted on everything
     # Mean log predictive density of held-out blocks, nats per sample.
     baseline_score: float = NAN
@@ -166,6 +166,11 @@ class Finding:
     full: float = NAN  # Current that is a load of 1, A; NaN if it is not the load
     has_throttle: bool = True  # Whether the recording has one
     seed: int = 0  # Random seed
+
+    @property
+    def sentence(self) -> str:
+        """Return the verdict in words."""
+        return ' '.join(self.words)
 
     @property
     def load(self) -> str:

@@ -12,7 +12,7 @@ import math
 import re
 from typing import Any
 
-from ou_monitor.discovery.finding import Cause, Criticism, Verdict
+from ou_monitor.discovery.finding import Cause, Criticism, Finding, Verdict
 from ou_monitor.model.spectral_lines import comb_of
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.ou import OU
@@ -25,6 +25,8 @@ from ou_monitor.text import chance as shown_chance, listed, number, p_words, vol
 GAIN = ('Gain: log predictive density of samples not used for the fit, in mnat (thousandths of a '
         'nat: 1 mnat per sample makes 1000 samples e = 2.7 times as likely); +- is half the 95 % '
         'interval.')
+# Maximum causes in the first sentence.
+_FIRST = 3
 # Reasons why a gain is unknown.
 VAGUE = ('its error is more than ten times the gain, because the rest of the recording hardly '
          'determines its parameters.')
@@ -166,50 +168,53 @@ def remaining_words(left: Sequence[Criticism]) -> str:
     return listed(texts[:4]) + ('' if len(texts) <= 4 else f' ({len(texts) - 4} more)')
 
 
-def verdict_sentence(verdict: Verdict, causes: Sequence[Cause], left: Sequence[Criticism],
-                     gain: float, gain_se: float, dropped: Sequence[str] = (),
-                     why: str = '', uncovered: int = 0, refused: str = '',
-                     stopped: bool = False, doubts: Sequence[str] = ()) -> str:
-    """Return the verdict in a sentence or two (gain, gain_se in nats)."""
-    if stopped and verdict is Verdict.UNEXPLAINED:
-        rest = f': {remaining_words(left)}' if left else ''
-        return ('The simulation deviates from the recording; the search was stopped before it '
-                f'found a cause{rest}.')
-    text = _verdict(verdict, causes, left, gain, gain_se, dropped, why, uncovered, doubts)
-    return f'{text} {refused}: trust the named causes, not the fitted values.' if refused else text
+def verdict_words(found: Finding, why: str = '', dropped: Sequence[str] = (), uncovered: int = 0,
+                  stopped: bool = False, doubts: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return the verdict, a sentence each: causes, their gain, whether it is right, refusal."""
+    # why: the gain is unknown; uncovered: samples at throttle that the others do not cover.
+    if not found.causes:
+        return (plain(by_load(_without_causes(found, dropped, uncovered, stopped), found.load)),)
+    order = sorted(found.causes, key=lambda c: -c.gain if math.isfinite(c.gain) else math.inf)
+    names = [both_names(name) for name in dict.fromkeys(cause.name for cause in order)]
+    more = len(names) - _FIRST
+    others = [f'{more} more'] if more > 0 else []
+    closer = 'With them the simulation ' + (
+        'passes every test' if found.verdict is Verdict.EXPLAINED else
+        'comes closer, but is not yet right' if found.closer else 'does not come closer')
+    refused = [f'{found.refused}: trust the named causes, not the fitted values.'
+               ] if found.refused else []
+    return tuple(by_load(text, found.load) for text in (
+        f'A plain simulation lacks {listed([*names[:_FIRST], *others])}.', _gain(found, why),
+        f'{": ".join([closer, *(["; ".join(doubts)] if doubts else [])])}.', *refused))
 
 
-def _verdict(verdict: Verdict, causes: Sequence[Cause], left: Sequence[Criticism], gain: float,
-             gain_se: float, dropped: Sequence[str], why: str, uncovered: int,
-             doubts: Sequence[str]) -> str:
-    """Return the verdict without a refusal."""
-    names = _names_with_counts([cause.name for cause in causes])
-    tried = (f' The nearest entries of the catalogue ({listed(list(dropped))}) fit only in part.'
-             if dropped else '')
-    if left and uncovered:
-        tried += (f' {uncovered} samples are at throttle that the rest of the recording does not '
-                  'cover, which alone may explain the rest'
-                  + ('.' if why else '; a recording that covers its whole range of throttle more '
-                     'than once would decide.'))
-    if verdict is Verdict.NO_EFFECT:
+def _without_causes(found: Finding, dropped: Sequence[str], uncovered: int, stopped: bool) -> str:
+    if found.verdict is Verdict.NO_EFFECT:
         return ('The plain OU simulates this recording: none of the statistics that can be '
                 'computed at this length deviates.')
-    if verdict is Verdict.UNEXPLAINED:
-        return ('The simulation deviates from the recording, and no known cause explains it: '
-                f'{remaining_words(left)}.{tried}')
-    if verdict is Verdict.EXPLAINED:
-        return (f'{listed(names)} explain{"s" if len(names) == 1 else ""} what the plain OU gets '
-                'wrong. ' + gain_words(gain, gain_se, why))
-    rest = '; '.join([*([remaining_words(left)] if left else []), *doubts])
-    return (f'{listed(names)} explain{"s" if len(names) == 1 else ""} a part of what the plain OU '
-            f'gets wrong; another part remains{": " if rest else ""}{rest}.{tried} '
-            + gain_words(gain, gain_se, why))
+    left = remaining_words(found.remaining)
+    if stopped:
+        return ('The simulation deviates from the recording; the search was stopped before it '
+                f'found a cause: {left}.')
+    return ('The simulation deviates from the recording, and no known cause explains it: '
+            + f'{left}.' + (
+                f' The nearest entries of the catalogue ({listed(list(dropped))}) fit in part.'
+                if dropped else '') + (
+                f' {uncovered} samples are at throttle that the rest of the recording does not '
+                'cover, which alone may explain the rest.' if uncovered else ''))
 
 
-def _names_with_counts(names: Sequence[str]) -> list[str]:
-    """Return each name once, with its number of terms."""
-    return [name if names.count(name) == 1 else f'{name} ({names.count(name)} terms)'
-            for name in dict.fromkeys(names)]
+def _gain(found: Finding, why: str) -> str:
+    """Return a gain in two parts: smaller one-step errors, and their size better predicted."""
+    gain, shrink, size = found.gain, found.shrink, found.size_gain
+    if not gain > Z95 * found.gain_se or not math.isfinite(size):
+        return gain_words(gain, found.gain_se, why)
+    errors = ('shrink by ' if shrink > 0.0 else 'grow by ') + f'{number(100.0 * abs(shrink), 2)} %'
+    smaller, better = ('+' * (x > 0.0) + number(1e3 * x) for x in (gain - size, size))
+    return (f'On samples not used for the fit, one-step errors {errors} (rms; '
+            f'{smaller} mnat per sample) and their size is predicted '
+            f'{"better" if size >= 0.0 else "worse"} ({better}): '
+            f'{gain_text(gain, found.gain_se)} mnat in all.')
 
 
 def collinear_note(inflation: float, limit: float) -> str:

@@ -9,18 +9,18 @@ import math
 
 import numpy as np
 from ou_monitor.analysis.overview import known_lines, Overview
-from ou_monitor.discovery.finding import Finding, Verdict
+from ou_monitor.discovery.finding import Finding
 from ou_monitor.discovery.words import (
-    both_names, by_load, cause_rows, GAIN, gain_text, gain_words, overlap_words, plain,
-    plain_model_words, PLAIN_NAMES, plain_words, with_error)
+    by_load, cause_rows, GAIN, gain_text, overlap_words, plain_model_words, PLAIN_NAMES,
+    plain_words, with_error)
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Part, Section, Table, Text)
 from ou_monitor.report.svg import Plot
-from ou_monitor.text import listed, number, Z95
+from ou_monitor.text import number
 
-# Maximum causes in the first sentence, and remaining discrepancies on a terminal.
-_FIRST, _SHOWN = 3, 8
+# Maximum remaining discrepancies on a terminal.
+_SHOWN = 8
 # Maximum rows of statistics drawn.
 _ROWS = 18
 # Sizes of the drawing of statistics, pixels.
@@ -55,42 +55,7 @@ def discovery_document(finding: Finding, seen: Overview | None = None, command: 
                   Section('What is left', [_discrepancies(finding)], folded=True),
                   lambda: [Section('Parameters', _parameters(finding), folded=True)]]
     parts.append(Section('What to know before using these numbers', [Notes.of(finding.notes)]))
-    return Document('What the simulation gets wrong', subject, answer(finding), parts, command)
-
-
-def answer(finding: Finding) -> list[str]:
-    """Return the strongest causes, and the gain of all in prediction errors."""
-    if not finding.causes:
-        return [plain(finding.sentence)]
-    order = sorted(finding.causes, key=lambda c: -c.gain if math.isfinite(c.gain) else math.inf)
-    names = [by_load(both_names(name), finding.load)
-             for name in dict.fromkeys(cause.name for cause in order)]
-    more = len(names) - _FIRST
-    others = [f'{more} more'] if more > 0 else []
-    worse = [*(['one-step errors are larger'] if finding.larger else []),
-             *(['the rate of dips is further from the measured one']
-               if finding.dips.worse else [])]
-    closer = ('With them the simulation ' + (
-        'passes every test.' if finding.verdict is Verdict.EXPLAINED else
-        'comes closer, but is not yet right.' if finding.closer else
-        f'does not come closer: {listed(worse)} than with the plain OU.'))
-    refused = [f'{finding.refused}: trust the named causes, not the fitted values.'
-               ] if finding.refused else []
-    return [f'A plain simulation lacks {listed([*names[:_FIRST], *others])}.',
-            _gain_words(finding), closer, *refused]
-
-
-def _gain_words(finding: Finding) -> str:
-    """Return a gain in two parts: smaller one-step errors, and their size better predicted."""
-    gain, shrink, size = finding.gain, finding.shrink, finding.size_gain
-    if not gain > Z95 * finding.gain_se or not math.isfinite(size):
-        return gain_words(gain, finding.gain_se)
-    errors = ('shrink by ' if shrink > 0.0 else 'grow by ') + f'{number(100.0 * abs(shrink), 2)} %'
-    smaller, better = ('+' * (x > 0.0) + number(1e3 * x) for x in (gain - size, size))
-    return (f'On samples not used for the fit, one-step errors {errors} (rms; '
-            f'{smaller} mnat per sample) and their size is predicted '
-            f'{"better" if size >= 0.0 else "worse"} ({better}): '
-            f'{gain_text(gain, finding.gain_se)} mnat in all.')
+    return Document('What the simulation gets wrong', subject, finding.words, parts, command)
 
 
 def _inputs(finding: Finding) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from ou_monitor.cli.main import main
 from ou_monitor.criticism.samples import Samples
 from ou_monitor.discovery.finding import Cause, Finding, Verdict
-from ou_monitor.discovery.words import both_names, explain, plain, PLAIN_NAMES
+from ou_monitor.discovery.words import both_names, explain, plain, PLAIN_NAMES, verdict_words
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_response import LoadSag
@@ -20,7 +20,6 @@ from ou_monitor.model.terms.tones import Tone
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.recordings.model_file import read_model
 from ou_monitor.recordings.read import read_recording
-from ou_monitor.report.discovery_document import answer
 from project import ROOT
 import pytest
 
@@ -113,7 +112,7 @@ def made(*causes):
     samples = Samples(np.arange(400) / 100.0, 5.0 + 0.01 * np.sin(np.arange(400.0) ** 2), None)
     model = SupplyModel((OU(60.0, 0.3, 5.0), *terms))
     return Finding(
-        'x', 400, 4.0, Verdict.EXPLAINED, 's', baseline=OU(60.0, 0.3, 5.0), baseline_score=2.0,
+        'x', 400, 4.0, Verdict.EXPLAINED, ('s',), baseline=OU(60.0, 0.3, 5.0), baseline_score=2.0,
         causes=tuple(Cause(term, {}, gain, se, p, (), explain(
             term, {}, gain, se, (), False, '', len(causes)), False)
             for term, gain, se, p in causes),
@@ -127,10 +126,10 @@ def test_the_answer_begins_with_the_largest_gains():
     finding = made(
         (LoadSag(0.6, 0.0), 0.2, 0.01, 0.0), (Drift(0.1, 0.0), nan, nan, nan),
         *[(Tone(0.01, f, 0.0, 0.0), 0.3, 0.01, 0.0) for f in (11.0, 23.0)])
-    assert re.findall(r'\((\w+)\)', answer(finding)[0]) == ['tone', 'load_sag', 'drift']
+    assert re.findall(r'\((\w+)\)', verdict_words(finding)[0]) == ['tone', 'load_sag', 'drift']
     more = replace(finding, verdict=Verdict.PARTLY_EXPLAINED, refused='It strays', causes=(
         *finding.causes, *made((MeasurementNoise(0.01), 0.1, 0.01, 0.0)).causes))
-    strongest, *_, refused = answer(more)
+    strongest, *_, refused = verdict_words(more)
     assert re.findall(r'\((\w+)\)', strongest) == ['tone', 'load_sag', 'measurement_noise']
     assert '1 more' in strongest and refused.startswith('It strays')
     assert more.closer and not replace(more, larger=True).closer

@@ -30,7 +30,7 @@ def finding(**changes):
                   False)
     simulated = {
         'recording': 'x', 'n': 10, 'duration': 1.0, 'verdict': Verdict.PARTLY_EXPLAINED,
-        'sentence': 's', 'baseline': OU(60.0, 0.3, 5.0), 'baseline_score': 2.0,
+        'words': ('s',), 'baseline': OU(60.0, 0.3, 5.0), 'baseline_score': 2.0,
         'criticism': (FINE, OFF, WORSE), 'causes': (cause,),
         'model': SupplyModel((OU(61.0, 0.3, 5.0), sag, tone, tone)),
         'se': ({'alpha': 1.0}, {'linear': 0.02}, {}, {}), 'score': 2.015, 'gain': 0.015,

@@ -16,7 +16,7 @@ from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import HeldSamples
 from ou_monitor.records import Recording
-from ou_monitor.report.discovery_document import answer, discovery_document
+from ou_monitor.report.discovery_document import discovery_document
 from ou_monitor.report.page import html as page_of
 from ou_monitor.report.terminal import terminal
 from pages import parsed, self_contained
@@ -112,7 +112,7 @@ def test_the_page_shows_verdict_causes_plots_and_command(sag):
                  'V/sqrt(s)'):
         assert part in text
     # Names of causes stand behind plain ones.
-    said = ' '.join(answer(sag))
+    said = sag.sentence
     assert 'sag (load_sag)' in said and ' '.join(said.replace('+-', '\u00b1').split()) in text
     drawings = root.findall('.//figure/svg')
     # The voltage over its simulations, and rows of statistics.

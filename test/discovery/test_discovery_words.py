@@ -3,10 +3,10 @@
 from dataclasses import replace
 import math
 
-from ou_monitor.discovery.finding import Cause, Criticism, Verdict
+from ou_monitor.discovery.finding import Cause, Criticism, Finding, Verdict
 from ou_monitor.discovery.words import (
     cause_rows, coupling_note, explain, gain_text, gain_words, overlap_words, parameters,
-    plain_words, verdict_sentence, with_error)
+    plain_words, verdict_words, with_error)
 from ou_monitor.model.terms.catalogue import catalogue
 from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.tones import Tone
@@ -97,17 +97,22 @@ def test_many_lines_are_told_by_their_fundamental():
     assert '7x (10.0 mV)' in row.explanation and 'Others: 73.00 Hz (10.0 mV).' in row.explanation
 
 
-@pytest.mark.parametrize('verdict, left, begin, gain', (
-    (Verdict.NO_EFFECT, False, 'The plain OU simulates this recording', False),
-    (Verdict.UNEXPLAINED, True, 'The simulation deviates from the recording', False),
-    (Verdict.EXPLAINED, False, 'tone explains what the plain OU gets wrong', True),
-    (Verdict.PARTLY_EXPLAINED, False, 'tone explains a part of what the plain OU', True),
-    (Verdict.PARTLY_EXPLAINED, True, 'tone explains a part of what the plain OU', True)))
-def test_each_verdict_has_its_sentence(verdict, left, begin, gain):
-    some = [left_over('skewness')] if left else []
-    text = verdict_sentence(verdict, [tone_cause(31.0, '')], some, 0.02, 0.003)
-    assert text.startswith(begin) and ('mnat' in text) == gain
-    assert ('skewed' in text) == left
+def finding(verdict, causes=(), left=(), **more):
+    return Finding('x', 10, 1.0, verdict, causes=tuple(causes), criticism=tuple(left), gain=0.02,
+                   gain_se=0.003, **more)
+
+
+@pytest.mark.parametrize('verdict, named, left, words', (
+    (Verdict.NO_EFFECT, False, False, 'The plain OU simulates this recording'),
+    (Verdict.UNEXPLAINED, False, True, 'no known cause explains it: prediction errors are skewed'),
+    (Verdict.EXPLAINED, True, False, 'the simulation passes every test'),
+    (Verdict.PARTLY_EXPLAINED, True, False, 'comes closer, but is not yet right: too slow'),
+    (Verdict.PARTLY_EXPLAINED, True, True, 'comes closer, but is not yet right: too slow')))
+def test_each_verdict_has_its_sentence(verdict, named, left, words):
+    found = finding(verdict, [tone_cause(31.0, '')] * named, [left_over('skewness')] * left)
+    text = ' '.join(verdict_words(found, doubts=['too slow'] if 'slow' in words else []))
+    assert words in text and ('mnat' in text) == named
+    assert ('A plain simulation lacks a line' in text) == named
 
 
 @pytest.mark.parametrize('name', [name for name in catalogue() if name != 'ou'])
@@ -127,18 +132,16 @@ def test_every_cause_has_its_words(name):
     assert all(f'factor over {name} = ' in text for name in term.factors())
 
 
-def test_the_verdict_counts_its_causes_and_says_what_is_left():
-    """Causes that repeat, the things that are left, the nearest entries, throttle never flown."""
+def test_the_verdict_says_what_is_left_or_refused():
+    """The nearest entries, throttle never flown, a search cut short, a refusal."""
     some = [left_over('band 4, 1 to 2 Hz')]
-
-    def partly(causes, **more):
-        return verdict_sentence(Verdict.PARTLY_EXPLAINED, causes, some, 0.015, 0.002, **more)
-    assert 'load_sag (2 terms)' in partly([SAG, SAG]) and 'spectrum' in partly([SAG])
-    assert '900 samples' in partly([SAG], uncovered=900) and '900' not in partly([SAG])
-    lost = verdict_sentence(Verdict.UNEXPLAINED, [], some, 0.0, 0.0, ['jumps'])
-    assert 'jumps' in lost
-    refused = verdict_sentence(Verdict.EXPLAINED, [SAG], [], -0.015, 0.002, refused='It is worse')
-    assert 'It is worse' in refused
+    lost = finding(Verdict.UNEXPLAINED, (), some)
+    for more, words in (({'dropped': ['jumps']}, 'jumps'), ({'uncovered': 900}, '900 samples'),
+                        ({'stopped': True}, 'was stopped'), ({}, 'spectrum')):
+        (text,) = verdict_words(lost, **more)
+        assert words in text and ('no known cause' in text) == ('stopped' not in more)
+    refused = finding(Verdict.EXPLAINED, [SAG], refused='It is worse')
+    assert verdict_words(refused)[-1].startswith('It is worse: trust the named causes')
     assert plain_words('throttle change over 2 s') == plain_words('throttle')
     assert plain_words('order line') != plain_words('line')
     # 0.24 alpha T = 6 nats; a corner is a rate over a turn.
