@@ -384,7 +384,7 @@ def plan(model: SupplyModel | ModelFile | str | Path | None = None, *, preset: s
         file, name = model if isinstance(model, ModelFile) else ModelFile(model), 'model'
     still = throttle is None and model is not None and not (
         file.model.needs_throttle or file.model.load)
-    profile, words, flown = (_unknown, 'none', None) if still else _throttle_of(
+    profile, words, flown = (constant(NAN), 'none', None) if still else _throttle_of(
         usual.throttle if throttle is None else throttle, start, end)
     length = usual.duration if flown is None else float(flown.t[-1] - flown.t[0])
     rate = _positive('--rate', _rate_of(file, usual.rate) if rate is None else rate, 'Hz')
@@ -402,11 +402,6 @@ def plan(model: SupplyModel | ModelFile | str | Path | None = None, *, preset: s
     resistance = _positive('--scale-resistance', resistance, '')
     charge = math.nan if capacity_left == -1.0 else capacity_left
     return Run(file, name, profile, words, flown, duration, rate, seed, charge, resistance)
-
-
-def _unknown(t: FloatArray) -> FloatArray:
-    """Return the throttle of a supply that does not depend on it: it is not written."""
-    return np.full(t.shape, NAN)
 
 
 def _rate_of(file: ModelFile, usual: float) -> float:

@@ -99,7 +99,12 @@ def _read_and_run(args: argparse.Namespace, label: str, function: Callable[..., 
     """Return the recording, and the result of a function of `bench`, with progress bars."""
     recording, _ = read_given(args)
     if getattr(args, 'save_model', None) is not None:
-        _check_load(recording)
+        from ou_monitor.criticism.integrity import examine
+        from ou_monitor.discovery.finding import unsaved_load
+
+        # Refused before the search.
+        if why := unsaved_load(examine(recording).full, recording.has_throttle):
+            raise InputError(_unsaved(why))
     with Progress(label, args.json == output.STDOUT) as progress:
         return recording, function(recording, progress=progress, **given)
 
@@ -107,15 +112,6 @@ def _read_and_run(args: argparse.Namespace, label: str, function: Callable[..., 
 def _command(args: argparse.Namespace, names: Iterable[str]) -> str:
     """Return the command that repeats this one, with some of its options."""
     return shlex.join(['ou-monitor', args.command, args.recording, *repeated(args, *names)])
-
-
-def _check_load(recording: Recording) -> None:
-    """Refuse to save a model of a load that a model file cannot hold, before the search."""
-    from ou_monitor.criticism.integrity import examine
-    from ou_monitor.discovery.finding import unsaved_load
-
-    if why := unsaved_load(examine(recording).full, recording.has_throttle):
-        raise InputError(_unsaved(why))
 
 
 def _unsaved(why: str) -> str:

@@ -176,7 +176,7 @@ def _agreement(recording: Recording, own: Readings, yardstick: Yardstick, simula
         np.ptp(own.throttle) >= MOVES and np.ptp(path) > 0.0))
     pooled = np.mean([m.distribution for m in measured], axis=0)
     responses = np.array([m.response for m in measured])
-    falls = [one.band for one in found if one.kind == 'answer']
+    falls = [band(-one.measured, -one.simulated) for one in found if one.kind == 'answer']
     stride = -(-own.t.size // traces.shape[1])
     low, high = np.percentile(traces, [2.5, 97.5], axis=0)
     empty = np.empty(0)

@@ -118,7 +118,7 @@ class Agreement:
     dips: tuple[Band, ...]  # Dips below each per minute
     spectrum: tuple[SpectrumBand, ...]  # By band of frequency
     line: SpectrumBand | None  # About the strongest spectral line of the recording, if any
-    # Deepest point of the mean response to rises of throttle, and its value 1 s after, V.
+    # Deepest fall of the mean response to rises of throttle, and its value 1 s after, V.
     fall: Band | None
     recovery: Band | None
     rises: int  # Rises of throttle
@@ -138,19 +138,24 @@ class Agreement:
         chance = '' if self.verdict is Likeness.DIFFERS else ', within chance'
         return f'Largest difference{chance}: in the simulation, {self.words}.'
 
+    def rows(self) -> list[tuple[str, str, int, Band]]:
+        """Return all numbers: name, unit, digits and band."""
+        response = [('fall after rises', self.fall), ('fall left after 1 s', self.recovery)]
+        return [('lowest voltage', 'V', 4, self.lowest), ('mean voltage', 'V', 4, self.mean),
+                *((f'dips below {level:.6g} V', '1/min', 3, dips)
+                  for level, dips in zip(self.levels, self.dips)),
+                *((name, 'V', 3, one) for name, one in response if one is not None),
+                ('KS distance', '', 2, self.apart),
+                *((f'rms {number(one.low_hz, 2)} to {number(one.high_hz, 2)} Hz', 'V', 3, one.rms)
+                  for one in self.spectrum),
+                *([] if self.line is None else [
+                    (f'rms at {number(self.line.middle_hz, 4)} Hz (line)', 'V', 3,
+                     self.line.rms)])]
+
     def measures(self) -> list[dict[str, Any]]:
-        """Return all numbers of the recording and of the simulations."""
-        response = [('fall after rises, V', self.fall), ('1 s after rises, V', self.recovery)]
-        bands = [('lowest voltage, V', self.lowest), ('mean voltage, V', self.mean),
-                 *((f'dips below {level:.6g} V, 1/min', dips)
-                   for level, dips in zip(self.levels, self.dips)),
-                 *((name, one) for name, one in response if one is not None),
-                 ('KS distance', self.apart),
-                 *((f'rms {one.low_hz:.3g} to {one.high_hz:.3g} Hz, V', one.rms)
-                   for one in self.spectrum),
-                 *([] if self.line is None else [
-                     (f'line at {self.line.middle_hz:.4g} Hz, V', self.line.rms)])]
-        return [{'measure': name, **one.as_data(), 'inside': one.inside} for name, one in bands]
+        """Return all numbers of the recording and of the simulations, in SI units."""
+        return [{'measure': f'{name}, {unit}'.removesuffix(', '), **one.as_data(),
+                 'inside': one.inside} for name, unit, _, one in self.rows()]
 
     def as_data(self) -> dict[str, Any]:
         """Return the data of `--json`."""

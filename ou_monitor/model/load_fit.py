@@ -76,14 +76,6 @@ class LoadFit:
         return _moved(self.model, np.clip(moved, low, high))
 
     @property
-    def at_bounds(self) -> tuple[str, ...]:
-        """Return the parameters that are at a bound."""
-        low, high, _, deviation = _bounds(self.model)
-        theta = _theta(self.model)
-        edge = np.minimum(theta - low, high - theta) < 1e-3 * deviation
-        return tuple(name for name, there in zip(_NAMES, edge) if there)
-
-    @property
     def resistance(self) -> tuple[float, float, float]:
         """Return resistance, Ohm, and its 95 % interval, statistical only; NaN without current."""
         if not self.model.full_current:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from ou_monitor.analysis.overview import known_lines, Overview
-from ou_monitor.comparison.yardstick import Agreement, Band, LEVEL, Likeness
+from ou_monitor.comparison.yardstick import Agreement, LEVEL, Likeness
 from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text)
 from ou_monitor.report.svg import Plot
@@ -66,23 +66,15 @@ def _answer(found: Agreement) -> list[str]:
 
 def _rows(found: Agreement) -> list[tuple[str, str, str, str]]:
     """Return quantity, measured, simulated with its 95 % band, and a remark."""
-    def row(name: str, of: Band, digits: int, factor: float = 1.0) -> tuple[str, str, str, str]:
-        low, high = sorted((factor * of.low, factor * of.high))
-        return (name, number(factor * of.measured, digits),
-                f'{number(factor * of.median, digits)}\n[{number(low, digits)}, '
-                f'{number(high, digits)}]', '' if of.inside else 'outside')
-
-    out = [row('lowest voltage, V', found.lowest, 4), row('mean voltage, V', found.mean, 4)]
-    out += [row(f'dips below {level:.6g} V, 1/min', dips, 3)
-            for level, dips in zip(found.levels, found.dips)]
-    if found.fall is not None and found.recovery is not None:
-        out += [row(f'fall after {found.rises} rises, mV', found.fall, 3, -1e3),
-                row('fall left after 1 s, mV', found.recovery, 3, -1e3)]
-    out.append(row('KS distance', found.apart, 2))
-    out += [row(f'rms {number(one.low_hz, 2)} to {number(one.high_hz, 2)} Hz, mV', one.rms, 3, 1e3)
-            for one in found.spectrum]
-    return out if found.line is None else [*out, row(
-        f'line at {number(found.line.middle_hz, 4)} Hz, mV rms', found.line.rms, 3, 1e3)]
+    out = []
+    for name, unit, digits, of in found.rows():
+        # Levels in V, differences in mV.
+        factor, unit = (1e3, 'mV') if (unit, digits) == ('V', 3) else (1.0, unit)
+        measured, low, median, high = (
+            number(factor * x, digits) for x in (of.measured, of.low, of.median, of.high))
+        out.append((f'{name}, {unit}'.removesuffix(', '), measured, f'{median}\n[{low}, {high}]',
+                    '' if of.inside else 'outside'))
+    return out
 
 
 def _path(found: Agreement) -> list[tuple[str, str]]:
@@ -114,8 +106,8 @@ def _others(found: Agreement) -> list[Part]:
             at.t, at.throttle, '', 2)))
     beside = []
     if at.response.size:
-        plot = Plot('Mean response to rises of throttle', 'time since the rise, s', 'change, V',
-                    width=450, height=250, legend_row=True)
+        plot = Plot(f'Mean response to {found.rises} rises of throttle', 'time since the rise, s',
+                    'change, V', width=450, height=250, legend_row=True)
         plot.band(at.after, at.response_low, at.response_high, 'simulated, 95 %', _SIMULATED)
         beside.append(Figure(plot.line(at.after, at.response, 'measured', 0, 'thick')))
     plot = Plot('Distribution', 'voltage, V', 'share of time below', width=450, height=250,
