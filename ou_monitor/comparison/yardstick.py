@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from ou_monitor.analysis.noise import dip_begins, noise_of, rise_that_ends
+from ou_monitor.analysis.noise import dip_begins, noise_of, remainder, rise_that_ends
 from ou_monitor.comparison.flight_model import Readings
 from ou_monitor.model.sinusoid import LOBE
 from ou_monitor.model.spectral_lines import find_lines
@@ -214,14 +214,16 @@ class Yardstick:
         low = [float(np.quantile(v, share)) for share in LOW_SHARES]
         self.levels = [*limits, *(between_codes(level, lsb) for level in low)]
         u = np.full(t.size, NAN) if samples.throttle is None else samples.throttle
-        noise = noise_of(Recording(t, v, u, current=samples.current))
-        self._rise = rise_that_ends(v, u, noise)
+        flown = Recording(t, v, u, current=samples.current)
+        left = remainder(flown)
+        self._rise = rise_that_ends(v, u, noise_of(flown, left))
         self._rate = 1.0 / samples.spacing
         self._segment = int(min(v.size, max(64, min(_SEGMENT * self._rate, v.size / 4))))
         lowest, highest = self._rate / self._segment, 0.5 * self._rate
         self.bands = np.geomspace(lowest, highest, _BANDS + 1)
-        # Of the differences, whose spectrum is flatter than that of a voltage under load.
-        found = find_lines([v], self._rate, white=[np.diff(v, prepend=v[0])]).lines
+        # Of what level and load leave; the differences have a flatter spectrum.
+        rest = np.nan_to_num(left.voltage)
+        found = find_lines([rest], self._rate, white=[np.diff(rest, prepend=0.0)]).lines
         self.line = max(found, key=lambda line: line.rms, default=None)
         self.rises = _rise_times(t, samples.throttle)
         self.after = np.linspace(-_BEFORE, _AFTER, _POINTS)
