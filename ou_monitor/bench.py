@@ -55,15 +55,13 @@ def _read(recording: Given) -> Recording:
 
 
 def _limit(recording: Recording, limit: float | None, cells: int) -> tuple[float | None, int]:
-    """Return the limit, V, and its cells: those given, else those of the log's header."""
-    from ou_monitor.analysis.crafts import CELL_LIMIT, check_cells, full_voltage, stated_limit
+    """Return the limit of the pack, V, and its cells: those given, else those of the log."""
+    from ou_monitor.analysis.crafts import check_cells, full_voltage, pack_limit, stated_limit
 
     if cells:
         check_cells(full_voltage(recording), cells)
-    if limit is not None:
-        return limit, cells
-    if cells:
-        return cells * CELL_LIMIT, cells
+    if (given := pack_limit(limit, cells)) is not None:
+        return given, cells
     stated = stated_limit(recording.source)
     return (None, 0) if stated is None else (stated[1], stated[0])
 
@@ -83,11 +81,12 @@ def analyze(recording: Given, *, levels: tuple[float, ...] | None = None, window
     window : float
         Window of the sliding estimate, s.
     brownout_voltage : float, optional
-        Brown-out limit, V; by default from the log's header, else the node's.
+        Brown-out limit, V, with `cells` in volts per cell (then by default 3.3); else by default
+        from the log's header or the node's.
     brownout_horizon : float
         Horizon of the risk, s.
     cells : int
-        Cells in series; without a voltage the limit is 3.3 V per cell.
+        Cells in series; 0: from the log, or a guess.
     progress : callable, optional
         Called with the share done, 0..1.
 
@@ -335,7 +334,7 @@ def discover(recording: Given, *, seed: int = 0, brownout_voltage: float | None 
 
 def design(throttle: float | None = None, *, recording: Given | None = None,
            network: Mapping[str, Any] | PowerNetwork | None = None, rail: str = 'bus',
-           voltage: float | None = None, horizon: float = 5.0, risk: float = 0.01,
+           voltage: float | None = None, cells: int = 0, horizon: float = 5.0, risk: float = 0.01,
            capacitances: tuple[float, float] | None = None, esr_fixed: bool = False) -> Result:
     """
     Find the smallest bulk capacitance that keeps the brown-out risk of a rail below a target.
@@ -352,7 +351,9 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     rail : {'bus', 'regulated'}
         The battery bus at the ESCs, or the regulated rail.
     voltage : float, optional
-        Brown-out level, V; by default 3.3 V per cell on the bus.
+        Brown-out level, V, on the bus with `cells` in volts per cell (by default 3.3).
+    cells : int
+        Cells in series; 0: those of the network, or of the recording.
     horizon : float
         Horizon of the risk, s.
     risk : float
@@ -382,7 +383,9 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     ('FOUND', True)
 
     """
-    from ou_monitor.analysis.crafts import cells_of, check_cells, full_voltage, stated_limit
+    from dataclasses import replace
+    from ou_monitor.analysis.crafts import (
+        cells_of, check_cells, full_voltage, pack_limit, stated_limit)
     from ou_monitor.paper.network import completed, PowerNetwork
     from ou_monitor.paper.design import (
         as_data, CELL_BROWNOUT, default_voltage, design as designed, LEAST, MOST, network_of,
@@ -392,6 +395,10 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     if throttle is not None and not hasattr(throttle, '__float__'):
         raise TypeError(f'the throttle is a number, 0..1, got a {type(throttle).__name__}: pass '
                         'a Recording or a path as recording=')
+    if cells:
+        network = replace(network, cells=cells) if isinstance(network, PowerNetwork) else {
+            **(network or {}), 'cells': cells}
+        voltage = pack_limit(voltage, cells) if voltage and rail == 'bus' else voltage
     taken, facts, error, known, assumed = '', None, 0.0, None, False
     if recording is None:
         if throttle is None:

@@ -28,13 +28,15 @@ CALLS = {
                 lambda: analyze(read_recording(FLIGHT, **PART), brownout_voltage=4.7)),
     'compare': ((FLIGHT, '--to', '4', '--seeds', '20', '--cells', '2', '--brownout-voltage',
                  '2.3'),
-                lambda: compare(read_recording(FLIGHT, **PART), seeds=20, brownout_voltage=4.6,
+                lambda: compare(read_recording(FLIGHT, **PART), seeds=20, brownout_voltage=2.3,
                                 cells=2)),
     'coupling': ((GECKO, '--signal', 'gyro_x_deg_s', '--band', '10,45'),
                  lambda: coupling(GECKO, 'gyro_x_deg_s', band=(10.0, 45.0))),
     'discover': ((FLIGHT, '--to', '4'), lambda: discover(read_recording(FLIGHT, **PART))),
-    'design': (('--throttle', '0.3', '--set', 'cells=4', '--set', 'bulk_capacitance=220uF'),
-               lambda: design(0.3, network={'cells': 4, 'bulk_capacitance': 220e-6})),
+    'design': (('--throttle', '0.3', '--cells', '4', '--brownout-voltage', '3.2', '--set',
+                'bulk_capacitance=220uF'),
+               lambda: design(0.3, network={'bulk_capacitance': 220e-6}, cells=4,
+                              voltage=3.2)),
     'reproduce': (('--seed', '2'), lambda: reproduce(seed=2))}
 
 

@@ -1,14 +1,12 @@
 """The documents name only existing files, links, options and keys, and their examples run."""
 
-import argparse
 import importlib.util
 from pathlib import Path
 import re
 import subprocess
 import sys
 
-from ou_monitor.analysis.crafts import CELL_LIMIT
-from ou_monitor.cli.arguments import brownout_limit
+from ou_monitor.analysis.crafts import CELL_LIMIT, pack_limit
 from ou_monitor.cli.commands import COMMANDS
 from project import metadata, ROOT
 import pytest
@@ -283,8 +281,7 @@ def test_continuous_integration_runs_the_suite():
 def test_the_limit_is_documented_as_it_is():
     text = ' '.join((ROOT / 'doc/commands.md').read_text().split())
     assert f'`--cells N` alone means {CELL_LIMIT:g} V per cell' in text
-    args = argparse.Namespace(brownout_voltage=3.5, cells=4)
-    assert brownout_limit(args) == 14.0 and '`--cells 4 --brownout-voltage 3.5` is 14 V' in text
+    assert pack_limit(3.5, 4) == 14.0 and '`--cells 4 --brownout-voltage 3.5` is 14 V' in text
     for name in ('analyze', 'compare', 'coupling', 'discover', 'fleet'):
         options = [n for one in COMMANDS[name].options if not isinstance(one, tuple)
                    for n in one.names]

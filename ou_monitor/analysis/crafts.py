@@ -35,6 +35,8 @@ _IRON_CELLS, _IRON = (4, 8, 12, 16), (3.2, 3.45)
 # Voltage of an empty lithium cell under load, V (vbat_min_cell_voltage of Betaflight, and the
 # default of design).
 CELL_LIMIT = 3.3
+# Maximum voltage of a cell, V: above any charged lithium cell.
+_CELL_MOST = 5.0
 # The voltage of the full pack is the highest median over this time, s.
 _FULL = 0.5
 
@@ -143,6 +145,17 @@ def check_cells(full: float, cells: int) -> None:
         raise InputError(
             f'--cells {cells}: {full:.4g} V at rest would be {full / cells:.3g} V per cell: it is '
             f'likely {cell_count(full) or round(full / 3.7) or 1} cells (lithium)')
+
+
+def pack_limit(voltage: float | None, cells: int | None) -> float | None:
+    """Return a limit of the pack, V, given in volts per cell if cells are; None if not given."""
+    if not cells:
+        return voltage
+    if voltage is not None and voltage > _CELL_MOST:
+        raise InputError(
+            f'--brownout-voltage: with --cells {cells} it is in volts per cell, and no cell has '
+            f'{voltage:g} V: write {voltage / cells:.3g}, or leave --cells out')
+    return float(cells * (CELL_LIMIT if voltage is None else voltage))
 
 
 def cells_of(recording: Recording, given: int = 0) -> tuple[int, str]:

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from ou_monitor.recordings.importers.log import CsvColumns, Series
     from ou_monitor.records import Recording
 
-# Maximum voltage of a cell, V: above any charged lithium cell.
-_CELL_MOST = 5.0
 # Fields of `CsvColumns`, and the options that give them.
 _COLUMNS = {'time': 'time_column', 'voltage': 'voltage_column', 'throttle': 'throttle_column',
             'current': 'current_column', **{name: name for name in (
@@ -78,23 +76,6 @@ def repeated(args: argparse.Namespace, *names: str) -> list[str]:
 
 def _word(value: object) -> str:
     return f'{value:.15g}' if isinstance(value, float) else str(value)
-
-
-def brownout_limit(args: argparse.Namespace) -> float | None:
-    """Return the limit of ``--brownout-voltage`` and ``--cells``, V; None if not given."""
-    # It imports SciPy, which not every command needs.
-    from ou_monitor.analysis.crafts import CELL_LIMIT
-
-    if args.brownout_voltage is None:
-        return None if args.cells is None else args.cells * CELL_LIMIT
-    voltage: float = args.brownout_voltage
-    if args.cells is None:
-        return voltage
-    if voltage > _CELL_MOST:
-        raise InputError(
-            f'--brownout-voltage: with --cells {args.cells} it is in volts per cell, and no cell '
-            f'has {voltage:g} V: write {voltage / args.cells:.3g}, or leave --cells out')
-    return float(args.cells * voltage)
 
 
 def check_ranges(given: Mapping[str, Any]) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from ou_monitor.bench import design
 from ou_monitor.cli import output
-from ou_monitor.cli.arguments import brownout_limit, check_outputs, read_given
+from ou_monitor.cli.arguments import check_outputs, read_given
 from ou_monitor.cli.commands import quantity
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.paper.network import PowerNetwork, UNITS
@@ -50,16 +50,13 @@ def run(args: argparse.Namespace) -> int:
         name = component(name.strip(), '--set')
         values[name] = value_of(f'--set {name}', name, text)
 
-    if args.cells is not None:
-        values['cells'] = args.cells
-    voltage = brownout_limit(args) if args.rail == 'bus' and args.brownout_voltage else (
-        args.brownout_voltage)
     recording = None if args.recording is None else read_given(args)[0]
     try:
         found = design(
             args.throttle, recording=recording, network=values, rail=args.rail,
-            voltage=voltage, horizon=args.brownout_horizon, risk=args.risk,
-            capacitances=(args.capacitance_min, args.capacitance_max), esr_fixed=args.esr_fixed)
+            voltage=args.brownout_voltage, cells=args.cells or 0, horizon=args.brownout_horizon,
+            risk=args.risk, capacitances=(args.capacitance_min, args.capacitance_max),
+            esr_fixed=args.esr_fixed)
     except ValueError as error:
         raise InputError(str(error)) from error
     output.deliver(args, found)

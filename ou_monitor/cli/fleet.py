@@ -13,7 +13,7 @@ from typing import Any, TYPE_CHECKING
 
 from ou_monitor import __version__
 from ou_monitor.cli import output
-from ou_monitor.cli.arguments import brownout_limit, check_ranges, columns_given, repeated
+from ou_monitor.cli.arguments import check_ranges, columns_given, repeated
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import how_to_install, InputError
 
@@ -115,6 +115,7 @@ def command_line(args: argparse.Namespace) -> str:
 
 def _options(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
     """Return the options of the work, with the content of the file they name."""
+    from ou_monitor.analysis.crafts import pack_limit
     from ou_monitor.fleet.analysis import Options
 
     config, more = args.msg_config, {}
@@ -130,7 +131,7 @@ def _options(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
                                  ) from error
         from ou_monitor.stream.config import load_msg_config
         load_msg_config(config)
-    limit = brownout_limit(args)
+    limit = pack_limit(args.brownout_voltage, args.cells)
     check_ranges({'window': args.window, 'brownout_voltage': limit,
                   'brownout_horizon': args.brownout_horizon})
     return Options(

@@ -12,8 +12,7 @@ from typing import Any, TYPE_CHECKING
 
 from ou_monitor import __version__, bench
 from ou_monitor.cli import output
-from ou_monitor.cli.arguments import (
-    brownout_limit, check_outputs, check_ranges, read_given, repeated)
+from ou_monitor.cli.arguments import check_outputs, check_ranges, read_given, repeated
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
 
@@ -89,9 +88,11 @@ def _bench_arguments(args: argparse.Namespace, *names: str) -> dict[str, Any]:
                   RECORDING=args.recording, **{
                       '--msg-config': args.msg_config, '--model': getattr(args, 'model', None)})
     given = {name: getattr(args, name) for name in names}
-    given.update(brownout_voltage=brownout_limit(args), cells=args.cells or 0)
-    check_ranges(given)
-    return given
+    # It imports SciPy, which not every command needs.
+    from ou_monitor.analysis.crafts import pack_limit
+
+    check_ranges({**given, 'brownout_voltage': pack_limit(args.brownout_voltage, args.cells)})
+    return {**given, 'brownout_voltage': args.brownout_voltage, 'cells': args.cells or 0}
 
 
 def _read_and_run(args: argparse.Namespace, label: str, function: Callable[..., Result],

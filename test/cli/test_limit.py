@@ -1,8 +1,6 @@
 """The voltage limit, given for the pack or per cell."""
 
-from argparse import Namespace
-
-from ou_monitor.cli.arguments import brownout_limit
+from ou_monitor.analysis.crafts import pack_limit
 from ou_monitor.cli.main import main
 from ou_monitor.errors import InputError
 import pytest
@@ -13,13 +11,13 @@ import pytest
     (4.5, None, 4.5)])
 def test_with_cells_the_limit_is_volts_per_cell(voltage, cells, limit):
     """Without, of the whole; cells alone have a limit of their own."""
-    found = brownout_limit(Namespace(brownout_voltage=voltage, cells=cells))
+    found = pack_limit(voltage, cells)
     assert found == (None if limit is None else pytest.approx(limit, rel=1e-12))
 
 
 def test_volts_of_the_pack_beside_cells_are_refused():
     with pytest.raises(InputError, match='no cell has 14 V: write 3.5, or leave --cells out'):
-        brownout_limit(Namespace(brownout_voltage=14.0, cells=4))
+        pack_limit(14.0, 4)
 
 
 @pytest.mark.parametrize('cells', ['0', '-1', '2.5', 'four', '99'])
