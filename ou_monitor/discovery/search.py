@@ -87,8 +87,8 @@ def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
         if decision.is_latent(catalogue()[best.name]):
             search.before_accepted[best.name] = criticise(fitter.samples, search.composite, bank)
         _accept(search, best, trials)
-        if catalogue()[best.name].ROLE is Role.LAW:
-            # Outliers have hidden smaller effects so far.
+        if catalogue()[best.name].ROLE is Role.LAW or catalogue()[best.name].FAMILY == 'line':
+            # Outliers and lines have hidden smaller effects so far.
             fitter.failed.clear()
         if best.composite.gaussian.cost < _SOON:
             choose_response(fitter, search, ())

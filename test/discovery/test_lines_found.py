@@ -16,7 +16,9 @@ from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.lines import prominence
 from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
+from ou_monitor.model.terms.reading import MeasurementNoise
 from ou_monitor.model.terms.shocks import HeavyTails
+from ou_monitor.model.terms.slow import SecondRelaxation
 from ou_monitor.model.terms.tones import Resonance, Tone
 from ou_monitor.records import NAN, Recording
 from project import needs_recordings, REAL, recorded
@@ -122,3 +124,22 @@ def test_a_peak_is_measured_in_standard_errors_of_its_neighbours():
     power[0] = 0.0
     z = np.fft.irfft(np.sqrt(power) * np.exp(1j * np.arange(51.0)))
     assert prominence(z, float(z.size), 21.0, 4.0) == pytest.approx(math.sqrt(10.0))
+
+
+def test_white_noise_that_a_line_hid_is_no_second_relaxation():
+    """Tried before the line, in vain, it was never tried again: a relaxation within a step won."""
+    rng, t = np.random.default_rng(404), np.arange(40000) / 2000.0
+    v = SupplyModel((OU(120.0, 0.35, 12.03), Tone(0.008, 317.0, 0.3, 0.0), MeasurementNoise(0.003)
+                     )).simulate(t, rng)
+    found = {cause.name: cause.term for cause in discover(Recording(t, v)).causes}
+    assert set(found) == {'tone', 'measurement_noise'}
+    assert abs(found['measurement_noise'].std - 0.003) < 3e-4
+
+
+@pytest.mark.parametrize('alpha, relaxes', [(0.05, False), (10.0, True), (200.0, False)])
+def test_a_relaxation_is_seen_neither_within_a_step_nor_beyond_the_end(alpha, relaxes):
+    """The recording lasts 40 s, a step 20 ms."""
+    samples = Samples(T, voltage(), None)
+    gaussian = evaluate(samples, (RAIL,))
+    whole = Composite((RAIL,), ({},), gaussian, gaussian.z, gaussian.density, 3, 0.0)
+    assert SecondRelaxation(alpha, 0.1).holds(Fitter(samples).view(whole)) is relaxes

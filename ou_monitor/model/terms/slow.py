@@ -50,7 +50,8 @@ class Drift(Term):
         return cls(0.0, 0.0), cls(0.0, NEXT_TO_ZERO)
 
 
-# Minimum number of relaxation times in a recording.
+# Minimum number of relaxation times in a recording, and maximum in a step: with more, 5 % of the
+# noise at most reaches the next sample, which white noise explains.
 _LEAST = 3.0
 
 
@@ -103,8 +104,8 @@ class SecondRelaxation(Term):
         return [*found, cls(6.0 * rate, 0.3 * spread * math.sqrt(12.0 * rate))]
 
     def holds(self, view: View) -> bool:
-        """Return whether it relaxes within the recording; otherwise it is a trend."""
-        return self.alpha * float(view.at[-1]) > _LEAST
+        """Return whether it relaxes within the recording, but not within a step."""
+        return _LEAST / float(view.at[-1]) < self.alpha < _LEAST * view.rate
 
     def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return its one state."""
