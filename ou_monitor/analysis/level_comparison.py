@@ -154,9 +154,11 @@ class SigmaChange:
     ratio_high: float
 
     @property
-    def differs(self) -> bool:
-        """Whether sigma is not the same, at `LEVEL`."""
-        return not self.ratio_low <= 1.0 <= self.ratio_high
+    def differs(self) -> bool | None:
+        """Whether sigma is not the same, at `LEVEL`; None if it may have changed by `NARROW`."""
+        if not self.ratio_low <= 1.0 <= self.ratio_high:
+            return True
+        return False if self.ratio_low * NARROW > 1.0 and self.ratio_high < NARROW else None
 
 
 def sigma_change(low: Estimate, high: Estimate, others: Sequence[Estimate] = ()) -> SigmaChange:

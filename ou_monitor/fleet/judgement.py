@@ -463,6 +463,11 @@ class Judgement:
         """Return the trends that are significant at the family rate."""
         return tuple(t for t in self.trends if t.p_family <= DRIFT_RATE)
 
+    @property
+    def possible(self) -> tuple[Trend, ...]:
+        """Return the trends whose own 95 % interval excludes 0, but that may be by chance."""
+        return tuple(t for t in self.trends if t.p_family > DRIFT_RATE and t.low * t.high > 0.0)
+
     def odd_recordings(self) -> list[tuple[str, int]]:
         """Return (quantity, index) of the outlying recordings, largest score first."""
         return _largest_first(self.recordings)

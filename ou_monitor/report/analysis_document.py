@@ -9,7 +9,7 @@ import math
 import numpy as np
 from ou_monitor.analysis.analyze import Analysis
 from ou_monitor.analysis.crafts import CELL_LIMIT, craft_advice, craft_line
-from ou_monitor.analysis.level_comparison import sigma_change
+from ou_monitor.analysis.level_comparison import NARROW, sigma_change
 from ou_monitor.analysis.level_result import LevelResult
 from ou_monitor.analysis.noise import BAND
 from ou_monitor.analysis.overview import answers, determined, known_lines
@@ -163,14 +163,21 @@ def _origin(analysis: Analysis) -> list[tuple[str, str]]:
 
 
 def _numbers(analysis: Analysis) -> list[str]:
-    ou = analysis.overview.whole or analysis.overview.facts.ou
+    whole, recording = analysis.overview.whole, analysis.recording
+    ou = whole or analysis.overview.facts.ou
     if ou.status != 'ok':
         return []
     low, high = ou.alpha_95
-    found = [f'The noise (level and response to load removed) has sigma = {number(ou.sigma)} '
-             f'(95 % {number(ou.sigma_95[0])} to {number(ou.sigma_95[1])}) V/sqrt(s), relaxes in '
-             f'tau = {number(1e3 / ou.alpha)} (95 % {number(1e3 / high)} to {number(1e3 / low)}) '
-             f'ms, and has a standard deviation of {number(1e3 * math.sqrt(ou.var_inf))} mV.']
+    held = recording.throttle[recording.t >= recording.t[-1] - ou.window_s]
+    held = 100.0 * held[np.isfinite(held)]
+    # All but a few readings in between.
+    flown = dict.fromkeys(f'{x:.0f}' for x in np.quantile(held, (0.05, 0.95))) if held.size else ()
+    at = f' at {" to ".join(flown)} % throttle' if flown else ''
+    found = [f'The noise of {"all" if whole else "the last"} {number(ou.window_s)} s{at} (level '
+             f'and response to load removed) has sigma = {number(ou.sigma)} (95 % '
+             f'{number(ou.sigma_95[0])} to {number(ou.sigma_95[1])}) V/sqrt(s), relaxes in tau = '
+             f'{number(1e3 / ou.alpha)} (95 % {number(1e3 / high)} to {number(1e3 / low)}) ms, '
+             f'and has a standard deviation of {number(1e3 * math.sqrt(ou.var_inf))} mV.']
     steady = [level.estimate for level in analysis.levels if level.estimate.usable]
     differing = []
     if steady and all(e.interval('sigma')[1] < ou.sigma_95[0] for e in steady):
@@ -198,10 +205,11 @@ def _change(analysis: Analysis) -> list[str]:
     found = sigma_change(low.estimate, high.estimate, [level.estimate for level in good[1:-1]])
     if math.isnan(found.ratio):
         return []
-    verb = 'does not change measurably' if not found.differs else (
-        'grows' if found.ratio_low > 1.0 else 'falls')
-    return [f'Sigma {verb} from {low.label} to {high.label} throttle (factor '
-            f'{number(found.ratio)}, 95 % {number(found.ratio_low)} to '
+    where = f'from {low.label} to {high.label} throttle'
+    start = f'Whether sigma changes {where} is unknown' if found.differs is None else (
+        f'Sigma grows {where}' if found.ratio_low > 1.0 else f'Sigma falls {where}'
+        if found.differs else f'Sigma is the same {where} within a factor of {NARROW:g}')
+    return [f'{start} (factor {number(found.ratio)}, 95 % {number(found.ratio_low)} to '
             f'{number(found.ratio_high)}).']
 
 

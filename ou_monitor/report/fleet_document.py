@@ -51,7 +51,7 @@ LOWEST_HEADS = ('vehicle', 'recording', 'lowest, V', 'at, s', 'dips', 'below, s'
 def fleet_document(fleet: Fleet, command: str = '') -> Document:
     """Return the report of a fleet."""
     rows = worst(fleet)
-    odd = finding_words(fleet)
+    odd, possible = finding_words(fleet), fleet.judgement.possible
     vehicles = vehicle_table(fleet)
     copies = [f"{_prefix(row)}{row['path']} is {row['duplicate_of']}" for row in fleet.duplicates]
     subject = (f'{counted(fleet.recordings, "recording")}, '
@@ -63,8 +63,11 @@ def fleet_document(fleet: Fleet, command: str = '') -> Document:
         Section('What stands out', [
             Notes.of(odd[:_SENTENCES], Severity.WARNING, _SHOWN),
             *([Text(f'and {len(odd) - _SENTENCES} more: --json lists all.')]
-              if len(odd) > _SENTENCES else [])] if odd else [
-                  Text('Nothing, at the false-alarm rates stated below.')]),
+              if len(odd) > _SENTENCES else []),
+            *([] if odd else [Text('Nothing for certain, at the false-alarm rates stated below.'
+                                   if possible else
+                                   'Nothing, at the false-alarm rates stated below.')]),
+            Notes.of([trend_words(trend) for trend in possible], most=_SHOWN)]),
         Section('Packs: resistance and sag', _packs(fleet)),
         Section('Lowest voltages', [lowest_table(fleet)]),
         Section('Not analysed: the next run tries them again', [
@@ -97,7 +100,8 @@ def _ageing(fleet: Fleet) -> str:
     if not any(judged.values[name].value.size for name in OF_PACK):
         return ''
     tested = [t for t in judged.trends if t.quantity in OF_PACK]
-    old = [t for t in tested if t.p_family <= DRIFT_RATE and t.slope > 0.0]
+    certain = [t for t in tested if t.p_family <= DRIFT_RATE and t.slope > 0.0]
+    old = certain or [t for t in tested if t.low > 0.0]
     if old:
         words = [f'{vehicle}{_flights_of_pack(fleet, [t for t in old if t.vehicle == vehicle])}: '
                  + ', '.join(_growth(judged, t) for t in old if t.vehicle == vehicle)
@@ -105,8 +109,10 @@ def _ageing(fleet: Fleet) -> str:
         more = f'; and {len(words) - _OLD} more' if len(words) > _OLD else ''
         likely = {t.vehicle for t in tested if t.low > 0.0} - {t.vehicle for t in old}
         also = f'; the 95 % interval of {len(likely)} more lies above 0, too' if likely else ''
-        return (f'Ageing pack{"s" * (len(words) > 1)} ({len(words)} of '
-                f'{len({t.vehicle for t in tested})}{also}): {"; ".join(words[:_OLD])}{more}.')
+        doubt = '' if certain else f'; not certain among {counted(len(judged.trends), "test")}'
+        return (f'{"A" if certain else "Possibly a"}geing pack{"s" * (len(words) > 1)} '
+                f'({len(words)} of {len({t.vehicle for t in tested})}{also}): '
+                f'{"; ".join(words[:_OLD])}{more}{doubt}.')
     if not tested:
         return (f'Whether a pack ages is unknown: no vehicle has {LEAST_FLIGHTS} flights with a '
                 'known resistance or sag.')
@@ -169,7 +175,8 @@ def _anomalies(fleet: Fleet) -> str:
     if not parts:
         tested = judged.trends or any(o.compared for o in (
             *judged.recordings.values(), *[v.outliers for v in judged.vehicles.values()]))
-        parts.append('Nothing stands out.' if tested else
+        parts.append('Nothing stands out for certain.' if judged.possible else
+                     'Nothing stands out.' if tested else
                      'There are too few recordings per vehicle to tell what stands out.')
     return ' '.join(parts)
 

@@ -8,7 +8,7 @@ from ou_monitor.analysis.level_result import fit_all
 from ou_monitor.analysis.levels import LoadLevel
 from ou_monitor.analysis.noise import remainder
 from ou_monitor.analysis.analyze import analyze
-from ou_monitor.analysis.level_comparison import alpha_constancy, sigma_change
+from ou_monitor.analysis.level_comparison import alpha_constancy, SigmaChange, sigma_change
 from ou_monitor.records import Estimate, Status
 import pytest
 from scipy import stats
@@ -126,6 +126,13 @@ def test_a_tone_is_not_taken_for_another_alpha():
         assert analysis.alpha_test.levels == 2
 
 
+def test_a_sigma_that_may_have_changed_is_not_the_same():
+    """Three cases: another sigma, the same within the factor that matters, and either."""
+    assert [SigmaChange(math.sqrt(low * high), low, high).differs for low, high in (
+        (1.1, 5.0), (0.2, 0.9), (0.8, 1.3), (0.812, 54.8), (0.3, 1.1))] == [
+            True, True, False, None, None]
+
+
 def test_scatter_between_levels_is_no_growth_of_sigma():
     """Levels with a scatter of 0.3 in ln sigma, known to 2 % each, beside a growth by 8."""
     # Of 400 drawings 8.5 % differ without growth (the scatter has 6 degrees of freedom) and 99 %
@@ -136,5 +143,5 @@ def test_scatter_between_levels_is_no_growth_of_sigma():
             levels = [replace(
                 estimate(60.0, 0.1), throttle=x, sigma_se=0.02,
                 sigma=math.exp(grows * x + 0.3 * z)) for x, z in zip(u, rng.standard_normal(8))]
-            found.append(sigma_change(levels[0], levels[-1], levels[1:-1]).differs)
+            found.append(sigma_change(levels[0], levels[-1], levels[1:-1]).differs is True)
     assert np.mean(found[:200]) < 0.145 and np.mean(found[200:]) > 0.96

@@ -8,8 +8,8 @@ from ou_monitor.fleet.fleet import Fleet
 from ou_monitor.fleet.judgement import judge
 from ou_monitor.fleet.table import NAMES
 from ou_monitor.report.fleet_document import (
-    as_data, facts, finding_words, fleet_document, lowest_table, pack_table, short_names,
-    vehicle_table, worst)
+    answer, as_data, change, facts, finding_words, fleet_document, lowest_table, pack_table,
+    short_names, trend_words, vehicle_table, worst)
 from ou_monitor.report.page import html
 import pytest
 from simulated_fleets import table
@@ -52,6 +52,18 @@ def test_the_page_tells_what_stands_out(odd):
     for words in ('Drift over the flights: <b>uav2</b> & co.', 'rest of the fleet: uav4.',
                   'other flights of their vehicle: 1 recording.'):
         assert words in fleet_document(odd).headline
+
+
+def test_an_interval_without_zero_is_never_nothing():
+    """Three packs with four flights: one may age, but not for certain among all tests."""
+    few = fleet(table(np.random.default_rng(4), 3, 4, ageing={1: 0.08}))
+    assert not few.judgement.drifting and {t.vehicle for t in few.judgement.possible} == {'uav1'}
+    first = answer(few)[0]
+    for trend in few.judgement.possible:
+        assert f'{trend.quantity} {change(trend.slope)}' in first and trend_words(
+            trend) in page_text(few)
+    assert 'uav1' in first and 'not certain among 12 tests' in first
+    assert 'Nothing stands out.' not in fleet_document(few).headline
 
 
 def test_stars_mark_significant_values_only(odd):
