@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ou_monitor.model.supply import SupplyModel
     from ou_monitor.paper.design import Flight, FlownRisk
     from ou_monitor.paper.network import PowerNetwork
-    from ou_monitor.recordings.importers.log import Series
+    from ou_monitor.recordings.importers.log import CsvColumns, Series
     from ou_monitor.recordings.model_file import ModelFile
     from ou_monitor.simulation import Profile, Run
 
@@ -515,7 +515,8 @@ def simulate(model: SupplyModel | ModelFile | str | Path | None = None, *,
              start: float | None = None, end: float | None = None, duration: float | None = None,
              rate: float | None = None, seed: int = 1, capacity_left: float | None = None,
              scale_resistance: float = 1.0, output: str | Path | None = None,
-             message: str | None = None, progress: Progress | None = None) -> Result:
+             message: str | None = None, columns: CsvColumns | None = None,
+             progress: Progress | None = None) -> Result:
     """
     Simulate a recording of a supply, exact in distribution at any rate.
 
@@ -545,6 +546,8 @@ def simulate(model: SupplyModel | ModelFile | str | Path | None = None, *,
         Bag to write, piece by piece; without it, samples are simulated on demand.
     message : str, optional
         Message of the voltage in the bag.
+    columns : CsvColumns, optional
+        As for `read_recording`, of the file that `throttle` names.
     progress : callable, optional
         Called with the share of the bag written, 0..1.
 
@@ -571,7 +574,8 @@ def simulate(model: SupplyModel | ModelFile | str | Path | None = None, *,
     from ou_monitor.simulation import plan
 
     run = plan(model, preset=preset, throttle=throttle, start=start, end=end, duration=duration,
-               rate=rate, seed=seed, capacity_left=capacity_left, resistance=scale_resistance)
+               rate=rate, seed=seed, capacity_left=capacity_left, resistance=scale_resistance,
+               columns=columns)
     written: dict[str, Any] = {}
     if output is not None:
         def pieces() -> Iterator[Recording]:

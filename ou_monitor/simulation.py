@@ -23,12 +23,12 @@ from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import MeasurementNoise, Quantization
 from ou_monitor.model.terms.slow import Drift
-from ou_monitor.recordings.importers.csv_form import (
-    form_of, numbers, THROTTLE, TIME, VOLTAGE)
+from ou_monitor.recordings.importers.csv_table import holds_supply, read_throttle_alone
+from ou_monitor.recordings.importers.formats import is_csv
 from ou_monitor.recordings.importers.log import CsvColumns
 from ou_monitor.recordings.model_file import ModelFile, read_model
 from ou_monitor.recordings.read import read_recording
-from ou_monitor.records import FloatArray, NAN, Recording
+from ou_monitor.records import clock_unit, FloatArray, NAN, Recording
 from ou_monitor.text import plain_number, printable
 
 # Stamps (s) -> throttle 0..1.
@@ -92,12 +92,12 @@ PROFILES: dict[str, tuple[Profile, str]] = {
 }
 
 
-def read_profile(text: str) -> Profile:
-    """Return the profile that a user asks for."""
+def read_profile(text: str, columns: CsvColumns | None = None) -> Profile:
+    """Return the profile that a user asks for; columns: of a CSV."""
     if text in PROFILES:
         return PROFILES[text][0]
-    if text.lower().endswith('.csv'):
-        return _from_csv(Path(text))
+    if text.lower().endswith('.csv') or Path(text).is_file():
+        return _from_csv(Path(text), columns)
     try:
         number = plain_number(text)
     except ValueError:
@@ -139,14 +139,12 @@ def _check_throttle(value: float, where: str) -> None:
         raise InputError(f'{where}: throttle must be a number 0..1, got {value:g}')
 
 
-def _from_csv(path: Path) -> Profile:
-    form = form_of(path, CsvColumns())
-    if not {TIME, THROTTLE} <= set(form.names):
-        raise InputError(f'{path} needs the columns {TIME} and {THROTTLE}, it has: '
-                         f"{', '.join(form.names)}")
-    t, throttle = numbers(path, form, [form.names.index(name) for name in (TIME, THROTTLE)])
+def _from_csv(path: Path, columns: CsvColumns | None) -> Profile:
+    t, throttle = read_throttle_alone(path, columns)
     if not t.size:
         raise InputError(f'{path} holds no row')
+    # Dates count from the first one.
+    t = t - (t[0] if clock_unit(t[0]) else 0.0)
     return through(_checked(list(zip(t.tolist(), throttle.tolist())), str(path)))
 
 
@@ -160,31 +158,28 @@ class RecordedThrottle:
     recording: Recording  # The part
 
 
-def is_recording(text: str) -> bool:
-    """Return whether the text for a throttle is the path of a recording."""
+def is_recording(text: str, columns: CsvColumns | None = None) -> bool:
+    """Return whether the text for a throttle is the path of a recording; columns: of a CSV."""
     path = Path(text)
     if text in PROFILES or not path.exists():
         return False
-    if path.suffix.lower() != '.csv':
-        return True
-    try:
-        # A file without voltage is a profile: times from 0 s, linear between.
-        return VOLTAGE in form_of(path, CsvColumns()).names
-    except InputError:
-        return False
+    # A table without voltage is a profile: times from 0 s, linear between.
+    table = path.suffix.lower() == '.csv' or is_csv(path)
+    return not table or holds_supply(path, columns)
 
 
-def read_throttle(text: str, start: float | None = None, end: float | None = None
-                  ) -> RecordedThrottle:
+def read_throttle(text: str, start: float | None = None, end: float | None = None,
+                  columns: CsvColumns | None = None) -> RecordedThrottle:
     """Return the throttle of a recording from start to end, s after its first sample."""
-    return recorded_throttle(read_recording(text, start=start, end=end), text)
+    return recorded_throttle(read_recording(text, start=start, end=end, columns=columns), text)
 
 
 def recorded_throttle(recording: Recording, name: str) -> RecordedThrottle:
     """Return the throttle of a recording (name: for error messages)."""
     known = np.isfinite(recording.throttle)
     if not known.any():
-        raise InputError(f"--throttle '{name}': the recording has no throttle")
+        raise InputError(f"--throttle '{name}': the recording has no throttle: name its column or "
+                         'series with --throttle-column')
     t, u = recording.t[known] - recording.t[0], recording.throttle[known]
     # The reader has refused percent and pulses; calibrated sticks may slightly exceed 0..1.
     return RecordedThrottle(partial(_held, t, np.clip(u, 0.0, 1.0)),
@@ -370,7 +365,8 @@ class Run:
 def plan(model: SupplyModel | ModelFile | str | Path | None = None, *, preset: str | None = None,
          throttle: Any = None, start: float | None = None, end: float | None = None,
          duration: float | None = None, rate: float | None = None, seed: int = 1,
-         capacity_left: float | None = None, resistance: float = 1.0) -> Run:
+         capacity_left: float | None = None, resistance: float = 1.0,
+         columns: CsvColumns | None = None) -> Run:
     """Return the run that the arguments of `ou_monitor.simulate` describe."""
     name = 'flight' if preset is None else preset
     if name not in PRESETS:
@@ -385,7 +381,7 @@ def plan(model: SupplyModel | ModelFile | str | Path | None = None, *, preset: s
     still = throttle is None and model is not None and not (
         file.model.needs_throttle or file.model.load)
     profile, words, flown = (constant(NAN), 'none', None) if still else _throttle_of(
-        usual.throttle if throttle is None else throttle, start, end)
+        usual.throttle if throttle is None else throttle, start, end, columns)
     length = usual.duration if flown is None else float(flown.t[-1] - flown.t[0])
     rate = _positive('--rate', _rate_of(file, usual.rate) if rate is None else rate, 'Hz')
     duration = _positive('--duration', length if duration is None else duration, 's')
@@ -411,20 +407,20 @@ def _rate_of(file: ModelFile, usual: float) -> float:
 
 
 def _throttle_of(throttle: Any, start: float | None, end: float | None,
-                 ) -> tuple[Profile, str, Recording | None]:
+                 columns: CsvColumns | None) -> tuple[Profile, str, Recording | None]:
     """Return the profile of a throttle, its name, and the recording that it is from."""
     if isinstance(throttle, Recording):
         return recorded_throttle(throttle, throttle.name).profile, throttle.name, throttle
     if callable(throttle):
         return throttle, 'given', None
     words = str(throttle)
-    if is_recording(words):
-        found = read_throttle(words, start, end)
+    if is_recording(words, columns):
+        found = read_throttle(words, start, end, columns)
         return found.profile, words, found.recording
     if start is not None or end is not None:
         raise InputError('--from and --to take a part of a recorded throttle: give --throttle '
                          'RECORDING')
-    return read_profile(words), words, None
+    return read_profile(words, columns), words, None
 
 
 def _positive(name: str, value: float, unit: str) -> float:

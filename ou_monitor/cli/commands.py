@@ -459,9 +459,9 @@ _SIMULATE = Command(
             help="samples per second (default: the preset's, or of the model's recording)"),
      seed(1, 'same seed, same recording'),
      Option('--throttle', metavar='PROFILE',
-            help='name of a profile, a number 0..1, points T:U,T:U,..., a CSV file with time_s '
-            'and throttle, or a recording, whose length is then the default'),
-     *PART,
+            help='name of a profile, a number 0..1, points T:U,T:U,..., a CSV of time and '
+            'throttle, or a recording, whose length is then the default'),
+     *PART, *COLUMNS,
      Option('--capacity-left', metavar='X', type=NUMBER,
             help='initial charge, 0..1, which throttle discharges, in place of drift; -1: '
             "the charge at the start of the model's recording"),

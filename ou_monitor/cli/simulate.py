@@ -7,7 +7,7 @@ import sys
 
 from ou_monitor.bench import simulate
 from ou_monitor.cli import output
-from ou_monitor.cli.arguments import part_of_recording
+from ou_monitor.cli.arguments import columns_given, part_of_recording
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.model_file import as_yaml
@@ -36,7 +36,8 @@ def run(args: argparse.Namespace) -> int:
         return 0
     # A profile's name or number is not an input file, so no output can overwrite it.
     start, end = part_of_recording(args)
-    recorded = args.throttle is not None and is_recording(args.throttle)
+    columns = columns_given(args)
+    recorded = args.throttle is not None and is_recording(args.throttle, columns)
     table = args.throttle if recorded or str(args.throttle).lower().endswith('.csv') else None
     output.check_paths(
         {'--model': args.model, '--throttle': table},
@@ -53,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
             args.model, preset=args.preset, throttle=args.throttle, start=start, end=end,
             duration=args.duration, rate=args.rate, seed=args.seed,
             capacity_left=args.capacity_left, scale_resistance=args.scale_resistance,
-            output=target, message=args.type, progress=progress)
+            output=target, message=args.type, columns=columns, progress=progress)
     if args.export is not None:
         _export(args, found.record)
         return 0

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from ou_monitor.errors import InputError
+from ou_monitor.recordings.importers.log import CsvColumns
 from ou_monitor.simulation import constant, is_recording, PROFILES, read_profile, through
 import pytest
 
@@ -96,6 +97,11 @@ def test_a_csv_is_a_profile(tmp_path):
     path.write_text('throttle,x,time_s\n0.0,9,0\n0.5,9,1\n0.5,9,2\n0.1,9,2\n')
     assert at(read_profile(str(path)), 0.0, 0.5, 1.5, 2.0, 50.0) == pytest.approx(
         [0.0, 0.25, 0.5, 0.1, 0.1])
+    path.write_text('t_ms;gas_percent\n0;0,0\n1000;50,0\n', encoding='utf-8')
+    assert at(read_profile(str(path)), 0.5, 2.0) == pytest.approx([0.25, 0.5])
+    named = CsvColumns(time='t_ms', throttle='x', throttle_unit='%')
+    path.write_text('t_ms;x\n0;0,0\n1000;50,0\n', encoding='utf-8')
+    assert at(read_profile(str(path), named), 0.5, 2.0) == pytest.approx([0.25, 0.5])
     one = tmp_path / 'one.csv'
     one.write_text('time_s,throttle\n0,0.7\n')
     assert at(read_profile(str(one)), 0.0, 10.0) == [0.7, 0.7]
@@ -117,15 +123,15 @@ def test_a_wrong_profile_is_named_in_one_line(text, words):
 
 @pytest.mark.parametrize('content, words', [
     (b'', 'empty'), (b'\n\n', 'empty'), (b'time_s,throttle\n', 'no row'),
-    (b'time_s,thrust\n0,0\n', 'it has: time_s, thrust'),
-    (b'0,0.1\n1,0.2\n', 'time_s and throttle'),
+    (b'time_s,x\n0,0\n', 'valid: time_s, x (--throttle-column)'),
+    (b'0,0.1,5\n1,0.2,3\n', "no column 'throttle'"),
     (b'time_s,throttle\n0,0.1\n1,x\n', 'throttle must be a number 0..1'),
     (b'time_s,throttle\n0,0.1\nx,0.1\n', 'times'),
-    (b'time_s,throttle\n0,0.1\n1,40\n', 'got 40'),
+    (b'time_s,throttle\n0,0.1\n1,400\n', 'got 400'),
     (b'time_s,throttle\n1,0.1\n0,0.1\n', 'must not fall'),
     (b'time_s,throttle\n0,0.1\n1,1_0\n', ":3: column 'throttle' holds '1_0'"),
     (b'time_s,throttle\n0,0.1\n1,0.1,5\n', ':3: 3 cells'),
-    (b'\xff\xfe\x00time', 'time_s and throttle'), (b'# nothing\n', 'stick.csv'),
+    (b'\xff\xfe\x00time', "no column 'time_s'"), (b'# nothing\n', 'stick.csv'),
     (None, 'cannot read'),
 ])
 def test_a_wrong_profile_csv_is_named_in_one_line(tmp_path, content, words):

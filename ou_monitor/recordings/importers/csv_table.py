@@ -217,14 +217,23 @@ def read_column(path: Path, name: str, columns: CsvColumns | None = None,
     return table.t, table.named[name]
 
 
-def holds_supply(path: Path) -> bool:
+def read_throttle_alone(path: Path, columns: CsvColumns | None = None,
+                        ) -> tuple[FloatArray, FloatArray]:
+    """Return the stamps, s, and the throttle, 0..1, of a CSV that needs no voltage."""
+    table = _table(path, columns or CsvColumns())
+    if logs.THROTTLE not in table.found:
+        raise InputError(_absent(path, table.form, THROTTLE, ' (--throttle-column)'))
+    return table.t, table.found[logs.THROTTLE][1]
+
+
+def holds_supply(path: Path, columns: CsvColumns | None = None) -> bool:
     """Return whether columns of time and voltage are found in the first lines of a file."""
     try:
-        nothing = CsvColumns()
-        form = form_of(path, nothing)
-        time = _time_of(path, form, nothing)
-        if not _series_of(path, form, nothing, time):
-            _supply_of(path, form, nothing, time, needed=True)
+        wanted = columns or CsvColumns()
+        form = form_of(path, wanted)
+        time = _time_of(path, form, wanted)
+        if not _series_of(path, form, wanted, time):
+            _supply_of(path, form, wanted, time, needed=True)
         return True
     except InputError:
         return False
