@@ -58,11 +58,6 @@ class Analysis:
     alarms: tuple[Dips, ...]  # Dips below usual alarms per cell; none if the cells are unknown
 
 
-# Rate of a relaxation, 1/s, over the lowest frequency that the level leaves, Hz: for slower ones
-# the fitted rate is too high (simulated OUs of 0.4 to 3 1/s at 10 Hz).
-_SLOWEST = 4.0 * math.pi
-
-
 def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
             window: float = 2.0, brownout_voltage: float | None = None,
             brownout_horizon: float = 5.0, cells: int = 0,
@@ -101,9 +96,6 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
                          ('LINES_LEFT_IN', [one for one in judged if one.lines_kept]),
                          ('SECOND_RELAXATION', [one for one in judged if one.wanders]),
                          ('AC_COUPLING', [one for one in judged if one.coupled]),
-                         ('SLOW_RELAXATION', [
-                             one for one in judged if one.estimate.usable
-                             and one.estimate.alpha < _SLOWEST * left.above]),
                          ('IMPULSES', [one for one in judged if one.estimate.usable
                                        and one.verdict.within is ProcessType.IMPULSES]))
                          for item in noise_items(name, [one.throttle for one in at])],

@@ -295,7 +295,7 @@ def fit_parts(recording: Recording, left: Remainder, segments: Sequence[LevelSeg
     if not n:
         return OuFacts('no_data'), Estimate(throttle=throttle, status=Status.TOO_FEW_SAMPLES)
     parts = [(left.voltage[s.start:s.stop], left.size[s.start:s.stop]) for s in segments]
-    ou = fit_pieces(parts, left.dt, left.walk)
+    ou = fit_pieces(parts, left.dt, left.walk, left.absorbed)
     time = float(sum(recording.t[s.stop - 1] - recording.t[s.start] for s in segments))
     mean = sum(float(recording.voltage[s.start:s.stop].sum()) for s in segments) / n
     looked = examine(recording.voltage[segments[-1].start:segments[-1].stop][-TAIL:])

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from ou_monitor.criticism.adc import find_step
 from ou_monitor.criticism.readings import bad_notes, find_bad
 from ou_monitor.model.ou_fit import FEWEST, regress
+from ou_monitor.model.whittle import ABSORBED_AT, absorbed_by
 from ou_monitor.records import FloatArray, NAN, Recording
 from ou_monitor.timeline import (
     in_order, MOST_THROTTLE, MOST_VOLTAGE, part_of, plausible, readings_of, supplied)
@@ -93,12 +94,14 @@ class Remainder:
     dt: float  # median step, s
     walk: float  # median random walk of the level, V/sqrt(s)
     above: float = 0.0  # lowest frequency that the level has not absorbed, Hz
+    absorbed: FloatArray | None = None  # ordinates that the regressions took, per reading
 
 
 def remainder(recording: Recording) -> Remainder:
     """Subtract level and load from the voltage of a recording."""
     t, n = recording.t, recording.n
     left, size, steps, walks, above = np.full(n, NAN), np.ones(n), [], [], 0.0
+    absorbed, used = np.zeros(ABSORBED_AT.size), 0
     edges: list[int] = [] if not n else np.searchsorted(t, np.linspace(
         t[0], t[-1], 1 + max(1, min(round(float(t[-1] - t[0]) / _PART), n // _IN_PART)))[1:-1]
                                                 ).tolist()
@@ -114,8 +117,11 @@ def remainder(recording: Recording) -> Remainder:
             steps.append(part.dt)
             walks.append(part.walk)
             above = max(above, 0.5 / part.slowest)
+            absorbed += absorbed_by(part.basis)
+            used += part.places.size
     return Remainder(left, size, float(np.median(steps)) if steps else NAN,
-                     float(np.median(walks)) if walks else NAN, above)
+                     float(np.median(walks)) if walks else NAN, above,
+                     absorbed / max(used, 1))
 
 
 def without_wild(recording: Recording, left: Remainder) -> tuple[Recording, Remainder]:

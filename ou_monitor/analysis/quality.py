@@ -166,10 +166,6 @@ _NOISE = {
         'Slow noise is missing, as behind an AC-coupled instrument: alpha, tau and Var_inf '
         'describe rail and instrument together; repeat with a DC-coupled instrument. '
         '`ou-monitor discover` fits both.'),
-    'SLOW_RELAXATION': (
-        'What varies beside white noise is nearly as slow as the level that is removed: an alpha '
-        'fitted to it is too high (by a factor of 2 where tau is 1.3 s), and its interval too '
-        'narrow.'),
     'IMPULSES': (
         'The noise has impulses: alpha, sigma and Var_inf include them, and their intervals are '
         'too narrow. `ou-monitor discover` tells impulses from noise.')}

@@ -9,6 +9,8 @@ Fit an Ornstein-Uhlenbeck process and white noise to a voltage, together with le
    domain (`whittle.CrossSpectrum`).  Intervals are quantiles from importance sampling about all
    maxima over the rate; the prior is flat in ln(alpha), and arcsine in the OU's share.
 
+`fit_pieces` fits what a regression has left: each frequency counts by the share that remains.
+
 The noise is white noise, the OU, and a random walk of the level.  Its size follows the load and
 its changes, and readings are weighted by it; otherwise errors of the load model would be fitted as
 a fast OU.  The walk, whose size has a prior and may be zero, absorbs changes of the level that the
@@ -91,6 +93,8 @@ _IMPRECISE = 0.37
 _WALK, _WALK_SD = 0.004, 0.8
 # Maximum alpha dt: beyond, neighbouring readings are uncorrelated.
 _FASTEST = 5.0
+# An interval of alpha that begins within this factor of the slowest rate has no lower end.
+_EDGE = 1.25
 # Loss of profile log-likelihood at the edge of a 95 % region of rate and share, nats: chi^2 with 2
 # degrees of freedom.
 _DROP = 3.0
@@ -182,6 +186,7 @@ class Regression:
     lengths: list[int]  # of the stretches
     walk: float  # usual walk of the level, V per sqrt(s)
     slowest: float  # half the distance of the level's knots, s: slower changes count as level
+    absorbed: FloatArray | None = None  # as in `CrossSpectrum`
 
     @property
     def free(self) -> int:
@@ -332,7 +337,7 @@ class _Likelihood:
 
     def __init__(self, part: Regression) -> None:
         self._cross = CrossSpectrum(
-            np.vstack([part.basis, part.voltage / part.size]), part.lengths)
+            np.vstack([part.basis, part.voltage / part.size]), part.lengths, part.absorbed)
 
     def at(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return minus the log-likelihood, and the variance of OU plus white noise, V^2."""
@@ -421,6 +426,8 @@ def fit_ou(part: Regression, span: float, *, precise: bool = False) -> OuFacts:
     log_alpha, log_var = points[:, 0] - math.log(dt), np.log(share * variance)
     spread = math.sqrt(2.0 / part.free)
     alpha, *alpha_95 = np.exp(_quantiles(log_alpha, weight, 0.0))
+    if alpha_95[0] * part.slowest < _EDGE:
+        return OuFacts('too_short', span)
     var_inf, *var_inf_95 = np.exp(_quantiles(log_var, weight, spread))
     ends = np.exp(_quantiles(0.5 * (log_alpha + log_var + math.log(2.0)), weight, 0.5 * spread))
     sigma = math.sqrt(2.0 * alpha * var_inf)
@@ -433,7 +440,8 @@ def fit_ou(part: Regression, span: float, *, precise: bool = False) -> OuFacts:
             costs, low, high, least, dt, span)
 
 
-def fit_pieces(parts: Sequence[tuple[FloatArray, FloatArray]], dt: float, walk: float) -> OuFacts:
+def fit_pieces(parts: Sequence[tuple[FloatArray, FloatArray]], dt: float, walk: float,
+               absorbed: FloatArray | None = None) -> OuFacts:
     """Fit the noise to pieces (V, relative size of the noise), each with its own mean."""
     parts = [part for part in parts if part[0].size >= _STRETCH]
     total = sum(part[0].size for part in parts)
@@ -451,7 +459,7 @@ def fit_pieces(parts: Sequence[tuple[FloatArray, FloatArray]], dt: float, walk: 
     size = np.concatenate([piece[1] for piece in cut])
     return fit_ou(Regression(
         dt, np.arange(voltage.size), voltage, size / math.sqrt(float(size @ size) / size.size),
-        np.zeros((0, voltage.size)), [n] * len(cut), walk, 0.5 * n * dt), span)
+        np.zeros((0, voltage.size)), [n] * len(cut), walk, 0.5 * n * dt, absorbed), span)
 
 
 def white_variance(ou: OuFacts, steps: float, dt: float) -> float:

@@ -100,15 +100,28 @@ def cosines(x: FloatArray) -> FloatArray:
     return np.concatenate([F.real, -F.imag[:, (n - 1) // 2:0:-1]], axis=1)
 
 
+# Frequencies at which it is kept how much a regression absorbs, radians per sample.
+ABSORBED_AT = np.append(0.0, np.geomspace(1e-6, np.pi, 200))
+
+
+def absorbed_by(basis: FloatArray) -> FloatArray:
+    """Return how many ordinates up to each of ABSORBED_AT orthonormal regressors, (p, n), take."""
+    n = basis.shape[1]
+    total = np.append(0.0, np.cumsum(np.sum(cosines(basis) ** 2, axis=0)))
+    return np.asarray(np.interp(ABSORBED_AT, np.pi * (np.arange(n + 1) - 0.5) / n, total))
+
+
 class CrossSpectrum:
     """Cross spectra of regressors and a voltage, and the likelihood of a noise spectrum."""
 
     # The ordinates come from the cosine transform, which continues the window as a mirror image;
     # so different values at its ends cause no leakage, unlike in a Fourier transform.
 
-    def __init__(self, rows: FloatArray, lengths: Sequence[int]) -> None:
+    def __init__(self, rows: FloatArray, lengths: Sequence[int],
+                 absorbed: FloatArray | None = None) -> None:
         # rows: regressors, and the voltage as the last row, shape (q, n), in stretches of evenly
         # spaced readings; without regressors (q = 1) each stretch has its own mean.
+        # absorbed: ordinates per reading that an earlier regression took, see `absorbed_by`.
         q, n = rows.shape
         self.free = n - (q - 1 or len(lengths))
         # Lost messages may cause hundreds of stretches; those of similar lengths share their bins.
@@ -122,8 +135,9 @@ class CrossSpectrum:
             while edges[-1] < longest:
                 edges.append(min(longest, edges[-1] + max(1, int(_WIDTH * edges[-1]))))
             cross = np.zeros((len(edges) - 1, q, q))
-            # Number of ordinates in the band, sum of their indices and of alternating signs.
-            sums = np.zeros((3, len(edges) - 1))
+            # Number of ordinates in the band, sum of their indices and of alternating signs, and
+            # ordinates absorbed before.
+            sums = np.zeros((4, len(edges) - 1))
             for part in group:
                 size = part.shape[1]
                 C = cosines(part)
@@ -133,9 +147,12 @@ class CrossSpectrum:
                 ends = np.append(starts, min(edges[-1], size))
                 bins = len(starts)
                 count = np.diff(ends)
-                sums[:, :bins] += np.stack([
+                sums[:3, :bins] += np.stack([
                     count, count * 0.5 * (ends[:-1] + ends[1:] - 1) / size,
                     count % 2 * (1 - 2 * (ends[:-1] % 2))])
+                if absorbed is not None:
+                    sums[3, :bins] += size * np.diff(np.interp(
+                        np.pi * (ends - 0.5) / size, ABSORBED_AT, absorbed))
                 sums[0, 0] -= q == 1
                 for k, row in enumerate(C):
                     cross[:bins, k, k:] += np.add.reduceat(C[k:] * row, starts, axis=1).T
@@ -145,7 +162,10 @@ class CrossSpectrum:
         cross = np.concatenate(crosses)
         self._cross = (cross + np.triu(cross, 1).transpose(0, 2, 1)).reshape(-1, q * q)
         self._q, self._n = q, np.concatenate(sizes)
-        self._count, place, sign = np.concatenate(places, axis=1)
+        self._count, place, sign, gone = np.concatenate(places, axis=1)
+        # Ordinates that still count, a tenth at least, because the absorbed share is a mean.
+        self._left = self._count - np.minimum(gone, 0.9 * self._count)
+        self._told = self.free - float(np.sum(self._count - self._left))
         omega = np.pi * place / np.maximum(self._count, 1e-9)
         self._sign = sign / np.maximum(self._count, 1.0)
         self._chord = 4.0 * np.sin(0.5 * omega) ** 2
@@ -180,7 +200,8 @@ class CrossSpectrum:
         if used is not None and used < self._q - 1:
             kept = [*range(used), self._q - 1]
             free, own = free + self._q - 1 - used, gram[:, kept][:, :, kept]
+        told = self._told + free - self.free
         d = np.log(np.diagonal(np.linalg.cholesky(own), axis1=1, axis2=2))
         left = 2.0 * d[:, -1]
-        value = 0.5 * free * left + 0.5 * np.log(S) @ self._count + d[:, :-1].sum(axis=1)
+        value = 0.5 * told * left + 0.5 * np.log(S) @ self._left + d[:, :-1].sum(axis=1)
         return value, np.exp(left) / free, gram

@@ -324,17 +324,13 @@ def _with_estimates(plot: Plot, x: FloatArray, levels: Sequence[LevelResult], na
 
 def _levels(analysis: Analysis) -> list[Part]:
     levels = analysis.levels
-    # A relaxation at the edge of what the level leaves, and not visible to the facts, is none.
-    slow = [] if analysis.overview.facts.ou.status == 'ok' else [
-        str(at) for item in analysis.quality if item.name == 'SLOW_RELAXATION'
-        for at in item.throttles]
     rows = [[level.label, number(level.time), str(level.n), number(level.mean, 4),
              *[number(1e3 * v) for v in (level.vpp, level.peak, level.vrms)],
              number(level.crest), number(1e3 * level.estimate.noise_std), level.kind.value]
             for level in levels]
     fits = [[level.label, *[_interval(level, name) for name in ('alpha', 'sigma', 'var_inf')],
              number(1e3 * level.estimate.tau)] for level in levels
-            if level.estimate.usable and str(level.throttle) not in slow]
+            if level.estimate.usable]
     return [
         Table(['throttle', 'time, s', 'samples', 'mean, V', 'Vpp, mV', 'peak, mV', 'Vrms, mV',
                'Vpp/Vrms', 'white, mV', 'process'], rows, left=[0, 9]),

@@ -130,12 +130,27 @@ def test_impulses_are_said_beside_the_fit_that_includes_them():
         assert ('IMPULSES' in names) == spikes
 
 
-@pytest.mark.parametrize('alpha, slow', [(0.8, True), (10.0, False)])
-def test_a_relaxation_as_slow_as_the_level_is_warned_of(alpha, slow):
-    """Five minutes at 10 Hz; the fit of 0.8 1/s is too high by a factor of 2."""
-    t = np.arange(3000) * 0.1
-    rng = np.random.default_rng(8)
-    v = simulate(t, alpha, 0.02 * math.sqrt(2.0 * alpha), rng, u0=12.0)
-    names = {item.name for item in analyze(Recording(
-        t, v + 0.005 * rng.standard_normal(t.size), np.full(t.size, 0.5))).quality}
-    assert ('SLOW_RELAXATION' in names) == slow
+def test_slow_relaxations_are_fitted_beside_the_level_that_takes_a_part_of_them():
+    """Of 12 intervals of 95 %, more than 3 miss with probability 0.002."""
+    outside = 0
+    for k in range(12):
+        rng = np.random.default_rng(k)
+        alpha = (1.0, 2.0, 3.0, 5.0)[k % 4]
+        t = np.arange(6000) * 0.1
+        v = simulate(t, alpha, 0.03 * math.sqrt(2.0 * alpha), rng, u0=12.0)
+        level, = analyze(Recording(t, v + 0.005 * rng.standard_normal(t.size))).levels
+        low, high = level.estimate.interval('alpha')
+        outside += not low <= alpha <= high
+    assert outside <= 3
+
+
+def test_pieces_shorter_than_the_relaxation_give_no_value():
+    """A stick that never rests leaves pieces of about 0.2 s, for a relaxation of 0.17 s."""
+    rng = np.random.default_rng(3)
+    t = np.arange(12_000) * 0.01
+    u = np.clip(0.5 + simulate(t, 2.0, 0.12, rng), 0.0, 1.0)
+    v = 12.0 - u + simulate(t, 6.0, 0.07, rng)
+    levels = analyze(Recording(t, v, u)).levels
+    assert levels
+    assert all(level.estimate.interval('alpha')[0] <= 6.0 for level in levels
+               if level.estimate.usable)
