@@ -205,7 +205,7 @@ def test_python_example_of_the_readme_runs(monkeypatch):
     (code,) = blocks('python')
     scope: dict[str, object] = {}
     exec(compile(code, 'README.md', 'exec'), scope)
-    low, high = scope['estimate'].interval('sigma', z=4.0)
+    low, high = scope['report'].ou.sigma_95
     assert low < 0.632 < high
 
 
