@@ -42,7 +42,9 @@ RELAXES = 20.0
 CHANCE = 0.05
 # Maximum number of causes accepted one by one: no recording of test/hidden has more effects.
 MOST = 8
-# Total filter time after which kinds whose fit takes seconds are no longer tried, s.
+# Total filter time after which kinds whose fit takes seconds are no longer tried, s; twice that
+# for broad ones: a spectrum shows beforehand whether they gain, and the slow part that a response
+# leaves, unmodelled, halved alpha.
 MOST_COST = 10.0
 # A statistic beyond this fails: one of 70 does by chance in 2300 recordings (3 of 8700 simulated).
 FAILS = 4.8
@@ -92,7 +94,7 @@ def _shows(kind: Kind, name: str, value: float) -> bool:
 
 def affordable(kind: Kind, cost: float) -> bool:
     """Return whether the search may still try a kind after fits of this cost (s)."""
-    return cost <= MOST_COST or not kind.SLOW_FIT
+    return cost <= MOST_COST * (1.0 + kind.BROAD) or not kind.SLOW_FIT
 
 
 # Which trial is accepted, and what comes with it.

@@ -153,7 +153,8 @@ def test_more_than_one_part_must_gain(gains, shared):
 
 
 @pytest.mark.parametrize('kind, cost, may', [
-    (Cheap, 99.0, True), (Dear, 9.9, True), (Dear, 10.1, False)])
+    (Cheap, 99.0, True), (Dear, 9.9, True), (Dear, 10.1, False),
+    (KINDS['second_relaxation'], 19.9, True), (KINDS['second_relaxation'], 20.1, False)])
 def test_slow_kinds_are_tried_only_while_time_is_left(kind, cost, may):
     assert decision.affordable(kind, cost) is may
 
