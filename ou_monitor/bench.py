@@ -54,6 +54,13 @@ def _read(recording: Given) -> Recording:
     return read_recording(recording)
 
 
+def check_size(recording: Recording) -> None:
+    """Raise InputError if a recording is too short for any estimate."""
+    if recording.n < _FEWEST:
+        raise InputError(f"'{recording.name}' holds {counted(recording.n, 'usable sample')}: "
+                         f'nothing can be estimated from fewer than {_FEWEST}')
+
+
 def _limit(recording: Recording, limit: float | None, cells: int) -> tuple[float | None, int]:
     """Return the limit of the pack, V, and its cells: those given, else those of the log."""
     from ou_monitor.analysis.crafts import check_cells, full_voltage, pack_limit, stated_limit
@@ -114,9 +121,7 @@ def analyze(recording: Given, *, levels: tuple[float, ...] | None = None, window
 
     recording = _read(recording)
     voltage, cells = _limit(recording, brownout_voltage, cells)
-    if recording.n < _FEWEST:
-        raise InputError(f"'{recording.name}' holds {counted(recording.n, 'usable sample')}: "
-                         f'nothing can be estimated from fewer than {_FEWEST}')
+    check_size(recording)
     if levels is not None and not recording.has_throttle:
         raise InputError(f"--levels: '{recording.name}' has no throttle; leave --levels out, or "
                          'name the topic with --throttle-topic')
@@ -454,7 +459,9 @@ def _flight(recording: Recording, full: float, cells: int, level: float | None, 
     from ou_monitor.paper.design import Flight
 
     if not recording.has_throttle:
-        raise InputError(f'--from {recording.name}: the recording has no throttle')
+        raise InputError(f'--from {recording.name}: the recording has no throttle, so sag and '
+                         'noise over throttle are unknown: name it with --throttle-column or '
+                         '--throttle-topic, or give --throttle and --set without --from')
     monitor = None
     if level is not None:
         monitor, parts = node_for(recording, MonitorSettings(

@@ -64,6 +64,8 @@ def number(what: str, fits: Callable[[float], bool]) -> Callable[[str], float]:
 _PREFIX = {'': 1.0, 'p': 1e12, 'n': 1e9, 'u': 1e6, 'µ': 1e6, 'm': 1e3, 'k': 1e-3, 'M': 1e-6}
 # Upper limit of a quantity, with which products stay finite.
 _QUANTITY_MOST = 1e15
+# Largest components of a craft, with a margin: more is a number without its prefix.
+_PART_MOST = {'F': 10.0, 'H': 1.0, 'Ohm': 100.0}
 _QUANTITY = re.compile(r'([+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?)\s*([pnuµmkM]?)'
                        r'(F|H|[Oo]hm|Ω|V|A|Hz|W|s|1/s)?', re.ASCII)
 
@@ -80,7 +82,13 @@ def quantity(unit: str) -> Callable[[object], float]:
         if given is not None and given != unit:
             raise argparse.ArgumentTypeError(f"'{text}' must be in {unit}" if unit else
                                              f"'{text}' must have no unit")
-        return float(match[1]) / _PREFIX[match[2]]
+        value = float(match[1]) / _PREFIX[match[2]]
+        if value > (most := _PART_MOST.get(unit, math.inf)):
+            small = 'mOhm' if unit == 'Ohm' else f'u{unit}'
+            raise argparse.ArgumentTypeError(
+                f"'{text}' is {value:g} {unit}, beyond {most:g} {unit}: write the prefix, such as "
+                f'{match[1]}{small}')
+        return value
     return read
 
 
@@ -118,6 +126,7 @@ def ends(text: str) -> str:
 FLIGHT = whole('a number from 1 on', 1)
 NUMBER = number('a number', math.isfinite)
 POSITIVE = number('a positive number', lambda value: 0.0 < value < math.inf)
+PROBABILITY = number('a probability between 0 and 1', lambda value: 0.0 < value < 1.0)
 TIME = number('a time in seconds, 0 or more', lambda value: 0.0 <= value < math.inf)
 
 RECORDING = Option(
@@ -336,8 +345,7 @@ _COUPLING = Command(
             '(gyroUnfilt[0], IMU.GyrX)'),
      Option('--band', metavar='LOW,HIGH', type=band,
             help='frequency band, Hz (default: 5 to a quarter of the slower rate)'),
-     Option('--level', metavar='P', default=0.05, type=number(
-         'a probability between 0 and 1', lambda value: 0.0 < value < 1.0),
+     Option('--level', metavar='P', default=0.05, type=PROBABILITY,
             help='probability of a false alarm (default: %(default)s)'),
      *limit('also count dips below this voltage, V'), *TOPICS, *FILES, JSON, REPORT, FORCE),
     ('flight.bbl --signal gyroUnfilt[0] --report gyro.html',
@@ -351,7 +359,7 @@ _DESIGN = Command(
     (Option('--from', metavar='RECORDING', dest='recording',
             help='take level, sag, resistance and noise from a flight (any recording that analyze '
             'reads); --set overrides it'),
-     Option('--risk', metavar='X', type=quantity(''), default='0.01',
+     Option('--risk', metavar='X', type=PROBABILITY, default=0.01,
             help='probability of a brown-out allowed within the horizon, 0..1 (default: '
             '%(default)s, as for the throttle budget of analyze)'),
      Option('--throttle', metavar='Y', type=number(

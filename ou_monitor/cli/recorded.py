@@ -8,6 +8,7 @@ from dataclasses import replace
 from datetime import datetime, timezone
 import math
 import shlex
+import sys
 from typing import Any, TYPE_CHECKING
 
 from ou_monitor import __version__, bench
@@ -99,13 +100,14 @@ def _read_and_run(args: argparse.Namespace, label: str, function: Callable[..., 
                   given: dict[str, Any]) -> tuple[Recording, Result]:
     """Return the recording, and the result of a function of `bench`, with progress bars."""
     recording, _ = read_given(args)
+    bench.check_size(recording)
     if getattr(args, 'save_model', None) is not None:
         from ou_monitor.criticism.integrity import examine
         from ou_monitor.discovery.finding import unsaved_load
 
-        # Refused before the search.
+        # Reported before the search, which may take long.
         if why := unsaved_load(examine(recording).full, recording.has_throttle):
-            raise InputError(_unsaved(why))
+            print(f'ou-monitor {args.command}: {_unsaved(why)}', file=sys.stderr, flush=True)
     with Progress(label, args.json == output.STDOUT) as progress:
         return recording, function(recording, progress=progress, **given)
 

@@ -1,6 +1,7 @@
 """`ou-monitor discover`: CSV in; summary, JSON, model, page out; one line for bad input."""
 
 from dataclasses import replace
+import json
 import re
 from xml.etree import ElementTree
 
@@ -93,7 +94,7 @@ def test_one_run_writes_summary_model_and_page(flight, tmp_path, capsys):
 
 def test_too_short_still_writes_all_but_the_model(tmp_path, capsys):
     path, data, page = (tmp_path / name for name in ('short.csv', 'd.json', 'r.html'))
-    write_csv(path, np.array([0.0, 0.1]), np.array([5.0, 5.1]))
+    write_csv(path, np.array([0.0, 0.1, 0.2]), np.array([5.0, 5.1, 5.0]))
     words = ['discover', path, '--save-model', tmp_path / 'm.yaml', '--report', page, '--json']
     assert 'no model' in failure(capsys, *words, data)
     assert strict(data.read_text())['verdict'] == 'insufficient_data'
@@ -166,7 +167,7 @@ def test_plain_names_stand_before_the_names_in_code():
 
 
 def test_a_model_that_is_not_saved_is_not_announced(tmp_path, capsys):
-    """Its load is the measured current: refused before the search, and nothing is written."""
+    """Its load is the measured current: reported before the search, whose result is given."""
     rng = np.random.default_rng(4)
     t = np.arange(3000) / 50.0
     amps = np.repeat(rng.uniform(1.0, 40.0, 60), 50)
@@ -178,5 +179,5 @@ def test_a_model_that_is_not_saved_is_not_announced(tmp_path, capsys):
     data = tmp_path / 'a.json'
     assert main(['discover', str(path), '--save-model', str(model), '--json', str(data)]) == 2
     out, err = capsys.readouterr()
-    assert 'no model saved: its load is the measured current' in err and not out
-    assert not model.exists() and not data.exists()
+    assert 'no model saved: its load is the measured current' in err and str(model) not in out
+    assert not model.exists() and json.loads(data.read_text())['load'] == 'current'

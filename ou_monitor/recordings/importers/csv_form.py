@@ -30,7 +30,7 @@ from typing import NamedTuple, TextIO
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
-from ou_monitor.recordings.importers.formats import is_text, kind_of_foreign
+from ou_monitor.recordings.importers.formats import is_text, kind_of_foreign, TEXT
 from ou_monitor.recordings.importers.log import CsvColumns
 from ou_monitor.records import FloatArray, TIME_UNITS
 from ou_monitor.stream.files import open_regular
@@ -190,6 +190,8 @@ def form_of(path: Path, wanted: CsvColumns) -> Form:
             found = _score_form(lines, encoding, delimiter, mark == ',', known, wanted.skip_rows)
             if found and (best is None or found[0] > best[0]):
                 best = found
+    if best is None and not any(is_number(cell) for cell in re.split(r'[,;|"\s]+', text) if cell):
+        raise InputError(f'{path} holds no numbers: expected rows of time and voltage')
     if best is None:
         raise InputError(f'{path}: the header cannot be separated from the numbers: --delimiter, '
                          '--decimal and --skip-rows say how it is written')
@@ -206,7 +208,7 @@ def _encoding(path: Path, head: bytes) -> str:
     kind = kind_of_foreign(head, path)
     # A logger that lost power leaves NUL bytes at the end; `numbers` names their line.
     nul = b'\0' in head and not (b'\n' in head and is_text(head.rstrip(b'\0')))
-    if nul or kind.startswith('it is') and kind != 'it is text':
+    if nul or kind.startswith('it is') and kind != TEXT:
         raise InputError(f'{path} is not text: {kind}')
     try:
         codecs.getincrementaldecoder('utf-8')().decode(head)

@@ -313,8 +313,9 @@ def _column_place(path: Path, form: Form, name: str, option: str) -> int:
     return form.names.index(name)
 
 
-def _choose(form: Form, quantity: str, taken: Sequence[int] = ()) -> list[int]:
-    """Return the candidate columns of a quantity, the first of the best pattern first."""
+def _choose(form: Form, quantity: str, taken: Sequence[int] = (), text: bool = False
+            ) -> list[int]:
+    """Return the candidate columns of a quantity, the best first (text: those of words)."""
     plain = [re.sub(r'\W+', '_', unit_of(name)[0].strip().lower()).strip('_') or 'time' * bool(
         unit) for name, unit in zip(form.names[:form.width], form.units)]
     ends = [re.sub(r'\W+', '_', re.split(
@@ -323,7 +324,7 @@ def _choose(form: Form, quantity: str, taken: Sequence[int] = ()) -> list[int]:
     right = {_TIME_NAME: TIME_WORDS, logs.VOLTAGE: VOLT_WORDS, logs.CURRENT: AMPERE_WORDS,
              logs.THROTTLE: {**SHARE_WORDS, **_PULSE_WORDS}}[quantity]
     free = [k for k in range(len(plain)) if k not in taken and form.names[k]
-            and _holds_numbers(form, k, quantity == _TIME_NAME)]
+            and _holds_numbers(form, k, quantity == _TIME_NAME) is not text]
     for pattern in _PATTERNS[quantity]:
         found = list(dict.fromkeys(
             k for texts in ([form.names[k].strip() for k in range(len(plain))], plain, ends)
@@ -732,9 +733,15 @@ def _read_note(form: Form, time: _Column, found: dict[str, _Column], units: dict
                wanted: CsvColumns) -> str:
     """Return in one line how a file was read; '' if nothing was detected."""
     encoding = '' if form.encoding in ('utf-8', 'utf-8-sig') else f', {form.encoding}'
+    used = {*time.place, *(column.place[0] for column in found.values())}
+    lacking = [quantity for quantity in (logs.THROTTLE, logs.CURRENT)
+               if quantity not in found and getattr(wanted, quantity) is None]
+    # Columns whose names fit, but whose cells are words.
+    words_of = [f'{form.names[k]} (text)' for quantity in lacking if form.line
+                for k in _choose(form, quantity, sorted(used), text=True)[:1]]
     if time.name == TIME and not form.comma and not encoding and {
             column.name for column in found.values()} <= {VOLTAGE, THROTTLE, CURRENT} and not any(
-                'guess' in words for words in units.values()):
+                'guess' in words for words in units.values()) and not words_of:
         return ''
     between = {',': 'commas', ';': 'semicolons', '\t': 'tabs', ' ': 'blanks'}.get(
         form.delimiter, f"'{form.delimiter}'")
@@ -746,17 +753,15 @@ def _read_note(form: Form, time: _Column, found: dict[str, _Column], units: dict
     others = [form.names[k] for k in places
               if form.names[k] not in {column.name for column in found.values()}]
     also = f'; also found: {", ".join(others)} (--voltage-column)' if others else ''
-    lacking = [quantity for quantity in (logs.THROTTLE, logs.CURRENT)
-               if quantity not in found and getattr(wanted, quantity) is None]
     if lacking:
         # Mention columns that may be a throttle or current under another name.
-        used = {*time.place, *(column.place[0] for column in found.values())}
-        rest = [name for k, name in enumerate(form.names[:form.width])
-                if k not in used and name not in others
-                and (logs.THROTTLE in lacking or re.search('curr|amps|strom|cour', name.lower()))
-                and not re.fullmatch(_INDEX_NAME, name.strip('# ').lower())
-                and (not form.rows or any(
-                    is_number(cell) and not is_missing(cell) for cell in form.cells(k)))]
+        rest = [*words_of, *(
+            name for k, name in enumerate(form.names[:form.width])
+            if k not in used and name not in others
+            and (logs.THROTTLE in lacking or re.search('curr|amps|strom|cour', name.lower()))
+            and not re.fullmatch(_INDEX_NAME, name.strip('# ').lower())
+            and (not form.rows or any(
+                is_number(cell) and not is_missing(cell) for cell in form.cells(k))))]
         options = ' or '.join(f'--{quantity}-column' for quantity in lacking)
         also += f'; not read: {some(rest, 3)} ({options})' if rest else ''
     return (f"Read {', '.join(parts)}{also}; cells between {between}, decimal "

@@ -82,6 +82,8 @@ def format_of(head: bytes) -> Format | None:
     return next((one for one in FORMATS if head and one.fits(head)), None)
 
 
+# What any other text may be.
+TEXT = 'it is text; if it is a table of time and voltage, name it NAME.csv'
 # First bytes -> what it is, and what to do.
 _FOREIGN = {
     b'SQLite format 3': "an SQLite rosbag2 (.db3): convert it with 'ros2 bag convert' to the "
@@ -112,7 +114,7 @@ def kind_of_foreign(head: bytes, path: Path = Path('LOG')) -> str:
         command = shlex.join(['ou-monitor', 'convert', str(path), path.stem])
         return f'it is a log, {log.words}, not a recording: convert it first, with {command}'
     if head[:1] and all(byte in b'\t\n\r' or 32 <= byte < 127 for byte in head):
-        return 'it is text'
+        return TEXT
     return 'its first bytes are ' + (head[:8].hex(' ') or 'missing')
 
 

@@ -736,3 +736,13 @@ def test_a_file_of_another_kind_is_named(content, words, tmp_path):
 def test_cells_that_are_no_time_or_number_are_refused(content, words, tmp_path):
     with pytest.raises(InputError, match=words):
         read_recording(written(tmp_path, content))
+
+
+def test_words_are_named_where_numbers_are_missing(tmp_path):
+    """A throttle of words is named as not read; a table of words only has no numbers."""
+    path = written(tmp_path, 'time_s,voltage_v,throttle\n' + ''.join(
+        f'{k},{12 + k % 2},{"low high".split()[k % 2]}\n' for k in range(9)), 'a.csv')
+    found = read_recording(path)
+    assert not found.has_throttle and 'not read: throttle (text)' in ' '.join(found.notes)
+    with pytest.raises(InputError, match='holds no numbers'):
+        read_recording(written(tmp_path, 'name,city\nbob,paris\nann,rome\n', 'b.csv'))
