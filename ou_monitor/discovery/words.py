@@ -15,7 +15,6 @@ from typing import Any
 from ou_monitor.discovery.finding import Cause, Criticism, Finding, Verdict
 from ou_monitor.model.spectral_lines import comb_of
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.term import Term
 from ou_monitor.model.terms.tones import Tone
 from ou_monitor.records import LARGEST_LOG_SE
@@ -102,6 +101,8 @@ def with_error(value: Any, error: Any, *, positive: bool = False) -> str:
         if positive and is_vague(value, error):
             return 'not determined'
         half = Z95 * error
+        if positive and half > value > 0.0:
+            return ' to '.join(number(value * math.exp(by / value), 2) for by in (-half, half))
         digits = min(max(2 + math.floor(math.log10(max(abs(value) / half, 1.0))), 2), 6)
         return f'{number(value, digits)} +- {number(half, 2)}'
     return number(value, 4)
@@ -117,7 +118,9 @@ def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
             alternatives: Sequence[str], exact: bool, why: str = '', together: int = 1,
             chance: float = math.nan) -> str:
     """Return an explanation of a cause: meaning, estimate, gain (nats) and remedy."""
-    parts = [term.MEANING, f'Estimate: {parameters(term, se)}.']
+    # The words of one term do not apply to others that share its row.
+    about = type(term) if together > 1 else term
+    parts = [about.MEANING, f'Estimate: {parameters(term, se)}.']
     if exact:
         parts.append('The samples themselves show it, without a model.')
     if not exact or gain != 0.0:
@@ -129,7 +132,7 @@ def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
                     for name in (term.NAME, *alternatives)]
         parts.append(f'This recording cannot separate it from {listed(list(alternatives))}; this '
                      f'would: {"; ".join(dict.fromkeys(separate))}.')
-    parts.append(term.REMEDY)
+    parts.append(about.REMEDY)
     return ' '.join(part for part in parts if part)
 
 
@@ -205,16 +208,17 @@ def _without_causes(found: Finding, dropped: Sequence[str], uncovered: int, stop
 
 
 def _gain(found: Finding, why: str) -> str:
-    """Return a gain in two parts: smaller one-step errors, and their size better predicted."""
+    """Return a gain: smaller one-step errors and, if it gains, their size better predicted."""
     gain, shrink, size = found.gain, found.shrink, found.size_gain
     if not gain > Z95 * found.gain_se or not math.isfinite(size):
         return gain_words(gain, found.gain_se, why)
     errors = ('shrink by ' if shrink > 0.0 else 'grow by ') + f'{number(100.0 * abs(shrink), 2)} %'
-    smaller, better = ('+' * (x > 0.0) + number(1e3 * x) for x in (gain - size, size))
-    return (f'On samples not used for the fit, one-step errors {errors} (rms; '
-            f'{smaller} mnat per sample) and their size is predicted '
-            f'{"better" if size >= 0.0 else "worse"} ({better}): '
-            f'{gain_text(gain, found.gain_se)} mnat in all.')
+    # A loss is that of the rms as a measure: a few large errors dominate it.
+    parts = (f'; {"+" * (shrink > 0.0)}{number(1e3 * (gain - size))} mnat per sample) and their '
+             f'size is predicted better (+{number(1e3 * size)}): ' if size > Z95 * found.gain_se
+             else '), a gain of ')
+    return (f'On samples not used for the fit, one-step errors {errors} (rms{parts}'
+            f'{gain_text(gain, found.gain_se)} mnat per sample in all.')
 
 
 def collinear_note(inflation: float, limit: float) -> str:
@@ -223,12 +227,6 @@ def collinear_note(inflation: float, limit: float) -> str:
             f'{number(inflation, 2)}; limit {limit:g}): a sag and a drift are hard to tell '
             'apart, and the errors of the response include that. Return to a low throttle between '
             'the steps.')
-
-
-def plain_model_words(baseline: OU) -> str:
-    """Return the plain model on one line."""
-    return (f'alpha = {number(baseline.alpha)} 1/s, sigma = {number(baseline.sigma)} V/sqrt(s), '
-            f'u0 = {number(baseline.u0, 4)} V')
 
 
 def gain_words(gain: float, gain_se: float, why: str = '', chance: float = math.nan) -> str:
@@ -300,7 +298,9 @@ def gain_text(gain: float, gain_se: float) -> str:
         return NOT_KNOWN
     if not math.isfinite(gain_se):
         return f'{number(1e3 * gain)}, error {NOT_KNOWN}'
-    return f'{number(1e3 * gain)} +- {number(1e3 * Z95 * gain_se, 2)}'
+    # Beside an error a hundred times as large, a gain is 0.
+    shown = gain if 100.0 * abs(gain) > Z95 * gain_se else 0.0
+    return f'{number(1e3 * shown)} +- {number(1e3 * Z95 * gain_se, 2)}'
 
 
 def _chance(cause: Cause) -> str:
@@ -355,7 +355,7 @@ PLAIN_NAMES = {
     'load_dependent_noise': 'sensor noise that follows throttle',
     'load_dependent_sigma': 'noise that changes with throttle',
     'load_sag': 'sag',
-    'load_transient': 'slow recovery after throttle',
+    'load_transient': 'a response to changes of throttle',
     'lopsided_noise': 'noise with falls deeper than its rises',
     'measurement_noise': 'noise of the sensor',
     'nonlinear_restoring': 'a load of constant power',

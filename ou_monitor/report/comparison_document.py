@@ -49,8 +49,8 @@ def _answer(found: Agreement) -> list[str]:
     lowest = (f'lowest voltage is {number(low.median, 4)} V ({number(low.low, 4)} to '
               f'{number(low.high, 4)}), measured {number(low.measured, 4)} V')
     if found.verdict is Likeness.LOOKS_LIKE_IT:
-        # Without throttle the mean path is constant and explains no variance.
-        path = [] if not found.explained > 0.0 else [
+        # Without changes of the load, the mean path is a drift at most.
+        path = [] if found.fall is None or not found.explained > 0.0 else [
             f'Its mean path explains {100.0 * found.explained:.0f} % of the variance.']
         rows = _rows(found)
         outside = [name.split(', ')[0] for name, _, _, remark in rows if remark]

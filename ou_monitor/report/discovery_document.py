@@ -11,13 +11,13 @@ import numpy as np
 from ou_monitor.analysis.overview import known_lines, Overview
 from ou_monitor.discovery.finding import Finding
 from ou_monitor.discovery.words import (
-    by_load, cause_rows, GAIN, gain_text, overlap_words, plain_model_words, PLAIN_NAMES,
+    by_load, cause_rows, GAIN, gain_text, overlap_words, parameters, PLAIN_NAMES,
     plain_words, with_error)
-from ou_monitor.model.terms.ou import OU
+from ou_monitor.records import NAN
 from ou_monitor.report.document import (
     Document, Facts, Figure, Notes, Part, Section, Table, Text)
 from ou_monitor.report.svg import Plot
-from ou_monitor.text import number
+from ou_monitor.text import number, Z95
 
 # Maximum remaining discrepancies on a terminal.
 _SHOWN = 8
@@ -50,7 +50,8 @@ def discovery_document(finding: Finding, seen: Overview | None = None, command: 
     if baseline is not None:
         after = ' before and after' if finding.causes else ''
         parts += [Section('Causes', _causes(finding)),
-                  Section('Gain' if finding.causes else 'What it predicts', _gain(finding)),
+                  Section('Gain' if finding.causes else 'What it predicts',
+                          _gain(finding, seen)),
                   lambda: [Section(f'Statistics{after}', _statistics(finding), folded=True)],
                   Section('What is left', [_discrepancies(finding)], folded=True),
                   lambda: [Section('Parameters', _parameters(finding), folded=True)]]
@@ -107,7 +108,7 @@ def _causes(finding: Finding) -> list[Part]:
              'gain. Terms of one kind that share a gain are one row.', legend=True)]
 
 
-def _gain(finding: Finding) -> list[Part]:
+def _gain(finding: Finding, seen: Overview | None) -> list[Part]:
     dips, baseline = finding.dips, finding.baseline
     assert baseline is not None and finding.model is not None
     ou = finding.model.terms[0]
@@ -122,9 +123,24 @@ def _gain(finding: Finding) -> list[Part]:
                   [row[:kept] for row in rows], left=[0]), Text(
                       '' if finding.refused else _under_load(finding)),
             Text('The plain OU, which includes level and load, has '
-                 f'{plain_model_words(baseline)}.'
-                 + (f' The extended model, as saved, has {plain_model_words(ou)}.'
-                    if finding.causes and isinstance(ou, OU) else ''))]
+                 f'{parameters(baseline, {})}.' + (
+                     f' The extended model has {parameters(ou, finding.se[0])}.'
+                     f'{_disagreement(finding, seen)}' if finding.causes else ''))]
+
+
+def _disagreement(finding: Finding, seen: Overview | None) -> str:
+    """Return that alpha is not that of the supply, and which to prefer; empty if it is."""
+    assert finding.model is not None
+    alpha, se = finding.model.terms[0].values()['alpha'], finding.se[0].get('alpha', NAN)
+    supply = None if seen is None else seen.facts.ou
+    if supply is None or supply.status != 'ok' or not abs(math.log(alpha / supply.alpha)) > (
+            Z95 * math.hypot(supply.log_se('alpha'), se / alpha)):
+        return ''
+    return (f' Its alpha disagrees with that under Relaxation ({number(supply.alpha)} 1/s, from '
+            f'the last {number(supply.window_s)} s): ' + (
+                'the model includes what its response to load leaves, so prefer that one.'
+                if finding.remaining else
+                'no statistic contradicts the model, so the relaxation seems to change.'))
 
 
 def _under_load(finding: Finding) -> str:

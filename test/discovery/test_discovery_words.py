@@ -8,7 +8,7 @@ from ou_monitor.discovery.words import (
     cause_rows, coupling_note, explain, gain_text, gain_words, overlap_words, parameters,
     plain_words, verdict_words, with_error)
 from ou_monitor.model.terms.catalogue import catalogue
-from ou_monitor.model.terms.load_response import LoadSag
+from ou_monitor.model.terms.load_response import LoadSag, LoadTransient
 from ou_monitor.model.terms.tones import Tone
 import pytest
 
@@ -48,7 +48,8 @@ def test_digits_follow_the_error(value, error, text):
 
 
 @pytest.mark.parametrize('error, text', [
-    (1.17, '1.0 +- 2.3'), (1.18, 'not determined'), (1e300, 'not determined')])
+    (0.5, '1.0 +- 0.98'), (0.52, '0.36 to 2.8'), (1.17, '0.10 to 9.9'),
+    (1.18, 'not determined'), (1e300, 'not determined')])
 def test_a_positive_parameter_is_shown_if_known_to_a_factor_of_10(error, text):
     """A coefficient of either sign is shown with any error: it is known to be that small."""
     assert with_error(1.0, error, positive=True) == text
@@ -150,6 +151,22 @@ def test_the_verdict_says_what_is_left_or_refused():
 
 
 @pytest.mark.parametrize('gain, error, text', [
-    (NAN, 0.1, 'not known'), (0.25, NAN, '250, error not known'), (0.25, 0.01, '250 +- 20')])
+    (NAN, 0.1, 'not known'), (0.25, NAN, '250, error not known'), (0.25, 0.01, '250 +- 20'),
+    (5.5e-7, 7.7e-5, '0 +- 0.15')])
 def test_a_gain_has_its_error_or_says_that_it_is_unknown(gain, error, text):
     assert gain_text(gain, error) == text
+
+
+def test_the_size_of_errors_is_told_only_where_it_gains():
+    """Single large errors may outweigh in the rms what the density gains; JSON has both parts."""
+    for shrink, parts in ((0.0, True), (0.0198, False), (0.1, False)):
+        words = verdict_words(finding(Verdict.EXPLAINED, [SAG], shrink=shrink))[1]
+        assert ('size is predicted' in words) is parts and '20.0 +- 5.9 mnat' in words
+
+
+def test_a_response_is_told_by_its_sign_and_time_constant():
+    told = [LoadTransient(gain, tau, 0.0).MEANING for gain in (0.1, -0.1) for tau in (0.1, 1.0)]
+    assert [word in text for word, text in zip(
+        ('motors and filters', 'polarisation', 'inrush', 'warms'), told)] == [True] * 4
+    assert LoadTransient(0.1, 1.0, 0.1).MEANING == LoadTransient.MEANING
+    assert len({*told, LoadTransient.MEANING}) == 5

@@ -100,11 +100,12 @@ class LoadTransient(Term):
     MEASURED: ClassVar[bool] = True
     SEVERAL: ClassVar[bool] = True
     RECURS: ClassVar[bool] = True
-    MEANING: ClassVar[str] = (
-        'The mean responds to changes of throttle: lag, inrush or slow recovery of polarisation.')
-    REMEDY: ClassVar[str] = (
-        'Include the fall after a throttle step in the brown-out margin; capacitance at the ESC '
-        'shortens it.')
+    MEANING: ClassVar[str] = by_parameters(
+        'The mean responds to changes of throttle: lag, inrush or slow recovery of polarisation.',
+        lambda term: term.about()[0])
+    REMEDY: ClassVar[str] = by_parameters(
+        'Include the fall after a throttle step in the brown-out margin.',
+        lambda term: term.about()[1])
     SEPARATED_BY: ClassVar[str] = (
         'single steps of throttle, each held for ten times the time constant of the response')
 
@@ -115,6 +116,12 @@ class LoadTransient(Term):
     rise: float = parameter('V', 'added to the gain while throttle rises', default=0.0)
     square: float = parameter('V', 'decaying part that follows the square of throttle',
                               label='decaying part, square', default=0.0)
+
+    def about(self) -> tuple[str, str]:
+        """Return what a response of this sign and time constant is, and what to do about it."""
+        kind = type(self)
+        late = self.gain + self.rise + self.square > 0.0
+        return (kind.MEANING, kind.REMEDY) if self.delay else _ABOUT[self.tau > _INRUSH, late]
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
@@ -182,6 +189,19 @@ SHORTEST = 0.5
 LONGEST = 0.125
 # Longest time that motors take to speed up, s.
 _INRUSH = 0.2
+# By whether it is slower than motors, and whether it delays the fall instead of deepening it.
+_ABOUT = {
+    (False, True): ('Part of the fall lags behind throttle, as do motors and filters.',
+                    'Shorter punches fall less.'),
+    (False, False): ('The voltage falls deepest just after throttle rises: inrush of motors.',
+                     'Include this fall in the brown-out margin; capacitance at the ESC makes it '
+                     'shallower.'),
+    (True, True): ('Part of the fall comes late after throttle and recovers as slowly: '
+                   'polarisation of a battery, or a slow regulator.',
+                   'Take the brown-out margin for the longest punch.'),
+    (True, False): ('Part of the fall after throttle rises recovers while it is held: a regulator '
+                    'corrects it, or a battery warms.',
+                    LoadTransient.REMEDY)}
 # Number of delays to try, and the longest, s.
 _DELAYS, _LATEST = 12, 0.1
 # Time constant, in durations of the recording, for a response that never decays.
