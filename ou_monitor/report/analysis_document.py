@@ -264,7 +264,11 @@ def _alarms(analysis: Analysis) -> list[Part]:
         str(one.brief), *(number(x, 2) for x in (one.longest_s, one.seconds))]
         for one in analysis.alarms]
     guess = ', a guess' * (craft.cells_from == 'guessed')
-    return [Section(f'Alarms ({counted(craft.cells, "cell")}{guess})', [Table(
+    title = f'Alarms ({counted(craft.cells, "cell")}{guess})'
+    if rows and not any(one.count for one in analysis.alarms):
+        highest = max(one.limit_v for one in analysis.alarms) / craft.cells
+        return [Text(f'{title}: none at {highest:.1f} V per cell or below would have sounded.')]
+    return [Section(title, [Table(
         ['alarm, V\nper cell', 'first at, s', 'before the\nlowest, s', 'before the\nend, s',
          'dips', 'under 1 s', 'longest, s', 'below, s'], rows),
         Text('Dips merge at a higher alarm: their number may fall while the time below '

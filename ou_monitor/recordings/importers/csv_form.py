@@ -515,8 +515,10 @@ def _stated_step(lines: list[str], above: list[list[str]]) -> tuple[float, str]:
 
 def numbers(path: Path, form: Form, places: Sequence[int],
             texts: dict[int, list[str]] | None = None,
-            left_out: list[str] | None = None, units: bool = True) -> list[FloatArray]:
+            left_out: list[str] | None = None, units: bool = True,
+            only: tuple[int, frozenset[str]] | None = None) -> list[FloatArray]:
     """Return columns of numbers, NaN where blank; `texts` gets cells as written."""
+    # only: a column, and the words in it whose rows hold numbers; words in others are NaN.
     # A bad line raises InputError, or with `left_out` is dropped and its error appended there.
     # units: whether a number with another unit in the next column is converted.
     parts: list[list[FloatArray]] = [[] for _ in places]
@@ -537,6 +539,9 @@ def numbers(path: Path, form: Form, places: Sequence[int],
                 for place, part in zip(places, parts):
                     where = partial(_place, path, form, place, begin, block)
                     cells = columns[place]
+                    if only:
+                        cells = tuple(cell if name in only[1] or is_number(cell) else 'nan'
+                                      for cell, name in zip(cells, columns[only[0]]))
                     if place in with_unit:
                         cells = _with_units(cells, columns[place + 1], form.units[place])
                     part.append(_floats(cells, where, form.comma, form.units[place],

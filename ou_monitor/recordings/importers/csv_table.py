@@ -182,9 +182,12 @@ def read(path: Path, request: Request) -> Log:
     taken = {column.name: quantity for quantity, (column, _) in table.found.items()}
     series = [Series(column.name, quantity, t, values, '1', 'column', 0)
               for quantity, (column, values) in table.found.items()]
+    words = {name for name, values in table.named.items()
+             if name not in request.names and not np.isfinite(values).any()}
     series += [Series(name, ANY, t, values, '1', 'column')
-               for name, values in table.named.items() if name not in taken]
+               for name, values in table.named.items() if name not in {*taken, *words}]
     notes: list[str] = [table.note] if table.note else []
+    notes += [f"Column '{name}' does not hold numbers." for name in sorted(words)]
     late = int(np.count_nonzero(np.diff(t) < 0.0))
     if late:
         notes.append(Note(f'{counted(late, "line")} came after a later stamp: sorted '
@@ -192,7 +195,7 @@ def read(path: Path, request: Request) -> Log:
         order = np.argsort(t, kind='stable')
         series = [replace(one, t=t[order], values=one.values[order]) for one in series]
     if request.everything:
-        known = {one.name for one in series} | {
+        known = {one.name for one in series} | words | {
             table.form.names[place] for place in table.time.place}
         others = [name for name in dict.fromkeys(header) if name not in known]
         if len(others) > MOST_COLUMNS:
@@ -246,6 +249,7 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
     time = clock = _time_of(path, form, wanted)
     if series := _series_of(path, form, wanted, time):
         form, label, value = series
+        asked = {*more}
         more, time = form.names, time._replace(place=())
     found = _supply_of(path, form, wanted, time, needed)
     others = {name: form.names.index(name) for name in more if name in form.names}
@@ -261,7 +265,8 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
             raise InputError(f"{path}:{form.line}: column '{form.names[place]}' occurs twice")
     if series:
         labels: list[str] = []
-        t, (mixed,) = _read(path, raw, clock, [value], left_out, {label: labels})
+        t, (mixed,) = _read(path, raw, clock, [value], left_out, {label: labels}, (
+            label, frozenset(asked.union(column.name for column in found.values()))))
         mine, *others_of = (np.array(labels) == form.names[place] for place in places)
         _check_one_series(path, raw, t, raw.names[value], np.where(mine, mixed, np.nan))
         values, stamps, t = [mixed[mine]], t, t[mine]
@@ -527,7 +532,7 @@ def _series_of(path: Path, form: Form, wanted: CsvColumns, time: _Column,
 
 def _read(path: Path, form: Form, time: _Column, places: list[int],
           left_out: list[str] | None = None, texts: dict[int, list[str]] | None = None,
-          ) -> tuple[FloatArray, list[FloatArray]]:
+          only: tuple[int, frozenset[str]] | None = None) -> tuple[FloatArray, list[FloatArray]]:
     """Return the time as written, days and clocks in s, and columns; texts as in `numbers`."""
     if not time.place:
         if not LEAST_STEP <= time.scale <= LONGEST_STEP:
@@ -538,13 +543,14 @@ def _read(path: Path, form: Form, time: _Column, places: list[int],
     if _holds_clocks(form, time.place[0]):
         clocks: list[list[str]] = [[] for _ in time.place]
         values = numbers(path, form, places, dict(zip(time.place, clocks)) | (texts or {}),
-                         left_out, texts is None)
+                         left_out, texts is None, only)
         cells = list(map(' '.join, zip(*clocks)))
         if len(clocks) > 1 and all(re.fullmatch(r'[\d.]+', part) for part in clocks[1]):
             cells = [f"{clock}.{part.split('.')[-1] if '.' in part else f'{part:0>3}'}"
                      for clock, part in zip(*clocks)]
         return clock_times(path, cells, time.name, left_out), values
-    t, *values = numbers(path, form, [*time.place, *places], texts, left_out, texts is None)
+    t, *values = numbers(
+        path, form, [*time.place, *places], texts, left_out, texts is None, only)
     if len(time.place) > 1:
         part, *values = values
         t = t + part * TIME_UNITS[time.unit]

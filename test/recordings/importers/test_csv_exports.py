@@ -746,3 +746,14 @@ def test_words_are_named_where_numbers_are_missing(tmp_path):
     assert not found.has_throttle and 'not read: throttle (text)' in ' '.join(found.notes)
     with pytest.raises(InputError, match='holds no numbers'):
         read_recording(written(tmp_path, 'name,city\nbob,paris\nann,rome\n', 'b.csv'))
+
+
+def test_words_of_other_series_do_not_stop_the_reading(tmp_path):
+    """AdvantageScope's list: only the cells of the series that are read must be numbers."""
+    rows = [f'{0.02 * k:.2f},/PDH/Voltage,{12 + k % 2}' + (
+        f'\n{0.02 * k:.2f},/Robot/Mode,auto' if not k % 10 else '') for k in range(99)]
+    text = 'Timestamp,Key,Value\n' + '\n'.join(rows) + '\n'
+    assert read_recording(written(tmp_path, text)).n == 99
+    wrong = text.replace('0.04,/PDH/Voltage,12', '0.04,/PDH/Voltage,low')
+    with pytest.raises(InputError, match=":5: column 'Value' holds 'low', not a number"):
+        read_recording(written(tmp_path, wrong))
