@@ -51,8 +51,9 @@ _NORM = math.exp(math.lgamma(0.5 * FREEDOM + 0.5) - math.lgamma(0.5 * FREEDOM)) 
 # Coefficients of the power series of its tail in FREEDOM / (FREEDOM + t^2), highest power first.
 _TAIL = [8.0 / (3.0 * math.pi) * math.comb(2 * k, k) / 4.0**k / (2 * k + 5)
          for k in range(9, -1, -1)]
-# Prior: its weight in horizons; its variances, in those of the noise and in squares of the fall;
-# its precisions of bias and gain.
+# Prior: its weight in horizons; its variances, in those of the noise and in squares of the fall
+# (on nine recorded flights, from gecko to cf_takeoff, 1 to 6 and 0.015 to 0.09); its precisions of
+# bias and gain.
 _PRIOR, _VARIANCES = 5.0, np.array([3.0, 0.03])
 _PRECISION = (1.0 / 0.75, 0.0, 1.0 / 0.48)
 # Memory, s; maximum squared error that counts: errors beyond 3 deviations weigh less.
