@@ -718,6 +718,11 @@ def clock_times(path: Path, cells: list[str], name: str, left_out: list[str] | N
         raise InputError(f"{path}: column '{name}': {error}") from error
     spans = [float(np.nanmax(t) - np.nanmin(t)) if np.isfinite(t).any() else math.inf
              for t in either]
+    # 10.22.31 is no date: with dots between, Italians write a time so.
+    dotted = [re.sub(r'^(\d\d?)[.,]([0-5]\d)[.,]([0-5]\d)(?!\d)', r'\1:\2:\3', cell)
+              for cell in cells]
+    if min(spans) == math.inf and dotted != cells:
+        return clock_times(path, dotted, name, left_out)
     # In 04/05 either may be the day: choose the shorter recording.
     t = either[0] if spans[0] <= spans[1] else either[1]
     if any(one is not None and not (one[1] or one[4]) for one in found):

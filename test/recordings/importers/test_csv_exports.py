@@ -757,3 +757,11 @@ def test_words_of_other_series_do_not_stop_the_reading(tmp_path):
     wrong = text.replace('0.04,/PDH/Voltage,12', '0.04,/PDH/Voltage,low')
     with pytest.raises(InputError, match=":5: column 'Value' holds 'low', not a number"):
         read_recording(written(tmp_path, wrong))
+
+
+def test_a_time_with_dots_is_no_date(tmp_path):
+    """10.22.31 cannot be a date; 10.05.24 can."""
+    times = [f'10.{22 + k // 60}.{k % 60:02}' for k in range(90)]
+    found = read_recording(written(tmp_path, 'Ora;Tensione\n' + ''.join(
+        f'{time};12,{k % 7}\n' for k, time in enumerate(times))))
+    np.testing.assert_allclose(found.t, 37320.0 + np.arange(90.0))
