@@ -59,7 +59,7 @@ KNOWN: dict[str, dict[str, tuple[float, float, float, float]]] = {
             'regbot_28': (3, 0.083, 0.0108, 0.174), 'regbot_30': (3, 0.058, 0.0079, NAN),
             'regbot_62': (3, 0.111, 0.0169, 0.415), 'regbot_81': (3, NAN, 0.0117, NAN),
             'frc_ol_1': (3, NAN, NAN, 0.0275)}}
-# Maximum cells of the known quads: a pack of 24 V, which robots have, looks like 7 cells.
+# Maximum cells of the known quads: the 24 V packs of robots look like 7 cells.
 _MOST_CELLS = max(cells for cells, *_ in KNOWN[QUAD].values())
 # Cells of the class of robots, and formats that do not say what recorded them.
 _ROBOT_CELLS, _ANY_VEHICLE = 3, ('csv', 'mcap', '')
@@ -148,7 +148,7 @@ def check_cells(full: float, cells: int) -> None:
 
 
 def pack_limit(voltage: float | None, cells: int | None) -> float | None:
-    """Return a limit of the pack, V, given in volts per cell if cells are; None if not given."""
+    """Return the limit of the pack, V, from volts (per cell, if cells are given), or None."""
     if not cells:
         return voltage
     if voltage is not None and voltage > _CELL_MOST:

@@ -45,8 +45,8 @@ class AlphaTest:
     # chi^2 with levels - 1 degrees of freedom.
     statistic: float = NAN
     p_value: float = NAN
-    # Ratio of alpha from the lowest to the highest level, with ln(alpha) linear in throttle, that
-    # the test detects with 90 % probability.
+    # Ratio of alpha, highest over lowest level, that the test detects with 90 % probability if
+    # ln(alpha) is linear in throttle.
     detectable_ratio: float = NAN
     # Fitted ratio, highest over lowest throttle (NaN if not determined), and its 95 % interval.
     ratio: float = NAN
@@ -155,7 +155,7 @@ class SigmaChange:
 
     @property
     def differs(self) -> bool | None:
-        """Whether sigma is not the same, at `LEVEL`; None if it may have changed by `NARROW`."""
+        """Whether sigma differs at `LEVEL`; None if a change by `NARROW` cannot be excluded."""
         if not self.ratio_low <= 1.0 <= self.ratio_high:
             return True
         return False if self.ratio_low * NARROW > 1.0 and self.ratio_high < NARROW else None

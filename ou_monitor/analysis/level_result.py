@@ -8,8 +8,8 @@ spectral lines, is fitted by the model that all commands share (`ou_monitor.mode
 Limits: a relaxation slower than half of a segment, or than 2.5 s, counts as drift of the level.
 
 The types of process are those of Table 1 of the paper, which names them by eye; here each has
-tests (`ou_monitor.analysis.level_tests`), adjusted so that any of them rejects in only one of a
-hundred recordings with stationary OU levels.  The first rule that applies names the level:
+tests (`ou_monitor.analysis.level_tests`), adjusted so that, of a hundred recordings with
+stationary OU levels, only one has any rejection.  The first rule that applies names the level:
 
 1. mean or intensity changes from block to block: 'quasi-stationary' (the
    verdict also names the type apart from these changes);
@@ -55,7 +55,7 @@ from scipy.signal import welch
 # Excess kurtosis that the tests must be able to detect, with this power, to name a level Gaussian.
 VISIBLE_KURTOSIS = 1.0
 _POWER = 0.9
-# Maximum share of the variance in spectral lines of a diffusion.
+# Maximum share of spectral lines in the variance of a level named a diffusion.
 _LINE_SHARE = 0.5
 
 
@@ -404,7 +404,7 @@ def fit_level(recording: Recording, left: Remainder, level: LoadLevel, levels: i
         _white(still.t[s.start:s.stop], still.voltage[s.start:s.stop], model)
         for s in within] if model.usable else ())
     if lines.lines and math.isfinite(level.throttle):
-        # A line that throttle has too belongs to the load.
+        # A line that is also in the throttle belongs to the load.
         commanded = find_lines([on_grid(still.t[s.start:s.stop], still.throttle[s.start:s.stop]
                                         ).values for s in within], even).lines
         lines = replace(lines, lines=tuple(line for line in lines.lines if not any(

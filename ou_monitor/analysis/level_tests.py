@@ -11,7 +11,7 @@ variance_drift Layard's test of equal variances of blocks (J. Am. Stat. Assoc. 6
 gaussian       D'Agostino & Pearson's K^2 of skewness and kurtosis, of innovations over
                the standard deviation of their block
 impulses       the largest innovation (Sidak) or a positive excess kurtosis, each at
-               half the level of the test
+               half the significance level
 correlated     lags 1..5 of the deviation, with variances robust against changing
                intensity (Lo & MacKinlay, Rev. Financ. Stud. 1, 1988)
 one_relaxation lags 1..10 of the innovations, likewise
@@ -87,7 +87,7 @@ class Shape:
 
     tests: tuple[TestResult, ...]  # In the order of `EFFECT`
     n: int  # Innovations
-    # Of the innovations over the standard deviation of their block; kurtosis is in excess.
+    # Moments of the innovations over the standard deviation of their block; excess kurtosis.
     skewness: float
     kurtosis: float
     impulses: int  # Innovations above the 99 % quantile of the largest of n normal ones
@@ -208,7 +208,7 @@ def _mean_drift(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Estima
         near = sum(float(c[lag:] @ c[:-lag]) for c in centred
                    for lag in range(1, _LAGS_RAW + 1)) / square
         scale = square / (z.size - blocks) * max(1.0, 1.0 + 2.0 * near)
-    # Innovations of a constant share the relative error of the fit, which limits the freedom.
+    # The error of the fit scales all innovations alike, which limits the degrees of freedom.
     freedom = math.inf
     if math.isfinite(alpha):
         error = 2.0 * math.hypot(estimate.alpha_se, estimate.sigma_se)
@@ -293,7 +293,7 @@ def _portmanteau(name: str, parts: Sequence[FloatArray], lags: int) -> TestResul
         se = math.sqrt(max(variance, 1e-300)) / total
         q += (r / se) ** 2
         squares += max(0.0, r * r - se * se)
-    # Only one fitted parameter, the noise, affects so few lags.
+    # Of the fitted parameters, only the noise affects so few lags.
     freedom = lags - 1.0 if name == 'one_relaxation' else freedom
     return TestResult(name, float(stats.chi2.sf(q, freedom)), math.sqrt(squares))
 

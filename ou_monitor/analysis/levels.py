@@ -40,15 +40,16 @@ MIN_TIME = 0.25
 # paper.
 MIN_STAY = 0.5
 MAX_LEVELS = 20  # Maximum number of levels
-# A passage: maximum duration, s; minimum difference between the means of its first and last
-# quarter, as a share of its range (a ramp has 0.75) and of the half width.
+# A passage through a level: maximum duration, s; minimum difference between the means of its first
+# and last quarter, as a share of its range (0.75 for a ramp) and as a share of the half width.
 _PASSAGE, _STEADY, _CROSSED = 3.0, 0.65, 0.75
 # Minimum pause that splits a segment, in median steps.
 GAP_STEPS = 20.0
 
 # Bin width of the histogram of throttle.
 _GRID = 0.0025
-# Two peaks are separate levels if the histogram falls below this share of the lower one between.
+# Two peaks are separate levels if, between them, the histogram falls below this share of the lower
+# peak.
 _VALLEY = 0.7
 
 
@@ -215,7 +216,7 @@ def level_segments(throttle: FloatArray, centres: Sequence[float], width: float
     level = np.asarray(centres)
     nearest = _distance_to_nearest(centres)
     inner = _half_widths(centres, width)
-    # The outer limit ends before a close neighbour.
+    # Keep the outer limit short of the next level.
     outer = np.maximum(inner, np.minimum(2.0 * width, 0.8 * nearest))
     edges = np.unique(np.concatenate((level - outer, level - inner, level + inner,
                                       level + outer)))

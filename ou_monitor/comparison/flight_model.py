@@ -88,8 +88,8 @@ class Damping:
         return np.asarray(path - self.share * (path - lowpass(path, t, self.time)))
 
 
-# Errors are drawn from readings with noise of similar size: share of all readings taken on either
-# side, and minimum number; tolerance for sizes that count as equal.
+# Errors are drawn from the readings of most similar noise size: share of all readings taken above
+# and below that size, and their minimum number; tolerance for sizes that count as equal.
 _ALIKE, _FEWEST, _ROUNDING = 0.02, 50, 1e-9
 # Minimum share of white noise in the variance, which the filter needs.
 _LEAST_WHITE = 1e-3
@@ -110,8 +110,8 @@ class FlightNoise:
     def draw(self, n: int, load: FloatArray | None, rng: np.random.Generator) -> FloatArray:
         """Return n samples of noise, V, under a throttle or current."""
         wanted = np.log(self.sizes.of(load_signs(n, self.spacing, load)))
-        # Draw from readings of the same size (within rounding) and a number of neighbours that is
-        # the same near the ends.
+        # Draw a reading of the same noise size (within rounding), then one of its neighbours by
+        # size; their number is the same near the ends.
         first = np.searchsorted(self.logs, wanted - _ROUNDING, side='left')
         last = np.searchsorted(self.logs, wanted + _ROUNDING, side='right')
         at = first + (rng.random(wanted.size) * (last - first)).astype(np.int64)
@@ -376,7 +376,7 @@ def damping(samples: Readings, path: FloatArray) -> Damping:
 
 
 def _sag_error(samples: Readings, load: _Load) -> float:
-    """Return the relative error of the sag as a mean of two parts."""
+    """Return the relative error of the sag, for a mean over two held-out parts."""
     # In each held-out part, the voltage is regressed on the predicted path; parts that move more
     # have more weight.  Temperature, wind and simplifications of the load model change the ratio.
     squares, weights = [], []

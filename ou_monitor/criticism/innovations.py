@@ -14,8 +14,8 @@ hundreds of samples.
 
 AC-coupled instrument, a high-pass: the ordinates below its corner are too small.  Their sum is
 tested by the gamma distribution, which holds for few ordinates, unlike the lower tail of the
-score.  It counts only if more than half of their power is missing, because the regression of
-the mean removes some, too.
+score.  A detection requires that more than half of their power is missing, because the
+regression of the mean removes some, too.
 
 Limits: only the rates in `FACTORS`, one at a time; a corner at the rate of the OU itself is
 absorbed by the fit; linear drifts are removed; samples are taken as evenly spaced.
@@ -42,12 +42,12 @@ LEAST_SHARE = 0.1
 FACTORS = (1.0 / 30.0, 1.0 / 10.0, 1.0 / 3.0, 3.0, 10.0)
 # Minimum ordinates of a test, and minimum samples of a segment.
 _FEWEST, _SHORTEST = 64, 64
-# A high-pass is considered only if the mean ordinate below its corner, minus 1, is less than this;
-# it removes 79 % there.
+# A high-pass is considered only if the mean ordinate below its corner, minus 1, is less than this
+# (a high-pass makes it -0.79).
 _MISSING = -0.5
 # Relative difference up to which steps count as equal.
 ALIKE = 0.3
-# Minimum measurement noise, for a regular filter, as a share of the variance of a step.
+# Minimum measurement noise, as a share of the variance of a step: keeps the filter nonsingular.
 _NO_NOISE = 1e-6
 
 
@@ -64,8 +64,8 @@ def steps_before(t: FloatArray) -> FloatArray:
     """Return the time before each sample, s; infinite before the first."""
     step = np.diff(t, prepend=-np.inf)
     usual = float(np.median(step[1:]))
-    # Small deviations change a prediction by much less than its error; equal steps save most of
-    # the time.
+    # Set nearly equal steps equal: this changes predictions by much less than their error, and
+    # saves most of the time of the filter.
     step[np.abs(step - usual) < ALIKE * usual] = usual
     return step
 

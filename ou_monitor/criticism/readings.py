@@ -16,14 +16,14 @@ from ou_monitor.records import FloatArray, NAN, Recording
 from ou_monitor.text import counted, number
 from ou_monitor.timeline import in_order, supplied
 
-# Minimum distance of an outlier from the median: in standard deviations, and in distances of the
-# next sample.
+# Minimum distance of an outlier from the median: in standard deviations, and as a multiple of the
+# distance of the sample next closest to it.
 _FAR, _GAP = 50.0, 5.0
 # Minimum repeats of an outlying value to be an error code; maximum share of such samples.
 _CODE, _MOST_CODES = 3, 0.2
 # Maximum single bad samples that are left out; for long recordings, one for each _EACH samples.
 _SINGLES, _EACH = 3, 100_000
-# Minimum other samples beside an error code whose share exceeds _MOST_CODES.
+# Minimum number of other samples if the share of an error code exceeds _MOST_CODES.
 _OTHERS = 100
 # Maximum values used for the spread.
 _EXAMINED = 200_000
@@ -89,7 +89,7 @@ def current_at(recording: Recording, t: FloatArray) -> FloatArray | None:
 
 def load_of(recording: Recording, t: FloatArray, v: FloatArray, u: FloatArray | None,
             notes: list[str]) -> tuple[FloatArray | None, float]:
-    """Return the load, and the current that is a load of 1, A; NaN if the load is throttle."""
+    """Return the load, and the current at which it is 1, A; NaN if the load is throttle."""
     # t in s, v in V.  The current is the load unless throttle predicts the voltage better.  It is
     # divided by its 99 % quantile, and shifted by the delay of the voltage.
     current = current_at(recording, t)

@@ -23,9 +23,9 @@ from ou_monitor.model.terms.term import Role, Term
 from ou_monitor.model.terms.tones import Tone
 from ou_monitor.records import FloatArray
 
-# Minimum measurement noise, for a regular filter, as a share of the variance of a step.
+# Minimum measurement noise, as a share of the variance of a step: keeps the filter nonsingular.
 NO_NOISE = 1e-6
-# Step of the numerical scores, in the logarithm of a parameter.
+# Step of the numerical derivatives (scores), in the logarithm of a parameter.
 _STEP = 1e-4
 # Maximum rounds of a fit, of a rough one, and of a last one that begins near the maximum.
 _ROUNDS, _FEW_ROUNDS, _LAST_ROUNDS = 12, 6, 2
@@ -63,8 +63,8 @@ class GaussianFit:
     terms: tuple[Term, ...]  # With their parameters; the first is the `ou`
     se: tuple[dict[str, float], ...]  # Standard errors by parameter, one dict per term
     mean: FloatArray  # Of the voltage, V; shape (n,)
-    # One-step errors, V, and their predictive variances, V^2, each without the event at its own
-    # sample; shape (n,).
+    # One-step errors, V, and their predictive variances, V^2, which exclude an event at the sample
+    # itself; shape (n,).
     innovation: FloatArray
     variance: FloatArray
     density: FloatArray  # Log predictive density of each sample, nats; shape (n,)
@@ -98,11 +98,12 @@ def fit_gaussian(samples: Samples, terms: Sequence[Term], part: slice,
 
 def evaluate(samples: Samples, terms: Sequence[Term], events: Events | None = None,
              se: Sequence[dict[str, float]] = (), inside: bool = False) -> GaussianFit:
-    """Filter a recording with given parameters; inside: variances include the events."""
+    """Filter a recording with given parameters (inside: variances include events there)."""
     run = _filter(samples, terms, events)
     mean = mean_of(samples, terms, run.segment)
     e = run.kalman.innovations(samples.voltage - mean)
-    # The law predicts the event at a sample itself, except during the fit of the Gaussian part.
+    # Exclude the event at the sample itself: its law predicts it.  Only the fit of the Gaussian
+    # part, which has no laws, includes it.
     variance = run.full if inside else run.plain
     return GaussianFit(tuple(terms), tuple(se), mean, e, variance, _log_density(e, variance),
                        run.segment.phi, run.cost)
@@ -112,8 +113,8 @@ def whitened(samples: Samples, terms: Sequence[Term], more: Sequence[Term],
              events: Events | None = None, offset: FloatArray | None = None, *,
              own: bool = False) -> FloatArray:
     """Return voltage, level and columns of the mean, whitened by the noise of a model."""
-    # Columns: of `more`, after those of the model if `own`; otherwise the model's terms that are
-    # not `MEASURED` are subtracted from the voltage.  offset in V.
+    # With `own`: the columns of the model's terms, then of `more`.  Without: only of `more`, and
+    # terms of the model that are not `MEASURED` are subtracted from the voltage.  offset in V.
     run = _filter(samples, terms, events)
     kept = terms if own else [term for term in terms if term.ROLE is not Role.MEAN]
     columns = columns_of(samples, (*kept, *more), run.segment)
@@ -432,7 +433,7 @@ def design_of(samples: Samples, terms: Sequence[Term], s: Segment) -> FloatArray
     for term in terms:
         if isinstance(term, ACCoupling):
             design = design.copy()
-            # The level behind an AC coupling is a parameter of its own: column 1 is unchanged.
+            # Column 1, the level, is unchanged: behind an AC coupling it is a free parameter.
             design[:, 2:] = term.pass_through(design[:, 2:], s)
     return design
 

@@ -16,7 +16,7 @@ the paper, both with a small eps; at eps = 1 the system is unchanged, and D and 
       b(u) = sum_xy pi(x) R0(x, y) A_y (A_x u + a_x),
       B(u) = 2 sum_xy pi(x) R0(x, y) sym[C(u; x) C(u; y)'].
 
-  Equation (6) of the paper lacks the 2, which (4) as printed needs: the variance of the integral
+  Equation (6) of the paper lacks the 2 that (4), as printed, needs: the variance of the integral
   of C(x(t)) grows at twice the integral of its autocovariance over positive lags
   (Korolyuk & Limnios, Stochastic Systems in Merging Phase Space, 2005, give it with the 2).
 
@@ -259,7 +259,7 @@ class Generator:
 
     @cached_property
     def _cumulative_kernel(self) -> FloatArray:
-        """Return the cumulative kernel, shape (n, n), exactly 1 from the last possible state."""
+        """Return the cumulative kernel, shape (n, n); each row ends at exactly 1."""
         below = np.cumsum(self.jump_probabilities, axis=1)
         return np.asarray(below / below[:, -1:])
 
@@ -285,8 +285,8 @@ class Generator:
         self, edges: FloatArray, state: IntArray, rng: np.random.Generator,
     ) -> Iterator[tuple[int, IntArray | slice, IntArray, FloatArray]]:
         """Advance an ensemble of paths from jump to jump, stopping at every edge, s."""
-        # Yields index of the interval, paths that leave a state (at an edge: all paths), these
-        # states, and the time spent in them since the last yield, s.
+        # Yields, at each jump and edge: index of the interval, the paths that jump (at an edge:
+        # all), their states until then, and the time in these since their last yield, s.
         rates, everyone = self.leaving, slice(None)
         hold = rng.standard_exponential(state.size) / rates[state]
         for k, width in enumerate(np.diff(edges)):

@@ -171,7 +171,7 @@ def _checked(content: Any, record: type, where: str) -> dict[str, Any]:
     for key, value in content.items():
         if key not in known:
             shown = printable(key, 60)
-            # Do not quote keys of a file that is probably no msg config.
+            # Do not quote the keys if the file is probably not a msg config.
             name = '' if closest(shown, known) is None else f" '{shown}'"
             raise InputError(f'{where}: unknown key{name}: {nearest(shown, known)}')
         accepted, word = _KINDS[str(known[key].type)]

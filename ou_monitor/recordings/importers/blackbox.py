@@ -186,7 +186,7 @@ def _facts(headers: Headers) -> dict[str, str]:
 
 
 def _cells(headers: Headers) -> dict[str, str]:
-    """Return cells and the lowest voltage of one, V, as the firmware counts them."""
+    """Return the number of cells, counted as in the firmware, and their lowest voltage, V."""
     words = [re.findall(r'\d+', str(headers.get(key, '')))
              for key in ('vbatcellvoltage', 'vbatref')]
     if len(words[0]) != 3 or len(words[1]) != 1:
@@ -275,7 +275,7 @@ def _throttles(t: FloatArray, columns: Fields,
 
 
 def _signed(value: FloatArray) -> FloatArray:
-    """Restore the sign of counts logged without one: a stick below its lowest pulse."""
+    """Restore the sign of counts logged as unsigned (a stick below its lowest pulse)."""
     value = np.where(value >= 2.0 ** 31, value - 2.0 ** 32, value)
     return np.where((value >= 2.0 ** 15) & (value < 2.0 ** 16), value - 2.0 ** 16, value)
 

@@ -50,7 +50,7 @@ _LONGEST = 40
 MOST_OF_LINE = 65536
 # Bytes, then lines, in which the format is detected; characters and rows read at once.
 _HEAD, _HEAD_LINES, _CHUNK, _BLOCK = 65536, 200, 1 << 20, 8192
-# Rows of numbers that must follow one another where the data begin.
+# Consecutive rows of numbers that mark the beginning of the data.
 _IN_A_ROW = 8
 
 # What a line of comment begins with.
@@ -59,7 +59,7 @@ DELIMITERS = {'tab': '\t', 'space': ' '}
 
 
 def _by_word(**units: str) -> dict[str, str]:
-    """Return words of units, in lower case -> unit."""
+    """Return a table of the words for units, in lower case -> unit."""
     return {word: unit for unit, words in units.items() for word in words.split()}
 
 
@@ -67,7 +67,7 @@ TIME_WORDS = _by_word(
     s='s sec secs second seconds sekunden', ms='ms msec millis millisecond milliseconds',
     us='us µs μs usec micros microseconds', ns='ns nsec nanoseconds', min='min mins minutes',
     h='h hr hours', d='d days')
-# These end the names of other quantities too: Voltage (min).
+# Ambiguous at the end of a name: 'Voltage (min)' is a minimum.
 _LONG = 'min|mins|minutes|h|hr|hours|d|days'
 VOLT_WORDS = _by_word(V='v volt volts vdc', mV='mv mvdc millivolt millivolts', cV='cv', dV='dv',
                       kV='kv', uV='uv µv μv')
@@ -78,7 +78,7 @@ SHARE_WORDS = dict.fromkeys(('%', 'percent', 'pct', 'prozent'), '%')
 OTHER_WORDS = frozenset(('', *('- sequence w wh ah mah hz khz rpm 1/min ° deg °c degc °f m m/s '
                                'km/h g kg n nm ohm mohm').split()))
 WORDS = {**TIME_WORDS, **VOLT_WORDS, **AMPERE_WORDS, **SHARE_WORDS}
-# Units in V, A, s and 1; the last letter is the quantity.
+# Unit -> its size in V, A, s or 1; the last letter shows the quantity.
 SCALES = {**TIME_UNITS, 'min': 60.0, 'h': 3600.0, 'd': 86400.0, 'V': 1.0, 'dV': 0.1, 'cV': 0.01,
           'mV': 1e-3, 'kV': 1e3, 'uV': 1e-6, 'A': 1.0, 'dA': 0.1, 'cA': 0.01, 'mA': 1e-3,
           'uA': 1e-6, '%': 0.01}
@@ -236,7 +236,7 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool, ma
     places = [k for k, ok in enumerate(good) if ok and (ok[-1] or 2 * sum(ok) >= len(ok))]
     first = _first_of_data(rows, skip, width, places)
     if first is None:
-        # A header alone is a format without rows.
+        # No rows: accept a header alone.
         first = len(rows)
         if len(filled) != 1 or any(map(is_value, filled[0])):
             return None
@@ -298,7 +298,7 @@ def _unlabelled(row: list[str], labels: Sequence[str]) -> list[str]:
 
 def _after_names(rows: list[list[str]], skip: int, first: int, width: int, places: list[int],
                  ) -> int:
-    """Return the first row below the names; `first` is the first without a bad cell."""
+    """Return the first row of data below the names (first: the first row without a bad cell)."""
     filled = [k for k in range(skip, first) if any(rows[k])]
     numeric = [k for k in filled if len(rows[k]) == width and any(
         is_value(rows[k][place]) for place in places)]
@@ -309,7 +309,7 @@ def _after_names(rows: list[list[str]], skip: int, first: int, width: int, place
 
 
 def _prepared(lines: list[str], delimiter: str, comma: bool, mark: str) -> list[str]:
-    """Return lines with decimal points and blank comments (between blanks: single ones)."""
+    """Return lines with decimal points, comments blanked; between blanks, single blanks."""
     lines = ['\n' if line.lstrip().startswith(COMMENTS) else line for line in lines]
     if lines and _RECEIVED.match(lines[0]):
         lines = [f'{found[1]}{delimiter}{rest}' if (found := _RECEIVED.match(line)) and (
@@ -415,7 +415,8 @@ def _header(rows: list[list[str]], lines: list[str], first: int, width: int, del
     if any(labels) and not (plain and len(plain[-1][1]) == width):
         return [label[:-1].strip() or ('time' if is_clock(cell) else f'column {k + 1}')
                 for k, (label, cell) in enumerate(zip(labels, rows[first]))], [], first + 1
-    # Else marked as a comment: delimited as the data, or by blanks, units in brackets.
+    # Otherwise the names may be in a comment: delimited like the data, or by blanks with units in
+    # brackets.
     comments = []
     for k in range(skip, first):
         text = lines[k].lstrip('#% \t')
@@ -430,7 +431,7 @@ def _header(rows: list[list[str]], lines: list[str], first: int, width: int, del
 
 def _names_and_units(above: list[tuple[int, list[str]]], width: int, needed: set[int],
                      ) -> tuple[list[str], list[str], int] | None:
-    """Return names, words of units and a line as `_header`; None: no line names all columns."""
+    """Return the same as `_header`; None if no line names all columns."""
     units: list[str] = []
     if len(above) > 1 and _are_units(above[-1][1]) and len(above[-2][1]) >= min(
             width, len(above[-1][1])):
@@ -439,7 +440,7 @@ def _names_and_units(above: list[tuple[int, list[str]]], width: int, needed: set
         return None
     line, names = above[-1]
     for _, over in reversed(above[:-1]):
-        # Names in several lines: a blank cell has the name above, a repeated one both.
+        # Names in several lines: the cell above replaces a blank name and precedes a repeated one.
         if len(over) != len(names) or any(map(is_value, over)):
             break
         count = Counter(names)
@@ -487,7 +488,7 @@ def first_word(text: str) -> str:
 
 
 def _are_units(row: list[str]) -> bool:
-    """Return whether a row states units: several, not outnumbered by other words, or just one."""
+    """Return whether a row states units: just one, or several and at most as many other words."""
     words = [cell.strip('[](){} ').lower() for cell in row]
     some = sum(word in WORDS for word in words)
     others = sum(word not in WORDS and word not in OTHER_WORDS and not is_number(word)
@@ -573,7 +574,7 @@ def _check_same_names(row: list[str], names: Sequence[str], where: Callable[[int
 
 
 def _with_units(cells: Sequence[str], units: Sequence[str], stated: str) -> tuple[str, ...]:
-    """Return cells with the units of their rows where these are not that of the column."""
+    """Return cells, with the unit of their row where it is not that of the column."""
     return tuple(cell if is_missing(cell) or first_word(unit) in ('', stated)
                  else f'{cell} {unit.strip()}' for cell, unit in zip(cells, units))
 
@@ -641,7 +642,7 @@ def _fitting(path: Path, rows: list[list[str]], width: int, last: int, form: For
                 raise InputError(wrong + _PARTIAL)
             left_out.append(wrong)
         if wrong or blank:
-            # It stays in the block, so that line numbers can be counted.
+            # Keep the row, emptied, so that lines are still counted.
             row.clear()
     return [row[:last + 1] for row in rows if row]
 

@@ -44,16 +44,16 @@ _DJI = '364:1684'
 MOST_COLUMNS = 300
 # Share of backward steps above which a column is not a time.
 _BACK = 0.25
-# A time without a unit has the coarsest unit with steps, and span, of at most these, s.
+# Maximum step and span of a time, s; an unstated unit is the coarsest one within both.
 _USUAL_STEP, _USUAL_SPAN = 2.0, 43200.0
 # Number of the first day of 1970 in Excel and MATLAB; days from there to 2100.
 _OF_1970, _TO_2100 = (25569.0, 719529.0), 47482.0
 # Values of a counter of 32 bits.
 _COUNTS = 2.0**32
-# Rows from which repeated stamps are the resolution of a clock.
+# Minimum rows before repeated stamps are put down to a coarse clock.
 _FEW_ROWS = 8
 # To spread rows that share stamps: minimum mean number of rows per stamp; maximum relative
-# deviation of that number; stamps per straight piece (with ten rows a stamp, a row is 1 % of it).
+# deviation of that number; stamps per straight piece (a row, of ten per stamp, is 1 % of a piece).
 _LEAST_SHARED, _UNSTEADY, _EVEN = 1.5, 0.2, 10
 # Change by rounding; standard errors above which a mean change is significant.
 _ROUNDING, _SURE = 1e-6, 4.0
@@ -96,10 +96,10 @@ _PATTERNS = {
         r'(?:_?(?:avg|average|mean))?(?:_?1)?|'
         r'(?!.*(?:max|min|limit)).*_batt?(?:ery)?_current'),
 }
-# Column by which a program is recognised ('': any program) -> for each of its columns, by the end
-# of the name in lower case: factor, unit, and the number that stands for "unknown".  Betaflight's
-# blackbox explorer writes the numbers of the log: us, 0.01 V and 0.01 A from version 4.0 on;
-# MAVLink those of SYS_STATUS, BATTERY_STATUS and POWER_STATUS (common.xml).
+# Exports with unscaled numbers.  Column that reveals the program ('': any program) -> end of a
+# column's name, in lower case -> factor, unit, and the number that stands for "unknown".
+# Betaflight's blackbox explorer: us, 0.01 V and 0.01 A, as logged from version 4.0 on.  MAVLink:
+# SYS_STATUS, BATTERY_STATUS and POWER_STATUS (common.xml).
 _RAW: dict[str, dict[str, tuple[float, str, float]]] = {
     'loopIteration': {'time': (1e-6, 'us', math.nan), 'rccommand[3]': (0.0, 'us', math.nan), **{
         f'{name}{end}': (0.01, unit, math.nan) for name, unit in (
@@ -163,7 +163,7 @@ def read_csv(path: Path, columns: CsvColumns | None = None, *, partial: bool = F
         if not filled.all() and filled.any():
             said.append(f"{counted(int((~filled).sum()), 'row')} left out: the cell of "
                         f"'{printable(column.name)}' is empty.")
-    # A blank cell is not a message: the last command holds.
+    # A blank throttle cell means no new command: hold the last one.
     throttle = hold(held.get(logs.THROTTLE, nothing))
     if filled.any():
         t, volts, throttle, current = (one[filled] for one in (t, volts, throttle, current))
@@ -558,10 +558,10 @@ def _read(path: Path, form: Form, time: _Column, places: list[int],
 
 
 def _unwrapped(t: FloatArray) -> FloatArray:
-    """Let a 32-bit counter go on where it began anew at 0: micros() does so after 72 minutes."""
+    """Unwrap a 32-bit counter of a time; micros() wraps after 72 minutes."""
     known = np.isfinite(t)
     on = np.unwrap(t[known], period=_COUNTS)
-    # After a restart of the logger, the step would be longer than others.
+    # A restart of the logger is not a wrap: unwrapped, it would leave an unusually long step.
     longest = 2.0 * np.diff(t[known]).max(initial=0.0)
     if ((t[known] >= 0.0) & (t[known] < _COUNTS)).all() and (np.diff(on) <= longest).all():
         t[known] = on
@@ -651,8 +651,8 @@ def _spread(t: FloatArray, volts: FloatArray) -> FloatArray:
     if rows.size < 2 or _LEAST_SHARED * begin.size > known.size or (step < 0.0).any():
         return t
     usual, first = float(np.median(rows)), change[begin[1:] - 1]
-    # Leave the stamps if the voltage changes only from one stamp to the next (repeated rows), or
-    # always in one direction there (several series in turn).
+    # Leave the stamps if the voltage changes only where the stamp does (repeated rows), or always
+    # in one direction where it does (several series in turn).
     if np.mean(np.abs(rows - usual) > max(1.0, _UNSTEADY * usual)) > WILD or np.count_nonzero(
             first) > (1.0 - WILD) * np.count_nonzero(change) or abs(
                 np.mean(first) - np.mean(change)) > _ROUNDING + np.std(first) * max(
@@ -688,13 +688,13 @@ def _in_si(quantity: str, column: _Column, values: FloatArray, given: str | None
             guess, unit = True, '-100:100'
         words = ', a guess: --throttle-unit' if guess and unit != '1' else ''
         if unit in ('us', 'ms'):
-            # An output without pulses.
+            # 0: an output without pulses.
             values = np.where(values == 0.0, THROTTLE_UNITS[unit][0], values)
         low, high = THROTTLE_UNITS.get(unit) or map(float, unit.split(':'))
         return (values - low) / (high - low), (
             '0..1' if unit == '1' else unit) + words
-    # Use the maker's factor, unless the numbers have been converted already (names are then kept):
-    # no supply is below 1 V.
+    # Use the maker's factor, unless it makes a supply of less than 1 V: then the numbers were
+    # converted already, under the same names.
     if column.scale and 'V' not in (given, beside) and (
             math.isnan(column.unknown) or (known == np.rint(known)).all()) and (
             quantity == logs.CURRENT or known.size and np.median(known) * column.scale >= 1.0):
