@@ -308,7 +308,7 @@ def fit_parts(recording: Recording, left: Remainder, segments: Sequence[LevelSeg
     square = sum(float(part @ part) for part in ends) / max(count, 1)
     steps = sum(float(np.sum(np.diff(part) ** 2)) for part in ends) / max(count - len(ends), 1)
     if ou.status != 'ok':
-        status = (Status.TOO_FEW_SAMPLES if ou.status != 'not_visible' else
+        status = (Status.TOO_SHORT if ou.status != 'not_visible' else
                   Status.CONSTANT if not ou.var_inf_below else
                   Status.UNBOUND if 0.5 * steps < _WANDERS * square else Status.NO_RELAXATION)
         return ou, replace(blank, status=status)

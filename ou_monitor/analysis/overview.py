@@ -279,4 +279,4 @@ def _ou_words(ou: OuFacts, whole: OuFacts | None = None) -> str:
             return f'none: no noise in {window}'
         return (f'not visible in {window}; one slower than {number(1e3 * ou.tau_below_s)} ms '
                 f'is below {number(1e3 * math.sqrt(ou.var_inf_below))} mV rms')
-    return 'unknown: too few readings'
+    return 'unknown: the recording is too short for it'
