@@ -221,7 +221,7 @@ def _plain_model(samples: Samples, state: Integrity) -> HeldOut:
         return found
     logged = fit_gaussian(state.raw, [guess(state.raw)], slice(0, state.raw.n)).terms
     gaussian = evaluate(samples, logged)
-    # The loss by holding out a block is taken from the fit without repeats.
+    # What holding out a block costs is known from the fit without repeats.
     density = gaussian.density + found.density - plain.density
     return HeldOut(replace(plain, terms=logged, gaussian=gaussian, density=density), density,
                    found.known & np.isfinite(density), gaussian.innovation)

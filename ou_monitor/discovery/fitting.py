@@ -34,7 +34,7 @@ _FULL, _PREVIEW, _FEW = 2, 8000, 4
 _WITHIN = 0.5
 # Maximum alternations between the fit and the `APART` parameters of its terms.
 _AGAIN = 3
-# Differences that count as none: between gains of two fits, nats, and between scores.
+# Gains of two fits, nats, and normal scores that differ by less count as equal.
 _ALIKE, _SAME = 0.1, 1e-6
 # Degree of a smooth drift, as of a discharge under changing load, and the variance inflation
 # factor above which the load counts as collinear with it: flights have 1.0 to 1.4, staircases and
@@ -78,7 +78,7 @@ class Fitter:
         return view_of(self.samples, composite.gaussian, composite.z, self.samples.train)
 
     def holds(self, composite: Composite) -> bool:
-        """Return whether all terms of a model still match their names."""
+        """Return whether every term is still what its name says."""
         view = self.view(composite)
         return all(term.holds(view) for term in composite.terms)
 
@@ -130,9 +130,9 @@ class Fitter:
     def trials(self, composite: Composite, kinds: Sequence[type[Term]],
                statistics: Callable[[Composite], Mapping[str, float]]) -> list[Trial]:
         """Return kinds that improve a model: all are estimated, the best few fitted in full."""
-        # Kinds that failed are tried again if their gain by score tests has risen since.  Slow
-        # kinds come last, and only if they imitate the best other kind or score tests still show
-        # them after it is added.
+        # Kinds that failed are tried again if score tests show more of them than then.  Kinds that
+        # are slow to fit come last, and only if they imitate the best other kind, or if score
+        # tests still show them once it is added.
         values = statistics(composite)
         shown = {kind: decision.score_gain(kind, values) for kind in kinds}
         tried = [kind for kind in kinds if not kind.SLOW_FIT
@@ -179,7 +179,7 @@ class Fitter:
         found, names = list(known), {trial.name for trial in known}
         best = sorted(estimates, key=lambda estimate: -estimate[0])[:_FEW]
         for gain, kind, start in best:
-            # Compare with full fits, in which a law may lose all of its estimated gain.
+            # In a full fit, a law may lose all of its estimated gain, so only full fits compare.
             top = max((trial.evidence for trial in found), default=0.0)
             if gain < _WITHIN * top or kind.NAME in names:
                 continue
@@ -207,7 +207,7 @@ class Fitter:
         return last[1]
 
     def _finds_events(self, kind: type[Term], view: View) -> bool:
-        """Return whether a law finds events (until it is added, they widen the Gaussian part)."""
+        """Return whether a law finds events, which widen the Gaussian part until it is added."""
         found = None if kind.SLOW_FIT else self.law_fit(kind, view)
         return found is not None and (found.push is not None or found.error is not None)
 
@@ -254,7 +254,7 @@ class Fitter:
         laws = [term for term in composite.terms if term.ROLE is Role.LAW]
         moved = [from_spectrum(self.samples, composite, [start.beside(ou), *others, start])
                  for start in starts]
-        # If the spectrum gains less than the penalty, the samples do not gain more.
+        # Where a spectrum gains less than the penalty, so would the samples.
         moved = sorted((fit for fit in moved if fit[0][-1].holds(view)
                         and fit[1] > max(decision.ACCEPT, least)), key=lambda fit: -fit[1])
         # Starts with the same gain have converged to one fit.
@@ -295,8 +295,8 @@ def _added_term(composite: Composite) -> Term:
 
 
 def _by_scores(samples: Samples, starts: list[Term], view: View) -> list[Term]:
-    """Sort starts by their gain in the scores; drop lines whose gain is far below the penalty."""
-    # Other terms stay: the `ou` partly absorbs slow ones, so their gain in the scores is small.
+    """Sort starts by what they gain in the normal scores; drop lines far below the penalty."""
+    # Other kinds are kept, because the `ou` absorbs part of a slow one, which then gains little.
     s = samples.segment(1.0, 0.0)
     scale = np.sqrt(view.variance)
     price = 0.5 * math.log(samples.train.stop)

@@ -34,7 +34,7 @@ from scipy.stats import chi2
 
 # Number of blocks of the held-out samples: the minimum for a good estimate of their spread.
 BLOCKS = 24
-# A gain is unknown if its error exceeds both: this multiple of the gain, and nats per sample.
+# A gain is unknown if its error exceeds both _VAGUE times the gain and _WIDE nats per sample.
 _VAGUE, _WIDE = 10.0, 0.1
 
 
@@ -152,9 +152,9 @@ _FAR = 1.5
 # Maximum mean loss from errors of the parameters, nats per sample; at the limit they are as large
 # as the noise.
 _UNKNOWN = 0.5
-# Tolerance beyond the throttle range of the other blocks: share of the range, and minimum.
+# How far throttle may pass the range of the other blocks: share of that range, and at least.
 _BEYOND, _STILL = 0.05, 0.01
-# Time, s, for which samples are not scored after throttle that no other block contains: most lags
+# After throttle that no other block contains, samples are not scored for this time, s; most lags
 # of recorded flights are shorter.
 _AFTER = 0.2
 
@@ -190,7 +190,7 @@ def held_out(samples: Samples, model: Composite) -> HeldOut:
     info = np.array([means[b].T @ means[b] + 0.5 * spreads[b].T @ spreads[b] for b in blocks])
     gram = np.array([columns[b].T @ columns[b] for b in blocks])
     density, known = model.density.copy(), np.ones(samples.n, dtype=np.bool_)
-    # With an offset, which a law estimates from later samples too, use errors without it.
+    # A law estimates its offset from later samples too, so the errors are those without it.
     plain = base if model.offset is None else evaluate(samples, terms, events)
     error = plain.innovation.copy()
     for b, own, mean in zip(blocks, info, gram, strict=True):
@@ -220,10 +220,9 @@ def held_out(samples: Samples, model: Composite) -> HeldOut:
 def errors_grow(new: FloatArray, old: FloatArray, variance: FloatArray, errors: float = Z95
                 ) -> bool:
     """Return whether one-step errors (rms) grew by more than `errors` standard errors."""
-    # If the new model is right, its errors, with these variances, V^2, are independent of their
-    # difference from the old ones, which gives the standard error of the increase.  A likelihood
-    # may rise although errors grow: to explain a few bursts as noise may cost less likelihood than
-    # it gains elsewhere.
+    # If the new model is right, its errors are independent of the differences from the old ones;
+    # their variances, V^2, then give the standard error of the increase.  Errors may grow although
+    # the likelihood rises: a model may give up a few bursts as noise and gain elsewhere.
     difference = old - new
     error = 2.0 * math.sqrt(float(np.sum(variance * difference**2)))
     return float(np.sum(new**2 - old**2)) > errors * error

@@ -23,8 +23,8 @@ _DIGITS = (4, 6)
 _DRAWS = 8
 # Quantiles of the load between which a fall is measured.
 _FLOWN = (0.01, 0.99)
-# Range in which the predicted minimum of a dip is sought, s; share of a dip's depth above which
-# the load has caused it.
+# The predicted minimum of a dip lies within this time of it, s; the load has caused the dip if it
+# predicts more than this share of its depth.
 _NEAR, _MADE = 0.05, 0.5
 
 

@@ -95,7 +95,7 @@ def mean_response(samples: Samples, composite: Composite, view: View,
 
 
 def _refined(samples: Samples, composite: Composite, found: MeanResponse) -> MeanResponse:
-    """Return a response with its time constants between those of the list."""
+    """Return a response with its time constants refined; those tried first are from a list."""
     # With a time constant wrong by half an octave, a response of 0.6 V leaves an error of 40 mV,
     # which would be taken for a slow OU.
     terms, worth = found.terms, found.worth
@@ -167,7 +167,7 @@ class _Regression:
         for k in start:
             chosen = self._with_term(chosen, k)
         chosen = self._moved(chosen)
-        # On the way, a better time constant may stand beside the one that it replaces.
+        # So far, a better time constant may stand beside the one that it replaces.
         self._apart = True
         while self._has_twins(chosen):
             chosen = max((self._less(chosen, k) for k in chosen),
@@ -197,8 +197,8 @@ class _Regression:
 
     def exchanged(self, own: int, places: Sequence[int]
                   ) -> tuple[tuple[int, ...], tuple[float, ...]]:
-        """Exchange the first `own` terms for better later ones; return them and their worth."""
-        # places: for each term of the rest, the place that it may take.
+        """Replace any of the first `own` terms by a better later one; return terms and worth."""
+        # places: for each later term, the one of the first that it may replace.
         self._apart = True
         chosen = list(range(own))
         for k, place in enumerate(places, own):

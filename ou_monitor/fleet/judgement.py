@@ -19,8 +19,8 @@ t test.  A pack is compared only with packs of the same number of cells.
 Outliers: the score of a value is its distance from the median (or the drift line) of its group
 divided by sqrt(s^2 + se^2), with its standard error se and the scatter s between recordings, a
 median absolute deviation.  The bound is a quantile of the largest score in simulated fleets
-without faults, with the same groups, errors and evaluation, and with the upper 90 % bound of s,
-which errs towards fewer false alarms.  If many members of a group are off, its median is too.
+without faults, evaluated in the same way; their s is the upper 90 % bound, so that false alarms
+are rather too few.  If many members of a group are off, its median is too.
 """
 
 from __future__ import annotations
