@@ -25,9 +25,10 @@ def written(tmp_path, text, encoding='utf-8'):
     'time_s,voltage_v,throttle,note\n0,5.0,0.1,"two\nlines"\n1,5.5,0.2,x\n',
     'time_s,voltage_v,throttle\f\n0,5.0,0.1\f\n1,5.5,0.2\f\n',
     'time_s,voltage_v,throttle\n0,5.0,0.1,\n1,5.5,0.2,, \n',
+    'time_s,voltage_v,throttle, ,note\n0,5.0,0.1,7,x\n1,5.5,0.2,8,y\n',
 ])
 def test_valid_csv_variants_are_read(tmp_path, text):
-    """Delimiters, order, extra columns, comments, blank lines and quotes."""
+    """Delimiters, order, extra columns, a blank name, comments, blank lines and quotes."""
     raw = read_csv(written(tmp_path, text))
     t, voltage, throttle = raw.t, raw.voltage, raw.throttle
     assert t.tolist() == [0.0, 1.0]

@@ -446,9 +446,12 @@ def _names_and_units(above: list[tuple[int, list[str]]], width: int, needed: set
         count = Counter(names)
         names = [f'{more} {name}'.strip() if k and count[name] > 1 else name or more
                  for k, (name, more) in enumerate(zip(names, over))]
-    # An index at the left has no name, any other column has one.
-    named = all(names[k:k + 1] != [''] or k not in needed for k in range(1, width))
-    return (names, units, line + 1) if named else None
+    # Beside an index at the left, most columns have names; a line of facts leaves more blank.
+    blank = [k for k in range(1, width) if k in needed and names[k:k + 1] == ['']]
+    if blank and 2 * len(blank) >= len(needed - {0}):
+        return None
+    names = [f'column {k + 1}' if k in blank else name for k, name in enumerate(names)]
+    return names, units, line + 1
 
 
 def _units_of(names: list[str], words: list[str], rows: list[list[str]], first: int,
