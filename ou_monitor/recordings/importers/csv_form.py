@@ -448,7 +448,7 @@ def _names_and_units(above: list[tuple[int, list[str]]], width: int, needed: set
                  for k, (name, more) in enumerate(zip(names, over))]
     # Beside an index at the left, most columns have names; a line of facts leaves more blank.
     blank = [k for k in range(1, width) if k in needed and names[k:k + 1] == ['']]
-    if blank and 2 * len(blank) >= len(needed - {0}):
+    if blank and (2 * len(blank) >= len(needed - {0}) or any(map(is_value, filter(None, names)))):
         return None
     names = [f'column {k + 1}' if k in blank else name for k, name in enumerate(names)]
     return names, units, line + 1

@@ -560,11 +560,11 @@ def _read(path: Path, form: Form, time: _Column, places: list[int],
 def _unwrapped(t: FloatArray) -> FloatArray:
     """Unwrap a 32-bit counter of a time; micros() wraps after 72 minutes."""
     known = np.isfinite(t)
-    on = np.unwrap(t[known], period=_COUNTS)
-    # A restart of the logger is not a wrap: unwrapped, it would leave an unusually long step.
-    longest = 2.0 * np.diff(t[known]).max(initial=0.0)
-    if ((t[known] >= 0.0) & (t[known] < _COUNTS)).all() and (np.diff(on) <= longest).all():
-        t[known] = on
+    if ((t[known] >= 0.0) & (t[known] < _COUNTS)).all():
+        on = np.unwrap(t[known], period=_COUNTS)
+        # A restart of the logger is not a wrap: unwrapped, it would leave an unusually long step.
+        if (np.diff(on) <= 2.0 * np.diff(t[known]).max(initial=0.0)).all():
+            t[known] = on
     return t
 
 
