@@ -55,7 +55,7 @@ text.light { fill: #ffffff; } .grid { stroke: #dde3e5; stroke-width: 1; }
 .dot.s2 { fill: #009e73; } .dot.s3 { fill: #cc79a7; } .dot.s4 { fill: #8a6d00; }
 .band.s7, .dot.s7 { fill: #9aa5a9; }
 .shade { fill: #d55e00; opacity: .35; }
-.panel { fill: #ffffff; opacity: .8; } .right { fill: none; stroke: #1c2326; stroke-width: 1.2; }
+.right { fill: none; stroke: #1c2326; stroke-width: 1.2; }
 </style>"""
 
 

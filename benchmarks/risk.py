@@ -242,7 +242,7 @@ def _reliability_table(title: str, found: Sequence[Horizon]) -> str:
 
 def _reliability_figure(found: Sequence[Horizon]) -> str:
     plot = Plot('Predicted and observed probability of a brown-out', 'predicted', 'observed',
-                width=900, height=480, log_x=True, log_y=True, legend_row=True)
+                width=900, height=480, log_x=True, log_y=True)
     line = np.geomspace(1e-4, 1.0, 50)
     plot.line(line, line, '', 7, 'dash')
     plot.band(line, line / _FACTOR, np.minimum(line * _FACTOR, 1.0), f'within {_FACTOR:g}', 7)

@@ -312,8 +312,8 @@ def _curves(analysis: Analysis) -> list[Part]:
 
 
 def _empty(title: str, unit: str, log: bool = False) -> Plot:
-    return Plot(title, 'throttle, %', unit, width=450, height=270, log_y=log,
-                legend_row=not log).limits(x=(-2.0, 102.0))
+    return Plot(title, 'throttle, %', unit, width=450, height=270, log_y=log).limits(
+        x=(-2.0, 102.0))
 
 
 def _column(values: Sequence[float] | Sequence[tuple[float, float]]) -> FloatArray:
@@ -479,8 +479,7 @@ def _drawn(analysis: Analysis) -> list[LevelResult]:
 
 def _shape(analysis: Analysis) -> list[Part]:
     spectrum = Plot('Spectrum (dashed: fitted OU and white noise)', 'frequency, Hz',
-                    'PSD, V\u00b2/Hz', width=450, height=330, log_x=True, log_y=True,
-                    legend_low=True)
+                    'PSD, V\u00b2/Hz', width=450, height=330, log_x=True, log_y=True)
     histogram = Plot('Deviation and the normal distribution',
                      'deviation / standard deviation', 'density', width=450, height=330,
                      log_y=True)

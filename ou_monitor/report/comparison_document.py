@@ -88,8 +88,7 @@ def _path(found: Agreement) -> list[tuple[str, str]]:
 
 def _voltage(found: Agreement) -> Plot:
     at = found.traces
-    plot = Plot('Voltage, measured and simulated', 'time, s', 'voltage, V', height=300,
-                legend_row=True)
+    plot = Plot('Voltage, measured and simulated', 'time, s', 'voltage, V', height=300)
     plot.band(at.at, at.low, at.high, 'simulated, 95 %', _SIMULATED)
     plot.line(at.t, at.simulated, 'one simulation', _SIMULATED, 'faint')
     plot.line(at.t, at.voltage, 'measured', 0)
@@ -107,11 +106,10 @@ def _others(found: Agreement) -> list[Part]:
     beside = []
     if at.response.size:
         plot = Plot(f'Mean response to {found.rises} rises of throttle', 'time since the rise, s',
-                    'change, V', width=450, height=250, legend_row=True)
+                    'change, V', width=450, height=250)
         plot.band(at.after, at.response_low, at.response_high, 'simulated, 95 %', _SIMULATED)
         beside.append(Figure(plot.line(at.after, at.response, 'measured', 0, 'thick')))
-    plot = Plot('Distribution', 'voltage, V', 'share of time below', width=450, height=250,
-                legend_row=True)
+    plot = Plot('Distribution', 'voltage, V', 'share of time below', width=450, height=250)
     plot.line(at.edges, at.simulated_distribution, 'simulated', _SIMULATED, 'thick')
     beside.append(Figure(plot.line(at.edges, at.distribution, 'measured', 0, 'thick')))
     return [*drawn, Pair(beside), Figure(_spectrum(found))]
@@ -121,7 +119,7 @@ def _spectrum(found: Agreement) -> Plot:
     middle = np.array([one.middle_hz for one in found.spectrum])
     power = [one.rms for one in found.spectrum]
     plot = Plot('Rms by frequency band', 'frequency, Hz', 'rms, V', height=220,
-                log_x=True, log_y=True, legend_row=True)
+                log_x=True, log_y=True)
     plot.bars(middle, np.array([one.low for one in power]), np.array([one.high for one in power]),
               'simulated, 95 %', _SIMULATED)
     plot.markers(middle, np.array([one.measured for one in power]), 'measured', 0)

@@ -57,7 +57,7 @@ def design_document(result: Design, source: str, taken: str = '', command: str =
 def _risk(result: Design) -> Plot:
     farads = np.array([row.capacitance for row in result.rows])
     plot = Plot('Risk by capacitance', 'bulk capacitance, uF', 'probability', log_x=True,
-                log_y=True, legend_row=True).limits(y=(_LEAST_RISK, 2.0))
+                log_y=True).limits(y=(_LEAST_RISK, 2.0))
     plot.line(1e6 * farads, np.maximum([row.risk for row in result.rows], _LEAST_RISK),
               f'within {result.horizon:g} s', 0, 'thick')
     plot.level(1e6 * farads, result.target, 'allowed')

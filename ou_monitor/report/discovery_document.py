@@ -71,7 +71,7 @@ def _voltage(finding: Finding) -> Plot:
     samples = finding.samples
     assert samples is not None
     t = samples.t - samples.t[0]
-    plot = Plot('Voltage', 'time, s', 'V', height=230, legend_row=True)
+    plot = Plot('Voltage', 'time, s', 'V', height=230)
     if finding.simulated is not None:
         rng = np.random.default_rng(finding.seed)
         low, high = np.full(samples.n, np.inf), np.full(samples.n, -np.inf)

@@ -87,7 +87,7 @@ def _transient() -> list[Part]:
     drawn = []
     for log in (False, True):
         plot = Plot('Fig. 5: decay after 20 %' + (', log scale' if log else ''), 'time, ms',
-                    '|U|, mV', width=450, height=330, log_y=log, legend_low=log)
+                    '|U|, mV', width=450, height=330, log_y=log)
         plot.limits(x=(-1.5, 55.0), y=(3.0, 600.0) if log else (-10.0, 420.0))
         for k, (y, label, style) in enumerate(curves):
             plot.line(1e3 * t, np.where(y > 0.0, y, math.nan) if log else y, label, k, style)
@@ -102,7 +102,7 @@ def _transient() -> list[Part]:
 
 def _spectrum(result: Reproduction) -> list[Part]:
     plot = Plot('Spectrum of the OU', 'frequency, Hz', 'PSD, V\u00b2/Hz', height=320, log_x=True,
-                log_y=True, legend_low=True)
+                log_y=True)
     wide = np.geomspace(1.0, 5e5, 200)
     lines = []
     for k, found in enumerate(result.spectra):

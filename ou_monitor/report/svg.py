@@ -26,7 +26,7 @@ _LETTER = 7.0
 _CAP = 7.0
 # Minimum characters of a shortened name.
 _SHORTEST = 6
-# Height of a legend in a row of its own, pixels.
+# Height of a row of the legend, pixels.
 _LEGEND = 18
 # Maximum magnitude of a drawn value; larger ones would overflow in the arithmetic of the axis.
 _HUGE = 1e100
@@ -161,19 +161,15 @@ class Plot:
     """
     One plot with two axes; sizes are in pixels, and screen readers read the title.
 
-    The legend is beside the title, else in a row below it, else in the upper right of the
-    axes.  legend_low: in the lower left instead.  legend_row: never beside the title, so that
-    plots side by side have axes of equal size.
+    The legend is in rows below the title.
     """
 
     def __init__(self, title: str, x_label: str, y_label: str, *, width: int = 860,
-                 height: int = 240, log_x: bool = False, log_y: bool = False,
-                 legend_low: bool = False, legend_row: bool = False) -> None:
+                 height: int = 240, log_x: bool = False, log_y: bool = False) -> None:
         self.title = title
         self.x_label, self.y_label = x_label, y_label
         self.width, self.height = width, height
         self.log_x, self.log_y = log_x, log_y
-        self._legend_low, self._legend_row = legend_low, legend_row
         self.curves: list[Curve] = []
         self.shades: list[tuple[float, float, str, str]] = []
         self.marks: list[tuple[float, str]] = []
@@ -283,26 +279,27 @@ class Plot:
                 parts.append(f'<line class="mark" x1="{pixel:.1f}" y1="{self._top}" '
                              f'x2="{pixel:.1f}" y2="{bottom}"/><text class="note" '
                              f'x="{pixel + 4:.1f}" y="{self._top + 12}">{escape(label)}</text>')
-        return '\n'.join([*parts, *self._legend(right, bottom), '</svg>'])
+        return '\n'.join([*parts, *self._legend(right), '</svg>'])
 
     @property
-    def _named(self) -> list[Curve]:
-        return [c for c in self.curves if c.label]
-
-    @property
-    def _legend_place(self) -> str:
-        """Return ``title``, ``row`` or, if neither has room, ``corner``."""
-        size = sum(_LETTER * len(c.label) + 34.0 for c in self._named)
-        right = self.width - _RIGHT
-        beside = _LEFT + 1.15 * _LETTER * len(self.title) + size < right
-        if beside and not self._legend_row:
-            return 'title'
-        return 'row' if _LEFT + size < right else 'corner'
+    def _legend_rows(self) -> list[list[Curve]]:
+        """Return the named curves in rows that fit between the margins."""
+        rows: list[list[Curve]] = []
+        room = 0.0
+        for curve in self.curves:
+            if not curve.label:
+                continue
+            if _entry_width(curve) > room:
+                rows.append([])
+                room = self.width - _LEFT - _RIGHT
+            rows[-1].append(curve)
+            room -= _entry_width(curve)
+        return rows
 
     @property
     def _top(self) -> int:
         """Return the upper end of the axes, pixels."""
-        return _TOP + (_LEGEND if self._named and self._legend_place == 'row' else 0)
+        return _TOP + _LEGEND * len(self._legend_rows)
 
     def _axes(self, x: Scale, y: Scale, right: int, bottom: int) -> list[str]:
         parts = []
@@ -361,22 +358,19 @@ class Plot:
                   for run in _runs(np.isfinite(px) & np.isfinite(py))]
         return f'<path class="line {curve.style}" d="{"".join(pieces)}"/>'
 
-    def _legend(self, right: int, bottom: int) -> list[str]:
-        """Return the legend: beside the title, in a row below it, or in a corner of the axes."""
-        named, place = self._named, self._legend_place
-        if not named:
-            return []
-        widths = [_LETTER * len(c.label) + 34.0 for c in named]
-        if place != 'corner':
-            starts = right - np.cumsum(widths[::-1])[::-1]
-            return [_legend_entry(c, float(x), 16 + (_LEGEND if place == 'row' else 0))
-                    for c, x in zip(named, starts)]
-        width, height = max(widths), 16 * len(named) + 8
-        left, top = ((_LEFT + 2.0, bottom - height) if self._legend_low
-                     else (right - width, self._top))
-        return [f'<rect class="panel" x="{left:.0f}" y="{top + 1}" width="{width:.0f}" '
-                f'height="{height}"/>',
-                *[_legend_entry(c, left + 4.0, top + 16 + 16 * k) for k, c in enumerate(named)]]
+    def _legend(self, right: int) -> list[str]:
+        """Return the legend, each row flush right."""
+        found = []
+        for k, row in enumerate(self._legend_rows, 1):
+            left = right - sum(map(_entry_width, row))
+            for curve in row:
+                found.append(_legend_entry(curve, left, 16 + k * _LEGEND))
+                left += _entry_width(curve)
+        return found
+
+
+def _entry_width(curve: Curve) -> float:
+    return _LETTER * len(curve.label) + 34.0
 
 
 def _legend_entry(curve: Curve, x: float, y: int) -> str:
