@@ -19,18 +19,11 @@ from ou_monitor.stream.files import read_yaml
 
 def _list(args: argparse.Namespace) -> None:
     network = PowerNetwork()
-    values = asdict(network)
+    values = {**asdict(network), 'line_gain': network.line_feedthrough}
     output.tell(args, Document('Components', '', (), [Table(['component', 'default', 'unit'], [
-        [name, _default_words(value, network), UNITS.get(name, '')]
-        for name, value in values.items()], left=[0, 2])]), lambda: {
-            name: {'default': network.line_feedthrough if value is None else value,
-                   'unit': UNITS.get(name, '')} for name, value in values.items()})
-
-
-def _default_words(value: object, network: PowerNetwork) -> str:
-    if value is None:
-        return f'{network.line_feedthrough:.4g}'
-    return str(value).lower() if isinstance(value, bool) else f'{value:g}'
+        [name, f'{value:g}', UNITS[name]] for name, value in values.items()], left=[0, 2])]),
+                lambda: {name: {'default': value, 'unit': UNITS[name]}
+                         for name, value in values.items()})
 
 
 def run(args: argparse.Namespace) -> int:
@@ -88,11 +81,6 @@ def component(name: str, where: str) -> str:
 
 def value_of(where: str, name: str, text: object) -> Any:
     """Return the value of a component."""
-    if name == 'constant_power':
-        word = str(text).strip().lower()
-        if word not in ('true', 'false'):
-            raise InputError(f"{where}: '{text}' is neither true nor false")
-        return word == 'true'
     try:
         value = quantity(UNITS[name])(text)
     except argparse.ArgumentTypeError as error:

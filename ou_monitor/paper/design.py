@@ -9,9 +9,8 @@ simulations with levels at 2.5 and 3.2 standard deviations (extrapolated to a ti
 first was 60 times too low (noise through a large ESR) to 4 times too high (no ESR), the second 1.1
 to 3 times too high.
 
-Without an LC filter, both risks fall as C rises once the network is slower than the noise; below
-that C, the second rose by up to 1.44 times in 39 of 6000 random networks.  With an LC filter the
-risk may rise with C, up to an oscillation.
+Both risks fall as C rises once the network is slower than the noise; below that C, the second rose
+by up to 1.44 times in 39 of 6000 random networks.
 
 `network_of` chooses components that reproduce a flight. All risks of its bus are then those of the
 live risk at the end of the flight (the one behind the budget of `analyze`): of the throttle, with
@@ -35,8 +34,7 @@ from typing import Any
 
 import numpy as np
 from ou_monitor.model.passage import mean_first_passage
-from ou_monitor.paper.network import (
-    completed, PowerNetwork, Rail, rail_at, UnstableNetworkError)
+from ou_monitor.paper.network import completed, PowerNetwork, Rail, rail_at
 from ou_monitor.text import number, percent
 from scipy.optimize import brentq
 from scipy.special import ndtr
@@ -82,8 +80,7 @@ class DesignRow:
     # Relaxation rate, 1/s, and time, s; NaN without noise.
     alpha: float
     tau: float
-    # Intensity, V/sqrt(s), and stationary variance, V^2; NaN and inf if the network is unstable
-    # (the risk is then 1).
+    # Intensity, V/sqrt(s), and stationary variance, V^2.
     sigma: float
     var_inf: float
     # Sag of the bus and mean of the rail, V; independent of the capacitor.
@@ -96,11 +93,6 @@ class DesignRow:
     # Probability within the horizon, by mean first passage of the OU and by the crossing rate.
     risk_ou: float
     risk_crossing: float
-
-    @property
-    def stable(self) -> bool:
-        """Return whether the network is stable."""
-        return math.isfinite(self.var_inf)
 
     @property
     def risk(self) -> float:
@@ -254,12 +246,7 @@ def design(
 
     def at(capacitance: float) -> DesignRow:
         changed = with_capacitance(network, capacitance, esr_follows)
-        try:
-            return as_flown(row_of(rail_at(changed, throttle, rail), voltage, horizon, sag_error))
-        except UnstableNetworkError:
-            return replace(present, capacitance=capacitance, esr=changed.bulk_esr,
-                           alpha=math.nan, tau=math.nan, sigma=math.nan, var_inf=math.inf,
-                           mean_time=0.0, crossing_rate=math.inf, risk_ou=1.0, risk_crossing=1.0)
+        return as_flown(row_of(rail_at(changed, throttle, rail), voltage, horizon, sag_error))
 
     rows = [at(float(c)) for c in np.geomspace(low, high, _GRID)]
     least = None
@@ -289,7 +276,7 @@ def _levers(found: Design, at: Callable[[float], DesignRow],
             return row_of(rail_at(changed, u, found.rail), found.voltage, found.horizon,
                           found.sag_error).risk
         except ValueError:
-            # Unstable, or a load beyond the battery.
+            # A load beyond the battery.
             return 1.0
 
     def resistance(share: float) -> float:
@@ -352,7 +339,7 @@ def _least(at: Callable[[float], DesignRow], rows: list[DesignRow],
 
 def _resistance(network: PowerNetwork, throttle: float, voltage: float) -> float:
     """Return the battery resistance at which the mean of the bus is `voltage`, Ohm."""
-    current = network.current_at(throttle) + network.regulator_current(voltage)
+    current = network.current_at(throttle) + network.regulator_power / voltage
     if current == 0.0 or voltage >= network.battery_voltage:
         return math.nan
     return (network.battery_voltage - voltage) / current
@@ -371,7 +358,7 @@ def as_data(result: Design, source: str, taken: str) -> dict[str, Any]:
         'answer': answer(result), 'effect': effect(result), 'present': row(result.present),
         'least': row(result.least), 'resistance_at_level': result.resistance,
         'levers': [asdict(lever) for lever in result.levers],
-        'risk_falls_with_capacitance': result.falls, 'lc_corner_hz': result.network.lc_corner,
+        'risk_falls_with_capacitance': result.falls,
         'rows': [row(r) for r in result.rows], 'measured': taken or None}
 
 
@@ -426,8 +413,6 @@ def effect(result: Design) -> str:
         b = result.rows[-1]
     else:
         b = result.doubled
-    if not b.stable:
-        return f'With {_uf(b)} the network is unstable.'
     text = (f'From {_uf(a)} to {_uf(b)}: alpha {_change(a.alpha, b.alpha, " 1/s")}, Var_inf '
             f'{_change(a.var_inf, b.var_inf, " V^2")}, sigma '
             f'{_change(a.sigma, b.sigma, " V/sqrt(s)")}, risk {_change(a.risk, b.risk)}.')
@@ -459,15 +444,8 @@ def remarks(result: Design) -> list[str]:
         notes.append('The crossing rate of the whole process decides: part of the noise is '
                      'faster than the OU of the slowest pole.')
     if not result.falls:
-        if not all(row.stable for row in result.rows):
-            notes.append('Some capacitances make the network unstable: the regulator, a '
-                         'constant-power load, cancels the damping of the filter.')
-        notes.append('More capacitance does not always lower the risk here (resonance or ESR): '
-                     'choose a value from the table.')
-    if result.network.filter_inductance > 0.0:
-        notes.append(f'LC filter: corner {result.network.lc_corner:.4g} Hz, ' + (
-            'no resonance (all poles are real).' if rail.resonance is None else
-            f'resonance at {rail.resonance.frequency:.4g} Hz with Q {rail.resonance.q:.3g}.'))
+        notes.append('More capacitance does not always lower the risk here (ESR): choose a value '
+                     'from the table.')
     return notes
 
 

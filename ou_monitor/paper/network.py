@@ -1,21 +1,22 @@
 """
 A multirotor's power network: components, the load at a throttle, and a rail as an OU.
 
-    battery -- R --+-- bus --+-- [ L, DCR --+-- filter ] --+-- regulator -- Ro --+-- regulated
-                   |         |              |                                    |
-               ESC current   C + ESR        Cf + ESR                   Co + ESR, MCU current
+    battery -- R --+-- bus --+-- regulator -- Ro --+-- regulated
+                   |         |                     |
+               ESC current   C + ESR          Co + ESR, MCU current
 
 The network is linear about its operating point, dx = A x dt + B dW, and the rail's deviation is
 c x.  Noise is coloured, with one state per source, so that the variance stays finite where a
 capacitor's ESR, r below, turns current directly into voltage.
 
 Limits: leads have no inductance, so edges faster than R/L (0.1 to 1 us) are not modelled.  The
-battery is one resistance without polarisation, so recovery over 0.3 s and more is missing.  The
-random part of the ESC current is the Markov switching of the paper, which spreads the power of a
-regular PWM over all frequencies: an upper bound, unless `switching_scale` is set from a measured
-rail.
+battery is one resistance without polarisation, so recovery over 0.3 s and more is missing.  There
+is no LC filter before the regulator, which draws constant power: its input has the incremental
+resistance -V^2/P.  The random part of the ESC current is the Markov switching of the paper, which
+spreads the power of a regular PWM over all frequencies: an upper bound, unless `switching_scale`
+is set from a measured rail.
 
-Effect of more bulk capacitance.  Without an LC filter, the impedance from ESC current to bus is
+Effect of more bulk capacitance.  The impedance from ESC current to bus is
 |Z(f)|^2 = R^2 (1 + (w r C)^2) / (1 + (w (R + r) C)^2), which falls with C at every frequency:
 Var_inf falls on both rails for noise of any colour, and so does the pole 1/((R + r) C), although
 section 4.5 of the paper says that alpha rises.  These poles are fast: with 40 mOhm, the 63 1/s of
@@ -27,9 +28,6 @@ the paper would need 0.4 F.  Exceptions:
   variance in the voltage, whatever C is.  As C rises, the share of the pole falls; below 1 %,
   alpha jumps up to the next pole, the rate of the noise.  With r C fixed (capacitors of one
   series in parallel), neither happens on the bus.
-- LC filter.  C shorts the battery resistance that damps L, so the resonance rises; if it is
-  excited, Var_inf of either rail may rise with C.  With a constant-power regulator it may become
-  an oscillation.
 """
 
 from __future__ import annotations
@@ -41,7 +39,6 @@ import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from ou_monitor.records import FloatArray
 from scipy.linalg import solve_continuous_lyapunov
 
@@ -54,7 +51,6 @@ NOMINAL_CELL = 3.7
 EXCITED = 0.01
 # Noise currents are the last states, in this order.
 SOURCES = ('switching', 'flutter', 'mcu')
-ComplexArray = npt.NDArray[np.complex128]
 
 
 def completed(values: dict[str, Any]) -> dict[str, Any]:
@@ -99,11 +95,6 @@ class PowerNetwork:
     # mean, and its rate, 1/s (motor and propeller, 30 ms); off by default.
     flutter: float = _part(0.0, zero=True)
     flutter_rate: float = _part(33.3, '1/s')
-    # LC filter between bus and regulator, H, Ohm, F, Ohm; an inductance of 0 means none.
-    filter_inductance: float = _part(0.0, 'H', zero=True)
-    filter_resistance: float = _part(0.05, 'Ohm', zero=True)
-    filter_capacitance: float = _part(100e-6, 'F')
-    filter_esr: float = _part(0.1, 'Ohm', zero=True)
     # Output voltage, V, and output resistance within the bandwidth, Ohm.
     regulator_voltage: float = _part(5.0, 'V')
     regulator_resistance: float = _part(0.03, 'Ohm')
@@ -113,9 +104,6 @@ class PowerNetwork:
     regulator_bandwidth: float = _part(20e3, 'Hz')
     regulator_efficiency: float = _part(0.9)  # Output power over input power, 0..1.
     line_gain: float | None = _part(None, zero=True)
-    # Whether the regulator draws constant power: its input then has the incremental resistance
-    # -V^2/P.
-    constant_power: bool = True
     # Capacitor of the regulated rail, F and Ohm (2 x 22 uF ceramic).
     output_capacitance: float = _part(44e-6, 'F')
     output_esr: float = _part(0.003, 'Ohm', zero=True)
@@ -142,10 +130,6 @@ class PowerNetwork:
     def _check(self, name: str, value: object, about: Mapping[str, Any]) -> None:
         if name == 'line_gain' and value is None:
             return
-        if name == 'constant_power':
-            if not isinstance(value, bool):
-                raise ValueError(f'constant_power must be true or false, got {value!r}')
-            return
         unit = f' {about["unit"]}'.rstrip()
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise ValueError(f'{name} must be a number{unit and f" in{unit}"}, got {value!r}')
@@ -154,13 +138,6 @@ class PowerNetwork:
         if not math.isfinite(value) or value < 0.0 or (value == 0.0 and not about['zero']):
             least = 'zero or positive' if about['zero'] else 'positive'
             raise ValueError(f'{name} must be {least} and finite, got {value}{unit}')
-
-    @property
-    def lc_corner(self) -> float:
-        """Corner 1/(2 pi sqrt(L C)) of the LC filter, Hz; inf without one."""
-        if self.filter_inductance == 0.0:
-            return math.inf
-        return 1.0 / (2.0 * math.pi * math.sqrt(self.filter_inductance * self.filter_capacitance))
 
     @property
     def line_feedthrough(self) -> float:
@@ -174,26 +151,13 @@ class PowerNetwork:
         """Power that the regulator draws, W."""
         return self.regulator_voltage * self.mcu_current / self.regulator_efficiency
 
-    @property
-    def series_resistance(self) -> float:
-        """Resistance between bus and regulator, Ohm; 0 without LC filter."""
-        return self.filter_resistance if self.filter_inductance > 0.0 else 0.0
-
     def current_at(self, throttle: float) -> float:
         """Return the mean current of the motors, A, at a throttle 0..1."""
         return float(self.current_max * throttle**self.current_exponent)
 
-    def regulator_current(self, bus: float) -> float:
-        """Return the mean current, A, that the regulator draws at a mean bus voltage, V."""
-        power = self.regulator_power
-        root = bus**2 - 4.0 * self.series_resistance * power
-        if bus <= 0.0 or root < 0.0:
-            raise ValueError(f'a bus at {bus:g} V cannot give the regulator {power:g} W')
-        return 2.0 * power / (bus + math.sqrt(root))
-
 
 # Units of the numbers of a network.
-UNITS = {part.name: part.metadata['unit'] for part in fields(PowerNetwork) if part.metadata}
+UNITS = {part.name: part.metadata['unit'] for part in fields(PowerNetwork)}
 
 
 @dataclass(frozen=True)
@@ -209,7 +173,7 @@ class Load:
     bus: float
     regulated: float
     sag: float  # Battery voltage less the mean of the bus, V.
-    input_conductance: float  # Incremental P/V^2 of the constant-power load, 1/Ohm, or 0.
+    input_conductance: float  # Incremental P/V^2 of the regulator, 1/Ohm.
 
 
 def load_at(network: PowerNetwork, throttle: float) -> Load:
@@ -227,37 +191,23 @@ def load_at(network: PowerNetwork, throttle: float) -> Load:
         network.escs * throttle * (1.0 - throttle))
     power = network.regulator_power
     resistance = network.battery_resistance
-    # The regulator's input v solves v = V - R (I + P/v) - series P/v.
+    # The bus v solves v = V - R (I + P/v); at the larger solution the network is stable.
     free = network.battery_voltage - resistance * current
-    root = free**2 - 4.0 * (resistance + network.series_resistance) * power
-    source = (free + math.sqrt(root)) / 2.0 if free > 0.0 and root >= 0.0 else 0.0
-    if source <= network.regulator_voltage:
+    root = free**2 - 4.0 * resistance * power
+    bus = (free + math.sqrt(root)) / 2.0 if free > 0.0 and root >= 0.0 else 0.0
+    if bus <= network.regulator_voltage:
         raise ValueError(
             f'the battery cannot supply the load at throttle {throttle:g}: {current:.4g} A '
             f'through battery_resistance {resistance:g} Ohm drops {resistance * current:.4g} V of '
             f'{network.battery_voltage:g} V, which leaves the regulator less than '
             f'{network.regulator_voltage:g} V')
-    drawn = power / source
-    bus = free - resistance * drawn
     return Load(
         current=current, switching_rms=rms,
         switching_rate=network.esc_frequency / (duty * (1.0 - duty)),
         flutter_rms=network.flutter * current, bus=bus,
         regulated=network.regulator_voltage - network.regulator_resistance * network.mcu_current,
         sag=network.battery_voltage - bus,
-        input_conductance=power / source**2 if network.constant_power else 0.0)
-
-
-class UnstableNetworkError(ValueError):
-    """The network has a pole in the right half-plane; the text names it."""
-
-
-@dataclass(frozen=True)
-class RailResonance:
-    """A complex pair of poles."""
-
-    frequency: float  # |p| / (2 pi), Hz.
-    q: float  # Quality factor, -|p| / (2 Re p).
+        input_conductance=power / bus**2)
 
 
 @dataclass(frozen=True)
@@ -295,32 +245,15 @@ class Rail:
         return max(0.0, float(self.c @ self.covariance @ self.c))
 
     @cached_property
-    def _modes(self) -> tuple[ComplexArray, ComplexArray]:
-        """Poles, slowest first, and their parts of the covariance at lag 0, V^2."""
-        poles, vectors = np.linalg.eig(self.a)
-        parts = (self.c @ vectors) * np.linalg.solve(vectors, self.covariance @ self.c)
-        order = np.argsort(np.abs(poles.real), kind='stable')
-        return (np.asarray(poles[order], dtype=np.complex128),
-                np.asarray(parts[order], dtype=np.complex128))
-
-    @property
-    def poles(self) -> ComplexArray:
-        """Poles, 1/s, shape (n,), slowest first, noise sources included."""
-        return self._modes[0]
-
-    @property
-    def shares(self) -> FloatArray:
-        """Share of Var_inf that each pole carries, shape (n,); zeros without noise."""
-        if self.var_inf == 0.0:
-            return np.zeros(self.poles.size)
-        return np.asarray(self._modes[1].real / self.var_inf)
-
-    @cached_property
     def alpha(self) -> float:
         """Relaxation rate, 1/s: the slowest pole that carries 1 % of Var_inf or more."""
-        # For a complex pair, the rate of its envelope; NaN without noise.
-        excited = np.flatnonzero(np.abs(self.shares) >= EXCITED)
-        return float(-self.poles[excited[0]].real) if excited.size else math.nan
+        # NaN without noise.
+        if self.var_inf == 0.0:
+            return math.nan
+        poles, vectors = np.linalg.eig(self.a)
+        # Part of each pole in the covariance at lag 0, V^2.
+        parts = (self.c @ vectors) * np.linalg.solve(vectors, self.covariance @ self.c)
+        return float(-poles.real[np.abs(parts.real / self.var_inf) >= EXCITED].max())
 
     @property
     def tau(self) -> float:
@@ -331,17 +264,6 @@ class Rail:
     def sigma(self) -> float:
         """Intensity of the OU with this alpha and Var_inf, sqrt(2 alpha Var_inf), V/sqrt(s)."""
         return math.sqrt(2.0 * self.alpha * self.var_inf)
-
-    @property
-    def resonance(self) -> RailResonance | None:
-        """Return the complex pair that carries most of Var_inf; None when all poles are real."""
-        above = np.flatnonzero(self.poles.imag > 1e-9 * np.abs(self.poles))
-        if not above.size:
-            return None
-        k = above[np.argmax(np.abs(self.shares[above]))]
-        pole = self.poles[k]
-        return RailResonance(float(abs(pole)) / (2.0 * math.pi),
-                             0.5 / float(-pole.real / abs(pole)))
 
     def crossing_rate(self, voltage: float) -> float:
         """Return the rate, 1/s, at which the rail falls below a voltage, V, far from its mean."""
@@ -376,39 +298,21 @@ def rail_at(network: PowerNetwork, throttle: float, rail: str = 'bus') -> Rail:
         row = a.shape[0] - len(SOURCES) + k
         a[row, row] = -rate
         b[row, k] = size * math.sqrt(2.0 * rate)
-    poles = np.linalg.eigvals(a)
-    worst = poles[np.argmax(poles.real)]
-    if worst.real >= 0.0:
-        raise UnstableNetworkError(
-            f'the network is unstable at throttle {throttle:g}: pole at {worst.real:.4g} '
-            f'+- {abs(worst.imag):.4g}i 1/s; the regulator, a constant-power load, has a negative '
-            f'resistance of {-1.0 / load.input_conductance:.4g} Ohm at its input: damp the filter '
-            '(raise filter_resistance or filter_esr) or raise filter_capacitance')
     return Rail(network, load, rail, a, b, outputs[rail])
 
 
 def _circuit(net: PowerNetwork, g: float) -> tuple[FloatArray, dict[str, FloatArray]]:
     """Return the matrix `a`, with zeros for the noise sources, and the row `c` of each rail."""
-    filtered = net.filter_inductance > 0.0
-    names = ['bulk', *(['inductor', 'filter'] if filtered else []), 'line', 'output', *SOURCES]
+    names = ['bulk', 'line', 'output', *SOURCES]
     unit = dict(zip(names, np.eye(len(names))))
     rate = {name: np.zeros(len(names)) for name in names}
     r, esr = net.battery_resistance, net.bulk_esr
     drawn = unit['switching'] + unit['flutter']
-    if filtered:
-        current = unit['inductor']
-        bus = (r * unit['bulk'] - r * esr * (drawn + current)) / (r + esr)
-        # The capacitor carries the inductor current plus g v of the regulator.
-        source = (unit['filter'] + net.filter_esr * current) / (1.0 - net.filter_esr * g)
-        rate['inductor'] = (bus - net.filter_resistance * current - source) / net.filter_inductance
-        rate['filter'] = (current + g * source) / net.filter_capacitance
-    else:
-        bus = source = (r * unit['bulk'] - r * esr * drawn) / (r + esr - r * esr * g)
-        current = -g * source
-    rate['bulk'] = (-bus / r - drawn - current) / net.bulk_capacitance
-    # `line` is the slow part of the regulator's input, which it rejects.
-    rate['line'] = 2.0 * math.pi * net.regulator_bandwidth * (source - unit['line'])
-    passed = net.line_feedthrough * (source - unit['line'])
+    bus = (r * unit['bulk'] - r * esr * drawn) / (r + esr - r * esr * g)
+    rate['bulk'] = (-bus / r - drawn + g * bus) / net.bulk_capacitance
+    # `line` is the slow part of the bus, which the regulator rejects.
+    rate['line'] = 2.0 * math.pi * net.regulator_bandwidth * (bus - unit['line'])
+    passed = net.line_feedthrough * (bus - unit['line'])
     ro, eso = net.regulator_resistance, net.output_esr
     regulated = (ro * unit['output'] + eso * passed - ro * eso * unit['mcu']) / (ro + eso)
     rate['output'] = ((passed - regulated) / ro - unit['mcu']) / net.output_capacitance

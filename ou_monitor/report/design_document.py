@@ -25,9 +25,8 @@ def design_document(result: Design, source: str, taken: str = '', command: str =
     chosen = [(present, 'present')]
     if result.least is not None:
         chosen.append((result.least, 'minimum'))
-    for row in result.rows[::_EVERY]:
-        if not any(math.isclose(row.capacitance, r.capacitance, rel_tol=0.01) for r, _ in chosen):
-            chosen.append((row, '' if row.stable else 'unstable'))
+    chosen += [(row, '') for row in result.rows[::_EVERY] if not any(
+        math.isclose(row.capacitance, r.capacitance, rel_tol=0.01) for r, _ in chosen)]
     cells = [[number(1e6 * r.capacitance), number(1e3 * r.esr), number(r.alpha),
               number(1e6 * r.tau), number(r.sigma), number(r.var_inf), _time(r.mean_time),
               probability(r.risk_ou), probability(r.risk_crossing), mark]

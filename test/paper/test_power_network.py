@@ -14,7 +14,6 @@ from scipy.linalg import expm
 
 # Battery, capacitor and ESC current alone: the textbook RC.
 RC = PowerNetwork(bulk_esr=0.0, mcu_current=0.0, mcu_noise=0.0)
-FILTERED = PowerNetwork(filter_inductance=10e-6)
 
 
 def gains(f, a, b, c):
@@ -63,17 +62,6 @@ def test_a_noise_slower_than_the_network_gives_its_own_rate():
     assert rail.alpha == pytest.approx(48e3 / 0.24, rel=1e-9)
 
 
-def test_lc_filter_rings_at_its_corner():
-    """From a stiff bus: frequency 1/(2 pi sqrt(L C)), damping DCR/2 sqrt(C/L)."""
-    network = replace(RC, battery_resistance=1e-7, filter_inductance=10e-6,
-                      filter_resistance=0.05, filter_esr=0.0)
-    rail = rail_at(network, 0.4, 'regulated')
-    assert network.lc_corner == pytest.approx(5032.92, rel=1e-6)
-    assert rail.resonance.frequency == pytest.approx(network.lc_corner, rel=1e-5)
-    assert 0.5 / rail.resonance.q == pytest.approx(0.025 * math.sqrt(100e-6 / 10e-6), rel=1e-5)
-    assert math.isinf(RC.lc_corner) and rail_at(RC, 0.4).resonance is None
-
-
 def test_constant_power_is_a_negative_resistance():
     """The bus sees R / (1 - R P/V^2), at the voltage where the regulator takes P."""
     network = PowerNetwork(mcu_current=3.0)
@@ -109,7 +97,7 @@ def test_the_regulator_passes_what_is_faster_than_its_bandwidth(network):
     assert PowerNetwork().line_feedthrough == pytest.approx(5.0 / 22.2)
 
 
-@pytest.mark.parametrize('network', [PowerNetwork(), FILTERED, PowerNetwork(flutter=0.05)])
+@pytest.mark.parametrize('network', [PowerNetwork(), PowerNetwork(flutter=0.05)])
 @pytest.mark.parametrize('rail', ['bus', 'regulated'])
 def test_variance_is_the_integral_of_the_density(network, rail):
     """Lyapunov's equation against quadrature of the one-sided PSD over ln f."""
@@ -117,7 +105,6 @@ def test_variance_is_the_integral_of_the_density(network, rail):
     area = quad(lambda x: density(here, math.exp(x)) * math.exp(x), math.log(1e-4),
                 math.log(1e11), limit=500, epsrel=1e-8)[0]
     assert here.var_inf == pytest.approx(area, rel=1e-5)
-    assert here.shares.sum() == pytest.approx(1.0, rel=1e-8)
 
 
 def test_ripple_is_largest_at_two_thirds_and_independent_escs_add_in_power():
@@ -136,16 +123,16 @@ def test_without_noise_the_rate_is_nan():
 
 
 resistances = st.floats(0.005, 0.2)
-no_filter = st.builds(
+networks = st.builds(
     PowerNetwork, battery_resistance=resistances, bulk_capacitance=st.floats(10e-6, 10e-3),
     bulk_esr=st.floats(0.0, 0.3), current_max=st.floats(5.0, 80.0),
     esc_frequency=st.floats(8e3, 96e3), flutter=st.floats(0.0, 0.1),
-    constant_power=st.booleans(), line_gain=st.none() | st.floats(0.001, 1.0))
+    mcu_current=st.floats(0.0, 5.0), line_gain=st.none() | st.floats(0.001, 1.0))
 
 
 @settings(max_examples=150, deadline=None)
-@given(no_filter, st.floats(0.05, 0.95), st.floats(1.05, 10.0), st.booleans())
-def test_without_filter_capacitance_lowers_the_variance(network, throttle, factor, follows):
+@given(networks, st.floats(0.05, 0.95), st.floats(1.05, 10.0), st.booleans())
+def test_capacitance_lowers_the_variance(network, throttle, factor, follows):
     """On both rails, whether the ESR stays or falls; the means stay."""
     esr = network.bulk_esr / (factor if follows else 1.0)
     more = replace(network, bulk_capacitance=factor * network.bulk_capacitance, bulk_esr=esr)
@@ -175,20 +162,11 @@ def test_zero_is_refused_where_it_means_nothing(name):
 
 @pytest.mark.parametrize('values, words', [
     ({'cells': 5.5}, 'whole number'), ({'regulator_efficiency': 1.1}, 'at most 1'),
-    ({'regulator_voltage': 24.0}, 'below battery_voltage'), ({'constant_power': 1}, 'true'),
+    ({'regulator_voltage': 24.0}, 'below battery_voltage'),
     ({'current_exponent': 0.5}, 'at least 1')])
 def test_values_that_contradict_are_refused(values, words):
     with pytest.raises(ValueError, match=words):
         PowerNetwork(**values)
-
-
-def test_an_unstable_network_is_refused_with_its_pole():
-    """An almost lossless filter into a constant-power load rings up; a plain load does not."""
-    network = PowerNetwork(filter_inductance=100e-6, filter_resistance=1e-3,
-                           filter_capacitance=1e-6, filter_esr=0.0)
-    with pytest.raises(ValueError, match=r'unstable.*pole at 3\d{3} \+- .*-158.5 Ohm'):
-        rail_at(network, 0.4)
-    assert rail_at(replace(network, constant_power=False), 0.4).poles.real.max() < 0.0
 
 
 @pytest.mark.parametrize('throttle, words', [
@@ -201,8 +179,6 @@ def test_bad_throttles_are_refused(throttle, words):
 def test_a_load_beyond_the_battery_is_refused():
     with pytest.raises(ValueError, match='battery cannot supply the load at throttle 0.9'):
         rail_at(PowerNetwork(current_max=600.0), 0.9)
-    with pytest.raises(ValueError, match='cannot give the regulator'):
-        FILTERED.regulator_current(0.1)
     with pytest.raises(ValueError, match="'bus' or 'regulated'"):
         rail_at(PowerNetwork(), 0.4, 'motor')
 
