@@ -3,8 +3,8 @@ Run tasks in many processes: on this machine, or on the workers of a Dask schedu
 
 Local processes are reached over pipes, so no port is open.  Only this module imports Dask.
 
-Limits: a worker that dies loses its tasks.  Other workers may have used up the memory for which it
-was killed, so its task is tried once more, alone, before it fails.
+Limits: a worker that dies takes the tasks of the other local workers with it.  They may have used
+up the memory for which it was killed, so each of these tasks is tried once more, alone.
 """
 
 from __future__ import annotations
@@ -114,38 +114,34 @@ class LocalWorkers(Workers):
         # The workers wait at the reading end: they exit when this process closes its end or dies.
         self._watched, self._alive = multiprocessing.get_context('spawn').Pipe(duplex=False)
         self._memory = max(int(_MEMORY_SHARE * usable_memory()) // count, _MEMORY_LEAST)
-        # One pool for each worker, so that a broken pool identifies its task.
-        self._pools: list[ProcessPoolExecutor | None] = [None] * count
-        self._at: dict[Future[Any], int] = {}
+        self._count = count
+        self._pool = self._new_pool()
+
+    def _new_pool(self) -> ProcessPoolExecutor:
+        # Spawned, because forking with threads is unsafe.
+        return ProcessPoolExecutor(self._count, multiprocessing.get_context('spawn'), _prepare,
+                                   (self._watched, self._memory))
 
     def _room(self) -> int:
-        return len(self._pools)
+        return self._count
 
     def _submit(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Future[Any]:
-        k = min(set(range(len(self._pools))) - set(self._at.values()))
-        pool = self._pools[k]
-        if pool is not None:
-            future = pool.submit(function, *arguments)
-        else:
-            # Spawned, because forking with threads is unsafe.  The first task starts the process.
-            pool = self._pools[k] = ProcessPoolExecutor(
-                1, multiprocessing.get_context('spawn'), _prepare, (self._watched, self._memory))
-            with _environment_of_workers():
-                future = pool.submit(function, *arguments)
-        self._at[future] = k
-        return future
+        # A task may start a process.
+        with _environment_of_workers():
+            try:
+                return self._pool.submit(function, *arguments)
+            except BrokenProcessPool:
+                self._pool.shutdown()
+                self._pool = self._new_pool()
+                return self._pool.submit(function, *arguments)
 
     def _wait(self, futures: Sequence[Future[Any]]) -> list[Future[Any]]:
         return list(wait(futures, return_when=FIRST_COMPLETED).done)
 
     def _outcome(self, future: Future[Any]) -> tuple[Any, str]:
-        k = self._at.pop(future)
         try:
             return future.result(), ''
         except BrokenProcessPool:
-            pool, self._pools[k] = self._pools[k], None
-            if pool is not None:
-                pool.shutdown()
             return None, LOST
         except Exception as error:
             # The function catches its own errors: this one is of the transport.
@@ -154,9 +150,7 @@ class LocalWorkers(Workers):
     def close(self) -> None:
         """End the workers at once."""
         self._alive.close()
-        for pool in self._pools:
-            if pool is not None:
-                pool.shutdown(cancel_futures=True)
+        self._pool.shutdown(cancel_futures=True)
         self._watched.close()
 
 
