@@ -1,4 +1,4 @@
-"""Check and use the arguments that several commands share, and write them as a command line."""
+"""Check and use the arguments that several commands share."""
 
 from __future__ import annotations
 
@@ -19,8 +19,6 @@ _COLUMNS = {'time': 'time_column', 'voltage': 'voltage_column', 'throttle': 'thr
             'current': 'current_column', **{name: name for name in (
                 'unit', 'time_unit', 'throttle_unit', 'sample_interval', 'delimiter', 'decimal',
                 'skip_rows')}}
-# Options that choose topics and columns, by their names in the parser.
-_TOPICS = ('msg_config', 'voltage_topic', 'throttle_topic', 'flight', *_COLUMNS.values())
 
 
 def check_outputs(args: argparse.Namespace, *names: str, **inputs: Any) -> None:
@@ -59,23 +57,6 @@ def columns_given(args: argparse.Namespace) -> CsvColumns | None:
     given = {name: getattr(args, option) for name, option in _COLUMNS.items()
              if getattr(args, option, None) is not None}
     return CsvColumns(**given) if given else None
-
-
-def repeated(args: argparse.Namespace, *names: str) -> list[str]:
-    """Return the words of a command line that repeat how a recording is read."""
-    words: list[str] = []
-    given = {'--from': getattr(args, 'start', None), '--to': getattr(args, 'end', None),
-             **{'--' + name.replace('_', '-'): getattr(args, name, None)
-                for name in (*names, *_TOPICS)}}
-    for option, value in given.items():
-        if value is not None:
-            words += [option, ','.join(map(_word, value)) if isinstance(value, tuple)
-                      else _word(value)]
-    return words + (['--partial'] if args.partial else [])
-
-
-def _word(value: object) -> str:
-    return f'{value:.15g}' if isinstance(value, float) else str(value)
 
 
 def check_ranges(given: Mapping[str, Any]) -> None:

@@ -7,13 +7,12 @@ import hashlib
 import math
 import os
 from pathlib import Path
-import shlex
 import sys
 from typing import Any, TYPE_CHECKING
 
 from ou_monitor import __version__
 from ou_monitor.cli import output
-from ou_monitor.cli.arguments import check_ranges, columns_given, repeated
+from ou_monitor.cli.arguments import check_ranges, columns_given
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import how_to_install, InputError
 
@@ -102,15 +101,7 @@ def _write(fleet: Fleet, folder: Path, args: argparse.Namespace) -> None:
     write_table(fleet.rows, folder / TABLE)
     found = Result(fleet, lambda command: fleet_document(fleet, command), lambda: as_data(fleet),
                    lambda: fleet.rows)
-    output.deliver(args, found, command_line(args), table=folder / TABLE, report=folder / REPORT)
-
-
-def command_line(args: argparse.Namespace) -> str:
-    """Return the command that repeats this fleet."""
-    words = ['ou-monitor', 'fleet', *args.recordings, '--output', args.output, *repeated(
-        args, 'vehicle_from', 'levels', 'window', 'brownout_voltage', 'cells',
-        'brownout_horizon')]
-    return shlex.join(words + (['--discover', '--seed', str(args.seed)] if args.discover else []))
+    output.deliver(args, found, table=folder / TABLE, report=folder / REPORT)
 
 
 def _options(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:

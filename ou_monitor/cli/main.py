@@ -69,7 +69,7 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
         import argcomplete
 
         argcomplete.autocomplete(parser)
-    args, extra = parser.parse_known_args(argv)
+    args, extra = parser.parse_known_args(argv, argparse.Namespace(words=argv))
     if extra:
         options = _options(parser, args.command)
         hint = nearest(extra[0].split('=')[0], options) if extra[0].startswith('-') else (

@@ -13,6 +13,7 @@ import json
 import math
 import os
 from pathlib import Path
+import shlex
 import shutil
 import sys
 import time
@@ -283,13 +284,13 @@ def check_folder(path: Path) -> None:
         raise InputError(f"cannot write '{path}': the folder '{path.parent}' does not exist")
 
 
-def deliver(args: argparse.Namespace, found: Result, command: str = '',
-            report: str | Path | None = None, **files: object) -> None:
+def deliver(args: argparse.Namespace, found: Result, report: str | Path | None = None,
+            **files: object) -> None:
     """Write a result to the page, JSON file and terminal that the arguments name."""
     # `report` is the path of a page that has been checked: an existing page is overwritten.
     force = args.force or report is not None
     report = report or getattr(args, 'report', None)
-    document = found.document(command)
+    document = found.document(shlex.join(['ou-monitor', *args.words]))
     if report is not None:
         from ou_monitor.report.page import html
         write_text(html(document), report, force)

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime, timezone
 import math
-import shlex
 import sys
 from typing import Any, TYPE_CHECKING
 
 from ou_monitor import __version__, bench
 from ou_monitor.cli import output
-from ou_monitor.cli.arguments import check_outputs, check_ranges, read_given, repeated
+from ou_monitor.cli.arguments import check_outputs, check_ranges, read_given
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
 
@@ -26,8 +25,7 @@ if TYPE_CHECKING:
 def analyze(args: argparse.Namespace) -> int:
     """Run `analyze`: the paper's Tables 1 and 2 for a recording."""
     given = _bench_arguments(args, 'levels', 'window', 'brownout_horizon')
-    _, found = _read_and_run(args, 'analyzing', bench.analyze, given)
-    output.deliver(args, found, _command(args, given))
+    output.deliver(args, _read_and_run(args, 'analyzing', bench.analyze, given)[1])
     return 0
 
 
@@ -37,8 +35,8 @@ def compare(args: argparse.Namespace) -> int:
 
     given = _bench_arguments(args, 'fit_until', 'seeds', 'seed')
     model = None if args.model is None else read_model(args.model).model
-    _, found = _read_and_run(args, 'comparing', bench.compare, {**given, 'model': model})
-    output.deliver(args, found, _command(args, [*given, 'model']))
+    output.deliver(args, _read_and_run(
+        args, 'comparing', bench.compare, {**given, 'model': model})[1])
     return 0
 
 
@@ -52,9 +50,8 @@ def coupling(args: argparse.Namespace) -> int:
         # Samples outside the part have no voltage; do not count them as dropped.
         part = (t >= recording.t[0]) & (t <= recording.t[-1])
         t, values = t[part], values[part]
-    found = bench.coupling(recording, replace(series, name=args.signal, t=t, values=values),
-                           **given)
-    output.deliver(args, found, _command(args, ['signal', *given]))
+    output.deliver(args, bench.coupling(
+        recording, replace(series, name=args.signal, t=t, values=values), **given))
     return 0
 
 
@@ -65,7 +62,7 @@ def discover(args: argparse.Namespace) -> int:
     why = finding.unsaved
     if finding.refused and not (why or args.force):
         why = f'{finding.refused}; --force saves it anyway'
-    output.deliver(args, finding, _command(args, given), model=None if why else args.save_model)
+    output.deliver(args, finding, model=None if why else args.save_model)
     if args.save_model is not None:
         # Last, so that a refused model does not stop the other files from being written.
         if why:
@@ -79,7 +76,7 @@ def reproduce(args: argparse.Namespace) -> int:
     check_outputs(args, 'report')
     with Progress('recomputing', args.json == output.STDOUT) as progress:
         found = bench.reproduce(seed=args.seed, progress=progress)
-    output.deliver(args, found, f'ou-monitor reproduce --seed {args.seed}')
+    output.deliver(args, found)
     return 0
 
 
@@ -110,11 +107,6 @@ def _read_and_run(args: argparse.Namespace, label: str, function: Callable[..., 
             print(f'ou-monitor {args.command}: {_unsaved(why)}', file=sys.stderr, flush=True)
     with Progress(label, args.json == output.STDOUT) as progress:
         return recording, function(recording, progress=progress, **given)
-
-
-def _command(args: argparse.Namespace, names: Iterable[str]) -> str:
-    """Return the command that repeats this one, with some of its options."""
-    return shlex.join(['ou-monitor', args.command, args.recording, *repeated(args, *names)])
 
 
 def _unsaved(why: str) -> str:

@@ -57,8 +57,8 @@ def test_report_and_json_files(flight, tmp_path, capsys):
     html = report.read_text(encoding='utf-8')
     assert '<b>' not in html and '&lt;b&gt;' in html
     command = re.search('<code>(.*)</code>', html).group(1)
-    assert '--levels 0.1,0.4 --window 1.5 --brownout-horizon 5 --brownout-voltage 4.5' in command
-    assert '.csv&#x27; --levels' in command
+    assert command.startswith('ou-monitor analyze &#x27;')
+    assert '.csv&#x27; --levels 0.4,0.1 --window 1.5 --brownout-voltage 4.5 --report' in command
 
 
 def test_unknown_is_null(tmp_path, capsys):
