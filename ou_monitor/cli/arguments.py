@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from ou_monitor.cli import output
@@ -21,16 +22,21 @@ _COLUMNS = {'time': 'time_column', 'voltage': 'voltage_column', 'throttle': 'thr
                 'skip_rows')}}
 
 
-def check_outputs(args: argparse.Namespace, *names: str, **inputs: Any) -> None:
+def check_outputs(args: argparse.Namespace, bag: tuple[str, Path | None] = ('', None),
+                  **inputs: Any) -> None:
     """Refuse outputs that overwrite an input, cannot be written, or (except for JSON) are '-'."""
-    targets = {f"--{name.replace('_', '-')}": getattr(args, name) for name in names}
-    for option, target in targets.items():
-        if target == output.STDOUT:
+    # bag: its option and path.
+    files = {'--save-model': getattr(args, 'save_model', None),
+             '--report': getattr(args, 'report', None)}
+    for option, target in files.items():
+        if str(target) == output.STDOUT:
             raise InputError(f"{option} needs a file: '-' is not supported")
-    for target in (args.json, *targets.values()):
+    for target in (args.json, *files.values()):
         # `check_paths` names the option of an empty path.
         output.check_writable(target or None)
-    output.check_paths(inputs, {'--json': args.json, **targets}, args.force)
+    if bag[1] is not None:
+        output.check_bag(*bag, args.force)
+    output.check_paths(inputs, {'--json': args.json, **files, bag[0]: bag[1]}, args.force)
 
 
 def read_given(args: argparse.Namespace, signal: str | None = None

@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from ou_monitor.cli import output
+from ou_monitor.cli.arguments import check_outputs, columns_given
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
 from ou_monitor.report.document import Document, Facts, Notes, Part, Table, Text
@@ -13,16 +14,11 @@ from ou_monitor.report.document import Document, Facts, Notes, Part, Table, Text
 
 def run(args: argparse.Namespace) -> int:
     """Convert, or list."""
-    if args.list:
-        if args.out is not None:
-            raise InputError(f"--list writes no bag: leave '{args.out}' out")
-    else:
-        # Before reading a long log.
-        output.check_bag('OUT', args.out, args.force)
-    output.check_paths({'LOG': args.log}, {'OUT': args.out, '--json': args.json}, args.force)
-    output.check_writable(args.json)
+    if args.list and args.out is not None:
+        raise InputError(f"--list writes no bag: leave '{args.out}' out")
+    # Before reading a long log.
+    check_outputs(args, ('OUT', args.out), LOG=args.log)
 
-    from ou_monitor.cli.arguments import columns_given
     from ou_monitor.recordings.importers.formats import import_log
     from ou_monitor.recordings.importers.log import Request
 

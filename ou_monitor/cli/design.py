@@ -28,7 +28,7 @@ def _list(args: argparse.Namespace) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    check_outputs(args, 'report', **{'--network': args.network, '--from': args.recording})
+    check_outputs(args, **{'--network': args.network, '--from': args.recording})
     if args.list:
         _list(args)
         return 0

@@ -268,9 +268,9 @@ def _overwrites(target: Path, source: Path) -> bool:
     return name == 'metadata.yaml' or name.endswith(_STORAGE)
 
 
-def check_writable(target: str | None) -> None:
+def check_writable(target: str | Path | None) -> None:
     """Refuse an output that cannot be written, before the work starts."""
-    if target is None or target == STDOUT:
+    if target is None or str(target) == STDOUT:
         return
     path = Path(target)
     if path.is_dir():

@@ -73,7 +73,7 @@ def discover(args: argparse.Namespace) -> int:
 
 def reproduce(args: argparse.Namespace) -> int:
     """Run `reproduce`: every number of the paper, recomputed, with a verdict."""
-    check_outputs(args, 'report')
+    check_outputs(args)
     with Progress('recomputing', args.json == output.STDOUT) as progress:
         found = bench.reproduce(seed=args.seed, progress=progress)
     output.deliver(args, found)
@@ -82,9 +82,8 @@ def reproduce(args: argparse.Namespace) -> int:
 
 def _bench_arguments(args: argparse.Namespace, *names: str) -> dict[str, Any]:
     """Return some arguments and the limit for a function of `bench`; check paths and ranges."""
-    check_outputs(args, *(name for name in ('save_model', 'report') if name in args),
-                  RECORDING=args.recording, **{
-                      '--msg-config': args.msg_config, '--model': getattr(args, 'model', None)})
+    check_outputs(args, RECORDING=args.recording, **{
+        '--msg-config': args.msg_config, '--model': getattr(args, 'model', None)})
     given = {name: getattr(args, name) for name in names}
     # It imports SciPy, which not every command needs.
     from ou_monitor.analysis.crafts import pack_limit

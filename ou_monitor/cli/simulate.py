@@ -7,7 +7,7 @@ import sys
 
 from ou_monitor.bench import simulate
 from ou_monitor.cli import output
-from ou_monitor.cli.arguments import columns_given, part_of_recording
+from ou_monitor.cli.arguments import check_outputs, columns_given, part_of_recording
 from ou_monitor.cli.output import Progress
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.model_file import as_yaml
@@ -21,7 +21,7 @@ _EXPORT_MOST = 200_000
 def run(args: argparse.Namespace) -> int:
     """Simulate."""
     if args.list:
-        output.check_paths({}, {'--json': args.json}, args.force)
+        check_outputs(args)
         output.tell(args, Document('Presets', '', (), [
             Table(['Preset', 'Throttle', 'Rate, Hz', 'Length, s', 'What it is'], [
                 [name, p.throttle, f'{p.rate:g}', f'{p.duration:g}', p.text]
@@ -39,14 +39,8 @@ def run(args: argparse.Namespace) -> int:
     columns = columns_given(args)
     recorded = args.throttle is not None and is_recording(args.throttle, columns)
     table = args.throttle if recorded or str(args.throttle).lower().endswith('.csv') else None
-    output.check_paths(
-        {'--model': args.model, '--throttle': table},
-        {'--output': args.output, '--save-model': args.save_model, '--json': args.json},
-        args.force)
-    if args.output is not None:
-        output.check_bag('--output', args.output, args.force)
-    output.check_writable(args.json)
-    output.check_writable(None if args.save_model is None else str(args.save_model))
+    check_outputs(args, ('--output', args.output), **{
+        '--model': args.model, '--throttle': table})
     target = None if args.export is not None else args.output
     with output.replacing(target, args.force), \
             Progress('simulating', args.json == output.STDOUT) as progress:

@@ -27,7 +27,7 @@ its diffusion limit.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 import math
 from typing import get_args, Literal
@@ -224,17 +224,10 @@ class Generator:
     @cached_property
     def stationary(self) -> FloatArray:
         """Return the stationary law pi, shape (n,)."""
-        # Elimination without subtractions (Grassmann, Taksar & Heyman, Oper. Res. 33 (1985) 1107):
-        # every entry has full relative precision, even for rates of very different size.
-        p = self.q / np.abs(self.q).max()
-        np.fill_diagonal(p, 0.0)
-        for k in range(self.size - 1, 0, -1):
-            p[:k, k] /= p[k, :k].sum()
-            p[:k, :k] += np.outer(p[:k, k], p[k, :k])
-        law = np.ones(self.size)
-        for k in range(1, self.size):
-            law[k] = law[:k] @ p[:k, k]
-        law /= law.sum()
+        # pi Q = 0, with one of the equations replaced by sum(pi) = 1.
+        equations = self.q.T / np.abs(self.q).max()
+        equations[-1] = 1.0
+        law = np.linalg.solve(equations, np.eye(self.size)[-1])
         law.setflags(write=False)
         return law
 
@@ -257,18 +250,6 @@ class Generator:
         np.fill_diagonal(p, 0.0)
         return np.asarray(p)
 
-    @cached_property
-    def _cumulative_kernel(self) -> FloatArray:
-        """Return the cumulative kernel, shape (n, n); each row ends at exactly 1."""
-        below = np.cumsum(self.jump_probabilities, axis=1)
-        return np.asarray(below / below[:, -1:])
-
-    def sped_up(self, factor: float) -> Generator:
-        """Return the chain on the clock factor * t, with `factor` times the rates."""
-        if not 0.0 < factor < np.inf:
-            raise ValueError(f'factor must be positive and finite, got {factor}')
-        return Generator(self.q * factor)
-
     def transition(self, t: float) -> FloatArray:
         """Return exp(Q t), shape (n, n): the law at time t, s, one row per initial state."""
         if not 0.0 <= t < np.inf:
@@ -288,6 +269,9 @@ class Generator:
         # Yields, at each jump and edge: index of the interval, the paths that jump (at an edge:
         # all), their states until then, and the time in these since their last yield, s.
         rates, everyone = self.leaving, slice(None)
+        kernel = np.cumsum(self.jump_probabilities, axis=1)
+        # Each row ends at exactly 1.
+        kernel /= kernel[:, -1:]
         hold = rng.standard_exponential(state.size) / rates[state]
         for k, width in enumerate(np.diff(edges)):
             left = np.full(state.size, width)
@@ -296,7 +280,7 @@ class Generator:
                 held, at = hold[which], state[which]
                 yield k, which, at, held
                 rest = left[which] - held
-                at = (rng.random(at.size)[:, None] >= self._cumulative_kernel[at]).sum(axis=1)
+                at = (rng.random(at.size)[:, None] >= kernel[at]).sum(axis=1)
                 new = rng.standard_exponential(which.size) / rates[at]
                 left[which], state[which], hold[which] = rest, at, new
                 which = which[new < rest]
@@ -404,15 +388,6 @@ class SwitchedSystem:
         matrix, offset = self.switched_average()
         return AffineSystem(self.drift_matrix + matrix, self.drift_offset + offset)
 
-    def balanced(self) -> SwitchedSystem:
-        """Return the same system with the average moved to the unswitched part."""
-        # At eps = 1 nothing changes; the switched part meets the balance condition, so the
-        # diffusion limit exists.
-        matrix, offset = self.switched_average()
-        return replace(
-            self, drift_matrix=self.drift_matrix + matrix, drift_offset=self.drift_offset + offset,
-            matrices=self.matrices - matrix, offsets=self.offsets - offset)
-
     def scaled(self, eps: float, scaling: Scaling) -> SwitchedSystem:
         """Return the system at eps, with scaled rates and with the unswitched part merged."""
         if not 0.0 < eps < np.inf:
@@ -421,7 +396,7 @@ class SwitchedSystem:
             raise ValueError(f"scaling must be 'averaging' or 'diffusion', got {scaling!r}")
         clock, speed = (1.0 / eps, 1.0) if scaling == 'averaging' else (1.0 / eps**2, 1.0 / eps)
         return SwitchedSystem(
-            self.generator.sped_up(clock), self.drift_matrix + speed * self.matrices,
+            Generator(clock * self.generator.q), self.drift_matrix + speed * self.matrices,
             self.drift_offset + speed * self.offsets)
 
     def simulate(
@@ -461,8 +436,7 @@ def require_balance(system: SwitchedSystem) -> None:
                     f'is {worst:+.6g} per second at u = 0')
             raise ValueError(
                 f'the balance condition does not hold: the averaged velocity of component {i} '
-                f'{what}, not 0; SwitchedSystem.balanced() moves the average to the unswitched '
-                'drift')
+                f'{what}, not 0; move the average to the unswitched drift')
 
 
 def switching_drift(system: SwitchedSystem) -> AffineSystem:

@@ -47,19 +47,10 @@ def test_stationary_law_is_the_null_space():
     assert FIVE.stationary == pytest.approx(law / law.sum(), rel=1e-12)
 
 
-def test_stationary_law_keeps_its_digits_over_forty_decades():
-    """Detailed balance of a birth-death chain, pi[k + 1] / pi[k] = up / down."""
-    up, down = np.array([1e-12, 1e6, 1e-9]), np.array([1e9, 1e-3, 1e10])
-    law = np.concatenate([[1.0], np.cumprod(up / down)])
-    q = np.diag(up, 1) + np.diag(down, -1)
-    chain = Generator(q - np.diag(q.sum(axis=1)))
-    assert chain.stationary == pytest.approx(law / law.sum(), rel=1e-13)
-
-
 @pytest.mark.parametrize('speed', [1.0, 1e5])
 def test_potential_is_the_integral(speed):
     """The defining integral, by quadrature, at rates of 1/s and of 100 kHz."""
-    chain = FIVE.sped_up(speed)
+    chain = Generator(speed * FIVE.q)
     projector = np.tile(FIVE.stationary, (5, 1))
     integral, _ = quad_vec(lambda t: expm(FIVE.q * t) - projector, 0.0, 60.0, epsabs=1e-12)
     assert chain.potential == pytest.approx(integral / speed, abs=1e-9 / speed)
@@ -88,7 +79,6 @@ def test_paths_jump_by_the_kernel_and_hold_exponentially():
 @pytest.mark.parametrize('call, message', [
     (lambda rng: Generator(np.array([[-1j, 1j], [1j, -1j]])), 'rates must be real'),
     (lambda rng: FIVE.starts(0, rng), 'paths must be 1 or more'),
-    (lambda rng: FIVE.sped_up(0.0), 'factor must be positive'),
     (lambda rng: FIVE.transition(-1.0), 't must be zero or positive'),
 ])
 def test_wrong_arguments_are_refused(call, message):

@@ -61,17 +61,6 @@ def test_simulation_has_the_exact_moments(eps, scaling):
         assert (np.abs(products.mean(axis=0) - covariance) < error).all()
 
 
-def test_balanced_changes_nothing_at_eps_one():
-    """Same moments; and the switched part averages to zero."""
-    balanced = PAPER.balanced()
-    pi = CYCLE.stationary
-    assert np.tensordot(pi, balanced.matrices, 1) == pytest.approx(0.0, abs=1e-14)
-    for found, expected in zip(
-            moments_of_switched(balanced, 0.5, U0, 1.0),
-            moments_of_switched(PAPER, 0.5, U0, 1.0), strict=True):
-        assert found == pytest.approx(expected, rel=1e-11, abs=1e-13)
-
-
 def test_paths_that_overflow_are_refused():
     system = SwitchedSystem(CYCLE, np.full((3, 1, 1), 9.0))
     with pytest.raises(ValueError, match='unstable: a path overflows before t = 100 s'):

@@ -1,4 +1,4 @@
-"""Markov chains and switched systems shared by several tests, and simulated paths of chains."""
+"""Markov chains and switched systems shared by several tests."""
 
 from convergence import cycle
 import numpy as np
@@ -16,26 +16,11 @@ PAPER = SwitchedSystem.of_matrix_model(
 def vector_system() -> SwitchedSystem:
     """Return a switched system of two components on `THREE`."""
     rng = np.random.default_rng(20)
-    centred = SwitchedSystem(
-        THREE, rng.standard_normal((3, 2, 2)), rng.standard_normal((3, 2))).balanced()
+    whole = SwitchedSystem(THREE, rng.standard_normal((3, 2, 2)), rng.standard_normal((3, 2)))
+    matrix, offset = whole.switched_average()
     return SwitchedSystem(
-        THREE, 0.7 * centred.matrices, centred.offsets, np.array([[-3.0, 1.0], [0.0, -2.0]]),
-        np.array([0.5, 0.0]))
-
-
-def drawn(chain, edges, paths, rng):
-    """Return states on a grid, (paths, k), and times spent in each, (paths, k - 1, states)."""
-    grid = np.asarray(edges, dtype=np.float64)
-    state = chain.starts(paths, rng)
-    states = np.empty((paths, grid.size), dtype=np.intp)
-    states[:, 0] = state
-    spent = np.zeros((paths, grid.size - 1, chain.size))
-    everyone = np.arange(paths)
-    for k, which, at, dt in chain.segments(grid, state, rng):
-        spent[everyone[which], k, at] += dt
-        if isinstance(which, slice):
-            states[:, k + 1] = at
-    return states, spent
+        THREE, 0.7 * (whole.matrices - matrix), whole.offsets - offset,
+        np.array([[-3.0, 1.0], [0.0, -2.0]]), np.array([0.5, 0.0]))
 
 
 def moments_of_switched(system, t, u0, eps, scaling='averaging'):
