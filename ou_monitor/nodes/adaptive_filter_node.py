@@ -44,7 +44,6 @@ INPUT_PARAMETERS = (
     Parameter('input.field', '',
               'Field path of the signal; empty: data, voltage of a battery, angular velocity of '
               'an IMU.'))
-OWN_TOPICS = ('input', 'sigma', 'state', '~/output', '~/cutoff', '~/lag')
 # Fields of the state that the filter uses.
 _FIELDS = ('sigma_se', 'alpha', 'throttle', 'load_noise')
 _UNKNOWN = [NAN] * len(_FIELDS)
@@ -201,7 +200,6 @@ class AdaptiveFilterNode(MonitorNode):
             lambda message: self._supply.take_sigma(message.data)), INPUT_QOS)
         self.create_subscription(DiagnosticArray, 'state', self.guarded(
             self._supply.take_state), INPUT_QOS)
-        self.refuse_other_overrides([*OWN_TOPICS, *self._motors.sources.topics])
         if self._type != AUTO:
             self._open(self._type)
         self.every(0.2, self._watch)

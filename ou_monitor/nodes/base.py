@@ -6,8 +6,7 @@ Each name and default exists once, in a table. An exception in a callback does n
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
 import functools
 import inspect
 import math
@@ -29,16 +28,14 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
-from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.time import Time
 from rclpy.timer import Timer
 from sensor_msgs.msg import BatteryState
 from std_srvs.srv import Trigger
 
-QOS = 'qos_overrides.'
 # Declared by rclpy itself.
-_BUILT_IN = ('use_sim_time', 'start_type_description_service', QOS)
+_BUILT_IN = ('use_sim_time', 'start_type_description_service')
 
 LOCK = Parameter(
     'lock_parameters', False,
@@ -242,16 +239,13 @@ class MonitorNode(Node):
         return (s for s in super().subscriptions if s not in self._polled)
 
     def create_publisher(self, kind: Any, topic: str, qos: Any, **options: Any) -> Publisher:
-        """Return a publisher; `qos_overrides` are honoured."""
-        with self._overriding(topic) as overriding:
-            return self._kept(super().create_publisher(kind, topic, qos, **overriding, **options))
+        """Return a publisher."""
+        return self._kept(super().create_publisher(kind, topic, qos, **options))
 
     def create_subscription(self, kind: Any, topic: str, callback: Any, qos: Any,
                             **options: Any) -> Subscription:
-        """Return a subscription; `qos_overrides` are honoured."""
-        with self._overriding(topic) as overriding:
-            return self._kept(super().create_subscription(
-                kind, topic, callback, qos, **overriding, **options))
+        """Return a subscription."""
+        return self._kept(super().create_subscription(kind, topic, callback, qos, **options))
 
     def serve(self, name: str, work: Callable[[], str]) -> None:
         """Offer a Trigger: `work` returns what was done, or raises `InputError` to refuse."""
@@ -272,28 +266,6 @@ class MonitorNode(Node):
         if hasattr(self, '_made'):
             self._made.append(made)
         return made
-
-    @contextmanager
-    def _overriding(self, topic: str) -> Iterator[dict[str, Any]]:
-        """Give the option that applies a topic's `qos_overrides`; InputError if it cannot."""
-        prefix = f'{QOS}{self.resolve_topic_name(topic)}.'
-        if not any(name.startswith(prefix) for name in getattr(self, '_parameter_overrides', ())):
-            yield {}
-            return
-        try:
-            yield {'qos_overriding_options': QoSOverridingOptions.with_default_policies()}
-        except (InvalidQosOverridesError, RuntimeError, ValueError) as error:
-            raise InputError(f'qos_overrides of {topic}: {error}') from error
-
-    def refuse_other_overrides(self, topics: Iterable[str]) -> None:
-        """Refuse `qos_overrides` for topics other than these and those of every node."""
-        known = [self.resolve_topic_name(topic) for topic in (
-            *topics, '/diagnostics', '/clock')]
-        for name in self._parameter_overrides:
-            if name.startswith(QOS) and not any(
-                    name.startswith(f'{QOS}{topic}.') for topic in known):
-                raise InputError(f"parameter '{name}' names no topic of this node; its topics "
-                                 f"are {', '.join(known)}")
 
     def create_polled(self, kind: Any, topic: str, qos: QoSProfile) -> Subscription:
         """Return a subscription whose messages wait in the middleware until they are taken."""

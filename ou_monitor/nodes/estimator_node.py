@@ -106,8 +106,6 @@ class EstimatorNode(MonitorNode):
         self.every(POLL, lambda: self._poll(HAND_OVER))
         self.every(1.0, self._diagnose)
         self.publish_every(lambda: self._publish(*self._report()))
-        self.refuse_other_overrides([*('~/' + key for key in (*OUTPUTS, 'brownout', 'state')),
-                                     *self._sources.topics])
 
     def _open_latch(self, name: str) -> LatchFile | None:
         if not name:

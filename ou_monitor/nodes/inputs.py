@@ -250,11 +250,6 @@ class SourceFinder:
         # Why a quantity is not used, such as an InputError of `open_source`; '' if it is.
         self.problems: dict[str, str] = {}
 
-    @property
-    def topics(self) -> list[str]:
-        """Return the topics that may be subscribed to."""
-        return [source.topic for source in self.sources.values()]
-
     def watch(self, needed: str = '') -> None:
         """Check the publishers; an InputError in opening the `needed` quantity is raised."""
         for quantity, source in self.sources.items():

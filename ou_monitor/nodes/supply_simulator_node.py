@@ -141,7 +141,6 @@ class SupplySimulatorNode(MonitorNode):
         self._throttle, self._turn = 0.0, -1
         self._watched = PublisherWatch(self)
         self.serve('~/reset', self._reset)
-        self.refuse_other_overrides([self._voltage.source.topic, *self._sources.topics])
         self.get_logger().info(
             f"{', '.join(term.NAME for term in self._model.terms)} at {self._rate:g} Hz on "
             f'{self.resolve_topic_name(self._voltage.source.topic)}'

@@ -172,22 +172,6 @@ def test_without_ros_one_line_says_so(tmp_path, name):
     assert done.stderr.count('\n') == 1 and 'ROS 2 is not installed' in done.stderr
 
 
-def test_qos_overrides_are_taken_or_refused(world):
-    from rclpy.qos import ReliabilityPolicy
-    probe = world.probe()
-    process = world.start(
-        'estimator', '--ros-args', '-p', 'msg_config:=std_float64',
-        '-p', 'qos_overrides./voltage.subscription.reliability:=reliable')
-    (end,) = wait_until(lambda: probe.node.get_subscriptions_info_by_topic('/voltage'))
-    assert end.qos_profile.reliability == ReliabilityPolicy.RELIABLE
-    wait_until(lambda: 'Waiting for a publisher on /voltage' in process.err)
-    assert process.stop() == 0
-    for name, words in (('/rail.subscription.depth:=5', 'names no topic of this node'),
-                        ('/voltage.subscription.reliability:=somehow', 'qos_overrides of')):
-        assert words in refusal(lambda: EstimatorNode('ou_estimator'), '-p',
-                                'msg_config:=std_float64', '-p', f'qos_overrides.{name}')
-
-
 def test_the_nodes_have_one_thread_of_blas():
     """More of them on one core wait for one another; what the user says stands."""
     code = ('import ou_monitor.nodes.run, os, sys; assert "numpy" not in sys.modules; '
