@@ -26,17 +26,18 @@ def check_outputs(args: argparse.Namespace, bag: tuple[str, Path | None] = ('', 
                   **inputs: Any) -> None:
     """Refuse outputs that overwrite an input, cannot be written, or (except for JSON) are '-'."""
     # bag: its option and path.
+    option, path = bag
     files = {'--save-model': getattr(args, 'save_model', None),
              '--report': getattr(args, 'report', None)}
-    for option, target in files.items():
+    for name, target in files.items():
         if str(target) == output.STDOUT:
-            raise InputError(f"{option} needs a file: '-' is not supported")
+            raise InputError(f"{name} needs a file: '-' is not supported")
     for target in (args.json, *files.values()):
         # `check_paths` names the option of an empty path.
         output.check_writable(target or None)
-    if bag[1] is not None:
-        output.check_bag(*bag, args.force)
-    output.check_paths(inputs, {'--json': args.json, **files, bag[0]: bag[1]}, args.force)
+    if path is not None:
+        output.check_bag(option, path, args.force)
+    output.check_paths(inputs, {'--json': args.json, **files, option: path}, args.force)
 
 
 def read_given(args: argparse.Namespace, signal: str | None = None
