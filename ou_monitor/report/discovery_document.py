@@ -129,11 +129,20 @@ def _gain(finding: Finding, seen: Overview | None) -> list[Part]:
 
 
 def _disagreement(finding: Finding, seen: Overview | None) -> str:
-    """Return that alpha is not that of the supply, and which to prefer; empty if it is."""
+    """Return where the relaxation is not that of the supply, and why; empty if it is."""
     assert finding.model is not None
-    alpha, se = finding.model.terms[0].values()['alpha'], finding.se[0].get('alpha', NAN)
+    ou = finding.model.terms[0].values()
+    alpha, se = ou['alpha'], finding.se[0].get('alpha', NAN)
     supply = None if seen is None else seen.facts.ou
-    if supply is None or supply.status != 'ok' or not abs(math.log(alpha / supply.alpha)) > (
+    if supply is None:
+        return ''
+    if supply.status == 'not_visible':
+        # NaN and infinite bounds compare as false.
+        beyond = bool(alpha * supply.tau_below_s < 1.0
+                      and ou['sigma'] ** 2 > 2.0 * alpha * supply.var_inf_below)
+        return (' Under Relaxation, changes as slow count as changes of the level, so the bound '
+                'there is lower.') * beyond
+    if supply.status != 'ok' or not abs(math.log(alpha / supply.alpha)) > (
             Z95 * math.hypot(supply.log_se('alpha'), se / alpha)):
         return ''
     return (f' Its alpha disagrees with that under Relaxation ({number(supply.alpha)} 1/s, from '

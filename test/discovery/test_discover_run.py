@@ -1,5 +1,6 @@
 """From a recording to a finding and its page: clear causes, bad input, correct verdicts."""
 
+from dataclasses import replace
 import json
 import math
 import re
@@ -9,13 +10,14 @@ import sys
 import numpy as np
 import ou_monitor
 from ou_monitor import discover
+from ou_monitor.analysis.overview import overview
 from ou_monitor.discovery.finding import Verdict
 from ou_monitor.errors import InputError
 from ou_monitor.model.supply import SupplyModel
 from ou_monitor.model.terms.load_response import LoadSag
 from ou_monitor.model.terms.ou import OU
 from ou_monitor.model.terms.reading import HeldSamples
-from ou_monitor.records import Recording
+from ou_monitor.records import OuFacts, Recording
 from ou_monitor.report.discovery_document import discovery_document
 from ou_monitor.report.page import html as page_of
 from ou_monitor.report.terminal import terminal
@@ -173,3 +175,20 @@ def test_ctrl_c_returns_the_causes_found_so_far(limit):
     assert names(found) == ['load_sag'] and max(shares) == 1.0
     stopped = any('stopped by the user' in note for note in found.notes)
     assert stopped == (limit < 0.6)
+
+
+def test_relaxation_of_the_model_beyond_the_bound_is_explained(sag):
+    """Where the supply shows no relaxation as slow and large, the page says why the model does."""
+    tau, var = 1.0 / sag.model.terms[0].alpha, sag.model.terms[0].sigma ** 2 / (
+        2.0 * sag.model.terms[0].alpha)
+    seen = overview(drawn_from(n=2000))
+
+    def shown(below_s, below_v2):
+        ou = OuFacts('not_visible', 60.0, tau_below_s=below_s, var_inf_below=below_v2)
+        return ' '.join(terminal(discovery_document(
+            sag, replace(seen, facts=replace(seen.facts, ou=ou)))).split())
+
+    words = 'changes as slow count as changes of the level'
+    assert words in shown(0.5 * tau, 0.5 * var)
+    assert words not in shown(2.0 * tau, 0.5 * var)
+    assert words not in shown(0.5 * tau, 2.0 * var)
