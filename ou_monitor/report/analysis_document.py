@@ -251,7 +251,8 @@ def _by_throttle(analysis: Analysis) -> Part:
             chance(risk)])
     heads = ['throttle', 'sag, mV', 'noise, mV rms', 'at steady\nthrottle, mV rms',
              'brown-out risk']
-    return Table.of_known(heads, rows, left=[0])
+    # Nothing is known of most throttles of a load that is only on or off.
+    return Table.of_known(heads, [row for row in rows if set(row[1:]) != {UNKNOWN}], left=[0])
 
 
 def _alarms(analysis: Analysis) -> list[Part]:

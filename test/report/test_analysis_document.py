@@ -46,9 +46,14 @@ def test_the_same_caution_of_two_levels_is_said_once(analysis):
     assert said(flags=(), noise_std=0.001) == []
 
 
-def test_the_table_over_throttle_is_that_of_the_facts(analysis):
+def over_throttle(analysis):
     table, *_ = next(part for part in analysis_document(analysis).parts
                      if getattr(part, 'heading', '') == 'Over throttle').parts
+    return table
+
+
+def test_the_table_over_throttle_is_that_of_the_facts(analysis):
+    table = over_throttle(analysis)
     assert table.heads[0] == 'throttle' and table.heads[-1] == 'brown-out risk'
     known = {row[0]: dict(zip(table.heads, row)) for row in table.rows}
     noise = analysis.overview.facts.noise
@@ -58,6 +63,15 @@ def test_the_table_over_throttle_is_that_of_the_facts(analysis):
     others = [row for name, row in known.items() if name not in ('10 %', '40 %')]
     assert len(others) == 9 and {row['noise, mV rms'] for row in others} == {'-'}
     assert all(row['throttle'].endswith('\nnot flown') for row in others)
+
+
+def test_throttles_of_which_nothing_is_known_are_left_out(analysis):
+    seen, unknown = analysis.overview, (float('nan'),) * 11
+    nothing = replace(
+        analysis, by_throttle=replace(analysis.by_throttle, risk=np.array(unknown)),
+        overview=replace(seen, facts=replace(
+            seen.facts, sag=replace(seen.facts.sag, sag_v=unknown))))
+    assert [row[0] for row in over_throttle(nothing).rows] == ['10 %', '40 %']
 
 
 @pytest.mark.parametrize('level, last, words', [(14.0, 13.5, 'right after this flight'),
