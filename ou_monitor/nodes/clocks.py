@@ -27,6 +27,7 @@ from array import array
 from collections import deque
 from collections.abc import Sequence
 import math
+from statistics import linear_regression
 
 import numpy as np
 from ou_monitor.records import FloatArray
@@ -209,9 +210,8 @@ class SimClockMap:
 
     def __init__(self) -> None:
         self._pairs: deque[tuple[float, float]] = deque(maxlen=PAIRS)
-        self._origin = 0.0
-        self._zero = 0.0
-        self._rate = 0.0
+        # Slope, and the value at the first pair less its clock, s.
+        self._rate = self._off = 0.0
 
     @property
     def ready(self) -> bool:
@@ -237,23 +237,12 @@ class SimClockMap:
             elif source == last_source:
                 return False
         self._pairs.append((source, clock))
-        self._fit()
+        if self.ready:
+            # Relative to the first pair, so that nanoseconds survive in floats.
+            first_source, first_clock = self._pairs[0]
+            self._rate, self._off = linear_regression(
+                *zip(*((x - first_source, y - first_clock) for x, y in self._pairs)))
         return stepped
-
-    def _fit(self) -> None:
-        """Fit the line; sums are taken about the means, so nanoseconds survive in floats."""
-        n = len(self._pairs)
-        first_source, first_clock = self._pairs[0]
-        mean_x = sum(x - first_source for x, _ in self._pairs) / n
-        mean_y = sum(y - first_clock for _, y in self._pairs) / n
-        sxx = sxy = 0.0
-        for source, clock in self._pairs:
-            x = source - first_source - mean_x
-            sxx += x * x
-            sxy += x * (clock - first_clock - mean_y)
-        self._rate = sxy / sxx if sxx > 0.0 else 0.0
-        self._origin = first_source + mean_x
-        self._zero = first_clock + mean_y
 
     def __call__(self, source: float) -> float:
         """Return the simulated time, s, at which a message was sent; NaN while undefined."""
@@ -263,4 +252,5 @@ class SimClockMap:
         return self._line(source)
 
     def _line(self, source: float) -> float:
-        return self._zero + self._rate * (source - self._origin)
+        first_source, first_clock = self._pairs[0]
+        return first_clock + (self._off + self._rate * (source - first_source))

@@ -17,7 +17,7 @@ from ou_monitor.fleet.judgement import (
 from ou_monitor.fleet.table import Row
 from ou_monitor.records import FloatArray, NAN, Severity
 from ou_monitor.report.document import (
-    Document, Facts, Figure, Notes, Pair, Part, Section, Table, Text, UNKNOWN)
+    Document, Figure, Notes, Pair, Part, Section, Table, Text, UNKNOWN)
 from ou_monitor.report.svg import Plot
 from ou_monitor.text import chance, counted, number, p_words, some, volts
 
@@ -26,12 +26,12 @@ _TITLES = {'resistance': 'Resistance', 'sag': 'Sag at full throttle',
 _UNITS = {'resistance': 'mOhm', 'sag': 'mV', 'sigma': 'V/\u221as', 'alpha': '1/s'}
 # Maximum significant drifts drawn; if there are none, this number of the most likely ones.
 _DRAWN, _LIKELY = 8, 2
-# Trends listed at any p (further ones need p below `DRIFT_RATE`), and maximum in all.
-_LEAST, _MOST = 6, 30
+# Maximum trends listed, the most likely ones.
+_MOST = 30
 # Maximum recordings in the table of the lowest voltages; rows and sentences on a terminal.
 _WORST, _SHOWN = 12, 10
-# Maximum sentences and recordings listed; JSON and the Parquet table have all of them.
-_SENTENCES, _RECORDINGS = 40, 500
+# Maximum recordings listed; JSON and the Parquet table have all of them.
+_RECORDINGS = 500
 # Maximum ratio of mean voltages of one pack: 4.35 V per cell if full, 2.8 V if empty under load.
 _ONE_PACK = 1.6
 # Maximum ageing packs in the answer.
@@ -59,11 +59,8 @@ def fleet_document(fleet: Fleet, command: str = '') -> Document:
                f'{counted(len(fleet.rows), "row")} in the table')
     parts: list[Part] = [
         lambda: [Figure(_lowest(fleet, rows), 'Each dot is a recording.')] if rows else [],
-        Facts(facts(fleet)),
         Section('What stands out', [
-            Notes.of(odd[:_SENTENCES], Severity.WARNING, _SHOWN),
-            *([Text(f'and {len(odd) - _SENTENCES} more: --json lists all.')]
-              if len(odd) > _SENTENCES else []),
+            Notes.of(odd, Severity.WARNING, _SHOWN),
             *([] if odd else [Text('Nothing for certain, at the false-alarm rates stated below.'
                                    if possible else
                                    'Nothing, at the false-alarm rates stated below.')]),
@@ -498,19 +495,18 @@ def sentences(fleet: Fleet) -> list[str]:
     rows = one_each(fleet)
     if not rows:
         return []
-    _, lowest = _lowest_of(rows)
-    found = dips_of(rows)
+    lowest, found = _lowest_of(rows), dips_of(rows)
     if found is None:
         text = f'The lowest voltage was {lowest}'
     elif not found[0]:
         text = f'No recording fell below {fleet.limit:g} V: the lowest was {lowest}'
     else:
-        most, (count, _, recordings) = worst(fleet)[0], found
+        most, (count, below, recordings) = worst(fleet)[0], found
         where = f'in {recordings} of {counted(len(rows), "recording")}'
         if recordings > 1 and most['dips'] > 1:
             where += f', most in {_name(most)}, {most["dips"]}'
-        text = (f'{counted(count, "dip")} below {fleet.limit:g} V {where}: the lowest was '
-                f'{lowest}')
+        text = (f'{counted(count, "dip")} below {fleet.limit:g} V, {number(below, 2)} s in all, '
+                f'{where}: the lowest was {lowest}')
     sags = [row for row in rows if row['sag'] is not None]
     if not sags:
         return [f'{text}.']
@@ -519,31 +515,15 @@ def sentences(fleet: Fleet) -> list[str]:
             f'{100.0 * row["sag_throttle"]:.0f} % throttle in {_name(row)}.']
 
 
-def _lowest_of(rows: Sequence[Row]) -> tuple[Row, str]:
-    """Return the recording with the lowest voltage per cell, and where and when in words."""
+def _lowest_of(rows: Sequence[Row]) -> str:
+    """Return the lowest voltage per cell in words, and where and when it was."""
     low = min(rows, key=_of_a_cell)
     found = f'{number(low["lowest"], 4)} V'
     if low['cells'] and len({row['cells'] for row in rows}) > 1:
         found = f'{number(_of_a_cell(low), 4)} V per cell ({found}, {_cells(low)} cells)'
-    return low, f'{found} at {number(low["lowest_at"])} s of {_name(low)}'
-
-
-def facts(fleet: Fleet) -> list[tuple[str, str]]:
-    """Return the facts of a fleet: pairs of name and words."""
-    rows = one_each(fleet)
-    if not rows:
-        return []
-    low, lowest = _lowest_of(rows)
     u = low['lowest_throttle']
-    lines = [('Lowest voltage',
-              lowest + ('' if u is None else f', at {100.0 * u:.0f} % throttle'))]
-    found = dips_of(rows)
-    if found is not None:
-        count, below, recordings = found
-        lines.append((f'Below {fleet.limit:g} V', (
-            f'{counted(count, "dip")}, {number(below, 2)} s in all, in {recordings} of '
-            f'{counted(len(rows), "recording")}') if count else 'never'))
-    return lines
+    return f'{found} at {number(low["lowest_at"])} s of {_name(low)}' + (
+        '' if u is None else f', at {100.0 * u:.0f} % throttle')
 
 
 def _name(row: Row) -> str:
@@ -631,11 +611,10 @@ def _drift(fleet: Fleet) -> list[Part]:
         Text('No drift is significant; the most likely ones are drawn.')]
     parts += Pair.two_by_two([
         Figure(_trend_plot(judged.values[t.quantity], t), _caption(t, fleet)) for t in drawn])
-    listed = [t for k, t in enumerate(judged.trends) if k < _LEAST or t.p_value < DRIFT_RATE]
     rows = [[t.vehicle, t.quantity, str(t.flights), change(t.slope) + '\n'
              + f'[{change(t.low)}, {change(t.high)}]',
              chance(t.p_value), chance(t.p_family),
-             'yes' if t.p_family <= DRIFT_RATE else 'no'] for t in listed[:_MOST]]
+             'yes' if t.p_family <= DRIFT_RATE else 'no'] for t in judged.trends[:_MOST]]
     more = len(judged.trends) - len(rows)
     return [*parts, Table(['vehicle', 'quantity', 'flights', 'change per flight\n[95 %]', 'p',
                            'fleet-wide p', 'significant'], rows, left=[0, 1]), Text(

@@ -8,7 +8,7 @@ from ou_monitor.fleet.fleet import Fleet
 from ou_monitor.fleet.judgement import judge
 from ou_monitor.fleet.table import NAMES
 from ou_monitor.report.fleet_document import (
-    answer, as_data, change, facts, finding_words, fleet_document, lowest_table, pack_table,
+    answer, as_data, change, finding_words, fleet_document, lowest_table, pack_table,
     short_names, trend_words, vehicle_table, worst)
 from ou_monitor.report.page import html
 import pytest
@@ -110,11 +110,9 @@ def test_the_lowest_voltage_comes_first():
                  sag_throttle=0.95), seen('c', 'hexa', 13.4, 1)]
     known = replace(fleet(rows), limit=13.5)
     assert fleet_document(known).headline.startswith(
-        '4 dips below 13.5 V in 2 of 3 recordings, most in b (quad), 3: the lowest was 13.10 V '
-        'at 12.0 s of b (quad). The rail sags by up to 1.90 V, at 95 % throttle in b (quad).')
-    assert facts(known) == [
-        ('Lowest voltage', '13.10 V at 12.0 s of b (quad), at 80 % throttle'),
-        ('Below 13.5 V', '4 dips, 0.40 s in all, in 2 of 3 recordings')]
+        '4 dips below 13.5 V, 0.40 s in all, in 2 of 3 recordings, most in b (quad), 3: the '
+        'lowest was 13.10 V at 12.0 s of b (quad), at 80 % throttle. The rail sags by up to '
+        '1.90 V, at 95 % throttle in b (quad).')
     assert [row['path'] for row in worst(known)] == ['b', 'c', 'a']
     text = page_text(known)
     assert text.index('4 dips below') < text.index('Lowest voltages') < text.index('Vehicles')
