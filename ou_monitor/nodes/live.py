@@ -189,7 +189,10 @@ def application(node: Any, token: str) -> Any:
 
 def _html() -> tuple[str, str]:
     """Return the page, and the policy that names its script and style by their hashes."""
-    html = resources.files(__package__).joinpath('live.html').read_text(encoding='utf-8')
+    html, drawing = (resources.files(package).joinpath(name).read_text(encoding='utf-8')
+                     for package, name in ((__package__, 'live.html'),
+                                           ('ou_monitor.report', 'plots_draw.js')))
+    html = html.replace('/* plots_draw.js */', drawing)
 
     def source(tag: str) -> str:
         text = html.split(f'<{tag}>')[1].split(f'</{tag}>')[0]
