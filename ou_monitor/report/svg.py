@@ -279,7 +279,7 @@ class Plot:
                 parts.append(f'<line class="mark" x1="{pixel:.1f}" y1="{self._top}" '
                              f'x2="{pixel:.1f}" y2="{bottom}"/><text class="note" '
                              f'x="{pixel + 4:.1f}" y="{self._top + 12}">{escape(label)}</text>')
-        return '\n'.join([*parts, *self._legend(right), '</svg>'])
+        return '\n'.join([*parts, *self._legend(), '</svg>'])
 
     @property
     def _legend_rows(self) -> list[list[Curve]]:
@@ -358,11 +358,10 @@ class Plot:
                   for run in _runs(np.isfinite(px) & np.isfinite(py))]
         return f'<path class="line {curve.style}" d="{"".join(pieces)}"/>'
 
-    def _legend(self, right: int) -> list[str]:
-        """Return the legend, each row flush right."""
+    def _legend(self) -> list[str]:
         found = []
         for k, row in enumerate(self._legend_rows, 1):
-            left = right - sum(map(_entry_width, row))
+            left = float(_LEFT)
             for curve in row:
                 found.append(_legend_entry(curve, left, 16 + k * _LEGEND))
                 left += _entry_width(curve)
