@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from ou_monitor.analysis.supply import SupplyFacts
     from ou_monitor.model.supply import SupplyModel
     from ou_monitor.paper.design import Flight, FlownRisk
-    from ou_monitor.paper.network import PowerNetwork
     from ou_monitor.recordings.importers.log import CsvColumns, Series
     from ou_monitor.recordings.model_file import ModelFile
     from ou_monitor.simulation import Profile, Run
@@ -338,7 +337,7 @@ def discover(recording: Given, *, seed: int = 0, brownout_voltage: float | None 
 
 
 def design(throttle: float | None = None, *, recording: Given | None = None,
-           network: Mapping[str, Any] | PowerNetwork | None = None, rail: str = 'bus',
+           network: Mapping[str, Any] | None = None, rail: str = 'bus',
            voltage: float | None = None, cells: int = 0, horizon: float = 5.0, risk: float = 0.01,
            capacitances: tuple[float, float] | None = None, esr_fixed: bool = False) -> Result:
     """
@@ -350,9 +349,9 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
         Throttle, 0..1; with a recording, by default the one exceeded for 1 % of it.
     recording : Recording or path, optional
         Flight that gives level, sag, resistance and noise.
-    network : mapping or PowerNetwork, optional
+    network : mapping, optional
         Components in SI units, such as ``{'cells': 4, 'bulk_capacitance': 470e-6}``; they override
-        measured values.  A PowerNetwork is for a design without a recording.
+        measured values.
     rail : {'bus', 'regulated'}
         The battery bus at the ESCs, or the regulated rail.
     voltage : float, optional
@@ -388,7 +387,6 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     ('FOUND', True)
 
     """
-    from dataclasses import replace
     from ou_monitor.analysis.crafts import (
         cells_of, check_cells, full_voltage, pack_limit, stated_limit)
     from ou_monitor.paper.network import completed, PowerNetwork
@@ -400,23 +398,19 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     if throttle is not None and not hasattr(throttle, '__float__'):
         raise TypeError(f'the throttle is a number, 0..1, got a {type(throttle).__name__}: pass '
                         'a Recording or a path as recording=')
+    values = dict(network or {})
     if cells:
-        network = replace(network, cells=cells) if isinstance(network, PowerNetwork) else {
-            **(network or {}), 'cells': cells}
+        values['cells'] = cells
         voltage = pack_limit(voltage, cells) if voltage and rail == 'bus' else voltage
     taken, facts, error, known, assumed = '', None, 0.0, None, False
     if recording is None:
         if throttle is None:
             raise ValueError('the throttle is missing: pass 0.4 for 40 %, or a recording, whose '
                              '99 % quantile of throttle is used')
-        circuit = network if isinstance(network, PowerNetwork) else PowerNetwork(
-            **completed(dict(network or {})))
+        circuit = PowerNetwork(**completed(values))
         level, source = default_voltage(circuit, rail) if voltage is None else (voltage, 'given')
-    elif isinstance(network, PowerNetwork):
-        raise ValueError('a PowerNetwork has all components already: with a recording, pass a '
-                         'mapping of the components that the flight does not show')
     else:
-        flown, values = supplied(readings_of(_read(recording))), dict(network or {})
+        flown = supplied(readings_of(_read(recording)))
         full, stated = full_voltage(flown), stated_limit(flown.source)
         cells = values.setdefault('cells', cells_of(flown)[0])
         if not cells:
