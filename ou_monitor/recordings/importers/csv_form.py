@@ -89,7 +89,7 @@ _WITH_UNIT = re.compile(
     rf'(.*(?:time|zeit|stamp|elapsed)|t)(?: ?[\[({{/_ ] ?| in )({_LONG})[\])}}]?|'
     r'(.*(?:time|stamp))([mun]s)|'  # ArduPilot's TimeUS
     rf'(.*?) ?[\[({{] ?{_WORD} ?[\])}}]|(.+?) in {_WORD}|(.[^/]*?|.+? ) ?/ ?{_WORD}|'
-    rf'(.+?)[ _]{_WORD}')
+    rf'(.+?)[ _](?!adc){_WORD}')  # Raw_ADC is no current
 # A unit before more words: 101 (VDC)- Battery.
 _BEFORE = re.compile(rf'(.*?)( ?[\[(]{_WORD}[\])]) ?[-:] ?(\w.*)', re.IGNORECASE)
 # Volts*100; current (10 mA).

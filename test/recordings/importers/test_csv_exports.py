@@ -38,6 +38,10 @@ def clock(k, pattern='%Y-%m-%d %H:%M:%S.%f', step=0.01):
 FORMS = {
     'plain': (table(['time_s,voltage_v,throttle,current_a'],
                     lambda k: f'{0.01 * k:.2f},{V[k]},{U[k]},{AMPS[k]}'), 0.01, True, True),
+    # A sketch's counts of its converter are not a current in A DC.
+    'sketch': (table(['# Format:', 'Timestamp(ms),Voltage(V),Raw_ADC,Current_State'],
+                      lambda k: f'{20 * k},{V[k]},{int(60 * V[k])},{k // 30}'), 0.02, False,
+                False),
     # InfiniiVision: names, then units.
     'keysight': (table(['x-axis,1', 'second,Volt'],
                        lambda k: f'{1e-5 * (k - 30):.5E},{V[k]:+.4E}', '\r\n'), 1e-5, False,
