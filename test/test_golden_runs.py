@@ -15,6 +15,8 @@ import pytest
 RUNS = {**golden_runs.RUNS, **golden_models.RUNS, **golden_parts.RUNS}
 # Another BLAS or version of NumPy moves numbers by less; what is below the second is nothing.
 RELATIVE, ABSOLUTE = 1e-5, 1e-9
+# Evidence comes from searches that stop near the maximum: two processors differ by 1.3e-5.
+OF_SEARCHES = {'discovery': 1e-4}
 
 
 @pytest.mark.parametrize('name', RUNS)
@@ -22,4 +24,4 @@ def test_golden_runs_are_unchanged(name):
     wanted = json.loads((ROOT / 'test/golden' / f'{name}.json').read_text(encoding='utf-8'),
                         parse_int=float)
     found = json.loads(json.dumps(RUNS[name]()), parse_int=float)
-    assert differences(found, wanted, RELATIVE, ABSOLUTE)[:10] == []
+    assert differences(found, wanted, OF_SEARCHES.get(name, RELATIVE), ABSOLUTE)[:10] == []
