@@ -316,7 +316,7 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
         inverse = np.linalg.pinv(information / np.outer(scale, scale)) / np.outer(scale, scale)
         if 0.5 * float(gradient @ inverse @ gradient) < (_NEARLY if rough else _SETTLED):
             break
-        better = None
+        better, predicted = None, 0.0
         for _ in range(6):
             ridge = (damping + 1e-9) * np.eye(len(free))
             step = np.linalg.solve(information / np.outer(scale, scale) + ridge,
@@ -328,7 +328,7 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
             new = _with_mean(samples, trial, events)
             cost += new.cost
             if float(new.density.sum()) > value - 1e-9 * abs(value):
-                better = new
+                better, predicted = new, float(gradient @ step - 0.5 * step @ information @ step)
                 break
             damping = max(10.0 * damping, 0.1)
         if better is None:
@@ -336,7 +336,9 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
         gain = float(better.density.sum()) - value
         terms, base, value = better.terms, better, float(better.density.sum())
         damping *= 0.3
-        if gain < (_NEARLY if rough else _SETTLED):
+        # A step that gains what a parabola predicts ends at its maximum; about the difference is
+        # left.
+        if min(gain, abs(gain - predicted)) < (_NEARLY if rough else _SETTLED):
             break
     # Standard errors are robust to heavy tails (sandwich of White 1982).
     covariance = inverse @ outer @ inverse

@@ -45,6 +45,9 @@ from ou_monitor.text import listed, number, Z95
 FAST = 'the rate of the samples used is too low to show this line.'
 # Alternations between drawing clipped or coarse samples and fitting the load to them.
 _REDRAWN = 3
+# Alternations that also choose the terms of the load: first from the codes, then from readings
+# drawn within them.
+_SEARCHED = 2
 # Maximum sampling step, in relaxation times, that still shows the relaxation.
 _BLIND = 1.0
 
@@ -174,13 +177,16 @@ def _without_clipping(samples: Samples, state: Integrity, start: Composite
 def _within_codes(samples: Samples, state: Integrity, start: Composite
                   ) -> tuple[Samples, Composite]:
     """Return the samples drawn within coarse codes, and the start of the search."""
-    rng, inside = np.random.default_rng(0), samples
-    for _ in range(_REDRAWN):
-        # Use the terms of the load that have evidence: readings drawn from a model with all terms
-        # would confirm each of them.
-        search = Search(start)
-        under_load(Fitter(inside), search)
-        model = search.composite
+    rng, inside, model = np.random.default_rng(0), samples, start
+    for turn in range(_REDRAWN):
+        if turn < _SEARCHED:
+            # Use the terms of the load that have evidence: readings drawn from a model with all
+            # terms would confirm each of them.
+            search = Search(start)
+            under_load(Fitter(inside), search)
+            model = search.composite
+        else:
+            model = Fitter(inside).fit(model.terms, model) or model
         drawn = redraw_within_codes(samples, model, rng)
         if drawn is samples:
             break

@@ -155,7 +155,10 @@ class _Regression:
         self._at = [np.arange(a, b) for a, b in zip(ends[:-1], ends[1:])]
         through[:, 1:] /= np.maximum(np.sqrt(np.mean(through[:, 1:]**2, axis=0)), 1e-300)
         self._blocks = np.array([part.T @ part for part in np.array_split(through, FOLDS)])
-        self._all = self._blocks.sum(axis=0)
+        # All samples, then all but one block each.
+        whole = self._blocks.sum(axis=0)
+        self._fitted = np.concatenate((whole[None], whole - self._blocks))
+        self._scored = np.concatenate((whole[None], self._blocks))
         self._n, self._penalty = samples.n, 0.5 * math.log(samples.n)
         self._known: dict[tuple[int, ...], tuple[float, FloatArray]] = {}
         # Whether to refuse sets that contain nearly equal time constants.
@@ -273,11 +276,10 @@ class _Regression:
         """Return the evidence, and the cost of each held-out block, nats."""
         if chosen not in self._known:
             at = np.concatenate([[1], *(self._at[k] for k in chosen)]).astype(int)
-            lost = np.array([_loss(self._all - block, block, at) for block in self._blocks])
-            inside = _loss(self._all, self._all, at)
+            inside, *lost = _losses(self._fitted, self._scored, at).tolist()
             search = sum(self._pool[k].SEARCH for k in chosen)
-            value = -max(inside + self._penalty * at.size, float(lost.sum())) - search
-            self._known[chosen] = value, lost
+            value = -max(inside + self._penalty * at.size, sum(lost)) - search
+            self._known[chosen] = value, np.array(lost)
         return self._known[chosen]
 
     def _steady(self, less: tuple[int, ...], more: tuple[int, ...]) -> bool:
@@ -308,10 +310,13 @@ class _Regression:
         return tuple(dict.fromkeys(self._pool[j].NAME for j in self._substitutes(chosen, k)))
 
 
-def _loss(fitted: FloatArray, scored: FloatArray, at: npt.NDArray[np.int64]) -> float:
-    """Fit some blocks; return half the sum of squared residuals on other blocks."""
-    gram = fitted[np.ix_(at, at)]
+def _losses(fitted: FloatArray, scored: FloatArray, at: npt.NDArray[np.int64]) -> FloatArray:
+    """Fit columns to samples; return half the sum of squared residuals on others, each pair."""
+    gram, seen = fitted[:, at[:, None], at], fitted[:, at, 0]
     # The columns are scaled; the ridge keeps equal columns from a division by zero.
-    beta = np.linalg.solve(gram + 1e-10 * np.trace(gram) * np.eye(at.size), fitted[at, 0])
-    inside = scored[np.ix_(at, at)]
-    return 0.5 * float(scored[0, 0] - 2.0 * beta @ scored[at, 0] + beta @ inside @ beta)
+    ridge = 1e-10 * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(at.size)
+    beta = np.linalg.solve(gram + ridge, seen[:, :, None])
+    inside = (scored[:, at[:, None], at] @ beta)[:, :, 0]
+    rest: FloatArray = scored[:, 0, 0] + np.einsum(
+        'bk,bk->b', beta[:, :, 0], inside - 2.0 * scored[:, at, 0])
+    return 0.5 * rest

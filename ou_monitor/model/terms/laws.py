@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 import math
 
 import numpy as np
@@ -36,7 +37,7 @@ class View:
     # white noise and other states; shape (n,).
     driven: FloatArray | float = 1.0
 
-    @property
+    @cached_property
     def rate(self) -> float:
         """Return the median sampling rate, Hz."""
         return 1.0 / float(np.median(self.step[1:]))

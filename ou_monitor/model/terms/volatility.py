@@ -13,6 +13,7 @@ from ou_monitor.model.terms.laws import climb, curvature_se, normal_scores, refi
 from ou_monitor.model.terms.segment import Effect, Segment, Stage
 from ou_monitor.model.terms.term import LawFit, parameter, Role, Term
 from ou_monitor.records import FloatArray
+from scipy.linalg import eigh_tridiagonal
 from scipy.special import comb, digamma, ndtr
 
 
@@ -72,15 +73,9 @@ class Volatility(Term):
         trained = view.train.stop // size
 
         def values(points: FloatArray) -> FloatArray:
-            found = np.full(points.shape[0], -math.inf)
-            inside = np.flatnonzero((np.abs(points[:, 0] + 1.5) < 2.5)
-                                    & (np.abs(points[:, 1] + 1.0) < 6.0))
-            # Points with the same rate share their transition probabilities.
-            for rate in np.unique(points[inside, 1]).tolist():
-                at = inside[points[inside, 1] == rate]
-                found[at] = _grid(squares[:trained], sizes[:trained], span, points[at])[1].sum(
-                    axis=0)
-            return found
+            inside = np.clip(points, *_RANGE)
+            return np.asarray(_grid(squares[:trained], sizes[:trained], span, inside)[1].sum(
+                axis=0))
 
         def value(x: FloatArray) -> float:
             return float(values(x[None])[0])
@@ -89,10 +84,9 @@ class Volatility(Term):
         if near is not None:
             x, _, e = near
         else:
-            x, top = climb(value, start, size=0.25, most=_EVALUATIONS[known])
-            if top == -math.inf:
-                return None
+            x, _ = climb(value, start, size=0.25, most=_EVALUATIONS[known])
             e = curvature_se(value, x)
+        x = np.clip(x, *_RANGE)
         before, density, levels = (one[..., 0] for one in _grid(squares, sizes, span, x[None]))
         scores = _scores(view.z, before, levels, size)[:view.z.size]
         gain = np.repeat((density + 0.5 * squares) / sizes, size)[:view.z.size]
@@ -167,37 +161,42 @@ _EVERY = 4
 _WANDERS = 2.0
 # Stationary probabilities of the levels.
 _STATIONARY: FloatArray = comb(_LEVELS - 1, np.arange(_LEVELS)) / 2.0 ** (_LEVELS - 1)
+# Range of ln std, ln rate (1/s) and mean of ln sigma.
+_RANGE = np.array([[-4.0, -7.0, -math.inf], [1.0, 5.0, math.inf]])
 # Evaluations of a first fit and of a refit; probability below which a level is ignored.
 _EVALUATIONS = 60, 30
 _NOTICED = 1e-9
 
 
-@lru_cache(maxsize=8)
-def _rouwenhorst(keep: float) -> FloatArray:
-    """Return the transition probabilities between levels, shape (levels, levels)."""
+@lru_cache(maxsize=1)
+def _modes() -> FloatArray:
+    """Return the modes of the levels, each column decaying at a multiple of the rate."""
+    # Those of Ehrenfest's urn, made symmetric: the j-th has the eigenvalue (levels - 1)/2 - j.
+    k = np.arange(1.0, _LEVELS)
+    return np.asarray(eigh_tridiagonal(np.zeros(_LEVELS), 0.5 * np.sqrt(k * (_LEVELS - k)))[1])
+
+
+def _kernels(keep: FloatArray) -> FloatArray:
+    """Return the transition probabilities between levels, shape (rates, levels, levels)."""
     # The conditional mean and variance are those of the OU even if it is so slow that its steps
     # are much smaller than the spacing of the levels (Rouwenhorst 1995; Kopecky & Suen, Rev. Econ.
-    # Dyn. 13 (2010) 701).
-    stay, go = 0.5 * (1.0 + keep), 0.5 * (1.0 - keep)
-    chances = np.array([[stay, go], [go, stay]])
-    for n in range(3, _LEVELS + 1):
-        larger = np.zeros((n, n))
-        larger[:-1, :-1] += stay * chances
-        larger[:-1, 1:] += go * chances
-        larger[1:, :-1] += go * chances
-        larger[1:, 1:] += stay * chances
-        larger[1:-1] /= 2.0
-        chances = larger
+    # Dyn. 13 (2010) 701): the levels are the sum of 64 two-state chains.
+    modes, root = _modes(), np.sqrt(_STATIONARY)
+    powers = keep[:, None] ** np.arange(_LEVELS - 1.0, -1.0, -1.0)
+    chances = (modes * powers[:, None, :]) @ modes.T * (root / root[:, None])
+    np.maximum(chances, 0.0, out=chances)
+    chances /= chances.sum(axis=2, keepdims=True)
     return chances
 
 
 def _grid(squares: FloatArray, sizes: FloatArray, span: float, points: FloatArray
           ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return each segment's prior, its log density, and the levels, for points of one rate."""
+    """Return each segment's prior, its log density, and the levels, for each point."""
     reach = math.sqrt(_LEVELS - 1.0)
     std = np.exp(points[:, :1])
     levels = points[:, 2:] + std * np.linspace(-reach, reach, _LEVELS)
-    kernel = _rouwenhorst(math.exp(-math.exp(float(points[0, 1])) * span))
+    rates, which = np.unique(points[:, 1], return_inverse=True)
+    kernel = _kernels(np.exp(-np.exp(rates) * span))[which]
     weight = -0.5 * squares[:, None, None] * np.exp(-2.0 * levels)
     weight -= sizes[:, None, None] * levels
     top = weight.max(axis=2)
@@ -207,7 +206,7 @@ def _grid(squares: FloatArray, sizes: FloatArray, span: float, points: FloatArra
     law = np.tile(_STATIONARY, (points.shape[0], 1))
     for k, row in enumerate(weight):
         before[k] = law
-        law = (law * row) @ kernel
+        law = ((law * row)[:, None] @ kernel)[:, 0]
         if k % _EVERY == 0:
             law /= law.sum(axis=1, keepdims=True)
     before /= before.sum(axis=2, keepdims=True)
