@@ -92,10 +92,19 @@ def load_of(recording: Recording, t: FloatArray, v: FloatArray, u: FloatArray | 
     """Return the load, and the current at which it is 1, A; NaN if the load is throttle."""
     # t in s, v in V.  The current is the load unless throttle predicts the voltage better.  It is
     # divided by its 99 % quantile, and shifted by the delay of the voltage.
+    some = slice(None, None, -(-v.size // _EXAMINED))
+    early: list[str] = []
+    if u is not None:
+        # A voltage that follows late is a cause, `load_transient`; it cannot precede its load.
+        late, sign = timing(t[some], v[some], u[some])
+        if late > 0.0 and sign > 0.0:
+            u = np.asarray(np.interp(t + late, t, u))
+            early = [f'The voltage answers {number(1e3 * late)} ms before the throttle shows it: '
+                     'the throttle was taken that much earlier.']
     current = current_at(recording, t)
     if current is None or not float(np.ptp(current)) > 0.0:
+        notes += early
         return u, NAN
-    some = slice(None, None, -(-v.size // _EXAMINED))
     late, sign = timing(t[some], v[some], current[some])
     full = sign * float(np.quantile(np.abs(current), _FULL))
     if not full:
@@ -105,6 +114,7 @@ def load_of(recording: Recording, t: FloatArray, v: FloatArray, u: FloatArray | 
         0.0 if u is None else _gain(t[some], v[some], u[some]))
     limit = 0.5 * _LAGS.size * math.log(v.size)
     if gain < (limit if u is None else -limit):
+        notes += early
         return u, NAN
     why = 'throttle was not recorded' if u is None else (
         f'it predicts the voltage better than throttle, by {number(gain)} nats' if gain > limit

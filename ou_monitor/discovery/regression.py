@@ -95,14 +95,14 @@ def mean_response(samples: Samples, composite: Composite, view: View,
 
 
 def _refined(samples: Samples, composite: Composite, found: MeanResponse) -> MeanResponse:
-    """Return a response with its time constants refined; those tried first are from a list."""
+    """Return a response with its time constants and delays refined; they are from a list."""
     # With a time constant wrong by half an octave, a response of 0.6 V leaves an error of 40 mV,
     # which would be taken for a slow OU.
     terms, worth = found.terms, found.worth
+    step = float(np.median(samples.step[1:]))
     for octaves in _FINER:
-        nearby = [(k, replace(term, tau=term.tau * 2.0 ** by)) for k, term in enumerate(terms)
-                  if isinstance(term, LoadTransient) and not term.delay
-                  for by in (-octaves, octaves)]
+        nearby = [(k, near) for k, term in enumerate(terms) if isinstance(term, LoadTransient)
+                  for near in _nearby(term, octaves, step)]
         if not nearby:
             break
         pool = [*terms, *(term for _, term in nearby)]
@@ -110,6 +110,15 @@ def _refined(samples: Samples, composite: Composite, found: MeanResponse) -> Mea
             len(terms), [k for k, _ in nearby])
         terms = tuple(pool[k] for k in chosen)
     return MeanResponse(terms, worth, found.rivals)
+
+
+def _nearby(term: LoadTransient, octaves: float, step: float) -> list[Term]:
+    """Return responses that are slower and faster by some octaves (step: of the samples, s)."""
+    if not term.delay:
+        return [replace(term, tau=term.tau * 2.0 ** by) for by in (-octaves, octaves)]
+    by = max(1, round(octaves * term.delay / step)) * step
+    return [replace(term, delay=delay) for delay in (term.delay - by, term.delay + by)
+            if delay > 0.5 * step]
 
 
 def _measured(term: Term) -> bool:
@@ -130,9 +139,12 @@ def _contains(term: Term, others: Sequence[Term]) -> bool:
 
 
 def _is_near(one: Term, other: Term) -> bool:
-    """Return whether two terms differ only by a small step of the time constant."""
-    return (isinstance(one, LoadTransient) and isinstance(other, LoadTransient)
-            and one.delay == other.delay and 0.5 < one.tau / other.tau < 2.0)
+    """Return whether two terms differ only by a small step of the time constant or delay."""
+    if not isinstance(one, LoadTransient) or not isinstance(other, LoadTransient) or (
+            bool(one.delay) is not bool(other.delay)):
+        return False
+    ratio = one.delay / other.delay if one.delay else one.tau / other.tau
+    return 0.5 < ratio < 2.0
 
 
 def _candidates(view: View) -> Iterator[Term]:

@@ -37,8 +37,9 @@ _OF_CURRENT = {'size': 2.0, 'fast_share': 0.7, 'slow_share': 0.7, 'endurance': 1
 _CENTRE = {'endurance': math.log(2000.0)}
 # Prior deviation of a constant level, which replaces the charge, V per cell.
 _LEVEL_SD = 0.2
-# Delay of the load: maximum in steps and in s; it is used if the residuals fall below this ratio.
-# Time constants of its fit, s: slower trends are removed; the load also enters with this lag.
+# Delay of the load: steps tried at once to each side, and its maximum, s; it is used if the
+# residuals fall below this ratio.  Time constants of its fit, s: slower trends are removed; the
+# load also enters with this lag.
 _SHIFTS, _LATEST, _PAYS, _SLOWER, _LATE = 10, 0.2, 0.95, 1.0, 0.06
 # Bounds of the parameters, in prior deviations from the centre.
 _REACH = 3.0
@@ -127,15 +128,25 @@ def timing(t: FloatArray, v: FloatArray, load: FloatArray) -> tuple[float, float
     left = v - lowpass(v, t, slow)
     late = lowpass(load, t, _LATE)
     loads = np.stack((load, late)) - lowpass(load, t, slow)
-    reach = min(_SHIFTS, int(_LATEST / dt))
-    found = {}
-    for shift in sorted(range(-reach, reach + 1), key=abs):
-        X = np.stack([np.interp(t + shift * dt, t, row) for row in loads])
-        product = X @ left
-        found[shift] = float(left @ left - product @ np.linalg.lstsq(
-            X @ X.T, product, rcond=1e-9)[0]), float(product[0])
-    best = min(found, key=lambda shift: found[shift][0])
-    best = best if found[best][0] < _PAYS * found[0][0] else 0
+    found: dict[int, tuple[float, float]] = {}
+
+    def try_around(middle: int, by: int) -> int:
+        """Try shifts in steps of `by` samples; return the best of all tried."""
+        for shift in sorted(range(middle - _SHIFTS * by, middle + _SHIFTS * by + 1, by), key=abs):
+            if shift not in found and abs(shift) * dt <= _LATEST:
+                X = np.stack([np.interp(t + shift * dt, t, row) for row in loads])
+                product = X @ left
+                found[shift] = float(left @ left - product @ np.linalg.lstsq(
+                    X @ X.T, product, rcond=1e-9)[0]), float(product[0])
+        return min(found, key=lambda shift: found[shift][0])
+
+    coarse = max(1, math.ceil(_LATEST / dt / _SHIFTS))
+    best = try_around(0, coarse)
+    if coarse > 1:
+        best = try_around(best, math.ceil(coarse / _SHIFTS))
+    # The end of the range is no minimum.
+    inside = abs(best) < max(found)
+    best = best if inside and found[best][0] < _PAYS * found[0][0] else 0
     return best * dt, -1.0 if found[best][1] > 0.0 else 1.0
 
 
