@@ -113,8 +113,9 @@ def _numbers(model: SupplyModel, throttle: FloatArray) -> _Numbers:
         charge = charge_at(u0 / load.cells) - charge_at(empty / load.cells)
         if load.discharge * share > 0.0:
             drain = charge / (load.discharge * share)
-    elif drift is not None and drift.rate < 0.0:
-        drain = (empty - u0) / drift.rate
+    elif drift is not None:
+        rate = drift.rate + drift.charge * float(np.mean(throttle))
+        drain = (empty - u0) / rate if rate < 0.0 else math.inf
     sags = [t for t in model.terms if isinstance(t, LoadSag)]
 
     def sag(u: FloatArray) -> float:

@@ -7,7 +7,7 @@ penalty (BIC), and the gain in cross-validation over blocks.  The first guards a
 second against a form that only improves one part of the recording.  Starting from the load model,
 terms are added and removed one at a time.
 
-Limits: delays come from a list, as do time constants before they are refined; the noise is not
+Limits: delays and time constants come from a list before they are refined; the noise is not
 fitted again.
 """
 
@@ -43,6 +43,9 @@ _ALIKE = 1.5
 _FINER = (0.25, 0.125, 0.0625)
 # Maximum number of terms added, removed or exchanged.
 _ROUNDS = 40
+# Maximum number of lags: motors or filters, and the fast and slow polarisation of a battery.  More
+# only correct the form of each other.
+_LAGS = 3
 
 
 def load_terms(samples: Samples) -> tuple[Term, ...]:
@@ -173,7 +176,7 @@ class _Regression:
         self._scored = np.concatenate((whole[None], self._blocks))
         self._n, self._penalty = samples.n, 0.5 * math.log(samples.n)
         self._known: dict[tuple[int, ...], tuple[float, FloatArray]] = {}
-        # Whether to refuse sets that contain nearly equal time constants.
+        # Whether to refuse sets that contain nearly equal time constants, or too many.
         self._apart = False
 
     def search(self, start: Sequence[int]) -> MeanResponse:
@@ -184,7 +187,7 @@ class _Regression:
         chosen = self._moved(chosen)
         # So far, a better time constant may stand beside the one that it replaces.
         self._apart = True
-        while self._has_twins(chosen):
+        while self._is_crowded(chosen):
             chosen = max((self._less(chosen, k) for k in chosen),
                          key=lambda less: self._evaluate(less)[0])
         chosen = self._moved(chosen)
@@ -205,10 +208,11 @@ class _Regression:
             chosen = better
         return chosen
 
-    def _has_twins(self, chosen: tuple[int, ...]) -> bool:
-        """Return whether two time constants are too near to be told apart."""
-        return any(_is_near(one, other)
-                   for one, other in combinations([self._pool[k] for k in chosen], 2))
+    def _is_crowded(self, chosen: tuple[int, ...]) -> bool:
+        """Return whether two time constants are too near to be told apart, or too many."""
+        lags = [term for term in (self._pool[k] for k in chosen)
+                if isinstance(term, LoadTransient)]
+        return len(lags) > _LAGS or any(_is_near(*pair) for pair in combinations(lags, 2))
 
     def exchanged(self, own: int, places: Sequence[int]
                   ) -> tuple[tuple[int, ...], tuple[float, ...]]:
@@ -280,7 +284,7 @@ class _Regression:
 
     def _evidence(self, chosen: tuple[int, ...]) -> float:
         """Return the evidence for a set of terms, nats."""
-        if self._apart and self._has_twins(chosen):
+        if self._apart and self._is_crowded(chosen):
             return -math.inf
         return self._evaluate(chosen)[0]
 

@@ -74,3 +74,34 @@ def test_throttle_stays_the_load_where_current_is_noise_or_unknown():
     for current in (None, noise, gap, np.full(N, 3.0), np.full(N, np.nan)):
         load, full = load_of(Recording(T, v, u, '', current=current), T, v, u, [])
         assert load is u and math.isnan(full)
+
+
+@pytest.mark.parametrize('late', [2, 6])
+def test_a_throttle_that_was_stamped_late_is_taken_earlier(late):
+    """Voltage cannot precede its load: alpha would be a fraction of the true one."""
+    load = flown(5)
+    v = sagged(load)
+    notes = []
+    found, _ = load_of(Recording(T, v, np.roll(load, late), ''), T, v, np.roll(load, late), notes)
+    np.testing.assert_allclose(found[10:-10], load[10:-10], rtol=0, atol=1e-9)
+    assert f'answers {late * 10:.1f} ms before the throttle' in notes[0]
+
+
+def test_a_response_that_comes_late_is_no_error_of_the_stamps():
+    load = flown(5)
+    notes = []
+    v = sagged(np.roll(load, 6))
+    found, _ = load_of(Recording(T, v, load, ''), T, v, load, notes)
+    assert found is load and not notes
+
+
+def test_discharge_by_charge_is_no_second_relaxation():
+    """The level follows the sum of the load, which wanders like a slow relaxation."""
+    rng = np.random.default_rng(3)
+    load = flown(5) * np.interp(T, np.arange(0.0, 40.0, 5.0), rng.uniform(0.3, 1.3, 8))
+    v = sagged(load) - 0.05 * np.cumsum(load) / RATE
+    found = discover(Recording(T, v, load, 'made'))
+    assert {cause.name for cause in found.causes} == {'load_sag', 'drift'}
+    drift = next(cause.term for cause in found.causes if cause.name == 'drift')
+    assert drift.charge == pytest.approx(-0.05, abs=0.02)
+    assert 5.0 < found.model.terms[0].alpha < 12.0

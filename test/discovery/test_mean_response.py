@@ -33,6 +33,8 @@ def response(tau, delay=0.0):
     (response(0.1), response(0.21), False, False), (response(0.21), response(0.1), False, False),
     (response(10.0), response(12.0), True, True), (response(10.0), response(0.09), False, False),
     (response(0.1), response(0.1, 0.05), False, False),
+    (response(9.0, 0.05), response(9.0, 0.06), True, False),
+    (response(9.0, 0.05), response(9.0, 0.11), False, False),
     (response(0.1), LoadSag(0.1, 0.0), False, False),
     (Drift(0.1, 0.0), Drift(-0.2, 0.0), False, True)])
 def test_time_constants_are_compared_by_their_ratio(one, other, near, there):

@@ -41,7 +41,9 @@ GAUSSIAN = {
          'on_sigma': 0.5},
         {'log_factor': [0.0, 0.5, 0.0, 1.0]}, {'log_factor': [0.0, 1.0, 0.0, 0.2]},
         {'on_sigma': 0.1}),
-    'drift': ({'rate': -0.01, 'curvature': 2e-4}, {'rate': 0.0}, {'curvature': 0.0}),
+    'drift': (
+        {'rate': -0.01, 'curvature': 2e-4, 'charge': -0.01}, {'rate': 0.0}, {'curvature': 0.0},
+        {'charge': 0.0}),
     'measurement_noise': ({'std': 0.5 * STEP}, {'std': 0.4 * STEP}, {'std': 0.6 * STEP}),
     'quantization': ({'step': 0.5 * STEP}, {'step': STEP}),
     'second_relaxation': (

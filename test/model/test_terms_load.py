@@ -66,3 +66,11 @@ def test_drift_counts_from_the_first_sample(start):
     found = level(term('drift', rate=-0.5, curvature=0.3), t=start + T)
     np.testing.assert_allclose(found, -0.5 * T + 0.3 * T ** 2, rtol=0,
                                atol=1e-12 if start == 0.0 else 1e-6)
+
+
+def test_drift_follows_the_charge_drawn():
+    """Charge times the sum of throttle over time, each value held over the step before it."""
+    throttle = np.random.default_rng(2).random(T.size)
+    drawn = np.append(0.0, np.cumsum(throttle[1:] * np.diff(T)))
+    found = level(term('drift', rate=-0.5, curvature=0.0, charge=-0.2), throttle=throttle)
+    np.testing.assert_allclose(found, -0.5 * T - 0.2 * drawn, rtol=0, atol=1e-12)

@@ -22,7 +22,7 @@ EXAMPLES = {
         'at': [0.0, 0.5, 1.0, *[0.0, 0.2] * 9, -0.6, 1.5],
         'log_factor': [0.0, 0.8, 1.0, *[0.0, 0.3, 0.0, -0.2, 0.0, 0.4] * 3, -0.6, 1.2],
         'on_sigma': 0.6},
-    'drift': {'rate': -0.01, 'curvature': 0.002},
+    'drift': {'rate': -0.01, 'curvature': 0.002, 'charge': -0.02},
     'measurement_noise': {'std': 0.02},
     'lopsided_noise': {'skew': -0.4, 'tail': 0.9},
     'quantization': {'step': 0.01},

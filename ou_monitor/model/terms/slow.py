@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from typing import ClassVar
 
@@ -18,16 +18,20 @@ from ou_monitor.records import FloatArray
 
 @dataclass(frozen=True)
 class Drift(Term):
-    """Add rate * t + curvature * t^2, t from the first sample; a curvature of 0 is not fitted."""
+    """
+    Add rate * t + curvature * t^2 + charge * q: q is the sum of throttle over time, in s.
+
+    t is from the first sample.  A curvature or charge of 0 is not fitted.
+    """
 
     NAME: ClassVar[str] = 'drift'
     FAMILY: ClassVar[str] = 'slow'
     STAGE: ClassVar[Stage] = Stage.LEVEL
+    NEEDS_THROTTLE: ClassVar[bool] = by_parameters(False, lambda term: term.charge != 0.0)
     ROLE: ClassVar[Role] = Role.MEAN
-    # The curvature is left out of a fit where it is 0.
     LINEAR: ClassVar[tuple[str, ...]] = by_parameters(
-        ('rate', 'curvature'),
-        lambda term: ('rate', 'curvature') if term.curvature else ('rate',))
+        ('rate', 'curvature', 'charge'), lambda term: (
+            'rate', *(name for name in ('curvature', 'charge') if getattr(term, name))))
     SIGNS: ClassVar[tuple[str, ...]] = ('time', 'band 0')
     MEASURED: ClassVar[bool] = True
     # A larger effect whose form is not exact always leaves a little for a trend to explain.
@@ -39,15 +43,31 @@ class Drift(Term):
     rate: float = parameter('V/s', 'slope at the first sample')
     curvature: float = parameter('V/s^2', 'coefficient of t^2')
 
-    def change(self, s: Segment) -> None:
-        """Move the level."""
-        t = s.at - s.origin
-        s.level += (self.rate + self.curvature * t) * t
+    charge: float = parameter('V/s', 'slope at full throttle, beyond that of rate', default=0.0)
+
+    def start(self, rng: np.random.Generator) -> Effect:
+        """Begin a simulation."""
+        drawn = 0.0
+
+        def effect(s: Segment) -> None:
+            nonlocal drawn
+            t = s.at - s.origin
+            s.level += (self.rate + self.curvature * t) * t
+            if self.charge:
+                # The first sample has no step before it.
+                step = np.where(np.isfinite(s.step), s.step, 0.0)
+                sums = drawn + np.cumsum(step * s.throttle)
+                drawn = float(sums[-1])
+                s.level += self.charge * sums
+
+        return effect
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return a straight line and a parabola."""
-        return cls(0.0, 0.0), cls(0.0, NEXT_TO_ZERO)
+        """Return a straight line, a parabola, and both with the charge drawn by the load."""
+        forms = cls(0.0, 0.0), cls(0.0, NEXT_TO_ZERO)
+        return forms if view.throttle is None else (
+            *forms, *(replace(form, charge=NEXT_TO_ZERO) for form in forms))
 
 
 # Minimum number of relaxation times in a recording, and maximum in a step: with more, 5 % of the
