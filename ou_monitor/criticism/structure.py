@@ -336,9 +336,10 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
         gain = float(better.density.sum()) - value
         terms, base, value = better.terms, better, float(better.density.sum())
         damping *= 0.3
-        # A step that gains what a parabola predicts ends at its maximum; about the difference is
-        # left.
-        if min(gain, abs(gain - predicted)) < (_NEARLY if rough else _SETTLED):
+        # A step that gains what a parabola predicts ends at its maximum, and about the difference
+        # is left; the errors of a full fit need the slopes there.
+        if gain < (_NEARLY if rough else _SETTLED) or (
+                rough and abs(gain - predicted) < _NEARLY):
             break
     # Standard errors are robust to heavy tails (sandwich of White 1982).
     covariance = inverse @ outer @ inverse
