@@ -22,9 +22,8 @@ from typing import Any
 from common import arguments, deliver, environment, ROOT, say, table
 from mcap.writer import CompressionType, Writer
 import numpy as np
-from ou_monitor.recordings.bag import BagReader, BagWriter, batches
+from ou_monitor.recordings.bag import BagReader, BagWriter, read_fields
 from ou_monitor.recordings.bag_samples import choose
-from ou_monitor.recordings.cdr import join
 from ou_monitor.recordings.standard_types import (
     BATTERY_STATE, encode_battery, encode_blocks, encode_scalars, FLOAT32, FLOAT32_ARRAY, SCHEMAS)
 from rosbags.highlevel import AnyReader
@@ -137,10 +136,8 @@ def ours(path: Path, case: Case) -> Columns:
     """Read with this package, to the same arrays as the others."""
     bag = BagReader(path)
     choice = choose(path, bag.topics, msg_config=case.config)
-    found = list(batches(bag, {VOLTAGE: choice.specs['voltage'],
-                               THROTTLE: choice.specs['throttle']}))
-    columns = {topic: join([batch[topic] for batch in found if topic in batch])
-               for topic in (VOLTAGE, THROTTLE)}
+    columns = read_fields(bag, {VOLTAGE: choice.specs['voltage'],
+                                THROTTLE: choice.specs['throttle']})
     return {topic: (column.stamp, column.values) for topic, column in columns.items()}
 
 

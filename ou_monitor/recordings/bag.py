@@ -1,8 +1,8 @@
 """
 Bags: an .mcap file, or a rosbag2 directory of several with its `metadata.yaml`.
 
-`BagReader` reads single messages, and `batches` reads fields of topics as arrays, in the order of
-log times; only chunks that overlap in time are in memory together.  A truncated or damaged bag is
+`BagReader` reads single messages in the order of log times, with only those chunks in memory that
+overlap in time; `read_fields` reads fields of topics as arrays.  A truncated or damaged bag is
 refused with the byte and the recording time of the damage or, on request, read as far as it is
 intact.  `BagWriter` writes bags with metadata.yaml version 9 (ROS 2 Jazzy); every version is read,
 because only the list of files and the custom data are used.
@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 from mcap.writer import CompressionType, Writer
 from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.cdr import (
-    Definitions, FieldColumn, FieldReader, join, MessageTable)
+    Definitions, FieldColumn, FieldReader, GrowingColumn, MessageTable)
 from ou_monitor.recordings.mcap_file import (
     ABOUT, custom_data, McapFile, moment, MOST_BYTES, MOST_NODES, ORIGIN, SAMPLE_RATE, Span)
 from ou_monitor.recordings.standard_types import parse_definition, SCHEMAS, TYPE_HASHES
@@ -271,13 +271,13 @@ def _same_fields(schema: Any, other: Any) -> bool:
     return False
 
 
-def batches(
+def read_fields(
     bag: BagReader, specs: Mapping[str, FieldSpec], *, end_ns: int | None = None,
     progress: Callable[[float], None] | None = None,
     broken: Callable[[str], None] | None = None, beside: Mapping[str, FieldSpec] | None = None,
-) -> Iterator[dict[str, FieldColumn]]:
+) -> dict[str, FieldColumn]:
     """
-    Yield fields of a bag by log time, batch by batch, at least to `end_ns`, ns.
+    Return fields of a bag in the order of log times, at least to `end_ns`, ns.
 
     `beside` names a second field to read from the same messages.  `broken` is called with the
     reason for each message that cannot be decoded; if it is None, the first raises InputError.
@@ -292,34 +292,23 @@ def batches(
         return FieldReader(spec, bag.definitions(spec.type), refuse, second)
 
     readers = {name: reader_of(spec, (beside or {}).get(name)) for name, spec in specs.items()}
-    pending: dict[str, list[FieldColumn]] = {name: [] for name in specs}
+    found = {name: GrowingColumn() for name in specs}
     counts = dict.fromkeys(specs, 0)
-    topics = [spec.topic for spec in specs.values()]
-    for part in bag.tables(topics, end_ns):
-        ready = {}
+    for part in bag.tables([spec.topic for spec in specs.values()], end_ns):
         for name, reader in readers.items():
             table = part.tables.get(reader.spec.topic)
             if table is not None:
                 counts[name] += table.n
-                pending[name].append(reader.read(table))
-            if not pending[name]:
-                continue
-            column = join(pending[name]).in_time_order()
-            if part.later_ns is not None:
-                column, left = column.split(column.place(part.later_ns))
-                pending[name] = [left] if left.n else []
-            if column.n:
-                ready[name] = column
+                found[name].add(reader.read(table))
         if progress is not None:
             progress(part.done)
-        if ready:
-            yield ready
     for name, spec in specs.items() if end_ns is None else ():
         stated = bag.counts[spec.topic]
         if counts[name] < stated:
             raise InputError(
                 f"{bag.path} is damaged: it states {stated} messages of topic '{spec.topic}', "
                 f'{counts[name]} were found; use --partial to read the intact part')
+    return {name: column.whole().in_time_order() for name, column in found.items()}
 
 
 # Chunks are read together up to this size, bytes unpacked.

@@ -8,7 +8,6 @@ user must choose.  Limits: a bag is read whole; an hour at 1 kHz takes some 150 
 
 from __future__ import annotations
 
-from array import array
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,9 +15,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError, nearest
-from ou_monitor.recordings.bag import BagReader, batches
+from ou_monitor.recordings.bag import BagReader, read_fields
 from ou_monitor.recordings.cdr import (
-    Field, FieldColumn, join, short_name, TimeArray, value_path)
+    Field, FieldColumn, short_name, TimeArray, value_path)
 from ou_monitor.recordings.importers.log import (
     CURRENT, RawColumns, Series, SIGNAL, THROTTLE, UNKNOWN, unusable_words, VOLTAGE)
 from ou_monitor.recordings.standard_types import FLOAT32, FLOAT64, IMU
@@ -26,7 +25,7 @@ from ou_monitor.records import Defect, defect_of, FloatArray, Note
 from ou_monitor.stream.config import FieldSpec, list_msg_configs, load_msg_config, MsgConfig
 from ou_monitor.stream.samples import clock_of, ThrottleHold
 from ou_monitor.text import counted, outside_words, part_words, printable, some
-from ou_monitor.timeline import check_throttle
+from ou_monitor.timeline import BATCH, check_throttle
 
 
 @dataclass(frozen=True)
@@ -218,27 +217,70 @@ def read_bag(
     # A current in the messages of the voltage belongs to the same message's voltage.
     own = CURRENT in specs and specs[CURRENT].topic == specs[VOLTAGE].topic
     beside = {VOLTAGE: specs.pop(CURRENT)} if own else {}
-    supply = _Supply(specs)
-    for batch in batches(bag, specs, end_ns=last, progress=progress, beside=beside,
-                         broken=leave_out if partial else None):
-        for name, column in batch.items():
-            before, column = column.split(column.place(first))
-            if last is not None:
-                column, _ = column.split(column.place(last))
-            batch[name] = column
-            if before.n and name != VOLTAGE:
-                supply.loads[name].before(before)
-        supply.take(batch)
+    columns = read_fields(bag, specs, end_ns=last, progress=progress, beside=beside,
+                          broken=leave_out if partial else None)
+    if last is not None:
+        columns = {which: one.split(one.place(last))[0] for which, one in columns.items()}
     if broken:
         notes.append(Note(f"{counted(len(broken), 'message')} dropped, the first: {broken[0]}.",
                           Defect.DAMAGED_FILE))
     name = printable(bag.path.name)
-    if not supply.t:
+    supply = columns[VOLTAGE].split(columns.pop(VOLTAGE).place(first))[1]
+    if not supply.values.size:
         whole = start is None and end is None
         if whole or any(defect_of(note).drops for note in notes):
             raise InputError(unusable_words(name, notes))
         raise InputError(outside_words(name, start, end, (bag.end_ns - bag.start_ns) * 1e-9))
-    return supply.columns(name, _source(bag, choice, name), notes)
+    clock = clock_of(specs[VOLTAGE])
+    t = supply.stamp if clock is None else clock.stamps(supply.stamp, supply.counts)
+    if clock is not None and clock.gaps:
+        notes.append(Note(f'{counted(clock.gaps, "gap")} between blocks of samples.',
+                          Defect.GAPS))
+    log_time, ends, stamped = supply.log_time, t, supply.stamped
+    if clock is not None:
+        some = supply.counts > 0
+        log_time, stamped = log_time[some], stamped[some]
+        ends = t[(np.cumsum(supply.counts) - 1)[some]]
+    holds: dict[str, ThrottleHold] = {}
+    for which, column in columns.items():
+        holds[which], unknown = _hold_of(column, specs[which], first, log_time, ends, stamped,
+                                         specs[VOLTAGE].sample_rate)
+        if which == THROTTLE:
+            if unknown:
+                notes.append(Note(f"{counted(unknown, 'throttle value')} dropped: not a finite "
+                                  'number.', Defect.NON_FINITE))
+            check_throttle(name, holds[which].held()[1])
+    volts, current = supply.values, None
+    if np.isfinite(supply.beside).any():
+        current = np.repeat(supply.beside, supply.counts)
+    # An hour at 1 kHz: 30 MB of log times are not needed any more.
+    del columns, supply, log_time
+    if CURRENT in holds:
+        current = holds[CURRENT].at(t)
+    throttle = holds[THROTTLE].at(t) if THROTTLE in holds else np.full(t.size, np.nan)
+    return RawColumns(t, volts, throttle, current, name, _source(bag, choice, name), tuple(notes))
+
+
+def _hold_of(column: FieldColumn, spec: FieldSpec, first: int, log_time: TimeArray,
+             ends: FloatArray, own: npt.NDArray[np.bool_], sample_rate: float | None,
+             ) -> tuple[ThrottleHold, int]:
+    """Return a throttle or current among voltage messages (ends in s), and the unknown values."""
+    # Of those before the part, from `first` (ns) on, only the last value holds in it.
+    known = np.flatnonzero(np.isfinite(column.values[:column.place(first)]))
+    _, column = column.split(int(known[-1]) if known.size else 0)
+    usable, unknown = np.isfinite(column.stamp), 0
+    if spec.nan == 'drop':
+        finite = np.isfinite(column.values)
+        usable, unknown = usable & finite, int(np.count_nonzero(~finite))
+    column = column.take(np.flatnonzero(usable))
+    hold = ThrottleHold(sample_rate)
+    # At equal log times the throttle counts as earlier than the voltage.
+    before = np.searchsorted(log_time, column.log_time, 'left')
+    for k in range(0, ends.size + 1, BATCH):
+        mine = slice(*np.searchsorted(before, (k, k + BATCH)))
+        hold.take(column.stamp[mine], column.values[mine], column.stamped[mine],
+                  ends[k:k + BATCH], own[k:k + BATCH], before[mine] - k)
+    return hold, unknown
 
 
 def _source(bag: BagReader, choice: TopicChoice, name: str) -> dict[str, str]:
@@ -260,101 +302,6 @@ def _limit(bag: BagReader, at: float) -> int:
     return bag.start_ns + round(min(at * 1e9, float(bag.end_ns - bag.start_ns + 1)))
 
 
-class _Load:
-    """Throttle or current from a topic of its own."""
-
-    def __init__(self, spec: FieldSpec, sample_rate: float | None) -> None:
-        self._spec = spec
-        self.hold = ThrottleHold(sample_rate)
-        # Messages since the last voltage.
-        self.waiting: list[FieldColumn] = []
-        self.unknown = 0
-
-    def before(self, column: FieldColumn) -> None:
-        """Take messages before the part to read; the last value holds in it."""
-        if np.isfinite(column.values).any():
-            self.waiting.clear()
-        self.waiting.append(column)
-
-    def take(self, log_time: TimeArray, ends: FloatArray, own: npt.NDArray[np.bool_]) -> None:
-        """Place waiting messages among the next voltage messages (ends in s)."""
-        at = values = np.empty(0)
-        stamped, before = np.empty(0, np.bool_), np.empty(0, np.int64)
-        if self.waiting:
-            column = join(self.waiting)
-            self.waiting.clear()
-            at, values = column.stamp, column.values
-            known = np.isfinite(at)
-            if self._spec.nan == 'drop':
-                finite = np.isfinite(values)
-                self.unknown += int(np.count_nonzero(~finite))
-                known &= finite
-            at, values = at[known], values[known]
-            stamped = column.stamped[known]
-            # At equal log times the throttle counts as earlier than the voltage.
-            before = np.searchsorted(log_time, column.log_time[known], 'left')
-        self.hold.take(at, values, stamped, ends, own, before)
-
-
-class _Supply:
-    """Samples of the voltage, with throttle and current, as they come from a bag."""
-
-    def __init__(self, specs: Mapping[str, FieldSpec]) -> None:
-        volts = specs[VOLTAGE]
-        self._clock = clock_of(volts)
-        # These grow in place: parts and the whole together would take twice the memory.
-        self.t, self._voltage, self._current = array('d'), array('d'), array('d')
-        self.loads = {name: _Load(spec, volts.sample_rate) for name, spec in specs.items()
-                      if name != VOLTAGE}
-
-    def take(self, batch: Mapping[str, FieldColumn]) -> None:
-        """Take messages in the order of the log."""
-        for name, load in self.loads.items():
-            if name in batch:
-                load.waiting.append(batch[name])
-        column = batch.get(VOLTAGE)
-        if column is None or not column.values.size:
-            return
-        stamps = column.stamp if self._clock is None else self._clock.stamps(
-            column.stamp, column.counts)
-        log_time, ends, own = column.log_time, stamps, column.stamped
-        if self._clock is not None:
-            some = column.counts > 0
-            log_time, own = log_time[some], own[some]
-            ends = stamps[(np.cumsum(column.counts) - 1)[some]]
-        for load in self.loads.values():
-            load.take(log_time, ends, own)
-        more = [(self.t, stamps), (self._voltage, column.values)]
-        if self._current or np.isfinite(column.beside).any():
-            # A battery without a current sensor costs no memory.
-            more += [(self._current, np.full(len(self.t) - len(self._current), np.nan)),
-                     (self._current, np.repeat(column.beside, column.counts))]
-        for whole, part in more:
-            whole.frombytes(np.ascontiguousarray(part).view(np.uint8))
-
-    def columns(self, name: str, source: dict[str, str], notes: list[str]) -> RawColumns:
-        """Return all samples taken."""
-        t = np.frombuffer(self.t)
-        found: dict[str, FloatArray] = {}
-        for which, load in self.loads.items():
-            load.take(np.empty(0, np.uint64), np.empty(0), np.empty(0, np.bool_))
-            if which == THROTTLE:
-                if load.unknown:
-                    notes.append(Note(f"{counted(load.unknown, 'throttle value')} dropped: not a "
-                                      'finite number.', Defect.NON_FINITE))
-                check_throttle(name, load.hold.held()[1])
-            found[which] = load.hold.at(t)
-        if self._current:
-            found[CURRENT] = np.frombuffer(self._current)
-        if self._clock is not None and self._clock.gaps:
-            notes.append(Note(f'{counted(self._clock.gaps, "gap")} between blocks of samples.',
-                              Defect.GAPS))
-        if THROTTLE not in found:
-            found[THROTTLE] = np.full(t.size, np.nan)
-        return RawColumns(t, np.frombuffer(self._voltage), found[THROTTLE],
-                          found.get(CURRENT), name, source, tuple(notes))
-
-
 def read_bag_signal(path: Path, signal: str, partial: bool) -> Series:
     """Read one scalar of a bag over time."""
     bag = BagReader(path, partial=partial)
@@ -363,10 +310,9 @@ def read_bag_signal(path: Path, signal: str, partial: bool) -> Series:
     stamped = Field('header', 'std_msgs/Header') in bag.definitions(kind)[short_name(kind)]
     spec = FieldSpec(topic, kind, field, nan='unknown',
                      stamp_field='header.stamp' if stamped else None)
-    parts = [batch['signal'] for batch in batches(bag, {'signal': spec})]
-    if not parts:
+    column = read_fields(bag, {SIGNAL: spec})[SIGNAL]
+    if not column.n:
         raise InputError(f"{path}: topic '{topic}' holds no message")
-    column = join(parts)
     unit = bag.origins.get(topic, {}).get(f'{topic[1:]}_unit', UNKNOWN)
     if spec.type == IMU:
         unit = {'angular_velocity': 'rad/s', 'linear_acceleration': 'm/s^2'}.get(

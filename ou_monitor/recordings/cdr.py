@@ -286,6 +286,19 @@ class MessageTable:
         return found.view(np.uint8).reshape(picked.size, length)
 
 
+def joined(tables: Sequence[MessageTable]) -> MessageTable:
+    """Return the messages of tables, one or more, one after another."""
+    if len(tables) == 1:
+        return tables[0]
+    begins = np.cumsum([0, *(len(table.data) for table in tables[:-1])])
+    return MessageTable(
+        b''.join(table.data for table in tables),
+        np.concatenate([table.channel for table in tables]),
+        np.concatenate([table.log_time for table in tables]),
+        np.concatenate([table.begin + at for table, at in zip(tables, begins)]),
+        np.concatenate([table.end + at for table, at in zip(tables, begins)]))
+
+
 def gather(data: bytes, at: IntArray, kind: str) -> npt.NDArray[Any]:
     """Return items of a kind from anywhere in a block of bytes."""
     size = np.dtype(kind).itemsize
@@ -340,9 +353,33 @@ class FieldColumn(NamedTuple):
         return self.take(np.argsort(self.log_time, kind='stable'))
 
 
-def join(parts: Sequence[FieldColumn]) -> FieldColumn:
-    """Return columns, one or more, one after another."""
-    return parts[0] if len(parts) == 1 else FieldColumn._make(map(np.concatenate, zip(*parts)))
+class GrowingColumn:
+    """Columns one after another; these grow in place, because parts and whole take twice that."""
+
+    # Type of each, and the value that takes no memory until there are others.
+    _KINDS = ((np.uint64, None), (np.float64, None), (np.bool_, None), (np.int64, 1),
+              (np.float64, None), (np.float64, np.nan))
+
+    def __init__(self) -> None:
+        self._n = 0
+        self._grown = [bytearray() for _ in self._KINDS]
+
+    def add(self, column: FieldColumn) -> None:
+        """Append a column."""
+        for whole, part, (_, usual) in zip(self._grown, column, self._KINDS):
+            if usual is not None and not whole:
+                if np.array_equal(part, np.broadcast_to(usual, part.shape), equal_nan=True):
+                    continue
+                whole += np.full(self._n, usual, part.dtype).tobytes()
+            whole += part.tobytes()
+        self._n += column.n
+
+    def whole(self) -> FieldColumn:
+        """Return all columns as one."""
+        return FieldColumn._make(
+            np.frombuffer(whole, kind) if whole or usual is None
+            else np.broadcast_to(usual, self._n)
+            for whole, (kind, usual) in zip(self._grown, self._KINDS))
 
 
 def seconds(log_time: TimeArray) -> FloatArray:

@@ -1,10 +1,11 @@
 """
 One .mcap file, read by the MCAP library: topics, places of their messages, and damage.
 
-A file with an intact summary is read by its summary; any other, and every file read with
-`partial`, is walked record by record.  Every stated size is compared with its limit before
-anything is read or unpacked.  The message indexes after a chunk are used only if they account for
-every byte of the chunk.  Damage is reported by chunk.  https://mcap.dev/spec
+The file is walked record by record.  Chunks that an intact summary lists are unpacked when they
+are read; others, and all of a file read with `partial`, already by the walk.  Every stated size is
+compared with its limit before anything is read or unpacked.  The message indexes after a chunk are
+used only if they account for every byte of the chunk.  Damage is reported by chunk.
+https://mcap.dev/spec
 
 Limits: without checksums a wrong byte within a message is not detected.  A lost message is
 detected only if the summary counts the messages, or the walk meets a broken record.
@@ -14,7 +15,7 @@ from __future__ import annotations
 
 from array import array
 import bisect
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 import io
 import math
@@ -34,7 +35,7 @@ from mcap.records import Channel, Chunk, Metadata, Schema
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
-from ou_monitor.recordings.cdr import gather, IntArray, MessageTable
+from ou_monitor.recordings.cdr import gather, IntArray, joined, MessageTable
 from ou_monitor.recordings.importers.formats import kind_of_foreign, MAGIC
 from ou_monitor.records import Defect, Note
 from ou_monitor.stream.files import open_regular, parse_yaml, path_words, plain_texts
@@ -162,6 +163,8 @@ class McapFile:
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._unpacked = self._tables = self._metadata = 0
+        # Whether the summary counts the messages and lists the chunks, which are read later.
+        self._trusted = False
         # Creating one costs as much as unpacking a small chunk.
         self._zstd = zstandard.ZstdDecompressor()
         with self._open() as file:
@@ -176,11 +179,7 @@ class McapFile:
                 raise InputError(f'{self.path} is not an MCAP file: '
                                  f'{kind_of_foreign(head, self.path)}')
             self._summary = self._read_summary(file)
-            # With `partial` the summary is not trusted.
-            if partial or not self._use_summary(file):
-                self._walk(file)
-            else:
-                self._read_metadata(file)
+            self._walk(file, self._use_summary(partial))
         self.origin_ns = self.start_ns
 
     @contextmanager
@@ -234,94 +233,76 @@ class McapFile:
                 'without a count of its messages to compare with.', Defect.DAMAGED_FILE))
             return None
 
-    def _use_summary(self, file: BinaryIO) -> bool:
-        """Take topics and chunks from the summary; False when that cannot be done."""
-        summary, size = self._summary, self._size
-        if summary is None or summary.statistics is None:
-            return False
-        counts = summary.statistics.channel_message_counts
-        indexes = sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset)
-        if (bool(indexes) != bool(summary.statistics.message_count)
-                or sum(counts.values()) != summary.statistics.message_count):
-            return False
-        end = len(MAGIC)
-        for index in indexes:
-            # A chunk listed twice, or within another, would be read twice; an unlisted one would
-            # be lost.
-            begin = index.chunk_start_offset
-            if (begin < end or index.chunk_length < _HEAD.size
-                    or _messages_between(file, end, begin)):
-                return False
-            end = begin + index.chunk_length + index.message_index_length
-        if end > size or _messages_between(file, end, size):
-            return False
-        unpacked = sum(index.uncompressed_size for index in indexes)
-        if unpacked > self._limit_of_all:
-            raise InputError(f'{path_words(self.path)}: ' + _over_limit(
-                'its chunks hold', unpacked, self._limit_of_all))
-        self._schemas.update(summary.schemas)
-        for channel in summary.channels.values():
-            self._add_channel(channel)
-        self.counts = {key: counts.get(key, 0) for key in self.topics}
-        # Chunks without messages have no index; files written without any index
-        # do not say which chunks those are.
-        indexed = any(index.message_index_offsets for index in indexes)
-        self.spans = [
-            Span(index.message_start_time, index.message_end_time,
-                 index.chunk_start_offset + _HEAD.size, index.chunk_length - _HEAD.size, True,
-                 frozenset(index.message_index_offsets) or None,
-                 # Longest index: 15 bytes per channel and 16 per message (of 31 bytes or more).
-                 index.message_index_length if index.message_index_length
-                 <= index.uncompressed_size + 15 * 65536 else 0, index.uncompressed_size)
-            for index in indexes if index.message_index_offsets or not indexed]
-        self.start_ns = summary.statistics.message_start_time
-        self.end_ns = summary.statistics.message_end_time
-        return True
+    def _use_summary(self, partial: bool) -> dict[int, Span]:
+        """Take topics and counts from the summary; return its chunks by their first byte."""
+        summary, end = self._summary, len(MAGIC)
+        if summary is None:
+            return {}
+        spans: dict[int, Span] = {}
+        # Chunks without messages have no index; files written without any index do not say which
+        # chunks those are.
+        indexed = any(index.message_index_offsets for index in summary.chunk_indexes)
+        for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
+            if index.chunk_start_offset < end or index.chunk_length < _HEAD.size:
+                # A chunk listed twice, or within another, would be read twice.
+                return {}
+            end = index.chunk_start_offset + index.chunk_length + index.message_index_length
+            spans[index.chunk_start_offset] = Span(
+                index.message_start_time, index.message_end_time,
+                index.chunk_start_offset + _HEAD.size, index.chunk_length - _HEAD.size, True,
+                frozenset(index.message_index_offsets) or (frozenset() if indexed else None),
+                index.message_index_length, index.uncompressed_size)
+        if end > self._size:
+            return {}
+        # With `partial` the summary gives only the places of chunks.
+        stated = None if partial else summary.statistics
+        if stated is not None and bool(spans) == bool(stated.message_count) == bool(
+                stated.channel_message_counts) and sum(
+                    stated.channel_message_counts.values()) == stated.message_count and (
+                        stated.channel_message_counts.keys() <= summary.channels.keys()):
+            self._trusted = True
+            self._schemas.update(summary.schemas)
+            for channel in summary.channels.values():
+                self._add_channel(channel)
+        return spans
 
-    def _read_metadata(self, file: BinaryIO) -> None:
-        """Read the metadata records that the summary lists; a broken one is noted."""
-        for index in self._summary.metadata_indexes:
-            try:
-                op, length = _frame(file, index.offset, self._size, True)
-                if op != Opcode.METADATA:
-                    raise Damage(f'it is missing at byte {index.offset}')
-                self._learn_about(file, length)
-            except Damage as error:
-                self.notes.append(f'Metadata of {printable(self.path.name)} cannot be read '
-                                  f'({error}).')
-                break
-
-    def _walk(self, file: BinaryIO) -> None:
-        """Walk the whole file once; note the places of its messages and its damage."""
-        summary = self._summary
-        starts = [] if summary is None else sorted(
-            index.chunk_start_offset for index in summary.chunk_indexes)
-        counted_there = None if summary is None else summary.statistics
+    def _walk(self, file: BinaryIO, chunks: Mapping[int, Span]) -> None:
+        """Walk the file once; note the places of its messages and its damage."""
+        starts = list(chunks)
+        statistics: Any = None if self._summary is None else self._summary.statistics
         private = False
         at, op, in_data = len(MAGIC), 0, True
         while op != Opcode.FOOTER and len(self.breaks) < _MOST_BREAKS:
+            place = bisect.bisect_right(starts, at)
+            following = starts[place] if place < len(starts) else self._size
             try:
-                op, length = _frame(file, at, self._size, in_data)
+                op, length = (Opcode.CHUNK, chunks[at].length) if at in chunks else _frame(
+                    file, at, self._size, in_data)
+                end = at + _HEAD.size + length
+                if end > following:
+                    raise Damage('a record reaches into the next chunk')
             except Damage as error:
                 self._break(at, error)
-                # An intact summary gives the start of the next chunk.
-                place = bisect.bisect_right(starts, at)
-                if place == len(starts):
+                if following == self._size:
                     break
-                at, in_data = starts[place], True
+                at, in_data = following, True
                 continue
-            end = at + _HEAD.size + length
             try:
                 if op == Opcode.MESSAGE:
-                    end = self._walk_messages(file, at, end)
+                    end = min(self._walk_messages(file, at, end), following)
                 elif op == Opcode.CHUNK:
-                    self._walk_chunk(file, length)
+                    span = chunks.get(at, Span(0, 0, at + _HEAD.size, length, True))
+                    end += span.index_length
+                    self._walk_chunk(file, span, at in chunks)
                 elif op == Opcode.DATA_END:
                     # Only repeats of schemas and channels, for the summary, follow.
                     in_data = False
                     stated = int.from_bytes(file.read(4), 'little')
                     file.seek(0)
-                    if stated and not self.breaks and _crc(file, at) != stated:
+                    # Chunks have checksums of their own.
+                    if stated and not self.breaks and not (
+                            self._trusted and all(span.chunk for span in self.spans)
+                            ) and _crc(file, at) != stated:
                         self._break(len(MAGIC), f'the checksum of the data up to byte {at} is '
                                     'wrong: something in it was changed')
                 elif op in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -329,11 +310,9 @@ class McapFile:
                         self._learn(op, self._content(file, length, self._limit))
                 elif op == Opcode.METADATA:
                     self._learn_about(file, length)
-                elif op == Opcode.ATTACHMENT:
-                    _check_attachment(file, length)
                 elif op == Opcode.MESSAGE_INDEX:
                     self._walk_index(file, at, length)
-                elif op >= _PRIVATE and counted_there is None and not private:
+                elif op >= _PRIVATE and statistics is None and not private:
                     private = True
                     raise Damage(f'a record of a private kind (0x{op:02x}) may have been a '
                                  'message, and no count shows whether one is missing')
@@ -348,8 +327,14 @@ class McapFile:
             elif at + len(MAGIC) < self._size:
                 self._break(at + len(MAGIC), f'{self._size - at - len(MAGIC)} bytes follow the '
                             'end of the recording; they may be another recording')
-        if counted_there is not None and not self.breaks:
-            for key, stated in counted_there.channel_message_counts.items():
+        if self._trusted:
+            self.counts = {key: statistics.channel_message_counts.get(key, 0)
+                           for key in self.topics}
+            self.start_ns, self.end_ns = (statistics.message_start_time,
+                                          statistics.message_end_time)
+            return
+        if statistics is not None and not self.breaks:
+            for key, stated in statistics.channel_message_counts.items():
                 found = self.counts.get(key, 0)
                 if found != stated and (key in self.topics or key not in self._channels):
                     self._break(len(MAGIC), f'somewhere before byte {self._size} messages were '
@@ -385,11 +370,17 @@ class McapFile:
                 self._learn(op, data[begin:end])
 
     def _learn_about(self, file: BinaryIO, length: int) -> None:
-        """Read the metadata record whose head was just read."""
-        self._metadata += length
-        if self._metadata > 2 * _MOST_METADATA:
-            raise Damage(f'metadata records exceed {2 * _MOST_METADATA} bytes')
-        record = _parse(Metadata, self._content(file, length, _MOST_METADATA))
+        """Read the metadata record whose head was just read; the first broken one is noted."""
+        try:
+            self._metadata += length
+            if self._metadata > 2 * _MOST_METADATA:
+                raise Damage(f'metadata records exceed {2 * _MOST_METADATA} bytes')
+            record = _parse(Metadata, self._content(file, length, _MOST_METADATA))
+        except Damage as error:
+            if not any(note.startswith('Metadata') for note in self.notes):
+                self.notes.append(f'Metadata of {printable(self.path.name)} cannot be read '
+                                  f'({error}).')
+            return
         if record.name == ABOUT:
             self.about |= plain_texts(record.metadata)
         elif record.name == ROSBAG2 and self._tables < _MOST_TABLES:
@@ -433,16 +424,23 @@ class McapFile:
             plain_texts({key.removeprefix(ORIGIN): value for key, value
                          in channel.metadata.items() if key.startswith(ORIGIN)}))
 
-    def _walk_chunk(self, file: BinaryIO, length: int) -> None:
-        """Count the messages of a chunk and register its channels."""
-        span = Span(0, 0, file.tell(), length, True)
+    def _walk_chunk(self, file: BinaryIO, span: Span, listed: bool) -> None:
+        """Add a chunk; unless it is listed in a trusted summary, unpack it to know its content."""
+        if listed and self._trusted:
+            self._unpacked += span.unpacked
+            if self._unpacked > self._limit_of_all:
+                raise InputError(f'{path_words(self.path)}: ' + _over_limit(
+                    'its chunks hold', self._unpacked, self._limit_of_all))
+            if span.channels != frozenset():
+                self.spans.append(span)
+            return
         try:
             data = self._data(file, span)
             self._unpacked += len(data)
             if self._unpacked > self._limit_of_all:
                 raise Damage(_over_limit('it and those before it hold', self._unpacked,
                                          self._limit_of_all))
-            places, others = _all_records(data, np.array([0, len(data)]))
+            places, others = _all_records(data)
             self._learn_all(data, others)
         except Damage as error:
             raise Damage(f'the chunk there is broken ({error})') from error
@@ -519,17 +517,8 @@ class McapFile:
 
     def tables(self, spans: Sequence[Span], wanted: set[str]) -> dict[str, MessageTable]:
         """Return the messages of some spans by topic, in the order of the file."""
-        try:
-            table = self._table_of(spans)
-        except Damage as error:
-            if len(spans) > 1:
-                # One by one: the first broken one is named.
-                for span in spans:
-                    self.tables([span], wanted)
-            raise InputError(
-                f'{self.path} is damaged at byte {spans[0].offset - _HEAD.size}: the chunk there '
-                f'is broken ({error}) ({moment(spans[0].start_ns, self.origin_ns)}); use '
-                '--partial to read the intact part') from error
+        with self._open() as file:
+            table = joined([self._table_of(file, span) for span in spans])
         topics: dict[str, npt.NDArray[np.bool_]] = {}
         channels = self.channels_of(wanted)
         for key in np.unique(table.channel).tolist():
@@ -539,26 +528,24 @@ class McapFile:
                 topics[name] = topics.get(name, False) | (table.channel == key)
         return {name: table.where(mine) for name, mine in topics.items()}
 
-    def _table_of(self, spans: Sequence[Span]) -> MessageTable:
-        """Return the messages of some spans; register their schemas and channels."""
-        blocks: list[bytes] = []
-        indexes: list[bytes] = []
-        with self._open() as file:
-            for span in spans:
-                blocks.append(self._data(file, span))
-                file.seek(span.offset + span.length)
-                indexes.append(file.read(span.index_length))
-        # One table of many small chunks costs as much as one chunk.
-        data = b''.join(blocks)
-        begins = np.cumsum([0, *map(len, blocks)])
-        places, others = _by_index(data, indexes, begins) or _all_records(data, begins)
-        table = _table(data, places)
-        limits = np.array([(span.start_ns, span.end_ns) if span.unpacked else (0, 2**64 - 1)
-                           for span in spans], np.uint64)
-        low, high = np.repeat(limits, np.diff(np.searchsorted(places, begins)), axis=0).T
-        if (table.log_time < low).any() or (table.log_time > high).any():
-            raise Damage('its messages do not have the times of its index')
-        self._learn_all(data, others)
+    def _table_of(self, file: BinaryIO, span: Span) -> MessageTable:
+        """Return the messages of a span; register its schemas and channels."""
+        try:
+            data = self._data(file, span)
+            file.seek(span.offset + span.length)
+            # Longest index: 15 bytes per channel and 16 per message (of 31 bytes or more).
+            index = file.read(min(span.index_length, len(data) + 15 * 65536))
+            places, others = _by_index(data, index) or _all_records(data)
+            table = _table(data, places)
+            if span.unpacked and ((table.log_time < span.start_ns)
+                                  | (table.log_time > span.end_ns)).any():
+                raise Damage('its messages do not have the times of its index')
+            self._learn_all(data, others)
+        except Damage as error:
+            raise InputError(
+                f'{self.path} is damaged at byte {span.offset - _HEAD.size}: the chunk there '
+                f'is broken ({error}) ({moment(span.start_ns, self.origin_ns)}); use '
+                '--partial to read the intact part') from error
         return table
 
 
@@ -623,27 +610,6 @@ def _frame(file: BinaryIO, at: int, size: int, in_data: bool) -> tuple[int, int]
     return op, length
 
 
-def _messages_between(file: BinaryIO, at: int, end: int) -> bool:
-    """Return whether a part of the data holds messages or chunks, or cannot be walked."""
-    op = 0
-    while at < end and op != Opcode.DATA_END:
-        try:
-            op, length = _frame(file, at, end, True)
-        except Damage:
-            return True
-        if op in (Opcode.MESSAGE, Opcode.CHUNK):
-            return True
-        at += _HEAD.size + length
-    return at > end
-
-
-def _check_attachment(file: BinaryIO, length: int) -> None:
-    """Check the checksum of an attachment, whose head was just read."""
-    found = _crc(file, length - 4)
-    if length < 36 or int.from_bytes(file.read(4), 'little') not in (0, found):
-        raise Damage(f'an attachment of {length} bytes is inconsistent')
-
-
 def _crc(file: BinaryIO, length: int) -> int:
     """Return the checksum of the next bytes of a file, up to its end."""
     found = 0
@@ -675,26 +641,25 @@ def _decompressed(compression: str, data: bytes, stated: int,
     return plain
 
 
-def _records(data: bytes, *, messages_only: bool = False, at: int = 0, end: int | None = None,
-             ) -> tuple[IntArray, list[tuple[int, int, int]], int]:
+Others = list[tuple[int, int, int]]
+
+
+def _records(data: bytes, at: int = 0, *, end: int | None = None, messages_only: bool = False,
+             ) -> tuple[IntArray, Others, int]:
     """Return places of messages, (opcode, begin, end) of others, and the last end."""
     places = array('q')
-    others: list[tuple[int, int, int]] = []
+    others: Others = []
     end = len(data) if end is None else end
     unpack, head, shortest, message = _HEAD.unpack_from, _HEAD.size, _MESSAGE.size, Opcode.MESSAGE
     while at + head <= end:
         op, length = unpack(data, at)
         behind = at + head + length
-        if behind > end:
+        if behind > end or messages_only and (op != message or length < shortest):
             break
         if op == message:
             if length < shortest:
-                if messages_only:
-                    break
                 raise Damage('a message in it is shorter than its own head')
             places.append(at)
-        elif messages_only:
-            break
         else:
             if len(others) == _MOST_OTHERS:
                 raise Damage(f'more than {_MOST_OTHERS} records in it are not messages')
@@ -703,56 +668,40 @@ def _records(data: bytes, *, messages_only: bool = False, at: int = 0, end: int 
     return np.frombuffer(places, np.int64) if places else np.empty(0, np.int64), others, at
 
 
-def _all_records(data: bytes, begins: IntArray) -> tuple[IntArray, list[tuple[int, int, int]]]:
-    """Return the records of chunks as `_records` does; for `begins` see `_by_index`."""
-    parts: list[IntArray] = []
-    others: list[tuple[int, int, int]] = []
-    for begin, end in zip(begins.tolist(), begins[1:].tolist()):
-        places, more, reached = _records(data, at=begin, end=end)
-        if reached < end:
-            raise Damage('a record within it is cut off')
-        parts.append(places)
-        others += more
-    return np.concatenate(parts), others
+def _all_records(data: bytes) -> tuple[IntArray, Others]:
+    """Return the records of a chunk as `_records` does."""
+    places, others, reached = _records(data)
+    if reached < len(data):
+        raise Damage('a record within it is cut off')
+    return places, others
 
 
-def _by_index(data: bytes, indexes: Sequence[bytes], begins: IntArray,
-              ) -> tuple[IntArray, list[tuple[int, int, int]]] | None:
-    """Return the records of chunks as `_records`; None if the indexes do not describe them."""
-    # begins: start of each chunk in `data`, and the end of the last.  Messages in the indexes and
-    # records of other kinds must fill each chunk from end to end.
-    parts = [np.empty(0, np.int64)]
-    for first, index in zip(begins.tolist(), indexes):
-        at = 0
-        while at < len(index):
-            if at + _HEAD.size + 6 > len(index):
-                return None
-            op, length = _HEAD.unpack_from(index, at)
-            count, odd = divmod(length - 6, 16)
-            if op != Opcode.MESSAGE_INDEX or odd or count < 0 or (
-                    at + _HEAD.size + length > len(index)):
-                return None
-            offsets = np.frombuffer(index, '<i8', 2 * count, at + _HEAD.size + 6)[1::2]
-            if count and not 0 <= int(offsets.min()) <= int(offsets.max()) < len(data):
-                return None
-            parts.append(offsets + first)
-            at += _HEAD.size + length
+def _by_index(data: bytes, index: bytes) -> tuple[IntArray, Others] | None:
+    """Return the records of a chunk as `_records`; None if its indexes do not describe them."""
+    # Messages in the indexes and records of other kinds must fill the chunk from end to end.
+    parts, at = [np.empty(0, np.int64)], 0
+    while at < len(index):
+        if at + _HEAD.size + 6 > len(index):
+            return None
+        op, length = _HEAD.unpack_from(index, at)
+        count, odd = divmod(length - 6, 16)
+        if op != Opcode.MESSAGE_INDEX or odd or count < 0 or (
+                at + _HEAD.size + length > len(index)):
+            return None
+        parts.append(np.frombuffer(index, '<i8', 2 * count, at + _HEAD.size + 6)[1::2])
+        at += _HEAD.size + length
     places = np.sort(np.concatenate(parts), kind='stable')
-    if not places.size or places[-1] > len(data) - _DATA:
+    if not places.size or places[0] < 0 or places[-1] > len(data) - _DATA:
         return None
-    ends = places + _HEAD.size + gather(data, places + 1, '<i8')
     # A length of 2^63 or more is negative here; one beyond the chunk is too long.
+    ends = places + _HEAD.size + gather(data, places + 1, '<i8')
     if not ((gather(data, places, 'u1') == Opcode.MESSAGE) & (ends >= places + _DATA)
             & (ends <= len(data))).all():
         return None
-    # A record must not cross from one chunk to the next.
-    inner = begins[1:-1]
-    at_inner = np.searchsorted(places, inner)
-    behind = np.append(0, np.insert(ends, at_inner, inner))
-    ahead = np.append(np.insert(places, at_inner, inner), len(data))
-    others: list[tuple[int, int, int]] = []
-    for gap in np.nonzero(behind != ahead)[0].tolist():
-        inside, more, end = _records(data, at=int(behind[gap]), end=int(ahead[gap]))
+    behind, ahead = np.append(0, ends), np.append(places, len(data))
+    others: Others = []
+    for gap in np.flatnonzero(behind != ahead).tolist():
+        inside, more, end = _records(data, int(behind[gap]), end=int(ahead[gap]))
         if end != ahead[gap] or inside.size:
             return None
         others += more
