@@ -32,7 +32,7 @@ import numpy.typing as npt
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.formats import is_text, kind_of_foreign, TEXT
 from ou_monitor.recordings.importers.log import CsvColumns
-from ou_monitor.records import FloatArray, TIME_UNITS
+from ou_monitor.records import FloatArray, LONGEST_STEP, TIME_UNITS
 from ou_monitor.stream.files import open_regular
 from ou_monitor.text import plain_number
 
@@ -100,6 +100,8 @@ _NAMES = re.compile(r'[^\s\[(]+(?: ?[\[(][^\])]*[\])])?')
 _OF_POINT, _OF_COMMA = (re.compile(rf'(?<![\d.,:])\d{{1,3}}(?:{mark}\d{{3}})+(?![\d{mark}:])')
                         for mark in (r'\.', ','))
 _OF_QUOTED = re.compile(r'"[-+]?\d{1,3}(?:,\d{3})+(?:\.\d+)?[^",\d]*"')
+# A number that shows that the decimal mark is a point.
+_OF_PLAIN = re.compile(r'(?:^|,)[-+]?\d+\.(?!\d{3}(?!\d))\d+(?=,|$)', re.MULTILINE)
 # A number with both marks shows which of them separates thousands.
 _BOTH_MARKS = {'.': r'(?<![\d.,:])\d{1,3}(?:,\d{3})+\.\d+(?![\d.,:])',
                ',': r'(?<![\d.,:])\d{1,3}(?:\.\d{3})+,\d+(?![\d.,:])'}
@@ -183,6 +185,8 @@ def form_of(path: Path, wanted: CsvColumns) -> Form:
     for delimiter in (',', ';', '\t', '|', ' ') if given is None else (given,):
         known = wanted.decimal or next((mark for mark, both in _BOTH_MARKS.items() if re.search(
             f'"[-+]?{both}[^",]*"' if delimiter == ',' else both, text)), '')
+        if not known and delimiter == ',' and _OF_QUOTED.search(text) and _OF_PLAIN.search(text):
+            known = '.'
         for mark in known or '.,':
             if mark == delimiter and not (known or _QUOTED.search(text)) or (
                     best and delimiter == ' ' and best[1].width > 1):
@@ -213,7 +217,12 @@ def _encoding(path: Path, head: bytes) -> str:
     try:
         codecs.getincrementaldecoder('utf-8')().decode(head)
     except UnicodeDecodeError:
-        # Units such as µs and °C of older Windows programs.
+        # Chinese names take two bytes a character; µs and °C of older Windows programs, one.
+        runs = [len(run) for run in re.findall(rb'[\x80-\xff]+', head)]
+        with suppress(UnicodeDecodeError):
+            if max(runs) >= 4 and not any(run % 2 for run in runs) and (
+                    codecs.getincrementaldecoder('gb18030')().decode(head)):
+                return 'gb18030'
         return 'cp1252'
     return 'utf-8'
 
@@ -568,10 +577,12 @@ def numbers(path: Path, form: Form, places: Sequence[int],
 
 
 def _check_same_names(row: list[str], names: Sequence[str], where: Callable[[int], str]) -> None:
-    """Raise InputError if a bad line is a header in another order: another table begins."""
+    """Raise InputError if a bad line is another header: another table begins."""
     cells = [cell.strip() for cell in row]
     others = [k for k, (cell, name) in enumerate(zip(cells, names)) if cell != name]
-    if others and set(cells) & {*names} - {''} and not any(map(is_value, cells)):
+    if others and not any(map(is_value, cells)) and (
+            set(cells) & {*names} - {''} or len({*cells}) == len(cells) > 1 and all(
+                cell[:1].isalpha() and not is_missing(cell) for cell in cells)):
         raise InputError(f"{where(others[0])} becomes '{shown(cells[others[0]])}': another table "
                          'begins there; move it to a file of its own')
 
@@ -722,11 +733,14 @@ def clock_times(path: Path, cells: list[str], name: str, left_out: list[str] | N
         raise InputError(f"{path}: column '{name}': {error}") from error
     spans = [float(np.nanmax(t) - np.nanmin(t)) if np.isfinite(t).any() else math.inf
              for t in either]
-    # 10.22.31 is no date: with dots between, Italians write a time so.
+    # 10.22.31 is no date, and dates alone are no stamps: Italians write a time with dots between.
     dotted = [re.sub(r'^(\d\d?)[.,]([0-5]\d)[.,]([0-5]\d)(?!\d)', r'\1:\2:\3', cell)
               for cell in cells]
-    if min(spans) == math.inf and dotted != cells:
-        return clock_times(path, dotted, name, left_out)
+    if dotted != cells and (min(spans) == math.inf or not any(one and one[8] for one in found)
+                            and all(_CLOCK.fullmatch(cell) for cell in dotted)):
+        t = clock_times(path, dotted, name, left_out)
+        if min(spans) == math.inf or np.abs(np.diff(t)).mean() <= LONGEST_STEP:
+            return t
     # In 04/05 either may be the day: choose the shorter recording.
     t = either[0] if spans[0] <= spans[1] else either[1]
     if any(one is not None and not (one[1] or one[4]) for one in found):

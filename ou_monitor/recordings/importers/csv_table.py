@@ -70,21 +70,21 @@ _PATTERNS = {
         r'time_s',
         r'(?:__|_)?time|t|zeit|ms_today|millis|micros|elapsed(?:_time)?|x_axis|x_value|'
         r'(?:milli|micro)?seconds?',
-        r'timestamp|date_?time|datum_?(?:und_)?(?:uhr)?zeit|temps|tiempo|tempo|uhrzeit|ora|heure',
+        r'timestamp|date_?time|datum_?(?:und_)?(?:uhr)?zeit|temps|tiempo|tempo|uhrzeit|ora|heure|时间',
         r'.*(?:time|zeit|stamp).*', r'date|datum'),
     logs.VOLTAGE: (
         r'voltage_v',
         r'v_?bat(?:t|tery)?(?:_?latest|_?filtered|_?voltage|_?v)?|batt?(?:ery)?_?(?:v|volt|volts|'
         r'voltage)|pack_?voltage|(?:input|inp|bus|supply|rail|main|link)_?(?:v|volt|voltage)'
         r'|v_?bus|vfas|cels|voltage_?(?:battery|batt?|raw)|bat_?spannung|akku_?spannung|pm_vbat',
-        r'u|v|volts?|voltage|spannung|tension|tensione|voltaje|[UVuv]\(.*\)|'
+        r'u|v|volts?|voltage|spannung|tension|tensione|voltaje|电压|[UVuv]\(.*\)|'
         r'[uv](?:rms|dc|mean|mn)?_?1?',
         r'volt(?:age)?_?filtered(?:_v)?|rxbt',
         r'(?!.*(?:axis|cell|temp|limit|zelle|motor|servo|rssi|phase|cpu|mcu|5v|sag)).*(?:volt|'
         r'spannung|vbat).*'),
     logs.THROTTLE: (
         r'throttle', r'thr(?:ottle)?_?(?:out|cmd|command|pct|percent)?|ga[sz]|'
-        r'acelerador|duty(?:_cycle)?|tho?o|tps|tastgrad|tastverh.*',
+        r'acelerador|油门|duty(?:_cycle)?|tho?o|tps|tastgrad|tastverh.*',
         r'rc_?command_3|rc_?out?(?:_?ch?_?3)?|servo3_raw',
         r'pwm|rc_?out?_?ch?_?1|thrust|gas_?(?:kanal|stellung|hebel)|esc(?:_signal|_pwm)?|'
         r'(?!.*(?:limit|trim|max|min)).*throttle.*'),
@@ -92,7 +92,7 @@ _PATTERNS = {
         r'current_a', r'amperage(?:_?latest)?|current_in|i_?bat(?:t|tery)?|'
         r'batt?(?:ery)?_?\d?_?(?:i|curr(?:ent)?|amps?)|current_?batt?(?:ery)?|'
         r'(?:.*_)?(?:bus|input|supply|main|pack|total|bms)_?current|i_?bus|curr',
-        r'(?:i(?:rms|dc|mn)?|curr(?:ent)?|amps?|strom|courant|corriente)'
+        r'(?:i(?:rms|dc|mn)?|curr(?:ent)?|amps?|strom|courant|corriente|电流)'
         r'(?:_?(?:avg|average|mean))?(?:_?1)?|'
         r'(?!.*(?:max|min|limit)).*_batt?(?:ery)?_current'),
 }

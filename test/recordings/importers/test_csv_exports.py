@@ -763,9 +763,30 @@ def test_words_of_other_series_do_not_stop_the_reading(tmp_path):
         read_recording(written(tmp_path, wrong))
 
 
-def test_a_time_with_dots_is_no_date(tmp_path):
-    """10.22.31 cannot be a date; 10.05.24 can."""
-    times = [f'10.{22 + k // 60}.{k % 60:02}' for k in range(90)]
+@pytest.mark.parametrize('minute', [22, 10])
+def test_a_time_with_dots_is_no_date(minute, tmp_path):
+    """10.22.31 cannot be a date; 10.10.24 can, but alone it is no stamp of a sample."""
+    times = [f'10.{minute + k // 60}.{k % 60:02}' for k in range(90 if minute > 12 else 31)]
     found = read_recording(written(tmp_path, 'Ora;Tensione\n' + ''.join(
         f'{time};12,{k % 7}\n' for k, time in enumerate(times))))
-    np.testing.assert_allclose(found.t, 37320.0 + np.arange(90.0))
+    np.testing.assert_allclose(found.t, 36000.0 + 60.0 * minute + np.arange(len(times)))
+    days = ''.join(f'{k:02}.05.24;12,{k % 7}\n' for k in range(1, 20))
+    found = read_recording(written(tmp_path, f'Datum;Spannung\n{days}'))
+    np.testing.assert_allclose(np.diff(found.t), 86400.0)
+
+
+@pytest.mark.parametrize('names', ['时间,电压,油门', '时间 (s),电压 (V),油门'])
+def test_chinese_names(names, tmp_path):
+    """Windows writes them as GBK, which no Western name resembles."""
+    rows = ''.join(f'{k / 100},12.{k % 7},0.{k % 5}\n' for k in range(60))
+    found = read_recording(written(tmp_path, f'{names}\n{rows}'.encode('gbk')))
+    np.testing.assert_allclose(found.throttle, np.arange(60) % 5 / 10)
+    assert 'gb18030' in found.notes[0] and '电压' in found.notes[0]
+    other = written(tmp_path, f'Größe,Zeit (s),Spannung (V)\n{rows}'.encode('cp1252'))
+    assert 'cp1252' in read_recording(other).notes[0]
+
+
+def test_a_point_elsewhere_shows_that_quoted_commas_separate_thousands(tmp_path):
+    path = written(tmp_path, 'time_s,U (mV)\n' + ''.join(
+        f'{k / 100},"12,{k:03}"\n' for k in range(60)))
+    np.testing.assert_allclose(read_recording(path).voltage, 12.0 + 1e-3 * np.arange(60))
