@@ -31,7 +31,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Channel, Chunk, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, MessageIndex, Metadata, Schema
 import numpy as np
 import numpy.typing as npt
 from ou_monitor.errors import InputError
@@ -56,6 +56,7 @@ _IN_DATA = {Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode
             Opcode.FOOTER}
 _IN_SUMMARY = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX,
                Opcode.STATISTICS, Opcode.METADATA_INDEX, Opcode.SUMMARY_OFFSET, Opcode.FOOTER}
+_UNREAD: dict[int, Any] = {Opcode.ATTACHMENT: Attachment, Opcode.MESSAGE_INDEX: MessageIndex}
 _LENGTHS = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
 
 # Keys in a channel's metadata: rate of the samples within a block, Hz; prefix of the keys about
@@ -310,8 +311,9 @@ class McapFile:
                         self._learn(op, self._content(file, length, self._limit))
                 elif op == Opcode.METADATA:
                     self._learn_about(file, length)
-                elif op == Opcode.MESSAGE_INDEX:
-                    self._walk_index(file, at, length)
+                elif op in _UNREAD and statistics is None and not self._behind_chunk():
+                    # No count would miss a message with another opcode.
+                    _parse(_UNREAD[op], self._content(file, length, self._limit))
                 elif op >= _PRIVATE and statistics is None and not private:
                     private = True
                     raise Damage(f'a record of a private kind (0x{op:02x}) may have been a '
@@ -458,15 +460,9 @@ class McapFile:
         self._add_span(_table(data, places), Span(0, 0, at, length, False))
         return at + length
 
-    def _walk_index(self, file: BinaryIO, at: int, length: int) -> None:
-        """Add a message index to the chunk just before it."""
-        size = int.from_bytes(file.read(6)[2:], 'little')
-        if length < 6 or size % 16 or size != length - 6:
-            raise Damage(f'a message index of {length} bytes is inconsistent')
-        last = self.spans[-1] if self.spans else None
-        if last is not None and last.chunk and (
-                last.offset + last.length + last.index_length == at):
-            self.spans[-1] = last._replace(index_length=last.index_length + _HEAD.size + length)
+    def _behind_chunk(self) -> bool:
+        """Return whether the last messages were in a chunk."""
+        return bool(self.spans) and self.spans[-1].chunk
 
     def _add_span(self, table: MessageTable, span: Span) -> None:
         """Add the messages of a span to the index."""

@@ -123,19 +123,15 @@ class Publishers:
         kept = np.ones(len(numbers), dtype=np.bool_)
         if not numbers:
             return kept
-        if any(number is None for number in numbers):
+        whole = [number for number in numbers if number is not None]
+        if len(whole) < len(numbers):
             self.numbered = False
             return kept
-        whole = np.array(numbers, dtype=np.int64)
         if publishers <= 1 and self._tracks and (
                 arrived[0] - max(track.arrived for track in self._tracks) > GIVE_UP):
             # The only publisher restarts after a silence: all others are gone.
             del self._tracks[1:]
-        if publishers <= 1 and len(self._tracks) <= 1:
-            self._take_only(whole, times, arrived)
-            return kept
-        for k, (number, time, at) in enumerate(
-                zip(whole.tolist(), times.tolist(), arrived.tolist())):
+        for k, (number, time, at) in enumerate(zip(whole, times.tolist(), arrived.tolist())):
             kept[k] = self._take_one(number, time, at, publishers)
         self._give_up(publishers)
         return kept
@@ -152,21 +148,6 @@ class Publishers:
         if self._tracks[last].arrived - self._tracks[0].arrived > GIVE_UP:
             self._tracks[0] = self._tracks.pop(last)
 
-    def _take_only(self, numbers: npt.NDArray[np.int64], times: FloatArray, arrived: FloatArray
-                   ) -> None:
-        """Register messages of the only publisher; numbers that start again are a new one."""
-        if not self._tracks:
-            self._tracks = [_Track(int(numbers[0]), float(times[0]), float(arrived[0]))]
-        track = self._tracks[0]
-        steps = np.diff(numbers, prepend=track.number)
-        self.lost += int(np.sum(steps[steps > 0] - 1))
-        step = int(numbers[-1]) - track.number
-        if step > 0 and times[-1] > track.time:
-            track.take(int(numbers[-1]), float(times[-1]), float(arrived[-1]))
-        else:
-            self._tracks[0] = _Track(int(numbers[-1]), float(times[-1]), float(arrived[-1]),
-                                     track.interval)
-
     def _take_one(self, number: int, time: float, arrived: float, publishers: int) -> bool:
         """Assign one message to a publisher; return whether it is the followed one."""
         off = [track.deviation(number, time) for track in self._tracks]
@@ -175,6 +156,10 @@ class Publishers:
         new = best < 0 or off[best] == math.inf or (
             len(self._tracks) < publishers and off[best] > 0.5 * max(
                 10, self._tracks[best].number))
+        if new and publishers <= 1 and len(self._tracks) == 1:
+            # The only publisher has started again.
+            self._tracks = [_Track(number, time, arrived, self._tracks[0].interval)]
+            return True
         if new:
             self._tracks.append(_Track(number, time, arrived))
             best = len(self._tracks) - 1
