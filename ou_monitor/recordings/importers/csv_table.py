@@ -70,7 +70,8 @@ _PATTERNS = {
         r'time_s',
         r'(?:__|_)?time|t|zeit|ms_today|millis|micros|elapsed(?:_time)?|x_axis|x_value|'
         r'(?:milli|micro)?seconds?',
-        r'timestamp|date_?time|datum_?(?:und_)?(?:uhr)?zeit|temps|tiempo|tempo|uhrzeit|ora|heure|时间',
+        r'timestamp|date_?time|datum_?(?:und_)?(?:uhr)?zeit|temps|tiempo|tempo|uhrzeit|ora|heure|'
+        r'时间',
         r'.*(?:time|zeit|stamp).*', r'date|datum'),
     logs.VOLTAGE: (
         r'voltage_v',
