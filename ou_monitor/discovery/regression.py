@@ -43,9 +43,6 @@ _ALIKE = 1.5
 _FINER = (0.25, 0.125, 0.0625)
 # Maximum number of terms added, removed or exchanged.
 _ROUNDS = 40
-# Maximum number of lags: motors or filters, and the fast and slow polarisation of a battery.  More
-# only correct the form of each other.
-_LAGS = 3
 
 
 def load_terms(samples: Samples) -> tuple[Term, ...]:
@@ -176,7 +173,7 @@ class _Regression:
         self._scored = np.concatenate((whole[None], self._blocks))
         self._n, self._penalty = samples.n, 0.5 * math.log(samples.n)
         self._known: dict[tuple[int, ...], tuple[float, FloatArray]] = {}
-        # Whether to refuse sets that contain nearly equal time constants, or too many.
+        # Whether to refuse sets that contain nearly equal time constants.
         self._apart = False
 
     def search(self, start: Sequence[int]) -> MeanResponse:
@@ -187,7 +184,7 @@ class _Regression:
         chosen = self._moved(chosen)
         # So far, a better time constant may stand beside the one that it replaces.
         self._apart = True
-        while self._is_crowded(chosen):
+        while self._has_twins(chosen):
             chosen = max((self._less(chosen, k) for k in chosen),
                          key=lambda less: self._evaluate(less)[0])
         chosen = self._moved(chosen)
@@ -208,11 +205,10 @@ class _Regression:
             chosen = better
         return chosen
 
-    def _is_crowded(self, chosen: tuple[int, ...]) -> bool:
-        """Return whether two time constants are too near to be told apart, or too many."""
-        lags = [term for term in (self._pool[k] for k in chosen)
-                if isinstance(term, LoadTransient)]
-        return len(lags) > _LAGS or any(_is_near(*pair) for pair in combinations(lags, 2))
+    def _has_twins(self, chosen: tuple[int, ...]) -> bool:
+        """Return whether two time constants are too near to be told apart."""
+        return any(_is_near(one, other)
+                   for one, other in combinations([self._pool[k] for k in chosen], 2))
 
     def exchanged(self, own: int, places: Sequence[int]
                   ) -> tuple[tuple[int, ...], tuple[float, ...]]:
@@ -284,7 +280,7 @@ class _Regression:
 
     def _evidence(self, chosen: tuple[int, ...]) -> float:
         """Return the evidence for a set of terms, nats."""
-        if self._apart and self._is_crowded(chosen):
+        if self._apart and self._has_twins(chosen):
             return -math.inf
         return self._evaluate(chosen)[0]
 

@@ -64,7 +64,7 @@ def test_all_terms_together_give_finite_samples():
     cuts = [0, 1, 2, 3, 50, 51, 120, 300]
     parts = [run.advance(T[a:b], load[a:b]) for a, b in zip(cuts, cuts[1:])]
     assert np.isfinite(whole).all() and set(model.needs_throttle) == {
-        'load_sag', 'load_transient', 'load_dependent_sigma', 'load_dependent_alpha',
+        'load_sag', 'load_transient', 'drift', 'load_dependent_sigma', 'load_dependent_alpha',
         'load_dependent_noise', 'throttle_tone'}
     # Of codes of 10 mV, none is another.
     np.testing.assert_allclose(np.concatenate(parts), whole, rtol=0, atol=1e-9)
