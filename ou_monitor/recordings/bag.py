@@ -24,7 +24,7 @@ from ou_monitor.errors import InputError, nearest
 from ou_monitor.recordings.cdr import (
     Definitions, FieldColumn, FieldReader, GrowingColumn, MessageTable)
 from ou_monitor.recordings.mcap_file import (
-    ABOUT, custom_data, McapFile, moment, MOST_BYTES, MOST_NODES, ORIGIN, SAMPLE_RATE, Span)
+    ABOUT, custom_data, McapFile, moment, MOST_BYTES, MOST_NODES, SAMPLE_RATE, Span)
 from ou_monitor.recordings.standard_types import parse_definition, SCHEMAS, TYPE_HASHES
 from ou_monitor.stream.config import FieldSpec
 from ou_monitor.stream.files import one_line, path_words, read_yaml
@@ -146,12 +146,11 @@ class BagReader:
     """
     Reads a bag (.mcap file or rosbag2 directory); with `partial` also a damaged one.
 
-    By topic: message types in `topics`, numbers in `counts`, rate of the samples within blocks,
-    Hz, in `sample_rates`, and origins of values in `origins`, if the bag states them.  `about` is
-    the custom data of metadata.yaml or of the files; `start_ns`, `end_ns` the log times of the
-    first and last message; `damage` the place and kind of damage, or None; `notes` topics left
-    out, and the like.  InputError: missing, empty, foreign, without messages, or damaged and not
-    `partial`.
+    By topic: message types in `topics`, numbers in `counts`, and rate of the samples within
+    blocks, Hz, in `sample_rates`, if the bag states it.  `about` is the custom data of
+    metadata.yaml or of the files; `start_ns`, `end_ns` the log times of the first and last
+    message; `damage` the place and kind of damage, or None; `notes` topics left out, and the like.
+    InputError: missing, empty, foreign, without messages, or damaged and not `partial`.
     """
 
     def __init__(self, path: Path | str, *, partial: bool = False) -> None:
@@ -176,7 +175,6 @@ class BagReader:
         self.topics: dict[str, str] = {}
         self.counts: dict[str, int] = {}
         self.sample_rates: dict[str, float] = {}
-        self.origins: dict[str, dict[str, str]] = {}
         self._schemas: dict[str, Any] = {}
         self._collect()
         self.notes = tuple(dict.fromkeys(note for file in self._files for note in file.notes))
@@ -192,8 +190,6 @@ class BagReader:
             for key, topic in file.topics.items():
                 if topic.sample_rate is not None:
                     self.sample_rates[topic.name] = topic.sample_rate
-                if topic.origin:
-                    self.origins[topic.name] = topic.origin
                 known = self.topics.setdefault(topic.name, topic.type)
                 if known != topic.type:
                     raise InputError(f"{self.path}: topic '{topic.name}' has two types, "
@@ -363,7 +359,6 @@ class BagWriter(AbstractContextManager['BagWriter']):
     def add_topic(
         self, name: str, type: str, *,  # noqa: A002
         schema: str | None = None, sample_rate: float | None = None,
-        origin: Mapping[str, str] | None = None,
     ) -> str:
         """Add a topic (sample_rate in Hz)."""
         topic = '/' + name.lstrip('/')
@@ -379,7 +374,6 @@ class BagWriter(AbstractContextManager['BagWriter']):
                     'topic_type_hash': TYPE_HASHES.get(type, '')}
         if sample_rate is not None:
             metadata[SAMPLE_RATE] = repr(float(sample_rate))
-        metadata |= {ORIGIN + key: _as_text(value) for key, value in (origin or {}).items()}
         self._channels[topic] = self._writer.register_channel(
             topic, 'cdr', self._schemas[type], metadata)
         self._counts[topic] = 0

@@ -289,8 +289,10 @@ def _source(bag: BagReader, choice: TopicChoice, name: str) -> dict[str, str]:
     for which in (VOLTAGE, THROTTLE):
         spec = choice.specs.get(which)
         if spec is not None:
+            # A converted bag names the field of the log that became the topic.
+            field = bag.about.get(f'{spec.topic[1:]}_field', spec.field)
             source |= {f'{which}_topic': spec.topic, f'{which}_type': spec.type,
-                       f'{which}_field': spec.field, **bag.origins.get(spec.topic, {})}
+                       f'{which}_field': field}
     # `ou-monitor convert` stores the log's own vehicle apart from the user's.
     vehicle = source.get('vehicle') or source.get('log_vehicle')
     return {**source, 'vehicle': vehicle} if vehicle else source
@@ -313,7 +315,7 @@ def read_bag_signal(path: Path, signal: str, partial: bool) -> Series:
     column = read_fields(bag, {SIGNAL: spec})[SIGNAL]
     if not column.n:
         raise InputError(f"{path}: topic '{topic}' holds no message")
-    unit = bag.origins.get(topic, {}).get(f'{topic[1:]}_unit', UNKNOWN)
+    unit = bag.about.get(f'{topic[1:]}_unit', UNKNOWN)
     if spec.type == IMU:
         unit = {'angular_velocity': 'rad/s', 'linear_acceleration': 'm/s^2'}.get(
             field.partition('.')[0], UNKNOWN)

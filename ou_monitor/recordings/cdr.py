@@ -370,8 +370,8 @@ class GrowingColumn:
             if usual is not None and not whole:
                 if np.array_equal(part, np.broadcast_to(usual, part.shape), equal_nan=True):
                     continue
-                whole += np.full(self._n, usual, part.dtype).tobytes()
-            whole += part.tobytes()
+                whole += np.full(self._n, usual, part.dtype).data
+            whole += np.ascontiguousarray(part).data
         self._n += column.n
 
     def whole(self) -> FieldColumn:

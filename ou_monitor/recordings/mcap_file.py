@@ -59,9 +59,8 @@ _IN_SUMMARY = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK_INDEX, Opcode.ATTACHM
 _UNREAD: dict[int, Any] = {Opcode.ATTACHMENT: Attachment, Opcode.MESSAGE_INDEX: MessageIndex}
 _LENGTHS = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
 
-# Keys in a channel's metadata: rate of the samples within a block, Hz; prefix of the keys about
-# the origin of the values.
-SAMPLE_RATE, ORIGIN = 'sample_rate_hz', 'origin.'
+# Key in a channel's metadata: rate of the samples within a block, Hz.
+SAMPLE_RATE = 'sample_rate_hz'
 # Metadata records on the origin of the recording: our own, and rosbag2's, which holds the text of
 # a metadata.yaml.  Maximum bytes and values of that text (2000 topics).
 ABOUT, ROSBAG2 = 'ou_monitor', 'rosbag2'
@@ -110,7 +109,6 @@ class Topic(NamedTuple):
     type: str  # noqa: A003
     schema: Any
     sample_rate: float | None  #: Rate of the samples within a block, Hz
-    origin: dict[str, str]  #: Origin of its values
 
 
 def usable_memory() -> int:
@@ -422,9 +420,7 @@ class McapFile:
         assert schema is not None
         self.topics[channel.id] = Topic(
             name, printable(schema.name), schema,
-            _rate(channel.metadata.get(SAMPLE_RATE, '')),
-            plain_texts({key.removeprefix(ORIGIN): value for key, value
-                         in channel.metadata.items() if key.startswith(ORIGIN)}))
+            _rate(channel.metadata.get(SAMPLE_RATE, '')))
 
     def _walk_chunk(self, file: BinaryIO, span: Span, listed: bool) -> None:
         """Add a chunk; unless it is listed in a trusted summary, unpack it to know its content."""

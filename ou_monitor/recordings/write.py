@@ -6,7 +6,7 @@ std_msgs/Float64), which resolves 0.5 uV at 5 V.
 
 Every series of a log keeps its own stamps, counted from the start of the log, within 10 ns over
 a day.  Gyros are sensor_msgs/Imu, motor speeds sensor_msgs/JointState (velocity, rad/s), named
-series std_msgs/Float64; the metadata of each topic have its unit.
+series std_msgs/Float64; the metadata of the bag have their units.
 """
 
 from __future__ import annotations
@@ -179,16 +179,15 @@ def write_log(
     total = sum(one.t.size for one in streams.values())
     # Refused before anything is written to disk.
     stamps = {topic: as_nanoseconds(one.t, one.name) + shift for topic, one in streams.items()}
-    whole, origins = {**about}, {}
+    whole = {**about}
     for topic, one in streams.items():
         _check_header(kinds[topic], one.name, stamps[topic])
-        origins[topic] = {f'{topic}_field': one.name, f'{topic}_unit': one.unit,
-                          f'{topic}_scale': one.scale, f'{topic}_what': one.words}
-        whole |= origins[topic]
+        whole |= {f'{topic}_field': one.name, f'{topic}_unit': one.unit,
+                  f'{topic}_scale': one.scale, f'{topic}_what': one.words}
     with BagWriter(path, about=whole) as bag:
         # Topics in the order of the table of contents: the voltage first.
         for topic in reversed(streams):
-            bag.add_topic(topic, kinds[topic], origin={**about, **origins[topic]})
+            bag.add_topic(topic, kinds[topic])
         names = [f'/{topic}' for topic in streams]
         parts = [_messages(k, kinds[topic], stamps[topic], one)
                  for k, (topic, one) in enumerate(streams.items())]
