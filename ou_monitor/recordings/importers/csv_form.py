@@ -420,7 +420,9 @@ def factor_of(name: str) -> float:
 def _header(rows: list[list[str]], lines: list[str], first: int, width: int, delimiter: str,
             skip: int, labels: Sequence[str]) -> tuple[list[str], list[str], int]:
     """Return names, the words of a line of units, and the number of the line of the names."""
-    plain = [(k, rows[k]) for k in range(skip, first) if any(rows[k])]
+    # A line of decimal numbers, as of the steps of a battery tester, has no names.
+    plain = [(k, rows[k]) for k in range(skip, first) if any(rows[k]) and 2 * sum(
+        '.' in cell and is_number(cell) for cell in rows[k]) <= len(rows[k])]
     if any(labels) and not (plain and len(plain[-1][1]) == width):
         return [label[:-1].strip() or ('time' if is_clock(cell) else f'column {k + 1}')
                 for k, (label, cell) in enumerate(zip(labels, rows[first]))], [], first + 1

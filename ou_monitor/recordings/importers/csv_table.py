@@ -283,6 +283,10 @@ def _table(path: Path, wanted: CsvColumns, *, more: Iterable[str] = (), needed: 
     if time.place and (np.diff(t) < 0.0).sum() > _BACK * t.size and (np.diff(volts) > 0.0).all():
         raise InputError(f"{path}: '{time.name}' runs backwards, and '{found[logs.VOLTAGE].name}' "
                          'only ever rises: are the two columns swapped?')
+    if logs.VOLTAGE in found and wanted.voltage is None and t.size and not np.nan_to_num(
+            volts).any() and len(form.names) > 2:
+        raise InputError(f"{path}: '{found[logs.VOLTAGE].name}' is 0 or blank in every row, as "
+                         'without its sensor: name another column by --voltage-column')
     t, words = _stamps(path, t, raw, wanted, clock)
     units = {'voltage': wanted.unit, 'throttle': wanted.throttle_unit}
     scaled, guesses = {}, {_TIME_NAME: words}
@@ -344,7 +348,9 @@ def _choose(form: Form, quantity: str, taken: Sequence[int] = (), text: bool = F
     found = [k for k in free if quantity != logs.THROTTLE and form.units[k] in right
              and not re.fullmatch(others, plain[k] or ' ')]
     if not found and quantity == logs.VOLTAGE:
-        found = [k for k in free if CHANNEL.fullmatch(plain[k] or ' ')]
+        # A column of 0 and 1 only is a line of a logic analyser.
+        found = [k for k in free if CHANNEL.fullmatch(plain[k] or ' ')
+                 and not {*form.cells(k)} <= {'0', '1'}]
     return found
 
 
@@ -634,7 +640,8 @@ def _stamps(path: Path, t: FloatArray, form: Form, wanted: CsvColumns, time: _Co
             unit, t = 'd', t - first
         words = '' if unit == 's' else ', a guess: --time-unit'
     t = t * SCALES[unit]
-    if usual * SCALES[unit] > LONGEST_STEP:
+    # Minutes and longer are no mistake for a finer unit, nor is what the user states.
+    if usual * SCALES[unit] > LONGEST_STEP and SCALES[unit] <= 1.0 and not wanted.time_unit:
         raise InputError(f'{path}: the samples are {usual * SCALES[unit]:g} s apart by '
                          f"'{time.name}': is it in ms, us or ns? Give --time-unit")
     return t, unit + words
@@ -727,9 +734,10 @@ def _throttle_unit(values: FloatArray, volts: FloatArray) -> str:
         return '1'
     if high <= 110.0:
         return '%'
-    if np.quantile(known[known > 0.0], WILD) >= 800.0 and high <= 2200.0:
+    negative = float(np.mean(values < -MOST_THROTTLE)) > WILD
+    if np.quantile(known[known > 0.0], WILD) >= 800.0 and high <= 2200.0 and not negative:
         return 'us'
-    if float(np.mean(values < -MOST_THROTTLE)) > WILD:
+    if negative:
         return next((f'{-end}:{end}' for end in _STICKS if high <= end), '1')
     # The thrust of a Crazyflie; other counts end at 10 000 at most.
     return '0:65535' if 10000.0 < high <= 65535.0 and values.min() >= 0.0 and (

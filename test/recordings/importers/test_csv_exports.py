@@ -513,6 +513,9 @@ def test_the_unit_of_a_throttle(tmp_path):
     # Pulses in ms.
     pulses = written(tmp_path, 't,U,Throttle\n0,12,1.1\n1,12,1.9\n', 'd.csv')
     np.testing.assert_allclose(read_recording(pulses).throttle, [0.1, 0.9])
+    # A stick at rest.
+    stick = written(tmp_path, 't,U,Thr\n0,12,-1024\n1,12,-1024\n', 'f.csv')
+    np.testing.assert_allclose(read_recording(stick).throttle, [0.0, 0.0])
     # A duty below 0 runs a motor in reverse.
     duty = written(tmp_path, 't,U,duty [%]\n0,12,-50\n1,12,50\n', 'c.csv')
     np.testing.assert_allclose(read_recording(duty).throttle, [-0.5, 0.5])
@@ -651,6 +654,32 @@ def test_counts_of_unknown_size_and_mixed_units_are_refused(tmp_path):
         read_recording(written(tmp_path, volts + '300,3,A\n'))
     found = read_recording(written(tmp_path, 'Time,Value,Unit\n0,12,V\n1,3,A\n2,12,V\n'))
     assert found.voltage.tolist() == [12.0, 12.0]
+
+
+@pytest.mark.parametrize('header, row, words', [
+    ('Time (s),Vfas,A1', lambda k: f'{0.1 * k:.1f},0.0,{V[k]}', "'Vfas' is 0 or blank"),
+    ('Time(s),D0,A0,A1', lambda k: f'{0.1 * k:.1f},1,{k % 2},0', "no column 'voltage_v'")])
+def test_dead_sensors_and_logic_lines_are_no_voltage(header, row, words, tmp_path):
+    with pytest.raises(InputError, match=words):
+        read_recording(written(tmp_path, table([header], row)))
+
+
+def test_hours_between_samples_are_believed(tmp_path):
+    """A unit that is stated, and coarse, is not questioned; nor is that of the user."""
+    path = written(tmp_path, table(['Test Time / h,Voltage / V'], lambda k: f'{0.1 * k},{V[k]}'))
+    assert np.median(np.diff(read_recording(path).t)) == pytest.approx(360.0)
+    path = written(tmp_path, table(['time_s,voltage_v'], lambda k: f'{360 * k},{V[k]}'))
+    with pytest.raises(InputError, match='360 s apart'):
+        read_recording(path)
+    assert read_recording(path, columns=CsvColumns(time_unit='s')).n == N
+
+
+def test_a_line_of_decimals_has_no_names(tmp_path):
+    """A battery tester writes a line for each step between the names and the first record."""
+    path = written(tmp_path, table(
+        [',,Record,Time,Total Time,Voltage(V)', '1,0.02,0.33,1465.46,0.10,Rest'],
+        lambda k: f',,{k},{0.1 * k:.1f},{0.1 * k:.1f},{V[k]}'))
+    assert read_recording(path, partial=True).voltage.tolist() == V.tolist()
 
 
 @pytest.mark.parametrize('row', [
