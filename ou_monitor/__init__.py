@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from ou_monitor.online.notch import AdaptiveNotch
     from ou_monitor.online.risk.first_passage import brownout_probability
     from ou_monitor.online.settings import MonitorSettings
+    from ou_monitor.recordings.importers.log import CsvColumns
     from ou_monitor.recordings.read import read_recording
     from ou_monitor.records import Estimate, Flag, Recording, Status
     from ou_monitor.report.result import Result
@@ -30,6 +31,7 @@ __version__ = '0.3.0'
 _HOMES = {
     'AdaptiveLowPass': 'ou_monitor.online.filter.lowpass',
     'AdaptiveNotch': 'ou_monitor.online.notch',
+    'CsvColumns': 'ou_monitor.recordings.importers.log',
     'Estimate': 'ou_monitor.records',
     'Flag': 'ou_monitor.records',
     'InputError': 'ou_monitor.errors',
@@ -48,10 +50,10 @@ _HOMES = {
 }
 
 __all__ = [
-    'AdaptiveLowPass', 'AdaptiveNotch', 'Estimate', 'Flag', 'InputError', 'MonitorSettings',
-    'Recording', 'Result', 'SlidingEstimator', 'Status', 'SupplyFacts', 'SupplyMonitor',
-    '__version__', 'analyze', 'brownout_probability', 'compare', 'coupling', 'design', 'discover',
-    'read_recording', 'reproduce', 'simulate', 'supply_facts',
+    'AdaptiveLowPass', 'AdaptiveNotch', 'CsvColumns', 'Estimate', 'Flag', 'InputError',
+    'MonitorSettings', 'Recording', 'Result', 'SlidingEstimator', 'Status', 'SupplyFacts',
+    'SupplyMonitor', '__version__', 'analyze', 'brownout_probability', 'compare', 'coupling',
+    'design', 'discover', 'read_recording', 'reproduce', 'simulate', 'supply_facts',
 ]
 
 

@@ -96,7 +96,7 @@ def _unit_items(recording: Recording) -> list[QualityItem]:
             'swap the leads of the sensor, or change the sign.')))
     step = float(np.median(np.diff(recording.t))) if recording.n > 1 else 0.0
     slow = step > _LONG_STEP or (step > _SLOW and recording.duration > _LONG_FLIGHT)
-    if slow and not clock_unit(recording.t[0]):
+    if slow and not clock_unit(recording.t[0]) and 'time_unit' not in recording.source:
         items.append(QualityItem('TIME_UNIT', Severity.WARNING, (
             f'The samples are {step:.3g} s apart, over {recording.duration / 3600.0:.3g} hours: '
             'is the unit of time smaller? If so, all rates and times are wrong by a factor of '

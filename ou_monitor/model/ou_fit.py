@@ -44,8 +44,8 @@ from ou_monitor.records import determined, FloatArray, MOST_READINGS, OU_WINDOWS
 # Minimum evidence for a relaxation over white noise alone, nats: more than white noise reached in
 # any window of 120 simulated recordings (test_ou_fit.py repeats a part).
 VISIBLE = 12.0
-# Distance of the level's knots, s; minimum number of parts.
-_HATS, _PARTS = 5.0, 3
+# Distance of the level's knots, s, at 1 Hz or faster; minimum readings a knot; minimum parts.
+_HATS, _PER_KNOT, _PARTS = 5.0, 5, 3
 # Lags, s, of throttle and current: from an ESC to polarisation.
 _LAGS = (0.004, 0.02, 0.06, 0.3, 1.0, 4.0)
 # Maximum shift of throttle and current, samples, and number of readings used to find it.
@@ -203,7 +203,8 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
         dt = sum(t[s.stop - 1] - t[s.start] for s in parts) / max(
             1, sum(s.stop - s.start - 1 for s in parts))
     span = float(t[-1] - t[0])
-    knots = np.linspace(t[0], t[-1], max(_PARTS, math.ceil(span / _HATS)) + 1)
+    apart = max(_HATS, _PER_KNOT * span / t.size)
+    knots = np.linspace(t[0], t[-1], max(_PARTS, math.ceil(span / apart)) + 1)
     level = [np.interp(t, knots, row) for row in np.eye(knots.size)]
     taus = [tau for tau in _LAGS if 0.5 * dt < tau < span / 3.0]
     u, i = _fill_gaps(t, u), _fill_gaps(t, i)

@@ -150,8 +150,10 @@ def tidy(raw: RawColumns) -> Recording:
     notes, t = [*raw.notes, *said], t[which]
     if not t.size:
         raise InputError(unusable_words(name, notes))
-    # Dates are in s.  Cheap test first: with this median spacing, the mean is at least half of it.
-    if (t.size > 2 and t[-1] - t[0] >= 0.5 * _SPARSE * (t.size - 1) - 1.0 and not clock_unit(t[0])
+    # Dates are in s, and other units than s are stated.
+    stated = clock_unit(t[0]) or 'time_unit' in raw.source
+    # Cheap test first: with this median spacing, the mean is at least half of it.
+    if (t.size > 2 and t[-1] - t[0] >= 0.5 * _SPARSE * (t.size - 1) - 1.0 and not stated
             and (spacing := float(np.median(np.diff(t)))) >= _SPARSE):
         notes.append(f'The samples are {spacing:.4g} s apart: is the time in ms, us or ns? '
                      'Give --time-unit for a CSV.')

@@ -152,6 +152,7 @@ class Form(NamedTuple):
     names: tuple[str, ...]  # Names of the columns as written, else 'column 1' and so on
     units: tuple[str, ...]  # As stated, '' if not stated
     width: int  # Cells of a row
+    indent: int  # Blank cells before each row of this table, if outer tables have other rows
     rows: tuple[tuple[str, ...], ...]  # The first rows
     step: float  # From row to row, s; NaN: not stated
     stated: str  # Words that state the step
@@ -187,6 +188,8 @@ def form_of(path: Path, wanted: CsvColumns) -> Form:
             f'"[-+]?{both}[^",]*"' if delimiter == ',' else both, text)), '')
         if not known and delimiter == ',' and _OF_QUOTED.search(text) and _OF_PLAIN.search(text):
             known = '.'
+        if not known and delimiter == ',' and _names_half(_split(lines, ',', False, '')):
+            known = ','
         for mark in known or '.,':
             if mark == delimiter and not (known or _QUOTED.search(text)) or (
                     best and delimiter == ' ' and best[1].width > 1):
@@ -254,6 +257,12 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool, ma
                       for row in rows[skip:first]):
         # The names do not fit the columns: rows have lost or gained cells.
         return None
+    # Battery testers indent the names and rows of an inner table by blank cells.
+    indent = next((k for k, name in enumerate(rows[at - 1]) if name), 0) if (
+        0 < at <= first) else 0
+    inner = [_of_table(row, indent) for row in rows[first:]]
+    indent *= any(map(any, inner))
+    rows[first:] = inner if indent else rows[first:]
     cells = [cell for row in rows[first:] for cell in row if cell]
     fit = sum(map(is_value, cells)) / max(len(cells), 1)
     above = lines[:max(first, 20)]
@@ -261,7 +270,8 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool, ma
     first_rows = tuple(tuple(row) for row in rows[first:] if any(row))
     return fit * (1.0 if width > 1 else 0.4) + 0.01 * min(width, 20) / 20, Form(
         encoding, delimiter, comma, mark, first, at, labels, ''.join(lines[:first]),
-        tuple(names), _units_of(names, words, rows, first), width, first_rows, step, stated)
+        tuple(names), _units_of(names, words, rows, first), width, indent, first_rows, step,
+        stated)
 
 
 def _split(lines: list[str], delimiter: str, comma: bool, mark: str) -> list[list[str]]:
@@ -274,7 +284,30 @@ def _split(lines: list[str], delimiter: str, comma: bool, mark: str) -> list[lis
                 skipinitialspace=True), [])])
         except csv.Error:
             rows.append([])
-    return [list(map(_with_point, row)) for row in rows] if comma and delimiter == ',' else rows
+    if comma and delimiter == ',':
+        half = _names_half(rows)
+        return [_joined(row, half) or list(map(_with_point, row)) for row in rows]
+    return rows
+
+
+def _names_half(rows: list[list[str]]) -> int:
+    """Return the number of names above rows of twice as many whole numbers, else 0."""
+    # Unquoted decimal commas between commas split each number in two.
+    filled = [row for row in rows if any(row)]
+    first = next((k for k, row in enumerate(filled) if _joined(row, len(row) // 2)), 0)
+    size, below = len(filled[first - 1]) if first else 0, filled[first:]
+    return size if sum(bool(_joined(row, size)) for row in below) > max(1, len(below) // 2) else 0
+
+
+def _joined(row: list[str], names: int) -> list[str]:
+    """Return the numbers of a row of twice as many whole numbers as names, else no cells."""
+    split = len(row) == 2 * names and all(map(re.compile(r'[-+]?\d+').fullmatch, row))
+    return [f'{whole}.{part}' for whole, part in zip(row[::2], row[1::2])] if split else []
+
+
+def _of_table(row: list[str], indent: int) -> list[str]:
+    """Return a row, emptied if it belongs to an outer table, as battery testers write them."""
+    return [] if any(cell.strip() for cell in row[:indent]) else row
 
 
 def _labels_of(rows: list[list[str]]) -> tuple[str, ...]:
@@ -605,12 +638,14 @@ def _blocks(path: Path, file: TextIO, form: Form, width: int,
         try:
             rows = list(islice(reader, _BLOCK))
             if form.comma and form.delimiter == ',':
-                rows = [list(map(_with_point, row)) for row in rows]
+                rows = [_joined(row, width) or list(map(_with_point, row)) for row in rows]
         except csv.Error as error:
             raise InputError(f'{path}:{form.skip + reader.line_num}: {error}: close each quote '
                              'in its line') from error
         if not rows:
             return
+        if form.indent:
+            rows = [_of_table(row, form.indent) for row in rows]
         if reader.line_num - before > len(rows):
             for k, row in enumerate(rows):
                 if any(line.count(form.delimiter) >= width - 1

@@ -86,7 +86,8 @@ _PATTERNS = {
     logs.THROTTLE: (
         r'throttle', r'thr(?:ottle)?_?(?:out|cmd|command|pct|percent)?|ga[sz]|'
         r'acelerador|油门|duty(?:_cycle)?|tho?o|tps|tastgrad|tastverh.*',
-        r'rc_?command_3|rc_?out?(?:_?ch?_?3)?|servo3_raw',
+        r'rc_?command_3',
+        r'rc_?data_3|rc_?out?(?:_?ch?_?3)?|servo3_raw',
         r'pwm|rc_?out?_?ch?_?1|thrust|gas_?(?:kanal|stellung|hebel)|esc(?:_signal|_pwm)?|'
         r'(?!.*(?:limit|trim|max|min)).*throttle.*'),
     logs.CURRENT: (
@@ -153,6 +154,8 @@ def read_csv(path: Path, columns: CsvColumns | None = None, *, partial: bool = F
     held = {quantity: values for quantity, (_, values) in table.found.items()}
     source = {'file': name, 'format': 'csv', **{
         quantity: printable(one.name) for quantity, (one, _) in table.found.items()}}
+    if table.time.unit not in ('', 's'):
+        source['time_unit'] = table.time.unit
     current = held.get(logs.CURRENT, nothing)
     if 2 * np.isfinite(current[np.isfinite(volts)]).sum() < np.isfinite(volts).sum():
         # Most rows with a voltage have no current: hold the last current.
@@ -400,14 +403,13 @@ def _time_of(path: Path, form: Form, wanted: CsvColumns) -> _Column:
 
 
 def _finest(form: Form, first: int) -> int:
-    """Return a finer time if the chosen one, in whole seconds, does not tell the rows apart."""
+    """Return another time if the chosen one starts anew or does not tell the rows apart."""
     named = [k for k in range(min(form.width, len(form.names)))
              if (re.search('time|zeit', form.names[k].lower()) or form.units[k] in TIME_WORDS)
              and not re.search(
                  'step|lap|interval', form.names[k].lower()) and _holds_numbers(form, k, True)]
-    apart = [k for k in (first, *named) if (
-        2 * len({*form.cells(k)}) > len(form.rows) or len(form.rows) < _FEW_ROWS)]
-    return first if first in apart else next((k for k in apart if _rises(form, k)), first)
+    return next((k for k in (first, *named) if _rises(form, k) and (
+        2 * len({*form.cells(k)}) > len(form.rows) or len(form.rows) < _FEW_ROWS)), first)
 
 
 def _parts_of_second(form: Form, clock: int) -> _Column | None:
@@ -452,10 +454,11 @@ def _steadiest(form: Form, places: list[int]) -> list[int]:
 
 
 def _rises(form: Form, place: int) -> bool:
-    """Return whether a column without a name never falls in the first rows."""
+    """Return whether the times in a column never fall in the first rows."""
     cells = form.cells(place)
-    return not all(map(is_number, cells)) or bool(
-        (np.diff([number_of(cell)[0] for cell in cells]) >= 0.0).all())
+    times = [number_of(cell)[0] for cell in cells] if all(map(is_number, cells)) else (
+        clock_times(Path(), cells, form.names[place], []))
+    return not (np.diff(times) < 0.0).any()
 
 
 def _unit_column(form: Form, place: int, unit: str | None) -> _Column:
@@ -781,4 +784,4 @@ def _read_note(form: Form, time: _Column, found: dict[str, _Column], units: dict
         also += f'; not read: {some(rest, 3)} ({options})' if rest else ''
     return (f"Read {', '.join(parts)}{also}; cells between {between}, decimal "
             f"{'comma' if form.comma else 'point'}{encoding}, numbers from line "
-            f'{form.skip + 1} on.')
+            f'{form.skip + 1} on{", without rows of outer tables" * (form.indent > 0)}.')

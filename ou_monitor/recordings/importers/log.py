@@ -175,7 +175,16 @@ def unusable_words(name: str, notes: Iterable[str]) -> str:
 
 @dataclass(frozen=True)
 class CsvColumns:
-    """How to read a CSV; None: detected."""
+    """
+    How to read a CSV; None: detected.
+
+    Examples
+    --------
+    >>> from ou_monitor import CsvColumns
+    >>> CsvColumns(voltage='Vbat', unit='mV', sample_interval=0.01).unit
+    'mV'
+
+    """
 
     # Names of columns; 'none' leaves the throttle or the current out.
     time: str | None = None

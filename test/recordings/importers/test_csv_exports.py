@@ -3,6 +3,7 @@
 from datetime import datetime, timedelta
 
 import numpy as np
+from ou_monitor.analysis.analyze import analyze
 from ou_monitor.cli.main import main
 from ou_monitor.errors import InputError
 from ou_monitor.recordings.importers.choose import choose, columns_of
@@ -374,7 +375,7 @@ def test_an_export_is_read_without_an_option(form, tmp_path):
     assert (found.current is not None) == current
     if current:
         np.testing.assert_allclose(found.current, AMPS, rtol=0.0, atol=6e-3)
-    assert len(found.source) == 3 + throttle + current
+    assert len({*found.source} - {'time_unit'}) == 3 + throttle + current
     said = [note for note in found.notes if note.startswith('Read time from')]
     assert len(said) == (form != 'plain')
     # Dates are not taken for a time in ms.
@@ -672,14 +673,35 @@ def test_hours_between_samples_are_believed(tmp_path):
     with pytest.raises(InputError, match='360 s apart'):
         read_recording(path)
     assert read_recording(path, columns=CsvColumns(time_unit='s')).n == N
+    for unit in ('ms', 'h'):
+        path = written(tmp_path, table([f'Time ({unit}),voltage'], lambda k: f'{9000 * k},{V[k]}'))
+        found = analyze(read_recording(path))
+        assert not any('apart' in note for note in found.recording.notes) and not any(
+            item.name == 'TIME_UNIT' for item in found.quality)
 
 
-def test_a_line_of_decimals_has_no_names(tmp_path):
-    """A battery tester writes a line for each step between the names and the first record."""
-    path = written(tmp_path, table(
-        [',,Record,Time,Total Time,Voltage(V)', '1,0.02,0.33,1465.46,0.10,Rest'],
-        lambda k: f',,{k},{0.1 * k:.1f},{0.1 * k:.1f},{V[k]}'))
-    assert read_recording(path, partial=True).voltage.tolist() == V.tolist()
+def test_rows_of_outer_tables_are_left_out(tmp_path):
+    """A battery tester writes a line for each cycle and step above its indented records."""
+    names = ['Cycle,Cap(Ah),Time', ',Step,Name,End(V),Time',
+             ',,Record,Time,Total Time,Voltage(V),Date']
+    path = written(tmp_path, table(names, lambda k: (
+        f'{k // 30},0.02,0.33\n,{k // 10},Rest,{V[k]},0:01:00\n' * (k % 10 == 0) +
+        f',,{k},0:00:{k % 10:02},0:00:{k:02},{V[k]},02/21/2020 10:32:{k:02}')))
+    found = read_recording(path)
+    assert found.voltage.tolist() == V.tolist() and np.ptp(found.t) == N - 1
+    assert 'without rows of outer tables' in found.notes[0]
+
+
+def test_decimal_commas_between_commas(tmp_path):
+    """Each number takes two cells of a row; a row of another width is refused."""
+    rows = [[german(f'{one:.3f}') for one in (20.0 * k, V[k], -AMPS[k])] for k in range(N)]
+    text = 'Time (ms),Voltage (V),Current (A)\n' + ''.join(','.join(row) + '\n' for row in rows)
+    found = read_recording(written(tmp_path, text))
+    np.testing.assert_allclose(found.voltage, V)
+    np.testing.assert_allclose(found.t, 0.02 * K)
+    np.testing.assert_allclose(found.current, -AMPS)
+    with pytest.raises(InputError, match=':62: 5 cells'):
+        read_recording(written(tmp_path, text + '1200,000,15,300,2\n'))
 
 
 @pytest.mark.parametrize('row', [
