@@ -1,5 +1,5 @@
 """
-The ARMA(1,1) of a sampled or block-averaged OU with white noise, and the errors of its parameters.
+ARMA(1,1) form of a sampled or block-averaged OU with white noise, and errors of the OU parameters.
 
 Samples of an OU are AR(1); white noise on top, or averaging over blocks, makes
 them ARMA(1,1): z_j - phi z_{j-1} = e_j - theta e_{j-1}, with phi = exp(-alpha D)
@@ -26,8 +26,8 @@ def block_autocovariance(a: float, m: int) -> tuple[float, float]:
     r = math.exp(-a / m)
     short, long = -math.expm1(-a / m), -math.expm1(-a)
     if a < 1e-3:
-        # The two terms of gamma0 cancel to order a; this series is accurate to 1e-9:
-        # 1 - mean |i-j|/m a + mean (|i-j|/m)^2 a^2/2 - mean (|i-j|/m)^3 a^3/6.
+        # The two terms of gamma0 cancel to order a; this series is accurate to 1e-9, with
+        # x = |i-j|/m: 1 - a mean(x) + a^2 mean(x^2)/2 - a^3 mean(x^3)/6.
         k = float(m)
         one = (k * k - 1.0) / (3.0 * k * k)
         two = (k * k - 1.0) / (6.0 * k * k)
@@ -40,7 +40,7 @@ def block_autocovariance(a: float, m: int) -> tuple[float, float]:
 
 
 def theta_at(a: float, m: int, share: float) -> float:
-    """Return the moving-average coefficient at a noise share."""
+    """Return the moving-average coefficient theta at a noise share lam."""
     phi = math.exp(-a)
     gamma0, gamma1 = block_autocovariance(a, m)
     gamma0 += share
@@ -51,16 +51,16 @@ def theta_at(a: float, m: int, share: float) -> float:
 def log_covariance(a: float, theta: float, m: int, n: int) -> tuple[float, float, float]:
     """Return the variances of ln(alpha), ln(sigma) and ln(Var_inf) from n blocks."""
     # The covariance of (phi, theta) is (1 - phi theta)/(phi - theta)^2 / n times [[(1-phi^2)(1-phi
-    # theta), (1-phi^2)(1-theta^2)], [., (1-theta^2)(1-phi theta)]], and the variance of ln q is
-    # 2/n (Box & Jenkins, Time Series Analysis, 7.2.6); the delta method gives those of the
-    # logarithms.
+    # theta), (1-phi^2)(1-theta^2)], [., (1-theta^2)(1-phi theta)]], and the variance of ln q, with
+    # q = Var e, is 2/n (Box & Jenkins, Time Series Analysis, 7.2.6); the delta method gives the
+    # variances of the other logarithms.
     phi = math.exp(-a)
     one, other = -math.expm1(-2.0 * a), 1.0 - theta * theta
     cross, apart = 1.0 - phi * theta, phi - theta
     common = cross / (apart * apart * n)
     v_phi, v_theta, v_cross = (common * one * cross, common * other * cross,
                                common * one * other)
-    # ln sigma^2 = ln q - ln q~(a, theta): derivatives of ln q~.
+    # Derivatives of ln q~(a, theta), with ln sigma^2 = ln q - ln q~: q~ is q at sigma = 1.
     d_t = 1.0 / apart + phi / cross
     d_a = 2.0 * phi * phi / one + phi / apart - phi * theta / cross - 1.0 / a - 1.0 / m
     if m > 1:

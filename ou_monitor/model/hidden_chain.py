@@ -14,19 +14,20 @@ from operator import mul
 import numpy as np
 from ou_monitor.records import FloatArray
 
-# Products, and levels of pairwise products, between two normalisations.  They do not underflow,
-# because the largest density of each sample is scaled to 1.
+# Number of products, and of levels of pairwise products, between two normalisations.  So few do
+# not underflow, because the largest density of each sample is scaled to 1.
 _EVERY, _LEVELS = 8, 3
-# Samples per block, over the square root of all samples: below 1, because an iteration over blocks
-# costs more.
+# Samples per block, relative to the square root of the number of samples: below 1, because a step
+# within the blocks (arrays) costs more than a step from block to block (plain Python).
 _SHORT = 0.4
-# Probability that counts as 0: no possible state explains the sample.
+# Probability below which a sample counts as impossible in every state.
 _NONE = 1e-300
 
 
 def forward(log_density: FloatArray, transition: FloatArray, start: FloatArray
             ) -> tuple[FloatArray, FloatArray]:
-    """Return the law of the states before each sample, and the log density of each sample."""
+    """Return the state probabilities before each sample, and the log density of each sample."""
+    # log_density: of a sample given the state before it and the state at it, shape (n, k, k).
     n, k, _ = log_density.shape
     top, padded = _in_blocks(log_density, transition)
     size, blocks = padded.shape[0], padded.shape[3]
@@ -92,14 +93,14 @@ def _largest(log: FloatArray) -> FloatArray:
 
 
 def _in_blocks(log_density: FloatArray, transition: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return each sample's scale, and the scaled products, shape (size, k, k, blocks)."""
+    """Return the log of each sample's scale, and scaled factors, shape (size, k, k, blocks)."""
     n, k, _ = log_density.shape
     log: FloatArray = log_density.transpose(1, 2, 0)
     size = max(1, round(_SHORT * math.sqrt(n)))
     blocks = -(-n // size)
     top = _largest(log)
     padded = np.empty((size, k, k, blocks))
-    # The last block is padded with samples without information.
+    # The last block is padded with samples whose density is 1 in all states.
     row = np.zeros(blocks * size)
     for i, j in np.ndindex(k, k):
         np.exp(log[i, j] - top, out=row[:n])
@@ -129,7 +130,7 @@ def _before_blocks(padded: FloatArray, start: FloatArray) -> FloatArray:
 
 
 def _normalised(weight: FloatArray, start: FloatArray) -> FloatArray:
-    """Return weights, shape (k, blocks), normalised, or the initial law if all are too small."""
+    """Normalise weights, shape (k, blocks); columns that sum to about 0 become `start`."""
     total = weight.sum(axis=0)
     fresh = (start / start.sum())[:, None]
     law: FloatArray = np.where(total >= _NONE, weight / np.maximum(total, _NONE), fresh)

@@ -7,10 +7,10 @@ tridiagonal; its banded Cholesky factor, in the order of time, is the
 information form of the Kalman filter (Rue & Held, Gaussian Markov Random
 Fields, 2005).
 
-If the model is constant, the gain converges: it is computed from the first samples, and a filter
-with constant gain does the rest.
+If the model is constant, the gain converges: it is computed for the first samples only, and a
+filter with constant gain processes the rest.
 
-Limits: Q_k must be regular and R_k above 0 (without measurement noise, use a millionth
+Limits: Q_k must be invertible and R_k above 0 (without measurement noise, set R_k to a millionth
 of Q_k); the cost grows with the square of the number of states.
 """
 
@@ -29,31 +29,31 @@ from scipy.signal import lfilter
 class StateSpace:
     """A model over n samples with d states."""
 
-    # Transition into each sample; the first is not used; shape (n, d, d).
+    # Transition matrices into each sample; the first is not used; shape (n, d, d).
     f: FloatArray
-    # Covariance of the noise added in that transition, V^2; for the first sample, covariance of
-    # the state; shape (n, d, d).
+    # Covariance of the noise added in each transition, V^2; the first is the covariance of the
+    # initial state; shape (n, d, d).
     q: FloatArray
     h: FloatArray  # Observation vector; shape (d,)
     r: FloatArray  # Variance of the measurement noise, V^2, > 0; shape (n,)
 
 
 class Filter:
-    """Gains of a model; filters series.  ValueError: the precision is not positive definite."""
+    """Kalman filter of a model.  Raises ValueError if a covariance is singular or not finite."""
 
     def __init__(self, model: StateSpace, n: int | None = None) -> None:
-        # After the samples of the model, its matrices and the gain are constant.
+        # Samples to filter; after the samples of the model, matrices and gain are constant.
         self._n = model.f.shape[0] if n is None else n
-        # Samples with their own gain, and states; variance of the innovations, V^2, shape (n,).
+        # Number of samples with their own gain, and number of states.
         self.shape = (model.f.shape[0], model.f.shape[1])
-        self.variance: FloatArray = self._solve(model)
+        self.variance: FloatArray = self._solve(model)  # Of the innovations, V^2, shape (n,)
         if self._n > model.f.shape[0]:
             self._steady = _SteadyFilter(self._last_loop, self._gain[-2], self._look[-2])
             more = np.full(self._n - model.f.shape[0] + 1, self.variance[-2])
             self.variance = np.concatenate((self.variance[:-1], more))
 
     def _solve(self, model: StateSpace) -> FloatArray:
-        """Compute the gains, segment by segment; return the variances."""
+        """Compute the gains, segment by segment; return the variances of the innovations."""
         h = model.h
         n, d = model.f.shape[0], model.f.shape[1]
         self._gain, self._look = np.empty((n, d)), np.empty((n, d))
@@ -90,13 +90,13 @@ class Filter:
             for i, j in np.argwhere(_pattern(loop)).tolist():
                 band[first - 1:end - 1, j, d + i - j] = -loop[i, j, first - begin:]
             if end - begin > 1:
-                # Use the gain before the last, because the last one assumes that no step follows.
+                # As for the constant gain in __init__, the last sample but one.
                 self._last_loop = loop[..., -2].copy()
         self._band_of_loop = band.reshape(n * d, 2 * d).T
         return variance
 
     def innovations(self, y: FloatArray) -> FloatArray:
-        """Return one-step innovations."""
+        """Return the one-step innovations of a series, (n,), or of p series, (n, p)."""
         columns = y[:, None] if y.ndim == 1 else y
         length = self._gain.shape[0]
         if length == self._n:
@@ -104,7 +104,7 @@ class Filter:
         else:
             e = np.empty_like(columns, dtype=np.float64)
             e[:length], state = self._states(columns[:length])
-            # The gain at the last solved sample differs from that at inner ones.
+            # Start with the state of the last sample but one, whose gain is the constant gain.
             e[length - 1:] = self._steady.innovations(columns[length - 1:], state[-2])
         return e[:, 0] if y.ndim == 1 else e
 
@@ -124,7 +124,7 @@ class Filter:
 
 # Maximum condition number of the eigenvectors for filtering the modes one by one.
 _DISTINCT = 1e10
-# Samples filtered at once otherwise.
+# Number of samples filtered at once if the modes cannot be filtered one by one.
 _CHUNK = 4096
 
 
@@ -213,7 +213,7 @@ def _multiply(a: FloatArray, b: FloatArray, left: Pattern, right: Pattern) -> Fl
 
 def _symmetric(a: FloatArray, b: FloatArray, left: Pattern, right: Pattern, out: FloatArray
                ) -> None:
-    """Write the symmetric product a^T b into `out` (zeros)."""
+    """Write the symmetric product a^T b into `out`, which must be zero."""
     for k, i in np.argwhere(left).tolist():
         for j in np.flatnonzero(right[k, :i + 1]).tolist():
             out[i, j] += a[k, i] * b[k, j]
@@ -222,7 +222,7 @@ def _symmetric(a: FloatArray, b: FloatArray, left: Pattern, right: Pattern, out:
 
 
 def _inverse(a: FloatArray) -> FloatArray:
-    """Invert positive definite matrices, shape (d, d, n), by their Cholesky factors; else NaN."""
+    """Invert matrices, shape (d, d, n), by Cholesky factors; NaN if not positive definite."""
     d = a.shape[0]
     if d == 1:
         return 1.0 / a
@@ -266,15 +266,15 @@ _ELEMENTS = 2e6
 
 
 def _filtered(f: FloatArray, q: FloatArray, h: FloatArray, r: FloatArray) -> FloatArray:
-    """Return filtered covariances, shape (d, d, n); q of the first sample is its prior."""
+    """Return filtered covariances, shape (d, d, n); the first q is the prior covariance."""
     d, n = f.shape[0], f.shape[2]
     turns = _pattern(f)
     weight = _inverse(q)
     known = _pattern(weight)
-    # What is not finite is refused below.
+    # Values that are not finite are rejected below.
     with np.errstate(over='ignore', invalid='ignore'):
         forward = _multiply(weight, f, known, turns)
-    # Information on this sample from the step into the next one.
+    # Information on each sample from the step into the next one.
     back = np.zeros_like(f)
     _symmetric(f[..., 1:], forward[..., 1:], turns, known @ turns, back[..., :-1])
     diagonal = weight + back
@@ -299,8 +299,8 @@ _AT_ONCE = 1024
 def _band(diagonal: FloatArray, below: FloatArray) -> FloatArray:
     """Return a block bidiagonal or symmetric block tridiagonal matrix, lower band storage."""
     d, n = diagonal.shape[0], diagonal.shape[2]
-    # In LAPACK's order, column by column; written in segments, because writing an element for all
-    # samples at once would miss the caches.
+    # In LAPACK's order, column by column.  It is written in segments, because writing an element
+    # for all samples at once would cause cache misses.
     band = np.zeros((n, d, 2 * d))
     inside = [(i, j) for j in range(d) for i in range(j, d)]
     across = np.argwhere(_pattern(below)).tolist()

@@ -1,16 +1,16 @@
 """
-The voltage of a battery under load, from throttle alone, and the start values for the next flight.
+The voltage of a battery under load, from throttle or current, and start values for a next flight.
 
 Limits: the form and its constants were chosen on nine recordings (doc/load.md); charge is computed
-from throttle, so wind and payload cause errors; all motors follow one law.
+from the load, so with throttle, wind and payload cause errors; all motors follow one law.
 
 v = N E(s0 - q) - S [x + f1 LP(x, t1) + f2 LP(x, t2)] - S K (ul - LP(ul, 20 ms))_+
 x = ul^p (E/3.8)^(p-1) exp(-2 h), ul = LP(u, lag), dq = x dt / (mean x T), dh = (sag/V) dq,
-with LP(x, tau) a first-order low-pass of time constant tau.
+with u throttle, E(s) of `open_circuit`, h Ohmic heat, and LP(x, tau) a low-pass of order 1.
 
 The start values (the response to throttle at take-off) come from one craft and one pack on one
-day; the filter widens their errors by the scatter between packs.  They have no level, because the
-charge at take-off is unknown.
+day; the filter widens their errors by the scatter between packs.  They contain no level, because
+the charge at take-off is unknown.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ou_monitor.records import FloatArray, NAN
 
 Number = TypeVar('Number', float, FloatArray)
 
-# Voltage at which the size of the sag is defined, V: the plateau of a lithium-polymer cell.
+# Cell voltage at which the size of the sag is defined, V: the plateau of a lithium-polymer cell.
 CELL = 3.8
 # A full cell has 4.20 V; 50 mV allow for the error of the sensor.
 FULL_CELL = 4.25
@@ -33,17 +33,17 @@ FULL_CELL = 4.25
 # to a common table for hobby cells (7.7 mV rms).
 _KNEE_SIZE, _KNEE_RATE = -0.39705, 35.0
 _CUBIC = (3.66631, 0.35371, -0.22145, 0.41052)
-# Charge below which the curve is a straight line, and its slope, V, because an error of a few per
+# Charge below which a straight line replaces the curve, and its slope, V: an error of a few per
 # cent in the charge must not put a prediction beyond the knee.  Slopes of 0.6 to 2.0 V work.
 _KNEE, _KNEE_SLOPE = 0.079, 1.2
-# Relative change of the response with the open-circuit voltage of a cell, 1/V, in addition to the
-# propeller's (a pack warms as it empties), and its scatter between packs.  Measured between halves
-# of a flight or successive flights of four packs: 0.6 (gecko), 1.3 (nazgul), -0.1 +- 0.7 (hiro),
-# 0.5 (roma); mean and prediction error by DerSimonian & Laird, Control. Clin. Trials 7 (1986) 177.
+# Relative change of the response per volt of a cell's open-circuit voltage, 1/V, because a pack
+# warms as it empties (without the propeller's change), and its scatter between packs.  Measured
+# between halves of a flight or successive flights of four packs: 0.6, 1.3, -0.1 +- 0.7, and 0.5;
+# mean and prediction error by DerSimonian & Laird, Control. Clin. Trials 7 (1986) 177.
 WARMING, WARMING_SE = 0.7, 0.33
 # Time constant of the inrush, s: a motor's current settles in about 20 ms.
 INRUSH_TIME = 0.02
-# Fall of ln resistance per unit of charge and relative sag.  Without cooling (150 Wh/kg,
+# Decrease of ln(resistance) per unit of charge and relative sag.  Without cooling (150 Wh/kg,
 # 1 kJ/kg/K, -1.5 %/K) it would be 8; with cooling and wires it is 2, chosen on the recordings.
 _HEATING = 2.0
 
@@ -57,14 +57,14 @@ def open_circuit(charge: npt.ArrayLike) -> FloatArray:
     return np.asarray(curve + _KNEE_SLOPE * np.minimum(s - _KNEE, 0.0), dtype=np.float64)
 
 
-# The curve as a table: its inverse and its slope are read from here.
+# The curve as a table, for its inverse and its slope.
 CHARGES = np.linspace(-0.2, 1.1, 261)
 LEVELS = open_circuit(CHARGES)
 SLOPES = np.gradient(LEVELS, CHARGES)
 
 
 def charge_at(cell: float) -> float:
-    """Return the charge, 0..1, of a cell with that open-circuit voltage, V."""
+    """Return the charge, 0..1, of a cell with an open-circuit voltage of `cell`, V."""
     return float(np.interp(cell, LEVELS, CHARGES))
 
 
@@ -93,7 +93,7 @@ class LoadModel:
     cells: int  # Cells in series, N
     mean_load: float  # Mean of x over the recording, the load to which `endurance` refers
     charge: float = 0.7  # Charge at the first sample, s0, 0..1
-    size: float = 0.12  # Relative sag at full throttle at once, S/(3.8 N)
+    size: float = 0.12  # Immediate relative sag at full throttle, S/(3.8 N)
     power: float = 1.8  # Exponent p of current over throttle
     # Polarisation f1, relative to the sag, and its time constant t1, s.
     fast_share: float = 0.2
@@ -104,14 +104,14 @@ class LoadModel:
     inrush: float = 0.5  # Inrush at a step from rest to full throttle, K, relative to the sag
     lag: float = 0.01  # Lag of the sag behind throttle, s
     endurance: float = 350.0  # Time at the mean load that would empty a full pack, T, s
-    before: float = 0.3  # Load before the first sample, relative to `mean_load`
-    # Current at full load, A, negative if discharge is negative; 0: the load is throttle.
+    before: float = 0.3  # Mean load before the first sample, relative to `mean_load`
+    # Current at full load, A, negative if discharge currents are negative; 0: load is throttle.
     full_current: float = 0.0
     delay: float = 0.0  # Delay of the load behind the voltage, s
     constant_level: float = NAN  # Constant level, V; NaN: a lithium pack that discharges
 
     def sag(self, throttle: npt.ArrayLike) -> FloatArray:
-        """Return the sag, V, at constant throttle, of cold cells at 3.8 V."""
+        """Return the steady sag, V, at a throttle of 0..1, of cold cells at 3.8 V."""
         if self.full_current:
             raise ValueError('the load of this model is a current, not throttle')
         x = np.asarray(throttle, dtype=np.float64) ** self.power
@@ -140,7 +140,7 @@ class LoadModel:
                 x = x * (level / CELL) ** (self.power - 1.0)
         rest: FloatArray | float = self.constant_level
         if math.isnan(self.constant_level):
-            # Ohmic heat warms the pack, and a warm pack has less resistance.
+            # Ohmic heat warms the pack, which lowers its resistance.
             total = self.size * (1.0 + self.fast_share + self.slow_share)
             x = x * np.exp(-_HEATING * np.cumsum(total * x * x * dt / full))
             rest = self.cells * open_circuit(np.maximum(
@@ -152,17 +152,17 @@ class LoadModel:
         return np.asarray(rest - self.size * CELL * self.cells * response, dtype=np.float64)
 
 
-# Lags of the response in flight, s, a factor of 6 to 8 apart, so that sums of them follow any lag
-# from 0 to 10 s: motors (0.06), sensors and converters, polarisation (rounded medians of
-# `load_fit`: 2 and 15).
+# Time constants of the response in flight, s: motors (0.06), sensors and converters (0.35),
+# polarisation (2 and 15, rounded medians of `load_fit`).  They are a factor of 6 to 8 apart, so
+# that sums of their responses approximate any time constant up to 10 s.
 LAGS = (0.06, 0.35, 2.0, 15.0)
-# Lags after which the response may also be linear in throttle, s.
+# Those lags at which the response also has a part linear in throttle, s.
 LINEAR_LAGS = (0.35, 2.0)
-# Coefficients of x, u, u^3, x after LAGS, u after LINEAR_LAGS, and inrush, with x = u^1.8.
+# Number of coefficients: of x = u^1.8, u, u^3, x after LAGS, u after LINEAR_LAGS, and inrush.
 SIZE = 4 + len(LAGS) + len(LINEAR_LAGS)
-# Places of the coefficients in former model files, without x after 0.35 s and u after a lag.
+# Indices of the coefficients of former model files, which lack x after 0.35 s and u after lags.
 _FORMER = (0, 1, 2, 3, 5, 6, SIZE - 1)
-# A model file may omit the last entries.
+# Number of fields, the last of LoadStart, that a model file may omit.
 _OPTIONAL = 9
 _COLUMNS = ('coefficients', 'covariance', 'log_variance', 'flown')
 
@@ -172,17 +172,17 @@ class LoadStart:
     """The response to throttle, as learned by `LoadFilter`."""
 
     cells: float  # Cells in series.
-    volts: float  # Open-circuit voltage when it was learned, V.
-    # Voltage drop at full throttle, V, due to x, u, u^3, x after LAGS, u after LINEAR_LAGS, and
-    # inrush.
+    volts: float  # Open-circuit voltage when the response was learned, V.
+    # Voltage drop at full throttle, V, due to each of x, u, u^3, x after LAGS, u after
+    # LINEAR_LAGS, and inrush.
     coefficients: tuple[float, ...]
     covariance: tuple[tuple[float, ...], ...]  # Of the coefficients, V^2.
     discharge: float  # Charge drawn per time at full load, 1/s.
     # ln of the variance, V^2, of white noise: constant, and coefficients of ripple and sqrt|du|.
     log_variance: tuple[float, float, float]
     flown: tuple[float, float]  # 10 % and 90 % quantile of throttle.
-    delay: float = 0.0  # Delay of throttle, s.
-    resistance: float = 0.0  # Ohm; 0: no current that affects the voltage.
+    delay: float = 0.0  # Delay of the recorded throttle behind the voltage, s.
+    resistance: float = 0.0  # Ohm; 0: no measured current affects the voltage.
     resistance_se: float = 0.0  # Its standard error, Ohm.
     # Residual rms while throttle moves, V, and its standard error; 0: unknown.
     noise: float = 0.0
@@ -190,7 +190,7 @@ class LoadStart:
     size_se: float = 0.0  # Relative standard error of the size of the response; 0: unknown.
     # Mean open-circuit voltage of a cell where the size was measured, V; 0: unknown.
     level: float = 0.0
-    # Relative change of the size with it, 1/V, and its standard error.
+    # Relative change of the size per volt of that level, 1/V, and its standard error.
     warming: float = WARMING
     warming_se: float = WARMING_SE
 
@@ -240,7 +240,7 @@ class LoadStart:
 
 
 def _present(values: dict[str, Any]) -> dict[str, Any]:
-    """Add the coefficients that a former file lacks: zero, with the usual deviation."""
+    """Add the coefficients that a former file lacks: zero, with their prior variance."""
     try:
         a, P = np.array(values['coefficients']), np.array(values['covariance'])
     except ValueError:
@@ -267,14 +267,14 @@ def _numbers(value: Any) -> Any:
 
 
 def usual_coefficients() -> tuple[FloatArray, FloatArray, float]:
-    """Return mean and covariance of the coefficients, and mean sag, per volt: the prior."""
+    """Return prior mean and covariance of the coefficients, and mean sag, each per volt."""
     # The coefficients are S b with a log-normal S, median 0.12.  In b, the share that lags by 60
     # ms is beta(0.5, 1), the share that lags by 0.35 s normal(0.05, 0.1), the coefficients of u
     # and u^3 are normal(0, 0.2), of u after a lag normal(0, 0.1), and the others log-normal.  The
-    # first, of x, is 1 minus those shares minus 0.7 times the coefficients of u and u^3; x after a
-    # lag has -0.7 times the coefficient of u after that lag.  Of six
-    # sets of deviations (0.1 to 0.3 for 0.35 s, 0.07 to 0.2 for u after a lag), chosen on twelve
-    # recorded flights; their errors one second ahead differ by less than 1 %.
+    # coefficient of x is 1, less the two shares and 0.7 times the coefficients of u and u^3; the
+    # coefficient of x after a lag includes -0.7 times the coefficient of u after that lag.
+    # The deviations were chosen among six sets (0.1 to 0.3 for 0.35 s, 0.07 to 0.2 for u after a
+    # lag) on twelve recorded flights; their errors one second ahead differ by less than 1 %.
     def lognormal(median: float, deviation: float) -> tuple[float, float]:
         mean = median * math.exp(0.5 * deviation ** 2)
         return mean, mean ** 2 * math.expm1(deviation ** 2)

@@ -1,9 +1,9 @@
 """
 The load model of a recording: a maximum a posteriori fit.
 
-Limits: the priors are narrow, so that a parameter cannot run away if the recording does not
-determine it; a parameter at three prior deviations shows that the form is wrong.
-Residuals are white noise and an Ornstein-Uhlenbeck process of 20 s and of a few mV.
+Limits: the priors are narrow, to bound parameters that the recording does not determine; a fitted
+parameter three prior standard deviations off shows that the form of the model is wrong.
+Residuals are modelled as white noise and an OU of 20 s and of a few mV.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from ou_monitor.model.ou import first_order
 from ou_monitor.records import determined, FloatArray, log_interval, NAN
 from scipy.optimize import least_squares
 
-# Prior centre and deviation of each parameter (of its logarithm unless it is in _LINEAR): usual
-# figures of lithium-polymer packs with two RC pairs, tightened on the recordings; lag and
-# endurance widened again on simulated boats, planes and e-bikes (doc/load.md).
+# Prior centre and standard deviation of each parameter (of its logarithm unless in _LINEAR): usual
+# figures of lithium-polymer packs with two RC pairs, narrowed on the recordings; lag and endurance
+# were widened again on simulated boats, planes and e-bikes (doc/load.md).
 _PRIOR = {
     'size': (math.log(0.12), 0.7), 'power': (math.log(1.8), 0.1),
     'fast_share': (math.log(0.2), 0.3), 'fast_time': (math.log(1.0), 0.7),
@@ -32,29 +32,29 @@ _PRIOR = {
 }
 _NAMES = tuple(_PRIOR)
 _LINEAR = {'charge': (0.0, 1.05), 'before': (0.0, 1.5)}
-# Deviations and centres if the load is a current: its scale, and what it feeds, are unknown.
+# Deviations and centres that differ if the load is a current, whose scale and use are unknown.
 _OF_CURRENT = {'size': 2.0, 'fast_share': 0.7, 'slow_share': 0.7, 'endurance': 1.0}
 _CENTRE = {'endurance': math.log(2000.0)}
-# Prior deviation of a constant level, which replaces the charge, V per cell.
+# Prior deviation of a constant level, V per cell (it replaces the charge).
 _LEVEL_SD = 0.2
-# Delay of the load: steps tried at once to each side, and its maximum, s; it is used if the
-# residuals fall below this ratio.  Time constants of its fit, s: slower trends are removed; the
-# load also enters with this lag.
+# Search for the delay of the load: number of shifts tried to each side, and maximum delay, s;
+# ratio of the squared residuals below which the delay is used; time constants, s, of the high-pass
+# that removes trends and of the lag with which the load enters a second time.
 _SHIFTS, _LATEST, _PAYS, _SLOWER, _LATE = 10, 0.2, 0.95, 1.0, 0.06
 # Bounds of the parameters, in prior deviations from the centre.
 _REACH = 3.0
-# Before a fit, the data are averaged over this time, s (OU and polarisation are slower), or over
-# this share of a short recording; minimum number of samples.
+# Before a fit, the data are averaged over bins of this time, s (OU and polarisation are slower),
+# or this share of a short recording; minimum number of samples.
 _BIN, _BIN_SHARE, _LEAST = 0.05, 0.01, 20
-# The slow error of a load is an OU: its time constant, s, and the standard deviations tried, V per
-# cell (maximum: doc/load.md).
+# The slow error of the load model is an OU: its time constant, s, and the standard deviations
+# tried, V per cell (doc/load.md explains the maximum).
 SLOW_TIME = 20.0
 _SLOW_STDS = np.geomspace(0.001, 0.00464, 5)
-# Initial white and slow noise, V per cell: the order of magnitude of the recordings.
+# Initial standard deviations of white and slow noise, V per cell, typical of the recordings.
 _WHITE_START, _SLOW_START = 0.02, 0.01
-# Scales tried for standardised innovations, whose law has heavy tails.
+# Scales tried for the heavy-tailed distribution of standardised innovations.
 _SIZES = np.geomspace(0.05, 2.0, 40).tolist()
-# Rounds of fit and noise; evaluations of the model in each.
+# Rounds of fitting parameters, then noise; maximum number of model evaluations in each.
 _ROUNDS, _EVALUATIONS = 4, 30
 
 
@@ -62,16 +62,16 @@ _ROUNDS, _EVALUATIONS = 4, 30
 class LoadFit:
     """A fitted load model, and its errors."""
 
-    model: LoadModel  # The parameters
+    model: LoadModel
     # Covariance of the parameters as fitted: logarithms, except charge and before; shape (11, 11).
     covariance: FloatArray
     condition: float  # Condition number of the Jacobian in prior deviations
     noise_std: float  # White noise of a 50 ms mean, V
     slow_std: float  # Standard deviation of the OU of 20 s, V
-    evidence: float  # Log evidence (Laplace) for the load and the law of the level, nat
+    evidence: float  # Log evidence (Laplace) for this load and this kind of level, nats
 
     def draw(self, rng: np.random.Generator) -> LoadModel:
-        """Draw a model within the errors of this one."""
+        """Draw a model from the normal distribution of the fitted parameters, within bounds."""
         low, high, _, _ = _bounds(self.model)
         moved = rng.multivariate_normal(_theta(self.model), self.covariance)
         return _moved(self.model, np.clip(moved, low, high))
@@ -122,7 +122,7 @@ def _bounds(model: LoadModel) -> tuple[FloatArray, FloatArray, FloatArray, Float
 
 
 def timing(t: FloatArray, v: FloatArray, load: FloatArray) -> tuple[float, float]:
-    """Return the delay of a load, s, and 1 if the voltage falls with it, else -1."""
+    """Return the delay of a load, s, and 1 if voltage falls when the load rises, else -1."""
     dt = float(np.median(np.diff(t)))
     slow = min(_SLOWER, 0.3 * float(t[-1] - t[0]))
     left = v - lowpass(v, t, slow)
@@ -131,7 +131,7 @@ def timing(t: FloatArray, v: FloatArray, load: FloatArray) -> tuple[float, float
     found: dict[int, tuple[float, float]] = {}
 
     def try_around(middle: int, by: int) -> int:
-        """Try shifts in steps of `by` samples; return the best of all tried."""
+        """Try shifts around `middle` in steps of `by` samples; return the best shift so far."""
         for shift in sorted(range(middle - _SHIFTS * by, middle + _SHIFTS * by + 1, by), key=abs):
             if shift not in found and abs(shift) * dt <= _LATEST:
                 X = np.stack([np.interp(t + shift * dt, t, row) for row in loads])
@@ -144,14 +144,14 @@ def timing(t: FloatArray, v: FloatArray, load: FloatArray) -> tuple[float, float
     best = try_around(0, coarse)
     if coarse > 1:
         best = try_around(best, math.ceil(coarse / _SHIFTS))
-    # The end of the range is no minimum.
+    # A best shift at the end of the range is not a minimum.
     inside = abs(best) < max(found)
     best = best if inside and found[best][0] < _PAYS * found[0][0] else 0
     return best * dt, -1.0 if found[best][1] > 0.0 else 1.0
 
 
 class _Noise:
-    """White noise and OU: whitens residuals of binned data; stamps in s."""
+    """White noise plus a slow OU, to whiten the residuals of binned data."""
 
     def __init__(self, t: FloatArray, cells: int) -> None:
         self._keep = np.exp(-np.diff(t) / SLOW_TIME)
@@ -184,14 +184,14 @@ class _Noise:
         return self._found[1]
 
     def evidence(self, residuals: FloatArray) -> float:
-        """Return the log-likelihood, nat, of innovations with Student's t of 4 degrees."""
+        """Return the log-likelihood, nats, of innovations under Student's t, 4 degrees."""
         z, variance, _ = self.whiten(residuals)
-        # Heavy tails, because otherwise the squares of a few punch-outs would decide.
+        # With normal tails, the squares of a few short full-throttle bursts would decide.
         return float(max(np.sum(-2.5 * np.log1p(0.25 * (z / size) ** 2)) + z.size * math.log(
             0.375 / size) for size in _SIZES) - 0.5 * np.log(variance).sum())
 
     def learn(self, residuals: FloatArray) -> None:
-        """Fit both variances to residuals, V, of the model."""
+        """Fit the variances of both noises to residuals of the model, V."""
         for _ in range(2):
             self.white = float(np.mean(self.whiten(residuals)[2] ** 2))
             scores = []
@@ -209,8 +209,7 @@ def _template(t: FloatArray, voltage: FloatArray, throttle: FloatArray | None,
         raise ValueError('a fit of the load needs throttle or current')
     full = delay = 0.0
     if current is None:
-        # The mean is only a scale for `endurance`.  1.6 is below the prior's exponent, because the
-        # level explains a part of the effect.
+        # The mean only scales `endurance`, so its exponent need not be the fitted `power`.
         moving = load > 0.05
         mean = float((load[moving] ** 1.6).mean()) if moving.any() else 0.1
     else:
@@ -222,7 +221,7 @@ def _template(t: FloatArray, voltage: FloatArray, throttle: FloatArray | None,
 
 
 def _bins(t: FloatArray) -> tuple[Callable[[FloatArray], FloatArray], npt.NDArray[np.intp]]:
-    """Return a function that averages over bins, and the first sample of each bin."""
+    """Return a function that averages over bins, and the index of each bin's first sample."""
     width = min(_BIN, _BIN_SHARE * float(t[-1] - t[0]))
     index = np.floor((t - t[0]) / width + 1e-9).astype(int)
     starts = np.concatenate(([0], np.flatnonzero(np.diff(index)) + 1))
@@ -231,7 +230,7 @@ def _bins(t: FloatArray) -> tuple[Callable[[FloatArray], FloatArray], npt.NDArra
 
 
 def level_evidence(t: FloatArray, voltage: FloatArray) -> float:
-    """Return the log evidence for a constant level without a load, as in `LoadFit`."""
+    """Return the log evidence, comparable to LoadFit.evidence, for a constant level alone."""
     mean, _ = _bins(t)
     cells = cells_in_series(float(np.quantile(voltage, 0.99)))
     noise, left = _Noise(mean(t), cells), mean(voltage - np.median(voltage))
@@ -239,7 +238,7 @@ def level_evidence(t: FloatArray, voltage: FloatArray) -> float:
         noise.learn(left)
         one = noise.whiten(np.ones(left.size))[0]
         left = left - float(one @ noise.whiten(left)[0]) / float(one @ one)
-    # Laplace, with one parameter, at the centre of its prior.
+    # Laplace approximation for one parameter, at the centre of its prior.
     return noise.evidence(left) - 0.5 * math.log(float(one @ one) * (_LEVEL_SD * cells) ** 2)
 
 
@@ -248,8 +247,8 @@ def fit_load(t: FloatArray, voltage: FloatArray, throttle: FloatArray | None,
              left_out: tuple[float, float] | None = None, near: LoadFit | None = None) -> LoadFit:
     """Fit the load model to finite samples (s, V, 0..1), or with a current, A, as the load."""
     # The level is constant (`constant_level`) or follows a lithium pack.  Voltage between the
-    # stamps left_out, s, is not used.  `near`, a similar fit (such as that of all the voltage),
-    # provides the start, and the cells, scale and delay, which are not fitted.
+    # stamps left_out, s, is not used.  `near`, a similar fit (for example to all the voltage),
+    # provides the starting point, and the cells, scale and delay, which are not fitted.
     if t.size < _LEAST:
         raise ValueError(f'a fit of the load needs {_LEAST} samples, got {t.size}')
     if not (np.isfinite(voltage).all() and (np.diff(t) > 0.0).all()):

@@ -7,19 +7,19 @@ Fit an Ornstein-Uhlenbeck process and white noise to a voltage, together with le
    current; both loads enter directly and through several lags with free initial states.
 3. `fit_ou` fits the noise jointly with these regressors, by restricted likelihood in the frequency
    domain (`whittle.CrossSpectrum`).  Intervals are quantiles from importance sampling about all
-   maxima over the rate; the prior is flat in ln(alpha), and arcsine in the OU's share.
+   maxima over alpha; the prior is flat in ln(alpha) and arcsine in the OU's share of variance.
 
-`fit_pieces` fits what a regression has left: each frequency counts by the share that remains.
+`fit_pieces` fits residuals of an earlier regression, and allows for the power that it absorbed.
 
-The noise is white noise, the OU, and a random walk of the level.  Its size follows the load and
-its changes, and readings are weighted by it; otherwise errors of the load model would be fitted as
-a fast OU.  The walk, whose size has a prior and may be zero, absorbs changes of the level that the
-hats miss and that would be fitted as a slow OU.
+The model of the noise is white noise, the OU, and a random walk of the level.  The size of the
+noise follows the load and its changes, and readings are weighted by it; otherwise errors of the
+load model would be fitted as a fast OU.  The walk, whose size has a prior and may be zero, absorbs
+changes of the level that the hats miss and that would be fitted as a slow OU.
 
-Limits: samples are taken as evenly spaced between gaps; a relaxation slower than 2.5 s (a sixth of
-a window below 15 s) counts as level; OU and white noise change in proportion, and results are for
-their mean size.  Fitted as OU, although they are not: repeats or rounding of slow changes, a load
-that neither throttle nor current shows, and noise with another spectrum (a filtered sensor).
+Limits: samples are treated as evenly spaced between gaps; a relaxation slower than 2.5 s (a sixth
+of a window below 15 s) counts as level; OU and white noise are assumed to change in proportion,
+and results are for their mean size.  Wrongly fitted as OU: repeats or rounding of slow changes, a
+load that neither throttle nor current shows, and noise with another spectrum (a filtered sensor).
 
 Coverage of the 95 % intervals on 1200 simulated rails under a quad's throttle (alpha 2 to 500 1/s,
 50 to 1000 Hz, OU of 20 mV, white noise to 30 mV, windows of 20 s, or 8 s above 300 Hz): alpha 93 %
@@ -54,10 +54,10 @@ _DELAYS, _DELAY_READINGS = 4, 8000
 _FAR = 20
 # Minimum range of a throttle that moves.
 _MOVED = 0.01
-# Minimum gap, in usual steps (restarting at each lost message would cost more than the error of
-# its time); minimum number of readings between gaps.
+# Minimum gap, in median steps (below it, splitting the data would cost more than the error in
+# time); minimum number of readings between gaps.
 _GAP, _STRETCH = 5.0, 16
-# Minimum share of the readings that equal pieces must contain.
+# Minimum share of the readings that pieces of equal length must contain.
 _HELD = 0.8
 # The shortest of OU_WINDOWS that determines alpha within this factor is used, else the longest.
 # Selecting by the visibility of the relaxation instead would bias alpha, because in a short window
@@ -67,36 +67,36 @@ PRECISE = 1.5
 FEWEST = 40
 # Maximum number of elements in an array of the likelihood: 16 MB of complex numbers.
 _AT_ONCE = 1 << 20
-# Points of the first grid in ln(alpha), logit(share of the OU) and ln(walk); ends of the logit.
-# The upper end is close to share 1: if alpha dt = 0.004, white noise of 1e-3 of the variance is
-# half of the spectrum at the highest frequency.
+# Number of points of the first grid in ln(alpha dt), logit(share of the OU) and ln(walk); ends of
+# the logit.  The upper end is close to share 1, because at alpha dt = 0.004 white noise of 1e-3
+# of the variance is half of the spectrum at the highest frequency.
 _GRID, _LOGIT = (24, 16, 5), (-7.0, 12.0)
-# For the bounds: further points in logit(share) about the best of the grid, and steps that refine
-# the walk.
+# For the bounds: further points in logit(share) about the best of the grid, and successive steps
+# in ln(walk) that refine it.
 _ASIDE = np.linspace(-1.2, 1.2, 17)
 _REFINE = (1.2, 0.6, 0.3, 0.15)
-# Law of the noise's size: time constants, s, of the lagged loads whose differences are taken;
-# prior deviation of the coefficients; rounds of the fit.
+# Size of the noise: time constants, s, of the lagged loads whose differences are predictors;
+# prior standard deviation of the coefficients; rounds of the fit.
 _CHANGES, _SIZE_SD, _SIZE_ROUNDS = (0.03, 0.2, 1.0), 0.5, 12
 # Maximum number of steps towards the maximum, and convergence tolerance of a step.
 _LOOKS, _NEAR = 40, 0.05
-# Draws about the maxima in each round, and rounds; minimum share of the draws for a maximum.
+# Draws in each round, over all maxima; rounds; minimum share of the draws for a maximum.
 _DRAWS, _ROUNDS, _FEWEST_DRAWN = 1000, 4, 0.05
-# Other minima of the cost over the rate: maximum cost above the lowest, nats, to be refined, and
-# to count (e^-6 of the likelihood does not affect a 95 % interval).
+# A minimum of the cost at another alpha is refined, and then kept, if it exceeds the lowest by
+# less than these, nats (e^-6 of the likelihood does not affect a 95 % interval).
 _REFINED, _RIVAL = 10.0, 6.0
 # A window is imprecise above this standard deviation of ln(alpha) (from the curvature at the
 # maximum, times 1.2): among 437 simulated windows, the 190 precise ones had at most 0.28.
 _IMPRECISE = 0.37
-# Usual walk of the level, V per sqrt(s) and cell, and prior deviation of its logarithm above that:
-# walks of .0015 to .015 fit the recordings (doc/load.md).
+# Usual walk of the level, V per sqrt(s) and cell; above it, prior standard deviation of its
+# logarithm.  Walks of .0015 to .015 fit the recordings (doc/load.md).
 _WALK, _WALK_SD = 0.004, 0.8
 # Maximum alpha dt: beyond, neighbouring readings are uncorrelated.
 _FASTEST = 5.0
-# An interval of alpha that begins within this factor of the slowest rate has no lower end.
+# A window is too short if the interval of alpha begins within this factor of the slowest rate.
 _EDGE = 1.25
-# Loss of profile log-likelihood at the edge of a 95 % region of rate and share, nats: chi^2 with 2
-# degrees of freedom.
+# Loss of profile log-likelihood at the edge of a 95 % region of alpha and share, nats: half of
+# chi^2 with 2 degrees of freedom.
 _DROP = 3.0
 # Largest share of the variance that an OU slower than `tau_below_s` may have.
 _QUARTER = 0.25
@@ -114,7 +114,7 @@ def usual_walk(v: FloatArray) -> float:
 
 
 def stretches(t: FloatArray) -> list[slice]:
-    """Return the stretches between gaps; a few lost messages are no gap."""
+    """Return the stretches between gaps; a few lost messages do not count as a gap."""
     steps = np.diff(t)
     gaps = np.flatnonzero(steps > _GAP * np.median(steps))
     edges = [0, *(gaps + 1).tolist(), t.size]
@@ -122,7 +122,7 @@ def stretches(t: FloatArray) -> list[slice]:
 
 
 def _lagged(x: FloatArray, share: float) -> FloatArray:
-    """Return a first-order lag that moves by `share` of the difference with each sample."""
+    """Return x after a first-order lag that moves `share` of the way to x at each sample."""
     # 1 / (1 - r z) is the product of all 1 + (r z)^(2^k).
     lagged = share * (x - x[0])
     step, rest = 1, 1.0 - share
@@ -149,7 +149,7 @@ def _basis(rows: FloatArray) -> FloatArray:
     rows = rows[size > 0.0] / size[size > 0.0, None]
     R = np.linalg.qr(rows.T, mode='r')
     kept = np.flatnonzero(np.abs(R.diagonal()) >= _SPANNED * math.sqrt(rows.shape[1]))
-    # Takes a third of the time of a QR by Householder, and handles dependent rows.
+    # Faster than computing Q by Householder (a third of the time), and valid for dependent rows.
     return np.asarray(np.linalg.inv(np.linalg.qr(R[:, kept], mode='r')).T @ rows[kept])
 
 
@@ -165,7 +165,7 @@ def _orthogonal_basis(rows: FloatArray, basis: FloatArray) -> FloatArray:
 
 
 def _shifted(x: FloatArray, late: int) -> FloatArray:
-    """Return `x` shifted by `late` samples; the end values are held."""
+    """Return `x` as read `late` samples later; the end values are held."""
     if not late:
         return x
     moved = np.roll(x, -late)
@@ -178,10 +178,10 @@ class Regression:
     """Residual of a voltage after level and load, and the regressors."""
 
     dt: float  # mean step within the stretches, s
-    places: npt.NDArray[np.intp]  # of the readings in stretches without gaps, shape (n,)
+    places: npt.NDArray[np.intp]  # indices of the readings in stretches, shape (n,)
     voltage: FloatArray  # V, residual, shape (n,)
-    size: FloatArray  # size of the noise over its rms, shape (n,)
-    # Orthonormal regressors over the size, shape (p, n); if empty, each stretch has its own mean.
+    size: FloatArray  # size of the noise relative to its rms, shape (n,)
+    # Regressors divided by the size, orthonormal, shape (p, n); if empty, a mean per stretch.
     basis: FloatArray
     lengths: list[int]  # of the stretches
     walk: float  # usual walk of the level, V per sqrt(s)
@@ -224,12 +224,12 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
         left, held = {}, _basis(np.stack(columns)[:, last])
         rest = v[last] - (held @ v[last]) @ held
         for late in sorted(range(-most, most + 1), key=abs):
-            # The earlier half only lets the lags settle.
+            # The earlier half of the readings only lets the lagged loads settle.
             loads = regressors(_shifted(x[-2 * _DELAY_READINGS:], late))[:5]
             Q = _orthogonal_basis(np.stack([c[last] for c in loads]), held)
             left[late] = float(rest @ rest - np.sum((Q @ rest) ** 2))
         least = min(left, key=left.__getitem__)
-        # A delay must improve the fit clearly; otherwise noise would choose it.
+        # A delay must improve the fit clearly, because the smallest residual may be chance.
         late = least if left[least] < left[0] * (1.0 - 10.0 / rest.size) else 0
         found: list[FloatArray] = regressors(_shifted(x, late))
         return found
@@ -245,7 +245,7 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
     places = np.concatenate([np.arange(s.start, s.stop) for s in parts] or [
         np.zeros(0)]).astype(np.intp)
     if u is not None or i is not None:
-        # The load before the window is unknown.
+        # Free initial states of the lags, because the load before the window is unknown.
         columns = [*columns, *(np.exp((t[0] - t) / tau) for tau in taus)]
     rows, v = np.stack([c[places] for c in columns]), v[places]
     size = np.ones(v.size)
@@ -262,7 +262,7 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
             left = left - (basis @ left) @ basis
         left = left * size
     if law.follows and left.any():
-        # Even with a wrong law of the size, the fitted variance is that of the noise.
+        # The weighted residual gets the variance of the residual, even if `law` is wrong.
         size = size * math.sqrt(float(np.sum((left / size) ** 2)) / float(left @ left))
     return Regression(dt, places, left, size, basis, [s.stop - s.start for s in parts],
                       walk, 0.5 * float(knots[1] - knots[0]))
@@ -270,14 +270,14 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
 
 def _innovations(x: FloatArray) -> FloatArray:
     """Return the innovations of an AR(1)."""
-    # `NoiseSize` assumes independent values; fitted to a slow OU, it would follow chance.
+    # For `NoiseSize`, which assumes independent values: with a slow OU it would follow chance.
     power = float(x @ x)
     phi = float(x[1:] @ x[:-1]) / power if power > 0.0 else 0.0
     return x - phi * np.append(x[:1], x[:-1])
 
 
 def load_signs(n: int, dt: float, *loads: FloatArray | None) -> FloatArray:
-    """Return normalised loads and their changes over several times; shape (k, n)."""
+    """Return magnitudes of loads, and of their changes over several times; shape (k, n)."""
     rows: list[FloatArray] = []
     for x in loads:
         if x is not None:
@@ -287,16 +287,16 @@ def load_signs(n: int, dt: float, *loads: FloatArray | None) -> FloatArray:
 
 
 class NoiseSize:
-    """Size of the noise: its ln is linear in `load_signs`, constant beyond their fitted range."""
+    """Size of the noise: ln(size) is linear in ln(1 + scaled load sign), within fitted limits."""
 
     def __init__(self, signs: FloatArray) -> None:
         n = max(1, signs.shape[1])
         # A constant sign carries no information.
         self._used = (signs != signs[:, :1]).any(axis=1)
         self._scale = 0.3 * np.sqrt((signs[self._used] ** 2).sum(axis=1, keepdims=True) / n)
-        laws = self._laws(signs)
-        self._mean = laws.sum(axis=1, keepdims=True) / n
-        self._X = np.vstack([np.ones(signs.shape[1]), laws - self._mean])
+        logs = self._logs(signs)
+        self._mean = logs.sum(axis=1, keepdims=True) / n
+        self._X = np.vstack([np.ones(signs.shape[1]), logs - self._mean])
         self._beta, self._rms, self._ends = np.zeros(len(self._X)), 1.0, (0.0, 0.0)
 
     @property
@@ -304,11 +304,11 @@ class NoiseSize:
         """Return whether any load moves."""
         return len(self._X) > 1
 
-    def _laws(self, signs: FloatArray) -> FloatArray:
+    def _logs(self, signs: FloatArray) -> FloatArray:
         return np.asarray(np.log1p(signs[self._used] / self._scale))
 
     def fit(self, left: FloatArray) -> FloatArray:
-        """Fit the law to noise, V; return its sizes over their rms."""
+        """Fit the coefficients to noise, V; return its size relative to the rms, shape (n,)."""
         X, n = self._X, left.size
         mean = float(left @ left) / max(1, n)
         if not self.follows or not mean > 1e-18:
@@ -328,13 +328,13 @@ class NoiseSize:
         return np.asarray(np.sqrt(variance / variance.mean()))
 
     def of(self, signs: FloatArray) -> FloatArray:
-        """Return the sizes, V, for signs by the last fit."""
-        X = np.vstack([np.ones(signs.shape[1]), self._laws(signs) - self._mean])
+        """Return the size of the noise, V, at load signs, by the last fit."""
+        X = np.vstack([np.ones(signs.shape[1]), self._logs(signs) - self._mean])
         return np.asarray(self._rms * np.exp(0.5 * np.clip(self._beta @ X, *self._ends)))
 
 
 class _Likelihood:
-    """Restricted log-likelihood of an OU and white noise, with integrated regressors."""
+    """Restricted likelihood (regressors integrated out) of OU, white noise and walk."""
 
     def __init__(self, part: Regression) -> None:
         self._cross = CrossSpectrum(
@@ -342,8 +342,8 @@ class _Likelihood:
 
     def at(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return minus the log-likelihood, and the variance of OU plus white noise, V^2."""
-        # Points of shape (k, 3): ln(alpha dt), logit(share of the OU), and ln of the variance of a
-        # step of the level over that of the noise.
+        # Points of shape (k, 3): ln(alpha dt), logit(share of the OU), and ln(walk), the walk
+        # being the ratio of two variances: a step of the level, and OU plus white noise.
         half = points.shape[0] // 2
         if half and points.shape[0] * self._cross.size > _AT_ONCE:
             value, variance = zip(self.at(points[:half]), self.at(points[half:]))
@@ -369,13 +369,13 @@ def fit_ou(part: Regression, span: float, *, precise: bool = False) -> OuFacts:
         # A constant signal has no noise, and so no relaxation.
         return OuFacts('not_visible', span, tau_below_s=dt, var_inf_below=0.0)
     likelihood = _Likelihood(part)
-    # Prior of ln of the variance of a step of the level over that of the noise.
+    # Approximate ln(walk), as in `_Likelihood.at`, of the usual walk.
     usual = math.log(dt * part.walk ** 2 * part.free / total)
     low = np.array([math.log(dt / part.slowest), _LOGIT[0], usual - 6.0 * _WALK_SD])
     high = np.array([math.log(_FASTEST), _LOGIT[1], usual + 6.0 * _WALK_SD])
 
     def costs(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return minus the log-posterior, flat in share, and the variance, V^2."""
+        """Return minus the log-posterior for a flat prior of the share, and the variance, V^2."""
         value, variance = likelihood.at(points)
         off = 0.5 * (points[:, 2] + np.log(variance / dt)) - math.log(part.walk)
         return value + 0.5 * np.maximum(off / _WALK_SD, 0.0) ** 2, variance
@@ -402,8 +402,8 @@ def fit_ou(part: Regression, span: float, *, precise: bool = False) -> OuFacts:
         roots.append(_curvature(cost, np.clip(rival[0], low, high)))
     if precise and len(peaks) > 1:
         return OuFacts('not_visible', span)
-    # Importance sampling from a wide distribution about each maximum; in later rounds, from
-    # distributions with the moments of the last points.
+    # Importance sampling, at first from a wide distribution about each maximum, and in later
+    # rounds from distributions with the moments of the last round's points.
     nearest = np.abs(points[:, :1] - [peak[0] for peak, _ in peaks]).argmin(axis=1)
     laws = [(1.0 / len(peaks), *_moments(
         np.vstack([np.clip(peak, low, high), points[nearest == k]]),
@@ -446,7 +446,7 @@ def fit_pieces(parts: Sequence[tuple[FloatArray, FloatArray]], dt: float, walk: 
     """Fit the noise to pieces (V, relative size of the noise), each with its own mean."""
     parts = [part for part in parts if part[0].size >= _STRETCH]
     total = sum(part[0].size for part in parts)
-    # Equal pieces: the longest, up to _HATS s, that contain enough readings.
+    # Choose the largest common length of pieces, up to _HATS s, that keeps enough readings.
     n = max([_STRETCH, *(part[0].size for part in parts)])
     n = min(n, max(_STRETCH, round(_HATS / dt)))
     while n > _STRETCH and sum(part[0].size // n * n for part in parts) < _HELD * total:
@@ -464,13 +464,13 @@ def fit_pieces(parts: Sequence[tuple[FloatArray, FloatArray]], dt: float, walk: 
 
 
 def white_variance(ou: OuFacts, steps: float, dt: float) -> float:
-    """Return the white variance beside an OU, V^2, from the mean square of steps over dt, s."""
+    """Return the variance of white noise, V^2, beside an OU; steps: mean squared step over dt."""
     relaxed = ou.var_inf * math.expm1(-ou.alpha * dt) if ou.status == 'ok' else 0.0
     return max(0.0, 0.5 * steps + relaxed)
 
 
 def known_ou(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | None) -> OuFacts:
-    """Fit the shortest of OU_WINDOWS, at the end of the readings, that is precise enough."""
+    """Fit the shortest of OU_WINDOWS, all ending with the readings, that is precise enough."""
     if not t.size:
         return OuFacts('no_data')
     t, v = t[-MOST_READINGS:], v[-MOST_READINGS:]
@@ -572,7 +572,7 @@ def _log_density(points: FloatArray, part: float, centre: FloatArray, root: Floa
 
 
 def _curvature(cost: Callable[[FloatArray], FloatArray], centre: FloatArray) -> FloatArray:
-    """Return a root of the covariance from a cost's curvature; deviations are at most 2."""
+    """Return a root of the covariance from a cost's curvature; deviations are at most 2.4."""
     step = 0.15 * np.eye(3)
     signs = ((1, 1, 1.0), (1, -1, -1.0), (-1, 1, -1.0), (-1, -1, 1.0))
     H = np.zeros((3, 3))
@@ -584,7 +584,7 @@ def _curvature(cost: Callable[[FloatArray], FloatArray], centre: FloatArray) -> 
 
 
 def _quantiles(log: FloatArray, weight: FloatArray, extra: float) -> FloatArray:
-    """Return median, 2.5 and 97.5 % quantile of points with added normal errors (sd extra)."""
+    """Return median, 2.5 and 97.5 % quantile, after adding normal errors of deviation `extra`."""
     if extra:
         nodes, w = np.polynomial.hermite_e.hermegauss(7)
         log = (log[:, None] + extra * nodes).ravel()

@@ -3,9 +3,9 @@ First passage of the OU to a level: mean time, and probability within a time spa
 
 A continuous OU path has no finite crossing rate, so risk is stated as first passage.
 
-The unit OU is dX = -X ds + sqrt(2) dW: levels in stationary standard deviations,
-positive towards the barrier, times in tau = 1/alpha.  This is for the continuous
-path; `sampled_passage` is for samples.
+The unit OU is dX = -X ds + sqrt(2) dW: levels are in stationary standard deviations, positive
+towards the barrier, and times in tau = 1/alpha.  All results are for the continuous path, not
+for its samples.
 
 Numerical method.  With T = 1 - exp(-2 s) and w = (b - x) / sqrt(T) the
 probability is written as P = 2 Phi(-w exp(-s)) exp(R).  The first factor is
@@ -45,7 +45,7 @@ _W_HIGH, _W_NODES = 30.0, 55
 _S_LOW, _S_HIGH, _S_NODES = 1e-5, 9.0, 88
 # Steps of the solver per step of the table, in w and in lambda.
 _FINE_W, _FINE_S = 2, 4
-# How far before the table, in lambda, the solver starts.
+# The solver starts this far below the table in lambda.
 _LEAD = 1.0
 # Nodes added at each end of each axis, so that the ends do not affect the splines.
 _PAD = 5
@@ -63,7 +63,7 @@ _SERIES = (10395.0, -945.0, 105.0, -15.0, 3.0, -1.0, 1.0)
 
 
 def normal_below(x: npt.ArrayLike) -> FloatArray:
-    """Return Phi(x), elementwise; SciPy's function would take 35 MB in the nodes."""
+    """Return Phi(x), elementwise, without SciPy, which would take 35 MB in the nodes."""
     z = np.asarray(x, dtype=np.float64) * -math.sqrt(0.5)
     values = np.array([math.erfc(each) for each in z.ravel().tolist()])
     return np.asarray(0.5 * values.reshape(z.shape))
@@ -292,10 +292,10 @@ def _parabola(w: FloatArray, at: float) -> FloatArray:
 
 def _log_rate(b: FloatArray) -> FloatArray:
     """Return ln of the long-run passage rate, 1/tau: the smallest nu with D_nu(-b) = 0."""
-    # D is the parabolic cylinder function.  For 0 < b <= 8 by the power series of the Hermite
-    # function, whose terms but the first are positive: nu = 2 Gamma(1 - nu/2) / sum over n >= 1
-    # of Gamma((n - nu)/2) (sqrt(2) b)^n / n!.  For larger b, by the asymptotic series of the mean
-    # time, 1/nu; for b <= 0, as the lowest energy above a wall.
+    # D is the parabolic cylinder function.  For 0 < b <= 8, nu comes from the power series of the
+    # Hermite function, in which only the first term is negative: nu = 2 Gamma(1 - nu/2) / sum over
+    # n >= 1 of Gamma((n - nu)/2) (sqrt(2) b)^n / n!.  For larger b, it comes from the asymptotic
+    # series of the mean time, 1/nu; for b <= 0, it is the lowest energy above a wall.
     result = np.empty(b.size)
     n = range(1, 260)
 
@@ -320,10 +320,10 @@ def _log_rate(b: FloatArray) -> FloatArray:
 
 
 def _lowest_energy(barrier: float) -> float:
-    """Return the least nu of -f'' + (x^2/4 - 1/2) f = nu f."""
-    # f is zero at the barrier and far below, and exp(-x^2/4) times the solution of the backward
-    # equation.  Collocation at Chebyshev points (Trefethen, Spectral Methods in MATLAB, 2000,
-    # program 6).
+    """Return the smallest eigenvalue nu of -f'' + (x^2/4 - 1/2) f = nu f."""
+    # f is exp(-x^2/4) times the solution of the backward equation, and zero at the barrier and far
+    # below it.  Solved by collocation at Chebyshev points (Trefethen, Spectral Methods in MATLAB,
+    # 2000, program 6).
     order, length = 64, 14.0
     x = np.cos(math.pi * np.arange(order + 1) / order)
     c = np.ones(order + 1)
@@ -337,7 +337,7 @@ def _lowest_energy(barrier: float) -> float:
 
 
 def _root(f: Callable[[float, T], float], argument: T, low: float, high: float) -> float:
-    """Return the zero between two ends to 1e-12 (Illinois; SciPy would cost nodes 25 MB)."""
+    """Return the zero between two ends to 1e-12, by the Illinois method, without SciPy."""
     f_low, f_high = f(low, argument), f(high, argument)
     side = 0
     while True:

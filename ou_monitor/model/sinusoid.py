@@ -1,14 +1,14 @@
 """
-Sinusoids in a voltage: fitted, and, where they are clear, detected and summed.
+Sinusoids in a voltage: fits at given frequencies, and detection of clear tones.
 
-`tones` is for the node, which must not load SciPy; `spectral_lines` searches with more power, in
+`tones` is for the node, which must not load SciPy; `spectral_lines` detects weaker lines, in
 averaged periodograms.  An ordinate of the periodogram of noise is exponential.  Divided by the
 median of its neighbours, of rank j among N, it exceeds r with probability
 prod_(i=1..j) 1 / (1 + r / (N - i + 1)), because the spacings of ordered exponential variables are
-independent and exponential (Renyi 1953): the test needs no model of the spectrum.
+independent and exponential (Renyi 1953).  So the test needs no model of the spectrum.
 
-Limits: those of `spectral_lines`; each piece of a few seconds is tested alone, so a weak tone that
-only the average of pieces shows is missed.
+Limits: as in `spectral_lines`; each piece of a few seconds is tested alone, so tones that are
+visible only in the average over pieces are missed.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ import numpy as np
 import numpy.typing as npt
 from ou_monitor.records import FloatArray
 
-# Probability that a recording without lines has one reported at any of its levels.
+# Probability of reporting a line, at any load level, in a recording without lines.
 FALSE_ALARM = 0.01
 # Maximum length of a short piece, s: tones of motors and converters drift.
 SHORT = 4.0
-# Lowest frequency, in periods of a piece: with fewer, slow noise looks like a line, and the mean
-# and trend that are removed contain a part of it.
+# Minimum number of periods of a line in a piece: with fewer, slow noise looks like a line, and
+# removing mean and trend removes a part of the line.
 FIRST = 10
-# Neighbours: every second ordinate, because the window correlates adjacent ones.  Distance of the
-# nearest, in bins; their number.
+# Neighbours of an ordinate: distance of the nearest, in bins, and number.  Only every second
+# ordinate is used, because the window correlates adjacent ones.
 GUARD, NEIGHBOURS = 4, 64
-# Maximum factor on that number in long pieces, whose bins are narrower.
+# Maximum factor on the number of neighbours in long pieces, whose bins are narrower.
 _MORE = 4
 # Number of bins on either side over which the window spreads a steady line.
 LOBE = 2
@@ -43,14 +43,14 @@ _PHASES, _TRIED = 64, 32
 
 @dataclass(frozen=True)
 class Sinusoid:
-    """A line within a piece."""
+    """A sinusoid fitted to a piece."""
 
     amplitude: float  # Peak, V
     frequency: float  # Hz
-    phase: float  # Of its sine at the first sample, rad
+    phase: float  # Argument of the sine at the first sample, rad
 
     def sampled(self, t: FloatArray) -> FloatArray:
-        """Return its voltage, V, at times since the first sample, s."""
+        """Return the voltage, V, at times since the first sample, s."""
         wave: FloatArray = self.amplitude * np.sin(
             2.0 * math.pi * (t * self.frequency % 1.0) + self.phase)
         return wave
@@ -61,7 +61,7 @@ def fit_sinusoid(piece: FloatArray, rate: float, frequency: float, reach: float)
     v = piece - piece.mean()
     size = max(1, v.size // _PHASES)
     count = v.size // size
-    # Each part of the piece as one complex number, in a rotating frame.
+    # Reduce each part of the piece to one complex number, in a frame rotating at `frequency`.
     turns = frequency / rate
     sums = v[:count * size].reshape(count, size) @ _rotation(turns, size)
     sums *= _rotation(turns * size, count)
@@ -70,7 +70,7 @@ def fit_sinusoid(piece: FloatArray, rate: float, frequency: float, reach: float)
     power[(np.abs(shifts) > reach) | (frequency + shifts <= 0.0)
           | (frequency + shifts >= 0.5 * rate)] = 0.0
     top = int(np.argmax(power))
-    # A parabola through the highest three: half a step would leave 3 % of the amplitude.
+    # Interpolate by a parabola: an error of half a step would leave 3 % of the amplitude.
     before, here, after = (float(power[k % power.size]) for k in (top - 1, top, top + 1))
     bent = before - 2.0 * here + after
     off = 0.5 * (before - after) / bent if before and after and bent < 0.0 else 0.0
@@ -83,7 +83,7 @@ def fit_sinusoid(piece: FloatArray, rate: float, frequency: float, reach: float)
 
 def without_sinusoids(piece: FloatArray, rate: float, frequencies: Sequence[float],
                       reach: float) -> FloatArray:
-    """Return a piece, V, without the strongest sinusoid near each frequency, in order (Hz)."""
+    """Subtract the strongest sinusoid near each frequency, Hz, in turn, from a piece, V."""
     for frequency in frequencies:
         piece = piece - fit_sinusoid(piece, rate, frequency, reach).sampled(
             np.arange(piece.size) / rate)
@@ -91,15 +91,15 @@ def without_sinusoids(piece: FloatArray, rate: float, frequencies: Sequence[floa
 
 
 def _rotation(turns: float, count: int) -> npt.NDArray[np.complex128]:
-    """Return a unit vector that rotates backwards by a number of turns per sample."""
+    """Return a unit phasor that rotates backwards by a number of turns per sample."""
     found: npt.NDArray[np.complex128] = np.exp(-2j * math.pi * (turns * np.arange(count) % 1.0))
     return found
 
 
 def local_median(density: FloatArray, where: np.ndarray, near: int) -> FloatArray:
-    """Return the upper median of the nearest neighbours on either side, shape of `where`."""
+    """Return the upper median of the nearest neighbours of each ordinate, shape of `where`."""
     n = where.size
-    # If there are many neighbours, several ordinates share them.
+    # If there are many neighbours, adjacent ordinates share one median.
     hop = max(1, near // NEIGHBOURS)
     centres = np.minimum(np.arange(0, n, hop) + hop // 2, n - 1)
     guard = GUARD + hop // 2
@@ -111,7 +111,7 @@ def local_median(density: FloatArray, where: np.ndarray, near: int) -> FloatArra
     for part in np.array_split(inner, max(1, inner.size * near // (1 << 18))):
         values = density[where[0] + centres[part, None] + both[None, :]]
         found[part] = np.partition(values, near // 2, axis=1)[:, near // 2]
-    # Near an end, one side has too few: use the nearest on the other.
+    # Near an end, one side has too few neighbours: take more from the other side.
     reach = np.arange(guard, guard + 4 * near, 2)
     offsets = np.concatenate((-reach[::-1], reach))
     edges = np.flatnonzero(~inside)
@@ -125,15 +125,15 @@ def local_median(density: FloatArray, where: np.ndarray, near: int) -> FloatArra
 
 
 def groups(hits: np.ndarray) -> list[np.ndarray]:
-    """Join ordinates of one line."""
+    """Group the ordinates that belong to one line."""
     if not hits.size:
         return []
     return list(np.split(hits, np.flatnonzero(np.diff(hits) > 2 * LOBE) + 1))
 
 
 def tones(v: FloatArray, white: FloatArray, rate: float, lowest: float = 0.0) -> FloatArray:
-    """Return the sum of the clear tones in even samples, V (rate and lowest in Hz); shape (n,)."""
-    # white: their innovations, whose flatter spectrum is tested.
+    """Return the sum of clear tones in evenly spaced samples, V (rate and lowest in Hz)."""
+    # white: innovations of v; lines are detected in their flatter spectrum.
     found, pieces = np.zeros(v.size), math.ceil(v.size / (SHORT * rate))
     for where in np.array_split(np.arange(v.size), max(1, pieces)):
         n = where.size
@@ -154,7 +154,7 @@ def tones(v: FloatArray, white: FloatArray, rate: float, lowest: float = 0.0) ->
 
 
 def neighbours(ordinates: int, share: float = 1.0) -> int:
-    """Return the number of neighbours: even, and the same band in Hz for long pieces."""
-    # share: length of a piece over that of a short one.
+    """Return the number of neighbours: even, and spanning the same band in Hz in long pieces."""
+    # share: length of the piece, relative to a short one.
     there = max(2, (ordinates - 2 * GUARD) // 4 * 2)
     return min(there, NEIGHBOURS * min(_MORE, max(1, int(share))))

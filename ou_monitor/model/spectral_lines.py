@@ -1,25 +1,24 @@
 """
-Spectral lines: detected by a test, measured with their error, and removed.
+Spectral lines: detection by a test, measurement with errors, and removal.
 
-`analyze` uses it for each load level, `discover` for the scores of a model and for samples that
-the fit does not use.
+`analyze` searches each load level, `discover` the scores of a model, `compare` the residuals.
 
 A periodogram ordinate of noise is exponential, and the sum of K ordinates is gamma, whatever the
 distribution of the noise; a line exceeds its neighbours.  The noise at each frequency is estimated
 by the median of neighbouring ordinates, whose distribution is known exactly; so the test needs no
 model of the spectrum, and a second line nearby does not hide the first.  There are two passes: in
 pieces of a few seconds, because tones of motors and converters drift, and in the longest possible
-pieces, where the tone of a crystal is clearest.
+pieces, where a tone of constant frequency (of a crystal oscillator) is clearest.
 
 Each line is subtracted as a sinusoid with its own amplitude, phase and frequency in each piece of
 the length in which it was found; this also removes a little noise.
 
-Limits: the noise is taken as constant over the neighbours (about 60 bins either side), and a line
-must also exceed the nearest eight on either side, so that a slope or a hump of the noise is none;
-a narrower resonance is reported as a line; samples are taken as evenly spaced; a line may be an
-alias; frequencies below `FIRST` periods of a piece are not searched.  A line whose frequency
-changes is spread over bins, and may be missed.  A tone that moves by more than a bin within a
-piece, or is modulated, leaves its sidebands.
+Limits: the noise is treated as constant over the neighbours (about 60 bins either side), and a
+line must also exceed the nearest eight on either side, so that a slope or hump of the noise does
+not count as a line; a narrower resonance does.  Samples are treated as evenly spaced; a line may
+be an alias; frequencies below `FIRST` periods per piece are not searched.  A line whose frequency
+changes is spread over bins, and may be missed.  If a tone moves by more than a bin within a piece,
+or is modulated, its sidebands remain.
 """
 
 from __future__ import annotations
@@ -45,10 +44,10 @@ _LONGEST = 1 << 20
 # Nodes and weights of quadrature over 0..1.
 _QUANTILES = 0.5 * (np.polynomial.legendre.leggauss(64)[0] + 1.0)
 _WEIGHTS = 0.5 * np.polynomial.legendre.leggauss(64)[1]
-# Number of the nearest ordinates on one side that a line must exceed, and the p-value of that; for
-# a weak line at the limit of the test it is 0.003.
+# Number of nearest ordinates on each side that a line must exceed, and maximum p-value of this
+# comparison (about 0.003 for the weakest line that is detected).
 _BESIDE, _UNLIKE = 8, 0.05
-# Maximum ratio of samples with missing ones filled in to samples given.
+# Maximum ratio of samples after interpolation to samples given.
 _FILLED = 4.0
 
 
@@ -58,7 +57,7 @@ class Line:
 
     frequency: float  # Hz, below half the sampling rate
     resolution: float  # Width of a bin, Hz: the error of the frequency
-    # Its root mean square and the 95 % interval, V.
+    # Root mean square and its 95 % interval, V.
     rms: float
     rms_low: float
     rms_high: float
@@ -66,8 +65,8 @@ class Line:
     p_value: float  # p-value of the ordinate, times the number of ordinates tested at all levels
 
 
-# Largest distance of a harmonic from a multiple of the fundamental, in fundamentals, and the
-# probability that as many lines of unrelated frequencies are that near to multiples.
+# Maximum distance of a harmonic from a multiple of the fundamental, in fundamentals, and maximum
+# probability that unrelated lines form an equally complete comb by chance.
 _NEAR_MULTIPLE, _UNRELATED = 0.01, 1e-3
 
 
@@ -76,11 +75,11 @@ class Comb:
     """Lines at multiples of one frequency."""
 
     fundamental: float  # Hz
-    harmonics: tuple[int, ...]  # Multiple at which each line is; 0: at none
+    harmonics: tuple[int, ...]  # Multiple at which each line lies; 0: not in the comb
 
 
 def comb_of(frequencies: Sequence[float]) -> Comb | None:
-    """Return the comb that holds most of the lines (Hz); None without one beyond chance."""
+    """Return the comb that contains most of the lines (Hz); None if chance can explain it."""
     f = np.asarray(frequencies, dtype=np.float64)
     best: tuple[int, float, npt.NDArray[np.intp]] | None = None
     for trial in np.unique(np.outer(f, (1.0, 0.5, 1.0 / 3.0)))[::-1].tolist():
@@ -101,42 +100,42 @@ class LineSearch:
     """Result of a search for lines."""
 
     lines: tuple[Line, ...] = ()  # Strongest first
-    tested: int = 0  # Ordinates tested at this level
-    # Frequencies searched, Hz.
+    tested: int = 0  # Ordinates tested at this load level
+    # Lowest and highest frequency searched, Hz.
     lowest: float = NAN
     highest: float = NAN
-    # RMS of a line that is found with 90 % probability where the noise is at its median, V.
+    # RMS of a line that is detected with 90 % probability at the median noise density, V.
     detectable: float = NAN
     why_not: str = ''  # Why there was no search; empty if there was one
 
 
 @dataclass(frozen=True, eq=False)
 class EvenGrid:
-    """Samples on an even clock, with missing ones interpolated."""
+    """Samples on an evenly spaced grid, with missing ones interpolated."""
 
     values: FloatArray  # Samples
-    where: npt.NDArray[np.intp]  # Which of them were given
+    where: npt.NDArray[np.intp]  # Indices of those that were given
     rate: float  # Samples per second, Hz
 
 
-# Step, over the median, below which a sample may lie between those of the clock.
+# Step, relative to the median, below which a sample may lie between points of the grid.
 SHORT_STEP = 0.75
 
 
 def on_grid(t: FloatArray, values: FloatArray) -> EvenGrid:
-    """Return samples on an even clock, with steps rounded to whole periods (t in s)."""
+    """Return samples on a grid of the median step, to which steps are rounded (t in s)."""
     step = np.diff(t)
     usual = float(np.median(step)) if step.size else math.inf
     ratio = step / usual
     number = np.maximum(1.0, np.rint(ratio))
-    # Samples between those of the clock: their short steps add up to whole ones.
+    # Samples between grid points: add up their short steps, and round the sum.
     short = ratio < SHORT_STEP
     if (short[1:] & short[:-1]).any():
         passed = np.cumsum(np.where(short, ratio, 0.0))
         whole = np.rint(passed - np.maximum.accumulate(np.where(short, 0.0, passed)))
         number = np.where(short, np.diff(whole, prepend=0.0), number)
     if number.sum() > _FILLED * t.size:
-        # If most of the time is gaps, join the samples without them.
+        # If most of the time is gaps, ignore the gaps.
         number = np.ones(step.size)
     where = np.append(0.0, np.cumsum(number)).astype(np.intp)
     rate = float(where[-1] / (t[-1] - t[0])) if step.size else NAN
@@ -148,10 +147,11 @@ def on_grid(t: FloatArray, values: FloatArray) -> EvenGrid:
 def find_lines(parts: Sequence[FloatArray], rate: float, *, false_alarm: float = FALSE_ALARM,
                levels: int = 1, white: Sequence[FloatArray] = (), lowest: float = 0.0,
                wide: bool = False) -> LineSearch:
-    """Look for lines in segments of even samples, V (rate and lowest in Hz), strongest first."""
-    # white: their innovations, whose flat spectrum is searched if the parts are not white.
+    """Search evenly spaced segments, V, for lines (rate and lowest in Hz); strongest first."""
+    # levels: number of load levels searched, which share false_alarm.
+    # white: innovations of `parts` (if they are not white), in which lines are detected.
     # wide: whether a line may be as wide as a hump of the noise.
-    # The mean is removed first: a detrended constant consists of rounding errors.
+    # The mean is removed first, because detrending a large constant leaves rounding errors.
     parts, white = ([part - part.mean() for part in some if part.size]
                     for some in (parts, white or parts))
     sizes = [part.size for part in parts]
@@ -168,8 +168,8 @@ def find_lines(parts: Sequence[FloatArray], rate: float, *, false_alarm: float =
     for length, where in tested.items():
         lines, least = _search(parts, white, rate, length, where,
                                false_alarm / (levels * count), wide)
-        # Drifting lines show in short pieces.  A line found in both passes is measured in short
-        # pieces, unless only the long ones show it clearly.
+        # A line found in both passes is measured in short pieces, because it may drift, unless
+        # only the long pieces show it clearly.
         for line in lines:
             same = [other for other in found if abs(line.frequency - other.frequency)
                     < 2 * LOBE * other.resolution]
@@ -198,7 +198,7 @@ def _search(parts: Sequence[FloatArray], whites: Sequence[FloatArray], rate: flo
     limit = threshold(k, near, chance)
     hits = np.flatnonzero(ratio > limit)
     if not wide:
-        # In a hump many ordinates are high; lines of a comb are farther apart.
+        # In a hump, unlike a comb, many adjacent ordinates are high: multiply by their number.
         count = np.searchsorted(hits, hits + NEIGHBOURS) - np.searchsorted(hits, hits - NEIGHBOURS)
         hits = hits[_beside(white, where[hits], k) * count < _UNLIKE]
     p = np.ones(where.size)
@@ -206,7 +206,7 @@ def _search(parts: Sequence[FloatArray], whites: Sequence[FloatArray], rate: flo
     background = raw[where] / np.maximum(white[where], 1e-300) * middle
     # The median of a gamma variable, in units of its mean.
     background /= float(gammaincinv(k, 0.5)) / k
-    # Use only the segments in which the line is measured, because short ones may be quieter.
+    # Only segments in which lines are measured count, because shorter ones may be quieter.
     held = [part for part in parts if part.size >= length]
     total = float(sum(part @ part for part in held) / sum(part.size for part in held))
     lines = [_measure(raw, background, white[where], middle, where, group, p, df, total, k)
@@ -215,9 +215,9 @@ def _search(parts: Sequence[FloatArray], whites: Sequence[FloatArray], rate: flo
 
 
 def _beside(density: FloatArray, at: np.ndarray, pieces: float) -> FloatArray:
-    """Return the probability that noise exceeds the ordinates on either side by as much."""
-    # The spectrum of slow noise is steep, or has a hump: many neighbours are then far below the
-    # ordinates on one side.
+    """Return p-values of ordinates against the nearest ones on the side that is higher."""
+    # Where the spectrum of the noise is steep or has a hump, the median of all neighbours may be
+    # far below the ordinates on one side.
     found = np.zeros(at.size)
     for k, centre in enumerate(at.tolist()):
         for side in (density[max(1, centre - GUARD - _BESIDE + 1):max(1, centre - GUARD + 1)],
@@ -253,15 +253,15 @@ def threshold(pieces: float, neighbours: int, level: float) -> float:
 
 
 def _piece_length(sizes: Sequence[int], most: int) -> int:
-    """Return the length of pieces, up to a maximum, at which a line is detected best."""
+    """Return the length of pieces, up to `most`, at which a line is detected best."""
     longest = max(sizes, default=0)
     if longest < FEWEST_SAMPLES:
         return 0
     top = min(longest, most)
     best, score = top, 0.0
     for length in {top, *(size for size in sizes if FEWEST_SAMPLES <= size < top)}:
-        # The power of a line grows with the number of pieces, and the scatter of noise with the
-        # root of that number.
+        # The power of a line grows with the number of pieces, the scatter of the noise only with
+        # its root.
         gained = length * math.sqrt(sum(size // length for size in sizes))
         if gained > score:
             best, score = length, gained
@@ -271,7 +271,7 @@ def _piece_length(sizes: Sequence[int], most: int) -> int:
 def _measure(raw: FloatArray, background: FloatArray, white: FloatArray, middle: FloatArray,
              where: np.ndarray, group: np.ndarray, p: FloatArray, df: float, total: float, k: float
              ) -> Line:
-    """Return frequency and power of the line that a group of ordinates belongs to."""
+    """Measure the line to which a group of ordinates belongs."""
     low, high = max(0, group[0] - LOBE), min(where.size, group[-1] + LOBE + 1)
     if group.size <= 2 * LOBE + 1:
         peak = int(group[np.argmax(white[group])])
@@ -281,7 +281,7 @@ def _measure(raw: FloatArray, background: FloatArray, white: FloatArray, middle:
     excess = np.maximum(white[low:high] - k / float(gammaincinv(k, 0.5)) * middle[low:high], 0.0)
     power = float((density - noise).sum() * df)
     floor = float(noise.mean() * df)
-    # Window of Hann: sum w^4 / (sum w^2)^2 = 1.94 / n; correlations 4/9 and 1/36 of neighbours.
+    # Hann window: sum w^4 / (sum w^2)^2 = 1.94 / n; correlations of neighbours 4/9 and 1/36.
     bins = high - low
     spread = bins + 2.0 * ((bins - 1) * 4.0 / 9.0 + max(bins - 2, 0) / 36.0)
     se = math.sqrt((3.89 * max(power, 0.0) * floor + spread * floor ** 2) / k)
@@ -293,7 +293,7 @@ def _measure(raw: FloatArray, background: FloatArray, white: FloatArray, middle:
 
 
 def _detectable(density: float, df: float, k: float, limit: float) -> float:
-    """Return the RMS that passes the limit with 90 % probability, V."""
+    """Return the RMS of a line that exceeds the limit with 90 % probability, V."""
     lift = float(chndtrinc(2.0 * limit * float(gammaincinv(k, 0.5)), 2.0 * k, 0.1))
     # A line at the centre of a bin has 2/3 of its power there; halfway between two bins, 0.48.
     return math.sqrt(lift / (2.0 * k) * density * df / 0.48)

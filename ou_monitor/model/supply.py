@@ -2,7 +2,7 @@
 A supply as a sum of terms, and its simulation.
 
 Limits: parameters that change (throttle, sigma) are constant between two samples;
-each term says which of its effects are exact in law.
+the docstring of each term states which of its effects are exact in law.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from ou_monitor.model.terms.segment import Effect, Segment, Stage
 from ou_monitor.model.terms.term import Term
 from ou_monitor.records import FloatArray
 
-# Samples that `SupplyModel.simulate` draws at a time: bounds memory, and keeps the data of all
-# terms in the processor's caches.
+# Number of samples that `SupplyModel.simulate` draws at a time: limits memory, and keeps the data
+# of all terms in the processor's caches.
 SEGMENT = 15_000
 
-# Size of an array that is allocated and freed once, so that the GNU allocator keeps the memory of
-# segments.  Otherwise it returns and requests it page by page, which can take longer than the
-# arithmetic.
+# Size of an array that is allocated and freed once, after which the GNU allocator keeps the memory
+# of segments for reuse.  Otherwise it would return it to the system and request it again page by
+# page, which can take longer than the arithmetic.
 _KEPT = 2**18
 
 # Relative difference below which steps count as equal, because stamps are rounded.
@@ -36,7 +36,7 @@ class SupplyModel:
     """
     Terms that add up to a supply.
 
-    ValueError: the first term is not the `ou`, or a term that may occur only once occurs twice.
+    Raises ValueError if the first term is not `ou`, or if a term occurs twice that may not.
 
     Examples
     --------
@@ -52,11 +52,11 @@ class SupplyModel:
 
     """
 
-    # The first is the `ou`, the only one of its kind.
+    # The first is `ou`, which occurs once.
     terms: tuple[Term, ...]
     # Start values of the load filter at take-off, learned from this craft; None: unknown.
     load: LoadStart | None = None
-    # Date of learning in the model file; empty: unknown.
+    # Date in the model file on which the model was learned; empty: unknown.
     date: str = field(default='', compare=False)
 
     def __post_init__(self) -> None:
@@ -94,7 +94,7 @@ class SupplyModel:
         """
         Draw a recording, V (t in s, rising).
 
-        throttle: 0..1, each held from the previous stamp to its own; one number for all samples.
+        throttle: 0..1, shape (n,), each for the time since the previous stamp; or one number.
         """
         stamps = np.asarray(t, dtype=np.float64)
         load = None if throttle is None else np.broadcast_to(
@@ -107,7 +107,7 @@ class SupplyModel:
         return voltage
 
 
-# Exponent of the current over throttle, for which `LoadStart.discharge` holds.
+# Exponent of throttle in the discharge current, as in `LoadStart.discharge`.
 _POWER = 1.8
 
 
@@ -116,12 +116,12 @@ class Discharge:
 
     def __init__(self, load: LoadStart, level: float, charge: float = math.nan) -> None:
         self._load = load
-        # The charge at which a pack has the model's level.
+        # The charge at which the open-circuit voltage is the level of the model.
         self._origin = charge_at(level / load.cells)
         self.charge = self._origin if math.isnan(charge) else charge
 
     def __call__(self, s: Segment) -> None:
-        """Lower the level."""
+        """Lower the level by the charge that throttle draws in a segment."""
         step = np.where(np.isfinite(s.step), s.step, 0.0)
         left = self.charge - np.cumsum(self._load.discharge * s.throttle ** _POWER * step)
         s.level += self._load.cells * (open_circuit(left) - open_circuit(self._origin))
@@ -135,7 +135,7 @@ class Simulation:
     The same seed gives the same samples, except for rounding, for any division into segments.
     `resistance` multiplies the response to throttle, for an old pack, and may change between
     segments.  With `charge`, 0..1 at the first sample, the level falls as throttle discharges the
-    pack (`model.load`), not by the recording's drift; NaN: the charge when the recording began.
+    pack (`model.load`), not by the `drift` term; NaN: the charge that matches the model's level.
     """
 
     def __init__(self, model: SupplyModel, rng: np.random.Generator, *,
@@ -177,7 +177,7 @@ class Simulation:
 
     def _in_order(self, rng: np.random.Generator) -> list[Effect]:
         """Return the effects of all terms in the order of their stages."""
-        # A term's draws depend on its name and its count among terms of that name, so adding
+        # The draws of a term depend on its name and its index among terms of that name, so
         # another term does not change them.
         seeds = rng.integers(0, 2**63, size=2).tolist()
         counts: dict[str, int] = {}
@@ -199,7 +199,7 @@ class Simulation:
         return effects
 
     def _scaled(self, effect: Effect) -> Effect:
-        """Return the effect of a response to throttle, times the resistance."""
+        """Return an effect of the load that multiplies the change of the level by `resistance`."""
         def scaled(s: Segment) -> None:
             if self.resistance == 1.0:
                 effect(s)

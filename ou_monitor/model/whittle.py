@@ -1,11 +1,11 @@
 """
-Fits to a periodogram: all time scales of a recording at once, in milliseconds of processor time.
+Whittle likelihood: spectra are fitted to a periodogram, in milliseconds for a whole recording.
 
 The ordinates of a long series are nearly independent exponential variables whose means are the
-spectrum (Whittle, Ark. Mat. 2 (1953) 423); averaged in bins they are gamma.  `Ordinates` is the
-periodogram of scores; `CrossSpectrum` also has regressors for a voltage, and uses the expected
-ordinates for the length of the window (debiased Whittle likelihood: Sykulski et al., Biometrika
-106 (2019) 251).
+spectrum (Whittle, Ark. Mat. 2 (1953) 423); averaged in bins they are gamma.  `Ordinates` is for
+the scores of a model.  `CrossSpectrum` is for a voltage with regressors, and uses the ordinates
+expected for the length of the window (debiased Whittle likelihood: Sykulski et al., Biometrika 106
+(2019) 251).
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ import math
 import numpy as np
 from ou_monitor.records import FloatArray
 
-# Number of ordinates at the slow end that are not binned, and bins per octave above them.
+# Number of ordinates at low frequencies that are not binned, and bins per octave above them.
 _SINGLE, _TO_OCTAVE = 16, 10
-# Scores beyond this are outliers, and ignored.
+# Scores beyond this are outliers, and clipped.
 _FAR = 5.0
 # Rounds of scoring, step of the numerical derivatives, convergence tolerance, nats, and maximum
 # step of a coordinate.
@@ -35,12 +35,12 @@ class Ordinates:
     # Mean of the ordinates of each bin, expected to be 1 for white scores of variance 1; shape
     # (k,).
     power: FloatArray
-    count: FloatArray  # Ordinates of each; shape (k,)
-    omega: FloatArray  # Middle, radians per sample; shape (k,)
+    count: FloatArray  # Number of ordinates in each bin; shape (k,)
+    omega: FloatArray  # Centre of each bin, radians per sample; shape (k,)
 
     @classmethod
     def of(cls, z: FloatArray) -> Ordinates:
-        """Return the ordinates of a series of scores, without outliers."""
+        """Return the ordinates of a series of scores, with outliers clipped."""
         z = np.clip(z, -_FAR, _FAR)
         power = np.abs(np.fft.rfft(z - z.mean())[1:-1]) ** 2 / z.size
         first = min(_SINGLE, power.size)
@@ -53,12 +53,12 @@ class Ordinates:
                    np.pi * (edges[:-1] + edges[1:] + 1.0) / z.size)
 
     def likelihood(self, log: FloatArray) -> float:
-        """Return the log-likelihood of a spectrum, given by its logarithm, nats."""
+        """Return the log-likelihood, nats, of a spectrum; log: its logarithm, shape (k,)."""
         return -float(self.count @ (log + self.power * np.exp(-log)))
 
     def climb(self, log_of: Callable[[FloatArray], FloatArray], start: FloatArray
               ) -> tuple[FloatArray, float]:
-        """Return the coordinates of the best spectrum, and its gain over white scores, nats."""
+        """Maximise over x the likelihood of log_of(x); return x and the gain over white, nats."""
         x = np.asarray(start, dtype=np.float64)
         log = log_of(x)
         value, damping = self.likelihood(log), _DAMPED
@@ -100,12 +100,13 @@ def cosines(x: FloatArray) -> FloatArray:
     return np.concatenate([F.real, -F.imag[:, (n - 1) // 2:0:-1]], axis=1)
 
 
-# Frequencies at which it is kept how much a regression absorbs, radians per sample.
+# Frequencies at which the absorption by a regression is tabulated, radians per sample.
 ABSORBED_AT = np.append(0.0, np.geomspace(1e-6, np.pi, 200))
 
 
 def absorbed_by(basis: FloatArray) -> FloatArray:
-    """Return how many ordinates up to each of ABSORBED_AT orthonormal regressors, (p, n), take."""
+    """Return the number of ordinates, up to each of ABSORBED_AT, that regressors absorb."""
+    # basis: orthonormal regressors, shape (p, n).
     n = basis.shape[1]
     total = np.append(0.0, np.cumsum(np.sum(cosines(basis) ** 2, axis=0)))
     return np.asarray(np.interp(ABSORBED_AT, np.pi * (np.arange(n + 1) - 0.5) / n, total))
@@ -114,17 +115,17 @@ def absorbed_by(basis: FloatArray) -> FloatArray:
 class CrossSpectrum:
     """Cross spectra of regressors and a voltage, and the likelihood of a noise spectrum."""
 
-    # The ordinates come from the cosine transform, which continues the window as a mirror image;
-    # so different values at its ends cause no leakage, unlike in a Fourier transform.
 
     def __init__(self, rows: FloatArray, lengths: Sequence[int],
                  absorbed: FloatArray | None = None) -> None:
+        # The cosine transform continues the window as its mirror image; so different values at
+        # the ends cause no leakage, unlike in a Fourier transform.
         # rows: regressors, and the voltage as the last row, shape (q, n), in stretches of evenly
         # spaced readings; without regressors (q = 1) each stretch has its own mean.
-        # absorbed: ordinates per reading that an earlier regression took, see `absorbed_by`.
+        # absorbed: result of `absorbed_by` for an earlier regression, per reading.
         q, n = rows.shape
         self.free = n - (q - 1 or len(lengths))
-        # Lost messages may cause hundreds of stretches; those of similar lengths share their bins.
+        # Lost messages may cause hundreds of stretches; stretches of similar length share bins.
         groups: dict[int, list[FloatArray]] = {}
         for part in np.split(rows, np.cumsum(lengths)[:-1], axis=1):
             groups.setdefault(round(math.log(part.shape[1]) / _WIDTH), []).append(part)
@@ -135,8 +136,8 @@ class CrossSpectrum:
             while edges[-1] < longest:
                 edges.append(min(longest, edges[-1] + max(1, int(_WIDTH * edges[-1]))))
             cross = np.zeros((len(edges) - 1, q, q))
-            # Number of ordinates in the band, sum of their indices and of alternating signs, and
-            # ordinates absorbed before.
+            # For each bin: number of ordinates, sum of their indices over the length, sum of
+            # (-1)^index, and number of ordinates absorbed by the earlier regression.
             sums = np.zeros((4, len(edges) - 1))
             for part in group:
                 size = part.shape[1]
@@ -163,15 +164,15 @@ class CrossSpectrum:
         self._cross = (cross + np.triu(cross, 1).transpose(0, 2, 1)).reshape(-1, q * q)
         self._q, self._n = q, np.concatenate(sizes)
         self._count, place, sign, gone = np.concatenate(places, axis=1)
-        # Ordinates that still count, a tenth at least, because the absorbed share is a mean.
+        # Ordinates not absorbed: at least a tenth, because the absorbed share is only a mean.
         self._left = self._count - np.minimum(gone, 0.9 * self._count)
-        self._told = self.free - float(np.sum(self._count - self._left))
+        self._effective = self.free - float(np.sum(self._count - self._left))
         omega = np.pi * place / np.maximum(self._count, 1e-9)
         self._sign = sign / np.maximum(self._count, 1.0)
         self._chord = 4.0 * np.sin(0.5 * omega) ** 2
         # Sum of the squares of an ordinate's weights on the first and the last reading.
         self._ends = np.where(omega > 0.0, 4.0 - self._chord, 2.0) / self._n
-        #: Inverse of the ordinates of a random walk; the mean is a regressor.
+        # Inverse of the ordinates of a random walk, with a nominal value for the mean (omega 0).
         self.walk = 4.0 * np.sin(0.5 * np.maximum(omega, 0.5 * np.pi / self._n)) ** 2
 
     @property
@@ -190,9 +191,9 @@ class CrossSpectrum:
 
     def cost(self, S: FloatArray, used: int | None = None
              ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return minus the log-likelihood of spectra, shape (k, bins), restricted and profiled."""
-        # used: number of regressors to use.  The second result is the factor on the spectrum, and
-        # the third are the products x' K^-1 z of all rows, shape (k, q, q).
+        """Return minus the restricted log-likelihood of spectra, shape (k, bins), and more."""
+        # It is profiled over a factor on each spectrum, which is the second result.  The third is
+        # the products x' K^-1 z of all rows, shape (k, q, q).  used: number of regressors to use.
         gram = ((1.0 / S) @ self._cross).reshape(-1, self._q, self._q)
         # Keep it definite despite rounding.
         gram[:, range(self._q), range(self._q)] *= 1.0 + 1e-10
@@ -200,8 +201,8 @@ class CrossSpectrum:
         if used is not None and used < self._q - 1:
             kept = [*range(used), self._q - 1]
             free, own = free + self._q - 1 - used, gram[:, kept][:, :, kept]
-        told = self._told + free - self.free
+        effective = self._effective + free - self.free
         d = np.log(np.diagonal(np.linalg.cholesky(own), axis1=1, axis2=2))
         left = 2.0 * d[:, -1]
-        value = 0.5 * told * left + 0.5 * np.log(S) @ self._left + d[:, :-1].sum(axis=1)
+        value = 0.5 * effective * left + 0.5 * np.log(S) @ self._left + d[:, :-1].sum(axis=1)
         return value, np.exp(left) / free, gram

@@ -213,7 +213,7 @@ def test_nothing_is_overwritten(tmp_path, name, capsys):
     (MODEL.replace('sigma: 0.5', 'sigma: 1e+100'), 'beyond'),
     (MODEL.replace('sigma: 0.5', 'sigma: 1000.0').replace(
         'load_sag\n  params: {linear: 1.0, square: 0.0}',
-        'nonlinear_restoring\n  params: {square: 1.0e+6, cube: 0.001}'), 'runs away'),
+        'nonlinear_restoring\n  params: {square: 1.0e+6, cube: 0.001}'), 'diverges'),
     (MODEL.replace('load_sag\n  params: {linear: 1.0, square: 0.0}',
                    'jumps\n  params: {rate: 1e12, mean: 0, std: 1}'), 'jumps.rate'),
 ])

@@ -1,1 +1,1 @@
-"""What a supply is made of: the OU and one module for each effect that may be added to it."""
+"""Terms of a supply model: the OU, and modules for the effects that may be added to it."""

@@ -1,4 +1,4 @@
-"""AC coupling of the instrument, whose corner may be taken for alpha."""
+"""AC coupling of the instrument; its corner may be mistaken for alpha."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class ACCoupling(Term):
     """
     A first-order high-pass between rail and reading.
 
-    The reading is U - l with dl = rate (U - l) dt, rate = 2 pi corner.  The
-    effect on the OU is exact in law; all other terms are approximated by
-    straight lines between samples.
+    The reading is U - l + offset with dl = rate (U - l) dt, rate = 2 pi corner.
+    The effect on the OU is exact in law; the sum of all other terms is
+    approximated by straight lines between samples.
     """
 
     NAME: ClassVar[str] = 'ac_coupling'
@@ -43,8 +43,8 @@ class ACCoupling(Term):
     MEANING: ClassVar[str] = (
         'The instrument is AC-coupled: the relaxation comes from its high-pass.')
     REMEDY: ClassVar[str] = (
-        'Repeat with DC coupling; use the alpha of this model for the rail, not that of the plain '
-        'fit.')
+        'Repeat with DC coupling; use the alpha of this model for the rail, not the alpha of the '
+        'plain fit.')
     SEPARATED_BY: ClassVar[str] = 'the same rail DC-coupled'
 
     corner: float = parameter('Hz', 'corner (-3 dB) of the high-pass', 0.0, above=True)
@@ -62,7 +62,7 @@ class ACCoupling(Term):
             alpha, step = s.alpha.copy(), s.step.copy()
             first = math.isnan(low)
             if first:
-                # From the stationary law given x, as if the level had always been constant.
+                # Draw from the stationary law given x, for a level that was always constant.
                 of_x = rate / (rate + alpha[0])
                 spread = s.sigma[0] ** 2 / (2.0 * alpha[0]) * s.power[0] * of_x * (1.0 - of_x)
                 low = float(level[0] + of_x * s.x[0] + math.sqrt(spread) * draws[0])
@@ -108,7 +108,7 @@ class ACCoupling(Term):
 def bridge(alpha: FloatArray, rate: float, step: FloatArray
            ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return start, end and spread of one step of a low-passed OU, given the OU at both ends."""
-    # l_k = exp(-rate step) l_{k-1} + start x_{k-1} + end x_k + sigma sqrt(spread) z; 1/s and s.
+    # l_k = exp(-rate step) l_{k-1} + start x_{k-1} + end x_k + sigma sqrt(spread) z, z normal.
     a = np.where(np.abs(alpha / rate - 1.0) < _APART, rate * (1.0 + _APART), alpha)
     share = rate / (rate - a)
     xx = -np.expm1(-2.0 * a * step) / (2.0 * a)

@@ -1,9 +1,9 @@
 """
 All terms: the classes with a NAME in a module of this folder, and causes of other packages.
 
-The names are those in model files and findings.  Another package declares its causes as entry
-points of the group `ou_monitor.causes`.  A cause that cannot be used is left out with a reason,
-and `discover` continues without it.
+Model files and findings use the same names.  Another package declares its causes as entry points
+of the group `ou_monitor.causes`.  If a cause cannot be used, the reason is reported, and
+`discover` continues without the cause.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _left_out: dict[str, str] = {}
 
 @cache
 def catalogue() -> Mapping[str, type[Term]]:
-    """Return all terms by name, the `ou` first, those of other packages last."""
+    """Return all terms by name: first the `ou`, last the terms of other packages."""
     found: dict[str, type[Term]] = {}
     for info in iter_modules(folder.__path__):
         module = import_module(f'{folder.__name__}.{info.name}')
@@ -45,7 +45,7 @@ def catalogue() -> Mapping[str, type[Term]]:
         try:
             kind = entry.load()
             _check(kind, entry.name, found)
-        # Any error in another package must not end a command.
+        # No error in another package may end a command.
         except (Exception, SystemExit) as error:
             _leave_out(entry.name, error)
         else:
@@ -67,7 +67,7 @@ def blamed(error: BaseException) -> tuple[str, ...]:
 
 
 def withdraw(error: BaseException) -> bool:
-    """Remove installed causes that raised an error, else all; return False if there are none."""
+    """Remove the installed causes to blame for an error, or else all; return False if none."""
     names = blamed(error) or _installed()
     for name in names:
         _leave_out(name, error)
@@ -94,7 +94,7 @@ def _leave_out(name: str, error: BaseException) -> None:
 
 
 def _check(kind: object, name: str, known: Mapping[str, type[Term]]) -> None:
-    """Refuse anything that is not a cause of this name."""
+    """Raise an error unless `kind` is a valid cause of this name."""
     if not (isinstance(kind, type) and issubclass(kind, Term)):
         raise TypeError('it is not a class derived from Term')
     if name != kind.NAME or not re.fullmatch('[a-z][a-z0-9_]*', name) or name in known:

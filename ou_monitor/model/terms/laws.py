@@ -1,4 +1,4 @@
-"""The data to which laws of the innovations are fitted (`View`), and common functions."""
+"""Data (`View`) to which laws, i.e. distributions of innovations, are fitted; common functions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _EDGE = 1e-15
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What a candidate is fitted to: the residual of the model so far."""
+    """The residual of the model so far, to which a candidate is fitted."""
 
     z: FloatArray  # Normal scores of the one-step innovations under the model so far; shape (n,)
     variance: FloatArray  # Predictive variance of each sample, V^2; shape (n,)
@@ -58,7 +58,7 @@ def log_normal(z: FloatArray, mean: FloatArray | float = 0.0, var: FloatArray | 
 
 def climb(value: Callable[[FloatArray], float], start: Sequence[float] | FloatArray,
           size: float = 0.4, most: int = 200) -> tuple[FloatArray, float]:
-    """Maximise a function of a few parameters (Nelder & Mead)."""
+    """Maximise a function of a few parameters (Nelder & Mead); return position and value."""
     x0 = np.asarray(start, dtype=np.float64)
     simplex = np.vstack([x0, x0 + size * np.eye(x0.size)])
     found = minimize(lambda x: -value(x), x0, method='Nelder-Mead',
@@ -83,7 +83,7 @@ def curvature_se(value: Callable[[FloatArray], float], at: FloatArray, step: flo
 
 def refine(values: Callable[[FloatArray], FloatArray], start: Sequence[float] | FloatArray,
            step: float = 0.1) -> tuple[FloatArray, float, FloatArray] | None:
-    """Maximise by Newton steps from nearby; return position, value and errors, or None."""
+    """Return position, value and errors of a maximum near `start` by Newton steps; None: none."""
     x = np.asarray(start, dtype=np.float64)
     size = x.size
     moves, pairs = step * np.eye(size), np.triu_indices(size, 1)
@@ -96,7 +96,7 @@ def refine(values: Callable[[FloatArray], FloatArray], start: Sequence[float] | 
             return None
         top, up, down = found[0], found[1:size + 1], found[size + 1:2 * size + 1]
         gradient, bend = (up - down) / (2.0 * step), np.diag((up - 2.0 * top + down) / step**2)
-        # Central differences, because a third derivative would bias one-sided ones.
+        # Central differences, because one-sided ones are biased by the third derivative.
         sides = found[2 * size + 1:].reshape(2, -1).sum(axis=0)
         alone = up + down - top
         bend[pairs] = (sides - alone[pairs[0]] - alone[pairs[1]]) / (2.0 * step**2)
@@ -104,7 +104,7 @@ def refine(values: Callable[[FloatArray], FloatArray], start: Sequence[float] | 
         curve, axes = np.linalg.eigh(bend)
         if curve[0] >= 0.0:
             return None
-        # Uphill along each axis, even where the curvature is positive.
+        # Step uphill along each principal axis, even if the curvature there is positive.
         by = axes @ (axes.T @ gradient / np.maximum(np.abs(curve), _STRAIGHT * -curve[0]))
         gain = 0.5 * float(by @ gradient)
         ends = x + np.clip(by, -0.5, 0.5) * _SHARES[:, None]
@@ -114,8 +114,8 @@ def refine(values: Callable[[FloatArray], FloatArray], start: Sequence[float] | 
         x, turn = ends[int(np.argmax(further))], turn + 1
 
 
-# Maximum Newton steps, gain below which they end, nats, step lengths tried, and minimum curvature
-# as a share of the largest.
+# Maximum number of Newton steps; gain, nats, below which they end; step lengths tried; minimum
+# curvature as a share of the largest.
 _NEWTON, _FLAT = 5, 0.05
 _SHARES = np.array([1.0, 0.4, 0.1])
 _STRAIGHT = 1e-3

@@ -1,4 +1,4 @@
-"""Common functions of spectral lines: states, and detection of broad and moving lines."""
+"""Common functions of the terms for lines: states, and detection of broad and moving lines."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def phase_noise(linewidth: float, rng: np.random.Generator
 def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float,
              lag: float = 0.0) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return two states that rotate, decay and are driven by noise, as `Term.block` (1/s, V)."""
-    # Autocovariance of the first: std^2 exp(-damping t) (cos a + lag sin a), a the angle in t.
+    # Autocovariance of the first: std^2 exp(-damping t) (cos a + lag sin a), a: angle in time t.
     shrink = np.exp(-damping * step)
     f, q = np.empty((step.size, 2, 2)), np.zeros((step.size, 2, 2))
     along, across = shrink * np.cos(turn), shrink * np.sin(turn)
@@ -45,7 +45,7 @@ def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float,
     if lag == 0.0:
         q[:, 0, 0] = q[:, 1, 1] = left
     else:
-        # The stationary covariance (1, -lag, 1 + 2 lag^2) less the rotated one.
+        # Stationary covariance (11: 1, 12: -lag, 22: 1 + 2 lag^2, times std^2) less the rotated.
         more, mixed = 2.0 * lag * lag * std * std, 2.0 * lag * std * std * along * across
         q[:, 0, 0] = left - more * across * across - mixed
         q[:, 1, 1] = left + more * (1.0 - along * along) + mixed
@@ -56,16 +56,16 @@ def rotation(turn: FloatArray, damping: float, step: FloatArray, std: float,
 
 # Segments per 1 / linewidth, and minimum number of segments.
 _FINE, _ENOUGH = 4.0, 12
-# Maximum `power_spread` of a line of constant amplitude, minimum of ringing; between the two,
-# evidence decides.  Simulated with outliers in 14 segments, 60 of 60 lines and 10 of 60 ringings
-# were below the maximum, 2 and 54 above the minimum (in 33 segments: 60 and 2, 0 and 60).
+# Maximum `power_spread` of a line of constant amplitude, and minimum of ringing; from 0.7 to 0.85,
+# evidence decides.  In simulations with outliers and 14 segments, 60 of 60 lines and 10 of 60
+# ringings were below CONSTANT, 2 and 54 above RINGING (33 segments: 60 and 2, 0 and 60).
 CONSTANT, RINGING = 0.85, 0.7
 
 
 def power_spread(view: View, frequency: float, linewidth: float) -> float:
-    """Return the interquartile range over the median of the power of a line by segment (Hz)."""
+    """Return interquartile range / median of a line's powers in segments (arguments in Hz)."""
     # 0 for a line of constant amplitude; ln 3 / ln 2 = 1.58 for ringing driven by noise, whose
-    # powers are exponential; NaN with too few segments.  Outliers hardly change it.
+    # powers are exponential; NaN with too few segments.  Outliers hardly affect it.
     length = int(view.rate / (_FINE * max(linewidth, 1.0 / float(view.at[-1]))))
     v, at = view.residual, view.at
     count = v.size // max(length, 1)
@@ -91,7 +91,7 @@ def prominence(z: FloatArray, rate: float, frequency: float, width: float) -> fl
 
 
 def broad_peaks(z: FloatArray, rate: float) -> list[tuple[float, float]]:
-    """Return the broad spectral peaks of scores (rate in Hz)."""
+    """Return frequency, Hz, and damping, 1/s, of broad spectral peaks of scores (rate in Hz)."""
     found = []
     for length in (64, 256, 1024, 4096):
         if z.size < 4 * length:
@@ -108,7 +108,7 @@ def broad_peaks(z: FloatArray, rate: float) -> list[tuple[float, float]]:
 
 
 def order_lines(view: View) -> list[tuple[float, float]]:
-    """Return the lines that follow throttle, by a Hough transform, then refined."""
+    """Return idle and slope, Hz, of lines that follow throttle (Hough transform, refined)."""
     if view.throttle is None:
         return []
     z, u = view.z[view.train], view.throttle[view.train]
@@ -120,7 +120,7 @@ def order_lines(view: View) -> list[tuple[float, float]]:
 
 
 def order_power(z: FloatArray, u: FloatArray, rate: float) -> tuple[float, float]:
-    """Return the rise of the strongest line that follows throttle, and the number tested."""
+    """Return the `rise` of the strongest line that follows throttle, and the number of trials."""
     top, trials = 0.0, 0.0
     for length in _lengths(rate):
         best = _hough(z, u, rate, length)
@@ -130,8 +130,8 @@ def order_power(z: FloatArray, u: FloatArray, rate: float) -> tuple[float, float
     return top, trials
 
 
-# Share of independent lines among those examined (neighbours share most bins): with it, 1 of 120
-# simulated flights of white noise exceeded the 95 % point.
+# Share of independent lines among the lines examined, because neighbours share most bins.  With
+# it, 1 of 120 simulated flights of white noise exceeded the 95 % point.
 _INDEPENDENT = 0.02
 # Maximum slope, in sampling rates: from idle to full throttle a line may fold once and return.
 _REACH = 1.0
@@ -140,7 +140,7 @@ _SHORTER = 8
 
 
 def _lengths(rate: float) -> tuple[int, ...]:
-    """Return the samples in a segment: a quarter of a second, and an eighth of that."""
+    """Return the lengths of segments, samples: about 0.25 s, and an eighth of it."""
     long = int(1 << max(5, round(math.log2(max(32.0, 0.25 * rate)))))
     short = max(long // _SHORTER, 32)
     return (long,) if short == long else (long, short)
@@ -150,21 +150,21 @@ def _lengths(rate: float) -> tuple[int, ...]:
 class _Line:
     """A line that follows throttle."""
 
-    rise: float  # Minus ln of the probability of its power by chance (bound)
-    # Frequency at no throttle, and its change up to full throttle, Hz.
+    rise: float  # Lower bound of -ln(probability of such a power by chance)
+    # Frequency at zero throttle, and its change up to full throttle, Hz.
     idle: float
     slope: float
     length: int  # Samples in a segment
 
 
 def _hough(z: FloatArray, u: FloatArray, rate: float, length: int) -> list[_Line]:
-    """Return the best idle for each slope, the strongest line first."""
+    """Return for each slope the line with the best idle, strongest first."""
     count = z.size // length
     if count < 8 or np.ptp(u) < 0.02:
         return []
     shape = z[:count * length].reshape(count, length)
     power = np.abs(np.fft.rfft(shape * np.hanning(length), 2 * length, axis=1)) ** 2
-    # Normalise each bin: a line at a fixed frequency does not follow throttle.
+    # Normalise each bin, which suppresses lines at a fixed frequency.
     power = (power / power.mean(axis=0)).astype(np.float32)
     load = u[:count * length].reshape(count, length).mean(axis=1)
     width = rate / (2.0 * length)
@@ -191,7 +191,7 @@ def _hough(z: FloatArray, u: FloatArray, rate: float, length: int) -> list[_Line
 
 def _refined(z: FloatArray, u: FloatArray, rate: float, idle: float, slope: float, width: float
              ) -> tuple[float, float]:
-    """Maximise the coherent power over segments that grow to the whole recording."""
+    """Refine idle and slope: maximise the power in segments that grow to the whole recording."""
     turns = np.cumsum(u - u.mean()) / rate
     idle += slope * float(u.mean())
     at = np.arange(z.size) / rate

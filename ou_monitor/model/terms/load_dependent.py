@@ -40,7 +40,7 @@ class LoadDependentSigma(Term):
     log_factor: tuple[float, ...] = parameters('', 'ln(sigma at the knot / sigma of the ou)')
 
     def check(self) -> None:
-        """Check that the knots rise and match."""
+        """Check that the knots rise, and that each has a factor."""
         if len(self.throttle) != len(self.log_factor) or not self.throttle:
             raise ValueError(
                 f'{self.NAME}: throttle and log_factor need the same number of values, got '
@@ -57,7 +57,7 @@ class LoadDependentSigma(Term):
         s.sigma *= np.exp(np.interp(s.throttle, self.throttle, self.log_factor))
 
     def free(self) -> tuple[str, ...]:
-        """Return all knots but the first, where sigma equals that of the OU."""
+        """Return the knots to fit: all but the first, where sigma is the OU's."""
         return tuple(f'log_factor {k}' for k in range(1, len(self.log_factor)))
 
     def moved(self, name: str, by: float) -> LoadDependentSigma:
@@ -98,19 +98,19 @@ class LoadDependentSigma(Term):
                 for _, knots, factors in forms[:2]]
 
 
-# Penalty of the search for the edge of a step, nats: ln of the edges tried.
+# Penalty of the search for the position of a step, nats: ln of the number of positions tried.
 _STEP_COST = 4.5
 # Penalty of the search for a knot, nats; number of bins, minimum scores in a bin, maximum knots.
 _KNOT_COST = 3.5
 _BINS, _IN_BIN, _MOST_KNOTS = 40, 20, 9
-# Largest logarithm of a factor; nothing else limits it where white noise hides the rail.
+# Maximum logarithm of a factor; nothing else limits it where white noise hides the rail.
 _MOST = 4.0
 # Minimum distance of knots, and half the width of a step, in throttle.
 _APART, _EDGE = 0.02, 0.002
 
 
 def _ends(throttle: FloatArray) -> FloatArray:
-    """Return lowest and highest throttle, held-out part included: knots of a straight line."""
+    """Return lowest and highest throttle, held-out part included, as knots of a straight line."""
     return np.array([throttle.min(), throttle.max()])
 
 
@@ -143,7 +143,7 @@ def _hats(x: FloatArray, knots: FloatArray) -> FloatArray:
 
 
 def _to_bins(bins: Bins, knots: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return for each set of knots the factors fitted to the bins, and the misfit, nats."""
+    """Return for each set of knots the log factors fitted to the bins, and the misfit, nats."""
     centre, log, count = bins
     # The logarithm of a standard deviation estimated from n scores has a variance of 1/(2 n).
     weight = 2.0 * count
@@ -157,7 +157,7 @@ def _to_bins(bins: Bins, knots: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _greedy(bins: Bins, knots: FloatArray, penalty: float, apart: float
             ) -> tuple[FloatArray, FloatArray, float]:
-    """Add the best knot while it gains `penalty`; return knots, factors and misfit, nats."""
+    """Add the best knot while it gains `penalty`; return knots, log factors and misfit, nats."""
     factors, misfit = _to_bins(bins, knots[None])
     found = knots, factors[0], float(misfit[0])
     while found[0].size < _MOST_KNOTS:
@@ -202,7 +202,7 @@ class LoadDependentAlpha(Term):
         return replace(self, slope=self.slope + by)
 
     def per_coordinate(self, name: str) -> float:
-        """Return 1: the slope is already that of a logarithm."""
+        """Return 1: the slope is itself the coordinate."""
         return 1.0
 
     @classmethod
@@ -213,30 +213,30 @@ class LoadDependentAlpha(Term):
 
 # Spans of the moving means of throttle from which changes are measured, s.
 _FAST, _SLOW = 0.03, 0.2
-# Inputs that the noise may depend on, and their time constants, s: throttle; its distance from
+# Inputs on which the noise may depend, and their time constants, s: throttle; its distance from
 # its mean over the last 30 ms; its change between samples; the distance between its means over the
 # last 30 and 200 ms; and decaying sums of its rises and of its falls.
 INPUTS = (('throttle', 0.0), ('fast', _FAST), ('step', 0.0), ('slow', _SLOW), *(
     (what, span) for span in (0.1, 0.5, 2.5) for what in ('rises', 'falls')))
-# Penalty of choosing an input, nats: ln of their number.
+# Penalty of choosing an input, nats: ln of the number of inputs.
 _INPUT_COST = math.log(len(INPUTS))
 # Minimum share of white noise in the one-step errors; below it, it cannot be separated.
 _LEAST_WHITE = 0.05
-# Quantiles between the bins of an input, dense at the top because most changes are zero.
+# Quantiles at the edges of an input's bins, dense at the top because most changes are zero.
 _SHARES = np.array([*np.linspace(0.0, 0.95, 39), 0.97, 0.98, 0.985, 0.99, 0.995, 0.998, 1.0])
-# Maximum squared score once the curves are roughly known, to limit the effect of wrong samples.
+# Maximum squared score once the curves are roughly known, to limit the effect of outliers.
 _LARGEST = 25.0
-# Rounds of fitting each curve given the others; minimum distance of knots over the range.
+# Rounds of fitting each curve given the others; minimum distance of knots relative to the range.
 _ROUNDS, _SPACING = 2, 0.02
-# Index of the curve that bends the sum of the others.
+# Index of the curve that is applied to the sum of the others.
 SUM = len(INPUTS)
 
 
 def _curve(square: FloatArray, x: FloatArray, shares: FloatArray, log: FloatArray | None
            ) -> tuple[FloatArray, FloatArray] | None:
-    """Return knots in x and ln of the scores' std over the first there; None if constant."""
-    # square: squared scores, shape (n,); shares: quantiles between the bins of x; log: a rough
-    # estimate of ln of the scores' std, shape (n,), if there is one.
+    """Return knots in x, and ln of the scores' std relative to the first; None if constant."""
+    # square: squared scores, shape (n,); shares: quantiles at the edges of the bins of x; log: a
+    # rough estimate of ln of the scores' std, shape (n,), if available.
     edges = np.unique(np.quantile(x, shares))
     if edges.size < 3:
         return None
@@ -245,7 +245,7 @@ def _curve(square: FloatArray, x: FloatArray, shares: FloatArray, log: FloatArra
         square = np.minimum(square, _LARGEST * usual * np.exp(2.0 * log))
     centre, values, count = _binned(square, x, edges)
     if log is not None:
-        # The mean of heavy-tailed squares is less certain than that of normal ones.
+        # With heavy tails, the mean square is less certain: reduce the effective count.
         unit = square * np.exp(-2.0 * log)
         count = count / max(0.5 * float(np.mean(unit**2) / np.mean(unit)**2) - 0.5, 1.0)
     flat = 0.0 if centre.size < 2 else float(np.sum(
@@ -266,8 +266,8 @@ class LoadDependentNoise(Term):
     Multiply the white noise by a factor that depends on throttle and its changes.
 
     The logarithm of the factor is a sum of curves over some of `INPUTS`, linear between knots and
-    constant beyond them; a last curve may bend the sum.  A power of the factor may multiply
-    sigma too, if the load disturbs the rail itself.
+    constant beyond them; a last curve may be applied to the sum.  A power of the factor may
+    multiply sigma too, if the load disturbs the rail itself.
     """
 
     NAME: ClassVar[str] = 'load_dependent_noise'
@@ -297,7 +297,7 @@ class LoadDependentNoise(Term):
     on_sigma: float = parameter('', 'power of the factor that multiplies sigma', 0.0, default=0.0)
 
     def check(self) -> None:
-        """Check that the knots rise and match."""
+        """Check the indices, that all lists have the same length, and that the knots rise."""
         whole = all(float(k).is_integer() and 0 <= k <= SUM for k in self.number)
         if not whole or not len(self.number) == len(self.at) == len(self.log_factor):
             raise ValueError(f'{self.NAME}: number (0 to {SUM}), at and log_factor '
@@ -308,13 +308,13 @@ class LoadDependentNoise(Term):
                 raise ValueError(f'{self.NAME}.at must rise for one input, got {list(knots)}')
 
     def curves(self) -> dict[int, tuple[FloatArray, FloatArray]]:
-        """Return knots and factors by the index of the input."""
+        """Return knots and log factors by the index of the input."""
         numbers = np.asarray(self.number, dtype=int)
         return {k: (np.asarray(self.at)[numbers == k], np.asarray(self.log_factor)[numbers == k])
                 for k in np.unique(numbers).tolist()}
 
     def factors(self) -> dict[str, tuple[list[float], list[float]]]:
-        """Return knots and factors by the name of the input; the product has an input itself."""
+        """Return knots and factors by input; `product`: a curve over the product of the others."""
         names = [f'{what} {span:g} s' if span else what for what, span in INPUTS]
         return {(*names, 'product')[k]: (
             (np.exp(at) if k == SUM else at).tolist(), np.exp(log).tolist())
@@ -361,7 +361,7 @@ class LoadDependentNoise(Term):
         square = view.z[view.train] ** 2
         white = 1.0 - np.broadcast_to(view.trust, view.z.shape)[view.train]
         if float(white.mean()) > _LEAST_WHITE:
-            # Subtract the rail's part, which the term does not scale.
+            # Subtract the part of the rail's own noise, which the term does not scale.
             square = np.maximum(square - (1.0 - white), 0.0) / np.maximum(white, _LEAST_WHITE)
         square = square * np.exp(2.0 * self.log_of(inputs))
         few = max(1, math.ceil(2.0 * _IN_BIN * _SHARES.size / square.size))

@@ -15,7 +15,7 @@ from ou_monitor.model.terms.term import by_parameters, NEXT_TO_ZERO, parameter, 
 from ou_monitor.records import FloatArray
 
 
-# Evidence needed for a growth beyond the penalty of its parameter, nats: as much as for a cause.
+# Evidence required for a growth in addition to the penalty of its parameter, nats: as for a cause.
 # Without it, a growth was found in 5 of 72 simulated flights with a steady sag; with it, in none.
 _GROWS = 6.0
 
@@ -26,7 +26,7 @@ class LoadSag(Term):
     Subtract (linear + growth * t) * throttle + square * throttle^2 from the level.
 
     t is the time since the first sample: the resistance of a pack rises as it empties, and falls
-    as it warms.  A square or growth of exactly 0 stays 0 in a fit.
+    as it warms.  A square or growth of exactly 0 is not fitted.
     """
 
     NAME: ClassVar[str] = 'load_sag'
@@ -42,8 +42,8 @@ class LoadSag(Term):
     MEASURED: ClassVar[bool] = True
     LIVE: ClassVar[bool] = True
     MEANING: ClassVar[str] = (
-        'The mean falls with throttle: IR drop of battery, leads and regulator. This is the fall '
-        'once settled; sag and resistance of the supply are read after 1 s.')
+        'The mean falls with throttle: IR drop of battery, leads and regulator. These are settled '
+        'values; sag and resistance of the supply refer to 1 s after a step.')
     REMEDY: ClassVar[str] = (
         'Give the estimator the throttle, so that it removes the sag; thicker or shorter leads '
         'reduce it.')
@@ -67,7 +67,7 @@ class LoadSag(Term):
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
         """Return a straight line, a parabola, and one that grows."""
-        # A straight line that grows would take its curvature from a slow transient.
+        # Not a growing straight line: a slow transient would be added to replace its curvature.
         return cls(0.0, 0.0), cls(0.0, NEXT_TO_ZERO), cls(0.0, NEXT_TO_ZERO, NEXT_TO_ZERO)
 
 
@@ -78,12 +78,12 @@ _ROUNDING = 1e-9
 @dataclass(frozen=True)
 class LoadTransient(Term):
     """
-    Add gain * d(u) + square * d(u^2) + rise * max(d(u), 0): d is a value less its low-pass (tau).
+    Add gain * d(u) + square * d(u^2) + rise * max(d(u), 0), with d(x) = x - low-pass of x (tau).
 
     u is the delayed throttle.  Without square, a unit step up adds (gain + rise) * exp(-t/tau), a
     unit step down -gain * exp(-t/tau): motors draw more current while they speed up, and return
-    none while they slow down.  gain > 0 delays the sag (gain and square equal to those of the sag
-    give a low-pass); gain < 0 deepens the sag at first (inrush).
+    none while they slow down.  gain > 0 delays the sag (if gain and square equal the sag's linear
+    and square, the result is a low-pass); gain < 0 deepens the sag at first (inrush).
     """
 
     NAME: ClassVar[str] = 'load_transient'
@@ -91,7 +91,7 @@ class LoadTransient(Term):
     STAGE: ClassVar[Stage] = Stage.LEVEL
     NEEDS_THROTTLE: ClassVar[bool] = True
     ROLE: ClassVar[Role] = Role.MEAN
-    # A rise or square of 0 stays 0 in a fit.
+    # A rise or square of 0 is not fitted.
     LINEAR: ClassVar[tuple[str, ...]] = by_parameters(
         ('gain', 'rise', 'square'), lambda term: (
             'gain', *(name for name in ('rise', 'square') if getattr(term, name))))
@@ -118,7 +118,7 @@ class LoadTransient(Term):
                               label='decaying part, square', default=0.0)
 
     def about(self) -> tuple[str, str]:
-        """Return what a response of this sign and time constant is, and what to do about it."""
+        """Return meaning and remedy of a response of this sign and time constant."""
         kind = type(self)
         late = self.gain + self.rise + self.square > 0.0
         return (kind.MEANING, kind.REMEDY) if self.delay else _ABOUT[self.tau > _INRUSH, late]
@@ -133,7 +133,7 @@ class LoadTransient(Term):
             nonlocal times, values
             throttle = s.throttle
             if self.delay > 0.0:
-                # Throttle `delay` ago; before the start, the first throttle.
+                # Use the throttle `delay` ago; at the beginning, the first throttle.
                 times = np.concatenate((times, s.at))
                 values = np.concatenate((values, throttle))
                 # Rounding matters where the delay is a whole number of steps.
@@ -160,7 +160,7 @@ class LoadTransient(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return time constants from half a step to a quarter of the recording, and delays."""
+        """Return time constants from half a step to an eighth of the recording, and delays."""
         step = 1.0 / view.rate
         longest = LONGEST * float(view.at[-1])
         if longest <= 2.0 * step:
@@ -175,7 +175,7 @@ class LoadTransient(Term):
         return tuple(form for term in (*lags, *late) for form in term.forms())
 
     def forms(self) -> tuple[LoadTransient, ...]:
-        """Return the response to throttle itself, to its square too, and with an inrush."""
+        """Return variants to fit: linear, with a square, and with an inrush if fast enough."""
         plain = replace(self, rise=0.0, square=0.0)
         inrush = self.tau < _INRUSH and not self.delay
         return (plain, replace(plain, square=NEXT_TO_ZERO),
@@ -185,20 +185,20 @@ class LoadTransient(Term):
 # Shortest visible time constant, in steps: one seventh of the response remains at the next sample.
 SHORTEST = 0.5
 # Longest time constant, in durations of the recording: a slower response looks like a drift
-# (with a quarter, held-out scores of ar8, jd and cf_takeoff were lower).
+# (with 0.25, the held-out scores of three recordings were lower).
 LONGEST = 0.125
 # Longest time that motors take to speed up, s.
 _INRUSH = 0.2
-# By whether it is slower than motors, and whether it delays the fall instead of deepening it.
+# Meaning and remedy by (slower than motors, delays the fall instead of deepening it).
 _ABOUT = {
-    (False, True): ('Part of the fall lags behind throttle, as do motors and filters.',
-                    'Shorter punches fall less.'),
+    (False, True): ('Part of the fall lags behind throttle: motors and filters respond late.',
+                    'Expect a smaller fall in short bursts of throttle.'),
     (False, False): ('The voltage falls deepest just after throttle rises: inrush of motors.',
-                     'Include this fall in the brown-out margin; capacitance at the ESC makes it '
-                     'shallower.'),
-    (True, True): ('Part of the fall comes late after throttle and recovers as slowly: '
+                     'Include this fall in the brown-out margin; capacitance at the ESC reduces '
+                     'it.'),
+    (True, True): ('Part of the fall follows throttle slowly, and recovers as slowly: '
                    'polarisation of a battery, or a slow regulator.',
-                   'Take the brown-out margin for the longest punch.'),
+                   'Set the brown-out margin for the longest burst of throttle.'),
     (True, False): ('Part of the fall after throttle rises recovers while it is held: a regulator '
                     'corrects it, or a battery warms.',
                     LoadTransient.REMEDY)}

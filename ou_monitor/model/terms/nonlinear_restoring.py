@@ -28,20 +28,20 @@ class NonlinearRestoring(Term):
         'The restoring force is not proportional to the deviation: a constant-power load, or '
         'softening near brown-out.')
     REMEDY: ClassVar[str] = (
-        'Expect deep excursions to be longer and more frequent than the linear model says.')
+        'Expect deep excursions to be longer and more frequent than the linear model predicts.')
     SEPARATED_BY: ClassVar[str] = 'larger excursions: load steps in both directions'
 
     square: float = parameter('1/(V s)', 'coefficient of x^2')
     cube: float = parameter('1/(V^2 s)', 'coefficient of x^3', 0.0)
 
     def check(self) -> None:
-        """Check that the force pulls back at large deviations."""
+        """Check that the force is restoring at large deviations."""
         if self.square != 0.0 and self.cube == 0.0:
-            raise ValueError(f'{self.NAME}: square needs a cube above 0, else the voltage runs '
-                             'away')
+            raise ValueError(f'{self.NAME}: square needs a cube above 0, else the voltage '
+                             'diverges')
 
     def change(self, s: Segment) -> None:
-        """Bend the force."""
+        """Add the nonlinear coefficients to the force."""
         s.bend = (s.bend[0] + self.square, s.bend[1] + self.cube)
 
     @classmethod
@@ -55,7 +55,7 @@ class NonlinearRestoring(Term):
 
     @classmethod
     def _fit_powers(cls, view: View, powers: tuple[int, ...]) -> LawFit | None:
-        """Fit the linear force and some powers."""
+        """Fit a change of the linear force, and coefficients of the given powers."""
         train = view.train
         span = np.where(np.isfinite(view.step), view.step, 0.0)
         s, x = np.sqrt(view.variance), view.state
@@ -86,8 +86,8 @@ class NonlinearRestoring(Term):
             return scores, log_normal(scores) - 0.5 * np.log(spread)
 
         level = [0.0, 1.0]
-        # The start is a regression with a constant force within each step.  Bad coefficients, or a
-        # stuck sensor, make the voltage overflow.
+        # Start from a regression, which holds the force constant within each step.  Overflows are
+        # harmless: they come from bad coefficients, or a stuck sensor.
         with np.errstate(over='ignore', invalid='ignore'):
             b = _maximise(lambda b: scored(b, train)[1], inverse @ (inside.T @ view.z[train]),
                           error)
@@ -101,9 +101,9 @@ class NonlinearRestoring(Term):
         errors = dict(zip(powers, error[1:].tolist(), strict=True))
         square, cube = by.get(2, 0.0), by.get(3, 0.0)
         if cube < 0.0:
-            # The force would push the voltage away without limit.
+            # The voltage would diverge.
             return None
-        # The cube must be large enough to keep the square from pushing the voltage away.
+        # The cube must be large enough for a stable voltage in spite of the square.
         cube = max(cube, _HOLDS * square * square / alpha)
         return LawFit(cls(square, cube), {'square': errors.get(2, math.nan),
                                           'cube': errors.get(3, math.nan)}, scores,
@@ -112,7 +112,7 @@ class NonlinearRestoring(Term):
 
 def _linearised(x: FloatArray, span: FloatArray, linear: float, square: float, cube: float,
                 variance: float) -> tuple[FloatArray, FloatArray]:
-    """Return the mean move of each deviation in a step, V, and its variance over `variance`."""
+    """Return the mean change of x in each step, V, and its variance relative to `variance`."""
     # In each part of the step, the force is linearised about the deviation at its beginning, with
     # the mean effect of its curvature (Shoji & Ozaki, Stoch. Anal. Appl. 16 (1998) 733).  Beyond
     # the extremum of a softening force, the force stays constant.
@@ -161,7 +161,7 @@ def _maximise(density: Callable[[FloatArray], FloatArray], b: FloatArray, error:
     return b
 
 
-# Minimum cube in square^2/alpha: from 1/4 on, the force has only one zero.
+# Minimum cube, in square^2/alpha: above 1/4, the force has only one zero.
 _HOLDS = 0.26
 # Slope of the force times the step: maximum, minimum, and value above which the step is split;
 # maximum number of parts.

@@ -13,9 +13,9 @@ from ou_monitor.model.terms.segment import Effect, Segment, Stage
 from ou_monitor.model.terms.term import parameter, Term
 from ou_monitor.records import FloatArray
 
-# With a nonlinear force, a step is split into parts of at most this many relaxation times (of the
-# whole force at one standard deviation); the error of the law is of second order in it.  Maximum
-# number of parts of a step.
+# With a nonlinear force, maximum length of the parts of a step, in relaxation times (of the whole
+# force at one standard deviation; the error in law is of second order in it), and maximum number
+# of parts of a step.
 _PART = 0.05
 _PARTS_MOST = 1_000_000
 # Maximum number of parts whose random numbers are stored at once.
@@ -64,8 +64,8 @@ class OU(Term):
 def _transition(s: Segment) -> tuple[FloatArray, FloatArray]:
     """Return the decay of the state in each step, and the deviation of the added noise, V."""
     n = s.step.size
-    # If all steps and alphas are equal, two values suffice: of the first sample, which may follow
-    # a gap, and of any other.
+    # If all steps and alphas are equal, two values suffice: one for the first sample, which may
+    # follow a gap, and one for the others.
     some = slice(2) if steady(s.step[1:]) and steady(s.alpha[1:]) else slice(n)
     alpha, step = s.alpha[some], s.step[some]
     phi = _extended(n, np.exp(-alpha * step))
@@ -89,18 +89,18 @@ def _nonlinear(s: Segment, kicks: FloatArray, before: float, rng: np.random.Gene
                ) -> FloatArray:
     """Return the state under a nonlinear force; rng gives the draws of split steps."""
     square, cube = s.bend
-    # A long first step starts from the stationary law.
+    # After 20 relaxation times, the law is stationary; the first step may be infinite.
     span = np.minimum(s.step, 20.0 / s.alpha)
     wanted = (s.alpha + _stiffness(s)) * span / _PART
     if not (wanted < _PARTS_MOST).all():
-        raise ValueError('nonlinear_restoring: the voltage runs away, or the force is far too '
-                         f'strong for a step of {float(span[np.argmax(wanted)]):g} s')
+        raise ValueError('nonlinear_restoring: the voltage diverges, or the force is too strong '
+                         f'for a step of {float(span[np.argmax(wanted)]):g} s')
     parts = np.maximum(1, np.ceil(wanted)).astype(np.int64)
     h = span / parts
     phi = np.exp(-s.alpha * h)
     spread = s.sigma * np.sqrt(-np.expm1(-2.0 * s.alpha * h) / (2.0 * s.alpha) * s.power)
     x = np.empty(s.t.size)
-    # In bundles of samples, which bounds the memory and keeps the order of the draws.
+    # Bundles of samples limit the memory; they do not change the order of the draws.
     for some in _bundles(parts):
         cut = parts[some]
         draws = np.empty(int(cut.sum()))
@@ -124,9 +124,9 @@ def _nonlinear(s: Segment, kicks: FloatArray, before: float, rng: np.random.Gene
                 before -= by_square * middle * middle
                 before /= math.sqrt(1.0 + by_cube * before * before)
                 if not (-1e6 < before < 1e6 and -0.5 < by_square * before < 0.5):
-                    raise ValueError('nonlinear_restoring: the voltage runs away; the force must '
-                                     'pull back where x^2 is stronger than alpha x (a larger '
-                                     'cube)')
+                    raise ValueError('nonlinear_restoring: the voltage diverges; increase cube, '
+                                     'so that the force restores where square x^2 exceeds '
+                                     'alpha x')
             before += push
             path.append(before)
         x[some] = path
@@ -134,14 +134,14 @@ def _nonlinear(s: Segment, kicks: FloatArray, before: float, rng: np.random.Gene
 
 
 def _bundles(parts: npt.NDArray[np.int64]) -> list[slice]:
-    """Return slices with about `_DRAWS` parts in all, or one sample that has more."""
+    """Return slices of samples with about `_DRAWS` parts each, or of one sample with more."""
     bundle = np.cumsum(parts) // _DRAWS
     edges = [0, *(np.flatnonzero(np.diff(bundle)) + 1).tolist(), parts.size]
     return [slice(first, last) for first, last in zip(edges, edges[1:])]
 
 
 def _stiffness(s: Segment) -> FloatArray:
-    """Return the rate that the nonlinear force adds at one deviation, 1/s, shape (n,)."""
+    """Return the rate that the nonlinear force adds at one standard deviation, 1/s, (n,)."""
     square, cube = s.bend
     var = s.sigma * s.sigma / (2.0 * s.alpha)
     if cube > 0.0:

@@ -28,8 +28,8 @@ class MeasurementNoise(Term):
     SIGNS: ClassVar[tuple[str, ...]] = ('-autocorrelation', '+band')
     MAY_LEAVE: ClassVar[float] = 0.3
     MEANING: ClassVar[str] = (
-        'The readings have white noise: of the sensor, or of a rail that relaxes faster than the '
-        'sampling, which looks the same.')
+        'The readings have white noise: from the sensor, or from a rail that relaxes faster than '
+        'the sampling, which looks the same.')
     REMEDY: ClassVar[str] = (
         'Sample faster to tell them apart; if it is the sensor, average in the ADC or use a finer '
         'range. Alpha and sigma fitted without it are too high.')
@@ -50,12 +50,12 @@ class MeasurementNoise(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return two shares of the one-step error."""
+        """Return starting points at two shares of the one-step error."""
         error = math.sqrt(float(np.median(view.variance)))
         return [cls(0.1 * error), cls(0.4 * error)]
 
     def holds(self, view: View) -> bool:
-        """Return whether it is a measurable share of the one-step error."""
+        """Return whether the noise is a measurable share of the one-step variance."""
         return self.variance() > _LEAST * float(np.median(view.variance))
 
     def variance(self) -> float:
@@ -68,7 +68,7 @@ class MeasurementNoise(Term):
 
 
 # Share of the one-step variance below which white noise counts as 0: a share s changes the log
-# likelihood of n samples by n s^2/4, too little to show even with 10^7 samples.
+# likelihood of n samples by n s^2/4, which is too little to detect even with 10^7 samples.
 _LEAST = 1e-3
 
 
@@ -79,7 +79,7 @@ class LopsidedNoise(Term):
 
     A draw is sinh((asinh(normal) + skew) / tail), standardised (Jones & Pewsey, Biometrika 96
     (2009) 761).  With skew < 0, dips are rarer and deeper than rises; with tail < 1, both tails
-    are heavier.  Without a `measurement_noise` to shape, it does nothing.
+    are heavier.  It has no effect without a `measurement_noise`.
     """
 
     NAME: ClassVar[str] = 'lopsided_noise'
@@ -120,12 +120,12 @@ class LopsidedNoise(Term):
         return found if float(white.mean()) > _MOSTLY and paid else None
 
     def refit_law(self, view: View) -> LawFit:
-        """Fit again unconditionally: the evidence decides whether the cause stays."""
+        """Fit again without conditions: the evidence decides whether the cause stays."""
         return self._best_fit(view)[0]
 
     @classmethod
     def _best_fit(cls, view: View) -> tuple[LawFit, bool]:
-        """Return the fit, and whether its asymmetry gains more than a parameter costs."""
+        """Return the fit, and whether asymmetry gains more than the penalty of a parameter."""
         z = view.z
         edges = np.unique(np.quantile(z[view.train], np.linspace(0.0, 1.0, _CELLS + 1)))
         cells = np.clip(np.searchsorted(edges, z[view.train]) - 1, 0, edges.size - 2)
@@ -192,7 +192,7 @@ class Quantization(Term):
     ROLE: ClassVar[Role] = Role.NOISE
     MEANING: ClassVar[str] = 'The resolution of the ADC is comparable to the noise.'
     REMEDY: ClassVar[str] = (
-        'Use a smaller range of the ADC or more gain ahead of it; sigma is partly rounding.')
+        'Use a smaller range of the ADC or more gain before it; a part of sigma is rounding.')
     SEPARATED_BY: ClassVar[str] = 'the same rail with a smaller range of the ADC'
 
     step: float = parameter('V', 'resolution, one code', 0.0, above=True)
@@ -208,7 +208,7 @@ class Quantization(Term):
 
 @dataclass(frozen=True)
 class Saturation(Term):
-    """Keep the voltage within limits."""
+    """Clip the voltage at limits."""
 
     NAME: ClassVar[str] = 'saturation'
     FAMILY: ClassVar[str] = 'sensor'
@@ -294,7 +294,7 @@ class ClockJitter(Term):
             # At the end of a segment the next step is unknown, so the previous one is used.
             bound = np.where(np.isfinite(gap), 0.45 * gap, 0.0)
             error = self.std * rng.standard_normal(s.t.size)
-            # With uneven stamps, the previous sample may be later than this one.
+            # Times must not decrease, but with uneven stamps the errors may exchange two samples.
             s.at = np.maximum(np.maximum.accumulate(s.t + np.clip(error, -bound, bound)), last)
             s.step = np.diff(s.at, prepend=last)
             last, stamp = float(s.at[-1]), float(s.t[-1])
@@ -303,7 +303,7 @@ class ClockJitter(Term):
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
-        """Fit hidden errors of the stamps: a longer step contains more noise."""
+        """Fit the hidden errors of the stamps, which show because longer steps add more noise."""
         return cls._best_fit(view, [math.log(0.2), 0.0], 40)
 
     def refit_law(self, view: View) -> LawFit | None:
@@ -319,8 +319,8 @@ class ClockJitter(Term):
         square = z * z
         if (float(np.mean(square**2)) > _MOST_KURTOSIS
                 or _square_correlation(square) > _MOST_CORRELATION):
-            # Errors of at most half a step have a smaller kurtosis, and a step that is too long
-            # makes the next one too short.
+            # Not jitter: errors of at most half a step cause a smaller kurtosis, and a step that
+            # is too long makes the next one too short, so neighbouring squares anticorrelate.
             return None
         state = view.state / np.sqrt(view.variance)
         z, inside = z[:_SHORT], state[view.train][:_SHORT]
@@ -343,15 +343,15 @@ class ClockJitter(Term):
 
 
 def _square_correlation(square: FloatArray) -> float:
-    """Return the correlation of neighbouring squares over its standard error."""
+    """Return the correlation of neighbouring squares in standard errors."""
     c = square - square.mean()
     return math.sqrt(c.size) * float(c[1:] @ c[:-1]) / float(c @ c)
 
 
-# Samples in a fit; maximum fourth moment that jitter causes; maximum correlation of neighbouring
-# squares, which jitter makes negative.
+# Number of samples in a fit; maximum fourth moment that jitter causes; maximum correlation of
+# neighbouring squares, in standard errors (jitter makes it negative).
 _SHORT, _MOST_KURTOSIS, _MOST_CORRELATION = 15000, 6.0, 4.0
-# Number of levels of a stamp's error.
+# Number of discrete levels of a stamp's error.
 _LEVELS = 7
 
 
@@ -361,9 +361,9 @@ _LEAST_JITTER = 1e-12
 
 def _errors(z: FloatArray, state: FloatArray, phi: float, x: FloatArray
             ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return predicted law of the last error, densities, stds and shifts of pairs, and prior."""
-    # A shift is the change of the score that the error of the step causes, per standard deviation
-    # of the rail from its mean.
+    """Return predicted probabilities of the last stamp's error, log densities, and more."""
+    # Further: stds and shifts for pairs of successive errors, and the prior of an error.  A shift
+    # is the change of the score due to the error of the step, per unit of `state`.
     nodes = np.linspace(-2.4, 2.4, _LEVELS)
     law = np.exp(-0.5 * nodes * nodes)
     law /= law.sum()

@@ -1,11 +1,11 @@
 """
 Markov switching of the mean or of sigma, unrelated to throttle.
 
-The filter of the Gaussian part does not know the levels: after a change of level its errors are
-large until it has followed, which takes longer with more white noise.  How far it has followed
-depends on all earlier states; they are replaced by their mean given the samples so far
-(generalised pseudo-Bayesian filter of first order; Blom & Bar-Shalom, IEEE Trans. Autom. Control
-33 (1988) 780).
+The filter of the Gaussian part assumes a constant level: after a change, its errors are large
+until it has converged to the new level, which takes longer with more white noise.  The progress of
+this convergence depends on all earlier states, which are approximated by their mean given the
+samples so far (generalised pseudo-Bayesian filter of first order; Blom & Bar-Shalom, IEEE Trans.
+Autom. Control 33 (1988) 780).
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from scipy.linalg import expm
 from scipy.special import ndtr
 
 
-# Median of the size of a normal score.
+# Median absolute value of a normal score.
 _MEDIAN = 0.6745
 # Filter gain above which it counts as 1; level, in standard deviations of an innovation, below
 # which it counts as 0.
 _ALL, NO_LEVEL = 0.98, 0.2
-# Minimum correlation of the residual for an OU beside the levels.
+# Minimum correlation of adjacent residuals to fit an OU to the voltage without levels.
 _LEAST = 1e-3
-# Starts: remaining share of the fitted noise when levels are added; heights of levels relative to
-# the spread.
+# Starting points: noise of the OU relative to the fit without levels; heights of the levels
+# relative to the spread.
 _CALMER, _HEIGHTS = (0.1, 0.01), (0.7, 1.2, 2.0)
 
 
@@ -53,7 +53,7 @@ def stationary_law(rates: FloatArray) -> FloatArray:
 
 
 def step_chances(x: FloatArray, step: float, states: int) -> FloatArray:
-    """Return the transition probabilities of one step."""
+    """Return the transition probabilities of one step, s, for coordinates x as in `Start`."""
     rates = rates_between(math.exp(x[0]), math.exp(x[1]), states)
     moved: FloatArray = expm((rates - np.diag(rates.sum(axis=1))) * step)
     return moved
@@ -71,7 +71,7 @@ class Scores:
     # Gain of the filter at the previous sample; shape (n,).
     trust: FloatArray
     step: float  # Time between samples, s
-    # How far the filter has followed the states up to two samples ago, in levels; shape (n,).
+    # Response of the filter to the states up to two samples ago, in levels; shape (n,).
     followed: FloatArray
 
     @classmethod
@@ -113,12 +113,12 @@ class Scores:
         exp, found, before = math.exp, [], law.tolist()
         followed = moved = 0.0
         for off, high, keep, draw, slow in columns:
-            # The filter has followed the level (at_once), or the rail that moves towards it.
+            # With at_once the filter follows the level, otherwise the rail, which follows it.
             behind = keep * (followed if at_once else followed - moved)
             found.append(behind)
             more = high * behind
             if states == 2:
-                # Written out because half the time of a search was spent here.
+                # Unrolled, because half the time of a search was spent here.
                 known = before[1] - middle
                 low, top = before
                 (a, b, c, d), (e, f) = off, scales
@@ -167,7 +167,7 @@ def chain_of(s: Scores, x: FloatArray, at_once: float, states: int = 2
 
 
 def moving(view: View, size: int) -> slice:
-    """Return the part of a given size in which the voltage moves most, relative to its noise."""
+    """Return the part of a given size with the largest variance relative to the noise."""
     moves = (view.residual / np.sqrt(view.variance))[view.train]
     starts = range(0, moves.size - size + 1, max(size // 2, 1))
     begin = max(starts, key=lambda k: float(moves[k:k + size].var()))
@@ -194,7 +194,7 @@ def relaxing(view: View, faster: float) -> View:
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A start of a fit."""
+    """Starting point of a fit."""
 
     x: FloatArray  # Two ln rates, level in std of an innovation, ln sigma ratio, ln scale
     at_once: float
@@ -203,8 +203,8 @@ class Start:
 
 
 def calm_levels(view: View, part: slice, spread: float, rates: FloatArray) -> Start | None:
-    """Return a start for levels in white noise, with a view that shows them; None without it."""
-    # An `ou` that was fitted to the levels follows them, so starts with less noise are tried.
+    """Return a start for levels beside white noise, and a view; None without white noise."""
+    # An `ou` that was fitted without levels absorbs them, so OUs with less noise are tried.
     # Heights are tried up to twice the spread, V, where two levels explain all of it.
     if bool((Scores.of(view).trust == 1.0).all()):
         return None
@@ -224,7 +224,7 @@ def calm_levels(view: View, part: slice, spread: float, rates: FloatArray) -> St
 
 
 def _with_less_noise(view: View, share: float) -> View:
-    """Return the view for a rail with a share of the noise, and the same white noise."""
+    """Return the view for an OU with a share of its noise, and the same white noise."""
     keep = min(float(np.median(view.phi[view.train])), 1.0 - 1e-9)
     trust = float(np.median(np.broadcast_to(view.trust, view.z.shape)[view.train]))
     variance = float(np.median(view.variance))
@@ -235,7 +235,7 @@ def _with_less_noise(view: View, share: float) -> View:
 
 
 def _filtered(view: View, keep: float, trust: float, variance: float) -> View:
-    """Return the view of a settled filter (keep: phi of a usual step; variance in V^2)."""
+    """Return the view of a steady-state filter (keep: phi of the median step; variance, V^2)."""
     phi = view.phi**(math.log(keep) / math.log(float(np.median(view.phi[view.train]))))
     before = np.concatenate(([0.0], view.residual[:-1]))
     e = view.residual - first_order(phi * (1.0 - trust), phi * trust * before, 0.0)
@@ -270,14 +270,14 @@ def without_levels(view: View, levels: FloatArray) -> View:
 
 
 def _settled_variances(keep: float, power: float, white: float) -> tuple[float, float]:
-    """Return the settled predictive variance of the OU, and the variance of the white noise."""
+    """Return the steady-state predictive variance of the OU, and the white noise's variance."""
     drive = power * (1.0 - keep * keep)
     b = white * (1.0 - keep * keep) - drive
     return 0.5 * (-b + math.sqrt(b * b + 4.0 * drive * white)), white
 
 
 def _dwells(view: View) -> FloatArray:
-    """Return the times in a state, s, from which fits start."""
+    """Return initial values of the mean time in a state, s."""
     return np.array([5.0, 50.0]) * math.exp(-_fastest(view))
 
 
@@ -288,12 +288,12 @@ def _densities(view: View, other: View) -> FloatArray:
 
 
 def _ahead(fit: LawFit, other: LawFit, part: slice) -> float:
-    """Return by how much a fit is more likely than another in a part of the samples, nats."""
+    """Return the log-likelihood of a fit less another fit's, in a part of the samples, nats."""
     return float((fit.gain - other.gain)[part].sum())
 
 
 def _first_fits(view: View) -> list[Start]:
-    """Return the best short fit without a level, and the best with one."""
+    """Return the best short fit with equal levels, and the best with different levels."""
     best: dict[bool, tuple[float, Start]] = {}
     spread = math.sqrt(float(np.mean(view.residual[view.train] ** 2)))
     first = slice(0, min(_SHORT, view.train.stop))
@@ -325,7 +325,7 @@ def _first_fits(view: View) -> list[Start]:
 
 
 def _fit_again(fit: LawFit, start: Start, view: View) -> Start:
-    """Return a start at a fit, for a view of another relaxation and noise."""
+    """Return a start at the rates and level of a fit, for a view with another OU."""
     term, unit = fit.term, math.sqrt(float(np.median(view.variance)))
     assert isinstance(term, RegimeSwitching)
     return Start(np.array([math.log(term.rate_up), math.log(term.rate_down), term.level / unit,
@@ -339,7 +339,7 @@ _MOST = 5_000_000
 @dataclass(frozen=True)
 class RegimeSwitching(Term):
     """
-    Switch between two or three states; each step up adds `level` and multiplies sigma.
+    Switch between two or three states; each higher state adds `level` and multiplies sigma.
 
     The rate from a state to each higher one is `rate_up`, to each lower one `rate_down`.
     Exact in law: switching times are drawn, and sigma is integrated over the parts of a
@@ -424,7 +424,7 @@ class RegimeSwitching(Term):
         return effect
 
     def holds(self, view: View) -> bool:
-        """Return whether enough changes are expected for a random process, not a few steps."""
+        """Return whether the expected number of changes suffices for a random process."""
         rates = rates_between(self.rate_up, self.rate_down, int(self.states))
         span = float(view.at[view.train.stop - 1] - view.at[0])
         return float(stationary_law(rates) @ rates.sum(axis=1)) * span >= _CHANGES
@@ -445,7 +445,7 @@ class RegimeSwitching(Term):
             if fit is None:
                 continue
             if start.to_refine and fit.offset is not None:
-                # The voltage without levels shows the relaxation and the noise of the rail.
+                # The voltage without levels gives a better OU.
                 starts.append(_fit_again(fit, start, without_levels(view, fit.offset)))
             if start.view is not view:
                 fit = replace(fit, gain=fit.gain + log_normal(start.view.z)
@@ -458,13 +458,13 @@ class RegimeSwitching(Term):
 
     @classmethod
     def _slow_or_three(cls, view: View, two: LawFit, start: Start) -> LawFit:
-        """Return a fit of slow levels or of three states if it is better than the two states."""
+        """Return a fit of slow levels or of three states if better than the fit of two states."""
         if two.power is None:
             slow, ahead, states = _slow_levels(view)
             if slow is not None and ahead > max(float(two.gain[view.train].sum()), _SLOW_AHEAD):
-                # The view mixes levels and noise in one relaxation; the next fit separates them.
+                # In this view one OU covers levels and noise; the next fit separates them.
                 return cls._best_fit(view, [slow], 0.0, 1, states) or two
-        # Three states that differ as the two do: in sigma, or in the level.
+        # As in the two states, the three differ in sigma, or in the level.
         trials = [np.array([0.0, 0.0, 0.0, ratio, -ratio]) for ratio in (0.45, 0.9)]
         if two.power is None:
             trials = [start.x * [1.0, 1.0, 0.6, 0.0, 1.0]]
@@ -505,7 +505,7 @@ class RegimeSwitching(Term):
 
         start = max(starts, key=value)
         if states == 2:
-            # Few changes determine the rates badly; counting them in all samples is better.
+            # Rates from few changes are inaccurate starts; try counts over all samples too.
             counted = _counted_rates(forward(*chain_of(within, start, at_once)[0])[0], scores.step)
             start = max(np.array(start), np.append(counted, start[2:]), key=value)
         x, top = climb(value, start, size=0.2, most=most)
@@ -530,14 +530,14 @@ class RegimeSwitching(Term):
         offset = None if abs(x[2]) < NO_LEVEL else moved
         # Probabilities of the states, given the samples so far.
         known = np.concatenate((before[1:], before[-1:]))
-        # Relative to the sigma of the lowest state, which thus becomes that of the `ou`.
+        # Relative to the lowest state, whose sigma thus becomes the sigma of the `ou`.
         power = 1.0 / (known @ np.exp(-2.0 * x[3] * np.arange(states)))
         return LawFit(term, se, normal, density - log_normal(view.z), 5,
                       power=None if abs(x[3]) < _NO_RATIO else power, offset=offset)
 
 
 def _counted_rates(before: FloatArray, step: float) -> FloatArray:
-    """Return ln of the rates of leaving each of two states, counted in the likelier state."""
+    """Return ln of the rates of leaving two states, by counting changes of the likelier state."""
     high = before[:, 1] > 0.5
     ups, downs = (int((high[1:] & ~high[:-1]).sum()), int((~high[1:] & high[:-1]).sum()))
     spent = step * np.array([(~high).sum(), high.sum()])
@@ -561,7 +561,7 @@ def _slow_levels(view: View) -> tuple[FloatArray | None, float, int]:
         return None, 0.0, 2
     mean = (mean - mean.mean()) / spread
     step = size / view.rate
-    # Weights, so that noise that depends on throttle is not taken for levels.
+    # Weights, so that noise that depends on throttle is not mistaken for levels.
     noisy = view.variance[view.train][:count * size].reshape(count, size).mean(axis=1)[1:]
     noisy /= math.exp(float(np.mean(np.log(noisy))))
 
@@ -600,9 +600,9 @@ def _slow_levels(view: View) -> tuple[FloatArray | None, float, int]:
 _FASTER = 1.0, 3.0, 9.0
 # Minimum evidence to try slow levels, nats.
 _SLOW_AHEAD = 8.0
-# Number of samples for comparing starts, and for the fit from the best.
+# Number of samples to compare starts, and to fit from the best start.
 _SHORT, _LONG = 8000, 30000
-# Largest rate of switching, 1/s.
+# Maximum rate of switching, 1/s.
 _FASTEST = 30.0
 # Minimum number of changes in the fitted part.
 _CHANGES = 8.0
@@ -613,7 +613,7 @@ _NO_RATIO = 0.05
 
 
 def _fastest(view: View) -> float:
-    """Return ln of the largest rate: states that last a few samples are another cause."""
+    """Return ln of the maximum rate: states of a few samples are another cause."""
     return math.log(min(_FASTEST, view.rate / 20.0))
 
 

@@ -33,21 +33,21 @@ class Segment:
     """Consecutive samples during a simulation; terms change it in place."""
 
     t: FloatArray  # Stamps, s; shape (n,)
-    at: FloatArray  # Times at which the samples are really taken, s; shape (n,)
+    at: FloatArray  # Times at which the samples are actually taken, s; shape (n,)
     # Time since the previous sample, s; infinite before the first, which has the stationary law;
     # shape (n,).
     step: FloatArray
-    throttle: FloatArray  # 0..1, each held from the previous stamp to its own; shape (n,)
+    throttle: FloatArray  # 0..1, each for the time since the previous stamp; shape (n,)
     origin: float  # Stamp of the first sample of the recording, s
     # Rate, 1/s, and intensity, V/sqrt(s), over the step before each sample; shape (n,).
     alpha: FloatArray
     sigma: FloatArray
     power: FloatArray  # Factor on the variance of the noise in that step; shape (n,)
     push: FloatArray  # Added to the state at the end of the step, V; shape (n,)
-    # Coefficients of x^2, 1/(V s), and x^3, 1/(V^2 s), of the restoring force beside alpha x.
+    # Coefficients of x^2, 1/(V s), and x^3, 1/(V^2 s), added to the restoring force alpha x.
     bend: tuple[float, float]
     x: FloatArray  # OU deviation, V; shape (n,)
-    level: FloatArray  # The rest of the voltage of the rail, V; shape (n,)
+    level: FloatArray  # Voltage of the rail without x, V; shape (n,)
     noise: FloatArray  # Factor on the std of the white measurement noise; shape (n,)
     voltage: FloatArray  # Reading, V; shape (n,)
     # Transformations of the normal draws of the white noise, in order.
@@ -55,7 +55,7 @@ class Segment:
 
     @property
     def phi(self) -> FloatArray:
-        """Return the share of the OU deviation that a step leaves; shape (n,)."""
+        """Return the share of the OU deviation that remains after each step; shape (n,)."""
         return np.asarray(np.exp(-self.alpha * self.step), dtype=np.float64)
 
     @property

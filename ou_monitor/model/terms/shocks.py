@@ -16,7 +16,7 @@ from ou_monitor.records import FloatArray
 from scipy.special import gammainccinv, gammaincinv, ndtr
 
 
-# Minimum of a sum of squares that divides.
+# Minimum of a sum of squares in a denominator.
 _TINY = 1e-280
 # Maximum number of events in one segment; limits time and memory.
 _MOST = 5_000_000
@@ -26,7 +26,7 @@ _OFTEN = 0.05
 
 @dataclass(frozen=True)
 class Jumps(Term):
-    """Push the state by normal amounts at the instants of a Poisson process."""
+    """Add normal jumps to the state, at the instants of a Poisson process."""
 
     NAME: ClassVar[str] = 'jumps'
     FAMILY: ClassVar[str] = 'events'
@@ -173,9 +173,9 @@ class Glitches(Term):
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
         """Find runs of up to three samples that contradict their neighbours on both sides."""
-        # The errors come from a filter without measurement errors, in which a sample affects only
-        # the next one, and so do their variances.  Bad samples have widened the fitted noise, so
-        # the scale is a median.
+        # Use errors and variances of a filter without measurement noise, in which a sample affects
+        # only the next one.  The scale is a median, because bad samples have increased the fitted
+        # noise.
         own = view.variance * (view.driven + (1.0 - view.trust) * (1.0 + view.phi ** 2))
         plain = (view.residual - view.phi * view.state) / np.sqrt(own)
         unit = float(np.median(np.abs(plain))) / 0.6745
@@ -214,7 +214,7 @@ def _glitch_scores(view: View, bad: npt.NDArray[np.bool_], share: float, spread:
     mean = keep * np.concatenate(([0.0], e[:-1])) / np.sqrt(view.variance)
     calm, hit = log_normal(view.z), log_normal(view.z, 0.0, wide * wide)
     more = log_normal(view.z, mean, again * again)
-    # What each transition predicts: no error, a new error, or a similar error again.
+    # Density for each transition: 0 no error, 1 a new error, 2 a similar error again.
     which = np.array([[0, 1, 0, 0], [0, 0, 2, 0], [0, 0, 0, 2], [0, 0, 0, 0]])
     go = 1.0 - lengths[0], lengths[2] / (lengths[1] + lengths[2])
     transition = np.array([[1.0 - share, share, 0.0, 0.0], [1.0 - go[0], 0.0, go[0], 0.0],
@@ -229,7 +229,7 @@ def _glitch_scores(view: View, bad: npt.NDArray[np.bool_], share: float, spread:
 
 def _repetition(e: FloatArray, bad: npt.NDArray[np.bool_], train: slice, spread: float
                 ) -> tuple[float, float]:
-    """Return slope and residual std, V, of errors regressed on the previous error of their run."""
+    """Return slope and residual std, V, of the regression of errors on the previous in a run."""
     e, bad = e[train], bad[train]
     second = np.flatnonzero(bad[1:] & bad[:-1]) + 1
     if second.size < _PAIRS:
@@ -276,7 +276,7 @@ def bad_samples(view: View, share: float, spread: float, lengths: FloatArray
 
 
 def outlying(voltage: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return the readings, V, that contradict the AR(1) through their neighbours."""
+    """Return which readings, V, contradict an AR(1) fitted to them; shape (n,)."""
     bad = np.zeros(voltage.size, dtype=np.bool_)
     # The second turn estimates the AR(1) without the outliers of the first.
     for _ in range(2):
@@ -300,7 +300,7 @@ def _best_runs(begin: npt.NDArray[np.int64], end: npt.NDArray[np.int64], gain: F
     """Return the samples of the best set of runs (weighted interval scheduling)."""
     order = np.argsort(end, kind='stable')
     begin, end = begin[order], end[order]
-    # For each run, how many end before it begins (a run also uses the innovation at its end).
+    # For each run, the number that end before it begins (a run uses the innovation at its end).
     clear = np.searchsorted(end, begin, side='left').tolist()
     best, taken = [0.0], []
     for value, k in zip(gain[order].tolist(), clear, strict=True):
@@ -319,7 +319,7 @@ def _best_runs(begin: npt.NDArray[np.int64], end: npt.NDArray[np.int64], gain: F
 
 @dataclass(frozen=True)
 class HeavyTails(Term):
-    """Make the noise of a step Student-t with the same variance, at the fitted sample spacing."""
+    """Make the noise of each step Student-t, with the same variance; dof holds for one spacing."""
 
     NAME: ClassVar[str] = 'heavy_tails'
     FAMILY: ClassVar[str] = 'events'
@@ -343,7 +343,7 @@ class HeavyTails(Term):
 
     @classmethod
     def fit_law(cls, view: View) -> LawFit | None:
-        """Fit a Student-t for the share of the scores that the OU drives, with a free scale."""
+        """Fit a Student-t, with a free scale, to the part of the scores that the OU drives."""
         share = np.broadcast_to(view.driven, view.z.shape)
         square, shares, count = _cells(view.z[view.train], share[view.train])
 
@@ -366,7 +366,7 @@ class _Mixture:
 
     def __init__(self, square: FloatArray, share: FloatArray, dof: float, scale: float) -> None:
         # A Student-t is a normal distribution whose variance is inverse-gamma distributed; the
-        # integral over the variance is a sum over close points of its logarithm.  `log`: log
+        # integral over the variance is a sum over a fine grid in its logarithm.  `log` are the log
         # densities of the scores.
         if dof <= 2.0:
             self.log: FloatArray = np.full(square.size, -math.inf)
@@ -375,7 +375,7 @@ class _Mixture:
         ends = np.log(gammaincinv(half, _OUTSIDE)), np.log(gammainccinv(half, _OUTSIDE))
         gamma = np.exp(np.linspace(*ends, _POINTS))
         log = half * np.log(gamma) - gamma
-        # In logarithms, because most weights underflow with many degrees of freedom.
+        # Use logarithms, because most weights underflow with many degrees of freedom.
         log -= log.max()
         log -= math.log(float(np.exp(log).sum()))
         self._weight = np.exp(log)
@@ -408,11 +408,11 @@ def _cells(z: FloatArray, share: FloatArray) -> tuple[FloatArray, FloatArray, Fl
     return (np.bincount(cell, z * z) / count, np.bincount(cell, share) / count, count)
 
 
-# Minimum share of the Student-t in the variance to give each sample a power.  With white noise,
-# the powers would explain it too, and the next fit would find none; without powers the variance is
-# still right.
+# Minimum share of the Student-t part in the variance to give each sample a `power`.  With white
+# noise, the powers would also explain the white noise, so that the next fit would not find it;
+# without powers the variance is still right.
 _ALONE = 0.99
-# Points of the variance, and the probability outside them; bins of share, and number and width of
-# the bins of scores, in a fit.
+# Number of points of the variance, and probability outside their range; in a fit, number of bins
+# of share, and number and width of bins of asinh(score).
 _POINTS, _OUTSIDE = 40, 1e-10
 _SHARES, _CELLS, _WIDTH = 8, 300, 0.03

@@ -19,9 +19,10 @@ from ou_monitor.records import FloatArray
 @dataclass(frozen=True)
 class Drift(Term):
     """
-    Add rate * t + curvature * t^2 + charge * q: q is the sum of throttle over time, in s.
+    Add rate * t + curvature * t^2 + charge * q.
 
-    t is from the first sample.  A curvature or charge of 0 is not fitted.
+    t is the time since the first sample, s, and q the integral of throttle since then, s.  A
+    curvature or charge of 0 is not fitted.
     """
 
     NAME: ClassVar[str] = 'drift'
@@ -34,7 +35,7 @@ class Drift(Term):
             'rate', *(name for name in ('curvature', 'charge') if getattr(term, name))))
     SIGNS: ClassVar[tuple[str, ...]] = ('time', 'band 0')
     MEASURED: ClassVar[bool] = True
-    # A larger effect whose form is not exact always leaves a little for a trend to explain.
+    # If the form of a larger effect is not exact, a trend always explains a little of its rest.
     LEAST_SHARE: ClassVar[float] = 0.02
     MEANING: ClassVar[str] = 'The mean moves slowly with time: discharge or warming.'
     REMEDY: ClassVar[str] = 'Use a window in which the drift is small, or remove the trend first.'
@@ -42,8 +43,7 @@ class Drift(Term):
 
     rate: float = parameter('V/s', 'slope at the first sample')
     curvature: float = parameter('V/s^2', 'coefficient of t^2')
-
-    charge: float = parameter('V/s', 'slope at full throttle, beyond that of rate', default=0.0)
+    charge: float = parameter('V/s', 'slope added at full throttle', default=0.0)
 
     def start(self, rng: np.random.Generator) -> Effect:
         """Begin a simulation."""
@@ -70,8 +70,8 @@ class Drift(Term):
             *forms, *(replace(form, charge=NEXT_TO_ZERO) for form in forms))
 
 
-# Minimum number of relaxation times in a recording, and maximum in a step: with more, 5 % of the
-# noise at most reaches the next sample, which white noise explains.
+# Minimum number of relaxation times in a recording, and maximum in a step: with more, white noise
+# explains the data, because at most 5 % of the deviation reaches the next sample.
 _LEAST = 3.0
 
 
@@ -92,7 +92,7 @@ class SecondRelaxation(Term):
     SEVERAL: ClassVar[bool] = True
     RECURS: ClassVar[bool] = True
     MEANING: ClassVar[str] = (
-        'A second relaxation of its own rate adds to the first: a second storage element.')
+        'A second relaxation, with its own rate, adds to the first: a second storage element.')
     REMEDY: ClassVar[str] = 'Keep both in the model; one alpha alone describes neither.'
     SEPARATED_BY: ClassVar[str] = 'a recording ten times as long, throttle held still'
 
@@ -128,16 +128,15 @@ class SecondRelaxation(Term):
         return _LEAST / float(view.at[-1]) < self.alpha < _LEAST * view.rate
 
     def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return its one state."""
+        """Return the state of the second OU."""
         phi = np.exp(-self.alpha * s.step)
         q = self.sigma * self.sigma * -np.expm1(-2.0 * self.alpha * s.step) / (2.0 * self.alpha)
         return phi[:, None, None], q[:, None, None], np.ones(1)
 
 
-# Octaves between poles: with the first value the spectrum is 1/f within 0.2 %, with the second
-# within 6 %.
+# Octaves between poles, to simulate (spectrum 1/f within 0.2 %) and to fit (within 6 %).
 _FINE, _COARSE = 0.5, 3.0
-# Relaxation times in a step above which the old state is negligible (exp(-20) = 2e-9).
+# Relaxation times in a step above which the previous state is negligible (exp(-20) = 2e-9).
 _FORGOTTEN = 20.0
 # Last pole, and corner of the low-pass, relative to the upper frequency.  The low-pass removes 1.5
 # % at the upper frequency, and most of the noise above the last pole.
@@ -164,12 +163,12 @@ class FlickerNoise(Term):
     SLOW_FIT: ClassVar[bool] = True
     BROAD: ClassVar[bool] = True
     SIGNS: ClassVar[tuple[str, ...]] = ('band', 'autocorrelation')
-    # Minimum: one every three octaves.
+    # The minimum; the number grows by one every three octaves.
     STATES: ClassVar[int] = 4
     IMITATES: ClassVar[tuple[str, ...]] = ('regime_switching', 'second_relaxation')
     MEANING: ClassVar[str] = '1/f noise: there is no single relaxation time.'
     REMEDY: ClassVar[str] = (
-        'Use alpha only for windows as long as this one; compare only windows of equal length.')
+        'Alpha holds only for windows of this length; compare only windows of equal length.')
     SEPARATED_BY: ClassVar[str] = 'a recording over two more decades of frequency'
 
     amplitude: float = parameter('V', 'square root of f times the PSD', 0.0)
@@ -178,7 +177,7 @@ class FlickerNoise(Term):
                             above=True)
 
     def check(self) -> None:
-        """Check that the ends leave room."""
+        """Check that low is below high."""
         if not self.low < self.high:
             raise ValueError(f'{self.NAME}: low must be below high, got {self.low:g} Hz and '
                              f'{self.high:g} Hz')
@@ -207,7 +206,7 @@ class FlickerNoise(Term):
             first = math.isnan(low)
             step = s.step.copy()
             if first:
-                # The past is negligible; the state of the low-pass is drawn separately.
+                # Draw the state of the low-pass from its stationary law, not from a step.
                 step[0] = 0.0
             driven, spread = np.zeros(s.t.size), np.zeros(s.t.size)
             of_first = 0.0
@@ -254,7 +253,7 @@ class FlickerNoise(Term):
         rate, finite = self.corner, np.isfinite(step)
         fast = poles * float(step[finite].min(initial=math.inf)) > _FORGOTTEN
         if fast[1:].any():
-            # One state represents all poles without memory from sample to sample.
+            # One state represents all poles that have no memory from sample to sample.
             seen = variances * rate / (rate + poles)
             first = int(np.argmax(fast))
             variances[first] *= float(seen[fast].sum() / seen[first])

@@ -5,8 +5,8 @@ A term defines its effect on a `Segment` of samples.  Each simulator has its own
 generator and keeps its state from segment to segment, so a recording depends neither
 on the division into segments nor on the draws of other terms.
 
-Each class in this folder that is derived from `Term` is a cause: search, report and
-model file find it through `catalogue`, and read everything about it from the class.
+Each class with a NAME in this folder that is derived from `Term` is a cause: search,
+reports and model files find it through `catalogue`, and use the attributes of the class.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from ou_monitor.records import FloatArray
 
 Value = TypeVar('Value')
 
-# Initial value of a coefficient that is to be fitted: one of exactly 0 stays 0.
+# Initial value of a coefficient that is to be fitted; a coefficient of exactly 0 is not.
 NEXT_TO_ZERO = 1e-12
 
 
 class Role(enum.Enum):
     """How a term enters a likelihood."""
 
-    # Found without a model, from the codes and stamps themselves.
+    # Detected without a model, from ADC codes and stamps.
     EXACT = enum.auto()
     # A sum of known columns with coefficients.
     MEAN = enum.auto()
@@ -48,7 +48,7 @@ class Role(enum.Enum):
 def parameter(unit: str, text: str, low: float = -math.inf, high: float = math.inf, *,
               above: bool = False, default: float | None = None, label: str = '') -> Any:
     """Declare a parameter; one with a default may be omitted, also in a model file."""
-    # label: its name in texts, if not that of the attribute.
+    # label: name in texts, if it differs from the name of the attribute.
     about = {'unit': unit, 'text': text, 'low': low, 'high': high, 'above': above, 'label': label}
     return field(metadata=about) if default is None else field(default=default, metadata=about)
 
@@ -60,7 +60,7 @@ def parameters(unit: str, text: str) -> Any:
 
 
 class _ByParameters(Generic[Value]):
-    """An attribute with one value for the class, and one for each term, from its parameters."""
+    """An attribute with a fixed value on the class, and a computed value on each instance."""
 
     def __init__(self, usual: Value, own: Callable[[Any], Value]) -> None:
         self._usual, self._own = usual, own
@@ -79,7 +79,7 @@ class Term:
     """
     Base of all terms: a frozen record of parameters.
 
-    ValueError: a parameter is not a number, or out of its range.
+    Raises ValueError if a parameter is not a number, or out of its range.
 
     Examples
     --------
@@ -90,7 +90,7 @@ class Term:
 
     """
 
-    # As in a model file and in a finding.
+    # Name and family in model files and findings.
     NAME: ClassVar[str] = ''
     FAMILY: ClassVar[str] = ''
     # When it acts in a simulation.
@@ -102,26 +102,26 @@ class Term:
     LINEAR: ClassVar[tuple[str, ...]] = ()
     # Positive parameters found by maximum likelihood, on a log scale (`DRIVE`, `BLOCK`, `NOISE`).
     FREE: ClassVar[tuple[str, ...]] = ()
-    # Prefixes of the names of the statistics that show this term, with + or - if only that sign
-    # does.
+    # Prefixes of the names of the statistics that indicate this term; a leading + or - means that
+    # only deviations of that sign do.
     SIGNS: ClassVar[tuple[str, ...]] = ()
     # Whether it depends on throttle or time only; the search tries it before latent causes.
     MEASURED: ClassVar[bool] = False
-    # Causes that are hard to tell from it; the search does not add one of a pair to the other.  It
-    # is enough to name the pair in one of the two classes.
+    # Causes that are hard to distinguish from it: the search does not add one of a pair to the
+    # other.  It is enough to name the pair in one of the two classes.
     IMITATES: ClassVar[tuple[str, ...]] = ()
     # Whether a model can have several, and whether the search looks for another one.
     SEVERAL: ClassVar[bool] = False
     RECURS: ClassVar[bool] = False
-    # Minimum evidence, as a share of the strongest cause's.
+    # Minimum evidence, relative to the strongest cause's.
     LEAST_SHARE: ClassVar[float] = 0.0
-    # Share of its signs that may remain after the fit; 0: no statistic may fail.
+    # Maximum ratio of the indicating statistics after and before the fit; 0: none may fail.
     MAY_LEAVE: ClassVar[float] = 0.0
     # Statistics that must not fail after the fit.
     REFUTED_BY: ClassVar[tuple[str, ...]] = ()
-    # Penalty for a search beyond the free parameters, nats.
+    # Penalty for choices of the search, in addition to the penalty for free parameters, nats.
     SEARCH: ClassVar[float] = 0.0
-    # Number of parameters that `apart` finds instead of the fit.
+    # Number of parameters that `apart` fits, outside the joint fit.
     APART: ClassVar[int] = 0
     # Whether a fit takes seconds; late in a search no such fit is started.
     SLOW_FIT: ClassVar[bool] = False
@@ -129,11 +129,11 @@ class Term:
     BROAD: ClassVar[bool] = False
     # Number of states that it adds to the linear system (`Role.BLOCK`).
     STATES: ClassVar[int] = 0
-    # The term that it modifies, which the model must have; None: the `ou`.
+    # The term that it modifies, which the model must contain; None: the `ou`.
     CHANGES: ClassVar[type[Term] | None] = None
     # Whether the live estimate, at the present throttle, includes its effect.
     LIVE: ClassVar[bool] = False
-    # For the report: what it is, what to do about it, which recording separates it from others.
+    # Texts for the report: meaning, remedy, and a recording that separates it from other causes.
     MEANING: ClassVar[str] = ''
     REMEDY: ClassVar[str] = ''
     SEPARATED_BY: ClassVar[str] = ''
@@ -170,7 +170,7 @@ class Term:
         return ()
 
     def holds(self, view: View) -> bool:
-        """Return whether the fitted parameters still describe this cause; by default, yes."""
+        """Return whether the fitted parameters still describe this cause; by default True."""
         return True
 
     def beside(self, ou: Term) -> Term:
@@ -197,7 +197,7 @@ class Term:
         return replace(self, **dict(zip(self.LINEAR, map(float, beta), strict=True)))
 
     def factors(self) -> dict[str, tuple[list[float], list[float]]]:
-        """Return knots and factors on the noise by the name of an input, if lists hide them."""
+        """Return readable knots and factors on the noise by input, if parameters are lists."""
         return {}
 
     def free(self) -> tuple[str, ...]:
@@ -209,7 +209,7 @@ class Term:
         return replace(self, **{name: getattr(self, name) * math.exp(by)})
 
     def apart(self, view: View) -> Self:
-        """Return the term with its `APART` parameters, fitted to the scores of a model with it."""
+        """Return the term with its `APART` parameters refitted to scores of a model with it."""
         return self
 
     def per_coordinate(self, name: str) -> float:
@@ -231,7 +231,7 @@ class Term:
         return 0.0
 
     def variances(self, s: Segment) -> FloatArray | float:
-        """Return the variance at each sample of a segment, if a measured input changes it."""
+        """Return `variance`, at each sample of a segment if a measured input changes it."""
         return self.variance()
 
     @classmethod
@@ -255,7 +255,7 @@ class Term:
 
     @classmethod
     def unit(cls, name: str) -> str:
-        """Return the unit of a parameter; empty for a number."""
+        """Return the unit of a parameter; empty if dimensionless."""
         return next(str(spec.metadata['unit']) for spec in fields(cls) if spec.name == name)
 
     @classmethod
@@ -272,7 +272,7 @@ class Term:
 
     @classmethod
     def read(cls, params: Mapping[str, Any]) -> Self:
-        """Return a term from its parameters; a ValueError names what is wrong."""
+        """Return a term from its parameters; a ValueError names missing and unknown ones."""
         names = cls.parameters()
         missing = [name for name in names if name not in {**cls.usual(), **params}]
         unknown = [name for name in params if name not in names]
@@ -291,12 +291,12 @@ class Term:
 
 @dataclass(frozen=True, eq=False)
 class LawFit:
-    """A law of the innovations, fitted."""
+    """A fitted law (distribution of the innovations)."""
 
-    term: Term  # With its parameters
-    se: dict[str, float]  # Their standard errors, where known
+    term: Term  # With its fitted parameters
+    se: dict[str, float]  # Standard errors of the parameters, where known
     z: FloatArray  # Normal scores: independent N(0, 1) if the law is right; shape (n,)
-    # Log predictive density of each sample less that of `View.z` under N(0, 1), nats; shape (n,).
+    # Gain of log predictive density at each sample over N(0, 1) for `View.z`, nats; shape (n,).
     gain: FloatArray
     free: int  # Number of fitted parameters
     push: FloatArray | None = None  # Variance that events add to the state, V^2; shape (n,)
@@ -305,7 +305,7 @@ class LawFit:
     # mean precision); shape (n,).
     power: FloatArray | None = None
     white: FloatArray | None = None  # The same for the variance of the white noise; shape (n,)
-    # Voltage that the law adds to the level, subtracted before the Gaussian fit, V; shape (n,).
+    # Voltage that the law adds to the level, V, to be subtracted before the Gaussian fit; (n,).
     offset: FloatArray | None = None
 
 

@@ -26,7 +26,7 @@ class Tone(Term):
     NAME: ClassVar[str] = 'tone'
     FAMILY: ClassVar[str] = 'line'
     STAGE: ClassVar[Stage] = Stage.LEVEL
-    # With a wandering phase, it is two states instead of known columns.
+    # With a wandering phase, the term has two states instead of known columns.
     ROLE: ClassVar[Role] = by_parameters(
         Role.MEAN, lambda term: Role.BLOCK if term.linewidth else Role.MEAN)
     LINEAR: ClassVar[tuple[str, ...]] = by_parameters(
@@ -63,7 +63,7 @@ class Tone(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return the strongest lines of the residual, and the first with a wandering phase too."""
+        """Return the strongest lines of the residual, the first also with a wandering phase."""
         found = [cls.at(line, view) for line in lines_of(view)[:_MOST]]
         spread = math.sqrt(float(np.median(view.variance)))
         least = _WANDERS / float(view.at[-1])
@@ -73,13 +73,13 @@ class Tone(Term):
 
     @classmethod
     def at(cls, line: Line, view: View) -> Tone:
-        """Return a start at a line of the residual, at its frequency in the whole recording."""
+        """Return a starting point at the frequency of a line, refined on the whole recording."""
         grid = on_grid(view.at, view.z)
         wave = fit_sinusoid(grid.values, grid.rate, line.frequency, line.resolution)
         return cls(0.0, wave.frequency, 0.0, 0.0)
 
     def holds(self, view: View) -> bool:
-        """Return whether it is a line, not ringing."""
+        """Return whether it is a line rather than ringing."""
         return self.linewidth < SHARP * self.frequency and (
             self.linewidth < WIDEST
             or not power_spread(view, self.frequency, self.linewidth) > CONSTANT)
@@ -90,7 +90,7 @@ class Tone(Term):
         return rotation(turn, math.pi * self.linewidth, s.step, self.amplitude / math.sqrt(2.0))
 
     def columns(self, s: Segment) -> FloatArray:
-        """Return the line in phase and in quadrature."""
+        """Return a sine and a cosine of unit amplitude."""
         columns = []
         for phase in (0.0, 0.5 * math.pi):
             level = replace(s, level=np.zeros(s.t.size))
@@ -116,12 +116,12 @@ def lines_of(view: View) -> tuple[Line, ...]:
     return find_lines([grid.values], grid.rate, false_alarm=_PROPOSED, wide=True).lines
 
 
-# Maximum number of lines tried; probability of a false one, large because evidence decides.
+# Maximum number of lines tried; their false-alarm probability, large because evidence decides.
 _MOST, _PROPOSED = 3, 0.5
-# Smaller of two initial linewidths, over the resolution of the recording (the other is halfway to
-# the maximum); minimum linewidth of ringing, Hz, if the amplitude varies.
+# Smaller of two initial linewidths, in resolutions of the recording (the other is the geometric
+# mean of it and the maximum); linewidth, Hz, from which a line's amplitude must be constant.
 _WANDERS, WIDEST = 3.0, 2.0
-# Largest width of a line over its frequency.
+# Maximum width of a line relative to its frequency.
 SHARP = 0.05
 
 
@@ -186,7 +186,7 @@ class Resonance(Term):
             across = np.divide(q[:, 0, 1], low, out=np.zeros(n), where=low > 0.0)
             rest = np.sqrt(np.maximum(q[:, 1, 1] - across * across, 0.0))
             kicks = low * pairs[:, 0] + 1j * (across * pairs[:, 0] + rest * pairs[:, 1])
-            # In a rotating frame, it is an OU with a real rate.
+            # In a rotating frame, the ringing is an OU with a real rate.
             turn = np.exp(2j * math.pi * self.frequency * ((s.at - s.origin) % (
                 1.0 / self.frequency)))
             phi = np.exp(-self.damping * s.step)
@@ -200,14 +200,14 @@ class Resonance(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return the broad peaks of the residual."""
+        """Return starting points at the broad peaks of the residual."""
         spread = float(np.sqrt(np.median(view.variance)))
         return [cls(frequency, width, 0.5 * spread, tilt)
                 for frequency, width in broad_peaks(view.z[view.train], view.rate)
                 for tilt in (0.0, -_STEEP, _STEEP)]
 
     def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return its two rotating states."""
+        """Return the two rotating states of the ringing."""
         turn = 2.0 * math.pi * self.frequency * np.where(np.isfinite(s.step), s.step, 0.0)
         return rotation(turn, self.damping, s.step, self.std,
                         self.tilt * self.damping / (2.0 * math.pi * self.frequency))
@@ -220,13 +220,13 @@ class Resonance(Term):
             width > WIDEST and not power_spread(view, self.frequency, width) < RINGING))
 
 
-# Initial tilt, and the largest: at 1, a step would add no noise to one of the states.
+# Initial and maximum tilt: at 1, a step would add no noise to one of the states.
 _STEEP, _STEEPEST = 0.9, 0.99
 
 
 @dataclass(frozen=True)
 class ThrottleTone(Term):
-    """Add a sine at idle + slope * throttle with the random phase of `Tone`."""
+    """Add a sine of frequency idle + slope * throttle, with the random phase of `Tone`."""
 
     NAME: ClassVar[str] = 'throttle_tone'
     FAMILY: ClassVar[str] = 'line'
@@ -282,14 +282,14 @@ class ThrottleTone(Term):
             abs(self.slope) * float(view.throttle[view.train].std()) > _MORE * self.linewidth)
 
     def block(self, s: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return its two states, which rotate at the frequency for the throttle."""
+        """Return two states, which rotate at the frequency for the throttle."""
         step = np.where(np.isfinite(s.step), s.step, 0.0)
         turn = 2.0 * math.pi * (self.idle + self.slope * s.throttle) * step
         damping = math.pi * max(self.linewidth, _NARROWEST)
         return rotation(turn, damping, s.step, self.amplitude / math.sqrt(2.0))
 
 
-# Minimum movement over the range of throttle, in bins: other lines are tones.
+# Minimum movement of a line over the range of throttle, in bins; lines that move less are tones.
 _MOVES = 30.0
 # Minimum movement of the line by one standard deviation of throttle, in widths of the line.
 _MORE = 1.0

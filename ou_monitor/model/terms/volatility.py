@@ -62,7 +62,7 @@ class Volatility(Term):
             math.log(max(self.std, 1e-3)), math.log(self.rate), _start(view)[2]]), known=True)
 
     def holds(self, view: View) -> bool:
-        """Return whether the recording has enough relaxations; with fewer, sigma has a trend."""
+        """Return whether the recording has enough relaxation times; if not, sigma has a trend."""
         return self.rate * float(view.at[-1]) > _WANDERS
 
     @classmethod
@@ -91,7 +91,7 @@ class Volatility(Term):
         scores = _scores(view.z, before, levels, size)[:view.z.size]
         gain = np.repeat((density + 0.5 * squares) / sizes, size)[:view.z.size]
         term = cls(math.exp(x[0]), math.exp(x[1]))
-        # Given all samples up to the end of each segment.
+        # Log probabilities of the levels, given all samples up to the end of each segment.
         log = np.log(np.maximum(before, 1e-300)) - sizes[:, None] * levels - 0.5 * squares[
             :, None] * np.exp(-2.0 * levels)
         weight = np.exp(log - log.max(axis=1)[:, None])
@@ -150,9 +150,9 @@ def _scores(z: FloatArray, before: FloatArray, levels: FloatArray, size: int) ->
     return normal_scores(chance.ravel())
 
 
-# Segments per recording; levels of ln sigma, spanning 8 standard deviations (later samples may
-# leave the range of the fit); steps between normalisations, so few that probabilities do not
-# underflow.
+# Number of segments in a recording; number of levels of ln sigma, which extend to +-8 standard
+# deviations, because later samples may leave the fitted range; number of steps between
+# normalisations, small enough to avoid underflow.
 _SEGMENTS = 1500
 _LEVELS = 65
 _EVERY = 4
@@ -170,17 +170,17 @@ _NOTICED = 1e-9
 
 @lru_cache(maxsize=1)
 def _modes() -> FloatArray:
-    """Return the modes of the levels, each column decaying at a multiple of the rate."""
-    # Those of Ehrenfest's urn, made symmetric: the j-th has the eigenvalue (levels - 1)/2 - j.
+    """Return the modes of the levels, in columns, each decaying at a multiple of the rate."""
+    # Eigenvectors of Ehrenfest's urn model, symmetrised; eigenvalue j is j - (levels - 1)/2.
     k = np.arange(1.0, _LEVELS)
     return np.asarray(eigh_tridiagonal(np.zeros(_LEVELS), 0.5 * np.sqrt(k * (_LEVELS - k)))[1])
 
 
 def _kernels(keep: FloatArray) -> FloatArray:
     """Return the transition probabilities between levels, shape (rates, levels, levels)."""
-    # The conditional mean and variance are those of the OU even if it is so slow that its steps
-    # are much smaller than the spacing of the levels (Rouwenhorst 1995; Kopecky & Suen, Rev. Econ.
-    # Dyn. 13 (2010) 701): the levels are the sum of 64 two-state chains.
+    # The levels are the sum of 64 two-state chains.  So conditional mean and variance equal the
+    # OU's, even if it is so slow that its steps are much smaller than the spacing of the levels
+    # (Rouwenhorst 1995; Kopecky & Suen, Rev. Econ. Dyn. 13 (2010) 701).
     modes, root = _modes(), np.sqrt(_STATIONARY)
     powers = keep[:, None] ** np.arange(_LEVELS - 1.0, -1.0, -1.0)
     chances = (modes * powers[:, None, :]) @ modes.T * (root / root[:, None])
@@ -191,7 +191,7 @@ def _kernels(keep: FloatArray) -> FloatArray:
 
 def _grid(squares: FloatArray, sizes: FloatArray, span: float, points: FloatArray
           ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return each segment's prior, its log density, and the levels, for each point."""
+    """Return the levels' prior in each segment, its log density, and the levels, by point."""
     reach = math.sqrt(_LEVELS - 1.0)
     std = np.exp(points[:, :1])
     levels = points[:, 2:] + std * np.linspace(-reach, reach, _LEVELS)
