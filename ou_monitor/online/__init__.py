@@ -1,1 +1,1 @@
-"""What runs on the craft, without ROS: samples -> window -> estimate -> risk and cutoff."""
+"""Onboard computations, without ROS: samples -> window -> estimate -> risk and cutoff."""

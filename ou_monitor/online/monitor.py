@@ -36,7 +36,8 @@ if TYPE_CHECKING:
 # Cautions that make the numbers doubtful; the others only inform.
 _DOUBTFUL = frozenset({Flag.SLOW_RATE, Flag.QUANTIZED, Flag.LOWPASS_UPSTREAM, Flag.SATURATED,
                        Flag.TREND, Flag.IRREGULAR})
-# Minimum voltage of a supply that is on, V: one cell has 2.5 V, noise without a supply 0.5 V.
+# Minimum voltage of a supply that is on, V: one cell has at least 2.5 V, noise without a supply
+# at most 0.5 V.
 _POWERED = 2.0
 # Time after which a much lower or higher voltage counts as another supply, s.
 _ANOTHER = 60.0
@@ -80,13 +81,13 @@ class SupplyMonitor:
         self._model = model
         self._flag = BrownoutFlag(self._settings)
         self._trust = InputTrust()
-        # The last report's verdict on the stamps and the input.
+        # Quality of the stamps, and doubt of the input, in the last report.
         self._stamps, self._doubt = StampOrder.GOOD, Doubt.NONE
         self._reset_reason = ''
         self._restarts, self._fault, self._faulty = 0, '', False
-        # For thinning: samples left out so far, and samples until the next one that is used.
+        # For thinning: samples left out so far, and samples pushed modulo `thin`.
         self._thinned = self._phase = 0
-        # Sum of the counts of earlier estimators.
+        # Sum of the counts of earlier estimators, before restarts.
         self._counted = Counters()
         # Number of late and unusable samples so far, and stamp of its last increase.
         self._odd, self._odd_at = 0, -math.inf
@@ -248,9 +249,9 @@ class SupplyMonitor:
 
     def distrust(self, reason: str) -> None:
         """
-        Do not use the stamps, for this reason, until called with an empty reason.
+        Do not trust the input, for this reason, until called with an empty reason.
 
-        The floor still works.
+        The check against the voltage floor continues.
         """
         self._trust.outside = reason
 
@@ -269,7 +270,7 @@ class SupplyMonitor:
                 if self._flag.clear() else '')
 
     def set_brownout(self, reason: str) -> None:
-        """Set the flag CRITICAL, as before a restart; latch, hold and clearing work as usual."""
+        """Set the flag CRITICAL, to restore it after a restart; all else works as usual."""
         self._flag.set_critical(reason)
 
     def doubt_brownout(self, reason: str) -> None:
@@ -324,7 +325,7 @@ class SupplyMonitor:
             stamps = self._trust.stamps(limit, 1.0 / e.rate if e.rate > 0.0 else NAN)
             doubt, why = self._trust.doubt(stamps, self._settings.brownout_voltage)
             if self._doubt is Doubt.UNIT is not doubt:
-                # The unit has changed: forget what was learned in the other one.
+                # The unit of the input has changed: discard results in the previous unit.
                 self._counted = self._counters()
                 self._begin()
                 e = self._estimate()
@@ -337,8 +338,8 @@ class SupplyMonitor:
             fresh = (silent <= limit and e.status is not Status.NO_DATA and doubt is Doubt.NONE)
             if again or not fresh:
                 self._load = self._load_filter.load()
-                # Use the better sigma of a longer window only if the short one shows an OU too;
-                # otherwise the load model is more accurate.
+                # Use the more accurate sigma of a longer window only if the short window shows
+                # an OU too; otherwise the load model is more accurate.
                 self._forecast.follow(*((shown, ou.window_s, ou_age) if e.usable and shown.usable
                                         else (e, e.duration)))
                 self._ahead = look_ahead(
@@ -407,7 +408,7 @@ class SupplyMonitor:
     def risk_if(self, throttle: float, dwell: float, voltage: float | None = None,
                 horizon: float | None = None) -> float:
         """
-        Return the same risk, if throttle goes to `throttle`, stays, and comes back.
+        Return the risk, as `risk`, if throttle goes to `throttle`, stays, and returns.
 
         Parameters
         ----------
@@ -439,7 +440,7 @@ class SupplyMonitor:
         return float(self._forecast.risk_if(throttle, dwell, level, ahead)[0])
 
     def changed_risk(self, sag: float, noise: float) -> FloatArray:
-        """Return the risks behind the budget, (51,), with sag and noise variance times these."""
+        """Return the budget's risks, (51,), with sag and noise variance multiplied by factors."""
         level, ahead = self._checked(None, None)
         return risk_over_throttle(self._forecast, level, ahead, sag, noise)
 
@@ -520,7 +521,7 @@ class SupplyMonitor:
         return Level.OK, e.status.value
 
     def _default_limit_words(self) -> str:
-        """Return a caution if the default limit is in force, and the supply is no 5 V rail."""
+        """Return a caution if the default limit is used on a supply above a 5 V rail."""
         limit, now = self._settings.brownout_voltage, self._forecast.voltage
         return (f'The limit is the default of {limit:g} V, for a 5 V rail, and the supply is at '
                 f'{now:.3g} V: set brownout.voltage.') if (
@@ -550,7 +551,7 @@ RISK_CURVE = tuple(k / 10.0 for k in range(11))
 class MonitorReport:
     """Result of the monitor at one instant."""
 
-    estimate: Estimate  # Newest estimate; its alpha, sigma and var_inf are those of `ou`
+    estimate: Estimate  # Newest estimate, with alpha, sigma and var_inf of `ou`
     risk: float  # Probability of a brown-out within the horizon; NaN if unknown
     # Highest throttle, 0..1, with a risk below `brownout.budget_limit`; NaN if unknown.
     budget: float
@@ -560,18 +561,18 @@ class MonitorReport:
     flag: FlagState  # The brown-out flag, with its reason
     level: Level  # Level for the diagnostics
     summary: str  # One line for the pilot
-    age: float  # Age of the newest voltage, s; inf when none ever came
+    age: float  # Age of the newest voltage, s; inf before the first
     # Age from which the input is stale, s: `stale_after`, less for a fast source, more for a slow
     # one.
     patience: float
     stamps: StampOrder  # Quality of the stamps
     doubt: Doubt  # Why the input is not trusted
-    fresh: bool  # Whether the numbers rest on samples that are trusted and not too old
+    fresh: bool  # Whether the numbers come from samples that are trusted and not too old
     # Samples that were only checked against the floor, because of overload.
     thinned: int
     restarts: int  # Restarts of the estimator after an error
     fault: str  # The last such error, in one line; empty when there was none
-    # Level, sag and noise under load; needs no relaxation.
+    # Level, sag and noise under load; known even if no OU is visible.
     load: SupplyLoad = SupplyLoad()
     # Method of the risk: ``first_passage``, ``load``, ``excursions`` or ``none``.
     risk_basis: str = 'none'
@@ -636,6 +637,6 @@ class MonitorReport:
         values['flags'] = ','.join(flag.name for flag in e.flags)
         for name in ('pushed', 'used', 'non_finite', 'late', 'held', 'resets'):
             values[name] = getattr(e.counters, name)
-        # NumPy's floats write their type's name beside the number.
+        # `float`, because the repr of NumPy's floats contains the name of their type.
         return {name: repr(float(v)) if isinstance(v, float) else str(v)
                 for name, v in values.items()}

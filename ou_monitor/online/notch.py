@@ -1,5 +1,5 @@
 """
-Notches that follow the motors, by their speeds or else by throttle, and are off if useless.
+Notches that follow the motors, by motor speeds or else by throttle, and are off if useless.
 
 samples -> spectra of frames -> law (throttle to frequency) and choice (which notches, or none)
 -> frequency, width and depth of each notch, sample by sample -> output.
@@ -8,20 +8,20 @@ samples -> spectra of frames -> law (throttle to frequency) and choice (which no
 in hover is proportional to its speed squared, so f is proportional to the square root of throttle
 u if the controller's throttle is a thrust, with an offset otherwise.  The candidates are all pairs
 of a frequency at `LOW` and one at `HIGH`; the score of each is the share of the past noise (old
-frames are forgotten) that a notch on its frequency would have removed.  The highest score wins.
-A median of the peaks would follow the most frequent peak; this law follows the loudest.
+frames are forgotten) that a notch at its frequency would have removed.  The highest score wins.
+(A law fitted to the median of the peaks would follow the most frequent peak, not the strongest.)
 
 **Choice** of notches in each channel: least noise in a D term at equal lag.  The noise of a
 candidate is the power of the derivative above `fmin` after its notches and a low-pass of order 2,
-whose cutoff is raised until both together lag as much as the low-pass alone.  It is averaged over
-frames before the law learns from them, for this low-pass, a slower and a faster one.  A channel
-uses the best candidate if it leaves less than `_ON` of the rms without notches, and is not worse
-with any of the low-passes; it changes to another that is better by a tenth in power.  It switches
-off if `_OFF` or more remains, or any low-pass becomes worse.
+whose cutoff is raised until both together lag as much as the low-pass alone.  It is computed for
+this low-pass, a slower and a faster one, for each frame before the law learns from the frame, and
+averaged.  A channel uses the best candidate if less than `_ON` of the rms without notches remains,
+and none of the low-passes has more noise than without; it changes to a candidate that has a tenth
+less power.  It switches off if `_OFF` or more remains, or any low-pass has more noise.
 
 Limits: only lines that follow the motors are removed, and motor speeds or throttle are needed.
-The law does not resolve speeds of single motors.  Lines above half the sample rate are aliased,
-fall with throttle, and are not followed.  A change of the vehicle is learned within half a minute.
+The law does not resolve speeds of single motors.  Lines above half the sample rate are not
+followed: their aliases fall with throttle.  A change of the vehicle is learned in half a minute.
 A frame with a gap of more than five intervals is dropped; smaller unevenness is interpolated.
 
 **Filters**: state-variable filters whose coefficients may change.  With w = 2 pi f and
@@ -34,10 +34,10 @@ by the trapezoidal rule with g = tan(pi f dt), so that the zero lies on f exactl
 
     v1 = (g (x - s2) + s1) / (1 + g (g + k)),  v2 = s2 + g v1,  s <- 2 v - s.
 
-A step of the coefficients moves y within the sample, so the caller moves them smoothly.
+A step of the coefficients is a step of y, so the caller changes them smoothly.
 
-Stable under any sequence of f, k and m: with K the least k, P = [[1, e], [e, 1]] and
-e < 4 K / (4 + K^2), s^T P s is a Lyapunov function for every k in K..2, and m is outside the loop.
+The filter is stable under any sequence of f, k and m: with K the smallest k, P = [[1, e], [e, 1]]
+and e < 4 K / (4 + K^2), s^T P s is a Lyapunov function for every k in K..2; m is outside the loop.
 test_biquads.py computes the bound of the state; adversarial sequences reach a tenth of it.
 """
 
@@ -55,8 +55,8 @@ from ou_monitor.online.filter.lowpass import FilterCounters, LARGEST, LATEST, SH
 from ou_monitor.online.settings import NotchSettings
 from ou_monitor.records import FloatArray, NAN
 
-# Speeds count as frozen if, after this many changes, they stay constant for this many mean times
-# between changes and for this time, s: no motor in flight holds its speed to the last digit.
+# Speeds count as frozen if they stay constant for this many mean intervals between changes and for
+# this time, s, after at least this many changes: no motor holds its speed to the last digit.
 _CHANGES, _FROZEN, _STUCK = 20, 50.0, 1.0
 
 
@@ -76,7 +76,7 @@ class NewestSpeeds:
         self._per_unit, self._stale_after = per_unit, stale_after
 
     def take(self, t: float, values: Sequence[float]) -> None:
-        """Take the speeds received at t, s; without a finite number nothing was received."""
+        """Take the speeds received at t, s; ignore them if none is finite."""
         speeds = [abs(one) * self._per_unit if math.isfinite(one) else NAN for one in values]
         if all(one != one for one in speeds):
             return
@@ -99,24 +99,24 @@ class NewestSpeeds:
                 return []
         if len(self._speeds) <= most:
             return self._speeds
-        # Elements of missing motors stay 0.
+        # Elements for motors that do not exist are 0.
         known = sorted(one for one in self._speeds if one > 0.0)
         if len(known) <= most:
             return known
-        # Neighbours in speed share a notch.
+        # Motors of similar speed share a notch.
         edges = [round(k * len(known) / most) for k in range(most + 1)]
         return [sum(known[a:b]) / (b - a) for a, b in zip(edges, edges[1:])]
 
 
-# Square roots of throttle at which a law is defined: the middle of the usual range.
+# Square roots of throttle at which candidate laws are defined, within the usual range.
 LOW, HIGH = 0.4, 0.85
-_GRID = 48  # Number of frequencies
-# Relative width of the notch by which laws are scored.
+_GRID = 48  # Number of frequencies at each of them
+# Bandwidth over frequency of the notch by which laws are scored.
 _WIDTH = 0.5
 # Memory of frames, s: the speed at one throttle falls with the charge, in minutes.
 _LAW_MEMORY = 30.0
-# Prior of the laws: share of noise removed by f ~ sqrt(u), weight of the prior in frames, and its
-# standard deviation in a / f(HIGH).
+# Prior score of the laws: share of noise removed by f ~ sqrt(u), weight in frames, and standard
+# deviation of a / f(HIGH).
 _PRIOR, _FRAMES, _SPREAD = 0.1, 8.0, 0.3
 
 
@@ -135,7 +135,7 @@ class MotorLaw:
         self._prior: FloatArray = _FRAMES * _PRIOR * np.exp(
             -0.5 * (self._a / (_SPREAD * high))**2)
         self._found: FloatArray = np.zeros_like(low)
-        # A law may end at an end of the grid, within rounding.
+        # Widen the grid by rounding errors, because a law may end at its ends.
         self._log: FloatArray = np.log(grid)
         self._log[[0, -1]] += -1e-3, 1e-3
         self.a = self.b = np.nan
@@ -146,7 +146,7 @@ class MotorLaw:
 
     def learn(self, power: FloatArray, root: float, passed: float,
               lost: float) -> None:
-        """Take a frame: power per bin, s since the last frame, factor on the earlier scores."""
+        """Take a frame, `passed` s after the last one; lost: factor on the earlier scores."""
         keep = float(np.exp(-passed / _LAW_MEMORY))
         removed = self._removed @ power
         f = self._a + self._b * root
@@ -160,11 +160,11 @@ class MotorLaw:
 # Length and distance of frames, s: throttle changes little within one, and it resolves 4 Hz.
 FRAME, HOP = 0.25, 0.0625
 _SMALLEST, _LONGEST = 16, 4096  # Samples in a frame
-_MISSING, _UNEVEN = 5.0, 0.3  # Gap that restarts a frame, deviation that is resampled; intervals
+_MISSING, _UNEVEN = 5.0, 0.3  # Intervals: gap that restarts a frame; deviation that is resampled
 
 
 class NotchFrames:
-    """Spectra of samples at an interval, s, with means of other inputs; `frequencies` in Hz."""
+    """Spectra of frames of samples, and means of other inputs (interval in s; bins in Hz)."""
 
     def __init__(self, interval: float) -> None:
         self.interval = interval
@@ -202,24 +202,25 @@ class NotchFrames:
         return power, rows[:, channels:].mean(axis=0)
 
 
-# Candidate bandwidths over frequency.
+# Candidate bandwidths relative to the frequency.
 WIDTHS: FloatArray = np.array([1.0, 0.66, 0.45, 0.3, 0.2, 0.13, 0.085])
-# Cutoffs of the low-passes after the notches, over `cutoff`; maximum share of the sample rate.
+# Cutoffs of the low-passes after the notches, over `cutoff`; their maximum, over the sample rate.
 _BEHIND, _FASTEST = (0.5, 1.0, 1.5), 0.25
-# Remaining share of the rms: to switch on, to switch off, "worse"; of the power: to change.
+# Maximum remaining share of the rms to switch on, to stay on, and for each single low-pass; share
+# of the present candidate's power below which another is chosen.
 _ON, _OFF, _HARM, _BETTER = 0.9, 0.97, 0.99, 0.9
 # Memory of the noise and of the loudest frame, s; frames before the first decision.
 _MEMORY, _LEVEL, _FEWEST = 5.0, 2.0, 6
 # Minimum share of the lag left to the low-pass, in a frame (one ten times as fast hardly filters)
 # and in the mean of frames.
 _LEAST, _LEAST_MEAN = 0.1, 0.4
-# Frames are weighted by amplitude: by power, a single crash would dominate.
+# Frames are weighted by power to this exponent (amplitude); by power, a crash would dominate.
 _BY_AMPLITUDE = 0.5
 _TINY = 1e-300
 
 
 class Candidate(NamedTuple):
-    """Notches that may be chosen: one on the throttle's frequency, or one on each motor's."""
+    """Notches that may be chosen: one at the frequency of the law, or one at each motor's."""
 
     source: str
     width: float  # Bandwidth over frequency
@@ -252,8 +253,8 @@ class NotchChoice:
         self.chosen: list[Candidate | None] = [None] * channels
 
     def normalise(self, power: FloatArray, passed: float) -> tuple[FloatArray, float]:
-        """Return a frame over the loudest recent power, and the factor on earlier frames."""
-        # A louder frame reduces the weight of earlier ones; quiet frames count again once loud
+        """Return a frame relative to the loudest recent power, and a factor on earlier frames."""
+        # A louder frame reduces the weight of earlier ones; quiet frames regain weight as loud
         # ones are forgotten.
         before = self._loudest * np.exp(-passed / _LEVEL)
         self._loudest = np.maximum(power[:, self._used] @ self._low[1], before)
@@ -297,7 +298,7 @@ class NotchChoice:
         return passes, WIDTHS * float(np.sum(0.5 / (self._rate * at)))
 
     def decide(self, sources: set[str]) -> None:
-        """Choose for each channel among the candidates whose source is known now."""
+        """Choose for each channel among the candidates whose source is available now."""
         known = np.array([source in sources and frames >= _FEWEST for source, frames in
                           zip(SOURCES, self._frames, strict=True)])
         left = self._noise / np.maximum(self._without, _TINY)
@@ -312,7 +313,7 @@ class NotchChoice:
             if old is not None:
                 k = SOURCES.index(old.source)
                 now = float(able[k, int(np.argmin(np.abs(WIDTHS - old.width)))])
-            # If the source of the old candidate is lost, the other takes over.
+            # If the source of the old candidate is lost, `now` is infinite, and another is chosen.
             limit = _ON if old is None else _OFF
             if best < limit**2 and best < _BETTER * now:
                 self.chosen[c] = found
@@ -320,8 +321,8 @@ class NotchChoice:
                 self.chosen[c] = None
 
 
-# Minimum gap, in intervals; samples that determine the interval; its relative change that counts
-# as a new rate.
+# Minimum gap, in intervals; number of samples that determine the interval; minimum relative change
+# of the interval that counts as a new rate.
 _GAP, _KNOWN, _OTHER = 5.0, 64, 0.1
 # Time constants, s: motors after a step of throttle (25 ms on a 5 inch propeller); changes of a
 # notch's depth, width and frequency.
@@ -456,7 +457,7 @@ class AdaptiveNotch:
         x : float or array_like, shape (n,) or (n, channels)
             Signal, any unit.  A sample with NaN is counted and does not change the output.
         throttle : float or array_like, shape (n,), optional
-            Throttle, 0..1; NaN: the last one, for a second.
+            Throttle, 0..1; NaN: the last finite one is used, for a second.
         rpm : array_like, shape (n,) or (n, motors), or (motors,) with one number t, optional
             Motor speeds, in `rpm_unit`; NaN: not received.
 
@@ -534,7 +535,7 @@ class AdaptiveNotch:
         return self._out
 
     def _follow_interval(self, dt: float) -> None:
-        """Follow the interval; restart at a new rate."""
+        """Track the mean interval; discard frames, law and choice if the rate changes."""
         mean = self._interval.add(dt)
         if self._frames is None:
             self._since += 1
@@ -576,7 +577,7 @@ class AdaptiveNotch:
             passed = self._frames.hop * self._frames.interval
             root, motors = float(rest[0]), rest[1:]
             power, lost = self._choice.normalise(power, passed)
-            # Score the law before it learns.
+            # Score the law before it learns from this frame.
             self._choice.take(power, self._law.frequency(root), motors[np.isfinite(motors)],
                               passed)
             if root == root:
@@ -586,7 +587,7 @@ class AdaptiveNotch:
             self._choice.decide(sources)
 
     def _targets(self, chosen: Candidate | None) -> list[float]:
-        """Return the present frequencies of a candidate, Hz; NaN: none."""
+        """Return the present frequencies of a candidate, Hz; NaN while unknown."""
         if chosen is None or self._law is None:
             return []
         return [self._law.frequency(self._root)] if chosen.source == 'throttle' else self._motors

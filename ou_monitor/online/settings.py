@@ -53,10 +53,9 @@ def parameters_of(settings: type[Any], prefix: str = '') -> tuple[Parameter, ...
 
 _Settings = TypeVar('_Settings')
 
-# The window is chosen by the data.
+# Value of `window` for a length that is chosen from the data.
 AUTO = 'auto'
-
-
+# Values of `law`.
 LAWS = ('constant_noise', 'kalman', 'threshold')
 
 
@@ -69,8 +68,8 @@ def _documented(settings: type[_Settings]) -> type[_Settings]:
     return settings
 
 
-# The default limit, V, is for a 5 V rail, whose median voltage lies in this range, V: lower is a
-# lithium cell, or a rail in constant brown-out.
+# Default limit, V, which is for a 5 V rail, and range of the median voltage of such a rail, V: a
+# lower voltage is a lithium cell, or a rail in constant brown-out.
 DEFAULT_LIMIT, RAIL = 4.5, (4.5, 6.0)
 
 
@@ -204,7 +203,7 @@ class FilterSettings:
         0.0, 'White measurement noise for kalman, unit^2/Hz, two-sided: variance of a '
         'sample over the sample rate.', 0.0, 1.0e12)
     alpha: float = _parameter(
-        63.0, 'Relaxation rate of the supply while the estimator does not know it, 1/s.',
+        63.0, 'Relaxation rate of the supply until the estimator provides one, 1/s.',
         1.0e-6, 1.0e9)
     smoothing: float = _parameter(
         0.2, 'Time constant of ln(cutoff) if the relative error of sigma is 0.1, s; it is '
@@ -256,7 +255,7 @@ class FilterSettings:
 
     @property
     def lowest(self) -> float:
-        """Return the lowest cutoff, Hz: fmin, or that for max_lag."""
+        """Return the lowest cutoff, Hz: fmin, or the cutoff for max_lag."""
         if self.max_lag:
             return cutoff_for_lag(self.order, self.max_lag, self.lag_frequency)
         return self.fmin
@@ -348,7 +347,7 @@ class NotchSettings:
 
     count: int = _parameter(4, 'Maximum number of notches that follow the motors; 0: none.', 0, 4)
     fmin: float = _parameter(
-        60.0, 'Lowest frequency of a notch and of what counts as noise, Hz: above the bandwidth '
+        60.0, 'Lowest frequency of notches and of the noise they reduce, Hz: above the bandwidth '
         'of the flight controller.', 1.0, 1.0e5)
     cutoff: float = _parameter(
         80.0, 'Cutoff of the second-order low-pass after the notches, Hz: notches are used if '

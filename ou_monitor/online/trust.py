@@ -4,9 +4,9 @@ Whether an input can be trusted: stamps against arrival, readings against each o
 `SupplyMonitor` uses `InputTrust`, in the node and offline; the adaptive filter checks its messages
 by the same `StampWatch`, and falls back to arrival times (`InputClock`).
 
-Limits: a source with few late samples (below a tenth), or one that repeats messages, has good
-stamps.  A stuck sensor and a coarse one read alike until the first change; both are UNKNOWN until
-then.
+Limits: stamps count as good if less than a tenth of them are late, or if messages are repeated.
+Until the first change of the reading, a stuck sensor cannot be distinguished from a coarse one; so
+both count as stuck until then.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ import numpy as np
 from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import FloatArray, NAN
 
-# A fast source is silent after this many missing samples, whatever `stale_after` is, but not
-# before this time, s: a busy machine pauses that long.
+# Maximum silence of a fast source, even if `stale_after` is longer: number of missing samples, but
+# at least this time, s, because a busy computer pauses that long.
 MISSED, LEAST_PATIENCE = 300, 0.3
-# Minimum number of samples to know the interval of a source.
+# Minimum number of samples for the rate of a source.
 _MEASURED = 20
-# Number of intervals after which a slow source is silent: two missed messages, and half an
+# Number of intervals after which a slow source is stale: two missed messages, and half an
 # interval of jitter.
 SLOW_MISSED = 2.5
-# Minimum step between arrivals of a slow source, s: shorter steps lie within LEAST_PATIENCE.
+# Minimum step between arrivals of a slow source, s; LEAST_PATIENCE covers shorter steps.
 _SLOW_STEP = LEAST_PATIENCE / SLOW_MISSED
-# Number of slow steps whose median is the interval, their minimum number, and their minimum share
-# of the time.
+# Maximum number of slow steps whose median is the interval; minimum number; minimum share of the
+# time that they cover.
 _SLOW_KEPT, _SLOW_FEWEST, _SLOW_SHARE = 5, 2, 0.5
 # Number of messages for the share of late ones, and minimum number for a decision.
 _LOOK, _FEWEST = 200, 20
@@ -42,7 +42,7 @@ FROZEN_AFTER = 0.1
 
 
 def patience(settings: MonitorSettings, rate: float, n: int, interval: float = 0.0) -> float:
-    """Return the silence after which a source is stale, s (interval, s, of a slow one)."""
+    """Return the silence after which a source is stale, s (interval of a slow source, s)."""
     limit = settings.stale_after
     if n >= _MEASURED and rate > 0.0:
         limit = min(limit, max(LEAST_PATIENCE, MISSED / rate))
@@ -99,17 +99,17 @@ class StampOrder(enum.Enum):
 
     @property
     def by_arrival(self) -> str:
-        """Return the sentence for samples that are placed by their arrival."""
+        """Return the sentence for samples whose times are their arrival times."""
         found, _, advice = self.value.partition(': they allow no estimate')
         return f'{found}: their arrival times are used{advice}'
 
 
 class StampWatch:
-    """Whether the stamps of arriving samples advance; `newest` stamp of this time line, s."""
+    """Checks that stamps of arriving samples advance; `newest`: stamp of this time line, s."""
 
     def __init__(self) -> None:
         self.newest = -math.inf
-        # Samples in the last batches, and how many of them were late or started a new time line.
+        # For each recent batch: samples, and how many were late or started a new time line.
         self._batches: deque[tuple[int, int]] = deque()
         self._looked = self._late = 0
         # Samples since the newest stamp, and arrival of the first of them.
@@ -165,7 +165,7 @@ class StampWatch:
             stopped = self._arrived - self._advanced
             if math.isnan(stopped):
                 stopped = self._since * interval
-            # If no interval was ever known, the stamps never advanced.
+            # An unknown interval (NaN) means that the stamps never advanced.
             if not stopped <= limit:
                 return StampOrder.FROZEN
         if self._looked >= _FEWEST and self._late > _IRREGULAR * self._looked:
@@ -174,7 +174,7 @@ class StampWatch:
 
 
 class InputClock:
-    """Times of messages: their stamps, or their arrival if those fail; none is dropped."""
+    """Times of messages: stamps, or arrival times if stamps are bad; no message is dropped."""
 
     def __init__(self) -> None:
         self.stamps = StampOrder.GOOD
@@ -195,28 +195,28 @@ class InputClock:
         if StampOrder.GOOD is before is self.stamps or math.isnan(self._time):
             self._time = stamp + self._shift
         else:
-            # Valid stamps continue from here.
+            # Once the stamps are good again, they continue from this time.
             self._time += max(arrived - self._arrived, 0.0)
             self._shift = self._time - stamp
         self._arrived = arrived
         return self._time
 
 
-# A sensor is stuck if its reading is constant for this time, s, and this number of readings; or
-# only the number, if it has never changed.  Longest constant readings of working sources: 2.81 s
-# (139 readings) on the ground, in_xr_141340; 1.70 s (172) in flight, cf_solo_large; 3 readings at
-# 1 Hz in flight, ac_jd_2004.
+# A sensor is stuck if its reading is constant for more than this time, s, and at least this number
+# of readings; if it has never changed, the number suffices.  Longest constant readings of working
+# sources in recordings: 2.81 s (139 readings) on the ground; in flight 1.70 s (172 readings), or
+# 3 readings at 1 Hz.
 _STUCK, _STUCK_READINGS = 5.0, 10
-# Factor on the longest constant reading that ended with one ADC step, while throttle is constant
-# too: a coarse ADC repeats its reading during a slow discharge.
+# While throttle is constant, the time is at least this factor times the longest constant reading
+# that ended with one ADC step: a coarse ADC repeats its reading during a slow discharge.
 _QUIET = 4.0
-# Range within which throttle counts as constant (cf_solo_large: 0.019 within 1.06 s of hover).
+# Range within which throttle counts as constant (0.019 within 1.06 s of a recorded hover).
 _STILL = 0.05
-# Largest ADC step in units of the smallest change: printed digits round steps (5 or 6 mV).
+# Maximum size of one ADC step, in smallest changes: printed digits round steps (5 or 6 mV).
 _ONE_STEP = 1.5
-# Longest step between two readings that counts, s: a gap is not a constant reading.
+# Maximum time, s, that one step adds to a constant reading: a gap is not a constant reading.
 _COUNTED = 1.0
-# Smallest change, as a share of the reading: float32 rounds by 6e-8.
+# Minimum change, as a share of the reading: float32 rounds by 6e-8.
 _CHANGE = 1e-6
 
 
@@ -237,13 +237,13 @@ class ConstantReading:
         """Take finite readings in order of arrival (t in s, of arrival where it is known)."""
         if not voltage.size:
             return
-        # Where the runs of one reading begin; the first may be the present one.
+        # Indices at which the reading changes; the first readings may continue the present run.
         before = np.concatenate(([self.value], voltage))
         size = np.abs(before[1:] - before[:-1])
         moved = (size > _CHANGE * np.abs(voltage)).nonzero()[0]
         times = np.concatenate(([self._at], t))
         steps = times[1:] - times[:-1]
-        # NaN of the first reading counts as 0.
+        # The step before the first reading is NaN, and counts as 0.
         elapsed = np.fmin(np.fmax(steps, 0.0), _COUNTED).cumsum()
         self._at, self.value = float(t[-1]), float(voltage[-1])
         begin = 0
@@ -287,8 +287,8 @@ class ConstantReading:
 _RECENT = 21
 # Highest plausible voltage, V: the largest brownout.voltage that can be set.
 MOST_SUPPLY = 1000.0
-# Ratio of readings to the limit above which the unit or the limit is wrong: above a full pack of
-# 24 cells with the default limit (22), below hundredths of a volt (100).
+# Ratio of readings to the limit above which the unit or the limit is wrong: more than for a full
+# pack of 24 cells with the default limit (22), less than for hundredths of a volt (100).
 _UNIT = 50.0
 
 
@@ -304,14 +304,14 @@ class Doubt(enum.Enum):
 
 
 class InputTrust:
-    """All reasons for which an input is not trusted."""
+    """Decides whether the input is trusted, and for which reason it is not."""
 
     def __init__(self) -> None:
         self._stamps = StampWatch()
         self._interval = SourceInterval()
         self._still = ConstantReading()
         self._recent = np.empty(0)
-        #: External reason; empty: none.
+        # Reason from outside; empty: none.
         self.outside = ''
 
     def push(self, t: FloatArray, voltage: FloatArray, throttle: FloatArray | None,
