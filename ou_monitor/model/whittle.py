@@ -115,7 +115,6 @@ def absorbed_by(basis: FloatArray) -> FloatArray:
 class CrossSpectrum:
     """Cross spectra of regressors and a voltage, and the likelihood of a noise spectrum."""
 
-
     def __init__(self, rows: FloatArray, lengths: Sequence[int],
                  absorbed: FloatArray | None = None) -> None:
         # The cosine transform continues the window as its mirror image; so different values at
