@@ -2,13 +2,13 @@
 Alpha, sigma and Var_inf online: `SlidingEstimator`, and `RelaxationFits` for `window: auto`.
 
 voltage = level + response to throttle + OU(alpha, sigma) + white noise, all estimated together.
-doc/estimation.md has the steps, the measured accuracy and the limits.  If a source changes its
-step by a third or more, the window begins anew.
+doc/estimation.md has the steps, the measured accuracy and the limits.  The window begins anew if a
+change of the source's rate changes the number of samples per block.
 
 `RelaxationFits` keeps the readings of a minute, fitted by `known_ou` of `ou_fit`.  A fit costs 30
 to 600 ms of CPU, so it is repeated only after a quarter of its window, at least 1 s; in the
-background it runs in a thread that takes at most 5 % of a core.  Limits: as in `ou_fit`; a source
-above 1 kHz keeps its last 65 536 readings; a change of the supply is followed one window late.
+background it runs in a thread that takes at most 5 % of a core.  Limits: as in `ou_fit`; above
+1 kHz, only the last 65 536 readings are kept; a change of the supply is followed one window late.
 """
 
 from __future__ import annotations
@@ -43,37 +43,37 @@ _SPAN = 300.0
 _SETTLED = 1e-7
 # Minimum samples to determine the rate.
 MIN_FOR_RATE = 8
-# A step that differs from the usual one by more than this share breaks the run.
+# A step that differs from the usual step by more than this share ends a run of even steps.
 UNEVEN = 0.5
-# The usual step is measured again when a batch's median differs by this factor.
+# The usual step is updated when the median step of recent stamps differs by this factor.
 NEW_RATE = 1.3
 # Number of stamps kept from batch to batch for that median.
 MEMORY = 32
-# Maximum samples per block, for sources up to 10 MHz; stamps that are closer are invalid.
+# Maximum samples per block, enough for sources up to 10 MHz; closer stamps are invalid.
 MOST_BLOCK = 1000.0
 # Minimum number of samples for a fit.
 MIN_SAMPLES = 20
 # Minimum length of a run of evenly spaced readings, and share of such readings below which the
 # window counts as uneven.
 _LAGS, _EVEN = 24, 0.5
-# Jitter of the stamps, in relaxation times, above which the exact stamps are used: the error of an
-# even grid is its square.
+# Jitter of the stamps, in relaxation times, above which exact stamps are used: the error due to an
+# even grid is the square of the jitter.
 _JITTER = 0.1
-# Tolerance of rounded stamps at the edge of the window, as a share of it.
+# Tolerance for rounded stamps at the edge of the window, as a share of the window.
 _ROUNDING = 1e-6
 # If the variance of increments is below this share of their mean square, the voltage is a ramp.
 _RAMP = 1e-9
 # Number of checks of the input's quality per window.
 _LOOKS = 4
-# Length of the sliding estimate beside the fit, s.
+# Window of the sliding estimate for `window: auto`, beside `RelaxationFits`, s.
 SLIDING = OU_WINDOWS[0]
 # Time between two fits, as a share of the window, and its minimum, s.
 _SHARE, _SOONEST = 0.25, 1.0
 # Share of one core that fits in the background may take.
 _CPU = 0.05
-# Status of an estimate without a relaxation in a window that is too short for a fit.
+# Statuses of an estimate without a relaxation whose window is too short for a fit.
 _SHORT = (Status.TOO_FEW_SAMPLES, Status.TOO_SHORT)
-# Cautions about the model of the sliding estimate, which the fit does not share.
+# Cautions that concern the model of the sliding estimate, but not `RelaxationFits`.
 _SLIDING_ONLY = frozenset({Flag.TREND, Flag.SLOW_RATE})
 
 
@@ -211,7 +211,7 @@ class SlidingEstimator:
         if batch.restart:
             self._forget()
         if batch.again:
-            # Block means do not show which readings were repeats.
+            # Discard block means, because repeats cannot be removed from them.
             self._thinner = BlockAverager(self._fastest)
             self._kept = ReadingBuffer(3)
             self._tail = np.empty(0)
@@ -219,7 +219,7 @@ class SlidingEstimator:
             [self._tail, batch.y])[-TAIL:]
         columns, restart = self._thinner.take(batch)
         if restart:
-            # Block means of another size cannot be fitted with the old ones.
+            # Means of blocks of different sizes cannot be fitted together.
             self._line.count(resets=1)
             self._kept = ReadingBuffer(3)
         if columns.size:
@@ -235,7 +235,7 @@ class SlidingEstimator:
         self._before = None
 
     def _slide(self) -> None:
-        """Move the end of the window to the newest reading; earlier readings are lost."""
+        """Move the window to the newest reading; readings that leave it do not come back."""
         t = self._kept.columns[0]
         if t.size:
             self._begin = max(self._begin, t.item(-1) - (1.0 + _ROUNDING) * self._window)
@@ -280,7 +280,7 @@ class SlidingEstimator:
             return Estimate(status=status, u0=float(y.mean()),
                             flags=tuple(input_flags(counters, quality, NAN)),
                             **measured)
-        # Throttle, or its lag, moves; if it is unknown, nothing is regressed.
+        # Regress on throttle and its lags if any of them moves, but not if throttle is unknown.
         known = not np.isnan(u).any()
         back = int(kept[0].searchsorted(t.item(0) - LOOK_BACK))
         before = kept[2, back:]
@@ -317,10 +317,10 @@ class SlidingEstimator:
         smoothness = NAN
         if one[1] > _RAMP * one[0]:
             smoothness = _smoothness(two[1] / one[1], fit.alpha_step, m)
-        # Set the trend if the drift is faster than a random walk of these increments: if the
-        # voltage does not return within the window, the fit may attribute any drift to chance.
-        # The longest lag shows movements in one direction.  Only for constant throttle, because
-        # moving throttle is regressed out.
+        # Also set the trend if the drift is faster than a random walk with these increments: if
+        # the voltage does not return within the window, the fit may attribute any drift to chance.
+        # Increments over the longest lag reveal movements in one direction.  This is only for
+        # constant throttle, because moving throttle is regressed out.
         if not load.size and far[2] >= _EVEN * t.size and one[2] * (
                 one[0] - one[1]) > TREND_SCORE ** 2 * max(one[1], far[1] / _LAGS):
             fit = replace(fit, trend=True)
@@ -328,7 +328,7 @@ class SlidingEstimator:
 
 
 def _smoothness(ratio: float, a: float, m: int) -> float:
-    """Return how much more neighbouring increments are correlated than in an OU."""
+    """Return the correlation of neighbouring increments in excess of an OU's."""
     # ratio: D_2 / D_1.  From D_1 = E(z_j - z_{j-1})^2 and D_2 = E(z_j - z_{j-2})^2, less the means
     # squared, their correlation is D_2 / (2 D_1) - 1.
     gamma0, gamma1 = arma.block_autocovariance(a, m)
@@ -362,7 +362,7 @@ class ReadingBuffer:
 
     @property
     def columns(self) -> FloatArray:
-        """Return what is kept, shape (rows, n); a view."""
+        """Return the readings kept, shape (rows, n); a view."""
         return self._store[:, :self._size]
 
     def cut(self, size: int) -> None:
@@ -373,7 +373,7 @@ class ReadingBuffer:
         """Add readings; keep those of the last `reach` seconds, but no more than `most`."""
         count = columns.shape[1]
         if self._size + count > self._store.shape[1]:
-            # One more, to show that there are data before the window.
+            # Keep one more, which shows that there are data before the window.
             first = max(0, int(np.searchsorted(
                 self.columns[0], columns[0, -1] - reach)) - 1, self._size + count - most - 1)
             old = self.columns[:, first:]
@@ -418,7 +418,7 @@ def lagged(t: FloatArray, u: FloatArray, tau: float) -> FloatArray:
 
 
 class BlockAverager:
-    """Learns the rate of the source, and averages blocks of m samples beyond `fastest`, Hz."""
+    """Measures the rate of the source, and averages blocks if it exceeds `fastest`, Hz."""
 
     def __init__(self, fastest: float) -> None:
         self._fastest = fastest
@@ -427,7 +427,7 @@ class BlockAverager:
         self.forget()
 
     def forget(self) -> None:
-        """Take the next samples as the first ones; the rate stays known."""
+        """Treat the next samples as the first, but keep the rate."""
         self._rest = np.empty((3, 0))
         self._stamps = np.empty(0)
 
@@ -512,7 +512,7 @@ class RelaxationFits:
         """Take readings in order."""
         t = self.readings[0]
         if batch.again:
-            # The newest of those kept, without repeats.
+            # The batch replaces the newest readings kept: it omits their repeats.
             self._kept.cut(int(np.searchsorted(t, batch.t[0])))
         elif t.size and batch.t[0] <= t[-1]:
             self.forget()
@@ -555,19 +555,19 @@ class RelaxationFits:
         self._due = end + max(_SOONEST, _SHARE * found.window_s)
 
     def in_force(self, e: Estimate) -> tuple[Estimate, OuFacts, float]:
-        """Return the sliding estimate with the fitted relaxation, and its age, s."""
+        """Return the sliding estimate with the relaxation to publish, the latter, and its age."""
         facts, age = self.facts, e.t - self.end
         sliding = of_estimate(e)
-        # Whether there are newer readings than those of the fit.
+        # Whether there are newer readings than in the fit.
         later = not self.readings.size or self.readings[0, -1] > self.end
         if facts is None or e.status is Status.NO_DATA or (
                 later and sliding.status == 'ok' and facts.window_s < sliding.window_s):
-            # In the first seconds, the sliding window is longer than that of the fit.
+            # In the first seconds, the sliding window is longer than the window of the fit.
             return e, sliding, 0.0
         if facts.status in ('no_data', 'too_short'):
             return _unknown(e, Status.TOO_SHORT), facts, age
         if age > max(facts.window_s, SLIDING):
-            # Fits are too slow.
+            # The fit is too old, because fits are too slow.
             return _unknown(e, Status.TOO_SHORT), OuFacts('no_data'), age
         if facts.status == 'not_visible':
             return _unknown(e, Status.NO_RELAXATION), facts, age

@@ -1,17 +1,17 @@
 """
 Fit OU parameters, noise and mean to the samples of a window.
 
-While throttle moves, or when the voltage drifts, sag, its curvature and its lag are regressed out
-of the mean, within the restricted likelihood (REML: Harville, J. Am. Stat. Assoc. 72 (1977) 320).
+While throttle moves, sag with its curvature and lag, and if necessary a drift, are regressed out
+of the mean within the restricted likelihood (REML: Harville, J. Am. Stat. Assoc. 72 (1977) 320).
 
 Evenly spaced samples, or block means: `SpectralLikelihood`, the Whittle likelihood
-(model/whittle.py), which `window: auto` and `supply_facts` maximise too.
+(model/whittle.py), which `window: auto` and `supply_facts` use too.
 
 Unevenly spaced samples: `StampLikelihood`, the exact Gaussian likelihood, equal to the Kalman
-filter's.  The inverse covariance Q of a sampled OU is tridiagonal, so it costs O(n): K = Q^-1 + nu
-I, with A = I + nu Q tridiagonal, K^-1 = Q A^-1 and log|K| = log|A| - log|Q|.  The gradient needs
-only the elimination and the three diagonals of A^-1, so a search that starts from the fit of
-evenly spaced samples takes a few evaluations.
+filter's.  The inverse covariance Q of a sampled OU is tridiagonal, so the cost is O(n): the
+covariance is K = Q^-1 + nu I; with A = I + nu Q tridiagonal, K^-1 = Q A^-1 and log|K| = log|A| -
+log|Q|.  The gradient needs only the elimination and the three diagonals of A^-1.  The search
+starts from a fit that treats the samples as evenly spaced, and takes a few evaluations.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _STILL = 1e-12
 # Minimum correlation of adjacent samples, standard errors, for a fit.
 _CORRELATED = 4.0
 # alpha times the step above which adjacent samples carry no information on the relaxation; number
-# of relaxations in the window below which a drift may be chance.
+# of relaxation times in the window below which a drift may be chance.
 _FASTEST, _DOUBTFUL = 4.6, 25.0
 
 
@@ -61,14 +61,14 @@ def independent(cov: FloatArray) -> FloatArray:
     return found
 
 
-# Standard errors from which a trend enters the model: by chance once in 16 000 long windows.
+# Score (standard errors) above which a trend is included: by chance once in 16 000 long windows.
 TREND_SCORE = 4.0
-# Few relaxations look like a trend more often, so the required score grows by a factor of 1 + 6/x,
-# x = alpha T.  A false trend then remains in 1 % of windows of 4 to 13 relaxations, and in 5 % of
-# random walks (16 apparent relaxations).  A drift of 8 standard deviations over 25 relaxations is
-# missed in one window of 12; with twice the constant, in one of 5.
+# A window of few relaxation times looks like a trend more often, so the required score is
+# multiplied by 1 + 6/x, x = alpha T.  False trends remain in 1 % of windows with x of 4 to 13, and
+# in 5 % of random walks (apparent x of 16).  A drift of 8 standard deviations at x = 25 is missed
+# in one window of 12; with twice the constant, in one of 5.
 _FEW = 6.0
-# Score from which a trend is examined (by chance once in 22 windows).
+# Score above which a fit with a trend is tried (by chance once in 22 windows).
 SUSPECT = 2.0
 
 
@@ -82,26 +82,26 @@ class FitEnd(enum.Enum):
 
 @dataclass(slots=True)
 class WindowFit:
-    """Parameters before correction for the length of the window."""
+    """Fitted parameters, before the correction for short windows."""
 
     outcome: FitEnd  # Outcome; unless it is FOUND the numbers may be NaN
     # 1/s and V/sqrt(s), as maximised.
     alpha: float
     sigma: float
     noise_var: float  # Variance of the white noise of one raw sample, V^2
-    noise_score: float  # Noise in units of its standard error
+    noise_score: float  # Distance of the noise from zero, in standard errors
     log_var: tuple[float, float, float]  # Variances of ln(alpha), ln(sigma), ln(Var_inf)
     level: FloatArray  # Means of voltage and load variables; shape (c,)
     # Load coefficients, V per unit, and covariance, V^2.
     beta: FloatArray
     beta_cov: FloatArray
     trend: bool  # Whether the mean drifts
-    n: int  # Samples, or block means, fitted
-    alpha_step: float  # alpha times the step between them
+    n: int  # Number of samples, or block means, fitted
+    alpha_step: float  # alpha times the step between samples
     high: float  # Bias of alpha, times the length of the window
 
 
-# Relaxations between two samples beyond which they are independent: exp(2 * 300) is a double.
+# Relaxation times after which two samples are independent; exp(2 * 300) does not overflow.
 _FAR = 300.0
 # Size at which a tridiagonal system is solved as a dense one, which needs fewer NumPy calls.
 _DENSE = 24
@@ -115,17 +115,17 @@ _MOST_POINTS = 24
 _STEP, _HAIR = 1e-4, 1e-3
 # Points of the first grid of a search, in ln a and z.
 _GRID = (16, 8)
-# Lower limit of the curvature of a direction, nats; longest step.
+# Minimum curvature of a direction, nats; maximum step.
 _FLAT, _LONGEST = 1e-3, 1.5
-# White noise, relative to the diffusion of one step: up to the first value the search is linear in
-# it, above it logarithmic; the second is the upper limit (1e4), which hides any OU.
+# White noise relative to the diffusion of one step: z is linear in it up to the first value, and
+# logarithmic above; the second is the upper limit of z (noise of 1e4, which hides any OU).
 _SMALL = 0.05
 _LOUDEST = math.log1p(1e4 / _SMALL)
 
 
 @dataclass(frozen=True, slots=True)
 class _Point:
-    """The likelihood at one choice of ln a and z, see `Likelihood.at`."""
+    """The likelihood at one choice of ln a (a = alpha step) and z (see `noise_scale`)."""
 
     # Minus the restricted log-likelihood, nats, and its derivatives by ln a and z.
     value: float
@@ -141,26 +141,26 @@ class _Point:
 class _Likelihood(Protocol):
     """A restricted likelihood, profiled over scale and mean."""
 
-    n: int  # Samples
-    m: int  # Raw samples in each
+    n: int  # Number of samples, or block means
+    m: int  # Raw samples in each block
     step: float  # Mean step, s
-    low: FloatArray  # Ends of ln a and z
+    low: FloatArray  # Lower and upper limits of ln a and z
     high: FloatArray
 
     def at(self, log_a: float, z: float, used: int) -> _Point:
         """Return the likelihood with the first `used` regressors."""
 
     def start(self, used: int) -> FloatArray:
-        """Return ln a and z where a search may begin."""
+        """Return ln a and z from which a search may start."""
 
 
 def _ends(n: int) -> tuple[FloatArray, FloatArray]:
-    """Return the ends of ln a and z: one relaxation in ten windows, neighbours uncorrelated."""
+    """Return limits of ln a and z: one relaxation time in ten windows, to no correlation."""
     return np.array([math.log(0.1 / (n - 1)), 0.0]), np.array([math.log(2.0 * _FASTEST), _LOUDEST])
 
 
 class SpectralLikelihood:
-    """Whittle likelihood of samples, or means of m, in even stretches; the last row is voltage."""
+    """Whittle likelihood of samples, or means of m, in even stretches; last row: voltage."""
 
     def __init__(self, rows: FloatArray, lengths: list[int], step: float, m: int = 1) -> None:
         self.n, self.m, self.step = rows.shape[1], m, step
@@ -253,7 +253,7 @@ class StampLikelihood:
         return _Point(value, slopes, rest / free, beta, inverse * (rest / free), gram)
 
     def start(self, used: int) -> FloatArray:
-        """Return ln a and z of a fit that takes the samples as evenly spaced."""
+        """Return ln a and z of a fit that treats the samples as evenly spaced."""
         even = SpectralLikelihood(self._table, [self.n], self.step)
         return maximise(even, used).place
 
@@ -318,8 +318,8 @@ class Maximum:
     beta_cov: FloatArray
     # Restricted log-likelihood at the maximum, nats.
     log_likelihood: float
-    # -1, 0 or 1: alpha ran into the slow end of the search (no restoring force visible), settled
-    # inside, or ran into the fast end (no correlation visible).
+    # -1, 0 or 1: alpha at the slow end of the search (no restoring force visible), inside, or at
+    # the fast end (no correlation visible).
     edge: int
     # alpha times the mean step, and noise_var over sigma^2 times the mean step.
     a: float
@@ -340,7 +340,7 @@ def maximise(likelihood: _Likelihood, used: int, before: Maximum | None = None) 
         None if before is None else before.curved, low, high)
     log_a, z = place.tolist()
     a, share = math.exp(log_a), _SMALL * math.expm1(z)
-    # The likelihood is flat at the slow end: within 5 % of the end is at the end.
+    # The likelihood is flat at the slow end, so values within 5 % of it count as the end.
     edge = -1 if log_a < low[0] + 0.05 else 1 if a > _FASTEST else 0
     return Maximum(a / likelihood.step, math.sqrt(at.scale), share * at.scale * likelihood.step,
                    at.beta, at.cov, -at.value, edge, a, share, at.gram, place, curved)
@@ -348,7 +348,7 @@ def maximise(likelihood: _Likelihood, used: int, before: Maximum | None = None) 
 
 def _minimised(f: Callable[[FloatArray], _Point], here: FloatArray, curved: FloatArray | None,
                low: FloatArray, high: FloatArray) -> tuple[FloatArray, _Point, FloatArray | None]:
-    """Return where f is least within a box, its point, and the curvature (Newton, BFGS)."""
+    """Minimise f within a box (Newton, BFGS); return place, point, and curvature."""
     at = f(here)
     left = _MOST_POINTS
     while left > 0:
@@ -357,7 +357,7 @@ def _minimised(f: Callable[[FloatArray], _Point], here: FloatArray, curved: Floa
             curved = np.stack([(f(here + step).slopes - at.slopes) / _STEP
                                for step in _STEP * np.eye(2)])
             curved = 0.5 * (curved + curved.T)
-        # At a bound beyond which f falls, only the other coordinate moves.
+        # If f decreases beyond a bound, only the other coordinate moves.
         free = ~(((here <= low) & (at.slopes > 0.0)) | ((here >= high) & (at.slopes < 0.0)))
         slopes = np.where(free, at.slopes, 0.0)
         values, vectors = np.linalg.eigh(np.where(np.outer(free, free), curved, np.eye(2)))
@@ -392,19 +392,19 @@ def _minimised(f: Callable[[FloatArray], _Point], here: FloatArray, curved: Floa
 
 # Samples up to which the exact likelihood is used.
 MOST = 4096
-# Minimum share of the variance of time that the load does not explain, for a trend.
+# Minimum share of the variance of time that the load does not explain, to fit a trend.
 _APART = 1e-5
 # Samples averaged into one of a coarser grid, and minimum number of samples on that grid.
 _FACTOR, _FEWEST = 4, 100
 # An ADC step acts as white noise only if the OU crosses several codes between two samples, which
-# need a distance of (0.7 step / sigma)^2 or more, s (doc/estimation.md).
+# must be at least (0.7 step / sigma)^2 s apart (doc/estimation.md).
 _DITHER = 0.7
 # Correction of the bias of alpha, in 1/T, for the spectral likelihood and for the exact one.  The
 # exact restricted likelihood makes alpha too high by 2/T (Tang & Chen, J. Econometrics 149 (2009)
 # 65: 4/T with unknown mean, half of it from the mean), the spectral one by 0.1 to 1.2/T, or 1.6 to
-# 2.5/T with 5 mV of noise (600 simulated windows each of 12 to 126 relaxations).  Var_inf =
-# sigma^2 / (2 alpha) is convex in alpha, so this one correction is a compromise: it leaves Var_inf
-# too high by 0.5/(alpha T) and 1.3/(alpha T).
+# 2.5/T with 5 mV of noise (600 simulated windows each of 12 to 126 relaxation times).  Var_inf =
+# sigma^2 / (2 alpha) is convex in alpha, so one correction for both is a compromise: it leaves
+# Var_inf too high by 0.5/(alpha T) and 1.3/(alpha T).
 _HIGH_BY = (0.5, 1.5)
 # Share of the mean square below which a residual, or the diffusion of one step, is rounding error.
 _EXACT = 1e-14
@@ -414,20 +414,20 @@ def fit_window(t: FloatArray, y: FloatArray, load: FloatArray, m: int, adc: floa
                stamps: Callable[[float], bool], before: Maximum | None,
                ) -> tuple[WindowFit, Maximum | None]:
     """Fit the OU, the noise and the mean (t in s, y in V, load of shape (c, n), adc step in V)."""
-    # load: empty while throttle is constant; m: raw samples averaged in each; stamps: function of
-    # alpha times the mean step that tells whether the exact likelihood is needed (inf: for any
-    # alpha); before: the second value returned for a nearly identical window.
+    # load: empty while throttle is constant; m: raw samples averaged in each sample; stamps:
+    # whether the exact likelihood is needed, given alpha times the mean step (inf: for any alpha);
+    # before: the second value returned for a nearly identical window.
     level = np.append(y.mean(), load.mean(axis=1))
     centred = load - level[1:, None]
     basis = independent(centred @ centred.T / t.size)
     known = basis.T @ centred
     time = (t - t[0]) / (t[-1] - t[0]) - 0.5
-    # The part of time that the load does not explain.
+    # Remove the part of time that the load explains.
     within = known @ time / t.size
     time = time - time.mean() - within @ known
     used, apart = 1 + len(known), float(time @ time) > _APART * t.size / 12.0
     rows = np.stack([np.ones(t.size), *known, *([time] if apart else []), y - level[0]])
-    # Fit the least-squares residuals, which avoids rounding errors; add their fit afterwards.
+    # Fit least-squares residuals, to avoid rounding errors; add the least-squares fit afterwards.
     plain = np.linalg.lstsq(rows[:used].T, rows[-1], rcond=None)[0]
     rows[-1] -= plain @ rows[:used]
     left = rows[-1]
@@ -455,8 +455,8 @@ def fit_window(t: FloatArray, y: FloatArray, load: FloatArray, m: int, adc: floa
         again = None if doubtful or found.edge or held > m else found
         if apart and found.edge <= 0 and (
                 doubtful or abs(_score(found.gram, used, likelihood.n)) > SUSPECT):
-            # Without restoring force any drift may be chance, so the fit that includes the drift
-            # decides.
+            # Without a restoring force any drift may be chance; so the restoring force in the fit
+            # with a drift decides.
             drifting = maximise(likelihood, used + 1, again)
             if drifting.edge <= 0 and drifting.beta[-1] ** 2 > drifting.beta_cov[-1, -1] * (
                     TREND_SCORE * (1.0 + _FEW / (drifting.a * likelihood.n))) ** 2:

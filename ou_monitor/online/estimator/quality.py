@@ -1,8 +1,8 @@
 """
 Quality of the input and the fit: ADC steps, bias, corrected errors, status, flags.
 
-In a diffusion equal adjacent values have probability zero, so repeats, grids and accumulations at
-the extremes are exact findings, made without a model.
+In a diffusion, equal adjacent values have probability zero; so repeats, grids and accumulations at
+the extremes are detected without a model.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ _ENOUGH = 64
 _FEWEST_STEPS = 3
 # Share of adjacent samples that differ, below which the ADC is coarse.
 _TIED = 0.9
-# Share of samples at the extreme from which the ADC range counts as exceeded, and
-# ratio to the number of samples at the code beside it.
+# Minimum share of samples at an extreme for the ADC range to count as exceeded, and minimum ratio
+# of their number to the number of samples at the adjacent code.
 _CLIPPED_SHARE = 0.01
 _CLIPPED_EXCESS = 3.0
 
@@ -34,7 +34,7 @@ class Quality:
     """Findings about readings."""
 
     step: float = 0.0  # ADC step, V; 0 if the values lie on no grid
-    held: float = 1.0  # Samples per refresh of a source that repeats its last value; 1: none
+    held: float = 1.0  # Samples per reading of a source that repeats readings; 1: no repeats
     saturated: bool = False  # Whether samples pile up at an extreme
     rms_increment: float = math.nan  # Root mean square of the steps between fresh samples, V
 
@@ -47,10 +47,10 @@ def examine(y: FloatArray, held: float = 1.0) -> Quality:
     changes = np.flatnonzero(steps)
     if changes.size < _FEWEST_STEPS:
         return Quality(held=held)
-    # Where many neighbours are equal, a few different steps reveal a grid, too.
+    # If many adjacent samples are equal, a single step size suffices to reveal a grid.
     tied = changes.size < _TIED * steps.size
     rms = float(np.sqrt(np.mean(steps * steps)))
-    # Steps whose squares are zero have no size to compare with.
+    # No step if its square underflows to zero.
     step = lattice(np.abs(steps[changes]), 1 if tied else _FEWEST_STEPS) if rms > 0.0 else 0.0
     return Quality(step, held, _piles_up(y), rms)
 
@@ -59,7 +59,7 @@ def lattice(sizes: FloatArray, fewest: int = _FEWEST_STEPS) -> float:
     """Return the common step of increments, V; 0 if there is none above 1e-3 of the largest."""
     ordered = np.unique(sizes)
     least = float(ordered[0])
-    # Rounding splits one step into several: join those within 1e-3 of the smallest.
+    # Rounding splits one step into several: average the steps within 1e-3 of the smallest.
     near = ordered[ordered < 1.001 * least]
     unit = float(near.mean())
     multiples = np.rint(ordered / unit)
@@ -83,21 +83,20 @@ def _piles_up(y: FloatArray) -> bool:
 
 # Relaxation times in the window from which alpha is known to a quarter (doc/estimation.md).
 GOOD_RELAXATIONS = 25.0
-# Standard error of ln(alpha), before it is widened, beyond which alpha is buried in noise ...
-_BURIED = 0.5
-# ... provided that noise, and not the length of the window, is the cause: minimum ratio of the
-# error to the error without noise.
-_BURIED_BY = 2.0
-# In short windows ln(alpha) has wider tails than its information says: its
-# standard error grows by 1 + 1.5/x + 70/x^2, x = alpha T + 1.5, which brings the
-# coverage of 95 % intervals to 94 % at x = 12; doc/estimation.md.
+# Alpha counts as buried in noise if the standard error of ln(alpha), before it is widened, exceeds
+# the first value, and the second times the error without noise (otherwise the cause is a short
+# window).
+_BURIED, _BURIED_BY = 0.5, 2.0
+# In short windows ln(alpha) has wider tails than its Fisher information implies.  So its standard
+# error is multiplied by 1 + 1.5/x + 70/x^2, x = alpha T + 1.5, which brings the coverage of 95 %
+# intervals to 94 % at x = 12; doc/estimation.md.
 _WIDER, _MUCH_WIDER, _AS_FITTED = 1.5, 70.0, 1.5
-# Distance from "no noise", in standard errors, within which errors of sigma shrink (measured).
+# Distance of the noise from zero, in standard errors, within which errors of sigma are reduced.
 _NEAR = 0.75
 # Minimum standard deviation of throttle to estimate the sag.
 MIN_THROTTLE_STD = 0.005
-# Correlation of neighbouring increments, above that of an OU, from which a
-# low-pass upstream is suspected, and in standard errors.
+# Correlation of neighbouring increments in excess of an OU's, absolute and in standard errors,
+# above which a low-pass upstream is suspected.
 _SMOOTH, _SMOOTH_SCORE = 0.05, 5.0
 
 
@@ -106,10 +105,10 @@ def log_errors(fit: WindowFit, duration: float) -> tuple[float, float, float]:
     # At least a thousandth, to avoid a division by zero.
     relaxations = max(fit.alpha * duration - fit.high + _AS_FITTED, 1e-3)
     wider = 1.0 + (_WIDER + _MUCH_WIDER / relaxations) / relaxations
-    # If no noise was found, theta is at its bound or near it, and the information overstates the
+    # If no noise was found, theta is at or near its bound, and the information overstates the
     # error of sigma.  Within `_NEAR` standard errors of the bound, the error is therefore reduced
-    # as for a normal distribution cut on one side (0.68 of the variance; theta makes up most of
-    # sigma's).
+    # as for a normal distribution truncated on one side (0.68 of the variance, because theta
+    # causes most of the variance of sigma).
     near = math.exp(-0.5 * math.pow(min(fit.noise_score / _NEAR, 1e3), 2))
     return (_se(fit.log_var[0]) * wider, _se(fit.log_var[1]) * math.sqrt(1.0 - 0.32 * near),
             _se(fit.log_var[2]) * wider)
@@ -122,7 +121,7 @@ def _se(variance: float) -> float:
 
 def judge(fit: WindowFit, measured: Mapping[str, Any], quality: Quality, throttle_std: float,
           smoothness: float) -> Estimate:
-    """Return the published estimate; `measured`: its fields that need no fit."""
+    """Return the published estimate; `measured`: fields that do not depend on the fit."""
     flags = input_flags(measured['counters'], quality, throttle_std)
     if fit.trend:
         flags.append(Flag.TREND)
@@ -145,7 +144,7 @@ def judge(fit: WindowFit, measured: Mapping[str, Any], quality: Quality, throttl
         return Estimate(status=Status.UNBOUND, flags=tuple(flags), **known)
     if fit.log_var[0] > max(_BURIED ** 2, _BURIED_BY ** 2 * 2.0 / relaxations):
         return Estimate(status=Status.BURIED, flags=tuple(flags), **known)
-    # In a short window alpha is often too high, so reduce `relaxations` by one standard error.
+    # In a short window alpha is often overestimated: reduce `relaxations` by one standard error.
     surely = relaxations * math.exp(-se[0])
     alpha = fit.alpha - fit.high / duration
     var_inf = fit.sigma ** 2 / (2.0 * alpha)
@@ -161,7 +160,7 @@ def judge(fit: WindowFit, measured: Mapping[str, Any], quality: Quality, throttl
 
 
 def input_flags(counters: Counters, quality: Quality, throttle_std: float) -> list[Flag]:
-    """Return the flags that need no fit."""
+    """Return the flags that do not depend on the fit."""
     flags: list[Flag] = []
     if quality.step > quality.rms_increment:
         flags.append(Flag.QUANTIZED)
@@ -187,5 +186,5 @@ def _level(fit: WindowFit, throttle: float, moves: bool) -> tuple[float, float]:
 
 
 def load_at(throttle: float) -> FloatArray:
-    """Return the load variables of a throttle that has long been steady."""
+    """Return the load variables for a throttle that has been constant for long."""
     return np.array([throttle, throttle * throttle, throttle, throttle])

@@ -23,8 +23,8 @@ OF_RATE = 0.45
 INTERVALS = 100
 ODD = 5.0
 _NEW = 5
-# Relative error of sigma for which the time constant `smoothing` is stated, and maximum factor on
-# it (our choice, within Betaflight's 1 to 10).
+# Relative error of sigma for which the time constant `smoothing` is stated, and maximum factor by
+# which other errors change the time constant (our choice, within Betaflight's 1 to 10).
 _ERROR, _RANGE = 0.1, 4.0
 
 
@@ -45,8 +45,8 @@ class Bound(enum.Enum):
 class SampleInterval:
     """Mean time between samples, s, over about 100 of them; 0 before the second sample."""
 
-    # Intervals over five times the mean are gaps and left out, unless a third of all are gaps.
-    # Five intervals in a row that are off by a factor of five are a new rate.
+    # Intervals over five times the mean count as gaps, and are left out unless a third of all are
+    # gaps.  Five successive intervals that differ by a factor of five are a new rate.
 
     __slots__ = ('_long', '_n', '_short', 'mean')
 
@@ -95,7 +95,7 @@ class CutoffControl:
     def __init__(self, settings: FilterSettings) -> None:
         self._settings = settings
         self._lowest = settings.lowest
-        # Target, approach to it, and cutoff in force, Hz.
+        # Target; cutoff that approaches it; cutoff in force, Hz.
         self._aim = self._moving = self.cutoff = settings.fallback
         self._wanted = math.nan
         self._started = self._follow_exactly = self._slewing = False
@@ -135,7 +135,7 @@ class CutoffControl:
             self._aim = self._moving = self.cutoff = settings.fallback
 
     def update(self, wanted: float, error: float, dt: float, interval: float) -> float:
-        """Take the law's cutoff, Hz; return the one in force (dt, interval in s; 0: unknown)."""
+        """Take the law's cutoff, return the cutoff in force, Hz (times in s; 0: unknown)."""
         self._choose(wanted)
         if not self._started:
             self._started, self._moving = True, self._aim
@@ -146,7 +146,7 @@ class CutoffControl:
         return self.cutoff
 
     def _choose(self, wanted: float) -> None:
-        """Set the target to the wanted cutoff if that is outside the dead band of the old one."""
+        """Set the target to the wanted cutoff, unless it is in the dead band of the old target."""
         if wanted != wanted:
             self._wanted, self._aim = wanted, self._settings.fallback
             self._follow_exactly = True

@@ -1,10 +1,10 @@
 """
 Laws from sigma to the wanted cutoff, each with its derivation.
 
-With w = 2 pi fc, the supply U an Ornstein-Uhlenbeck process of intensity
-sigma and rate alpha, and `coupling` times its deviation in the signal, the
-output variance is (coupling sigma)^2 V(w), by the integral of
-|H(iw)|^2 / (alpha^2 + w^2) over the frequencies:
+The supply U is an Ornstein-Uhlenbeck process of intensity sigma and rate
+alpha, and the signal contains `coupling` times its deviation.  With
+w = 2 pi fc, the output variance is then (coupling sigma)^2 V(w), by the
+integral of |H(iw)|^2 / (alpha^2 + w^2) over the frequencies:
 
     low-pass, order 1     V = w / (2 alpha (w + alpha))
     low-pass, order 2     V = w (sqrt2 w + alpha) / (2 sqrt2 alpha (w^2 + sqrt2 w alpha + alpha^2))
@@ -13,14 +13,14 @@ output variance is (coupling sigma)^2 V(w), by the integral of
 
 All grow with w, so each variance has one cutoff.
 
-White noise: with the input linear between samples a step of the filter is z' = F z + a x_(k-1)
-+ b x_k (its columns come from `LowPassState`), so independent samples of variance 1
+White noise: with the input linear between samples, a step of the filter is z' = F z + a x_(k-1)
++ b x_k (F, a and b come from `LowPassState`).  So independent samples of variance 1
 give the stationary covariance
 
     C = F C F^T + a a^T + b b^T + F b a^T + a b^T F^T,
 
-and the slopes (x_k - x_(k-1)) / dt, whose neighbours are correlated by -1/2,
-with g = a + b
+and their slopes (x_k - x_(k-1)) / dt, adjacent ones of which have a correlation of -1/2,
+give, with g = a + b,
 
     C dt^2 = F C F^T dt^2 + 2 g g^T - F g g^T - g g^T F^T.
 
@@ -43,7 +43,7 @@ from ou_monitor.records import FloatArray, NAN
 # Range of angles (2 pi cutoff interval) in the table, and step of their logarithms: interpolation,
 # and the power law below the first, are accurate to 1e-4.
 _LEAST_ANGLE, _MOST_ANGLE, _STEP = 1e-4, 300.0, 0.02
-# Minimum rise of ln noise from angle to angle; where it is smaller, all noise passes already.
+# Minimum rise of ln noise from angle to angle; beyond a smaller rise, all noise passes.
 _STILL = 1e-6
 
 
@@ -61,7 +61,7 @@ def white_noise(mode: str, order: int, angle: float) -> float:
         g1, g2 = a1 + b1, a2 + b2
         m1, m2 = f11 * g1 + f12 * g2, f21 * g1 + f22 * g2
         drive = (2.0 * g1 * (g1 - m1), 2.0 * g1 * g2 - m1 * g2 - m2 * g1, 2.0 * g2 * (g2 - m2))
-    # The three elements of the symmetric C.
+    # Solve for the three elements of the symmetric C.
     turned = [[1.0 - f11 * f11, -2.0 * f11 * f12, -f12 * f12],
               [-f11 * f21, 1.0 - f11 * f22 - f12 * f21, -f12 * f22],
               [-f21 * f21, -2.0 * f21 * f22, 1.0 - f22 * f22]]
@@ -78,7 +78,7 @@ def _step(order: int, angle: float, y: float, slope: float, start: float, end: f
 
 @cache
 def _table(mode: str, order: int) -> tuple[FloatArray, FloatArray, float]:
-    """Return ln of angles and of their noise, both rising, and the exponent below."""
+    """Return ln of angles and of their noise, both rising, and the exponent of noise below."""
     count = math.ceil(math.log(_MOST_ANGLE / _LEAST_ANGLE) / _STEP) + 1
     angle = math.log(_LEAST_ANGLE) + _STEP * np.arange(count)
     noise = np.log([white_noise(mode, order, one) for one in np.exp(angle).tolist()])
@@ -90,7 +90,7 @@ def _table(mode: str, order: int) -> tuple[FloatArray, FloatArray, float]:
 
 
 def held_cutoff(mode: str, order: int, fmax: float, times: float, interval: float) -> float:
-    """Return the cutoff of the sampled filter, as `relative_cutoff` (Hz, interval in s)."""
+    """Return `relative_cutoff` for the sampled filter, Hz (interval in s)."""
     angle, noise, power = _table(mode, order)
     log = math.log(TWO_PI * fmax * interval)
     before = math.log(white_noise(mode, order, math.exp(log))) if log > angle[-1] else (
@@ -123,9 +123,9 @@ def threshold_law(settings: FilterSettings, sigma: float, alpha: float,
 
 def constant_noise_law(settings: FilterSettings, sigma: float, alpha: float,
                        interval: float) -> float:
-    """Return the cutoff at which the rms of the output noise is the wanted one."""
-    # Without `coupling` the noise is white, with a variance proportional to sigma^2.  By default
-    # its rms in the output is kept as at `sigma_ref` and fmax.
+    """Return the cutoff at which the rms of the output noise has the wanted value."""
+    # Without `coupling`, the noise is taken as white, with a variance proportional to sigma^2.  By
+    # default the output keeps the rms that it has at `sigma_ref` and fmax.
     if settings.coupling:
         wanted = settings.noise_wanted or settings.coupling * settings.sigma_ref * math.sqrt(
             supply_noise(settings.mode, settings.order, settings.fmax, alpha))
@@ -139,7 +139,7 @@ def constant_noise_law(settings: FilterSettings, sigma: float, alpha: float,
 
 def relative_cutoff(mode: str, order: int, fmax: float, times: float, interval: float) -> float:
     """Return the cutoff, Hz, at which white noise `times` as large has the same rms as at fmax."""
-    # interval in s, 0: continuous.  Range of the table of white noise.
+    # interval in s, 0: continuous.  The condition is the range of `_table`.
     if interval > 0.0 and 1e-6 < TWO_PI * fmax * interval < 1e2 and times < 1e3:
         return held_cutoff(mode, order, fmax, times, interval)
     # Far below the sample rate, white noise of two-sided density N has the variance N w / 2 (order
@@ -170,7 +170,7 @@ _LOGS = -14.0, 21.0
 
 def cutoff_for_noise(mode: str, order: int, rms: float, intensity: float,
                      alpha: float) -> float:
-    """Return the cutoff, Hz, at which the supply's noise has a given rms; inf: there is none."""
+    """Return the cutoff, Hz, at which the supply's noise has a given rms; inf: never so large."""
     if intensity <= 1e-12 * rms:
         return math.inf
     wanted = (rms / intensity) ** 2

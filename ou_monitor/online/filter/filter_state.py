@@ -6,7 +6,7 @@ With w = 2 pi fc, input x, output y:
     order 1:  y' = w (x - y)
     order 2:  y' = w s,  s' = w (x - y - sqrt(2) s)     (Butterworth)
 
-A changing cutoff only stretches time (dtau = w dt), so for *any* sequence of
+A change of the cutoff only stretches time (dtau = w dt), so for *any* sequence of
 cutoffs, y is the response of one fixed filter to the input in stretched time.  So y
 is continuous, and at most the largest input times the integral of the absolute
 impulse response: 1 for order 1, coth(pi / 2) = 1.0903 for order 2.
@@ -57,7 +57,7 @@ class LowPassState:
 
 
 def phase_lag(order: int, cutoff: float, frequency: float) -> float:
-    """Return the phase lag of a low-pass (cutoff in Hz, frequency in Hz)."""
+    """Return the phase lag of a low-pass, degrees (cutoff in Hz, frequency in Hz)."""
     ratio = frequency / cutoff
     if order == 1:
         return math.degrees(math.atan(ratio))
@@ -90,7 +90,7 @@ def cutoff_for_lag(order: int, lag: float, frequency: float) -> float:
 
 
 def share_for_lag(response: complex, raw: complex, most: float) -> float:
-    """Return the share of the unfiltered signal that reduces a lag to a limit, rad."""
+    """Return the share of the raw signal in a mixture whose lag is at most `most`, rad."""
     # A mixture (1 - m) H + m R has the lag p where (1 - m) H e^(ip) + m R e^(ip) has the imaginary
     # part 0.
     if -cmath.phase(response) <= most:

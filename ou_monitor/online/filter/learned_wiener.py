@@ -1,10 +1,10 @@
 """
 The law `kalman`: a Wiener filter of a signal in supply noise, learned in flight.
 
-The vector z holds the outputs of four low-passes, and the input: an unknown signal plus noise,
-z = z_s + z_n.  The noise is known: `coupling` times the supply's noise, an OU with sigma and
-alpha, plus white noise n0.  With the covariances C_s of the signal and C_n of the noise, and c_s,
-the last column of C_s, the weights
+The vector z contains the outputs of four low-passes, and the input.  It is the sum of an unknown
+signal and noise, z = z_s + z_n.  The noise is known: `coupling` times the supply's noise (an OU
+with sigma and alpha), plus white noise n0.  With the covariances C_s of the signal and C_n of the
+noise, and c_s, the last column of C_s, the weights
 
     w = (C_s + C_n)^-1 c_s,    C_s = C_z - C_n,
 
@@ -14,9 +14,9 @@ IEEE Trans. Signal Process. 50, 2230).  C_z is a mean of z z^T with the time con
 Each hop of 10 ms has the weight 1 / noise^2 (noise: power), because the variance of z z^T grows
 with noise^2.  C_s keeps only what exceeds the sampling error of C_z - C_n, in each direction.
 
-- Wrong noise: if the stated noise is so large that the power of the signal would be negative, it
-  is reduced.  If it is too small, that shows only in a slope, whose power is finite: some
-  direction contains almost no signal, and the noise is increased to the power found there.
+- Wrong noise: if the stated noise is so large that the power of the signal would be negative, the
+  noise is reduced.  If it is too small, this can be detected only for a derivative, where some
+  direction contains almost no signal; the noise is increased to the power in that direction.
 - Manoeuvre after calm: if a hop does not fit C_s + C_n (largest normalised square above the 99.9 %
   quantile of chi squared), C_s is scaled up in proportion, which opens the filter at once.
 - If the lag of the combination exceeds its limit, just enough of the input is mixed in to meet it
@@ -28,9 +28,9 @@ linear between samples; for a derivative the input is the difference quotient.
 C_n for noise with autocorrelation phi^k: with the noise p' = phi p + e as a further state, the
 covariance solves P = A P A^T + q g g^T, which is summed by doubling, A -> A A.
 
-Limits: for a signal, noise above its stated value passes as signal.  The gain at frequency 0 is
-below 1.  Motions slower than 2 Hz or faster than 128 Hz are filtered no better than by these
-low-passes.  Intervals within 1 % of each other count as equal.
+Limits: in mode `lowpass`, noise above its stated value passes as signal.  The gain at frequency 0
+is below 1.  Below 2 Hz and above 128 Hz the filter is no better than its slowest and its fastest
+low-pass.  Intervals within 1 % of each other count as equal.
 """
 
 from __future__ import annotations
@@ -119,8 +119,8 @@ def noise_of(key: int, decay: float, slope: bool) -> FloatArray:
     return np.asarray(p[np.ix_(outputs, outputs)])
 
 
-# Time between updates of the weights, also time constant of the transition; memory, s; both
-# chosen on bf3s, roma, jd and gecko (benchmarks/learned.py).
+# Time between updates of the weights, which is also the time constant of the transition, and
+# memory, s; chosen on four recorded flights (benchmarks/learned.py).
 _HOP, _MEMORY = 0.01, 5.0
 # Weight of the prior (no signal), s.
 _BEFORE = 1.0
@@ -130,7 +130,7 @@ _MISFIT = 20.515
 _ROWS = 256
 # Regularisation: noise added to each output, as a share of its noise and of its power.
 _FLOOR, _FLOOR_OF_ALL, _TINY = 1e-9, 1e-12, 1e-200
-# Minimum factor on the stated noise; maximum value that is learned from.
+# Minimum factor on the stated noise; maximum input that is used for learning.
 _LEAST, _LARGEST = 1e-3, 1e60
 # Maximum weight of a step, in intervals.
 _GAP = 5.0
@@ -152,7 +152,7 @@ class LearnedWiener:
         self._state = np.zeros(2 * COUNT)
         self._state[:-2:2] = self.y
         self._rows = np.empty((_ROWS, COUNT))
-        self._n, self._for = 0, 0.0
+        self._n, self._for = 0, 0.0  # Samples in the present hop, and its duration, s
         self._weights = np.zeros(COUNT) if self._slope else _RAW.copy()
         self._offset = 0.0
         self._log_sigma = NAN
@@ -205,7 +205,7 @@ class LearnedWiener:
         try:
             found = self._best(noise, misfit)
         except np.linalg.LinAlgError:
-            # The means are of noise many powers of ten larger, and too inaccurate: forget them.
+            # Discard the means: noise many powers of ten larger has made them too inaccurate.
             self._sum, self._whiten = 0.0, None
             return
         if np.all(np.isfinite(found)):
@@ -249,7 +249,7 @@ class LearnedWiener:
         return found
 
     def _misfit(self, rows: FloatArray) -> float:
-        """Return the factor by which the hop exceeds the model; 1: it fits."""
+        """Return the factor by which the power of the hop exceeds the model; 1: it fits."""
         if self._whiten is None:
             return 1.0
         squares = np.sum((rows @ self._whiten)**2, axis=1)

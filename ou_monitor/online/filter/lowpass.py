@@ -32,7 +32,7 @@ from ou_monitor.online.settings import FilterSettings
 from ou_monitor.records import FloatArray, NAN
 
 _TWO_PI = 2.0 * math.pi
-# Signals and stamps beyond this, and steps below it, overflow in the filter.
+# Limits within which nothing overflows: maximum signal and stamp, s; minimum step, s.
 LARGEST, LATEST, SHORTEST = 1e150, 1e18, 1e-12
 # Minimum gap in mean intervals, and minimum number of samples in the mean to count one.
 _GAP, _KNOWN = 5.0, 10
@@ -92,7 +92,7 @@ class AdaptiveLowPass:
         self._kalman: LearnedWiener | None = None
         self._known = False
         self._sigma = NAN
-        # State before a parameter changed, until the next sample.
+        # Copy from before a change of parameters, until the next sample.
         self._before: LearnedWiener | None = None
         self._interval = SampleInterval()
         self.counters = FilterCounters()
@@ -115,8 +115,8 @@ class AdaptiveLowPass:
         """
         Cutoff in force, within fmin..fmax, Hz.
 
-        With `shadow`, the one that would be in force; with `kalman`, that of a low-pass of equal
-        lag.
+        With `shadow`, the cutoff that would be in force; with `kalman`, the cutoff of a low-pass
+        of equal lag.
         """
         by_lag = self._equivalent_cutoff()
         return self._within_limits(by_lag) if by_lag == by_lag else self._control.cutoff
@@ -138,7 +138,7 @@ class AdaptiveLowPass:
 
     @property
     def bound(self) -> Bound:
-        """Return what decides the cutoff in force."""
+        """Return what determines the cutoff in force."""
         if self._kalman is not None and self._known:
             if self._kalman.mixed:
                 return Bound.LAG if self._settings.max_lag else Bound.LOWEST
@@ -299,7 +299,7 @@ class AdaptiveLowPass:
         return self._kalman.y if self._kalman is not None and self._known else self._state.y
 
     def _start_kalman(self, x: float, sigma: float) -> None:
-        """Make the Kalman filter at the first known sigma."""
+        """Create the Kalman filter if sigma is known."""
         self._known = math.isfinite(sigma) and sigma >= 0.0
         if self._known:
             self._sigma = sigma
@@ -322,7 +322,7 @@ class AdaptiveLowPass:
         if begun:
             self._offset = self._out - self._kalman.y
         elif self._before is not None:
-            # The output continues from what the old parameters would have given.
+            # Continue from the output that the old parameters would have given.
             self._offset += self._before.advance(*sample) - self._kalman.y
         self._before = None
         if known != self._known:
@@ -335,7 +335,7 @@ class AdaptiveLowPass:
         s = self._settings
         if s.law == 'kalman':
             return self._equivalent_cutoff()
-        # Jitter of the stamps needs no new search.
+        # Jitter of the stamps must not cause a new search.
         if abs(interval - self._law_interval) > _MOVED * self._law_interval:
             self._law_interval = interval
         # Replace NaN, which never equals itself.

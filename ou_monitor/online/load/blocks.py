@@ -1,16 +1,16 @@
 """
 Group samples into blocks, and learn the delay of throttle and the noise from them.
 
-A block has one throttle; at most about 50 a second.  Limits: an incomplete block is not
-returned, so a fast source is followed 20 ms late; of several throttle changes within 20 ms only
-the first three are resolved.
+A block has one throttle; there are at most about 50 blocks a second.  Limits: an incomplete block
+is not returned, so a fast source is followed 20 ms late; of several throttle changes within 20 ms
+only the first three are resolved.
 
-Delay: the voltage, without changes slower than a second, is correlated with throttle that is taken
-to be 0 to 200 ms late; the largest correlation wins.  A source slower than 7 Hz does not determine
-the delay.  A new delay is used only if it leaves a quarter less variance than the present one.
+Delay: the voltage, without changes slower than a second, is correlated with throttle for delays of
+throttle of 0 to 200 ms; the largest correlation determines the delay, unless the source is slower
+than 7 Hz.  A new delay is used only if it leaves a quarter less variance than the present one.
 
 Noise: ln variance = b . (1, ripple(u), sqrt|du|), learned by Fisher scoring; in a mean of n
-samples, the part that varies within a block is divided by n.
+samples, the part of the variance within a block is divided by n.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ class LoadBlock:
     last: float
     voltage: float  # Mean voltage, V
     throttle: float  # Mean throttle, 0..1; NaN where unknown
-    current: float  # Mean of the currents that are known, A; NaN without one
-    n: int  # Samples
+    current: float  # Mean of the known currents, A; NaN if none is known
+    n: int  # Number of samples
     within: float  # Variance of a sample about the mean, V^2; NaN for a single sample
 
 
@@ -68,7 +68,7 @@ class LoadBlocks:
         if not t.size:
             return []
         if math.isnan(self._zero):
-            # Offset of the squares, to keep digits.
+            # Subtracted before squaring, to keep precision.
             self._zero = float(voltage[0])
         before, held, step, changes = self._last
         dt = np.diff(t, prepend=before)
@@ -106,8 +106,8 @@ class LoadBlocks:
     def _block(self, sums: FloatArray) -> LoadBlock:
         n, t, off, square, throttle, current, known, last = sums.tolist()
         within = max(0.0, square - off * off / n) / (n - 1.0) if n > 1.0 else NAN
-        # Without its rounding, which depends on the parts in which samples arrive, and which
-        # sqrt|du| of the noise would raise from 1e-17 to 1e-8.
+        # Round the mean throttle: its rounding error depends on how samples are split into calls,
+        # and sqrt|du| of the noise would amplify it from 1e-17 to 1e-8.
         return LoadBlock(t / n, last, self._zero + off / n, round(throttle / n, 12),
                          current / known if known else NAN, int(n), within)
 
@@ -119,24 +119,24 @@ _SLOW = 1.0
 _SHARE, _LAG = 1.0 / 3.0, 0.06
 # Minimum time compared, s, and memory, s.
 _FIRST, _MEMORY = 10.0, 60.0
-# Ratio of the residual variance of another delay to that of the present one, below which the other
-# is used.
+# Maximum ratio of residual variances, with another delay and with the present one, to change to
+# the other delay.
 _BETTER = 0.75
-# Time that this must last, s.
+# Time for which the ratio must stay below the maximum, s.
 _LASTING = 3.0
-# Length of the segments of a test, s, in which responses are nearly independent; memory, s;
-# minimum number.
+# Test of the relation to the voltage: length of segments, s, whose responses are nearly
+# independent; memory, s; minimum number of segments.
 _PIECE, _PIECES_MEMORY, _FEWEST = 2.0, 120.0, 5.0
 # Minimum rms of a load for a test of its relation to the voltage.
 _MOVED = 0.01
 # Standard errors of a significant relation: one false alarm in 700 tests.
 _SIGNIFICANT = 3.0
-# Longest step between blocks, s, that distinguishes these delays.
+# Maximum step between blocks, s, with which these delays can be distinguished.
 _LONGEST = 0.15
 
 
 class LoadDelay:
-    """Running correlations of voltage and load at several delays, in lists, which are faster."""
+    """Running correlations of voltage and load at several delays (lists, for speed)."""
 
     def __init__(self, delay: float = 0.0, *, either: bool = False) -> None:
         # Whether the load may have either sign.
@@ -212,7 +212,7 @@ class LoadDelay:
         return bool(mean > -_SIGNIFICANT * math.sqrt(max(0.0, variance) / (self._pieces - 1.0)))
 
     def _choose(self, dt: float) -> bool:
-        # With a load of known sign, count only voltages that fall as it rises.
+        # With a load of known sign, use only delays at which the voltage falls as the load rises.
         falls = self._xv if self._either else [min(one, 0.0) for one in self._xv]
         left = [1.0 - one * one / max(self._xx * other, 1e-300)
                 for one, other in zip(falls, self._vv)]
@@ -226,17 +226,17 @@ class LoadDelay:
         return True
 
 
-# Limit of standard scores: larger ones weigh less, and count as this limit in the noise.
+# Limit of standard scores, above which errors weigh less, and limit of their squares in the noise.
 CLIP, _OUTLIER = 4.0, 16.0
 # Variance of a prediction, V^2, above which the filter has diverged, as after readings of
 # megavolts, and restarts.
 DIVERGED = 1e12
-# Difference below which voltages are one reading of an ADC, V.
+# Difference below which two voltages are the same reading of an ADC, V.
 _SAME = 1e-6
-# Change of throttle below which it counts as held.
+# Change of throttle below which throttle counts as constant.
 _HELD = 1e-3
-# Memory of the noise, in updates: maximum, initial value, and growth per update; short at first,
-# while the coefficients are still wrong.
+# Memory of the noise, in updates: maximum, initial value, and growth per update.  It is short at
+# first, while the coefficients are still wrong.
 _NOISE_MEMORY, _NOISE_FIRST, _NOISE_SHARE = 2000.0, 50.0, 1.0 / 3.0
 
 
@@ -248,18 +248,18 @@ class LoadNoise:
     """Noise of blocks of samples; volts: voltage of the pack."""
 
     def __init__(self, volts: float, b: tuple[float, float, float] | None = None) -> None:
-        # Prior: 0.4 % of the voltage, with the usual effect of ripple and changes of throttle; or
+        # Prior: 0.4 % of the voltage, with typical effects of ripple and changes of throttle; or
         # the noise of another flight, within a factor of 1.4.
         self.b = (math.log((0.004 * volts) ** 2), 2.0, 4.0) if b is None else b
         x, y, z = (4.0, 4.0, 9.0) if b is None else (0.5, 0.5, 1.0)
         self._covariance = [[x, 0.0, 0.0], [0.0, y, 0.0], [0.0, 0.0, z]]
-        # Mean square of the standard scores, and correlation of neighbours.
+        # Mean square of the standard scores, and correlation of successive ones.
         self.scale, self.correlation = 1.0, 0.0
         self._last, self._n = 0.0, 0
         # Step of the ADC, V, and share of blocks whose value differs from the previous one.
         self._step, self._changing, self._held = math.inf, 1.0, math.nan
         self._unseen = (0.05 * volts) ** 2
-        # Samples in a block, the variance within one, and that of its mean, V^2.
+        # Means over blocks: number of samples, variance within a block and of its mean, V^2.
         self._size, self._within, self._between = 1.0, 0.0, 0.0
 
     def variance(self, u: float, du: float, n: int) -> float:
@@ -269,7 +269,7 @@ class LoadNoise:
 
     @property
     def log_variance(self) -> tuple[float, float, float]:
-        """Return b of a single sample."""
+        """Return b for a single sample, at least with the noise of rounding."""
         own = 1.0
         if self._between > 0.0:
             own += self._within * (1.0 - 1.0 / self._size) / self._between
@@ -312,7 +312,7 @@ class LoadNoise:
         f = 1.0, ripple(u), math.sqrt(du)
         R = self.variance(u, du, n)
         square = min(e * e / (s + R), _OUTLIER)
-        # The uncertainty of the state is not noise.
+        # Share of noise in the variance; the rest is uncertainty of the state.
         share = max(R / (s + R), 0.05)
         grown = 1.0 + 1.0 / min(_NOISE_MEMORY, _NOISE_FIRST + _NOISE_SHARE * self._n)
         C = [[grown * one for one in row] for row in self._covariance]

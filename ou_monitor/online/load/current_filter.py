@@ -1,12 +1,12 @@
 """
 Level and resistance of a supply from its measured current, by a Kalman filter.
 
-Limits: the scale and sign are not corrected, so a wrong scale makes the resistance wrong.  A load
-that follows throttle but bypasses the current sensor makes it too high (a sag of 0.1 V at full
-throttle turns 0.2 into 0.4 Ohm on a robot that draws 1 A); the stated error includes this only if
-throttle explains more of the residual than noise does.  A constant current gives no information.
-Throttle as a further regressor would absorb the other load, but on quads with slow current sensors
-at least half of the resistance too.
+Limits: scale and sign of the current are not corrected, so a wrong scale makes the resistance
+wrong.  A load that follows throttle but bypasses the current sensor makes it too high (a sag of
+0.1 V at full throttle turns 0.2 into 0.4 Ohm on a robot that draws 1 A); the stated error includes
+this only if throttle explains more of the residual than noise does.  A constant current gives no
+information.  (Throttle as a further regressor would absorb the other load, but on quads with slow
+current sensors it would also absorb at least half of the resistance.)
 """
 
 from __future__ import annotations
@@ -20,35 +20,35 @@ from ou_monitor.online.load.blocks import (
 from ou_monitor.online.load.supply_load import AT_ONCE, hold, POWER, reached
 from ou_monitor.records import FloatArray, NAN
 
-# Current from which the filter starts, A; factor by which the largest current must rise before the
-# prior is taken again, for that current.
+# Minimum current to start the filter, A; factor by which the largest current must rise for the
+# prior to be applied again, for the new largest current.
 _LEAST, _MORE = 1e-2, 4.0
-# Prior deviation of the voltage drop at the largest current, relative to the voltage; shares of
-# the drop that appear at once and after each of LAGS, and their deviations.
+# Prior standard deviation of the voltage drop at the largest current, relative to the voltage;
+# shares of the drop that appear at once and after each of LAGS, and their standard deviations.
 _FALL = 0.3
 _SHARES = np.array([1.0, 0.1, 0.05, 0.2, 0.3])
 _SHARE_STD = (0.3, 0.3, 0.1, 0.1, 0.15)
 _PRIOR = _FALL ** 2 * (np.outer(_SHARES, _SHARES) + np.diag(np.square(_SHARE_STD)))
 _DRAWN_STATES = 2 + _SHARES.size
-# Random walk of the level, V per sqrt(s) and cell: twice that of the filter for throttle, because
-# the charge is counted from a guess.
+# Random walk of the level, V per sqrt(s) and cell: twice the walk in `LoadFilter`, because less is
+# known of the discharge.
 _DRAWN_WALK = 0.003
-# Minimum time to empty a pack at the largest current, s; without discharge the level is constant.
+# Typical minimum time to empty a pack at the largest current, s, for the prior of the discharge.
 _EMPTY = 100.0
-# Change of each coefficient in 100 s: 2 % of a sag of 12 %.
+# Variance of the change of each coefficient, per second: 2 % of a sag of 12 % in 100 s.
 _DRAWN_DRIFT = (0.02 * 0.12) ** 2 / 100.0 * np.eye(_SHARES.size)
-# Largest relative error of a known resistance, and minimum relative error, because the filter's
+# Maximum relative error of a known resistance, and minimum relative error, because the filter's
 # own error omits the warming of a pack.
 _KNOWN, LEAST_ERROR = 0.33, 0.1
 # Throttle at which an ESC ripples most (`ripple`).
 _LOUDEST = 0.7
-# Current over throttle: memory, s; correlation time of deviations, s; prior deviation of its
-# coefficients, in units of those deviations.
+# Regression of current on throttle: memory, s; correlation time of the residuals, s; prior
+# standard deviation of the coefficients, in residuals.
 _MEMORY, _ONE, _WIDE = 120.0, 1.0, 30.0
-# Ends of the band, s, in which throttle is tried beside current, and minimum share of the variance
-# of throttle that current leaves unexplained; a smaller one is rounding or lag of the current (up
-# to 0.0045 in simulated vehicles without a bypass, 5e-5 on hebi_x; 0.007 to 0.8 on roma 1 and 3,
-# ar8, jd, in_xr, js_11t, as_f60, euc_1, frc_ol_1, and regbot_28, 62 and 81).
+# Time constants, s, of the band in which throttle is tried as a further regressor, and minimum
+# share of its variance that current leaves unexplained: smaller shares are rounding or lag of the
+# current (up to 0.0045 in simulated vehicles without a bypass, and 5e-5 on one recording of such a
+# vehicle; 0.007 to 0.8 on twelve other recordings).
 _BAND, _APART = np.array([[1.0], [20.0]]), 5e-3
 # Time for which unknown throttle or current is held, s.
 UNKNOWN_HELD = 1.0
@@ -59,17 +59,17 @@ class CurrentFilter:
 
     def __init__(self) -> None:
         self._t = self._known_at = self._unit = NAN
-        # Seen: time for which current has been known, s.
+        # Largest current, so far and as received, and the last one, A; time with current, s.
         self._largest = self._peak = self._before = self._seen = 0.0
         # Current at once and after each of LAGS, A.
         self._drawn: list[float] = []
         self.lost = False
-        # Last block: voltage without the response to load, V, and log density, nat.
+        # Of the last block: voltage without the response to load, V, and log density, nats.
         self.rest = self.density = NAN
         self.delay = LoadDelay(either=True)
-        # Current over throttle: weighted products of 1, x, u, u^3 with one another and current.
+        # Regression of current on throttle: weighted products of (1, x, u, u^3, current).
         self._squares = np.zeros((5, 5))
-        # Weighted products of x, current and voltage after a band-pass; the two lags of these.
+        # Weighted products of band-passed x, current and voltage; their two low-passes.
         self._beside, self._lags = np.zeros((3, 3)), np.zeros((2, 0))
 
     def time(self, block: LoadBlock) -> None:
@@ -90,7 +90,7 @@ class CurrentFilter:
         self._settle(voltage)
 
     def _rescale(self) -> None:
-        """Relate the state to a larger current, and take the prior for it; keep the level."""
+        """Rescale the state to a larger current, and apply the prior for it; keep the level."""
         m, P, ratio = self._m, self._P, self._largest / self._unit
         self._unit = self._largest
         m[1:] *= ratio
@@ -103,7 +103,7 @@ class CurrentFilter:
         P -= gain @ P[1:]
 
     def _settle(self, v: float) -> None:
-        """Make the level unknown."""
+        """Re-estimate the level from one voltage, V."""
         m, P = self._m, self._P
         h = self._regressors()
         m[0] = v - h[1:] @ m[1:]
@@ -120,7 +120,7 @@ class CurrentFilter:
             if not block.t - self._known_at <= UNKNOWN_HELD:
                 self.lost = True
             return
-        # A single wild reading must not rescale the filter: another one must follow.
+        # A single wild reading must not rescale the filter: a second one must confirm it.
         alone = max(self._before, self._largest) < abs(x) / _MORE and self._largest >= _LEAST
         self._before = abs(x)
         if alone:
@@ -128,7 +128,7 @@ class CurrentFilter:
         lost, self.lost, self._known_at = self.lost or fresh, False, block.last
         self._largest = max(self._largest, abs(x))
         if lost or not self._drawn:
-            # Start as if steady: a constant current then gives no information.
+            # Assume a constant current before; a constant current then gives no information.
             self._drawn = [x] * (1 + len(LAGS))
         else:
             self._drawn = _lagged(self._drawn, x, block.t - self._t)
@@ -155,7 +155,7 @@ class CurrentFilter:
         self.rest = block.voltage - float(self._regressors()[2:] @ self._m[2:])
 
     def _compare(self, now: FloatArray, dt: float) -> None:
-        """Take x, current and voltage for `_bypassed`."""
+        """Update the products for `_bypassed` by x, current and voltage."""
         if not dt or not self._lags.size:
             self._lags = np.stack((now, now))
         self._lags = self._lags - np.expm1(-dt / _BAND) * (now - self._lags)
@@ -164,12 +164,12 @@ class CurrentFilter:
 
     @property
     def _bypassed(self) -> float:
-        """Return the relative error of the resistance by loads that bypass the current sensor."""
+        """Return the relative error of the resistance due to loads that bypass the sensor."""
         # It is the change of the resistance with throttle as a further regressor, times the share
-        # of the rest of the voltage that throttle explains.  Both are taken after a band-pass,
-        # because throttle also explains what a slow sensor misses, and charge lowers the level.
+        # of the residual voltage that throttle explains.  Both are computed after a band-pass,
+        # because throttle also explains fast errors of the sensor, and the level changes slowly.
         (xx, xi, xv), (_, ii, iv), (_, _, vv) = self._beside.tolist()
-        # Voltage and throttle without current.
+        # Residual squares of voltage and x, and their product, after regression on current.
         rest, moved, both = (vv - iv * iv / ii, xx - xi * xi / ii, xv - xi * iv / ii
                              ) if ii > 0.0 else (0.0, 0.0, 0.0)
         if not (rest > 0.0 and moved > _APART * xx and iv):
@@ -188,7 +188,7 @@ class CurrentFilter:
         P[2:, 2:] += _DRAWN_DRIFT * (self._volts ** 2 * dt)
         h = self._regressors()
         noise = self.noise
-        # The noise depends on current as on throttle, and is largest at the largest current.
+        # The noise depends on current as on throttle; it is largest at the largest current.
         now = self._drawn[0] / self._largest
         u, du = _LOUDEST * abs(now), abs(now - self._load)
         R = noise.variance(u, du, block.n)
@@ -224,11 +224,11 @@ class CurrentFilter:
 
     @property
     def at_once(self) -> float:
-        """Return the resistance after `AT_ONCE`, Ohm, whether or not it is known."""
+        """Return the resistance after `AT_ONCE`, Ohm, even if its error is large."""
         return abs(float(np.append(1.0, reached(AT_ONCE)) @ self._m[2:])) / self._unit
 
     def _reached(self) -> FloatArray:
-        """Return the shares of the coefficients that have responded after `hold`."""
+        """Return the share of each coefficient's response that has developed after `hold`."""
         return np.append(1.0, reached(hold(self._seen)))
 
     def sag(self, throttle: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -1,5 +1,5 @@
 """
-The voltage under load, learned in flight by a Kalman filter that needs no relaxation rate.
+The voltage under load, learned in flight by a Kalman filter, without a relaxation rate.
 
 Limits: late throttle makes the sag too small (100 ms: by a third on a racing quad); outside the
 throttle range flown, the sag is extrapolated; changes of the true sag are followed within minutes.
@@ -29,16 +29,16 @@ from ou_monitor.timeline import MOST_CURRENT, MOST_THROTTLE, plausible
 
 # Lag of the whole response, s: half of the response time of an ESC.
 _LAG = 0.004
-# Random walk of the level, V per sqrt(s) and cell: as in an OU of 4.6 mV and 20 s, found by the
-# batch fit; and for an emptying pack (chosen on bf_hiro_4s, where 0.02 to 0.05 work).
+# Random walk of the level, V per sqrt(s) and cell: usually, as in an OU of 4.6 mV and 20 s (from
+# the batch fit), and for a nearly empty pack (chosen on one recording; 0.02 to 0.05 work).
 _WALK, _FAST_WALK = 0.0015, 0.03
-# Faster level: prediction time, s; share of the mean square error below which it is used; memory,
-# s; minimum time compared, s; interval of predictions, s.
+# `FastLevel`: prediction time, s; maximum ratio of mean square errors to use it; memory, s;
+# minimum time compared, s; interval of predictions, s.
 _AHEAD, _PAYS, _COMPARED, _LEAST_COMPARED, _EVERY = 1.0, 0.98, 30.0, 10.0, 0.1
-# The load's size may change by 25 % in 100 s; each coefficient by 2 % of full sag by itself.
+# Variance of changes per second: 25 % of all loads in 100 s; 2 % of full sag for each coefficient.
 _WARMING, _CHANGE = 0.25 ** 2 / 100.0, 0.02 ** 2 / 100.0
-# Time constant of the scale of the load, which follows the level, s: if it were faster, every
-# correction would move the regressors at constant throttle, and the filter would learn from that.
+# Time constant of the scale of the load, which follows the level, s.  If it were shorter, every
+# correction would change the regressors at constant throttle, from which the filter would learn.
 _RESIZE = 30.0
 # Memory of the throttle flown, s.
 _FLOWN_MEMORY = 120.0
@@ -52,11 +52,11 @@ _MOVED = 0.02
 _LEAST_ERROR = 0.1
 # Gap, s, after which the level is unknown: the battery may have been changed.
 _PAUSE = 60.0
-# Ratio of two levels, up or down, above which the battery is that of another craft.
+# Ratio of two levels, up or down, above which the battery belongs to another craft.
 _OTHER_CRAFT = 1.6
 # Relative variance of the size of the sag on another day.
 _OTHER_DAY = 0.2 ** 2
-# Number of throttle bins, and number of bins combined for the noise: 0.1.
+# Number of throttle bins, and number of bins that are combined for the noise (0.1 of throttle).
 _BINS, _NEAR = 50, 5
 # dE/ds, V, of a cell at each 10 mV of open-circuit voltage from 3.4 V.
 _LOWEST, _PER_VOLT = 3.4, 100.0
@@ -67,13 +67,13 @@ _DRIFT = _CHANGE * np.eye(_MEAN.size) * _SIZE ** 2
 
 
 class FastLevel:
-    """A level that changes faster than that of the filter, used once it predicts better."""
+    """A level that follows faster than the filter's, and is used once it predicts better."""
 
     def __init__(self) -> None:
-        # Stamp, s; level before discharge, V; its discharge, V; variance, V^2; time compared, s.
+        # Stamp, s; level plus the fall by discharge, V; variance, V^2; that fall, V; s compared.
         self._t = self._level = self._variance = NAN
         self._drawn = self._since = 0.0
-        # Stamp, level of the filter and the faster one; mean square of their errors, V^2.
+        # Stamp, level of the filter and faster level; mean squares of their errors, V^2.
         self._past: deque[tuple[float, float, float]] = deque()
         self._errors = (0.0, 0.0)
         self._better = False
@@ -105,13 +105,13 @@ class FastLevel:
             self._better = self._since > _LEAST_COMPARED and fast < _PAYS * slow
 
     def of(self, level: float, variance: float) -> tuple[float, float]:
-        """Return the better of the filter's level and this one, V, and its variance, V^2."""
+        """Return the better level, the filter's or this one, V, and its variance, V^2."""
         return (self._level - self._drawn, self._variance) if self._better else (level, variance)
 
 
 def _beyond(flown: tuple[float, float], error: FloatArray) -> FloatArray:
-    """Return errors over TABLE; beyond the throttles flown none is smaller than there."""
-    # A correction that counts as error vanishes where the corrected curve crosses the other.
+    """Return errors over TABLE, raised so that they do not fall outside the throttles flown."""
+    # They may fall, because the correction of a sag, which counts as an error, may change sign.
     low, high = np.searchsorted(TABLE, flown, 'right').tolist()
     return np.append(error[:high], np.maximum.accumulate(
         np.append(error[low - 1:high].max(), error[high:]))[1:])
@@ -133,14 +133,14 @@ class LoadFilter:
         # Blocks that wait for their load, and received loads that may still be needed.
         self._waiting: deque[LoadBlock] = deque()
         self._received: deque[LoadBlock] = deque()
-        # Log density of the last block, nat; how much better current predicts; time compared, s.
+        # Log density of the last block, nats; its mean gain with current; time compared, s.
         self._density, self._better, self._compared = NAN, NAN, 0.0
 
     def push(self, t: npt.ArrayLike, voltage: npt.ArrayLike,
              throttle: npt.ArrayLike | None = None,
              current: npt.ArrayLike | None = None) -> None:
-        """Add samples in order, s, V, 0..1, A; an unknown load is held for a second."""
-        # Several times as fast as `broadcast_arrays`, for parts of a few samples.
+        """Add samples in order, s, V, 0..1, A; an unknown load keeps its last value for 1 s."""
+        # For a few samples, this is several times as fast as `broadcast_arrays`.
         columns = np.full((4, np.size(t)), NAN)
         for row, given in zip(columns, (t, voltage, throttle, current)):
             if given is not None:
@@ -170,7 +170,7 @@ class LoadFilter:
         """Pair each block with the throttle and the current received `delay` later."""
         if math.isfinite(block.throttle) and self._delay.take(
                 block.t, block.voltage, block.throttle ** POWER):
-            # Coefficients learned with another delay are wrong, and their errors too small.
+            # Coefficients learned with the old delay are wrong, and their errors too small.
             self._forget()
         if self._current is None and math.isfinite(block.current):
             self._current = CurrentFilter()
@@ -192,7 +192,7 @@ class LoadFilter:
             self._take(replace(first, throttle=throttle.throttle, current=current.current))
 
     def _take(self, block: LoadBlock) -> None:
-        """Take one block: the very first, the first of a new time line, or a later one."""
+        """Take one block: the very first one, the first of a new time line, or a later one."""
         u, before, self._density = block.throttle, self._t, NAN
         fresh = self._opening or not block.t - self._t <= _PAUSE
         if not math.isfinite(self._t):
@@ -209,7 +209,7 @@ class LoadFilter:
                 du = abs(u - self._throttle)
                 pieces = [(block.t, u)]
                 if u != self._throttle and self._last > self._t:
-                    # The last throttle was held to the end of its block.
+                    # The previous throttle was constant to the end of its block.
                     pieces.insert(0, (self._last, self._throttle))
                 self._throttle = u
                 self._predict(pieces)
@@ -262,7 +262,7 @@ class LoadFilter:
         self._opening = True
         m, P = np.zeros(_STATES), np.zeros((_STATES, _STATES))
         m[2:], P[2:, 2:] = _MEAN * self._volts, _COV * self._volts ** 2
-        # 350 s at a mean load of 0.23, known to a factor of two.
+        # Prior of the discharge: 350 s at a mean load of 0.23, within a factor of two.
         m[1] = 1.0 / 80.0
         P[1, 1] = m[1] ** 2
         m[0] = self._m[0]
@@ -294,7 +294,7 @@ class LoadFilter:
         held = u if math.isfinite(u) else 0.0
         self._lagged = self._settled = held
         x = held ** POWER
-        # The state of the slowest lag is unknown, between rest and a steady load.
+        # The state of the slowest lag is unknown: use the mean of rest and a steady load.
         self._lags = [x] * (len(LAGS) - 1) + [0.5 * x] + [held] * len(LINEAR_LAGS)
         m, P = self._m, self._P
         h = self._regressors()
@@ -314,7 +314,7 @@ class LoadFilter:
     def _regressors(self) -> FloatArray:
         u, g = self._lagged, -self._factor
         if math.isnan(self._throttle):
-            # The level is then the voltage under the present load.
+            # Without throttle, the level is the voltage under the present load.
             g = 0.0
         return np.array([1.0, 0.0, g * u ** POWER, g * u, g * u ** 3,
                          *(g * x for x in self._lags), g * max(u - self._settled, 0.0)])
@@ -331,12 +331,12 @@ class LoadFilter:
         return float(x)
 
     def _fall(self, level: float) -> float:
-        """Return the fall of the level, V, per unit of charge."""
+        """Return the fall of the level, V, per unit of charge, for the cells in series."""
         place = int((level / self._cells - _LOWEST) * _PER_VOLT + 0.5)
         return self._cells * float(_SLOPE_AT[min(len(_SLOPE_AT) - 1, max(0, place))])
 
     def _predict(self, pieces: list[tuple[float, float]]) -> None:
-        """Predict to the last of some stamps, s, with the throttle before each."""
+        """Predict over pieces: each has the stamp of its end, s, and its throttle."""
         m, P, used = self._m, self._P, 0.0
         dt = pieces[-1][0] - self._t
         if math.isnan(self._throttle):
@@ -354,7 +354,7 @@ class LoadFilter:
         self._fast.fall(used * float(m[1]))
         P[0] -= P[1] * used
         P[:, 0] -= P[:, 1] * used
-        # In a gap, a pack recovers by more than its random walk: up to 2 % in a minute.
+        # In a gap, a pack may recover by more than its random walk: by up to 2 % in a minute.
         self._resize(dt)
         P[0, 0] += (_WALK * self._cells) ** 2 * dt + (
             0.02 * self._volts) ** 2 * max(0.0, dt - 2.0) / 60.0
@@ -386,7 +386,7 @@ class LoadFilter:
             self._contrasts.take(block.t, block.voltage, h[2:], total,
                                  float(m[0]) / self._cells)
             self._highest = max(self._highest, float(m[0]))
-            # The uncertainty of the state is not noise.
+            # Without the uncertainty of the state.
             share = R / (s + R)
             square = share * block.n * min(abs(e), self._volts) ** 2
             square += (block.n - 1) * block.within if block.n > 1 else 0.0
@@ -394,7 +394,7 @@ class LoadFilter:
         clipped = max(-CLIP, min(CLIP, score))
         noise.follow(clipped)
         self._density = log_density(clipped, s + R * scale)
-        # Large errors of one sign for half a second: another battery, so re-estimate the level.
+        # Large errors of one sign for half a second: perhaps another battery, so free the level.
         self._bias += 0.1 * (max(-6.0, min(6.0, score)) - self._bias)
         if abs(self._bias) > 3.0:
             P[0, 0] += (0.05 * self._volts) ** 2
@@ -419,7 +419,7 @@ class LoadFilter:
             else tuple(np.sqrt(law).tolist())
 
     def _between(self, share: float) -> tuple[float, float]:
-        """Return the range of throttles flown, without a share at each end."""
+        """Return the range of throttles flown, without a share of the time at each end."""
         total = np.cumsum(self._flown[0])
         if not total[-1] > 0.0:
             return self._throttle, self._throttle
@@ -466,7 +466,7 @@ class LoadFilter:
 
     @property
     def known(self) -> bool:
-        """Whether the sag is known, as in `load`, which takes several times as long."""
+        """Whether the sag is known: as `load().known`, but several times as fast."""
         low, high = self._flown_range() if math.isfinite(self._t + self._throttle) else (0.0, 0.0)
         return high - low >= _MOVED and (
             self._by_throttle(low, high)[0] is LoadStatus.KNOWN
@@ -483,7 +483,7 @@ class LoadFilter:
             low, high)
 
     def _by_throttle(self, low: float, high: float) -> tuple[LoadStatus, float]:
-        """Return the status without a current, and the largest error of a known sag, V."""
+        """Return the status without current, and an error that suffices for a known sag, V."""
         (a, C), b, held = self._sag_law(), self._noise.log_variance, hold(self._seen)
         d = static(high, held) - static(low, held)
         swing, swing_se = float(d @ a), math.sqrt(max(0.0, float(d @ C @ d)))
@@ -528,8 +528,8 @@ class LoadFilter:
         load = self.load()
         if not (load.known and self._m[0] > 0.0):
             return None
-        # The size is that of the whole flight, because the coefficients follow the last half
-        # minute; its error is at least a tenth.
+        # Use the size over the whole flight, because the coefficients follow the last half
+        # minute.  It is a weighted mean with the present size, whose error is SIZE_ERROR.
         found, size, size_se = self._contrasts.against(self._m[2:]), 1.0, SIZE_ERROR
         if found.ratio > 0.0:
             size += (found.ratio - 1.0) / (1.0 + (found.se / SIZE_ERROR) ** 2)
@@ -547,7 +547,7 @@ class LoadFilter:
             noise, noise_se, size_se, level, found.warming, found.warming_se)
 
     def against(self, start: LoadStart | None, date: str = '') -> ModelComparison:
-        """Return the comparison of this flight with the model of another, of that date."""
+        """Compare this flight with the model of another flight, learned on `date`."""
         if start is None or not math.isfinite(self._t) or math.isnan(self._highest):
             return ModelComparison()
         ohm = (NAN, NAN) if self._current is None else self._current.resistance

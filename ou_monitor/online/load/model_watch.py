@@ -20,29 +20,29 @@ from ou_monitor.records import FloatArray, NAN
 # Length, s, of the stretches within which voltages and the model's response are compared, so that
 # the level cancels out (1 s and 4 s give the same); maximum number kept, five minutes.
 _STRETCH, _MOST = 2.0, 150
-# Minimum effective number of stretches: their scatter gives the error.
+# Minimum effective number of stretches, because their scatter gives the error.
 _FEWEST = 4.0
-# Minimum relative error of the model, because its form errs if throttle is used differently.
+# Minimum relative error of the model, because its form is inexact if throttle is used differently.
 _FORM = 0.05
-# Relative error of a sag that only the filter has learned.
+# Relative error of a sag that the filter has learned without contrasts.
 SIZE_ERROR = 0.1
 # Minimum relative error of the noise: its scatter between simulated flights of one model.
 _NOISE_FORM = 0.15
 # Minimum relative error of the discharge per load: rms of ln of its ratio on 12 recorded pairs
-# (halves of gecko, nazgul and hiro, three flights of roma), with packs at different charges.
+# (halves of a flight, or two flights of one craft), with packs at different charges.
 _DISCHARGE_FORM = 0.64
 # Lower limit of the noise, V.
 _LEAST_NOISE = 1e-6
-# A pack is weaker if its sag exceeds that of the model by both limits: a share, and a number of
+# A pack is weaker if its sag exceeds the model's by both of these: a share, and a number of
 # standard errors of the logarithm (exceeded by chance in 1 % of cases).
 _LEAST, _ERRORS = 0.10, 2.33
 # Relative error above which the ratio is not determined.
 _VAGUE = 0.15
-# Below this ratio of sag to the model's, pack or load differs: warm packs have 0.75 or more.
+# Ratio of sag to the model's below which pack or load differs (warm packs have 0.75 or more).
 _OTHER = 0.7
-# Factor between level and the model's level, up or down, beyond which it is another pack.
+# Ratio of the level to the model's, up or down, beyond which it is another pack.
 OTHER_LEVEL = 1.3
-# Level of a lithium cell at rest, V: least at take-off, least later, and most (LiHV).
+# Limits of a lithium cell's level at rest, V: minimum at take-off, minimum, and maximum (LiHV).
 _TAKE_OFF, _EMPTY, _FULL = 3.4, 3.2, 4.4
 
 
@@ -64,7 +64,7 @@ class ModelComparison:
     sag_ratio_se: float = NAN  # Its standard error, the model's included
     resistance_ratio: float = NAN  # NaN without a current in either flight
     resistance_ratio_se: float = NAN
-    # Of the residual while throttle moves; NaN where the model has none.
+    # Of the residual while throttle moves; NaN if the model does not contain it.
     noise_ratio: float = NAN
     noise_ratio_se: float = NAN
     # Of the discharge per load, known to a factor of two.
@@ -73,7 +73,7 @@ class ModelComparison:
     words: str = ''  # One sentence; empty: nothing to do
 
     def fields(self) -> dict[str, object]:
-        """Return what is published; the interval of the sag is two numbers."""
+        """Return the published fields; the interval of the ratio of sags is two numbers."""
         values = {f'model_{f.name}': getattr(self, f.name) for f in fields(self)}
         low, high = self.sag_ratio_95
         return values | {'model_verdict': self.verdict.name,
@@ -87,7 +87,7 @@ class ModelComparison:
 
 @dataclass(frozen=True)
 class Contrast:
-    """Measured response to throttle against the predicted one; NaN: too few stretches."""
+    """Measured response to throttle relative to a predicted one; NaN: too few stretches."""
 
     ratio: float = NAN  # Slope of the voltage over the predicted response
     se: float = NAN
@@ -103,7 +103,7 @@ class LoadContrasts:
     """Weighted products of voltage and regressors within stretches of 2 s, means removed."""
 
     def __init__(self) -> None:
-        # Of each: weights, 1/V^2, level of a cell, V, and products of voltage and regressors.
+        # For each: sum of weights, 1/V^2; level of a cell, V; products of voltage and regressors.
         self._stretches: deque[tuple[float, float, FloatArray]] = deque(maxlen=_MOST)
         self._begin, self._sums = NAN, np.zeros((2 + SIZE, 2 + SIZE))
         self._origin = 0.0
@@ -136,7 +136,7 @@ class LoadContrasts:
             return Contrast()
         # Residual of each stretch from the slope of the others (jackknife).
         left = (along - ratio * squares) / (1.0 - share)
-        # The logarithm, so that glitches in one stretch do not decide.
+        # Average logarithms, so that glitches in one stretch do not dominate.
         squared = (products[:, 0, 0] - 2.0 * ratio * along + ratio * ratio * squares) / weights
         noise = 0.5 * np.log(np.maximum(squared, _LEAST_NOISE ** 2))
         mean = float(share @ noise)
@@ -148,14 +148,14 @@ class LoadContrasts:
 
 
 def _warming(levels: FloatArray, left: FloatArray, squares: FloatArray) -> tuple[float, float]:
-    """Return the slope of relative residuals over levels, 1/V, and its error, with the prior."""
+    """Return the slope of relative residuals over level, 1/V, and its error, prior included."""
     weight = float(squares @ levels ** 2)
     if not weight > 0.0:
         return WARMING, WARMING_SE
     slope = float(levels @ left) / weight
     each = levels * (left - slope * levels * squares)
-    # The model's form may err by _FORM at both ends of the range of levels, which is sqrt(12)
-    # standard deviations wide if they are uniform.
+    # The form of the model may be wrong by _FORM at both ends of the range of levels, which is
+    # sqrt(12) standard deviations wide if levels are uniform.
     variance = (float(each @ each) / weight + _FORM ** 2 * float(squares.sum()) / 6.0) / weight
     own, usual = 1.0 / variance, WARMING_SE ** -2
     return (slope * own + WARMING * usual) / (own + usual), (own + usual) ** -0.5
@@ -164,11 +164,11 @@ def _warming(levels: FloatArray, left: FloatArray, squares: FloatArray) -> tuple
 def other_pack(start: LoadStart, highest: float, level: float) -> str:
     """Return why the highest or present level, V, indicates another pack; '': it does not."""
     cells = start.cells
-    # The number of cells means nothing for a rail.
+    # For a rail, the number of cells is meaningless.
     if not _EMPTY <= start.volts / cells <= _FULL:
         other = not 1.0 / OTHER_LEVEL < level / start.volts < OTHER_LEVEL
     elif highest / cells < _TAKE_OFF:
-        # Never full in this flight; one that was full may merely have emptied.
+        # The highest level counts, because the flight may have emptied a charged pack.
         return (f'The highest voltage at rest, {highest:.2f} V, is {highest / cells:.2f} V for '
                 f"each of the model's {cells:.0f} cells: another pack, or an empty one.")
     else:
@@ -184,7 +184,7 @@ def judge(ratio: float, se: float, date: str) -> tuple[ModelVerdict, str]:
     more, model = ratio - 1.0, 'the model' + (f' of {date}' if date else '')
     sizes = sorted((100.0 * (abs(more) - 1.96 * se), 100.0 * (abs(more) + 1.96 * se)))
     found = f'Sag {100.0 * abs(more):.0f} % ({sizes[0]:.0f} to {sizes[1]:.0f})'
-    # Most errors are factors, so the error of the logarithm hardly depends on ageing.
+    # Most errors are multiplicative, so the error of the logarithm hardly depends on ageing.
     if more > _LEAST and math.log(ratio) > _ERRORS * se / ratio:
         return ModelVerdict.WEAKER, f'{found} above {model}: weak or cold pack.'
     if ratio + _ERRORS * se < _OTHER:
@@ -195,7 +195,7 @@ def judge(ratio: float, se: float, date: str) -> tuple[ModelVerdict, str]:
 def compare(found: Contrast, start: LoadStart, ohm: float, ohm_se: float, other: str, date: str,
             discharge: float, discharge_se: float) -> ModelComparison:
     """Compare this flight with an earlier model (ohm: now; other: from `other_pack`)."""
-    # Levels at which the two were measured: the sag of a pack falls as it empties and warms.
+    # Correct for the difference in level, because the sag changes as a pack empties and warms.
     apart = found.level - (start.level or start.volts / start.cells)
     as_found = math.exp(-start.warming * apart)
     ratio = found.ratio * as_found

@@ -16,20 +16,20 @@ import numpy.typing as npt
 from ou_monitor.model.load import LAGS, LINEAR_LAGS
 from ou_monitor.records import Estimate, FloatArray, NAN, Status
 
-# Exponent of the load over throttle, and, less 1, over the level: the prior of `load_fit`.
+# Exponent of throttle in the load, and, less 1, of the level: the prior of `load_fit`.
 POWER = 1.8
-# Time at constant throttle after which the sag is read, s: motors and converters have settled, and
-# longer punch-outs are rare.  In less than ten such times it would be an extrapolation: a tenth of
-# the time for which the load has been known is then read.
+# Time at constant throttle for which the sag is stated, s: motors and converters have settled, and
+# longer bursts of throttle are rare.  If the load has been known for less than _HOLDS such times,
+# the sag is stated for 1/_HOLDS of the time known, because more would be an extrapolation.
 HOLD, _HOLDS = 1.0, 10.0
-# Time at constant current after which the resistance at once is read, s: as a user would, from the
-# changes between samples at 10 Hz.
+# Time at constant current for which the immediate resistance is stated, s: what a user would read
+# from the changes between samples at 10 Hz.
 AT_ONCE = 0.1
 # Throttles of the table of the sag.
 TABLE = np.linspace(0.0, 1.0, 101)
-# Sweeps in which the sag is made to rise; in 10 it is within 3 % of the limit on cf_pair.
+# Number of sweeps in `rising` (10 come within 3 % of the limit on a recording).
 _SWEEPS = 10
-# Sentences on the relaxation, used if level, sag and noise are known without it.
+# Sentences on the relaxation for estimates in which only level, sag and noise are known.
 _NO_ALPHA = {
     Status.NO_RELAXATION: 'The relaxation is not visible{at}: only a higher rate can show it.',
     Status.BURIED: 'The relaxation is buried in noise{at}.',
@@ -38,24 +38,24 @@ _NO_ALPHA = {
 
 
 def reached(seconds: float, lags: tuple[float, ...] = LAGS) -> FloatArray:
-    """Return the shares of responses that lag, in that time after a step."""
+    """Return the share of each lagged response that has developed so long after a step."""
     return -np.expm1(-seconds / np.array(lags))
 
 
 def hold(known: float) -> float:
-    """Return the time after which the sag is read, s, of a load known for some seconds."""
+    """Return the time for which the sag is stated, s; known: time with known load, s."""
     return min(HOLD, known / _HOLDS)
 
 
 def static(throttle: npt.ArrayLike, held: float = HOLD) -> FloatArray:
-    """Return the regressors of the sag after that time, s, at a throttle, shape (n, SIZE - 1)."""
+    """Return the regressors of the sag, (n, SIZE - 1), at throttles held for `held` s."""
     u = np.asarray(throttle, dtype=np.float64)[..., None]
     x = u ** POWER
     return np.concatenate([x, u, u ** 3, x * reached(held), u * reached(held, LINEAR_LAGS)], -1)
 
 
 def rising(a: FloatArray, covariance: FloatArray, table: FloatArray) -> FloatArray:
-    """Return the most likely coefficients with which the table, shape (k, n), rises (Hildreth)."""
+    """Return the most likely coefficients for which table @ a rises by rows (Hildreth)."""
     steps = np.diff(table[::10], axis=0)
     falls, both, push = steps @ a, steps @ covariance @ steps.T, np.zeros(steps.shape[0])
     for k in np.tile(np.arange(push.size), _SWEEPS if (falls < 0.0).any() else 0).tolist():
@@ -77,7 +77,7 @@ class LoadStatus(enum.Enum):
 
 
 class Basis(enum.Enum):
-    """Input of the level: the one that predicted the last half minute best."""
+    """Input from which the level is computed: the best predictor of the last half minute."""
 
     NONE = 'neither throttle nor current'
     THROTTLE = 'throttle'
@@ -93,7 +93,7 @@ class SupplyLoad:
     level: float = NAN
     # Last voltage without the response to load (sag-compensated), V; the level is its mean.
     rest: float = NAN
-    # Resistance after a second, Ohm; NaN without a current that affects the voltage.
+    # Resistance 1 s after a step of current, Ohm; NaN without a current that affects the voltage.
     resistance: float = NAN
     resistance_se: float = NAN  # Its standard error, Ohm.
     resistance_at_once: float = NAN  # Resistance after `AT_ONCE`, Ohm.
@@ -114,7 +114,7 @@ class SupplyLoad:
         return self.status is LoadStatus.KNOWN
 
     def sag(self, throttle: npt.ArrayLike) -> FloatArray:
-        """Return the sag, V, after a second, by the prior unless `known`; NaN: unknown."""
+        """Return the sag, V, after 1 s; mainly the prior unless `known`; NaN: unknown."""
         return self._read(throttle, self._sag)
 
     def sag_se(self, throttle: npt.ArrayLike) -> FloatArray:
@@ -165,8 +165,8 @@ class LoadState:
     # Stamp, s, and throttle now.
     t: float
     throttle: float
-    # Of level, V, discharge per load, and the coefficients, V, of `LoadStart`; covariance: larger
-    # if innovations exceed their prediction.
+    # State: level, V; discharge per load, 1/s; coefficients, V, as in `LoadStart`.  Its covariance
+    # is increased if innovations are larger than predicted.
     mean: FloatArray
     covariance: FloatArray
     lags: tuple[float, ...]  # x = u^1.8 after LAGS, and throttle u after LINEAR_LAGS.
@@ -174,6 +174,6 @@ class LoadState:
     fall: float  # Fall of the level, V per unit of charge.
     # Coefficients of ln variance, V^2, of a sample: 1, ripple, sqrt|du|.
     log_variance: tuple[float, float, float]
-    ripple_se: float  # Standard error of the second of them.
+    ripple_se: float  # Standard error of the coefficient of ripple.
     deviation: tuple[float, ...]  # Noise, V, at equal steps of throttle from 0 to 1.
     flown: tuple[float, float]  # Throttles between which the noise is known.

@@ -1,24 +1,24 @@
 """
-The last minutes of a flight, possible future throttle, and the lowest voltage of each course.
+The last minutes of a flight, possible courses of throttle, and the lowest voltage in each.
 
 doc/risk.md has the formulas: of the lowest voltage (step 1), of the pilot's future throttle (3),
 and of the excursions (4).
 
-A course jumps to a peak of throttle, then to another throttle.  Its samples form four groups: in
-the inrush, in both halves of the time at the peak after it, and after the peak.  Limits: within a
+A course jumps to a peak of throttle, then to another throttle.  Its samples form four groups:
+during the inrush, in the two halves of the rest of the peak, and after the peak.  Limits: within a
 group the mean path counts as constant; samples of noise are independent, as in the load filter.
 
-The pilot: each completed horizon is one course.  Rises from the present throttle are added, one
-into each fifth of the range above it (rule of succession).  Limits: within a horizon, the peak is
-assumed to come first.
+Pilot's future throttle: each completed horizon provides one course.  One rise from the present
+throttle into each fifth of the range above it is added (rule of succession).  Limits: within a
+horizon, the peak is assumed to come first.
 
-Excursions need no load: the risk follows from the margin of the voltage now.  One drop of twice
-the deviation of the last 5 s is added to those of the flight.  Horizons below 1 s and above 5 s
-use the nearest coefficients.  Limits: throttle is not used; the tail beyond 8 deviations falls
-like that of Student's t in the other laws.
+Excursions do not need the load: the risk follows from the margin of the present voltage.  To the
+drops of the flight, one of twice the standard deviation of the last 5 s is added.  Horizons below
+1 s and above 5 s use the nearest coefficients.  Limits: throttle is not used; the tail beyond 8
+deviations is assumed to fall as the tail of Student's t in the other laws does.
 
-Limits of the blocks: a source slower than a block fills blocks with its last value.  A longer
-silence is not filled, and a horizon that contains it is not complete.
+Limits of the blocks: with a source slower than a block, empty blocks repeat its last value, up to
+a maximum silence; a horizon with a longer silence counts as incomplete.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from ou_monitor.model.passage import normal_below
 from ou_monitor.online.load.supply_load import LoadState, POWER
 from ou_monitor.records import FloatArray, NAN
 
-# The first group after a rise, in time constants of the inrush.
+# Duration of the first group after a rise, in time constants of the inrush.
 _RISE = 2.0
-# Length of a rise, s; share of it that counts for the inrush: the inrush of a ramp is that of a
-# step times time constant / length.
+# Duration of a rise, s, and factor on the inrush of a step, because a rise is a ramp: time
+# constant / duration.
 _RAMP = 0.2
 _SHARE_OF_RISE = INRUSH_TIME / _RAMP
 
@@ -51,8 +51,8 @@ def _largest_medians() -> tuple[FloatArray, FloatArray, FloatArray]:
     """
     Return ln n, and mean and deviation of the largest of n running medians of three normals.
 
-    A median stays below x unless two of three neighbours pass x: a chain of three states (samples
-    since the last that passed x), computed for n = 1, 2, 4, ... steps by squaring.
+    A median is below x unless two of its three samples are above x.  This is a chain of three
+    states (samples since the last above x), computed for n = 1, 2, 4, ... steps by squaring.
     """
     x = np.linspace(-6.0, 8.0, 561)
     over = normal_below(-x)
@@ -101,14 +101,14 @@ class Sampling:
 
 
 def held(throttle: npt.ArrayLike, dwell: npt.ArrayLike, rest: float) -> Courses:
-    """Return courses that go to a throttle, stay for a time, s, and come back to `rest`."""
+    """Return courses that go to a throttle, stay for a time, s, and return to `rest`."""
     peak, times = np.broadcast_arrays(*np.atleast_1d(throttle, dwell))
     return Courses(peak.astype(np.float64), times.astype(np.float64),
                    np.full(peak.shape, rest))
 
 
 def _groups(state: LoadState, u: FloatArray, tau: FloatArray, inrush: FloatArray) -> FloatArray:
-    """Return the regressors (k, j, states) of groups in the order in which they are flown."""
+    """Return the mean regressors, (k, j, states), of j consecutive groups of k courses."""
     x = u ** POWER
     g = -state.size
     rows = np.empty(u.shape + (state.mean.size,))
@@ -145,7 +145,7 @@ def lowest(state: LoadState, courses: Courses, horizon: float, sampling: Samplin
     half = 0.5 * (stay - first)
     tau = np.stack([first, half, half, span - stay], axis=1)
     u = np.stack([peak, peak, peak, courses.rest], axis=1)
-    # A median of three shows inrush and noise of a rise if two samples are within the ramp.
+    # Inrush and noise of a rise affect a median of three only if two samples are within the ramp.
     up = np.maximum(0.0, peak - state.throttle) * _SHARE_OF_RISE * min(
         max(_RAMP / dt - 1.0, 0.0), 1.0)
     inrush = np.zeros_like(u)
@@ -160,7 +160,7 @@ def lowest(state: LoadState, courses: Courses, horizon: float, sampling: Samplin
     largest = np.interp(np.log(np.maximum(count, 1.0)), _LN_N, _MEAN)
     j = np.argmin(np.where(tau > 0.5 * dt, means - sd * largest, np.inf), axis=1)
     row, mean, sd, largest = rows[k, j], means[k, j], sd[k, j], largest[k, j]
-    # Samples of other groups count by how often they are as low: the tail of the largest.
+    # Samples of other groups count by how often they are as low as the lowest of group j.
     apart = np.maximum(means - mean[:, None], 0.0) / sd[:, None]
     ln_n = np.log(np.maximum((count * np.exp(-largest[:, None] * apart)).sum(axis=1), 1.0))
     known = np.maximum(((row @ state.covariance) * row).sum(axis=1), 0.0)
@@ -168,7 +168,7 @@ def lowest(state: LoadState, courses: Courses, horizon: float, sampling: Samplin
             np.sqrt(known + (sd * np.interp(ln_n, _LN_N, _DEVIATION)) ** 2))
 
 
-# Length of a block, s, time that is kept, s, and silence that is not filled, s.
+# Length of a block, s; time that is kept, s; maximum silence that is filled, s.
 BLOCK, KEPT, SILENCE = 0.05, 300.0, 2.5
 # Throttle within this distance of the highest counts as the peak.
 AT_PEAK = 0.05
@@ -261,7 +261,7 @@ class FlightHistory:
         """Return the mean sqrt|du| between blocks in the last minute."""
         change = np.abs(np.diff(self.table[2, -round(60.0 / BLOCK):]))
         change = change[np.isfinite(change)]
-        # Without rounding, of which the root would be 1e-8.
+        # Round first, because the root of a rounding error is 1e-8.
         return float(np.sqrt(np.round(change, 12)).mean()) if change.size else 0.0
 
     def outcome(self, t: float, horizon: float) -> tuple[float, float, float] | None:
@@ -297,11 +297,13 @@ def sliding(least: np.ufunc, x: FloatArray, width: int) -> FloatArray:
     return np.asarray(least(out[:out.size - rest], out[rest:]) if rest else out)
 
 
+# Horizons, s, and coefficients there of 1, margin less mean drop, and margin (logistic fit).
 _LN_HORIZON = np.log([1.0, 2.0, 5.0])
 _COEFFICIENTS = np.array([(-0.90, -0.62, -0.34), (-0.52, -0.12, -0.68), (-1.08, 0.23, -0.52)])
-# Largest margin of the fit, in S, and power with which the risk falls beyond it.
+# Maximum margin of the fit, in standard deviations of the drops, and power with which the risk
+# falls beyond it.
 _FARTHEST, _POWER = 8.0, 5.0
-_RECENT = 5.0  # Time whose deviation gives the further drop, s
+_RECENT = 5.0  # Time whose standard deviation gives the added drop, s
 # Minimum deviation as a share of the voltage, for a constant source.
 _LEAST = 1e-3
 # Minimum deviation at 0 V, V.
@@ -318,7 +320,7 @@ def excursions(past: FlightHistory, horizon: float) -> tuple[float, float]:
     recent = last[-round(_RECENT / BLOCK):]
     recent = recent[np.isfinite(recent)]
     drops = past.drops(horizon)
-    # The n drops overlap: they count as n dt / h.
+    # Drops in overlapping horizons count as (number) x (block) / (horizon).
     n = drops.size * BLOCK / max(horizon, BLOCK)
     first = 2.0 * float(recent.std())
     least = max(_LEAST * abs(float(last[-1])), _SMALLEST)
@@ -340,7 +342,7 @@ def excursion_risk(now: float, levels: FloatArray, horizon: float, mean: float, 
         1.0 + np.exp(-score)))
 
 
-# Scale of the weight in throttle (of 1) and in age, s.
+# Scales of the weight of a past horizon: difference of throttle, and age, s.
 _LIKE, _MEMORY = 0.25, 100.0
 # Added rises, as shares of the range above the present throttle; their dwell, in horizons.
 _RISES, _RISE_DWELL = (0.1, 0.3, 0.5, 0.7, 0.9), 0.2
@@ -350,7 +352,7 @@ _APART, _SHARE, _MOST = 0.2, 0.1, 320
 
 @dataclass(frozen=True, eq=False)
 class FlownHorizons:
-    """Completed horizons: throttle at first, peak, dwell (s), rest, age (s); shapes (k,)."""
+    """Throttle in completed horizons: first, peak, dwell (s), rest; age (s); shapes (k,)."""
 
     first: FloatArray
     peak: FloatArray
@@ -377,7 +379,7 @@ def flown(past: FlightHistory, horizon: float) -> FlownHorizons:
     rest = np.where(count < width, (total - (within * near).sum(axis=1))
                     / np.maximum(width - count, 1), peak)
     good = np.isfinite(total + mean[at])
-    # A block that holds the peak may have a mean below it.
+    # At least one block, because the mean of the block that contains the peak may be below it.
     dwell = np.maximum(count, 1) * BLOCK
     return FlownHorizons(*(x[good] for x in (mean[at], peak, dwell, rest, (n - 1 - at) * BLOCK)))
 

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from ou_monitor.model.passage import passage_probability
 from ou_monitor.records import Estimate, FloatArray, NAN
 
-# Quadrature nodes over the present voltage; those of the other averages are below.
+# Number of quadrature nodes over the present voltage (for the other averages: `_MANY`, `_FEW`).
 _START_NODES = 3
 
 
@@ -56,22 +56,21 @@ def brownout_probability(e: Estimate, voltage: float, horizon: float,
     Parameters
     ----------
     e : Estimate
-        The estimate; unless it is usable the risk is unknown.  Its standard
-        errors are averaged over.
+        The estimate; unless it is usable the risk is unknown.  The risk is
+        averaged over its standard errors.
     voltage : float
         Brown-out level, V.
     horizon : float
         Time ahead, s, > 0.
     now : float, optional
-        Present voltage, V, with the noise of `e.noise_std` on it; the mean
+        Present voltage, V, a reading with noise of `e.noise_std`; the mean
         level when left out.
 
     Returns
     -------
     float
-        Probability 0..1; NaN when the estimate is not usable and the present
-        voltage does not decide; 1 when the present voltage is at or below
-        `voltage`.
+        Probability 0..1; 1 when the present voltage is at or below `voltage`;
+        else NaN when the estimate is not usable.
 
     Raises
     ------
@@ -110,7 +109,7 @@ def risk_of(supply: Supply, voltage: npt.ArrayLike, horizon: float, now: float |
 
 
 class _Paths:
-    """Start and parameters of the path at the quadrature nodes over their errors."""
+    """Start and parameters of the path at quadrature nodes, which cover their errors."""
 
     def __init__(self, supply: Supply, now: float | None, noise_std: float, grid: FloatArray,
                  weights: FloatArray) -> None:
@@ -138,7 +137,7 @@ class _Paths:
 
 @dataclass(frozen=True)
 class Passage:
-    """The law of the lowest voltage, V, within a horizon from one instant on."""
+    """Distribution of the lowest voltage, V, within a horizon from one instant on."""
 
     supply: Supply
     now: float
@@ -166,7 +165,7 @@ def _nodes(supply: Supply, grid: FloatArray, weights: FloatArray
         np.asarray(value, dtype=np.float64)[..., None] for value in (
             supply.u0, supply.u0_se, supply.ln_alpha, supply.ln_alpha_se, supply.ln_sigma,
             supply.ln_sigma_se, supply.covariance))
-    # Along ln Var_inf = 2 ln sigma - ln alpha, and along ln alpha given that.
+    # One axis is ln Var_inf = 2 ln sigma - ln alpha, another ln alpha given ln Var_inf.
     variance = np.maximum(4.0 * ln_sigma_se**2 + ln_alpha_se**2 - 4.0 * covariance, 0.0)
     shared = np.divide(2.0 * covariance - ln_alpha_se**2, variance, out=np.zeros_like(variance),
                        where=variance > 0.0)
@@ -198,6 +197,6 @@ def _grid(*counts: int) -> tuple[FloatArray, FloatArray]:
             np.prod([axis.ravel() for axis in weights], axis=0))
 
 
-# Nodes over ln Var_inf, which counts most, over ln alpha given that, and over the level.
+# Nodes over ln Var_inf, which matters most, over ln alpha given ln Var_inf, and over the level.
 _MANY = _grid(7, 3, 3)
 _FEW = _grid(5, 1, 3)

@@ -1,15 +1,15 @@
 """
 The brown-out flag: a level from risks and a voltage floor.
 
-doc/risk.md lists the levels, and when they are entered and left.  A flag is as good as its risk;
-with an unknown risk the level is UNKNOWN, never OK, and the flag is never false.
+doc/risk.md lists the levels, and when they are entered and left.  The flag is only as good as the
+risk; with an unknown risk the level is UNKNOWN, never OK, and the flag is never false.
 
-The voltage floor is a threshold on the samples that needs no model.  The median of the last
-`brownout.floor_time` seconds decides, so a single wrong sample does not.  Every sample is checked,
-also between two reports, and also if its stamp is late, frozen, irregular or missing: then it
-counts in order of arrival.  Such samples that arrive at the same time are spaced by their usual
-interval.  The next update reports a dip, even if nothing has arrived since.  A wrong
-value that a logger repeats for more than half of `brownout.floor_time` counts.
+The voltage floor is a threshold on the samples, without a model.  It is compared with the median
+of the last `brownout.floor_time` seconds, so that a single wrong sample has no effect.  Every
+sample is checked, also between two reports.  If its stamp is late, frozen, irregular or missing,
+its order of arrival counts; such samples that arrive together are spaced by their usual interval.
+The next update reports a dip, even if nothing has arrived since.  Limit: a wrong value that a
+logger repeats for more than half of `brownout.floor_time` counts as a dip.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ _BACK = 1.0
 _USUAL = 200
 # Maximum number of samples kept: the longest floor_time, 10 s, at 20 kHz.
 _MOST = 200_000
-# Maximum step forward, over `_longest_gap`: twice the span of three samples.  Without it,
-# random stamps would move the time line until a float no longer resolves milliseconds.
+# Maximum step forward, in `_longest_gap`: twice the span of three samples.  Without it, random
+# stamps would advance the time line until a float no longer resolves milliseconds.
 _FAR = 4.0
 
 
 class FloorWatch:
     """
-    Whether the voltage is at or below the floor; `dips` counts its falls to the floor.
+    Detects a voltage at or below the floor; `dips` counts its falls to the floor.
 
-    Three samples that span more than twice `stale_after` are not combined in a median, unless the
-    source is slower: `interval` is the time between its samples, s, 0 for a fast one.
+    Three samples that span more than twice `stale_after` are not combined in a median, except for
+    slow sources; `interval`: time between the samples of a slow source, s, else 0.
     """
 
     def __init__(self, settings: MonitorSettings) -> None:
@@ -91,7 +91,7 @@ class FloorWatch:
 
     def _placed(self, t: FloatArray, v: FloatArray, arrival: FloatArray | None
                 ) -> tuple[FloatArray, FloatArray]:
-        """Return the samples' places on a time line that never goes back, s, and their volts."""
+        """Return times on a time line that never goes back, s, and the voltages at them, V."""
         if arrival is None:
             if t.max() < self._newest - _BACK:
                 self.reset()
@@ -126,7 +126,7 @@ class FloorWatch:
     def _late_steps(self, arrival: FloatArray | None) -> FloatArray | float:
         """Return the time by which late samples advance the time line, s."""
         if arrival is None or self._arrived == -math.inf:
-            # Unknown interval: assume two per `brownout.floor_time`, so two of three decide.
+            # Unknown interval: assume half of `brownout.floor_time`, so two of three decide.
             return (0.5 * self.settings.brownout_floor_time if math.isnan(self._usual)
                     else self._usual)
         return np.maximum(np.diff(arrival, prepend=self._arrived), 0.0)
@@ -139,7 +139,7 @@ class FloorWatch:
         return least + np.maximum.accumulate(np.maximum(elapsed - least, 0.0))
 
     def _learn(self, times: FloatArray, before: float) -> None:
-        """Learn the usual interval (times in s); a pause counts at most as twice the usual one."""
+        """Update the usual interval (times in s); a pause counts at most as twice the interval."""
         known = before > -math.inf
         n = times.size - 1 + known
         if not n:
@@ -178,7 +178,7 @@ class FloorWatch:
         return int(self._t.size)
 
     def take(self, arriving: bool = True) -> bool:
-        """Return whether the voltage was low since the last call, or is (if samples arrive)."""
+        """Return whether the voltage was low since the last call, or is now (if `arriving`)."""
         low, self._was_low = self._was_low or (self._low and arriving), False
         return low and self.settings.floor > 0.0
 
@@ -207,7 +207,7 @@ class FlagState:
     reason: str = 'nothing is known yet'  # Reason: a clause without a full stop
     age: float = NAN  # Time spent in the level, s
     low: bool = False  # Whether the voltage is at or below the floor, or was since the last update
-    dips: int = 0  # How often it has gone down to the floor so far
+    dips: int = 0  # Number of falls of the voltage to the floor so far
 
 
 class BrownoutFlag:
@@ -223,7 +223,7 @@ class BrownoutFlag:
         # Time since which the risk has always been at or above the entry value of a level.
         self._above: dict[FlagLevel, float] = {}
         self._state = FlagState()
-        # Why nothing but CRITICAL is reported; empty: no such reason.
+        # Why UNKNOWN is reported in place of OK and WARN; empty: it is not.
         self._doubt = ''
 
     @property
@@ -247,7 +247,7 @@ class BrownoutFlag:
         self._floor.push(t, voltage, arrival)
 
     def new_time_line(self) -> None:
-        """Take stamps that start anew; the level stays as long as it is held."""
+        """Accept stamps that start anew; the level stays as long as it is held."""
         self._floor.new_time_line()
 
     def clear(self) -> bool:
@@ -300,7 +300,7 @@ class BrownoutFlag:
         return self._state
 
     def _set_clock(self, t: float) -> None:
-        """Set the clock; when it steps back, everything remembered steps with it."""
+        """Set the clock; if it steps back, stored times are shifted by the same step."""
         self._now = t if math.isfinite(t) else NAN
         if math.isnan(self._now):
             return
@@ -323,7 +323,7 @@ class BrownoutFlag:
 
     def _wanted(self, risk: float, soon: float, tight: bool, known: bool, low: bool
                 ) -> tuple[FlagLevel, str]:
-        """Return the level by risks and floor, before hold and latch."""
+        """Return the level that follows from risks and floor, before hold and latch."""
         s = self._settings
         asks = {FlagLevel.CRITICAL: (soon, s.brownout_critical, f'risk {soon:.2g} within 1 s, '
                                      'throttle as it is'),

@@ -10,13 +10,14 @@ Law learned in flight, from completed horizons: lowest - start = b0 s + b1 (mu -
 mean mu and deviation s of `lowest`, by least squares with forgetting; e has Student's t
 distribution with five degrees of freedom, and the variance k0 s^2 + k1 (mu - start)^2.
 
-Each law is mixed with a wider one, weighted by the share of horizons that contradict the law: each
-counts with the probability that the law was wrong in it (rule of succession), overlapping ones as
-step / horizon.  For first passage the wider law is the excursions.  For a given throttle it is as
-wide as the excursions, at most `_WIDEST` times the law (excursions include punches, which say
-nothing about idling), or wider if contradicting voltages were farther below the law's mean.
+Each law is mixed with a wider one, whose weight is the share of horizons that contradict the law
+(rule of succession).  A horizon counts with the probability that the law was wrong in it, and with
+step / horizon where horizons overlap.  For first passage the wider law is the excursions.  For a
+given throttle it is as wide as the excursions, but at most `_WIDEST` times as wide as the law,
+because excursions include bursts of throttle, which are irrelevant to idling.  It is wider if
+contradicting voltages were farther below the mean of the law.
 
-Limits, beside those of doc/risk.md: all throttles share one bias and one gain; values between two
+Limits, in addition to doc/risk.md: all throttles share one bias and one gain; values between two
 horizons are interpolated.
 
 `look_ahead` computes the risk, its curve over throttle, and the throttle budget for the present
@@ -44,28 +45,27 @@ from ou_monitor.online.settings import MonitorSettings
 from ou_monitor.records import Estimate, FloatArray, NAN
 from ou_monitor.timeline import Batch
 
-# Degrees of freedom: heavy tails for a model that is sometimes wrong.
+# Degrees of freedom of Student's t: heavy tails, because the model is sometimes wrong.
 FREEDOM = 5.0
 _NORM = math.exp(math.lgamma(0.5 * FREEDOM + 0.5) - math.lgamma(0.5 * FREEDOM)) / math.sqrt(
     math.pi * (FREEDOM - 2.0))
-# Coefficients of the power series of its tail in FREEDOM / (FREEDOM + t^2), highest power first.
+# Coefficients of the power series of the tail in FREEDOM / (FREEDOM + t^2), highest power first.
 _TAIL = [8.0 / (3.0 * math.pi) * math.comb(2 * k, k) / 4.0**k / (2 * k + 5)
          for k in range(9, -1, -1)]
-# Prior: its weight in horizons; its variances, in those of the noise and in squares of the fall
-# (on nine recorded flights, from gecko to cf_takeoff, 1 to 6 and 0.015 to 0.09); its precisions of
-# bias and gain.
+# Prior of the law: weight of the variances, in horizons; variances k0 and k1 (1 to 6 and 0.015 to
+# 0.09 on nine recorded flights); precision matrix of bias and gain (elements 00, 01, 11).
 _PRIOR, _VARIANCES = 5.0, np.array([3.0, 0.03])
 _PRECISION = (1.0 / 0.75, 0.0, 1.0 / 0.48)
-# Memory, s; maximum squared error that counts: errors beyond 3 deviations weigh less.
+# Memory, s; limit of squared standardised errors; standardised error beyond which errors weigh
+# less in the regression.
 MEMORY, _LARGEST, _HUBER = 120.0, 36.0, 3.0
-# Maximum initial widening of a law: chosen on gecko, nazgul, roma, bf3s, erle, cf_solo (2 to 6
-# tried).
+# Maximum initial width of the wider law, in widths of the law (2 to 6 tried on six recordings).
 _WIDEST = 4.0
 # Weight of the initial width, in horizons, when it is averaged with the misses of this flight
-# (chosen on gecko, frc_ol_1 and cf_solo; 1 and 4 tried).
+# (1 and 4 tried on three recordings).
 _FIRST = 4.0
-# Horizons that initially count as agreeing with the law for a given throttle: chosen on the
-# recordings of `_WIDEST`, hiro, cf_pair, cf_bl00, frc_ol_1 and euc_1 (1, 4, 9 and 19 tried).
+# Number of horizons that initially count as agreeing with the law for a given throttle (1, 4, 9
+# and 19 tried on eleven recordings).
 _AGREE = 4.0
 
 
@@ -79,7 +79,7 @@ def density(x: FloatArray, mean: FloatArray, deviation: FloatArray) -> FloatArra
 def below(level: float, mean: FloatArray, deviation: FloatArray) -> FloatArray:
     """Return P(x < level) for the same Student's t, elementwise."""
     t = (level - mean) / deviation * math.sqrt(FREEDOM / (FREEDOM - 2.0))
-    # Abramowitz & Stegun 26.7.4; its terms cancel in the far tail, which is summed instead.
+    # Abramowitz & Stegun 26.7.4; its terms cancel in the far tail, where the series is used.
     angle = np.arctan2(math.sqrt(FREEDOM), np.abs(t))
     c = np.sin(angle)
     tail = (angle - np.cos(angle) * c * (1.0 + 2.0 / 3.0 * c * c)) / math.pi
@@ -95,7 +95,7 @@ def _wider(spread: FloatArray, deviation: float, misses: tuple[float, float]) ->
 
 
 class LowestLaw:
-    """Bias, gain, both variances (of noise and fall), and the errors of bias and gain."""
+    """`values`: bias b0, gain b1, variances k0 and k1, and covariance of b0 and b1 (3 values)."""
 
     def __init__(self, values: FloatArray) -> None:
         self.values = values
@@ -114,10 +114,10 @@ class Calibrator:
     """Learns a `LowestLaw` from completed horizons."""
 
     def __init__(self) -> None:
-        # Sums for the regression on deviation and predicted fall: of products, and with the fall.
+        # Regression on deviation and predicted fall: sums of their products, and with the fall.
         self._information: tuple[float, ...] = _PRECISION
         self._weighted: tuple[float, ...] = _PRECISION[1:]
-        # Horizons, and their squared misses over those expected, that count for each variance.
+        # For each variance: effective number of horizons, and sum of the variances they imply.
         self._count, self._squares = np.zeros(2), np.zeros(2)
         self._settle()
 
@@ -139,7 +139,7 @@ class Calibrator:
         parts = self._variance * np.array([deviation * deviation, x * x])
         total = float(parts.sum())
         least = weight / total * min(1.0, _HUBER * math.sqrt(total) / max(abs(miss), 1e-9))
-        # Each variance learns from a horizon as much as it contributes: the score equations.
+        # Each variance learns in proportion to its share of the total (score equations).
         share = weight * parts / total
         self._count = self._count * keep + share
         self._squares = self._squares * keep + share * self._variance * min(
@@ -175,9 +175,9 @@ class ContradictionRate:
     def add(self, law: float, far: float, weight: float, elapsed: float, miss: float = 0.0
             ) -> float:
         """
-        Learn from the two densities, 1/V, of a lowest voltage; return that of the mixture.
+        Learn from the two densities, 1/V, of a lowest voltage; return the mixture's density.
 
-        miss: how far that voltage is below the law's mean, V; else 0.
+        miss: distance of that voltage below the mean of the law, V; 0 if above.
         """
         keep = math.exp(-elapsed / MEMORY)
         share = self.value
@@ -192,17 +192,17 @@ class ContradictionRate:
 # Horizons, s, from which the flight learns; those between are interpolated in ln h.
 HORIZONS = (0.5, 1.0, 2.0, 5.0, 15.0)
 _LN_HORIZONS = np.log(HORIZONS)
-# Share in the interpolation below which a horizon does not count: more than rounding.
+# Share in the interpolation below which a horizon is left out, above rounding errors.
 _LEAST_SHARE = 1e-9
 # Time between updates, s, and as a share of the horizon.
 LOOK, _LOOK_SHARE = 0.2, 0.2
 # Minimum time between updates by arrival, s: stamps may run a thousand times too fast, and an
 # update takes 1 ms.  A replay at four times the speed is not affected.
 _REST = 0.05
-# Largest error of ln sigma for averaging; with a larger one sigma is unknown.
+# Limit of the error of ln sigma; with a larger one, sigma is practically unknown.
 _LARGEST_ERROR = 1.0
-# Prior of first passage, which is in use only if the tests of the window have found an OU: odds,
-# and number of horizons that count as predicted correctly.
+# Prior for first passage, which is used only if the tests of the window have found an OU: it is
+# right in all but one of this number of horizons.
 _ODDS = 10.0
 # Share of the excursions in the method `load`, because the pilot's next throttle is unknown.
 # Half: the errors of the two forecasts differ, and no flight is long enough to learn weights (on
@@ -226,7 +226,7 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False)
 class _PendingHorizon:
-    """State at one time, kept until a horizon from there on is complete."""
+    """State at the beginning of a horizon (mean, deviation: of drops), kept until it is over."""
 
     t: float
     voltage: float
@@ -251,7 +251,7 @@ class _HorizonLaws:
 
     @property
     def values(self) -> FloatArray:
-        """Return all that is interpolated between horizons."""
+        """Return all values that are interpolated between horizons."""
         return np.append(self.calibrator.law.values, (
             self.held.value, *self.held.misses, self.passage.value, self.evidence))
 
@@ -302,11 +302,11 @@ class Forecast:
     """
     Risk with the pilot's future throttle, and with a given one.
 
-    look: update interval, s; horizon: the only horizon that risks have, s; NaN: any.
+    look: update interval, s; horizon: the only one for which risks are needed, s; NaN: any.
     """
 
     def __init__(self, loads: LoadFilter, look: float = LOOK, horizon: float = NAN) -> None:
-        # Takes a third of a second, once; done here so that no sample has to wait.
+        # This takes a third of a second once, so it is done before the first sample.
         prepare()
         self._loads, self._look_time = loads, look
         self.follow(Estimate(), 0.0)
@@ -403,7 +403,7 @@ class Forecast:
             plain.ln_sigma_se, 0.5 * state.ripple_se * float(apart.mean())), _LARGEST_ERROR))
 
     def passage(self) -> Passage | None:
-        """Return the law of the lowest voltage from now on; None if unknown."""
+        """Return the distribution of the lowest voltage from now on; None if unknown."""
         supply, now = self.supply(), self.voltage
         noise = self.estimate.noise_std
         return None if supply is None or math.isnan(now) else Passage(
@@ -437,13 +437,13 @@ class Forecast:
                 None if state is None else pilot(done, state.throttle, laws.horizon), passage))
 
     def _flight(self, horizon: float) -> tuple[float, float, FlownHorizons]:
-        """Return excursions and courses of the flight, computed once for the newest samples."""
+        """Return excursions and throttle of the flight, computed once for the newest samples."""
         if horizon not in self._kept:
             self._kept[horizon] = *excursions(self._past, horizon), flown(self._past, horizon)
         return self._kept[horizon]
 
     def _learned(self, horizon: float) -> tuple[LowestLaw, float, float, float, float, float]:
-        """Return the law, both shares of wrong horizons, and the evidence for a horizon."""
+        """Return the law, its contradictions (3 values), first passage's share, and evidence."""
         if horizon not in self._laws:
             values = np.sum([share * laws.values for laws, share in zip(
                 self._by_horizon, _shares(horizon)) if share > _LEAST_SHARE], axis=0)
@@ -570,7 +570,7 @@ def risk_over_throttle(forecast: Forecast, voltage: float, horizon: float, sag: 
                        noise: float = 1.0) -> FloatArray:
     """Return the risk of each throttle of a grid, (51,), held for the horizon; see `risk_if`."""
     risks = forecast.risk_if(_GRID, horizon, voltage, horizon, sag, noise)
-    # Less throttle is never riskier, but just after high throttle the law rates idle as riskier.
+    # Less throttle is never riskier, although just after high throttle the law may say so.
     return np.asarray(np.minimum.accumulate(risks[::-1])[::-1])
 
 
