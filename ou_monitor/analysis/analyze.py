@@ -1,9 +1,9 @@
 """
 A recording -> Tables 1 and 2 of the paper, with intervals, tests and curves over throttle.
 
-The recording also goes through `SupplyMonitor`, as in flight, so that node and command agree on
-the same data, even if throttle is never constant.  The limits of the monitor apply; the risk is
-for the state at the end of the recording.  Throttles not flown are NaN.
+`SupplyMonitor` also processes the recording, as in flight, so that node and command agree on the
+same data; this needs no constant throttle.  The limits of the monitor apply.  The risk is for the
+state at the end of the recording, and NaN at throttles above the highest flown.
 
 `as_data` returns the JSON of `analyze`; see doc/analysis.md.
 """
@@ -49,13 +49,13 @@ class Analysis:
     levels: tuple[LevelResult, ...]  # In order of throttle
     alpha_test: AlphaTest  # Whether alpha is the same at all levels
     by_throttle: ByThrottle  # Risk over throttle
-    sliding: Sliding  # Reports of the node
+    sliding: Sliding  # Estimates and risk of the node over time
     quality: tuple[QualityItem, ...]  # Cautions about the numbers, worst first
     brownout_default: bool  # Whether the voltage of the risk is the default of the node
     notes: tuple[str, ...]  # What was dropped or left out, one sentence each
     overview: Overview  # Lowest voltage, dips, sag and noise
     craft: Craft  # Cells, and a comparison with known crafts
-    alarms: tuple[Dips, ...]  # Dips below usual alarms per cell; none if the cells are unknown
+    alarms: tuple[Dips, ...]  # Dips below usual alarms per cell; empty if cells are unknown
 
 
 def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
@@ -63,7 +63,7 @@ def analyze(recording: Recording, *, levels: tuple[float, ...] | None = None,
             brownout_horizon: float = 5.0, cells: int = 0,
             progress: Progress | None = None) -> Analysis:
     """Analyse a recording load level by load level (window and horizon in s, voltage in V)."""
-    # cells: in series, to which the voltage refers; 0: none.
+    # cells: number of cells in series, for the voltage per cell; 0: not given.
     report: Progress = progress or (lambda share: None)
     all_of_it = readings_of(recording)
     recording = supplied(all_of_it)
@@ -112,7 +112,7 @@ def _default_voltage(recording: Recording) -> float:
 
 
 def _left_out(recording: Recording, found: tuple[LoadLevel, ...]) -> tuple[str, ...]:
-    """Return notes of the parts that belong to no level."""
+    """Return notes on the parts that belong to no level."""
     if not recording.n:
         return ('The recording holds no samples.',)
     if not recording.has_throttle:
@@ -167,7 +167,7 @@ class Sliding:
 def slide(recording: Recording, window: float, brownout_voltage: float = NAN,
           brownout_horizon: float = 5.0,
           progress: Callable[[float], None] | None = None) -> Sliding:
-    """Run the node's monitor, or without a limit its estimator, over a recording (s, V, s)."""
+    """Run the node's monitor (without a limit, only its estimator) over a recording (s, V)."""
     if not (math.isfinite(brownout_horizon) and brownout_horizon > 0.0):
         raise ValueError(f'the horizon must be a positive number of seconds, got '
                          f'{brownout_horizon}')
@@ -185,7 +185,7 @@ def slide(recording: Recording, window: float, brownout_voltage: float = NAN,
         if monitor is None:
             seen = estimator.estimate(), NAN
         else:
-            # The monitor also learns from reports in between.
+            # Reports that are not shown also update the state of the monitor.
             last = monitor.report(0.0, alone=True)
             seen = last.estimate, last.risk
         # Estimates before the first window is full are too poor to show.
@@ -208,7 +208,7 @@ class ByThrottle:
     risk: FloatArray  # Probability of a brown-out within the horizon; NaN if unknown; shape (k,)
     budget: float  # Highest throttle that keeps the risk within `limit`; NaN if unknown
     budget_reason: str  # What limits the budget, or why it is unknown
-    limit: float  # Risk of the budget
+    limit: float  # Maximum risk that defines the budget, 0..1
     # Voltage, V, and horizon, s, of the risk.
     voltage: float
     horizon: float
@@ -217,7 +217,7 @@ class ByThrottle:
 
 def by_throttle(recording: Recording, found: Overview, voltage: float, horizon: float,
                 ) -> ByThrottle:
-    """Return the risk of the node over throttle (V, s)."""
+    """Return the node's risk over throttle (voltage in V, horizon in s)."""
     grid, last = np.array(THROTTLES), found.end
     risk = np.full(grid.size, NAN)
     if last is not None and last.risk_curve:

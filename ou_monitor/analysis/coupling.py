@@ -1,11 +1,10 @@
 """
 How much of a signal, such as a gyro axis, is noise of the supply.
 
-Limits: white noise of the voltage sensor lowers the gain by its share of the voltage in the band.
+Limits: white noise of the voltage sensor lowers the gain by its share of the power in the band.
 Effects of throttle are regressed out if they are linear in throttle and its square, with a lag
 shorter than a segment.  Reported but not corrected: motor rotation, which disturbs both gyro and
-supply and shows as a narrow line; a signal that *leads* the voltage, which it drives through the
-motors.
+supply and shows as a narrow line; a signal that *leads* the voltage because it drives the motors.
 
 Method: Fourier coefficients of half-overlapping Hann segments.  `measure_coherence` tests for
 coupling.  If there is any, the signal is regressed on voltage, throttle and its square.  Segments
@@ -13,13 +12,12 @@ are weighted by the noise of the signal, which grows with throttle, so that a fe
 dominate.  Repeated readings of the ADC are dropped, because the steps between them come from the
 logger.
 
-All series are brought to the even grid of the fastest one by cubic splines, which do not alias.
-The usable band ends at a quarter of the slowest rate; above, the spline attenuates by more than
-3 %.  Limits: aliases of the original sampling stay, and a stamp error of e seconds gives a phase
-error of 2 pi f e.
+Cubic splines, which do not alias, bring all series to the even grid of the fastest one (a series
+more than 8 times as fast as the slowest is averaged instead).  The usable band ends at a quarter
+of the slowest rate; above, the spline attenuates by more than 3 %.  Limits: aliases of the
+original sampling stay, and a stamp error of e seconds gives a phase error of 2 pi f e.
 
-`measure_coherence` tests whether two series are coherent, at a stated level for any spectra.  Two
-tests must both reject:
+`measure_coherence` tests whether two series of any spectra are coherent.  Two tests must reject:
 
 - Each bin of each segment is divided by the rms of the signal over the bins around it, because a
   manoeuvre changes the shape of the gyro spectrum.  If the signal is then white Gaussian, the
@@ -55,10 +53,10 @@ LOWEST = 5.0
 _LONGEST, _SHORTEST, _PIECES = 1.0, 0.1, 40
 FEWEST = 16  # Minimum number of segments
 LONGEST_LAG = 0.05  # Maximum lag that is searched, s
-# Minimum share of the common time that is used without a note.
+# Used share of the common time below which a note says so.
 _SHARE_USED = 0.9
 _BLOCKS = 12  # Blocks of the jackknife
-# Probability of detection at the limit of the gain.
+# Probability with which a gain at the reported limit is detected.
 POWER = 0.9
 
 
@@ -153,7 +151,7 @@ def estimate_coupling(
     if seen:
         share = 1.0 - float(rest.sum() / (np.abs(x)**2).sum())
         gain, lag = _fit(frequency, v, x, rest / count)
-        # Weights by the whole signal favour segments in which its noise opposes the voltage;
+        # Weights by the whole signal favour segments in which its noise cancels the coupled part;
         # weights by the noise alone do not.
         turned = gain * np.exp(-2j * math.pi * frequency * lag) * v
         noise = np.sqrt((np.abs(x - turned)**2 / rest).sum(1))[:, None]
@@ -176,7 +174,7 @@ def estimate_coupling(
 
 def _as_read(t: FloatArray, voltage: FloatArray, notes: list[str],
              ) -> tuple[FloatArray, FloatArray]:
-    """Return the voltage without repeated readings, with a note."""
+    """Return the voltage without repeated readings; note how many were left out."""
     good = np.isfinite(t) & np.isfinite(voltage)
     at, values, period = refreshes(t[good], voltage[good])
     if period > 1.0:
@@ -216,7 +214,7 @@ def _band(band: tuple[float, float] | None, grid: Grid) -> tuple[float, float]:
 
 
 def _segment_length(grid: Grid, low: float) -> int:
-    """Return the samples of a segment: short, but the band starts at the third bin or later."""
+    """Return the number of samples of a segment; the band starts at its third bin or later."""
     seconds = min(max(grid.duration / _PIECES, _SHORTEST), _LONGEST)
     return max(32, round(max(seconds, 3.0 / low) * grid.rate))
 
@@ -297,7 +295,7 @@ _LEAST_SAMPLES = 4
 class Grid:
     """Series on one grid."""
 
-    rate: float  # Of the grid, Hz
+    rate: float  # Rate of the grid, Hz
     usable: float  # Highest frequency at which all series are unattenuated, Hz
     # Parts without a gap in any series; each a tuple of the series, shape (n,).
     runs: list[tuple[FloatArray, ...]]
@@ -404,13 +402,13 @@ _AROUND = 11
 STRIDE = 2
 # Power correlation of half-overlapping Hann segments: (1/6)^2.
 OVERLAP = 1.0 / 36.0
-# Random draws of signs; minimum draws that exceed a statistic for a p-value by counting (otherwise
-# it is extrapolated).
+# Random draws of signs; a p-value is a count if more than this number of draws reach the statistic
+# (otherwise it is extrapolated).
 _DRAWS, _COUNTED = 499, 10
 # Segments with a common sign, because overlap, lines and slow manoeuvres correlate them; minimum
-# number of blocks, so that 2^16 draws exist.
+# number of blocks, so that 2^16 different draws exist.
 _BLOCK, _SIGNED = 16, 16
-# Family-wise level of bins that may be a line.
+# Family-wise significance level at which a bin counts as coherent in `_is_narrow`.
 _LINE = 1e-4
 
 
@@ -418,7 +416,7 @@ _LINE = 1e-4
 class Coherence:
     """Share of a signal that a voltage explains, for each bin, with its tests."""
 
-    p_value: float  # Family-wise: of the sum over bins and the largest bin, each at half the level
+    p_value: float  # Family-wise, from two tests: the sum over bins and the largest bin
     squared: FloatArray  # Squared partial coherence, 0..1; shape (m,)
     response: ComplexArray  # Signal units per volt; shape (m,)
     # Power of the voltage over the power of the unexplained signal, 1 / gain^2; shape (m,).
@@ -430,7 +428,7 @@ class Coherence:
     narrow: bool  # Only a few bins are coherent, and the others contradict their gain
 
     def limit(self, level: float, power: float) -> float:
-        """Return the gain that the sum would detect with probability `power`."""
+        """Return the gain that the test of the sum would detect with probability `power`."""
         ratio = self.ratio[::STRIDE]
         freedom = 2 * ratio.size
         needed = float(stats.chi2.isf(0.5 * level, freedom))
@@ -443,7 +441,7 @@ def measure_coherence(voltage: ComplexArray, signal: ComplexArray, causes: list[
                       level: float, rng: np.random.Generator) -> Coherence:
     """Test Fourier coefficients of shape (segments, bins), with the causes regressed out."""
     weight = 1.0 / local_size(signal)
-    # Each bin is a part of its own weight; `share` corrects the bias.
+    # Each bin contributes to its own weight; `share` corrects the bias.
     share = 1.0 - 1.0 / _independent(signal.shape[1])
     whole = weight * signal
     basis = basis_of([weight * cause for cause in causes])
@@ -473,7 +471,7 @@ def local_size(signal: ComplexArray) -> FloatArray:
         mean = uniform_filter1d(power, _AROUND, axis=1, mode='reflect')
     else:
         mean = np.broadcast_to(power.mean(axis=1, keepdims=True), power.shape)
-    # A running sum leaves rounding errors behind a loud bin.
+    # A running sum leaves rounding errors after a loud bin.
     floor = max(1e-14 * float(power.max()), float(np.finfo(np.float64).tiny))
     size: FloatArray = np.sqrt(np.maximum(mean, floor))
     return size
@@ -508,7 +506,7 @@ def without(y: ComplexArray, basis: list[ComplexArray]) -> ComplexArray:
 
 
 def chance(squared: FloatArray, spare: float, level: float) -> tuple[float, float, float]:
-    """Return the p-values of the sum and of the largest bin, and its threshold."""
+    """Return the p-values of the sum and of the largest bin, and the threshold of that bin."""
     information = -spare * np.log1p(-squared)
     p_sum = float(stats.gamma.sf(information.sum(), squared.size))
     p_max = -math.expm1(squared.size * math.log1p(-math.exp(-float(information.max()))))
@@ -534,7 +532,7 @@ def _sign_test(v: ComplexArray, x: ComplexArray, basis: list[ComplexArray],
     shared = _power(signs, np.add.reduceat(np.conj(v) * x, starts))
     squared = shared / np.where(size > 0.0, size, 1.0) / np.maximum(power - taken, 1e-12 * power)
     information = -np.log1p(-np.clip(squared, 0.0, 1.0 - 1e-12))
-    # Random signs remove the correlation across ends of blocks.
+    # Random signs remove the correlation between blocks, which the measurement still has.
     information[0] /= 1.0 + 2.0 * OVERLAP * (starts.size - 1) / count
     return _tail(information.sum(1), 'gamma'), _tail(information.max(1), 'gumbel')
 
@@ -545,7 +543,7 @@ def _power(signs: FloatArray, parts: ComplexArray) -> FloatArray:
 
 
 def _tail(drawn: FloatArray, law: str) -> float:
-    """Return the share of draws that reach the first; if few do, by a fitted distribution."""
+    """Return the share of draws that reach the first; if few do, extrapolate by a fitted law."""
     reached = int((drawn >= drawn[0] * (1.0 - 1e-12)).sum())
     if reached > _COUNTED:
         return reached / drawn.size

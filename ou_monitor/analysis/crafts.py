@@ -21,19 +21,19 @@ from ou_monitor.errors import InputError
 from ou_monitor.records import NAN, plain_data, Recording
 from ou_monitor.text import counted, number
 
-# Throttle at which crafts are compared, and tolerance if the flown range ends before it.
+# Throttle at which crafts are compared, and the half width about it that must have been flown.
 _AT, _NEAR = 0.5, 0.15
-# Maximum factor from the median that is usual.
+# Maximum factor between a usual value and the median of its class.
 _USUAL = 2.0
 # A lithium cell at rest, V: highest after charging (LiHV 4.35 V, and 0.1 V for the sensor), lowest
 # without damage (a lead-acid cell has 2.1 V), and lowest at the beginning of a flight.
 HIGHEST_CELL, LOWEST_CELL, _BEGINS = 4.45, 2.5, 3.0
-# Between a full cell (4.2 V) and one stored half full (3.8 V).
+# Voltage at rest that a guess of the cells prefers, V: between full (4.2) and half full (3.8).
 _HALF = 4.0
-# Cells of usual packs of LiFePO4, and the plateau of such a cell at rest, V.
+# Cells of usual LiFePO4 packs, and the range of the plateau of such a cell at rest, V.
 _IRON_CELLS, _IRON = (4, 8, 12, 16), (3.2, 3.45)
 # Voltage of an empty lithium cell under load, V (vbat_min_cell_voltage of Betaflight, and the
-# default of design).
+# default of `design`).
 CELL_LIMIT = 3.3
 # Maximum voltage of a cell, V: above any charged lithium cell.
 _CELL_MOST = 5.0
@@ -59,9 +59,9 @@ KNOWN: dict[str, dict[str, tuple[float, float, float, float]]] = {
             'regbot_28': (3, 0.083, 0.0108, 0.174), 'regbot_30': (3, 0.058, 0.0079, NAN),
             'regbot_62': (3, 0.111, 0.0169, 0.415), 'regbot_81': (3, NAN, 0.0117, NAN),
             'frc_ol_1': (3, NAN, NAN, 0.0275)}}
-# Maximum cells of the known quads: the 24 V packs of robots look like 7 cells.
+# Maximum cells of the known quads; more are not compared, as the 24 V packs of robots look like 7.
 _MOST_CELLS = max(cells for cells, *_ in KNOWN[QUAD].values())
-# Cells of the class of robots, and formats that do not say what recorded them.
+# Cells of the class of robots, and formats that any vehicle may have recorded.
 _ROBOT_CELLS, _ANY_VEHICLE = 3, ('csv', 'mcap', '')
 _UNITS = {'sag': 'mV per cell at 50 % throttle', 'noise': 'mV rms per cell at 50 % throttle',
           'resistance': 'mOhm per cell'}
@@ -90,7 +90,7 @@ class Measure:
     kind: str  # Class that it is compared with
     name: str  # sag, noise or resistance
     value: float  # V, V or Ohm per cell
-    usual: tuple[float, float]  # Usual range, likewise
+    usual: tuple[float, float]  # Usual range, in the same unit
     verdict: str  # usual, high, low or unknown
     reason: str  # Likely reason; empty if usual
     remedy: str
@@ -107,7 +107,7 @@ class Craft:
     measures: tuple[Measure, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it as strict JSON holds it."""
+        """Return the craft as strict JSON."""
         return {'cells': self.cells or None, 'cells_from': self.cells_from,
                 'full_v': plain_data(self.full_v), 'class': self.kind or None, 'measures': [
                     {'class': one.kind, 'name': one.name, 'value': plain_data(one.value),
@@ -182,7 +182,7 @@ def stated_limit(source: Mapping[str, str]) -> tuple[int, float] | None:
 
 
 def craft_of(recording: Recording, facts: SupplyFacts, given: int = 0) -> Craft:
-    """Compare a supply with known crafts of its class, or of all classes that it may be of."""
+    """Compare a supply with known crafts of its class, or of all possible classes."""
     cells, source = cells_of(recording, given)
     kinds = [MICRO if cells == 1 else QUAD] if 0 < cells <= _MOST_CELLS else []
     if source == 'guessed' and cells == _ROBOT_CELLS and (
@@ -191,7 +191,7 @@ def craft_of(recording: Recording, facts: SupplyFacts, given: int = 0) -> Craft:
     if not kinds or not recording.has_throttle:
         return Craft(cells, source, full_voltage(recording), '', ())
     seen = bool(flown_near(recording, _AT, _NEAR)[0])
-    # Noise from changes that the load model does not follow does not mean a missing capacitor.
+    # Errors of the load model at changes of throttle count as noise, but need no capacitor.
     calm = float(np.interp(_AT, facts.noise.throttle, facts.noise.steady_rms_v)) / cells
     # Values and standard errors; the error of the noise is negligible.
     values = {
@@ -247,7 +247,7 @@ def craft_line(craft: Craft) -> str:
 
 def craft_advice(craft: Craft) -> list[str]:
     """Return a sentence for each measure that is high: the likely reason and a remedy."""
-    # If the number of cells is a guess, it may not be a pack at all.
+    # If the number of cells is a guess, the supply may not be a battery pack at all.
     if craft.cells_from == 'guessed':
         return []
     return [f'The {one.name} is {_USUAL * one.value / one.usual[1]:.1f} times the median of '

@@ -2,10 +2,10 @@
 Compare load levels: the change of sigma, and whether alpha is constant.
 
 The paper assumes the same alpha at every load.  The test is chi^2 of ln(alpha) about the weighted
-mean, with standard errors at the common alpha: they grow with 1/sqrt(alpha T), so a level whose
-alpha is high by chance would otherwise weigh too much.  Levels that one OU in white noise does not
+mean, with standard errors at the common alpha: they are proportional to 1/sqrt(alpha T), so a high
+alpha by chance would otherwise weigh too much.  Levels that one OU in white noise does not
 describe (more than one relaxation, or lines with impulses) are withheld, because their standard
-errors do not include this.  Limits: only levels with a usable fit count; weak spectral lines stay
+errors ignore the misfit.  Limits: only levels with a usable fit count; weak spectral lines stay
 in the fit; a test that does not reject proves nothing, so the detectable ratio is reported too.
 
 The tests have the significance level `LEVEL`, like the printed intervals.  Each level is fitted by
@@ -27,7 +27,7 @@ from scipy.special import chndtrinc
 
 # Significance level of a difference, and power of the test at `detectable_ratio`.
 LEVEL, POWER = 0.05, 0.9
-# Minimum factor of a change that matters: in most flights tau is not known better than that.
+# Minimum change that matters, as a factor: in most flights tau is not known more precisely.
 NARROW = 1.5
 
 
@@ -38,7 +38,7 @@ class AlphaTest:
     # ``differs``, ``constant`` (the test would have detected a change by `NARROW`) or
     # ``undetermined``.
     verdict: str
-    levels: int  # Levels that count
+    levels: int  # Number of levels in the test
     # Common alpha, 1/s, and the standard error of its logarithm.
     alpha: float = NAN
     alpha_se: float = NAN
@@ -146,7 +146,7 @@ def at_common_alpha(logs: FloatArray, errors: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class SigmaChange:
-    """Sigma of one level over that of another."""
+    """Ratio of the sigmas of two levels."""
 
     # As fitted (NaN where it is not determined), and its 95 % interval.
     ratio: float

@@ -7,9 +7,9 @@ spectral lines, is fitted by the model that all commands share (`ou_monitor.mode
 
 Limits: a relaxation slower than half of a segment, or than 2.5 s, counts as drift of the level.
 
-The types of process are those of Table 1 of the paper, which names them by eye; here each has
-tests (`ou_monitor.analysis.level_tests`), adjusted so that, of a hundred recordings with
-stationary OU levels, only one has any rejection.  The first rule that applies names the level:
+The types of process are from Table 1 of the paper, which assigns them by eye.  Here tests decide
+(`ou_monitor.analysis.level_tests`), adjusted so that only one in a hundred recordings of
+stationary OU levels has any rejection.  The first rule that applies names the level:
 
 1. mean or intensity changes from block to block: 'quasi-stationary' (the
    verdict also names the type apart from these changes);
@@ -83,7 +83,7 @@ def detectable_kurtosis(n: int) -> float:
 
 @dataclass(frozen=True)
 class KindVerdict:
-    """What a level is called, and why."""
+    """Type of process of a level, and the reason."""
 
     kind: ProcessType
     why: str  # Reason without numbers, by which levels are grouped
@@ -145,7 +145,7 @@ def _apart_from_changes(estimate: Estimate, shape: Shape, line_share: float) -> 
 
 
 def _gaussian(estimate: Estimate, shape: Shape, line_share: float, normal: str) -> KindVerdict:
-    """Return the type of a level whose shape no test rejects as Gaussian."""
+    """Return the type of a level whose distribution no test distinguishes from a normal one."""
     correlated = shape['correlated']
     if not correlated.rejects:
         return _plain(ProcessType.GAUSSIAN, 'neighbouring samples are uncorrelated', normal)
@@ -218,7 +218,7 @@ class LevelSpectrum:
 def level_spectrum(recording: Recording, segments: Sequence[LevelSegment],
                    estimate: Estimate) -> LevelSpectrum:
     """Return the PSD of a level (Welch, Hann), averaged over its segments."""
-    # Samples are taken as evenly spaced; if not, it is smeared near the Nyquist frequency.
+    # Samples are taken as evenly spaced; uneven ones smear the PSD near the Nyquist frequency.
     longest = max((s.stop - s.start for s in segments), default=0)
     rate = segment_rate(recording, segments)
     if longest < _MIN_LENGTH or not rate > 0.0:
@@ -233,8 +233,8 @@ def level_spectrum(recording: Recording, segments: Sequence[LevelSegment],
             frequency, density = welch(recording.voltage[s.start:s.stop], fs=rate,
                                        nperseg=length, detrend='constant')
             summed, weight = summed + n * density, weight + n
-    # Without the first bin, which the removal of the mean distorts, and the last, at the Nyquist
-    # frequency, which is not doubled like the others.
+    # Without the first two bins, which the removal of the mean distorts, and the last, at the
+    # Nyquist frequency, which is not doubled like the others.
     frequency, density = even_on_log(frequency[2:-1], summed[2:-1] / weight, _PER_DECADE)
     fitted = np.full(frequency.size, math.nan)
     if estimate.usable:
@@ -278,7 +278,7 @@ _WANDERS = 0.5
 
 
 def mean_variance(time: float, n: int, estimate: Estimate, rms: float) -> float:
-    """Return the variance of the mean of a segment of OU in white noise, V^2 (s, rms in V)."""
+    """Return the variance of the mean of a segment of OU in white noise, V^2 (in s and V)."""
     if not estimate.usable:
         return rms * rms / max(n, 1)
     at = max(estimate.alpha * time, 1e-9)
@@ -334,8 +334,8 @@ class LevelResult:
     peak: float
     vrms: float
     deviation: FloatArray  # That deviation, V; shape (n,)
-    ou: OuFacts  # Relaxation without level, load and lines, or its bounds
-    estimate: Estimate  # The same as the node reports it
+    ou: OuFacts  # Fitted relaxation (level, load and lines removed), or bounds on it
+    estimate: Estimate  # The same fit in the form that the node reports
     shape: Shape  # Tests of the type of process, adjusted over all levels
     verdict: KindVerdict = KindVerdict(ProcessType.UNDETERMINED, 'not judged')
     spectrum: LevelSpectrum = field(default_factory=LevelSpectrum)
@@ -368,7 +368,7 @@ class LevelResult:
         return self.vpp / self.vrms if self.vrms > 0.0 else NAN
 
     def density(self) -> tuple[FloatArray, FloatArray]:
-        """Return edges and density of the deviation over Vrms; empty with too few samples."""
+        """Return histogram edges and density of deviation/Vrms; empty with too few samples."""
         if self.n < _LEAST_BINNED or not self.vrms > 0.0:
             return np.zeros(0), np.zeros(0)
         z = self.deviation / self.vrms
@@ -438,7 +438,7 @@ def fit_all(recording: Recording, left: Remainder, levels: Sequence[LoadLevel]) 
 
 
 def _known_parts(segment: LevelSegment, voltage: FloatArray) -> list[LevelSegment]:
-    """Return the parts of a segment without gaps, for which the remainder is known."""
+    """Return the parts of a segment without gaps, in which the remainder is not NaN."""
     known = np.isfinite(voltage[segment.start:segment.stop])
     turns = np.flatnonzero(np.diff(known, prepend=False, append=False)) + segment.start
     return [LevelSegment(a, b)
@@ -458,7 +458,7 @@ def _white(t: FloatArray, voltage: FloatArray, estimate: Estimate) -> FloatArray
 
 
 def _grid_rate(grids: Sequence[EvenGrid]) -> float:
-    """Return the rate of the clock of segments, Hz; 0 if they have no duration."""
+    """Return the mean rate of the grids, Hz; 0 if they have no duration."""
     steps = sum(grid.values.size - 1 for grid in grids)
     time = sum((grid.values.size - 1) / grid.rate for grid in grids)
     return steps / time if time > 0.0 else 0.0

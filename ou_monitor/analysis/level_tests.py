@@ -5,7 +5,7 @@ Each test works on the one-step innovations of the fitted model, which are indep
 normal if the level is a stationary OU in white noise:
 
 =============  ========================================================================
-mean_drift     means of blocks of innovations, F test that includes the error of alpha
+mean_drift     means of blocks of innovations, F test that includes the errors of the fit
 variance_drift Layard's test of equal variances of blocks (J. Am. Stat. Assoc. 68, 1973),
                which is robust against heavy tails
 gaussian       D'Agostino & Pearson's K^2 of skewness and kurtosis, of innovations over
@@ -16,7 +16,7 @@ correlated     lags 1..5 of the deviation, with variances robust against changin
                intensity (Lo & MacKinlay, Rev. Financ. Stud. 1, 1988)
 one_relaxation lags 1..10 of the innovations, likewise
 second_relaxation
-               `ou_monitor.criticism.innovations`, in their periodogram
+               periodogram of the innovations (`ou_monitor.criticism.innovations`)
 =============  ========================================================================
 
 A rejection counts only if the effect is large enough to matter: with 10^5 samples, even a change
@@ -102,7 +102,7 @@ class Shape:
 
 def examine_level(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Estimate,
                   above: float = 0.0) -> Shape:
-    """Test one level (parts: stamps, s, and V); noise slower than `above`, Hz, was removed."""
+    """Test one level (parts: stamps, s, and V); noise below `above`, Hz, was removed."""
     parts = [(t, v) for t, v in parts if t.size >= 2]
     n = sum(t.size for t, _ in parts)
     time = sum(float(t[-1] - t[0]) for t, _ in parts)
@@ -192,8 +192,8 @@ def _mean_drift(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Estima
             f'fewer than three blocks of {_MEAN_BLOCK:g} relaxation times'))
     centre = float(total.mean())
     z = join([innovations(t, v - centre, alpha, var_inf, noise_var) for t, v in parts])
-    # A constant voltage gives constant innovations.  Leave out the first of each part, which has
-    # no past.
+    # A shift of the voltage shifts all innovations equally, except the first of each part, which
+    # has no past and is left out.
     ends = np.cumsum([t.size for t, _ in parts])[:-1]
     z = np.delete(z, np.concatenate(([0], ends)).astype(np.intp))
     pieces = np.array_split(z, blocks)
@@ -224,7 +224,7 @@ def _mean_drift(parts: Sequence[tuple[FloatArray, FloatArray]], estimate: Estima
 
 def _constant_gain(parts: Sequence[tuple[FloatArray, FloatArray]], alpha: float, var_inf: float,
                    noise_var: float) -> float:
-    """Return the innovation to which a constant input settles, 1/V."""
+    """Return the innovation, per V, that a constant input settles to, 1/V."""
     t = max((t for t, _ in parts), key=len)
     step = float(np.median(np.diff(t)))
     steady: FloatArray = step * np.arange(float(max(64, t.size)))

@@ -1,9 +1,9 @@
 """
-Noise of a recording, by one regression of the voltage on level, throttle and current; and dips.
+Noise of a recording, by regression of the voltage on level, throttle and current; and dips.
 
-Noise is the residual of that regression (`ou_monitor.model.ou_fit`), in parts of a minute.  A dip
-ends when a reading is above the limit by more than that noise at steady throttle, or than a step
-of the ADC: every command counts dips so.
+Noise is the residual of that regression (`ou_monitor.model.ou_fit`), fitted minute by minute.  In
+all commands, a dip ends when a reading exceeds the limit by more than a hysteresis: the noise at
+steady throttle or the step of the ADC, whichever is larger.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _PART, _IN_PART = 60.0, 200
 _LATE = 0.06
 # Maximum range of a steady throttle, and the time over which it is taken, s.
 _STEADY, _STEADY_TIME = 0.02, 0.2
-# Maximum share of single readings that are wild; more are noise.
+# Maximum share of readings that are left out as outliers ("wild"); if there are more, none are.
 _WILD = 0.01
 # Half width of the band of throttle about each of THROTTLES; minimum readings in it.
 BAND, _IN_BAND = 0.05, 10
@@ -41,7 +41,7 @@ _IN_TIME, _IN_SHARE = 0.5, 0.02
 
 @dataclass(frozen=True)
 class Noise:
-    """Rms of what the load does not explain, over throttle."""
+    """Rms of the voltage that the load does not explain, over throttle."""
 
     throttle: tuple[float, ...]  # 0..1
     rms_v: tuple[float, ...]  # in flight, including changes of throttle, V
@@ -94,7 +94,7 @@ class Remainder:
     dt: float  # median step, s
     walk: float  # median random walk of the level, V/sqrt(s)
     above: float = 0.0  # lowest frequency that the level has not absorbed, Hz
-    absorbed: FloatArray | None = None  # ordinates that the regressions took, per reading
+    absorbed: FloatArray | None = None  # `absorbed_by` of the regressions, per reading
 
 
 def remainder(recording: Recording) -> Remainder:
@@ -125,7 +125,7 @@ def remainder(recording: Recording) -> Remainder:
 
 
 def without_wild(recording: Recording, left: Remainder) -> tuple[Recording, Remainder]:
-    """Return a recording without single readings far from level and load, and its remainder."""
+    """Return a recording without outliers from level and load, and its remainder."""
     known = np.flatnonzero(np.isfinite(left.voltage))
     wild = known[find_bad(left.voltage[known], int(_WILD * known.size))]
     if not wild.size:
@@ -185,7 +185,7 @@ def _needed_readings(recording: Recording) -> float:
 
 def _over_throttle(u: FloatArray, square: FloatArray, enough: float,
                    beyond: float | None = None) -> tuple[float, ...]:
-    """Return rms, V, at THROTTLES: measured, else interpolated; beyond those measured constant."""
+    """Return rms, V, interpolated at THROTTLES; outside the measured, `beyond` or the nearest."""
     at, rms = [], []
     for throttle in THROTTLES:
         near = np.abs(u - throttle) <= BAND

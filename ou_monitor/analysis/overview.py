@@ -23,7 +23,7 @@ from ou_monitor.text import counted, number, percent, volts
 
 # Minimum ratio of the fitted noise between the ends of throttle that is reported as a trend.
 _GROWS = 1.25
-# Minimum share of a recording in its only level that stands for the whole (our choice).
+# Minimum share of a recording that its only level must cover to stand for the whole (our choice).
 _WHOLE = 0.9
 # Minimum noise, V; less is rounding.
 _NOTHING = 1e-9
@@ -42,7 +42,7 @@ class LoudestLine:
     # Number of lines of that level, and their total share.
     lines: int
     all_share: float
-    fundamental: float  # Of which most of these lines are multiples, Hz; NaN: of none
+    fundamental: float  # Frequency of which most are multiples, Hz; NaN if there is none
 
 
 @dataclass(frozen=True)
@@ -56,14 +56,14 @@ class Overview:
     # Lowest and highest index of THROTTLES near which there are enough readings.
     flown: tuple[int, int]
     drawn: float = NAN  # Largest current, A, after a median of three readings; NaN without one
-    # Ratio of the noise at the highest throttle flown to that at the lowest, from all between.
+    # Noise at the highest over noise at the lowest throttle flown, from a fit to all throttles.
     growth: float = 1.0
     step: float = 0.0  # Median time between readings, s
     line: LoudestLine | None = None  # Strongest spectral line
     cells: int = 0  # Cells in series to which the limit refers; 0: none
     end: MonitorReport | None = None  # Report of the node at the end; None without a limit
-    # Fit of a whole recording of one stationary level, if it is known better than in the window of
-    # `facts.ou` and agrees with it.
+    # Fit of the whole recording, if that is one stationary level, and if the fit is more precise
+    # than `facts.ou` and agrees with it.
     whole: OuFacts | None = None
 
     @property
@@ -89,7 +89,7 @@ def overview(recording: Recording, limit: float | None = None,
              levels: Sequence[LevelResult] = (), cells: int = 0,
              left: Remainder | None = None, monitor: SupplyMonitor | None = None) -> Overview:
     """Return the facts (limit in V for `cells` in series; left, monitor: see `facts_and_end`)."""
-    # levels: the source of lines.
+    # levels: for spectral lines, and for the fit of the whole recording.
     facts, load, end = facts_and_end(recording, limit, left, monitor)
     known = recording.throttle[np.isfinite(recording.throttle)]
     near = np.flatnonzero(flown_near(recording, THROTTLES)).tolist() or [0]
@@ -222,7 +222,7 @@ def _dips(found: Overview, below: float = NAN) -> str:
 
 def determined(found: Overview, k: int, flown: bool = True) -> bool:
     """Return whether the sag at a throttle of THROTTLES is larger than its 95 % error."""
-    # Where it was not flown, the sag at the highest throttle flown must be, too.
+    # At a throttle that was not flown, also require it of the sag at the highest throttle flown.
     sag, se = found.facts.sag.sag_v, found.facts.sag.se_v
     return all(sag[i] > 2.0 * se[i] for i in (k, k if flown else found.flown[1]))
 

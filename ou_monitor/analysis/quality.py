@@ -50,7 +50,7 @@ class QualityItem:
 
 def quality_list(recording: Recording, throttles: Sequence[float], estimates: Sequence[Estimate],
                  more: Sequence[QualityItem] = (), known: bool = False) -> tuple[QualityItem, ...]:
-    """Return all cautions, worst first (known: the facts have alpha)."""
+    """Return all cautions, worst first (known: alpha of the whole recording is determined)."""
     found: dict[tuple[str, Severity, str], list[float]] = {}
     for throttle, estimate in zip(throttles, estimates):
         for doubt in _fit_doubts(estimate, known):

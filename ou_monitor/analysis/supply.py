@@ -1,14 +1,14 @@
 """
 Compute the facts that all commands report (sag, noise, dips, resistance, OU): `supply_facts`.
 
-Sag, resistance and budget are the node's at the end of the recording.  Noise, alpha, sigma and
-Var_inf come from one regression of the voltage on level, throttle and current
-(`ou_monitor.model.ou_fit`): noise is its residual; alpha, sigma and Var_inf come from the shortest
-window at the end of the recording in which alpha is known within a factor of 1.5, else from the
-longest.
+Sag, resistance and budget are the node's values at the end of the recording.  Noise, alpha, sigma
+and Var_inf come from regressions of the voltage on level, throttle and current
+(`ou_monitor.model.ou_fit`): noise is their residual; alpha, sigma and Var_inf come from the
+shortest window at the end of the recording in which alpha is known within a factor of 1.5, else
+from the longest.
 
-The limits of that fit and of the node's filter apply.  The filter takes most time: 1.6 CPU s for
-130 s at 200 Hz, and 4 s with a limit, for the budget.
+The limits of that fit and of the node's filter apply.  The filter takes most of the time: 1.6 CPU
+s for 130 s at 200 Hz; with a limit, the budget makes it 4 s.
 """
 
 from __future__ import annotations
@@ -67,9 +67,9 @@ class Dips:
 
 @dataclass(frozen=True)
 class Sag:
-    """Sag after a second at each throttle, at the end of the recording, positive."""
+    """Sag one second after a step to each throttle, positive, at the end of the recording."""
 
-    known: bool  # whether it is known over the throttles flown
+    known: bool  # whether the sag is known over the throttles flown
     flown: tuple[float, float]  # 1 % and 99 % quantile of throttle
     throttle: tuple[float, ...]  # 0..1
     sag_v: tuple[float, ...]  # V
@@ -176,8 +176,8 @@ def facts_and_end(recording: Recording, limit: float | None = None, left: Remain
                   monitor: SupplyMonitor | None = None,
                   ) -> tuple[SupplyFacts, SupplyLoad, MonitorReport | None]:
     """Return the facts, and the node's load and, with a limit, V, its report at the end."""
-    # left: `remainder` of the recording, wild readings included; monitor: of `node_for`, fed with
-    # it; both without the times off (`supplied`), and computed if omitted.
+    # left: `remainder` of the recording, outliers included; monitor: from `node_for`, fed with the
+    # recording.  Both cover only times with power (`supplied`), and are computed if omitted.
     if limit is not None and not math.isfinite(limit):
         raise ValueError(f'the limit must be finite, got {limit} V')
     if left is None and recording.n > 1:
@@ -223,7 +223,7 @@ def node_for(recording: Recording, settings: MonitorSettings,
 
 def fed(recording: Recording, window: float, push: Callable[[slice], None],
         ) -> Iterator[tuple[float, bool]]:
-    """Push a recording part by part; yield the time, s, and whether it is one of `_POINTS`."""
+    """Push a recording in parts; yield the time, s, and whether it is one of `_POINTS` shown."""
     t, duration, done = recording.t, recording.duration, 0
     step = max(0.25 * window, duration / _POINTS)
     each = max(1, min(math.ceil(step / _STEP), _MOST // _POINTS))

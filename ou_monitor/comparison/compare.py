@@ -23,12 +23,12 @@ from ou_monitor.model.supply import SupplyModel
 from ou_monitor.records import FloatArray, Recording
 from ou_monitor.text import counted, number, percent
 
-# Minimum readings and duration, s, of a part; minimum simulations (with so few, 5 % of good models
-# are refused) and maximum.
+# Minimum readings and duration, s, of a part; minimum number of simulations (at which 5 % of good
+# models are rejected), and maximum.
 _LEAST, _SHORTEST, _FEWEST_SEEDS, _MOST_SEEDS = 50, 0.2, 20, 10_000
 # Maximum points of the band on a page.
 _POINTS = 2000
-# Least probability of the other kind of level that is reported.
+# Minimum probability of the other kind of level (constant or falling) to be reported.
 _UNSURE = 0.05
 # Time at the beginning over which a model from a file is aligned with the recording, s.
 _ALIGNED = 2.0
@@ -38,7 +38,7 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
             fit_until: float | None = None, seeds: int = 50, seed: int = 0,
             levels: tuple[float, ...] = (),
             progress: Callable[[float], None] | None = None) -> Agreement:
-    """Compare a recording with simulations: see `ou_monitor.compare` (levels of falls: V)."""
+    """Compare a recording with simulations: see `ou_monitor.compare` (levels of dips: V)."""
     report = progress or (lambda share: None)
     if not _FEWEST_SEEDS <= seeds <= _MOST_SEEDS:
         raise ValueError(f'seeds must lie within {_FEWEST_SEEDS} to {_MOST_SEEDS}, got {seeds}')
@@ -142,8 +142,8 @@ def _fit_notes(model: FlightModel, samples: Readings) -> list[str]:
             found.append('No discharge is visible, so the level is constant.')
         if model.doubt > _UNSURE:
             falls = math.isnan(model.load.model.constant_level)
-            found.append(f'Whether the level {"stands" if falls else "falls"} is open: it does in '
-                         f'{percent(model.doubt)} of the simulations.')
+            found.append(f'The level may {"be constant" if falls else "fall"} instead: it does so '
+                         f'in {percent(model.doubt)} of the simulations.')
         return found
     if samples.current is None and samples.throttle is None:
         return ['Throttle is not recorded: only level and noise are simulated.']

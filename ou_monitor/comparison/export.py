@@ -46,7 +46,7 @@ _SEEDS = 20  # Simulations of each model
 class Export:
     """A model for another simulator."""
 
-    text: str  # What that simulator reads
+    text: str  # Parameters in the format of that simulator
     notes: tuple[str, ...]  # A line for each term that it cannot express, with the term's effect
     model: SupplyModel  # The part that it can simulate, as a model
 
@@ -198,7 +198,7 @@ def _omitted_terms(model: SupplyModel, target: str, throttle: FloatArray, rate: 
             continue
         rest = (replace(model.ou, sigma=0.0), *model.terms[1:]) if k == 0 else (
             *model.terms[:k], *model.terms[k + 1:])
-        # A term's draws do not depend on other terms, so the difference is its effect.
+        # The random draws of a term do not depend on other terms: the difference is its effect.
         moved = whole - _simulated(SupplyModel(rest, model.load), throttle, rate)
         notes.append(f'{term.NAME} is left out: {1e3 * float(np.std(moved)):.3g} mV rms, up to '
                      f'{1e3 * float(np.abs(moved).max()):.3g} mV')

@@ -1,12 +1,12 @@
 """
 A model of one flight, fitted to a part of it, that can be simulated over any throttle.
 
-First the load is fitted, if it improves predictions, then the residual: an OU in white noise; the
-size of both follows the load and its changes (`model.ou_fit`).
+The load is fitted first, and kept if it has clearly more evidence than a level alone.  The
+residual is an OU in white noise; the size of both follows the load and its changes (`NoiseSize`).
 
 Limits: errors come from four held-out parts, so a lasting change after the fitted part is not
-covered; all correlated noise is described by one OU, whose size follows the load as the white
-noise's does; readings are taken as evenly spaced.
+covered; one OU describes all correlated noise, and its size and the size of the white noise follow
+the load in the same way; readings are taken as evenly spaced.
 """
 
 from __future__ import annotations
@@ -88,8 +88,8 @@ class Damping:
         return np.asarray(path - self.share * (path - lowpass(path, t, self.time)))
 
 
-# Errors are drawn from the readings of most similar noise size: share of all readings taken above
-# and below that size, and their minimum number; tolerance for sizes that count as equal.
+# Errors are drawn from readings of similar noise size: share of all readings taken on either side,
+# and their minimum number; difference of ln(size) up to which sizes are equal.
 _ALIKE, _FEWEST, _ROUNDING = 0.02, 50, 1e-9
 # Minimum share of white noise in the variance, which the filter needs.
 _LEAST_WHITE = 1e-3
@@ -101,7 +101,7 @@ class FlightNoise:
 
     sizes: NoiseSize  # Size of the errors over the load and its changes
     logs: FloatArray  # ln of the size, V, at the readings of the fit, increasing; shape (n,)
-    errors: FloatArray  # Errors there, V, from which errors are drawn; shape (n,)
+    errors: FloatArray  # Errors at these readings, V, for simulations to draw; shape (n,)
     # Autoregressive and moving-average coefficient of the filter; 0 if no OU is visible.
     phi: float
     theta: float
@@ -118,7 +118,7 @@ class FlightNoise:
         most = self.errors.size - 1
         reach = min(max(_FEWEST, int(_ALIKE * self.errors.size)), most // 2)
         near = np.clip(at, reach, most - reach) + rng.integers(-reach, reach + 1, at.size)
-        # Not scaled, so that an outlier at low noise does not become a larger one at high noise.
+        # Errors are not scaled: an outlier at low noise would become a larger one at high noise.
         return np.asarray(lfilter([1.0, -self.theta], [1.0, -self.phi], self.errors[near]))
 
     def mean_error(self, duration: float) -> float:
@@ -296,7 +296,7 @@ def fit_flight(samples: Readings, report: Callable[[float], None]) -> FlightMode
 
 @dataclass(frozen=True, eq=False)
 class _Load:
-    """A load, its fit, and for each part the fit to the other parts and its errors there, V."""
+    """A load, its fit, and for each part a fit to the others, with its errors in that part, V."""
 
     fit: LoadFit
     current: FloatArray | None
@@ -307,7 +307,7 @@ class _Load:
 
 
 def _best(samples: Readings, report: Callable[[float], None]) -> _Load | None:
-    """Return the load with most evidence, with both kinds of level; None if none has any."""
+    """Return the load with most evidence; None if none has clearly more than a level alone."""
     found: _Load | None = None
     most = level_evidence(samples.t, samples.voltage)
     # The simpler one first: throttle before current.
@@ -325,7 +325,7 @@ def _best(samples: Readings, report: Callable[[float], None]) -> _Load | None:
 
 
 def _loads(samples: Readings) -> list[FloatArray | None]:
-    """Return the loads to try, those that change: throttle (None), and current."""
+    """Return the loads that change: throttle (as None), and current."""
     found: list[FloatArray | None] = []
     if samples.throttle is not None and np.ptp(samples.throttle) >= MOVES:
         found.append(None)
@@ -376,7 +376,7 @@ def damping(samples: Readings, path: FloatArray) -> Damping:
 
 
 def _sag_error(samples: Readings, load: _Load) -> float:
-    """Return the relative error of the sag, for a mean over two held-out parts."""
+    """Return the relative error of the mean sag of two held-out parts."""
     # In each held-out part, the voltage is regressed on the predicted path; parts that move more
     # have more weight.  Temperature, wind and simplifications of the load model change the ratio.
     squares, weights = [], []

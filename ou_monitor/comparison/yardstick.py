@@ -1,14 +1,14 @@
 """
 Compare a recording with simulations of it: measures, records, verdict.
 
-Levels lie halfway between two codes of the ADC, so that no reading equals a level.  Falls through
-a level are counted as dips are in `supply_facts`, with hysteresis.
+Voltage levels lie halfway between two codes of the ADC, so that no reading equals a level.  Dips
+below a level are counted with hysteresis, as in `supply_facts`.
 
 The score of a number is its distance from the median, in half-widths of a band that is estimated
 from the simulations and the recording; the half-width is at least a difference that a pilot would
-not notice.  The largest weighted score is ranked among those of the simulations.  Of recordings
-that follow the model, at most 2 % are called different by this rank, and 5 % because their level
-is outside its band.
+not notice.  The largest weighted score is ranked among the largest scores of the simulations.  Of
+recordings that follow the model, at most 2 % are called different by this rank, and 5 % because
+their mean voltage is outside its band.
 """
 
 from __future__ import annotations
@@ -115,17 +115,17 @@ class Agreement:
     lowest: Band
     mean: Band
     levels: tuple[float, ...]  # Levels, V
-    dips: tuple[Band, ...]  # Dips below each per minute
+    dips: tuple[Band, ...]  # Dips below each level per minute
     spectrum: tuple[SpectrumBand, ...]  # By band of frequency
     line: SpectrumBand | None  # About the strongest spectral line of the recording, if any
     # Deepest fall of the mean response to rises of throttle, and its value 1 s after, V.
     fall: Band | None
     recovery: Band | None
     rises: int  # Rises of throttle
-    # Largest difference of the distribution from that of all simulations.
+    # Largest difference (KS) from the joint distribution of all simulations.
     apart: Band
     seeds: int  # Simulations
-    p_value: float  # Share of simulations, recording included, with a score as large
+    p_value: float  # Share of simulations and recording with at least the recording's score
     verdict: Likeness
     words: str  # The largest difference, as a part of a sentence
     farthest: str  # Kind of that difference: a key of _WEIGHTS, or path
@@ -221,14 +221,14 @@ class Yardstick:
         self._segment = int(min(v.size, max(64, min(_SEGMENT * self._rate, v.size / 4))))
         lowest, highest = self._rate / self._segment, 0.5 * self._rate
         self.bands = np.geomspace(lowest, highest, _BANDS + 1)
-        # Of what level and load leave; the differences have a flatter spectrum.
+        # Search the residual of level and load; its differences have a flatter spectrum.
         rest = np.nan_to_num(left.voltage)
         found = find_lines([rest], self._rate, white=[np.diff(rest, prepend=0.0)]).lines
         self.line = max(found, key=lambda line: line.rms, default=None)
         self.rises = _rise_times(t, samples.throttle)
         self.after = np.linspace(-_BEFORE, _AFTER, _POINTS)
         reach = 0.5 * (float(v.max()) - float(v.min())) + 10.0 * lsb
-        # Of the distribution, V.
+        # Edges of the bins of the distribution, V.
         self.edges = np.linspace(v.min() - reach, v.max() + reach, _BINS)
 
     def measure(self, v: FloatArray) -> Measures:
@@ -280,8 +280,8 @@ def _rise_times(t: FloatArray, throttle: FloatArray | None) -> npt.NDArray[np.fl
     return np.array(found)
 
 
-# Probability of a false `DIFFERS` by the largest score; of fewer than 49 simulations, the score
-# must exceed all.  At 5 %, one good model in twenty was refused.
+# Probability of a false `DIFFERS` by the largest score; with fewer than 49 simulations, the score
+# must exceed all of theirs.
 LEVEL = 0.02
 # Importance for a pilot, relative to the lowest voltage and the number of dips.
 _WEIGHTS = {'lowest': 1.0, 'dips': 1.0, 'level': 0.8, 'answer': 0.8, 'line': 0.8,
@@ -312,8 +312,8 @@ class Difference:
 
     def scores(self) -> FloatArray:
         """Return the weighted scores: of the recording, then of each simulation."""
-        # The scale includes the recording like each simulation; otherwise it would be the farthest
-        # too often.
+        # The scale includes the recording like each simulation; otherwise the recording would have
+        # the largest score too often.
         off = np.append(self.measured, self.simulated)
         off -= np.median(off)
         up, down = (Z95 * math.sqrt(float(np.mean(side ** 2))) if side.size else 0.0
@@ -330,14 +330,14 @@ class Difference:
 
 def band(measured: float, simulated: FloatArray) -> Band:
     """Return a number of the recording with the band of the simulations, shape (seeds,)."""
-    # In 95 % of cases a further simulation lies within these; by NumPy's default, of 50, in 91 %.
+    # 95 % of further simulations lie within these (91 % by NumPy's default method, from 50).
     low, median, high = np.percentile(simulated, [_LOW, 50.0, _HIGH], method='weibull').tolist()
     return Band(measured, low, median, high)
 
 
 def differences(yardstick: Yardstick, own: Measures, others: Sequence[Measures],
                 spread: float, bias: Sequence[float]) -> list[Difference]:
-    """Return all numbers that are judged; V: range of the voltage, bias of the path by third."""
+    """Return the judged numbers (spread: range of the voltage; bias: of the path by third; V)."""
     volts = max(_RANGE * spread, 1e-12)
 
     def of(pick: Callable[[Measures], float]) -> FloatArray:

@@ -1,7 +1,7 @@
 """
 Effects of the ADC on the readings: steps, clipping, repeats.
 
-Ties have probability zero in a diffusion, so they need no model.
+Ties (equal neighbours) have probability zero in a diffusion, so these effects need no model.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ _SHARE, _NEAR = 0.99, 0.1
 # code); minimum number of gaps between codes; numbers of decimals tried.
 _SPARSE, _FEWEST_CODES = 2.0, 4
 _DECIMALS = range(7)
-# Minimum number of equal changes, because without codes no two are equal.
+# Minimum number of equal changes in `usual_change`: without ADC codes no two are equal.
 _AGAIN = 20
 # Clipping: minimum samples at the limit, visits to it, and excess over neighbouring codes in
 # standard errors.
 _LEAST, _VISITS, _CLEAR = 8, 3, 5.0
 # Maximum number of codes by which noise added after clipping raises a reading.
 _LIFTED = 2
-# Step, in standard deviations of the noise, up to which counts of neighbouring codes follow a
-# density.
+# Maximum step, in standard deviations of the noise, at which the counts of neighbouring codes
+# follow a smooth density.
 _COARSE = 2.0
-# Number of throttle ranges, each with its own noise; throttle above the lowest that is still idle.
+# Number of throttle ranges, each with its own noise; maximum throttle at idle, above the lowest.
 _LOADS, _STILL = 8, 0.01
 
 
@@ -88,7 +88,7 @@ def _unprinted(codes: FloatArray, gaps: FloatArray, weight: FloatArray) -> float
 
 def _refine_step(codes: FloatArray, gaps: FloatArray, weight: FloatArray, first: float,
                  near: float = 0.0) -> float:
-    """Return the step near `first` that fits the codes to `near`, V; 0 if none does."""
+    """Return the step near `first` that fits the codes within `near`, V; 0 if none does."""
     step = float(gaps[gaps < 1.5 * first].mean())
     number = np.concatenate(([0.0], np.cumsum(np.rint(gaps / step))))
     middle = float(weight @ number) / float(weight.sum())
@@ -186,8 +186,8 @@ def _clipping_limit(x: FloatArray, step: float, noisy: npt.NDArray[np.bool_]) ->
     return math.inf
 
 
-# Minimum number of repeats, or of runs of repeats; chance of a tie up to which the size of the
-# changes predicts the number of ties.
+# Minimum number of repeats, or of runs of repeats; maximum probability of a tie at which the size
+# of the changes predicts the number of ties.
 _FEWEST_TIES, _FINE = 20, 0.15
 # Lags at which equal values are counted (lag 8 still detects that seven of ten samples are held),
 # and longer lags, at which the period of a line is sought.
@@ -196,7 +196,7 @@ _APART, _PERIODS = (2, 4, 8), range(9, 101)
 _CALMEST = 100.0
 # Minimum excess of ties, and maximum deficit of the changes at the ends of runs, standard errors.
 _CLEARLY, _SHORT = 6.0, 3.0
-# Share at either end of the range where a limit may hold readings.
+# Share of the readings at either end of the range, whose runs may come from clipping.
 _END = 0.1
 # Maximum samples used to find repeats.
 _EXAMINED = 200_000
@@ -244,7 +244,7 @@ def _has_excess_ties(v: FloatArray) -> bool:
 
 
 def _code_step(v: FloatArray) -> float:
-    """Return the step between codes, at least that of floats, V."""
+    """Return the step between codes, at least the resolution of float32, V."""
     return max(find_step(v), usual_change(v), 0.5 * _FLOAT32 * float(np.abs(v).max()))
 
 
@@ -261,8 +261,8 @@ def _ties_of_codes(moved: FloatArray, code: float) -> tuple[float, float]:
 
 def _in_long_runs(v: FloatArray) -> npt.NDArray[np.bool_]:
     """Return which samples (from the second on) belong to runs of repeats too long for chance."""
-    # A calm rail enters and leaves a run with a change of about one code.  A lost link stops
-    # between ordinary changes, and the voltage has moved further when the link is back.
+    # A quiet rail enters and leaves a run with a change of about one code.  With a lost link, the
+    # change before the run is of ordinary size, and the change after it is larger.
     step = np.diff(v)
     none = np.zeros(step.size, dtype=np.bool_)
     equal = (step == 0.0) & (v[1:] > v.min()) & (v[1:] < v.max())
@@ -287,7 +287,7 @@ def _in_long_runs(v: FloatArray) -> npt.NDArray[np.bool_]:
         return none
     usual = 0.5 - _SHORT / math.sqrt(12.0 * begins.size)
     if 0.5 * float(np.mean(size < 1.25 * code)) > usual:
-        # A change by one code is not small here.
+        # Most changes are by one code, so they do not tell a quiet rail from a lost link.
         return none
     for ending in (np.abs(step[begins - 1]), np.abs(step[ends])):
         rank = (np.searchsorted(size, ending - 0.25 * code)

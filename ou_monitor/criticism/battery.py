@@ -4,7 +4,7 @@ Test statistics of a model's scores: each is about standard normal if the model 
 Mean and spread of each come from a `NullBank`: simulations of the fitted baseline with the stamps
 and throttle of the data, fitted and evaluated in the same way.  Two kinds use theory instead:
 lines that follow throttle, because simulating them takes too long, and errors after large ones.
-A name begins with its kind, to which the `SIGNS` of terms refer.
+The name of a statistic begins with its kind, to which the `SIGNS` of terms refer.
 
 Three kinds of statistics belong to no term: loops of throttle, a growing effect of throttle, and
 errors after large ones.  They expose effects that imitate a term but have hysteresis, develop over
@@ -40,11 +40,11 @@ _CLUSTERS = (0.02, 0.1, 0.5, 2.5, 8.0)
 _SEGMENTS, _TRIPLES = (32, 128, 512), 10
 # Quantiles of throttle at which a relay (hysteresis) switches down and up.
 _RELAYS = ((0.15, 0.85), (0.28, 0.72), (0.4, 0.6))
-# Minimum share of a regressor's power that must remain beside the static response to throttle.
+# Minimum share of a regressor's power that the static response to throttle leaves unexplained.
 _LEAST = 0.02
 # Minimum size of a large error, standard deviations; minimum distance between two, samples.
 _LARGE, _APART = 4.0, 20
-# Minimum number of large errors.
+# Minimum number of large errors for statistics of the errors after them.
 _FEW = 5
 # Edges of the groups of samples after a large error.
 _AFTER = (1, 4, 16, 64, 256, 1024)
@@ -229,7 +229,7 @@ def _state(w: FloatArray, square: FloatArray, given: Covariates) -> Iterator[tup
 
 
 def _beyond_second_order(w: FloatArray, given: Covariates) -> Iterator[tuple[str, float]]:
-    """Yield statistics beyond second order: power that comes and goes, and products of three."""
+    """Yield statistics beyond second order: bursts of power, and products of three errors."""
     n = w.size
     for length in _SEGMENTS:
         count = n // length
@@ -341,9 +341,9 @@ def covariates_of(samples: Samples, composite: Composite) -> Covariates:
 
 # Number of simulated recordings.
 SIZE = 24
-# Weight, in recordings, of the theoretical spread of 1 in the estimated spread.
+# Weight, in recordings, of the theoretical mean 0 and spread 1 in the estimated ones.
 _PRIOR = 24.0
-# Degrees of freedom of a score divided by that spread: if the m draws have weight w, the squared
+# Degrees of freedom of a score divided by its spread: if the m draws have weight w, the squared
 # spread has variance w^2 2/(m - 1), like a chi square with (m - 1)/w^2 degrees.  Of 8700 plain OU
 # recordings (2000 to 6000 samples, five throttles and rates), 0.89 % have a family-wise p below
 # 1 %, and 0.14 % below 0.1 %; with the normal distribution, 1.52 and 0.31 % do.
@@ -370,7 +370,7 @@ def criticise(samples: Samples, composite: Composite, bank: NullBank) -> dict[st
 
 def simulate_bank(given: Covariates, phi: float, rng: np.random.Generator, size: int = SIZE
                   ) -> NullBank:
-    """Simulate the bank of the plain OU."""
+    """Simulate the null distributions of the statistics for a plain OU."""
     rows = []
     n = given.at.size
     for _ in range(size):
@@ -382,7 +382,7 @@ def simulate_bank(given: Covariates, phi: float, rng: np.random.Generator, size:
 
 def simulate_bank_of(samples: Samples, composite: Composite, rng: np.random.Generator,
                      size: int = SIZE) -> NullBank:
-    """Simulate the bank of a model with more terms than the `ou`."""
+    """Simulate the null distributions for a model with more terms than the `ou`."""
     # Needed if the step of the ADC is as large as the noise: then errors of the right model are
     # neither normal nor independent.
     model, rows, given = SupplyModel(composite.terms), [], covariates_of(samples, composite)

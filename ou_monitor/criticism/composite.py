@@ -21,7 +21,7 @@ from ou_monitor.records import FloatArray
 
 # Maximum rounds between laws and the Gaussian part.
 _ROUNDS = 3
-# Limits of a factor on the noise; convergence tolerance of its mean logarithm.
+# Limits of a factor on the noise; convergence tolerance of its mean change, in logarithms.
 _POWERS = 1e-3, 1e3
 _ALIKE = 0.03
 # Processor time of the fastest law with a `SLOW_FIT`, s per sample.
@@ -42,7 +42,7 @@ class Composite:
     free: int  # Number of free parameters
     search: float  # Penalty for searched alternatives, nats
     events: Events | None = None  # Events from the laws, used in the Gaussian part
-    offset: FloatArray | None = None  # Offset from the laws, likewise, V; shape (n,)
+    offset: FloatArray | None = None  # Offset from the laws, used there too, V; shape (n,)
     cost: float = 0.0  # Processor time of the fits, s, estimated from filters and laws
 
     def score(self, samples: Samples) -> float:

@@ -1,4 +1,4 @@
-"""Histograms and spectra for pages, and the range that simulations may fill."""
+"""Histograms and spectra for pages, and the range allowed for simulations."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def outline(edges: FloatArray, heights: npt.ArrayLike) -> tuple[FloatArray, Floa
 
 
 # Margin on either side of the recorded range, as a share of it.  The extremes of two halves of a
-# stationary flight differ by less; those of a wrong sag or a growing drift, by more.
+# stationary flight differ by less; with a wrong sag or a growing drift, they differ by more.
 MARGIN = 0.5
 
 
@@ -31,7 +31,7 @@ def seen_range(voltage: FloatArray) -> tuple[float, float]:
 
 
 def stray(simulated: FloatArray, voltage: FloatArray) -> float:
-    """Return by how much simulations, V, shape (..., n), leave `seen_range`, V; inf: diverged."""
+    """Return how far simulations, V, shape (..., n), leave `seen_range`, V; inf if not finite."""
     low, high = seen_range(voltage)
     if not np.isfinite(simulated).all():
         return float('inf')

@@ -13,9 +13,9 @@ correlations at single lags would miss a second OU ten times slower, which is co
 hundreds of samples.
 
 AC-coupled instrument, a high-pass: the ordinates below its corner are too small.  Their sum is
-tested by the gamma distribution, which holds for few ordinates, unlike the lower tail of the
-score.  A detection requires that more than half of their power is missing, because the
-regression of the mean removes some, too.
+tested by the gamma distribution, which is exact for few ordinates too (the lower tail of the score
+is not).  A detection requires that more than half of their power is missing, because the
+regression of the mean also removes some.
 
 Limits: only the rates in `FACTORS`, one at a time; a corner at the rate of the OU itself is
 absorbed by the fit; linear drifts are removed; samples are taken as evenly spaced.
@@ -38,7 +38,7 @@ from scipy.signal import periodogram
 FAMILY_WISE = 0.01
 # Minimum variance of a second relaxation that matters, over Var_inf.
 LEAST_SHARE = 0.1
-# Rates of the other pole that are tested, over the rate of the first.
+# Tested rates of the other pole, relative to the rate of the first.
 FACTORS = (1.0 / 30.0, 1.0 / 10.0, 1.0 / 3.0, 3.0, 10.0)
 # Minimum ordinates of a test, and minimum samples of a segment.
 _FEWEST, _SHORTEST = 64, 64

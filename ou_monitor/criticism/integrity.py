@@ -1,8 +1,8 @@
 """
 Findings that need no model (stamps, repeats, ADC codes, clipping), and the samples to fit.
 
-These findings are exact, because ties have probability zero in a diffusion.  If stamps scatter
-about an even grid, the scatter is real only if the voltage increments follow the steps.
+These findings are exact, because equal readings have probability zero in a diffusion.  If stamps
+scatter about an even grid, the scatter is real only if the voltage increments follow the steps.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ class Integrity:
     """Exact findings in a recording, and the samples to fit."""
 
     samples: Samples | None  # For the fit; None if there is nothing to fit
-    exact: tuple[Term, ...]  # Findings, with parameters
+    exact: tuple[Term, ...]  # Causes found without a model, with parameters
     notes: tuple[str, ...]  # What was dropped or left out, one sentence each
     reason: str = ''  # Why there is nothing to fit; otherwise empty
     # Samples as logged, repeats included, for the score of the plain model; None if they equal
     # `samples`.
     raw: Samples | None = None
     full: float = NAN  # Current that is a load of 1, A; NaN if the load is throttle
-    # Samples that were drawn, not measured, and so are not scored; shape (samples.n,).
+    # Clipped samples, replaced by random draws and so not scored; shape (samples.n,).
     drawn: npt.NDArray[np.bool_] | None = None
 
 
@@ -158,7 +158,7 @@ def _usable_throttle(u: FloatArray | None, recorded: bool, notes: list[str]) -> 
 _SMALL, _LARGE = 0.02, 0.45
 # Correlation of neighbouring errors up to which they count as independent.
 _WHITE = 0.3
-_TINY = 1e-6  # Scatter that counts as none, in steps
+_TINY = 1e-6  # Scatter that counts as zero, in steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +166,7 @@ class Stamps:
     """Corrected stamps."""
 
     t: FloatArray  # Stamps to use, s; shape (n,)
-    error: float  # Standard deviation of wrong stamps, s; 0 if they are right
+    error: float  # Standard deviation of the errors of stamps, s; 0 if stamps are right
     notes: tuple[str, ...]  # What was changed, one sentence each
 
 
@@ -223,7 +223,7 @@ def _are_wrong(step: FloatArray, number: FloatArray, voltage: FloatArray) -> boo
     square = change[use] ** 2 / power - 1.0
     x = step[use] - step[use].mean()
     follow, weight = float(x @ square), float(x @ x)
-    # For normal errors with the variance of the squares.
+    # Log-likelihood ratio for normal errors with the variance of the squares.
     ratio = 0.5 * ((follow - rail * weight) ** 2 - follow**2) / (
         weight * float(square @ square) / square.size)
     return bool(ratio > 0.5 * math.log(square.size))

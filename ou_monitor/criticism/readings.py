@@ -17,7 +17,7 @@ from ou_monitor.text import counted, number
 from ou_monitor.timeline import in_order, supplied
 
 # Minimum distance of an outlier from the median: in standard deviations, and as a multiple of the
-# distance of the sample next closest to it.
+# distance of the next closer sample.
 _FAR, _GAP = 50.0, 5.0
 # Minimum repeats of an outlying value to be an error code; maximum share of such samples.
 _CODE, _MOST_CODES = 3, 0.2
@@ -95,7 +95,8 @@ def load_of(recording: Recording, t: FloatArray, v: FloatArray, u: FloatArray | 
     some = slice(None, None, -(-v.size // _EXAMINED))
     early: list[str] = []
     if u is not None:
-        # A voltage that follows late is a cause, `load_transient`; it cannot precede its load.
+        # A voltage cannot precede its load, so the stamps of such a throttle are late; a voltage
+        # that follows late is the cause `load_transient`.
         late, sign = timing(t[some], v[some], u[some])
         if late > 0.0 and sign > 0.0:
             u = np.asarray(np.interp(t + late, t, u))
@@ -199,7 +200,7 @@ def _quantiles(v: FloatArray, *shares: float) -> list[float]:
 
 
 def bad_notes(t: FloatArray, v: FloatArray, bad: npt.NDArray[np.bool_]) -> list[str]:
-    """Return notes of bad samples (t in s, v in V)."""
+    """Return notes on bad samples (t in s, v in V)."""
     rest = f'while all others lie within {_range(v[~bad])} V'
     values, count = np.unique(v[bad], return_counts=True)
     notes = [f'{many} samples read exactly {_short(value)} V, {rest}: taken as an error code, or '

@@ -58,7 +58,7 @@ class Samples:
     t: FloatArray  # Increasing, s; shape (n,)
     voltage: FloatArray  # V; shape (n,)
     throttle: FloatArray | None  # 0..1; None if unknown or constant; shape (n,)
-    longer: Samples | None = None  # Samples that begin with these
+    longer: Samples | None = None  # Longer series that begins with these samples
     # ADC codes as logged, V, if `voltage` is spread evenly within their cells; shape (n,).
     codes: FloatArray | None = None
     cell: float = 0.0  # Width of a cell, V; 0 without spreading
@@ -92,7 +92,7 @@ class Samples:
                        None if self.codes is None else self.codes[part], self.cell)
 
     def columns(self, term: Term) -> FloatArray:
-        """Return the columns of a term of the mean, computed once; they are causal."""
+        """Return the columns of a term of the mean, computed once for all beginnings (causal)."""
         source = self.longer or self
         # The columns do not depend on the coefficients of the term.
         unit = term.with_linear([1.0] * len(term.LINEAR))
@@ -219,7 +219,7 @@ def lines_between(t: FloatArray, voltage: FloatArray, which: slice) -> list[Tone
         wave = fit_sinusoid(e, 1.0 / dt, line.frequency, line.resolution)
         if 0.5 * wave.amplitude ** 2 > _COMMON * line.rms ** 2:
             turn = 2.0 * math.pi * wave.frequency * dt
-            # The first difference belongs to the second sample.
+            # The first error belongs to the second sample.
             gain = 1.0 - keep * np.exp(-1j * turn)
             found.append(Tone(wave.amplitude / abs(gain), wave.frequency,
                               wave.phase - turn - float(np.angle(gain)), 0.0))

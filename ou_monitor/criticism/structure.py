@@ -98,7 +98,7 @@ def fit_gaussian(samples: Samples, terms: Sequence[Term], part: slice,
 
 def evaluate(samples: Samples, terms: Sequence[Term], events: Events | None = None,
              se: Sequence[dict[str, float]] = (), inside: bool = False) -> GaussianFit:
-    """Filter a recording with given parameters (inside: variances include events there)."""
+    """Filter with given parameters (inside: variances include the event at each sample)."""
     run = _filter(samples, terms, events)
     mean = mean_of(samples, terms, run.segment)
     e = run.kalman.innovations(samples.voltage - mean)
@@ -336,8 +336,8 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
         gain = float(better.density.sum()) - value
         terms, base, value = better.terms, better, float(better.density.sum())
         damping *= 0.3
-        # A step that gains what a parabola predicts ends at its maximum, and about the difference
-        # is left; the errors of a full fit need the slopes there.
+        # A step that gains what the parabola predicts has reached the maximum, within about the
+        # difference.  A full fit goes on, because its errors need the slopes at the maximum.
         if gain < (_NEARLY if rough else _SETTLED) or (
                 rough and abs(gain - predicted) < _NEARLY):
             break
