@@ -31,29 +31,29 @@ TIE = 3.0
 # A form that is wrong by 7 % leaves (7 %)^2 of the evidence; in simulated loads of ten shapes
 # (test/hidden), further terms gained at most 0.8 % if the form was right.
 FORM = 0.005
-# Evidence per sample with which a correction of a form is accepted all the same, nats: one-step
-# errors shrink by 2 %.  An unmodelled lag of that size biases alpha, or imitates a latent cause.
+# Evidence per sample that is enough for a correction of a form in any case, nats: one-step errors
+# shrink by 2 %.  An unmodelled lag of that size biases alpha, or imitates a latent cause.
 VISIBLE = 0.02
 CURVE = 0.1
-# Minimum number of relaxation times in a recording; with fewer the rate is a trend.  At the limit
-# its relative error is sqrt(2/20) = 30 %.
+# Minimum number of relaxation times in a recording; with fewer, the OU counts as a trend.  At this
+# limit, the relative error of its rate is sqrt(2/20) = 30 %.
 RELAXES = 20.0
 # Largest p-value of a named cause.
 CHANCE = 0.05
 # Maximum number of causes accepted one by one: no recording of test/hidden has more effects.
 MOST = 8
 # Total filter time after which kinds whose fit takes seconds are no longer tried, s; twice that
-# for broad ones: a spectrum shows beforehand whether they gain, and the slow part that a response
-# leaves, unmodelled, halved alpha.
+# for BROAD ones, because a spectrum shows beforehand whether they gain, and because without them
+# the slow residual of a response to throttle halved alpha.
 MOST_COST = 10.0
-# A statistic beyond this fails: one of 70 does by chance in 2300 recordings (3 of 8700 simulated).
+# Limit of a statistic: by chance, any of 70 exceeds it in 1 of 2300 recordings (3 of 8700 drawn).
 FAILS = 4.8
 # Maximum share of its initial value that a statistic may keep, because the form of a cause is not
 # exact.
 OWN_SHARE = 0.07
 # In a model with measured causes: maximum share of a latent cause's largest sign that may remain.
 # In 70 independently simulated recordings (b052f3b), right causes with a sign still above FAILS
-# left at most 13 %, but for one with 35 %; wrong causes left 30 to 97 %.
+# left at most 13 %, except one with 35 %; wrong causes left 30 to 97 %.
 BESIDE_SHARE = 0.3
 
 

@@ -227,7 +227,7 @@ def _plain_model(samples: Samples, state: Integrity) -> HeldOut:
         return found
     logged = fit_gaussian(state.raw, [guess(state.raw)], slice(0, state.raw.n)).terms
     gaussian = evaluate(samples, logged)
-    # What holding out a block costs is known from the fit without repeats.
+    # The loss from holding out a block is taken from the fit to the samples without repeats.
     density = gaussian.density + found.density - plain.density
     return HeldOut(replace(plain, terms=logged, gaussian=gaussian, density=density), density,
                    found.known & np.isfinite(density), gaussian.innovation)
@@ -236,8 +236,8 @@ def _plain_model(samples: Samples, state: Integrity) -> HeldOut:
 def _causes(samples: Samples, state: Integrity, left: Pruned, se: tuple[dict[str, Any], ...],
             plain: HeldOut, scored: npt.NDArray[np.bool_], rivals: Mapping[str, list[str]]
             ) -> tuple[Cause, ...]:
-    """Return all causes: exact findings first, then those of the search."""
-    # The gain of a cause is how much the model loses without it, fitted again.  If there are many
+    """Return all causes: exact findings first, then the causes that the search named."""
+    # The gain of a cause is the loss of the model refitted without it.  If there are many
     # causes of one kind (harmonics of a line), they are left out together and share one gain.
     # Repeats, clipping and wrong stamps, which are corrected in the samples, also share one gain:
     # what the plain OU loses if it is fitted to the samples as logged.
@@ -307,7 +307,7 @@ def _notes(named: Named, model: Composite, dropped: Sequence[str], samples: Samp
     elif ou.alpha * step > _BLIND:
         notes.append(no_relaxation_note(ou.alpha, step))
     elif relaxes(ou.alpha, duration) and not model.has('load_sag') and not model.has('drift'):
-        # Behind an AC coupling no change of the level lasts.
+        # A lasting sag or drift would rule out an AC coupling.
         notes.append(coupling_note(ou.alpha, duration))
     return tuple(notes)
 
@@ -336,7 +336,7 @@ def doubts(terms: Sequence[Term], dips: LowDips, duration: float, step: float,
                      f'{number(dips.baseline)} times')
     if not fall.fits:
         found.append(f'its voltage falls by {number(fall.explained, 2)} V from low to high '
-                     f'throttle; the readings do by {number(fall.measured, 2)} V')
+                     f'throttle; the readings fall by {number(fall.measured, 2)} V')
     ends = [f'{name} of {term.NAME}' for term in terms for name in _at_ends(term, duration, step)]
     if ends:
         found.append(f'{listed(ends)} {"are" if ends[1:] else "is"} at the end of the range')

@@ -34,7 +34,7 @@ class Criticism:
     # Normal score of the data under the plain and under the extended model.
     before: float
     after: float
-    # Band over all statistics: one recording of a correct model in a hundred leaves it.
+    # Band: any statistic leaves its band in one of a hundred recordings of a correct model.
     low: float
     high: float
     # Probability that any statistic of a correct model is as far off.
@@ -79,16 +79,16 @@ class Cause:
 
 @dataclass(frozen=True)
 class LowDips:
-    """Dips below a low level: in the samples, and how many of them simulations have."""
+    """Dips below a low level, in the samples and in simulations."""
 
     level: float = NAN  # V
     count: int = 0  # Dips in the samples
-    made: int | None = None  # Dips of which the load caused more than half; None: no response
+    made: int | None = None  # Dips mostly caused by the load; None: no response to load
     # Dips per minute in the samples and on average in simulations.
     observed: float = NAN
     baseline: float = NAN
     extended: float = NAN
-    # Standard errors: of the count, for independent dips, and of the averages.
+    # Standard errors: of `observed`, for independent dips, and of the averages.
     observed_se: float = NAN
     baseline_se: float = NAN
     extended_se: float = NAN
@@ -163,7 +163,7 @@ class Finding:
     # The extended model of `samples`; it lacks effects removed from them, such as repeats.
     simulated: SupplyModel | None = None
     refused: str = ''  # Why the extended model is refused, in words; otherwise empty
-    full: float = NAN  # Current that is a load of 1, A; NaN if it is not the load
+    full: float = NAN  # Current that is a load of 1, A; NaN if current is not the load
     has_throttle: bool = True  # Whether the recording has one
     seed: int = 0  # Random seed
 
@@ -207,7 +207,7 @@ class Finding:
         return tuple(sorted((c for c in self.criticism if c.is_off), key=lambda c: -abs(c.after)))
 
     def as_data(self) -> dict[str, Any]:
-        """Return the finding for JSON (doc/discovery.md); beside `params` lie `se` and `units`."""
+        """Return the finding for JSON (doc/discovery.md), with `se` and `units` of `params`."""
         baseline = self.baseline
         found: dict[str, Any] = plain_data({
             'recording': self.recording, 'load': self.load, 'full_load_a': self.full,

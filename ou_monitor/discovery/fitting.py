@@ -78,7 +78,7 @@ class Fitter:
         return view_of(self.samples, composite.gaussian, composite.z, self.samples.train)
 
     def holds(self, composite: Composite) -> bool:
-        """Return whether every term is still what its name says."""
+        """Return whether every term still has the effect that its name says."""
         view = self.view(composite)
         return all(term.holds(view) for term in composite.terms)
 
@@ -130,7 +130,7 @@ class Fitter:
     def trials(self, composite: Composite, kinds: Sequence[type[Term]],
                statistics: Callable[[Composite], Mapping[str, float]]) -> list[Trial]:
         """Return kinds that improve a model: all are estimated, the best few fitted in full."""
-        # Kinds that failed are tried again if score tests show more of them than then.  Kinds that
+        # Kinds that failed are tried again if their gain by score tests is larger now.  Kinds that
         # are slow to fit come last, and only if they imitate the best other kind, or if score
         # tests still show them once it is added.
         values = statistics(composite)
@@ -207,7 +207,7 @@ class Fitter:
         return last[1]
 
     def _finds_events(self, kind: type[Term], view: View) -> bool:
-        """Return whether a law finds events, which widen the Gaussian part until it is added."""
+        """Return whether a law finds events; without it, they inflate the fitted variances."""
         found = None if kind.SLOW_FIT else self.law_fit(kind, view)
         return found is not None and (found.push is not None or found.error is not None)
 
@@ -254,7 +254,7 @@ class Fitter:
         laws = [term for term in composite.terms if term.ROLE is Role.LAW]
         moved = [from_spectrum(self.samples, composite, [start.beside(ou), *others, start])
                  for start in starts]
-        # Where a spectrum gains less than the penalty, so would the samples.
+        # If a start gains less than the penalty in the spectrum, it does so in the samples too.
         moved = sorted((fit for fit in moved if fit[0][-1].holds(view)
                         and fit[1] > max(decision.ACCEPT, least)), key=lambda fit: -fit[1])
         # Starts with the same gain have converged to one fit.

@@ -3,7 +3,7 @@ Gain of a model on samples that were not used for its fit.
 
 Blocked cross-validation (Bergmeir & Benitez, Inf. Sci. 191 (2012) 192): each block in turn is
 predicted, one step ahead, with parameters from the other blocks.  One fit to everything is enough:
-for each block, one scoring step removes its contribution, and the mean is solved again.  Scores
+for each block, one scoring step removes its contribution, and the mean is fitted again.  Scores
 are log densities; neighbouring scores are correlated, so their error comes from means of blocks.
 Only samples at throttle that the other blocks cover are scored; elsewhere a model extrapolates.
 
@@ -53,7 +53,7 @@ def mean_difference(new: FloatArray, old: FloatArray) -> tuple[float, float]:
     blocks = difference[:size * BLOCKS].reshape(BLOCKS, size).mean(axis=1)
     c = blocks - blocks.mean()
     own = float(c @ c) / (BLOCKS - 1)
-    # Neighbouring blocks count with half weight; a negative correlation is ignored.
+    # Covariance of neighbouring blocks (Bartlett weight 1/2, for both sides); ignored if negative.
     shared = max(float(c[1:] @ c[:-1]) / (BLOCKS - 1), 0.0)
     return mean, math.sqrt((own + shared) / BLOCKS)
 
@@ -77,7 +77,7 @@ def without(samples: Samples, model: Composite, *indices: int, plain: Composite 
     if first is not None and plain is not None and (
             float(first.density.sum()) >= float(plain.density.sum())):
         return first
-    # Without white noise or a response to throttle, the rail has to explain their effects.
+    # Without white noise or a response to throttle, the `ou` has to explain their effects.
     second = _fitted(samples, (guess(samples), *kept[1:]), known)
     return max((fit for fit in (first, second) if fit is not None), default=None,
                key=lambda fit: float(fit.density.sum()))
@@ -152,7 +152,7 @@ _FAR = 1.5
 # Maximum mean loss from errors of the parameters, nats per sample; at the limit they are as large
 # as the noise.
 _UNKNOWN = 0.5
-# How far throttle may pass the range of the other blocks: share of that range, and at least.
+# Margin by which throttle may exceed the range of the other blocks: share of that range, minimum.
 _BEYOND, _STILL = 0.05, 0.01
 # After throttle that no other block contains, samples are not scored for this time, s; most lags
 # of recorded flights are shorter.
@@ -190,7 +190,7 @@ def held_out(samples: Samples, model: Composite) -> HeldOut:
     info = np.array([means[b].T @ means[b] + 0.5 * spreads[b].T @ spreads[b] for b in blocks])
     gram = np.array([columns[b].T @ columns[b] for b in blocks])
     density, known = model.density.copy(), np.ones(samples.n, dtype=np.bool_)
-    # A law estimates its offset from later samples too, so the errors are those without it.
+    # A law estimates its offset from later samples too, so the errors are computed without it.
     plain = base if model.offset is None else evaluate(samples, terms, events)
     error = plain.innovation.copy()
     for b, own, mean in zip(blocks, info, gram, strict=True):
@@ -222,7 +222,7 @@ def errors_grow(new: FloatArray, old: FloatArray, variance: FloatArray, errors: 
     """Return whether one-step errors (rms) grew by more than `errors` standard errors."""
     # If the new model is right, its errors are independent of the differences from the old ones;
     # their variances, V^2, then give the standard error of the increase.  Errors may grow although
-    # the likelihood rises: a model may give up a few bursts as noise and gain elsewhere.
+    # the likelihood rises: a model may treat a few bursts as noise and gain elsewhere.
     difference = old - new
     error = 2.0 * math.sqrt(float(np.sum(variance * difference**2)))
     return float(np.sum(new**2 - old**2)) > errors * error

@@ -23,8 +23,8 @@ _DIGITS = (4, 6)
 _DRAWS = 8
 # Quantiles of the load between which a fall is measured.
 _FLOWN = (0.01, 0.99)
-# The predicted minimum of a dip lies within this time of it, s; the load has caused the dip if it
-# predicts more than this share of its depth.
+# Maximum time between a dip and its predicted minimum, s; the load has caused the dip if the
+# prediction has more than this share of its depth.
 _NEAR, _MADE = 0.05, 0.5
 
 
@@ -84,7 +84,7 @@ def load_fall(samples: Samples, terms: Sequence[Term]) -> LoadFall:
 
 
 def _responses(samples: Samples, terms: Sequence[Term]) -> list[Term]:
-    """Return the responses of the mean to measured inputs; none without one to the load."""
+    """Return the responses of the mean to measured inputs; empty if none is to the load."""
     found = [term for term in terms if term.ROLE is Role.MEAN and term.MEASURED]
     known = samples.throttle is not None and any(term.NEEDS_THROTTLE for term in found)
     return found if known else []

@@ -117,7 +117,7 @@ def named_causes(samples: Samples, start: Composite, rng: np.random.Generator,
 
 @dataclass(frozen=True)
 class _Result:
-    """A search, its model fitted to everything, and the residuals."""
+    """A search, its model fitted to everything, and the statistics of that model."""
 
     search: Search
     whole: Composite

@@ -48,7 +48,7 @@ class Pruned:
 
     full: HeldOut  # The model
     names: list[str]  # Its causes, in the order of acceptance
-    worth: list[Worth] = field(default_factory=list)  # One for each
+    worth: list[Worth] = field(default_factory=list)  # Worth of each cause
     out: list[str] = field(default_factory=list)  # Removed causes
 
 
@@ -178,7 +178,7 @@ def group_of(model: Composite, names: Sequence[str], k: int) -> tuple[int, ...]:
 def refusal(samples: Samples, terms: Sequence[Term], gain: float, gain_se: float,
             larger: bool = False) -> str:
     """Return why a model is refused, in words; otherwise empty (gains in nats per sample)."""
-    # larger: whether its one-step errors are significantly larger.
+    # larger: whether its one-step errors are significantly larger than those of the plain OU.
     if math.isfinite(gain) and not decision.improves_predictions(gain, gain_se, 0.0):
         return 'The extended model predicts worse than the plain OU'
     if larger:

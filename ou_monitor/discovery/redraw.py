@@ -32,8 +32,8 @@ _LEAST_WHITE = 0.1
 _SWEEPS, _NOTHING = 8, 1e6
 # Maximum ADC step, in moves of the rail between readings, whose rounding counts as white noise.
 # Rounding errors of neighbours correlate by exp(-2 (pi / step)^2): 11 % here, 73 % at 8.  In
-# simulations, steps of 2.3 to 4 moves gave no false name (8 recordings each), steps of 8.3 in 9 of
-# 20 recordings.
+# simulations, steps of 2.3 to 4 moves gave no false names (8 recordings each), and steps of 8.3
+# gave false names in 9 of 20 recordings.
 _COARSE = 3.0
 # Grid across a code: points per move of the rail (with two, sums are exact to 1e-9), minimum and
 # maximum points; margin beyond the code, in standard deviations of the white noise.

@@ -75,7 +75,7 @@ class MeanResponse:
 
     terms: tuple[Term, ...]  # In the order of their evidence, the largest first
     worth: tuple[float, ...]  # Evidence lost without each, nats
-    rivals: tuple[tuple[str, ...], ...]  # For each, the causes that would do as well
+    rivals: tuple[tuple[str, ...], ...]  # For each, other causes that fit about as well
 
 
 def mean_response(samples: Samples, composite: Composite, view: View,
@@ -83,7 +83,7 @@ def mean_response(samples: Samples, composite: Composite, view: View,
     """Choose the terms of the mean; the other terms of the model stay as they are."""
     own = [term for term in composite.terms if _measured(term)]
     pool = [*(term for term in start if not _contains(term, own)), *own]
-    # With only a rough noise model, a growing sag would take the place of other terms.
+    # At the start the noise model is rough, and a growing sag would take the place of other terms.
     forms = [form for term in pool if isinstance(term, LoadTransient) for form in term.forms()]
     pool += [term for term in (*forms, *_candidates(view)) if not _contains(term, pool)
              and not (start and isinstance(term, LoadSag) and term.growth)]
@@ -95,7 +95,7 @@ def mean_response(samples: Samples, composite: Composite, view: View,
 
 
 def _refined(samples: Samples, composite: Composite, found: MeanResponse) -> MeanResponse:
-    """Return a response with its time constants and delays refined; they are from a list."""
+    """Return a response with refined time constants and delays; so far they are from a list."""
     # With a time constant wrong by half an octave, a response of 0.6 V leaves an error of 40 mV,
     # which would be taken for a slow OU.
     terms, worth = found.terms, found.worth
@@ -299,7 +299,7 @@ class _Regression:
         return decision.is_shared(self._evaluate(less)[1] - self._evaluate(more)[1])
 
     def _with_plainer_term(self, chosen: tuple[int, ...]) -> tuple[int, ...]:
-        """Return a set in which a term is replaced by a plainer one that does as well, if any."""
+        """Return the set with a term replaced by a plainer one that fits as well, if any."""
         for k in chosen:
             plain = [j for j in self._substitutes(chosen, k)
                      if decision.is_plainer(type(self._pool[j]), type(self._pool[k]))]
@@ -310,7 +310,7 @@ class _Regression:
         return chosen
 
     def _substitutes(self, chosen: tuple[int, ...], k: int) -> list[int]:
-        """Return the terms of other kinds that would do as well in the place of a term."""
+        """Return the terms of other kinds that fit about as well in the place of a term."""
         value, less = self._evidence(chosen), self._less(chosen, k)
         return [j for j, term in enumerate(self._pool)
                 if type(term) is not type(self._pool[k]) and j not in chosen
@@ -318,12 +318,12 @@ class _Regression:
                 and self._evidence(self._with_term(less, j)) > value - decision.TIE]
 
     def _rivals(self, chosen: tuple[int, ...], k: int) -> tuple[str, ...]:
-        """Return the causes that would do as well in the place of a term."""
+        """Return the causes that fit about as well in the place of a term."""
         return tuple(dict.fromkeys(self._pool[j].NAME for j in self._substitutes(chosen, k)))
 
 
 def _losses(fitted: FloatArray, scored: FloatArray, at: npt.NDArray[np.int64]) -> FloatArray:
-    """Fit columns to samples; return half the sum of squared residuals on others, each pair."""
+    """Fit columns by each product in `fitted`; return half the squared residuals in `scored`."""
     gram, seen = fitted[:, at[:, None], at], fitted[:, at, 0]
     # The columns are scaled; the ridge keeps equal columns from a division by zero.
     ridge = 1e-10 * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(at.size)

@@ -75,7 +75,7 @@ def name_causes(fitter: Fitter, search: Search, bank: NullBank, *,
                 given: Sequence[str] = (), latent: bool = True,
                 progress: Progress | None = None) -> None:
     """Accept causes one after the other, the best first."""
-    # A cause that was accepted and removed again would be accepted again.
+    # Causes that were accepted and removed: without this list, they would be accepted again.
     removed: list[str] = []
     for turn in range(decision.MOST):
         if progress is not None:
@@ -175,7 +175,7 @@ def _round(fitter: Fitter, search: Search, bank: NullBank, given: Sequence[str],
         if first and steady:
             return steady
     trials.sort(key=lambda trial: -trial.evidence)
-    # In a tie measured causes come first; a trend is one, because time is measured.
+    # In a tie, measured causes come first (a trend counts as measured, because time is).
     return sorted(trials, key=lambda trial: not (
         catalogue()[trial.name].MEASURED and trial.evidence > trials[0].evidence - decision.TIE))
 
@@ -371,10 +371,10 @@ def whole_load(fitter: Fitter, plain: Composite, load: Sequence[Term]) -> Compos
 
 
 def _noise_beside(fitter: Fitter, composite: Composite, on_sigma: bool) -> Composite:
-    """Return a model with the noise of a recording under load."""
+    """Return a model with the noise terms, under load, that have evidence."""
     # on_sigma: whether sigma may follow the law of the white noise.  Not before the response to
-    # throttle is chosen, because noise with memory imitates one, and not if simulations then leave
-    # the recorded range, which one-step predictions hardly constrain.
+    # throttle is chosen, because noise with memory imitates a response, and not if simulations
+    # would leave the recorded range: one-step predictions hardly constrain that.
     best = composite
     ou = composite.terms[0]
     assert isinstance(ou, OU)

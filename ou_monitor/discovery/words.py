@@ -20,7 +20,7 @@ from ou_monitor.model.terms.tones import Tone
 from ou_monitor.records import LARGEST_LOG_SE
 from ou_monitor.text import chance as shown_chance, listed, number, p_words, volts, Z95
 
-# What a gain is, and the errors beside it.
+# Explanation of gains and of the errors printed beside them.
 GAIN = ('Gain: log predictive density of samples not used for the fit, in mnat (thousandths of a '
         'nat: 1 mnat per sample makes 1000 samples e = 2.7 times as likely); +- is half the 95 % '
         'interval.')
@@ -118,7 +118,7 @@ def explain(term: Term, se: Mapping[str, Any], gain: float, gain_se: float,
             alternatives: Sequence[str], exact: bool, why: str = '', together: int = 1,
             chance: float = math.nan) -> str:
     """Return an explanation of a cause: meaning, estimate, gain (nats) and remedy."""
-    # The words of one term do not apply to others that share its row.
+    # If several terms share a row, use the words of their kind, not of one term.
     about = type(term) if together > 1 else term
     parts = [about.MEANING, f'Estimate: {parameters(term, se)}.']
     if exact:
@@ -143,12 +143,12 @@ def left_out_note(count: int, scored: int) -> str:
 
 
 def coupling_note(alpha: float, duration: float) -> str:
-    """Return for which rails an AC coupling is ruled out (alpha in 1/s, duration in s)."""
+    """Return for which rails an AC coupling is not ruled out (alpha in 1/s, duration in s)."""
     # Evidence for an AC coupling is 0.24 alpha T nats (alpha: rate of the rail behind it; T:
     # duration).
     slowest = 0.24 * duration / 6.0
     return (f'If the supply itself relaxes more slowly than in {number(slowest)} s, the '
-            'relaxation found could be that of an AC-coupled instrument (a high-pass at '
+            'relaxation found could come from an AC-coupled instrument (a high-pass at '
             f'{number(alpha / (2.0 * math.pi))} Hz); a recording with a DC-coupled one decides.')
 
 
@@ -174,7 +174,7 @@ def remaining_words(left: Sequence[Criticism]) -> str:
 def verdict_words(found: Finding, why: str = '', dropped: Sequence[str] = (), uncovered: int = 0,
                   stopped: bool = False, doubts: Sequence[str] = ()) -> tuple[str, ...]:
     """Return the verdict, a sentence each: causes, their gain, whether it is right, refusal."""
-    # why: the gain is unknown; uncovered: samples at throttle that the others do not cover.
+    # why: reason for an unknown gain; uncovered: samples at throttle that other blocks lack.
     if not found.causes:
         return (plain(by_load(_without_causes(found, dropped, uncovered, stopped), found.load)),)
     order = sorted(found.causes, key=lambda c: -c.gain if math.isfinite(c.gain) else math.inf)
@@ -208,12 +208,12 @@ def _without_causes(found: Finding, dropped: Sequence[str], uncovered: int, stop
 
 
 def _gain(found: Finding, why: str) -> str:
-    """Return a gain: smaller one-step errors and, if it gains, their size better predicted."""
+    """Return a gain in words: change of one-step errors, and of the prediction of their size."""
     gain, shrink, size = found.gain, found.shrink, found.size_gain
     if not gain > Z95 * found.gain_se or not math.isfinite(size):
         return gain_words(gain, found.gain_se, why)
     errors = ('shrink by ' if shrink > 0.0 else 'grow by ') + f'{number(100.0 * abs(shrink), 2)} %'
-    # A loss is that of the rms as a measure: a few large errors dominate it.
+    # Errors may grow although predictions improve: a few large errors dominate their rms.
     parts = (f'; {"+" * (shrink > 0.0)}{number(1e3 * (gain - size))} mnat per sample) and their '
              f'size is predicted better (+{number(1e3 * size)}): ' if size > Z95 * found.gain_se
              else '), a gain of ')
@@ -298,7 +298,7 @@ def gain_text(gain: float, gain_se: float) -> str:
         return NOT_KNOWN
     if not math.isfinite(gain_se):
         return f'{number(1e3 * gain)}, error {NOT_KNOWN}'
-    # Beside an error a hundred times as large, a gain is 0.
+    # A gain below a hundredth of its error is shown as 0.
     shown = gain if 100.0 * abs(gain) > Z95 * gain_se else 0.0
     return f'{number(1e3 * shown)} +- {number(1e3 * Z95 * gain_se, 2)}'
 

@@ -47,7 +47,7 @@ INPUT_PARAMETERS = (
 # Fields of the state that the filter uses.
 _FIELDS = ('sigma_se', 'alpha', 'throttle', 'load_noise')
 _UNKNOWN = [NAN] * len(_FIELDS)
-# A sigma whose window exceeds the sliding one by this ratio comes from a fit.
+# Minimum ratio of the window of sigma to the sliding window if sigma comes from a longer fit.
 _LONGER = 1.1
 _USABLE = (Status.OK.name, Status.SHORT_WINDOW.name)
 
@@ -119,7 +119,7 @@ class SupplyInput:
             return f'the estimator reports {status}'
         window = _number(self._state, 'window_s')
         if fresh and window > _LONGER * _number(self._state, 'duration'):
-            # Such a sigma does not follow the throttle.
+            # An average over a long window does not follow the throttle.
             return f'sigma is an average over the last {window:g} s, too long for the filter'
         return ''
 
@@ -175,7 +175,7 @@ class AdaptiveFilterNode(MonitorNode):
     FIXED = (*INPUT_PARAMETERS, _MODE, *MOTOR_PARAMETERS)
 
     def start(self) -> None:
-        """Begin with no message filtered."""
+        """Begin without any filtered message."""
         self._channels: Channels | None = None
         self._filters: list[AdaptiveLowPass] = []
         values = self.values()
@@ -212,7 +212,7 @@ class AdaptiveFilterNode(MonitorNode):
         NotchSettings.from_options(notch_options(values))
 
     def apply(self, values: Mapping[str, Any]) -> None:
-        """Bring checked parameters into force; the output does not move."""
+        """Bring checked parameters into force; the output does not jump."""
         super().apply(values)
         for channel in (self._idle, *self._filters):
             channel.configure(**_filter_options(values))

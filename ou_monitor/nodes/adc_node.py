@@ -7,8 +7,8 @@ stamp is the kernel's time of the last one.  msg_config `adc` reads these messag
 and IIO devices without a buffer, are polled; each sample is a sensor_msgs/BatteryState, stamped
 when polled.  `/diagnostics` at 1 Hz.
 
-Limits: one channel.  Blocks carry kernel stamps only with a timestamp channel; a gap in them
-splits a block, so that the estimator detects the gap.
+Limits: one channel.  Blocks carry kernel stamps only with a timestamp channel; a gap in these
+stamps splits a block, so that the estimator detects the gap.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ LOCK = Parameter(
     'lock_parameters', False,
     'Whether to refuse what can disarm the node at run time: changes of any parameter except '
     'publish_rate, and the services ~/clear_brownout and ~/save_model.')
-# Busy wait at the end of a sleep, s: as long as sleep is usually late; a 1 kHz bag then costs a
+# Busy wait at the end of a sleep, s: the usual lateness of `sleep`.  With it, a 1 kHz bag costs a
 # tenth of a core.
 SPIN = 0.0001
 # Maximum single sleep, s: limits the delay in noticing a signal.
@@ -262,7 +262,7 @@ class MonitorNode(Node):
         return self._kept(super().create_service(kind, name, callback, **options))
 
     def _kept(self, made: Any) -> Any:
-        """Record an object for `stop` to close; rclpy makes others before the list exists."""
+        """Record an object for `stop` to close, unless `Node.__init__` makes it for itself."""
         if hasattr(self, '_made'):
             self._made.append(made)
         return made
@@ -354,7 +354,7 @@ def managed(kind: type[MonitorNode]) -> Callable[[str], MonitorNode]:
     # Before it is active it has parameters and lifecycle services only.  After a failure it stays
     # in its former state.
     class Managed(LifecycleNodeMixin, kind):  # type: ignore[misc, valid-type]
-        """A node whose work is begun and ended by transitions."""
+        """A node that begins and ends its work by lifecycle transitions."""
 
         def __init__(self, name: str) -> None:
             kind.__init__(self, name, managed=True)  # type: ignore[call-arg]
@@ -421,7 +421,7 @@ def wait_until(instant: float, going: Callable[[], bool]) -> bool:
 
 
 def battery(location: str = '') -> BatteryState:
-    """Return a message about a battery of which nothing but the voltage will be known."""
+    """Return a BatteryState whose values, except the voltage to be set, are unknown (NaN)."""
     nan = math.nan
     return BatteryState(current=nan, charge=nan, capacity=nan, design_capacity=nan, percentage=nan,
                         temperature=nan, present=True, location=location)

@@ -7,8 +7,8 @@ that it is never silently false.  Messages wait in the middleware, which keeps t
 are fetched 50 times a second and read before each report, so that a flood of messages does not
 delay an output.  Hold, delay and latch run in real time, even under `use_sim_time`.
 
-Limits: one voltage; an estimate older than `stale_after` is not published as
-a number, though `~/state` still shows its fields.
+Limits: one voltage; the values of an estimate older than `stale_after` are published as NaN,
+though `~/state` still shows them.
 """
 
 from __future__ import annotations
@@ -256,7 +256,7 @@ class EstimatorNode(MonitorNode):
             stream.thin //= 2
 
     def _watch_throttle(self) -> None:
-        # Three messages of a slow source.
+        # Allow for three missed messages of a slow source.
         limit = 3.0 * max(self._monitor.settings.stale_after, self._throttle_silence.interval)
         age = self._throttle_silence.age
         if age is not None and age > limit and not math.isnan(self._stream.throttle):

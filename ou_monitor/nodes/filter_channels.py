@@ -17,8 +17,8 @@ from ou_monitor.nodes.sources import definition_of, message_class
 from ou_monitor.recordings.cdr import value_path
 from ou_monitor.stream.config import FieldPath, FieldSpec, put, walk
 
-# Output types of derivatives: of an angular velocity; of another signal with a stamp (in x); of
-# one without.
+# Output types of derivatives: of an angular velocity; of another signal with a stamp (in x); of a
+# signal without a stamp.
 ACCEL, VECTOR, PLAIN = ('geometry_msgs/msg/AccelStamped', 'geometry_msgs/msg/Vector3Stamped',
                         'std_msgs/msg/Float64')
 _NONE = (math.nan, math.nan, math.nan)

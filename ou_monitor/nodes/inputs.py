@@ -1,8 +1,8 @@
 """
-What a node subscribes to: find sources on the graph, fetch messages, and give each a time.
+Inputs of a node: find sources on the graph, fetch messages, and give each a time.
 
-Time is the message's own stamp, or else the middleware's source
-timestamp, under `use_sim_time` mapped to simulated time through `/clock`.
+The time is the message's own stamp, or else the middleware's source timestamp, which `/clock` maps
+to simulated time under `use_sim_time`.
 """
 
 from __future__ import annotations
@@ -140,8 +140,8 @@ class PolledInput:
         self._reader = FieldReader(
             spec, definition_of(kind), lambda index, why: None, beside)
         self.publishers = Publishers()
-        # Fetched, not yet read: messages, when (wall and monotonic clock, s), and their total
-        # size.
+        # Fetched, not yet read: messages, times of fetching (wall and monotonic clock, s), and
+        # total size, bytes.
         self._fetched: list[tuple[bytes, dict[str, Any]]] = []
         self._when: list[tuple[float, float]] = []
         self._bytes = 0
@@ -176,7 +176,7 @@ class PolledInput:
         sent = np.array([info['source_timestamp'] for info in infos], dtype=np.uint64)
         received = np.array([info['received_timestamp'] for info in infos]) * 1e-9
         received = np.where(received > 0.0, np.minimum(received, wall), wall)
-        # Messages that waited in the middleware arrived earlier; the wall clock may have been set.
+        # Messages that waited in the middleware arrived earlier (limited: the clock may be set).
         arrived: FloatArray = np.maximum.accumulate(now - np.clip(
             wall - received, 0.0, MOST_WAIT))
         times: FloatArray = sent.astype(np.float64) * 1e-9

@@ -1,8 +1,8 @@
 """
 The node behind the live page: listens to estimator and filter, and keeps the last minute.
 
-Limits: with five rows per second, the plot of the voltage misses a dip between two rows, which the
-flag shows; of the filter's signals, each row has the extremes.
+Limits: with five rows per second, the plot of the voltage misses dips between two rows (the flag
+shows them); for the filter's signals, each row has the extremes since the row before.
 """
 
 from __future__ import annotations

@@ -98,7 +98,7 @@ class Prefetch:
         """End the thread."""
         self._closed.set()
         while self._thread.is_alive():
-            # It may wait for a free place.
+            # The thread may be waiting for a free place in the queue.
             with suppress(Empty):
                 self._batches.get(timeout=0.01)
         self._thread.join()
@@ -108,7 +108,7 @@ class Prefetch:
         try:
             while not self._closed.is_set():
                 batch = []
-                # What came before an error is kept.
+                # Messages before an error are kept.
                 batch.extend(itertools.islice(source, size))
                 if self._batches.full() or not batch:
                     self._full.set()
@@ -223,7 +223,7 @@ class Player(Node):
                              + ', '.join(self._outputs))
         origin, rate = first[2], self._options.rate
         start, frequency = time.monotonic(), self._options.clock
-        # Instants of /clock; past ones are skipped: the clock may be late but never piles up.
+        # Times of /clock; missed ones are skipped, so that late ticks do not pile up.
         ticks, tick = 0, start if frequency > 0.0 else math.inf
         for topic, _, log_time, data in itertools.chain((first,), messages):
             due = start + (log_time - origin) * 1e-9 / rate

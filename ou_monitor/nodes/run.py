@@ -1,11 +1,10 @@
 """
 Start, spin and end a node: the same for every executable.
 
-Exit status: 0 after SIGINT, SIGTERM or the end of the work; 2 for unusable
-user input, with one FATAL line that says what is wrong and what to
-do; SIGALRM if the middleware hangs (`END`); anything else is a bug and shows its
-traceback.  This module can be imported where ROS 2 is not installed, so that the executables
-can report that.
+Exit status: 0 after SIGINT, SIGTERM or the end of the work; 2 for unusable user input, with one
+FATAL line that says what is wrong and what to do; SIGALRM if the middleware hangs (`END`);
+anything else is a bug and shows its traceback.  This module can be imported where ROS 2 is not
+installed, so that the executables can report that.
 """
 
 from __future__ import annotations
@@ -149,7 +148,7 @@ def _run(name: str, work: Callable[[], int], args: list[str] | None, stopped: li
 
 
 def _choose_queues() -> None:
-    """Make Fast DDS use a queue that needs no CPU, unless the user has configured it."""
+    """Make Fast DDS keep messages while the process has no CPU, unless the user configured it."""
     # By default a queue holds 512 messages of all topics together, and is given up with its
     # content if the process does not read for 1 s. Other middlewares ignore these variables. If
     # discovery is limited to this machine, the configuration is not changed: rmw_fastrtps would

@@ -172,7 +172,7 @@ class SupplySimulatorNode(MonitorNode):
                 self._model, rate=self._rate, seed=values['seed'],
                 charge=None if self._model.load is None else charge,
                 resistance=values['scale_resistance'])
-            # Stamp of the first sample, s; NaN: the clock's time then.
+            # Stamp of the first sample, s; NaN: set from the clock when that sample is drawn.
             self._begin = math.nan
             self.problem = ''
         return f"Restarted with seed {values['seed']}."
@@ -265,7 +265,7 @@ class SupplySimulatorNode(MonitorNode):
         return throttle
 
     def _wait(self, due: float) -> bool:
-        """Wait until the node's clock runs, or was set; return whether to continue."""
+        """Wait until the clock reaches `due`, s, or jumps; return False if the node is ending."""
         while not self.ending.is_set():
             simulated = self.get_clock().ros_time_is_active
             left = due - (self.stamp_now() if simulated else time.time())
