@@ -203,7 +203,7 @@ class ByThrottle:
     """Curves over throttle."""
 
     throttle: FloatArray  # 0, 0.1, .. 1; shape (k,)
-    # Whether that throttle was flown; else sag and noise are inter- or extrapolated; shape (k,).
+    # Whether that throttle was flown; if not, the risk is inter- or extrapolated; shape (k,).
     known: npt.NDArray[np.bool_]
     risk: FloatArray  # Probability of a brown-out within the horizon; NaN if unknown; shape (k,)
     budget: float  # Highest throttle that keeps the risk within `limit`; NaN if unknown

@@ -23,8 +23,8 @@ original sampling stay, and a stamp error of e seconds gives a phase error of 2 
   manoeuvre changes the shape of the gyro spectrum.  If the signal is then white Gaussian, the
   squared partial coherence of a bin exceeds c by chance with probability (1 - c)^(K - 1 - p), for
   any voltage, with K segments and p causes regressed out (Halliday et al., 1995).
-- Moving lines and bursts are not whitened by that, so the same statistics are computed with random
-  signs of the signal for blocks of neighbouring segments (Freedman and Lane, 1983).
+- That does not whiten moving lines and bursts.  So the second test compares these statistics with
+  their values under random signs of blocks of neighbouring segments (Freedman and Lane, 1983).
 
 Limits: both signs of the series must be equally likely.  A line with the same frequency and phase
 in both is detected although it is not coupling (`narrow`).
@@ -53,7 +53,7 @@ LOWEST = 5.0
 _LONGEST, _SHORTEST, _PIECES = 1.0, 0.1, 40
 FEWEST = 16  # Minimum number of segments
 LONGEST_LAG = 0.05  # Maximum lag that is searched, s
-# Used share of the common time below which a note says so.
+# Minimum share of the common time that is used; below it, a note is added.
 _SHARE_USED = 0.9
 _BLOCKS = 12  # Blocks of the jackknife
 # Probability with which a gain at the reported limit is detected.

@@ -180,7 +180,7 @@ def _gaussian(estimate: Estimate, shape: Shape, line_share: float, normal: str) 
 
 
 def _share(share: float) -> str:
-    """Return a share of Var_inf, which is a first-order estimate and not accurate above 1."""
+    """Return a share of Var_inf in words; a first-order estimate, not accurate above 1."""
     return 'as large as Var_inf' if share > 1.0 else f'about {100.0 * share:.0f} % of Var_inf'
 
 
@@ -211,7 +211,7 @@ class LevelSpectrum:
 
     frequency: FloatArray = field(default_factory=_empty)  # Even on a log axis, Hz; shape (k,)
     density: FloatArray = field(default_factory=_empty)  # Measured, V^2/Hz; shape (k,)
-    # The fitted OU in white noise at the same rate, V^2/Hz; NaN without a fit; shape (k,).
+    # Density of the fitted OU in white noise, sampled equally, V^2/Hz; NaN without; shape (k,).
     fitted: FloatArray = field(default_factory=_empty)
 
 
@@ -340,7 +340,7 @@ class LevelResult:
     verdict: KindVerdict = KindVerdict(ProcessType.UNDETERMINED, 'not judged')
     spectrum: LevelSpectrum = field(default_factory=LevelSpectrum)
     lines: LineSearch = field(default_factory=LineSearch)  # Spectral lines
-    lines_kept: bool = False  # Whether the fit includes them, because impulses may cause them
+    lines_kept: bool = False  # Whether the fit includes lines, because impulses may cause them
 
     @property
     def kind(self) -> ProcessType:

@@ -52,8 +52,8 @@ _LAGS_RAW, _LAGS_FITTED = 5, 10  # Lags tested, of samples and of innovations
 LEAST = {'mean_drift': 0.25, 'variance_drift': 0.1, 'gaussian': 0.3, 'impulses': 0.5,
          'correlated': 0.0, 'one_relaxation': 0.1, 'second_relaxation': LEAST_SHARE}
 EFFECT = {
-    'mean_drift': 'standard deviation of the mean beyond its sampling error, divided by that of '
-                  'the voltage',
+    'mean_drift': 'standard deviation of the mean beyond its sampling error, divided by the '
+                  'standard deviation of the voltage',
     'variance_drift': 'relative standard deviation of the intensity beyond its sampling error',
     'gaussian': 'larger of |skewness| and |excess kurtosis| / 2',
     'impulses': 'excess kurtosis, or impulses beyond the range of the noise per 1000 samples',

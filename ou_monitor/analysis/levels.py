@@ -122,7 +122,7 @@ def _is_long_enough(t: FloatArray, level: LoadLevel) -> bool:
 
 
 def _longest_held(t: FloatArray, found: tuple[LoadLevel, ...]) -> tuple[LoadLevel, ...]:
-    """Return the levels at which most time was spent, in their order."""
+    """Return at most `MAX_LEVELS` levels, those with most time, in their order."""
     least = sorted((_time_at(t, level) for level in found), reverse=True)[:MAX_LEVELS][-1]
     return tuple(level for level in found if _time_at(t, level) >= least)[:MAX_LEVELS]
 
@@ -167,7 +167,7 @@ def _gaps(t: FloatArray) -> BoolArray:
 
 
 def _modes(t: FloatArray, throttle: FloatArray, width: float) -> list[float]:
-    """Return the throttles at which time was spent, increasing."""
+    """Return the modes of throttle, weighted by time, in increasing order."""
     known = np.isfinite(throttle)
     if not known.any():
         return []
@@ -210,7 +210,7 @@ def _are_separate(density: FloatArray, peak: int, other: int, reach: int) -> boo
 
 def level_segments(throttle: FloatArray, centres: Sequence[float], width: float
                    ) -> list[tuple[LevelSegment, int]]:
-    """Return the segments of throttle at levels, each with the index of its level."""
+    """Return the segments of constant throttle, each with the index of its level."""
     if not centres:
         return []
     level = np.asarray(centres)

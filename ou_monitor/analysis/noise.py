@@ -35,7 +35,7 @@ _STEADY, _STEADY_TIME = 0.02, 0.2
 _WILD = 0.01
 # Half width of the band of throttle about each of THROTTLES; minimum readings in it.
 BAND, _IN_BAND = 0.05, 10
-# Minimum time of these readings, s, and as a share of a short recording.
+# Minimum time of these readings, s; in a short recording, a share of its duration.
 _IN_TIME, _IN_SHARE = 0.5, 0.02
 
 
@@ -55,7 +55,7 @@ def floats(values: FloatArray) -> tuple[float, ...]:
 
 
 def rise_at(recording: Recording, t: FloatArray) -> FloatArray:
-    """Return the hysteresis of a dip of `supply_facts`, V, at some stamps, s."""
+    """Return the hysteresis of dips in `supply_facts`, V, at given stamps, s."""
     which, _ = in_order(recording.t, recording.voltage[:, None], MOST_VOLTAGE)
     recording = part_of(recording, which)
     if recording.n < 2:

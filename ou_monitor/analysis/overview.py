@@ -60,7 +60,7 @@ class Overview:
     growth: float = 1.0
     step: float = 0.0  # Median time between readings, s
     line: LoudestLine | None = None  # Strongest spectral line
-    cells: int = 0  # Cells in series to which the limit refers; 0: none
+    cells: int = 0  # Number of cells in series, for the limit per cell; 0: not given
     end: MonitorReport | None = None  # Report of the node at the end; None without a limit
     # Fit of the whole recording, if that is one stationary level, and if the fit is more precise
     # than `facts.ou` and agrees with it.
@@ -88,7 +88,7 @@ class Overview:
 def overview(recording: Recording, limit: float | None = None,
              levels: Sequence[LevelResult] = (), cells: int = 0,
              left: Remainder | None = None, monitor: SupplyMonitor | None = None) -> Overview:
-    """Return the facts (limit in V for `cells` in series; left, monitor: see `facts_and_end`)."""
+    """Return the facts (limit of the pack in V; left, monitor: see `facts_and_end`)."""
     # levels: for spectral lines, and for the fit of the whole recording.
     facts, load, end = facts_and_end(recording, limit, left, monitor)
     known = recording.throttle[np.isfinite(recording.throttle)]
@@ -222,7 +222,7 @@ def _dips(found: Overview, below: float = NAN) -> str:
 
 def determined(found: Overview, k: int, flown: bool = True) -> bool:
     """Return whether the sag at a throttle of THROTTLES is larger than its 95 % error."""
-    # At a throttle that was not flown, also require it of the sag at the highest throttle flown.
+    # At a throttle that was not flown, require this at the highest throttle flown, too.
     sag, se = found.facts.sag.sag_v, found.facts.sag.se_v
     return all(sag[i] > 2.0 * se[i] for i in (k, k if flown else found.flown[1]))
 

@@ -55,13 +55,13 @@ class Lowest:
 
 @dataclass(frozen=True)
 class Dips:
-    """Dips below a limit; one lasts until a reading is clearly above the limit."""
+    """Dips below a limit; one lasts until a reading exceeds limit plus hysteresis."""
 
     limit_v: float  # V
     count: int  # dips
     seconds: float  # total time below, s
     longest_s: float  # time below in the longest dip, s
-    first_s: float = NAN  # begin of the first dip since the first reading, s
+    first_s: float = NAN  # time from the first reading to the first dip, s
     brief: int = 0  # dips shorter than a second
 
 
@@ -175,7 +175,7 @@ def supply_facts(recording: Recording, limit: float | None = None) -> SupplyFact
 def facts_and_end(recording: Recording, limit: float | None = None, left: Remainder | None = None,
                   monitor: SupplyMonitor | None = None,
                   ) -> tuple[SupplyFacts, SupplyLoad, MonitorReport | None]:
-    """Return the facts, and the node's load and, with a limit, V, its report at the end."""
+    """Return the facts, the node's load and, with a limit, V, the node's report at the end."""
     # left: `remainder` of the recording, outliers included; monitor: from `node_for`, fed with the
     # recording.  Both cover only times with power (`supplied`), and are computed if omitted.
     if limit is not None and not math.isfinite(limit):

@@ -38,7 +38,7 @@ def compare(recording: Recording, model: SupplyModel | None = None, *,
             fit_until: float | None = None, seeds: int = 50, seed: int = 0,
             levels: tuple[float, ...] = (),
             progress: Callable[[float], None] | None = None) -> Agreement:
-    """Compare a recording with simulations: see `ou_monitor.compare` (levels of dips: V)."""
+    """Compare a recording with simulations: see `ou_monitor.compare` (levels: limits, V)."""
     report = progress or (lambda share: None)
     if not _FEWEST_SEEDS <= seeds <= _MOST_SEEDS:
         raise ValueError(f'seeds must lie within {_FEWEST_SEEDS} to {_MOST_SEEDS}, got {seeds}')

@@ -3,7 +3,7 @@ Export a model to another simulator, and report what that simulator cannot expre
 
 According to their sources (`SOURCES`), PX4 simulates a linear discharge from full to empty, Gazebo
 also the sag of a constant load, and ArduPilot a charge curve minus current times resistance.  None
-has noise, lags, inrush or an ADC.
+of them simulates noise, lags, inrush or an ADC.
 """
 
 from __future__ import annotations

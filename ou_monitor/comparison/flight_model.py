@@ -301,8 +301,8 @@ class _Load:
     fit: LoadFit
     current: FloatArray | None
     constant_level: bool
-    other: LoadFit  # With the other kind of level
-    doubt: float  # Its probability
+    other: LoadFit  # Fit with the other kind of level
+    doubt: float  # Probability of the other kind of level
     parts: tuple[tuple[LoadFit, FloatArray], ...] = ()
 
 
@@ -310,7 +310,7 @@ def _best(samples: Readings, report: Callable[[float], None]) -> _Load | None:
     """Return the load with most evidence; None if none has clearly more than a level alone."""
     found: _Load | None = None
     most = level_evidence(samples.t, samples.voltage)
-    # The simpler one first: throttle before current.
+    # The simpler load comes first: throttle before current.
     loads = _loads(samples)
     for k, current in enumerate(loads):
         constant, falling = (_fit(samples, current, kind) for kind in (True, False))

@@ -69,7 +69,7 @@ class SpectrumBand:
 
     @property
     def middle_hz(self) -> float:
-        """Return the geometric middle, Hz."""
+        """Return the geometric mean of the two frequencies, Hz."""
         return math.sqrt(self.low_hz * self.high_hz)
 
 

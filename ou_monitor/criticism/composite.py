@@ -2,8 +2,8 @@
 Fit a whole model: its Gaussian part, then the laws of its innovations in turn.
 
 A law is a term of the distribution of the innovations.  It maps normal scores to new ones and
-returns the ratio of densities, so that laws compose.  Events that it finds go back into the
-Gaussian part as extra variance, and both are fitted again.
+returns the ratio of densities, so that laws can be chained.  Events that a law finds go back into
+the Gaussian part as extra variance, and both are fitted again.
 """
 
 from __future__ import annotations

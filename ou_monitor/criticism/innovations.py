@@ -139,7 +139,7 @@ def other_pole(parts: Sequence[FloatArray], rate: float, alpha: float, var_inf: 
 
 
 def _spectrum(omega: FloatArray, step: float) -> FloatArray:
-    """Return the spectrum of a sampled OU of variance 1; `step` is alpha times the step."""
+    """Return the spectrum of a sampled OU of variance 1 (step: alpha times the time step)."""
     phi = math.exp(-step)
     found: FloatArray = -math.expm1(-2.0 * step) / (1.0 - 2.0 * phi * np.cos(omega) + phi * phi)
     return found

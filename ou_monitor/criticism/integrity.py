@@ -47,7 +47,7 @@ class Integrity:
     # Samples as logged, repeats included, for the score of the plain model; None if they equal
     # `samples`.
     raw: Samples | None = None
-    full: float = NAN  # Current that is a load of 1, A; NaN if the load is throttle
+    full: float = NAN  # Current at which the load is 1, A; NaN if the load is throttle
     # Clipped samples, replaced by random draws and so not scored; shape (samples.n,).
     drawn: npt.NDArray[np.bool_] | None = None
 

@@ -154,7 +154,7 @@ def find_bad(v: FloatArray, singles: int = _SINGLES) -> npt.NDArray[np.bool_]:
     low, middle, high = _quantiles(some, 0.2, 0.5, 0.8)
     if low == high:
         low, high = _quantiles(some, 0.05, 0.95)
-    # Standard deviation of a normal distribution with this inner 60 %.
+    # Standard deviation of a normal distribution whose inner 60 % spans this range.
     spread = (high - low) / 1.683
     with np.errstate(over='ignore'):
         away = np.abs(v - middle)
@@ -179,7 +179,7 @@ def find_bad(v: FloatArray, singles: int = _SINGLES) -> npt.NDArray[np.bool_]:
 
 
 def _off_value(v: FloatArray) -> float | None:
-    """Return the value, if any, that many samples have and that is far from all others."""
+    """Return the frequent value, if any, that is far from all other samples."""
     values, count = np.unique(v, return_counts=True)
     value = float(values[count.argmax()])
     others = v[v != value]

@@ -92,7 +92,7 @@ class Samples:
                        None if self.codes is None else self.codes[part], self.cell)
 
     def columns(self, term: Term) -> FloatArray:
-        """Return the columns of a term of the mean, computed once for all beginnings (causal)."""
+        """Return the columns of a term of the mean, cached (causal: shared by shorter parts)."""
         source = self.longer or self
         # The columns do not depend on the coefficients of the term.
         unit = term.with_linear([1.0] * len(term.LINEAR))
@@ -111,7 +111,7 @@ class Samples:
         return self.cell * self.cell / 12.0
 
     def spread(self, codes: FloatArray, cell: float, rng: np.random.Generator) -> Samples:
-        """Return samples with codes, V, spread evenly within their cells, V (0: as they are)."""
+        """Return samples with codes, V, spread evenly within cells, V (width 0: unchanged)."""
         # The mean log density of a value spread within a cell is at most the log of the code's
         # probability over the width (Jensen; Theis et al., ICLR 2016).  So, where codes repeat, a
         # narrow distribution cannot gain without limit, as it does with the density at the code.

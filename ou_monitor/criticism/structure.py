@@ -2,7 +2,7 @@
 The Gaussian part of a model: mean, poles, intensities and noise, fitted together.
 
 A model is a list of terms: `Role.MEAN` terms are columns of a regression, `DRIVE` terms change
-alpha and sigma along the recording, `BLOCK` terms add states, and `NOISE` terms white errors.
+alpha and sigma along the recording, `BLOCK` terms add states, and `NOISE` terms add white errors.
 `LAW` terms (the distribution of the innovations) are fitted in `composite`; events that they find
 enter here as extra variance at their samples.
 """
@@ -37,7 +37,7 @@ _MANY = 4
 # Samples after which the gain of a time-invariant filter is constant (predictive variance within
 # 1e-5 of its limit).
 _SETTLES = 1024
-# A full and a rough fit have converged when a step gains less than this, nats.
+# Convergence tolerances of a full and of a rough fit: gain of a step, nats.
 _SETTLED, _NEARLY = 0.02, 0.5
 _RNG = np.random.default_rng(0)
 
@@ -62,7 +62,7 @@ class GaussianFit:
 
     terms: tuple[Term, ...]  # With their parameters; the first is the `ou`
     se: tuple[dict[str, float], ...]  # Standard errors by parameter, one dict per term
-    mean: FloatArray  # Of the voltage, V; shape (n,)
+    mean: FloatArray  # Mean of the voltage, V; shape (n,)
     # One-step errors, V, and their predictive variances, V^2, which exclude an event at the sample
     # itself; shape (n,).
     innovation: FloatArray
@@ -351,7 +351,7 @@ def _maximise(samples: Samples, terms: tuple[Term, ...], events: Events | None,
 
 def slopes_of(samples: Samples, terms: Sequence[Term], events: Events | None, base: GaussianFit,
               free: Sequence[tuple[int, str]]) -> tuple[FloatArray, FloatArray, float]:
-    """Return slopes of the scores, and of the log variances, shape (n, free), and time, s."""
+    """Return slopes of scores and of log variances, shape (n, free), and processor time, s."""
     v, cost = base.variance, 0.0
     means, spreads = np.empty((2, samples.n, len(free)))
     for j, (k, name) in enumerate(free):

@@ -57,7 +57,7 @@ OWN_SHARE = 0.07
 BESIDE_SHARE = 0.3
 
 
-# Which kinds are tried.
+# -- kinds to try
 
 def kinds_to_try(kinds: Iterable[Kind], model: Sequence[Kind], given: Collection[str],
                  throttle: bool, first: bool) -> list[Kind]:
@@ -97,7 +97,7 @@ def affordable(kind: Kind, cost: float) -> bool:
     return cost <= MOST_COST * (1.0 + kind.BROAD) or not kind.SLOW_FIT
 
 
-# Which trial is accepted, and what comes with it.
+# -- acceptance of trials
 
 def least_evidence(kind: Kind, largest: float, again: int = 0) -> float:
     """Return the minimum evidence of a response of the mean, nats (largest: evidence of all)."""
@@ -155,7 +155,7 @@ def improves_predictions(gain: float, error: float, chance: float) -> bool:
     return chance <= CHANCE and not gain < -error
 
 
-# Which accepted causes stay.
+# -- withdrawal of accepted causes
 
 def failing(before: Statistics, after: Statistics) -> list[str]:
     """Return the statistics that are outside their band in spite of the causes."""

@@ -142,12 +142,12 @@ class Finding:
     duration: float  # s
     verdict: Verdict
     words: tuple[str, ...] = ()  # The verdict, a sentence each
-    baseline: OU | None = None  # The plain model, fitted on everything
+    baseline: OU | None = None  # The plain model, fitted to everything
     # Mean log predictive density of held-out blocks, nats per sample.
     baseline_score: float = NAN
     criticism: tuple[Criticism, ...] = ()  # All statistics
     causes: tuple[Cause, ...] = ()  # As accepted
-    model: SupplyModel | None = None  # The extended model, fitted on everything
+    model: SupplyModel | None = None  # The extended model, fitted to everything
     se: tuple[Mapping[str, Any], ...] = ()  # Its standard errors, one dict per term
     # Score of the extended model, its gain, and the gain's standard error, nats per sample.
     score: float = NAN
@@ -163,8 +163,8 @@ class Finding:
     # The extended model of `samples`; it lacks effects removed from them, such as repeats.
     simulated: SupplyModel | None = None
     refused: str = ''  # Why the extended model is refused, in words; otherwise empty
-    full: float = NAN  # Current that is a load of 1, A; NaN if current is not the load
-    has_throttle: bool = True  # Whether the recording has one
+    full: float = NAN  # Current at which the load is 1, A; NaN if current is not the load
+    has_throttle: bool = True  # Whether the recording has throttle
     seed: int = 0  # Random seed
 
     @property
@@ -263,7 +263,7 @@ def _discrepancy(c: Criticism, observed: float, chance: float) -> dict[str, Any]
 
 
 def unsaved_load(full: float, has_throttle: bool) -> str:
-    """Return why a model file cannot hold a load; full: current that is a load of 1, A, or NaN."""
+    """Return why a model file cannot hold a load (full: current at a load of 1, A, or NaN)."""
     return '' if math.isnan(full) else (
         'Its load is the measured current, and a model file is for throttle' + (
             ' (--current-column none uses throttle as the load)' if has_throttle else

@@ -82,7 +82,7 @@ def prune_by_gain(samples: Samples, model: Composite, names: Sequence[str], plai
 
 
 def _leave_out_vague(samples: Samples, state: Pruned) -> None:
-    """Remove causes whose amplitudes are all undetermined, unless another one needs them."""
+    """Remove causes whose amplitudes are all undetermined, unless another cause needs them."""
     for k in reversed(range(len(state.names))):
         at = position(state.full.model, state.names, k)
         term = state.full.model.terms[at]

@@ -49,7 +49,7 @@ _ROUGH = 20.0
 # Maximum time of a fit, s, to choose the mean again after each cause.
 _SOON = 1.0
 # Maximum rounds that add lines to a tone (three motors or converters, each with harmonics), and
-# maximum lines added in one.
+# maximum lines added in one round.
 _LINE_TURNS, _MOST_LINES = 3, 12
 
 
@@ -410,7 +410,7 @@ _DRAWS = 16
 
 
 def outside_range(samples: Samples, terms: Sequence[Term], share: float = 0.5) -> float:
-    """Return by how much simulated levels leave the recorded range, V: a quantile over draws."""
+    """Return how far simulated levels leave the recorded range, V (quantile `share` of draws)."""
     # The level is a running median of five samples, which ignores single bad samples.  With heavy
     # tails of index a, the extreme of a simulation of the right model is more than twice the
     # recorded one with probability 1/(1 + 2^a).  So with a = 2, one in five simulations leaves the

@@ -109,7 +109,7 @@ def with_error(value: Any, error: Any, *, positive: bool = False) -> str:
 
 
 def is_vague(value: Any, error: Any) -> bool:
-    """Return whether the error of a positive number exceeds `LARGEST_LOG_SE`, as in `Estimate`."""
+    """Return whether a positive number's relative error exceeds `LARGEST_LOG_SE` (`Estimate`)."""
     return (isinstance(value, float) and isinstance(error, float)
             and 0.0 < LARGEST_LOG_SE * value < error)
 

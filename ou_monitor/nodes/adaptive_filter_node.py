@@ -9,7 +9,7 @@ doc/messages.md lists its topics:
 - `throttle` and `rpm`, if `notch.count` is above 0: for the notches, which come before the
   low-pass; without `throttle`, the throttle in `state` is used;
 - `~/output`: type, stamp and frame of the input; a derivative is a geometry_msgs/AccelStamped or
-  Vector3Stamped.
+  Vector3Stamped, or without a stamp a Float64.
 
 Limits: of an Imu only the angular velocity is filtered, of a BatteryState only the voltage, unless
 `input.field` names another field.  Other fields, covariances included, stay unchanged.
@@ -37,7 +37,7 @@ from ou_monitor.online.trust import InputClock, SLOW_MISSED, SourceInterval, Sta
 from ou_monitor.records import Level, NAN, Status
 from std_msgs.msg import Float64
 
-# Fixed at run time: the mode decides the unit of the output.
+# Cannot be changed at run time: the mode decides the unit of the output.
 _MODE = next(p for p in FILTER_PARAMETERS if p.name == 'mode')
 INPUT_PARAMETERS = (
     Parameter('input.type', AUTO, "Message type of `input`; auto: the publisher's type."),

@@ -174,7 +174,7 @@ class MonitorNode(Node):
             self.publish_every(self._outputs_callback)
 
     def every(self, period: float, callback: Callable[[], None]) -> Timer:
-        """Call back every `period` s of real time, so silence shows under simulated time too."""
+        """Call back every `period` s of real time, to detect silence under simulated time too."""
         timer = self.create_timer(period, self.guarded(callback), clock=self.steady)
         self._made.append(timer)
         return timer

@@ -42,8 +42,8 @@ LEAST, FIRST_SPAN = 200, 0.2
 # Messages and seconds between judgements (a judgement takes 0.2 ms for 400 messages, 0.6 ms for
 # 10 000).
 JUDGE, JUDGE_SPAN = 100, 0.1
-# A message is near the line within NEAR sqrt(n) periods, n the messages examined: an untimed
-# source drifts from its line as sqrt(n), so its share of near messages does not depend on n.
+# A message is near the line within NEAR sqrt(n) periods, n the messages examined: a source without
+# a timer drifts from its line as sqrt(n), so its share of near messages does not depend on n.
 # Measured: at most 14 % of a Poisson source is near (99th percentile, n = 200; 12 % from 400 on),
 # 23 % or more of a 10 kHz timer whose process pauses 30 times a second for 5..50 ms, 21 % when one
 # message in a hundred is also lost.

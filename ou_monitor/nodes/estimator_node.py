@@ -44,8 +44,8 @@ POLL = 0.02
 # Maximum time between two transfers of fetched messages to the monitor, s; each report makes one
 # too. A transfer takes 2 to 3 ms of CPU, however few samples there are.
 HAND_OVER = 0.25
-# Maximum share of the time for estimates: above it they become less frequent; if pushing the
-# samples alone exceeds it, samples are thinned.
+# Maximum share of the time that estimates take; to keep it, estimates become less frequent, and if
+# pushing the samples alone exceeds it, samples are thinned.
 SHARE = 0.25
 # An estimate that takes longer than this, s of CPU, is not made for every report.
 HEAVY = 0.02
@@ -198,7 +198,7 @@ class EstimatorNode(MonitorNode):
         self._thin_if_costly(time.thread_time() - pushing)
 
     def _merge(self, voltage: Arrivals | None, throttle: Arrivals) -> Arrivals | None:
-        """Place throttle messages among voltages, by arrival; return the voltages left."""
+        """Place throttle messages among voltages, by arrival; return the remaining voltages."""
         times = self._times(throttle)
         column = throttle.column
         for k in range(0, column.n, -(-column.n // MOST_THROTTLES)):
@@ -388,7 +388,7 @@ class EstimatorNode(MonitorNode):
         self._diagnosed = self.steady_now()
         found = self._report()
         if found[0].flag.low:
-            # A dip appears in one report; without a hold the next one does not contain it.
+            # Without a hold, a dip is in only one report, so publish this one.
             self._publish(*found)
         self._diagnostics.publish(self._message('supply', *found, self.stamp_now()))
 

@@ -1,10 +1,10 @@
 """
 The files of a node: its model, and the latch of the flag, which survives a restart.
 
-A model file is replaced only if it is a regular file and still has the bytes that were read. The
-latch is a small file with one JSON object: OK or CRITICAL, and the name of the node.  A lock on
-its inode shows that the node runs.  Only regular files that contain this name are written or
-replaced.  This module does not import ROS.
+A model file is replaced only if it is a regular file and still has the bytes that were read.  The
+latch is a small file with one JSON object: node, level (OK or CRITICAL), reason and time.  A lock
+on its inode shows that the node runs.  An existing latch file is replaced only if it is a regular
+file that names this node.  This module does not import ROS.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ BATCH, AHEAD = 1000, 200
 
 
 class SpacingError:
-    """How far the spacing of events was from the intended one, in whole microseconds."""
+    """Deviations of the spacing of events from the intended one, in whole microseconds."""
 
     def __init__(self) -> None:
         # A histogram, so that days of replay take no more memory than minutes.

@@ -43,7 +43,7 @@ SOURCE_PARAMETERS: tuple[Parameter, ...] = (
     Parameter('adc.sample_rate', 0.0,
               'True rate of the samples in a block, Hz; 0: as the msg_config says.', 0.0, 1.0e9),
 )
-# For the node that follows the motors.
+# For `adaptive_filter`, whose notches follow the motors.
 MOTOR_PARAMETERS: tuple[Parameter, ...] = (
     _CONFIG, *_where('throttle', 'throttle'), *_where('rpm', 'motor speeds'))
 
