@@ -3,13 +3,13 @@ The voltage of a Linux IIO or hwmon device: polled, or in blocks from the kernel
 
 Limits: file permissions decide what can be read and written; errors say what to do.  A polled
 voltage (hwmon `inN_input`, or IIO `_raw` without a buffer) is as old as the driver's last
-conversion; polling faster than its `update_interval` repeats the number.  A buffer serves one
-program, and one channel is read.  Without a timestamp channel a block has the time at which it
-was read, which includes the scheduler's delay.
+conversion; polling faster than its `update_interval` repeats the number.  Only one program can
+read a buffer, and only one channel is read.  Without a timestamp channel, a block is stamped when
+it is read, later than its last sample by the scheduler's delay.
 
-The kernel's ABI (Documentation/ABI/testing/sysfs-bus-iio, iio_devbuf): an element of a scan is
-`[be|le]:[s|u]bits/storagebits[>>shift]`, lies at a multiple of its own size, in the order of the
-indices, and a scan is padded to a multiple of its largest element.  Volts are
+The kernel's ABI (Documentation/ABI/testing/sysfs-bus-iio, iio_devbuf): a scan holds its elements
+in the order of their indices, each at a multiple of its own size, and is padded to a multiple of
+the largest one.  An element's type is `[be|le]:[s|u]bits/storagebits[>>shift]`.  Volts are
 (raw + offset) * scale / 1000.
 """
 
@@ -120,13 +120,13 @@ def choose_channel(folder: Path, known: Sequence[str], channel: str) -> str:
 
 
 def find_attribute(folder: Path, channel: str, what: str) -> Path | None:
-    """Return the attribute of a channel, else of its kind, else of the device; None if missing."""
+    """Return the file of an attribute: of the channel, of all voltages, of the device; or None."""
     return next((folder / name for name in (f'{channel}_{what}', f'in_voltage_{what}', what)
                  if (folder / name).exists()), None)
 
 
 def channel_number(folder: Path, channel: str, what: str, missing: float) -> float:
-    """Return the number in an attribute of a channel."""
+    """Return the number in an attribute of a channel, or `missing` if there is no such file."""
     path = find_attribute(folder, channel, what)
     return missing if path is None else number_of(path)
 
@@ -155,7 +155,7 @@ class PolledChannel:
         self.read()
 
     def read(self) -> float:
-        """Return the present voltage, V (both kinds count in mV)."""
+        """Return the present voltage, V (hwmon and IIO both report mV)."""
         return (number_of(self._path) + self._offset) * self._scale * 1e-3
 
 
@@ -177,7 +177,7 @@ class Element:
 
 
 def parse_element(name: str, index: int, kind: str) -> Element:
-    """Return an element by its `_index` and `_type`."""
+    """Return an element, given the contents of its files `_index` and `_type` (kind)."""
     match = _TYPE.fullmatch(kind)
     if match is None:
         raise InputError(f"{name}_type is '{kind[:40]}', not of the form le:s12/16>>4")
@@ -220,11 +220,11 @@ class Scan:
 
 
 STAMP = 'in_timestamp'
-# An interval above this multiple of the typical one means samples lost by a full buffer.
+# An interval above this multiple of the typical interval means that a full buffer lost samples.
 HOLE = 1.5
-# Number of newest intervals whose median is the typical one.
+# Number of newest intervals whose median is the typical interval.
 INTERVALS = 64
-# Size of the kernel's buffer, blocks: the longest delay without loss.
+# Size of the kernel's buffer, blocks: the longest delay in reading that loses no samples.
 BLOCKS = 64
 # Maximum wait for samples, s; also the maximum delay at shutdown.
 NAP = 0.1
@@ -247,7 +247,7 @@ class Block:
 class IioBuffer:
     """The buffer of one IIO device: its folder in sysfs, and its character device."""
 
-    # `block` 0: the samples of 10 ms; `rate`, Hz, and `trigger` are set unless 0 or empty.
+    # block: samples in a block (0: those of 10 ms); rate, Hz, and trigger: set unless 0 or empty.
 
     def __init__(self, folder: Path, character: Path, channel: str = '', block: int = 0,
                  rate: float = 0.0, trigger: str = '') -> None:
@@ -271,7 +271,7 @@ class IioBuffer:
         self.rate = channel_number(folder, self.channel, 'sampling_frequency', math.nan)
         self.block = block or (max(round(0.01 * self.rate), 1) if self.rate > 0.0 else 1)
         if find_attribute(folder, self.channel, 'scale') is None:
-            raise InputError(f'{folder.name} does not say what a count of {self.channel} is '
+            raise InputError(f'{folder.name} does not state the scale of {self.channel} '
                              f'(no {self.channel}_scale)')
         self._scale = channel_number(folder, self.channel, 'scale', math.nan)
         self._offset = channel_number(folder, self.channel, 'offset', 0.0)

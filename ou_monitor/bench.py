@@ -1,8 +1,8 @@
 """
-The commands as functions: each reads what it is given and returns a `Result`.
+The commands as functions that return a `Result`.
 
-A recording is a `Recording`, or a path that `read_recording` reads.  Imports wait for the call, so
-that a function loads only what it uses.
+A recording is a `Recording`, or a path that `read_recording` reads.  Modules are imported inside
+the functions, so that each function loads only what it uses.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ Given = Union[Recording, str, Path]
 Progress = Callable[[float], None]
 Pairs = tuple[npt.ArrayLike, npt.ArrayLike]
 
-# Minimum number of samples: one more than the parameters of mean and trend.
+# Minimum number of samples: one more than the two parameters of a straight line.
 _FEWEST = 3
-# Rate from which samples are written in blocks by default, Hz.
+# Minimum rate at which samples are written in blocks by default, Hz.
 _BLOCKS_FROM = 5000.0
 
 
@@ -61,7 +61,7 @@ def check_size(recording: Recording) -> None:
 
 
 def _limit(recording: Recording, limit: float | None, cells: int) -> tuple[float | None, int]:
-    """Return the limit of the pack, V, and its cells: those given, else those of the log."""
+    """Return the pack's limit, V, and number of cells: as given, else as the log states them."""
     from ou_monitor.analysis.crafts import check_cells, full_voltage, pack_limit, stated_limit
 
     if cells:
@@ -87,8 +87,8 @@ def analyze(recording: Given, *, levels: tuple[float, ...] | None = None, window
     window : float
         Window of the sliding estimate, s.
     brownout_voltage : float, optional
-        Brown-out limit, V, with `cells` in volts per cell (then by default 3.3); else by default
-        from the log's header or the node's.
+        Brown-out limit, V; if `cells` is given, V per cell, by default 3.3.  Without either, the
+        limit in the log's header, else the default of the node.
     brownout_horizon : float
         Horizon of the risk, s.
     cells : int
@@ -128,7 +128,7 @@ def analyze(recording: Given, *, levels: tuple[float, ...] | None = None, window
                      brownout_horizon=brownout_horizon, cells=cells, progress=progress)
     facts = found.overview.facts
     if found.brownout_default:
-        # Without a given limit, report no dips and no budget, as the other commands.
+        # Without a given limit, report no dips and no budget, as the other commands do.
         facts = replace(facts, dips=None, budget=None)
     return Result(found, partial(analysis_document, found), partial(_analysis_data, found),
                   'levels', facts)
@@ -155,8 +155,8 @@ def compare(recording: Given, model: SupplyModel | str | Path | None = None, *,
     model : SupplyModel or path, optional
         Model to simulate; by default a model fitted to the part before fit_until.
     fit_until : float, optional
-        Start of the simulated part, s after the first sample; by default the middle, or with a
-        model the first sample.
+        Start of the simulated part, s after the first sample; by default the middle of the
+        recording, or its first sample if a model is given.
     seeds : int
         Number of simulations, 20 to 10000.
     seed : int
@@ -176,8 +176,8 @@ def compare(recording: Given, model: SupplyModel | str | Path | None = None, *,
     Raises
     ------
     InputError
-        When the recording is too short, does not change, or lacks throttle that the model needs;
-        when fit_until lies outside it.
+        When the recording is too short, is constant, or lacks the throttle that the model needs;
+        when fit_until lies outside the recording.
     ValueError
         When seeds is out of its range.
 
@@ -217,8 +217,8 @@ def coupling(recording: Given, signal: str | Series | Pairs, *,
     recording : Recording or path
         The supply.
     signal : str or pair of arrays
-        The signal: with a path, the name of a topic and field, a column or a series; with a
-        `Recording`, stamps (s, or dates) and values.
+        The signal.  If the recording is a path: name of a topic and field, a column or a series
+        in that file; if it is a `Recording`: stamps (s, or dates) and values.
     band : tuple of float, optional
         Frequency band, Hz; by default from 5 Hz to a quarter of the slower rate.
     level : float
@@ -346,7 +346,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     Parameters
     ----------
     throttle : float, optional
-        Throttle, 0..1; with a recording, by default the one exceeded for 1 % of it.
+        Throttle, 0..1; by default the 99 % quantile of the recording's throttle.
     recording : Recording or path, optional
         Flight that gives level, sag, resistance and noise.
     network : mapping, optional
@@ -355,13 +355,13 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
     rail : {'bus', 'regulated'}
         The battery bus at the ESCs, or the regulated rail.
     voltage : float, optional
-        Brown-out level, V, on the bus with `cells` in volts per cell (by default 3.3).
+        Brown-out level, V; on the bus, if `cells` is given, V per cell (by default 3.3).
     cells : int
         Cells in series; 0: those of the network, or of the recording.
     horizon : float
         Horizon of the risk, s.
     risk : float
-        Maximum risk, 0..1; the default is that of the throttle budget of `analyze`.
+        Maximum risk, 0..1; the throttle budget of `analyze` has the same default.
     capacitances : tuple of float, optional
         Smallest and largest capacitance tried, F.
     esr_fixed : bool
@@ -424,8 +424,8 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
             flown, full, cells, level if rail == 'bus' else None, horizon, risk)
         if not facts.sag.known and 'battery_resistance' not in values:
             raise InputError(f'the sag of {flown.name} is unknown, so a remedy cannot be chosen: '
-                             'give --set battery_resistance=OHM, or fly more changes of throttle')
-        # A peak of a few readings is not the throttle to design for.
+                             'give --set battery_resistance=OHM, or vary the throttle more')
+        # The 99 % quantile, so that a peak of a few readings does not count.
         throttle = min(1.0, flight.flown[1]) if throttle is None else throttle
         circuit = network_of(flight, throttle, values)
         if rail != 'bus' and voltage is None:
@@ -446,7 +446,7 @@ def design(throttle: float | None = None, *, recording: Given | None = None,
 
 def _flight(recording: Recording, full: float, cells: int, level: float | None, horizon: float,
             risk: float) -> tuple[Flight, SupplyFacts, FlownRisk | None]:
-    """Return a flight in numbers, its facts, and the risk at its end (full, level in V)."""
+    """Return a flight in numbers, its facts, and its final risk as a function (full, level: V)."""
     from ou_monitor.analysis.supply import facts_and_end, node_for
     from ou_monitor.online.estimator.estimator import SLIDING
     from ou_monitor.online.settings import MonitorSettings
@@ -467,7 +467,7 @@ def _flight(recording: Recording, full: float, cells: int, level: float | None, 
     @cache
     def over_throttle(sag: float, noise: float) -> FloatArray:
         assert monitor is not None
-        # The logarithm is interpolated, as for the budget.
+        # The logarithm is interpolated, as for the throttle budget.
         return np.asarray(np.log(np.maximum(monitor.changed_risk(sag, noise), 1e-300)))
 
     def risk_at(throttle: float, sag: float, noise: float) -> float:
@@ -533,10 +533,10 @@ def simulate(model: SupplyModel | ModelFile | str | Path | None = None, *,
     start, end : float, optional
         Part of the recording that `throttle` names, s.
     duration : float, optional
-        Length, s; by default that of the preset or of the recorded throttle.
+        Length, s; by default the preset's length or that of the recorded throttle.
     rate : float, optional
-        Samples per second, Hz; by default that of the model's recording, if its file has it, or
-        of the preset.
+        Samples per second, Hz; by default the rate of the model's recording if the model file
+        states it, else the preset's rate.
     seed : int
         Equal seeds give equal recordings.
     capacity_left : float, optional
@@ -548,7 +548,7 @@ def simulate(model: SupplyModel | ModelFile | str | Path | None = None, *,
     message : str, optional
         Message of the voltage in the bag.
     columns : CsvColumns, optional
-        As for `read_recording`, of the file that `throttle` names.
+        As for `read_recording`, for the CSV that `throttle` names.
     progress : callable, optional
         Called with the share of the bag written, 0..1.
 

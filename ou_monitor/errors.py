@@ -15,17 +15,17 @@ import itertools
 
 from ou_monitor.text import printable
 
-# Maximum number of valid words to choose a hint from (a table may have many columns), and to list.
+# Maximum number of valid words to search for a hint (a table may have many columns), and to list.
 _MOST_CHOICES, _MOST_SHOWN = 1000, 60
 
 
 class InputError(Exception):
     """
-    An input of the user cannot be used; the text is one line for the user.
+    A user's input cannot be used; the text is one line for the user.
 
     Command-line programs print it after their name and exit with status 2; nodes log it at FATAL
-    and exit with status 2.  Text from a file or a file name in it is escaped, so that it cannot
-    control a terminal (`text.printable`).
+    and exit with status 2.  Unprintable characters, as from file names, are escaped, so that they
+    cannot control a terminal (`text.printable`).
 
     Examples
     --------
@@ -50,12 +50,12 @@ def refusal(error: OSError) -> str:
 
 
 def how_to_install(extra: str) -> str:
-    """Return how to install an extra of this package, which is in no registry."""
+    """Return how to install an extra; the package is not on PyPI, so from its source."""
     return f"run pip install '.[{extra}]' in the folder of its source"
 
 
 def closest(word: str, valid: Iterable[str]) -> str | None:
-    """Return the valid word that starts with a word, or else is most similar to it, or None."""
+    """Return the first valid word that starts with `word`, else the most similar one, or None."""
     choices = list(itertools.islice(valid, _MOST_CHOICES))
     begun = [choice for choice in choices if word.strip('-') and choice.startswith(word)]
     return next(iter(begun or difflib.get_close_matches(word, choices, n=1, cutoff=0.5)), None)

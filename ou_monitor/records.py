@@ -20,7 +20,7 @@ from ou_monitor.text import Z95
 FloatArray = npt.NDArray[np.float64]
 
 NAN = float('nan')
-# Maximum factor between a known positive parameter and an end of its 95 % interval.
+# A positive parameter is unknown if an end of its 95 % interval is off by more than this factor.
 LARGEST_FACTOR = 10.0
 # The corresponding standard error of the parameter's logarithm.
 LARGEST_LOG_SE = math.log(LARGEST_FACTOR) / Z95
@@ -28,12 +28,12 @@ LARGEST_LOG_SE = math.log(LARGEST_FACTOR) / Z95
 _INFINITE = 709.0
 # Units of a time, in s.
 TIME_UNITS = {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9}
-# The years 2000 and 2100, s since 1970: the ranges of a clock in s, ms, us and ns do not overlap.
+# Start of 2000 and of 2100, s since 1970: in between, the size of a stamp shows its unit.
 _CLOCKS = 946_684_800.0, 4_102_444_800.0
-# Largest magnitude accepted as a stamp, s: the year 5138, below any clock in ms.
+# Largest magnitude accepted as a stamp, s: the year 5138; a present date in ms is larger.
 MOST_STAMP = 1.0e11
-# Median steps below and above which the unit of the time is wrong, s: no oscilloscope is faster,
-# no logger of a supply is slower.
+# Plausible median time steps, s; outside, the time unit is wrong: no oscilloscope is faster, no
+# logger of a supply is slower.
 LEAST_STEP, LONGEST_STEP = 1e-12, 100.0
 
 
@@ -68,7 +68,7 @@ def as_numbers(values: npt.ArrayLike) -> FloatArray:
 
 
 def clock_unit(stamp: float) -> str:
-    """Return the unit in which a stamp since 1970 is a date of 2000 to 2100; '': none."""
+    """Return the unit in which a stamp since 1970 is a date of 2000 to 2100, or ''."""
     return next((unit for unit, scale in TIME_UNITS.items()
                  if _CLOCKS[0] <= stamp * scale <= _CLOCKS[1]), '')
 
@@ -77,8 +77,8 @@ def as_seconds(values: npt.ArrayLike) -> FloatArray:
     """
     Return stamps in s; dates count from 1970 (UTC), NaT and masked stamps become NaN.
 
-    Numbers are seconds, unless all are dates of 2000 to 2100 in ms, us or ns since 1970.  Time
-    spans, and dates with a time zone as in pandas and xarray, are accepted too.
+    Numbers count as seconds, unless all are dates of 2000 to 2100 in ms, us or ns since 1970.
+    Time differences, and dates with a time zone (pandas, xarray), are accepted too.
     """
     plain = type(values) is np.ndarray and values.dtype == np.float64
     data = np.asarray(values if plain else np.ma.getdata(values))
@@ -99,7 +99,7 @@ def as_seconds(values: npt.ArrayLike) -> FloatArray:
         return as_numbers(values)
     if np.datetime_data(data.dtype)[0] == 'generic':
         raise ValueError('stamps without a unit: timedelta64 needs one, such as [ns]')
-    # Seconds and the rest apart: float64 holds 1.7e18 ns inexactly, and int64 overflows at 1e19.
+    # Whole seconds and the rest separately: float64 cannot hold 1.7e18 ns, and int64 ends at 9e18.
     whole = data.astype(f'{data.dtype.kind}8[s]')
     seconds = whole.astype(np.int64) + (data - whole) / np.timedelta64(1, 's')
     return np.where(np.isnat(data) | np.ma.getmask(values), NAN, seconds)
@@ -108,7 +108,7 @@ def as_seconds(values: npt.ArrayLike) -> FloatArray:
 def _fine_unit(stamps: npt.NDArray[Any], masked: npt.NDArray[np.bool_] | np.bool_) -> str:
     """Return 'ms', 'us' or 'ns' if all stamps are dates since 1970 in that unit, else ''."""
     most = float(stamps.max(initial=0))
-    # Also false for NaN.
+    # A NaN among the stamps makes this false; the finite ones are checked below.
     if most <= MOST_STAMP:
         return ''
     known = stamps[np.isfinite(stamps) & ~masked]
@@ -130,7 +130,7 @@ def log_interval(value: float, log_se: float, z: float = Z95) -> tuple[float, fl
 
 
 def determined(value: float, low: float, high: float) -> bool:
-    """Whether an interval spans at most `LARGEST_FACTOR` either way."""
+    """Whether both ends of an interval are within a factor `LARGEST_FACTOR` of the value."""
     return low * LARGEST_FACTOR >= value and high <= value * LARGEST_FACTOR
 
 
@@ -139,7 +139,7 @@ class Status(enum.Enum):
     Outcome of an estimate; the value is the sentence for the pilot.
 
     The numbers are usable only with `OK` and `SHORT_WINDOW` (`Estimate.usable`); with any other
-    status the unknown ones are NaN.
+    status, numbers that could not be estimated are NaN.
 
     Examples
     --------
@@ -209,7 +209,7 @@ class Defect(enum.Enum):
 
 
 class Note(str):
-    """A sentence of a reader, with the defect that it reports."""
+    """A sentence from the reader of a file, with the defect that it reports."""
 
     defect: Defect
 
@@ -429,18 +429,18 @@ class Estimate:
         return log_interval(getattr(self, name), getattr(self, name + '_se'), z)
 
 
-# Windows at the end of the readings in which a relaxation is searched, s, and maximum number of
-# readings: a minute at 1 kHz.
+# Lengths of the final part of a recording in which a relaxation is sought, s, and maximum number
+# of readings: a minute at 1 kHz.
 OU_WINDOWS, MOST_READINGS = (2.0, 8.0, 30.0, 60.0), 65536
 
 
 @dataclass(frozen=True)
 class OuFacts:
     """
-    The fitted relaxation (an OU beside white noise), or bounds on it.
+    The fitted relaxation (an OU process plus white noise), or bounds on it.
 
-    `not_visible`: a relaxation slower than `tau_below_s`, but faster than the level wanders, has a
-    variance below `var_inf_below` (95 %); a faster one may make up all of the noise.
+    `not_visible`: a relaxation slower than `tau_below_s`, but faster than the drift of the level,
+    has a variance below `var_inf_below` (95 %); a faster one may be all of the noise.
     """
 
     status: str  # ok, not_visible, too_short or no_data
@@ -473,11 +473,11 @@ class Recording:
         Voltage, V, finite.
     throttle : ndarray, shape (n,)
         Throttle 0..1, the last value known at each stamp; NaN where unknown, and everywhere
-        without a throttle.  A number holds for all samples.
+        without a throttle.  A scalar applies to all samples.
     name : str
         Name for messages and pages.
     source : dict
-        Topics, types, units and files it was read from.
+        Topics, types, units and files from which it was read.
     notes : tuple of str
         What the reader dropped or repaired, one sentence each.
     current : ndarray, shape (n,), or None

@@ -56,13 +56,13 @@ LOADS = ((0.0, 0.0), (10.0, 0.0), (10.0, 0.05), (20.0, 0.05), (20.0, 0.10), (30.
 
 def through(points: Sequence[tuple[float, float]], period: float | None = None,
             stick_rate: float | None = None) -> Profile:
-    """Return straight lines through points (s, 0..1), constant beyond them."""
+    """Return lines through points (s, 0..1); period, s, and steps at stick_rate, Hz: if given."""
     return partial(_through, np.array(points, dtype=np.float64).T, period, stick_rate)
 
 
 def _through(points: FloatArray, period: float | None, stick_rate: float | None, t: FloatArray,
              ) -> FloatArray:
-    # Several times as fast as t % period; its only error is one rounding.
+    # Several times as fast as t % period, and equal to it within one rounding error.
     at = t if period is None else t - np.floor(t / period) * period
     if stick_rate is not None:
         # Tolerance for rounding: a stamp at an update has the new value.
@@ -93,7 +93,7 @@ PROFILES: dict[str, tuple[Profile, str]] = {
 
 
 def read_profile(text: str, columns: CsvColumns | None = None) -> Profile:
-    """Return the profile that a user asks for; columns: of a CSV."""
+    """Return the profile that a text describes (columns: those of a CSV)."""
     if text in PROFILES:
         return PROFILES[text][0]
     if text.lower().endswith('.csv') or Path(text).is_file():
@@ -143,7 +143,7 @@ def _from_csv(path: Path, columns: CsvColumns | None) -> Profile:
     t, throttle = read_throttle_alone(path, columns)
     if not t.size:
         raise InputError(f'{path} holds no row')
-    # Dates count from the first one.
+    # Stamps since 1970 are counted from the first one.
     t = t - (t[0] if clock_unit(t[0]) else 0.0)
     return through(_checked(list(zip(t.tolist(), throttle.tolist())), str(path)))
 
@@ -159,7 +159,7 @@ class RecordedThrottle:
 
 
 def is_recording(text: str, columns: CsvColumns | None = None) -> bool:
-    """Return whether the text for a throttle is the path of a recording; columns: of a CSV."""
+    """Return whether the text for a throttle names a recording (columns: those of a CSV)."""
     path = Path(text)
     if text in PROFILES or not path.exists():
         return False
@@ -195,23 +195,23 @@ def _held(t: FloatArray, u: FloatArray, at: FloatArray) -> FloatArray:
 U0 = 5.0
 ALPHA = 63.0
 
-# Noise intensity by throttle, V/sqrt(s).  10 % and 40 % are Table 2; 5 % follows
-# from its Vrms of 9.38 mV (Table 1); motors off reads "~0": half a step of the
-# oscilloscope (9.375 mV) at most.
+# Noise intensity by throttle, V/sqrt(s).  10 % and 40 % are from Table 2; 5 % is from its Vrms of
+# 9.38 mV (Table 1).  With the motors off the paper prints "~0", so the Vrms is at most half an
+# oscilloscope step of 9.375 mV, which is used here.
 SIGMA = {0.0: 4.7e-3 * math.sqrt(2.0 * ALPHA), 0.05: 9.38e-3 * math.sqrt(2.0 * ALPHA),
          0.10: 0.3156, 0.40: 0.632}
 
 # Deviation right after 20 % throttle is released, V (Fig. 5).
 TRANSIENT_SAG = 0.368
 
-# The flight: sag at full throttle, V, and the sensor's white noise, V.
+# Preset 'flight': sag at full throttle, V, and the sensor's white noise, V.
 FLIGHT_SAG = 0.3
 FLIGHT_NOISE = 2e-3
 
 
 @dataclass(frozen=True)
 class Preset:
-    """A supply, and how it is flown and sampled."""
+    """A supply with its throttle and its sampling."""
 
     text: str  # Description
     model: SupplyModel  # The supply
@@ -262,7 +262,7 @@ LARGEST = 1e9
 
 
 class RunningSupply:
-    """A simulation, sample k at k/rate, Hz; charge, resistance as in `Simulation`."""
+    """A running simulation: sample k is at k/rate (Hz); charge, resistance: see `Simulation`."""
 
     def __init__(self, model: SupplyModel, *, rate: float, seed: int,
                  charge: float | None = None, resistance: float = 1.0) -> None:
@@ -280,7 +280,7 @@ class RunningSupply:
         with np.errstate(over='ignore', invalid='ignore'):
             voltage = self.simulation.advance(
                 self.times(throttle.size),
-                # Rounded as in a message: the bag then has the throttle that was simulated.
+                # Rounded as in a message, so that a bag holds the throttle that was simulated.
                 throttle.astype(np.float32).astype(np.float64))
         if not (np.abs(voltage) <= LARGEST).all():
             raise ValueError(
@@ -297,7 +297,7 @@ def lacks(model: SupplyModel) -> tuple[str, ...]:
         missing.append('no response to throttle (load_sag)')
     if model.load is None:
         missing.append('no charge (load)' + ('' if 'drift' in names else ' and no drift')
-                       + ': it does not run empty')
+                       + ': it never discharges')
     return tuple(missing)
 
 
@@ -316,7 +316,7 @@ def simulated(model: SupplyModel, profile: Profile, *, duration: float, rate: fl
         raise InputError(str(error)) from error
 
 
-# Maximum rate, Hz, above which stamps would coincide, and maximum duration of a bag, s.
+# Maximum rate, Hz (stamps count in ns), and maximum duration, s, of a bag.
 _RATE_MOST, _DURATION_MOST = 1e9, 9e9
 
 

@@ -10,7 +10,7 @@ Z95 = 1.959963984540054
 
 
 def printable(text: object, most: int | None = None) -> str:
-    """Return a text as one safe line: other characters escaped, the middle left out."""
+    """Return a text as one line, unprintable characters escaped, without its middle if long."""
     found = str(text)
     if not found.isprintable():
         found = ''.join(
@@ -23,21 +23,21 @@ def printable(text: object, most: int | None = None) -> str:
 
 
 def plain_number(text: str) -> float:
-    """Parse a number; unlike `float`, raise ValueError for 5_01 and for an Arabic 5."""
+    """Parse a number; unlike `float`, raise ValueError for 5_01 and for non-ASCII digits."""
     if '_' in text or not text.isascii():
         raise ValueError(f"'{printable(text, 60)}' is not a number")
     return float(text)
 
 
 def some(names: Iterable[str], most: int = 40) -> str:
-    """Return at most `most` names in one line, and the number of the others."""
+    """Return at most `most` names in one line, and the number left out."""
     held = list(names)
     more = len(held) - most
     return ', '.join(held[:most]) + (f' and {more} more' if more > 0 else '')
 
 
 def number(value: float, digits: int = 3) -> str:
-    """Return a number with some significant digits, trailing zeros included."""
+    """Return a number with `digits` significant digits, trailing zeros included."""
     if not math.isfinite(value):
         return '-'
     if value == 0.0:
@@ -51,7 +51,7 @@ def number(value: float, digits: int = 3) -> str:
 
 
 def percent(share: float) -> str:
-    """Return a share with at least two digits and its sign: '0.056 %', '100 %'."""
+    """Return a share, 0..1, in percent, to two significant digits: '0.056 %', '100 %'."""
     value = float(f'{100.0 * share:.2g}')
     return f'{value:g} %'
 
@@ -89,11 +89,11 @@ def span_words(start: float | None, end: float | None) -> str:
 
 
 def outside_words(name: str, start: float | None, end: float | None, length: float) -> str:
-    """Return the text of the error for a part without samples (length of the recording in s)."""
+    """Return the error message for a part without samples (length of the recording in s)."""
     return f'{name} holds no sample {span_words(start, end)}: it lasts {length:.3f} s'
 
 
 def part_words(start: float | None, end: float | None) -> str:
-    """Return the note on a part."""
+    """Return the note that only a part was read."""
     return (f'Only the part {span_words(start, end)} of the recording was read; times in the '
             'report count from its start.')

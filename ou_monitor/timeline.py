@@ -1,24 +1,24 @@
 """
-The time line: samples of any source in order, each reading once, with counters for the rest.
+The time line: samples of any source in order of time, each reading once; dropped ones are counted.
 
 Node, estimator and offline reading share these rules:
 
 - samples with a non-finite or implausible stamp or voltage are dropped (`non_finite`);
 - an implausible throttle or current becomes NaN;
-- late stamps are sorted within one push; later ones, and repeated stamps, are dropped (`late`);
+- samples of one push are sorted; stamps not after those of earlier pushes are dropped (`late`);
 - a stamp that is earlier or later by more than a pause starts a new time line;
 - a reading that a logger repeats counts once (`held`).
 
 Repeats: a voltage read at 100 Hz and logged at 1 kHz appears ten times, and the repeats would look
-like increments of zero.  They are recognised by the gaps between changes, all multiples of one
-period, which need not be whole (3, 3, 4).  A coarse ADC also repeats values, but changes at
-irregular distances, or (ramp, square wave, ripple) always by one code and with a constant sum of
-two neighbouring gaps.
+like increments of zero.  They are recognised because the numbers of samples between two changes
+(gaps) are multiples of one period, which may be a fraction (3, 3, 4).  A coarse ADC also repeats
+values, but its gaps are irregular, or (ramp, square wave, ripple) all changes are of one code and
+the sums of two neighbouring gaps are equal.
 
-Limits: repeats need at least two samples per reading, and are recognised after 64 samples.  The
-first samples are then passed on again without repeats (`Batch.again`).  Repeats are not recognised
-if readings jitter by more than a tenth of a period (standard deviation), or if there are fewer
-than four samples per reading and the ADC step exceeds 1.3 times the usual increment.
+Limits: repeats are recognised only with at least two samples per reading, and after 64 samples,
+which are then passed on again without repeats (`Batch.again`).  They are not recognised if the
+readings jitter by more than a tenth of a period (standard deviation), or if there are fewer than
+four samples per reading and the ADC step exceeds 1.3 times the usual increment.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ from ou_monitor.records import (
     Recording)
 from ou_monitor.text import counted
 
-# Share of gaps that may differ from the pattern: lost samples, late logger.
+# Share of gaps that may differ from the pattern, because of lost samples or a late logger.
 _ODD = 0.05
 # Largest deviation of a gap from the pattern, in periods: 7..13 for a period of 10.
 _WIDEST = 0.35
-# Evidence required against gaps of independent changes, nats: exp(-20) is one in 5e8.
+# Minimum evidence for a period against independent changes, nats: exp(-20) is one in 5e8.
 _EVIDENCE = 20.0
 # Minimum share of changes whose size differs from the most common size.
 _SIZES = 0.1
-# To keep a period found earlier: minimum share of regular gaps.
+# Minimum share of regular gaps to keep a period found earlier.
 _KEEP = 0.8
-# To give it up: minimum number of gaps.
+# Minimum number of gaps to decide that; with fewer, the period is kept.
 _FEWEST = 8
 # Relative difference below which two step sizes are equal (float32 rounding).
 _SAME = 1e-3
@@ -69,8 +69,8 @@ class Batch:
     # Stamps, s, strictly increasing; voltage, V; throttle and current, A, NaN where unknown;
     # shape (4, n), n > 0.
     columns: FloatArray
-    shortest: float  # least step, from the sample before on, s
-    longest: float  # largest step, s
+    shortest: float  # shortest step, s, including the step from the sample before the batch
+    longest: float  # longest step, s, including the same one
     restart: bool  # a new time line starts here: forget all earlier samples
     again: bool = False  # samples already passed on, now without their repeats
 
@@ -105,7 +105,7 @@ def as_columns(t: FloatArray, y: FloatArray, u: FloatArray | float | None = None
 
 
 def refresh_period(y: FloatArray, known: float = 1.0) -> float:
-    """Return samples per refresh of the source (y in V)."""
+    """Return the samples per reading, 1 without repeats (y in V; known: period found earlier)."""
     steps = np.diff(y)
     changes = np.flatnonzero(steps)
     gaps = np.diff(changes).astype(np.float64)
@@ -120,7 +120,7 @@ def refresh_period(y: FloatArray, known: float = 1.0) -> float:
     usual = float(np.median(gaps))
     if usual < 2.0:
         return 1.0
-    # Long gaps span several periods, because few readings change a coarse ADC code.
+    # Long gaps span several periods: the code of a coarse ADC changes at few readings only.
     evidence, period = 0.0, 1.0
     for first in np.unique(gaps[gaps <= 1.5 * usual])[:_TRIED].tolist():
         about = _period(gaps, float(gaps[np.abs(gaps - first) <= max(1.0, 0.1 * first)].mean()))
@@ -135,10 +135,10 @@ def refresh_period(y: FloatArray, known: float = 1.0) -> float:
 
 
 def _evidence(gaps: FloatArray, period: float) -> float:
-    """Return the evidence against gaps of independent changes, nats."""
+    """Return the evidence for a period, against independent changes, nats."""
     distance = np.sort(np.abs(_excess(gaps, period)))
     width = float(distance[math.ceil((1.0 - _ODD) * gaps.size) - 1])
-    # Gaps are whole samples: a deviation below one means two neighbouring lengths.
+    # Gaps are whole samples, so a deviation below one is only rounding.
     if width >= 1.0 and width > _WIDEST * period:
         return 0.0
     if abs(period - round(period)) > _WHOLE:
@@ -167,7 +167,7 @@ def _excess(gaps: FloatArray, period: float) -> FloatArray:
 
 
 def _chance(period: float, width: float, longest: int) -> float:
-    """Return the share of gaps between independent changes that would fit (geometric law)."""
+    """Return the share of gaps between independent changes that fit by chance (geometric law)."""
     gaps = np.arange(1.0, max(longest, 20.0 * period) + 1.0)
     law = np.power(1.0 - 1.0 / period, gaps - 1.0) / period
     return float(law[np.abs(_excess(gaps, period)) <= width + 1e-9].sum())
@@ -193,8 +193,8 @@ def _several_sizes(sizes: FloatArray) -> bool:
 class Repeats:
     """Drops repeats from a stream, in batches of any size; `period`: samples per refresh."""
 
-    # A refresh may return the previous value, and dropping it would bias the noise.  So in a long
-    # run a refresh is assumed each period, and passed on half a period later.
+    # A new reading may equal the previous one, and dropping it would bias the noise.  So a long
+    # run of equal values counts as one reading per period, each passed on half a period later.
 
     def __init__(self) -> None:
         self.period = 1.0
@@ -231,7 +231,7 @@ class Repeats:
         number = np.rint(place / self.period)
         due = np.rint(number * self.period) == place
         if math.isnan(self._value):
-            # The age of the first value of a time line is unknown.
+            # The first value of a time line may have been read long before.
             due[0] = False
         sure = (number == 0.0) | (length >= (number + 0.5) * self.period)
         last = int(starts[-1])
@@ -246,7 +246,7 @@ class Repeats:
 
 
 def reading_places(y: FloatArray) -> tuple[Picked, float]:
-    """Return the places of new readings in a voltage, V, and samples per reading (1: all)."""
+    """Return the indices of new readings in a voltage, V, and the samples per reading."""
     repeats = Repeats()
     first = max(0, (y.size - _MIDDLE) // 2)
     repeats.period = refresh_period(y[first:first + _MIDDLE])
@@ -262,14 +262,14 @@ def refreshes(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, flo
 
 
 def reading_times(t: FloatArray, period: float) -> FloatArray:
-    """Return the reading times of a source from the stamps of their first log entries, s."""
-    # A logger is late by up to one of its steps.  A source with its own clock, whose period is not
-    # a whole number of those steps, was read on the even grid nearest to the stamps.
+    """Return when the source was read, s, given the stamps t at which readings were logged."""
+    # A reading is logged up to one logger step late.  If the period is not a whole number of
+    # logger steps, the source has its own clock: the readings lie on the even grid nearest to t.
     if t.size < 2 or abs(period - round(period)) < _WHOLE:
         return t
     usual = (t[-1] - t[0]) / (t.size - 1)
     grid = on_grid(t, np.maximum(1.0, np.rint(np.diff(t) / usual)))
-    # The logger's step is 1/period of those here.
+    # A logger step is 1/period of the usual step of t.
     return grid if float(np.abs(t - grid).max()) < 1.5 * usual / period else t
 
 
@@ -283,7 +283,7 @@ def on_grid(t: FloatArray, number: FloatArray) -> FloatArray:
 
 
 def readings_of(recording: Recording) -> Recording:
-    """Return a recording with each reading of its source once; a note counts the repeats."""
+    """Return a recording without repeats of a reading; a note counts the repeats."""
     places, period = reading_places(recording.voltage)
     if period <= 1.0:
         return recording
@@ -299,9 +299,9 @@ def supplied(recording: Recording, at_ends: bool = False) -> Recording:
     """
     Return a recording without wild readings and without the times when its supply was off.
 
-    Notes state both.  Off: below `OFF` of the usual voltage, with the readings up to `_ON` before
-    and after.  A signal that is low too often, or mostly between `OFF` and `_ON`, is not a supply
-    that was off.  at_ends: leave out only the start and the end of the recording.
+    Notes report both.  A supply is off below `OFF` of its usual voltage, and in adjacent readings
+    below `_ON`.  If it is low too often, or mostly between `OFF` and `_ON`, all readings are kept.
+    at_ends: leave out only the start and the end of the recording.
     """
     usual = float(np.quantile(recording.voltage, 0.8)) if recording.n else 0.0
     wild = recording.voltage > WILD_FACTOR * usual
@@ -363,21 +363,22 @@ def ordered(recording: Recording) -> Recording:
     return recording
 
 
-# Shares of the usual voltage below which a supply is off (4S replaced by 5 V of USB: 0.3), and
-# above which it is on again.
+# Shares of the usual voltage below which a supply is off (0.3 is on: 5 V of USB in place of 4S),
+# and above which it is on again.
 OFF, _ON = 0.2, 0.7
-# Maximum reading, in usual voltages (6S after 5 V of USB: 5).
+# Maximum reading, as a multiple of the usual voltage (6S after 5 V of USB: 5).
 WILD_FACTOR = 20.0
-# Maximum number of outages, also as a share of the samples; maximum share of samples off; maximum
-# ratio of samples between the two limits to samples below the lower one.
+# Maximum number of outages, or if larger, their maximum share of the samples (also of wild
+# readings); maximum share of samples off; maximum ratio of samples between the two limits to
+# samples below the lower one.
 _OUTAGES, _FEW, _MOST_OFF, _BETWEEN = 10, 0.01, 0.5, 1.0
 # Largest accepted magnitude of a voltage, V: far above any supply, with squares and cubes finite.
 MOST_VOLTAGE = 1.0e6
 # Largest accepted magnitude of a current, A: far above any supply.
 MOST_CURRENT = 1.0e6
-# Largest magnitude accepted as a throttle of 0..1, with generous ends.
+# Largest magnitude accepted as a throttle of 0..1, with a margin.
 MOST_THROTTLE = 2.0
-# Share of implausible throttles up to which they count as errors of single samples.
+# Maximum share of implausible throttles that are errors of single samples, not another unit.
 WILD = 0.05
 # Maximum samples in a batch; NumPy's overhead per call is then negligible.
 BATCH = 32768
@@ -385,9 +386,10 @@ BATCH = 32768
 TAIL, _ENOUGH, _LOOK = 1024, 64, 256
 # Minimum number of late samples per backward step if the clock itself went back.
 _STRETCH = 20
-# Places of samples; all of them as a slice.
+# Indices of samples, or a slice if all are meant.
 Picked = npt.NDArray[np.intp] | slice
-# Share of ties above which repeats are searched: two samples per reading make a third or more.
+# Share of samples equal to the one before above which repeats are searched (a third or more if
+# there are repeats).
 _TIED = 0.25
 
 
@@ -425,7 +427,7 @@ def hold(values: FloatArray) -> FloatArray:
 
 
 class TimeLine:
-    """Buffer, order and counters of the samples of one source."""
+    """Buffers, orders and counts the samples of one source."""
 
     def __init__(self) -> None:
         # Columns t, V, throttle and current of each push since the last `flush`.
@@ -471,7 +473,7 @@ class TimeLine:
         return self.take(np.concatenate(parts, axis=1), pause)
 
     def take(self, columns: FloatArray, pause: float) -> list[Batch]:
-        """Return the readings of columns as of a `Batch`, without the buffer (pause in s)."""
+        """Return the readings among samples (columns of a `Batch`; pause in s), unbuffered."""
         return [part for batch in self.order(columns, pause) for part in self._readings(batch)]
 
     def order(self, columns: FloatArray, pause: float) -> list[Batch]:
@@ -482,7 +484,7 @@ class TimeLine:
             self.count(non_finite=int(np.count_nonzero(~good)))
             columns = columns[:, good]
         batches: list[Batch] = []
-        # Split at each jump of time, where the newest stamp starts anew.
+        # Split at each jump in time: each part after it starts a new time line.
         while columns.size:
             t = columns[0]
             restart = math.isfinite(self.newest) and abs(t[0] - self.newest) > pause
@@ -511,7 +513,7 @@ class TimeLine:
         return Batch.of(columns, restart, before=before)
 
     def _readings(self, batch: Batch) -> list[Batch]:
-        """Drop repeats; when they are first recognised, restart the tail without them."""
+        """Drop repeats; when they are first recognised, pass on the tail again without them."""
         if batch.restart:
             self._begin_anew()
         whole = np.concatenate([self._tail, batch.columns], axis=1)
@@ -544,7 +546,7 @@ class TimeLine:
 
 def in_order(t: FloatArray, rows: FloatArray, most: float, unit: str = '',
              ) -> tuple[Picked, list[str]]:
-    """Return which samples a time line keeps, rows (n, m) up to `most`, and notes."""
+    """Return which samples a time line keeps (rows: values up to `most`, (n, m)), and notes."""
     # The comparisons are also false for NaN.
     good = np.isfinite(t) & ((rows <= most) & (rows >= -most)).all(axis=1)
     if good.all() and (t[1:] > t[:-1]).all():

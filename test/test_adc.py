@@ -125,7 +125,7 @@ def test_a_device_is_found_by_each_of_its_names(tmp_path):
 
 @pytest.mark.parametrize('spoil, words', [
     (lambda f, c: (f / 'buffer/enable').unlink(), 'cannot set .*buffer/enable'),
-    (lambda f, c: (f / 'in_voltage_scale').unlink(), 'what a count of in_voltage1 is'),
+    (lambda f, c: (f / 'in_voltage_scale').unlink(), 'does not state the scale of in_voltage1'),
     (lambda f, c: (f / 'in_voltage_scale').write_text('much\n'), "holds 'much', not a number"),
     (lambda f, c: (f / 'current_timestamp_clock').write_text('sundial\n'), 'sundial'),
     (lambda f, c: c.unlink(), 'cannot open .*No such file'),

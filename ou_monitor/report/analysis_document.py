@@ -95,7 +95,7 @@ def _budget(analysis: Analysis) -> str:
     if math.isnan(curves.voltage):
         middle, craft = float(np.median(analysis.recording.voltage)), analysis.craft
         if craft.measures:
-            # The user has to confirm that it is a lithium pack.
+            # The user has to confirm that the supply is a lithium pack.
             source = 'from the log' if craft.cells_from == 'log' else 'a guess from the voltage'
             return (f'unknown: no limit; --cells {craft.cells} ({source}) sets it to '
                     f'{CELL_LIMIT * craft.cells:g} V, --brownout-voltage to any other')
@@ -126,10 +126,10 @@ def _budget(analysis: Analysis) -> str:
 
 
 def _fall_within_budget(analysis: Analysis) -> str:
-    """Return the fall below the limit at a throttle within the budget, in words; empty: none."""
+    """Return in words that the voltage fell below the limit within the budget, or ''."""
     recording, curves = analysis.recording, analysis.by_throttle
     k = int(np.argmin(recording.voltage))
-    # The voltage may follow throttle late.
+    # The voltage may lag behind throttle.
     top = recording.throttle[np.searchsorted(recording.t, recording.t[k] - 0.5):k + 1].max()
     if recording.voltage[k] >= curves.voltage or not top <= curves.budget + 0.01:
         return ''
@@ -137,7 +137,7 @@ def _fall_within_budget(analysis: Analysis) -> str:
 
 
 def _why_no_throttle(analysis: Analysis) -> str:
-    """Return why no throttle meets the limit: a low end, the flight before, or a low rest."""
+    """Return why no throttle is safe: last reading, flight before, or voltage at rest."""
     rest, last = analysis.overview.load.level, float(analysis.recording.voltage[-1])
     if last < analysis.by_throttle.voltage < rest:
         return f'at the end of this recording, which reads {number(last, 4)} V'
@@ -170,7 +170,7 @@ def _numbers(analysis: Analysis) -> list[str]:
     low, high = ou.alpha_95
     held = recording.throttle[recording.t >= recording.t[-1] - ou.window_s]
     held = 100.0 * held[np.isfinite(held)]
-    # All but a few readings in between.
+    # 5 % to 95 %, so that a few unusual readings do not count.
     flown = dict.fromkeys(f'{x:.0f}' for x in np.quantile(held, (0.05, 0.95))) if held.size else ()
     at = f' at {" to ".join(flown)} % throttle' if flown else ''
     found = [f'The noise of {"all" if whole else "the last"} {number(ou.window_s)} s{at} (level '
@@ -188,8 +188,8 @@ def _numbers(analysis: Analysis) -> list[str]:
     if differing:
         where = ('At steady throttle' if analysis.recording.has_throttle else
                  'Over the whole recording')
-        found.append(f'{where} {listed(differing)}: the values above also describe what '
-                     'follows changes of load, or lines.')
+        found.append(f'{where} {listed(differing)}: the values above also include transients '
+                     'after load changes, or spectral lines.')
     return found
 
 
@@ -251,7 +251,7 @@ def _by_throttle(analysis: Analysis) -> Part:
             chance(risk)])
     heads = ['throttle', 'sag, mV', 'noise, mV rms', 'at steady\nthrottle, mV rms',
              'brown-out risk']
-    # Nothing is known of most throttles of a load that is only on or off.
+    # A load that is only on or off leaves most throttles unknown.
     return Table.of_known(heads, [row for row in rows if set(row[1:]) != {UNKNOWN}], left=[0])
 
 

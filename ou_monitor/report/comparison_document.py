@@ -14,9 +14,9 @@ from ou_monitor.text import listed, number
 _MEASURED, _SIMULATED = 7, 1
 _VOLTAGE = ('Line: measured. Band: 95 % of the simulations at each moment. Pale line: one '
             'simulation. Dashed lines: levels below which dips are counted.')
-# Fitted range if a model was given, so nothing was fitted.
+# Fitted range that stands for a given model.
 _NOTHING = (0.0, 0.0)
-# Of 12 numbers, so many or more are outside their 95 % bands in 2 % of good simulations.
+# Numbers outside their 95 % bands that are too many: of 12, 2 % of good simulations have as many.
 _TOO_MANY = 3
 
 
@@ -49,7 +49,7 @@ def _answer(found: Agreement) -> list[str]:
     lowest = (f'lowest voltage is {number(low.median, 4)} V ({number(low.low, 4)} to '
               f'{number(low.high, 4)}), measured {number(low.measured, 4)} V')
     if found.verdict is Likeness.LOOKS_LIKE_IT:
-        # Without changes of the load, the mean path is a drift at most.
+        # Without load changes the mean path is at most a drift, and not worth a sentence.
         path = [] if found.fall is None or not found.explained > 0.0 else [
             f'Its mean path explains {100.0 * found.explained:.0f} % of the variance.']
         rows = _rows(found)

@@ -1,4 +1,4 @@
-"""The report of `coupling`: the share of supply noise in a signal, and their coherence."""
+"""The report of `coupling`: share of supply noise in a signal, its coherence with the voltage."""
 
 from __future__ import annotations
 

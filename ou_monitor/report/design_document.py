@@ -20,7 +20,7 @@ _LEAST_RISK = 1e-9
 
 def design_document(result: Design, source: str, taken: str = '', command: str = '',
                     ) -> Document:
-    """Return the report of a design; `taken` describes the values from a flight, if any."""
+    """Return the report of a design (source: of the limit; taken: describes a flight's values)."""
     present = result.present
     chosen = [(present, 'present')]
     if result.least is not None:
@@ -74,9 +74,8 @@ def taken_words(flight: Flight, network: PowerNetwork, throttle: float, assumed:
     return (f'From the flight: {flight.level:.4g} V open-circuit at its end (by the load '
             f'model; the risks include its error), {network.cells} '
             f'cells (highest median of 0.5 s {flight.full:.4g} V; --cells N for others), sag '
-            f'{sag:.3g} V (+- {2.0 * se:.2g} V, which the risks include: those of analyze, with '
-            'the sag and noise of each row) and '
-            'noise '
+            f'{sag:.3g} V (+- {2.0 * se:.2g} V, included in the risks, which are computed as in '
+            'analyze, with the sag and noise of each row) and noise '
             f'{1e3 * float(np.interp(throttle, flight.throttle, flight.noise)):.3g} mV rms at '
             f'{percent(throttle)} throttle, resistance '
             + ('unknown without a measured current (--set battery_resistance=OHM): it is shown '

@@ -25,7 +25,7 @@ _SHOWN = 8
 _ROWS = 18
 # Sizes of the drawing of statistics, pixels.
 _WIDTH, _LEFT, _RIGHT, _ROW, _TOP, _BOTTOM = 860, 250, 20, 22, 34, 40
-# Simulations that give the band of the voltage.
+# Number of simulations for the band of the voltage.
 _DRAWS = 20
 # Maximum score on the straight part of the scale; larger scores are logarithmic.
 _STRAIGHT = 4.0
@@ -79,7 +79,7 @@ def _voltage(finding: Finding) -> Plot:
             try:
                 drawn = finding.simulated.simulate(samples.t, rng, samples.throttle)
             except ValueError:
-                # A diverging force has no simulation.
+                # A model with a diverging force cannot be simulated.
                 break
             low, high = np.fmin(low, drawn), np.fmax(high, drawn)
         if np.isfinite(low).all():
@@ -129,7 +129,7 @@ def _gain(finding: Finding, seen: Overview | None) -> list[Part]:
 
 
 def _disagreement(finding: Finding, seen: Overview | None) -> str:
-    """Return where the relaxation is not that of the supply, and why; empty if it is."""
+    """Return how the model's relaxation differs from the supply's and why, or ''."""
     assert finding.model is not None
     ou = finding.model.terms[0].values()
     alpha, se = ou['alpha'], finding.se[0].get('alpha', NAN)
@@ -140,20 +140,20 @@ def _disagreement(finding: Finding, seen: Overview | None) -> str:
         # NaN and infinite bounds compare as false.
         beyond = bool(alpha * supply.tau_below_s < 1.0
                       and ou['sigma'] ** 2 > 2.0 * alpha * supply.var_inf_below)
-        return (' Under Relaxation, changes as slow count as changes of the level, so the bound '
-                'there is lower.') * beyond
+        return (' Relaxation counts such slow changes as changes of the level, so its bound '
+                'is lower.') * beyond
     if supply.status != 'ok' or not abs(math.log(alpha / supply.alpha)) > (
             Z95 * math.hypot(supply.log_se('alpha'), se / alpha)):
         return ''
-    return (f' Its alpha disagrees with that under Relaxation ({number(supply.alpha)} 1/s, from '
-            f'the last {number(supply.window_s)} s): ' + (
-                'the model includes what its response to load leaves, so prefer that one.'
+    return (f' Its alpha disagrees with the one under Relaxation ({number(supply.alpha)} 1/s, '
+            f'from the last {number(supply.window_s)} s): ' + (
+                'the model also fits errors of its response to load: prefer the latter value.'
                 if finding.remaining else
                 'no statistic contradicts the model, so the relaxation seems to change.'))
 
 
 def _under_load(finding: Finding) -> str:
-    """Return the effects of the load in words; empty if it has none."""
+    """Return the effects of the load in words; empty if they are unknown."""
     fall, dips, load = finding.fall, finding.dips, finding.load
     if math.isnan(fall.measured):
         return ''

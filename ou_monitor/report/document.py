@@ -1,5 +1,5 @@
 """
-The report of a command, as records; `page` and `terminal` write them.
+The report of a command as records, which `page` and `terminal` turn into text.
 
 Empty parts are left out.  Texts are ASCII; a page replaces '+-' by its sign, and 'sigma' and
 'V/sqrt(s)' in the heads of tables by symbols.  In a cell or a head, text after a line break is
@@ -98,7 +98,7 @@ class Section:
     folded: bool = False
 
 
-# A function returns parts that only a page shows; the terminal does not compute them.
+# A function returns parts for a page only; a terminal never calls it.
 Part = Union[Text, Facts, Notes, Table, Figure, Pair, Section,
              Callable[[], 'Sequence[Part]']]
 
@@ -120,7 +120,7 @@ class Document:
 
 
 def worst_first(notes: Iterable[tuple[Severity, str]]) -> Notes:
-    """Return notes by severity, each sentence once."""
+    """Return notes in order of severity, worst first, each sentence once."""
     said: dict[str, Severity] = {}
     for severity, text in notes:
         said[text] = max(severity, said.get(text, severity))

@@ -24,17 +24,17 @@ from ou_monitor.text import chance, counted, number, p_words, some, volts
 _TITLES = {'resistance': 'Resistance', 'sag': 'Sag at full throttle',
            'sigma': 'Noise intensity \u03c3', 'alpha': 'Relaxation rate \u03b1'}
 _UNITS = {'resistance': 'mOhm', 'sag': 'mV', 'sigma': 'V/\u221as', 'alpha': '1/s'}
-# Maximum significant drifts drawn; if there are none, this number of the most likely ones.
+# Maximum number of significant drifts drawn; if there are none, of the most likely ones.
 _DRAWN, _LIKELY = 8, 2
 # Maximum trends listed, the most likely ones.
 _MOST = 30
 # Maximum recordings in the table of the lowest voltages; rows and sentences on a terminal.
 _WORST, _SHOWN = 12, 10
-# Maximum recordings listed; JSON and the Parquet table have all of them.
+# Maximum recordings listed on the page; JSON and the Parquet table have all.
 _RECORDINGS = 500
 # Maximum ratio of mean voltages of one pack: 4.35 V per cell if full, 2.8 V if empty under load.
 _ONE_PACK = 1.6
-# Maximum ageing packs in the answer.
+# Maximum ageing packs named in the answer.
 _OLD = 3
 # Heads of the tables of packs and of vehicles.
 PACK_HEADS = ('vehicle', 'flights', 'dates', 'cells', 'resistance\nper cell, mOhm',
@@ -92,7 +92,7 @@ def answer(fleet: Fleet) -> list[str]:
 
 
 def _ageing(fleet: Fleet) -> str:
-    """Return which packs age, or how fast one might age undetected; empty without packs."""
+    """Return which packs age, or the fastest ageing not excluded; '' without resistance or sag."""
     judged = fleet.judgement
     if not any(judged.values[name].value.size for name in OF_PACK):
         return ''
@@ -132,7 +132,7 @@ def _flights_of_pack(fleet: Fleet, trends: Sequence[Trend]) -> str:
 
 
 def _growth(judged: Judgement, trend: Trend) -> str:
-    """Return by how much a quantity of a pack grows, from where to where."""
+    """Return by how much a quantity of a pack grows, and its first and last value."""
     values = judged.values[trend.quantity]
     first, last = (_without_unit(values, trend.line(np.array(float(flight))))
                    for flight in (trend.first, trend.last))
@@ -284,7 +284,7 @@ def _dates(rows: Sequence[Row]) -> str:
 
 
 def _at_throttle(values: Values) -> str:
-    """Return ' at' the throttle at which recordings are compared; empty without one."""
+    """Return ' at ... throttle', at which recordings are compared; empty without one."""
     if values.name in OF_PACK:
         return ' at full throttle' if values.name == 'sag' else ''
     at = values.curve.reference
@@ -472,7 +472,7 @@ def one_each(fleet: Fleet) -> list[Row]:
 
 
 def dips_of(rows: Sequence[Row]) -> tuple[int, float, int] | None:
-    """Return number of dips, seconds below the limit, recordings with dips; None without one."""
+    """Return number of dips, seconds below the limit, recordings with dips; None if unknown."""
     known = [row for row in rows if row['dips'] is not None]
     return None if not known else (
         sum(int(row['dips']) for row in known), sum(row['below_s'] for row in known),

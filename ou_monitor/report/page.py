@@ -73,7 +73,7 @@ def embed(plot: Plot, most: int = MOST) -> str:
         'marks': [[x, label] for x, label in plot.marks], 'names': plot.names,
         'block': base64.b64encode(zlib.compress(bytes(block), 6)).decode('ascii')}
     text = json.dumps(plain_data(found), allow_nan=False, separators=(',', ':'))
-    # Without tags and entities, HTML and XML parsers read the same text.
+    # Without these signs there are no tags and entities: HTML and XML parsers read the same text.
     for sign in '<>&':
         text = text.replace(sign, f'\\u{ord(sign):04x}')
     return f'<script type="application/json" class="plot-data">{text}</script>'
@@ -105,7 +105,7 @@ def _changes(curve: Curve) -> Curve:
 
 
 def _in_order(curve: Curve) -> Curve:
-    """Sort markers and bars by x, for searching; leave other curves unchanged."""
+    """Sort markers and bars by x, for the search in the script; leave other curves unchanged."""
     if curve.kind not in ('markers', 'bars'):
         return curve
     order = np.argsort(curve.x, kind='stable')
@@ -167,13 +167,13 @@ def _file(name: str) -> str:
 def _script() -> tuple[str, str]:
     """Return the script, and its hash as a source of the content security policy."""
     code = ''.join(_file(f'plots_{part}.js') for part in ('draw', 'input', 'live'))
-    # These marks are character data to XML parsers, comments to scripts.
+    # For XML parsers these marks enclose character data; in the script they are comments.
     text = f"//<![CDATA[\n'use strict';\n{{\n{code}}}\n//]]>"
     digest = base64.b64encode(hashlib.sha256(text.encode('utf-8')).digest()).decode('ascii')
     return text, f"'sha256-{digest}'"
 
 
-# A hyphen that is a minus sign: not within a word or a range of dates.
+# A hyphen that is a minus sign, not one within a word or a date.
 _MINUS = re.compile(r'(?<![\w.)^-])-(?=[\d.])')
 # Signs that a terminal may lack.
 _SIGNS = {'+-': '\u00b1', ' -> ': ' \u2192 '}
@@ -199,7 +199,7 @@ def _head(text: str) -> str:
 
 
 def html(document: Document) -> str:
-    """Return a document as a whole page, which loads nothing else."""
+    """Return a document as a self-contained page."""
     body = _joined(document.parts)
     if document.command:
         again = f'<p><code>{escape(document.command)}</code></p>'

@@ -50,7 +50,7 @@ def _table(rows: Sequence[Row]) -> Table:
 
 
 def _explanations(rows: Sequence[Row]) -> Callable[[], list[Part]]:
-    """Return the meaning of each row and how it was recomputed; on a page only."""
+    """Return a function that gives the meaning of each row, and how it was recomputed."""
     return lambda: [Notes.of(f'{row.quantity}: {row.sentence} How: {row.how}.' for row in rows)]
 
 

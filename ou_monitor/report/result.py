@@ -59,8 +59,8 @@ class Result:
         """
         Keep the record, and functions that compute the rest on demand.
 
-        rows: a function, or the name of a list in the data.  A supply given as a function is left
-        out of the JSON.  Use module-level functions: closures cannot be pickled.
+        rows: a function, or the name of a list in the data.  If `supply` is a function, the JSON
+        does not contain it.  Use module-level functions: closures cannot be pickled.
         """
         self.record = record
         self.document = document
@@ -79,12 +79,12 @@ class Result:
 
     def to_dict(self) -> dict[str, Any]:
         """
-        Return all numbers, as `--json` of the command writes them.
+        Return all numbers, equal to the command's `--json`.
 
         Returns
         -------
         dict
-            Of plain values; unknown numbers are None.
+            Plain values; unknown numbers are None.
 
         """
         data = dict(self._data())

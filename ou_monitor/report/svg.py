@@ -61,7 +61,7 @@ class Scale:
             self.low, self.high, count)
 
 
-# A logarithmic axis shorter than this factor has even ticks.
+# A logarithmic axis whose ends differ by less than this factor has evenly spaced ticks.
 _SHORT = 10.0 ** 0.7
 
 
@@ -75,7 +75,7 @@ def linear_ticks(low: float, high: float, count: int = 6) -> list[float]:
 
 
 def log_ticks(low: float, high: float) -> list[float]:
-    """Return powers of ten, and their multiples of 2 and 5 if the axis is short."""
+    """Return powers of ten, and 2 and 5 times these if the axis is short."""
     first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
     decades = math.log10(high / low)
     if high < low * _SHORT:
@@ -112,7 +112,7 @@ def span(values: list[FloatArray], log: bool = False, pad: float = 0.05,
         return (0.1, 10.0) if log else (0.0, 1.0)
     low, high = (float(v) for v in np.quantile(joined, [trim, 1.0 - trim]))
     room = high - low
-    # A range within the rounding of its values is widened.
+    # Widen a range that is within the rounding error of its values.
     if room <= 1e-9 * max(abs(low), abs(high), 1e-12):
         room = 0.5 if log else max(0.1 * abs(low), 1e-6)
         low, high = low - 0.5 * room, high + 0.5 * room
@@ -159,9 +159,9 @@ class Curve:
 
 class Plot:
     """
-    One plot with two axes; sizes are in pixels, and screen readers read the title.
+    One plot with two axes; sizes are in pixels.
 
-    The legend is in rows below the title.
+    The legend is in rows below the title, which is also the text for screen readers.
     """
 
     def __init__(self, title: str, x_label: str, y_label: str, *, width: int = 860,

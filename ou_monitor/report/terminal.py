@@ -11,12 +11,12 @@ from ou_monitor.records import Severity
 from ou_monitor.report.document import (
     Document, Facts, Notes, Part, Section, Table, Text)
 
-# Maximum and minimum width of text, characters; in between, text is as wide as the terminal.
+# Maximum and minimum width of text, characters; between them, the terminal's width is used.
 COLUMNS, _NARROWEST = 100, 40
 
 
 def columns() -> int:
-    """Return the width of text, characters: the terminal's if there is one, within limits."""
+    """Return the width of text, characters."""
     if not sys.stdout.isatty():
         return COLUMNS
     return max(_NARROWEST, min(COLUMNS, shutil.get_terminal_size().columns))

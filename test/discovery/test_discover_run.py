@@ -188,7 +188,7 @@ def test_relaxation_of_the_model_beyond_the_bound_is_explained(sag):
         return ' '.join(terminal(discovery_document(
             sag, replace(seen, facts=replace(seen.facts, ou=ou)))).split())
 
-    words = 'changes as slow count as changes of the level'
+    words = 'counts such slow changes as changes of the level'
     assert words in shown(0.5 * tau, 0.5 * var)
     assert words not in shown(2.0 * tau, 0.5 * var)
     assert words not in shown(0.5 * tau, 2.0 * var)
