@@ -3,7 +3,7 @@ A recording -> Tables 1 and 2 of the paper, with intervals, tests and curves ove
 
 `SupplyMonitor` also processes the recording, as in flight, so that node and command agree on the
 same data; this needs no constant throttle.  The limits of the monitor apply.  The risk is for the
-state at the end of the recording, and NaN at throttles above the highest flown.
+state at the end of the recording, and NaN at throttles 0.1 or more above the highest flown.
 
 `as_data` returns the JSON of `analyze`; see doc/analysis.md.
 """

@@ -402,7 +402,7 @@ _AROUND = 11
 STRIDE = 2
 # Power correlation of half-overlapping Hann segments: (1/6)^2.
 OVERLAP = 1.0 / 36.0
-# Random draws of signs; a p-value is a count if more than this number of draws reach the statistic
+# Random draws of signs; number of draws that must reach the statistic for a p-value by counting
 # (otherwise it is extrapolated).
 _DRAWS, _COUNTED = 499, 10
 # Segments with a common sign, because overlap, lines and slow manoeuvres correlate them; minimum

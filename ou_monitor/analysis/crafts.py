@@ -191,7 +191,7 @@ def craft_of(recording: Recording, facts: SupplyFacts, given: int = 0) -> Craft:
     if not kinds or not recording.has_throttle:
         return Craft(cells, source, full_voltage(recording), '', ())
     seen = bool(flown_near(recording, _AT, _NEAR)[0])
-    # Errors of the load model at changes of throttle count as noise, but need no capacitor.
+    # Noise that is high only while throttle changes is a load model error, not a bad capacitor.
     calm = float(np.interp(_AT, facts.noise.throttle, facts.noise.steady_rms_v)) / cells
     # Values and standard errors; the error of the noise is negligible.
     values = {

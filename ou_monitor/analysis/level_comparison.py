@@ -2,11 +2,11 @@
 Compare load levels: the change of sigma, and whether alpha is constant.
 
 The paper assumes the same alpha at every load.  The test is chi^2 of ln(alpha) about the weighted
-mean, with standard errors at the common alpha: they are proportional to 1/sqrt(alpha T), so a high
-alpha by chance would otherwise weigh too much.  Levels that one OU in white noise does not
-describe (more than one relaxation, or lines with impulses) are withheld, because their standard
-errors ignore the misfit.  Limits: only levels with a usable fit count; weak spectral lines stay
-in the fit; a test that does not reject proves nothing, so the detectable ratio is reported too.
+mean, with standard errors at the common alpha: they are proportional to 1/sqrt(alpha T), so an
+alpha that is high by chance would otherwise weigh too much.  Levels that one OU in white noise
+does not describe (more than one relaxation, or lines with impulses) are withheld, because their
+standard errors ignore the misfit.  Limits: only levels with a usable fit count; weak spectral
+lines stay in the fit; not rejecting proves nothing, so the detectable ratio is reported too.
 
 The tests have the significance level `LEVEL`, like the printed intervals.  Each level is fitted by
 itself here; `discover` fits one model to a whole recording, and uses statistics of its innovations

@@ -14,7 +14,7 @@ impulses       the largest innovation (Sidak) or a positive excess kurtosis, eac
                half the significance level
 correlated     lags 1..5 of the deviation, with variances robust against changing
                intensity (Lo & MacKinlay, Rev. Financ. Stud. 1, 1988)
-one_relaxation lags 1..10 of the innovations, likewise
+one_relaxation lags 1..10 of the innovations, in the same way
 second_relaxation
                periodogram of the innovations (`ou_monitor.criticism.innovations`)
 =============  ========================================================================

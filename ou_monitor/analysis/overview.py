@@ -1,7 +1,8 @@
 """
 The facts of a supply in words, which every command reports first.
 
-Every number comes from `supply_facts`; only the strongest spectral line is from the load levels.
+The numbers come from `supply_facts`, except the strongest spectral line and the fit of a whole
+recording, which come from the load levels.
 """
 
 from __future__ import annotations

@@ -89,7 +89,7 @@ class Damping:
 
 
 # Errors are drawn from readings of similar noise size: share of all readings taken on either side,
-# and their minimum number; difference of ln(size) up to which sizes are equal.
+# and their minimum number; difference of ln(size) up to which sizes count as equal.
 _ALIKE, _FEWEST, _ROUNDING = 0.02, 50, 1e-9
 # Minimum share of white noise in the variance, which the filter needs.
 _LEAST_WHITE = 1e-3

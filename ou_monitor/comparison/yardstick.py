@@ -221,7 +221,7 @@ class Yardstick:
         self._segment = int(min(v.size, max(64, min(_SEGMENT * self._rate, v.size / 4))))
         lowest, highest = self._rate / self._segment, 0.5 * self._rate
         self.bands = np.geomspace(lowest, highest, _BANDS + 1)
-        # Search the residual of level and load; its differences have a flatter spectrum.
+        # Lines of the residual are detected in its differences, whose spectrum is flatter.
         rest = np.nan_to_num(left.voltage)
         found = find_lines([rest], self._rate, white=[np.diff(rest, prepend=0.0)]).lines
         self.line = max(found, key=lambda line: line.rms, default=None)

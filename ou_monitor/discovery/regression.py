@@ -263,7 +263,7 @@ class _Regression:
         return best if best is not None and self._evidence(best) > value + 0.1 else None
 
     def _needed_evidence(self, beside: tuple[int, ...], k: int, largest: float) -> float:
-        """Return the minimum evidence of a term beside others, nats."""
+        """Return the minimum evidence of a term in addition to others, nats."""
         kind = type(self._pool[k])
         again = any(type(self._pool[j]) is kind for j in beside)
         return decision.least_evidence(kind, max(largest, 0.0), self._n if again else 0)

@@ -24,7 +24,7 @@ from ou_monitor.text import chance as shown_chance, listed, number, p_words, vol
 GAIN = ('Gain: log predictive density of samples not used for the fit, in mnat (thousandths of a '
         'nat: 1 mnat per sample makes 1000 samples e = 2.7 times as likely); +- is half the 95 % '
         'interval.')
-# Maximum causes in the first sentence.
+# Maximum number of causes that the first sentence names.
 _FIRST = 3
 # Reasons why a gain is unknown.
 VAGUE = ('its error is more than ten times the gain, because the rest of the recording hardly '

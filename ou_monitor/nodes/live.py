@@ -1,7 +1,7 @@
 """
 `ou-monitor live`: a page to watch while flying, served from the topics of the nodes.
 
-The page is read-only.  Limits: HTTP without encryption; on any address but 127.0.0.1, requests
+The page is read-only.  Limits: HTTP without encryption; on other than loopback addresses, requests
 need the token that the command prints.  Connections beyond `CONNECTIONS` are closed, and so is a
 connection without a complete request after `PATIENCE`.
 """

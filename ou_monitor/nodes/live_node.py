@@ -34,7 +34,7 @@ _SHOWN = ('brownout.voltage', 'brownout.horizon')
 # Fields of the state shown as numbers, and as words.
 _NUMBERS = ('voltage', 'throttle', 'sigma', 'noise_std', 'brownout_risk', 'throttle_budget', 'age')
 _WORDS = ('brownout', 'brownout_level', 'risk_basis', 'status')
-# Topics a filter subscribes to beside its signal.
+# Topics that a filter subscribes to in addition to its signal.
 _BESIDE = ('sigma', 'state', 'rpm', 'throttle', 'clock')
 
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 T = TypeVar('T')
 
-# Timeout of reading a file, s: most take 10 ms, the largest allowed 5 s.
+# Timeout of reading or writing a file, s: most take 10 ms, the largest allowed 5 s.
 PATIENCE = 20.0
 # Period of calls that keep the node working while it waits, s.
 PAUSE = 0.02
@@ -184,7 +184,7 @@ def _sync_folder(path: Path) -> None:
         os.close(folder)
 
 
-# Maximum size of a latch file, bytes; ours have at most 1000.
+# Maximum size of a latch file that is read, bytes; nodes write at most 1000.
 _MOST = 4096
 _KEYS = {'node', 'level', 'reason', 'time'}
 # Time between attempts to write, s.
@@ -314,7 +314,7 @@ class LatchFile:
         return data
 
     def _replace(self, text: bytes) -> None:
-        """Write beside, sync, read back, lock and rename."""
+        """Write a new file, sync, read back and lock it, and rename it over the old one."""
         exists = self._claim() is not None
         # Readable by all, like an ordinary file.
         handle, beside = _write_beside(self.path, text, 0o644)

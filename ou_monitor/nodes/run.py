@@ -49,7 +49,7 @@ def run(name: str, work: Callable[[], int], args: list[str] | None = None) -> in
     """Initialise ROS 2, do the work, shut down; return the exit status."""
     # rclpy ends the context on SIGINT and SIGTERM and then calls the previous handler.  Python's
     # own would raise KeyboardInterrupt inside a callback, which the EventsExecutor turns into
-    # SystemError: so ours only records the signal.  While modules are still being loaded nothing
+    # SystemError: so `note` only records the signal.  While modules are still being loaded nothing
     # needs an orderly end: the process ends at once. While a node is being made no callback runs,
     # and the signal raises like any error.
     stopped: list[int] = []

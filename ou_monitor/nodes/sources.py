@@ -1,5 +1,5 @@
 """
-Topics, types and fields of voltage and throttle.
+Topics, types and fields of voltage, throttle and motor speeds.
 
 They come from a msg_config; with `auto`, the type that a publisher offers on the topic selects a
 generic msg_config.  Parameters override single entries.
