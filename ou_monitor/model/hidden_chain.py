@@ -2,8 +2,8 @@
 Hidden Markov chains over many samples, without a Python loop over samples.
 
 Forward probabilities are products of small matrices (Rabiner, Proc. IEEE 77 (1989) 257).  The
-samples are split into blocks of equal length, whose products are computed side by side, so the
-Python loop has a few hundred iterations for any number of samples.
+samples are split into blocks of equal length, whose products are computed side by side.  So the
+number of iterations in Python grows only with the square root of the number of samples.
 """
 
 from __future__ import annotations

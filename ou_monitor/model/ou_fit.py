@@ -44,13 +44,13 @@ from ou_monitor.records import determined, FloatArray, MOST_READINGS, OU_WINDOWS
 # Minimum evidence for a relaxation over white noise alone, nats: more than white noise reached in
 # any window of 120 simulated recordings (test_ou_fit.py repeats a part).
 VISIBLE = 12.0
-# Distance of the level's knots, s, at 1 Hz or faster; minimum readings a knot; minimum parts.
+# Distance of the level's knots, s, at 1 Hz or faster; minimum readings per knot; minimum parts.
 _HATS, _PER_KNOT, _PARTS = 5.0, 5, 3
 # Lags, s, of throttle and current: from an ESC to polarisation.
 _LAGS = (0.004, 0.02, 0.06, 0.3, 1.0, 4.0)
 # Maximum shift of throttle and current, samples, and number of readings used to find it.
 _DELAYS, _DELAY_READINGS = 4, 8000
-# Maximum shift of a current, samples, if a shift is searched for.
+# Maximum shift of a current, samples, if a larger shift is allowed by `reach`.
 _FAR = 20
 # Minimum range of a throttle that moves.
 _MOVED = 0.01
@@ -270,7 +270,7 @@ def regress(t: FloatArray, v: FloatArray, u: FloatArray | None, i: FloatArray | 
 
 def _innovations(x: FloatArray) -> FloatArray:
     """Return the innovations of an AR(1)."""
-    # For `NoiseSize`, which assumes independent values: with a slow OU it would follow chance.
+    # `NoiseSize` assumes independent values: fitted to a slow OU, it would follow chance.
     power = float(x @ x)
     phi = float(x[1:] @ x[:-1]) / power if power > 0.0 else 0.0
     return x - phi * np.append(x[:1], x[:-1])

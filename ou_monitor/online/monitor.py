@@ -270,7 +270,7 @@ class SupplyMonitor:
                 if self._flag.clear() else '')
 
     def set_brownout(self, reason: str) -> None:
-        """Set the flag CRITICAL, to restore it after a restart; all else works as usual."""
+        """Restore a CRITICAL flag after a restart; latch, hold and clearing work as usual."""
         self._flag.set_critical(reason)
 
     def doubt_brownout(self, reason: str) -> None:

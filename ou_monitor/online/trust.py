@@ -112,7 +112,7 @@ class StampWatch:
         # For each recent batch: samples, and how many were late or started a new time line.
         self._batches: deque[tuple[int, int]] = deque()
         self._looked = self._late = 0
-        # Samples since the newest stamp, and arrival of the first of them.
+        # Samples since the newest stamp; arrival of that stamp, and of the last sample.
         self._since = 0
         self._advanced = self._arrived = NAN
 
@@ -178,7 +178,7 @@ class InputClock:
 
     def __init__(self) -> None:
         self.stamps = StampOrder.GOOD
-        # Number of messages placed by their arrival.
+        # Number of messages whose arrival time was used.
         self.by_arrival = 0
         self._watch = StampWatch()
         self._arrived = self._time = NAN  # Of the last message, s
@@ -221,7 +221,7 @@ _CHANGE = 1e-6
 
 
 class ConstantReading:
-    """How long the newest reading has been repeated, and how long a working source repeats one."""
+    """Durations for which readings stay constant: the newest one, and ones that did change."""
 
     def __init__(self) -> None:
         self.value = NAN

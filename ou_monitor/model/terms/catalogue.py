@@ -67,7 +67,7 @@ def blamed(error: BaseException) -> tuple[str, ...]:
 
 
 def withdraw(error: BaseException) -> bool:
-    """Remove the installed causes to blame for an error, or else all; return False if none."""
+    """Remove the installed causes that raised an error, else all; return False if none exist."""
     names = blamed(error) or _installed()
     for name in names:
         _leave_out(name, error)

@@ -83,7 +83,7 @@ def curvature_se(value: Callable[[FloatArray], float], at: FloatArray, step: flo
 
 def refine(values: Callable[[FloatArray], FloatArray], start: Sequence[float] | FloatArray,
            step: float = 0.1) -> tuple[FloatArray, float, FloatArray] | None:
-    """Return position, value and errors of a maximum near `start` by Newton steps; None: none."""
+    """Return position, value and errors of a maximum near `start` by Newton steps, or None."""
     x = np.asarray(start, dtype=np.float64)
     size = x.size
     moves, pairs = step * np.eye(size), np.triu_indices(size, 1)

@@ -78,7 +78,7 @@ def power_spread(view: View, frequency: float, linewidth: float) -> float:
 
 
 def prominence(z: FloatArray, rate: float, frequency: float, width: float) -> float:
-    """Return by how many standard errors a peak, Hz, exceeds both sides; -inf if one is empty."""
+    """Return a peak's excess over both its sides, in standard errors; -inf without a side (Hz)."""
     power = np.abs(np.fft.rfft(z - z.mean()))[1:] ** 2
     away = (np.fft.rfftfreq(z.size, 1.0 / rate)[1:] - frequency) / width
     inside = power[np.abs(away) <= 0.5]

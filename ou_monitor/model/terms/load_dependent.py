@@ -220,7 +220,7 @@ INPUTS = (('throttle', 0.0), ('fast', _FAST), ('step', 0.0), ('slow', _SLOW), *(
     (what, span) for span in (0.1, 0.5, 2.5) for what in ('rises', 'falls')))
 # Penalty of choosing an input, nats: ln of the number of inputs.
 _INPUT_COST = math.log(len(INPUTS))
-# Minimum share of white noise in the one-step errors; below it, it cannot be separated.
+# Minimum share of white noise in the one-step errors; with less, it cannot be separated.
 _LEAST_WHITE = 0.05
 # Quantiles at the edges of an input's bins, dense at the top because most changes are zero.
 _SHARES = np.array([*np.linspace(0.0, 0.95, 39), 0.97, 0.98, 0.985, 0.99, 0.995, 0.998, 1.0])
@@ -347,7 +347,7 @@ class LoadDependentNoise(Term):
 
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
-        """Return the curves fitted to the squares of the scores, for white noise and for both."""
+        """Return curves fitted to squares of the scores, without and with a factor on sigma."""
         if view.throttle is None:
             return []
         white = cls((), (), ()).apart(view)

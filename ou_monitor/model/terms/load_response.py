@@ -67,7 +67,7 @@ class LoadSag(Term):
     @classmethod
     def candidates(cls, view: View) -> Sequence[Term]:
         """Return a straight line, a parabola, and one that grows."""
-        # Not a growing straight line: a slow transient would be added to replace its curvature.
+        # No growth with a straight line: a slow transient would then be added for the curvature.
         return cls(0.0, 0.0), cls(0.0, NEXT_TO_ZERO), cls(0.0, NEXT_TO_ZERO, NEXT_TO_ZERO)
 
 
@@ -81,9 +81,9 @@ class LoadTransient(Term):
     Add gain * d(u) + square * d(u^2) + rise * max(d(u), 0), with d(x) = x - low-pass of x (tau).
 
     u is the delayed throttle.  Without square, a unit step up adds (gain + rise) * exp(-t/tau), a
-    unit step down -gain * exp(-t/tau): motors draw more current while they speed up, and return
-    none while they slow down.  gain > 0 delays the sag (if gain and square equal the sag's linear
-    and square, the result is a low-pass); gain < 0 deepens the sag at first (inrush).
+    unit step down -gain * exp(-t/tau): motors draw more current while they speed up, but return no
+    current while they slow down.  gain > 0 delays the sag (if gain and square equal the sag's
+    linear and square, the result is a low-pass); gain < 0 deepens the sag at first (inrush).
     """
 
     NAME: ClassVar[str] = 'load_transient'

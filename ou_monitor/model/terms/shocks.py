@@ -278,7 +278,7 @@ def bad_samples(view: View, share: float, spread: float, lengths: FloatArray
 def outlying(voltage: FloatArray) -> npt.NDArray[np.bool_]:
     """Return which readings, V, contradict an AR(1) fitted to them; shape (n,)."""
     bad = np.zeros(voltage.size, dtype=np.bool_)
-    # The second turn estimates the AR(1) without the outliers of the first.
+    # The second round estimates the AR(1) without the outliers of the first.
     for _ in range(2):
         c = voltage - voltage[~bad].mean()
         pairs = ~bad[1:] & ~bad[:-1]

@@ -35,7 +35,7 @@ class Drift(Term):
             'rate', *(name for name in ('curvature', 'charge') if getattr(term, name))))
     SIGNS: ClassVar[tuple[str, ...]] = ('time', 'band 0')
     MEASURED: ClassVar[bool] = True
-    # If the form of a larger effect is not exact, a trend always explains a little of its rest.
+    # The inexact form of a larger effect always leaves a little for a trend to explain.
     LEAST_SHARE: ClassVar[float] = 0.02
     MEANING: ClassVar[str] = 'The mean moves slowly with time: discharge or warming.'
     REMEDY: ClassVar[str] = 'Use a window in which the drift is small, or remove the trend first.'

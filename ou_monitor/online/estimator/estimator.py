@@ -555,7 +555,7 @@ class RelaxationFits:
         self._due = end + max(_SOONEST, _SHARE * found.window_s)
 
     def in_force(self, e: Estimate) -> tuple[Estimate, OuFacts, float]:
-        """Return the sliding estimate with the relaxation to publish, the latter, and its age."""
+        """Return the estimate to publish, its relaxation, and the age of the relaxation, s."""
         facts, age = self.facts, e.t - self.end
         sliding = of_estimate(e)
         # Whether there are newer readings than in the fit.

@@ -43,7 +43,7 @@ from ou_monitor.records import FloatArray, NAN
 # Range of angles (2 pi cutoff interval) in the table, and step of their logarithms: interpolation,
 # and the power law below the first, are accurate to 1e-4.
 _LEAST_ANGLE, _MOST_ANGLE, _STEP = 1e-4, 300.0, 0.02
-# Minimum rise of ln noise from angle to angle; beyond a smaller rise, all noise passes.
+# Minimum rise of ln noise from angle to angle: the table ends where all noise passes.
 _STILL = 1e-6
 
 

@@ -5,8 +5,8 @@ A block has one throttle; there are at most about 50 blocks a second.  Limits: a
 is not returned, so a fast source is followed 20 ms late; of several throttle changes within 20 ms
 only the first three are resolved.
 
-Delay: the voltage, without changes slower than a second, is correlated with throttle for delays of
-throttle of 0 to 200 ms; the largest correlation determines the delay, unless the source is slower
+Delay: the voltage, without changes slower than a second, is correlated with throttle at assumed
+delays of 0 to 200 ms; the largest correlation determines the delay, unless the source is slower
 than 7 Hz.  A new delay is used only if it leaves a quarter less variance than the present one.
 
 Noise: ln variance = b . (1, ripple(u), sqrt|du|), learned by Fisher scoring; in a mean of n

@@ -386,7 +386,7 @@ class LoadFilter:
             self._contrasts.take(block.t, block.voltage, h[2:], total,
                                  float(m[0]) / self._cells)
             self._highest = max(self._highest, float(m[0]))
-            # Without the uncertainty of the state.
+            # Take only the share due to noise, not to the uncertainty of the state.
             share = R / (s + R)
             square = share * block.n * min(abs(e), self._volts) ** 2
             square += (block.n - 1) * block.within if block.n > 1 else 0.0
@@ -483,7 +483,7 @@ class LoadFilter:
             low, high)
 
     def _by_throttle(self, low: float, high: float) -> tuple[LoadStatus, float]:
-        """Return the status without current, and an error that suffices for a known sag, V."""
+        """Return the status without current, and the error, V, that is accepted for any sag."""
         (a, C), b, held = self._sag_law(), self._noise.log_variance, hold(self._seen)
         d = static(high, held) - static(low, held)
         swing, swing_se = float(d @ a), math.sqrt(max(0.0, float(d @ C @ d)))

@@ -70,7 +70,7 @@ class ModelComparison:
     # Of the discharge per load, known to a factor of two.
     discharge_ratio: float = NAN
     discharge_ratio_se: float = NAN
-    words: str = ''  # One sentence; empty: nothing to do
+    words: str = ''  # One sentence; empty: nothing to report
 
     def fields(self) -> dict[str, object]:
         """Return the published fields; the interval of the ratio of sags is two numbers."""

@@ -38,7 +38,7 @@ _NO_ALPHA = {
 
 
 def reached(seconds: float, lags: tuple[float, ...] = LAGS) -> FloatArray:
-    """Return the share of each lagged response that has developed so long after a step."""
+    """Return the share of each lagged response that has developed `seconds` after a step."""
     return -np.expm1(-seconds / np.array(lags))
 
 
@@ -55,7 +55,7 @@ def static(throttle: npt.ArrayLike, held: float = HOLD) -> FloatArray:
 
 
 def rising(a: FloatArray, covariance: FloatArray, table: FloatArray) -> FloatArray:
-    """Return the most likely coefficients for which table @ a rises by rows (Hildreth)."""
+    """Return the most likely coefficients for which table @ a increases (Hildreth's method)."""
     steps = np.diff(table[::10], axis=0)
     falls, both, push = steps @ a, steps @ covariance @ steps.T, np.zeros(steps.shape[0])
     for k in np.tile(np.arange(push.size), _SWEEPS if (falls < 0.0).any() else 0).tolist():

@@ -218,7 +218,7 @@ class BrownoutFlag:
         self._floor = FloorWatch(self._settings)
         self._now = self._last = NAN
         self._level = FlagLevel.UNKNOWN
-        # When the level was entered, and when its risk was last known.
+        # Times at which the level was entered, and at which risk or floor were last known.
         self._since = self._known = NAN
         # Time since which the risk has always been at or above the entry value of a level.
         self._above: dict[FlagLevel, float] = {}

@@ -570,7 +570,7 @@ def risk_over_throttle(forecast: Forecast, voltage: float, horizon: float, sag: 
                        noise: float = 1.0) -> FloatArray:
     """Return the risk of each throttle of a grid, (51,), held for the horizon; see `risk_if`."""
     risks = forecast.risk_if(_GRID, horizon, voltage, horizon, sag, noise)
-    # Less throttle is never riskier, although just after high throttle the law may say so.
+    # Less throttle is never riskier; the law may predict otherwise just after high throttle.
     return np.asarray(np.minimum.accumulate(risks[::-1])[::-1])
 
 
