@@ -215,7 +215,7 @@ class LoadStart:
         if not (self.cells > 0.0 and self.volts > 0.0 and min(positive) >= 0.0
                 and 0.0 <= self.flown[0] <= self.flown[1] <= 1.0 and 0.0 <= self.delay <= 1.0):
             raise ValueError('the load needs cells and volts above 0, discharge, resistance '
-                             'and noise from 0 on, flown within 0..1, and delay within 0..1 s')
+                             'and noise of at least 0, flown and delay (s) within 0..1')
 
     def values(self) -> dict[str, Any]:
         """Return the entries of a model file."""

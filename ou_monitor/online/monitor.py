@@ -266,7 +266,7 @@ class SupplyMonitor:
 
         """
         old = self._flag.state
-        return (f'CRITICAL of {old.age:.1f} s is cleared; the flag is judged anew.'
+        return (f'CRITICAL of {old.age:.1f} s is cleared; the next report decides again.'
                 if self._flag.clear() else '')
 
     def set_brownout(self, reason: str) -> None:

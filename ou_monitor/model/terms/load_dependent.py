@@ -293,7 +293,7 @@ class LoadDependentNoise(Term):
 
     number: tuple[float, ...] = parameters('', 'index of the input of each knot: see INPUTS, SUM')
     at: tuple[float, ...] = parameters('', 'value of the input at the knot, rising for each input')
-    log_factor: tuple[float, ...] = parameters('', 'ln of the factor there')
+    log_factor: tuple[float, ...] = parameters('', 'ln of the factor at the knot')
     on_sigma: float = parameter('', 'power of the factor that multiplies sigma', 0.0, default=0.0)
 
     def check(self) -> None:

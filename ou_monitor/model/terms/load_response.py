@@ -111,7 +111,7 @@ class LoadTransient(Term):
 
     gain: float = parameter('V', 'part of a step to full throttle that decays with tau',
                             label='decaying part')
-    tau: float = parameter('s', 'time constant of its decay', 0.0, above=True)
+    tau: float = parameter('s', 'time constant of the decay', 0.0, above=True)
     delay: float = parameter('s', 'delay before the response begins', 0.0)
     rise: float = parameter('V', 'added to the gain while throttle rises', default=0.0)
     square: float = parameter('V', 'decaying part that follows the square of throttle',
@@ -199,8 +199,8 @@ _ABOUT = {
     (True, True): ('Part of the fall follows throttle slowly, and recovers as slowly: '
                    'polarisation of a battery, or a slow regulator.',
                    'Set the brown-out margin for the longest burst of throttle.'),
-    (True, False): ('Part of the fall after throttle rises recovers while it is held: a regulator '
-                    'corrects it, or a battery warms.',
+    (True, False): ('Part of the fall after a rise of throttle recovers while throttle is held: a '
+                    'regulator corrects it, or a battery warms.',
                     LoadTransient.REMEDY)}
 # Number of delays to try, and the longest, s.
 _DELAYS, _LATEST = 12, 0.1

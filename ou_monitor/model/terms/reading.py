@@ -32,7 +32,7 @@ class MeasurementNoise(Term):
         'the sampling, which looks the same.')
     REMEDY: ClassVar[str] = (
         'Sample faster to tell them apart; if it is the sensor, average in the ADC or use a finer '
-        'range. Alpha and sigma fitted without it are too high.')
+        'range. Alpha and sigma fitted without this noise are too high.')
     SEPARATED_BY: ClassVar[str] = (
         'the same rail at several times the sampling rate, or the input of the ADC shorted')
 

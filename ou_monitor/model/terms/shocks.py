@@ -38,7 +38,7 @@ class Jumps(Term):
     SEVERAL: ClassVar[bool] = True
     MEANING: ClassVar[str] = (
         'Random jumps of the rail that decay at the rate alpha: load pulses.')
-    REMEDY: ClassVar[str] = 'Look for what switches at that rate: servos, payload, radio.'
+    REMEDY: ClassVar[str] = 'Look for loads that switch at that rate: servos, payload, radio.'
     SEPARATED_BY: ClassVar[str] = 'recordings with one load after another switched off'
 
     rate: float = parameter('1/s', 'jumps per second', 0.0)

@@ -242,7 +242,7 @@ class ThrottleTone(Term):
     RECURS: ClassVar[bool] = True
     MAY_LEAVE: ClassVar[float] = 0.3
     MEANING: ClassVar[str] = 'A line whose frequency follows throttle: commutation of the motors.'
-    REMEDY: ClassVar[str] = 'Capacitance at the ESC; a notch that follows throttle.'
+    REMEDY: ClassVar[str] = 'Add capacitance at the ESC, or a notch that follows throttle.'
     SEPARATED_BY: ClassVar[str] = 'a slow sweep of throttle'
 
     amplitude: float = parameter('V', 'peak', 0.0)

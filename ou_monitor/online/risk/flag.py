@@ -326,7 +326,7 @@ class BrownoutFlag:
         """Return the level that follows from risks and floor, before hold and latch."""
         s = self._settings
         asks = {FlagLevel.CRITICAL: (soon, s.brownout_critical, f'risk {soon:.2g} within 1 s, '
-                                     'throttle as it is'),
+                                     'at the present throttle'),
                 FlagLevel.WARN: (risk, s.brownout_warn, f'risk {risk:.2g}')}
         above = [level for level, (found, enter, _) in asks.items() if known and found >= enter]
         if tight and known and FlagLevel.WARN not in above:
