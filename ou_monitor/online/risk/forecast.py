@@ -4,7 +4,7 @@ Brown-out risk by the method that predicts this flight best, and the risk if thr
 Methods: `first_passage` (the OU in the window, at the present throttle), `load` (half the response
 to the pilot's future throttle, half the excursions), and `excursions` (the drops of this flight,
 used alone if the load is unknown).  First passage and the other method are averaged, weighted by
-how well each predicted the lowest voltages of completed horizons (Bayes, with forgetting).
+the share of completed horizons whose lowest voltage contradicts first passage.
 
 Law learned in flight, from completed horizons: lowest - start = b0 s + b1 (mu - start) + e, with
 mean mu and deviation s of `lowest`, by least squares with forgetting; e has Student's t
@@ -12,10 +12,10 @@ distribution with five degrees of freedom, and the variance k0 s^2 + k1 (mu - st
 
 Each law is mixed with a wider one, whose weight is the share of horizons that contradict the law
 (rule of succession).  A horizon counts with the probability that the law was wrong in it, and with
-step / horizon where horizons overlap.  For first passage the wider law is the excursions.  For a
-given throttle it is as wide as the excursions, but at most `_WIDEST` times as wide as the law,
-because excursions include bursts of throttle, which are irrelevant to idling.  It is wider if
-contradicting voltages were farther below the mean of the law.
+step / horizon where horizons overlap.  For first passage the other method takes the place of the
+wider law.  For a given throttle it is as wide as the excursions, but at most `_WIDEST` times as
+wide as the law, because excursions include bursts of throttle, which are irrelevant to idling.  It
+is wider if contradicting voltages were farther below the mean of the law.
 
 Limits, in addition to doc/risk.md: all throttles share one bias and one gain; values between two
 horizons are interpolated.
@@ -173,12 +173,8 @@ class ContradictionRate:
         return self._wrong - 1.0, self._squares
 
     def add(self, law: float, far: float, weight: float, elapsed: float, miss: float = 0.0
-            ) -> float:
-        """
-        Learn from the two densities, 1/V, of a lowest voltage; return the mixture's density.
-
-        miss: distance of that voltage below the mean of the law, V; 0 if above.
-        """
+            ) -> None:
+        """Learn from both densities, 1/V, of a lowest voltage (miss: V below the law's mean)."""
         keep = math.exp(-elapsed / MEMORY)
         share = self.value
         both = share * far + (1.0 - share) * law
@@ -186,7 +182,6 @@ class ContradictionRate:
         self._wrong = 1.0 + (self._wrong - 1.0) * keep + weight * wrong
         self._squares = self._squares * keep + weight * wrong * miss * miss
         self._right = self._first + (self._right - self._first) * keep + weight * (1.0 - wrong)
-        return both
 
 
 # Horizons, s, from which the flight learns; those between are interpolated in ln h.
@@ -201,9 +196,9 @@ LOOK, _LOOK_SHARE = 0.2, 0.2
 _REST = 0.05
 # Limit of the error of ln sigma; with a larger one, sigma is practically unknown.
 _LARGEST_ERROR = 1.0
-# Prior for first passage, which is used only if the tests of the window have found an OU: it is
-# right in all but one of this number of horizons.
-_ODDS = 10.0
+# Prior for first passage, which is used only if the tests of the window have found an OU: the
+# number of horizons that it has predicted, for one that it has not.
+_PREDICTED = 9.0
 # Share of the excursions in the method `load`, because the pilot's next throttle is unknown.
 # Half: the errors of the two forecasts differ, and no flight is long enough to learn weights (on
 # ten flights of seven quadcopters, weights learned in flight were worse).
@@ -245,15 +240,13 @@ class _HorizonLaws:
         self.pending: deque[_PendingHorizon] = deque()
         self.next = self.learned = -math.inf
         self.calibrator = Calibrator()
-        self.held, self.passage = ContradictionRate(_AGREE), ContradictionRate(_ODDS - 1.0)
-        # Log-likelihood ratio of first passage to the other method.
-        self.evidence = 0.0
+        self.held, self.passage = ContradictionRate(_AGREE), ContradictionRate(_PREDICTED)
 
     @property
     def values(self) -> FloatArray:
         """Return all values that are interpolated between horizons."""
         return np.append(self.calibrator.law.values, (
-            self.held.value, *self.held.misses, self.passage.value, self.evidence))
+            self.held.value, *self.held.misses, self.passage.value))
 
     def learn(self, begun: _PendingHorizon, low: float, peak: float, dwell: float,
               sampling: Sampling) -> None:
@@ -278,11 +271,8 @@ class _HorizonLaws:
                           max(float(middle[0] - low), 0.0))
             other = _HALF * far + (1.0 - _HALF) * float(shares @ found[1:])
             self.calibrator.add(low, float(mean[0]), float(deviation[0]), start, weight, elapsed)
-        self.evidence *= math.exp(-elapsed / MEMORY)
         if begun.passage is not None:
-            first = self.passage.add(begun.passage.density(low, self.horizon), far, weight,
-                                     elapsed)
-            self.evidence += weight * math.log(max(first, 1e-300) / max(other, 1e-300))
+            self.passage.add(begun.passage.density(low, self.horizon), other, weight, elapsed)
 
 
 def _shares(horizon: float) -> list[float]:
@@ -328,7 +318,7 @@ class Forecast:
         self._samples = 0
         self._begun = NAN
         self._next = -math.inf
-        self._laws: dict[float, tuple[LowestLaw, float, float, float, float, float]] = {}
+        self._laws: dict[float, tuple[LowestLaw, float, float, float, float]] = {}
         self._kept: dict[float, tuple[float, float, FlownHorizons]] = {}
         for laws in self._by_horizon:
             laws.pending.clear()
@@ -442,8 +432,8 @@ class Forecast:
             self._kept[horizon] = *excursions(self._past, horizon), flown(self._past, horizon)
         return self._kept[horizon]
 
-    def _learned(self, horizon: float) -> tuple[LowestLaw, float, float, float, float, float]:
-        """Return the law, its contradictions (3 values), first passage's share, and evidence."""
+    def _learned(self, horizon: float) -> tuple[LowestLaw, float, float, float, float]:
+        """Return the law, its contradictions (3 values), and those of first passage."""
         if horizon not in self._laws:
             values = np.sum([share * laws.values for laws, share in zip(
                 self._by_horizon, _shares(horizon)) if share > _LEAST_SHARE], axis=0)
@@ -454,7 +444,7 @@ class Forecast:
         """Return P(below `voltage`, V, within `horizon`, s), including future throttle."""
         now = self.voltage
         state = self._state()
-        law, _, _, _, missed, evidence = self._learned(horizon)
+        law, _, _, _, missed = self._learned(horizon)
         mean, deviation, done = self._flight(horizon)
         level = np.array([voltage])
         far = NAN if math.isnan(deviation) or math.isnan(now) else float(
@@ -478,10 +468,8 @@ class Forecast:
                                     self.estimate.noise_std))
             if math.isnan(far):
                 return Outcome(passage, 'first_passage', DOMINANT[0])
-            share = 0.5 + 0.5 * math.tanh(0.5 * (math.log(_ODDS - 1.0) + evidence))
-            first = missed * far + (1.0 - missed) * passage
-            risk = share * first + (1.0 - share) * risk
-            if share > 0.5:
+            risk = missed * risk + (1.0 - missed) * passage
+            if missed < 0.5:
                 basis, cause = 'first_passage', DOMINANT[0]
         return Outcome(min(max(risk, 0.0), 1.0), 'none' if math.isnan(risk) else basis, cause)
 
