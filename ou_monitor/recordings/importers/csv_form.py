@@ -246,14 +246,15 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool, ma
     rows, full = ([_unlabelled(row, labels) for row in some] for some in (rows, full))
     good = [[is_value(row[k]) for row in full if row[k]] for k in range(width)]
     places = [k for k, ok in enumerate(good) if ok and (ok[-1] or 2 * sum(ok) >= len(ok))]
-    first = _first_of_data(rows, skip, width, places)
+    facts = _end_of_facts(rows, skip)
+    first = _first_of_data(rows, max(skip, facts), width, places)
     if first is None:
         # No rows: accept a header alone.
         first = len(rows)
         if len(filled) != 1 or any(map(is_value, filled[0])):
             return None
-    names, words, at = _header(rows, lines, first, width, delimiter, skip, labels)
-    if not at and any(len(row) > 2 and all(row) and not any(map(is_value, row))
+    names, words, at = _header(rows, lines, first, width, delimiter, skip, labels, facts > 0)
+    if not at and not facts and any(len(row) > 2 and all(row) and not any(map(is_value, row))
                       for row in rows[skip:first]):
         # The names do not fit the columns: rows have lost or gained cells.
         return None
@@ -315,6 +316,14 @@ def _labels_of(rows: list[list[str]]) -> tuple[str, ...]:
     either = [[found[0] if (found := _LABEL.match(cell)) and is_number(cell[found.end():]) else ''
                for cell in row] for row in rows[len(rows) // 2:][:2]]
     return tuple(one if one == other else '' for one, other in zip(either[0], either[-1]))
+
+
+def _end_of_facts(rows: list[list[str]], skip: int) -> int:
+    """Return the first row below named facts and a blank line; 0: another form."""
+    words = [k for k, row in enumerate(rows) if k >= skip and row and row[0] and not (
+        is_value(row[0]) or is_missing(row[0]))]
+    end = words[-1] + 1 if len(words) > _IN_A_ROW else 0
+    return end if end and end + _IN_A_ROW < len(rows) and not any(rows[end]) else 0
 
 
 def _first_of_data(rows: list[list[str]], skip: int, width: int, places: list[int]) -> int | None:
@@ -451,18 +460,22 @@ def factor_of(name: str) -> float:
 
 
 def _header(rows: list[list[str]], lines: list[str], first: int, width: int, delimiter: str,
-            skip: int, labels: Sequence[str]) -> tuple[list[str], list[str], int]:
+            skip: int, labels: Sequence[str], facts: bool) -> tuple[list[str], list[str], int]:
     """Return names, the words of a line of units, and the number of the line of the names."""
     # A line of decimal numbers, as of the steps of a battery tester, has no names.
     plain = [(k, rows[k]) for k in range(skip, first) if any(rows[k]) and 2 * sum(
         '.' in cell and is_number(cell) for cell in rows[k]) <= len(rows[k])]
+    if facts:
+        # The names of the columns are one of the facts.
+        plain = [(k, row) for k, row in plain if len(row) == width and re.search(
+            'name|trace|label|channel', row[0].lower()) and not any(map(is_value, row))][:1]
     if any(labels) and not (plain and len(plain[-1][1]) == width):
         return [label[:-1].strip() or ('time' if is_clock(cell) else f'column {k + 1}')
                 for k, (label, cell) in enumerate(zip(labels, rows[first]))], [], first + 1
     # Otherwise the names may be in a comment: delimited like the data, or by blanks with units in
     # brackets.
     comments = []
-    for k in range(skip, first):
+    for k in (k for k in range(skip, first) if lines[k].lstrip().startswith(COMMENTS)):
         text = lines[k].lstrip('#% \t')
         either = next(csv.reader([text], delimiter=delimiter), []), _NAMES.findall(text)
         comments += [(k, [cell.strip() for cell in cells])
@@ -483,6 +496,9 @@ def _names_and_units(above: list[tuple[int, list[str]]], width: int, needed: set
     if not above:
         return None
     line, names = above[-1]
+    if len(needed) > 1 and len(names) == 1 and re.fullmatch(r'[A-Za-z][^,;\t|]*', names[0]):
+        # A title.
+        return None
     for _, over in reversed(above[:-1]):
         # Names in several lines: the cell above replaces a blank name and precedes a repeated one.
         if len(over) != len(names) or any(map(is_value, over)):

@@ -473,6 +473,12 @@ def _unit_column(form: Form, place: int, unit: str | None) -> _Column:
     return _Column((place,), name, unit or stated, 0.0)
 
 
+def _stem(name: str) -> str:
+    """Return a name without the words for voltage, current and their units."""
+    return re.sub(r'volt(?:age)?s?|curr(?:ent)?|amp(?:erage|s)?|spannung|strom', '', unit_of(
+        name)[0].lower())
+
+
 def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: _Column, needed: bool,
                ) -> dict[str, _Column]:
     """Return the columns of voltage, throttle and current that exist."""
@@ -482,6 +488,7 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: _Column, needed
     given = [form.names.index(name) for name in (
         wanted.time, *(name for name, *_ in names.values())) if name in form.names]
     taken = [*time.place, *given]
+    currents = {_stem(form.names[k]) for k in _choose(form, logs.CURRENT, taken)}
     found: dict[str, _Column] = {}
     for quantity, (name, option, unit) in names.items():
         if name == NONE and quantity != logs.VOLTAGE:
@@ -497,6 +504,9 @@ def _supply_of(path: Path, form: Form, wanted: CsvColumns, time: _Column, needed
         if not places and quantity == logs.VOLTAGE:
             # Another option may have taken it; that is refused below.
             places = [k for k in _choose(form, quantity) if k in given]
+        if quantity == logs.VOLTAGE:
+            # Prefer a voltage that has a current of the same name.
+            places.sort(key=lambda k: _stem(form.names[k]) not in currents)
         if not places and quantity == logs.VOLTAGE:
             places = _steadiest(form, [k for k in _nameless_columns(form) if k not in taken])
         if places:

@@ -692,6 +692,35 @@ def test_rows_of_outer_tables_are_left_out(tmp_path):
     assert 'without rows of outer tables' in found.notes[0]
 
 
+def test_facts_and_a_title_above_rows_without_names(tmp_path):
+    """Yokogawa's facts end at a blank line and hold the names; GW Instek's end with a title."""
+    path = written(tmp_path, table(
+        ['"Header Size",15', '"Model Name","DLM3054"', '"Comment",""', '"BlockNumber",1',
+         '"TraceName","U_BAT   ","I_BAT   "', f'"BlockSize",{N},{N}', '"VUnit","V","A"',
+         '"SampleRate",1.0E+03,1.0E+03', '"HResolution",1.0E-03,1.0E-03', '"HUnit","s","s"',
+         f'"DisplayBlockSize",{N},{N}', '"DisplayPointNo.",1,1',
+         '"Date","2024/06/18","2024/06/18"', '"Time","14:22:07.510","14:22:07.510"', ''],
+        lambda k: f', {V[k]:.7E}, {AMPS[k]:.7E}'))
+    found = read_recording(path)
+    np.testing.assert_allclose(found.t, 1e-3 * K)
+    np.testing.assert_allclose(found.voltage, V)
+    np.testing.assert_allclose(found.current, AMPS)
+    path = written(tmp_path, table(
+        ['Format,1.0B', 'Source,CH1', 'Vertical Units,V', 'Sampling Period,4.000E-04',
+         'Horizontal Old Scale,5.000E-03', 'Mode,Detail', 'Waveform Data'],
+        lambda k: f'{4e-4 * k:.8E},{V[k]:.6f},'))
+    found = read_recording(path)
+    np.testing.assert_allclose(found.t, 4e-4 * K, atol=1e-12)
+    np.testing.assert_allclose(found.voltage, V)
+
+
+def test_a_voltage_with_a_current_of_its_name_is_preferred(tmp_path):
+    path = written(tmp_path, table(
+        ['t,12V battery voltage,HV battery voltage,HV battery current'],
+        lambda k: f'{k},{13 + k % 2},{350 + V[k]},{AMPS[k]}'))
+    np.testing.assert_allclose(read_recording(path).voltage, 350.0 + V)
+
+
 def test_decimal_commas_between_commas(tmp_path):
     """Each number takes two cells of a row; a row of another width is refused."""
     rows = [[german(f'{one:.3f}') for one in (20.0 * k, V[k], -AMPS[k])] for k in range(N)]
