@@ -254,8 +254,9 @@ def _score_form(lines: list[str], encoding: str, delimiter: str, comma: bool, ma
         if len(filled) != 1 or any(map(is_value, filled[0])):
             return None
     names, words, at = _header(rows, lines, first, width, delimiter, skip, labels, facts > 0)
-    if not at and not facts and any(len(row) > 2 and all(row) and not any(map(is_value, row))
-                      for row in rows[skip:first]):
+    if not at and not facts and any(
+            len(row) > 2 and all(row) and not any(map(is_value, row))
+            for row in rows[skip:first]):
         # The names do not fit the columns: rows have lost or gained cells.
         return None
     # Battery testers indent the names and rows of an inner table by blank cells.
