@@ -38,8 +38,8 @@ _CUBIC = (3.66631, 0.35371, -0.22145, 0.41052)
 _KNEE, _KNEE_SLOPE = 0.079, 1.2
 # Relative change of the response per volt of a cell's open-circuit voltage, 1/V, in addition to
 # the propeller's (a pack warms as it empties), and scatter of this change between packs.  Measured
-# between halves of a flight or successive flights of four packs: 0.6, 1.3, -0.1 +- 0.7, and 0.5;
-# mean and prediction error by DerSimonian & Laird, Control. Clin. Trials 7 (1986) 177.
+# between halves of a flight or successive flights: 0.6 (gecko), 1.3 (nazgul), -0.1 +- 0.7 (hiro),
+# 0.5 (roma); mean and prediction error by DerSimonian & Laird, Control. Clin. Trials 7 (1986) 177.
 WARMING, WARMING_SE = 0.7, 0.33
 # Time constant of the inrush, s: a motor's current settles in about 20 ms.
 INRUSH_TIME = 0.02

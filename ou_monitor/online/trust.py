@@ -204,13 +204,13 @@ class InputClock:
 
 # A sensor is stuck if its reading is constant for more than this time, s, and at least this number
 # of readings; if it has never changed, the number suffices.  Longest constant readings of working
-# sources in recordings: 2.81 s (139 readings) on the ground; in flight 1.70 s (172 readings), or
-# 3 readings at 1 Hz.
+# sources: 2.81 s (139 readings) on the ground (in_xr_141340); in flight 1.70 s (172 readings,
+# cf_solo_large), or 3 readings at 1 Hz (ac_jd_2004).
 _STUCK, _STUCK_READINGS = 5.0, 10
 # While throttle is constant, the time is at least this factor times the longest constant reading
 # that ended with one ADC step: a coarse ADC repeats its reading during a slow discharge.
 _QUIET = 4.0
-# Range within which throttle counts as constant (0.019 within 1.06 s of a recorded hover).
+# Range within which throttle counts as constant (cf_solo_large: 0.019 within 1.06 s of hover).
 _STILL = 0.05
 # Maximum size of one ADC step, in smallest changes: printed digits round steps (5 or 6 mV).
 _ONE_STEP = 1.5

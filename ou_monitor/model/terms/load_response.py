@@ -185,7 +185,7 @@ class LoadTransient(Term):
 # Shortest visible time constant, in steps: one seventh of the response remains at the next sample.
 SHORTEST = 0.5
 # Longest time constant, in durations of the recording: a slower response looks like a drift
-# (with 0.25, the held-out scores of three recordings were lower).
+# (with 0.25, held-out scores of ar8, jd and cf_takeoff were lower).
 LONGEST = 0.125
 # Longest time that motors take to speed up, s.
 _INRUSH = 0.2

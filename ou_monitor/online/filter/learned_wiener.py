@@ -120,7 +120,7 @@ def noise_of(key: int, decay: float, slope: bool) -> FloatArray:
 
 
 # Time between updates of the weights, which is also the time constant of the transition, and
-# memory, s; chosen on four recorded flights (benchmarks/learned.py).
+# memory, s; chosen on bf3s, roma, jd and gecko (benchmarks/learned.py).
 _HOP, _MEMORY = 0.01, 5.0
 # Weight of the prior (no signal), s.
 _BEFORE = 1.0

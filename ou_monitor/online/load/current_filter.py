@@ -47,8 +47,8 @@ _LOUDEST = 0.7
 _MEMORY, _ONE, _WIDE = 120.0, 1.0, 30.0
 # Time constants, s, of the band in which throttle is tried as a further regressor, and minimum
 # share of its variance that current leaves unexplained: smaller shares are rounding or lag of the
-# current (up to 0.0045 in simulated vehicles without a bypass, and 5e-5 on one recording of such a
-# vehicle; 0.007 to 0.8 on twelve other recordings).
+# current (up to 0.0045 in simulated vehicles without a bypass, 5e-5 on hebi_x; 0.007 to 0.8 on
+# roma 1 and 3, ar8, jd, in_xr, js_11t, as_f60, euc_1, frc_ol_1, and regbot_28, 62 and 81).
 _BAND, _APART = np.array([[1.0], [20.0]]), 5e-3
 # Time for which unknown throttle or current is held, s.
 UNKNOWN_HELD = 1.0

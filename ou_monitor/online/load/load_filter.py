@@ -30,7 +30,7 @@ from ou_monitor.timeline import MOST_CURRENT, MOST_THROTTLE, plausible
 # Lag of the whole response, s: half of the response time of an ESC.
 _LAG = 0.004
 # Random walk of the level, V per sqrt(s) and cell: usually, as in an OU of 4.6 mV and 20 s (from
-# the batch fit), and for a nearly empty pack (chosen on one recording; 0.02 to 0.05 work).
+# the batch fit), and for a nearly empty pack (chosen on bf_hiro_4s; 0.02 to 0.05 work).
 _WALK, _FAST_WALK = 0.0015, 0.03
 # `FastLevel`: prediction time, s; maximum ratio of mean square errors to use it; memory, s;
 # minimum time compared, s; interval of predictions, s.

@@ -29,7 +29,7 @@ SIZE_ERROR = 0.1
 # Minimum relative error of the noise: its scatter between simulated flights of one model.
 _NOISE_FORM = 0.15
 # Minimum relative error of the discharge per load: rms of ln of its ratio on 12 recorded pairs
-# (halves of a flight, or two flights of one craft), with packs at different charges.
+# (halves of gecko, nazgul and hiro, three flights of roma), with packs at different charges.
 _DISCHARGE_FORM = 0.64
 # Lower limit of the noise, V.
 _LEAST_NOISE = 1e-6

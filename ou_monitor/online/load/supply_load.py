@@ -27,7 +27,7 @@ HOLD, _HOLDS = 1.0, 10.0
 AT_ONCE = 0.1
 # Throttles of the table of the sag.
 TABLE = np.linspace(0.0, 1.0, 101)
-# Number of sweeps in `rising` (10 come within 3 % of the limit on a recording).
+# Number of sweeps in `rising` (10 come within 3 % of the limit on cf_pair).
 _SWEEPS = 10
 # Sentences on the relaxation for estimates in which only level, sag and noise are known.
 _NO_ALPHA = {

@@ -52,20 +52,22 @@ _NORM = math.exp(math.lgamma(0.5 * FREEDOM + 0.5) - math.lgamma(0.5 * FREEDOM)) 
 # Coefficients of the power series of the tail in FREEDOM / (FREEDOM + t^2), highest power first.
 _TAIL = [8.0 / (3.0 * math.pi) * math.comb(2 * k, k) / 4.0**k / (2 * k + 5)
          for k in range(9, -1, -1)]
-# Prior of the law: weight of the variances, in horizons; variances k0 and k1 (1 to 6 and 0.015 to
-# 0.09 on nine recorded flights); precision matrix of bias and gain (elements 00, 01, 11).
+# Prior of the law: weight of the variances, in horizons; variances k0 and k1 (on nine recorded
+# flights, from gecko to cf_takeoff, 1 to 6 and 0.015 to 0.09); precision matrix of bias and gain
+# (elements 00, 01, 11).
 _PRIOR, _VARIANCES = 5.0, np.array([3.0, 0.03])
 _PRECISION = (1.0 / 0.75, 0.0, 1.0 / 0.48)
 # Memory, s; limit of squared standardised errors; standardised error beyond which errors weigh
 # less in the regression.
 MEMORY, _LARGEST, _HUBER = 120.0, 36.0, 3.0
-# Maximum initial width of the wider law, in widths of the law (2 to 6 tried on six recordings).
+# Maximum initial width of the wider law, in widths of the law: chosen on gecko, nazgul, roma,
+# bf3s, erle and cf_solo (2 to 6 tried).
 _WIDEST = 4.0
 # Weight of the initial width, in horizons, when it is averaged with the misses of this flight
-# (1 and 4 tried on three recordings).
+# (chosen on gecko, frc_ol_1 and cf_solo; 1 and 4 tried).
 _FIRST = 4.0
-# Number of horizons that initially count as agreeing with the law for a given throttle (1, 4, 9
-# and 19 tried on eleven recordings).
+# Number of horizons that initially count as agreeing with the law for a given throttle: chosen on
+# the recordings of `_WIDEST`, hiro, cf_pair, cf_bl00, frc_ol_1 and euc_1 (1, 4, 9, 19 tried).
 _AGREE = 4.0
 
 
