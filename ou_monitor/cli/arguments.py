@@ -25,7 +25,7 @@ _COLUMNS = {'time': 'time_column', 'voltage': 'voltage_column', 'throttle': 'thr
 def check_outputs(args: argparse.Namespace, bag: tuple[str, Path | None] = ('', None),
                   **inputs: Any) -> None:
     """Refuse outputs that overwrite an input, cannot be written, or (except for JSON) are '-'."""
-    # bag: its option and path.
+    # bag: option and path of a bag to be written.
     option, path = bag
     files = {'--save-model': getattr(args, 'save_model', None),
              '--report': getattr(args, 'report', None)}
@@ -33,7 +33,7 @@ def check_outputs(args: argparse.Namespace, bag: tuple[str, Path | None] = ('', 
         if str(target) == output.STDOUT:
             raise InputError(f"{name} needs a file: '-' is not supported")
     for target in (args.json, *files.values()):
-        # `check_paths` names the option of an empty path.
+        # An empty path passes here: `check_paths` reports it with its option.
         output.check_writable(target or None)
     if path is not None:
         output.check_bag(option, path, args.force)
@@ -42,7 +42,7 @@ def check_outputs(args: argparse.Namespace, bag: tuple[str, Path | None] = ('', 
 
 def read_given(args: argparse.Namespace, signal: str | None = None
                ) -> tuple[Recording, Series | None]:
-    """Read RECORDING as the arguments say, and a signal of it, with a progress bar."""
+    """Read RECORDING, and a signal in it, as the arguments say, with a progress bar."""
     from ou_monitor.recordings.read import read_beside, read_recording
 
     start, end = part_of_recording(args)
@@ -58,7 +58,7 @@ def read_given(args: argparse.Namespace, signal: str | None = None
 
 
 def columns_given(args: argparse.Namespace) -> CsvColumns | None:
-    """Return the named columns of a CSV; None when none was named."""
+    """Return the columns of a CSV that the options name; None without such an option."""
     from ou_monitor.recordings.importers.log import CsvColumns
 
     given = {name: getattr(args, option) for name, option in _COLUMNS.items()
@@ -67,7 +67,7 @@ def columns_given(args: argparse.Namespace) -> CsvColumns | None:
 
 
 def check_ranges(given: Mapping[str, Any]) -> None:
-    """Refuse options that the node would refuse as its parameters."""
+    """Refuse values that the node would refuse for its parameters of the same names."""
     from ou_monitor.online.settings import ESTIMATOR_PARAMETERS
 
     for parameter in ESTIMATOR_PARAMETERS:

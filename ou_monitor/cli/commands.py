@@ -1,4 +1,4 @@
-"""The table of commands: purpose, module and options of each; imports none of them."""
+"""The table of commands with purpose, module and options; a module is imported when it runs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Option:
 
 
 class OptionalOut(argparse.Action):
-    """A flag that makes OUT optional; if it always were, it could not follow an option."""
+    """A flag that makes OUT optional (argparse wants an always optional OUT before options)."""
 
     def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
                  values: Any, option_string: str | None = None) -> None:
@@ -38,7 +38,7 @@ _DIGITS = 18
 
 
 def whole(what: str, low: int, high: float = math.inf, step: int = 1) -> Callable[[str], int]:
-    """Return a parser of whole numbers in a range, multiples of a step; what: its wording."""
+    """Return a parser of whole numbers in a range, multiples of a step; what: for its error."""
     def read(text: str) -> int:
         value = int(text) if text.isascii() and text.isdigit() and len(text) <= _DIGITS else -1
         if not low <= value <= high or value % step:
@@ -48,7 +48,7 @@ def whole(what: str, low: int, high: float = math.inf, step: int = 1) -> Callabl
 
 
 def number(what: str, fits: Callable[[float], bool]) -> Callable[[str], float]:
-    """Return a parser of numbers for which `fits` is true; what: its wording."""
+    """Return a parser of numbers for which `fits` is true; what: wording for its error."""
     def read(text: str) -> float:
         try:
             value = plain_number(text)
@@ -60,11 +60,11 @@ def number(what: str, fits: Callable[[float], bool]) -> Callable[[str], float]:
     return read
 
 
-# Divisors, because they are exact: 10u is exactly 1e-5.
+# Divisors, because unlike the factor 1e-6, 1e6 is exact: 10u is exactly 1e-5.
 _PREFIX = {'': 1.0, 'p': 1e12, 'n': 1e9, 'u': 1e6, 'µ': 1e6, 'm': 1e3, 'k': 1e-3, 'M': 1e-6}
-# Upper limit of a quantity, with which products stay finite.
+# Upper limit of a quantity, so that products stay finite.
 _QUANTITY_MOST = 1e15
-# Largest components of a craft, with a margin: more is a number without its prefix.
+# Upper limits of components of a craft, with a margin: larger numbers lack their prefix.
 _PART_MOST = {'F': 10.0, 'H': 1.0, 'Ohm': 100.0}
 _QUANTITY = re.compile(r'([+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?)\s*([pnuµmkM]?)'
                        r'(F|H|[Oo]hm|Ω|V|A|Hz|W|s|1/s)?', re.ASCII)
@@ -184,7 +184,7 @@ JSON = Option(
     help="write the result as JSON ('-': to standard output, and nothing else)")
 FORCE = Option('--force', action='store_true', help='overwrite existing files')
 REPORT = Option('--report', metavar='FILE.html', help='write a self-contained HTML page')
-# Cells of the largest packs that fly, with a margin.
+# Up to the cells of the largest packs in use, with a margin.
 _CELLS = whole('a number of cells, 1 to 28', 1, 28)
 TYPES = ('battery_state', 'float32', 'float64', 'adc_block')
 
@@ -196,14 +196,14 @@ def seed(default: int, text: str = 'same seed, same result') -> Option:
 
 
 def levels(found: str) -> Option:
-    """Return the option of the load levels; found: their default."""
+    """Return the option of the load levels; found: wording of the default."""
     return Option('--levels', metavar='0,0.05,...', type=throttles,
                   help=f'throttles 0..1 of the load levels (default: {found})')
 
 
 def limit(meaning: str, *also: str, kind: Callable[[str], float] = POSITIVE,
           ) -> tuple[Option, ...]:
-    """Return the options of the limit; meaning: of --brownout-voltage; also: its other names."""
+    """Return --brownout-voltage (meaning: its help; also: its other names) and --cells."""
     return (Option('--brownout-voltage', *also, metavar='V', type=kind, help=meaning),
             Option('--cells', metavar='N', type=_CELLS,
                    help='cells in series: --brownout-voltage is then in volts per cell (default '
@@ -221,7 +221,7 @@ def estimate(voltage: str) -> tuple[Option, ...]:
 
 
 class _Help(argparse.HelpFormatter):
-    """Help whose lines that begin with blanks, such as examples, stay unchanged."""
+    """A help formatter that leaves indented lines, such as examples, unchanged."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         fill = super()._fill_text
@@ -464,15 +464,15 @@ _SIMULATE = Command(
              help='model file, as discover writes it')),
      Option('--duration', metavar='S', type=POSITIVE, help='length, s'),
      Option('--rate', metavar='HZ', type=POSITIVE,
-            help="samples per second (default: the preset's, or of the model's recording)"),
+            help="samples per second (default: as in the preset or the model's recording)"),
      seed(1, 'same seed, same recording'),
      Option('--throttle', metavar='PROFILE',
             help='name of a profile, a number 0..1, points T:U,T:U,..., a CSV of time and '
             'throttle, or a recording, whose length is then the default'),
      *PART, *COLUMNS,
      Option('--capacity-left', metavar='X', type=NUMBER,
-            help='initial charge, 0..1, which throttle discharges, in place of drift; -1: '
-            "the charge at the start of the model's recording"),
+            help='initial charge, 0..1; throttle then discharges the battery, in place of drift; '
+            "-1: the charge at the start of the model's recording"),
      Option('--scale-resistance', metavar='X', type=NUMBER, default=1.0,
             help='factor on the response to throttle: 1.4 is a pack aged by 40 %% (default '
             '%(default)s)'),

@@ -16,7 +16,7 @@ def run(args: argparse.Namespace) -> int:
     """Convert, or list."""
     if args.list and args.out is not None:
         raise InputError(f"--list writes no bag: leave '{args.out}' out")
-    # Before reading a long log.
+    # Checked before the log is read, which may take long.
     check_outputs(args, ('OUT', args.out), LOG=args.log)
 
     from ou_monitor.recordings.importers.formats import import_log

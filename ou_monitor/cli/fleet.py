@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
             raise InputError(f"'{path}' is not a file: remove it, or name another folder")
     output.check_paths({}, {**made, '--json': args.json}, force=True)
     output.check_paths({}, {'--json': args.json}, args.force)
-    # These two files of an earlier run are written again; other files are not ours.
+    # Table and report of an earlier run are replaced; other files only with --force.
     output.check_paths({}, made, args.force or is_own(folder))
     output.check_writable(args.json)
 
@@ -89,7 +89,7 @@ def _check_installed(args: argparse.Namespace) -> None:
 
 
 def version() -> str:
-    """Return the package version of a worker."""
+    """Return the version of this package (also called on the workers of a scheduler)."""
     return __version__
 
 
@@ -105,7 +105,7 @@ def _write(fleet: Fleet, folder: Path, args: argparse.Namespace) -> None:
 
 
 def _options(args: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
-    """Return the options of the work, with the content of the file they name."""
+    """Return the options of the analysis, and a hash of the msg_config file that they name."""
     from ou_monitor.analysis.crafts import pack_limit
     from ou_monitor.fleet.analysis import Options
 

@@ -26,13 +26,13 @@ INTERRUPTED = 130
 
 
 def _complain(text: str) -> None:
-    """Write one line to standard error, whatever a file name or a library's message contains."""
+    """Write a text to standard error as one line, even if it contains line breaks."""
     with suppress(OSError, ValueError):
         print(' '.join(text.split()), file=sys.stderr, flush=True)
 
 
 def _end(number: int, frame: object) -> NoReturn:
-    """Exit as after an error, so that files moved aside are restored."""
+    """Exit on SIGTERM as after an error, so that files moved aside are restored."""
     sys.exit(128 + number)
 
 
@@ -93,12 +93,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if argv is None else argv)
     where = PROGRAM
     for name in ('stdout', 'stderr'):
-        # Closed by the parent, as daemons do: nobody reads the output, and its loss is not an
-        # error.
+        # None if the parent process closed the stream, as for a daemon: discard the output.
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, 'w', encoding='utf-8'))
     if isinstance(sys.stdout, TextIOWrapper):
-        # Like standard error: an unprintable character in a file name is not an error.
+        # Escape characters that the terminal cannot encode, as standard error does.
         sys.stdout.reconfigure(errors='backslashreplace')
     try:
         try:
@@ -106,8 +105,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             where = f'{PROGRAM} {args.command}'
             return int(args.run(args))
         except SystemExit as stop:
-            # From argparse: --help, --version and bad arguments.  Its output is still in the
-            # buffer, so an error of writing it can still be reported.
+            # From argparse: --help, --version and bad arguments.  Flush its output here, so that
+            # an error in writing it is reported.
             from ou_monitor.cli.output import say
 
             say('', end='')
@@ -120,12 +119,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         from ou_monitor.cli.output import abandon_stdout
 
-        # The reader (head, less) has closed the pipe: write nothing more, not even in the flush at
+        # The reading program (head, less) closed the pipe: write no more, not even the flush at
         # exit.
         abandon_stdout()
         return 0
     except OSError as error:
-        # Refusals by the system, such as searching a folder, may come from any call.
+        # The operating system may refuse any call, such as listing a folder.
         _complain(f'{where}: {refusal(error)}')
         return BAD_INPUT
     except MemoryError:

@@ -111,7 +111,7 @@ def write_json(data: Mapping[str, Any], target: str, force: bool = False) -> Non
     # Imported here, so that `--help` needs no NumPy.
     from ou_monitor.records import plain_data
 
-    # ASCII suits every encoding of standard output, and file names that are not valid text.
+    # ASCII, because it fits every encoding of standard output, and escapes invalid file names.
     text = json.dumps(plain_data(data), indent=2, allow_nan=False)
     if target == STDOUT:
         say(text)
@@ -134,7 +134,7 @@ def say(text: str, end: str = '\n') -> None:
 
 def abandon_stdout() -> None:
     """Discard what is left in the buffer, so that the flush at exit cannot fail."""
-    # A standard output without a file, as in a test, has nothing to discard.
+    # Standard output without a file descriptor, as in a test, needs nothing.
     with suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
@@ -149,7 +149,7 @@ def write_text(text: str, target: str | Path, force: bool = False) -> None:
         write_whole(path, content, over=force)
         return
     try:
-        # A FIFO without a reader refuses, instead of waiting for one.
+        # Without blocking, so that a FIFO without a reader fails instead of waiting for one.
         with open(path, 'wb', opener=lambda name, flags: os.open(
                 name, os.O_WRONLY | os.O_NONBLOCK)) as file:
             os.set_blocking(file.fileno(), True)
@@ -247,7 +247,7 @@ def _is_device(path: Path) -> bool:
 
 
 def _real(path: Path) -> Path:
-    """Return a path without links; a loop of links, which `resolve` refuses, stays as it is."""
+    """Return a path with links resolved; a loop of links, which `resolve` refuses, is kept."""
     return Path(os.path.realpath(path))
 
 
@@ -311,13 +311,13 @@ def tell(args: argparse.Namespace, document: Document,
 
 
 def summary(answer: Sequence[str], **files: object) -> None:
-    """Write the last lines of a terminal: two sentences and the files."""
+    """Print the last lines: two sentences of the answer, and the files written."""
     from ou_monitor.report.terminal import paragraph
 
     made = {name: path for name, path in files.items()
             if path is not None and str(path) != STDOUT}
     if len(made) > 1:
-        # Name the page for readers; a script knows its JSON file.
+        # Name the JSON file only if there is no other.
         made.pop('json', None)
     last = '; '.join(f'{name.capitalize()}: {path}' for name, path in made.items())
     say('\n' + '\n'.join([*map(paragraph, answer[:2]), last or paragraph(_NO_FILE)]))

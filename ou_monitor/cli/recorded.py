@@ -81,11 +81,11 @@ def reproduce(args: argparse.Namespace) -> int:
 
 
 def _bench_arguments(args: argparse.Namespace, *names: str) -> dict[str, Any]:
-    """Return some arguments and the limit for a function of `bench`; check paths and ranges."""
+    """Return the named arguments and the limit for a function of `bench`, after checking them."""
     check_outputs(args, RECORDING=args.recording, **{
         '--msg-config': args.msg_config, '--model': getattr(args, 'model', None)})
     given = {name: getattr(args, name) for name in names}
-    # It imports SciPy, which not every command needs.
+    # Imported here, because it imports SciPy, which not every command needs.
     from ou_monitor.analysis.crafts import pack_limit
 
     check_ranges({**given, 'brownout_voltage': pack_limit(args.brownout_voltage, args.cells)})
@@ -113,7 +113,7 @@ def _unsaved(why: str) -> str:
 
 
 def model_text(finding: Finding, recording: Recording | None = None) -> str:
-    """Return the extended model, with the state at take-off, as the text of a model file."""
+    """Return the extended model, and start values for the next flight, as a model file's text."""
     from ou_monitor.online.load.load_filter import LoadFilter
     from ou_monitor.recordings.model_file import as_yaml, ModelFile
     from ou_monitor.records import plain_data

@@ -52,7 +52,7 @@ def work(path: str, options: Options) -> dict[str, Any]:
     except MemoryError:
         why = 'The recording does not fit into the memory of the worker: use fewer workers.'
     except Exception as error:
-        # A defect of ours in one recording must not stop the others.
+        # A defect of this package must not stop the analysis of the other recordings.
         why = (f'The analysis failed ({type(error).__name__}: {printable(error, 200)}): please '
                'report it.')
     return {'error': ' '.join(why.split()), 'levels': []}

@@ -197,7 +197,7 @@ def _source(path: Path) -> FoundRecording:
 
 def duplicates(sources: Sequence[FoundRecording],
                progress: Callable[[float], None] | None = None) -> dict[Path, Path]:
-    """Return the duplicates, each with its original, the oldest one (progress 0..1)."""
+    """Return each duplicate with its original, the oldest of the equal ones (progress 0..1)."""
     sizes: dict[int, list[FoundRecording]] = {}
     for source in sources:
         if source.size:

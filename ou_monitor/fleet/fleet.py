@@ -1,9 +1,9 @@
 """
 Analyse many recordings, and resume a stopped run.
 
-Each result is saved in a file of its own as soon as it is there.  It is valid for a recording with
-the same path, size, time of change, options and version of the package.  Failed recordings are not
-saved, so the next run tries them again.
+Each result is saved in its own file at once.  It is used again for a recording with the same path,
+size and time of change, if the options and the version of the package are the same.  Failed
+recordings are not saved, so the next run tries them again.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _MOST = 50_000_000
 
 
 def is_own(folder: Path) -> bool:
-    """Return whether a fleet has written into a folder before."""
+    """Return whether an earlier run of fleet wrote into a folder."""
     try:
         with open_regular(folder / FOLDER / _MARK) as file:
             return file.read(len(_MARK_TEXT) + 1) == _MARK_TEXT
@@ -46,7 +46,7 @@ def is_own(folder: Path) -> bool:
 
 
 class SavedResults:
-    """The saved results in the folder of a fleet, which is created; InputError if that fails."""
+    """The saved results in a folder, which is created; raises InputError if that fails."""
 
     def __init__(self, folder: Path, options: Mapping[str, Any]) -> None:
         self._folder = folder / FOLDER
@@ -169,7 +169,7 @@ def _work(missing: Sequence[FoundRecording], results: dict[Path, dict[str, Any]]
 def _table(sources: Sequence[FoundRecording], results: dict[Path, dict[str, Any]],
            twice: dict[Path, Path], pattern: re.Pattern[str] | None
            ) -> tuple[list[Row], list[str]]:
-    """Return all rows, and notes on how vehicles and flights were named."""
+    """Return all rows of the table, and notes on vehicles, flights and damage."""
     # A copy belongs to the vehicle named by its content, else by its own path.
     whole = {s.path: results[twice.get(s.path, s.path)] for s in sources}
     vehicles, notes = assign({path: r.get('vehicle', '') for path, r in whole.items()}, pattern)

@@ -1,26 +1,26 @@
 """
 The fleet table -> drifting vehicles, and outliers among recordings and vehicles.
 
-doc/fleet.md states the tests, their false-alarm rates and their limits; here is how they are
+doc/fleet.md states the tests, their false-alarm rates and their limits; this is how they are
 computed.
 
 Common throttle: the logarithms of sigma and alpha follow one curve over throttle for all vehicles
 (straight between knots, fitted by Huber's estimate, with a level for each vehicle).  Values are
-moved along it to the median throttle, with the error of the move; without throttle they stay.
-Resistance and sag come from the `supply` facts, per cell where cells are known.
+moved along the curve to the median throttle, which adds an error; values without throttle are not
+moved.  Resistance and sag come from the `supply` facts, per cell where cells are known.
 
-Drift: a line through the logarithms over the number of the flight, weighted by their errors and a
+Drift: a line through the logarithms against flight number.  Weights come from the errors and a
 normal scatter between flights (Paule and Mandel).  The scale of the t test is the scatter about
 the line, so an error common to all flights does not count.
 
-Few vehicles (fewer than `LEAST_VEHICLES`): the pooled scatter between flights is the scale of the
-t test.  A pack is compared only with packs of the same number of cells.
+Fewer than `LEAST_VEHICLES` vehicles: each is compared with the mean of the others by a t test,
+scaled by the pooled scatter between flights; packs only with packs of as many cells.
 
 Outliers: the score of a value is its distance from the median (or the drift line) of its group
 divided by sqrt(s^2 + se^2), with its standard error se and the scatter s between recordings, a
 median absolute deviation.  The bound is a quantile of the largest score in simulated fleets
-without faults, evaluated in the same way; their s is the upper 90 % bound, so that false alarms
-are rather too few.  If many members of a group are off, its median is too.
+without faults, evaluated in the same way; they use the upper 90 % bound of s, which gives too few
+false alarms rather than too many.  If many members of a group are off, its median is off too.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ USABLE = ('OK', 'SHORT_WINDOW')
 QUANTITIES = {'resistance': 'Ohm', 'sag': 'V', 'sigma': 'V/sqrt(s)', 'alpha': '1/s'}
 OF_PACK = {'resistance': ('resistance', 'resistance_se', 'resistance', ''),
            'sag': ('sag_full', 'sag_full_se', 'sag', 'sag_throttle')}
-# Maximum relative error of a pack's value; with a larger one it is unknown.
+# Maximum relative error of a pack's value; with a larger error the value is unknown.
 _VAGUE = 0.5
 # Bend of Huber's function, in standard deviations (95 % efficiency); maximum rounds of the fit.
 _HUBER = 1.345
@@ -58,7 +58,7 @@ class CommonCurve:
     """The common curve over throttle of the logarithm of a quantity: straight between knots."""
 
     reference: float  # Throttle at which recordings are compared; NaN without throttle
-    # Throttles, and the logarithm there less that at the reference; empty: flat.
+    # Throttles of the knots, and the curve there minus its value at the reference; empty: flat.
     knots: tuple[float, ...] = ()
     heights: tuple[float, ...] = ()
     # Covariance of the slopes between k knots, for independent recordings; shape (k - 1, k - 1).
@@ -93,7 +93,7 @@ class Values:
     cells: IntArray  # Cells by which values are divided; 0: they are not; shape (n,)
 
     def shown(self, value: FloatArray | float) -> FloatArray:
-        """Return numbers on the scale of `value` in the unit of the quantity."""
+        """Convert logarithms, as in the field `value`, to the unit of the quantity."""
         return np.asarray(np.exp(np.asarray(value, dtype=np.float64)))
 
     def interval(self) -> tuple[FloatArray, FloatArray]:
@@ -176,7 +176,7 @@ def _pieces(u: FloatArray, knots: Sequence[float]) -> FloatArray:
 
 def _curve(y: FloatArray, u: FloatArray, vehicles: Sequence[str], recordings: IntArray
            ) -> CommonCurve:
-    """Return the common curve of levels; flat where throttle does not vary."""
+    """Return the common curve of levels (y: logarithms, u: throttle); flat if u is constant."""
     known = np.isfinite(u)
     if not known.any():
         return CommonCurve(NAN)
@@ -193,7 +193,7 @@ def _curve(y: FloatArray, u: FloatArray, vehicles: Sequence[str], recordings: In
     slopes = np.zeros(parts)
     inner, rest = np.zeros((y.size, parts + 1)), y
     for _ in range(_ROUNDS):
-        # Centring removes the level of each vehicle; one without throttle has weight 0.
+        # Centring removes the level of each vehicle; one without known throttle has count 0.
         count = np.maximum(np.bincount(of, weight, len(names)), 1e-300)
         inner = np.column_stack([
             column - (np.bincount(of, weight * column, len(names)) / count)[of]
@@ -300,7 +300,7 @@ def _trends_of(values: Values) -> list[Trend]:
         x, y = values.flights[mine].astype(np.float64), values.value[mine]
         slope, start, se = weighted_line(x, y, values.error[mine])
         reach = float(stats.t.ppf(0.975, mine.size - 2)) * se
-        # Equal values: 0 / 0.
+        # Equal values would give 0 / 0.
         p_value = 2.0 * float(stats.t.sf(abs(slope) / se, mine.size - 2)) if se > 0.0 else 1.0
         found.append(Trend(values.name, name, int(mine.size), slope, slope - reach, slope + reach,
                            start, int(x[0]), int(x[-1]), p_value))
@@ -455,8 +455,8 @@ class Judgement:
 
     values: dict[str, Values]  # Quantity -> recordings
     trends: tuple[Trend, ...]  # All that were tested, lowest p-value first
-    recordings: dict[str, Outliers]  # Quantity -> each recording in its vehicle
-    vehicles: dict[str, VehicleValues]  # Quantity -> each vehicle among the others
+    recordings: dict[str, Outliers]  # Quantity -> each recording against others of its vehicle
+    vehicles: dict[str, VehicleValues]  # Quantity -> each vehicle against the others
 
     @property
     def drifting(self) -> tuple[Trend, ...]:
@@ -465,7 +465,7 @@ class Judgement:
 
     @property
     def possible(self) -> tuple[Trend, ...]:
-        """Return the trends whose own 95 % interval excludes 0, but that may be by chance."""
+        """Return the trends that are significant by themselves (95 %), not at the family rate."""
         return tuple(t for t in self.trends if t.p_family > DRIFT_RATE and t.low * t.high > 0.0)
 
     def odd_recordings(self) -> list[tuple[str, int]]:
@@ -486,7 +486,7 @@ def judge(rows: Sequence[Row], seed: int = 0) -> Judgement:
     """Return what stands out."""
     values = {name: values_of(rows, name) for name in QUANTITIES}
     tested = trends(tuple(values.values()))
-    # Each quantity is compared twice: recordings within vehicles, and vehicles.
+    # Each quantity is compared twice: among the recordings of a vehicle, and among vehicles.
     rate = OUTLIER_RATE / (2 * len(QUANTITIES))
     drifting = [t for t in tested if t.p_family <= DRIFT_RATE]
     recordings, vehicles = {}, {}

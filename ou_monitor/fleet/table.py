@@ -109,7 +109,7 @@ COLUMNS = (
     Column('size_bytes', 'count', 'byte', 'size of the recording on disk'),
 )
 NAMES = tuple(column.name for column in COLUMNS)
-# Columns that are not copied from the result of the recording.
+# Columns that are not copied from the result of the recording, but set separately.
 _OTHERWISE = ('vehicle', 'start', 'error')
 
 

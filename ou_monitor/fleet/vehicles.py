@@ -2,8 +2,8 @@
 Vehicle and flight number of a recording.
 
 The vehicle is named by the metadata of the recording, else by a pattern in its path, else by its
-folder.  Recordings are compared within a vehicle only; those of unknown vehicles are not compared.
-Flights are in the order of their dates: of the stamps, of the log, or in the name of the file.
+folder.  Recordings are compared within a vehicle only, and not at all if the vehicle is unknown.
+Flights are ordered by date, which is from the stamps, the log's header or the name of the file.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def read_pattern(text: str) -> re.Pattern[str]:
 
 def assign(stated: Mapping[Path, str], pattern: re.Pattern[str] | None = None
            ) -> tuple[dict[Path, Vehicle], list[str]]:
-    """Return the vehicle of each recording."""
+    """Return the vehicle of each recording (stated: by its metadata), and notes."""
     found: dict[Path, Vehicle] = {}
     differing, unmatched = [], []
     folders = _folder_names({path.parent for path, name in stated.items() if not name})
@@ -64,7 +64,7 @@ def assign(stated: Mapping[Path, str], pattern: re.Pattern[str] | None = None
             if not by_pattern:
                 unmatched.append(path)
         elif path.parent in named:
-            # Other recordings of the folder name their vehicle, so the folder is not a vehicle.
+            # Other recordings in the folder name their vehicles: the folder's name is not one.
             found[path] = Vehicle('', FOLDER)
             mixed.append(path)
         else:
@@ -73,7 +73,7 @@ def assign(stated: Mapping[Path, str], pattern: re.Pattern[str] | None = None
         (differing, 'metadata and --vehicle-from name different vehicles; the metadata are used.'),
         (unmatched, '--vehicle-from finds no vehicle in the path; these recordings are not '
          'compared.'),
-        (mixed, 'the metadata name no vehicle, though those of other recordings in the folder do; '
+        (mixed, 'the metadata name no vehicle, though other recordings in the folder name one; '
          'these recordings are not compared. --vehicle-from can name their vehicle by the path.')
     ) if paths)]
     both = {v.name for v in found.values() if v.named_by == METADATA} & {

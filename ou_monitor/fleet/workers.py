@@ -3,8 +3,8 @@ Run tasks in many processes: on this machine, or on the workers of a Dask schedu
 
 Local processes are reached over pipes, so no port is open.  Only this module imports Dask.
 
-Limits: a worker that dies takes the tasks of the other local workers with it.  They may have used
-up the memory for which it was killed, so each of these tasks is tried once more, alone.
+Limits: if a local worker dies, the tasks running on all local workers are lost.  Any of them may
+have used up the memory for which it was killed, so each is tried once more, alone.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _ONE_THREAD = dict.fromkeys(
 _MEMORY_SHARE, _MEMORY_LEAST = 0.9, 1 << 29
 # Timeout for a scheduler and for a worker, s.
 _PATIENCE = 30.0
-# Period of checking whether workers are left, s.
+# Time between two checks whether a worker is left, s.
 _LOOK = 1.0
 LOST = ('The worker died on this recording, also in a second attempt on its own: it was killed, '
         'or the recording does not fit into memory.')
@@ -111,7 +111,8 @@ class LocalWorkers(Workers):
     """Processes of this machine, each with a share of the memory."""
 
     def __init__(self, count: int) -> None:
-        # The workers wait at the reading end: they exit when this process closes its end or dies.
+        # Each worker waits at the reading end, and exits when this process closes the other end
+        # or dies.
         self._watched, self._alive = multiprocessing.get_context('spawn').Pipe(duplex=False)
         self._memory = max(int(_MEMORY_SHARE * usable_memory()) // count, _MEMORY_LEAST)
         self._count = count
@@ -126,7 +127,7 @@ class LocalWorkers(Workers):
         return self._count
 
     def _submit(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Future[Any]:
-        # A task may start a process.
+        # Submitting a task may start a worker process.
         with _environment_of_workers():
             try:
                 return self._pool.submit(function, *arguments)
@@ -144,7 +145,7 @@ class LocalWorkers(Workers):
         except BrokenProcessPool:
             return None, LOST
         except Exception as error:
-            # The function catches its own errors: this one is of the transport.
+            # The function catches its own errors, so this is an error of the transport.
             return None, failure(error)
 
     def close(self) -> None:
@@ -180,7 +181,7 @@ def _environment_of_workers() -> Iterator[None]:
 
 
 def _prepare(watched: Connection, memory: int) -> None:
-    """Limit the memory of this worker (bytes), and end it with the main process."""
+    """Limit the memory of this worker (bytes), and make it exit when the main process does."""
     hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
     if hard == resource.RLIM_INFINITY or memory < hard:
         resource.setrlimit(resource.RLIMIT_DATA, (memory, hard))

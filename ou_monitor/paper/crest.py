@@ -1,10 +1,10 @@
 """
 Crest factors Vpp/Vrms of an Ornstein-Uhlenbeck process on a screen, without and with jumps.
 
-Paths are drawn with the exact transition over steps of a hundred samples of the paper.  Extremes
-within a step are those of a Brownian bridge; their relative error is alpha dt = 0.006.  The
-crest factor does not depend on sigma.  Section 5, "diffusion and jump components", is recomputed
-from jumps that relax at alpha.
+Paths are drawn with the exact transition over steps of a hundred oscilloscope samples.  Extremes
+within a step are drawn from a Brownian bridge; their relative error is alpha dt = 0.006.  The
+crest factor does not depend on sigma.  For section 5, "diffusion and jump components", jumps that
+relax at the rate alpha are simulated.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from scipy.signal import lfilter
 # Screen lengths tried, ms; the paper gives none.
 SCREENS_MS = (10, 100, 500)
 TYPICAL_MS = 100  # Length for the statements and the plot, ms
-# Share of screens left out at either end.
+# Share of screens below, and above, the band of crest factors.
 TAIL = 0.05
 # Oscilloscope samples per step of the simulation; segments in memory; screens of white noise.
 _SAMPLES, _AT_ONCE, _WHITE = 100, 100, 200
@@ -106,7 +106,7 @@ def _draw(rng: np.random.Generator, paths: int) -> dict[int, FloatArray]:
 
 def screen_for(crest_factor: float) -> float:
     """Return the screen length at which an OU shows a crest factor, s."""
-    # Half of the screens of this length go beyond crest/2 standard deviations on one side:
+    # At this length, half of the screens exceed crest/2 standard deviations on one side:
     # passages above a high level d are nearly a Poisson process of rate alpha d exp(-d^2/2) /
     # sqrt(2 pi).
     d = 0.5 * crest_factor

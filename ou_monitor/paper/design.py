@@ -12,16 +12,15 @@ to 3 times too high.
 Both risks fall as C rises once the network is slower than the noise; below that C, the second rose
 by up to 1.44 times in 39 of 6000 random networks.
 
-`network_of` chooses components that reproduce a flight. All risks of its bus are then those of the
-live risk at the end of the flight (the one behind the budget of `analyze`): of the throttle, with
-the sag times the share of the resistance, and with the noise times the share that the network
-leaves of it. They include the errors of sag and level and what throttle did not explain. Limits:
+`network_of` chooses components that reproduce a flight. All risks of its bus are then computed as
+the live risk at the end of the flight, which also gives the throttle budget of `analyze`. For
+other components, the sag is scaled with the resistance, and the noise with the noise of the
+network. The risks include the errors of sag and level and what throttle did not explain. Limits:
 sag and noise are as measured, including the white noise and the filter of the sensor. Noise added
 by changes of throttle, and an OU if one was found, count as slow fluctuations of the current,
 which capacitors on a board do not change; the rest is attributed to the switching of the ESCs.
 Without a measured current, the resistance is the given or default one, and the current is scaled
-to the sag: the effect of packs in parallel is then still right, but the effect of an ESR is
-uncertain.
+to fit the sag: the effect of packs in parallel is still right, the effect of an ESR uncertain.
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ _FAR = 8.0
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(40)
 
 
-# Risk of a flight by throttle, share of the sag, and share of the variance of the noise.
+# Throttle, and factors on the sag and on the variance of the noise -> risk of a flight.
 FlownRisk = Callable[[float, float, float], float]
 
 
@@ -175,7 +174,7 @@ def row_of(rail: Rail, voltage: float, horizon: float, sag_error: float = 0.0) -
     mean_time, crossing = _times(rail, voltage)
     se = sag_error * rail.load.sag if rail.name == 'bus' else 0.0
     if se > 0.0:
-        # If the mean is below the voltage, the risk is 1; other means are integrated.
+        # Where the uncertain mean is below the voltage, the risk is 1; integrate over the rest.
         lowest = max((voltage - rail.mean) / se, -_FAR)
         risks = np.full(2, float(ndtr((voltage - rail.mean) / se)))
         z = lowest + 0.5 * (_FAR - lowest) * (_NODES + 1.0)
@@ -218,7 +217,7 @@ def design(
     Return the minimum bulk capacitance that meets a brown-out risk (capacitances in F).
 
     sag_error as in `row_of`, for a network without a flight; flown: the risk of a flight at this
-    voltage and horizon, which then is that of all rows and levers.
+    voltage and horizon, from which all rows and levers are then computed.
     """
     low, high = capacitances
     for name, value, unit in (('voltage', voltage, 'V'), ('horizon', horizon, 's'),
@@ -276,13 +275,13 @@ def _levers(found: Design, at: Callable[[float], DesignRow],
             return row_of(rail_at(changed, u, found.rail), found.voltage, found.horizon,
                           found.sag_error).risk
         except ValueError:
-            # A load beyond the battery.
+            # The battery cannot supply the load.
             return 1.0
 
     def resistance(share: float) -> float:
         if flown is None:
             return risk(replace(network, battery_resistance=share * network.battery_resistance))
-        # A smaller sag leaves more of the error of the level, but no course of voltage is lower.
+        # Less resistance cannot lower the voltage: limit an apparent rise by the level's error.
         return min(flown(throttle, share, 1.0), found.present.risk)
 
     def limit(share: float) -> float:
@@ -304,7 +303,7 @@ def _levers(found: Design, at: Callable[[float], DesignRow],
 
 
 def _share(risk: Callable[[float], float], least: float, target: float) -> float:
-    """Return the largest share of 1, down to `least`, that meets the target; NaN if none does."""
+    """Return the largest share, `least` to 1, that meets the target; NaN if none does."""
     if risk(1.0) <= target:
         return 1.0
     if risk(least) > target:
@@ -422,7 +421,7 @@ def effect(result: Design) -> str:
 
 
 def _change(a: float, b: float, unit: str | None = None) -> str:
-    """Return the change of a value; of a risk without a unit."""
+    """Return the change of a value in words; without a unit, it is a risk."""
     first, second = (probability(v) if unit is None else number(v) for v in (a, b))
     if first == second:
         return f'stays at {first}{unit or ""}'
@@ -478,7 +477,7 @@ class Flight:
     var_inf: float  # Variance of the OU, V^2
 
 
-# Components that a flight shows; if one is given, the budget of the flight does not apply.
+# Components that a flight shows; if one is given, the risk of the flight does not apply.
 SHOWN = frozenset(('battery_voltage', 'battery_resistance', 'current_max', 'current_exponent',
                    'switching_scale', 'flutter'))
 

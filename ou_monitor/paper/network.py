@@ -47,9 +47,9 @@ RAILS = ('bus', 'regulated')
 LEAST_DUTY = 0.01
 # A lithium cell at rest, V.
 NOMINAL_CELL = 3.7
-# Minimum share of Var_inf of an excited pole.
+# Minimum share of Var_inf for a pole to count as excited.
 EXCITED = 0.01
-# Noise currents are the last states, in this order.
+# Noise currents: the last states of the system, in this order.
 SOURCES = ('switching', 'flutter', 'mcu')
 
 
@@ -59,7 +59,7 @@ def completed(values: dict[str, Any]) -> dict[str, Any]:
     if 'cells' in found:
         found.setdefault('battery_voltage', NOMINAL_CELL * found['cells'])
     if found.get('battery_voltage', math.inf) <= PowerNetwork.regulator_voltage:
-        # As on a Crazyflie.
+        # A craft of one cell, such as a Crazyflie.
         found.setdefault('regulator_voltage', 3.0)
     return found
 
@@ -267,12 +267,12 @@ class Rail:
 
     def crossing_rate(self, voltage: float) -> float:
         """Return the rate, 1/s, at which the rail falls below a voltage, V, far from its mean."""
-        # It is for the full Gaussian process, not only its OU, and is the larger of two rates. For
-        # rough paths it is q/(2 Var) d/sqrt(2 pi) exp(-d^2/2) (Pickands, Trans. AMS 145 (1969)
-        # 51), for smooth paths sqrt(v/Var)/(2 pi) exp(-d^2/2) (Rice, Bell Syst. Tech. J. 24 (1945)
-        # 46). d: distance to the voltage in standard deviations; q: quadratic variation per
-        # second; v: variance of the smooth part of the slope. For an OU, the first is the rate of
-        # its mean first passage.
+        # The larger of two rates of the full Gaussian process, not only of its OU. For rough paths
+        # it is q/(2 Var) d/sqrt(2 pi) exp(-d^2/2) (Pickands, Trans. AMS 145 (1969) 51), for smooth
+        # paths sqrt(v/Var)/(2 pi) exp(-d^2/2) (Rice, Bell Syst. Tech. J. 24 (1945) 46). d:
+        # distance to the voltage in standard deviations; q: quadratic variation per second; v:
+        # variance of the smooth part of the slope. For an OU, the first rate is the inverse of the
+        # mean first-passage time.
         if self.mean <= voltage:
             return math.inf
         if self.var_inf == 0.0:

@@ -16,9 +16,9 @@ Range = tuple[float, float]
 
 # Tolerance of a recomputed number, standard errors: by chance, one row in 370 exceeds it.
 STANDARD_ERRORS = 3.0
-# Relative tolerance: a number halfway between two roundings agrees with both.
+# Relative tolerance, so that a number halfway between two roundings agrees with both.
 _TIE = 1e-9
-# Maximum steps of an instrument in its smallest reading.
+# Maximum number of steps tried in the smallest reading of an instrument.
 _FINEST = 64
 
 
@@ -119,7 +119,7 @@ class Row:
         """Return the verdict from the ranges."""
         if _overlap(self.printed.ends, self.interval):
             return RowVerdict.AGREES
-        # With the inputs of both varied within their rounding.
+        # Vary the inputs of both numbers within their rounding.
         if _overlap(_join(self.printed.ends, self.printed_inputs),
                     _join(self.interval, self.inputs)):
             return RowVerdict.ROUNDING
@@ -192,7 +192,7 @@ class PrintedLoad:
 
     @property
     def vrms_range(self) -> Range:
-        """Return Vrms within half a step of the oscilloscope, mV."""
+        """Return the range of Vrms, half a step of the oscilloscope either way, mV."""
         return VRMS_STEP.around(self.vrms)
 
     @property
@@ -202,7 +202,7 @@ class PrintedLoad:
 
     @property
     def crest_range(self) -> Range:
-        """Return Vpp/Vrms within half a step of either."""
+        """Return the range of Vpp/Vrms if either reading is off by up to half a step."""
         return over(VPP_STEP.around(self.vpp), self.vrms_range)
 
     @property

@@ -108,7 +108,7 @@ def _coupling(rows: Sequence[Row]) -> str:
     line = PAPER_FIT
     fitted = _row(rows, f'alpha fitted, rail of {transient.TYPICAL_RAIL:g}')
     slope = _row(rows, 'd ln(alpha fitted)')
-    # Variance of an OU behind a high-pass: alpha / (alpha + corner) of its own.
+    # A high-pass leaves alpha / (alpha + corner) of the variance of an OU.
     kept = math.sqrt(published.ALPHA.value / (published.ALPHA.value + CORNER))
     alpha = published.ALPHA.text
     return (f'{alpha} 1/s is 2 pi x {published.ALPHA.value / (2.0 * math.pi):.2f} Hz, and '
@@ -326,7 +326,7 @@ def _row_data(row: Row) -> dict[str, Any]:
 
 # Length of a drawn screen, s.
 SCREEN = 0.1
-# For the spectrum: length, s, and points per decade.
+# Spectrum: length of the simulated recording, s, and points per decade.
 _SPECTRUM, _PER_DECADE = 2.0, 12
 
 
@@ -357,7 +357,7 @@ def lorentzian(frequency: FloatArray, alpha: float, sigma: float) -> FloatArray:
 
 
 def _screen(state: published.PrintedLoad, rng: np.random.Generator) -> Screen:
-    """Return a screen of a load state; Vrms with motors off is half a step."""
+    """Return a screen of a load state (motors off: with a Vrms of half a step)."""
     t = np.arange(round(SCREEN * published.SAMPLING_HZ)) / published.SAMPLING_HZ
     step = 1e-3 * published.VPP_STEP.size
     sigma = state.sigma or 0.5e-3 * published.VRMS_STEP.size * math.sqrt(

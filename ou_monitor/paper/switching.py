@@ -23,7 +23,7 @@ from scipy.integrate import quad
 WHERE = 'Section 3.3'
 # Telegraph noise of +-SPEED, V/s, with RATE switches a second each way.
 RATE, SPEED = 1000.0, 1.0
-# Multiplicative noise dU = +-c U dt; small relative to RATE: the limit holds to c^2/(4 q^2).
+# Multiplicative noise dU = +-GROWTH U dt, 1/s; the limit's error is GROWTH^2 / (4 RATE^2).
 GROWTH = 100.0
 # An example, since the paper gives only alpha: rates, 1/s and rad/s; two states that switch like
 # an ESC of 24 kHz, with each coefficient +-30 % about its mean.
@@ -39,7 +39,7 @@ class IntegralVariance:
     # Variance and its standard error, V^2; shape (k,).
     variance: FloatArray
     error: FloatArray
-    # Rates of formula (6) with the 2 and without, V^2/s.
+    # Rates by formula (6) with the factor of 2 and without, V^2/s.
     correct: float
     printed: float
 
@@ -157,7 +157,7 @@ def averaging_rows(rng: np.random.Generator, paths: int = 400) -> list[Row]:
     half = 1.0 / CARRIER
     phase = printed.solve([0.0, half, 2.0 * half], [0.0, 1.0, 0.0])[:, 1]
     turned = float((phase[2] - phase[1]) / (phase[1] - phase[0]))
-    # As the text intends it, its coefficients switched by an ESC.
+    # The matrix as the text intends it, with coefficients switched by an ESC.
     rate = 2.0 * published.ESC_HZ[0]
     system = SwitchedSystem.of_matrix_model(
         Generator.telegraph(rate, rate), alpha=DAMPING * _SWING, omega=CARRIER * _SWING,

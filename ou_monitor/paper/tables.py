@@ -24,7 +24,7 @@ from scipy.special import erfc
 DELTA = 0.1
 # Spacing of nearly independent samples, in tau: their correlation is exp(-_SPACING).
 _SPACING = 8.0
-# An example of an RC rail, Ohm, F, A^2/Hz (two-sided); its elasticities do not depend on them.
+# An RC rail, Ohm, F, A^2/Hz (two-sided); its elasticities do not depend on these values.
 _R, _C, _S = 0.07, 470e-6, 1e-6
 
 

@@ -4,7 +4,7 @@ The paper's theory (section 3): matrix model, Markov switching, averaging and di
 A chain x(t) on n states has the generator Q: Q[x, y] is the rate of going from x to y, 1/s, and
 every row sums to zero.  Every state must be reachable from every other: then the stationary law pi
 (pi Q = 0) is unique, and the potential R0 = integral_0^inf (exp(Q t) - Pi) dt exists.  Holding
-times are exponential; the next state is drawn from the cumulative rates of the state left.
+times are exponential; the next state is drawn in proportion to the rates of the present one.
 
 A system switched by it is du/dt = D u + d + speed (A_x u + a_x), x = x(clock t).  Two scalings of
 the paper, both with a small eps; at eps = 1 the system is unchanged, and D and d are not sped up:
@@ -16,8 +16,8 @@ the paper, both with a small eps; at eps = 1 the system is unchanged, and D and 
       b(u) = sum_xy pi(x) R0(x, y) A_y (A_x u + a_x),
       B(u) = 2 sum_xy pi(x) R0(x, y) sym[C(u; x) C(u; y)'].
 
-  Equation (6) of the paper lacks the 2 that (4), as printed, needs: the variance of the integral
-  of C(x(t)) grows at twice the integral of its autocovariance over positive lags
+  Equation (6) of the paper lacks the factor 2 that (4), as printed, needs: the variance of the
+  integral of C(x(t)) grows at twice the integral of its autocovariance over positive lags
   (Korolyuk & Limnios, Stochastic Systems in Merging Phase Space, 2005, give it with the 2).
 
 Between two jumps a switched system is affine; so are its average and the drift of
@@ -54,8 +54,8 @@ def augmented(matrix: npt.ArrayLike, offset: npt.ArrayLike) -> FloatArray:
 
 def flow(matrix: FloatArray, offset: FloatArray, tau: FloatArray, u: FloatArray) -> FloatArray:
     """Move m states along their affine systems (1/s), each for its own time tau, s."""
-    # Taylor series of the exponential acting on the state, in substeps of norm at most 1, to the
-    # last digit; without eigenvectors, so that a defective matrix is handled too. Very long steps
+    # Taylor series of the exponential acting on the state, to the last digit, in substeps of norm
+    # at most 1. It needs no eigenvectors, so it handles a defective matrix too. Very long steps
     # use the matrix exponential.
     if not u.size:
         return u.copy()
@@ -313,7 +313,7 @@ def check_rates(q: FloatArray) -> None:
 
 
 def check_classes(rates: FloatArray) -> None:
-    """Refuse chains that do not visit every state again and again (rates in 1/s)."""
+    """Refuse chains in which some state cannot be reached from another (rates in 1/s)."""
     count, label = connected_components(rates > 0.0, directed=True, connection='strong')
     if count > 1:
         classes = [np.flatnonzero(label == c).tolist() for c in range(count)]
@@ -422,8 +422,8 @@ class SwitchedSystem:
 
 # Tolerance of the average, as a share of the largest switched entry.
 BALANCE_TOLERANCE = 1e-9
-PRINTED_FACTOR = 1.0  # In B of equation (6), as printed
-CORRECT_FACTOR = 2.0  # As (4) needs it
+PRINTED_FACTOR = 1.0  # Factor in B of equation (6), as printed
+CORRECT_FACTOR = 2.0  # Factor that equation (4) needs
 
 
 def require_balance(system: SwitchedSystem) -> None:
@@ -443,7 +443,7 @@ def switching_drift(system: SwitchedSystem) -> AffineSystem:
     """Return b(u), equation (5), of a balanced system."""
     require_balance(system)
     weight = system.generator.stationary[:, None] * system.generator.potential
-    # A_y after A_x: the chain is in x first.
+    # The product is A_y A_x, in this order: the chain is in x first.
     after = np.tensordot(weight, system.matrices, 1)
     return AffineSystem(
         np.einsum('xij,xjk->ik', after, system.matrices),

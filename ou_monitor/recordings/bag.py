@@ -47,7 +47,7 @@ class BagFiles(NamedTuple):
 
 
 def _qos() -> list[dict[str, Any]]:
-    """Return the QoS that rosbag2 writes for bags, with copies, so that YAML needs no alias."""
+    """Return the QoS that rosbag2 writes; its dicts are copies, or YAML would write aliases."""
     return [{
         'history': 'keep_last', 'depth': 10, 'reliability': 'reliable', 'durability': 'volatile',
         'deadline': dict(_FOR_EVER), 'lifespan': dict(_FOR_EVER), 'liveliness': 'automatic',
@@ -134,12 +134,12 @@ class RawMessage(NamedTuple):
 
 
 class Part(NamedTuple):
-    """The messages of one chunk or run."""
+    """The messages of some chunks that are read together."""
 
     tables: dict[str, MessageTable]  #: Topic -> its messages, in the order of the file
     #: No later part has a message before this log time, ns; None after the last part.
     later_ns: int | None
-    done: float  #: Share of the bytes to be read that is done, 0..1
+    done: float  #: Share of the bytes that has been read, 0..1
 
 
 class BagReader:
@@ -158,7 +158,7 @@ class BagReader:
         self.path = Path(path)
         paths, about, missing = find_files(self.path, partial)
         self._files = [McapFile(file, partial) for file in paths]
-        # The metadata of the directory wins: people edit it.
+        # The metadata of the directory take precedence, because users edit them.
         self.about = {key: value for known in (*(file.about for file in self._files), about)
                       for key, value in known.items()}
         held = [file for file in self._files if file.spans]
@@ -202,7 +202,7 @@ class BagReader:
                     self.counts.get(topic.name, 0) + file.counts.get(key, 0))
 
     def tables(self, topics: Iterable[str], end_ns: int | None = None) -> Iterator[Part]:
-        """Yield the places of messages, chunk by chunk, up to `end_ns`, ns, or the end."""
+        """Yield the messages as tables, some chunks at a time, up to `end_ns`, ns, or the end."""
         wanted = set(topics)
         for topic in sorted(wanted):
             if topic not in self.topics:
@@ -326,7 +326,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
 
     def __init__(self, path: Path | str, *, about: Mapping[str, str] | None = None) -> None:
         """Open the target; never overwrite anything."""
-        # A file name may hold bytes that are not text; MCAP and YAML cannot store those.
+        # A file name may contain bytes that are not text, which MCAP and YAML cannot store.
         self._about = {key: _as_text(value) for key, value in (about or {}).items()}
         self.path = Path(path)
         self._folder = None if self.path.suffix == '.mcap' else self.path

@@ -1,9 +1,9 @@
 """
 The voltage samples of a bag with their throttle and current.
 
-A msg config fits by name when the bag has its topic (or one ending with it, as in a namespace)
-with its type; a generic one also fits by type when only one topic has it.  If several fit, the
-user must choose.  Limits: a bag is read whole; an hour at 1 kHz takes some 150 MB.
+A msg config fits by name if the bag has its topic (or one ending with it, as in a namespace) with
+its type; a generic one also fits by type if only one topic has that type.  If several fit, the
+user must choose.  Limits: the samples of a bag are in memory at once: 150 MB for an hour at 1 kHz.
 """
 
 from __future__ import annotations
@@ -114,8 +114,8 @@ def _detect(path: Path, topics: Mapping[str, str], voltage_topic: str | None) ->
         _absolute(voltage_topic): topics[_absolute(voltage_topic)]}
     fitting = [config for config in configs if _by_name(config.voltage, considered)]
     if not fitting:
-        # A topic named by the user decides by its type; otherwise the throttle's topic must be
-        # known, to exclude it.
+        # If the user named a topic, its type decides; otherwise all topics are needed, to exclude
+        # the throttle's.
         known = considered if voltage_topic is not None else topics
         fitting = [config for config in configs
                    if config.generic and _only_of_type(config, known)]
@@ -149,7 +149,7 @@ def _throttle(
     spec = config.throttle
     if throttle_topic is not None:
         topic = _absolute(throttle_topic)
-        # Read a topic named by the user as any shipped config reads its type.
+        # Read a topic named by the user like any config that has a throttle of its type.
         for one in (spec, *(c.throttle for c in list_msg_configs().values()),
                     FieldSpec(topic, FLOAT64, 'data')):
             if one is not None and one.type == topics[topic]:
@@ -264,8 +264,8 @@ def read_bag(
 def _hold_of(column: FieldColumn, spec: FieldSpec, first: int, log_time: TimeArray,
              ends: FloatArray, own: npt.NDArray[np.bool_], sample_rate: float | None,
              ) -> tuple[ThrottleHold, int]:
-    """Return a throttle or current among voltage messages (ends in s), and the unknown values."""
-    # Of those before the part, from `first` (ns) on, only the last value holds in it.
+    """Return a throttle or current to pair with voltages (ends in s), and its unknown values."""
+    # Of the values before the part, which starts at `first`, ns, only the last one is needed.
     known = np.flatnonzero(np.isfinite(column.values[:column.place(first)]))
     _, column = column.split(int(known[-1]) if known.size else 0)
     usable, unknown = np.isfinite(column.stamp), 0

@@ -3,8 +3,8 @@ CDR messages as arrays: the layout of one message, verified in all others.
 
 CDR has no fixed offsets: a text or a sequence shifts all that follows. But in a recording the same
 texts and lengths recur. So a message is walked once, by the definition of its type, and its layout
-holds for all messages of the same size with the same length words: their fields are columns.
-Messages unlike all before are walked one by one; one that does not fit its type is refused.
+holds for all messages of the same size with the same length words: their fields are columns. A
+message with a new layout is walked by itself; one that does not fit its type is refused.
 
 Plain CDR version 1 (OMG DDS-XTypes 7.4.3): alignment is counted from after the 4-byte header.
 The fields come from the definition in a bag or from the message class.  Limits: a type with a
@@ -42,8 +42,8 @@ _HEADER = 4
 
 # Maximum steps of a walk beyond four per byte (a few bytes may state 2^32 empty elements); depth.
 _FREE_STEPS, _MOST_DEPTH = 1000, 50
-# Maximum layouts for messages of one length, and length words in one that is compared with others;
-# a topic with more has no recurring layout.
+# Maximum number of layouts kept for messages of one size, and of length words in a kept layout; a
+# topic with more has no recurring layout.
 MOST_LAYOUTS, _MOST_WORDS = 16, 64
 
 
@@ -158,14 +158,14 @@ class Layout:
         self.words: list[tuple[int, int]] = []
         # (offset, bytes) of every text, its closing zero left out.
         self.texts: list[tuple[int, int]] = []
-        # Places of the wanted fields; an element beyond its array is missing.
+        # Places of the wanted fields, except elements beyond the end of their array.
         self.places: dict[FieldPath, Place] = {}
         self._order = '<' if data[1] else '>'
         self._word_of = struct.Struct(f'{self._order}I')
         self._data, self._definitions, self._wanted = data, definitions, wanted
         self._at, self._left = _HEADER, 4 * len(data) + _FREE_STEPS
         self._message(kind, (), 0)
-        # A layout may be kept for long.
+        # The layout is kept, the message is not.
         self._data = b''
 
     def holds_for(self, rows: Rows) -> npt.NDArray[np.bool_]:
@@ -177,7 +177,7 @@ class Layout:
             same &= word == value
         high = np.zeros(rows.shape[0], np.uint8)
         for offset, size in self.texts:
-            # By columns, which are long; rows are short.
+            # Along the messages, which are many; a text is short.
             for k in range(offset, offset + size):
                 high |= rows[:, k]
         same &= high < 0x80
@@ -354,9 +354,9 @@ class FieldColumn(NamedTuple):
 
 
 class GrowingColumn:
-    """Columns one after another; these grow in place, because parts and whole take twice that."""
+    """Joins columns by growing in place: the parts and the whole would take twice the memory."""
 
-    # Type of each, and the value that takes no memory until there are others.
+    # Type of each, and its usual value, which takes no memory until another one occurs.
     _KINDS = ((np.uint64, None), (np.float64, None), (np.bool_, None), (np.int64, 1),
               (np.float64, None), (np.float64, np.nan))
 
@@ -383,7 +383,7 @@ class GrowingColumn:
 
 
 def seconds(log_time: TimeArray) -> FloatArray:
-    """Return ns as s; whole seconds apart, because an epoch in ns does not fit a float64."""
+    """Return ns as s; whole seconds separately: ns since 1970 exceed a float64's precision."""
     whole, rest = np.divmod(log_time, np.uint64(1_000_000_000))
     return whole + rest * 1e-9
 
@@ -433,14 +433,14 @@ class FieldReader:
                         for one in (spec, beside) if one is not None]
         self._stamp = stamp_paths(spec, definitions)
         self._wanted = frozenset((*self._stamp, *(path for _, path, _ in self._fields)))
-        # Length of the message -> layouts met.
+        # Size of the message -> layouts found so far.
         self._layouts: dict[int, list[Layout]] = {}
 
     def read(self, table: MessageTable) -> FieldColumn:
         """Return the field of the messages of a table, in its order."""
         n = table.n
         stamp, beside, count = np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, np.int64)
-        # Indices of messages alike, shape (k,), and their values, shape (k, values in each).
+        # Indices of messages of one layout, shape (k,), and their values, shape (k, in each).
         blocks: list[tuple[IntArray, FloatArray]] = []
         kept, refused = np.ones(n, np.bool_), dict[int, str]()
         # A damaged message may hold a signalling NaN, of which NumPy would warn.
@@ -472,7 +472,7 @@ class FieldReader:
 
     def _groups(self, table: MessageTable, refused: dict[int, str],
                 ) -> Iterator[tuple[IntArray, Rows, Layout]]:
-        """Yield indices, rows and layout of messages alike; note why others are refused."""
+        """Yield indices, rows and layout of messages of one layout; note why others do not fit."""
         lengths = table.end - table.begin
         for length in np.unique(lengths).tolist():
             left = np.nonzero(lengths == length)[0]

@@ -1,10 +1,11 @@
 """
 One .mcap file, read by the MCAP library: topics, places of their messages, and damage.
 
-The file is walked record by record.  Chunks that an intact summary lists are unpacked when they
-are read; others, and all of a file read with `partial`, already by the walk.  Every stated size is
-compared with its limit before anything is read or unpacked.  The message indexes after a chunk are
-used only if they account for every byte of the chunk.  Damage is reported by chunk.
+The file is walked record by record.  Chunks that an intact summary lists are unpacked later, when
+their messages are read; all others, and all chunks with `partial`, are unpacked during the walk.
+Every stated size is compared with its limit before anything is read or unpacked.  The message
+indexes after a chunk are used only if they account for every byte of it.  Damage is reported by
+chunk.
 https://mcap.dev/spec
 
 Limits: without checksums a wrong byte within a message is not detected.  A lost message is
@@ -79,7 +80,7 @@ _BLOCK = 64 * 1024
 # Maximum ratio of unpacked chunks to the file: 20 to 30 for logs of a constant voltage, 30 000 for
 # zeros.
 _MOST_RATIO = 256
-# Lowest limit of a chunk, bytes, and its largest share of the memory.
+# Minimum limit of an unpacked chunk, bytes; the maximum is this fraction (1/8) of the memory.
 _LEAST_LIMIT, _CHUNKS_AT_ONCE = 64 * 1024 * 1024, 8
 
 
@@ -88,12 +89,12 @@ class Damage(Exception):
 
 
 class Span(NamedTuple):
-    """A part of the file with messages that is read at once."""
+    """A part of the file that is read at once: a chunk, or messages outside of chunks."""
 
     #: Log times of its first and last message, ns.
     start_ns: int
     end_ns: int
-    #: Bytes of the file: the content of a chunk, or messages outside of chunks.
+    #: Place of its content in the file, bytes, and whether it is a chunk.
     offset: int
     length: int
     chunk: bool
@@ -164,7 +165,7 @@ class McapFile:
         self._unpacked = self._tables = self._metadata = 0
         # Whether the summary counts the messages and lists the chunks, which are read later.
         self._trusted = False
-        # Creating one costs as much as unpacking a small chunk.
+        # Shared, because creating one takes as long as unpacking a small chunk.
         self._zstd = zstandard.ZstdDecompressor()
         with self._open() as file:
             self._size = file.seek(0, os.SEEK_END)
@@ -294,7 +295,7 @@ class McapFile:
                     end += span.index_length
                     self._walk_chunk(file, span, at in chunks)
                 elif op == Opcode.DATA_END:
-                    # Only repeats of schemas and channels, for the summary, follow.
+                    # Then only the summary follows, which repeats schemas and channels.
                     in_data = False
                     stated = int.from_bytes(file.read(4), 'little')
                     file.seek(0)
@@ -310,7 +311,8 @@ class McapFile:
                 elif op == Opcode.METADATA:
                     self._learn_about(file, length)
                 elif op in _UNREAD and statistics is None and not self._behind_chunk():
-                    # No count would miss a message with another opcode.
+                    # Without a count, a message with a damaged opcode would not be missed: check
+                    # that this is no message.
                     _parse(_UNREAD[op], self._content(file, length, self._limit))
                 elif op >= _PRIVATE and statistics is None and not private:
                     private = True
@@ -398,7 +400,7 @@ class McapFile:
         self._channels[channel.id] = channel
         schema = self._schemas.get(channel.schema_id)
         if schema is None and self._summary is not None:
-            # Its definition was in a broken part.
+            # Its definition was in a damaged part of the file.
             schema = self._summary.schemas.get(channel.schema_id)
         encoding = 'none' if schema is None else schema.encoding
         why = ''
@@ -685,7 +687,7 @@ def _by_index(data: bytes, index: bytes) -> tuple[IntArray, Others] | None:
     places = np.sort(np.concatenate(parts), kind='stable')
     if not places.size or places[0] < 0 or places[-1] > len(data) - _DATA:
         return None
-    # A length of 2^63 or more is negative here; one beyond the chunk is too long.
+    # A length of 2^63 or more is negative here, so its end fails the test too.
     ends = places + _HEAD.size + gather(data, places + 1, '<i8')
     if not ((gather(data, places, 'u1') == Opcode.MESSAGE) & (ends >= places + _DATA)
             & (ends <= len(data))).all():

@@ -2,7 +2,7 @@
 Model files: the terms of a supply as YAML.
 
 `model:` is a list of terms, each `{term: NAME, params: {...}, se: {...}}`, the first being `ou`;
-`load:` (optional) is the start of the load filter at take-off; `provenance:` is free text.
+`load:` (optional) holds start values of the load filter; `provenance:` is free text.
 Written by `discover`, read by `simulate` and by the estimator node.
 """
 
@@ -35,7 +35,7 @@ class ModelFile:
     """Content of a model file."""
 
     model: SupplyModel
-    # Standard errors by parameter, one dict a term, empty if unknown; in the parameter's unit.
+    # Standard errors by parameter, in its unit, one dict for each term; empty if unknown.
     se: tuple[dict[str, Any], ...] = ()
     # Recording, commit, date, held-out score; free text.
     provenance: dict[str, Any] = field(default_factory=dict)
@@ -43,7 +43,7 @@ class ModelFile:
 
 @one_line()
 def read_model(path: str | Path) -> ModelFile:
-    """Read a model file of at most 1 MB: 2 to 5 s for the largest, so a node needs a thread."""
+    """Read a model file (a node needs a thread: the largest, 1 MB, takes 2 to 5 s)."""
     return parse_model(read_yaml(path, 'the model file'), path_words(path))
 
 

@@ -54,7 +54,7 @@ def read_recording(
         note.
     start, end : float, optional
         Part to read, s after the first message of the bag (by log time) or the first sample of
-        the CSV or log: start <= t < end.  The throttle before it is held.
+        the CSV or log: start <= t < end.  The last throttle before the part holds in it.
     flight : int, optional
         Flight of a log with several, from 1; default: the largest.
     columns : CsvColumns, optional
@@ -93,7 +93,7 @@ def _read(
     start: float | None = None, end: float | None = None, flight: int | None = None,
     columns: CsvColumns | None = None, progress: Callable[[float], None] | None = None,
 ) -> tuple[Recording, Log | None]:
-    """Read a recording with the repeats of its logger, and a log with a signal by name."""
+    """Read a recording, logger's repeats included; return its log too (with `signal`), if any."""
     _check_part(start, end)
     csv, log = is_csv(path), is_log(path)
     for option, value in (('msg-config', msg_config), ('voltage-topic', voltage_topic),
@@ -120,7 +120,7 @@ def _read(
 
 def _read_log(path: Path, signal: str | None, columns: CsvColumns | None, flight: int | None,
               progress: Callable[[float], None] | None) -> tuple[Recording, Log]:
-    """Read the supply of a log; return also the log, with a signal by name."""
+    """Read the supply of a log; return also the log, which includes `signal`."""
     named = columns or CsvColumns()
     if named != CsvColumns(voltage=named.voltage, throttle=named.throttle,
                            current=named.current):
@@ -150,7 +150,7 @@ def tidy(raw: RawColumns) -> Recording:
     notes, t = [*raw.notes, *said], t[which]
     if not t.size:
         raise InputError(unusable_words(name, notes))
-    # Dates are in s, and other units than s are stated.
+    # The unit is certain if the stamps are dates or the source states it.
     stated = clock_unit(t[0]) or 'time_unit' in raw.source
     # Cheap test first: with this median spacing, the mean is at least half of it.
     if (t.size > 2 and t[-1] - t[0] >= 0.5 * _SPARSE * (t.size - 1) - 1.0 and not stated
@@ -185,7 +185,7 @@ def _part(recording: Recording, start: float | None, end: float | None) -> Recor
 
 def read_beside(path: str | Path, signal: str, *, partial: bool = False,
                 columns: CsvColumns | None = None, **options: Any) -> tuple[Recording, Series]:
-    """Read as `read_recording` does, with the logger's repeats, and a whole scalar beside it."""
+    """Read as `read_recording`, but keep repeats, and read a scalar over the whole file."""
     path = Path(path)
     recording, log = _read(path, signal, partial=partial, columns=columns, **options)
     if log is None:
@@ -196,7 +196,7 @@ def read_beside(path: str | Path, signal: str, *, partial: bool = False,
 
 def read_signal(path: str | Path, signal: str, *, partial: bool = False,
                 columns: CsvColumns | None = None) -> Series:
-    """Read one scalar over time; `columns` names the time of a CSV."""
+    """Read one scalar over time; `columns` names the time column of a CSV."""
     path = Path(path)
     if not signal:
         raise InputError('the name of the signal is empty: TOPIC/FIELD or a column')

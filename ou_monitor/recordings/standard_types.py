@@ -158,7 +158,7 @@ def _template(kind: str, content: str, wanted: frozenset[FieldPath]) -> tuple[by
 
 def _encode(kind: str, columns: Mapping[str, npt.NDArray[Any]],
             stamps_ns: npt.NDArray[np.int64] | None = None, **content: Any) -> list[bytes]:
-    """Return messages that differ in some fields, by their paths; the rest is as in `content`."""
+    """Return messages with `columns` (path -> values) and, in all of them, `content`."""
     if stamps_ns is not None:
         columns = {'header.stamp.sec': stamps_ns // 1_000_000_000,
                    'header.stamp.nanosec': stamps_ns % 1_000_000_000, **columns}

@@ -40,19 +40,19 @@ SLICE = 1000
 BLOCK_RATE = 10000.0
 BLOCK = 100
 
-# Period, s, after which an unchanged throttle is repeated, for late subscribers and bags played
+# Period, ns, after which an unchanged throttle is repeated, for late subscribers and bags played
 # from the middle.
 THROTTLE_PERIOD_NS = 1_000_000_000
 
-# Range of 64-bit stamps, with a margin for shifts.
+# Largest stamp, ns: half the range of 64-bit stamps, as a margin for shifts.
 _LAST_NS = 2.0**62
 
 # The header's stamp counts seconds in an int32.
 LAST_HEADER_NS = (2**31) * 1_000_000_000 - 1
 
 Stamps = npt.NDArray[np.int64]
-# Log time (ns), topic index, message.  At equal times the throttle comes first: it holds for that
-# sample.
+# Log time (ns), index of the topic, message.  At equal times the throttle (0) comes first, because
+# it holds for the voltage of that time.
 Timed = tuple[int, int, bytes]
 THROTTLE, VOLTAGE = 0, 1
 
@@ -154,7 +154,7 @@ def as_nanoseconds(t: FloatArray, name: str) -> npt.NDArray[np.int64]:
 
 def check_steady(name: str, since_first: npt.NDArray[np.int64], before: int,
                  sample_rate: float) -> None:
-    """Refuse a spacing other than the stated one, because blocks have no stamps for it."""
+    """Refuse a spacing other than the stated one, because blocks hold no stamps of samples."""
     grid = (before + np.arange(since_first.size)) * (1e9 / sample_rate)
     if np.abs(since_first - grid).max() > 0.5e9 / sample_rate:
         raise InputError(
@@ -177,7 +177,7 @@ def write_log(
     first = min(float(one.t[0]) for one in streams.values())
     shift = max(0, -round(first * 1e9))
     total = sum(one.t.size for one in streams.values())
-    # Refused before anything is written to disk.
+    # Check the stamps before anything is written to disk.
     stamps = {topic: as_nanoseconds(one.t, one.name) + shift for topic, one in streams.items()}
     whole = {**about}
     for topic, one in streams.items():
@@ -185,7 +185,7 @@ def write_log(
         whole |= {f'{topic}_field': one.name, f'{topic}_unit': one.unit,
                   f'{topic}_scale': one.scale, f'{topic}_what': one.words}
     with BagWriter(path, about=whole) as bag:
-        # Topics in the order of the table of contents: the voltage first.
+        # Add the voltage first, so that it is the first topic in listings.
         for topic in reversed(streams):
             bag.add_topic(topic, kinds[topic])
         names = [f'/{topic}' for topic in streams]

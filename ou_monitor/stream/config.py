@@ -163,8 +163,8 @@ def _load(path: Path) -> MsgConfig:
 
 
 def _checked(content: Any, record: type, where: str) -> dict[str, Any]:
-    """Return the keys of a record; InputError names the first wrong one."""
-    # The name is the file's.
+    """Return the content if its keys and values fit a record; InputError names the first wrong."""
+    # `name` is from the name of the file.
     known = {one.name: one for one in fields(record) if one.name != 'name'}
     if not isinstance(content, dict):
         raise InputError(f"{where}: expected keys ({', '.join(known)}), found none")

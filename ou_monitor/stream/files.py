@@ -29,7 +29,7 @@ MOST_BYTES = 1_000_000
 MOST_NODES = 20_000
 MOST_DEPTH = 64
 MOST_ALIASES = 100
-# Maximum digits of a number: the largest float64 has 309, and conversion costs their square.
+# Maximum digits of a number: the largest float64 has 309, and conversion takes quadratic time.
 MOST_DIGITS = 400
 
 
@@ -54,18 +54,18 @@ def open_regular(path: str | Path) -> BinaryIO:
 
 
 def write_whole(path: Path, content: bytes, *, over: bool = True) -> None:
-    """Write a file whole or not at all; without `over`, only if none is there."""
+    """Write a file completely or not at all; replace an existing one only with `over`."""
     draft = path.with_name(f'.{path.name}.{os.getpid()}.draft')
     try:
-        # The path may be a FIFO, which would wait for its reader, or a link to another folder.
+        # The draft's name may be taken by a FIFO, which would block, or by a link.
         draft.unlink(missing_ok=True)
         draft.write_bytes(content)
         if not over:
-            # Take the name; this fails if a file has appeared since the output was checked.
+            # Reserve the name: this fails if a file has appeared since the output was checked.
             os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
         os.replace(draft, path)
     except OSError as error:
-        # The folder itself may refuse.
+        # Removing the draft may fail for the same reason.
         with suppress(OSError):
             draft.unlink(missing_ok=True)
         raise InputError(f"cannot write '{path}': {error.strerror or error}") from error

@@ -1,20 +1,20 @@
 """
 Messages -> samples in order, throttle beside each, ready for the monitor.
 
-Publishers: rclpy does not report the sender, so the sequence numbers of the messages tell
-publishers apart; two with equal numbers and times cannot be told apart.
+Publishers: rclpy does not report the sender, so publishers are distinguished by the sequence
+numbers of their messages; two with equal numbers and times cannot be distinguished.
 
 Throttle: one rule for the node and offline.  A throttle holds from its own stamp on if its clock
-is the voltage's, otherwise from the next voltage message on.  The clocks are compared at each
-throttle message, with the newest voltage stamp received by then.  A throttle has no maximum age;
-the caller knows the present time and decides when it is too old.  Samples handed to the monitor
-are final: a throttle that arrives later applies to later samples only.
+is the same as the voltage's, otherwise from the next voltage message on.  The clocks are compared
+at each throttle message, with the newest voltage stamp received by then.  A throttle has no
+maximum age; the caller knows the present time and decides when it is too old.  Samples handed to
+the monitor are final: a throttle that arrives later applies to later samples only.
 
 Blocks: the stamp of a block of ADC samples is the *arrival* time of its last sample, late by some
-milliseconds of bus and scheduler that vary from block to block.  A quartz times the samples
-themselves, so their time line runs at the stated rate and drifts only slowly towards the stamps.
-A constant delay stays; one lost block (within max(2 blocks, 0.25 s)) looks like jitter, is not
-counted as a gap, and is made up slowly.
+milliseconds of bus and scheduler that vary from block to block.  The samples themselves are timed
+by a quartz, so their time line runs at the stated rate and follows the stamps only slowly.  A
+constant delay is not corrected; one lost block (within max(2 blocks, 0.25 s)) looks like jitter:
+it is not counted as a gap, and the time line catches up slowly.
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ if TYPE_CHECKING:
 
 
 # Maximum lead (unsynchronized clocks) and lag (queues) of a stamp of the receiver's clock, s;
-# beyond, it is of another clock.
+# beyond them, the stamp is from another clock.
 AHEAD, BEHIND = 0.25, 5.0
-# Largest delay once the clock is known, s: no queue holds ten minutes.
+# Largest delay once the clock is known, s: no queue delays messages by ten minutes.
 MOST_DELAY = 600.0
 # Silence of the followed publisher, s, after which another one is followed.
 GIVE_UP = 1.0
 # Silence, in message intervals, that may be a pause of the publisher rather than a loss.
 PAUSE = 10.0
-# Tracks kept beyond the number of publishers, until the end of a batch.
+# Maximum number of tracks, beyond the number of publishers, within a batch.
 _MORE = 4
 # Weight of a new interval in the mean interval of a publisher.
 _LEARN = 0.05
 
 
 class SourceClock:
-    """Age of the newest sample; `name`: clock of its stamp, 'ros', 'foreign' or 'unknown'."""
+    """Computes the age of the newest sample; `name`: its clock, 'ros', 'foreign' or 'unknown'."""
 
     def __init__(self) -> None:
         self.name = 'unknown'
@@ -129,7 +129,7 @@ class Publishers:
             return kept
         if publishers <= 1 and self._tracks and (
                 arrived[0] - max(track.arrived for track in self._tracks) > GIVE_UP):
-            # The only publisher restarts after a silence: all others are gone.
+            # Only one publisher is left after a silence: drop the tracks of the others.
             del self._tracks[1:]
         for k, (number, time, at) in enumerate(zip(whole, times.tolist(), arrived.tolist())):
             kept[k] = self._take_one(number, time, at, publishers)
@@ -137,7 +137,7 @@ class Publishers:
         return kept
 
     def _give_up(self, publishers: int) -> None:
-        """Forget publishers that are gone, follow another one; only after a whole batch."""
+        """After a whole batch, forget publishers that are gone, and if need be follow another."""
         while len(self._tracks) > max(publishers, 2):
             # A publisher has restarted: the one that has been silent longest is gone.
             gone = min(range(len(self._tracks)), key=lambda k: self._tracks[k].arrived)
@@ -288,7 +288,7 @@ class ThrottleHold:
                 after_own = np.where(early, voltage_own[0], after_own)
             apart = np.where(own == after_own, APART, APART_MIXED)
             one_clock = np.abs(stamps - compared) <= apart
-            # By arrival: after the newest voltage and after each earlier throttle.
+            # With another clock, place by arrival: after the newest voltage and earlier throttles.
             latest = np.maximum.accumulate(np.concatenate([[self._latest], np.where(
                 one_clock, stamps, np.nextafter(after + 2.0 * self._slack, math.inf))]))[1:]
             self._places.append(np.where(one_clock, stamps, latest))
@@ -309,7 +309,7 @@ class ThrottleHold:
         places, values = self.held()
         values = np.append(np.nan, values)
         found = np.empty(t.size)
-        # In parts: the places of all samples at once would take as much memory as the samples.
+        # In parts: the indices of all samples at once would take as much memory as the samples.
         for k in range(0, t.size, BATCH):
             part = slice(k, k + BATCH)
             found[part] = values[np.searchsorted(places, t[part] + self._slack, 'right')]
@@ -336,9 +336,9 @@ KEEP = 1024
 
 class SampleStream:
     """
-    Collects samples between two reports for the monitor; throttle is paired at each `flush`.
+    Collects samples between two reports for the monitor; `flush` pairs them with the throttle.
 
-    `messages`: voltage messages received; `unplaced`: those without a time (`/clock` has not
+    `messages`: number of voltage messages; `unplaced`: number without a time (`/clock` has not
     started), checked against the voltage floor only; one of `thin` samples enters the estimate.
     """
 
@@ -354,8 +354,8 @@ class SampleStream:
         self._ends: list[FloatArray] = []
         self._own: list[BoolArray] = []
         self._count = 0
-        # Throttles since then: stamp, value, whether the message carries it, voltage messages
-        # before it.
+        # Throttles since then: stamp, value, whether the stamp is the message's own, number of
+        # voltage messages before it.
         self._loads: deque[tuple[float, float, bool, int]] = deque(maxlen=KEEP)
         self._empty = True
         self._newest = self._newest_throttle = -math.inf
@@ -411,7 +411,7 @@ class SampleStream:
         last = np.cumsum(counts) - 1
         firsts, ends = stamps[last + 1 - counts], stamps[last]
         columns = stamps, values, np.repeat(arrived, counts), np.repeat(current, counts)
-        # Stamps of late blocks stay on the time line; only its restart makes them go back.
+        # Late blocks are stamped along the time line: stamps go back only when it restarts.
         before = np.concatenate(([self._newest], ends[:-1]))
         back = np.flatnonzero(firsts < before - BACK)
         # The last of several backward steps in one call counts.
@@ -435,7 +435,7 @@ class SampleStream:
         self._newest = max(self._newest, float(ends.max()))
 
     def add_throttle(self, end: float, own: bool, value: float) -> bool:
-        """Add the value of one throttle message with the stamp `end`, s; `own`: it carries it."""
+        """Add one throttle message (end: its stamp, s; own: whether the stamp is its own)."""
         if end < self._newest_throttle - BACK:
             self.flush()
             self._hold.restart(self._last_throttle)
@@ -475,7 +475,7 @@ class SampleStream:
             self._block.reset()
 
     def _begin_anew(self, reason: str) -> None:
-        """Clear the window; blocks have started a new time line already."""
+        """Clear the window, and restart the throttle's time line, but not the block clock's."""
         self.flush()
         if not self._empty:
             self._monitor.reset(reason)

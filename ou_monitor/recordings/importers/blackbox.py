@@ -42,7 +42,7 @@ _PART = 16
 GYRO, UNFILTERED, DEBUG, ACCELEROMETER = 'gyroADC', 'gyroUnfilt', 'debug', 'accSmooth'
 # debug_mode GYRO_SCALED of Betaflight 4.0 to 4.5: the gyro before its filters, deg/s.
 _GYRO_SCALED, _FIRST, _LAST = 6, (4, 0, 0), (4, 6, 0)
-# A scale below this is in rad/us, as Baseflight had it, not in deg/s.
+# A gyro scale below this is in rad/us, as in Baseflight, not in deg/s.
 _BASEFLIGHT = 1e-3
 
 Fields = dict[str, FloatArray]
@@ -167,7 +167,7 @@ def _in_time(table: FloatArray) -> tuple[FloatArray, int]:
     table = table.copy()
     table[:, 0] = time
     kept = table[good]
-    # Parts that go back in time are not bytes of this flight.
+    # Frames that go back in time do not belong to this flight.
     ahead = np.ones(len(kept), dtype=bool)
     ahead[1:] = kept[1:, 0] > np.maximum.accumulate(kept[:-1, 0])
     kept = kept[ahead]
@@ -211,7 +211,7 @@ def _version(headers: Headers) -> tuple[str, tuple[int, int, int]]:
 
 
 def _battery_scales(headers: Headers) -> tuple[float | None, float | None]:
-    """Return V and A per unit, as blackbox-log-viewer has them; None: unknown."""
+    """Return V and A per logged unit, as in blackbox-log-viewer; None: unknown."""
     name, version = _version(headers)
     if name == 'inav' and version >= (2, 0, 0):
         return 0.01, 0.01

@@ -178,7 +178,7 @@ def _no_voltage(path: Path, log: Log, option: str) -> str:
 
 
 def _alternatives(log: Log, chosen: tuple[Series, Series | None], option: str) -> list[str]:
-    """Return a note on the alternatives."""
+    """Return notes on other series that could be the voltage or the throttle."""
     notes: list[str] = []
     for quantity, one in zip((VOLTAGE, THROTTLE), chosen):
         others = [other for other in _series_of(log, quantity)
@@ -195,7 +195,7 @@ def _alternatives(log: Log, chosen: tuple[Series, Series | None], option: str) -
 IMU, SPEEDS = 'imu', 'motor_speed'
 # Topics that a named series must not take.
 _TAKEN = ('voltage', 'throttle', 'current', IMU, SPEEDS)
-# Number of parts of a series whose rates are compared; ratio above which a change is noted.
+# Number of parts of a series whose rates are compared; ratio of rates above which this is noted.
 _PARTS, _UNEQUAL = 10, 1.5
 # Minimum length of a gap, in typical steps.
 _GAP = 3.0

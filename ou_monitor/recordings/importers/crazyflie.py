@@ -53,7 +53,7 @@ _UNITS = {**{f'{_GYRO}.{axis}': ('rad/s', DEGREE) for axis in 'xyz'},
 
 
 class _Event(NamedTuple):
-    """Content of a record of one event."""
+    """Layout of the records of one event."""
 
     name: str
     row: np.dtype[np.void]

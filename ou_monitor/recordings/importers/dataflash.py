@@ -53,7 +53,7 @@ PLAIN = (
     ('MOTB', 'ThrOut', THROTTLE, 3, 'throttle output of the mixer'),
     ('RATE', 'AOut', THROTTLE, 4, 'throttle output'),
 )
-# Message -> rank; the first of several instances.  Axes are front, right, down.
+# Message -> rank of its first instance.  Axes are front, right, down.
 GYROS = {'IMU': 0, 'GYR': 1, 'IMU2': None, 'IMU3': None}
 RATES, FORCES = ('GyrX', 'GyrY', 'GyrZ'), ('AccX', 'AccY', 'AccZ')
 # Units of the fields if the log does not state them (before 2018).
@@ -79,7 +79,7 @@ def read(path: Path, request: Request) -> Log:
         text = not file.read(2).startswith(b'\xa3\x95')
     with _plain_text(path, text) as (name, mended):
         reader = DFReader.DFReader_text if text else DFReader.DFReader_binary
-        # Created without `__init__`, so that its files can be closed if `__init__` fails.
+        # `__init__` is called separately, so that the files can be closed if it fails.
         log: Any = reader.__new__(reader)
         try:
             with quiet_process():
@@ -89,7 +89,7 @@ def read(path: Path, request: Request) -> Log:
             parameters: dict[str, float] = dict(log.params)
             # Unix time of boot by GPS; 0: unknown.
             boot = float(getattr(log.clock, 'timebase', 0.0) or 0.0)
-            # Damage may repeat a name: the first format counts.
+            # If damage repeats the name of a format, its first definition counts.
             forms = {one.name: one for one in reversed([*log.formats.values()])}
             names = tuple(f'{one.name}.{field}' for one in log.formats.values()
                           for field in _numbers(one))
@@ -137,7 +137,7 @@ def _plain_text(path: Path, text: bool) -> Iterator[tuple[str, list[str]]]:
 
 def _close(log: Any) -> None:
     for name in ('data_map', 'filehandle'):
-        # A map still in use by a failed set-up cannot be closed here; it is freed with the log.
+        # A memory map that a failed `__init__` still uses cannot be closed; it goes with the log.
         with suppress(BufferError):
             if hasattr(log, name):
                 getattr(log, name).close()

@@ -23,8 +23,8 @@ from ou_monitor.records import defect_of, Note
 from ou_monitor.stream.files import open_regular, plain_texts
 from ou_monitor.text import printable
 
-# Enough to identify every format; the format messages of a text log come first in it.
-HEAD = 8192  # bytes
+# Number of first bytes that identify a format; a dataflash text log starts with FMT messages.
+HEAD = 8192
 
 MAGIC = b'\x89MCAP0\r\n'
 ULOG = b'ULog\x01\x12\x35'
@@ -82,7 +82,7 @@ def format_of(head: bytes) -> Format | None:
     return next((one for one in FORMATS if head and one.fits(head)), None)
 
 
-# What any other text may be.
+# Words for text of any other format.
 TEXT = 'it is text; if it is a table of time and voltage, name it NAME.csv'
 # First bytes -> what it is, and what to do.
 _FOREIGN = {
@@ -174,7 +174,7 @@ def import_log(path: Path, request: Request) -> Log:
     try:
         module = import_module(f'{__package__}.{form.module}')
     except ImportError as error:
-        # Only packages that the importer loads are extras; our own errors are not hidden.
+        # Explain only a missing extra; do not hide errors of this package.
         if not form.package or (error.name or '').split('.')[0] != form.package:
             raise
         raise InputError(
@@ -182,7 +182,7 @@ def import_log(path: Path, request: Request) -> Log:
             f'{how_to_install(form.module)}') from error
     if request.progress is not None:
         request = replace(request, progress=_terminal_progress(request.progress))
-    # Broken bytes give numbers that no cast accepts, and fields of any shape.
+    # Damaged bytes may give numbers that overflow (ignored) and any exception (caught by `quiet`).
     with np.errstate(all='ignore'), quiet(path, form.package or 'ou_monitor'):
         log: Log = module.read(path, request)
     # Names in a log reach messages, tables and bags.

@@ -63,7 +63,7 @@ class Motion:
 
 def gyro_of(name: str, t: FloatArray, rates: FloatArray | None, forces: FloatArray | None,
             scale: str, words: str, rank: int | None = None) -> Iterator[Motion]:
-    """Yield a gyro, unless it is None, with its accelerometer, unless that is; see `Motion`."""
+    """Yield a gyro with its accelerometer (None: there is none); see `Motion`."""
     if rates is not None:
         yield Motion(name, t, {RATE: rates, **({} if forces is None else {FORCE: forces})},
                      scale, words, rank)
@@ -87,7 +87,7 @@ UNKNOWN = '?'
 
 # Maximum magnitude: larger values come from corrupt bytes, and a message could not hold them.
 LARGEST = 1e9
-# Stamps of corrupt bytes: groups of fewer than _FEW samples, over _FAR from the others.
+# Stamps come from corrupt bytes if fewer than _FEW samples are over _FAR from all others.
 _FAR = 3600.0  # s
 _FEW = 16
 Progress = Callable[[float], None]
@@ -194,7 +194,7 @@ class CsvColumns:
     unit: str | None = None
     time_unit: str | None = None
     throttle_unit: str | None = None
-    current: str | None = None  # Name of a column, as the throttle
+    current: str | None = None  # Name of a column, or 'none'
     # What separates cells: a character, 'tab' or 'space'; the decimal mark: '.' or ','.
     delimiter: str | None = None
     decimal: str | None = None
@@ -217,13 +217,13 @@ class Request:
 
 
 def one_flight(path: Path, request: Request) -> None:
-    """Refuse a flight other than the first for formats that hold one flight a file."""
+    """Refuse a flight other than the first, for formats with one flight per file."""
     if request.flight not in (None, 1):
         raise InputError(f'{path} holds one flight, so --flight {request.flight} does not exist')
 
 
 def sound(t: FloatArray, rows: FloatArray) -> tuple[Picked, list[str]]:
-    """Return samples as `in_order`, without those whose stamps come from corrupt bytes."""
+    """Select samples as `in_order` does, but leave out stamps from corrupt bytes."""
     notes: list[str] = []
     places = np.flatnonzero(np.isfinite(t) & np.isfinite(rows).all(axis=1))
     if places.size < t.size:
@@ -296,7 +296,7 @@ def log_of(form: str, series: Sequence[Series], facts: dict[str, str], notes: It
            names: Iterable[str], inertial: Iterable[Motion] = (),
            speeds: Motion | None = None, start: float = math.inf) -> Log:
     """Return a log, its stamps counted from the first of its series, or `start` (s) if earlier."""
-    # Corrupt bytes give stamps near zero: a first sample counts only with others near it.
+    # Corrupt bytes may give an early stamp: it counts only if others are near it.
     start = min([start, *(float(one.t[near(one.t)].min()) for one in series if one.t.size)])
 
     def shifted(parts: Iterable[_Timed]) -> tuple[_Timed, ...]:

@@ -68,10 +68,10 @@ LARGEST = 10_000
 
 
 class _WatchedFile(io.BufferedReader):
-    """A file that records which bytes pyulog skips silently, and prevents two faults of it."""
+    """A file that records which bytes pyulog skips silently, and avoids two faults of pyulog."""
 
-    # An endless loop, because pyulog steps back by the stated length of a message even if the file
-    # ended within it; and reading the rest of the file again at each byte of a damaged part.
+    # First, an endless loop: pyulog steps back by the stated length of a message even if the file
+    # ended within it.  Second, it reads the rest of the file at each byte of a damaged part.
 
     progress: Progress | None = None
     size = 1
@@ -106,7 +106,7 @@ class _WatchedFile(io.BufferedReader):
         return data
 
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        """Move; a step back beyond the last read starts where pyulog believes to be."""
+        """Move; a step back beyond the last read counts from the position that pyulog assumes."""
         if whence == io.SEEK_CUR and -offset > self.had:
             offset += self.missing
         return super().seek(offset, whence)
@@ -211,7 +211,7 @@ def _facts(ulog: Any) -> dict[str, str]:
     if uuid.strip('0'):
         facts['vehicle'] = f'{board} {uuid}'.lstrip()
     elif board:
-        # Many vehicles share one; simulators state 0.
+        # Without a serial number (simulators state 0); many vehicles have the same board.
         facts['board'] = board
     given = ulog.initial_parameters
     cells = given.get('BAT1_N_CELLS', given.get('BAT_N_CELLS', 0))
