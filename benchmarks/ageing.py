@@ -1,5 +1,5 @@
 """
-Verdicts on a flight beside a saved model: aged packs, and recorded pairs (5 min a model).
+Verdicts of comparing a flight with a saved model: aged packs, recorded pairs (5 min per model).
 
 `aged`: a model is learned from one simulated flight and compared with 60 s of others, which have
 1, 1.1, 1.2 and 1.4 times the sag and start at three places of the recorded throttle, and with 5 s
@@ -27,7 +27,7 @@ from ou_monitor.recordings.model_file import read_model
 from ou_monitor.records import Recording
 from ou_monitor.simulation import read_throttle, RecordedThrottle, simulated
 
-# Hz; length of the flight for learning and of those compared, s.
+# Sampling rate, Hz; lengths of the flight for learning and of the compared flights, s.
 RATE, TAUGHT, LENGTH = 100.0, 120.0, 60.0
 AGES, PLACES = (1.0, 1.1, 1.2, 1.4), (0.0, 1.0 / 3.0, 2.0 / 3.0)
 # Recorded flights by craft; a craft with one flight is compared by its halves.

@@ -21,7 +21,7 @@ ArduPilot Copter (`AP_BattMonitor_Params.cpp`, `AP_BattMonitor_Backend.cpp`, rea
 after more than BATT_LOW_TIMER = 10 s below BATT_LOW_VOLT = 10.5 V; raw voltage, or with
 BATT_FS_VOLTSRC = 1 the voltage at rest.  Also with BATT_LOW_VOLT set to the limit.
 
-The closed loop is simulated: dips that throttle does not announce, and an hour without any.
+The closed loop is simulated: dips that throttle does not cause, and an hour without dips.
 
     OU_MONITOR_REALDATA=... python benchmarks/alarms.py flights --page doc/results/alarms.md
     OU_MONITOR_REALDATA=... python benchmarks/alarms.py flights gecko --strips doc/results
@@ -317,7 +317,7 @@ def supply(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray, np
         x += (u ** 1.8 - x) / (0.06 * RATE)
         y += (u ** 1.8 - y) / (2.0 * RATE)
         throttle[k], lagged[k], slow[k] = u, x, y
-    # An hour needs several packs: the level falls, and returns to that of a full pack.
+    # An hour needs several packs: the level falls, and jumps to a full pack's every ten minutes.
     level = 16.3 - 0.8 * (t % 600.0) / 600.0
     noise = 0.02 * (1.0 + throttle) * rng.standard_normal(n)
     voltage = level - 1.2 * lagged - 0.5 * slow + noise

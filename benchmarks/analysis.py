@@ -1,5 +1,5 @@
 """
-How often `analyze` finds effects that are there, and effects that are not (10 min).
+How often `analyze` detects real effects, and how often it raises false alarms (10 min).
 
 Recordings of three load levels, 5 s each at 1 kHz, with the paper's alpha, white noise of 3 mV and
 a sag.
@@ -65,7 +65,7 @@ def differs(found: Analysis) -> bool:
 ALARMS: dict[str, Callable[[Analysis], bool]] = {
     "a process type other than 'diffusion'": lambda found: kinds(found) != {'diffusion'},
     'a line': line, 'alpha differs (stated 5 %)': differs}
-# Effects that are there, and the check that finds them.
+# Effects in the recordings, and the check that should detect each.
 THERE: dict[str, tuple[Callable[[Analysis], bool], dict[str, Any]]] = {
     'tone of 1.4 mV rms: a line': (line, {'effect': tone}),
     'one sample in 1000 off by 8 steps: with impulses': (

@@ -42,7 +42,7 @@ import zstandard
 START = 1_704_067_200_000_000_000
 MS = 1_000_000
 COUNT = 400
-# Longest time of one reading, s, on a busy machine; more is a hang.
+# Timeout of one reading, s, with a margin for a busy machine.
 PATIENCE = 60
 LIES = (0, 1, 2, 7, 8, 0x7f, 0xff, 2**16, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**63,
         2**64 - 1)
@@ -116,7 +116,7 @@ def mutated(sound: bytes, rng: np.random.Generator) -> tuple[str, bytes]:
     """Return the kind of an attack, and a file after it."""
     data = bytearray(sound)
     parts = records(sound)
-    # Without statistics nobody can know that a record was removed.
+    # Without statistics, a missing chunk cannot be detected: leave the chunks alone.
     if not any(sound[begin] == Opcode.STATISTICS for begin, _ in parts):
         parts = [part for part in parts if sound[part[0]] != Opcode.CHUNK]
     kind = str(rng.choice([*BYTES, 'more', 'swap', 'twice', 'lost', 'length', 'word', 'kind',
@@ -156,7 +156,7 @@ def text(value: str | bytes) -> bytes:
 
 
 def record(op: int, *parts: bytes, length: int | None = None) -> bytes:
-    """Return a record, whose stated length may be a lie."""
+    """Return a record; `length`: a false one to be stated."""
     content = b''.join(parts)
     return struct.pack('<BQ', op, len(content) if length is None else length) + content
 
@@ -165,15 +165,15 @@ class Crafted:
     """A crafted file of correct chunks and of parts with false contents."""
 
     def __init__(self, rng: np.random.Generator) -> None:
-        """Choose the parts that lie."""
+        """Start a file; `rng` decides which parts are false."""
         self.rng, self.count = rng, 0
 
     def lies(self, chance: float = 0.12) -> bool:
-        """Return whether the next part lies."""
+        """Return whether the next part is false."""
         return bool(self.rng.random() < chance)
 
     def lie(self) -> int:
-        """Return a number that is wrong nearly anywhere."""
+        """Return a number that is almost certainly wrong."""
         return int(self.rng.choice(np.array(LIES, object)))
 
     def definitions(self) -> bytes:
@@ -212,7 +212,7 @@ class Crafted:
         return out
 
     def chunk(self, content: bytes, first: int) -> bytes:
-        """Return a chunk; its header may lie."""
+        """Return a chunk, whose header may be false."""
         way = str(self.rng.choice(['', 'zstd', 'lz4']))
         packed, size, crc = content, len(content), zlib.crc32(content)
         if self.lies(0.05):
@@ -243,7 +243,7 @@ class Crafted:
         chunks = int(self.rng.integers(1, 6))
         for k in range(chunks):
             first = self.count
-            # Messages may also stand outside of chunks.
+            # Messages may also be outside of chunks.
             if self.rng.random() < 0.1 and k:
                 data += self.messages(int(self.rng.integers(1, 50)))
                 continue
@@ -372,7 +372,7 @@ def verdict_of_sheet(data: bytes, found: Recording) -> str:
     lines = [line for line in re.split('\r\n|\n|\r', data.decode(code, 'replace'))
              if line.strip() and not line.lstrip().startswith('#')]
     while lines[1:] and lines[0] == lines[1] and not numbers(lines[0]):
-        lines = lines[1:]  # The header stands twice.
+        lines = lines[1:]  # The header occurs twice.
     lines = lines[not any("'column 1'" in note for note in found.notes):]
     stand: dict[float, list[list[float]]] = {}
     everything = {math.nan}

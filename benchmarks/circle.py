@@ -1,11 +1,11 @@
 """
-Do `compare` and `discover` recognise simulations of the models that `discover` saved (25 min).
+Whether `compare` and `discover` recognise simulations of models saved by `discover` (25 min).
 
     OU_MONITOR_REALDATA=FOLDER python benchmarks/circle.py --page doc/results/circle.md
 
-Each model is simulated with the throttle of its own recording and new seeds.  `compare` must say
-that this looks like the model; `discover` must find no cause that the model lacks; a tone that is
-added to the model must be found at its frequency.
+Each model is simulated with the throttle of its own recording and new seeds.  `compare` must
+report that the simulation looks like the model; `discover` must find no cause that the model
+lacks; a tone that is added to the model must be found at its frequency.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ MODELS = {**{name: FLIGHTS[name] for name in ('gecko', 'nazgul', 'bf3s', 'cf_sol
           'hiro': HIRO, 'mm_bench_3': BENCHES['mm_bench_3']}
 # Part of each recording that is simulated, s.
 SECONDS = 60.0
-# The added tone: its amplitude over the rms of the readings' differences, and its frequency over
-# the rate (the one farther from the model's lines; load and OU hardly reach either).
+# The added tone: its amplitude relative to the rms of the readings' differences, and two
+# frequencies relative to the rate, of which the one farther from the model's lines is used.
 AMPLITUDE, SHARES = 1.0, (0.23, 0.13)
 # Largest relative error of a frequency that counts as found.
 NEAR = 1e-3

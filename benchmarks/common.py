@@ -85,7 +85,7 @@ def recorded() -> Path:
 
 def flights(names: Sequence[str] = (), of: Mapping[str, tuple[str, int | None]] = FLIGHTS
             ) -> Iterator[tuple[str, Recording]]:
-    """Yield name and recording of each flight whose file exists, with a line for the others."""
+    """Yield name and recording of each flight whose file exists; report the missing ones."""
     folder = recorded()
     for name, (file, number) in of.items():
         if names and name not in names:

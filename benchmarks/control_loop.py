@@ -25,15 +25,15 @@ from ou_monitor.online.estimator.estimator import SlidingEstimator
 from ou_monitor.online.filter.lowpass import AdaptiveLowPass
 from ou_monitor.records import FloatArray, NAN
 
-# A smaller swing of the cutoff, octaves, does not matter to the loop.
+# Minimum swing of the cutoff, octaves, that counts as hunting.
 SWING = 0.5
-# The cutoff hunts if it swings at least this many times as much as with the loop cut.
+# Minimum ratio of the swing to the swing with the loop cut.
 FACTOR = 3.0
 COUPLINGS = (0.1, 0.3, 1.0, 1.5, 2.0, 3.0, 4.0)
 # A threshold just above sigma in a quiet hover, where a law is most likely to hunt.
 _ABOVE = 0.72
 _BARE = {'smoothing': 0.0, 'slew': 0.0, 'dead_band': 0.0}
-# The coupling of this law is set to that of the loop.
+# The coupling of this law is set to the loop's.
 _KALMAN = {'law': 'kalman', 'n0': 1e-7}
 CASES: dict[str, dict[str, object]] = {
     'constant_noise, defaults': {},

@@ -1,10 +1,10 @@
 """
-Orders of convergence of a switched supply to its limits, and a rail under an ESC (10 s).
+Orders of convergence of a switched supply to its limits (10 s), and chains that switch it.
 
 Averaging (paper, 3.2): u^eps - u^0 is sqrt(eps) times a Gaussian process, so its rms has order 1/2
 in eps.  Diffusion (3.3): a rail driven by a fast chain x(t), dU = -alpha U dt + c(x) dt, tends to
-the Ornstein-Uhlenbeck process with sigma^2 = 2 sum pi c R0 c, c less its mean. Its variance at any
-eps is exact, so the distance from the limit has no sampling noise.
+the Ornstein-Uhlenbeck process with sigma^2 = 2 sum pi c R0 c, where c is centred. The variance at
+any eps is computed exactly, so the distance from the limit has no sampling noise.
 """
 
 from __future__ import annotations

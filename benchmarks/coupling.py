@@ -82,7 +82,7 @@ def supply(rng: np.random.Generator, t: np.ndarray, rise: np.ndarray) -> np.ndar
 
 def draw(rng: np.random.Generator, kind: str, flight: Flight, axis: np.ndarray,
          other: Flight) -> dict[str, list[bool]]:
-    """Return whether coupling was seen without any, and with coupling added."""
+    """Return whether coupling was reported: without coupling, and with coupling added."""
     turned = np.roll(axis, rng.integers(axis.size // 10, axis.size - axis.size // 10))
     if kind == KINDS[2]:
         found = estimate_coupling(flight.t, flight.voltage, flight.gyro_t, turned,

@@ -159,8 +159,8 @@ def corrected(plain: Fit, duration: float) -> Fit:
     """
     Return a restricted fit with its small-sample bias removed.
 
-    2/T of alpha remain (Tang & Chen 2009, less the half that comes from the level); Var_inf,
-    convex in alpha, is taken at alpha - 1/T.
+    A bias of 2/T remains in alpha (Tang & Chen 2009, less the half that comes from the level);
+    Var_inf, convex in alpha, is taken at alpha - 1/T.
     """
     alpha, sigma, _ = plain.values
     if alpha * duration <= 2.0:

@@ -26,7 +26,7 @@ from common import ROOT
 from ou_monitor.records import determined
 
 ENDINGS = ('.csv', '.bbl', '.bfl', '.txt', '.bin', '.ulg', '.mcap')
-# Longest time of one command, s: `discover` of a long flight on a busy machine.
+# Timeout of one command, s: enough for `discover` of a long flight on a busy machine.
 MOST = 3600.0
 
 

@@ -6,11 +6,11 @@ The adaptive low-pass against the best fixed cutoff and the truth; its control l
         --figure doc/results/filter_dterm.svg
     python benchmarks/filter.py loop --page doc/results/filter.md
 
-sigma follows throttle, which moves in steps and ramps.  Each signal has a linear model, so its
-best linear estimate is that of a Kalman filter that knows sigma at every sample; it uses no code
-of the package.  *In hindsight*: the one of 41 cutoffs (21 curves) with the least mean square error
-in that flight.  `sweep` runs many cutoffs at once; a test compares it with the package.  The first
-3 s of a flight, in which the estimator fills its window, are not scored.
+sigma follows throttle, which moves in steps and ramps.  Each signal has a linear model, so a
+Kalman filter that knows sigma at every sample gives the best linear estimate; it uses no code of
+the package.  *In hindsight*: of 41 cutoffs (or 21 curves), the one with the least mean square
+error in that flight.  `sweep` runs many cutoffs at once; a test compares it with the package.  The
+first 3 s of a flight, in which the estimator fills its window, are not scored.
 """
 
 from __future__ import annotations

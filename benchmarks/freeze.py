@@ -1,5 +1,5 @@
 """
-Keep the JSON of every command on recorded runs, and print what changed between two (10 min).
+Save the JSON of commands on recorded runs; print what changed between two versions (10 min).
 
     python benchmarks/freeze.py keep BEFORE --root OTHER_CHECKOUT
     python benchmarks/freeze.py keep AFTER

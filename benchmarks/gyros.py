@@ -34,7 +34,7 @@ class Gyro:
     signal: np.ndarray  # Angular velocity, degree/s.
     # As in `convert`: the mean of the motors' commands if the log has them, 0..1.
     throttle: np.ndarray
-    rpm: np.ndarray | None  # Speed of the shafts.
+    rpm: np.ndarray | None  # Speeds of the motor shafts, 1/min.
 
 
 def read(name: str, seconds: float = np.inf) -> Gyro | None:

@@ -1,13 +1,13 @@
 """
-Law `kalman` on recorded gyros, which knows the noise but not the signal (4 min).
+Law `kalman` on recorded gyros, given the noise but not the signal (4 min).
 
     OU_MONITOR_REALDATA=FOLDER python benchmarks/learned.py --page doc/results/learned.md
 
 The truth is a gyro axis after a zero-phase low-pass at 30 Hz (or an eighth of the rate, if less),
 in stretches of 20 s from 8 s on.  Supply noise (an OU of 63 1/s with 0.09 of the truth's
 deviation) and white noise of 0.01 rad/s (or a tenth of the truth's deviation, if less) are added.
-The mean square error from the 200th sample on is divided, in each stretch, by that of the best of
-15 fixed cutoffs from 2 to 110 Hz (0.44 of the rate) in hindsight.
+In each stretch, the mean square error from the 200th sample on is divided by the error of the best
+of 15 fixed cutoffs from 2 to 110 Hz (0.44 of the rate) in hindsight.
 
 The constants of `learned_wiener` and `low_pass_span` were chosen on bf3s, roma and jd, and for the
 first second on gecko; nazgul and erle were not used for this.

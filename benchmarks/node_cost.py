@@ -1,5 +1,5 @@
 """
-CPU of the nodes for each message, against nodes that only count or read it (1 min).
+CPU of the nodes per message, against nodes that only count messages or read a field (1 min).
 
     .venv/bin/python benchmarks/node_cost.py [--seconds 10] [--page doc/results/node_cost.md]
 
@@ -57,7 +57,7 @@ while rclpy.ok():
 """
 # Throttle messages per second, sent with the voltages.
 STICK = 50.0
-# Label, kind and rate of the messages, command.
+# Kind of the messages, and label and command of each node.
 CASES: tuple[tuple[str, list[tuple[str, list[str]]]], ...] = (
     ('Float64', [
         ('counts', ['-c', _LISTENER, 'Float64', 'voltage', 'counts', 'n0']),
@@ -112,7 +112,7 @@ def trial(kind: str, nodes: list[tuple[str, list[str]]], rate: float, seconds: f
     stick = node.create_publisher(Float64, 'throttle', 10)
     values, sticks = rail(rate)
     moved = 0
-    # A node that distrusts its input costs little, so the table shows how often it knew the risk.
+    # A node that rejects its input costs little, so the table shows how often the risk was known.
     risks: list[float] = []
     node.create_subscription(
         Float64, '/ou_estimator/brownout_risk', lambda m: risks.append(m.data), 10)

@@ -11,7 +11,7 @@ by that of the best fixed low-pass of that lag.  Low-passes are Butterworth or o
 equal poles, whichever is best on the scored part, with and without notch.
 
 The first half of a flight is for learning; the second is scored.  `from nothing`: the whole flight
-is scored, with nothing known before.
+is scored, without learning before.
 
 Betaflight's RPM filter: three harmonics of each motor up to 0.48 of the rate, Q 5, faded in over
 100..150 Hz, motor speeds through a low-pass of 150 Hz (src/main/flight/rpm_filter.c and
@@ -130,7 +130,7 @@ def rpm_filter(gyro: gyros.Gyro) -> tuple[np.ndarray, np.ndarray]:
     motors = signal.lfilter(b, a, gyro.rpm / 60.0, axis=0)
     f = np.concatenate([k * motors for k in (1, 2, 3)], axis=1)
     share = np.clip((f - 100.0) / 50.0, 0.0, 1.0) * (f < 0.48 * gyro.rate)
-    # A notch above the limit sits on it in Betaflight, whose rate is 3.2 kHz or more.
+    # A notch above the limit has no effect here; Betaflight (3.2 kHz or more) keeps it there.
     keep = share.max(axis=0) > 0.0
     return notches(gyro, np.maximum(f, 100.0)[:, keep], 0.2, share[:, keep])
 

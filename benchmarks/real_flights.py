@@ -17,7 +17,7 @@ from ou_monitor.model.load_fit import fit_load
 from ou_monitor.online.load.load_filter import LoadFilter
 from ou_monitor.records import Recording
 
-# Seconds until a load should be known; of a flight shorter than 30 s.
+# Time after which the load should be known, s; for a flight shorter than 30 s.
 SETTLED, SHORT_SETTLED = 20.0, 8.0
 # Time between reports of the filter, s, as in a node.
 LOOK = 0.1

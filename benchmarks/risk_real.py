@@ -205,7 +205,7 @@ def false_alarms(cases: list[Case], says: Callable[[Case], np.ndarray], share: f
     highest, rises, minutes = [], [], 0.0
     for case in cases:
         y, loud = case.happened[:, 1].astype(int), says(case)
-        # A run of reports before a dip, or several: caught if one of them has an alarm.
+        # A run of reports before one or more dips; these are caught if one report has an alarm.
         begins = np.flatnonzero(np.diff(y, prepend=0) == 1)
         ends = np.flatnonzero(np.diff(y, append=0) == -1) + 1
         highest += [loud[a:b].max() for a, b in zip(begins, ends)]
@@ -269,7 +269,7 @@ def tables(cases: dict[str, list[Case]], facts: dict[str, dict[str, float]]) -> 
 def main() -> int:
     """Measure the flights and print the tables, or put them into the page."""
     parser = arguments(__doc__, names=True)
-    parser.add_argument('--json', type=Path, help='file for what is known of each flight')
+    parser.add_argument('--json', type=Path, help='file for the figures of each flight')
     options = parser.parse_args()
     cases: dict[str, list[Case]] = {'middle': [], 'single': []}
     facts = {}

@@ -46,8 +46,8 @@ UNSEEN = {'only_nan': 0.7, 'millivolts': 0.7, 'type': 0.7, 'silent': 0.7, 'resta
 # In these phases no estimate is possible, so the flag must never be false.
 NEVER_FALSE = ('frozen', 'backwards', 'wild', 'only_nan', 'type', 'silent')
 LONG, SHORT = (4.0, 12.0), (2.0, 4.0)
-# A dip need not be seen so shortly after the start or after a new publisher, s (discovery), nor so
-# shortly before a publisher ends (its last messages may be lost).
+# Times without a duty to see dips, s: after a new publisher (discovery), after the start, and
+# before a publisher ends (its last messages may be lost).
 SETTLE, FIRST, LEAVE = 1.0, 3.0, 0.3
 # Of dips: time between them, s (dense: the least at which they can be distinguished), length, s,
 # and voltage, V (never above the lowest floor that is set).
@@ -91,8 +91,8 @@ def phases(seed: int, seconds: float) -> list[Phase]:
     weights = {**SEEN, **UNSEEN}
     made, now = [Phase('good', 0.0, FIRST + 2.0)], FIRST + 2.0
     while now < seconds:
-        # If a publisher paused or changed while another is there, the node would switch to that
-        # one.
+        # Phases do not overlap: if the source paused while the second publisher is there, the
+        # node would follow the second one.
         kind = rng.choices(list(weights), list(weights.values()))[0]
         length = rng.uniform(*(LONG if kind in SEEN else SHORT))
         if kind == 'second':
@@ -238,7 +238,7 @@ class Source:
                     self._phase = self._phases[at]
                     self._enter(self._phase)
                     break
-                # One step after the end of a dip.
+                # Note a dip once its end has passed.
                 while dip_at < len(self._dips) and now > _end(self._dips[dip_at]):
                     self._note_dip(dip_at)
                     dip_at += 1
